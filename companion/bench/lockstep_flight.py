@@ -357,7 +357,7 @@ class LockstepFlight:
             "height": height_m - limits.max_altitude_m - PLACE_TOLERANCE_M,
             "lowness": 0.0 if landing else limits.min_altitude_m - PLACE_TOLERANCE_M - height_m,
             "distance": math.hypot(*away) - limits.max_distance_m - PLACE_TOLERANCE_M,
-            "fence": 0.0 if limits.fence.holds(away) else 1.0,
+            "fence": 0.0 if limits.fence.contains(away) else 1.0,
             "crash": 1.0 if truth.crashed or (truth.on_ground and not landing) else 0.0,
         }
         if moment.sent.velocity_ned_mps is not None:

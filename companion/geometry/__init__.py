@@ -1,1 +1,1 @@
-"""Geometry without a vehicle: fences, formations, rows of points."""
+"""Vehicle-independent geometry: fences, formations, lists of points, geodesy."""

@@ -1,4 +1,4 @@
-"""Rows of points as people write them."""
+"""Parser for lists of points in commands and settings."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import math
 
 
 def points_from(text: str) -> tuple[tuple[float, ...], ...]:
-    """Points from `north,east[,height]`, parted by spaces or semicolons.
+    """Parse points `north,east[,height]` (metres), separated by spaces or semicolons.
 
     Raises:
-        ValueError: a line that names the point that is none.
+        ValueError: the text contains something else; the message names it.
     """
     points = []
     for word in text.replace(";", " ").split():
@@ -18,6 +18,6 @@ def points_from(text: str) -> tuple[tuple[float, ...], ...]:
         except ValueError:
             point = ()
         if len(point) not in (2, 3) or not all(map(math.isfinite, point)):
-            raise ValueError(f"a point is north,east or north,east,height in metres, got {word!r}")
+            raise ValueError(f"a point must be north,east or north,east,height in metres, got {word!r}")
         points.append(point)
     return tuple(points)

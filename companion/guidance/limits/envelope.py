@@ -127,7 +127,7 @@ class Envelope:
         where = f"{away[0]:.1f} m north and {away[1]:.1f} m east of home"
         if math.hypot(*away) > self.limits.max_distance_m:
             return f"{where} is farther than guidance.max_distance_m = {self.limits.max_distance_m:g}"
-        if not self.limits.fence.holds(away):
+        if not self.limits.fence.contains(away):
             return f"{where} is not inside the fence (guidance.fence_include, fence_exclude)"
         here = state.position_ned_m
         if here is not None and abs(goal[2] - here[2]) <= SAME_HEIGHT_M:
@@ -269,7 +269,7 @@ class Envelope:
             if north * circle[-1][0] + east * circle[-1][1] > allowed_mps + 1e-9:
                 reasons.append(f"distance from home limited to {limits.max_distance_m:g} m")
         circle += level_constraints(rows, down)
-        over_ground = limits.fence.slowed((north, east), away, self._towards_fence, also=circle)
+        over_ground = limits.fence.limit_velocity((north, east), away, self._towards_fence, also=circle)
         if math.dist(over_ground, (north, east)) > 1e-9:
             if not reasons or not reasons[-1].startswith("distance from home"):
                 reasons.append(self._what_slows((north, east)))
@@ -333,13 +333,13 @@ class Envelope:
             place = (asked[0], asked[1], down)
 
         goal = (place[0] - home[0], place[1] - home[1])
-        inside = limits.fence.clipped((here[0] - home[0], here[1] - home[1]), goal)
+        inside = limits.fence.clip((here[0] - home[0], here[1] - home[1]), goal)
         if inside != goal:
             place = (home[0] + inside[0], home[1] + inside[1], down)
             reasons.append("kept inside the fence")
         way = (place[0] - here[0], place[1] - here[1])
         active = (way[0] * POSITION_GAIN_PER_S, way[1] * POSITION_GAIN_PER_S)
-        freed = NO_FENCE.slowed(active, here[:2], abs, self.near)
+        freed = NO_FENCE.limit_velocity(active, here[:2], abs, self.near)
         if math.dist(freed, active) > 1e-9:
             reach_s = 1.0 / POSITION_GAIN_PER_S
             place = (here[0] + freed[0] * reach_s, here[1] + freed[1] * reach_s, place[2])

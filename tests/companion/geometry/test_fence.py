@@ -1,4 +1,4 @@
-"""A fence of polygons: what it lets through, and that nothing gets over it."""
+"""Polygon fence: containment, velocity limits, clipped goals, settings."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from companion.geometry.fence import Fence, Place, Polygon
+from companion.geometry.fence import Fence, Point, Polygon
 from companion.settings.reading import load_settings
 
 SQUARE = ((-20.0, -20.0), (20.0, -20.0), (20.0, 20.0), (-20.0, 20.0))
 POND = ((5.0, 5.0), (10.0, 5.0), (10.0, 10.0), (5.0, 10.0))
-# A bay in the north side, its tip at the middle.
+# A notch in the north side, its tip at the centre.
 BAY = ((-20.0, -20.0), (20.0, -20.0), (0.0, 0.0), (20.0, 20.0), (-20.0, 20.0))
 coordinate = st.floats(-30, 30)
-place = st.tuples(coordinate, coordinate)
+point = st.tuples(coordinate, coordinate)
 speed = st.tuples(st.floats(-10, 10), st.floats(-10, 10))
 
 
@@ -39,137 +39,137 @@ def stars(draw: st.DrawFn) -> tuple[tuple[float, float], ...]:
 
 def test_inside_and_outside() -> None:
     fence = Fence(SQUARE, (POND,))
-    assert fence.holds((0.0, 0.0))
-    assert not fence.holds((7.0, 7.0))
-    assert not fence.holds((21.0, 0.0))
-    assert Fence().holds((1e6, 0.0))
+    assert fence.contains((0.0, 0.0))
+    assert not fence.contains((7.0, 7.0))
+    assert not fence.contains((21.0, 0.0))
+    assert Fence().contains((1e6, 0.0))
 
 
-@given(stars(), place)
-def test_inside_agrees_with_the_winding_number(polygon: Polygon, here: Place) -> None:
+@given(stars(), point)
+def test_inside_agrees_with_the_winding_number(polygon: Polygon, here: Point) -> None:
     angles = [math.atan2(e - here[1], n - here[0]) for n, e in polygon]
     winding = sum(
         math.remainder(b - a, math.tau) for a, b in zip(angles, angles[1:] + angles[:1], strict=True)
     )
-    # On the line itself either is right.
+    # On an edge both answers are accepted.
     edges = zip(polygon, polygon[1:] + polygon[:1], strict=True)
     assume(
         all(abs((b[0] - a[0]) * (here[1] - a[1]) - (b[1] - a[1]) * (here[0] - a[0])) > 1e-6 for a, b in edges)
     )
-    assert Fence(polygon).holds(here) == (abs(winding) > 1.0)
-    assert Fence(exclude=(polygon,)).holds(here) == (abs(winding) < 1.0)
+    assert Fence(polygon).contains(here) == (abs(winding) > 1.0)
+    assert Fence(exclude=(polygon,)).contains(here) == (abs(winding) < 1.0)
 
 
-@given(stars(), place, speed, st.booleans())
-def test_a_velocity_only_ever_gets_less_and_passes_again_unchanged(
-    polygon: Polygon, here: Place, velocity: Place, inside: bool
+@given(stars(), point, speed, st.booleans())
+def test_limiting_never_speeds_up_and_is_idempotent(
+    polygon: Polygon, here: Point, velocity: Point, inside: bool
 ) -> None:
     fence = Fence(polygon) if inside else Fence(exclude=(polygon,))
-    slowed = fence.slowed(velocity, here, braking)
-    assert math.hypot(*slowed) <= math.hypot(*velocity) + 1e-9
-    assert math.dist(fence.slowed(slowed, here, braking), slowed) < 1e-6
+    limited = fence.limit_velocity(velocity, here, braking)
+    assert math.hypot(*limited) <= math.hypot(*velocity) + 1e-9
+    assert math.dist(fence.limit_velocity(limited, here, braking), limited) < 1e-6
 
 
 @given(stars(), speed, st.booleans(), st.floats(0, math.tau))
 @settings(max_examples=60, deadline=None)
-def test_whoever_flies_what_is_left_never_gets_over_it(
-    polygon: Polygon, velocity: Place, inside: bool, turn: float
+def test_limited_velocity_never_crosses_the_fence(
+    polygon: Polygon, velocity: Point, inside: bool, turn: float
 ) -> None:
     fence = Fence(polygon) if inside else Fence(exclude=(polygon,))
     here = (0.0, 0.0) if inside else (40.0 * math.cos(turn), 40.0 * math.sin(turn))
-    assume(fence.holds(here))
+    assume(fence.contains(here))
     for step in range(400):
-        # Wanting to go somewhere else now and then, so that corners are come to as well.
+        # The wanted direction turns, so that corners are reached as well.
         angle = turn + 0.05 * step
         wanted = (
             velocity[0] * math.cos(angle) - velocity[1] * math.sin(angle),
             velocity[0] * math.sin(angle) + velocity[1] * math.cos(angle),
         )
-        north, east = fence.slowed(wanted, here, braking)
+        north, east = fence.limit_velocity(wanted, here, braking)
         here = (here[0] + 0.02 * north, here[1] + 0.02 * east)
-        assert fence.holds(here)
+        assert fence.contains(here)
 
 
-def edge_m(polygon: Polygon, here: Place) -> float:
+def edge_m(polygon: Polygon, here: Point) -> float:
     from companion.geometry.fence import _edges, _nearest
 
     return min(math.dist(_nearest(a, b, here), here) for a, b in _edges(polygon))
 
 
-def test_along_an_edge_and_back_from_it_nothing_is_taken() -> None:
+def test_velocity_along_or_away_from_an_edge_is_kept() -> None:
     fence = Fence(SQUARE)
-    assert fence.slowed((0.0, 3.0), (19.0, 0.0), braking) == (0.0, 3.0)
-    assert fence.slowed((-4.0, 1.0), (19.0, 0.0), braking) == (-4.0, 1.0)
-    north, east = fence.slowed((4.0, 1.0), (19.0, 0.0), braking)
+    assert fence.limit_velocity((0.0, 3.0), (19.0, 0.0), braking) == (0.0, 3.0)
+    assert fence.limit_velocity((-4.0, 1.0), (19.0, 0.0), braking) == (-4.0, 1.0)
+    north, east = fence.limit_velocity((4.0, 1.0), (19.0, 0.0), braking)
     assert north == pytest.approx(braking(0.5))
     assert east == 1.0
 
 
-def test_in_the_tip_of_a_bay_it_stops() -> None:
-    north, east = Fence(BAY).slowed((3.0, 0.0), (-0.9, 0.0), braking)
+def test_velocity_is_limited_in_a_concave_corner() -> None:
+    north, east = Fence(BAY).limit_velocity((3.0, 0.0), (-0.9, 0.0), braking)
     assert 0.0 <= north < 1.0
     assert abs(east) < 0.5
 
 
-def test_on_the_edge_itself_nothing_goes_out() -> None:
+def test_no_outward_velocity_on_the_edge() -> None:
     fence = Fence(SQUARE, (POND,))
-    assert fence.slowed((5.0, 0.0), (20.0, 0.0), braking) == pytest.approx((0.0, 0.0))
-    assert fence.slowed((-5.0, 0.0), (20.0, 0.0), braking) == (-5.0, 0.0)
-    assert fence.slowed((0.0, 4.0), (7.0, 5.0), braking) == pytest.approx((0.0, 0.0))
+    assert fence.limit_velocity((5.0, 0.0), (20.0, 0.0), braking) == pytest.approx((0.0, 0.0))
+    assert fence.limit_velocity((-5.0, 0.0), (20.0, 0.0), braking) == (-5.0, 0.0)
+    assert fence.limit_velocity((0.0, 4.0), (7.0, 5.0), braking) == pytest.approx((0.0, 0.0))
 
 
-def test_in_an_acute_corner_the_speed_falls_and_does_not_jump() -> None:
+def test_speed_is_continuous_in_an_acute_corner() -> None:
     fence = Fence(((0.0, 0.0), (30.0, -17.32), (30.0, 17.32)))
     here, before = (25.0, 0.0), (-5.0, 0.0)
     for _ in range(1500):
-        now = fence.slowed((-5.0, 0.5), here, braking)
+        now = fence.limit_velocity((-5.0, 0.5), here, braking)
         assert math.dist(now, before) < 0.7
         before, here = now, (here[0] + 0.02 * now[0], here[1] + 0.02 * now[1])
-        assert fence.holds(here)
+        assert fence.contains(here)
     assert 0.4 < here[0] < 2.5
 
 
-def test_one_more_limit_is_kept_together_with_the_edges() -> None:
+def test_additional_constraint_holds_together_with_edges() -> None:
     fence = Fence(exclude=(((40.0, -5.0), (60.0, 15.0), (60.0, -25.0)),))
     for step in range(200):
         angle = 0.05 * step
         velocity = (4.0 * math.cos(angle), 4.0 * math.sin(angle))
-        north, east = fence.slowed(velocity, (38.0, -4.0), braking, also=[(1.0, 0.0, 0.3)])
+        north, east = fence.limit_velocity(velocity, (38.0, -4.0), braking, also=[(1.0, 0.0, 0.3)])
         assert north <= 0.3 + 1e-6
         assert math.hypot(north, east) <= 4.0 + 1e-9
 
 
-def test_from_outside_the_way_back_does_not_lead_through_another_area() -> None:
+def test_return_from_outside_stops_at_exclusion() -> None:
     fence = Fence(SQUARE, (POND,))
-    assert fence.clipped((30.0, 7.0), (-15.0, 7.0))[0] == pytest.approx(10.5)
+    assert fence.clip((30.0, 7.0), (-15.0, 7.0))[0] == pytest.approx(10.5)
 
 
-def test_who_is_outside_already_gets_no_farther() -> None:
+def test_outside_the_fence_no_further_out() -> None:
     fence = Fence(SQUARE)
-    assert fence.slowed((2.0, 0.5), (25.0, 0.0), braking) == pytest.approx((0.0, 0.5))
-    assert fence.slowed((-2.0, 0.5), (25.0, 0.0), braking) == (-2.0, 0.5)
+    assert fence.limit_velocity((2.0, 0.5), (25.0, 0.0), braking) == pytest.approx((0.0, 0.5))
+    assert fence.limit_velocity((-2.0, 0.5), (25.0, 0.0), braking) == (-2.0, 0.5)
 
 
-def test_a_place_beyond_an_edge_is_cut_off_before_it() -> None:
+def test_goal_beyond_an_edge_is_clipped() -> None:
     fence = Fence(SQUARE, (POND,))
-    assert fence.clipped((0.0, 0.0), (40.0, 0.0)) == pytest.approx((19.5, 0.0))
-    assert fence.clipped((0.0, 7.0), (15.0, 7.0)) == pytest.approx((4.5, 7.0))
-    assert fence.clipped((0.0, 0.0), (3.0, 3.0)) == (3.0, 3.0)
-    assert fence.clipped((30.0, 0.0), (40.0, 0.0)) == (30.0, 0.0)
-    assert fence.clipped((30.0, 0.0), (0.0, 0.0)) == (0.0, 0.0)
+    assert fence.clip((0.0, 0.0), (40.0, 0.0)) == pytest.approx((19.5, 0.0))
+    assert fence.clip((0.0, 7.0), (15.0, 7.0)) == pytest.approx((4.5, 7.0))
+    assert fence.clip((0.0, 0.0), (3.0, 3.0)) == (3.0, 3.0)
+    assert fence.clip((30.0, 0.0), (40.0, 0.0)) == (30.0, 0.0)
+    assert fence.clip((30.0, 0.0), (0.0, 0.0)) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize(
     ("corners", "words"),
     [
-        ("0,0 1,1", "three corners"),
-        ("0,0 10,10 10,0 0,10", "may not cross"),
-        ("0,0 0,0 10,0", "may not cross"),
+        ("0,0 1,1", "3 corners"),
+        ("0,0 10,10 10,0 0,10", "must not cross"),
+        ("0,0 0,0 10,0", "must not cross"),
         ("0,0 10,0,5 10,10", "a corner is north,east"),
         ("0,0 10,x 10,10", "'10,x'"),
     ],
 )
-def test_what_is_no_area_is_told_with_its_key(corners: str, words: str, tmp_path: Path) -> None:
+def test_invalid_polygon_is_reported_with_its_key(corners: str, words: str, tmp_path: Path) -> None:
     path = tmp_path / "companion.toml"
     for line in (f'fence_include = "{corners}"', f'fence_exclude = "{corners}"'):
         path.write_text(f"[guidance]\n{line}\n")
@@ -185,6 +185,6 @@ def test_settings_become_the_fence() -> None:
     }
     settings = load_settings("/dev/null", overrides, {})
     fence = settings.guidance.fence()
-    assert fence.holds((0.0, 0.0))
-    assert not fence.holds((1.8, 1.2))
-    assert not fence.holds((6.0, 0.0))
+    assert fence.contains((0.0, 0.0))
+    assert not fence.contains((1.8, 1.2))
+    assert not fence.contains((6.0, 0.0))

@@ -277,7 +277,7 @@ def test_a_vehicle_flown_against_a_polygon_stops_inside_it_and_says_why() -> Non
         sent, why = envelope.apply(setpoint, vehicle.state, vehicle.now_ns, 0.02)
         reasons.update(why)
         vehicle.fly(sent, 0.02)
-        assert fence.holds((vehicle.position[0], vehicle.position[1]))
+        assert fence.contains((vehicle.position[0], vehicle.position[1]))
     assert vehicle.position[0] > 14.0
     assert vehicle.position[1] > 14.0
     assert "slowed down at the fence" in reasons
@@ -317,7 +317,7 @@ def test_home_that_is_not_told_for_a_while_is_where_it_was_and_without_one_a_fen
     envelope.reset()
     again, _ = envelope.apply(out, homeless, 1, 0.02)
     assert again.velocity_ned_mps == pytest.approx(first.velocity_ned_mps)
-    assert fence.holds((149.0, 0.0))
+    assert fence.contains((149.0, 0.0))
 
 
 @pytest.mark.parametrize("acceleration_mps2", [2.0, 5.0, 10.0, 20.0])
