@@ -347,4 +347,4 @@ class Fleet:
             pose = pose_from_message(json.loads(message)) if self._as_text else message
             # It came between two ticks; the receiver stamps it as it comes.
             receipt_ns = member.flight.now_ns - round((self.now_s - came_s) * 1e9)
-            member.flight.inputs.poses.take(pose, receipt_ns)
+            member.flight.inputs.poses.ingest(pose, receipt_ns)

@@ -108,7 +108,7 @@ def fly_demo(seed: int, *, synthetic: bool = False) -> DemoFlight:
     if outcome is None:
         failure = f"not finished in {LIMIT_S:g} s: {flight.guidance.status}"
     elif not outcome.success:
-        words = behaviour.told(outcome) if isinstance(behaviour, SequenceBehaviour) else outcome
+        words = behaviour.with_step(outcome) if isinstance(behaviour, SequenceBehaviour) else outcome
         failure = words.reason
     elif confirmed != TARGET_CLASS:
         failure = f"confirmed a {confirmed}, not a {TARGET_CLASS}"

@@ -1,7 +1,7 @@
-"""From what is seen to where to go: behaviours, limits, and the core that steps one behaviour at a time.
+"""Guidance: behaviours, limits, and the core that steps one behaviour at a time.
 
-The behaviours are imported here because each of them adds its command to `registry.COMMANDS`; help texts list
-them in this order.
+The behaviours are imported here because each adds its command to `registry.COMMANDS`; help texts list them in
+this order.
 """
 
 # isort: off

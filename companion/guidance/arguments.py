@@ -1,4 +1,4 @@
-"""The kinds of arguments a command takes: how each is written, and what it may be."""
+"""Argument types of commands: notation, allowed values, validation."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ FARTHEST_M = 5000.0
 
 
 class GrammarError(ValueError):
-    """The text is no command. The message is one line for a person."""
+    """The text is not a valid command. The message is one line for a person."""
 
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """How a number is written and what it may be."""
+    """A number with its unit and allowed range."""
 
     key: str
     unit: str
@@ -39,7 +39,7 @@ class ClassName:
 
 @dataclass(frozen=True, slots=True)
 class EnumArgument:
-    """One of a few words."""
+    """One of a fixed set of words."""
 
     key: str
     words: tuple[str, ...]
@@ -48,7 +48,7 @@ class EnumArgument:
 
 @dataclass(frozen=True, slots=True)
 class Points:
-    """A row of places, `north,east` or `north,east,height`, metres from home."""
+    """A list of points, `north,east` or `north,east,height`, metres from home."""
 
     key: str
     meaning: str
@@ -64,7 +64,7 @@ class FileName:
 
 @dataclass(frozen=True, slots=True)
 class Word:
-    """A word that is not one of a few, such as a vehicle's name."""
+    """A free word, such as a vehicle's name."""
 
     key: str
     meaning: str
@@ -72,7 +72,7 @@ class Word:
 
 @dataclass(frozen=True, slots=True)
 class ClassNames:
-    """The names of some object classes, parted by commas."""
+    """Names of object classes, separated by commas."""
 
     key: str
     meaning: str
@@ -82,12 +82,12 @@ Argument = Number | ClassName | EnumArgument | Points | FileName | ClassNames | 
 
 
 def names_in(text: str) -> tuple[str, ...]:
-    """The names in a list parted by commas."""
+    """Split a comma-separated list of names."""
     return tuple(name.strip() for name in text.split(","))
 
 
 def known_class(text: str, class_names: Sequence[str]) -> str:
-    """The detector's own spelling of a class name. Raises GrammarError with the nearest names."""
+    """The detector's spelling of a class name. Raises GrammarError that suggests the nearest names."""
     if text in class_names:
         return text
     for name in class_names:
@@ -97,7 +97,7 @@ def known_class(text: str, class_names: Sequence[str]) -> str:
 
 
 def check(word: str, argument: Argument, value: Any, default: Any) -> None:
-    """Raises GrammarError where the value of a command's argument is not allowed."""
+    """Validate an argument's value. Raises GrammarError."""
     match argument:
         case Number(key, _, low, high):
             if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
@@ -124,35 +124,33 @@ def check(word: str, argument: Argument, value: Any, default: Any) -> None:
                     )
         case FileName(key):
             if not isinstance(value, str) or not value.strip() or not value.isprintable():
-                raise GrammarError(f"{word}: {key} must be a name or a path, got {value!r}")
+                raise GrammarError(f"{word}: {key} must be a file name or a path, got {value!r}")
         case ClassNames(key):
             names = names_in(value) if isinstance(value, str) and value.isprintable() else ()
             if not names or not all(names):
-                raise GrammarError(
-                    f"{word}: {key} must be names of classes such as person,car, got {value!r}"
-                )
+                raise GrammarError(f"{word}: {key} must be class names such as person,car, got {value!r}")
         case ClassName(key):
             if value == default:
                 return
             if not isinstance(value, str) or not value.strip() or not value.isprintable():
-                raise GrammarError(f"{word}: {key} must be the name of a class, got {value!r}")
+                raise GrammarError(f"{word}: {key} must be a class name, got {value!r}")
 
 
 def range_of(argument: Number) -> str:
-    """What a number may be, in words."""
+    """The allowed range of a number, in words."""
     return (
         f"a number from {argument.low:g} to {argument.high:g}{' ' + argument.unit if argument.unit else ''}"
     )
 
 
 def nearest(word: str, known: list[str]) -> str:
-    """What a misspelt word may have meant, or what there is."""
+    """Suggest known words close to an unknown one, or list the known words."""
     plain = {_plain(name): name for name in known}
     near = [plain[match] for match in difflib.get_close_matches(_plain(word), list(plain), 3, 0.5)]
     if near:
         return f"did you mean {' or '.join(near)}?"
     more = ", …" if len(known) > 12 else ""
-    return f"there are: {', '.join(known[:12])}{more}"
+    return f"known: {', '.join(known[:12])}{more}"
 
 
 def _plain(name: str) -> str:

@@ -1,9 +1,9 @@
-"""Whose vehicle it is: tells our own mode changes from a pilot's.
+"""Command authority: distinguish our own mode changes from those of a pilot.
 
-What we asked for is known, but not when it shows: a HEARTBEAT comes once a second, a request takes its time,
-and the autopilot moves on by itself (take-off ends in hold, landing ends disarmed). Every mode that none of
-this explains was chosen by someone else, and someone else always wins. So does one who steers the vehicle
-without a change of mode (`setpoint_monitor`).
+The requested mode is known, but not when it shows: a HEARTBEAT comes once a second, a request takes time, and
+the autopilot changes mode by itself (take-off ends in hold, landing ends disarmed). Any other mode was chosen
+by someone else, and our command ends. It also ends when someone else steers the vehicle without a change of
+mode (`setpoint_monitor`).
 """
 
 from __future__ import annotations
@@ -15,23 +15,23 @@ from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
 from companion.vehicle.streamer import SILENCE_S, StreamState
 
-# A heartbeat's period and some: so long may the vehicle show an old mode after it acknowledged a new one.
+# The vehicle may show the old mode for this long after acknowledging a new one: a heartbeat period and more.
 SHOW_DELAY_S = 2.0
-# PX4 ends a take-off inside NAV_MC_ALT_RAD (0.8 m); heights measured in two ways differ by some more. A hold
-# that appears lower than this below the wanted height was asked for by a pilot.
+# PX4 ends a take-off inside NAV_MC_ALT_RAD (0.8 m); the two height estimates differ by some more. A hold more
+# than this below the wanted height was requested by a pilot.
 TAKEOFF_SHORT_M = 1.3
-# What the autopilot says of a failsafe comes so shortly before or after its change of mode.
-SAID_S = 1.0
+# The autopilot reports a failsafe within this time of its change of mode.
+REPORT_WINDOW_S = 1.0
 _FAILSAFES = "commander_failsafe_enter"
 _LASTING_FAILSAFES = ("commander_failsafe_enter", "commander_failsafe_enter_generic")
 GOING_DOWN = (FlightMode.LAND, FlightMode.RETURN, FlightMode.PRECISION_LAND)
 
 
 class Authority:
-    """Follows the modes and the motion of one vehicle while we are in command of it.
+    """Monitors the modes and the motion of one vehicle while we are in command of it.
 
     Attributes:
-        monitor: compares its motion with our setpoints.
+        monitor: compares the motion with our setpoints.
     """
 
     def __init__(self) -> None:
@@ -46,11 +46,11 @@ class Authority:
 
     @property
     def mode(self) -> FlightMode | None:
-        """The mode we last asked for; None while we are not in command."""
+        """The mode last requested; None while not in command."""
         return self._mode
 
-    def take(self, state: VehicleState) -> None:
-        """We take command of a vehicle as it is now."""
+    def acquire(self, state: VehicleState) -> None:
+        """Take command of a vehicle in its current state."""
         self._mode = state.mode
         self._leaving = set()
         self._leaving_until_ns = 0
@@ -60,34 +60,34 @@ class Authority:
         self._failsafe_before = state.failsafe
 
     def release(self) -> None:
-        """We are not in command any more; nothing is compared."""
+        """Give up command; nothing is compared any more."""
         self._mode = None
 
     def request(self, mode: FlightMode, state: VehicleState, altitude_m: float | None = None) -> None:
-        """We ask for a mode: until `settled`, what it was before may still be shown."""
+        """Note a mode request: until `settled`, the previous mode may still show."""
         self._leaving |= {state.mode}
         if self._mode is not None:
             self._leaving |= {self._mode}
         if mode is FlightMode.TAKEOFF:
             self._leaving |= {FlightMode.HOLD}
             self._takeoff_altitude_m = altitude_m if altitude_m is not None else 0.0
-            # From the ground, disarmed after a landing of ours, it begins anew.
+            # From the ground, disarmed after our own landing.
             self._was_armed = state.armed
         self._mode = mode
         self._leaving_until_ns = float("inf")
 
     def settled(self, now_ns: int) -> None:
-        """The request is done; the old mode may still show for a heartbeat, if the new one never showed."""
+        """The request is done; until the new mode shows, the old one may show for one more heartbeat."""
         self._leaving_until_ns = now_ns + SHOW_DELAY_S * 1e9
 
     def dropped(self, now_ns: int) -> None:
-        """We do not wait for the request any more; it may still take effect, and show after the next one."""
+        """The request is abandoned; it may still take effect, and show after the next one."""
         if self._mode is not None:
             self._dropped[self._mode] = now_ns + SHOW_DELAY_S * 1e9
         self.settled(now_ns)
 
     def refused(self, mode: FlightMode) -> None:
-        """The request came to nothing: the mode from before is ours again."""
+        """The request was refused: the previous mode is the expected one again."""
         self._mode = mode
         self._leaving = set()
 
@@ -100,10 +100,10 @@ class Authority:
         sent: Setpoint | None = None,
         landing: bool = False,
     ) -> str | None:
-        """Why we are not in command any more; None while we are. Call it once for every step.
+        """Why command was lost; None while in command. Call it once per step.
 
         Args:
-            sent: the setpoint that the vehicle is to fly now; None: none. landing: it leads to the ground.
+            sent: the setpoint the vehicle should fly now; None: none. landing: it leads to the ground.
         """
         shown = sent if state.mode is self._mode else None
         ignored = self.monitor.update(shown, state, landing=landing)
@@ -111,13 +111,13 @@ class Authority:
             return None
         if not state.connected(now_ns):
             silent_s = (now_ns - state.heartbeat_ns) / 1e9
-            return f"the link to the autopilot is lost: no heartbeat for {silent_s:.1f} s"
+            return f"autopilot heartbeat lost: none for {silent_s:.1f} s"
         explained = self._explained(state, now_ns)
         self._failsafe_before &= state.failsafe
         if state.failsafe and not self._failsafe_before and (flying_by_setpoint or not explained):
             return f"autopilot failsafe: {_shown(state.mode)}"
         if not explained:
-            # A pilot's change moves the intended mode along, a failsafe leaves it as we asked for it.
+            # A pilot's change also changes the intended mode; a failsafe keeps the one we requested.
             by_itself = state.intended_beside is state.mode and state.intended_mode is self._mode
             who = "autopilot failsafe" if by_itself else "the pilot took over"
             return f"{who}: {_shown(state.mode)}"
@@ -127,29 +127,29 @@ class Authority:
         return ignored
 
     def reason_is_logged(self, state: VehicleState, now_ns: int) -> bool:
-        """Whether what `lost` said is all that the autopilot will say of it.
+        """Whether the autopilot has reported everything it will report about the reason.
 
-        A HEARTBEAT may show a new mode a moment before CURRENT_MODE tells whose it was, and either before
-        the autopilot says in words what it does.
+        A HEARTBEAT may show a new mode shortly before CURRENT_MODE reports the intended mode, and both may
+        come before the autopilot's text message.
         """
         if state.mode is self._mode:
-            return True  # not for a mode
-        silent = not state.reports or bool(self.reasons_for(state, now_ns))
+            return True  # not a change of mode
+        complete = not state.reports or bool(self.reasons_for(state, now_ns))
         if state.reports and self._holds_by_itself(state):
-            # What is wrong is said first; whether the hold is to last, only in the event of the failsafe.
-            silent = any(one.name.startswith(_FAILSAFES) for one in _warnings(state, now_ns))
-        whose = state.intended_beside in (FlightMode.UNKNOWN, state.mode) or state.failsafe
-        return whose and (silent or state.intended_mode is state.mode)
+            # The cause is reported first; only the failsafe's event shows whether the hold is lasting.
+            complete = any(one.name.startswith(_FAILSAFES) for one in _warnings(state, now_ns))
+        attributed = state.intended_beside in (FlightMode.UNKNOWN, state.mode) or state.failsafe
+        return attributed and (complete or state.intended_mode is state.mode)
 
     def reasons_for(self, state: VehicleState, now_ns: int) -> str:
-        """What the autopilot warned of when it took command, in its own words; empty if it did not."""
+        """The autopilot's own warnings when it took command; empty: none."""
         warnings = _warnings(state, now_ns)
         return words_of(one for one in warnings if self._mode is None or among_modes(self._mode, one.modes))
 
     def chose_hold(self, state: VehicleState, now_ns: int) -> bool:
-        """A failsafe took it out of OFFBOARD into a hold that is meant to last.
+        """Whether a failsafe left OFFBOARD for a lasting hold.
 
-        Not one that waits for COM_FAIL_ACT_T before what PX4 does in earnest: its events have other names.
+        Not the hold during COM_FAIL_ACT_T, before PX4's actual failsafe action: its events have other names.
         """
         return self._holds_by_itself(state) and any(
             one.name in _LASTING_FAILSAFES for one in _warnings(state, now_ns)
@@ -164,7 +164,7 @@ class Authority:
 
     def _explained(self, state: VehicleState, now_ns: int) -> bool:
         if state.mode is self._mode:
-            # Shown while the request is still under way, an old mode may flicker; after it, no more.
+            # While the request is in progress the old mode may flicker; afterwards it may not.
             if self._leaving_until_ns != float("inf"):
                 self._leaving = set()
             return True
@@ -173,7 +173,7 @@ class Authority:
         if now_ns <= self._dropped.get(state.mode, 0):
             return True
         if self._mode in GOING_DOWN and (not state.armed or state.landed is LandedState.ON_GROUND):
-            # Landed and disarmed, PX4 shows the mode that was chosen before the landing.
+            # Landed and disarmed, PX4 shows the mode selected before the landing.
             return True
         if FlightMode.TAKEOFF in (self._mode, *self._leaving) and state.mode is FlightMode.HOLD:
             short_m = self._takeoff_altitude_m - (state.altitude_m or 0.0)
@@ -182,14 +182,14 @@ class Authority:
 
 
 def silence(stream: StreamState, state: VehicleState, paused_s: float) -> str | None:
-    """Why our setpoints failed to go out, if they did. `paused_s`: since the step of guidance before.
+    """Why the setpoint stream was interrupted; None: it was not. `paused_s`: since the previous step.
 
-    PX4 would take OFFBOARD up again by itself if setpoints came back; only an operator may.
+    PX4 would resume OFFBOARD by itself if setpoints came back; only an operator may.
     """
     if paused_s > SILENCE_S:
-        return f"our own guidance stood still for {paused_s:.1f} s"
+        return f"guidance loop paused for {paused_s:.1f} s"
     if stream is StreamState.EXPIRED:
-        return f"no setpoint left for too long: {state.without_setpoints}"
+        return f"setpoint stream interrupted: {state.without_setpoints}"
     return None
 
 
@@ -198,4 +198,4 @@ def _shown(mode: FlightMode) -> str:
 
 
 def _warnings(state: VehicleState, now_ns: int) -> list[Report]:
-    return state.warnings_since(now_ns - round(SAID_S * 1e9))
+    return state.warnings_since(now_ns - round(REPORT_WINDOW_S * 1e9))

@@ -1,4 +1,4 @@
-"""The contract of a behaviour: what it needs, and four hooks. A behaviour never touches the link."""
+"""The behaviour interface: requirements and four hooks. A behaviour never accesses the link."""
 
 from __future__ import annotations
 
@@ -20,38 +20,38 @@ from vision.obstacle_sectors import ObstacleSectors
 
 
 class Requirement(StrEnum):
-    """What a behaviour cannot do without. A missing one is a refusal that names it."""
+    """What a behaviour needs to begin. A missing requirement is named in the refusal."""
 
     POSITION = "position"  # fresh and valid local position and attitude
     IN_AIR = "in_air"
     ON_GROUND = "on_ground"
-    PERCEPTION = "perception"  # a perception worker that delivers
+    PERCEPTION = "perception"  # a perception worker that delivers frames
     BATTERY = "battery"  # more charge than guidance.min_battery_percent
-    DEPTH_OR_SIZE = "depth_or_size"  # a range: depth, the ground in the picture, or classes of known height
-    MARKER = "marker"  # perception that looks for markers
-    GIMBAL = "gimbal"  # one that answers
-    NEIGHBOURS = "neighbours"  # other vehicles whose poses are fresh
+    DEPTH_OR_SIZE = "depth_or_size"  # a range: depth, the ground in the image, or classes of known height
+    MARKER = "marker"  # marker detection
+    GIMBAL = "gimbal"  # a gimbal manager that responds
+    NEIGHBOURS = "neighbours"  # fresh poses of other vehicles
 
 
 @dataclass(frozen=True, slots=True)
 class BehaviourContext:
-    """Everything a behaviour may look at in one update.
+    """The input of one update of a behaviour.
 
     Attributes:
         now_ns: CLOCK_MONOTONIC nanoseconds.
         state: the vehicle.
-        targets: what is seen now, in the level world frame; empty when nothing is or when it is too old.
-        perception_age_s: age of the newest detection message by its capture stamp; None: none ever came.
-        perception_fresh: that age is within the declared maximum.
-        obstacles: what the newest depth image says, however old; None: none came.
-        sent: what the envelope let through of the last setpoint; None before the first.
-        neighbourhood: the other vehicles; None: nobody listens for them.
-        min_separation_m: what is kept to each of them.
-        markers: what is seen of markers, or why none can be.
-        gimbal: how the gimbal stands to what flies; where it looks is in `state`.
-        ranging: what there is to tell how far away something is.
-        max_acceleration_mps2: the envelope's.
-        goal_ned_m: `Outcome.goal_ned_m` of the behaviour that ended just before; None: it had none.
+        targets: of the newest frame, in the level world frame; empty: none, or the frame is too old.
+        perception_age_s: age of the newest detection message by its capture stamp; None: none received.
+        perception_fresh: that age is within the configured maximum.
+        obstacles: from the newest depth image, of any age; None: none received.
+        sent: the last setpoint after the envelope; None before the first.
+        neighbourhood: the other vehicles; None: poses are not shared.
+        min_separation_m: minimum distance to each of them.
+        markers: detected markers, or why there can be none.
+        gimbal: control and mounting of the gimbal; its attitude is in `state`.
+        ranging: which means of range estimation are available.
+        max_acceleration_mps2: the envelope's limit.
+        goal_ned_m: `Outcome.goal_ned_m` of the previous behaviour; None: it had none.
     """
 
     now_ns: int
@@ -69,24 +69,24 @@ class BehaviourContext:
     max_acceleration_mps2: float = 3.0
     goal_ned_m: Vector3 | None = None
 
-    def why_blind(self, usually: str) -> str:
-        """Why nothing that is seen can be steered by, in words; `usually` where it is not the gimbal."""
-        why = self.gimbal.undirected
-        return f"where the camera looks is not known ({why})" if why else usually
+    def perception_fault(self, default: str) -> str:
+        """Why targets cannot be used, in words; `default` where the gimbal is not the reason."""
+        why = self.gimbal.direction_fault
+        return f"camera direction unknown ({why})" if why else default
 
     @property
     def neighbours(self) -> tuple[Neighbour, ...]:
-        """The other vehicles that are known and placed."""
+        """The other vehicles with a known position."""
         return () if self.neighbourhood is None else self.neighbourhood.vehicles
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """A behaviour has ended.
+    """How a behaviour ended.
 
     Attributes:
-        success: it did what was asked. reason: how it ended, for people.
-        goal_ned_m: where the vehicle is to stand now, local NED metres; None: where it comes to rest.
+        success: the command was carried out. reason: how it ended, for people.
+        goal_ned_m: position to hold now, local NED metres; None: where the vehicle comes to rest.
     """
 
     success: bool
@@ -96,9 +96,9 @@ class Outcome:
 
 @dataclass(frozen=True, slots=True)
 class ModeRequest:
-    """Let the autopilot fly one of its own modes (take-off, land, return, hold) until further notice.
+    """Request one of the autopilot's own modes (take-off, land, return, hold) until the next output.
 
-    `altitude_m` is for FlightMode.TAKEOFF: height above home. `arm` asks to arm first (only take-off does).
+    `altitude_m` is for FlightMode.TAKEOFF: height above home. `arm`: arm first (only take-off does).
     """
 
     mode: FlightMode
@@ -107,68 +107,68 @@ class ModeRequest:
 
     def __post_init__(self) -> None:
         if self.mode is FlightMode.TAKEOFF and self.altitude_m is None:
-            raise ValueError("a take-off needs an altitude")
+            raise ValueError("ModeRequest(TAKEOFF) needs altitude_m")
 
 
-# What an update may answer: a setpoint to fly, a mode of the autopilot's own, or the end.
+# What an update returns: a setpoint, an autopilot mode, or the end of the behaviour.
 BehaviourOutput = Setpoint | ModeRequest | Outcome
 
 
 class Behaviour(ABC):
-    """One way of flying. `name` is its word in the command grammar."""
+    """Base class of behaviours. `name` is its word in the command grammar."""
 
     name: str
     requirements: frozenset[Requirement] = frozenset()
-    # Classes that perception must know for this behaviour to make sense.
+    # Classes that the detector must know.
     class_names: tuple[str, ...] = ()
-    # Vehicles whose poses must be fresh, where it requires NEIGHBOURS.
+    # Vehicles whose poses must be fresh, if it requires NEIGHBOURS.
     neighbour_names: tuple[str, ...] = ()
-    # Above the horizon, radians; what the gimbal must reach, where it requires GIMBAL.
+    # Pitches that the gimbal must reach, radians above the horizon, if it requires GIMBAL.
     gimbal_pitches_rad: tuple[float, ...] = ()
 
     def goals(self, context: BehaviourContext) -> tuple[Vector3, ...]:
-        """Where it would fly to if it began now, local NED metres, as far as that is known before."""
+        """Points it would fly to if it began now, local NED metres, as far as they are known."""
         return ()
 
-    def on_activate(self, context: BehaviourContext) -> None:  # noqa: B027  (a hook that may be left out)
+    def on_activate(self, context: BehaviourContext) -> None:  # noqa: B027  (an optional hook)
         """Called once, before the first update."""
 
     @abstractmethod
     def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
         """Called at the guidance rate. `dt_s` is the time since the last update (0 at the first)."""
 
-    def on_deactivate(self) -> None:  # noqa: B027  (a hook that may be left out)
-        """Called once, when it ended or was replaced."""
+    def on_deactivate(self) -> None:  # noqa: B027  (an optional hook)
+        """Called once, when the behaviour has ended or was replaced."""
 
     def request_failed(self, why: str) -> bool:
-        """The autopilot did not do what was asked. True: another way is known; False: that is the end."""
+        """A mode request was refused. True: the behaviour goes on without it; False: it ends."""
         return False
 
     def take_notes(self) -> Sequence[str]:
-        """What happened that people should know, since it was last asked for."""
+        """Notes for people since the last call."""
         return ()
 
     @property
     def active(self) -> Behaviour:
-        """What flies now: itself, or of several in turn the one whose turn it is."""
+        """The behaviour that is active now: itself, or the current one of a sequence."""
         return self
 
     @property
     def landing_target(self) -> LandingTarget | None:
-        """What the autopilot is to be told of a target that it lands on by itself; None: nothing."""
+        """The target for the autopilot's own precision landing; None: none."""
         return None
 
     @property
     def gimbal_aim(self) -> GimbalAim | None:
-        """Where the gimbal is to look now; None: it is nothing to this behaviour, or no more."""
+        """Where to point the gimbal now; None: this behaviour does not use it (any more)."""
         return None
 
     @property
     def landing(self) -> bool:
-        """Whether it comes down to the ground on purpose: the lowest altitude does not hold then."""
+        """Whether it descends to the ground on purpose: the minimum altitude does not apply then."""
         return False
 
     @property
     def status(self) -> str:
-        """A few words on what it is doing now, for people."""
+        """What it is doing now, in a few words."""
         return self.name

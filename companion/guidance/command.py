@@ -1,4 +1,4 @@
-"""What every command is: a word, a help text, its arguments as fields, and the behaviour it becomes."""
+"""Base class of commands: a word, a help text, arguments as fields, and the behaviour to build."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from companion.vehicle.gimbal import GimbalAim
 
 @dataclass(frozen=True, slots=True)
 class BuildContext:
-    """What a command may need to become a behaviour.
+    """What a command may need to build its behaviour.
 
     Attributes:
         footprint: of the steering camera; None: not known.
-        class_names: what the detector knows; None: not known.
-        attachment: the lines that came with the command (a mission's text).
-        check_requirements: guidance's own; a mission asks it at each of its steps.
+        class_names: the detector's classes; None: not known.
+        attachment: lines sent along with the command (a mission's text).
+        check_requirements: `Guidance.check_requirements`; a mission calls it at each step.
     """
 
     footprint: Footprint | None = None
@@ -36,12 +36,12 @@ NO_CONTEXT = BuildContext()
 
 @dataclass(frozen=True)
 class Command(ABC):
-    """What an operator asks for. A subclass is made and registered by `registry.behaviour`.
+    """An operator's command. A subclass is turned into a dataclass and registered by `registry.behaviour`.
 
     Attributes:
-        word: how it is called. help: what it does, one line.
-        takes_attachment: further lines may come with it.
-        renamed: former key of an argument → its key now, for the error message.
+        word: name in the grammar. help: one line.
+        takes_attachment: further lines may be sent along.
+        renamed: former key of an argument → its current key, for the error message.
     """
 
     word: ClassVar[str]
@@ -57,16 +57,16 @@ class Command(ABC):
 
     @abstractmethod
     def build(self, context: BuildContext) -> Behaviour:
-        """A new behaviour, ready for guidance. Raises GrammarError where the command cannot be flown."""
+        """Build the behaviour. Raises GrammarError where the command cannot be flown."""
 
     @property
     def endless(self) -> bool:
-        """It goes on until another command comes."""
+        """Whether it runs until another command comes."""
         return False
 
     @property
     def aim(self) -> GimbalAim | None:
-        """Where it points the gimbal while the active behaviour goes on; None: it has a behaviour."""
+        """For a command that only points the gimbal, where to; None: the command has a behaviour."""
         return None
 
     def __str__(self) -> str:
@@ -76,20 +76,20 @@ class Command(ABC):
             if value == default_of(field):
                 continue
             written = _quoted(value) if isinstance(value, str) else _plain_number(value)
-            # Words without a key may all belong to the first argument.
+            # All words without a key may belong to the first argument.
             required = field.default is MISSING and index == 0
             words.append(written if required else f"{argument.key}={written}")
         return " ".join(words)
 
 
 def arguments_of(kind: type[Command]) -> list[tuple[Field[Any], Argument]]:
-    """Each field of a command and what its argument may be, in their order."""
+    """The fields of a command with their argument types, in order."""
     hints = get_type_hints(kind, include_extras=True)
     return [(field, get_args(hints[field.name])[1]) for field in fields(kind)]
 
 
 def default_of(field: Field[Any]) -> Any:
-    """What the field is when the argument is left out; None where it may not be."""
+    """The default of a field; None where the argument is required."""
     return None if field.default is MISSING else field.default
 
 
@@ -100,6 +100,6 @@ def _quoted(text: str) -> str:
 
 
 def _plain_number(value: float) -> str:
-    """As people write it, where nothing is lost by that."""
+    """The shortest notation that keeps the value."""
     short = f"{value:g}"
     return short if float(short) == value else repr(value)

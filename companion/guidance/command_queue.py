@@ -1,7 +1,7 @@
-"""Commands on their way to guidance: one that needs a gimbal waits, briefly, until the gimbal is known.
+"""Queue of commands: one that needs a gimbal waits until the gimbal manager has responded.
 
-A command that waits does not begin any more once something newer has happened: another command, a change of
-mode or arming whoever made it, a loss of command, a low battery, the end of the service.
+A waiting command is superseded by another command, any change of mode or arming, a loss of command, a low
+battery, or the end of the service.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class CommandQueue:
     """Part of the guidance core.
 
     Args:
-        gimbal: points the gimbal for commands that only do that.
+        gimbal: carries out commands that only point the gimbal.
     """
 
     def __init__(self, gimbal: GimbalController) -> None:
@@ -41,13 +41,13 @@ class CommandQueue:
         gimbal_user: str,
         out: OutputCollector,
     ) -> None:
-        """A new command. `gimbal_user`: name of the behaviour that moves the gimbal now; empty: none does."""
+        """Add a new command. `gimbal_user`: name of the behaviour that moves the gimbal now; empty: none."""
         self.supersede(command.text, out)
         if command.mode_changes not in (None, self._mode_changes):
             out.result(command.identifier, Outcome(False, f"superseded by {_change(state)}"))
             return
         if command.aim is not None and gimbal_user:
-            reason = f"gimbal: {gimbal_user} moves it; end that first"
+            reason = f"gimbal: in use by {gimbal_user}; end that behaviour first"
             out.result(command.identifier, Outcome(False, reason))
             return
         behaviour = command.behaviour
@@ -59,16 +59,16 @@ class CommandQueue:
             self._due.append(command)
 
     def watch(self, mode_changes: int, state: VehicleState, out: OutputCollector) -> None:
-        """A change of mode or arming: it is not the vehicle that a waiting command was given to."""
+        """Supersede waiting commands after a change of mode or arming."""
         if self._mode_changes is not None and mode_changes != self._mode_changes:
             self.supersede(_change(state), out)
         self._mode_changes = mode_changes
 
     def supersede(self, by: str, out: OutputCollector) -> None:
-        """A behaviour that waits does not begin any more. `by`: what has happened, for the answer."""
+        """Answer waiting behaviours as superseded. `by`: the cause, for the answer."""
         left = []
         for waiting in self._waiting:
-            if waiting.command.behaviour is None:  # it moves no vehicle
+            if waiting.command.behaviour is None:  # gimbal only
                 left.append(waiting)
             else:
                 reason = f"superseded by {by} while waiting for the gimbal"
@@ -76,18 +76,18 @@ class CommandQueue:
         self._waiting = left
 
     def close(self, out: OutputCollector) -> None:
-        """The service ends: nothing that waits begins any more."""
+        """The service ends: answer every waiting command."""
         self.supersede("the end of the service", out)
         for waiting in self._waiting:
             out.result(waiting.command.identifier, Outcome(False, ENDING))
         self._waiting = []
 
     def take_due(self, now_ns: int, state: VehicleState, out: OutputCollector) -> list[CommandInput]:
-        """The behaviours that are to begin now, in their order. Gimbal commands go to the gimbal."""
+        """Remove and return the behaviours to begin now, in order. Gimbal commands go to the gimbal."""
         known = is_known(state.gimbal, now_ns)
-        over = [w for w in self._waiting if known or now_ns > w.until_ns or self._gimbal.not_found]
-        self._waiting = [w for w in self._waiting if w not in over]
-        due, self._due = [*(w.command for w in over), *self._due], []
+        done = [w for w in self._waiting if known or now_ns > w.until_ns or self._gimbal.not_found]
+        self._waiting = [w for w in self._waiting if w not in done]
+        due, self._due = [*(w.command for w in done), *self._due], []
         for command in due:
             if command.aim is not None:
                 self._gimbal.point(command.identifier, command.aim, now_ns, state, out)
@@ -95,6 +95,6 @@ class CommandQueue:
 
 
 def _change(state: VehicleState) -> str:
-    """What has changed, for the answer of a command that was given before."""
+    """The change in words, for the answer to a superseded command."""
     now = f"{state.mode.value}, {'armed' if state.armed else 'disarmed'}"
-    return f"a change of the vehicle (now {now})"
+    return f"a change of mode or arming (now {now})"

@@ -2,11 +2,10 @@
 
 One behaviour is active at a time. Guidance engages OFFBOARD for it, keeps its setpoints inside the envelope
 and yields to the pilot. There is no asyncio, no clock and no I/O here: the service, the campaigns and the
-tests call this one function, and nothing else drives a behaviour.
+tests call this one function, and nothing else steps a behaviour.
 
-When the vehicle shows a mode that was not requested, or does not move as the setpoints say, our command
-ends at once and nothing is streamed any more until an operator's next command, even if OFFBOARD comes back by
-itself.
+When the vehicle shows a mode that was not requested, or does not follow the setpoints, our command ends at
+once and nothing is streamed until the operator's next command, even if OFFBOARD comes back by itself.
 """
 
 from __future__ import annotations
@@ -49,17 +48,17 @@ from companion.vehicle.streamer import StreamState
 
 logger = logging.getLogger(__name__)
 
-# PX4 takes OFFBOARD after one setpoint; a few more cost 60 ms and survive a lost packet.
+# PX4 accepts OFFBOARD after one setpoint; two more cost 60 ms and tolerate a lost packet.
 SETPOINTS_BEFORE_OFFBOARD = 3
 ENGAGE_TIMEOUT_S = 3.0
-# Command was lost: so long may the autopilot take to tell why. Nothing is streamed meanwhile.
+# After a loss of command: wait this long for the autopilot's reason. Nothing is streamed meanwhile.
 REASON_WAIT_S = 0.3
-# In OFFBOARD without a known position: brake for this long, then leave the vehicle to the autopilot.
+# In OFFBOARD without a position estimate: brake for this long, then hand over to the autopilot.
 POSITION_LOSS_S = 2.0
 
 
 class Phase(StrEnum):
-    """How far our command of the vehicle has come."""
+    """State of our command of the vehicle."""
 
     IDLE = "idle"  # not in command
     READY = "ready"  # in command, nothing requested of the vehicle yet
@@ -71,12 +70,12 @@ class Phase(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class GuidanceOptions:
-    """What an operator sets.
+    """The operator's settings of guidance.
 
     Attributes:
         own_address: system and component id of our messages.
-        lifetime_s: how long a setpoint counts, whatever its behaviour wrote.
-        perception_max_age_s: what is seen is not steered by when it is older.
+        lifetime_s: lifetime of every setpoint; overrides the behaviour's.
+        perception_max_age_s: maximum age of targets.
     """
 
     limits: Limits = Limits()  # noqa: RUF009 - frozen
@@ -91,15 +90,15 @@ class GuidanceOptions:
 class Guidance:
     """One vehicle's guidance.
 
-    After a behaviour that flew by setpoints a hold goes on, until the next command; after one that ended in a
-    mode of the autopilot's own nothing is streamed.
+    A behaviour that flew by setpoints is followed by a hold until the next command. After one that ended in
+    an autopilot mode nothing is streamed.
 
     Attributes:
-        asked: the last setpoint that a behaviour gave; None while none is flown.
-        sent: what the envelope made of it (or the brake that is streamed while a mode is requested).
+        asked: the last setpoint of a behaviour; None while none is flown.
+        sent: the same after the envelope (or the brake that is streamed while a mode is requested).
         limited_by: which limits acted on it.
-        phase: how far our command has come.
-        gimbal: what is asked of the gimbal; for its status.
+        phase: state of our command.
+        gimbal: the gimbal controller; for its status.
     """
 
     def __init__(self, options: GuidanceOptions | None = None) -> None:
@@ -141,17 +140,17 @@ class Guidance:
 
     @property
     def active(self) -> Behaviour | None:
-        """The behaviour whose turn it is, of several in turn; None: none has been updated yet."""
+        """The active behaviour, inside a sequence its current one; None: none has been updated yet."""
         return self._active
 
     @property
     def behaviour(self) -> Behaviour | None:
-        """What is active now, also the hold that goes on when nothing else is; None: nothing."""
+        """The behaviour being flown, including the hold between commands; None: none."""
         return self._behaviour
 
     @property
     def context(self) -> BehaviourContext | None:
-        """What behaviours saw at the newest step; None before the first."""
+        """The input of behaviours at the newest step; None before the first."""
         return self._context
 
     @property
@@ -161,7 +160,7 @@ class Guidance:
 
     @property
     def in_command(self) -> bool:
-        """The vehicle does what we ask, as far as we know."""
+        """Whether we are in command of the vehicle, as far as known."""
         return self.phase is not Phase.IDLE
 
     @property
@@ -179,17 +178,17 @@ class Guidance:
         return words if self.busy else f"{words}, no command"
 
     def step(self, now_ns: int, inputs: GuidanceInput) -> GuidanceOutput:
-        """One step: from everything that is known now to everything that is to be done.
+        """Advance guidance by one step.
 
         Args:
-            now_ns: CLOCK_MONOTONIC nanoseconds; it never goes back.
+            now_ns: CLOCK_MONOTONIC nanoseconds; never decreasing.
         """
         out = self._out
         out.begin(now_ns)
         for answer in inputs.answers:
             self.gimbal.take_answer(answer, now_ns, out)
         if inputs.mode_changes != self._mode_changes and self.phase is Phase.IDLE:
-            self._goal_ned_m = None  # somebody else has flown since
+            self._goal_ned_m = None  # flown by someone else since
         self._mode_changes = inputs.mode_changes
         before, context = self._context, self._observe(now_ns, inputs)
         self._context, self._class_names = context, inputs.class_names
@@ -228,15 +227,17 @@ class Guidance:
         if missing is not None or context is None:
             return missing
         for goal in behaviour.goals(context):
-            if (why := self._envelope.why_not_there(goal, context.state)) is not None:
+            if (why := self._envelope.check_goal(goal, context.state)) is not None:
                 return f"{behaviour.name} would leave the limits: {why}"
         return None
 
     def _observe(self, now_ns: int, inputs: GuidanceInput) -> BehaviourContext:
-        """What behaviours see, without targets that are too old or whose camera has no known direction."""
-        gimbal = self.gimbal.sight(now_ns, inputs.state)
+        """The input of behaviours, without targets that are too old or whose camera direction is unknown."""
+        gimbal = self.gimbal.snapshot(now_ns, inputs.state)
         age_s = None if inputs.seen_ns is None else (now_ns - inputs.seen_ns) / 1e9
-        fresh = age_s is not None and age_s <= self.options.perception_max_age_s and not gimbal.undirected
+        fresh = (
+            age_s is not None and age_s <= self.options.perception_max_age_s and not gimbal.direction_fault
+        )
         return BehaviourContext(
             now_ns,
             inputs.state,
@@ -269,7 +270,7 @@ class Guidance:
     # --- commands ----------------------------------------------------------------------------------------
 
     def _begin_command(self, command: CommandInput, context: BehaviourContext) -> None:
-        """Let a command's behaviour take the place of the active one; refused, the active one goes on."""
+        """Replace the active behaviour by a command's; if that is refused, the active one goes on."""
         behaviour = command.behaviour
         assert behaviour is not None
         try:
@@ -284,7 +285,7 @@ class Guidance:
             return
         self._end(Outcome(False, f"replaced by {behaviour.name}"))
         if self.phase is Phase.IDLE:
-            self._authority.take(context.state)
+            self._authority.acquire(context.state)
             self.phase = Phase.READY
         elif self.phase is Phase.REQUESTING:
             self._drop_request()
@@ -295,7 +296,7 @@ class Guidance:
         self._out.event(EventKind.STARTED, behaviour.name, "started")
 
     def _answer_endless(self, inputs: GuidanceInput) -> None:
-        """A command without an end of its own is answered when the vehicle flies it."""
+        """Answer an endless command when the vehicle flies it."""
         command = self._command
         if command is None or not command.endless or self.phase is not Phase.OFFBOARD:
             return
@@ -304,14 +305,14 @@ class Guidance:
             self._command = None
 
     def _new_landing_target(self) -> LandingTarget | None:
-        """What the autopilot lands on by itself, once for every frame that shows it."""
+        """The target of the autopilot's precision landing, once per frame that shows it."""
         target = None if self._behaviour is None else self._behaviour.landing_target
         if target is None or target.captured_ns <= self._landing_target_ns:
             return None
         self._landing_target_ns = target.captured_ns
         return target
 
-    # --- one step of what is active ----------------------------------------------------------------------
+    # --- one step of the behaviour -----------------------------------------------------------------------
 
     def _update(self, context: BehaviourContext, inputs: GuidanceInput, paused_s: float) -> None:
         assert self._behaviour is not None
@@ -328,7 +329,7 @@ class Guidance:
         if why is not None or self._yielded is not None:
             self._yield(why, context)
             return
-        # Before any hook of the behaviour: what the autopilot has answered must not be lost by its exception.
+        # Before any hook of the behaviour: its exception must not lose the autopilot's answers.
         for answer in inputs.answers:
             if answer.identifier == self._request:
                 self._take_answer(answer, context)
@@ -348,7 +349,7 @@ class Guidance:
         self._active, self._landing, self._gimbal_user = None, False, ""
 
     def _run(self, behaviour: Behaviour, context: BehaviourContext, sent_count: int) -> None:
-        """One update of the behaviour, and what follows from it."""
+        """Update the behaviour and act on its output."""
         if Requirement.POSITION in behaviour.requirements and not self._position_known(context):
             return
         if not self._activated:
@@ -380,7 +381,7 @@ class Guidance:
                 raise TypeError(f"update returned {got}, expected Setpoint, ModeRequest or Outcome")
 
     def _behaviour_failed(self, error: Exception, context: BehaviourContext, sent_count: int) -> None:
-        """A hook of the behaviour raised: the vehicle is held. To be called where an exception is handled."""
+        """A hook of the behaviour raised: hold. Call it from the exception handler."""
         name = "guidance" if self._behaviour is None else self._behaviour.name
         logger.exception("%s failed", name)
         why = f"{name} failed: {type(error).__name__}: {error}"
@@ -398,9 +399,9 @@ class Guidance:
     def _limit(
         self, behaviour: Behaviour, setpoint: Setpoint, context: BehaviourContext, dt_s: float
     ) -> None:
-        """What the envelope leaves of a setpoint is streamed; without the depth that it needs, a brake."""
+        """Stream a setpoint after the envelope; a brake where required depth is missing."""
         rules = self.options.obstacles
-        # How long a setpoint counts is the operator's setting, whatever its behaviour wrote.
+        # The lifetime is the operator's setting, not the behaviour's.
         asked = replace(setpoint, deadline_ns=context.now_ns + round(self.options.lifetime_s * 1e9))
         blind = rules.blind(context)
         self._report_perception_fault(behaviour, blind)
@@ -408,7 +409,7 @@ class Guidance:
             self._brake(context)
             self.asked, self.limited_by = asked, (blind,)
             return
-        self._envelope.near = rules.rows(self._memory.filled(context))
+        self._envelope.obstacle_constraints = rules.constraints(self._memory.filled(context))
         self.asked = asked
         self.sent, self.limited_by = self._envelope.apply(
             asked,
@@ -420,7 +421,7 @@ class Guidance:
         )
 
     def _report_perception_fault(self, behaviour: Behaviour, blind: str | None) -> None:
-        """Tell once that the vehicle brakes for want of depth, and once that it flies on."""
+        """Log once that the vehicle brakes without depth, and once that depth is back."""
         if (blind is not None) is not self._blind:
             self._blind = blind is not None
             if blind is None:
@@ -431,7 +432,7 @@ class Guidance:
     def _report_reset(
         self, behaviour: Behaviour, before: BehaviourContext | None, context: BehaviourContext
     ) -> None:
-        """Tell that the estimate was reset. Goals stay on the ground where they are (`vehicle.state`)."""
+        """Log a reset of the estimate. Goals keep their position on the ground (`vehicle.state`)."""
         if before is not None and context.state.reset_count > before.state.reset_count:
             words = context.state.reset_words(before.state)
             self._out.event(
@@ -439,7 +440,7 @@ class Guidance:
             )
 
     def _conclude(self, outcome: Outcome, context: BehaviourContext, sent_count: int) -> None:
-        """It ended by itself: hold where setpoints are flown, else leave it to the autopilot."""
+        """The behaviour ended by itself: hold if setpoints are flown, else hand over to the autopilot."""
         self._end(outcome)
         self._goal_ned_m = outcome.goal_ned_m
         if self.phase is Phase.REQUESTING:
@@ -453,7 +454,7 @@ class Guidance:
             self._run(hold, replace(context, goal_ned_m=self._goal_ned_m), sent_count)
 
     def _monitor_battery(self, behaviour: Behaviour, context: BehaviourContext) -> None:
-        """Too little charge ends what is flown; the vehicle brakes until what the operator chose begins."""
+        """Low battery ends the behaviour; the vehicle brakes until the configured action begins."""
         state, now_ns = context.state, context.now_ns
         if (why := self._battery.unknown(behaviour, state, now_ns)) is not None:
             self._battery_event(behaviour, why)
@@ -472,16 +473,16 @@ class Guidance:
         self._queue.supersede(f"an event ({message})", self._out)
 
     def _position_known(self, context: BehaviourContext) -> bool:
-        """False: brake for now; for too long: give the command up."""
+        """Check the position estimate; without it brake, and after `POSITION_LOSS_S` give up command."""
         fault = context.state.position_fault(context.now_ns)
         if fault is None:
             self._position_lost_ns = None
             return True
         if self._position_lost_ns is None:
-            logger.warning("no position or attitude to fly by (%s): braking", fault)
+            logger.warning("position or attitude lost (%s): braking", fault)
             self._position_lost_ns = context.now_ns
         if context.now_ns - self._position_lost_ns > POSITION_LOSS_S * 1e9:
-            self._lose(f"no position or attitude to fly by for {POSITION_LOSS_S:g} s ({fault})")
+            self._lose(f"position or attitude lost for {POSITION_LOSS_S:g} s ({fault})")
         elif self.phase is Phase.OFFBOARD:
             self._brake(context)
         return False
@@ -494,7 +495,7 @@ class Guidance:
     # --- requests to the vehicle -------------------------------------------------------------------------
 
     def _start_engaging(self, context: BehaviourContext, sent_count: int) -> None:
-        """Setpoints first; OFFBOARD is requested when some have left."""
+        """Stream a brake; OFFBOARD is requested after `SETPOINTS_BEFORE_OFFBOARD` setpoints."""
         self._drop_request()
         self.phase, self._streaming = Phase.ENGAGING, True
         self._engaging_since_ns = context.now_ns
@@ -507,10 +508,10 @@ class Guidance:
         if sent_count - self._sent_before_engaging >= SETPOINTS_BEFORE_OFFBOARD:
             self._request = self._out.request(SetMode(FlightMode.OFFBOARD))
         elif context.now_ns - self._engaging_since_ns > ENGAGE_TIMEOUT_S * 1e9:
-            self._fail(f"offboard not requested: no setpoint left within {ENGAGE_TIMEOUT_S:g} s")
+            self._fail(f"offboard not requested: no setpoint sent within {ENGAGE_TIMEOUT_S:g} s")
 
     def _start_request(self, request: ModeRequest, context: BehaviourContext) -> None:
-        """Request a mode of the autopilot's own. Out of OFFBOARD, a brake is streamed until it shows."""
+        """Request an autopilot mode. From OFFBOARD, a brake is streamed until the mode shows."""
         self._drop_request()
         self.phase, self._requested = Phase.REQUESTING, request
         self._authority.request(request.mode, context.state, request.altitude_m)
@@ -518,14 +519,14 @@ class Guidance:
         self._ask_next(context)
 
     def _ask_next(self, context: BehaviourContext) -> None:
-        """The next action of a requested mode, once the one before is done."""
+        """Request the next action of a mode sequence, once the previous one is done."""
         if self._sequence is not None and self._request is None:
             action = self._sequence.next(context.now_ns, context.state)
             if action is not None:
                 self._request = self._out.request(action)
 
     def _take_answer(self, answer: Answer, context: BehaviourContext) -> None:
-        """The request is over: it was done, or refused."""
+        """Handle the answer to the pending request."""
         self._request = None
         if answer.refused is not None:
             self._sequence = None
@@ -545,19 +546,19 @@ class Guidance:
             self._silence()
 
     def _fail(self, why: str) -> None:
-        """The autopilot did not do what was requested."""
+        """The autopilot refused the request."""
         behaviour, context = self._behaviour, self._context
         if behaviour is not None and context is not None and behaviour.request_failed(why):
             flying = self.phase is Phase.REQUESTING and self._streaming
             if not flying:
                 self._silence()
-            # What shows now is the mode from before: a pilot's would have ended our command already.
+            # The mode that shows now is the previous one: a pilot's would have ended our command already.
             self._authority.refused(FlightMode.OFFBOARD if flying else context.state.mode)
             self.phase, self._requested = Phase.OFFBOARD if flying else Phase.READY, None
             return
         self._end(Outcome(False, why))
         if self.phase is Phase.REQUESTING and self._streaming:
-            # Still flying setpoints: hold. If the mode changed after all, that ends our command.
+            # Still flying setpoints: hold. If the mode changed nevertheless, that ends our command.
             self._authority.refused(FlightMode.OFFBOARD)
             self.phase, self._requested = Phase.OFFBOARD, None
             self._begin(HoldBehaviour(), None, busy=False)
@@ -567,34 +568,34 @@ class Guidance:
     # --- the end of a behaviour, or of our command -------------------------------------------------------
 
     def _yield(self, why: str | None, context: BehaviourContext) -> None:
-        """Fall silent at once; say why when the autopilot has told whose change of mode it was."""
+        """Stop streaming at once; report the reason when the autopilot has reported its own."""
         since_ns, first = self._yielded or (context.now_ns, why or "")
         self._yielded = (since_ns, why or first)
         self._silence()
         state, now_ns = context.state, context.now_ns
         waited_s = (now_ns - since_ns) / 1e9
         if why is None or waited_s >= REASON_WAIT_S or self._authority.reason_is_logged(state, now_ns):
-            said = self._authority.reasons_for(state, now_ns)
+            reasons = self._authority.reasons_for(state, now_ns)
             if self._authority.chose_hold(state, now_ns):
-                # PX4 would take our silence for lost setpoints, and leave its hold for a return after 1.2 s.
+                # Else PX4 treats the setpoints as lost and leaves hold for a return after 1.2 s.
                 self._out.request(SetMode(FlightMode.HOLD))
-            self._lose(f"{self._yielded[1]} ({said})" if said else self._yielded[1])
+            self._lose(f"{self._yielded[1]} ({reasons})" if reasons else self._yielded[1])
 
     def _lose(self, why: str) -> None:
-        """Command was taken from us: not one setpoint more."""
+        """Command was lost: stop streaming and end the behaviour."""
         self._yielded = None
         self._silence()
         self._goal_ned_m = None
         behaviour, outcome = self._behaviour, Outcome(False, why)
-        self._end(outcome, told=True)
+        self._end(outcome, reported=True)
         self._release()
         if behaviour is not None:
             message = f"command lost: {why}"
             self._out.event(EventKind.LOST, behaviour.name, message, outcome, warning=True)
             self._queue.supersede(f"an event ({message})", self._out)
 
-    def _end(self, outcome: Outcome, *, told: bool = False) -> None:
-        """Take the active behaviour off, and answer the command that asked for it."""
+    def _end(self, outcome: Outcome, *, reported: bool = False) -> None:
+        """Remove the active behaviour and answer its command."""
         behaviour, command, busy = self._behaviour, self._command, self._busy
         after_battery, self._after_battery = self._after_battery, False
         self._behaviour = self._command = self._active = None
@@ -609,13 +610,13 @@ class Guidance:
         if command is not None:
             self._out.result(command.identifier, outcome)
         if after_battery:
-            # Nobody asked for it, so nobody else tells how it ended.
+            # No command waits for its result: log how it ended.
             self._battery_event(behaviour, f"{behaviour.name} after low battery: {outcome.reason}")
-        if busy and not told:
+        if busy and not reported:
             self._out.event(EventKind.ENDED, behaviour.name, outcome.reason, outcome)
 
     def _release(self) -> None:
-        """Not in command any more."""
+        """Give up command."""
         self._yielded = None
         self._drop_request()
         self._silence()
@@ -629,7 +630,7 @@ class Guidance:
         self.limited_by = ()
 
     def _drop_request(self) -> None:
-        """Forget a request: it is not repeated, but it may still take effect."""
+        """Abandon the pending request: it is not repeated, but may still take effect."""
         pending = self._request is not None or self._sequence is not None
         self._requested = self._sequence = None
         if self._request is not None:

@@ -1,12 +1,12 @@
-"""The one grammar of commands, for every door: command line, zenoh queryable, console, sequences.
+"""The command grammar, shared by command line, zenoh queryable, console and missions.
 
     command  = word { argument }
-    argument = value | key "=" value          values without a key fill the arguments in their order
+    argument = value | key "=" value          values without a key fill the arguments in order
     value    = bare word | "quoted, with spaces"
 
-Class names are compared without regard to case, and `_` and `-` count as a space: `traffic_light` is
-"traffic light". A number may carry its own unit: `distance=3m`. Every command is a frozen dataclass whose
-fields carry their key, unit and allowed range, so a command made in code is held to the same limits, and
+Class names are case-insensitive, and `_` and `-` count as a space: `traffic_light` is "traffic light". A
+number may be followed by its unit: `distance=3m`. Every command is a frozen dataclass whose fields declare
+key, unit and allowed range, so a command made in code has the same limits, and
 `parse(str(command)) == command`.
 """
 
@@ -37,19 +37,19 @@ from companion.guidance.registry import COMMANDS
 
 
 def parse(text: str, class_names: Sequence[str] | None = None) -> Command:
-    """One command.
+    """Parse one command.
 
     Args:
-        text: as described at the top of this module.
-        class_names: what the detector knows; names are then checked and written as the detector writes them.
-            None: any name is taken as it is.
+        text: see the module docstring.
+        class_names: the detector's classes; names are checked and take the detector's spelling. None: any
+            name is accepted.
 
     Raises:
-        GrammarError: with one line that says what is wrong and what would be right.
+        GrammarError: one line with the error and what was expected.
     """
     tokens = list(_tokens(text))
     if not tokens:
-        raise GrammarError(f"no command; there are: {', '.join(COMMANDS)}")
+        raise GrammarError(f"no command; known: {', '.join(COMMANDS)}")
     word = tokens[0].text.lower()
     if word not in COMMANDS or tokens[0].key is not None:
         raise GrammarError(f"unknown command {tokens[0].whole!r}; {nearest(word, list(COMMANDS))}")
@@ -65,7 +65,7 @@ def parse(text: str, class_names: Sequence[str] | None = None) -> Command:
 
 
 def usage(kind: type[Command]) -> str:
-    """One line: how the command is written, with its defaults."""
+    """One line: the syntax of a command with its defaults."""
     words = [kind.word]
     for field, argument in arguments_of(kind):
         default = default_of(field)
@@ -85,13 +85,13 @@ def usage(kind: type[Command]) -> str:
 
 
 def summary() -> str:
-    """Every command in two lines: how it is written, and what it does."""
+    """Every command in two lines: syntax and help."""
     lines = [f"  {usage(kind)}\n      {kind.help}" for kind in COMMANDS.values()]
-    return "\n".join(["Commands (`companion commands` tells their arguments; plug-ins add more):", *lines])
+    return "\n".join(["Commands (arguments: `companion commands`; plug-ins add more):", *lines])
 
 
 def describe() -> str:
-    """The help text: every command, its arguments, units, ranges and defaults."""
+    """The full help text: every command with arguments, units, ranges and defaults."""
     lines = []
     for kind in COMMANDS.values():
         lines += [usage(kind), f"    {kind.help}"]
@@ -102,7 +102,7 @@ def describe() -> str:
 
 
 def markdown() -> str:
-    """The same as tables for the documentation, one section a command."""
+    """The same as Markdown tables, one section per command."""
     lines = []
     for kind in COMMANDS.values():
         lines += [
@@ -128,7 +128,7 @@ def markdown() -> str:
 
 
 def allowed_values(argument: Argument) -> str:
-    """What a value may be, in words; empty where any of its kind is."""
+    """The allowed values in words; empty: any value of the type."""
     match argument:
         case Number(_, unit, low, high):
             return f"{low:g} to {high:g}{' ' + unit if unit else ''}"
@@ -138,10 +138,10 @@ def allowed_values(argument: Argument) -> str:
 
 
 def json_schema(class_names: Sequence[str] | None = None) -> dict[str, Any]:
-    """The table of commands as JSON Schema (draft 2020-12): word → an object of its arguments by their keys.
+    """The commands as JSON Schema (draft 2020-12): word → object of its arguments by key.
 
     Args:
-        class_names: what the detector knows; None: any class name is allowed.
+        class_names: the detector's classes; None: any class name is allowed.
     """
     commands: dict[str, Any] = {}
     for kind in COMMANDS.values():
@@ -217,7 +217,9 @@ def _assigned(kind: type[Command], tokens: list[_Token]) -> Iterator[tuple[str, 
             yield claim(arguments[0][1].key, " ".join(token.text for token in bare))
     else:
         if len(bare) > len(arguments):
-            raise GrammarError(f"{kind.word}: {bare[len(arguments)].whole!r} is too much: {usage(kind)}")
+            raise GrammarError(
+                f"{kind.word}: unexpected argument {bare[len(arguments)].whole!r}: {usage(kind)}"
+            )
         for token, (_, argument) in zip(bare, arguments, strict=False):
             yield claim(argument.key, token.text)
     for token in tokens:
@@ -228,7 +230,7 @@ def _assigned(kind: type[Command], tokens: list[_Token]) -> Iterator[tuple[str, 
                 f"{kind.word}: {token.key}= was renamed to {now}= in version 0.2.0: {usage(kind)}"
             )
         if token.key not in by_key:
-            known = nearest(token.key, list(by_key)) if by_key else "it takes none"
+            known = nearest(token.key, list(by_key)) if by_key else "the command takes no arguments"
             raise GrammarError(f"{kind.word}: unknown argument {token.key!r}; {known}")
         yield claim(token.key, token.text)
 

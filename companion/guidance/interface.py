@@ -1,4 +1,4 @@
-"""The values that go into guidance and those that come out of it. Plain data: no link, no clock, no I/O."""
+"""Input and output values of guidance. Plain data: no link, no clock, no I/O."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from vision.obstacle_sectors import ObstacleSectors
 
 @dataclass(frozen=True, slots=True)
 class SetMode:
-    """Ask for a flight mode; done when the vehicle shows it."""
+    """Set a flight mode; done when the vehicle shows it."""
 
     mode: FlightMode
 
@@ -40,7 +40,7 @@ class TakeOff:
 
 @dataclass(frozen=True, slots=True)
 class FindGimbal:
-    """Ask for a gimbal manager and its streams; refused when none answers."""
+    """Request a gimbal manager and its streams; refused when none responds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,7 @@ class PointGimbal:
 
 @dataclass(frozen=True, slots=True)
 class ReleaseGimbal:
-    """Give primary control of the gimbal back."""
+    """Release primary control of the gimbal."""
 
 
 Action = SetMode | Arm | TakeOff | FindGimbal | TakeGimbal | PointGimbal | ReleaseGimbal
@@ -65,7 +65,7 @@ Action = SetMode | Arm | TakeOff | FindGimbal | TakeGimbal | PointGimbal | Relea
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """Something to ask of the vehicle. It is answered once, by an `Answer` with the same identifier."""
+    """A request to the vehicle. It is answered once, by an `Answer` with the same identifier."""
 
     identifier: int
     action: Action
@@ -73,7 +73,7 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What became of a request. `refused` is the reason in words; None: it was done."""
+    """The result of a request. `refused` is the reason in words; None: it was done."""
 
     identifier: int
     refused: str | None = None
@@ -84,12 +84,12 @@ class CommandInput:
     """An operator's command. It is answered once, by a `CommandResult` with the same identifier.
 
     Attributes:
-        text: as it is written, for messages.
-        behaviour: what is to be flown; None: the command only points the gimbal.
-        aim: where the gimbal is to look; None for a behaviour.
-        endless: the command has no end of its own, so it is answered when the vehicle flies it.
-        mode_changes: `GuidanceInput.mode_changes` when the command was given; None: not known. A change of
-            mode or arming since then supersedes it: it was given to the vehicle as it was.
+        text: the command as written, for messages.
+        behaviour: what to fly; None: the command only points the gimbal.
+        aim: where to point the gimbal; None for a behaviour.
+        endless: the command does not end by itself, so it is answered when the vehicle flies it.
+        mode_changes: `GuidanceInput.mode_changes` when the command was given; None: not known. A later
+            change of mode or arming supersedes the command.
     """
 
     identifier: int
@@ -101,12 +101,12 @@ class CommandInput:
 
     def __post_init__(self) -> None:
         if (self.behaviour is None) == (self.aim is None):
-            raise ValueError(f"{self.text}: a command is a behaviour or a gimbal aim, exactly one of them")
+            raise ValueError(f"{self.text}: expected exactly one of behaviour and aim")
 
 
 @dataclass(frozen=True, slots=True)
 class CommandResult:
-    """How a command ended, was refused, or that it is in progress (an endless one)."""
+    """The result of a command: ended, refused, or in progress (an endless one)."""
 
     identifier: int
     outcome: Outcome
@@ -114,33 +114,33 @@ class CommandResult:
 
 @dataclass(frozen=True, slots=True)
 class StreamStatus:
-    """What became of our setpoints: the streamer's state and how many setpoints have left."""
+    """The streamer's state and the number of setpoints sent."""
 
     state: StreamState = StreamState.SILENT
     sent_count: int = 0
 
 
 class EventKind(StrEnum):
-    """What can happen to a behaviour, or to the gimbal."""
+    """Kinds of events of behaviours and the gimbal."""
 
     STARTED = "started"
     ENGAGED = "engaged"  # the vehicle shows OFFBOARD and flies our setpoints
-    NOTED = "noted"  # something that people should know
+    NOTED = "noted"  # a note for people
     ENDED = "ended"
     REFUSED = "refused"
-    LOST = "lost"  # command was taken from us
-    BLIND = "blind"  # it brakes for want of depth
-    BATTERY = "battery"  # too little charge to fly on, or its state is unknown
+    LOST = "lost"  # command was lost
+    BLIND = "blind"  # braking: no depth
+    BATTERY = "battery"  # low battery, or its state is unknown
     GIMBAL = "gimbal"
 
 
 @dataclass(frozen=True, slots=True)
 class GuidanceEvent:
-    """One line for the record.
+    """One event for the log.
 
     Attributes:
-        behaviour: its word; empty where the event is of no behaviour.
-        outcome: there when a behaviour ended or was refused.
+        behaviour: its word; empty where no behaviour is concerned.
+        outcome: set when a behaviour ended or was refused.
     """
 
     stamp_ns: int
@@ -153,22 +153,22 @@ class GuidanceEvent:
 
 @dataclass(frozen=True, slots=True)
 class GuidanceInput:
-    """Everything that guidance is told at one step. Stamps are CLOCK_MONOTONIC nanoseconds.
+    """The input of one guidance step. Stamps are CLOCK_MONOTONIC nanoseconds.
 
     Attributes:
         state: the vehicle.
-        stream: what became of the setpoints of the steps before.
-        targets: what the steering camera saw in its newest frame, local NED.
-        seen_ns: capture stamp of that frame; None: none came yet.
-        obstacles: what the newest depth image says, however old; None: none came.
-        markers: what is seen of markers, or why none can be.
-        neighbourhood: the other vehicles; None: nobody listens for them.
-        ranging: what there is to tell how far away an object is.
-        class_names: what the detector knows; None: not known, so not checked.
-        mode_changes: how often mode or armed changed since the link opened. A change that was reverted
-            between two steps counts too.
-        answers: to requests of earlier steps. commands: the new ones, the oldest first.
-        ending: the service ends: no command begins, and what is held is given back.
+        stream: the setpoint stream of the previous steps.
+        targets: from the steering camera's newest frame, local NED.
+        seen_ns: capture stamp of that frame; None: none received yet.
+        obstacles: from the newest depth image, of any age; None: none received.
+        markers: detected markers, or why there can be none.
+        neighbourhood: the other vehicles; None: poses are not shared.
+        ranging: which means of range estimation are available.
+        class_names: the detector's classes; None: not known, so not checked.
+        mode_changes: how often mode or armed changed since the link opened, including a change that was
+            reverted between two steps.
+        answers: to requests of earlier steps. commands: the new ones, oldest first.
+        ending: the service ends: no command begins, and control is released.
     """
 
     state: VehicleState
@@ -188,13 +188,13 @@ class GuidanceInput:
 
 @dataclass(frozen=True, slots=True)
 class GuidanceOutput:
-    """What is to be done after one step.
+    """The output of one guidance step.
 
     Attributes:
         setpoint: to stream from now on, a brake included; None: stop streaming.
-        requests: new ones. cancelled: identifiers of requests that nobody waits for any more.
-        landing_target: for the autopilot, once for every frame that shows one.
-        released: after `ending`: nothing is asked and nothing is held any more.
+        requests: new ones. cancelled: identifiers of abandoned requests.
+        landing_target: for the autopilot, once per frame that shows one.
+        released: after `ending`: no request is pending and no control is held.
     """
 
     setpoint: Setpoint | None
@@ -208,7 +208,7 @@ class GuidanceOutput:
 
 @dataclass(slots=True)
 class OutputCollector:
-    """Gathers what one step puts out. Identifiers of requests go on from step to step."""
+    """Collects the output of one step. Request identifiers continue from step to step."""
 
     now_ns: int = 0
     requests: list[Request] = field(default_factory=list)
@@ -223,13 +223,13 @@ class OutputCollector:
         self.requests, self.cancelled, self.events, self.results = [], [], [], []
 
     def request(self, action: Action) -> int:
-        """Ask for something; returns the request's identifier."""
+        """Add a request; returns its identifier."""
         self._identifier += 1
         self.requests.append(Request(self._identifier, action))
         return self._identifier
 
     def cancel(self, identifier: int) -> None:
-        """Nobody waits for this request any more; one of this very step is not made at all."""
+        """Abandon a request; one added in this step is removed."""
         kept = [request for request in self.requests if request.identifier != identifier]
         if len(kept) == len(self.requests):
             self.cancelled.append(identifier)
@@ -244,11 +244,11 @@ class OutputCollector:
         *,
         warning: bool = False,
     ) -> None:
-        """Tell people."""
+        """Add an event."""
         level: Literal["info", "warning"] = "warning" if warning else "info"
         self.events.append(GuidanceEvent(self.now_ns, kind, behaviour, message, outcome, level))
 
     def result(self, identifier: int | None, outcome: Outcome) -> None:
-        """Answer a command; None: nobody asked, or it was answered before."""
+        """Answer a command; None: no command, or it was answered before."""
         if identifier is not None:
             self.results.append(CommandResult(identifier, outcome))

@@ -1,4 +1,4 @@
-"""A request for one of the autopilot's own modes as actions: mode, pre-arm checks, arming, take-off."""
+"""A mode request as a sequence of actions: mode, pre-arm checks, arming, take-off."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ READY_TIMEOUT_S = 3.0
 
 
 class ModeSequence:
-    """Only a take-off that says so arms."""
+    """The actions of one mode request. Only a take-off with `arm` set arms."""
 
     def __init__(self, request: ModeRequest, state: VehicleState) -> None:
         self._actions: list[SetMode | Arm | TakeOff] = []
@@ -20,7 +20,7 @@ class ModeSequence:
             self._actions.append(SetMode(request.mode))
             return
         if request.arm and not state.armed:
-            # After a landing PX4 may show a mode in which it never arms: the one from before the landing.
+            # After a landing PX4 may show the mode from before the landing, in which it does not arm.
             if state.mode is not FlightMode.HOLD:
                 self._actions.append(SetMode(FlightMode.HOLD))
             self._actions.append(Arm())
@@ -28,13 +28,13 @@ class ModeSequence:
 
     @property
     def finished(self) -> bool:
-        """Every action was given out."""
+        """Whether every action was returned by `next`."""
         return not self._actions
 
     def next(self, now_ns: int, state: VehicleState) -> SetMode | Arm | TakeOff | None:
-        """The next action, once the one before is done. None: not yet, the pre-arm checks still run.
+        """The next action, once the previous one is done. None: the pre-arm checks still run.
 
-        After `READY_TIMEOUT_S` arming is asked for all the same: the autopilot then says what is wrong.
+        After `READY_TIMEOUT_S` arming is requested anyway: the autopilot then reports what is wrong.
         """
         if not self._actions:
             return None

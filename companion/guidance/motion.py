@@ -1,4 +1,4 @@
-"""Small laws of motion that several behaviours share. Local NED, metres, seconds."""
+"""Motion control laws shared by behaviours. Local NED, metres, seconds."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import math
 
 from companion.vehicle.state import Vector3, VehicleState
 
-# Answer of a velocity command to an error of position, 1/s: about PX4's own MPC_XY_P and MPC_Z_P.
+# Gain from position error to velocity, 1/s: about PX4's own MPC_XY_P and MPC_Z_P.
 POSITION_GAIN = 0.9
-# How much more is asked for of each m/s that the vehicle is off what is wanted.
+# Extra velocity commanded per m/s of velocity error.
 VELOCITY_GAIN = 0.5
-# Corrections of drift are slow on purpose.
+# Limit of drift corrections.
 MAX_CORRECTION_MPS = 0.8
-# A slow vehicle that is asked to stop flies on for its speed times this.
+# Stopping distance of a slow vehicle: its speed times this.
 STOPPING_DELAY_S = 0.5
-# Under the envelope's acceleration, so that a vehicle that answers late still stops in time.
+# Below the envelope's acceleration, so that a vehicle with delay still stops in time.
 STOPPING_MPS2 = 0.7
 # `PositionController`: gains of position (1/s), of velocity (as VELOCITY_GAIN), of the integral (1/s²), and
 # the integral's limit. Tuned in lockstep in gusts of 0.6 m/s with MPC_XY_VEL_P_ACC 1.2 to 3: 0.17 m
@@ -25,18 +25,18 @@ HOLD_VELOCITY_GAIN = 1.5
 HOLD_DOWN_GAIN = 1.3
 HOLD_INTEGRAL_GAIN = 0.4
 HOLD_INTEGRAL_MPS = 0.5
-# Farther away than this the error is the way to go, not a disturbance to be integrated.
+# Farther away than this the error is remaining distance, not a disturbance to integrate.
 HOLD_INTEGRAL_M = 1.0
-# Arrived: within so much of the goal and slower than so much...
+# Arrived: within this distance of the goal and slower than this...
 ARRIVED_M = 0.3
 ARRIVED_MPS = 0.3
-# ... at the end of one of these: (distance m, speed m/s, duration s). In strong gusts no vehicle stands as
-# still as the first one asks for.
+# ... at the end of one of these: (distance m, speed m/s, duration s). In strong gusts no vehicle meets the
+# first one.
 SETTLED = ((ARRIVED_M, ARRIVED_MPS, 1.0), (0.8, 0.8, 4.0))
 
 
 def position_and_yaw(state: VehicleState) -> tuple[Vector3, float]:
-    """Both, of a state that has them. Raises RuntimeError where a requirement was not checked."""
+    """Position (local NED) and yaw. Raises RuntimeError where either is unknown (unchecked requirement)."""
     position, yaw_rad = state.position_ned_m, state.yaw_rad
     if position is None or yaw_rad is None:
         raise RuntimeError("position or attitude is unknown: the behaviour must require POSITION")
@@ -44,9 +44,9 @@ def position_and_yaw(state: VehicleState) -> tuple[Vector3, float]:
 
 
 def home_of(state: VehicleState) -> Vector3:
-    """Home, local NED. Raises ValueError with a line for a person while it is not known."""
+    """Home, local NED. Raises ValueError with a line for a person while it is unknown."""
     if state.home_position_ned_m is None:
-        raise ValueError("the vehicle has not told where home is")
+        raise ValueError("home position not received")
     return state.home_position_ned_m
 
 
@@ -57,33 +57,33 @@ def ground_speed(state: VehicleState) -> float:
 
 
 def correction(error_m: float, limit_mps: float = MAX_CORRECTION_MPS) -> float:
-    """Speed that takes an error of position away."""
+    """Velocity that corrects a position error, m/s."""
     return max(-limit_mps, min(limit_mps, POSITION_GAIN * error_m))
 
 
 def towards(
-    place: Vector3, position: Vector3, gain: float, limit_mps: float = MAX_CORRECTION_MPS
+    point: Vector3, position: Vector3, gain: float, limit_mps: float = MAX_CORRECTION_MPS
 ) -> tuple[float, float]:
-    """Velocity over ground (north, east) that takes the vehicle to a place."""
-    north, east = place[0] - position[0], place[1] - position[1]
+    """Horizontal velocity (north, east) towards a point."""
+    north, east = point[0] - position[0], point[1] - position[1]
     distance = math.hypot(north, east)
     scale = min(gain, limit_mps / distance) if distance > 1e-6 else 0.0
     return (north * scale, east * scale)
 
 
-def stay_at(place: Vector3, position: Vector3) -> Vector3:
-    """Velocity that keeps the vehicle at a place (for setpoints that also carry a yaw rate)."""
-    return (*towards(place, position, POSITION_GAIN), correction(place[2] - position[2]))
+def stay_at(point: Vector3, position: Vector3) -> Vector3:
+    """Velocity that keeps the vehicle at a point (for setpoints that also carry a yaw rate)."""
+    return (*towards(point, position, POSITION_GAIN), correction(point[2] - position[2]))
 
 
-def pressed(
+def add_velocity_error(
     wanted: tuple[float, float], state: VehicleState, top_speed_mps: float, gain: float = VELOCITY_GAIN
 ) -> tuple[float, float]:
-    """A velocity over ground, with more of it where the vehicle does not follow; never above the top speed.
+    """A horizontal velocity command plus a share of the velocity error, limited to the top speed.
 
-    PX4's velocity controller has gathered what drag cost it on the way (MPC_XY_VEL_I_ACC), and goes on with
-    that for seconds when it should stop: measured half a metre of overshoot. Asking for more than is wanted
-    acts like a higher MPC_XY_VEL_P_ACC: 2.7 instead of 1.8, well inside the range PX4 allows.
+    The integral of PX4's velocity controller (MPC_XY_VEL_I_ACC) has compensated drag and persists for seconds
+    when the vehicle should stop: 0.5 m of overshoot measured. The extra command acts like a higher
+    MPC_XY_VEL_P_ACC: 2.7 instead of 1.8, well inside the range PX4 allows.
     """
     north_mps, east_mps, _ = state.velocity_ned_mps or (*wanted, 0.0)
     north = wanted[0] + gain * (wanted[0] - north_mps)
@@ -116,10 +116,10 @@ def speed_of(state: VehicleState) -> float:
 
 
 class PositionController:
-    """Velocity setpoints that fly to a point and keep the vehicle there, in wind and gusts.
+    """Velocity setpoints that fly to a point and hold it in wind and gusts.
 
-    A velocity proportional to the distance left, more of it where the vehicle does not follow (see
-    `pressed`), and an integral near the point.
+    A velocity proportional to the distance left, the velocity error (see `add_velocity_error`), and an
+    integral near the point.
     """
 
     def __init__(self) -> None:
@@ -128,10 +128,10 @@ class PositionController:
     def velocity(
         self, goal_ned_m: Vector3, state: VehicleState, dt_s: float, top_speed_mps: float = MAX_CORRECTION_MPS
     ) -> Vector3:
-        """The velocity to ask for, local NED m/s.
+        """The velocity command, local NED m/s.
 
         Args:
-            goal_ned_m: where to stand, local NED. dt_s: since the last call.
+            goal_ned_m: point to hold, local NED. dt_s: since the last call.
             top_speed_mps: horizontally, and vertically.
 
         Raises:
@@ -151,7 +151,7 @@ class PositionController:
             self._integral_mps = (0.0, 0.0)
         wanted = (north * scale, east * scale)
         most_mps = top_speed_mps + HOLD_INTEGRAL_MPS
-        north_mps, east_mps = pressed(wanted, state, most_mps, HOLD_VELOCITY_GAIN)
+        north_mps, east_mps = add_velocity_error(wanted, state, most_mps, HOLD_VELOCITY_GAIN)
         return (
             north_mps + self._integral_mps[0],
             east_mps + self._integral_mps[1],
@@ -160,13 +160,13 @@ class PositionController:
 
 
 class Arrival:
-    """Whether the vehicle has arrived: near its goal, slow, and settled there."""
+    """Arrival detector: near the goal, slow, and settled there."""
 
     def __init__(self) -> None:
         self._since_ns: list[int | None] = [None] * len(SETTLED)
 
     def update(self, distance_m: float, speed_mps: float, now_ns: int, near_m: float = ARRIVED_M) -> bool:
-        """Call at every update with the distance to the goal and the speed. `near_m`: `ARRIVED_M` or less."""
+        """True once arrived. Call it at every update. `near_m`: at most `ARRIVED_M`."""
         arrived = False
         for index, (tolerance_m, slow_mps, lasting_s) in enumerate(SETTLED):
             since_ns = self._since_ns[index]
@@ -181,10 +181,10 @@ class Arrival:
 
 
 def in_degrees(bearing_rad: float) -> int:
-    """A bearing as people write it: 0..359."""
+    """A bearing in whole degrees, 0..359."""
     return round(math.degrees(bearing_rad)) % 360
 
 
 def laps_text(laps: float) -> str:
-    """A number of laps as people say it."""
+    """A number of laps in words."""
     return "1 lap" if laps == 1.0 else f"{laps:g} laps"

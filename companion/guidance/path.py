@@ -1,7 +1,7 @@
-"""Following a path: where along it the vehicle is, how fast it may be there, and which velocity leads on.
+"""Path following: progress along a path, speed profile, and velocity command.
 
-The path is a row of points in local NED, joined by straight lines. Speeds come from its bends: what a bend of
-radius r allows is √(a·r), and before it the vehicle slows down by √(v² + 2·a·s).
+A path is a list of points in local NED joined by straight lines. Speeds come from its bends: a bend of radius
+r allows √(a·r), and before it the vehicle slows down by √(v² + 2·a·s).
 """
 
 from __future__ import annotations
@@ -15,31 +15,31 @@ from itertools import accumulate, pairwise
 from companion.guidance.motion import MAX_CORRECTION_MPS, POSITION_GAIN, STOPPING_MPS2, stopping_speed
 from companion.vehicle.state import Vector3
 
-# Under the envelope's 2 m/s², so that something is left against wind.
+# Below the envelope's 2 m/s², to keep a reserve against wind.
 ACCELERATION_MPS2 = 1.0
-# A corner is flown as a bend: what the path turns within so far of a point is its bend there.
+# A corner is flown as a bend: the turn of the path within this distance before and after a point.
 BEND_M = 1.0
 SPACING_M = 0.25
 SAME_M = 0.01
 SLOWEST_MPS = 0.4
-# How late a multirotor's velocity follows: it is led by the path as it will be then.
+# Delay of a multirotor's velocity: the command is the path's direction that far ahead.
 DELAY_S = 0.4
-# The vehicle is looked for on the path no further on than this and the way of its speed.
+# The nearest point is searched no further ahead than this plus the distance flown meanwhile.
 SEARCH_AHEAD_M = 3.0
-# So near to where the path turns back on itself the vehicle was there.
+# A reversal of the path counts as reached within this distance.
 CORNER_M = 0.5
 LONGEST_M = 5_000.0
-# Bends are told from the directions two steps of this apart, so a shorter round has none.
+# Bends are computed from directions 2·BEND_M apart, so a shorter loop has none.
 SHORTEST_ROUND_M = 4.0 * BEND_M
 _MOST_PARTS = 2000
 
 
 @dataclass(frozen=True, slots=True)
 class PathPoint:
-    """A place on the path and what goes on there.
+    """A point on the path.
 
     Attributes:
-        position_ned_m: the place. direction: (north, east, down) unit vector along the path.
+        position_ned_m: local NED metres. direction: (north, east, down) unit vector along the path.
         speed_mps: the greatest speed there.
     """
 
@@ -49,18 +49,19 @@ class PathPoint:
 
 
 class Path:
-    """A path with its speeds.
+    """A path with its speed profile.
 
     Args:
-        points: at least two, local NED metres; those that are where the one before is are left out.
+        points: at least two, local NED metres; repeated points are skipped.
         speed_mps: along straight lines.
-        closed: from the last point back to the first, again and again: nothing is slowed down for an end.
+        closed: a loop from the last point back to the first, without slowing down for an end.
 
     Attributes:
-        length_m: of one round. speed_mps: as given.
+        length_m: of one lap. speed_mps: as given.
 
     Raises:
-        ValueError: fewer than two different points, a path too long to be meant, or too short to go round.
+        ValueError: fewer than two different points, longer than `LONGEST_M`, or a loop shorter than
+            `SHORTEST_ROUND_M`.
     """
 
     def __init__(self, points: Sequence[Vector3], speed_mps: float, *, closed: bool = False) -> None:
@@ -73,11 +74,10 @@ class Path:
         self.closed, self.speed_mps = closed, speed_mps
         length_m = sum(math.dist(a, b) for a, b in pairwise(corners))
         if not length_m <= LONGEST_M:
-            raise ValueError(f"a path may be {LONGEST_M:g} m long at most, this one has {length_m:.0f} m")
+            raise ValueError(f"a path must be at most {LONGEST_M:g} m long, got {length_m:.0f} m")
         if closed and length_m < SHORTEST_ROUND_M:
             raise ValueError(
-                f"a path flown round and round must be {SHORTEST_ROUND_M:g} m long at least, "
-                f"this one has {length_m:.1f} m"
+                f"a closed path must be at least {SHORTEST_ROUND_M:g} m long, got {length_m:.1f} m"
             )
         self._points = _spaced(corners, max(SPACING_M, length_m / _MOST_PARTS))
         self._at = list(accumulate((math.dist(a, b) for a, b in pairwise(self._points)), initial=0.0))
@@ -86,64 +86,64 @@ class Path:
         self._speeds = self._allowed(speed_mps)
 
     def point(self, along_m: float) -> PathPoint:
-        """What is `along_m` from the beginning; beyond an open path's end, the end."""
-        index, share = self._part(along_m)
+        """The point `along_m` from the start; beyond an open path's end, the end."""
+        index, fraction = self._part(along_m)
         before, after = self._speeds[index], self._speeds[index + 1]
-        # Speeds change by acceleration, so it is their squares that lie on a line.
-        speed = math.sqrt(before**2 + share * (after**2 - before**2))
-        return PathPoint(self._between(index, share), self._directions[index], speed)
+        # At constant acceleration the square of the speed is linear in distance.
+        speed = math.sqrt(before**2 + fraction * (after**2 - before**2))
+        return PathPoint(self._between(index, fraction), self._directions[index], speed)
 
     def direction(self, along_m: float) -> Vector3:
         """`PathPoint.direction` there, alone."""
         return self._directions[self._part(along_m)[0]]
 
     def nearest(self, position: Vector3, from_m: float, to_m: float) -> float:
-        """How far along the nearest place to `position` is, looked for between two places."""
+        """Distance along the path of the point nearest to `position`, between `from_m` and `to_m`."""
         steps = max(2, math.ceil((to_m - from_m) / SPACING_M))
         tried = [from_m + (to_m - from_m) * step / steps for step in range(steps + 1)]
         if not self.closed:
             tried = [min(max(along, 0.0), self.length_m) for along in tried]
-        best = min(tried, key=lambda along: math.dist(self._place(along), position))
+        best = min(tried, key=lambda along: math.dist(self._position(along), position))
         here = self.point(best)
         offset = [p - h for p, h in zip(position, here.position_ned_m, strict=True)]
         best += sum(o * d for o, d in zip(offset, here.direction, strict=True))
         return min(max(best, from_m), to_m)
 
     def _part(self, along_m: float) -> tuple[int, float]:
-        """Which piece of the path that is on, and which share of it lies before."""
+        """Index of the segment at a distance along the path, and the fraction of it."""
         along_m = self._on_path(along_m)
         index = min(max(bisect_right(self._at, along_m) - 1, 0), len(self._points) - 2)
-        share = (along_m - self._at[index]) / (self._at[index + 1] - self._at[index])
-        return index, min(max(share, 0.0), 1.0)
+        fraction = (along_m - self._at[index]) / (self._at[index + 1] - self._at[index])
+        return index, min(max(fraction, 0.0), 1.0)
 
-    def _place(self, along_m: float) -> Vector3:
-        """The place alone: many are tried at every turn."""
+    def _position(self, along_m: float) -> Vector3:
+        """The position alone: `nearest` evaluates many."""
         return self._between(*self._part(along_m))
 
-    def _between(self, index: int, share: float) -> Vector3:
+    def _between(self, index: int, fraction: float) -> Vector3:
         start, end = self._points[index], self._points[index + 1]
         return (
-            start[0] + share * (end[0] - start[0]),
-            start[1] + share * (end[1] - start[1]),
-            start[2] + share * (end[2] - start[2]),
+            start[0] + fraction * (end[0] - start[0]),
+            start[1] + fraction * (end[1] - start[1]),
+            start[2] + fraction * (end[2] - start[2]),
         )
 
     def _on_path(self, along_m: float) -> float:
         return along_m % self.length_m if self.closed else min(max(along_m, 0.0), self.length_m)
 
     def _allowed(self, speed_mps: float) -> list[float]:
-        """Greatest speed at each point: its bend's, and what can be slowed down from before the next."""
+        """Greatest speed at each point: that of its bend, and from which the next one's can be reached."""
         speeds = [min(speed_mps, self._bend_speed(along)) for along in self._at]
         if not self.closed:
             speeds[-1] = 0.0
-        rounds = 2 if self.closed else 1  # the second round knows the first one's beginning
-        for _ in range(rounds):
+        passes = 2 if self.closed else 1  # the second pass uses the first one's start speed
+        for _ in range(passes):
             if self.closed:
                 speeds[-1] = speeds[0] = min(speeds[0], speeds[-1])
             for index in range(len(speeds) - 2, -1, -1):
-                way = self._at[index + 1] - self._at[index]
+                distance = self._at[index + 1] - self._at[index]
                 speeds[index] = min(
-                    speeds[index], math.sqrt(speeds[index + 1] ** 2 + 2.0 * ACCELERATION_MPS2 * way)
+                    speeds[index], math.sqrt(speeds[index + 1] ** 2 + 2.0 * ACCELERATION_MPS2 * distance)
                 )
         return speeds
 
@@ -158,27 +158,27 @@ class Path:
 
 
 class PathFollower:
-    """A vehicle on its way along a path: call `velocity` at every turn.
+    """Follows a path: call `velocity` at every update.
 
     Args:
-        laps: of a closed path, after which the vehicle stops; 0: it never does.
+        laps: of a closed path, after which the vehicle stops; 0: it does not stop.
 
     Attributes:
-        along_m: how far it has come, over all rounds; it never goes back.
-        off_m: how far beside the path it was at the last turn.
-        end_m: where along the path it stops; infinite: nowhere.
+        along_m: progress over all laps; it never decreases.
+        off_m: cross-track distance at the last update.
+        end_m: distance along the path where it stops; infinite: it does not.
     """
 
     def __init__(self, path: Path, laps: float = 1.0) -> None:
         self.path = path
-        rounds = laps if path.closed else 1.0
-        self.end_m = rounds * path.length_m if rounds else math.inf
+        laps = laps if path.closed else 1.0
+        self.end_m = laps * path.length_m if laps else math.inf
         self.along_m = 0.0
         self.off_m = 0.0
         self._joined = not path.closed
 
     def velocity(self, position: Vector3, speed_mps: float) -> Vector3:
-        """The velocity over ground and down that brings it on along the path, and back onto it.
+        """The velocity (NED) along the path and back onto it.
 
         Args:
             position: of the vehicle, local NED metres. speed_mps: its ground speed.
@@ -199,7 +199,7 @@ class PathFollower:
         ahead = self.path.point(self.along_m + DELAY_S * here.speed_mps)
         offset = [h - p for h, p in zip(here.position_ned_m, position, strict=True)]
         self.off_m = math.hypot(*offset)
-        # Far beside the path it is flown to first, and along it only as far as that leaves speed.
+        # Returning to the path has priority; progress along it gets the remaining speed.
         back_mps = min(POSITION_GAIN * self.off_m, max(MAX_CORRECTION_MPS, here.speed_mps))
         slowest = min(SLOWEST_MPS, self.path.speed_mps)
         along_mps = math.sqrt(max(0.0, max(here.speed_mps, slowest) ** 2 - back_mps**2))
@@ -209,7 +209,7 @@ class PathFollower:
         return (north, east, down)
 
     def _before_turning_back(self, reach_m: float) -> float:
-        """Where the path turns back on itself both ways look alike: no further before that was flown to."""
+        """Limit the search to the next reversal of the path, where both legs are equally near."""
         here, at = self.path.direction(self.along_m), self.along_m + CORNER_M
         while at < reach_m:
             at += SPACING_M / 2
@@ -218,18 +218,18 @@ class PathFollower:
         return reach_m
 
     def bearing(self) -> float | None:
-        """Where the path leads from here, radians from north; None where it goes straight up or down."""
+        """Bearing of the path ahead, radians from north; None where it goes straight up or down."""
         north, east, _ = self.path.direction(self.along_m + BEND_M)
         return math.atan2(east, north) if math.hypot(north, east) > 0.2 else None
 
     @property
     def left_m(self) -> float:
-        """How much of the way is left until it stops."""
+        """Distance left until it stops."""
         return max(0.0, self.end_m - self.along_m)
 
     @property
     def end_ned_m(self) -> Vector3 | None:
-        """Where it stops, local NED; None: nowhere."""
+        """Where it stops, local NED; None: it does not stop."""
         return self.path.point(self.end_m).position_ned_m if math.isfinite(self.end_m) else None
 
 
@@ -238,7 +238,7 @@ def _dot(one: Vector3, other: Vector3) -> float:
 
 
 def _direction(start: Vector3, end: Vector3) -> Vector3:
-    """Unit vector from one place to another."""
+    """Unit vector from one point to another."""
     length_m = math.dist(start, end)
     return (
         (end[0] - start[0]) / length_m,

@@ -1,6 +1,6 @@
-"""The vehicle's pose for the others, and theirs for it: published at 10 Hz, heard from the bus.
+"""Pose sharing: publish the vehicle's pose at 10 Hz, receive those of other vehicles.
 
-A pose is published only while the vehicle knows where on earth it is: who hears none counts it as silent.
+A pose is published only while the global position is known; without one the others treat it as silent.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ logger = logging.getLogger(__name__)
 
 
 class PoseSharing:
-    """One vehicle's part.
+    """Pose sharing of one vehicle.
 
     Args:
-        vehicle: its name. on_event: called with (level, text) for what a person should know.
+        vehicle: its name. on_event: called with (level, text) for events.
 
     Attributes:
-        vehicle: its name. source: of this run of the service, random.
-        unread: messages that were no poses.
+        vehicle: its name. source: random identifier of this run of the service.
+        unread: count of invalid messages.
     """
 
     def __init__(self, vehicle: str, on_event: Callable[[str, str], None]) -> None:
@@ -37,33 +37,33 @@ class PoseSharing:
         self._neighbours = Neighbours(vehicle, self.source)
         self.unread = 0
 
-    def hear(self, payload: bytes, receipt_ns: int) -> None:
-        """A message on anybody's `pose`, this vehicle's own too, that came at that time (CLOCK_MONOTONIC)."""
+    def on_message(self, payload: bytes, receipt_ns: int) -> None:
+        """Handle a message on any vehicle's `pose` topic, received at that time (CLOCK_MONOTONIC ns)."""
         try:
             pose = pose_from_message(json.loads(payload))
         except (PoseError, ValueError) as error:
-            # Once is enough: it may come ten times a second.
+            # Logged once: it may come ten times a second.
             if not self.unread:
-                self._on_event("warning", f"a pose on the network is not read: {error}")
+                self._on_event("warning", f"invalid pose message ignored: {error}")
             self.unread += 1
             return
-        self.take(pose, receipt_ns)
+        self.ingest(pose, receipt_ns)
 
-    def take(self, pose: Pose, receipt_ns: int) -> None:
-        """A pose that came at that time, CLOCK_MONOTONIC nanoseconds."""
+    def ingest(self, pose: Pose, receipt_ns: int) -> None:
+        """Handle a pose received at that time, CLOCK_MONOTONIC nanoseconds."""
         namesakes = len(self._neighbours.namesakes)
-        self._neighbours.hear(pose, receipt_ns)
+        self._neighbours.ingest(pose, receipt_ns)
         if len(self._neighbours.namesakes) > namesakes:
             self._on_event(
-                "error", f"another service calls its vehicle {self.vehicle} too: give each its vehicle.name"
+                "error", f"duplicate vehicle.name {self.vehicle!r} on the network: give each service its own"
             )
 
-    def around(self, state: VehicleState, now_ns: int) -> Neighbourhood:
+    def neighbourhood(self, state: VehicleState, now_ns: int) -> Neighbourhood:
         """The other vehicles now."""
-        return self._neighbours.around(state, now_ns)
+        return self._neighbours.neighbourhood(state, now_ns)
 
     def pose(self, state: VehicleState, active: Behaviour | None, now_ns: int) -> Pose | None:
-        """The pose to publish; None while the global position is unknown. `flown`: the active behaviour."""
+        """The pose to publish; None while the global position is unknown. `active`: the active behaviour."""
         note = active.note if isinstance(active, FormationBehaviour) else None
         role = "follower" if note is not None else "alone"
         if note is None and self._neighbours.leads():
@@ -71,12 +71,12 @@ class PoseSharing:
         return pose_of(state, now_ns, vehicle=self.vehicle, source=self.source, role=role, formation=note)
 
     def message(self, state: VehicleState, active: Behaviour | None, now_ns: int) -> dict[str, Any] | None:
-        """The same as it is published."""
+        """The same as published."""
         pose = self.pose(state, active, now_ns)
         return None if pose is None else pose_message(pose)
 
     def status(self, now_ns: int) -> dict[str, Any]:
-        """For `status`: how old what is known of each other vehicle is, seconds."""
+        """For `status`: age of each other vehicle's pose, seconds, and counts of dropped messages."""
         return {
             "ages_s": self._neighbours.ages_s(now_ns),
             "unread": self.unread,

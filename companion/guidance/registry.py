@@ -1,7 +1,7 @@
-"""The table of commands: a decorator that adds one to it, for those of this package and of plug-ins.
+"""The table of commands, and the decorator that registers those of this package and of plug-ins.
 
-A behaviour is one file. It holds its command (word, arguments with unit, range and help) and the behaviour
-that the command becomes, and adds itself:
+A behaviour is one file. It contains the command (word, arguments with unit, range and help) and the behaviour
+that the command builds, and registers itself:
 
     @behaviour("circle", "fly a circle about the point ahead")
     class Circle(Command):
@@ -10,8 +10,8 @@ that the command becomes, and adds itself:
         def build(self, context: BuildContext) -> Behaviour:
             return CircleBehaviour(self.radius_m)
 
-Grammar, help, documentation and JSON Schema are made from this table. A file outside of this package is
-loaded only where the setting `plugins` names it (`companion.plugins`).
+Grammar, help, documentation and JSON Schema are generated from this table. A file outside this package is
+loaded only if the setting `plugins` names it (`companion.plugins`).
 """
 
 from __future__ import annotations
@@ -33,23 +33,23 @@ _Kind = TypeVar("_Kind", bound=Command)
 
 @dataclass_transform(frozen_default=True)
 def behaviour(word: str, help_text: str) -> Callable[[type[_Kind]], type[_Kind]]:
-    """Make a frozen dataclass of a command and add it to the table.
+    """Turn a command into a frozen dataclass and register it.
 
     Args:
-        word: how it is called: lower-case letters, digits and hyphens.
-        help_text: what it does, one line without a full stop.
+        word: name in the grammar: lower-case letters, digits and hyphens.
+        help_text: one line without a full stop.
 
     Raises:
-        TypeError: a field has no argument (`Annotated[float, Number(...)]`) beside its type.
-        ValueError: the word has other characters, or another command has it.
+        TypeError: a field's type is not annotated with an argument (`Annotated[float, Number(...)]`).
+        ValueError: the word has other characters, or is already registered.
     """
 
     def register(kind: type[_Kind]) -> type[_Kind]:
         if _WORD.fullmatch(word) is None:
-            raise ValueError(f"{kind.__qualname__}: a command is one lower-case word, got {word!r}")
+            raise ValueError(f"{kind.__qualname__}: a command must be one lower-case word, got {word!r}")
         if (other := COMMANDS.get(word)) is not None and not _same(kind, other):
             raise ValueError(
-                f"{kind.__module__}: there is a command {word!r} already, of {other.__module__}; "
+                f"{kind.__module__}: command {word!r} is already registered by {other.__module__}; "
                 "choose another word"
             )
         made = dataclass(frozen=True)(kind)
@@ -65,5 +65,5 @@ def behaviour(word: str, help_text: str) -> Callable[[type[_Kind]], type[_Kind]]
 
 
 def _same(kind: type[Command], other: type[Command]) -> bool:
-    """The same class again: its module was read twice."""
+    """Whether it is the same class, of a module that was imported twice."""
     return (kind.__module__, kind.__qualname__) == (other.__module__, other.__qualname__)

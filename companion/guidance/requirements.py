@@ -1,4 +1,4 @@
-"""What a behaviour cannot do without, checked before it begins: a refusal names what is missing."""
+"""Check of a behaviour's requirements before it begins; a refusal names what is missing."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from companion.guidance.limits.obstacles import NO_RULES, ObstacleRules
 from companion.vehicle.state import LandedState
 
 PERCEPTION_GAP_S = 1.5
-"""A detector that was heard within this is at work.
+"""A detector whose newest frame is at most this old is running.
 
-It may be late for a moment: a small computer that starts the very program that sends the command is busy.
-Steering asks more (`perception_fresh`); until then behaviours brake.
+It may be late for a moment, for example while a small computer starts the program that sends the command.
+Steering requires `perception_fresh`; until then behaviours brake.
 """
 
 AIRBORNE = (LandedState.IN_AIR, LandedState.TAKING_OFF, LandedState.LANDING)
@@ -31,15 +31,15 @@ def check_requirements(
     """Why this behaviour cannot begin now, in one line; None: it can.
 
     Args:
-        context: the newest; None before there is one.
-        class_names: what the detector knows; None: not known, not checked.
-        battery: the least charge to begin with. obstacles: whether depth is needed.
+        context: the newest; None before the first.
+        class_names: the detector's classes; None: not known, not checked.
+        battery: minimum charge. obstacles: whether depth is needed.
     """
     if context is None:
-        return "the vehicle's state is not known yet"
+        return "vehicle state not received yet"
     state, now_ns = context.state, context.now_ns
     if not state.connected(now_ns):
-        return "there is no link to the autopilot"
+        return "no link to the autopilot"
     missing = []
     for requirement in sorted(behaviour.requirements):
         match requirement:
@@ -51,8 +51,8 @@ def check_requirements(
                 missing.append(f"to be on the ground ({_where(context)})")
             case Requirement.PERCEPTION if not _perceiving(context):
                 missing.append(f"perception ({_perception_age(context)})")
-            case Requirement.PERCEPTION if context.gimbal.undirected:
-                missing.append(f"to know where its camera looks ({context.gimbal.undirected})")
+            case Requirement.PERCEPTION if context.gimbal.direction_fault:
+                missing.append(f"the camera's direction ({context.gimbal.direction_fault})")
             case Requirement.GIMBAL:
                 missing += missing_gimbal(state, now_ns, context.gimbal, behaviour.gimbal_pitches_rad)
                 if Requirement.PERCEPTION in behaviour.requirements and not context.gimbal.carries_camera:
@@ -78,7 +78,7 @@ def check_requirements(
 def _where(context: BehaviourContext) -> str:
     armed = "armed" if context.state.armed else "disarmed"
     landed = context.state.landed.value.replace("_", " ")
-    return f"{armed}, {'not known where' if landed == 'unknown' else landed}"
+    return f"{armed}, {'landed state unknown' if landed == 'unknown' else landed}"
 
 
 def _perceiving(context: BehaviourContext) -> bool:
@@ -88,5 +88,5 @@ def _perceiving(context: BehaviourContext) -> bool:
 
 def _perception_age(context: BehaviourContext) -> str:
     if context.perception_age_s is None:
-        return "nothing came from the detector yet"
-    return f"its newest frame is {context.perception_age_s:.1f} s old"
+        return "no detections received yet"
+    return f"newest frame {context.perception_age_s:.1f} s old"

@@ -57,7 +57,7 @@ class CommandHandler:
         outcome = await asyncio.shield(ended)
         more: dict[str, Any] = {}
         if isinstance(command.behaviour, SequenceBehaviour):
-            outcome = command.behaviour.told(outcome)
+            outcome = command.behaviour.with_step(outcome)
             more = {"steps": [asdict(step) for step in command.behaviour.records]}
         self._on_event("info" if outcome.success else "warning", f"{command.text}: {outcome.reason}")
         answer = {"success": outcome.success, "reason": outcome.reason}

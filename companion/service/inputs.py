@@ -121,7 +121,7 @@ class InputAssembler:
             None if newest is None else newest.captured_ns,
             self._obstacles,
             self._markers.sight(now_ns, self._settings.guidance.perception_max_age_s),
-            self.poses.around(state, now_ns),
+            self.poses.neighbourhood(state, now_ns),
             steering.ranging(self.camera_pitch_rad(state)),
             steering.class_names,
             self._mode_changes,

@@ -81,7 +81,7 @@ class Service:
             on_command=self.command,
             views=tuple(settings.cameras),
             listeners=[
-                (topics.POSE, lambda data: self.inputs.poses.hear(data, time.monotonic_ns())),
+                (topics.POSE, lambda data: self.inputs.poses.on_message(data, time.monotonic_ns())),
                 (topics.STATUS, lambda data: self.others.on_status(data, time.monotonic_ns())),
             ],
         )

@@ -1,4 +1,4 @@
-"""Fly to an object of a class and stop before it: visual servoing on its filtered place."""
+"""Approach: fly to an object of a class and stop before it, servoing on its filtered position."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from companion.guidance.motion import (
     STOPPING_MPS2,
     Arrival,
     PositionController,
+    add_velocity_error,
     correction,
     ground_speed,
     position_and_yaw,
-    pressed,
     speed_of,
     stopping_point,
     stopping_speed,
@@ -27,45 +27,44 @@ from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
 from vision.attitude import wrap_angle
 
-# Away from an object that is too near: slowly, the camera does not look backwards.
+# Retreat from an object that is too near: slow, because the camera does not look backwards.
 MAX_RETREAT_MPS = 1.0
-# Slower than this a vehicle that has lost its object stands.
+# Slower than this the vehicle counts as stopped after losing its object.
 STANDING_MPS = 0.3
-# The last of the way is flown to a fixed place before the object, so that wind does not carry the vehicle
-# around it. Inside the first distance to that place it is chosen; beyond the second it is given up.
+# The end of the approach is flown to a fixed point before the object, so that wind does not carry the vehicle
+# around it. Within the first distance of that point it is fixed; beyond the second it is released.
 ANCHOR_M = (1.5, 3.0)
-# That place follows the filtered place of the object with this time constant: the filter lets an object
-# wander, and so follows the noise of single ranges, which is more without depth and changes with the
-# vehicle's roll. An object whose filtered place is farther off than STILL_M, or than this share of its range,
-# has moved, and is not reached yet.
-PLACE_TIME_CONSTANT_S = 1.5
-PLACE_TIME_CONSTANT_WITHOUT_DEPTH_S = 3.0
+# That point follows the object's filtered position with this time constant: the filter follows the noise of
+# single ranges, which is greater without depth and changes with the vehicle's roll. An object whose filtered
+# position is farther off than STILL_M, or than this fraction of its range, has moved and is not reached yet.
+GOAL_TIME_CONSTANT_S = 1.5
+GOAL_TIME_CONSTANT_WITHOUT_DEPTH_S = 3.0
 STILL_M = 0.6
-STILL_SHARE = 0.1
+STILL_FRACTION = 0.1
 MAX_LAG_M = 0.25
-# With depth, reached within this. Other arrivals allow more, but range and own estimate err as well here, and
-# the hold that follows keeps to the latter. By the ground alone the goal itself wanders by more.
+# Arrival tolerance with depth. Smaller than that of other arrivals, because errors of range and own estimate
+# add to it, and the hold that follows keeps the error. Without depth the goal itself drifts by more.
 REACHED_M = 0.15
-# Detectors miss single frames; this long without the object and the vehicle brakes.
+# Detectors miss single frames; after this long without the object the vehicle brakes.
 LOST_AFTER_S = 1.0
-# What appears where a lost object was, in this direction and at half to twice its range, is taken for it.
+# A detection within this angle of a lost object, at 0.5 to 2 times its range, is associated with it.
 SAME_BEARING_RAD = math.radians(6.0)
-# Nearer than this the bearing to the object's nearest point swings too much to be followed.
+# Nearer than this the bearing to the object's nearest point is too noisy to follow.
 MIN_YAW_RANGE_M = 1.0
 BASE_TIMEOUT_S = 45.0
 
 
 class ApproachBehaviour(Behaviour):
-    """Keeps its height, turns its nose to the object and stops `distance_m` before its nearest surface.
+    """Keeps the height, yaws to the object and stops `distance_m` before its nearest surface.
 
-    It begins with the true object of the class before the nose (see `TargetSelector`) and stays with it.
-    Lost, it brakes and looks for `lost_timeout_s` before it gives up.
+    It selects the confirmed object of the class ahead (see `TargetSelector`) and stays with it. After losing
+    it, it brakes and waits for `lost_timeout_s` before it fails.
 
     Args:
-        tracking: keeps the camera's gimbal on the object; None: it is left alone.
+        tracking: keeps the camera's gimbal on the object; None: the gimbal is not used.
 
     Attributes:
-        lost_at: where the object was last known to be, if losing it ended the approach.
+        lost_at: last known position of the object, if losing it ended the approach.
     """
 
     name = "approach"
@@ -93,16 +92,16 @@ class ApproachBehaviour(Behaviour):
         self._confidence = confidence
         self._lost_timeout_s = lost_timeout_s
         self._track: ObjectTrack | None = None
-        self._choice = TargetSelector()
+        self._selector = TargetSelector()
         self._doubted = False
         self._down_m = 0.0
         self._seen_ns = 0
         self._until_ns: float = math.inf
         self._started_ns = 0
         self._bearing_rad: float | None = None
-        self._wait_place: Vector3 | None = None
+        self._wait_point: Vector3 | None = None
         self._anchor_rad: float | None = None
-        self._place: Vector3 = (0.0, 0.0, 0.0)
+        self._object_ned_m: Vector3 = (0.0, 0.0, 0.0)
         self._arrival, self._controller = Arrival(), PositionController()
         self._range_m = math.nan
 
@@ -111,8 +110,8 @@ class ApproachBehaviour(Behaviour):
         self._down_m = position[2]
         self._started_ns = self._seen_ns = context.now_ns
         self._until_ns = context.now_ns + BASE_TIMEOUT_S * 1e9
-        self._track = self._bearing_rad = self._wait_place = self._anchor_rad = None
-        self._choice = TargetSelector()
+        self._track = self._bearing_rad = self._wait_point = self._anchor_rad = None
+        self._selector = TargetSelector()
         self._doubted = False
         self.lost_at = None
         self._arrival, self._controller = Arrival(), PositionController()
@@ -135,13 +134,13 @@ class ApproachBehaviour(Behaviour):
             if why is not None:
                 return Outcome(False, f"approach lost the gimbal: {why}")
         if now_ns > self._until_ns:
-            away = f"still {self._range_m:.1f} m away" if track else "its range never became known"
+            away = f"still {self._range_m:.1f} m away" if track else "range never known"
             took_s = (now_ns - self._started_ns) / 1e9
             return Outcome(False, f"did not reach the {self._class_name} in {took_s:.0f} s: {away}")
         if track is None or unseen_s > LOST_AFTER_S or not context.perception_fresh:
             return self._wait(dt_s, context, position, unseen_s)
-        if self._wait_place is not None:
-            self._wait_place, self._controller = None, PositionController()
+        if self._wait_point is not None:
+            self._wait_point, self._controller = None, PositionController()
 
         bearing = math.atan2(east - position[1], north - position[0])
         if self._range_m > MIN_YAW_RANGE_M or self._bearing_rad is None:
@@ -150,9 +149,9 @@ class ApproachBehaviour(Behaviour):
         top = self._speed_mps if error_m > 0 else min(MAX_RETREAT_MPS, self._speed_mps)
         goal = self._goal(track.position_ned_m, position, bearing, dt_s)
         if goal is not None:
-            self._range_m = math.dist(self._place[:2], position[:2])
-            moved_m = math.dist(self._place[:2], track.position_ned_m[:2])
-            still = moved_m < max(STILL_M, STILL_SHARE * self._range_m)
+            self._range_m = math.dist(self._object_ned_m[:2], position[:2])
+            moved_m = math.dist(self._object_ned_m[:2], track.position_ned_m[:2])
+            still = moved_m < max(STILL_M, STILL_FRACTION * self._range_m)
             off_m = math.dist(goal, position) if still else math.inf
             near_m = REACHED_M if self._by_depth else ARRIVED_M
             if self._arrival.update(off_m, speed_of(state), now_ns, near_m):
@@ -160,10 +159,10 @@ class ApproachBehaviour(Behaviour):
             velocity = self._controller.velocity(goal, state, dt_s, top)
             return Setpoint.velocity(velocity, now_ns, yaw_rad=self._bearing_rad)
         speed = stopping_speed(error_m, top, STOPPING_MPS2)
-        # Towards what the camera does not look at yet, only as fast as the nose comes round.
+        # Slower while the nose does not point at the object yet.
         speed *= max(0.0, math.cos(wrap_angle(bearing - yaw_rad))) ** 2
         wanted = (speed * math.cos(bearing), speed * math.sin(bearing))
-        north_mps, east_mps = pressed(wanted, state, self._speed_mps)
+        north_mps, east_mps = add_velocity_error(wanted, state, self._speed_mps)
         velocity = (north_mps, east_mps, correction(self._down_m - position[2]))
         return Setpoint.velocity(velocity, now_ns, yaw_rad=self._bearing_rad)
 
@@ -175,7 +174,7 @@ class ApproachBehaviour(Behaviour):
     def status(self) -> str:
         if self._track is None:
             return f"looking for the {self._class_name}"
-        if self._wait_place is not None:
+        if self._wait_point is not None:
             return f"lost the {self._class_name}, waiting"
         return f"{self._class_name} {self._range_m:.1f} m away"
 
@@ -193,11 +192,11 @@ class ApproachBehaviour(Behaviour):
             return
         if fitting:
             self._doubted = not any(target.trusted for target in fitting)
-        chosen = self._choice.take(fitting, yaw_rad, context.now_ns)
+        chosen = self._selector.update(fitting, yaw_rad, context.now_ns)
         if chosen is None:
             return
         if chosen.position_ned_m is None:
-            # Turned to, it may come fully into the picture, and its range with it.
+            # Fully inside the image it may get a range.
             self._bearing_rad = chosen.bearing_rad
             if self._tracking is not None:
                 self._tracking.turn_to(chosen, context)
@@ -205,7 +204,7 @@ class ApproachBehaviour(Behaviour):
         self._begin(chosen, position, context.now_ns)
 
     def _find_again(self, lost: ObjectTrack, fitting: list[Target], position: Vector3) -> None:
-        """A wrong range can lead the track away from its object: begin anew with what is where it was."""
+        """Restart the track at a detection near the lost object: a wrong range can divert a track."""
         north, east = lost.position_ned_m[0] - position[0], lost.position_ned_m[1] - position[1]
         bearing, range_m = math.atan2(east, north), math.hypot(north, east)
         for target in sorted(fitting, key=lambda target: target.track_id != lost.track_id):
@@ -221,30 +220,30 @@ class ApproachBehaviour(Behaviour):
     def _begin(self, target: Target, position: Vector3, now_ns: int) -> None:
         self._track = ObjectTrack(target, position)
         self._seen_ns = target.captured_ns
-        way_m = abs(target.ground_range_m - self._distance_m)
-        self._until_ns = now_ns + (BASE_TIMEOUT_S + 3.0 * way_m / self._speed_mps) * 1e9
+        path_m = abs(target.ground_range_m - self._distance_m)
+        self._until_ns = now_ns + (BASE_TIMEOUT_S + 3.0 * path_m / self._speed_mps) * 1e9
 
-    def _goal(self, place: Vector3, position: Vector3, bearing: float, dt_s: float) -> Vector3 | None:
-        """The place to stop at, once it is near: on the side of the object from which the vehicle came."""
+    def _goal(self, point: Vector3, position: Vector3, bearing: float, dt_s: float) -> Vector3 | None:
+        """The point to stop at, once it is near: on the vehicle's side of the object."""
         chosen = self._anchor_rad is not None
         away_rad = bearing + math.pi if self._anchor_rad is None else self._anchor_rad
         if chosen:
-            late_s = PLACE_TIME_CONSTANT_S if self._by_depth else PLACE_TIME_CONSTANT_WITHOUT_DEPTH_S
-            share = min(1.0, dt_s / late_s)
-            was, now, down = self._place, place, place[2]
-            place = (was[0] + share * (now[0] - was[0]), was[1] + share * (now[1] - was[1]), down)
-            # The smoothed place of an object that comes nearer lags behind it, but not by more than this.
-            nearer_m = (now[0] - place[0]) * math.cos(away_rad) + (now[1] - place[1]) * math.sin(away_rad)
+            time_constant_s = GOAL_TIME_CONSTANT_S if self._by_depth else GOAL_TIME_CONSTANT_WITHOUT_DEPTH_S
+            gain = min(1.0, dt_s / time_constant_s)
+            was, now, down = self._object_ned_m, point, point[2]
+            point = (was[0] + gain * (now[0] - was[0]), was[1] + gain * (now[1] - was[1]), down)
+            # The lag of the smoothed position behind an approaching object is limited.
+            nearer_m = (now[0] - point[0]) * math.cos(away_rad) + (now[1] - point[1]) * math.sin(away_rad)
             if nearer_m > MAX_LAG_M:
                 north, east = math.cos(away_rad), math.sin(away_rad)
                 excess_m = nearer_m - MAX_LAG_M
-                place = (place[0] + excess_m * north, place[1] + excess_m * east, down)
+                point = (point[0] + excess_m * north, point[1] + excess_m * east, down)
         goal = (
-            place[0] + self._distance_m * math.cos(away_rad),
-            place[1] + self._distance_m * math.sin(away_rad),
+            point[0] + self._distance_m * math.cos(away_rad),
+            point[1] + self._distance_m * math.sin(away_rad),
             self._down_m,
         )
-        self._place = place
+        self._object_ned_m = point
         near = math.dist(goal[:2], position[:2]) < ANCHOR_M[1 if chosen else 0]
         if not near:
             self._leave_goal()
@@ -263,27 +262,27 @@ class ApproachBehaviour(Behaviour):
     def _wait(
         self, dt_s: float, context: BehaviourContext, position: Vector3, unseen_s: float
     ) -> BehaviourOutput:
-        """Not seen: brake, stay where the vehicle comes to rest, and keep looking there."""
-        if self._wait_place is None:
+        """Object not seen: brake, hold where the vehicle comes to rest, and keep the heading."""
+        if self._wait_point is None:
             self._leave_goal()
         if unseen_s > self._lost_timeout_s:
             if not context.perception_fresh:
-                why = context.why_blind("nothing comes from the detector")
+                why = context.perception_fault("no detections received")
             elif self._doubted:
                 why = DOUBTED
             elif self._track is None:
-                why = "it was never seen with a known range"
+                why = "never seen with a known range"
             else:
                 why = f"last seen {self._range_m:.1f} m away"
                 self.lost_at = self._track.position_ned_m
             return Outcome(False, f"lost the {self._class_name} for {unseen_s:.1f} s: {why}")
-        if self._wait_place is None and ground_speed(context.state) < STANDING_MPS:
+        if self._wait_point is None and ground_speed(context.state) < STANDING_MPS:
             north, east, _ = stopping_point(context.state)
-            self._wait_place = (north, east, self._down_m)
-        if self._wait_place is None:
+            self._wait_point = (north, east, self._down_m)
+        if self._wait_point is None:
             velocity = (0.0, 0.0, correction(self._down_m - position[2]))
         else:
-            velocity = self._controller.velocity(self._wait_place, context.state, dt_s)
+            velocity = self._controller.velocity(self._wait_point, context.state, dt_s)
         if self._bearing_rad is None:
             return Setpoint.velocity(velocity, context.now_ns, yaw_rate_radps=0.0)
         return Setpoint.velocity(velocity, context.now_ns, yaw_rad=self._bearing_rad)

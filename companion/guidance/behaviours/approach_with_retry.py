@@ -1,4 +1,4 @@
-"""An approach that does not give up at once: what it has lost is looked for where it was, then all around."""
+"""Approach with retries: a lost object is searched where it was last seen, then by a full turn."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
 
-# So long the nose is on the place where the object was last known to be, once it points there.
+# How long to look at the last known position, once the nose points there.
 LOOK_BACK_S = 3.0
-# Half a turn at the envelope's slowest useful rate.
+# Time for half a turn at the slowest useful yaw rate.
 LOOK_BACK_LIMIT_S = 12.0
 POINTED_RAD = math.radians(6.0)
 
@@ -33,13 +33,13 @@ class Approach(Command):
     class_name: Annotated[str, ClassName("class", "what to fly to")]
     distance_m: Annotated[float, Number("distance", "m", 1.0, 100.0, "where to stop, to its surface")] = 5.0
     speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 10.0, "at most")] = 2.0
-    confidence: Annotated[float, Number("confidence", "", 0.05, 1.0, "least confidence that counts")] = 0.3
+    confidence: Annotated[float, Number("confidence", "", 0.05, 1.0, "minimum confidence")] = 0.3
     lost_timeout_s: Annotated[
         float, Number("lost_timeout", "s", 0.5, 60.0, "wait for a lost object this long")
     ] = 5.0
     retries: Annotated[
         float,
-        Number("retries", "", 0.0, 20.0, "how often a lost object is looked for, where it was and around"),
+        Number("retries", "", 0.0, 20.0, "how often to search for a lost object"),
     ] = 2.0
     gimbal: GimbalUse = "leave"
 
@@ -68,13 +68,13 @@ class Approach(Command):
 
 
 class PersistentApproach(Behaviour):
-    """Approaches; having lost the object (the approach has waited for it), looks back, then turns once.
+    """Approaches; after losing the object looks at its last position, then turns once.
 
     Args:
-        approach: makes a new approach. retries: how often it is looked for again.
-        confidence: least that counts, of what is looked for.
-        tracking: what the approaches keep the camera's gimbal on the object with; None: it is left alone.
-        field_rad: what the camera sees from its left edge to its right.
+        approach: builds a new approach. retries: how often a lost object is searched.
+        confidence: minimum for detections of the search.
+        tracking: gimbal tracking shared by the approaches; None: the gimbal is not used.
+        field_rad: the camera's horizontal field of view.
     """
 
     name = "approach"
@@ -96,10 +96,10 @@ class PersistentApproach(Behaviour):
         self.requirements = self._approach.requirements
         self._tracking, self._field_rad = tracking, field_rad
         self._seek: SeekBehaviour | None = None
-        self._sightings = DetectionConfirmer((class_name,), confidence)
+        self._confirmer = DetectionConfirmer((class_name,), confidence)
         self._lost_at: Vector3 | None = None
-        self._place: Vector3 = (0.0, 0.0, 0.0)
-        self._looked_since_ns: int | None = None
+        self._hold_point: Vector3 = (0.0, 0.0, 0.0)
+        self._looking_since_ns: int | None = None
         self._begun_ns = 0
         self._tried = 0
         self._why = ""
@@ -118,7 +118,7 @@ class PersistentApproach(Behaviour):
                 return step
             self._why, self._lost_at, self._approach = step.reason, lost_at, None
             return self._look_again(context)
-        if self._tracking is not None and (why := self._tracking.taken(context)) is not None:
+        if self._tracking is not None and (why := self._tracking.control_fault(context)) is not None:
             return Outcome(False, f"approach lost the gimbal: {why}")
         if self._seek is None:
             return self._look_back(context)
@@ -148,51 +148,51 @@ class PersistentApproach(Behaviour):
         if self._approach is not None:
             return self._approach.status
         doing = "where it was" if self._seek is None else "all around"
-        return f"lost the {self._class_name}, looking {doing} ({self._tried} of {self._retries})"
+        return f"lost the {self._class_name}, searching {doing} ({self._tried} of {self._retries})"
 
     def _look_again(self, context: BehaviourContext) -> BehaviourOutput:
-        """Begin once more where it was; the end, if that was done often enough."""
+        """Start another search where the object was; the outcome if the retries are used up."""
         if self._tried >= self._retries:
             times = "once" if self._tried == 1 else f"{self._tried} times"
-            return Outcome(False, self._why + (f"; looked for it again {times}" if self._tried else ""))
+            return Outcome(False, self._why + (f"; searched again {times}" if self._tried else ""))
         self._tried += 1
-        self._notes.append(f"approach: {self._why}; looking for it, {self._tried} of {self._retries}")
-        self._sightings.reset(context.now_ns)
-        self._place, _ = position_and_yaw(context.state)
-        self._looked_since_ns, self._begun_ns = None, context.now_ns
+        self._notes.append(f"approach: {self._why}; searching, {self._tried} of {self._retries}")
+        self._confirmer.reset(context.now_ns)
+        self._hold_point, _ = position_and_yaw(context.state)
+        self._looking_since_ns, self._begun_ns = None, context.now_ns
         return self._look_back(context)
 
     def _look_back(self, context: BehaviourContext) -> BehaviourOutput:
-        """Stand, nose to where it was; then turn."""
+        """Hold with the nose towards the last known position; then turn."""
         assert self._lost_at is not None
         now_ns = context.now_ns
         position, yaw_rad = position_and_yaw(context.state)
-        if (found := self._sightings.look(context)) is not None:
+        if (found := self._confirmer.update(context)) is not None:
             return self._go_there(context, f"found the {found.class_name} where it was")
         bearing_rad = math.atan2(self._lost_at[1] - position[1], self._lost_at[0] - position[0])
         if (
-            self._looked_since_ns is None
+            self._looking_since_ns is None
             and abs(math.remainder(bearing_rad - yaw_rad, math.tau)) < POINTED_RAD
         ):
-            self._looked_since_ns = now_ns
-        looked_ns = now_ns - (now_ns if self._looked_since_ns is None else self._looked_since_ns)
+            self._looking_since_ns = now_ns
+        looked_ns = now_ns - (now_ns if self._looking_since_ns is None else self._looking_since_ns)
         if looked_ns > LOOK_BACK_S * 1e9 or now_ns - self._begun_ns > LOOK_BACK_LIMIT_S * 1e9:
             self._seek = SeekBehaviour(
                 self._class_name, laps=1.0, confidence=self._confidence, sweep=self._sweep()
             )
             self._seek.on_activate(context)
             return self._seek.update(0.0, context)
-        return Setpoint.velocity(stay_at(self._place, position), now_ns, yaw_rad=bearing_rad)
+        return Setpoint.velocity(stay_at(self._hold_point, position), now_ns, yaw_rad=bearing_rad)
 
     def _sweep(self) -> GimbalSweep | None:
-        """Who has walked on stands between the pitch at which he was lost and level."""
+        """A sweep between the pitch at which the object was lost and level."""
         aim = None if self._tracking is None else self._tracking.aim
         if aim is None or abs(math.degrees(aim.pitch_rad)) < LEAST_SWEEP_DEG:
             return None
         return GimbalSweep(aim.pitch_rad, math.radians(USUAL_RATE_DPS), self._field_rad)
 
-    def _go_there(self, context: BehaviourContext, told: str) -> BehaviourOutput:
-        self._notes.append(f"approach: {told}")
+    def _go_there(self, context: BehaviourContext, note: str) -> BehaviourOutput:
+        self._notes.append(f"approach: {note}")
         self._approach = self._make()
         self._approach.on_activate(context)
         return self._approach.update(0.0, context)

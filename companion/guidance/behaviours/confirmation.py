@@ -1,7 +1,7 @@
-"""When what is seen counts as found, and turning the nose to it: what `seek`, `patrol` and searches share.
+"""Confirmation of detections and yaw alignment, shared by `seek`, `patrol` and area searches.
 
-One detection is a rumour. Several frames that agree on a direction, of an object that counts as true, make a
-find; it is confirmed when the vehicle faces it and still sees it. Of several finds the surest is the best.
+A find needs several frames that agree on a direction, of an object with a confirmed track. It is verified
+when the vehicle faces it and still sees it. Of several finds the one with the highest confidence is the best.
 """
 
 from __future__ import annotations
@@ -15,29 +15,29 @@ from companion.guidance.behaviour import BehaviourContext
 from companion.guidance.targets.target import Target
 from vision.attitude import wrap_angle
 
-# So many frames of the last so many seconds must agree on a direction.
+# Number of frames within the window that must agree on a direction.
 FRAMES_NEEDED = 3
 FRAMES_WINDOW_S = 1.5
 SAME_BEARING_RAD = math.radians(12.0)
-# After a first sighting a turn waits this long for the others to come.
+# After a first detection a turn pauses this long for more.
 LOOK_S = 1.0
-# Facing the object: how well, for how long it must last, and when to give the sighting up.
+# Facing the object: tolerance, duration, time-out, and when a detection counts as lost.
 FACING_RAD = math.radians(4.0)
 FACING_S = 0.4
 FACING_TIMEOUT_S = 12.0
 SIGHT_LOST_S = 2.0
-# Found means seen now, not a moment ago.
+# A find must have been seen within this time.
 SIGHT_FRESH_S = 0.7
-# Candidates less sure than the surest by no more than this are as good: the nearest of them is taken.
-AS_SURE = 0.1
+# Candidates whose confidence is within this of the best are equal: the nearest is selected.
+EQUAL_CONFIDENCE = 0.1
 
 
 class DetectionConfirmer:
-    """What was seen lately of some classes.
+    """Confirms recent detections of some classes.
 
     Attributes:
-        doubted: something was seen often enough, and did not count as true.
-        look_until_ns: something was seen just now; by then there should be more of it.
+        doubted: an object was seen often enough but not confirmed.
+        look_until_ns: after a first detection, the time until which more are expected.
     """
 
     def __init__(self, class_names: Collection[str], confidence: float) -> None:
@@ -48,31 +48,31 @@ class DetectionConfirmer:
         self.look_until_ns: float = 0
 
     def reset(self, now_ns: int) -> None:
-        """Forget everything. Frames captured before now do not count: they may be of another place."""
+        """Forget everything. Frames captured before now are ignored: they may show another place."""
         self._seen.clear()
         self._newest_ns = now_ns
         self.doubted, self.look_until_ns = False, 0
 
     def forget(self) -> None:
-        """Forget what was seen; frames that were looked at stay looked at."""
+        """Forget detections; processed frames are not processed again."""
         self._seen.clear()
 
     def fresh(self, context: BehaviourContext) -> list[Target]:
-        """The targets of frames not looked at before that are of these classes, and sure enough."""
+        """Targets of new frames that are of these classes, with enough confidence."""
         fresh = [target for target in context.targets if target.captured_ns > self._newest_ns]
         if fresh:
             self._newest_ns = max(target.captured_ns for target in fresh)
         return [t for t in fresh if t.class_name in self._class_names and t.score >= self._confidence]
 
-    def look(
+    def update(
         self, context: BehaviourContext, wanted: Callable[[Target], bool] = lambda target: True
     ) -> Target | None:
-        """Take what new frames show. A target: found now. `wanted` may leave some out."""
+        """Process new frames; returns the target confirmed now, if any. `wanted` filters targets."""
         found = self.agreed([t for t in self.fresh(context) if wanted(t)], context.now_ns)
         return found[0] if found else None
 
     def agreed(self, seen: Collection[Target], now_ns: int) -> list[Target]:
-        """Take targets that are `fresh`; those of them that are found now, the surest in this frame first."""
+        """Process `fresh` targets; returns those confirmed now, highest confidence first."""
         found: list[Target] = []
         if not seen:
             return found
@@ -90,7 +90,7 @@ class DetectionConfirmer:
             ]
             if len({t.captured_ns for t in agreeing}) < FRAMES_NEEDED:
                 continue
-            # Its track counts as true from some frame on, and then for good; but a rival name comes and goes.
+            # A track stays confirmed from some frame on; an ambiguous class may come and go.
             first = next((index for index, t in enumerate(agreeing) if t.trusted), len(agreeing))
             since = [t.trusted for t in agreeing[first:]]
             if target.trusted and 2 * sum(since) > len(since):
@@ -102,12 +102,12 @@ class DetectionConfirmer:
 
 @dataclass(slots=True)
 class _Candidate:
-    """What is known of one object that was seen on a turn.
+    """One object that was seen on a turn.
 
     Attributes:
-        target: as it was last seen without doubt. range_m: the newest that is known.
-        frames, doubted: how many frames showed it, without doubt and with.
-        found: they agreed.
+        target: newest trusted detection. range_m: newest known range.
+        frames, doubted: number of frames in which it was trusted, and in which it was not.
+        found: it was confirmed.
     """
 
     target: Target
@@ -117,13 +117,13 @@ class _Candidate:
     found: bool = False
 
     @property
-    def sureness(self) -> float:
-        """Its track's median confidence, less the more frames doubted it, and the fewer there are."""
+    def rank(self) -> float:
+        """The track's median confidence, reduced by untrusted frames and by a low number of frames."""
         return self.target.score * self.frames / (self.frames + self.doubted + FRAMES_NEEDED)
 
 
 class Candidates:
-    """What was found on a turn, to be compared when the turn is done."""
+    """Objects found on a turn, compared when the turn is done."""
 
     def __init__(self) -> None:
         self._seen: list[_Candidate] = []
@@ -148,17 +148,17 @@ class Candidates:
             candidate.found = candidate.found or target in found
 
     def best(self) -> Target | None:
-        """The surest, as it was last seen; of those about as sure, the nearest. None: nothing was found."""
+        """The nearest of the finds within `EQUAL_CONFIDENCE` of the highest rank; None: no find."""
         found = [one for one in self._seen if one.found]
         if not found:
             return None
-        least = max(one.sureness for one in found) - AS_SURE
-        as_sure = [one for one in found if one.sureness >= least]
-        nearest = min(as_sure, key=lambda one: one.range_m if math.isfinite(one.range_m) else math.inf)
+        least = max(one.rank for one in found) - EQUAL_CONFIDENCE
+        best = [one for one in found if one.rank >= least]
+        nearest = min(best, key=lambda one: one.range_m if math.isfinite(one.range_m) else math.inf)
         return nearest.target
 
     def drop(self, target: Target) -> None:
-        """It was not there after all, whatever it was called."""
+        """Remove everything in the direction of a find that was not verified."""
         self._seen = [one for one in self._seen if apart_rad(one.target, target) > SAME_BEARING_RAD]
 
 
@@ -169,10 +169,10 @@ def _same(known: Target, target: Target) -> bool:
 
 
 class YawAligner:
-    """The nose on its way to what was found.
+    """Turns the nose to a find.
 
     Attributes:
-        target: it, as it was seen last.
+        target: its newest detection.
     """
 
     def __init__(self, found: Target, now_ns: int) -> None:
@@ -182,7 +182,7 @@ class YawAligner:
         self._facing_since_ns: int | None = None
 
     def follow(self, seen: Collection[Target]) -> None:
-        """Take what new frames show of it."""
+        """Update the target from new frames."""
         found = self.target
         same = [
             target
@@ -198,20 +198,20 @@ class YawAligner:
             )
 
     def expect_later(self, now_ns: int) -> None:
-        """The camera does not look there yet: that it is not seen says nothing."""
+        """The camera does not point there yet, so a missing detection does not count."""
         self._expected_ns = now_ns
 
     def lost(self, now_ns: int) -> bool:
-        """It was not there after all, or it went away."""
+        """Whether the target is lost, or facing it timed out."""
         unseen_s = (now_ns - max(self.target.captured_ns, self._expected_ns)) / 1e9
         return unseen_s > SIGHT_LOST_S or now_ns - self._since_ns > FACING_TIMEOUT_S * 1e9
 
     def off_rad(self, yaw_rad: float) -> float:
-        """How far the nose is from it."""
+        """Angle between the nose and the target."""
         return _across(wrap_angle(self.target.bearing_rad - yaw_rad), self.target.elevation_rad)
 
     def faced(self, yaw_rad: float, now_ns: int) -> bool:
-        """Whether the nose has pointed at it for long enough, and it is still seen."""
+        """Whether the nose has pointed at the target for `FACING_S`, and it is still seen."""
         unseen_s = (now_ns - self.target.captured_ns) / 1e9
         if unseen_s > SIGHT_FRESH_S or self.off_rad(yaw_rad) > FACING_RAD:
             self._facing_since_ns = None
@@ -221,11 +221,11 @@ class YawAligner:
 
 
 def apart_rad(first: Target, second: Target) -> float:
-    """The angle between two targets across the line of sight: level, it is that between their bearings."""
+    """Angle between two targets; at the horizon that between their bearings."""
     elevation_rad = (first.elevation_rad + second.elevation_rad) / 2
     return _across(wrap_angle(first.bearing_rad - second.bearing_rad), elevation_rad)
 
 
 def _across(bearing_rad: float, elevation_rad: float) -> float:
-    """What a difference of bearings comes to so far off the horizon: nearly below, all bearings are one."""
+    """The angle that corresponds to a difference of bearings at an elevation."""
     return abs(bearing_rad) * math.cos(elevation_rad)

@@ -1,4 +1,4 @@
-"""A figure of eight, level, about the place where it begins."""
+"""Figure eight: a level lemniscate about the position where it begins."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from companion.vehicle.state import Vector3
 _POINTS = 96
 
 
-@behaviour("figure-eight", "fly a level eight about this place, first towards the nose")
+@behaviour("figure-eight", "fly a level eight about the current position, first towards the nose")
 class FigureEight(Command):
-    radius_m: Annotated[float, Number("radius", "m", 3.0, 200.0, "from its middle to either end")] = 10.0
+    radius_m: Annotated[float, Number("radius", "m", 3.0, 200.0, "from its centre to either end")] = 10.0
     speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "at most; bends are slower")] = 2.0
     laps: Annotated[float, Number("laps", "", 0.0, 1000.0, "how many; 0: until another command")] = 1.0
-    nose: Annotated[
-        str, EnumArgument("nose", ("along", "still"), "where it points: along the way, or as it is")
-    ] = "along"
+    nose: Annotated[str, EnumArgument("nose", ("along", "still"), "yaw: along the path, or unchanged")] = (
+        "along"
+    )
 
     @property
     def endless(self) -> bool:
@@ -36,7 +36,7 @@ class FigureEight(Command):
 
 
 class FigureEightBehaviour(PathFlight):
-    """Bernoulli's lemniscate, crossed in the middle towards the nose; each loop reaches `radius_m` out."""
+    """Bernoulli's lemniscate; starts at its centre towards the nose; each loop extends to `radius_m`."""
 
     name = "figure-eight"
 
@@ -53,15 +53,15 @@ class FigureEightBehaviour(PathFlight):
         centre, yaw_rad = position_and_yaw(context.state)
         return Path(lemniscate(centre, yaw_rad, self._radius_m), self._speed_mps, closed=True)
 
-    def _active(self) -> str:
+    def _success_text(self) -> str:
         return f"{laps_text(self._laps)} of the eight flown"
 
 
 def lemniscate(centre: Vector3, bearing_rad: float, radius_m: float) -> list[Vector3]:
-    """One round of Bernoulli's lemniscate from its middle.
+    """Points of one lap of Bernoulli's lemniscate, from its centre.
 
     Args:
-        centre: local NED metres. bearing_rad: of the long axis. radius_m: from the middle to either end.
+        centre: local NED metres. bearing_rad: of the long axis. radius_m: from the centre to either end.
     """
     points = []
     for step in range(_POINTS):

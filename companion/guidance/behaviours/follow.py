@@ -1,4 +1,4 @@
-"""Keep a distance and a bearing to a moving object of a class."""
+"""Follow: keep a distance and a bearing to a moving object of a class."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from companion.guidance.arguments import ClassName, EnumArgument, Number
 from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome, Requirement
 from companion.guidance.command import BuildContext, Command
 from companion.guidance.gimbal.tracking import GimbalTracking, GimbalUse
-from companion.guidance.motion import correction, in_degrees, position_and_yaw, pressed
+from companion.guidance.motion import add_velocity_error, correction, in_degrees, position_and_yaw
 from companion.guidance.registry import behaviour
 from companion.guidance.targets.choosing import TargetSelector
 from companion.guidance.targets.moving_track import MovingTrack
@@ -18,20 +18,20 @@ from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.setpoint import Setpoint
 from vision.attitude import wrap_angle
 
-# Answer to what is missing in distance and along the circle, 1/s, and the fastest that is made good: on top
-# of the object's own velocity.
+# Gain of the errors of distance and along the circle, 1/s, and the limits of their correction, on top of the
+# object's own velocity.
 GAIN_PER_S = 1.2
-# More of a velocity is asked for where the vehicle does not follow it, see `motion.pressed`.
-PRESS = 1.0
+# Gain of the velocity error, see `motion.add_velocity_error`.
+VELOCITY_ERROR_GAIN = 1.0
 MOST_CLOSING_MPS = 2.5
 MOST_CIRCLING_MPS = 2.0
-# An object slower than this has no course: the last one is kept.
+# Below this speed the object's last course is kept.
 COURSE_MPS = 0.7
-# A course swings with the noise of a velocity; the place to be, 8 m away, must not: its fastest turn, rad/s.
+# Rate limit of the course, rad/s: the course is noisy, and it moves a goal at `distance_m`.
 COURSE_RATE_RADPS = 0.35
-# What is known of the object's velocity counts fully below this uncertainty, and less above.
+# Uncertainty up to which the object's velocity is used fully; less above.
 SURE_OF_SPEED_MPS = 1.0
-# Detectors miss single frames; unseen for longer, the speed towards a guess is held back.
+# Detectors miss single frames; unseen for longer, the predicted velocity is reduced.
 UNSEEN_S = 0.6
 
 
@@ -44,17 +44,23 @@ class Follow(Command):
         EnumArgument(
             "bearing",
             ("here", "compass", "course"),
-            "where to stay: as it is, or `angle` from north or course",
+            "where to stay: unchanged, or `angle` from north or course",
         ),
     ] = "here"
     angle_deg: Annotated[
         float,
-        Number("angle", "deg", -360.0, 360.0, "seen from the object, clockwise; of course, 180 is behind"),
+        Number(
+            "angle",
+            "deg",
+            -360.0,
+            360.0,
+            "seen from the object, clockwise; relative to its course 180 is behind",
+        ),
     ] = 180.0
     speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "at most")] = 5.0
-    confidence: Annotated[float, Number("confidence", "", 0.05, 1.0, "least confidence that counts")] = 0.3
+    confidence: Annotated[float, Number("confidence", "", 0.05, 1.0, "minimum confidence")] = 0.3
     occlusion_s: Annotated[
-        float, Number("occlusion", "s", 0.5, 60.0, "follow a hidden object's expected way this long")
+        float, Number("occlusion", "s", 0.5, 60.0, "follow a hidden object's predicted path this long")
     ] = 3.0
     duration_s: Annotated[
         float, Number("duration", "s", 0.0, 3600.0, "how long; 0: until another command")
@@ -80,18 +86,18 @@ class Follow(Command):
 
 
 class FollowBehaviour(Behaviour):
-    """Keeps its height, looks at the object and keeps `distance_m` from its nearest surface.
+    """Keeps the height, yaws to the object and keeps `distance_m` from its nearest surface.
 
-    It begins with the true object of the class before the nose (see `TargetSelector`) and stays with it.
-    Unseen, it goes on to where the object is expected to be, for `occlusion_s`; then it ends.
+    It selects the confirmed object of the class ahead (see `TargetSelector`) and stays with it. Unseen, it
+    follows the prediction for `occlusion_s`; then it fails.
 
     Args:
-        bearing: where the vehicle stays, seen from the object: "here", in the direction in which it is;
-            "compass", `angle_rad` clockwise from north; "course", that far clockwise from the object's
-            direction of motion (π is behind it).
+        bearing: where the vehicle stays, seen from the object: "here", its current direction; "compass",
+            `angle_rad` clockwise from north; "course", that far clockwise from the object's direction of
+            motion (π is behind it).
         speed_mps: at most, the object's own speed included.
-        duration_s: ends after this, successfully; 0: until another command.
-        tracking: keeps the camera's gimbal on the object; None: it is left alone.
+        duration_s: ends after this, with success; 0: until another command.
+        tracking: keeps the camera's gimbal on the object; None: the gimbal is not used.
     """
 
     name = "follow"
@@ -131,7 +137,7 @@ class FollowBehaviour(Behaviour):
 
     def _forget(self, now_ns: int, down_m: float) -> None:
         self._track: MovingTrack | None = None
-        self._choice = TargetSelector()
+        self._selector = TargetSelector()
         self._started_ns = self._seen_ns = now_ns
         self._down_m = down_m
         self._doubted = False
@@ -154,13 +160,15 @@ class FollowBehaviour(Behaviour):
         self._unseen_s = (now_ns - self._seen_ns) / 1e9
         if self._duration_s and now_ns - self._started_ns >= self._duration_s * 1e9:
             if track is None:
-                return Outcome(False, f"saw no {self._class_name} to follow in {self._duration_s:g} s")
+                return Outcome(
+                    False, f"no localized {self._class_name!r} to follow in {self._duration_s:g} s"
+                )
             return Outcome(True, f"followed the {self._class_name} for {self._duration_s:g} s")
         if self._unseen_s > self._occlusion_s:
             return Outcome(False, self._lost(context))
         if track is not None:
-            place = track.place(now_ns)
-            north, east = place[0] - position[0], place[1] - position[1]
+            point = track.position_at(now_ns)
+            north, east = point[0] - position[0], point[1] - position[1]
             self._range_m = math.hypot(north, east)
         if self._tracking is not None:
             newest = None if track is None else track.newest
@@ -175,17 +183,17 @@ class FollowBehaviour(Behaviour):
 
         self._yaw_rad = towards_rad = math.atan2(east, north)
         wanted = self._wanted(track, towards_rad, dt_s)
-        north_mps, east_mps = pressed(wanted, state, self._speed_mps, PRESS)
+        north_mps, east_mps = add_velocity_error(wanted, state, self._speed_mps, VELOCITY_ERROR_GAIN)
         return Setpoint.velocity((north_mps, east_mps, height_mps), now_ns, yaw_rad=towards_rad)
 
     def _wanted(self, track: MovingTrack, towards_rad: float, dt_s: float) -> tuple[float, float]:
-        """Velocity over ground: the object's own, and what is missing along the line to it and across.
+        """Horizontal velocity: the object's own, plus corrections along and across the line to it.
 
-        In polar form about the object, so that the way to another side of it leads around it.
+        In polar coordinates about the object, so that the path to another side of it leads around it.
         """
         trust = min(1.0, SURE_OF_SPEED_MPS / max(track.speed_sigma_mps, 1e-6))
         if self._unseen_s > UNSEEN_S:
-            # The farther the guess, the less is flown towards it.
+            # The longer the prediction, the less it is followed.
             trust *= max(0.0, 1.0 - (self._unseen_s - UNSEEN_S) / max(self._occlusion_s, UNSEEN_S)) ** 0.5
         north, east = (trust * speed for speed in track.velocity)
         closing = GAIN_PER_S * (self._range_m - self._distance_m)
@@ -196,12 +204,12 @@ class FollowBehaviour(Behaviour):
             from_object_rad = wrap_angle(towards_rad + math.pi)
             missing_m = wrap_angle(goal_rad - from_object_rad) * max(self._range_m, 1.0)
             circling = max(-MOST_CIRCLING_MPS, min(MOST_CIRCLING_MPS, GAIN_PER_S * missing_m))
-        # Growing bearings about the object run along (sin, -cos) of the direction to it.
+        # Increasing bearings about the object are along (sin, -cos) of the direction to it.
         c, s = math.cos(towards_rad), math.sin(towards_rad)
         return (north + closing * c + circling * s, east + closing * s - circling * c)
 
     def _goal_rad(self, track: MovingTrack, towards_rad: float, dt_s: float) -> float | None:
-        """Where to be, seen from the object; None: anywhere on the circle."""
+        """Goal bearing, seen from the object; None: anywhere on the circle."""
         if self._bearing == "here":
             return None
         if self._bearing == "compass":
@@ -231,11 +239,11 @@ class FollowBehaviour(Behaviour):
             return
         if fitting:
             self._doubted = not any(target.trusted for target in fitting)
-        chosen = self._choice.take(fitting, yaw_rad, context.now_ns)
+        chosen = self._selector.update(fitting, yaw_rad, context.now_ns)
         if chosen is None:
             return
         if chosen.position_ned_m is None:
-            # Turned to, it may come fully into the picture, and its range with it.
+            # Fully inside the image it may get a range.
             self._yaw_rad = chosen.bearing_rad
             if self._tracking is not None:
                 self._tracking.turn_to(chosen, context)
@@ -244,7 +252,7 @@ class FollowBehaviour(Behaviour):
 
     def _lost(self, context: BehaviourContext) -> str:
         if not context.perception_fresh:
-            why = context.why_blind("nothing comes from the detector")
+            why = context.perception_fault("no detections received")
         elif self._track is not None:
             north, east = self._track.velocity
             moving = (
@@ -254,7 +262,7 @@ class FollowBehaviour(Behaviour):
         elif self._doubted:
             why = DOUBTED
         else:
-            why = "it was never seen with a known range"
+            why = "never seen with a known range"
         return f"lost the {self._class_name} for {self._unseen_s:.1f} s: {why}"
 
     @property

@@ -1,4 +1,4 @@
-"""Fly along a row of points, once or round and round, slowing down for the corners."""
+"""Follow path: fly along a list of points, once or repeatedly, slowing down for corners."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from companion.guidance.registry import behaviour
 from companion.vehicle.state import Vector3
 
 
-@behaviour("follow-path", "fly along a row of points, slowing down for corners")
+@behaviour("follow-path", "fly along a list of points, slowing down for corners")
 class FollowPath(Command):
     renamed: ClassVar[Mapping[str, str]] = {"nose": "yaw_mode"}
     points: Annotated[
@@ -38,22 +38,22 @@ class FollowPath(Command):
             raise GrammarError(f"follow-path: laps must be 0, or 1 or more, got {self.laps:g}")
 
     @property
-    def places(self) -> tuple[tuple[float, ...], ...]:
+    def points_m(self) -> tuple[tuple[float, ...], ...]:
         """(north, east) or (north, east, height) of each point, metres from home."""
         return points_from(self.points)
 
     def build(self, context: BuildContext) -> Behaviour:
         along = self.yaw_mode == "path"
-        return FollowPathBehaviour(self.places, self.speed_mps, laps=self.laps, nose_along=along)
+        return FollowPathBehaviour(self.points_m, self.speed_mps, laps=self.laps, nose_along=along)
 
 
 class FollowPathBehaviour(PathFlight):
-    """From where the vehicle is to the first point, and on along the others.
+    """Flies from the current position to the first point, and along the others.
 
     Args:
-        points: (north, east) or (north, east, height) metres from home; without a height, the one before's.
-        laps: 0: until another command; any but 1: from the last point on to the first again.
-        round_trip: that also for a single lap.
+        points: (north, east) or (north, east, height) metres from home; the default height is the previous.
+        laps: 0: until another command; other than 1: a closed path, from the last point to the first.
+        round_trip: a closed path also for a single lap.
     """
 
     name = "follow-path"
@@ -73,25 +73,25 @@ class FollowPathBehaviour(PathFlight):
 
     def goals(self, context: BehaviourContext) -> tuple[Vector3, ...]:
         """See Behaviour."""
-        return tuple(self._places(context))
+        return tuple(self._points_ned(context))
 
-    def _places(self, context: BehaviourContext) -> list[Vector3]:
+    def _points_ned(self, context: BehaviourContext) -> list[Vector3]:
         position, _ = position_and_yaw(context.state)
         home = home_of(context.state)
-        down, places = position[2], list[Vector3]()
+        down, points = position[2], list[Vector3]()
         for north, east, *height in self._points:
             down = home[2] - height[0] if height else down
-            places.append((home[0] + north, home[1] + east, down))
-        return places
+            points.append((home[0] + north, home[1] + east, down))
+        return points
 
     def _path(self, context: BehaviourContext) -> Path:
         position, _ = position_and_yaw(context.state)
-        places = self._places(context)
+        points = self._points_ned(context)
         if self._round_trip:
-            return Path(places, self._speed_mps, closed=True)
-        return Path([position, *places], self._speed_mps)
+            return Path(points, self._speed_mps, closed=True)
+        return Path([position, *points], self._speed_mps)
 
-    def _active(self) -> str:
+    def _success_text(self) -> str:
         if not self._round_trip:
             return f"all {len(self._points)} points flown"
         return f"{laps_text(self._laps)} of {len(self._points)} points flown"

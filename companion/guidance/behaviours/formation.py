@@ -1,9 +1,9 @@
-"""Fly in formation: hold a slot about a leader, a vehicle or a place that moves, and let it move on with it.
+"""Formation: hold a slot relative to a leader, which is a vehicle or a virtual point on a path.
 
-The slot is where the shape says, in the leader's heading frame; its velocity (the leader's, and what the turn
-adds) is flown by as it is, and what is missing to the slot by a proportional law, the same for every vehicle:
-so vehicles that change slots do not cross (`companion.geometry.formation.assign`). A leader that is not heard
-any more is not guessed at: its followers brake, hold, and after a while end.
+The slot is fixed in the leader's heading frame. Its velocity (the leader's plus that of the turn) is fed
+forward, and the position error is corrected by a proportional law, the same for every vehicle, so that
+vehicles that change slots do not collide (`companion.geometry.formation.assign`). A leader whose pose is lost
+is not predicted: its followers brake, hold, and end after `lost_timeout_s`.
 """
 
 from __future__ import annotations
@@ -21,37 +21,37 @@ from companion.guidance.command import BuildContext, Command
 from companion.guidance.formation.group import Agreement, Group
 from companion.guidance.formation.neighbours import Neighbour, Neighbourhood
 from companion.guidance.formation.pose import FormationNote, Plan, Structure
-from companion.guidance.formation.separation import MARGIN_M, avoid, pushed_apart
+from companion.guidance.formation.separation import MARGIN_M, avoid, repulsion
 from companion.guidance.formation.virtual_structure import VirtualStructure
-from companion.guidance.motion import home_of, position_and_yaw, pressed, stopping_speed
+from companion.guidance.motion import add_velocity_error, home_of, position_and_yaw, stopping_speed
 from companion.guidance.registry import behaviour
 from companion.vehicle.setpoint import Setpoint
 from vision.attitude import wrap_angle
 
 VIRTUAL = "virtual"
 LOST_TIMEOUT_S = 5.0
-# Answer to an error of place, 1/s, and the speed over ground and up or down it may ask for.
+# Gain of the position error, 1/s, and the limits of its horizontal and vertical velocity.
 SLOT_GAIN_PER_S = 0.8
 CATCH_UP_MPS = 1.8
 CLIMB_MPS = 1.0
-# The outermost slot is swung round no faster than this, and set into that motion at this.
+# Limits of the outermost slot's speed and acceleration in a turn.
 SWING_MPS = 1.5
 SWING_MPS2 = 0.7
-# Above this a vehicle brakes first: held at once, it would fly back to where it was told.
+# Above this speed the vehicle brakes before it holds, else it would fly back.
 STANDING_MPS = 0.5
-# A neighbour slower than this beside the formation stands in the way and is flown around.
+# A neighbour slower than this relative to the formation is an obstacle to fly around.
 IN_THE_WAY_MPS = 0.6
-# Ways past others are flown so far outside of the least distance.
+# Clearance of detours around others, added to the minimum separation.
 CLEARANCE_M = 1.2
-# Nearer than this to its slot a vehicle flies straight there.
+# Nearer than this to its slot the vehicle flies straight there.
 FAR_M = 3.0
-# Of a virtual structure: all are there, so near and for so long; then the others are told so for a while.
-THERE_M, THERE_S, TELL_S = 1.2, 1.0, 1.5
+# Virtual structure: slot tolerance and duration for completion; then how long completion is published.
+ARRIVED_M, ARRIVED_S, PUBLISH_S = 1.2, 1.0, 1.5
 
 
 @dataclass(frozen=True, slots=True)
 class _Leader:
-    """What is followed now: local NED, and a heading that may jump."""
+    """Motion of the leader, local NED; the heading may jump."""
 
     position: Vector3
     velocity: Vector3
@@ -60,7 +60,7 @@ class _Leader:
     over: bool = False
 
 
-# More vehicles than have been flown, even on paper.
+# Sanity limit.
 MOST_SLOTS = 200
 
 
@@ -68,15 +68,15 @@ MOST_SLOTS = 200
 class Formation(Command):
     shape: Annotated[str, EnumArgument("shape", SHAPES, "of the formation")]
     leader: Annotated[str, Word("leader", 'vehicle.name of the leader, or "virtual"')]
-    spacing_m: Annotated[float, Number("spacing", "m", 1.0, 100.0, "of neighbouring slots")] = 6.0
-    slot: Annotated[str, Word("slot", "number of the slot to take, from 1, or auto")] = "auto"
+    spacing_m: Annotated[float, Number("spacing", "m", 1.0, 100.0, "between neighbouring slots")] = 6.0
+    slot: Annotated[str, Word("slot", "slot number from 1, or auto")] = "auto"
     points: Annotated[
         str | None, Points("points", 'path of a virtual leader, from home: "0,0 20,0 20,20,8"')
     ] = None
     speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "of a virtual leader, at most")] = 2.0
     laps: Annotated[float, Number("laps", "", 0.0, 1000.0, "of its path; 0: until another command")] = 1.0
     lost_timeout_s: Annotated[
-        float, Number("lost_timeout", "s", 0.5, 600.0, "hold this long without the leader's pose")
+        float, Number("lost_timeout", "s", 0.5, 600.0, "how long to hold without the leader's pose")
     ] = 5.0
 
     @property
@@ -89,7 +89,7 @@ class Formation(Command):
         return None if self.slot == "auto" else int(self.slot)
 
     @property
-    def places(self) -> tuple[tuple[float, ...], ...]:
+    def points_m(self) -> tuple[tuple[float, ...], ...]:
         """(north, east) or (north, east, height) of each point of the path, metres from home."""
         return points_from(self.points or "")
 
@@ -98,9 +98,7 @@ class Formation(Command):
         if self.slot != "auto" and not (self.slot.isdecimal() and 1 <= int(self.slot) <= MOST_SLOTS):
             raise GrammarError(f"formation: slot must be auto or 1 to {MOST_SLOTS}, got {self.slot!r}")
         if (self.leader == "virtual") != (self.points is not None):
-            raise GrammarError(
-                "formation: leader=virtual and points=… belong together; one of them is missing"
-            )
+            raise GrammarError("formation: give both leader=virtual and points=…, or neither")
         if 0.0 < self.laps < 1.0:
             raise GrammarError(f"formation: laps must be 0, or 1 or more, got {self.laps:g}")
 
@@ -110,7 +108,7 @@ class Formation(Command):
             self.leader,
             self.spacing_m,
             self.slot_number,
-            points=self.places,
+            points=self.points_m,
             speed_mps=self.speed_mps,
             laps=self.laps,
             lost_timeout_s=self.lost_timeout_s,
@@ -122,13 +120,13 @@ class FormationBehaviour(Behaviour):
 
     Args:
         shape: line, column, wedge or circle. leader: a vehicle's name, or "virtual" with points.
-        slot: the one to take, from 1; None: the one that suits all best.
-        points, speed_mps, laps: the path of a virtual structure, as `follow-path` has it.
-        lost_timeout_s: so long is waited for a leader that is not heard.
+        slot: the requested slot, from 1; None: assigned.
+        points, speed_mps, laps: the path of a virtual structure, as in `follow-path`.
+        lost_timeout_s: how long to wait for the leader's pose.
 
     Attributes:
-        note: what the others are told; None while nothing is flown.
-        slot_offset_ned_m: from the leader to the slot, as it was last flown.
+        note: published to the others; None while inactive.
+        slot_offset_ned_m: from the leader to the slot, as last flown.
     """
 
     name = "formation"
@@ -159,8 +157,8 @@ class FormationBehaviour(Behaviour):
         self._turn_rate_radps = 0.0
         self._error_m = 0.0
         self._lost_since_ns: int | None = None
-        self._place: Vector3 | None = None
-        self._there_since_ns: int | None = None
+        self._hold_point: Vector3 | None = None
+        self._arrived_since_ns: int | None = None
         self._over_since_ns: int | None = None
         self._words = "waiting for the others"
         self._side = 1.0
@@ -176,7 +174,7 @@ class FormationBehaviour(Behaviour):
     def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
         hood = context.neighbourhood
         if hood is None or hood.problem is not None or hood.anchor is None:
-            return self._without_leader(context, "the others are not heard" if hood is None else hood.problem)
+            return self._without_leader(context, "pose sharing is off" if hood is None else hood.problem)
         leader = self._leader(dt_s, context, hood)
         if isinstance(leader, Outcome):
             return leader
@@ -192,28 +190,28 @@ class FormationBehaviour(Behaviour):
             return ended
         self._turn(dt_s, hood, leader, agreement)
         offset = agreement.offset(hood.own, centre_taken=self._centre_taken(hood))
-        self._tell(hood, agreement)
+        self._publish(hood, agreement)
         if offset is None:
             self._words = f"waiting for a slot from {agreement.by}"
             return self._stand(context)
-        self._place = None
+        self._hold_point = None
         return self._fly(context, hood, leader, agreement, offset, position)
 
     # ---- the leader -------------------------------------------------------------------------------------
 
     def _leader(self, dt_s: float, context: BehaviourContext, hood: Neighbourhood) -> _Leader | Outcome | str:
-        """What is followed; or why it cannot be now; or why it cannot be at all."""
+        """The leader's motion; a string: why it is unknown now; an Outcome: why it cannot be followed."""
         if self._structure is not None:
             return self._virtual_leader(dt_s, context, hood, self._structure)
         if self.leader_name == hood.own:
             return Outcome(False, f"{hood.own} cannot follow itself: name another leader")
         leader = hood.named(self.leader_name)
         if leader is None or leader.silent:
-            return f"{self.leader_name}, the leader, is not heard"
+            return f"no pose from the leader {self.leader_name}"
         if leader.formation is not None and leader.formation.leader == hood.own:
-            return Outcome(False, f"{leader.name} follows {hood.own}: two cannot follow each other")
+            return Outcome(False, f"{leader.name} follows {hood.own}: vehicles cannot follow each other")
         if not (leader.airborne or leader.virtual):
-            return Outcome(False, f"{leader.name}, the leader, is on the ground")
+            return Outcome(False, f"the leader {leader.name} is on the ground")
         return _Leader(
             leader.position_ned_m, leader.velocity_ned_mps, leader.heading_rad, leader.turn_rate_radps
         )
@@ -222,21 +220,21 @@ class FormationBehaviour(Behaviour):
         self, dt_s: float, context: BehaviourContext, hood: Neighbourhood, structure: VirtualStructure
     ) -> _Leader | Outcome | str:
         assert hood.anchor is not None
-        told = self._told_structures(hood)
+        published = self._published_structures(hood)
         mover = min((other.name for other in self._companions(hood) if not other.silent), default=hood.own)
         if mover < hood.own:
-            if mover not in told:
-                return f"{mover} has not told yet where the structure is"
+            if mover not in published:
+                return f"no structure state from {mover} yet"
             structure.leave()
-            other, where = told[mover]
-            place = hood.anchor.local(*where.place)
+            other, where = published[mover]
+            point = hood.anchor.local(*where.place)
             north, east, down = (
-                p + v * other.age_s for p, v in zip(place, where.velocity_ned_mps, strict=True)
+                p + v * other.age_s for p, v in zip(point, where.velocity_ned_mps, strict=True)
             )
             return _Leader((north, east, down), where.velocity_ned_mps, where.heading_rad, 0.0, where.over)
         try:
             if not structure.begun:
-                known = max((where for _, where in told.values()), key=lambda w: w.along_m, default=None)
+                known = max((where for _, where in published.values()), key=lambda w: w.along_m, default=None)
                 if known is not None:
                     structure.take_over(hood.anchor, known)
                 else:
@@ -253,14 +251,14 @@ class FormationBehaviour(Behaviour):
         return _Leader(position, velocity, heading, 0.0, self._over_since_ns is not None)
 
     def _companions(self, hood: Neighbourhood) -> list[Neighbour]:
-        """Those who fly in this formation, as far as they are known."""
+        """The known neighbours in this formation."""
         return [
             other
             for other in hood.vehicles
             if other.formation is not None and other.formation.leader == self.leader_name
         ]
 
-    def _told_structures(self, hood: Neighbourhood) -> dict[str, tuple[Neighbour, Structure]]:
+    def _published_structures(self, hood: Neighbourhood) -> dict[str, tuple[Neighbour, Structure]]:
         return {
             other.name: (other, other.formation.structure)
             for other in self._companions(hood)
@@ -271,49 +269,49 @@ class FormationBehaviour(Behaviour):
         leader = hood.named(self.leader_name)
         return self._structure is None and not (leader is not None and leader.virtual)
 
-    # ---- the others -------------------------------------------------------------------------------------
+    # ---- the other vehicles ---------------------------------------------------------------------------
 
     def _agree(self, hood: Neighbourhood, leader: _Leader, position: Vector3) -> Agreement:
         if self._group is None:
             self._group = Group(hood.own, self.leader_name, self._shape, self._spacing_m, self._slot)
         self._group.centre_taken = self._centre_taken(hood)
         heading = self._heading_rad or 0.0
-        places = {other.name: _in_frame(other.position_ned_m, leader, heading) for other in hood.vehicles}
-        places[hood.own] = _in_frame(position, leader, heading)
-        self._agreement = self._group.agree(hood.vehicles, places, self._error_m)
+        positions = {other.name: _in_frame(other.position_ned_m, leader, heading) for other in hood.vehicles}
+        positions[hood.own] = _in_frame(position, leader, heading)
+        self._agreement = self._group.agree(hood.vehicles, positions, self._error_m)
         return self._agreement
 
     def _ended(self, context: BehaviourContext, agreement: Agreement, leader: _Leader) -> Outcome | None:
         own = context.neighbourhood.own if context.neighbourhood is not None else ""
-        given = agreement.slots.get(own)
-        if self._slot is not None and agreement.slots and given != self._slot:
+        assigned = agreement.slots.get(own)
+        if self._slot is not None and agreement.slots and assigned != self._slot:
             holder = next((name for name, number in agreement.slots.items() if number == self._slot), None)
             if holder is not None:
-                return Outcome(False, f"slot {self._slot} is {holder}'s: choose another, or slot=auto")
+                return Outcome(False, f"slot {self._slot} is taken by {holder}: choose another, or slot=auto")
         if agreement.plan.spacing_m < context.min_separation_m + MARGIN_M:
             least_m = context.min_separation_m + MARGIN_M
             return Outcome(
                 False,
-                f"spacing must be {least_m:g} m at least with guidance.min_separation_m at "
-                f"{context.min_separation_m:g} m, got {agreement.plan.spacing_m:g} m",
+                f"spacing must be at least {least_m:g} m with guidance.min_separation_m = "
+                f"{context.min_separation_m:g}, got {agreement.plan.spacing_m:g} m",
             )
         if self._structure is None:
             return None
         now_ns = context.now_ns
         if agreement.by != own:
             return Outcome(True, "the structure has flown its path") if leader.over else None
-        if not (self._structure.arrived and agreement.worst_error_m < THERE_M):
-            self._there_since_ns = None
-        elif self._there_since_ns is None:
-            self._there_since_ns = now_ns
-        elif self._over_since_ns is None and now_ns - self._there_since_ns > THERE_S * 1e9:
+        if not (self._structure.arrived and agreement.worst_error_m < ARRIVED_M):
+            self._arrived_since_ns = None
+        elif self._arrived_since_ns is None:
+            self._arrived_since_ns = now_ns
+        elif self._over_since_ns is None and now_ns - self._arrived_since_ns > ARRIVED_S * 1e9:
             self._over_since_ns = now_ns
-        if self._over_since_ns is not None and now_ns - self._over_since_ns > TELL_S * 1e9:
+        if self._over_since_ns is not None and now_ns - self._over_since_ns > PUBLISH_S * 1e9:
             return Outcome(True, "the structure has flown its path")
         return None
 
     def _turn(self, dt_s: float, hood: Neighbourhood, leader: _Leader, agreement: Agreement) -> None:
-        """The formation's heading: after the leader's, as fast as its outermost slot can be swung round."""
+        """Turn the formation's heading to the leader's, limited by the speed of the outermost slot."""
         assert self._heading_rad is not None
         by = hood.named(agreement.by)
         if agreement.by != hood.own and by is not None and by.formation is not None and by.formation.count:
@@ -330,7 +328,7 @@ class FormationBehaviour(Behaviour):
         self._turn_rate_radps += change
         self._heading_rad = wrap_angle(self._heading_rad + self._turn_rate_radps * dt_s)
 
-    def _tell(self, hood: Neighbourhood, agreement: Agreement) -> None:
+    def _publish(self, hood: Neighbourhood, agreement: Agreement) -> None:
         assigning = agreement.by == hood.own
         note = FormationNote(
             self.leader_name,
@@ -345,12 +343,12 @@ class FormationBehaviour(Behaviour):
         if assigning and self._structure is not None and self._structure.begun and hood.anchor is not None:
             _, _, heading = self._structure.motion()
             over = self._over_since_ns is not None
-            told = self._structure.told(hood.anchor, note.heading_rad if heading is None else heading, over)
-            note = replace(note, structure=told)
+            heading = note.heading_rad if heading is None else heading
+            note = replace(note, structure=self._structure.snapshot(hood.anchor, heading, over))
         self.note = note
 
     def _report_waiting(self, hood: Neighbourhood) -> None:
-        """Until the leader is heard nothing is assigned, but the others know who waits."""
+        """Publish that this vehicle waits: without the leader's pose no slots are assigned."""
         plan = Plan(0, hood.own, self._shape, self._spacing_m)
         held = self.note
         self.note = FormationNote(self.leader_name, plan if held is None else held.plan, self._slot)
@@ -374,28 +372,28 @@ class FormationBehaviour(Behaviour):
         self.slot_offset_ned_m = (north, east, down)
         missing = (slot[0] - position[0], slot[1] - position[1], slot[2] - position[2])
         self._error_m = math.hypot(*missing)
-        way_m = math.hypot(missing[0], missing[1])
-        gain = min(SLOT_GAIN_PER_S, CATCH_UP_MPS / way_m) if way_m > 1e-6 else 0.0
+        distance_m = math.hypot(missing[0], missing[1])
+        gain = min(SLOT_GAIN_PER_S, CATCH_UP_MPS / distance_m) if distance_m > 1e-6 else 0.0
         nearest_m = context.min_separation_m
         closing = (missing[0] * gain, missing[1] * gain)
-        if way_m > FAR_M:
+        if distance_m > FAR_M:
             standing = [other for other in hood.vehicles if _stands(other, moving)]
             closing, self._side = avoid(
-                closing, way_m, position, standing, nearest_m + CLEARANCE_M, self._side
+                closing, distance_m, position, standing, nearest_m + CLEARANCE_M, self._side
             )
-        # Neighbours in their slots do not push each other.
+        # No repulsion between neighbours in their slots.
         soft_m = min(nearest_m + CLEARANCE_M, max(nearest_m + MARGIN_M, 0.9 * agreement.plan.spacing_m))
-        push = pushed_apart(position, hood.vehicles, soft_m)
+        push = repulsion(position, hood.vehicles, soft_m)
         down = max(-CLIMB_MPS, min(CLIMB_MPS, SLOT_GAIN_PER_S * missing[2]))
         wanted = (moving[0] + closing[0] + push[0], moving[1] + closing[1] + push[1])
-        north, east = pressed(wanted, context.state, math.hypot(*wanted) + 1.0)
+        north, east = add_velocity_error(wanted, context.state, math.hypot(*wanted) + 1.0)
         self._words = (
             f"slot {agreement.slots[hood.own]} of {agreement.plan.shape}, {self._error_m:.1f} m from it"
         )
         return Setpoint.velocity((north, east, moving[2] + down), context.now_ns, yaw_rad=self._heading_rad)
 
     def _without_leader(self, context: BehaviourContext, why: str | None) -> BehaviourOutput:
-        """Brake and hold; not for ever."""
+        """Brake and hold, at most for the time-out."""
         now_ns = context.now_ns
         if self._lost_since_ns is None:
             self._lost_since_ns = now_ns
@@ -408,24 +406,27 @@ class FormationBehaviour(Behaviour):
     def _stand(self, context: BehaviourContext) -> Setpoint:
         state, now_ns = context.state, context.now_ns
         yaw_rad = self._heading_rad if self._heading_rad is not None else state.yaw_rad
-        if self._place is None and math.hypot(*(state.velocity_ned_mps or (0.0, 0.0, 0.0))) < STANDING_MPS:
-            self._place = state.position_ned_m
-        if self._place is None:
+        if (
+            self._hold_point is None
+            and math.hypot(*(state.velocity_ned_mps or (0.0, 0.0, 0.0))) < STANDING_MPS
+        ):
+            self._hold_point = state.position_ned_m
+        if self._hold_point is None:
             return Setpoint.velocity((0.0, 0.0, 0.0), now_ns, yaw_rad=yaw_rad)
-        return Setpoint.position(self._place, now_ns, yaw_rad=yaw_rad)
+        return Setpoint.position(self._hold_point, now_ns, yaw_rad=yaw_rad)
 
     @property
     def status(self) -> str:
         return f"formation, {self._words}"
 
 
-def _in_frame(place: Vector3, leader: _Leader, heading_rad: float) -> Vector3:
-    """A place as (forward, right, down) of the leader."""
-    north, east = place[0] - leader.position[0], place[1] - leader.position[1]
+def _in_frame(position: Vector3, leader: _Leader, heading_rad: float) -> Vector3:
+    """A position as (forward, right, down) relative to the leader."""
+    north, east = position[0] - leader.position[0], position[1] - leader.position[1]
     cosine, sine = math.cos(heading_rad), math.sin(heading_rad)
-    return (north * cosine + east * sine, east * cosine - north * sine, place[2] - leader.position[2])
+    return (north * cosine + east * sine, east * cosine - north * sine, position[2] - leader.position[2])
 
 
 def _stands(other: Neighbour, moving: Vector3) -> bool:
-    """It keeps its place in the formation, or stands where the formation does."""
+    """Whether a neighbour is stationary relative to the formation."""
     return not other.virtual and math.dist(other.velocity_ned_mps[:2], moving[:2]) < IN_THE_WAY_MPS

@@ -1,6 +1,6 @@
-"""Point the gimbal as a step of a mission: the vehicle holds until it looks there.
+"""Point the gimbal as a step of a mission: the vehicle holds until the gimbal has turned.
 
-An operator's `gimbal` does not pass here: it changes nothing about what flies (`gimbal_controller`).
+An operator's `gimbal` command does not use this behaviour (see `gimbal.controller`).
 """
 
 from __future__ import annotations
@@ -17,14 +17,12 @@ from companion.guidance.registry import behaviour
 from companion.vehicle.gimbal import GimbalAim
 
 
-@behaviour("gimbal", "point the gimbal, whatever flies; alone: level and ahead")
+@behaviour("gimbal", "point the gimbal, during any behaviour; default: level and ahead")
 class Gimbal(Command):
     pitch_deg: Annotated[
         float, Number("pitch", "deg", -90.0, 90.0, "above the horizon; below is negative")
     ] = 0.0
-    yaw_deg: Annotated[
-        float, Number("yaw", "deg", -180.0, 180.0, "clockwise from the nose, with which it turns")
-    ] = 0.0
+    yaw_deg: Annotated[float, Number("yaw", "deg", -180.0, 180.0, "clockwise from the nose")] = 0.0
 
     @property
     def aim(self) -> GimbalAim:
@@ -36,7 +34,7 @@ class Gimbal(Command):
 
 
 class PointGimbalBehaviour(HoldBehaviour):
-    """Holds, and ends when the gimbal looks where it is to look."""
+    """Holds, and ends when the gimbal points at the aim."""
 
     name = "gimbal"
     requirements = frozenset({Requirement.POSITION, Requirement.IN_AIR, Requirement.GIMBAL})
@@ -47,16 +45,18 @@ class PointGimbalBehaviour(HoldBehaviour):
         self.gimbal_pitches_rad = (aim.pitch_rad,)
 
     def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
-        # At the first turn it is still told of what came before.
+        # The first update still shows the previous owner's problem.
         if context.gimbal.problem and context.now_ns > self._since_ns:
             return Outcome(False, f"gimbal: {context.gimbal.problem}")
         state, gimbal = context.state, context.state.gimbal
         off_rad = None if gimbal is None else gimbal.off_rad(self._aim, state.yaw_rad or 0.0)
         known = gimbal is not None and gimbal.attitude_fresh(context.now_ns)
         if known and off_rad is not None and off_rad <= POINTED_RAD:
-            return Outcome(True, f"the gimbal looks {direction_text(self._aim)}")
+            return Outcome(True, f"gimbal points {direction_text(self._aim)}")
         if context.now_ns - self._since_ns > POINT_TIMEOUT_S * 1e9:
-            return Outcome(False, f"gimbal: it does not look {direction_text(self._aim)} after all")
+            return Outcome(
+                False, f"gimbal: not pointing {direction_text(self._aim)} after {POINT_TIMEOUT_S:g} s"
+            )
         return super().update(dt_s, context)
 
     @property

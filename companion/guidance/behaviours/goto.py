@@ -1,4 +1,4 @@
-"""Fly straight to a place: metres from home, metres from here by the nose, or latitude and longitude."""
+"""Goto: fly straight to a point given from home, from the current position, or by latitude and longitude."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ NEAREST_M = 0.05
 GLOBAL_MAX_AGE_S = 0.5
 
 
-@behaviour("goto", "fly straight to a place, given by one pair of its arguments")
+@behaviour("goto", "fly straight to a point, given by one pair of arguments")
 class Goto(Command):
     north_m: Annotated[float | None, Number("north", "m", -5000.0, 5000.0, "of home, with east")] = None
     east_m: Annotated[float | None, Number("east", "m", -5000.0, 5000.0, "of home, with north")] = None
-    altitude_m: Annotated[float | None, Number("altitude", "m", 1.0, 500.0, "above home; else as it is")] = (
-        None
-    )
+    altitude_m: Annotated[
+        float | None, Number("altitude", "m", 1.0, 500.0, "above home; default: unchanged")
+    ] = None
     forward_m: Annotated[float | None, Number("forward", "m", -5000.0, 5000.0, "of here, with right")] = None
     right_m: Annotated[float | None, Number("right", "m", -5000.0, 5000.0, "of here, with forward")] = None
     latitude_deg: Annotated[
@@ -37,7 +37,7 @@ class Goto(Command):
     ] = None
     speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "at most")] = 3.0
     heading_deg: Annotated[
-        float | None, Number("heading", "deg", -360.0, 360.0, "of the nose; else along the way")
+        float | None, Number("heading", "deg", -360.0, 360.0, "of the nose; default: along the path")
     ] = None
 
     def __post_init__(self) -> None:
@@ -52,7 +52,7 @@ class Goto(Command):
             got = " and ".join(begun) if begun else "none of them"
             raise GrammarError(f"goto: give exactly one pair of {', '.join(pairs)}; got {got}")
         if None in pairs[begun[0]]:
-            raise GrammarError(f"goto: {begun[0]} belong together; one of them is missing")
+            raise GrammarError(f"goto: give both {begun[0]}; one is missing")
 
     def build(self, context: BuildContext) -> Behaviour:
         return GotoBehaviour(
@@ -66,11 +66,11 @@ class Goto(Command):
 
 
 class GotoBehaviour(PathFlight):
-    """Exactly one pair says where; what is not said about the height stays as it is.
+    """Flies to a point given by exactly one pair.
 
     Args:
-        from_home_m: (north, east) of home. from_here_m: (forward, right) of where it begins.
-        global_deg: (latitude, longitude), WGS 84. altitude_m: above home; None: as it is.
+        from_home_m: (north, east) of home. from_here_m: (forward, right) of the position where it begins.
+        global_deg: (latitude, longitude), WGS 84. altitude_m: above home; None: unchanged.
     """
 
     name = "goto"
@@ -86,7 +86,7 @@ class GotoBehaviour(PathFlight):
         heading_rad: float | None = None,
     ) -> None:
         super().__init__(speed_mps, heading_rad=heading_rad)
-        given = [place for place in (from_home_m, from_here_m, global_deg) if place is not None]
+        given = [pair for pair in (from_home_m, from_here_m, global_deg) if pair is not None]
         if len(given) != 1:
             raise ValueError("goto needs exactly one of from_home_m, from_here_m and global_deg")
         self._from_home_m, self._from_here_m, self._global_deg = from_home_m, from_here_m, global_deg
@@ -96,7 +96,7 @@ class GotoBehaviour(PathFlight):
         position, _ = position_and_yaw(context.state)
         goal = self._goal(context)
         if math.dist(goal, position) < NEAREST_M:
-            # A path has a length: who is there already arrives from a hand's breadth above.
+            # A path needs a length: at the goal already, it starts 5 cm above.
             position = (goal[0], goal[1], goal[2] - NEAREST_M)
         return Path([position, goal], self._speed_mps)
 
@@ -105,7 +105,7 @@ class GotoBehaviour(PathFlight):
         try:
             return (self._goal(context),)
         except ValueError:
-            return ()  # it says so when it begins
+            return ()  # reported when it begins
 
     def _goal(self, context: BehaviourContext) -> Vector3:
         state = context.state
@@ -121,15 +121,15 @@ class GotoBehaviour(PathFlight):
             return (position[0] + north, position[1] + east, down)
         assert self._global_deg is not None
         if not (math.isfinite(state.latitude_deg) and math.isfinite(state.longitude_deg)):
-            raise ValueError("the vehicle does not know its latitude and longitude")
+            raise ValueError("latitude and longitude not received")
         age_s = (context.now_ns - state.global_ns) / 1e9
         if age_s > GLOBAL_MAX_AGE_S:
-            raise ValueError(f"the vehicle's latitude and longitude are {age_s:.1f} s old")
+            raise ValueError(f"latitude and longitude stale ({age_s:.1f} s)")
         north, east = north_east((state.latitude_deg, state.longitude_deg), self._global_deg)
         return (position[0] + north, position[1] + east, down)
 
-    def _active(self) -> str:
-        return "there"
+    def _success_text(self) -> str:
+        return "goal reached"
 
 
 def _pair(first: float | None, second: float | None) -> tuple[float, float] | None:

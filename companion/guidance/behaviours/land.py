@@ -1,4 +1,4 @@
-"""The autopilot's own ways down: land here, or return and land."""
+"""The autopilot's landing modes: land here, or return and land."""
 
 from __future__ import annotations
 
@@ -16,11 +16,10 @@ from companion.guidance.command import BuildContext, Command
 from companion.guidance.registry import behaviour
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
 
-# MPC_LAND_SPEED is 0.7 m/s by default; landing detection and PX4's delay to disarm (COM_DISARM_LAND) come on
-# top.
+# MPC_LAND_SPEED is 0.7 m/s by default, plus landing detection and PX4's delay to disarm (COM_DISARM_LAND).
 SLOWEST_DESCENT_MPS = 0.4
 GROUND_TIMEOUT_S = 30.0
-# RTL climbs to RTL_RETURN_ALT (30 m) first, then cruises at 5 m/s; both taken generously.
+# RTL climbs to RTL_RETURN_ALT (30 m) first, then cruises at 5 m/s; generous bounds of both.
 RETURN_ALTITUDE_M = 60.0
 SLOWEST_RETURN_MPS = 1.5
 
@@ -38,7 +37,7 @@ class Rtl(Command):
 
 
 class LandBehaviour(Behaviour):
-    """Lands where it is, and ends when the autopilot has disarmed."""
+    """Lands at the current position, and ends when the autopilot has disarmed."""
 
     name = "land"
     requirements: frozenset[Requirement] = frozenset()
@@ -70,7 +69,7 @@ class LandBehaviour(Behaviour):
         return ModeRequest(self.mode)
 
     def timeout_s(self, state: VehicleState) -> float:
-        """How long it may take from this state, seconds."""
+        """Time-out from this state, seconds."""
         return GROUND_TIMEOUT_S + max(0.0, state.altitude_m or 0.0) / SLOWEST_DESCENT_MPS
 
     @property

@@ -1,8 +1,9 @@
-"""Land on a marker: find it, stay above it, come down in a cone that narrows, and touch down on its pad.
+"""Land on a marker: find it, hold above it, descend in a narrowing cone, and touch down on its pad.
 
-Down to the final height it is flown by sight, by us. The last of the way is blind: the marker has left the
-picture, and the autopilot's own landing goes down where it is. Lost or missed before that, the vehicle climbs
-and tries again, a few times. Or the autopilot flies all of it, told by LANDING_TARGET where the pad is.
+Down to the final height the descent is guided by marker detections. The rest is blind: the marker no longer
+fits into the image, and the autopilot's own landing goes straight down. If the marker is lost or missed
+before that, the vehicle climbs and tries again, up to `attempts` times. Alternatively the autopilot flies its
+precision landing with LANDING_TARGET messages.
 """
 
 from __future__ import annotations
@@ -30,60 +31,59 @@ from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, Vector3
 
-# A sighting is a rumour: so many, the newest no older than this, make a pad.
-SIGHTINGS_NEEDED, SIGHT_FRESH_S = 3, 0.6
-# Unseen for so long, the descent waits; for so long, it is given up.
+# A pad is found after this many detections, the newest at most this old.
+DETECTIONS_NEEDED, SIGHT_FRESH_S = 3, 0.6
+# Unseen for the first time, the descent pauses; for the second, it is aborted.
 WAIT_AFTER_S, LOST_AFTER_S = 0.4, 2.2
-# From higher up than this there is time: the place is remembered, and flown to, for longer.
+# From higher than this the pad's position is used for longer without detections.
 LOW_M, LOST_HIGH_AFTER_S = 3.5, 5.0
-# The cone: allowed distance beside the pad's centre, metres, at the ground and for each metre of height.
+# The cone: allowed horizontal distance from the pad's centre, metres, on the ground and per metre of height.
 CONE_M, CONE_PER_M = 0.10, 0.20
-# The answer to a distance beside the pad, 1/s, and how much more of a velocity is asked for where the vehicle
-# does not follow: like an MPC_XY_VEL_P_ACC of 5, the most PX4 allows. Measured in lockstep in gusts, with an
-# acceleration limit of 5 m/s².
-GAIN_PER_S, PRESS = 1.6, 1.75
+# Gain of the horizontal distance to the pad, 1/s, and of the velocity error: like an MPC_XY_VEL_P_ACC of 5,
+# the maximum of PX4. Tuned in lockstep in gusts, with an acceleration limit of 5 m/s².
+GAIN_PER_S, VELOCITY_ERROR_GAIN = 1.6, 1.75
 DESCENT_MPS, SLOWEST_DESCENT_MPS, DESCENT_PER_M = 0.8, 0.2, 0.3
-# Unseen, it rises a little: from higher up more is in the picture. So slowly, m/s.
+# Unseen, the vehicle climbs slowly: from higher up the image covers more.
 RISE_MPS = 0.3
-# Gusts move it up and down too: the wanted height is held by so much for each metre, 1/s, but no further off.
+# Gain of the height error, 1/s, and its limit: gusts displace the vehicle vertically, too.
 HEIGHT_GAIN_PER_S, HEIGHT_LEASH_M = 1.2, 0.5
-# Blind from here on: a marker of a pad's size no longer fits into the picture.
+# Blind below this: a marker of a pad's size no longer fits into the image.
 FINAL_M = 0.45
-# What may be off when the blind part begins: the distance, and what the speed will make of it.
+# Tolerance for starting the blind part: distance, plus speed times the lookahead.
 FINAL_ERROR_M, FINAL_LOOKAHEAD_S = 0.12, 0.35
-# In gusts it never stands that still: after so long of waiting, what is allowed has grown by as much again.
+# In gusts that is not reached: the tolerance grows to its double over this waiting time.
 PATIENCE_S = 6.0
-# Seen so far off during the blind part, and still so high, it is not landed.
+# Detected this far off and still this high during the blind part, the landing is aborted.
 MISSED_M, MISSED_HEIGHT_M = 0.3, 0.45
 CLIMB_MPS, CLIMB_M = 1.0, 2.5
 TOUCHDOWN_MPS = 0.7
 BASE_TIMEOUT_S, BLIND_TIMEOUT_S, LANDING_TIMEOUT_S, DELEGATED_TIMEOUT_S = 60.0, 5.0, 30.0, 150.0
-# An autopilot that fell back to landing where it was did not land on the marker.
+# Farther from the pad than this, the autopilot has fallen back to a normal landing.
 ON_PAD_M = 1.0
 
 
 class _Phase(StrEnum):
-    SEARCH = "looking for"
+    SEARCH = "searching for"
     DESCEND = "descending to"
     FINAL = "landing on"
-    CLIMB = "climbing to find again"
-    DELEGATED = "the autopilot lands on"
+    CLIMB = "climbing to search again for"
+    DELEGATED = "autopilot landing on"
 
 
 @behaviour("land-on-marker", "find a marker below, descend onto it in a narrowing cone, land and disarm")
 class LandOnMarker(Command):
     renamed: ClassVar[Mapping[str, str]] = {"pad": "target"}
-    identifier: Annotated[float, Number("id", "", 0.0, 1023.0, "of the marker whose pad to land on")]
+    identifier: Annotated[float, Number("id", "", 0.0, 1023.0, "id of the pad's marker")]
     method: Annotated[
         str,
         EnumArgument(
-            "method", ("offboard", "autopilot"), "who flies: we, or the autopilot by LANDING_TARGET"
+            "method", ("offboard", "autopilot"), "flown by setpoints, or by the autopilot with LANDING_TARGET"
         ),
     ] = "offboard"
     target: Annotated[str, EnumArgument("target", ("static", "moving"), "whether the pad moves")] = "static"
     attempts: Annotated[float, Number("attempts", "", 1.0, 10.0, "descents before giving up")] = 3.0
-    search_m: Annotated[float, Number("search", "m", 0.0, 50.0, "how far around to look for it")] = 5.0
-    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 5.0, "over ground, at most")] = 1.5
+    search_m: Annotated[float, Number("search", "m", 0.0, 50.0, "radius of the search")] = 5.0
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 5.0, "horizontal, at most")] = 1.5
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -110,12 +110,12 @@ class LandOnMarkerBehaviour(Behaviour):
     """Lands on the pad of one marker, and ends when the autopilot has disarmed.
 
     Args:
-        identifier: of the marker; others that lie on its pad count too.
-        by_autopilot: it flies its precision landing; we only tell it where the pad is.
-        moving: the pad may move, in a line and slowly; the blind part is flown with its velocity.
+        identifier: of the marker; others on the same pad are used too.
+        by_autopilot: the autopilot flies its precision landing with our LANDING_TARGET messages.
+        moving: the pad may move slowly in a line; the blind part is flown with its velocity.
         attempts: descents before giving up.
-        search_m: how far around to look for it.
-        speed_mps: over ground, at most.
+        search_m: radius of the search.
+        speed_mps: horizontal, at most.
     """
 
     name = "land-on-marker"
@@ -154,7 +154,7 @@ class LandOnMarkerBehaviour(Behaviour):
         self._started_down_m = position[2]
         self._pad = self._target = self._blind_since_ns = None
         self._failures = []
-        # Frames captured before the command do not count: they may be of another place.
+        # Frames captured before the command are ignored: they may show another point.
         self._newest_ns = context.now_ns
         self._begin_search(context, position)
 
@@ -188,22 +188,22 @@ class LandOnMarkerBehaviour(Behaviour):
             return f"{words}, {self._search.status}"
         return words if math.isnan(self._height_m) else f"{words}, {self._height_m:.1f} m above it"
 
-    # --- what is seen
+    # --- detections
 
     def _observe(self, context: BehaviourContext) -> None:
-        sight = context.markers
+        markers = context.markers
         self._blind_since_ns = (
-            None if sight.fresh else self._blind_since_ns or max(context.now_ns, self._newest_ns)
+            None if markers.fresh else self._blind_since_ns or max(context.now_ns, self._newest_ns)
         )
-        sightings = [
+        detections = [
             target
-            for target in sight.targets
+            for target in markers.targets
             if target.pad == self._identifier and target.captured_ns > self._newest_ns
         ]
-        if not sightings:
+        if not detections:
             return
-        self._newest_ns = max(target.captured_ns for target in sightings)
-        for target in sightings:
+        self._newest_ns = max(target.captured_ns for target in detections)
+        for target in detections:
             if self._pad is None:
                 self._pad = PadFilter(target, moving=self._moving)
             elif not self._pad.add(target):
@@ -220,10 +220,10 @@ class LandOnMarkerBehaviour(Behaviour):
         return math.inf if self._pad is None else self._pad.unseen_s(now_ns)
 
     def _found(self, now_ns: int) -> PadFilter | None:
-        """The pad, when it is seen now and for sure."""
+        """The pad, if it was detected often enough and just now."""
         pad = self._pad
         return (
-            pad if pad is not None and pad.count >= SIGHTINGS_NEEDED and pad.unseen_s(now_ns) < SIGHT_FRESH_S
+            pad if pad is not None and pad.count >= DETECTIONS_NEEDED and pad.unseen_s(now_ns) < SIGHT_FRESH_S
             else None
         )  # fmt: skip
 
@@ -253,15 +253,16 @@ class LandOnMarkerBehaviour(Behaviour):
             return self._descending(dt_s, context, position)
         if self._blind_since_ns is not None:
             if now_ns - self._blind_since_ns > BLIND_TIMEOUT_S * 1e9:
-                return Outcome(False, f"nothing came from the camera for {BLIND_TIMEOUT_S:g} s")
+                return Outcome(False, f"no camera frames for {BLIND_TIMEOUT_S:g} s")
             return Setpoint.brake(now_ns)
         search = self._search
         assert search is not None
-        place = search.update(dt_s, position)
+        point = search.update(dt_s, position)
         if search.ended:
-            what = f"looked {self._search_m:g} m around"
-            return Outcome(False, f"marker {self._identifier} was not seen, {what}{self._so_far()}")
-        return self._to(place, context, position, (0.0, 0.0), correction(place[2] - position[2], CLIMB_MPS))
+            return Outcome(
+                False, f"marker {self._identifier} not found within {self._search_m:g} m{self._so_far()}"
+            )
+        return self._to(point, context, position, (0.0, 0.0), correction(point[2] - position[2], CLIMB_MPS))
 
     def _descending(self, dt_s: float, context: BehaviourContext, position: Vector3) -> BehaviourOutput:
         now_ns, pad = context.now_ns, self._pad
@@ -269,8 +270,8 @@ class LandOnMarkerBehaviour(Behaviour):
         unseen_s = pad.unseen_s(now_ns)
         if unseen_s > (LOST_AFTER_S if self._height_m < LOW_M else LOST_HIGH_AFTER_S):
             return self._climb(f"lost {self._height_m:.1f} m above it", context, position)
-        place, drift = pad.at(now_ns), pad.velocity_mps
-        error_m = math.dist(place[:2], position[:2])
+        point, drift = pad.at(now_ns), pad.velocity_mps
+        error_m = math.dist(point[:2], position[:2])
         if self._height_m <= FINAL_M:
             self._waiting_s += dt_s
             if unseen_s < LOST_AFTER_S and self._well_above(error_m, context, drift):
@@ -283,10 +284,10 @@ class LandOnMarkerBehaviour(Behaviour):
             rate = -RISE_MPS if self._height_m < LOW_M else 0.0
         elif self._height_m <= FINAL_M:
             rate = 0.0
-        return self._to(place, context, position, drift, self._held(rate, dt_s, position))
+        return self._to(point, context, position, drift, self._held(rate, dt_s, position))
 
     def _held(self, rate_mps: float, dt_s: float, position: Vector3) -> float:
-        """The velocity down that keeps to a height which changes at a rate."""
+        """Downward velocity that tracks a height setpoint which changes at a rate."""
         wanted_m = self._wanted_down_m + rate_mps * dt_s
         wanted_m = max(position[2] - HEIGHT_LEASH_M, min(position[2] + HEIGHT_LEASH_M, wanted_m))
         self._wanted_down_m = wanted_m
@@ -301,20 +302,20 @@ class LandOnMarkerBehaviour(Behaviour):
     def _finishing(self, dt_s: float, context: BehaviourContext, position: Vector3) -> BehaviourOutput:
         now_ns, pad = context.now_ns, self._pad
         assert pad is not None
-        place, drift = pad.at(now_ns), pad.velocity_mps
-        error_m = math.dist(place[:2], position[:2])
+        point, drift = pad.at(now_ns), pad.velocity_mps
+        error_m = math.dist(point[:2], position[:2])
         seen = pad.unseen_s(now_ns) < WAIT_AFTER_S
         if seen and error_m > MISSED_M and self._height_m > MISSED_HEIGHT_M and not self._touching:
-            return self._climb(f"{error_m:.1f} m beside it before touching down", context, position)
+            return self._climb(f"{error_m:.1f} m off before touchdown", context, position)
         on_ground = context.state.landed is LandedState.ON_GROUND
         if self._touching or on_ground:
             self._touching |= on_ground
             return ModeRequest(FlightMode.LAND)
-        return self._to(place, context, position, drift, TOUCHDOWN_MPS)
+        return self._to(point, context, position, drift, TOUCHDOWN_MPS)
 
     def _climb(self, why: str, context: BehaviourContext, position: Vector3) -> BehaviourOutput:
         self._failures.append(why)
-        # Higher than where it began, the marker may be too small to be seen.
+        # Not much higher than the start: there the marker may be too small to detect.
         self._goal_down_m = min(position[2], max(self._started_down_m, position[2] - 2 * CLIMB_M))
         self._enter(_Phase.CLIMB, context.now_ns, BASE_TIMEOUT_S)
         return self._climbing(0.0, context, position)
@@ -322,27 +323,27 @@ class LandOnMarkerBehaviour(Behaviour):
     def _climbing(self, dt_s: float, context: BehaviourContext, position: Vector3) -> BehaviourOutput:
         now_ns, pad = context.now_ns, self._pad
         left_m = position[2] - self._goal_down_m
-        held = context.sent is not None and (context.sent.velocity_ned_mps or (0, 0, 0))[2] > -0.05
-        # An envelope's ceiling ends a climb as well as its goal does.
-        self._blocked_s = self._blocked_s + dt_s if held else 0.0
+        blocked = context.sent is not None and (context.sent.velocity_ned_mps or (0, 0, 0))[2] > -0.05
+        # A climb also ends where the envelope stops it.
+        self._blocked_s = self._blocked_s + dt_s if blocked else 0.0
         if left_m < 0.3 or self._blocked_s > 3.0:
             if len(self._failures) >= self._attempts:
                 return Outcome(False, f"gave up{self._so_far()}")
             if pad is not None and pad.unseen_s(now_ns) > LOST_AFTER_S:
-                # Where it is now is to be seen anew; what is remembered may have been the mistake.
+                # Discard the position: it may have been wrong.
                 self._pad = self._target = None
             self._begin_search(context, position)
             return self._searching(dt_s, context, position)
-        place = position if pad is None else pad.at(now_ns)
+        point = position if pad is None else pad.at(now_ns)
         drift = (0.0, 0.0) if pad is None else pad.velocity_mps
         if self._unseen_s(now_ns) > 2 * LOST_AFTER_S:
-            place, drift = position, (0.0, 0.0)
-        return self._to(place, context, position, drift, -CLIMB_MPS)
+            point, drift = position, (0.0, 0.0)
+        return self._to(point, context, position, drift, -CLIMB_MPS)
 
     def _delegated(self, dt_s: float, context: BehaviourContext, position: Vector3) -> BehaviourOutput:
         return ModeRequest(FlightMode.PRECISION_LAND)
 
-    # --- ends and ways
+    # --- ends and helpers
 
     def _landed(self, context: BehaviourContext, position: Vector3) -> Outcome:
         assert self._pad is not None
@@ -356,22 +357,22 @@ class LandOnMarkerBehaviour(Behaviour):
         if not self._failures:
             return ""
         times = "once" if len(self._failures) == 1 else f"{len(self._failures)} times"
-        return f"; came down {times} without landing: {', then '.join(self._failures)}"
+        return f"; descended {times} without landing: {', then '.join(self._failures)}"
 
     def _to(
         self,
-        place: Vector3,
+        point: Vector3,
         context: BehaviourContext,
         position: Vector3,
         drift: tuple[float, float],
         down_mps: float,
     ) -> Setpoint:
-        """Towards a place over ground that moves with `drift`, and down (negative: up) at a rate."""
-        north, east = towards(place, position, GAIN_PER_S, self._speed_mps)
+        """Setpoint towards a horizontal point that moves with `drift`, and down (negative: up) at a rate."""
+        north, east = towards(point, position, GAIN_PER_S, self._speed_mps)
         wanted = (north + drift[0], east + drift[1])
         now_north, now_east, _ = context.state.velocity_ned_mps or (*wanted, 0.0)
-        north = wanted[0] + PRESS * (wanted[0] - now_north)
-        east = wanted[1] + PRESS * (wanted[1] - now_east)
+        north = wanted[0] + VELOCITY_ERROR_GAIN * (wanted[0] - now_north)
+        east = wanted[1] + VELOCITY_ERROR_GAIN * (wanted[1] - now_east)
         top_mps = self._speed_mps + math.hypot(*drift)
         scale = min(1.0, top_mps / max(math.hypot(north, east), 1e-6))
         velocity = (north * scale, east * scale, down_mps)

@@ -1,4 +1,4 @@
-"""Where to look for a marker that is not seen at once: wait, climb a little, then fly a spiral."""
+"""Search path for a marker that is not seen at once: wait, climb, then fly a spiral."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ WAIT_S = 1.5
 CLIMB_M = 3.0
 CLIMB_MPS = 1.0
 SPEED_MPS = 1.0
-# Turns of the spiral lie this share of the height apart: well inside what a camera of 60° sees below.
+# Pitch of the spiral, as a fraction of the height: well inside the footprint of a 60° camera.
 PITCH_OF_HEIGHT = 0.7
 
 
 class MarkerSearch:
-    """A search around a place.
+    """A search around a point.
 
     Args:
-        place: local NED metres, where it begins.
-        radius_m: how far out the spiral goes; 0: only wait and climb.
-        height_m: above the ground at the beginning.
+        point: centre, local NED metres.
+        radius_m: of the spiral; 0: only wait and climb.
+        height_m: initial height above the ground.
     """
 
-    def __init__(self, place: Vector3, radius_m: float, height_m: float) -> None:
-        self._place, self._radius_m = place, radius_m
+    def __init__(self, point: Vector3, radius_m: float, height_m: float) -> None:
+        self._point, self._radius_m = point, radius_m
         self._pitch_m = max(1.0, PITCH_OF_HEIGHT * (height_m + CLIMB_M))
         self._angle_rad = 0.0
         self._elapsed_s = 0.0
@@ -32,7 +32,7 @@ class MarkerSearch:
 
     @property
     def status(self) -> str:
-        """In words."""
+        """Progress in words."""
         return f"{self._reached_m:.1f} m around" if self._angle_rad > 0.0 else "here"
 
     @property
@@ -40,11 +40,11 @@ class MarkerSearch:
         return self._pitch_m * self._angle_rad / math.tau
 
     def update(self, dt_s: float, position: Vector3) -> Vector3:
-        """Where to be next, local NED. `ended` is set when all was looked at."""
+        """The next position, local NED. `ended` is set when the whole area was covered."""
         self._elapsed_s += dt_s
-        north, east, down = self._place
+        north, east, down = self._point
         if self._elapsed_s < WAIT_S:
-            return self._place
+            return self._point
         climbed_m = min(CLIMB_M, CLIMB_MPS * (self._elapsed_s - WAIT_S))
         height = down - climbed_m
         if climbed_m < CLIMB_M:
@@ -52,14 +52,14 @@ class MarkerSearch:
         if self._reached_m >= self._radius_m:
             self.ended |= self._elapsed_s > 2 * WAIT_S + CLIMB_M / CLIMB_MPS
             return self._at(height)
-        # Only as fast as the vehicle follows: what it has not flown over it has not looked at.
-        place = self._at(height)
-        if math.dist(place[:2], position[:2]) < SPEED_MPS * 1.5:
+        # Only as fast as the vehicle follows, so that nothing is skipped.
+        point = self._at(height)
+        if math.dist(point[:2], position[:2]) < SPEED_MPS * 1.5:
             self._angle_rad += dt_s * SPEED_MPS / max(self._reached_m, self._pitch_m / 2)
         return self._at(height)
 
     def _at(self, height: float) -> Vector3:
-        north, east, _ = self._place
+        north, east, _ = self._point
         reached_m = min(self._reached_m, self._radius_m)
         return (
             north + reached_m * math.cos(self._angle_rad),

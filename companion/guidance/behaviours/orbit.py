@@ -1,4 +1,4 @@
-"""Circle about a point, nose to the centre, height kept."""
+"""Orbit: circle about a point at constant height, nose to the centre."""
 
 from __future__ import annotations
 
@@ -22,43 +22,43 @@ from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
 from vision.attitude import wrap_angle
 
-# Nearer to the centre than this there is no direction outwards.
+# Nearer to the centre than this the outward direction is undefined.
 MIN_RADIUS_M = 0.2
-# How late velocity, acceleration and heading of a multirotor follow: a first guess, the integrals below find
-# the rest. The heading's is about 1 / MC_YAW_P; 0.34 s measured in lockstep.
+# Initial delays of velocity, acceleration and heading of a multirotor; the integrals below correct the rest.
+# The heading's is about 1 / MC_YAW_P; 0.34 s measured in lockstep.
 VELOCITY_DELAY_S = 0.1
 ACCELERATION_DELAY_S = 0.2
 YAW_DELAY_S = 0.34
-# What may be asked for beyond the wanted speed to come back onto the circle.
+# Limit of the velocity command relative to the speed, for returning to the circle.
 SPEED_MARGIN = 1.25
-# Gains of the error of radius (1/s; its integral 1/s²) and of velocity outwards, as in
-# `motion.PositionController`; of the velocity along the circle; of the integrals of speed (1/s²) and
-# heading (1/s).
+# Gains of the radius error (1/s; its integral 1/s²) and of the outward velocity, as in
+# `motion.PositionController`; of the velocity along the circle; of the integrals of speed (1/s²) and heading
+# (1/s).
 RADIUS_GAIN, RADIUS_INTEGRAL_GAIN = 1.3, 0.4
 VELOCITY_GAIN = 1.5
 ALONG_GAIN = 0.6
 SPEED_INTEGRAL_GAIN = 0.3
 HEADING_INTEGRAL_GAIN = 0.5
-# What drag may be found to take along the circle, for each m/s flown.
+# Limit of the estimated drag along the circle, per m/s.
 MAX_DRAG_PER_S = 0.75
 MAX_LEAD_RAD = 0.6
-# Farther than this from the circle it is only flown to.
+# Farther than this from the circle the integrals are frozen.
 ON_CIRCLE_M = 1.5
-# On the circle the velocity that is asked for turns all the time. What that takes of the envelope's
-# acceleration is kept to this share of it, by flying slower: the rest is for corrections. An orbit of 8 m at
-# 4 m/s flies 3.7 m/s at 3 m/s²; its radius errs by 0.22 m (p95) in gusts of 0.6 m/s.
-TURNING_SHARE = 0.8
-# The speed is adapted to that by so many m/s² for each m/s² above or below, at most by so many, filtered.
+# On the circle the velocity command turns continuously. That may use this fraction of the envelope's
+# acceleration, else the vehicle flies slower; the rest is for corrections. An orbit of 8 m at 4 m/s flies 3.7
+# m/s at 3 m/s²; its radius error is 0.22 m (p95) in gusts of 0.6 m/s.
+TURNING_FRACTION = 0.8
+# Speed adaptation to that: gain, limit, and filter time constant.
 PACE_GAIN, MAX_PACE_MPS2, PACE_FILTER_S = 1.0, 0.5, 0.5
 SLOWEST_MPS = 0.5
 
-# What a circle may ask of the vehicle sideways.
+# Limit of the centripetal acceleration of a command.
 MAX_CENTRIPETAL_MPS2 = 2.0
 
 
 @behaviour("orbit", "circle, nose to the centre: the point `radius` ahead, or an object of a class")
 class Orbit(Command):
-    class_name: Annotated[str, ClassName("class", "circle about this object, if given")] = ""
+    class_name: Annotated[str, ClassName("class", "object to circle about, optional")] = ""
     radius_m: Annotated[float, Number("radius", "m", 1.0, 100.0, "of the circle")] = 10.0
     speed_mps: Annotated[float, Number("speed", "m/s", 0.1, 10.0, "along the circle")] = 2.0
     laps: Annotated[float, Number("laps", "", 0.0, 100.0, "how many; 0: until another command")] = 0.0
@@ -87,14 +87,14 @@ class Orbit(Command):
 
 
 class OrbitBehaviour(Behaviour):
-    """Flies at `speed_mps` along the circle; what is needed to come back onto the circle is taken from it.
+    """Flies at `speed_mps` along the circle; returning to the circle uses part of that speed.
 
-    On the circle everything is constant as seen from the centre, so integrals of the errors of radius, speed
-    and heading find what to ask for, whatever the vehicle's delays are. It is slower than asked where the
-    envelope does not let it keep the radius.
+    On the circle all commands are constant in polar coordinates, so integrals of the errors of radius, speed
+    and heading compensate any delays of the vehicle. It flies slower where the envelope would not let it keep
+    the radius.
 
-    The centre is the point `radius_m` ahead of the vehicle when it begins or, with a class name, the place of
-    the object of that class nearest to the nose, taken once.
+    The centre is the point `radius_m` ahead of the vehicle at the start or, with a class name, the position
+    of the object of that class nearest to the nose, determined once.
     """
 
     name = "orbit"
@@ -141,13 +141,13 @@ class OrbitBehaviour(Behaviour):
             self._centre = target.position_ned_m
         away_m = 0.0 if self._centre is None else math.dist(position[:2], self._centre[:2])
         path_m = self._laps * math.tau * self._radius_m + abs(away_m - self._radius_m)
-        turning_mps2 = TURNING_SHARE * context.max_acceleration_mps2
+        turning_mps2 = TURNING_FRACTION * context.max_acceleration_mps2
         slow_mps = min(self._speed_mps, math.sqrt(turning_mps2 * self._radius_m))
         self._until_ns = context.now_ns + (2.0 * path_m / slow_mps + 30.0) * 1e9
 
     def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
         if self._centre is None:
-            return Outcome(False, f"no {self._class_name} with a known place in sight to orbit")
+            return Outcome(False, f"no localized {self._class_name!r} to orbit")
         position, yaw_rad = position_and_yaw(context.state)
         north, east = position[0] - self._centre[0], position[1] - self._centre[1]
         distance = math.hypot(north, east)
@@ -194,21 +194,21 @@ class OrbitBehaviour(Behaviour):
         return Setpoint.velocity(velocity, context.now_ns, yaw_rad=heading, acceleration_ned_mps2=turning)
 
     def _acceleration(self, angle_rad: float, inward_mps2: float) -> Vector3:
-        """What the vehicle needs at this angle of the circle: to turn, and against drag."""
+        """Feed-forward acceleration at an angle of the circle: centripetal, and against drag."""
         north, east = math.cos(angle_rad), math.sin(angle_rad)
         around_mps2 = self._turn * self._drag_mps2
         return (-inward_mps2 * north - around_mps2 * east, -inward_mps2 * east + around_mps2 * north, 0.0)
 
     def _adapt_pace(self, along_mps: float, distance_m: float, limit_mps2: float, dt_s: float) -> None:
-        """Slower where the turning of what is asked for takes too much of the envelope's acceleration."""
+        """Reduce the speed where turning takes too much of the envelope's acceleration."""
         turning_mps2 = math.hypot(*self._asked_mps) * along_mps / distance_m
         self._turning_mps2 += min(1.0, dt_s / PACE_FILTER_S) * (turning_mps2 - self._turning_mps2)
-        change = PACE_GAIN * (TURNING_SHARE * limit_mps2 - self._turning_mps2)
+        change = PACE_GAIN * (TURNING_FRACTION * limit_mps2 - self._turning_mps2)
         pace = self._pace_mps + max(-MAX_PACE_MPS2, min(MAX_PACE_MPS2, change)) * dt_s
         self._pace_mps = max(min(pace, self._speed_mps), min(SLOWEST_MPS, self._speed_mps))
 
     def _asked(self, missing_m: float, out_mps: float, along_mps: float, dt_s: float) -> tuple[float, float]:
-        """Velocity to ask for, outwards and along the circle, from what the vehicle has of both."""
+        """Velocity command outwards and along the circle, from the measured velocity."""
         pace = self._pace_mps
         fastest = SPEED_MARGIN * self._speed_mps
         wanted_out = stopping_speed(missing_m, pace, STOPPING_MPS2, RADIUS_GAIN)
@@ -218,7 +218,7 @@ class OrbitBehaviour(Behaviour):
             self._drag_mps2 += SPEED_INTEGRAL_GAIN * (wanted_along - along_mps) * dt_s
             self._out_mps = max(-self._speed_mps, min(self._speed_mps, self._out_mps))
             self._drag_mps2 = max(0.0, min(MAX_DRAG_PER_S * along_mps, self._drag_mps2))
-        # The vehicle flies what was asked a moment ago; that lacks the centripetal acceleration since then.
+        # The vehicle flies an earlier command, which lacks the centripetal acceleration since then.
         late = VELOCITY_DELAY_S * wanted_along**2 / max(self._radius_m, self._radius_m - missing_m)
         asked_out = wanted_out + VELOCITY_GAIN * (wanted_out - out_mps) + self._out_mps - late
         asked_out = max(-fastest, min(fastest, asked_out))
@@ -228,7 +228,7 @@ class OrbitBehaviour(Behaviour):
     @property
     def status(self) -> str:
         angle = 0.0 if self._angle_rad is None else self._angle_rad
-        return f"orbiting, {self._flown_rad / math.tau:.1f} laps, {in_degrees(angle)}° of the centre"
+        return f"orbiting, {self._flown_rad / math.tau:.1f} laps, {in_degrees(angle)}° from the centre"
 
     def _nearest_to_nose(self, targets: tuple[Target, ...], yaw_rad: float) -> Target | None:
         fitting = [t for t in targets if t.class_name == self._class_name and t.position_ned_m is not None]

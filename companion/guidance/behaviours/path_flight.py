@@ -1,4 +1,4 @@
-"""Flying a path to its end, or round and round: what `goto`, `follow-path` and `figure-eight` share."""
+"""Base class of path behaviours: `goto`, `follow-path`, `figure-eight`, and area searches."""
 
 from __future__ import annotations
 
@@ -9,35 +9,35 @@ from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourO
 from companion.guidance.motion import (
     Arrival,
     PositionController,
+    add_velocity_error,
     ground_speed,
     in_degrees,
     position_and_yaw,
-    pressed,
     speed_of,
 )
 from companion.guidance.path import Path, PathFollower
 from companion.vehicle.setpoint import Setpoint
 from vision.attitude import wrap_angle
 
-# So near to its end, along the way and beside it, the end is flown to as a point, see `PositionController`.
+# Within this distance of its end, the end is flown to as a point, see `PositionController`.
 END_M = 1.5
-# With a heading that was asked for, it is there when the nose is, too.
+# Arrival with a commanded heading requires the yaw within this.
 HEADING_RAD = math.radians(5.0)
-# No metre of the way gained in so long, and it is not going to be: a limit, or the wind.
+# No progress of GAIN_M in this time: a limit or the wind holds the vehicle.
 STUCK_S = 12.0
 GAIN_M = 0.5
 SPEED_MARGIN = 1.25
-# Nearer than this to the end the nose no longer follows the way.
+# Nearer than this to the end the yaw no longer follows the path.
 KEEP_NOSE_M = 2.0
 
 
 class PathFlight(Behaviour):
-    """Flies the path that `_path` makes when it begins.
+    """Flies the path that `_path` builds at the start.
 
     Args:
         speed_mps: along it, at most.
         laps: of a closed path; 0: until another command.
-        heading_rad: of the nose throughout; None: along the way where `nose_along`, else as it is.
+        heading_rad: constant yaw; None: along the path if `nose_along`, else unchanged.
     """
 
     requirements = frozenset({Requirement.POSITION, Requirement.IN_AIR})
@@ -61,11 +61,11 @@ class PathFlight(Behaviour):
 
     @abstractmethod
     def _path(self, context: BehaviourContext) -> Path:
-        """The path, from where the vehicle is. Raises ValueError with a line that says why there is none."""
+        """Build the path from the vehicle's position. Raises ValueError with the reason if there is none."""
 
     @abstractmethod
-    def _active(self) -> str:
-        """What to say when it was flown."""
+    def _success_text(self) -> str:
+        """The reason of a successful outcome."""
 
     def on_activate(self, context: BehaviourContext) -> None:
         _, self._yaw_rad = position_and_yaw(context.state)
@@ -78,7 +78,7 @@ class PathFlight(Behaviour):
             self._problem = str(error)
 
     def resume(self, context: BehaviourContext) -> None:
-        """Something else was flown in between: the way goes on where it was left."""
+        """Continue the path after an interruption."""
         self._best_m, self._best_ns = -math.inf, context.now_ns
         self._arrival, self._controller = Arrival(), PositionController()
 
@@ -91,9 +91,9 @@ class PathFlight(Behaviour):
         velocity = follower.velocity(position, ground_speed(state))
         end = follower.end_ned_m
         away_m = math.inf if end is None or follower.left_m > END_M else math.dist(end, position)
-        turned = self._heading_rad is None or abs(wrap_angle(self._heading_rad - yaw_rad)) <= HEADING_RAD
-        if self._arrival.update(away_m, speed_of(state), now_ns) and turned:
-            return Outcome(True, self._active(), end)
+        aligned = self._heading_rad is None or abs(wrap_angle(self._heading_rad - yaw_rad)) <= HEADING_RAD
+        if self._arrival.update(away_m, speed_of(state), now_ns) and aligned:
+            return Outcome(True, self._success_text(), end)
         if stuck := self._stuck(follower, now_ns):
             return Outcome(False, stuck)
         bearing = follower.bearing()
@@ -104,12 +104,14 @@ class PathFlight(Behaviour):
         if end is not None and away_m < END_M:
             velocity = self._controller.velocity(end, state, dt_s, self._speed_mps)
         else:
-            over_ground = pressed((velocity[0], velocity[1]), state, SPEED_MARGIN * self._speed_mps)
+            over_ground = add_velocity_error(
+                (velocity[0], velocity[1]), state, SPEED_MARGIN * self._speed_mps
+            )
             velocity = (*over_ground, velocity[2])
         return Setpoint.velocity(velocity, now_ns, yaw_rad=self._yaw_rad)
 
     def _stuck(self, follower: PathFollower, now_ns: int) -> str | None:
-        """No way was gained for long: how far it came, and what may hold it."""
+        """The reason if there was no progress for `STUCK_S`; None: there was."""
         gained_m = follower.along_m - follower.off_m
         if gained_m > self._best_m + GAIN_M:
             self._best_m, self._best_ns = gained_m, now_ns
@@ -117,8 +119,8 @@ class PathFlight(Behaviour):
             return None
         left = f", {follower.left_m:.0f} m before its end" if math.isfinite(follower.left_m) else ""
         return (
-            f"{self.name} came no further for {STUCK_S:g} s, {follower.off_m:.1f} m beside the path{left}: "
-            f"a limit of [guidance] or the wind holds the vehicle"
+            f"{self.name}: no progress for {STUCK_S:g} s, {follower.off_m:.1f} m off the path{left}: "
+            f"held by a limit of [guidance] or by wind"
         )
 
     @property

@@ -1,4 +1,4 @@
-"""Round and round along waypoints, stopping for what is seen on the way, and on from where it was left."""
+"""Patrol: fly a closed path repeatedly, stop for detected objects, then continue."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ from companion.guidance.targets.target import Target
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
 
-# Slower than this the vehicle has stopped, and stays there.
+# Slower than this the vehicle counts as stopped, and holds.
 STANDING_MPS = 0.4
-# Without a single frame for so long a patrol is blind.
+# A patrol ends after this time without a frame.
 BLIND_TIMEOUT_S = 10.0
 
 
 @dataclass(slots=True)
 class _Known:
-    """An object that the patrol has stopped for."""
+    """An object for which the patrol has stopped."""
 
     class_name: str
     track_id: int | None
-    place: Vector3 | None
+    position_ned_m: Vector3 | None
     until_ns: float
 
 
-@behaviour("patrol", "fly a round of points again and again, and stop for what is seen on the way")
+@behaviour("patrol", "fly a closed path repeatedly, and stop for detected objects")
 class Patrol(Command):
     renamed: ClassVar[Mapping[str, str]] = {
         "do": "on_detection",
@@ -44,22 +44,22 @@ class Patrol(Command):
         "again": "revisit",
         "apart": "merge_radius",
     }
-    points: Annotated[str, Points("points", "the round: north,east or north,east,height, metres from home")]
-    class_names: Annotated[str, ClassNames("classes", "what to stop for, parted by commas")]
+    points: Annotated[str, Points("points", "the path: north,east or north,east,height, metres from home")]
+    class_names: Annotated[str, ClassNames("classes", "what to stop for, separated by commas")]
     on_detection: Annotated[
         str, EnumArgument("on_detection", ("hold", "approach"), "stop and face it, or fly up to `distance`")
     ] = "hold"
     distance_m: Annotated[float, Number("distance", "m", 1.0, 100.0, "where an approach stops")] = 5.0
     dwell_s: Annotated[float, Number("dwell", "s", 0.0, 600.0, "time spent at an object")] = 5.0
     revisit_s: Annotated[
-        float, Number("revisit", "s", 0.0, 3600.0, "time within which the same object is passed by")
+        float, Number("revisit", "s", 0.0, 3600.0, "time within which the same object is ignored")
     ] = 120.0
     merge_radius_m: Annotated[
         float, Number("merge_radius", "m", 0.5, 100.0, "detections within this distance are one object")
     ] = 5.0
     speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "at most")] = 3.0
     laps: Annotated[float, Number("laps", "", 0.0, 1000.0, "how many; 0: until another command")] = 0.0
-    confidence: Annotated[float, Number("confidence", "", 0.05, 1.0, "least confidence that counts")] = 0.4
+    confidence: Annotated[float, Number("confidence", "", 0.05, 1.0, "minimum confidence")] = 0.4
 
     @property
     def endless(self) -> bool:
@@ -67,22 +67,22 @@ class Patrol(Command):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if len(self.places) < 2:
-            raise GrammarError("patrol: a round has at least two points")
+        if len(self.points_m) < 2:
+            raise GrammarError(f"patrol: points must be at least 2 points, got {len(self.points_m)}")
 
     @property
-    def places(self) -> tuple[tuple[float, ...], ...]:
+    def points_m(self) -> tuple[tuple[float, ...], ...]:
         """(north, east) or (north, east, height) of each point, metres from home."""
         return points_from(self.points)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The classes, each by itself."""
+        """The class names as a tuple."""
         return names_in(self.class_names)
 
     def build(self, context: BuildContext) -> Behaviour:
         return PatrolBehaviour(
-            self.places,
+            self.points_m,
             self.names,
             speed_mps=self.speed_mps,
             laps=self.laps,
@@ -95,15 +95,15 @@ class Patrol(Command):
 
 
 class PatrolBehaviour(Behaviour):
-    """Flies the round; stops for an object that counts as true, turns to it and says where it is.
+    """Flies the closed path; stops for a confirmed object, turns to it and logs its position.
 
     Args:
-        points: (north, east) or (north, east, height) metres from home; from the last on to the first.
-        speed_mps: along the way. laps: 0: until another command.
-        approach_m: fly to within so much of what was found; None: look at it from the way.
-        dwell_s: how long it stays there.
-        revisit_s: an object that was stopped for does not stop the patrol again within this time.
-        merge_radius_m: what is nearer than this to where an object was is the same one.
+        points: (north, east) or (north, east, height) metres from home; a closed path.
+        speed_mps: along the path. laps: 0: until another command.
+        approach_m: distance to which to approach a find; None: face it from the path.
+        dwell_s: time spent at an object.
+        revisit_s: an object does not stop the patrol again within this time.
+        merge_radius_m: detections within this distance of an object's position belong to it.
     """
 
     name = "patrol"
@@ -125,14 +125,14 @@ class PatrolBehaviour(Behaviour):
         self.class_names = tuple(class_names)
         if approach_m is not None:
             self.requirements = PatrolBehaviour.requirements | {Requirement.DEPTH_OR_SIZE}
-        self._way = FollowPathBehaviour(points, speed_mps, laps=laps, round_trip=True)
-        self._sightings = DetectionConfirmer(class_names, confidence)
+        self._route = FollowPathBehaviour(points, speed_mps, laps=laps, round_trip=True)
+        self._confirmer = DetectionConfirmer(class_names, confidence)
         self._speed_mps, self._confidence = speed_mps, confidence
         self._approach_m, self._dwell_s = approach_m, dwell_s
         self._revisit_s, self._merge_radius_m = revisit_s, merge_radius_m
         self._known: list[_Known] = []
         self._notes: list[str] = []
-        self._gaze: YawAligner | None = None
+        self._aligner: YawAligner | None = None
         self._reported = False
         self._approach: ApproachBehaviour | None = None
         self._wait_until_ns: float | None = None
@@ -143,13 +143,13 @@ class PatrolBehaviour(Behaviour):
 
     def goals(self, context: BehaviourContext) -> tuple[Vector3, ...]:
         """See Behaviour."""
-        return self._way.goals(context)
+        return self._route.goals(context)
 
     def on_activate(self, context: BehaviourContext) -> None:
-        self._way.on_activate(context)
-        self._sightings.reset(context.now_ns)
+        self._route.on_activate(context)
+        self._confirmer.reset(context.now_ns)
         self._known.clear()
-        self._gaze = self._approach = self._stop = self._blind_since_ns = self._wait_until_ns = None
+        self._aligner = self._approach = self._stop = self._blind_since_ns = self._wait_until_ns = None
         self._found = 0
 
     def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
@@ -159,17 +159,17 @@ class PatrolBehaviour(Behaviour):
         if not context.perception_fresh:
             return self._wait_blind(context, position)
         self._blind_since_ns = None
-        if self._gaze is not None:
-            return self._look_at(self._gaze, context, position, yaw_rad)
-        found = self._sightings.look(context, lambda target: not self._known_already(target, context))
+        if self._aligner is not None:
+            return self._inspect(self._aligner, context, position, yaw_rad)
+        found = self._confirmer.update(context, lambda target: not self._known_already(target, context))
         if found is not None:
-            self._gaze, self._reported, self._stop = YawAligner(found, context.now_ns), False, None
+            self._aligner, self._reported, self._stop = YawAligner(found, context.now_ns), False, None
             self._down_m = position[2]
             return self._stand(context, position, found.bearing_rad)
         if self._stop is not None:
-            # Blind for a moment, it stood there.
+            # It stopped while perception was stale.
             self._resume(context)
-        step = self._way.update(dt_s, context)
+        step = self._route.update(dt_s, context)
         if isinstance(step, Outcome) and step.success:
             stops = f"{self._found} {'stop' if self._found == 1 else 'stops'}"
             return Outcome(True, f"{step.reason}, {stops}")
@@ -182,32 +182,32 @@ class PatrolBehaviour(Behaviour):
     @property
     def status(self) -> str:
         if self._approach is not None:
-            return f"patrol, to what was found: {self._approach.status}"
-        if self._gaze is not None:
-            return f"patrol, looking at a {self._gaze.target.class_name}"
-        return self._way.status.replace(self._way.name, "patrol", 1)
+            return f"patrol, approaching a find: {self._approach.status}"
+        if self._aligner is not None:
+            return f"patrol, facing a {self._aligner.target.class_name}"
+        return self._route.status.replace(self._route.name, "patrol", 1)
 
-    def _look_at(
-        self, gaze: YawAligner, context: BehaviourContext, position: Vector3, yaw_rad: float
+    def _inspect(
+        self, aligner: YawAligner, context: BehaviourContext, position: Vector3, yaw_rad: float
     ) -> BehaviourOutput:
-        """Stand, turn to it, tell of it; then go there, or stay for a while."""
+        """Stop, face the object and log it; then approach it, or dwell."""
         now_ns = context.now_ns
-        gaze.follow(self._sightings.fresh(context))
+        aligner.follow(self._confirmer.fresh(context))
         if self._wait_until_ns is not None:
-            self._remember(gaze.target, now_ns)
+            self._remember(aligner.target, now_ns)
             if now_ns >= self._wait_until_ns:
                 return self._go_on(context, position)
-        elif gaze.lost(now_ns):
-            self._note(f"lost sight of a {_named(gaze.target)} before it was faced")
-            self._remember(gaze.target, now_ns)
+        elif aligner.lost(now_ns):
+            self._note(f"lost a {_named(aligner.target)} before facing it")
+            self._remember(aligner.target, now_ns)
             return self._go_on(context, position)
-        elif gaze.faced(yaw_rad, now_ns):
+        elif aligner.faced(yaw_rad, now_ns):
             self._found += 1
-            self._remember(gaze.target, now_ns)
-            self._note(f"found a {_named(gaze.target)}, {self._place_text(gaze.target, context)}")
+            self._remember(aligner.target, now_ns)
+            self._note(f"found a {_named(aligner.target)}, {self._position_text(aligner.target, context)}")
             if self._approach_m is not None:
                 self._approach = ApproachBehaviour(
-                    gaze.target.class_name,
+                    aligner.target.class_name,
                     distance_m=self._approach_m,
                     speed_mps=min(self._speed_mps, 3.0),
                     confidence=min(0.3, self._confidence),
@@ -215,7 +215,7 @@ class PatrolBehaviour(Behaviour):
                 self._approach.on_activate(context)
                 return self._fly_there(self._approach, 0.0, context, position)
             self._wait_until_ns = now_ns + self._dwell_s * 1e9
-        return self._stand(context, position, gaze.target.bearing_rad)
+        return self._stand(context, position, aligner.target.bearing_rad)
 
     def _fly_there(
         self, approach: ApproachBehaviour, dt_s: float, context: BehaviourContext, position: Vector3
@@ -226,41 +226,41 @@ class PatrolBehaviour(Behaviour):
         approach.on_deactivate()
         self._approach = None
         self._note(step.reason)
-        # What is seen from here is what was flown to: it is still looked at while waiting.
+        # The object ahead is the one approached: it is still updated while waiting.
         self._stop, self._wait_until_ns = None, context.now_ns + self._dwell_s * 1e9
         _, yaw_rad = position_and_yaw(context.state)
         return self._stand(context, position, yaw_rad)
 
     def _stand(self, context: BehaviourContext, position: Vector3, bearing_rad: float) -> Setpoint:
-        """Brake, stay where the vehicle comes to rest, nose to a direction."""
+        """Brake, hold where the vehicle comes to rest, nose to a bearing."""
         if self._stop is None and ground_speed(context.state) < STANDING_MPS:
             self._stop = (position[0], position[1], self._down_m)
         velocity = (0.0, 0.0, 0.0) if self._stop is None else stay_at(self._stop, position)
         return Setpoint.velocity(velocity, context.now_ns, yaw_rad=bearing_rad)
 
     def _go_on(self, context: BehaviourContext, position: Vector3) -> BehaviourOutput:
-        self._gaze = self._wait_until_ns = None
-        self._sightings.forget()
+        self._aligner = self._wait_until_ns = None
+        self._confirmer.forget()
         self._resume(context)
-        return self._way.update(0.0, context)
+        return self._route.update(0.0, context)
 
     def _resume(self, context: BehaviourContext) -> None:
         self._stop = None
-        self._way.resume(context)
+        self._route.resume(context)
 
     def _wait_blind(self, context: BehaviourContext, position: Vector3) -> BehaviourOutput:
-        """Nothing is seen at all: flying on would leave a part of the way unseen."""
+        """Perception is stale: stop, so that no part of the path is flown unseen."""
         now_ns = context.now_ns
         if self._blind_since_ns is None:
             self._blind_since_ns, self._down_m, self._stop = now_ns, position[2], None
         if now_ns - self._blind_since_ns > BLIND_TIMEOUT_S * 1e9:
-            why = context.why_blind("nothing came from the detector")
+            why = context.perception_fault("no detections received")
             return Outcome(False, f"{why} for {BLIND_TIMEOUT_S:g} s")
         _, yaw_rad = position_and_yaw(context.state)
         return self._stand(context, position, yaw_rad)
 
     def _known_already(self, target: Target, context: BehaviourContext) -> bool:
-        """Whether the patrol stopped for it lately. One that moves is followed in memory."""
+        """Whether the patrol stopped for it within `revisit_s`. Updates the position of a moving object."""
         self._known = [known for known in self._known if known.until_ns > context.now_ns]
         for known in self._known:
             if self._same(known, target):
@@ -282,16 +282,16 @@ class PatrolBehaviour(Behaviour):
             return False
         if known.track_id is not None and known.track_id == target.track_id:
             return True
-        if known.place is None or target.position_ned_m is None:
+        if known.position_ned_m is None or target.position_ned_m is None:
             return False
-        return math.dist(known.place[:2], target.position_ned_m[:2]) <= self._merge_radius_m
+        return math.dist(known.position_ned_m[:2], target.position_ned_m[:2]) <= self._merge_radius_m
 
-    def _place_text(self, target: Target, context: BehaviourContext) -> str:
-        place = target.position_ned_m
-        if place is None:
+    def _position_text(self, target: Target, context: BehaviourContext) -> str:
+        position = target.position_ned_m
+        if position is None:
             return f"bearing {math.degrees(target.bearing_rad) % 360:.0f}°, range unknown"
         home = home_of(context.state)
-        north, east = place[0] - home[0], place[1] - home[1]
+        north, east = position[0] - home[0], position[1] - home[1]
         return f"{target.ground_range_m:.1f} m away, {north:.1f} m north and {east:.1f} m east of home"
 
     def _note(self, text: str) -> None:
@@ -303,5 +303,5 @@ def _named(target: Target) -> str:
 
 
 def _update(known: _Known, target: Target) -> None:
-    known.place = target.position_ned_m or known.place
+    known.position_ned_m = target.position_ned_m or known.position_ned_m
     known.track_id = target.track_id if target.track_id is not None else known.track_id

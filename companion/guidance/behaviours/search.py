@@ -1,4 +1,4 @@
-"""Search an area along a pattern until an object of a class is found, then stop and face it."""
+"""Area search: fly a pattern until an object of a class is found, then stop and face it."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from companion.vehicle.state import Vector3
 STANDING_MPS = 0.4
 
 
-@behaviour("seek", "turn, or search an area, until an object of the class is seen; then face it")
+@behaviour("seek", "turn, or search an area, until an object of the class is found; then face it")
 class Seek(Command):
-    class_name: Annotated[str, ClassName("class", "what to look for")]
+    class_name: Annotated[str, ClassName("class", "what to search for")]
     laps: Annotated[float, Number("laps", "", 0.25, 20.0, "turns before giving up")] = 2.0
     rate_radps: Annotated[float, Number("rate", "rad/s", 0.05, 1.0, "how fast to turn")] = 0.5
-    confidence: Annotated[float, Number("confidence", "", 0.05, 1.0, "least confidence that counts")] = 0.4
+    confidence: Annotated[float, Number("confidence", "", 0.05, 1.0, "minimum confidence")] = 0.4
     direction: Annotated[
         str, EnumArgument("direction", ("clockwise", "counterclockwise"), "seen from above")
     ] = "clockwise"
@@ -45,15 +45,16 @@ class Seek(Command):
         float | None, Number("height", "m", 1.0, 1000.0, "of the lawnmower's area, south to north")
     ] = None
     spacing_m: Annotated[
-        float | None, Number("spacing", "m", 1.0, 200.0, "between strips; else what the camera sees")
+        float | None,
+        Number("spacing", "m", 1.0, 200.0, "between strips; default: from the camera's footprint"),
     ] = None
     speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "over an area, at most")] = 2.0
     sweep_deg: Annotated[
         float | None,
-        Number("sweep", "deg", -90.0, 90.0, "gimbal up and down between level and this; below is negative"),
+        Number("sweep", "deg", -90.0, 90.0, "gimbal sweep between level and this pitch; below is negative"),
     ] = None
     sweep_rate_dps: Annotated[
-        float, Number("sweep_rate", "deg/s", 2.0, 60.0, "of the gimbal; slower, the turn is slower too")
+        float, Number("sweep_rate", "deg/s", 2.0, 60.0, "of the gimbal; slower also slows the turn")
     ] = USUAL_RATE_DPS
 
     def __post_init__(self) -> None:
@@ -63,7 +64,7 @@ class Seek(Command):
                 f"seek: sweep must be {LEAST_SWEEP_DEG:g} deg or more from level, got {self.sweep_deg:g}"
             )
         if self.sweep_deg is not None and self.pattern != "turn":
-            raise GrammarError(f"seek: pattern={self.pattern} takes no sweep")
+            raise GrammarError(f"seek: pattern={self.pattern} does not use sweep")
         if self.sweep_deg is None and self.sweep_rate_dps != USUAL_RATE_DPS:
             raise GrammarError("seek: sweep_rate needs sweep")
         given = {
@@ -78,7 +79,7 @@ class Seek(Command):
             if value is None and key in needed:
                 raise GrammarError(f"seek: pattern={self.pattern} needs {' and '.join(needed)}")
             if value is not None and key not in allowed:
-                raise GrammarError(f"seek: pattern={self.pattern} takes no {key}")
+                raise GrammarError(f"seek: pattern={self.pattern} does not use {key}")
 
     def build(self, context: BuildContext) -> Behaviour:
         if self.pattern != "turn":
@@ -109,12 +110,12 @@ class Seek(Command):
 
 
 class SearchBehaviour(PathFlight):
-    """Flies an expanding square or a lawnmower's way about where it begins, nose along the way.
+    """Flies an expanding square or a lawnmower pattern about its start, nose along the path.
 
     Args:
         radius_m: half a side of the expanding square. size_m: (west to east, south to north) of the
             lawnmower's area. Exactly one of them.
-        spacing_m: of neighbouring strips; None: as `footprint` allows at the height flown.
+        spacing_m: between strips; None: from `footprint` at the current height.
     """
 
     name = "seek"
@@ -138,15 +139,15 @@ class SearchBehaviour(PathFlight):
         self._class_name = class_name
         self._radius_m, self._size_m = radius_m, size_m
         self._spacing_m, self._footprint = spacing_m, footprint
-        self._sightings = DetectionConfirmer((class_name,), confidence)
-        self._gaze: YawAligner | None = None
+        self._confirmer = DetectionConfirmer((class_name,), confidence)
+        self._aligner: YawAligner | None = None
         self._stop: Vector3 | None = None
         self._blind_since_ns: int | None = None
 
     def on_activate(self, context: BehaviourContext) -> None:
         super().on_activate(context)
-        self._sightings.reset(context.now_ns)
-        self._gaze = self._stop = self._blind_since_ns = None
+        self._confirmer.reset(context.now_ns)
+        self._aligner = self._stop = self._blind_since_ns = None
 
     def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
         now_ns = context.now_ns
@@ -154,35 +155,35 @@ class SearchBehaviour(PathFlight):
         if not context.perception_fresh:
             self._blind_since_ns = now_ns if self._blind_since_ns is None else self._blind_since_ns
             if now_ns - self._blind_since_ns > BLIND_TIMEOUT_S * 1e9:
-                why = context.why_blind("nothing came from the detector")
+                why = context.perception_fault("no detections received")
                 return Outcome(False, f"{why} for {BLIND_TIMEOUT_S:g} s")
             return self._stand(context, position, yaw_rad)
         self._blind_since_ns = None
-        if self._gaze is not None:
-            self._gaze.follow(self._sightings.fresh(context))
-            if self._gaze.faced(yaw_rad, now_ns):
-                return Outcome(True, found_text(self._gaze.target))
-            if not self._gaze.lost(now_ns):
-                return self._stand(context, position, self._gaze.target.bearing_rad)
-            self._gaze = None
-            self._sightings.forget()
-        elif (found := self._sightings.look(context)) is not None:
-            self._gaze, self._stop = YawAligner(found, now_ns), None
+        if self._aligner is not None:
+            self._aligner.follow(self._confirmer.fresh(context))
+            if self._aligner.faced(yaw_rad, now_ns):
+                return Outcome(True, found_text(self._aligner.target))
+            if not self._aligner.lost(now_ns):
+                return self._stand(context, position, self._aligner.target.bearing_rad)
+            self._aligner = None
+            self._confirmer.forget()
+        elif (found := self._confirmer.update(context)) is not None:
+            self._aligner, self._stop = YawAligner(found, now_ns), None
             return self._stand(context, position, found.bearing_rad)
         if self._stop is not None:
             self._stop = None
             self.resume(context)
         step = super().update(dt_s, context)
         if isinstance(step, Outcome) and step.success:
-            why = f": {DOUBTED}" if self._sightings.doubted else ""
-            return Outcome(False, f"no {self._class_name} seen in the whole area{why}")
+            why = f": {DOUBTED}" if self._confirmer.doubted else ""
+            return Outcome(False, f"no {self._class_name} found in the area{why}")
         return step
 
     @property
     def status(self) -> str:
-        if self._gaze is not None:
+        if self._aligner is not None:
             return f"facing the {self._class_name}"
-        return f"looking for a {self._class_name} over an area{super().status.removeprefix(self.name)}"
+        return f"searching an area for a {self._class_name}{super().status.removeprefix(self.name)}"
 
     def _stand(self, context: BehaviourContext, position: Vector3, bearing_rad: float) -> Setpoint:
         if self._stop is None and ground_speed(context.state) < STANDING_MPS:
@@ -195,17 +196,17 @@ class SearchBehaviour(PathFlight):
         spacing_m = self._spacing_m
         if spacing_m is None:
             if self._footprint is None:
-                raise ValueError("the camera's footprint is not known: give spacing")
+                raise ValueError("camera footprint unknown: set spacing")
             spacing_m = self._footprint.spacing_m(context.state.altitude_m or 0.0)
         if self._radius_m is not None:
             points = expanding_square(self._radius_m, spacing_m)
         else:
             assert self._size_m is not None
             points = lawnmower(*self._size_m, spacing_m)
-        places = [(position[0] + north, position[1] + east, position[2]) for north, east in points]
+        path = [(position[0] + north, position[1] + east, position[2]) for north, east in points]
         if self._radius_m is not None and len(points) == 1:
-            raise ValueError(f"from here strips {spacing_m:.0f} m apart show it all: use pattern=turn")
-        return Path([position, *places], self._speed_mps)
+            raise ValueError(f"one strip of {spacing_m:.0f} m covers the area: use pattern=turn")
+        return Path([position, *path], self._speed_mps)
 
-    def _active(self) -> str:
-        return "the whole area flown"
+    def _success_text(self) -> str:
+        return "whole area searched"

@@ -1,4 +1,4 @@
-"""Give the vehicle back to the autopilot: its own hold mode, and nothing of ours any more."""
+"""Stop: hand the vehicle over to the autopilot's hold mode."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from companion.vehicle.state import FlightMode
 TIMEOUT_S = 5.0
 
 
-@behaviour("stop", "end our command; the autopilot holds its position by itself")
+@behaviour("stop", "end our command; the autopilot holds the position")
 class Stop(Command):
     def build(self, context: BuildContext) -> Behaviour:
         return StopBehaviour()
 
 
 class StopBehaviour(Behaviour):
-    """Asks for HOLD and ends when the autopilot shows it."""
+    """Requests HOLD and ends when the autopilot shows it."""
 
     name = "stop"
 
@@ -34,6 +34,6 @@ class StopBehaviour(Behaviour):
         if self._asked and mode is FlightMode.HOLD:
             return Outcome(True, "stopped: the autopilot holds")
         if context.now_ns > self._until_ns:
-            return Outcome(False, f"hold mode was not reached in {TIMEOUT_S:g} s: {mode.value} mode")
+            return Outcome(False, f"hold mode not reached in {TIMEOUT_S:g} s: {mode.value} mode")
         self._asked = True
         return ModeRequest(FlightMode.HOLD)

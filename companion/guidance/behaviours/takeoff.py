@@ -19,14 +19,14 @@ from companion.guidance.registry import behaviour
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, Vector3, VehicleState
 
-# PX4 counts a take-off as done inside its altitude acceptance radius (NAV_MC_ALT_RAD, 0.8 m) and holds there:
-# measured 1.8-2.2 m of 2.5 m. What is left beyond this tolerance is climbed by setpoint.
+# PX4 ends a take-off inside its altitude acceptance radius (NAV_MC_ALT_RAD, 0.8 m) and holds there: measured
+# 1.8-2.2 m of 2.5 m. An error beyond this tolerance is climbed by setpoint.
 ALTITUDE_TOLERANCE_M = ARRIVED_M
-# Time for the autopilot's hold to come to rest before the height is judged.
+# Time for the autopilot's hold to settle before the height is checked.
 SETTLE_S = 1.0
-# So long within the tolerance, and it is there.
+# Arrival needs this long within the tolerance.
 THERE_S = 0.5
-# Arming, spooling up and a climb at half a metre a second.
+# Arming and spooling up, plus a climb at 0.5 m/s.
 BASE_TIMEOUT_S = 25.0
 SLOWEST_CLIMB_MPS = 0.5
 CLIMB_MPS = 1.0
@@ -41,7 +41,7 @@ class Takeoff(Command):
 
 
 class TakeoffBehaviour(Behaviour):
-    """Arms, takes off to `altitude_m` above home and ends when that height is reached."""
+    """Arms, takes off to `altitude_m` above home and ends at that height."""
 
     name = "takeoff"
 
@@ -57,12 +57,12 @@ class TakeoffBehaviour(Behaviour):
 
     @property
     def requirements(self) -> frozenset[Requirement]:  # type: ignore[override]
-        """The last of the climb is flown by setpoints: not without a fresh position."""
+        """The end of the climb is flown by setpoints and needs a fresh position."""
         climbing = set() if self._top is None else {Requirement.POSITION}
         return frozenset({Requirement.ON_GROUND} | climbing)
 
     def goals(self, context: BehaviourContext) -> tuple[Vector3, ...]:
-        """See Behaviour: the autopilot climbs there by itself, where no limit of setpoints holds."""
+        """See Behaviour: checked in advance, because the envelope does not limit the autopilot's climb."""
         state = context.state
         home = state.home_position_ned_m or (0.0, 0.0, 0.0)
         north, east, _ = state.position_ned_m or home
@@ -106,7 +106,7 @@ class TakeoffBehaviour(Behaviour):
 
     @staticmethod
     def _above(state: VehicleState, missing_m: float) -> Vector3:
-        """The place at the wanted height, over where the vehicle is; local NED."""
+        """The point at the wanted height above the vehicle's position, local NED."""
         north, east, down = state.position_ned_m or (0.0, 0.0, 0.0)
         return (north, east, down - missing_m)
 

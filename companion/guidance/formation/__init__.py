@@ -1,1 +1,1 @@
-"""Vehicles near each other: poses, separation, who is in a formation, who takes which slot."""
+"""Multiple vehicles: poses, separation, formation membership and slot assignment."""

@@ -1,9 +1,9 @@
-"""How vehicles that fly in one formation agree: on the plan, on who is in it, and on who takes which slot.
+"""Agreement of a formation's vehicles on plan, members and slots, without negotiation.
 
-Nobody is asked and nothing is waited for. Every vehicle tells its own note with its pose, and reads those of
-the others. Of the plans told the greatest holds for all, so a command to one of them changes the formation.
-Of those who are heard the one whose name comes first assigns the slots, and the others take what it tells;
-when it falls silent the next one does. Slots are assigned anew only when somebody comes, goes or wishes.
+Every vehicle publishes its own note with its pose, and reads those of the others. The greatest published plan
+holds for all, so a command to one vehicle changes the formation. The first by name of the vehicles that are
+not silent assigns the slots; the others adopt its assignment; when it falls silent the next one assigns.
+Slots are assigned again only when the members, the plan or the requested slots change.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from companion.geometry.formation import Vector3, assign, radius_m, slots
 from companion.guidance.formation.neighbours import Neighbour
 from companion.guidance.formation.pose import FormationNote, Plan
 
-# So long the slot of a silent vehicle is kept free: it may be where it was, and it may come back.
+# The slot of a silent vehicle is kept free for this long: it may still be there, or come back.
 CLOSE_UP_S = 5.0
 
 
 @dataclass(frozen=True, slots=True)
 class Agreement:
-    """What holds now.
+    """The current agreement.
 
     Attributes:
-        plan: what is flown. slots: name → slot, from 1. count: of slots.
-        by: who assigned them. members: names of all in it, also of the silent ones.
-        worst_error_m: of those that are heard, how far the farthest is from its slot.
+        plan: what is flown. slots: vehicle → slot, from 1. count: number of slots.
+        by: the vehicle that assigned them. members: names of all members, including silent ones.
+        worst_error_m: greatest slot error of the members that are not silent.
     """
 
     plan: Plan
@@ -37,24 +37,24 @@ class Agreement:
     worst_error_m: float = 0.0
 
     def offset(self, name: str, *, centre_taken: bool) -> Vector3 | None:
-        """The slot of a vehicle: (forward, right, down) metres of the leader; None: it has none yet."""
+        """A vehicle's slot offset, (forward, right, down) metres from the leader; None: none assigned yet."""
         number = self.slots.get(name)
         if number is None or number > self.count:
             return None
         return slots(self.plan.shape, self.count, self.plan.spacing_m, centre_taken=centre_taken)[number - 1]
 
     def reach_m(self, *, centre_taken: bool) -> float:
-        """How far out the outermost slot is."""
+        """Horizontal distance of the outermost slot, metres."""
         return radius_m(slots(self.plan.shape, self.count, self.plan.spacing_m, centre_taken=centre_taken))
 
 
 @dataclass
 class Group:
-    """One vehicle's part in a formation about a leader.
+    """One vehicle's membership in a formation about a leader.
 
     Args:
-        own: its name. leader: whom all follow. wish: the slot it shall have, from 1; None: any.
-        centre_taken: the leader is a vehicle, and its own place no slot.
+        own: its name. leader: name of the leader. wish: the slot requested for it, from 1; None: any.
+        centre_taken: the leader is a vehicle, and its own position is not a slot.
     """
 
     own: str
@@ -69,14 +69,14 @@ class Group:
     _basis: object = None
 
     def agree(
-        self, others: Sequence[Neighbour], places: dict[str, Vector3], own_error_m: float = 0.0
+        self, others: Sequence[Neighbour], positions: dict[str, Vector3], own_error_m: float = 0.0
     ) -> Agreement:
-        """What holds, by all that is heard now.
+        """Derive the agreement from the neighbours' current notes.
 
         Args:
-            others: all neighbours; those of other formations are passed over.
-            places: name → (forward, right, down) of the leader, of every neighbour and of this vehicle.
-            own_error_m: how far this vehicle is from its slot.
+            others: all neighbours; those of other formations are ignored.
+            positions: name → (forward, right, down) from the leader, of every neighbour and this vehicle.
+            own_error_m: slot error of this vehicle.
         """
         notes = {
             other.name: other.formation
@@ -85,21 +85,21 @@ class Group:
             and other.formation.leader == self.leader
             and other.age_s <= CLOSE_UP_S
         }
-        heard = [other.name for other in others if other.name in notes and not other.silent]
+        active = [other.name for other in others if other.name in notes and not other.silent]
         plan = self._agreed_plan([note.plan for note in notes.values()])
-        by = min([self.own, *heard])
+        by = min([self.own, *active])
         if by == self.own:
-            self._assign(plan, notes, places)
+            self._assign(plan, notes, positions)
         elif notes[by].plan == plan and notes[by].count:
             self._slots, self._count, self._basis = dict(notes[by].slots), notes[by].count, None
-        worst = max([own_error_m, *(notes[name].error_m for name in heard)])
+        worst = max([own_error_m, *(notes[name].error_m for name in active)])
         members = tuple(sorted([self.own, *notes]))
         return Agreement(plan, dict(self._slots), self._count, by, members, worst)
 
-    def _agreed_plan(self, told: Sequence[Plan]) -> Plan:
-        newest = max(told, default=None)
+    def _agreed_plan(self, plans: Sequence[Plan]) -> Plan:
+        newest = max(plans, default=None)
         if self._plan is None:
-            # A command that says what is flown already joins; any other is a newer plan.
+            # A command equal to the flown plan joins it; any other is a newer plan.
             if newest is not None and (newest.shape, newest.spacing_m) == (self.shape, self.spacing_m):
                 self._plan = newest
             else:
@@ -109,7 +109,7 @@ class Group:
             self._plan = max(self._plan, newest)
         return self._plan
 
-    def _assign(self, plan: Plan, notes: dict[str, FormationNote], places: dict[str, Vector3]) -> None:
+    def _assign(self, plan: Plan, notes: dict[str, FormationNote], positions: dict[str, Vector3]) -> None:
         wishes = {self.own: self.wish, **{name: note.wish for name, note in notes.items()}}
         basis = (plan, tuple(sorted(wishes.items())))
         if basis == self._basis:
@@ -122,9 +122,9 @@ class Group:
         self._count = max([len(wishes), *granted.values()])
         offsets = slots(plan.shape, self._count, plan.spacing_m, centre_taken=self.centre_taken)
         free = [number for number in range(1, self._count + 1) if number not in granted.values()]
-        # Who wished for a taken slot gets none: its operator is told so.
+        # A vehicle that requested an occupied slot gets none; its behaviour ends with that reason.
         rest = [name for name in sorted(wishes) if wishes[name] is None]
-        # The best slots are filled first: none stays empty before one that is taken.
+        # Slots are filled in order, without gaps.
         free = free[: len(rest)]
-        taken = assign([places[name] for name in rest], [offsets[number - 1] for number in free])
-        self._slots = {**granted, **{name: free[index] for name, index in zip(rest, taken, strict=True)}}
+        indices = assign([positions[name] for name in rest], [offsets[number - 1] for number in free])
+        self._slots = {**granted, **{name: free[index] for name, index in zip(rest, indices, strict=True)}}

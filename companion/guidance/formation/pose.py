@@ -1,7 +1,7 @@
-"""What a vehicle tells the others of itself, as it goes over the bus: `companion/<vehicle>/pose`.
+"""The pose message that vehicles share: `companion/<vehicle>/pose`.
 
-Places are latitude, longitude and height above sea level, so that vehicles with local origins of their own
-fit together. Stamps are of the sender's clock, which no receiver knows; see `neighbours.py`.
+Positions are latitude, longitude and height above sea level, because every vehicle has its own local origin.
+Stamps are of the sender's clock, whose offset is unknown to receivers; see `neighbours.py`.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ ROLES = ("alone", "leader", "follower", "virtual")
 
 
 class PoseError(ValueError):
-    """What came is no pose. The message is one line for a person."""
+    """The message is not a valid pose. The text is one line for a person."""
 
 
 @dataclass(frozen=True, slots=True, order=True)
 class Plan:
-    """What is flown. Of two plans the greater holds: whoever commands anew counts one on."""
+    """A formation plan. Of two plans the greater one holds; every new command increments `version`."""
 
     version: int
     author: str
@@ -35,14 +35,14 @@ class Plan:
 
 @dataclass(frozen=True, slots=True)
 class Structure:
-    """Where a virtual structure is on its path.
+    """State of a virtual structure on its path.
 
     Attributes:
         place: latitude and longitude, degrees, and height above sea level, metres.
-        velocity_ned_mps, heading_rad: of its leader that is not there.
-        origin: where the path's points are measured from, written as `place`.
-        along_m: how far along the path it has come.
-        over: it stands at the end of its path, and all vehicles are in their slots.
+        velocity_ned_mps, heading_rad: of its virtual leader.
+        origin: origin of the path's points, in the format of `place`.
+        along_m: progress along the path.
+        over: it is at the end of its path, and all vehicles are in their slots.
     """
 
     place: Vector3
@@ -55,17 +55,17 @@ class Structure:
 
 @dataclass(frozen=True, slots=True)
 class FormationNote:
-    """How a vehicle flies in a formation.
+    """A vehicle's part in a formation.
 
     Attributes:
-        leader: whom it follows. plan: what it takes for the plan.
-        wish: the slot its operator asked for, from 1; None: any.
-        error_m: how far it is from its slot.
-        slots: who flies in which slot, from 1, as this vehicle has assigned them; of several that have, the
-            one whose name comes first counts.
-        count: how many slots there are.
+        leader: name of the leader. plan: the plan it follows.
+        wish: the slot its operator requested, from 1; None: any.
+        error_m: distance to its slot.
+        slots: (vehicle, slot from 1) as assigned by this vehicle; of several assigning vehicles the first
+            by name holds.
+        count: number of slots.
         heading_rad, turn_rate_radps: of the formation, which turns slower than a leader can.
-        structure: of a virtual structure, where it is.
+        structure: state of the virtual structure, if any.
     """
 
     leader: str
@@ -81,15 +81,15 @@ class FormationNote:
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """One message.
+    """One pose message.
 
     Attributes:
-        vehicle: its name. source: changes when its service starts anew.
+        vehicle: its name. source: changes when its service restarts.
         published_ns: by the sender's CLOCK_MONOTONIC. age_s: of the position, when it was published.
         altitude_m: above sea level. heading_rad: clockwise from north.
         turn_rate_radps: of the heading, clockwise.
-        role: alone, leader, follower or virtual (a leader that is not there).
-        airborne: it flies.
+        role: alone, leader, follower or virtual (not a real vehicle).
+        airborne: armed and not on the ground.
     """
 
     vehicle: str
@@ -108,13 +108,13 @@ class Pose:
 
 
 def global_problem(state: VehicleState, now_ns: int) -> str | None:
-    """Why the vehicle does not know where on earth it is; None: it does."""
+    """Why the vehicle's global position is unknown; None: it is known."""
     if state.position_fault(now_ns) is not None or state.velocity_ned_mps is None:
-        return "its own position is not known"
+        return "own position unknown"
     if not all(map(math.isfinite, (state.latitude_deg, state.longitude_deg, state.altitude_amsl_m))):
-        return "its own latitude and longitude are not known"
+        return "own latitude and longitude unknown"
     age_s = (now_ns - state.global_ns) / 1e9
-    return f"its own latitude and longitude are {age_s:.1f} s old" if age_s > GLOBAL_MAX_AGE_S else None
+    return f"own latitude and longitude are {age_s:.1f} s old" if age_s > GLOBAL_MAX_AGE_S else None
 
 
 def pose_of(
@@ -126,7 +126,7 @@ def pose_of(
     role: str = "alone",
     formation: FormationNote | None = None,
 ) -> Pose | None:
-    """What to tell of a vehicle now; None while it does not know where on earth it is."""
+    """The pose of a vehicle now; None while its global position is unknown."""
     yaw_rad = state.yaw_rad
     if global_problem(state, now_ns) is not None or yaw_rad is None or state.velocity_ned_mps is None:
         return None
@@ -148,19 +148,19 @@ def pose_of(
 
 
 def turn_rate(state: VehicleState) -> float:
-    """How fast the heading turns, rad/s clockwise: body rates through roll and pitch."""
+    """Turn rate of the heading, rad/s clockwise, from body rates, roll and pitch."""
     if state.attitude is None or state.angular_velocity_frd_radps is None:
         return 0.0
     w, x, y, z = state.attitude
     _, pitch_rate, yaw_rate = state.angular_velocity_frd_radps
     roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
-    # Upright within reason: straight up there is no heading to turn.
+    # Bounded near 90° of pitch, where the heading is undefined.
     return (math.sin(roll) * pitch_rate + math.cos(roll) * yaw_rate) / max(0.2, math.cos(pitch))
 
 
 def pose_message(pose: Pose) -> dict[str, Any]:
-    """As it is published, JSON-able."""
+    """A pose as published (JSON-compatible)."""
     return {
         "vehicle": pose.vehicle,
         "source": pose.source,
@@ -212,7 +212,7 @@ def _note_message(note: FormationNote) -> dict[str, Any]:
 
 
 def pose_from_message(message: Any) -> Pose:
-    """What was published. Raises PoseError for what is none: it came off the network."""
+    """Parse and validate a published pose. Raises PoseError."""
     fields = _Fields(message, "pose")
     role = fields.text("role")
     if role not in ROLES:
@@ -269,7 +269,7 @@ def _structure_from(message: Any) -> Structure:
 
 
 class _Fields:
-    """An object's fields, each checked as it is read."""
+    """Fields of an object, validated as they are read."""
 
     def __init__(self, message: Any, what: str) -> None:
         if not isinstance(message, Mapping):
@@ -288,7 +288,7 @@ class _Fields:
     def text(self, key: str) -> str:
         value = self.value(key)
         if not isinstance(value, str) or not 1 <= len(value) <= 100:
-            raise PoseError(f"{self._what}: {key} must be a text of 1 to 100 characters, got {value!r:.50}")
+            raise PoseError(f"{self._what}: {key} must be a string of 1 to 100 characters, got {value!r:.50}")
         return value
 
     def number(self, key: str, low: float, high: float) -> float:
@@ -296,9 +296,9 @@ class _Fields:
 
     def whole(self, key: str, low: int) -> int:
         value = self.value(key)
-        # As large as a nanosecond stamp may be in 64 bits.
+        # The range of a 64-bit nanosecond stamp.
         if isinstance(value, bool) or not isinstance(value, int) or not low <= value < 2**63:
-            raise PoseError(f"{self._what}: {key} must be a whole number from {low}, got {value!r:.50}")
+            raise PoseError(f"{self._what}: {key} must be an integer of at least {low}, got {value!r:.50}")
         return value
 
     def vector(self, key: str, limit: float) -> Vector3:

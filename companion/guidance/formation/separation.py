@@ -1,13 +1,12 @@
-"""Apart from each other: no vehicle is flown nearer to another than a least distance.
+"""Separation: keep a minimum distance between vehicles.
 
-Towards a neighbour no more speed is left than can be taken off in the way that is there, and the neighbour's
-own way of stopping counts: one that flies ahead goes on for a while even when it brakes, one that comes
-nearer needs room itself. That is the car-following law of Gipps (1981, "A behavioural car-following model for
-computer simulation"): v <= sqrt((b·t)² + 2·b·way + v_ahead²) - b·t, with both braking at b and t the time
-until we answer, which grows with the age of what we know. Each neighbour so makes a half-space of velocities;
-what was asked for is brought into all of them by the least change, one after the other (van den Berg et al.
-2011, "Reciprocal n-body collision avoidance", with the line of centres for the plane). Standing still is in
-every half-space: a limit only takes away, and never makes anybody flee.
+The speed towards a neighbour is limited so that both can stop in the distance left, including the neighbour's
+own stopping distance, by the car-following law of Gipps (1981, "A behavioural car-following model for
+computer simulation"): v <= sqrt((b·t)² + 2·b·distance + v_ahead²) - b·t, with both braking at b and t our
+reaction time, which grows with the age of the pose. Each neighbour defines a half-space of velocities; the
+commanded velocity is projected into all of them one after the other (van den Berg et al. 2011, "Reciprocal
+n-body collision avoidance", with the plane normal to the line of centres). Zero velocity is in every
+half-space: a limit only reduces speed and never makes a vehicle move away.
 """
 
 from __future__ import annotations
@@ -19,24 +18,24 @@ from typing import NamedTuple
 from companion.guidance.formation.neighbours import Neighbour
 from companion.vehicle.state import Vector3
 
-# Kept on top of the least distance: two places are estimates, each some 0.4 m wrong, and gusts push.
+# Added to the minimum distance: two position estimates, each some 0.4 m wrong, and gusts.
 MARGIN_M = 1.0
-# How late a multirotor's velocity follows.
-ANSWER_S = 0.4
-# Closing speed for each metre left, at most. Both close, so it is half of what one could have alone:
-# velocities that follow by 0.3 s are then damped critically.
+# Delay of a multirotor's velocity response.
+REACTION_S = 0.4
+# Maximum closing speed per metre left. Both vehicles may close, so it is half of what one could have alone:
+# critically damped for velocities with a time constant of 0.3 s.
 GAIN_PER_S = 0.4
-# Part of the greatest acceleration that is kept for stopping, against a vehicle that answers late.
+# Part of the maximum acceleration that is planned for stopping; the rest covers the vehicle's delay.
 BRAKING = 0.5
-# Ways around somebody are looked for so far ahead, in steps of so much to either side.
+# Detours are searched this far ahead, in steps of this angle to either side.
 LOOK_M = 12.0
 TURN_RAD = math.radians(15.0)
 _TURNS = 10
 _FAVOUR = 2
-# Speed away from somebody too near, for each metre that is missing, and at most.
+# Speed away from a vehicle that is too near, per metre missing, and its limit.
 PUSH_PER_S = 0.8
 PUSH_MPS = 1.0
-# What slows down for one may push towards another: so often it is taken back.
+# Correcting for one constraint may violate another: maximum number of projections.
 _ROUNDS = 20
 
 
@@ -54,14 +53,14 @@ def allowed_speed(left_m: float, ahead_mps: float, age_s: float, braking_mps2: f
     """The speed towards a neighbour from which both can stop in time; never less than 0.
 
     Args:
-        left_m: way that is left. ahead_mps: of the neighbour, away from us; negative: towards us.
-        age_s: of what is known of it. braking_mps2: of both.
+        left_m: distance left. ahead_mps: of the neighbour, away from us; negative: towards us.
+        age_s: of its pose. braking_mps2: of both.
     """
-    answer_s = ANSWER_S + age_s
+    reaction_s = REACTION_S + age_s
     if ahead_mps < 0.0:
-        left_m -= -ahead_mps * answer_s + ahead_mps**2 / (2.0 * braking_mps2)
+        left_m -= -ahead_mps * reaction_s + ahead_mps**2 / (2.0 * braking_mps2)
         ahead_mps = 0.0
-    late = braking_mps2 * answer_s
+    late = braking_mps2 * reaction_s
     square = late**2 + 2.0 * braking_mps2 * left_m + ahead_mps**2
     stopping = math.sqrt(max(0.0, square)) - late
     return max(0.0, min(stopping, ahead_mps + GAIN_PER_S * max(0.0, left_m)))
@@ -70,85 +69,89 @@ def allowed_speed(left_m: float, ahead_mps: float, age_s: float, braking_mps2: f
 def constraints_at(
     position: Vector3, neighbours: Sequence[Neighbour], separation_m: float, braking_mps2: float
 ) -> list[SpeedConstraint]:
-    """The limits at a place (local NED): one for every neighbour that is really there."""
-    rows = []
+    """The constraints at a position (local NED): one for every real neighbour."""
+    constraints = []
     for neighbour in neighbours:
         if neighbour.virtual:
             continue
         offset = [n - p for n, p in zip(neighbour.position_ned_m, position, strict=True)]
         distance_m = math.hypot(*offset)
-        # In the same place every way leads apart.
+        # At the same position every direction leads apart.
         north, east, down = (part / distance_m for part in offset) if distance_m > 1e-6 else (0.0, 0.0, 0.0)
         ahead = sum(v * d for v, d in zip(neighbour.velocity_ned_mps, (north, east, down), strict=True))
         left_m = distance_m - separation_m - MARGIN_M
-        # A silent one is at rest; how late we answer does not grow with its silence.
+        # A silent neighbour is taken to be at rest, so its age does not add to the reaction time.
         age_s = 0.0 if neighbour.silent else neighbour.age_s
-        rows.append(
+        constraints.append(
             SpeedConstraint(
                 north, east, down, allowed_speed(left_m, ahead, age_s, braking_mps2), neighbour.name
             )
         )
-    return rows
+    return constraints
 
 
-def apply_separation(velocity: Vector3, rows: Sequence[SpeedConstraint]) -> tuple[Vector3, tuple[str, ...]]:
-    """What is left of a velocity (NED), no faster than it came, and because of whom."""
+def apply_separation(
+    velocity: Vector3, constraints: Sequence[SpeedConstraint]
+) -> tuple[Vector3, tuple[str, ...]]:
+    """Limit a velocity (NED); returns it, never faster than the input, and the names that limited it."""
     top = math.hypot(*velocity)
-    acting = [row for row in rows if row.allowed_mps < top]
+    acting = [constraint for constraint in constraints if constraint.allowed_mps < top]
     names: dict[str, None] = {}
     for _ in range(_ROUNDS):
         before = velocity
-        for row in acting:
-            excess = _towards(velocity, row) - row.allowed_mps
+        for constraint in acting:
+            excess = _towards(velocity, constraint) - constraint.allowed_mps
             if excess > 1e-9:
-                names[row.name] = None
+                names[constraint.name] = None
                 velocity = (
-                    velocity[0] - excess * row.north,
-                    velocity[1] - excess * row.east,
-                    velocity[2] - excess * row.down,
+                    velocity[0] - excess * constraint.north,
+                    velocity[1] - excess * constraint.east,
+                    velocity[2] - excess * constraint.down,
                 )
         if velocity == before:
             return velocity, tuple(names)
-    # Standing still keeps every limit, so what still breaks one is shortened towards that.
-    share = 1.0
-    for row in acting:
-        towards = _towards(velocity, row)
-        if towards > row.allowed_mps + 1e-6:
-            share = min(share, row.allowed_mps / towards)
-    return (velocity[0] * share, velocity[1] * share, velocity[2] * share), tuple(names)
+    # Zero velocity satisfies every constraint: scale down what still violates one.
+    fraction = 1.0
+    for constraint in acting:
+        towards = _towards(velocity, constraint)
+        if towards > constraint.allowed_mps + 1e-6:
+            fraction = min(fraction, constraint.allowed_mps / towards)
+    return (velocity[0] * fraction, velocity[1] * fraction, velocity[2] * fraction), tuple(names)
 
 
-def level_constraints(rows: Sequence[SpeedConstraint], down_mps: float) -> list[tuple[float, float, float]]:
-    """The same limits for a velocity over ground (north, east, speed), beside this one downwards."""
+def level_constraints(
+    constraints: Sequence[SpeedConstraint], down_mps: float
+) -> list[tuple[float, float, float]]:
+    """The constraints on horizontal velocity (north, east, speed), given the vertical one."""
     level = []
-    for row in rows:
-        share = math.hypot(row.north, row.east)
-        if share > 1e-3:
-            allowed = max(0.0, (row.allowed_mps - down_mps * row.down) / share)
-            level.append((row.north / share, row.east / share, allowed))
+    for constraint in constraints:
+        fraction = math.hypot(constraint.north, constraint.east)
+        if fraction > 1e-3:
+            allowed = max(0.0, (constraint.allowed_mps - down_mps * constraint.down) / fraction)
+            level.append((constraint.north / fraction, constraint.east / fraction, allowed))
     return level
 
 
 def avoid(
     wanted: tuple[float, float],
-    way_m: float,
+    distance_m: float,
     position: Vector3,
     standing: Sequence[Neighbour],
     clearance_m: float,
     side: float = 1.0,
 ) -> tuple[tuple[float, float], float]:
-    """A velocity over ground (north, east) that leads past whoever stands in the way.
+    """A horizontal velocity (north, east) that leads around standing vehicles.
 
-    The straight way if it is free, else the free one that turns off it least. Both sides alike, the one it
-    turned to last is kept; first that is the right, as vehicles that meet head on both pass there.
+    The straight path if it is free, else the free direction with the least turn. Between equal sides the last
+    one is kept; initially the right, so that vehicles that meet head on both pass on the right.
 
     Args:
-        wanted: relative to those who stand. way_m: how far it is to go. standing: local NED.
-        clearance_m: wanted to everybody on the way.
-        side: what this told last: 1 right, -1 left.
+        wanted: relative to the standing vehicles. distance_m: to the goal. standing: local NED.
+        clearance_m: to keep to each of them.
+        side: the previously returned side: 1 right, -1 left.
 
     Returns:
-        The velocity, as fast as the wanted one where any way is free, and the side it turns to.
+        The velocity, as fast as the wanted one if any direction is free (else zero), and the side.
     """
     speed = math.hypot(*wanted)
     if speed < 1e-6:
@@ -160,8 +163,8 @@ def avoid(
         )
         if abs(offset[2]) < clearance_m
     ]
-    reach_m = min(way_m, LOOK_M)
-    # The other side must be better by _FAVOUR steps to be changed to.
+    reach_m = min(distance_m, LOOK_M)
+    # Changing sides must save at least _FAVOUR steps.
     turns = [
         0.0,
         *(
@@ -173,16 +176,16 @@ def avoid(
     ]
     for turn in turns:
         cosine, sine = math.cos(turn * TURN_RAD), math.sin(turn * TURN_RAD)
-        way = (wanted[0] * cosine - wanted[1] * sine, wanted[0] * sine + wanted[1] * cosine)
-        if all(_clear((way[0] / speed, way[1] / speed), reach_m, there, clearance_m) for there in near):
-            return way, side if turn == 0.0 else math.copysign(1.0, turn)
+        turned = (wanted[0] * cosine - wanted[1] * sine, wanted[0] * sine + wanted[1] * cosine)
+        if all(_clear((turned[0] / speed, turned[1] / speed), reach_m, there, clearance_m) for there in near):
+            return turned, side if turn == 0.0 else math.copysign(1.0, turn)
     return (0.0, 0.0), side
 
 
 def _clear(
     ahead: tuple[float, float], reach_m: float, there: tuple[float, float], clearance_m: float
 ) -> bool:
-    """Whether a straight way keeps clear of a place; from too near already: whether it leads away."""
+    """Whether a straight path keeps clear of a point; from inside the clearance: whether it leads away."""
     along = there[0] * ahead[0] + there[1] * ahead[1]
     if along <= 0.0:
         return True
@@ -192,12 +195,10 @@ def _clear(
     return math.hypot(there[0] - nearest * ahead[0], there[1] - nearest * ahead[1]) >= clearance_m
 
 
-def pushed_apart(
-    position: Vector3, neighbours: Sequence[Neighbour], distance_m: float
-) -> tuple[float, float]:
-    """A velocity over ground (north, east) away from everybody nearer than a distance.
+def repulsion(position: Vector3, neighbours: Sequence[Neighbour], distance_m: float) -> tuple[float, float]:
+    """A horizontal velocity (north, east) away from every neighbour nearer than a distance.
 
-    A limit cannot undo what a gust has done; a behaviour that flies among others can.
+    The limit only reduces speed; a behaviour that flies among others uses this to restore the distance.
     """
     north = east = 0.0
     for neighbour in neighbours:
@@ -212,5 +213,5 @@ def pushed_apart(
     return (north * scale, east * scale)
 
 
-def _towards(velocity: Vector3, row: SpeedConstraint) -> float:
-    return velocity[0] * row.north + velocity[1] * row.east + velocity[2] * row.down
+def _towards(velocity: Vector3, constraint: SpeedConstraint) -> float:
+    return velocity[0] * constraint.north + velocity[1] * constraint.east + velocity[2] * constraint.down

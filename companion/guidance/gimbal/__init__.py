@@ -1,1 +1,1 @@
-"""The camera's gimbal: whose it is, where it is to look."""
+"""The camera's gimbal: control, pointing, sweeping, tracking."""

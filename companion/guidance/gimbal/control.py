@@ -1,9 +1,9 @@
-"""Whose the gimbal is, and what to ask of its manager next. No link, no clock: `gimbal_controller` asks.
+"""Primary control of the gimbal: what to request of its manager next. No link and no clock.
 
-Control is taken when somebody wants the gimbal moved and given back when nobody does any more. It is never
-fought for: who has it at the beginning keeps it (the autopilot itself, which keeps it after a landing, is
-nobody), and once another has taken it, it is not taken again for the same errand. While the manager does not
-tell who has it, it may be a ground station's, and is not taken.
+Primary control is requested when the gimbal is to be moved and released afterwards. An existing owner is
+never displaced (the autopilot itself, which keeps control after a landing, does not count as one), and after
+another component has taken control, it is not requested again for the same owner. While the manager does not
+report the owner, it may be a ground station, and control is not requested.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from enum import StrEnum
 from companion.vehicle.gimbal import NOBODY, Address, GimbalAim, GimbalState, address_text
 
 AUTOPILOT_COMPONENT = 1  # MAV_COMP_ID_AUTOPILOT1
-# An aim that moves goes out so often at most; each is a command that is answered.
+# Minimum period of pointing commands; each is acknowledged.
 AIM_PERIOD_S = 0.1
 SAME_AIM_RAD = math.radians(0.2)
-# GIMBAL_MANAGER_STATUS may come once in two seconds, and what it shows may be from before we asked.
+# GIMBAL_MANAGER_STATUS may come every 2 s, and may show the state before our request.
 SHOWN_WITHIN_S = 2.5
-_UNTOLD = "its manager does not tell who has control of it"
+_UNKNOWN_OWNER = "primary control is not reported by its manager"
 
 
 class GimbalCommand(StrEnum):
-    """What is asked of a gimbal's manager."""
+    """Requests to a gimbal manager."""
 
     TAKE = "take"
     POINT = "point"
@@ -33,7 +33,7 @@ class GimbalCommand(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class GimbalRequest:
-    """One thing to ask; `aim` is for POINT."""
+    """One request; `aim` is for POINT."""
 
     ask: GimbalCommand
     aim: GimbalAim | None = None
@@ -43,12 +43,12 @@ class GimbalControl:
     """One client of one gimbal manager.
 
     Args:
-        own: whom our messages are from.
+        own: system and component id of our messages.
 
     Attributes:
-        held: control is ours, as far as we know.
-        pointed: the newest aim that was accepted for whom it is moved now; None: none yet.
-        problem: why it is not moved any more for whom it was moved; empty: nothing is wrong.
+        held: we have primary control, as far as known.
+        pointed: the newest accepted aim of the current owner; None: none yet.
+        problem: why the gimbal is not moved any more for the current owner; empty: no problem.
     """
 
     def __init__(self, own: Address) -> None:
@@ -65,24 +65,24 @@ class GimbalControl:
         self._doubted_ns: int | None = None
         self._give_back_due_ns: float = -math.inf
 
-    def elsewhere(self, gimbal: GimbalState | None) -> Address | None:
-        """Who is known to have control that is not to be taken from him; None: nobody is."""
+    def other_owner(self, gimbal: GimbalState | None) -> Address | None:
+        """The component in control that must not be displaced; None: none known."""
         primary = None if gimbal is None else gimbal.primary_control
         free = (None, NOBODY, self._own, (self._own[0], AUTOPILOT_COMPONENT))
         return None if primary in free else primary
 
     def holds(self, now_ns: int, gimbal: GimbalState | None) -> bool:
-        """Whether control is ours by what the manager shows now, which `update` may not have seen yet."""
+        """Whether we have control by the manager's newest status, which `update` may not have seen yet."""
         return self.held and self._taken_over(now_ns, gimbal) is None
 
     def update(
         self, now_ns: int, gimbal: GimbalState | None, aim: GimbalAim | None, owner: object | None
     ) -> GimbalRequest | None:
-        """What to ask now, if anything; `answered` must follow before more is asked.
+        """The next request, if any; `answered` must follow before the next one.
 
         Args:
-            aim: where it is to look; None: nobody wants it moved.
-            owner: who wants that. Another one begins anew, whatever stopped the one before.
+            aim: where to point; None: the gimbal is not to be moved.
+            owner: the object that sets the aim. A new one resets `problem` and `pointed`.
         """
         if owner is not self._owner:
             self._owner, self.problem, self.pointed = owner, "", None
@@ -90,7 +90,7 @@ class GimbalControl:
             self._shown = True
         if self.held and (why := self._taken_over(now_ns, gimbal)) is not None:
             self.held = False
-            if self._doubted_ns is None:  # else it was told already, of whose errand it was
+            if self._doubted_ns is None:  # else already reported
                 self.problem = why
         if self._asked is not None:
             return None
@@ -110,7 +110,7 @@ class GimbalControl:
         return self._ask(GimbalRequest(GimbalCommand.POINT, aim))
 
     def answered(self, now_ns: int, refused: str | None) -> None:
-        """What was asked was done, or why it was not."""
+        """Handle the answer to the pending request."""
         asked, self._asked = self._asked, None
         if asked is None:
             return
@@ -123,7 +123,7 @@ class GimbalControl:
             case GimbalCommand.GIVE_BACK if refused is None:
                 self.held, self._doubted_ns = False, None
             case GimbalCommand.GIVE_BACK:
-                # Still ours, perhaps: asked again when the manager shows that, but not at every word of it.
+                # Possibly still ours: released again when the manager shows it, at a limited rate.
                 self._doubted_ns, self._give_back_due_ns = now_ns, now_ns + SHOWN_WITHIN_S * 1e9
             case _:
                 self.problem = refused or ""
@@ -134,16 +134,16 @@ class GimbalControl:
         return request
 
     def _not_to_be_taken(self, now_ns: int, gimbal: GimbalState | None) -> str | None:
-        """Why control is not asked for, in words; None: whoever has it, it may be taken from him."""
+        """Why control must not be requested, in words; None: it may be."""
         if gimbal is None or not gimbal.control_known(now_ns):
-            return _UNTOLD
+            return _UNKNOWN_OWNER
         if self._doubted_ns is not None and gimbal.status_ns <= self._doubted_ns:
-            return _UNTOLD  # since the denial
-        who = self.elsewhere(gimbal)
-        return None if who is None else f"{address_text(who)} has control of it"
+            return _UNKNOWN_OWNER  # no status since the denial
+        who = self.other_owner(gimbal)
+        return None if who is None else f"{address_text(who)} has primary control"
 
     def _taken_over(self, now_ns: int, gimbal: GimbalState | None) -> str | None:
-        """Why control is not ours any more, by what the manager shows; None: it is, or it does not tell."""
+        """Why control is lost, by the manager's status; None: it is not, or not reported."""
         if gimbal is None or gimbal.primary_control is None or gimbal.status_ns <= self._taken_ns:
             return None
         primary = gimbal.primary_control
@@ -153,15 +153,15 @@ class GimbalControl:
         if not self._shown and primary == self._taken_from and waiting:
             return None
         if primary == NOBODY:
-            return "control of it was taken away"
-        return f"{address_text(primary)} has taken control of it"
+            return "primary control was removed"
+        return f"{address_text(primary)} has taken primary control"
 
     def _ours(self, now_ns: int, gimbal: GimbalState | None) -> bool:
-        """Whether there is something to give back.
+        """Whether there is control to release.
 
-        After a refusal only what the manager has shown since tells: given back by one who does not have it,
-        control may be lost to the one who does (PX4 compares system and component each by itself). That
-        may also be ours where only the answer to the taking was lost.
+        After a refusal only a newer status of the manager decides: a release by a component without control
+        may take it from its owner (PX4 compares system and component ids separately). We may also have
+        control if only the answer to our request was lost.
         """
         if self._doubted_ns is None:
             return self.held
@@ -172,7 +172,7 @@ class GimbalControl:
         return self.held and now_ns >= self._give_back_due_ns
 
     def _unsure(self, now_ns: int, gimbal: GimbalState | None) -> bool:
-        """Refused, and the manager has not shown since whose it is: it may be another's by now."""
+        """Whether a request was refused and the manager has not reported the owner since."""
         if self._doubted_ns is None or (gimbal is not None and gimbal.status_ns > self._doubted_ns):
             return False
         return now_ns - self._doubted_ns <= SHOWN_WITHIN_S * 1e9

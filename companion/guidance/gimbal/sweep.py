@@ -1,7 +1,7 @@
-"""The gimbal's way up and down while the vehicle turns, and how fast it may turn for nothing to be missed.
+"""Gimbal sweep in pitch while the vehicle turns, and the turn rate at which nothing is missed.
 
-Between two visits of the camera to the same pitch lies at most one whole way there and back. As long as the
-picture's width has not turned by in that time, everything between the ends comes into it.
+The camera returns to the same pitch after at most one full sweep there and back. If the vehicle turns by less
+than the image's width in that time, everything between the end pitches is seen.
 """
 
 from __future__ import annotations
@@ -10,28 +10,28 @@ import math
 
 from companion.vehicle.gimbal import GimbalAim
 
-# A shorter way up and down shows nothing that a camera at rest does not.
+# A smaller sweep shows nothing that a fixed camera does not.
 LEAST_SWEEP_DEG = 5.0
 USUAL_RATE_DPS = 20.0
-# Of the picture's width a fifth is not counted on: boxes at its edge are cut.
-COUNTED_ON = 0.8
-# So far the gimbal may be behind what it is asked before it is waited for: in angle, and in time.
+# Usable part of the image's width: boxes at its edge are cut.
+USABLE_WIDTH = 0.8
+# Lag of the gimbal that is tolerated before the sweep waits: angle, and time.
 BEHIND_RAD, BEHIND_S = math.radians(8.0), 0.4
 AT_END_RAD = math.radians(5.0)
-# Waited for so long, it does not follow at all.
+# After waiting this long, the gimbal counts as stuck.
 PATIENCE_S = 5.0
 
 
 class GimbalSweep:
-    """Between level and an end, at a rate. Pitches are radians above the horizon.
+    """A sweep between level and an end pitch. Pitches are radians above the horizon.
 
     Args:
-        end_rad: the other end, below the horizon or above.
-        rate_radps: how fast it pitches.
-        field_rad: what the camera sees from its left edge to its right.
+        end_rad: the end pitch, below the horizon or above.
+        rate_radps: pitch rate.
+        field_rad: the camera's horizontal field of view.
 
     Attributes:
-        waiting: the gimbal is behind, and what turns should stand.
+        waiting: the gimbal lags, and the vehicle should not turn.
     """
 
     def __init__(self, end_rad: float, rate_radps: float, field_rad: float) -> None:
@@ -44,29 +44,29 @@ class GimbalSweep:
 
     @property
     def turn_rate_radps(self) -> float:
-        """How fast the vehicle may turn."""
+        """Maximum turn rate of the vehicle."""
         there_and_back_s = 2.0 * abs(self.end_rad) / self._rate_radps
-        return COUNTED_ON * self._field_rad / there_and_back_s
+        return USABLE_WIDTH * self._field_rad / there_and_back_s
 
     @property
     def aim(self) -> GimbalAim | None:
-        """Where the gimbal is to look now; None before `begin`."""
+        """Where to point the gimbal now; None before `begin`."""
         return None if self._pitch_rad is None else GimbalAim(self._pitch_rad)
 
     def begin(self, measured_rad: float) -> None:
-        """From where the gimbal looks now, towards the end."""
+        """Start from the gimbal's current pitch, towards the end."""
         limit = math.pi / 2
         self._pitch_rad = self._began_rad = max(-limit, min(limit, measured_rad))
         self._goal_rad, self._waited_s, self.waiting = self.end_rad, 0.0, False
 
     def step(self, dt_s: float, measured_rad: float) -> None:
-        """Go on for `dt_s`, with the gimbal where it is measured to be; turn back at the ends."""
+        """Advance by `dt_s` with the gimbal at the measured pitch; reverse at the ends."""
         self.towards(self._goal_rad, dt_s, measured_rad)
         if self._pitch_rad == self._goal_rad and abs(measured_rad - self._goal_rad) <= AT_END_RAD:
             self._goal_rad = 0.0 if self._goal_rad == self.end_rad else self.end_rad
 
     def towards(self, pitch_rad: float, dt_s: float, measured_rad: float) -> None:
-        """Go towards a pitch and stay there; wait where the gimbal does not follow."""
+        """Move towards a pitch and stay there; wait while the gimbal lags."""
         assert self._pitch_rad is not None
         behind_rad = abs(self._pitch_rad - measured_rad)
         at_end = self._pitch_rad == pitch_rad
@@ -78,17 +78,17 @@ class GimbalSweep:
             self._pitch_rad += max(-reach, min(reach, pitch_rad - self._pitch_rad))
 
     def back(self, dt_s: float, measured_rad: float) -> bool:
-        """Go back to where it began. True: it is there."""
+        """Return to the initial pitch. True: reached."""
         self.towards(self._began_rad, dt_s, measured_rad)
         return self._pitch_rad == self._began_rad and not self.waiting
 
     def stuck(self, measured_rad: float) -> str | None:
-        """Why there is no use in going on, in words; None: the gimbal follows."""
+        """Why the sweep has failed, in words; None: the gimbal follows."""
         if self._waited_s <= PATIENCE_S or self._pitch_rad is None:
             return None
         return f"the gimbal does not follow: {gap_text(self._pitch_rad, measured_rad)}"
 
 
 def gap_text(asked_rad: float, measured_rad: float) -> str:
-    """What was asked of a gimbal and where it is, for people."""
-    return f"asked for {math.degrees(asked_rad):.0f}°, it is at {math.degrees(measured_rad):.0f}°"
+    """Commanded and measured pitch in words."""
+    return f"commanded {math.degrees(asked_rad):.0f}°, measured {math.degrees(measured_rad):.0f}°"

@@ -1,4 +1,4 @@
-"""Keeping the camera's gimbal on an object that is flown to: its pitch, as the nose keeps the bearing."""
+"""Gimbal tracking: keep the camera's pitch on an object while the vehicle's yaw keeps the bearing."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ GimbalUse = Annotated[
     str, EnumArgument("gimbal", ("leave", "track"), "leave it alone, or keep its camera on the object")
 ]
 
-# Straight below, an elevation says nothing of a height.
+# Straight below, an elevation does not determine a height.
 STEEPEST_RAD = math.radians(89.0)
-# Nearer than this it is above or below, and its direction swings with every centimetre.
+# Nearer than this the object is above or below, and its elevation is too sensitive.
 NEAREST_M = 0.1
-# The object's height stays: of each detection's word of it, so much is believed.
+# Smoothing of the object's height: weight of the newest detection.
 NEWEST_SHARE = 0.5
 
 
 class GimbalTracking:
-    """Where the gimbal looks so that an object stays in the middle of the picture's height.
+    """Pitch aim that keeps an object vertically centred in the image.
 
-    A detection tells the object's height, by its elevation and its range. At that height it is looked at
-    while the vehicle flies on and while the object is hidden.
+    A detection's elevation and range give the object's height. The gimbal points at that height while the
+    vehicle moves and while the object is hidden.
 
     Attributes:
-        aim: where the gimbal is to look; None: not begun, or nobody knows where it looks.
+        aim: where to point the gimbal; None: not started, or its attitude is unknown.
     """
 
     def __init__(self) -> None:
@@ -42,36 +42,36 @@ class GimbalTracking:
         self._behind_since_ns: int | None = None
 
     def begin(self, context: BehaviourContext) -> None:
-        """Stay where the gimbal looks, so that control of it is had when the object is seen."""
+        """Hold the current pitch, so that control is acquired before the object is seen."""
         gimbal = context.state.gimbal
         self.aim = self._seen = self._down_m = self._behind_since_ns = None
         self._begun_ns = context.now_ns
         if gimbal is not None and gimbal.pitch_rad is not None:
             self.aim = GimbalAim(gimbal.nearest_pitch_rad(gimbal.pitch_rad))
 
-    def taken(self, context: BehaviourContext) -> str | None:
+    def control_fault(self, context: BehaviourContext) -> str | None:
         """Why the gimbal is not moved any more, in words; None: it is."""
-        if context.now_ns <= self._begun_ns:  # at the first turn it is still told of what came before
+        if context.now_ns <= self._begun_ns:  # the first update still shows the previous owner's problem
             return None
         return context.gimbal.problem or None
 
     def turn_to(self, target: Target, context: BehaviourContext) -> None:
-        """Look at what has no range yet: it may come fully into the picture, and its range with it."""
-        self._look(target.elevation_rad, context)
+        """Point at a target without a range: fully inside the image it may get one."""
+        self._point_at(target.elevation_rad, context)
 
     def keep_on(
         self, newest: Target | None, range_m: float, position: Vector3, context: BehaviourContext
     ) -> str | None:
-        """Look at the object where it is thought to be now, as far as the gimbal reaches.
+        """Point at the object's estimated position, within the gimbal's range.
 
         Args:
-            newest: its newest detection; None: there was none with a range.
-            range_m: how far away it is thought to be now, horizontal metres.
+            newest: its newest detection; None: none with a range.
+            range_m: its estimated range now, horizontal metres.
             position: the vehicle's, local NED metres.
-            context: tells of the gimbal.
+            context: for the gimbal's state.
 
         Returns:
-            Why there is no use in going on, in words; None: the gimbal follows.
+            Why tracking has failed, in words; None: the gimbal follows.
         """
         if newest is not None:
             range_m = max(range_m, NEAREST_M)
@@ -83,17 +83,17 @@ class GimbalTracking:
                 before_m = down_m if self._down_m is None else self._down_m
                 self._down_m = before_m + NEWEST_SHARE * (down_m - before_m)
             assert self._down_m is not None
-            self._look(math.atan2(position[2] - self._down_m, range_m), context)
-        return self.taken(context) or self._stuck(context)
+            self._point_at(math.atan2(position[2] - self._down_m, range_m), context)
+        return self.control_fault(context) or self._stuck(context)
 
-    def _look(self, elevation_rad: float, context: BehaviourContext) -> None:
+    def _point_at(self, elevation_rad: float, context: BehaviourContext) -> None:
         pitch_rad = elevation_rad - context.gimbal.camera_pitch_rad
         gimbal = context.state.gimbal
-        if gimbal is not None:  # else it is lost, and told so
+        if gimbal is not None:  # else the gimbal is lost, which is reported
             self.aim = GimbalAim(gimbal.nearest_pitch_rad(pitch_rad))
 
     def _stuck(self, context: BehaviourContext) -> str | None:
-        """It does not go where it is asked to, for longer than a gimbal may take."""
+        """The gimbal lags behind its aim for longer than `PATIENCE_S`, in words; None: it does not."""
         gimbal, now_ns = context.state.gimbal, context.now_ns
         measured_rad = None if gimbal is None else gimbal.pitch_rad
         if self.aim is None or measured_rad is None or abs(self.aim.pitch_rad - measured_rad) <= BEHIND_RAD:

@@ -1,1 +1,1 @@
-"""What no behaviour can leave or ignore: envelope, obstacles, battery, setpoint monitor."""
+"""Limits that hold for every behaviour: envelope, obstacles, battery, setpoint monitor."""

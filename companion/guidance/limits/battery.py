@@ -1,8 +1,8 @@
-"""The least charge to fly with: below it no behaviour begins, and one that flies is ended.
+"""Minimum battery charge: below it no behaviour begins, and an active one is ended.
 
-The autopilot's own estimate is taken as it is told (SYS_STATUS and BATTERY_STATUS, `battery_remaining`). One
-that does not come, or comes no more, is not guessed: nothing begins without it. It does not end a flight: to
-lose a message is no reason to land somewhere, and the autopilot's own battery failsafe goes on.
+The charge is the autopilot's estimate (SYS_STATUS and BATTERY_STATUS, `battery_remaining`). Without a fresh
+value no behaviour begins. Losing it does not end a flight: a lost message is no reason to land, and the
+autopilot's own battery failsafe stays active.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.behaviours.land import LandBehaviour, ReturnBehaviour
 from companion.vehicle.state import VehicleState
 
-# BATTERY_STATUS comes every two seconds, SYS_STATUS more often: three of the slower one are missing.
+# BATTERY_STATUS comes every 2 s, SYS_STATUS more often: three of the slower one are missing.
 BATTERY_MAX_AGE_S = 6.0
-# A charge that dips while the motors pull is not a low battery.
+# A short dip under load is not a low battery.
 LOW_FOR_S = 1.0
 
 BatteryAction = Literal["rtl", "land", "hold"]
@@ -30,10 +30,10 @@ ENDINGS: dict[str, type[Behaviour]] = {
 
 @dataclass(frozen=True, slots=True)
 class BatteryMinimum:
-    """What charge a behaviour needs, 0..1 (0: none), and what follows a flight that falls below it.
+    """The minimum charge, 0..1 (0: no limit), and the action in flight below it.
 
     Raises:
-        ValueError: the fraction is outside 0..1, or the action is none.
+        ValueError: the fraction is outside 0..1, or the action is unknown.
     """
 
     fraction: float = 0.0
@@ -41,12 +41,12 @@ class BatteryMinimum:
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.fraction <= 1.0:
-            raise ValueError(f"the least charge must be 0 to 1, got {self.fraction}")
+            raise ValueError(f"the minimum charge must be 0 to 1, got {self.fraction}")
         if self.action not in ENDINGS:
             raise ValueError(f"the action must be one of {', '.join(ENDINGS)}, got {self.action!r}")
 
     def missing(self, behaviour: Behaviour, state: VehicleState, now_ns: int) -> str | None:
-        """What a behaviour that needs charge lacks, in words; None: nothing."""
+        """What is missing for a behaviour that needs charge, in words; None: nothing."""
         if self.fraction == 0.0 or not needs_charge(behaviour):
             return None
         charge = fresh_charge(state, now_ns)
@@ -56,7 +56,7 @@ class BatteryMinimum:
         return f"{needed} ({_known(state, now_ns)}; guidance.min_battery_percent)"
 
     def below(self, state: VehicleState, now_ns: int) -> bool:
-        """A fresh value says that the charge is less than allowed."""
+        """Whether a fresh value is below the minimum."""
         charge = fresh_charge(state, now_ns)
         return charge is not None and charge < self.fraction
 
@@ -65,13 +65,13 @@ NO_MINIMUM = BatteryMinimum()
 
 
 def needs_charge(behaviour: Behaviour) -> bool:
-    """It flies on: it says so, or it begins on the ground or steers. Ways down and handing back do not."""
+    """Whether a behaviour keeps flying, so that the minimum applies: not landing, returning and stopping."""
     flies = {Requirement.BATTERY, Requirement.POSITION, Requirement.ON_GROUND}
     return not behaviour.requirements.isdisjoint(flies)
 
 
 def fresh_charge(state: VehicleState, now_ns: int) -> float | None:
-    """The charge, 0..1; None when it is not known or too old."""
+    """The charge, 0..1; None when unknown or stale."""
     if state.battery_fraction is None or now_ns - state.battery_ns > BATTERY_MAX_AGE_S * 1e9:
         return None
     return state.battery_fraction
@@ -79,14 +79,14 @@ def fresh_charge(state: VehicleState, now_ns: int) -> float | None:
 
 def _known(state: VehicleState, now_ns: int) -> str:
     if state.battery_fraction is None:
-        return "the autopilot does not tell its charge"
+        return "battery state not received"
     if fresh_charge(state, now_ns) is None:
-        return f"its charge is not known: last told {(now_ns - state.battery_ns) / 1e9:.0f} s ago"
-    return f"it has {state.battery_fraction:.0%}"
+        return f"battery state stale ({(now_ns - state.battery_ns) / 1e9:.0f} s)"
+    return f"battery at {state.battery_fraction:.0%}"
 
 
 class BatteryMonitor:
-    """Looks at the charge in flight: says once when it has run low, and once when it is not told any more."""
+    """Monitors the charge in flight; reports a low battery and a stale battery state once each."""
 
     def __init__(self, minimum: BatteryMinimum) -> None:
         self.minimum = minimum
@@ -95,11 +95,11 @@ class BatteryMonitor:
         self._acted = False
 
     def reset(self) -> None:
-        """A new command: what was said of the one before is said again."""
+        """Start over for a new command: everything is reported again."""
         self._low_since_ns, self._unknown, self._acted = None, False, False
 
     def ending(self, behaviour: Behaviour, state: VehicleState, now_ns: int) -> str | None:
-        """Why what flies now must end; told once for each command."""
+        """Why the active behaviour must end; reported once per command."""
         if self._acted or self.minimum.fraction == 0.0 or not needs_charge(behaviour):
             return None
         if not self.minimum.below(state, now_ns):
@@ -111,15 +111,15 @@ class BatteryMonitor:
             return None
         self._acted = True
         return (
-            f"the battery has {state.battery_fraction:.0%}, below the {self.minimum.fraction:.0%} of "
-            f"guidance.min_battery_percent"
+            f"battery at {state.battery_fraction:.0%}, below guidance.min_battery_percent = "
+            f"{self.minimum.fraction * 100:g}"
         )
 
     def unknown(self, behaviour: Behaviour, state: VehicleState, now_ns: int) -> str | None:
-        """That the charge is not told any more; said once until it is told again."""
+        """That the battery state is unknown or stale; reported once until it is fresh again."""
         if self.minimum.fraction == 0.0 or not needs_charge(behaviour):
             return None
         before, self._unknown = self._unknown, fresh_charge(state, now_ns) is None
         if before or not self._unknown:
             return None
-        return f"battery: {_known(state, now_ns)}; flying on, the autopilot's own failsafe watches it"
+        return f"{_known(state, now_ns)}; the flight continues, the autopilot's battery failsafe stays active"

@@ -1,10 +1,10 @@
-"""The limits that no behaviour can leave: the last thing a setpoint passes before it is sent.
+"""Flight envelope: the limits every setpoint passes before it is sent.
 
-The envelope only ever takes away. A velocity that leaves it is never faster than the one that came, neither
-over ground nor upwards or downwards; braking is never delayed. A setpoint inside every limit passes as it is.
+The envelope only reduces. A limited velocity is never faster than the input, neither horizontally nor
+vertically; braking is never delayed. A setpoint inside every limit passes unchanged.
 
-A velocity's feed-forward acceleration may turn it, and hold it against drag. It never makes the vehicle
-faster than the velocity that is sent, nor leads it nearer to a fence than that.
+The feed-forward acceleration may turn the velocity and compensate drag. It never makes the vehicle faster
+than the sent velocity, nor brings it nearer to a fence.
 """
 
 from __future__ import annotations
@@ -27,41 +27,41 @@ from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3, VehicleState
 from vision.attitude import wrap_angle
 
-# PX4 flies towards a position with about this much speed for each metre that is missing (MPC_XY_P 0.95,
-# MPC_Z_P 1.0), so a position limit/gain ahead is flown to with no more than the limit.
+# PX4 flies towards a position setpoint with about this speed per metre of distance (MPC_XY_P 0.95, MPC_Z_P
+# 1.0), so a position limit/gain ahead is flown to no faster than the limit.
 POSITION_GAIN_PER_S = 1.0
-# A loop that stood still must not earn itself a jump.
+# Bounds the step after a pause of the loop.
 LONGEST_STEP_S = 0.2
-# So long a feed-forward acceleration acts before what it did is seen.
+# A feed-forward acceleration acts for this long before its effect is measured.
 FEED_FORWARD_S = 0.3
-# A velocity controller stands off its setpoint by the feed-forward over its gain (PX4: MPC_XY_VEL_P_ACC 1.8),
-# so that of a slow setpoint is small, and that of a stop is none. What an orbit needs is below this.
+# A velocity controller deviates from its setpoint by the feed-forward over its gain (PX4: MPC_XY_VEL_P_ACC
+# 1.8), so it is limited in proportion to the speed. An orbit needs less than this.
 FEED_FORWARD_PER_S = 1.0
 FEED_FORWARD_FADES_MPS = 0.3
-# Heights that differ by less are the same one.
+# Heights that differ by less count as equal.
 SAME_HEIGHT_M = 0.05
-# Part of the greatest acceleration that is kept for stopping at a fence, against a vehicle that answers late.
+# Part of the maximum acceleration that is planned for stopping at a fence; the rest covers delay.
 FENCE_BRAKING = 0.5
-# How late a multirotor's velocity follows.
+# Delay of a multirotor's velocity response.
 FENCE_DELAY_S = 0.4
-# Speed for each metre left, at most: a velocity that follows by 0.3 s is then critically damped.
+# Maximum speed per metre left: critically damped for a velocity time constant of 0.3 s.
 FENCE_GAIN_PER_S = 0.8
 NO_FENCE = Fence()
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What the vehicle may be asked for.
+    """Limits of setpoints.
 
     Attributes:
-        max_horizontal_speed_mps: over ground.
+        max_horizontal_speed_mps: horizontal speed.
         max_climb_mps, max_descend_mps: upwards, downwards.
         max_yaw_rate_radps: either way.
-        max_acceleration_mps2: at which a commanded velocity may grow or turn.
+        max_acceleration_mps2: of a commanded velocity.
         min_altitude_m, max_altitude_m: band above home.
         max_distance_m: horizontally from home.
-        fence: polygons about home to stay inside and out of.
-        min_separation_m: to every other vehicle that tells where it is.
+        fence: inclusion and exclusion polygons about home.
+        min_separation_m: to every other vehicle that publishes its pose.
 
     Raises:
         ValueError: a limit is not finite and positive, or the band of altitudes is empty.
@@ -91,17 +91,17 @@ class Limits:
 
 
 class Limited(NamedTuple):
-    """What the envelope let through, and a few words for every limit that acted."""
+    """The limited setpoint, and the limits that acted, in words."""
 
     sent: Setpoint
     reasons: tuple[str, ...]
 
 
 class Envelope:
-    """Applies `limits` to a stream of setpoints. It remembers the last one, for acceleration and yaw rate.
+    """Applies `limits` to a stream of setpoints; keeps the last one for acceleration and yaw rate.
 
     Attributes:
-        near: what obstacles allow: (north, east) unit direction, and the speed in it.
+        obstacle_constraints: (north, east) unit direction, and the speed allowed in it.
     """
 
     def __init__(self, limits: Limits | None = None) -> None:
@@ -111,32 +111,32 @@ class Envelope:
         self._yaw_rad: float | None = None
         self._neighbours: Sequence[Neighbour] = ()
         self._landing = False
-        self.near: tuple[tuple[float, float, float], ...] = ()
+        self.obstacle_constraints: tuple[tuple[float, float, float], ...] = ()
 
     def reset(self) -> None:
-        """Forget the last setpoint: the next one starts from how the vehicle really moves."""
+        """Forget the last setpoint: the next one starts from the measured velocity."""
         self._velocity = self._yaw_rad = None
 
-    def why_not_there(self, goal: Vector3, state: VehicleState) -> str | None:
-        """Why a goal (local NED metres) is nowhere to fly to; None: it is allowed.
+    def check_goal(self, goal: Vector3, state: VehicleState) -> str | None:
+        """Why a goal (local NED metres) violates the limits; None: it is allowed.
 
-        The height the vehicle has is always allowed: a way along it asks for no other.
+        The vehicle's current height is always allowed.
         """
         home = state.home_position_ned_m or self._home or (0.0, 0.0, 0.0)
         away = (goal[0] - home[0], goal[1] - home[1])
         where = f"{away[0]:.1f} m north and {away[1]:.1f} m east of home"
         if math.hypot(*away) > self.limits.max_distance_m:
-            return f"{where} is farther than guidance.max_distance_m = {self.limits.max_distance_m:g}"
+            return f"{where} exceeds guidance.max_distance_m = {self.limits.max_distance_m:g}"
         if not self.limits.fence.contains(away):
-            return f"{where} is not inside the fence (guidance.fence_include, fence_exclude)"
+            return f"{where} is outside the fence (guidance.fence_include, fence_exclude)"
         here = state.position_ned_m
         if here is not None and abs(goal[2] - here[2]) <= SAME_HEIGHT_M:
             return None
         height_m, low_m, high_m = home[2] - goal[2], self.limits.min_altitude_m, self.limits.max_altitude_m
         if height_m > high_m + SAME_HEIGHT_M:
-            return f"{height_m:.1f} m above home is higher than guidance.max_altitude_m = {high_m:g}"
+            return f"{height_m:.1f} m above home exceeds guidance.max_altitude_m = {high_m:g}"
         if height_m < low_m - SAME_HEIGHT_M:
-            return f"{height_m:.1f} m above home is lower than guidance.min_altitude_m = {low_m:g}"
+            return f"{height_m:.1f} m above home is below guidance.min_altitude_m = {low_m:g}"
         return None
 
     def apply(
@@ -149,17 +149,17 @@ class Envelope:
         *,
         landing: bool = False,
     ) -> Limited:
-        """What may be sent of a setpoint.
+        """Limit a setpoint.
 
         Args:
-            setpoint: as the behaviour asked for it.
-            state: for where the vehicle is, how it moves, and where home is.
+            setpoint: from the behaviour.
+            state: position, velocity and home of the vehicle.
             now_ns: CLOCK_MONOTONIC nanoseconds.
-            dt_s: since the last call; more than 0.2 s counts as that.
-            neighbours: other vehicles, to keep apart from.
-            landing: the lowest altitude does not hold: the way leads to the ground.
+            dt_s: since the last call; at most 0.2 s is used.
+            neighbours: other vehicles to keep separation from.
+            landing: the minimum altitude does not apply.
 
-        Without a known position a position setpoint cannot be judged: a brake takes its place.
+        Without a known position a position setpoint is replaced by a brake.
         """
         dt_s = max(0.0, min(dt_s, LONGEST_STEP_S))
         self._neighbours, self._landing = neighbours, landing
@@ -167,11 +167,11 @@ class Envelope:
         if state.home_position_ned_m is not None:
             self._home = state.home_position_ned_m
         elif self._home is not None:
-            # An autopilot may take a moment to tell it again; where it was is the best guess meanwhile.
+            # An autopilot may send it again only later; until then the last one is used.
             state = replace(state, home_position_ned_m=self._home)
         elif self.limits.fence != NO_FENCE:
             self.reset()
-            return Limited(Setpoint.brake(now_ns), ("home unknown, and there is a fence about it",))
+            return Limited(Setpoint.brake(now_ns), ("home position not received: no fence without it",))
         if setpoint.position_ned_m is not None and state.position_ned_m is None:
             self.reset()
             return Limited(Setpoint.brake(now_ns), ("position unknown",))
@@ -185,10 +185,10 @@ class Envelope:
                 forward = self._limit_feed_forward(setpoint.acceleration_ned_mps2, velocity, state, reasons)
                 sent = replace(sent, acceleration_ned_mps2=forward)
         elif setpoint.position_ned_m is not None and state.position_ned_m is not None:
-            place = self._limit_position(setpoint.position_ned_m, state.position_ned_m, state, reasons)
+            position = self._limit_position(setpoint.position_ned_m, state.position_ned_m, state, reasons)
             self._velocity = None
-            if place != setpoint.position_ned_m:
-                sent = replace(sent, position_ned_m=place)
+            if position != setpoint.position_ned_m:
+                sent = replace(sent, position_ned_m=position)
         return Limited(self._limit_yaw(sent, state, dt_s, reasons), tuple(reasons))
 
     def _limit_velocity(
@@ -203,54 +203,54 @@ class Envelope:
         scale = 1.0
         for limit, value, what in parts:
             if value > limit * (1.0 + 1e-12):
-                # All of it alike, so that a steep way is flown slower and not another way.
+                # All axes are scaled alike, to keep the direction.
                 scale = min(scale, limit / value)
                 reasons.append(f"{what} limited to {limit:g} m/s")
         north, east, down = (value * scale for value in asked) if scale < 1.0 else asked
         velocity = self._slew((north, east, down), state, dt_s, reasons)
-        # Last, so that no slew delays what a fence takes away.
+        # Last, so that the acceleration limit does not delay braking at a fence.
         return self._slow_at_fences(velocity, state, reasons)
 
     def _limit_feed_forward(
         self, asked: Vector3, sent: Vector3, state: VehicleState, reasons: list[str]
     ) -> Vector3 | None:
-        """What may be left of it beside the velocity that is sent: level, and only what turns or holds that.
+        """Limit the feed-forward acceleration: horizontal, and only to turn or keep the sent velocity.
 
-        It is no more than the greatest acceleration, and than FEED_FORWARD_PER_S times the sent speed. Along
-        the velocity it fades out as the vehicle reaches the sent speed. None is left where it leads nearer to
-        a fence, an obstacle or a neighbour than the limits allow.
+        It is at most the maximum acceleration, and FEED_FORWARD_PER_S times the sent speed. Along the
+        velocity it fades out as the vehicle reaches the sent speed. It is dropped where it would lead nearer
+        to a fence, an obstacle or a neighbour than the limits allow.
         """
         speed, velocity = math.hypot(sent[0], sent[1]), state.velocity_ned_mps
         if velocity is None or state.position_ned_m is None:
-            reasons.append("position or velocity unknown: no acceleration ahead")
+            reasons.append("position or velocity unknown: no feed-forward")
             return None
         if speed < 1e-6:
             return None
         most = min(self.limits.max_acceleration_mps2, FEED_FORWARD_PER_S * speed)
         north, east, _ = _shorten(asked, most)
-        way = (sent[0] / speed, sent[1] / speed)
-        along = north * way[0] + east * way[1]
+        direction = (sent[0] / speed, sent[1] / speed)
+        along = north * direction[0] + east * direction[1]
         if along > 0.0:
-            missing = speed - (velocity[0] * way[0] + velocity[1] * way[1])
+            missing = speed - (velocity[0] * direction[0] + velocity[1] * direction[1])
             taken = along * (1.0 - max(0.0, min(1.0, missing / FEED_FORWARD_FADES_MPS)))
-            north, east = north - taken * way[0], east - taken * way[1]
+            north, east = north - taken * direction[0], east - taken * direction[1]
         ahead = (velocity[0] + north * FEED_FORWARD_S, velocity[1] + east * FEED_FORWARD_S, velocity[2])
         if self._cut_mps(ahead, state) > self._cut_mps(velocity, state) + 1e-6:
-            reasons.append("no acceleration ahead of a limit")
+            reasons.append("no feed-forward towards a limit")
             return None
         return (north, east, 0.0)
 
     def _cut_mps(self, velocity: Vector3, state: VehicleState) -> float:
-        """How much of a velocity fences, obstacles and neighbours take away."""
+        """How much of a velocity fences, obstacles and neighbours remove, m/s."""
         return math.dist(velocity, self._slow_at_fences(velocity, state, []))
 
     def _slow_at_fences(self, velocity: Vector3, state: VehicleState, reasons: list[str]) -> Vector3:
-        """Take away what would carry the vehicle over a fence: no more speed than the way left stops."""
+        """Limit the velocity so that the vehicle stops before fences, altitude limits and neighbours."""
         limits, altitude_m = self.limits, state.altitude_m
         if state.position_ned_m is None or altitude_m is None:
             return velocity
-        rows = self._rows(state.position_ned_m)
-        velocity = self._keep_apart(velocity, rows, reasons)
+        constraints = self._separation_constraints(state.position_ned_m)
+        velocity = self._keep_separation(velocity, constraints, reasons)
         north, east, down = velocity
         if down < -self._towards_fence(limits.max_altitude_m - altitude_m):
             down = -self._towards_fence(limits.max_altitude_m - altitude_m)
@@ -261,14 +261,14 @@ class Envelope:
         home = state.home_position_ned_m or (0.0, 0.0, 0.0)
         away = (state.position_ned_m[0] - home[0], state.position_ned_m[1] - home[1])
         distance_m = math.hypot(*away)
-        # The circle is one more edge, so that what one takes away another cannot give back.
-        circle: list[tuple[float, float, float]] = list(self.near)
+        # Distance from home is one more constraint of the same projection.
+        circle: list[tuple[float, float, float]] = list(self.obstacle_constraints)
         if distance_m > 0.0:
             allowed_mps = self._towards_fence(limits.max_distance_m - distance_m)
             circle.append((away[0] / distance_m, away[1] / distance_m, allowed_mps))
             if north * circle[-1][0] + east * circle[-1][1] > allowed_mps + 1e-9:
                 reasons.append(f"distance from home limited to {limits.max_distance_m:g} m")
-        circle += level_constraints(rows, down)
+        circle += level_constraints(constraints, down)
         over_ground = limits.fence.limit_velocity((north, east), away, self._towards_fence, also=circle)
         if math.dist(over_ground, (north, east)) > 1e-9:
             if not reasons or not reasons[-1].startswith("distance from home"):
@@ -276,32 +276,37 @@ class Envelope:
             north, east = over_ground
         return (north, east, down)
 
-    def _rows(self, place: Vector3) -> list[SpeedConstraint]:
+    def _separation_constraints(self, position: Vector3) -> list[SpeedConstraint]:
         limits = self.limits
         return constraints_at(
-            place, self._neighbours, limits.min_separation_m, BRAKING * limits.max_acceleration_mps2
+            position, self._neighbours, limits.min_separation_m, BRAKING * limits.max_acceleration_mps2
         )
 
-    def _keep_apart(self, velocity: Vector3, rows: Sequence[SpeedConstraint], reasons: list[str]) -> Vector3:
-        """Take away what would carry the vehicle nearer to another than they may be."""
-        left, because_of = apply_separation(velocity, rows)
+    def _keep_separation(
+        self, velocity: Vector3, constraints: Sequence[SpeedConstraint], reasons: list[str]
+    ) -> Vector3:
+        """Limit the velocity to keep separation from the neighbours."""
+        left, because_of = apply_separation(velocity, constraints)
         if because_of:
-            reasons.append(f"kept {self.limits.min_separation_m:g} m from {', '.join(because_of)}")
+            names = ", ".join(repr(name) for name in because_of)
+            reasons.append(f"separation limit: {self.limits.min_separation_m:g} m to {names}")
         return left
 
     def _what_slows(self, velocity: tuple[float, float]) -> str:
-        near = any(velocity[0] * row[0] + velocity[1] * row[1] > row[2] + 1e-9 for row in self.near)
-        return "slowed down before an obstacle" if near else "slowed down at the fence"
+        by_obstacle = any(
+            velocity[0] * one[0] + velocity[1] * one[1] > one[2] + 1e-9 for one in self.obstacle_constraints
+        )
+        return "speed limited by an obstacle" if by_obstacle else "speed limited by the fence"
 
     def _towards_fence(self, left_m: float) -> float:
-        """The speed from which the vehicle stops in so much way, which begins when it answers."""
+        """The speed from which the vehicle stops within a distance, including its delay."""
         braking = FENCE_BRAKING * self.limits.max_acceleration_mps2
         late = braking * FENCE_DELAY_S
         left_m = max(0.0, left_m)
         return min(math.sqrt(late**2 + 2.0 * braking * left_m) - late, FENCE_GAIN_PER_S * left_m)
 
     def _slew(self, asked: Vector3, state: VehicleState, dt_s: float, reasons: list[str]) -> Vector3:
-        """Let the velocity change by the greatest acceleration, without ever being more than asked for."""
+        """Limit the change of the velocity to the maximum acceleration; never exceed the requested one."""
         previous = self._velocity or state.velocity_ned_mps or (0.0, 0.0, 0.0)
         step = (asked[0] - previous[0], asked[1] - previous[1], asked[2] - previous[2])
         size, allowed = math.hypot(*step), self.limits.max_acceleration_mps2 * dt_s
@@ -326,49 +331,49 @@ class Envelope:
         if down != asked[2]:
             reasons.append(f"altitude kept within {limits.min_altitude_m:g} to {limits.max_altitude_m:g} m")
         away = _shorten((asked[0] - home[0], asked[1] - home[1], 0.0), limits.max_distance_m)
-        place = (home[0] + away[0], home[1] + away[1], down)
-        if math.dist(place[:2], asked[:2]) > 1e-9:
+        position = (home[0] + away[0], home[1] + away[1], down)
+        if math.dist(position[:2], asked[:2]) > 1e-9:
             reasons.append(f"distance from home limited to {limits.max_distance_m:g} m")
         else:
-            place = (asked[0], asked[1], down)
+            position = (asked[0], asked[1], down)
 
-        goal = (place[0] - home[0], place[1] - home[1])
+        goal = (position[0] - home[0], position[1] - home[1])
         inside = limits.fence.clip((here[0] - home[0], here[1] - home[1]), goal)
         if inside != goal:
-            place = (home[0] + inside[0], home[1] + inside[1], down)
-            reasons.append("kept inside the fence")
-        way = (place[0] - here[0], place[1] - here[1])
-        active = (way[0] * POSITION_GAIN_PER_S, way[1] * POSITION_GAIN_PER_S)
-        freed = NO_FENCE.limit_velocity(active, here[:2], abs, self.near)
+            position = (home[0] + inside[0], home[1] + inside[1], down)
+            reasons.append("position limited by the fence")
+        path = (position[0] - here[0], position[1] - here[1])
+        active = (path[0] * POSITION_GAIN_PER_S, path[1] * POSITION_GAIN_PER_S)
+        freed = NO_FENCE.limit_velocity(active, here[:2], abs, self.obstacle_constraints)
         if math.dist(freed, active) > 1e-9:
             reach_s = 1.0 / POSITION_GAIN_PER_S
-            place = (here[0] + freed[0] * reach_s, here[1] + freed[1] * reach_s, place[2])
-            reasons.append("slowed down before an obstacle")
-        offset = (place[0] - here[0], place[1] - here[1], 0.0)
+            position = (here[0] + freed[0] * reach_s, here[1] + freed[1] * reach_s, position[2])
+            reasons.append("speed limited by an obstacle")
+        offset = (position[0] - here[0], position[1] - here[1], 0.0)
         carrot = _shorten(offset, limits.max_horizontal_speed_mps / POSITION_GAIN_PER_S)
         if carrot != offset:
-            place = (here[0] + carrot[0], here[1] + carrot[1], place[2])
+            position = (here[0] + carrot[0], here[1] + carrot[1], position[2])
             reasons.append(f"horizontal speed limited to {limits.max_horizontal_speed_mps:g} m/s")
         highest = here[2] - limits.max_climb_mps / POSITION_GAIN_PER_S
         lowest = here[2] + limits.max_descend_mps / POSITION_GAIN_PER_S
-        if place[2] < highest:
-            place = (place[0], place[1], highest)
+        if position[2] < highest:
+            position = (position[0], position[1], highest)
             reasons.append(f"climb limited to {limits.max_climb_mps:g} m/s")
-        elif place[2] > lowest:
-            place = (place[0], place[1], lowest)
+        elif position[2] > lowest:
+            position = (position[0], position[1], lowest)
             reasons.append(f"descent limited to {limits.max_descend_mps:g} m/s")
-        # A place is flown to with a speed that goes with the way to it, so the same law holds for both.
-        north, east, down = (POSITION_GAIN_PER_S * (p - h) for p, h in zip(place, here, strict=True))
-        left = self._keep_apart((north, east, down), self._rows(here), reasons)
+        # The speed towards a position is proportional to the distance, so the same law applies.
+        north, east, down = (POSITION_GAIN_PER_S * (p - h) for p, h in zip(position, here, strict=True))
+        left = self._keep_separation((north, east, down), self._separation_constraints(here), reasons)
         if left != (north, east, down):
             north, east, down = (h + v / POSITION_GAIN_PER_S for h, v in zip(here, left, strict=True))
             return (north, east, down)
-        return place
+        return position
 
     def _limit_yaw(
         self, setpoint: Setpoint, state: VehicleState, dt_s: float, reasons: list[str]
     ) -> Setpoint:
-        """Limit a yaw rate, or the rate at which a wanted heading runs ahead of the last one."""
+        """Limit a yaw rate, or the rate of change of a yaw setpoint."""
         limit = self.limits.max_yaw_rate_radps
         if setpoint.yaw_rate_radps is not None:
             self._yaw_rad = None
@@ -390,7 +395,7 @@ class Envelope:
 
 
 def _shorten(vector: Vector3, longest: float) -> Vector3:
-    """The same direction over ground, no longer than `longest`; down as it was."""
+    """Limit the horizontal length to `longest`; down is unchanged."""
     length = math.hypot(vector[0], vector[1])
     if length <= longest * (1.0 + 1e-12):
         return vector

@@ -1,15 +1,15 @@
-"""Whether the vehicle moves as our setpoints say; if it does not, something else steers it.
+"""Setpoint monitor: detect that the vehicle does not follow our setpoints, so something else steers it.
 
-A ground station can move or stop a vehicle in OFFBOARD (GUIDED) without a change of mode: ArduPilot takes
-DO_REPOSITION and DO_PAUSE_CONTINUE there, and both autopilots take setpoints of any sender. ArduPilot's fence
-stops it too. Nothing but the motion shows any of this.
+A ground station can move or stop a vehicle in OFFBOARD (GUIDED) without a change of mode: ArduPilot accepts
+DO_REPOSITION and DO_PAUSE_CONTINUE there, and both autopilots accept setpoints of any sender. ArduPilot's
+fence stops it too. Only the motion shows this.
 
-The measured velocity is compared with those of vehicles that follow. The fastest one has the velocity that
-was sent; the slowest approaches it with the time constant `SLOWEST_S`. Whatever lies between the two follows.
-The same holds for what was sent `DELAY_S` before. The residual is the distance from there, so a step, a
-reversal or a delay of the setpoint leaves none. A badly tuned vehicle overshoots and swings about what was
-sent; that is a residual, but it accelerates towards the setpoint all the time. So a residual counts only
-where it lasts and that acceleration is missing.
+The measured velocity is compared with those of two vehicles that follow: the fastest has the sent velocity,
+the slowest approaches it with the time constant `SLOWEST_S`. Anything between the two follows, also relative
+to the setpoint of `DELAY_S` before. The residual is the distance from that range, so a step, a reversal or a
+delay of the setpoint leaves none. A badly tuned vehicle oscillates about the setpoint; that is a residual,
+but it keeps accelerating towards the setpoint. So a residual counts only if it lasts without that
+acceleration.
 """
 
 from __future__ import annotations
@@ -21,28 +21,28 @@ from dataclasses import dataclass
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import LandedState, Vector3, VehicleState
 
-# Time constant of the slowest vehicle that counts as one that follows. PX4 in its SIH simulation takes 0.5 to
-# 1 s for the first nine tenths of a step.
+# Time constant of the slowest vehicle that counts as following. PX4 in its SIH simulation takes 0.5 to 1 s
+# for 90 % of a step.
 SLOWEST_S = 2.0
 # Telemetry, transport, the autopilot's shaping of a setpoint and its tilt: with 0.2 s of additional delay.
 DELAY_S = 0.5
 # (residual m/s, lasting s). The later ones are for slow setpoints. Set by flights in lockstep, in wind up to
 # 3 m/s with gusts of 0.6 m/s; formations of five are the hardest: with 0.8 m/s for 1 s five of seven ended.
 RULES = ((1.5, 1.0), (1.0, 2.5), (0.5, 6.0))
-# The residual is at least this part of the commanded speed: a vehicle that flies the right way, slower than
-# it should (wind, a speed limit of the autopilot's), follows.
+# Minimum residual relative to the commanded speed: a vehicle that flies in the right direction but slower
+# (wind, a speed limit of the autopilot) follows.
 RELATIVE = 0.7
-# A vehicle that follows gains at least 1/RESPONSE_S m/s in the direction of the error for each m/s and second
-# of it. Errors whose directions cancel by more than half are swinging.
+# A vehicle that follows gains at least 1/RESPONSE_S m/s in the direction of the error per m/s and second of
+# it. Errors whose directions cancel by more than half are oscillation.
 RESPONSE_S = 8.0
 STEADY = 0.5
-# Speed towards a position setpoint for each metre left (PX4: MPC_XY_P 0.95; Copter: PSC_POSXY_P 1).
+# Speed towards a position setpoint per metre left (PX4: MPC_XY_P 0.95; Copter: PSC_POSXY_P 1).
 POSITION_GAIN_PER_S = 0.95
-# Autopilots may add the speed at which a position setpoint moves. It is filtered by this; a jump is no speed.
+# Autopilots may add the speed of a moving position setpoint: filter time constant, and jump threshold.
 FEED_FORWARD_S, JUMP_MPS = 0.5, 15.0
-# After a longer gap in the measurements the comparison begins again.
+# After a longer gap in the measurements the comparison restarts.
 MAX_GAP_S = 0.5
-# A vehicle that comes down to land and is slower than this may stand: the autopilot takes seconds to say so.
+# A landing vehicle slower than this may be on the ground: the autopilot reports it seconds later.
 CONTACT_MPS = 0.3
 NOT_IN_AIR = (LandedState.ON_GROUND, LandedState.TAKING_OFF, LandedState.LANDING)
 REASON = "vehicle does not follow setpoints (autopilot fence, another commander, or wind)"
@@ -55,7 +55,7 @@ class _Lasting:
 
     Attributes:
         since_ns, velocity_mps: when it began, and the velocity then.
-        error_m, error_length_m: the integral of the velocity error since, and of its size.
+        error_m, error_length_m: integrals of the velocity error since then, and of its magnitude.
     """
 
     since_ns: int
@@ -64,7 +64,7 @@ class _Lasting:
     error_length_m: float = 0.0
 
     def answered(self, velocity: Vector3) -> bool:
-        """Whether the vehicle swings about the setpoint or has accelerated towards it."""
+        """Whether the vehicle oscillates about the setpoint or has accelerated towards it."""
         size_m = math.hypot(*self.error_m)
         if size_m < STEADY * self.error_length_m:
             return True
@@ -74,11 +74,11 @@ class _Lasting:
 
 
 class SetpointMonitor:
-    """Compares what was sent with how the vehicle moves.
+    """Compares sent setpoints with the vehicle's motion.
 
     Attributes:
-        residual_mps: how far the newest measured velocity is from that of a vehicle that follows.
-        commanded_mps: the speed that the residual is judged by.
+        residual_mps: distance of the newest measured velocity from that of a vehicle that follows.
+        commanded_mps: the speed that the residual is compared with.
     """
 
     def __init__(self) -> None:
@@ -91,15 +91,15 @@ class SetpointMonitor:
         self._lasting: list[_Lasting | None] = [None] * len(RULES)
 
     def update(self, sent: Setpoint | None, state: VehicleState, *, landing: bool = False) -> str | None:
-        """Compare the newest measurement, if it is a new one.
+        """Process the newest measurement, if there is a new one.
 
         Args:
-            sent: the setpoint that the vehicle flies, local NED; None: none of ours.
+            sent: our setpoint that the vehicle flies, local NED; None: none.
             state: position and velocity with their stamp, `position_ns`.
             landing: the setpoints lead to the ground.
 
         Returns:
-            Why the vehicle counts as steered by something else; None: it follows, or that is not known.
+            Why the vehicle counts as steered by something else; None: it follows, or that is unknown.
         """
         velocity, stamp_ns = state.velocity_ned_mps, state.position_ns
         if sent is None or velocity is None or state.landed in NOT_IN_AIR or state.position_valid is False:
@@ -134,7 +134,7 @@ class SetpointMonitor:
         return f"{REASON}: {math.hypot(*goal):.1f} m/s commanded, {math.hypot(*velocity):.1f} m/s flown"
 
     def _settled(self, sent: Setpoint, state: VehicleState, dt_s: float) -> tuple[Vector3, ...]:
-        """What the velocity of a vehicle that follows may settle to, the first without feed-forward."""
+        """Velocities a vehicle that follows may settle to; the first without feed-forward."""
         goal, before = sent.position_ned_m, self._goal
         self._goal = goal
         if sent.velocity_ned_mps is not None:
@@ -149,7 +149,7 @@ class SetpointMonitor:
         return (towards, _minus(towards, _scaled(self._feed_forward, -1.0)))
 
     def _judge(self, stamp_ns: int, velocity: Vector3, error: Vector3, dt_s: float) -> bool:
-        """Whether a rule's residual has lasted, and the vehicle has not answered to it."""
+        """Whether a rule's residual has lasted without a response of the vehicle."""
         ignored = False
         for index, (threshold_mps, lasting_s) in enumerate(RULES):
             lasting = self._lasting[index]
@@ -180,12 +180,12 @@ def _scaled(a: Vector3, by: float) -> Vector3:
 
 
 def _filtered(value: Vector3, towards: Vector3, steps: float) -> Vector3:
-    """The output of a first-order filter after so many time constants."""
+    """A first-order filter step over a number of time constants."""
     return _minus(value, _scaled(_minus(value, towards), 1.0 - math.exp(-steps)))
 
 
 def _distance(point: Vector3, a: Vector3, b: Vector3) -> float:
-    """From a point to the line segment between two others."""
+    """Distance of a point from the line segment between two others."""
     along, off = _minus(b, a), _minus(point, a)
     length_2 = sum(value * value for value in along)
     share = sum(x * y for x, y in zip(along, off, strict=True)) / length_2 if length_2 > 0.0 else 0.0

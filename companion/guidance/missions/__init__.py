@@ -1,1 +1,1 @@
-"""Mission files: how one is read, and those that come along."""
+"""Missions: file format, sequencing, and the bundled mission files."""

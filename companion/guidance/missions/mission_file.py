@@ -1,17 +1,17 @@
-"""Mission files: TOML, a table `[[step]]` for each step, checked whole before anything is flown.
+"""Mission files: TOML with a table `[[step]]` per step, validated completely before the flight.
 
 name = "find the car"
-timeout_s = 600                  # of everything, if given
+timeout_s = 600                  # of the whole mission, optional
 
 [[step]]
 do = "takeoff 5"                 # any command of the grammar, except another mission
 on_failure = "abort"             # or "continue", "rtl", "land", "end", or the name of a step
 
 [[step]]
-name = "look"                    # for branches to lead to
+name = "look"                    # target of branches
 do = "seek car"
-timeout_s = 60                   # a command without an end of its own needs it, and ends well with it
-visits = 3                       # once more, and the mission has failed
+timeout_s = 60                   # required for an endless command, which then ends with success
+visits = 3                       # starting it more often fails the mission
 on_success = "continue"          # the next step; after the last one: "end"
 """
 
@@ -52,7 +52,7 @@ _Count = Annotated[int, Field(ge=1, le=1000)]
 
 
 class MissionError(GrammarError):
-    """A mission that cannot be flown. `problems` has one line each, with file and step; the text is those."""
+    """An invalid mission. `problems` has one line each, with file and step; the text joins them."""
 
     def __init__(self, *problems: str) -> None:
         super().__init__("\n".join(problems))
@@ -64,7 +64,7 @@ class Mission(Command):
     takes_attachment = True
 
     file: Annotated[
-        str, FileName("file", "a path on the service's computer, or the name of one that came along")
+        str, FileName("file", "a path on the service's computer, or the name of a bundled mission")
     ]
 
     def build(self, context: BuildContext) -> Behaviour:
@@ -78,7 +78,7 @@ class Mission(Command):
 
 
 class StepTable(BaseModel):
-    """One `[[step]]` as it is written."""
+    """One `[[step]]` table of the file."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
@@ -92,7 +92,7 @@ class StepTable(BaseModel):
 
 
 class MissionTable(BaseModel):
-    """The whole file as it is written."""
+    """The whole file."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
@@ -104,7 +104,7 @@ class MissionTable(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class _Read:
-    """A step with its command, and where it leads: the index of a step, or a word."""
+    """A step with its command and branches: the index of a step, or a word."""
 
     table: StepTable
     command: Command
@@ -113,10 +113,10 @@ class _Read:
 
 
 def find_mission(name: str) -> Path:
-    """The file that a name means: a path, or `NAME.toml` here or among those that come with this package.
+    """Resolve a mission's name: a path, or `NAME.toml` in the working directory or bundled with this package.
 
     Raises:
-        MissionError: there is none.
+        MissionError: not found.
     """
     path = Path(name)
     bundled = sorted(file.stem for file in MISSIONS_FOLDER.glob("*.toml"))
@@ -125,17 +125,16 @@ def find_mission(name: str) -> Path:
             if candidate.is_file():
                 return candidate
     except (OSError, ValueError) as error:
-        raise MissionError(f"{name[:80]!r} is no name of a mission: {error}") from error
+        raise MissionError(f"invalid mission name {name[:80]!r}: {error}") from error
     if name in bundled:
         return MISSIONS_FOLDER / f"{name}.toml"
     raise MissionError(
-        f"no mission {name!r}: no such file in {Path.cwd()}, and those that come along are: "
-        f"{', '.join(bundled)}"
+        f"mission {name!r} not found: no such file in {Path.cwd()}; bundled missions: {', '.join(bundled)}"
     )
 
 
 def read_mission(path: Path) -> str:
-    """The text of a mission file. Raises MissionError with a line for a person."""
+    """Read a mission file. Raises MissionError with a line for a person."""
     try:
         size = path.stat().st_size
         if size > LARGEST_BYTES:
@@ -151,26 +150,26 @@ def plan_from(
     class_names: Sequence[str] | None = None,
     footprint: Footprint | None = None,
 ) -> Plan:
-    """A mission, checked.
+    """Parse and validate a mission.
 
     Args:
-        text: of the file. source: its name, for what is said about it.
-        class_names: what the detector knows; None: not known, any is taken.
+        text: of the file. source: its name, for messages.
+        class_names: the detector's classes; None: not known, any is accepted.
         footprint: of the steering camera; None: not known.
 
     Raises:
-        MissionError: with every problem found: no TOML, an unknown key, a step that is no command, an unknown
-            class or step, a step that is never reached, a loop that is never left.
+        MissionError: with every problem found: invalid TOML, an unknown key, an invalid command, an unknown
+            class or step, an unreachable step, a loop without exit.
     """
     try:
         written = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise MissionError(f"{source}: no TOML: {error}") from error
+        raise MissionError(f"{source}: invalid TOML: {error}") from error
     try:
         table = MissionTable.model_validate(written)
     except ValidationError as error:
-        said = [_said(source, dict(problem)) for problem in error.errors()]
-        raise MissionError(*said, *_bad_commands(written, source, class_names)) from error
+        lines = [_problem_text(source, dict(problem)) for problem in error.errors()]
+        raise MissionError(*lines, *_bad_commands(written, source, class_names)) from error
     problems: list[str] = []
     read = _read_steps(table, source, class_names, problems)
     if problems:
@@ -188,22 +187,22 @@ def plan_from(
 
 
 def describe(plan: Plan) -> list[str]:
-    """The plan, a line a step, for people."""
+    """The plan for people, one line per step."""
     lines = [f"mission {plan.name}: {len(plan.steps)} steps"]
     if plan.timeout_s is not None:
         lines[0] += f", {plan.timeout_s:g} s at most"
     for index, step in enumerate(plan.steps):
-        told = [f"{index + 1}. {step.command}"]
+        words = [f"{index + 1}. {step.command}"]
         if step.title != step.command:
-            told.append(f"({step.title})")
+            words.append(f"({step.title})")
         if step.repeat > 1:
-            told.append(f"{step.repeat} times")
+            words.append(f"{step.repeat} times")
         if step.timeout_s is not None:
-            told.append(f"for {step.timeout_s:g} s" if step.endless else f"within {step.timeout_s:g} s")
+            words.append(f"for {step.timeout_s:g} s" if step.endless else f"within {step.timeout_s:g} s")
         if step.visits is not None:
-            told.append(f"begun {step.visits} times at most")
-        told.append(f"→ {_shown(plan, step.on_success)}; failing → {_shown(plan, step.on_failure)}")
-        lines.append(" ".join(told))
+            words.append(f"at most {step.visits} visits")
+        words.append(f"→ {_shown(plan, step.on_success)}; on failure → {_shown(plan, step.on_failure)}")
+        lines.append(" ".join(words))
     return lines
 
 
@@ -230,28 +229,28 @@ def _called(index: int, table: StepTable) -> str:
     return f"step {index + 1}" + ("" if table.name is None else f" ({table.name})")
 
 
-def _said(source: str, problem: dict[str, object]) -> str:
-    """One of pydantic's problems as a line: file, step, key, what is wrong."""
-    place = problem["loc"]
-    assert isinstance(place, tuple)
+def _problem_text(source: str, problem: dict[str, object]) -> str:
+    """One pydantic error as a line: file, step, key, problem."""
+    location = problem["loc"]
+    assert isinstance(location, tuple)
     words = [source]
-    if len(place) >= 2 and place[0] == "step" and isinstance(place[1], int):
-        words.append(f"step {place[1] + 1}")
-        place = place[2:]
-    # Of a union, the last names only which of its types it was.
-    key = next((str(part) for part in place if isinstance(part, str)), "")
+    if len(location) >= 2 and location[0] == "step" and isinstance(location[1], int):
+        words.append(f"step {location[1] + 1}")
+        location = location[2:]
+    # In a union the last part only names the member type.
+    key = next((str(part) for part in location if isinstance(part, str)), "")
     if problem["type"] == "extra_forbidden":
         known = list(StepTable.model_fields if len(words) == 2 else MissionTable.model_fields)
         return f"{': '.join(words)}: unknown key {key!r}; {nearest(key, known)}"
     if problem["type"] == "missing":
-        told = "a mission has at least one [[step]]" if key == "step" else f"{key} is missing"
-        return f"{': '.join(words)}: {told}"
-    came = str(problem.get("input"))[:60]
-    return f"{': '.join(words)}: {key}: {problem['msg']}, got {came}"
+        text = "a mission needs at least one [[step]]" if key == "step" else f"{key} is missing"
+        return f"{': '.join(words)}: {text}"
+    found = str(problem.get("input"))[:60]
+    return f"{': '.join(words)}: {key}: {problem['msg']}, got {found}"
 
 
 def _bad_commands(written: dict[str, object], source: str, class_names: Sequence[str] | None) -> list[str]:
-    """Of a file whose tables are wrong: the commands that are wrong too, to be mended at once."""
+    """The invalid commands of a file whose tables are invalid, so that all errors are reported together."""
     steps = written.get("step")
     problems = []
     for index, step in enumerate(steps if isinstance(steps, list) else []):
@@ -267,16 +266,16 @@ def _bad_commands(written: dict[str, object], source: str, class_names: Sequence
 def _read_steps(
     table: MissionTable, source: str, class_names: Sequence[str] | None, problems: list[str]
 ) -> list[_Read]:
-    """Every step with its command and its branches. What is wrong is added to `problems`."""
+    """Parse the command and the branches of every step. Errors are added to `problems`."""
     named: dict[str, int] = {}
     for index, step in enumerate(table.step):
         if step.name is None:
             continue
         where = f"{source}: {_called(index, step)}"
         if step.name in _WORDS:
-            problems.append(f"{where}: a step cannot be called {step.name!r}: that is where branches lead to")
+            problems.append(f"{where}: name {step.name!r} is a reserved branch word; choose another")
         elif step.name in named:
-            problems.append(f"{where}: the name is taken by step {named[step.name] + 1}")
+            problems.append(f"{where}: name already used by step {named[step.name] + 1}")
         named.setdefault(step.name, index)
     read = []
     for index, step in enumerate(table.step):
@@ -299,22 +298,22 @@ def _read_steps(
             problems.append(f"{where}: {error}")
             continue
         if isinstance(command, Mission):
-            problems.append(f"{where}: a mission flies no other mission")
+            problems.append(f"{where}: a mission cannot start another mission")
         if command.endless and step.timeout_s is None:
-            problems.append(f"{where}: {step.do!r} never ends by itself: give it timeout_s")
+            problems.append(f"{where}: {step.do!r} does not end by itself; set timeout_s")
         read.append(_Read(step, command, *followers))
     return read
 
 
 def _unreached(read: Sequence[_Read], source: str) -> list[str]:
-    """A line for every step to which nothing leads."""
+    """A line for every unreachable step."""
     reached, waiting = {0}, [0]
     while waiting:
         fresh = _steps_after(read[waiting.pop()]) - reached
         reached |= fresh
         waiting += fresh
     return [
-        f"{source}: {_called(index, step.table)}: is never reached"
+        f"{source}: {_called(index, step.table)}: unreachable"
         for index, step in enumerate(read)
         if index not in reached
     ]
@@ -323,33 +322,33 @@ def _unreached(read: Sequence[_Read], source: str) -> list[str]:
 def _never_left(read: Sequence[_Read], source: str) -> list[str]:
     """A line for every loop of steps that only a failure of the whole mission would end.
 
-    A loop is all right if one of its branches leads out of it, other than to `abort`, or a step of it has a
-    limit of visits.
+    A loop is valid if one of its branches leads out of it, other than to `abort`, or one of its steps limits
+    its visits.
     """
     reach = [_reach(read, index) for index in range(len(read))]
-    problems, told = [], set[int]()
+    problems, reported = [], set[int]()
     for index in range(len(read)):
-        if index in told or index not in reach[index]:
+        if index in reported or index not in reach[index]:
             continue
         loop = {other for other in reach[index] if index in reach[other]}
-        told |= loop
-        ways_out = {
+        reported |= loop
+        exits = {
             follows
             for step in loop
             for follows in (read[step].on_success, read[step].on_failure)
             if follows not in loop and follows != ABORT
         }
-        if ways_out or any(read[step].table.visits is not None for step in loop):
+        if exits or any(read[step].table.visits is not None for step in loop):
             continue
         names = ", ".join(_called(step, read[step].table) for step in sorted(loop))
         problems.append(
-            f"{source}: {names}: a loop without exit: lead one of its branches out, or limit a step's visits"
+            f"{source}: {names}: loop without exit; add a branch out of it, or set visits on one of its steps"
         )
     return problems
 
 
 def _reach(read: Sequence[_Read], start: int) -> set[int]:
-    """Every step that can come after this one."""
+    """All steps that can follow a step."""
     reached: set[int] = set()
     waiting = [start]
     while waiting:

@@ -1,8 +1,8 @@
-"""A mission: behaviours in turn, each with its time-out and where to go on when it worked or did not.
+"""A mission: a sequence of behaviours, each with a time-out and branches on success and failure.
 
-It is one behaviour to guidance, so what holds for one holds for all of its steps. One setpoint follows the
-other where steps change, in the same turn of the loop. An operator's next command takes its place as a whole,
-and a pilot's mode change ends it as a whole: between two steps our command is never given up and taken again.
+To guidance it is one behaviour, so the same rules hold for all steps. The next step begins in the same update
+in which the previous one ends. An operator's next command replaces the whole mission, and a pilot's mode
+change ends it: command is not released between steps.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from companion.vehicle.state import Vector3
 
 logger = logging.getLogger(__name__)
 
-# Where a step may lead besides another step.
+# Branch targets besides steps.
 CONTINUE, END, ABORT, RTL, LAND = "continue", "end", "abort", "rtl", "land"
-# Failing, the vehicle may be taken down by the autopilot; the mission has failed all the same.
+# On failure the autopilot may bring the vehicle down; the mission has failed nevertheless.
 WAYS_DOWN = (RTL, LAND)
 
 
@@ -29,13 +29,13 @@ class PlannedStep:
     """One step of a plan.
 
     Attributes:
-        title: its name, or its number; for people.
-        command: what is flown, in the grammar's words.
-        make: a new behaviour that flies it.
-        endless: it ends by its time-out, and that is a success.
-        timeout_s: after which it has failed (or, endless, is done); None: the behaviour's own limits alone.
-        repeat: how often it is flown, one time after the other succeeding.
-        visits: how often it may be begun; once more fails the mission. None: no limit.
+        title: its name, or its command; for people.
+        command: in the grammar.
+        make: builds the behaviour.
+        endless: it ends by its time-out, with success.
+        timeout_s: after which it has failed (or, endless, succeeded); None: only the behaviour's own limits.
+        repeat: how often it is flown in succession, as long as it succeeds.
+        visits: how often it may be started; once more fails the mission. None: no limit.
         on_success, on_failure: index of the next step, or `end`, `abort`, `rtl` or `land`.
     """
 
@@ -52,11 +52,11 @@ class PlannedStep:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """A mission that was checked: every index is one of a step, and it has an end.
+    """A validated mission: every index is valid, and it has an end.
 
     Attributes:
-        name: for people. steps: in the order of the file; the first one begins.
-        way_down: makes the behaviour for `rtl` and `land`. timeout_s: of the whole; None: no limit.
+        name: for people. steps: in the order of the file, starting with the first.
+        way_down: builds the behaviour for `rtl` and `land`. timeout_s: of the whole; None: no limit.
     """
 
     name: str
@@ -67,7 +67,7 @@ class Plan:
 
 @dataclass(frozen=True, slots=True)
 class StepRecord:
-    """What became of one step that was flown."""
+    """The result of one step."""
 
     title: str
     command: str
@@ -81,10 +81,10 @@ class SequenceBehaviour(Behaviour):
     """Flies a plan.
 
     Args:
-        refused: why a behaviour cannot begin now, None if it can; guidance's own rule, asked at every step.
+        refused: `Guidance.check_requirements`, called at every step.
 
     Attributes:
-        records: the steps that have ended, in the order in which they were flown.
+        records: the steps that have ended, in order.
     """
 
     name = "mission"
@@ -94,7 +94,7 @@ class SequenceBehaviour(Behaviour):
         self.records: list[StepRecord] = []
         self._at = 0
         self._active: Behaviour | None = None
-        # The first one, made at once, tells what the mission needs to begin.
+        # The first step's behaviour declares what the mission needs to begin.
         first = plan.steps[0].make()
         self._first: Behaviour | None = first
         self.neighbour_names = first.neighbour_names
@@ -112,7 +112,7 @@ class SequenceBehaviour(Behaviour):
 
     @property
     def requirements(self) -> frozenset[Requirement]:  # type: ignore[override]
-        """Of the step that is flown; before, of the first one, if the mission ends with its failure."""
+        """Of the current step; before the start, of the first one if its failure aborts the mission."""
         if self._active is not None:
             return self._active.requirements
         if self._first is None or self._plan.steps[0].on_failure != ABORT:
@@ -121,10 +121,10 @@ class SequenceBehaviour(Behaviour):
 
     @property
     def where(self) -> str:
-        """Which step it is at: `step 2 of 6 (find)`."""
+        """The current step: `step 2 of 6 (find)`."""
         step = self._plan.steps[self._at]
         if self._failure:
-            return f"way down after {self._failure}"
+            return f"descent after {self._failure}"
         return f"step {self._at + 1} of {len(self._plan.steps)} ({step.title})"
 
     @property
@@ -132,8 +132,8 @@ class SequenceBehaviour(Behaviour):
         doing = "" if self._active is None else f": {self._active.status}"
         return f"mission {self._plan.name}, {self.where}{doing}"
 
-    def told(self, outcome: Outcome) -> Outcome:
-        """The same with the step it was at: what ended it from outside (a pilot, a command) knows of none."""
+    def with_step(self, outcome: Outcome) -> Outcome:
+        """Add the current step to an outcome that came from outside (a pilot, another command)."""
         if outcome.success or self._ended or self._active is None:
             return outcome
         return Outcome(False, f"{self.where}: {outcome.reason}")
@@ -144,7 +144,7 @@ class SequenceBehaviour(Behaviour):
         return notes
 
     def request_failed(self, why: str) -> bool:
-        """The autopilot refused a step's mode: that fails the step, not more."""
+        """The autopilot refused a mode: the step fails, not the mission."""
         if self._active is None:
             return False
         self._request_failure = why
@@ -180,7 +180,7 @@ class SequenceBehaviour(Behaviour):
             if (ended := self._begin(0, context)) is not None:
                 return ended
             dt_s = 0.0
-        # Steps may end as soon as they begin; so many in one turn go round in circles.
+        # Steps may end at once; this many in one update are a loop.
         for _ in range(2 * len(self._plan.steps) + 2):
             if not self._failure and self._out_of_time(context):
                 ended = self._give_up(context)
@@ -192,10 +192,10 @@ class SequenceBehaviour(Behaviour):
             if ended is not None:
                 return ended
             dt_s = 0.0
-        return Outcome(False, f"{self.where}: its steps end as soon as they begin: {self.records[-1].reason}")
+        return Outcome(False, f"{self.where}: loop of steps that end at once: {self.records[-1].reason}")
 
     def _fly(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
-        """One turn of the step that is flown."""
+        """Update the current step."""
         active, planned = self._active, self._plan.steps[self._at]
         assert active is not None
         context = replace(context, goal_ned_m=self._goal_ned_m)
@@ -212,7 +212,7 @@ class SequenceBehaviour(Behaviour):
                 active.on_activate(context)
             return active.update(dt_s, context)
         except Exception as error:
-            # What goes wrong in one step is that step's failure: the plan says what then.
+            # An exception fails the step; the plan says how to go on.
             logger.exception("%s failed", active.name)
             return Outcome(False, f"{active.name} failed: {type(error).__name__}: {error}")
 
@@ -225,18 +225,18 @@ class SequenceBehaviour(Behaviour):
         return Outcome(False, f"timed out after {limit_s:g} s: {self._status_of_flown()}")
 
     def _status_of_flown(self) -> str:
-        return self._active.status if self._active is not None else "not begun"
+        return self._active.status if self._active is not None else "not started"
 
     def _after(self, outcome: Outcome, context: BehaviourContext) -> Outcome | None:
-        """What follows a step that has ended; the outcome of all, if nothing does."""
+        """Start what follows a step that has ended; returns the mission's outcome if nothing does."""
         planned, where = self._plan.steps[self._at], self.where
         self._goal_ned_m = outcome.goal_ned_m
-        self._take_last_notes()
+        self._collect_notes()
         self._leave()
         if self._failure:
             return Outcome(False, f"{self._failure}; {outcome.reason}")
-        told = (planned.title, planned.command, outcome.success, outcome.reason)
-        self.records.append(StepRecord(*told, self._begun_ns, context.now_ns))
+        fields = (planned.title, planned.command, outcome.success, outcome.reason)
+        self.records.append(StepRecord(*fields, self._begun_ns, context.now_ns))
         self._repeats += 1
         if outcome.success and self._repeats < planned.repeat:
             return self._begin(self._at, context, again=True)
@@ -244,14 +244,14 @@ class SequenceBehaviour(Behaviour):
         self._notes.append(f"mission {self._plan.name}: {where} {_done(outcome)}{_then(self._plan, follows)}")
         return self._go_on(follows, f"{where}: {outcome.reason}", context)
 
-    def _go_on(self, follows: int | str, told: str, context: BehaviourContext) -> Outcome | None:
+    def _go_on(self, follows: int | str, reason: str, context: BehaviourContext) -> Outcome | None:
         if isinstance(follows, int):
             return self._begin(follows, context)
         if follows == END:
             return Outcome(True, f"flown, {len(self.records)} steps", self._goal_ned_m)
         if follows == ABORT:
-            return Outcome(False, told)
-        self._failure = told
+            return Outcome(False, reason)
+        self._failure = reason
         self._active, self._activated, self._begun_ns = self._plan.way_down(follows), False, context.now_ns
         return None
 
@@ -262,8 +262,8 @@ class SequenceBehaviour(Behaviour):
             self._repeats = 0
             self._visits[index] += 1
             if planned.visits is not None and self._visits[index] > planned.visits:
-                told = f"{self.where}: begun {planned.visits} times already"
-                return self._go_on(_final(planned.on_failure), told, context)
+                reason = f"{self.where}: visits limit {planned.visits} reached"
+                return self._go_on(_final(planned.on_failure), reason, context)
         self._active, self._first = self._first or planned.make(), None
         times = f", {self._repeats + 1} of {planned.repeat} times" if planned.repeat > 1 else ""
         number = f"step {index + 1} of {len(self._plan.steps)}"
@@ -275,15 +275,15 @@ class SequenceBehaviour(Behaviour):
         return limit_s is not None and context.now_ns - self._started_ns > limit_s * 1e9
 
     def _give_up(self, context: BehaviourContext) -> Outcome | None:
-        """The time of the whole mission is over: the step that is flown fails for good."""
-        told = f"{self.where}: the mission's {self._plan.timeout_s:g} s are over"
+        """The mission's time-out has passed: the current step fails."""
+        reason = f"{self.where}: mission timed out after {self._plan.timeout_s:g} s"
         self._goal_ned_m = None
-        self._take_last_notes()
+        self._collect_notes()
         self._leave()
-        self._notes.append(f"mission {self._plan.name}: {told}")
-        return self._go_on(_final(self._plan.steps[self._at].on_failure), told, context)
+        self._notes.append(f"mission {self._plan.name}: {reason}")
+        return self._go_on(_final(self._plan.steps[self._at].on_failure), reason, context)
 
-    def _take_last_notes(self) -> None:
+    def _collect_notes(self) -> None:
         if self._active is not None:
             self._notes.extend(self._active.take_notes())
 
@@ -298,12 +298,12 @@ def _done(outcome: Outcome) -> str:
 
 
 def _then(plan: Plan, follows: int | str) -> str:
-    """Where it goes on, if that is anywhere a person would not expect."""
+    """The next step or branch in words; empty at the end."""
     if isinstance(follows, str):
         return "" if follows == END else f"; {follows}"
-    return f"; on with {plan.steps[follows].title}"
+    return f"; next: {plan.steps[follows].title}"
 
 
 def _final(follows: int | str) -> str:
-    """A step begun too often may be followed by a way down, not by more steps."""
+    """A step over its limit may be followed by `rtl` or `land`, not by more steps."""
     return follows if isinstance(follows, str) and follows in WAYS_DOWN else ABORT

@@ -1,1 +1,1 @@
-"""What is seen as places in local NED: made from detections and markers, filtered, chosen."""
+"""Targets in local NED: from detections and markers, filtered, selected."""

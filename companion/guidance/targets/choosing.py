@@ -1,4 +1,4 @@
-"""Which object a behaviour begins with: a detector misses single frames, so one frame must not decide."""
+"""Target selection over several frames, because a detector misses single frames."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from collections.abc import Sequence
 from companion.guidance.targets.target import Target
 from vision.attitude import wrap_angle
 
-# From the first true object on it is looked for so long whether another is meant.
+# Candidates are collected for this long from the first confirmed object on.
 CHOOSING_S = 0.4
-# Before the nose are all within this, and of them the one that is nearest to the vehicle is meant.
+# Objects within this angle of the nose count as ahead; of these the nearest one is selected.
 BEFORE_RAD = math.radians(10.0)
 
 
 class TargetSelector:
-    """Collects the true objects of the first moments and takes the nearest of those before the nose.
+    """Collects confirmed objects for `CHOOSING_S` and selects the nearest one ahead.
 
-    With none before it, the one nearest to the nose. What is true in some frames and doubted in as many is
-    not chosen.
+    If none is ahead, the one with the smallest angle from the nose. An object that is ambiguous in at least
+    as many frames as it is confirmed in is not selected.
     """
 
     def __init__(self) -> None:
@@ -29,13 +29,13 @@ class TargetSelector:
         self._since_ns: int | None = None
         self._newest_ns = -1
 
-    def take(self, fitting: Sequence[Target], yaw_rad: float, now_ns: int) -> Target | None:
-        """The choice, once it is made: its newest detection. None: not yet.
+    def update(self, fitting: Sequence[Target], yaw_rad: float, now_ns: int) -> Target | None:
+        """The selected object's newest detection; None: not selected yet.
 
         Args:
-            fitting: of the newest frame, those of the class, `trusted` or not. Without identities one frame
+            fitting: the newest frame's targets of the class, `trusted` or not. Without track ids one frame
                 decides.
-            yaw_rad: of the nose.
+            yaw_rad: of the vehicle.
         """
         trusted = [target for target in fitting if target.trusted]
         if any(target.track_id is None for target in trusted):
@@ -60,7 +60,7 @@ class TargetSelector:
         chosen = _nearest(sure, yaw_rad)
         if now_ns - chosen.captured_ns > 2 * CHOOSING_S * 1e9:
             assert chosen.track_id is not None
-            self._forget(chosen.track_id)  # gone again: the next nearest
+            self._forget(chosen.track_id)  # lost again: select the next nearest
             self._since_ns = now_ns if self._seen else None
             return None
         return chosen

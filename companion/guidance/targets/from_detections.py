@@ -1,7 +1,7 @@
-"""From detections to targets: boxes in a picture become directions and places in local NED.
+"""Detections to targets: boxes in an image become directions and positions in local NED.
 
 A frame is some tens of milliseconds old when its detections arrive, and the vehicle has turned since: the
-attitude and the position used here are those of the moment of capture, interpolated from a short history.
+attitude and position of the capture time are used, interpolated from a short history.
 """
 
 from __future__ import annotations
@@ -29,44 +29,44 @@ from vision.tracking.association import overlaps
 _Sample = TypeVar("_Sample")
 
 HISTORY_S = 3.0
-# Beyond the ends of the history the nearest sample is taken for this long; a quadrotor turns 10° in it.
+# The nearest sample is used up to this far beyond the history; a quadrotor turns 10° in this time.
 MAX_OUTSIDE_S = 0.2
-# A box that touches the picture's lower edge (pixels) hides where its object stands.
+# Within this many pixels a box touches the image edge; at the lower edge its ground contact is hidden.
 EDGE_PX = 2.0
 # One degree of attitude error at this depression is half the range.
 MIN_DEPRESSION_RAD = math.radians(2.0)
-# Below this height the ground plane says nothing about range.
+# Below this height the ground plane gives no range.
 MIN_HEIGHT_M = 0.3
-# A range from a height needs a box so tall: one pixel more or less is a twelfth of it.
+# Minimum box height for a range from a known height: one pixel is a twelfth of it.
 LEAST_HEIGHT_PX = 12.0
-# The lowest that is seen of an object is its wheels, its feet or its underside; the nearest surface is so
-# much nearer: the median over all classes in benchmarks/range_error.py, on other seeds than the published.
+# The lowest visible part of an object is its wheels, feet or underside; its nearest surface is this much
+# nearer: median over all classes in benchmarks/range_error.py, on seeds other than the published ones.
 CONTACT_INSET_M = 0.2
-# Where the object of a box touches its lower edge in a rolled picture: so much of the way from the middle to
-# where a rectangle would. 95 % of errors, rendered frames, up to 20° of roll: 1.20 m with 0.25, 1.23 with 0,
-# 1.49 with 0.5. Of synthetic approaches (to boxes), in wind, fewer arrive with 0.
+# Where the object touches the lower edge of its box in a rolled image: this fraction of the offset at which a
+# rectangle would. 95 % of errors, rendered frames, up to 20° of roll: 1.20 m with 0.25, 1.23 with 0, 1.49
+# with 0.5. Of synthetic approaches (to boxes) in wind, fewer arrive with 0.
 CONTACT_SHARE = 0.25
-# One sigma of that place, shares of the box's width. Beyond this roll nothing is known of it.
+# One sigma of that offset, fraction of the box's width. Beyond this roll it is not corrected.
 CONTACT_SIGMA = 0.25
 MAX_CONTACT_ROLL_RAD = math.radians(30.0)
 # One sigma of the range, metres, from the same measurement. Depth: fixed, and per metre of range.
 DEPTH_SIGMA = (0.15, 0.02)
-# Of a box cut off by the picture's edge, what is nearest may be outside.
+# The nearest point of a box cut off by the image edge may be outside.
 CUT_SIGMA_M = 0.3
 # Ground: fixed, and per radian of depression; two pixels of the box's edge and half a degree of attitude.
 GROUND_SIGMA_M, GROUND_SIGMA_RAD = 0.3, 0.015
 HEIGHT_SIGMA = (0.3, 0.2)
-# Boxes that overlap by so much are of one thing; those of a rider and the bicycle do not. A name must be
-# surer by this than any other it is given.
-SAME_THING_IOU, CLEARLY_SURER = 0.7, 0.1
+# Boxes with at least this IoU belong to one object (those of a rider and the bicycle do not). A class is
+# unambiguous if its score exceeds that of every other class of the object by this.
+SAME_OBJECT_IOU, CLEAR_MARGIN = 0.7, 0.1
 
 
 class HistoryError(LookupError):
-    """The history does not reach to the asked moment. The message says by how much."""
+    """The history does not cover the requested time. The message says by how much."""
 
 
 class Pose(NamedTuple):
-    """Where the vehicle was.
+    """The vehicle's pose at a time.
 
     Attributes:
         ned_from_body: (3, 3) float64 rotation from body FRD to NED.
@@ -80,9 +80,9 @@ class Pose(NamedTuple):
 
 
 class StateHistory:
-    """The attitudes and positions of the last few seconds, each at its own stamp (CLOCK_MONOTONIC ns).
+    """Attitudes and positions of the last few seconds, each with its own stamp (CLOCK_MONOTONIC ns).
 
-    Of a gimbal the attitudes too, each with what its yaw counts from.
+    Also the gimbal's attitudes, each with the reference of its yaw.
     """
 
     def __init__(self, duration_s: float = HISTORY_S) -> None:
@@ -92,7 +92,7 @@ class StateHistory:
         self._gimbal: deque[tuple[int, tuple[Quaternion, YawFrame]]] = deque()
 
     def add(self, state: VehicleState) -> None:
-        """Remember what is new in a snapshot; older or repeated stamps are passed over."""
+        """Add the new samples of a snapshot; older or repeated stamps are ignored."""
         if state.attitude is not None and _newer(self._attitudes, state.attitude_ns):
             self._attitudes.append((state.attitude_ns, state.attitude))
             self._forget(self._attitudes)
@@ -106,10 +106,10 @@ class StateHistory:
             self._forget(self._gimbal)
 
     def at(self, stamp_ns: int) -> Pose:
-        """The pose at a moment: attitude by slerp, position linearly between the samples around it.
+        """The pose at a time: attitude by slerp, position by linear interpolation.
 
         Raises:
-            HistoryError: nothing is known yet, or the moment lies outside by more than `MAX_OUTSIDE_S`.
+            HistoryError: no samples yet, or the time lies outside by more than `MAX_OUTSIDE_S`.
         """
         ned_from_body = self._ned_from_body(stamp_ns)
         before, after, fraction = _around(self._positions, stamp_ns, "position of the vehicle")
@@ -117,16 +117,16 @@ class StateHistory:
         return Pose(ned_from_body, (north, east, down), height)
 
     def gimbal_at(self, stamp_ns: int) -> Quaternion:
-        """(w, x, y, z), turns the gimbal's frame (FRD) into NED at a moment, by slerp.
+        """Quaternion (w, x, y, z) from the gimbal's frame (FRD) to NED at a time, by slerp.
 
-        A yaw that the gimbal tells against the nose is turned by the vehicle's heading of that same moment.
+        A yaw relative to the vehicle is rotated by the vehicle's heading of the same time.
 
         Raises:
-            HistoryError: as `at`, of the gimbal's attitude or, where its yaw needs it, of the vehicle's.
+            HistoryError: as `at`, for the gimbal's attitude or, for a relative yaw, the vehicle's.
         """
         first, second, fraction = _around(self._gimbal, stamp_ns, "attitude of the gimbal")
         if first[1] is not second[1]:
-            # What it counts from has changed between the two: nothing lies between them.
+            # The yaw reference changed between the two: do not interpolate.
             first = second = first if fraction < 0.5 else second
         turned = slerp(first[0], second[0], fraction)
         if first[1] is YawFrame.NORTH:
@@ -145,10 +145,10 @@ class StateHistory:
 
 
 def mount_at(mount: CameraMount, history: StateHistory, stamp_ns: int) -> CameraMount:
-    """How a camera was mounted at a moment: on a gimbal, as that looked then; else as ever.
+    """The camera's mount at a time; on a gimbal, with the gimbal's attitude of that time.
 
     Raises:
-        HistoryError: where the gimbal looked then is not known.
+        HistoryError: the gimbal's attitude at that time is unknown.
     """
     if not mount.on_gimbal:
         return mount
@@ -165,23 +165,23 @@ def targets_from_detections(
 ) -> tuple[Target, ...]:
     """The targets of one frame, in the order of its detections.
 
-    Range comes from the detection's nearest point where it has one (`nearest_camera_m`, from depth), else
-    from where the ray through the box's lower edge meets the ground, less `CONTACT_INSET_M`.
-    The ground is taken as flat and level with home. There is no range if the box touches the picture's lower
-    edge, or the ray points less than 2° down. Then the class's height in `heights_m` tells it, if the whole
-    object is in the picture.
+    The range comes from the detection's nearest point if it has one (`nearest_camera_m`, from depth), else
+    from the intersection of the ray through the box's lower edge with the ground, less `CONTACT_INSET_M`. The
+    ground is assumed flat and level with home. That gives no range if the box touches the image's lower edge,
+    or the ray points less than 2° down; then the class's height in `heights_m` is used, if the box is not cut
+    off at its top or bottom.
 
-    What the detector also calls something else, (nearly) as surely, is not `trusted`: a car that may be a
-    truck is not flown to.
+    A detection that has a similar score as another class is not `trusted`: a car that may be a truck is not
+    flown to.
 
     Raises:
-        HistoryError: the vehicle's pose at `captured_ns`, or where its gimbal looked then, is not known.
+        HistoryError: the pose of the vehicle or its gimbal at `captured_ns` is unknown.
     """
     pose, mount = history.at(captured_ns), mount_at(mount, history, captured_ns)
     if not detections:
         return ()
     sights = _sights(detections, camera, mount, pose)
-    doubtful = _named_otherwise(detections)
+    ambiguous = _ambiguous(detections)
     return tuple(
         _target(
             detection,
@@ -191,19 +191,19 @@ def targets_from_detections(
             mount,
             pose,
             height_m=heights_m.get(detection["class_name"]),
-            trusted=not doubt,
+            trusted=not doubtful,
         )
-        for detection, sight, doubt in zip(detections, sights, doubtful, strict=True)
+        for detection, sight, doubtful in zip(detections, sights, ambiguous, strict=True)
     )
 
 
 class _Sight(NamedTuple):
-    """What the geometry of one box says: three numbers each, NED, offsets in metres; NaN: it says nothing.
+    """The geometry of one box: NED vectors from the vehicle, offsets in metres; NaN: unknown.
 
     Attributes:
-        direction: unit, to the box's centre.
+        direction: unit vector to the box's centre.
         nearest: to the nearest point of its surface, by depth.
-        on_ground: to where the middle of its lower edge meets the ground.
+        on_ground: to the intersection of the middle of its lower edge with the ground.
         lens: to the optical centre.
     """
 
@@ -216,9 +216,9 @@ class _Sight(NamedTuple):
 def _sights(
     detections: Sequence[DetectionRecord], camera: CameraModel, mount: CameraMount, pose: Pose
 ) -> list[_Sight]:
-    """Of all boxes at once: a frame's targets are worked out between its arrival and the next setpoint."""
+    """The geometry of all boxes, vectorized: it runs between a frame's arrival and the next setpoint."""
     count = len(detections)
-    # From edges to the centres of pixels, which rays go through.
+    # From pixel edges to pixel centres, through which rays go.
     left, top, right, bottom = np.array([detection["xyxy"] for detection in detections]).T - 0.5
     unknown = [math.nan] * 3
     nearest = np.array([detection["nearest_camera_m"] or unknown for detection in detections], np.float64)
@@ -232,42 +232,42 @@ def _sights(
     on_ground = feet.on_ground(pose.height_m, MIN_DEPRESSION_RAD)
     offsets = lines.camera_ned_m + nearest @ mount.ned_from_optical(pose.ned_from_body).T
     of_each, lens = (centres.directions, offsets, on_ground), lines.camera_ned_m.tolist()
-    rows = zip(*(values.tolist() for values in of_each), strict=True)
-    return [_Sight(direction, at, foot, lens) for direction, at, foot in rows]
+    geometry = zip(*(values.tolist() for values in of_each), strict=True)
+    return [_Sight(direction, at, foot, lens) for direction, at, foot in geometry]
 
 
 def _contact_px(
     width: NDArray[np.float64], height: NDArray[np.float64], roll_rad: float
 ) -> NDArray[np.float64]:
-    """How far right of the middle of its lower edge each box's object touches that edge, pixels.
+    """Offset of each object's ground contact from the middle of its box's lower edge, pixels to the right.
 
-    In a rolled picture an upright rectangle touches it with its lower corner; what is rounder, nearer to the
-    middle.
+    In a rolled image an upright rectangle touches the edge with its lower corner, a rounder shape nearer to
+    the middle.
     """
     if abs(roll_rad) > MAX_CONTACT_ROLL_RAD:
         return np.zeros(len(width))
     sine, cosine = math.sin(abs(roll_rad)), math.cos(roll_rad)
-    # The height of the rectangle whose outline, turned by the roll, is as wide and as high as the box.
+    # Height of the rectangle whose outline, rotated by the roll, has the box's width and height.
     upright = np.clip((height * cosine - width * sine) / (cosine**2 - sine**2), 0.0, height)
     to_corner = np.minimum(upright * sine - width / 2, 0.0)
     return CONTACT_SHARE * math.copysign(1.0, roll_rad) * to_corner
 
 
 def _roll_rad(mount: CameraMount, pose: Pose) -> float:
-    """By how much the picture's rows are turned from the horizontal; of one that looks straight down, 0."""
+    """Angle between the image's rows and the horizontal; 0 for a camera that looks straight down."""
     down = mount.ned_from_optical(pose.ned_from_body)[2]
     return math.asin(max(-1.0, min(1.0, float(down[0]))))
 
 
-def _named_otherwise(detections: Sequence[DetectionRecord]) -> list[bool]:
-    """Of each: a box of another class, (nearly) as sure, is about the same thing."""
+def _ambiguous(detections: Sequence[DetectionRecord]) -> list[bool]:
+    """For each: whether a box of another class with a similar score covers the same object."""
     if len({detection["class_name"] for detection in detections}) < 2:
         return [False] * len(detections)
     boxes = np.array([detection["xyxy"] for detection in detections])
     scores = np.array([_score(detection) for detection in detections])
     names = np.array([detection["class_name"] for detection in detections])
-    rivals = (names[:, None] != names) & (scores[:, None] < scores + CLEARLY_SURER)
-    doubtful: list[bool] = (rivals & (overlaps(boxes, boxes) >= SAME_THING_IOU)).any(axis=1).tolist()
+    rivals = (names[:, None] != names) & (scores[:, None] < scores + CLEAR_MARGIN)
+    doubtful: list[bool] = (rivals & (overlaps(boxes, boxes) >= SAME_OBJECT_IOU)).any(axis=1).tolist()
     return doubtful
 
 
@@ -335,14 +335,14 @@ def _target(
 
 
 def _towards(lens: list[float], direction: list[float], nearest: list[float]) -> list[float]:
-    """The offset in a direction from the lens that is as far away over ground, and as high, as `nearest`."""
+    """The offset in a direction from the lens, with the horizontal range and the height of `nearest`."""
     range_m = math.hypot(nearest[0] - lens[0], nearest[1] - lens[1])
-    share = range_m / max(math.hypot(direction[0], direction[1]), 1e-9)
-    return [lens[0] + direction[0] * share, lens[1] + direction[1] * share, nearest[2]]
+    scale = range_m / max(math.hypot(direction[0], direction[1]), 1e-9)
+    return [lens[0] + direction[0] * scale, lens[1] + direction[1] * scale, nearest[2]]
 
 
 def _nearer(lens: list[float], direction: list[float], foot: list[float], by_m: float) -> list[float]:
-    """Over ground in a direction from the lens, as far that way as a foot, less `by_m`, never behind it."""
+    """The offset in a direction from the lens, with the range of `foot` less `by_m`, and its height."""
     level = max(math.hypot(direction[0], direction[1]), 1e-9)
     north, east = direction[0] / level, direction[1] / level
     range_m = (foot[0] - lens[0]) * north + (foot[1] - lens[1]) * east
@@ -351,7 +351,7 @@ def _nearer(lens: list[float], direction: list[float], foot: list[float], by_m: 
 
 
 def _measurable(camera: CameraModel, top: float, bottom: float) -> bool:
-    """Tall enough, and neither its top nor its foot is cut off by the picture's edge."""
+    """Whether a box is tall enough and not cut off by the image's upper or lower edge."""
     return top > EDGE_PX and bottom < camera.height - 1 - EDGE_PX and bottom - top >= LEAST_HEIGHT_PX
 
 
@@ -360,13 +360,13 @@ def _newer(samples: deque[tuple[int, _Sample]], stamp_ns: int) -> bool:
 
 
 def _around(samples: deque[tuple[int, _Sample]], stamp_ns: int, what: str) -> tuple[_Sample, _Sample, float]:
-    """The samples before and after a moment and how far between them it is; the nearest beyond the ends."""
+    """The samples before and after a time, and its fraction between them; beyond the ends the nearest."""
     if not samples:
-        raise HistoryError(f"no {what} is known yet")
+        raise HistoryError(f"no {what} received yet")
     outside_s = max(samples[0][0] - stamp_ns, stamp_ns - samples[-1][0]) / 1e9
     if outside_s > MAX_OUTSIDE_S:
         side = "older than the oldest" if stamp_ns < samples[0][0] else "newer than the newest"
-        raise HistoryError(f"the frame is {outside_s:.2f} s {side} {what}, allowed are {MAX_OUTSIDE_S:g} s")
+        raise HistoryError(f"the frame is {outside_s:.2f} s {side} {what}, allowed: {MAX_OUTSIDE_S:g} s")
     index = bisect_right(samples, stamp_ns, key=lambda sample: sample[0])
     if index == 0:
         return samples[0][1], samples[0][1], 0.0

@@ -1,7 +1,7 @@
-"""From markers to places: a marker before the camera becomes a place in local NED, and its pad with it.
+"""Markers to targets: positions of detected markers and their pads in local NED.
 
-As with detections, attitude and position are those of the moment of capture (`targets.StateHistory`), so a
-vehicle that banks does not swing its marker.
+As with detections, attitude and position are those of the capture time (`targets.StateHistory`), so banking
+does not displace the marker.
 """
 
 from __future__ import annotations
@@ -18,25 +18,25 @@ from companion.vehicle.state import Vector3
 from vision.camera_model import CameraModel, CameraMount
 from vision.markers import Marker, MarkerPose, PadMarker
 
-# Two poses that fit so alike (see `Marker.ambiguity`) are told apart by what is known of pads: level.
+# Above this ambiguity (see `Marker.ambiguity`) the pose nearer to level is chosen, as pads are level.
 AMBIGUOUS = 0.25
-# Straight down must be this far inside the picture, as a share of it, for a camera to follow a marker down.
+# Margin, as a fraction of the image size, by which straight down must be inside the image to land.
 DOWN_MARGIN = 0.08
 
 
 @dataclass(frozen=True, slots=True)
 class MarkerTarget:
-    """One marker, seen once.
+    """One detected marker.
 
     Attributes:
-        identifier: in its dictionary. pad: the marker whose pad it lies on, its own unless settings say else.
+        identifier: in its dictionary. pad: id of the pad it lies on, its own unless configured otherwise.
         captured_ns: CLOCK_MONOTONIC stamp of the frame.
         bearing_rad: clockwise from north, -π..π. elevation_rad: above the horizon. Both from the vehicle.
         distance_m: straight from the vehicle. ground_range_m: over ground.
         position_ned_m: of its centre, local NED. pad_ned_m: of its pad's centre.
-        pad_offset_frd_m: from the vehicle to the pad's centre in the body frame of that moment.
-        heading_rad: where its upper edge points, clockwise from north.
-        size_m, side_px: its side, and how long that is in the picture. reprojection_px: how well it fits.
+        pad_offset_frd_m: from the vehicle to the pad's centre, in the body frame at the capture time.
+        heading_rad: direction of its upper edge, clockwise from north.
+        size_m, side_px: side length, and the same in the image. reprojection_px: reprojection error.
     """
 
     identifier: int
@@ -57,30 +57,30 @@ class MarkerTarget:
 
 @dataclass(frozen=True, slots=True)
 class MarkerSight:
-    """What is seen of markers now.
+    """The current marker detections.
 
     Attributes:
-        targets: of the newest frame; empty when nothing is seen or it is too old to steer by.
-        captured_ns: of that frame; 0: none ever came.
-        age_s: since then; None: none ever came.
-        fresh: that is within the declared maximum.
-        missing: what is missing before markers can be landed on; empty if nothing is.
+        targets: of the newest frame; empty: none, or the frame is too old.
+        captured_ns: of that frame; 0: none received.
+        age_s: since then; None: none received.
+        fresh: that age is within the configured maximum.
+        missing: what is missing for landing on markers; empty: nothing.
     """
 
     targets: tuple[MarkerTarget, ...] = ()
     captured_ns: int = 0
     age_s: float | None = None
     fresh: bool = False
-    missing: str = "perception that looks for markers (markers.dictionary is not set)"
+    missing: str = "marker detection (markers.dictionary is not set)"
 
     def unavailable(self, gap_s: float) -> str | None:
-        """What is missing, in words; None: nothing is. A camera may be late by `gap_s`."""
+        """What is missing, in words; None: nothing. A camera may be late by `gap_s`."""
         if self.missing:
             return self.missing
         if self.age_s is None:
-            return "a camera that looks for markers (nothing came from it yet)"
+            return "marker detections (none received yet)"
         if not self.fresh and self.age_s > gap_s:
-            return f"a camera that looks for markers (its newest frame is {self.age_s:.1f} s old)"
+            return f"marker detections (newest frame {self.age_s:.1f} s old)"
         return None
 
 
@@ -94,13 +94,13 @@ def marker_targets(
     history: StateHistory,
     on_pads: Mapping[int, PadMarker],
 ) -> tuple[MarkerTarget, ...]:
-    """Where the markers of one frame are, in their order.
+    """The marker targets of one frame, in order.
 
     Args:
-        on_pads: those that lie on another's pad, by their own id.
+        on_pads: markers that lie on another marker's pad, by their own id.
 
     Raises:
-        HistoryError: the vehicle's pose at `captured_ns`, or where its gimbal looked then, is not known.
+        HistoryError: the pose of the vehicle or its gimbal at `captured_ns` is unknown.
     """
     if not markers:
         return ()
@@ -109,14 +109,14 @@ def marker_targets(
 
 
 def looks_down(camera: CameraModel, mount: CameraMount) -> bool:
-    """Whether what is straight below a level vehicle is well inside the picture.
+    """Whether straight down, with the vehicle level, is inside the image by `DOWN_MARGIN`.
 
-    A camera on a gimbal must be told how it was held (`mount_at`).
+    For a camera on a gimbal pass its mount at a time (`mount_at`).
     """
     below = mount.ned_from_optical(np.eye(3)).T @ np.array([0.0, 0.0, 1.0])
     column, row = camera.project(below.reshape(1, 3))[0]
     wide, high = camera.width * DOWN_MARGIN, camera.height * DOWN_MARGIN
-    # NaN, which is behind the camera, fails both comparisons.
+    # NaN (behind the camera) fails both comparisons.
     return bool(wide <= column <= camera.width - wide and high <= row <= camera.height - high)
 
 
@@ -124,13 +124,13 @@ def _target(
     marker: Marker, captured_ns: int, mount: CameraMount, pose: Pose, on_pads: Mapping[int, PadMarker]
 ) -> MarkerTarget:
     ned_from_optical = mount.ned_from_optical(pose.ned_from_body)
-    place, rotation = marker.position_camera_m, marker.rotation
+    position, rotation = marker.position_camera_m, marker.rotation
     if marker.other is not None and marker.ambiguity > AMBIGUOUS:
-        # The one whose face looks up more: NED, so up is -z.
-        both = (MarkerPose(place, rotation, marker.reprojection_px), marker.other)
+        # The pose whose face points up more: NED, so up is -z.
+        both = (MarkerPose(position, rotation, marker.reprojection_px), marker.other)
         level = min(both, key=lambda fit: (ned_from_optical @ fit.rotation)[2, 2])
-        place, rotation = level.position_camera_m, level.rotation
-    offset = ned_from_optical @ place + pose.ned_from_body @ mount.position_frd_m
+        position, rotation = level.position_camera_m, level.rotation
+    offset = ned_from_optical @ position + pose.ned_from_body @ mount.position_frd_m
     heading_rad = _heading(ned_from_optical @ rotation)
     on_pad = on_pads.get(marker.identifier)
     pad_offset = offset
@@ -159,7 +159,7 @@ def _target(
 
 
 def _heading(ned_from_marker: NDArray[np.float64]) -> float:
-    """Of the upper edge, from both of the print's axes: a tilt that is not there must not turn it."""
+    """Heading of the upper edge, from both axes of the print, so that an apparent tilt does not rotate it."""
     right, upper = ned_from_marker[:2, 0], ned_from_marker[:2, 1]
     return math.atan2(upper[1] - right[0], upper[0] + right[1])
 

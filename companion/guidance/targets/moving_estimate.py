@@ -1,8 +1,8 @@
-"""What is known of one moving object: a constant-velocity Kalman filter over ground.
+"""Horizontal motion estimate of one object: a constant-velocity Kalman filter.
 
 The state is position and velocity (north, east), local NED, driven by white acceleration (Bar-Shalom, Li &
 Kirubarajan 2001, "Estimation with Applications to Tracking and Navigation", ch. 6.2). A measurement is a
-place with the ellipse of a bearing and a range, or a bearing alone.
+position with the error ellipse of bearing and range, or a bearing alone.
 """
 
 from __future__ import annotations
@@ -18,25 +18,24 @@ from companion.guidance.targets.target import RangeSource, Target
 from companion.guidance.targets.track import NEAREST_M, measurement_noise
 from companion.vehicle.state import Vector3
 
-# Spectral density of the acceleration, m²/s³: what turns a walk round in a second or two.
+# Spectral density of the acceleration, m²/s³: a walking person reverses in one or two seconds.
 ACCELERATION_M2_PER_S3 = 1.5
-# Before two looks nothing is known of the velocity, one sigma.
+# One sigma of the unknown initial velocity.
 FIRST_VELOCITY_SIGMA_MPS = 2.0
 FASTEST_MPS = 15.0
-# What is off in a range by attitude, height and slope is off by the same from frame to frame: what one says
-# against the last is surer than what it says of the place, by so much of a sigma. Not so when the range comes
-# from somewhere else than in the last.
+# Range errors from attitude, height and slope are correlated between frames: relative to the last frame the
+# noise is this fraction of a sigma, unless the range source has changed.
 FRAME_TO_FRAME = 0.35
 
 Vector = NDArray[np.float64]
 
 
 class Fit(NamedTuple):
-    """A detection against an estimate of its moment: how far it is off.
+    """The innovation of a detection against an estimate at its time.
 
     Attributes:
         squared: Mahalanobis distance squared.
-        innovation: (2,) metres north and east of where the object is expected.
+        innovation: (2,) metres north and east of the expected position.
         spread: (2, 2) its covariance.
     """
 
@@ -47,18 +46,18 @@ class Fit(NamedTuple):
 
     @property
     def off_m(self) -> float:
-        """How far from where the object is expected."""
+        """Distance from the expected position."""
         return float(np.hypot(*self.innovation))
 
 
 @dataclass(frozen=True, slots=True)
 class MovingEstimate:
-    """Place and velocity of an object at a moment.
+    """Horizontal position and velocity of an object at a time.
 
     Attributes:
         state: (4,) north, east, metres; north, east, m/s. covariance: (4, 4).
-        captured_ns: the moment.
-        source: where the range of the newest measurement came from.
+        captured_ns: that time.
+        source: range source of the newest measurement.
     """
 
     state: Vector
@@ -68,22 +67,24 @@ class MovingEstimate:
 
     @classmethod
     def initialize(cls, target: Target, vehicle: Vector3) -> Self:
-        """The first. Raises ValueError: the target has no range."""
+        """Initialize from a target. Raises ValueError if it has no range."""
         if target.position_ned_m is None:
-            raise ValueError(f"a track begins with a known place; this {target.class_name} has no range")
-        place = np.array(target.position_ned_m[:2], np.float64)
+            raise ValueError(f"cannot initialize a track: {target.class_name!r} has no range")
+        position = np.array(target.position_ned_m[:2], np.float64)
         covariance = np.zeros((4, 4))
-        covariance[:2, :2] = measurement_noise(target, place - vehicle[:2])
+        covariance[:2, :2] = measurement_noise(target, position - vehicle[:2])
         covariance[2:, 2:] = np.eye(2) * FIRST_VELOCITY_SIGMA_MPS**2
-        return cls(np.concatenate([place, (0.0, 0.0)]), covariance, target.captured_ns, target.range_source)
+        return cls(
+            np.concatenate([position, (0.0, 0.0)]), covariance, target.captured_ns, target.range_source
+        )
 
     @property
     def velocity(self) -> tuple[float, float]:
-        """Over ground, m/s."""
+        """(north, east), m/s."""
         return (float(self.state[2]), float(self.state[3]))
 
     def at(self, stamp_ns: int) -> MovingEstimate:
-        """After a time of constant velocity and white acceleration."""
+        """Predict to a time with constant velocity and white acceleration."""
         elapsed_s = max(0.0, (stamp_ns - self.captured_ns) / 1e9)
         move = np.eye(4)
         move[0, 2] = move[1, 3] = elapsed_s
@@ -101,11 +102,11 @@ class MovingEstimate:
         )
 
     def fit(self, target: Target, vehicle: Vector3) -> Fit:
-        """A detection of this moment against it; `vehicle`: its position then, local NED."""
+        """The innovation of a detection at this time; `vehicle`: the vehicle's position then, local NED."""
         if target.position_ned_m is not None:
             measured = np.array(target.position_ned_m[:2])
         else:
-            # A bearing alone: a place in that direction as far away as the object is thought to be.
+            # Bearing alone: a position in that direction at the estimated range.
             range_m = max(NEAREST_M, float(np.hypot(*(self.state[:2] - vehicle[:2]))))
             measured = np.array(
                 (
@@ -121,13 +122,13 @@ class MovingEstimate:
         return Fit(float(innovation @ np.linalg.solve(spread, innovation)), target, innovation, spread)
 
     def update(self, fit: Fit) -> MovingEstimate:
-        """With a detection that fits taken in."""
+        """The estimate updated with a detection."""
         gain = np.linalg.solve(fit.spread, self.covariance[:2, :]).T
         state = self.state + gain @ fit.innovation
         speed = math.hypot(state[2], state[3])
         if speed > FASTEST_MPS:
             state[2:] *= FASTEST_MPS / speed
-        # Joseph's form keeps it symmetric and positive.
+        # Joseph form keeps it symmetric and positive definite.
         kept = np.eye(4)
         kept[:, :2] -= gain
         noise = fit.spread - self.covariance[:2, :2]

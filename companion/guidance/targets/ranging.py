@@ -1,4 +1,4 @@
-"""Whether it can be told at all how far away what is seen is, before something is flown to."""
+"""Available means of range estimation, checked before a behaviour flies to an object."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from vision.camera_model import CameraModel
 
 @dataclass(frozen=True, slots=True)
 class RangeMeans:
-    """What the camera that steers has for it. By default everything: nothing is missing.
+    """Means of range estimation of the steering camera. The default has all.
 
     Attributes:
-        depth: it has given depth.
-        ground: its picture shows ground, of a level vehicle above it.
-        classes: whose height is known (`detector.class_heights_m`).
+        depth: depth was received.
+        ground: its image shows the ground when the vehicle is level above it.
+        classes: those with a known height (`detector.class_heights_m`).
     """
 
     depth: bool = True
@@ -25,7 +25,7 @@ class RangeMeans:
     classes: frozenset[str] = frozenset()
 
     def missing(self, class_names: Iterable[str]) -> str | None:
-        """What is missing before the range of these can be known, in words; None: nothing is."""
+        """What is missing for the range of these classes, in words; None: nothing."""
         if self.depth or self.ground:
             return None
         unknown = [name for name in class_names if name not in self.classes]
@@ -41,7 +41,7 @@ ALL_MEANS = RangeMeans()
 
 
 def sees_ground(camera: CameraModel, pitch_rad: float) -> bool:
-    """Whether the lower edge of a picture looks far enough down for the ground to tell ranges.
+    """Whether the lower edge of the image points far enough down for ranges from the ground.
 
     Args:
         pitch_rad: of the camera above the horizon, with the vehicle level.

@@ -1,4 +1,4 @@
-"""A target: a detection turned into a direction and, where possible, a place in the level world frame."""
+"""A target: a detection with its direction and, if the range is known, its position in local NED."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from enum import StrEnum
 
 from companion.vehicle.state import Vector3
 
-# What to say when only doubtful objects were seen.
-DOUBTED = "what was seen does not count as true (tracker.confirm_score), or may be of another class"
+# The reason when no seen object was trusted.
+DOUBTED = "target not confirmed (score < tracker.confirm_score) or class ambiguous"
 
 
 class RangeSource(StrEnum):
-    """Where a target's range comes from."""
+    """Source of a target's range."""
 
     DEPTH = "depth"
     GROUND_PLANE = "ground_plane"
@@ -23,27 +23,27 @@ class RangeSource(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """One seen object.
+    """One detected object.
 
     Attributes:
-        class_name, confidence: as the detector says, of this frame.
+        class_name, confidence: from the detector, of this frame.
         captured_ns: CLOCK_MONOTONIC stamp of the frame.
         bearing_rad: direction of the box's centre, clockwise from north, -π..π (attitude removed).
         elevation_rad: above the horizon, positive up.
         ground_range_m: horizontal, from the vehicle to the object's nearest surface; NaN when unknown. At the
-            capture, as everything here: for the range now, use `position_ned_m` and where the vehicle is now.
-        range_source: where that comes from.
+            capture time, like all fields: for the range now use `position_ned_m` and the current position.
+        range_source: source of `ground_range_m`.
         position_ned_m: local NED; None when the range is unknown. `ground_range_m` away in the direction of
             the box's centre, or of its foot if the range comes from the ground or the class's height: the
-            nearest point itself jumps between the corners of an object that turns.
+            nearest point itself jumps between the corners of a turning object.
         box_xyxy: pixels, as detected.
-        track_id: of the object, the same from frame to frame; None without a track.
+        track_id: constant from frame to frame; None without a track.
         track_score: median confidence over the track; None without a track.
-        trusted: it may be chosen to be flown to: its track counts as true, or nobody looks for tracks; and it
-            is not as likely of another class, neither in this frame nor over its track.
+        trusted: it may be selected as a goal: its track is confirmed, or tracking is off; and its class is
+            not ambiguous, neither in this frame nor over its track.
         depth_m: along the camera's optical axis to the nearest surface; NaN without a depth image.
-        distance_m: straight from the vehicle to the nearest surface; NaN when the range is unknown.
-        range_sigma_m: of `ground_range_m`, one sigma; NaN: not stated.
+        distance_m: from the vehicle to the nearest surface; NaN when the range is unknown.
+        range_sigma_m: one sigma of `ground_range_m`; NaN: not stated.
     """
 
     class_name: str
@@ -64,5 +64,5 @@ class Target:
 
     @property
     def score(self) -> float:
-        """How sure it is, 0..1: of a followed object over its history, else in this frame."""
+        """`track_score` of a tracked object, else `confidence`; 0..1."""
         return self.confidence if self.track_score is None else self.track_score

@@ -1,10 +1,9 @@
-"""One object followed on the ground plane: a Kalman filter on its place, and which detection is it.
+"""Tracking of one object on the ground plane: a Kalman filter on its position, and data association.
 
-The state is a position in local NED (north, east) that wanders (random walk). A measurement is a bearing and,
-where known, a range; its noise is an ellipse along the line of sight, so a bearing alone still corrects what
-it knows about, and the same arithmetic decides whether a detection can be this object at all (Mahalanobis
-distance). Where the picture's own tracker knows which box is which, its identities come first: what was seen
-beside the object is never taken for it.
+The state is a position in local NED (north, east) with random-walk noise. A measurement is a bearing and, if
+known, a range; its noise is an ellipse along the line of sight, so a bearing alone corrects only across it.
+The same ellipse gates detections (Mahalanobis distance). Track ids of the image tracker have priority: an
+object that was seen beside this one is never associated with it.
 """
 
 from __future__ import annotations
@@ -19,12 +18,12 @@ from companion.guidance.targets.target import RangeSource, Target
 from companion.vehicle.state import Vector3
 from vision.attitude import wrap_angle
 
-# How far an object may wander: 1 m in a second, one sigma. A walking person's pace.
-WANDER_M2_PER_S = 1.0
+# Random walk of an object: 1 m in 1 s, one sigma, a walking person's pace.
+RANDOM_WALK_M2_PER_S = 1.0
 # Noise of one measurement across the line of sight, one sigma: a few pixels and a degree of attitude.
 BEARING_SIGMA_RAD = 0.03
 ACROSS_SIGMA_M = 0.25
-# Along it, the target states its own; of one that does not: fixed, and per metre of range.
+# Along the line of sight, for targets without their own sigma: fixed, and per metre of range.
 UNSTATED_SIGMA = (0.3, 0.12)
 UNKNOWN_RANGE_SIGMA_M = 1e3
 # χ² with two degrees of freedom, 99.9 %.
@@ -33,15 +32,15 @@ NEAREST_M = 0.3
 
 
 class ObjectTrack:
-    """The filtered place of one object, begun from a target whose place is known."""
+    """Filtered position of one object, initialized from a target with a known position."""
 
     def __init__(self, target: Target, vehicle: Vector3) -> None:
         if target.position_ned_m is None:
-            raise ValueError(f"a track begins with a known place; this {target.class_name} has no range")
+            raise ValueError(f"cannot initialize a track: {target.class_name!r} has no range")
         self._class_name = target.class_name
-        self._place = np.array(target.position_ned_m[:2], np.float64)
+        self._position = np.array(target.position_ned_m[:2], np.float64)
         self._down_m = target.position_ned_m[2]
-        self._covariance = measurement_noise(target, self._place - vehicle[:2])
+        self._covariance = measurement_noise(target, self._position - vehicle[:2])
         self._captured_ns = target.captured_ns
         self._newest = target
         self._track_id = target.track_id
@@ -60,26 +59,26 @@ class ObjectTrack:
 
     @property
     def track_id(self) -> int | None:
-        """The object's identity in the picture; None while it has none."""
+        """The image tracker's id of the object; None without one."""
         return self._track_id
 
     @property
     def position_ned_m(self) -> Vector3:
-        """Local NED; down is that of the newest measured place."""
-        return (float(self._place[0]), float(self._place[1]), self._down_m)
+        """Local NED; down is that of the newest measurement."""
+        return (float(self._position[0]), float(self._position[1]), self._down_m)
 
     def is_another(self, target: Target) -> bool:
-        """Whether this was seen beside the object, so that it cannot be the object."""
+        """Whether this was seen beside the object, so that it is a different one."""
         return target.track_id in self._others
 
     def restart(self, target: Target, vehicle: Vector3) -> ObjectTrack:
-        """The same object begun again at a target that is taken for it."""
+        """A new track of the same object, initialized at a target."""
         track = ObjectTrack(target, vehicle)
         track._others = self._others
         return track
 
     def update(self, targets: Sequence[Target], vehicle: Vector3) -> bool:
-        """Take the detection that is this object, if any. True: there was a new one.
+        """Associate a detection with this object, if any. True: there was a new one.
 
         Args:
             targets: of one frame (their stamps equal); a frame already seen changes nothing.
@@ -92,7 +91,7 @@ class ObjectTrack:
         if not fresh:
             return False
         elapsed_s = (fresh[0].captured_ns - self._captured_ns) / 1e9
-        predicted = self._covariance + np.eye(2) * WANDER_M2_PER_S * elapsed_s
+        predicted = self._covariance + np.eye(2) * RANDOM_WALK_M2_PER_S * elapsed_s
         best: tuple[float, Target, NDArray[np.float64], NDArray[np.float64]] | None = None
         for target in fresh:
             innovation, noise = self._innovation(target, vehicle)
@@ -104,7 +103,7 @@ class ObjectTrack:
             return False
         _, target, innovation, spread = best
         gain = np.linalg.solve(spread, predicted).T
-        self._place = self._place + gain @ innovation
+        self._position = self._position + gain @ innovation
         kept = (np.eye(2) - gain) @ predicted
         self._covariance = (kept + kept.T) / 2
         if target.position_ned_m is not None:
@@ -116,7 +115,7 @@ class ObjectTrack:
         return True
 
     def _same_identity(self, targets: list[Target]) -> list[Target]:
-        """Those that can be this object: the one with its identity, or else strangers that count as true."""
+        """Candidates: targets with the object's track id, else trusted ones with an unknown id."""
         own = [t for t in targets if t.track_id is not None and t.track_id == self._track_id]
         if own:
             # A second box on the object itself is not another object.
@@ -135,15 +134,15 @@ class ObjectTrack:
         if target.position_ned_m is not None:
             measured = np.array(target.position_ned_m[:2])
         else:
-            # A bearing alone: a place in that direction as far away as the object was thought to be.
-            range_m = max(NEAREST_M, float(np.hypot(*(self._place - vehicle[:2]))))
+            # Bearing alone: a position in that direction at the estimated range.
+            range_m = max(NEAREST_M, float(np.hypot(*(self._position - vehicle[:2]))))
             direction = np.array([math.cos(target.bearing_rad), math.sin(target.bearing_rad)])
             measured = np.array(vehicle[:2]) + direction * range_m
-        return measured - self._place, measurement_noise(target, measured - vehicle[:2])
+        return measured - self._position, measurement_noise(target, measured - vehicle[:2])
 
 
 def measurement_noise(target: Target, line_of_sight: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(2, 2) covariance of a measured place, given the vector from the vehicle to it."""
+    """(2, 2) covariance of a measured position, given the vector from the vehicle to it."""
     range_m = max(NEAREST_M, float(np.hypot(*line_of_sight)))
     along = line_of_sight / range_m
     across = np.array([-along[1], along[0]])

@@ -1,4 +1,4 @@
-"""A flight in lockstep with a camera on a gimbal, which looks where the built-in vehicle's gimbal does."""
+"""Lockstep flight with a camera on the built-in vehicle's gimbal."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ PERSON_M = (0.5, 0.6, 1.7)
 
 
 def person(bearing_deg: float, distance_m: float = 4.0) -> SceneObject:
-    """Somebody who stands."""
+    """A standing person."""
     bearing = math.radians(bearing_deg)
     pose = ScenePose(distance_m * math.cos(bearing), distance_m * math.sin(bearing))
     return SceneObject("person", PERSON_M, lambda _: pose)
 
 
 def gimbal_flight(
-    thing: SceneObject, *, seed: int = 5, mount: CameraMount = ON_GIMBAL, **options: Any
+    scene_object: SceneObject, *, seed: int = 5, mount: CameraMount = ON_GIMBAL, **options: Any
 ) -> LockstepFlight:
-    """In the air, with a detector that sees the thing where the gimbal looks at it."""
+    """In the air, with a detector that sees the object through the gimbal's camera."""
     vehicles: list[LockstepVehicle] = []
 
-    def looks() -> Quaternion:
+    def gimbal_attitude() -> Quaternion:
         gimbal = vehicles[0].vehicle.gimbal
         assert gimbal is not None
         return gimbal.quaternion
@@ -42,8 +42,8 @@ def gimbal_flight(
         vehicles.append(vehicle)
         return SyntheticCamera(camera_settings(CAMERA, mount), detect=detector)
 
-    # A box that shakes is the detector's fault, and is measured elsewhere.
+    # Box noise of the detector is tested elsewhere.
     detector = SyntheticDetector(
-        [thing], CAMERA, mount, seed=seed, faults=Faults(0.0, 0.05, 0.0, 0.0), gimbal=looks
+        [scene_object], CAMERA, mount, seed=seed, faults=Faults(0.0, 0.05, 0.0, 0.0), gimbal=gimbal_attitude
     )
     return LockstepFlight.airborne(seed=seed, height_m=HEIGHT_M, camera=camera, gimbal=True, **options)

@@ -1,4 +1,4 @@
-"""Guidance in lockstep with a scripted autopilot: PX4's modes and landed states in memory, a turned clock."""
+"""Guidance in lockstep with a scripted autopilot: PX4's modes and landed states, a simulated clock."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ SHOWN_TIMEOUT_S = 3.0
 
 
 class ScriptedAutopilot:
-    """Answers guidance's requests. Modes show `lag_s` after they changed, as a HEARTBEAT does."""
+    """Answers guidance's requests. A mode shows `lag_s` after its change, as in a HEARTBEAT."""
 
     def __init__(self, vehicle: KinematicVehicle, lag_s: float = 0.0) -> None:
         self.vehicle = vehicle
@@ -80,7 +80,7 @@ class ScriptedAutopilot:
         )
 
     def start(self, request: Request) -> None:
-        """Begin to carry out a request of guidance."""
+        """Start a request of guidance."""
         match request.action:
             case SetMode(mode):
                 self.requests.append(mode.value)
@@ -101,33 +101,33 @@ class ScriptedAutopilot:
                 self.change_mode(FlightMode.TAKEOFF)
                 self._answers.append(Answer(request.identifier))
             case _:
-                self._answers.append(Answer(request.identifier, "no gimbal answers"))
+                self._answers.append(Answer(request.identifier, "no gimbal"))
 
     def cancel(self, identifier: int) -> None:
-        """Nobody waits for it any more."""
+        """Abandon a request."""
         self._pending = [pending for pending in self._pending if pending[0] != identifier]
 
     def take_answers(self) -> tuple[Answer, ...]:
-        """Those that have come since the last call."""
+        """The answers since the last call."""
         now_ns = self.vehicle.now_ns
         for pending in list(self._pending):
             identifier, since_ns, shown = pending
             late = now_ns - since_ns > SHOWN_TIMEOUT_S * 1e9
             if shown() or late:
                 self._pending.remove(pending)
-                words = None if shown() else f"it did not show in 3 s: {self._shown[1].value} mode"
+                words = None if shown() else f"not shown in 3 s: {self._shown[1].value} mode"
                 self._answers.append(Answer(identifier, words))
         answers, self._answers = tuple(self._answers), []
         return answers
 
     def change_mode(self, mode: FlightMode) -> None:
-        """By us or by a pilot: the vehicle does not tell them apart."""
+        """Change the mode, as requested by us or by a pilot."""
         if mode is FlightMode.LAND and self.vehicle.mode is not FlightMode.LAND:
             self._mode_before_landing = self.vehicle.mode
         self.vehicle.mode = mode
 
     def step(self, dt_s: float) -> None:
-        """Fly on, and let what changed show after the lag."""
+        """Advance the vehicle; changes show after the lag."""
         vehicle, dt_ns = self.vehicle, round(dt_s * 1e9)
         altitude = -vehicle.position[2]
         still = Setpoint.brake(vehicle.now_ns)
@@ -166,7 +166,7 @@ class ScriptedAutopilot:
 
 
 class Pending:
-    """A command that was given, and its outcome when it has one."""
+    """A command, and its outcome once it has one."""
 
     def __init__(self, results: dict[int, Outcome], identifier: int) -> None:
         self._results, self._identifier = results, identifier
@@ -179,16 +179,16 @@ class Pending:
 
 
 class GuidanceHarness:
-    """Autopilot, streamer and guidance, 50 times a second of a turned clock.
+    """Autopilot, streamer and guidance at 50 Hz of a simulated clock.
 
     Args:
         options: of guidance.
-        inputs: changes what guidance is told, besides vehicle, stream, answers and commands.
+        inputs: modifies the input of guidance.
 
     Attributes:
         streaming: the streamer runs.
-        perception_age_s: of the newest frame, in which nothing is seen; None: none came.
-        outputs: what guidance put out, one for each step.
+        perception_age_s: of the newest, empty frame; None: none received.
+        outputs: of guidance, one per step.
     """
 
     def __init__(
@@ -212,7 +212,7 @@ class GuidanceHarness:
         self._identifiers = itertools.count(1)
 
     def run(self, seconds: float = STEP_S) -> None:
-        """Let time pass."""
+        """Advance time."""
         for _ in range(max(1, round(seconds / STEP_S))):
             self.autopilot.step(STEP_S)
             self.step()
@@ -249,7 +249,7 @@ class GuidanceHarness:
     def command(
         self, behaviour: Behaviour | None = None, *, aim: GimbalAim | None = None, endless: bool = False
     ) -> Pending:
-        """Give a command; guidance takes it at once."""
+        """Give a command and step guidance once."""
         identifier = next(self._identifiers)
         text = "gimbal" if behaviour is None else behaviour.name
         self.step(CommandInput(identifier, text, behaviour, aim, endless))
@@ -260,7 +260,7 @@ class GuidanceHarness:
         self.step(ending=True)
 
     def until(self, condition: Callable[[], object], seconds: float = 60.0) -> None:
-        """Let time pass until something is so. Raises AssertionError if it does not come to be."""
+        """Advance time until a condition holds. Raises AssertionError after `seconds`."""
         for _ in range(round(seconds / STEP_S)):
             if condition():
                 return
@@ -268,7 +268,7 @@ class GuidanceHarness:
         raise AssertionError(f"not in {seconds} s of flight: {[e.message for e in self.events]}")
 
     def outcome(self, pending: Pending, seconds: float = 120.0) -> Outcome:
-        """Of a command, when it has ended."""
+        """The outcome of a command, once it has ended."""
         self.until(pending.done, seconds)
         return pending.result()
 
@@ -293,17 +293,17 @@ def engaged(harness: GuidanceHarness, behaviour: Behaviour | None = None) -> Pen
 
 
 def kinds(harness: GuidanceHarness) -> list[EventKind]:
-    """What guidance has told of, in order."""
+    """Kinds of the events so far, in order."""
     return [event.kind for event in harness.events]
 
 
 @dataclass
 class Flight:
-    """A behaviour flown through guidance, with a camera at 10 Hz whose results come 0.1 s late.
+    """A behaviour flown through guidance, with a 10 Hz camera of 0.1 s latency.
 
     Attributes:
-        steps: what the behaviour gave in OFFBOARD, the last one its outcome.
-        track: where the vehicle was.
+        steps: outputs of the behaviour in OFFBOARD, the last one its outcome.
+        track: positions of the vehicle.
     """
 
     behaviour: Behaviour
@@ -320,7 +320,7 @@ class Flight:
     def run(
         self, seconds: float, each: Callable[[float, KinematicVehicle], None] = lambda t, v: None
     ) -> Outcome | None:
-        """Fly until it ends or the time is over (None). `each(seconds, vehicle)` runs every step."""
+        """Fly until it ends; None after the time limit. `each(seconds, vehicle)` runs every step."""
         self.vehicle.mode = FlightMode.HOLD
         pending: list[tuple[int, tuple[Target, ...]]] = []
         shown: tuple[Target, ...] = ()
@@ -344,14 +344,14 @@ class Flight:
             if command is None:
                 command = harness.command(recording)
             harness.run()
-            self.track.append(self.vehicle.place)
+            self.track.append(self.vehicle.position_ned_m)
             if command.done():
                 return command.result()
         return None
 
 
 class _Recording(Behaviour):
-    """Another behaviour, with a list of what it gives. Needs nothing before it begins."""
+    """Wraps a behaviour and records its outputs. Has no requirements."""
 
     def __init__(self, inner: Behaviour, steps: list[BehaviourOutput]) -> None:
         self._inner, self._steps = inner, steps

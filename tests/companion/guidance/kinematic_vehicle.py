@@ -1,4 +1,4 @@
-"""A vehicle for tests in lockstep: it follows velocity, position, yaw and yaw rate with a short lag."""
+"""Kinematic vehicle for lockstep tests: follows velocity, position, yaw and yaw rate with a short lag."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ START_NS = 1_000_000_000_000
 
 @dataclass
 class KinematicVehicle:
-    """Local NED. Velocity and yaw rate answer as a first-order lag, like a multirotor's outer loops."""
+    """Local NED. First-order lag of velocity and yaw rate, like a multirotor's outer loops."""
 
     position: list[float] = field(default_factory=lambda: [0.0, 0.0, -5.0])
     velocity: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
@@ -39,7 +39,7 @@ class KinematicVehicle:
             mode=self.mode,
             landed=self.landed,
             ready_to_arm=True,
-            position_ned_m=self.place,
+            position_ned_m=self.position_ned_m,
             velocity_ned_mps=(self.velocity[0], self.velocity[1], self.velocity[2]),
             attitude=quaternion_from_euler(0.0, 0.0, self.yaw_rad),
             home_altitude_amsl_m=489.0,
@@ -47,7 +47,7 @@ class KinematicVehicle:
         )
 
     @property
-    def place(self) -> Vector3:
+    def position_ned_m(self) -> Vector3:
         return (self.position[0], self.position[1], self.position[2])
 
     def fly(self, setpoint: Setpoint, dt_s: float) -> None:
@@ -70,7 +70,7 @@ class KinematicVehicle:
 
 @dataclass
 class SeenObject:
-    """Something that stands on the ground, with the camera's view of it."""
+    """An object on the ground and how the camera sees it."""
 
     class_name: str
     north: float
@@ -93,33 +93,33 @@ def look(
     half_view_rad: float = math.radians(40),
     noise: Callable[[], float] = lambda: 0.0,
 ) -> tuple[Target, ...]:
-    """What a level camera looking forward makes of them."""
+    """Targets of a level forward-looking camera."""
     targets = []
-    for thing in objects:
-        north, east = thing.north - vehicle.position[0], thing.east - vehicle.position[1]
+    for scene_object in objects:
+        north, east = scene_object.north - vehicle.position[0], scene_object.east - vehicle.position[1]
         distance = math.hypot(north, east)
         bearing = math.atan2(east, north)
-        if not thing.visible or abs(wrap_angle(bearing - vehicle.yaw_rad)) > half_view_rad:
+        if not scene_object.visible or abs(wrap_angle(bearing - vehicle.yaw_rad)) > half_view_rad:
             continue
-        range_m = max(0.1, (distance - thing.radius_m) * (1.0 + noise()))
-        place = (
+        range_m = max(0.1, (distance - scene_object.radius_m) * (1.0 + noise()))
+        point = (
             vehicle.position[0] + range_m * math.cos(bearing),
             vehicle.position[1] + range_m * math.sin(bearing),
             0.0,
         )
         targets.append(
             Target(
-                thing.class_name,
-                thing.confidence,
+                scene_object.class_name,
+                scene_object.confidence,
                 captured_ns,
                 bearing,
                 math.atan2(vehicle.position[2], distance),
-                range_m if thing.with_range else math.nan,
-                thing.source if thing.with_range else RangeSource.NONE,
-                place if thing.with_range else None,
-                track_id=thing.track_id,
-                track_score=thing.track_score,
-                trusted=thing.trusted,
+                range_m if scene_object.with_range else math.nan,
+                scene_object.source if scene_object.with_range else RangeSource.NONE,
+                point if scene_object.with_range else None,
+                track_id=scene_object.track_id,
+                track_score=scene_object.track_score,
+                trusted=scene_object.trusted,
             )
         )
     return tuple(targets)

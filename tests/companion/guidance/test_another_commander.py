@@ -1,4 +1,4 @@
-"""Somebody else steers the vehicle without a change of its mode, in lockstep: our command ends."""
+"""Another commander steers the vehicle without a mode change, in lockstep: our command ends."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ def speed_mps(flight: LockstepFlight) -> float:
 
 
 def lost(flight: LockstepFlight) -> bool:
-    """Command was lost because the vehicle does not follow, and nothing leaves any more."""
-    told = [event for event in flight.events if event.kind is EventKind.LOST]
-    if not told:
+    """Command was lost because the vehicle does not follow, and the stream has stopped."""
+    losses = [event for event in flight.events if event.kind is EventKind.LOST]
+    if not losses:
         return False
-    assert REASON in told[-1].message
+    assert REASON in losses[-1].message
     assert flight.guidance.phase is Phase.IDLE
     flight.run(0.1)
     assert flight.streamer.state is StreamState.SILENT
@@ -48,7 +48,7 @@ def lost(flight: LockstepFlight) -> bool:
 
 
 @pytest.mark.parametrize("command", ["orbit radius=8 speed=2", "goto forward=60 right=0", "figure-eight"])
-def test_a_pause_of_a_ground_station_ends_our_command(command: str) -> None:
+def test_pause_by_ground_station_ends_command(command: str) -> None:
     flight = airborne("ardupilot")
     flight.command(command)
     flight.run(8.0)
@@ -60,8 +60,8 @@ def test_a_pause_of_a_ground_station_ends_our_command(command: str) -> None:
     assert flight.state.mode is FlightMode.OFFBOARD
 
 
-def test_after_a_pause_and_its_end_nothing_is_flown() -> None:
-    """It flew on at 3 m/s."""
+def test_no_motion_after_pause_and_continue() -> None:
+    """Regression: it flew on at 3 m/s."""
     flight = airborne("ardupilot")
     flight.command("orbit radius=8 speed=3")
     flight.run(8.0)
@@ -75,7 +75,7 @@ def test_after_a_pause_and_its_end_nothing_is_flown() -> None:
         assert speed_mps(flight) < 1.0
 
 
-def test_an_orbit_that_an_autopilots_fence_stops_ends() -> None:
+def test_orbit_ends_when_autopilot_fence_stops_it() -> None:
     flight = airborne("ardupilot")
     for name, value in (("FENCE_ENABLE", 1), ("FENCE_RADIUS", 30)):
         flight.vehicle.vehicle.parameters.set(name, value)
@@ -90,7 +90,7 @@ def test_an_orbit_that_an_autopilots_fence_stops_ends() -> None:
 
 
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
-def test_setpoints_of_another_commander_end_our_hold(autopilot: str) -> None:
+def test_setpoints_of_another_commander_end_hold(autopilot: str) -> None:
     flight = airborne(autopilot)
     flight.command("hold")
     flight.run(6.0)
@@ -103,7 +103,7 @@ def test_setpoints_of_another_commander_end_our_hold(autopilot: str) -> None:
     assert flight.run_until(lambda: lost(flight), 6.0)
 
 
-def test_one_reposition_is_flown_over_and_ends_nothing() -> None:
+def test_single_reposition_does_not_end_command() -> None:
     flight = airborne("ardupilot")
     flight.command("orbit radius=8 speed=2")
     flight.run(6.0)
@@ -119,8 +119,8 @@ def test_one_reposition_is_flown_over_and_ends_nothing() -> None:
 
 
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
-def test_a_flight_in_gusts_is_followed(autopilot: str) -> None:
-    """The largest residual that lasted, far below what ends a command."""
+def test_flight_in_gusts_counts_as_following(autopilot: str) -> None:
+    """The largest lasting residual is far below the threshold."""
     flight = LockstepFlight.airborne(seed=4, height_m=6.0, wind_mps=3.0, gusts_mps=0.6, autopilot=autopilot)
     for command in ("goto forward=20 right=10 speed=4", "orbit radius=6 speed=2", "hold"):
         flight.command(command)

@@ -9,12 +9,12 @@ from tests.companion.guidance.guidance_harness import Flight
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
 
 
-def distance_to(vehicle: KinematicVehicle, thing: SeenObject) -> float:
-    return math.dist(vehicle.position[:2], (thing.north, thing.east)) - thing.radius_m
+def distance_to(vehicle: KinematicVehicle, scene_object: SeenObject) -> float:
+    return math.dist(vehicle.position[:2], (scene_object.north, scene_object.east)) - scene_object.radius_m
 
 
 @pytest.mark.parametrize(("north", "east"), [(20.0, 5.0), (8.0, -3.0), (45.0, 0.0), (6.0, 0.0)])
-def test_approach_stops_at_the_asked_distance_without_passing_it(north: float, east: float) -> None:
+def test_approach_stops_at_the_distance_without_overshoot(north: float, east: float) -> None:
     car = SeenObject("car", north, east)
     vehicle = KinematicVehicle()
     nearest = []
@@ -22,7 +22,7 @@ def test_approach_stops_at_the_asked_distance_without_passing_it(north: float, e
     outcome = flight.run(120.0, lambda seconds, v: nearest.append(distance_to(v, car)))
     assert outcome is not None
     assert outcome.success, outcome.reason
-    assert outcome.reason.startswith("reached car at ")
+    assert outcome.reason.startswith("reached car")
     assert distance_to(vehicle, car) == pytest.approx(5.0, abs=0.35)
     assert min(nearest) > 4.6
     assert abs(vehicle.position[2] + 5.0) < 0.1
@@ -40,7 +40,7 @@ def test_approach_arrives_with_noisy_ranges() -> None:
     assert distance_to(vehicle, car) == pytest.approx(5.0, abs=0.8)
 
 
-def test_approach_backs_off_when_it_begins_too_near() -> None:
+def test_approach_retreats_when_it_starts_too_near() -> None:
     person = SeenObject("person", 2.0, 0.0)
     vehicle = KinematicVehicle()
     outcome = Flight(ApproachBehaviour("person", distance_m=4.0), vehicle, [person]).run(60.0)
@@ -49,7 +49,7 @@ def test_approach_backs_off_when_it_begins_too_near() -> None:
     assert distance_to(vehicle, person) == pytest.approx(4.0, abs=0.35)
 
 
-def test_approach_stays_with_its_object_when_a_nearer_one_of_the_class_appears() -> None:
+def test_approach_keeps_its_object_when_a_nearer_appears() -> None:
     first, second = SeenObject("car", 25.0, 0.0), SeenObject("car", 14.0, 7.0, visible=False)
     vehicle = KinematicVehicle()
 
@@ -62,7 +62,7 @@ def test_approach_stays_with_its_object_when_a_nearer_one_of_the_class_appears()
     assert distance_to(vehicle, first) == pytest.approx(5.0, abs=0.35)
 
 
-def test_approach_follows_an_object_that_walks() -> None:
+def test_approach_follows_a_walking_object() -> None:
     person = SeenObject("person", 20.0, 0.0)
 
     def each(seconds: float, vehicle: KinematicVehicle) -> None:
@@ -76,7 +76,7 @@ def test_approach_follows_an_object_that_walks() -> None:
     assert distance_to(vehicle, person) == pytest.approx(5.0, abs=0.5)
 
 
-def test_a_lost_object_brakes_the_vehicle_and_ends_the_approach_after_the_timeout() -> None:
+def test_approach_brakes_and_ends_when_target_lost() -> None:
     car = SeenObject("car", 40.0, 0.0)
     vehicle = KinematicVehicle()
     stopped_at = []
@@ -93,7 +93,7 @@ def test_a_lost_object_brakes_the_vehicle_and_ends_the_approach_after_the_timeou
     assert max(stopped_at) - min(stopped_at) < 0.2
 
 
-def test_an_object_that_comes_back_in_time_is_approached_on() -> None:
+def test_approach_continues_when_object_reappears() -> None:
     car = SeenObject("car", 25.0, 0.0)
 
     def each(seconds: float, vehicle: KinematicVehicle) -> None:
@@ -105,7 +105,7 @@ def test_an_object_that_comes_back_in_time_is_approached_on() -> None:
     assert outcome.success, outcome.reason
 
 
-def test_a_silent_detector_brakes_and_ends_the_approach() -> None:
+def test_silent_detector_brakes_and_ends_approach() -> None:
     flight = Flight(ApproachBehaviour("car"), objects=[SeenObject("car", 40.0, 0.0)])
 
     def each(seconds: float, vehicle: KinematicVehicle) -> None:
@@ -118,7 +118,7 @@ def test_a_silent_detector_brakes_and_ends_the_approach() -> None:
     assert math.hypot(*flight.vehicle.velocity) < 0.1
 
 
-def test_without_any_range_the_vehicle_turns_to_the_object_but_does_not_fly_at_it() -> None:
+def test_approach_without_range_only_yaws() -> None:
     car = SeenObject("car", 20.0, 12.0, with_range=False)
     vehicle = KinematicVehicle()
     outcome = Flight(ApproachBehaviour("car"), vehicle, [car]).run(60.0)
@@ -129,7 +129,7 @@ def test_without_any_range_the_vehicle_turns_to_the_object_but_does_not_fly_at_i
     assert vehicle.yaw_rad == pytest.approx(math.atan2(12.0, 20.0), abs=0.05)
 
 
-def test_the_last_metres_are_flown_on_bearings_alone_when_the_range_goes_away() -> None:
+def test_approach_finishes_on_bearings_when_range_is_lost() -> None:
     car = SeenObject("car", 20.0, 2.0)
 
     def each(seconds: float, vehicle: KinematicVehicle) -> None:
@@ -143,7 +143,7 @@ def test_the_last_metres_are_flown_on_bearings_alone_when_the_range_goes_away() 
 
 
 @pytest.mark.parametrize("source", [RangeSource.DEPTH, RangeSource.GROUND_PLANE])
-def test_a_first_range_that_was_wrong_does_not_lose_the_object_for_good(source: RangeSource) -> None:
+def test_wrong_first_range_does_not_lose_the_object(source: RangeSource) -> None:
     car = SeenObject("car", 16.0, 1.0, source=source)
     wrong = [0.8]
 

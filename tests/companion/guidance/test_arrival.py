@@ -1,7 +1,7 @@
-"""How near behaviours come to their goals, in lockstep with the built-in vehicle in wind and gusts.
+"""Arrival accuracy of behaviours, in lockstep with the built-in vehicle in wind and gusts.
 
-The built-in vehicle moves as a real PX4 was measured to (velocity step, stop and overshoot); the others
-answer more slowly. Distances are those that the vehicle itself knows: its estimate is off by some more.
+The built-in vehicle moves like a measured PX4 (velocity step, stop and overshoot); the others respond more
+slowly. Distances are by the vehicle's own estimate, whose error comes on top.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def air(name: str, seed: int) -> Air:
 def then_hold(
     flight: LockstepFlight, behaviour: Behaviour, limit_s: float = 120.0
 ) -> tuple[Outcome, list[Moment]]:
-    """How it ended, and the moments of the hold that followed it as the next step of a mission."""
+    """The outcome, and the moments of the hold that follows as the next step of a mission."""
     outcomes: list[Outcome] = []
 
     class Watched(SequenceBehaviour):
@@ -79,7 +79,7 @@ def then_hold(
 
 
 def assert_arrived(outcome: Outcome, hold: list[Moment], goal: Vector3, name: str) -> None:
-    """There within 0.3 m and slower than 0.3 m/s, and kept: as near by what answers as PX4 does."""
+    """Arrived within 0.3 m and 0.3 m/s, and held; the tolerance of the hold depends on the vehicle."""
     assert outcome.goal_ned_m == pytest.approx(goal, abs=1e-3)
     first = hold[0].context.state
     assert first.velocity_ned_mps is not None
@@ -92,7 +92,7 @@ def assert_arrived(outcome: Outcome, hold: list[Moment], goal: Vector3, name: st
 
 
 @pytest.mark.parametrize(("name", "seed"), CASES)
-def test_goto_arrives_and_the_hold_keeps_its_goal(name: str, seed: int) -> None:
+def test_goto_arrives_and_hold_keeps_its_goal(name: str, seed: int) -> None:
     flight = LockstepFlight.airborne(**air(name, seed))
     chance = random.Random(seed)
     goal = (chance.uniform(-15.0, 15.0), chance.uniform(-15.0, 15.0))
@@ -106,7 +106,7 @@ def test_goto_arrives_and_the_hold_keeps_its_goal(name: str, seed: int) -> None:
 
 
 @pytest.mark.parametrize(("name", "seed"), CASES)
-def test_figure_eight_ends_standing_where_it_began(name: str, seed: int) -> None:
+def test_figure_eight_stops_where_it_began(name: str, seed: int) -> None:
     flight = LockstepFlight.airborne(**air(name, seed))
     begin: list[Vector3] = []
 
@@ -135,7 +135,7 @@ def test_approach_fixes_its_goal_on_arrival(name: str, seed: int) -> None:
 
 
 def on_circle(radius_m: float, speed_mps: float, name: str, seed: int) -> tuple[list[float], list[float]]:
-    """Sorted errors of radius (m) and of the nose (degrees), settled."""
+    """Sorted settled errors of radius (m) and heading (degrees)."""
     flight = LockstepFlight.airborne(**air(name, seed))
     orbit = OrbitBehaviour(radius_m, speed_mps, 2.0, clockwise=bool(seed % 2))
     log = flight.fly(orbit, 150.0)
@@ -157,7 +157,7 @@ def on_circle(radius_m: float, speed_mps: float, name: str, seed: int) -> tuple[
 
 @pytest.mark.parametrize(("radius_m", "speed_mps"), [(8.0, 4.0), (10.0, 2.0), (5.0, 3.0)])
 @pytest.mark.parametrize(("name", "seed"), [("px4", 1), ("px4", 2), ("slow", 3)])
-def test_orbit_keeps_radius_and_nose(radius_m: float, speed_mps: float, name: str, seed: int) -> None:
+def test_orbit_keeps_radius_and_heading(radius_m: float, speed_mps: float, name: str, seed: int) -> None:
     wide, nose = on_circle(radius_m, speed_mps, name, seed)
     share = round(0.9 * len(wide))
     assert wide[share] <= (0.25 if name == "px4" else 0.35)
@@ -166,7 +166,7 @@ def test_orbit_keeps_radius_and_nose(radius_m: float, speed_mps: float, name: st
 
 @pytest.mark.parametrize(("name", "seed"), CASES)
 @pytest.mark.parametrize("height_m", [2.5, 5.0])
-def test_takeoff_reaches_its_height_and_reports_it(name: str, seed: int, height_m: float) -> None:
+def test_takeoff_reaches_and_reports_its_height(name: str, seed: int, height_m: float) -> None:
     vehicle = LockstepVehicle({"onboard": RATES_HZ}, **air(name, seed))
     flight = LockstepFlight(SimulatedDriver(vehicle), plain_settings())
     assert flight.run_until(lambda: flight.state.ready_to_arm, 30.0)

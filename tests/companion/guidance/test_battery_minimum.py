@@ -31,12 +31,12 @@ def orbiting(harness: GuidanceHarness) -> Pending:
     return future
 
 
-def told(harness: GuidanceHarness) -> list[str]:
+def battery_events(harness: GuidanceHarness) -> list[str]:
     return [event.message for event in harness.events if event.kind is EventKind.BATTERY]
 
 
 @pytest.mark.parametrize("behaviour", [HoldBehaviour, OrbitBehaviour, TakeoffBehaviour])
-def test_nothing_begins_to_fly_below_the_least_charge_and_the_refusal_names_it(
+def test_low_battery_refuses_behaviours_that_fly(
     behaviour: type[HoldBehaviour | OrbitBehaviour | TakeoffBehaviour],
 ) -> None:
     harness = flying()
@@ -45,35 +45,35 @@ def test_nothing_begins_to_fly_below_the_least_charge_and_the_refusal_names_it(
     harness.autopilot.battery_fraction = 0.14
     harness.run(0.1)
     reason = harness.command(behaviour(2.5) if behaviour is TakeoffBehaviour else behaviour()).result().reason
-    assert "needs a battery above 15% (it has 14%; guidance.min_battery_percent)" in reason
+    assert "14%; guidance.min_battery_percent" in reason
     assert not harness.guidance.in_command
 
 
 @pytest.mark.parametrize("behaviour", [LandBehaviour, ReturnBehaviour, StopBehaviour])
-def test_the_ways_down_and_handing_back_need_no_charge(behaviour: Callable[[], Behaviour]) -> None:
+def test_landing_and_stop_need_no_charge(behaviour: Callable[[], Behaviour]) -> None:
     harness = flying()
     harness.autopilot.battery_fraction = 0.01
     harness.run(0.1)
     assert not harness.command(behaviour()).done()
 
 
-def test_a_charge_that_is_not_told_is_a_refusal_that_says_so() -> None:
+def test_missing_battery_state_is_refused() -> None:
     harness = flying()
     harness.autopilot.battery_fraction = None
     harness.run(0.1)
     reason = harness.command(HoldBehaviour()).result().reason
-    assert "the autopilot does not tell its charge" in reason
+    assert "battery state not received" in reason
 
 
-def test_a_charge_that_is_old_is_a_refusal_that_says_how_old() -> None:
+def test_stale_battery_state_is_refused_with_its_age() -> None:
     harness = flying()
     harness.autopilot.battery_alive = False
     harness.run(BATTERY_MAX_AGE_S + 1.0)
     reason = harness.command(HoldBehaviour()).result().reason
-    assert "last told 7 s ago" in reason
+    assert "stale (7 s)" in reason
 
 
-def test_zero_turns_it_off() -> None:
+def test_minimum_of_zero_disables_the_check() -> None:
     harness = flying(BatteryMinimum(0.0))
     harness.autopilot.battery_fraction = None
     harness.run(0.1)
@@ -81,29 +81,26 @@ def test_zero_turns_it_off() -> None:
 
 
 @pytest.mark.parametrize(("action", "mode"), [("rtl", FlightMode.RETURN), ("land", FlightMode.LAND)])
-def test_a_flight_below_it_brakes_and_goes_the_way_the_operator_chose(
-    action: BatteryAction, mode: FlightMode
-) -> None:
+def test_low_battery_in_flight_brakes_and_starts_the_action(action: BatteryAction, mode: FlightMode) -> None:
     harness = flying(BatteryMinimum(0.15, action))
     future = orbiting(harness)
     harness.autopilot.battery_fraction = 0.14
     before = len(harness.autopilot.setpoints)
     harness.until(future.done, 3.0)
     assert not future.result().success
-    assert future.result().reason == "the battery has 14%, below the 15% of guidance.min_battery_percent"
+    assert "guidance.min_battery_percent = 15" in future.result().reason
     harness.until(lambda: harness.autopilot.state.mode is mode, 3.0)
     last = harness.autopilot.setpoints[before:][-1]
     assert last.velocity_ned_mps == (0.0, 0.0, 0.0)
     harness.until(lambda: not harness.guidance.in_command, 60.0)
     assert not harness.autopilot.state.armed
-    harness.run()  # so that its end is told
-    assert [line.split(":")[0] for line in told(harness)] == [
-        "the battery has 14%, below the 15% of guidance.min_battery_percent",
-        f"{action} after low battery",
-    ]
+    harness.run()  # so that its end is logged
+    low, ended = battery_events(harness)
+    assert "battery at 14%" in low
+    assert ended.startswith(f"{action} after low battery")
 
 
-def test_hold_after_low_battery_stays_under_our_command() -> None:
+def test_hold_after_low_battery_keeps_command() -> None:
     harness = flying(BatteryMinimum(0.15, "hold"))
     future = orbiting(harness)
     harness.autopilot.battery_fraction = 0.14
@@ -111,10 +108,10 @@ def test_hold_after_low_battery_stays_under_our_command() -> None:
     harness.run(5.0)
     assert harness.guidance.phase == "offboard"
     assert isinstance(harness.guidance.behaviour, HoldBehaviour)
-    assert len(told(harness)) == 1
+    assert len(battery_events(harness)) == 1
 
 
-def test_the_hold_that_goes_on_after_a_command_is_ended_too() -> None:
+def test_low_battery_ends_the_hold_after_a_command() -> None:
     harness = flying()
     harness.run(0.1)
     future = harness.command(HoldBehaviour(0.5))
@@ -123,7 +120,7 @@ def test_the_hold_that_goes_on_after_a_command_is_ended_too() -> None:
     harness.until(lambda: harness.autopilot.state.mode is FlightMode.RETURN, 5.0)
 
 
-def test_a_dip_of_the_charge_ends_nothing() -> None:
+def test_short_dip_of_the_charge_is_ignored() -> None:
     harness = flying()
     future = orbiting(harness)
     for _ in range(3):
@@ -134,17 +131,17 @@ def test_a_dip_of_the_charge_ends_nothing() -> None:
     assert not future.done()
 
 
-def test_a_charge_that_comes_no_more_in_flight_is_said_once_and_the_flight_goes_on() -> None:
+def test_stale_battery_in_flight_is_logged_once() -> None:
     harness = flying()
     future = orbiting(harness)
     harness.autopilot.battery_alive = False
     harness.run(15.0)
     assert not future.done()
-    assert len(told(harness)) == 1
-    assert "flying on" in told(harness)[0]
+    assert len(battery_events(harness)) == 1
+    assert "stale" in battery_events(harness)[0]
 
 
-def test_a_low_battery_while_offboard_is_still_asked_for_ends_in_the_return_as_well() -> None:
+def test_low_battery_while_engaging_starts_the_return() -> None:
     harness = flying()
     harness.autopilot.lag_s = 1.5
     harness.run(0.1)
@@ -155,7 +152,7 @@ def test_a_low_battery_while_offboard_is_still_asked_for_ends_in_the_return_as_w
     harness.until(lambda: harness.autopilot.state.mode is FlightMode.RETURN, 5.0)
 
 
-def test_both_battery_messages_carry_their_stamp() -> None:
+def test_both_battery_messages_set_the_stamp() -> None:
     state = apply_message(VehicleState(), "BATTERY_STATUS", {"id": 0, "battery_remaining": 40}, 5)
     assert (state.battery_fraction, state.battery_ns) == (0.4, 5)
     fields = {"onboard_control_sensors_health": 0, "battery_remaining": 39}
@@ -166,6 +163,6 @@ def test_both_battery_messages_carry_their_stamp() -> None:
 
 
 @pytest.mark.parametrize(("fraction", "action"), [(1.5, "rtl"), (-0.1, "rtl"), (0.2, "dive")])
-def test_a_minimum_that_is_none_is_refused(fraction: float, action: str) -> None:
+def test_invalid_minimum_is_rejected(fraction: float, action: str) -> None:
     with pytest.raises(ValueError, match="must be"):
-        BatteryMinimum(fraction, action)  # type: ignore[arg-type]  # one of them is no action
+        BatteryMinimum(fraction, action)  # type: ignore[arg-type]  # one action is invalid

@@ -1,4 +1,4 @@
-"""The example plug-in, installed as a package of its own, and flown."""
+"""The example plug-in, installed as a package and flown."""
 
 from __future__ import annotations
 
@@ -45,16 +45,16 @@ def test_plugin_flies_its_circle(installed: Path, monkeypatch: pytest.MonkeyPatc
         flight = LockstepFlight.airborne(seed=3, settings=settings)
         flight.command("circle radius=6 speed=1.5")
         flight.run(15.0)
-        places = []
-        for _ in range(25):  # once round: 2 pi 6 m / 1.5 m/s
+        positions = []
+        for _ in range(25):  # one lap: 2 pi 6 m / 1.5 m/s
             flight.run(1.0)
-            places.append(flight.vehicle.truth.position_ned_m)
+            positions.append(flight.vehicle.truth.position_ned_m)
     finally:
         COMMANDS.clear()
         COMMANDS.update(before)
         sys.modules.pop("companion_circle", None)
     # The circle that fits best: x^2 + y^2 = 2 a x + 2 b y + c (Kasa 1976).
-    points = np.array([place[:2] for place in places])
+    points = np.array([position[:2] for position in positions])
     terms = np.column_stack([2 * points, np.ones(len(points))])
     (north, east, rest), *_ = np.linalg.lstsq(terms, (points**2).sum(axis=1), rcond=None)
     radius = math.sqrt(rest + north**2 + east**2)
@@ -83,6 +83,6 @@ def test_service_flies_an_installed_plugin(
             "--connect",
             service.endpoint,
         ]
-        told = subprocess.run(send, capture_output=True, text=True, timeout=60, cwd=tmp_path)
-        assert told.returncode == 0, told.stderr
+        sent = subprocess.run(send, capture_output=True, text=True, timeout=60, cwd=tmp_path)
+        assert sent.returncode == 0, sent.stderr
         assert service.command("land")["success"]

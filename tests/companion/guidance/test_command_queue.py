@@ -1,4 +1,4 @@
-"""A command that waits for the gimbal does not begin once something newer has happened."""
+"""Commands that wait for the gimbal, and what supersedes them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class NeedsGimbal(Behaviour):
 
 
 class Waiting:
-    """A harness whose autopilot does not answer whether it has a gimbal, and a command that waits for it."""
+    """A harness whose autopilot does not answer the gimbal request, and a command that waits for it."""
 
     def __init__(self) -> None:
         self.harness = GuidanceHarness(flying())
@@ -48,33 +48,33 @@ class Waiting:
         return self.harness.outcome(self.command, 1.0).reason
 
 
-def test_without_an_answer_it_goes_on_after_its_time_and_is_refused() -> None:
+def test_without_an_answer_it_is_refused_after_the_timeout() -> None:
     waiting = Waiting()
     waiting.harness.run(FIND_TIMEOUT_S - 0.5)
     assert not waiting.command.done()
     assert len(waiting.find) == 1
     waiting.harness.run(1.0)
-    assert "a gimbal (none answers)" in waiting.reason()
+    assert "gimbal manager not responding" in waiting.reason()
 
 
 @pytest.mark.parametrize("newer", ["behaviour", "aim"])
-def test_a_newer_command_supersedes_it(newer: str) -> None:
+def test_newer_command_supersedes_it(newer: str) -> None:
     waiting = Waiting()
     if newer == "behaviour":
         later: Pending = waiting.harness.command(HoldBehaviour())
-        assert waiting.reason() == "superseded by hold while waiting for the gimbal"
+        assert waiting.reason().startswith("superseded by hold")
         assert not later.done()
     else:
         waiting.harness.command(aim=GimbalAim(-0.5))
-        assert waiting.reason() == "superseded by gimbal while waiting for the gimbal"
+        assert waiting.reason().startswith("superseded by gimbal")
 
 
-def test_a_gimbal_command_waits_on_while_others_come() -> None:
+def test_gimbal_command_is_not_superseded() -> None:
     harness = Waiting().harness
     pointing = harness.command(aim=GimbalAim(-0.5))
     harness.command(HoldBehaviour())
     harness.run(0.5)
-    assert not pointing.done(), "it moves no vehicle"
+    assert not pointing.done(), "gimbal only"
 
 
 @pytest.mark.parametrize(
@@ -84,16 +84,16 @@ def test_a_gimbal_command_waits_on_while_others_come() -> None:
         (lambda harness: setattr(harness.vehicle, "armed", False), "(now hold, disarmed)"),
     ],
 )
-def test_a_change_of_mode_or_arming_supersedes_it(
+def test_change_of_mode_or_arming_supersedes_it(
     change: Callable[[GuidanceHarness], None], words: str
 ) -> None:
     waiting = Waiting()
     change(waiting.harness)
     waiting.harness.run(0.1)
-    assert waiting.reason() == (f"superseded by a change of the vehicle {words} while waiting for the gimbal")
+    assert words in waiting.reason()
 
 
-def test_a_change_that_was_reverted_between_two_steps_supersedes_it() -> None:
+def test_change_reverted_between_steps_supersedes_it() -> None:
     harness = GuidanceHarness(flying())
     changes = 0
 
@@ -111,13 +111,13 @@ def test_a_change_that_was_reverted_between_two_steps_supersedes_it() -> None:
     assert "(now hold, armed)" in command.result().reason
 
 
-def test_the_end_of_the_service_supersedes_it() -> None:
+def test_end_of_service_supersedes_it() -> None:
     waiting = Waiting()
     waiting.harness.close()
-    assert waiting.reason() == "superseded by the end of the service while waiting for the gimbal"
+    assert "end of the service" in waiting.reason()
 
 
-def test_a_loss_of_command_supersedes_it() -> None:
+def test_loss_of_command_supersedes_it() -> None:
     waiting = Waiting()
     harness = waiting.harness
     harness.command(OrbitBehaviour())
@@ -128,4 +128,4 @@ def test_a_loss_of_command_supersedes_it() -> None:
     harness.streaming = True
     harness.run(0.1)
     assert EventKind.LOST in kinds(harness)
-    assert later.result().reason.startswith("superseded by an event (command lost: ")
+    assert "command lost" in later.result().reason

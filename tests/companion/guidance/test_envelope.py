@@ -34,7 +34,7 @@ def vehicle(
 def settled(
     envelope: Envelope, setpoint: Setpoint, state: VehicleState, seconds: float = 20.0
 ) -> tuple[Setpoint, tuple[str, ...]]:
-    """What is sent once slew limits have run out."""
+    """The sent velocity once the acceleration limit has settled."""
     for _ in range(round(seconds / 0.1)):
         sent, reasons = envelope.apply(setpoint, state, NOW, 0.1)
     return sent, reasons
@@ -42,8 +42,8 @@ def settled(
 
 speeds = st.floats(-20, 20)
 velocities = st.tuples(speeds, speeds, speeds)
-places = st.tuples(st.floats(-400, 400), st.floats(-400, 400), st.floats(-100, 20))
-states = st.builds(vehicle, places, velocities, st.floats(-3, 3), st.tuples(*[st.floats(-20, 20)] * 3))
+positions = st.tuples(st.floats(-400, 400), st.floats(-400, 400), st.floats(-100, 20))
+states = st.builds(vehicle, positions, velocities, st.floats(-3, 3), st.tuples(*[st.floats(-20, 20)] * 3))
 yaw_arguments = st.one_of(
     st.just({}),
     st.builds(lambda v: {"yaw_rad": v}, st.floats(-3, 3)),
@@ -51,13 +51,13 @@ yaw_arguments = st.one_of(
 )
 velocity_setpoints = st.builds(lambda v, yaw: Setpoint.velocity(v, NOW, **yaw), velocities, yaw_arguments)
 setpoints = velocity_setpoints | st.builds(
-    lambda p, yaw: Setpoint.position(p, NOW, yaw_rad=yaw), places, st.floats(-3, 3)
+    lambda p, yaw: Setpoint.position(p, NOW, yaw_rad=yaw), positions, st.floats(-3, 3)
 )
 durations = st.floats(0, 0.5)
 
 
 @given(st.lists(st.tuples(velocity_setpoints, states, durations), min_size=1, max_size=6))
-def test_a_velocity_never_leaves_faster_than_it_came_nor_beyond_a_limit(
+def test_velocity_never_exceeds_input_or_limits(
     steps: list[tuple[Setpoint, VehicleState, float]],
 ) -> None:
     envelope = Envelope(LIMITS)
@@ -85,11 +85,9 @@ inside_states = st.builds(
 )
 
 
-# A vehicle outside the fences is led back step by step, so its positions do change from step to step.
+# Outside the fences the limited position moves back step by step.
 @given(setpoints, inside_states, durations)
-def test_what_was_let_through_passes_again_unchanged(
-    asked: Setpoint, state: VehicleState, dt_s: float
-) -> None:
+def test_limited_setpoint_passes_again_unchanged(asked: Setpoint, state: VehicleState, dt_s: float) -> None:
     envelope = Envelope(LIMITS)
     once, _ = envelope.apply(asked, state, NOW, dt_s)
     again, _ = envelope.apply(once, state, NOW, dt_s)
@@ -108,19 +106,17 @@ def test_what_was_let_through_passes_again_unchanged(
     st.tuples(st.floats(-3, 3), st.floats(-3, 3), st.floats(-1.9, 0.9)),
     st.tuples(st.floats(-100, 100), st.floats(-100, 100), st.floats(-40, -5)),
 )
-def test_inside_every_limit_the_very_same_setpoint_is_sent(velocity: Vector3, place: Vector3) -> None:
+def test_setpoint_inside_the_limits_is_the_same_object(velocity: Vector3, position: Vector3) -> None:
     envelope = Envelope(LIMITS)
     asked = Setpoint.velocity(velocity, NOW, yaw_rate_radps=0.5)
-    sent, reasons = envelope.apply(asked, vehicle(place, velocity), NOW, 0.02)
+    sent, reasons = envelope.apply(asked, vehicle(position, velocity), NOW, 0.02)
     assert sent is asked
     assert reasons == ()
 
 
-@given(places, states)
-def test_a_position_leaves_inside_the_band_of_altitudes_unless_the_way_there_is_long(
-    place: Vector3, state: VehicleState
-) -> None:
-    sent, _ = Envelope(LIMITS).apply(Setpoint.position(place, NOW), state, NOW, 0.02)
+@given(positions, states)
+def test_position_stays_inside_the_altitude_band(position: Vector3, state: VehicleState) -> None:
+    sent, _ = Envelope(LIMITS).apply(Setpoint.position(position, NOW), state, NOW, 0.02)
     assert sent.position_ned_m is not None
     north, east, down = sent.position_ned_m
     here = state.position_ned_m
@@ -129,14 +125,14 @@ def test_a_position_leaves_inside_the_band_of_altitudes_unless_the_way_there_is_
     assert -LIMITS.max_climb_mps - 1e-6 <= down - here[2] <= LIMITS.max_descend_mps + 1e-6
 
 
-def test_a_position_outside_the_fence_becomes_the_nearest_one_inside() -> None:
+def test_position_outside_the_fence_is_moved_inside() -> None:
     state = vehicle((199.0, 0.0, -49.5))
     sent, reasons = Envelope(LIMITS).apply(Setpoint.position((300.0, 0.0, -80.0), NOW), state, NOW, 0.02)
     assert sent.position_ned_m == pytest.approx((200.0, 0.0, -50.0))
     assert len(reasons) == 2
 
 
-def test_a_velocity_grows_with_no_more_than_the_greatest_acceleration() -> None:
+def test_velocity_grows_with_limited_acceleration() -> None:
     envelope, state, previous = Envelope(LIMITS), vehicle(), 0.0
     for _ in range(40):
         sent, _ = envelope.apply(Setpoint.velocity((4.0, 0.0, 0.0), NOW), state, NOW, 0.05)
@@ -155,7 +151,7 @@ def test_braking_is_never_delayed() -> None:
     assert sent.velocity_ned_mps == (0.0, 0.0, 0.0)
 
 
-def test_after_a_reset_the_first_velocity_starts_from_how_the_vehicle_moves() -> None:
+def test_after_reset_velocity_starts_from_the_measured_one() -> None:
     envelope = Envelope(LIMITS)
     sent, _ = envelope.apply(
         Setpoint.velocity((4.0, 0.0, 0.0), NOW), vehicle(velocity=(3.0, 0.0, 0.0)), NOW, 0.1
@@ -175,7 +171,7 @@ def test_after_a_reset_the_first_velocity_starts_from_how_the_vehicle_moves() ->
     ],
     ids=["floor", "below the floor", "ceiling", "fence", "beyond the fence"],
 )
-def test_at_a_fence_nothing_goes_further_out(
+def test_no_outward_velocity_at_a_fence(
     asked: Vector3, state: VehicleState, component: int, sign: int
 ) -> None:
     sent, reasons = settled(Envelope(LIMITS), Setpoint.velocity(asked, NOW), state)
@@ -184,24 +180,24 @@ def test_at_a_fence_nothing_goes_further_out(
     assert reasons
 
 
-def test_the_lowest_altitude_does_not_hold_for_a_landing_and_all_else_does() -> None:
+def test_landing_ignores_the_minimum_altitude_only() -> None:
     state, down = vehicle((0.0, 0.0, -0.6)), Setpoint.velocity((0.0, 0.0, 3.0), NOW)
     envelope = Envelope(LIMITS)
     for _ in range(100):
         sent, _ = envelope.apply(down, state, NOW, 0.05, landing=True)
     assert sent.velocity_ned_mps == pytest.approx((0.0, 0.0, LIMITS.max_descend_mps))
-    place = Setpoint.position((0.0, 0.0, 0.0), NOW)
-    assert envelope.apply(place, state, NOW, 0.05, landing=True).sent is place
-    # Only as long as it is said.
+    asked = Setpoint.position((0.0, 0.0, 0.0), NOW)
+    assert envelope.apply(asked, state, NOW, 0.05, landing=True).sent is asked
+    # Only while `landing` is set.
     velocity = envelope.apply(down, state, NOW, 0.05).sent.velocity_ned_mps
     assert velocity is not None
     assert velocity[2] <= 0.0
-    position = envelope.apply(place, state, NOW, 0.05).sent.position_ned_m
+    position = envelope.apply(asked, state, NOW, 0.05).sent.position_ned_m
     assert position is not None
     assert position[2] == -LIMITS.min_altitude_m
 
 
-def test_along_and_back_from_the_fence_the_vehicle_may_fly() -> None:
+def test_velocity_along_or_away_from_the_fence_is_kept() -> None:
     state = vehicle((220.0, 0.0, -10.0))
     back, _ = settled(Envelope(LIMITS), Setpoint.velocity((-3.0, 0.0, 0.0), NOW), state)
     assert back.velocity_ned_mps == pytest.approx((-3.0, 0.0, 0.0))
@@ -209,14 +205,14 @@ def test_along_and_back_from_the_fence_the_vehicle_may_fly() -> None:
     assert along.velocity_ned_mps == pytest.approx((0.0, 3.0, 0.0), abs=1e-6)
 
 
-def test_the_fence_is_around_home_not_around_the_origin() -> None:
+def test_fence_is_centred_on_home() -> None:
     state = vehicle((250.0, 0.0, -10.0), home=(200.0, 0.0, 5.0))
     sent, _ = settled(Envelope(LIMITS), Setpoint.velocity((3.0, 0.0, 0.0), NOW), state)
     assert sent.velocity_ned_mps is not None
     assert sent.velocity_ned_mps[0] == pytest.approx(3.0)
 
 
-def test_a_vehicle_flown_against_the_fence_stops_inside_it() -> None:
+def test_vehicle_flown_at_the_fence_stops_inside() -> None:
     envelope, north, speed = Envelope(LIMITS), 150.0, 0.0
     for _ in range(2000):
         state = vehicle((north, 0.0, -10.0), (speed, 0.0, 0.0))
@@ -227,7 +223,7 @@ def test_a_vehicle_flown_against_the_fence_stops_inside_it() -> None:
     assert 199.0 < north < 200.3
 
 
-def test_a_wanted_heading_runs_ahead_no_faster_than_the_yaw_rate() -> None:
+def test_yaw_setpoint_is_rate_limited() -> None:
     envelope = Envelope(LIMITS)
     headings: list[float] = []
     for _ in range(50):
@@ -240,7 +236,7 @@ def test_a_wanted_heading_runs_ahead_no_faster_than_the_yaw_rate() -> None:
     assert headings[-1] == pytest.approx(-3.0)
 
 
-def test_without_a_position_a_position_setpoint_becomes_a_brake() -> None:
+def test_position_setpoint_without_position_is_a_brake() -> None:
     sent, reasons = Envelope(LIMITS).apply(Setpoint.position((5, 0, -5), NOW), VehicleState(), NOW, 0.02)
     assert sent.velocity_ned_mps == (0.0, 0.0, 0.0)
     assert reasons == ("position unknown",)
@@ -262,12 +258,12 @@ class SomeLimits(TypedDict, total=False):
         {"max_yaw_rate_radps": -1},
     ],
 )
-def test_limits_that_make_no_sense_are_refused_by_name(arguments: SomeLimits) -> None:
+def test_invalid_limits_are_rejected_by_name(arguments: SomeLimits) -> None:
     with pytest.raises(ValueError, match=next(iter(arguments))):
         Limits(**arguments)
 
 
-def test_a_vehicle_flown_against_a_polygon_stops_inside_it_and_says_why() -> None:
+def test_vehicle_flown_at_a_polygon_stops_inside() -> None:
     fence = Fence(((-15.0, -15.0), (15.0, -15.0), (15.0, 15.0), (-15.0, 15.0)))
     limits = Limits(fence=fence)
     vehicle, envelope = KinematicVehicle(), Envelope(limits)
@@ -280,19 +276,19 @@ def test_a_vehicle_flown_against_a_polygon_stops_inside_it_and_says_why() -> Non
         assert fence.contains((vehicle.position[0], vehicle.position[1]))
     assert vehicle.position[0] > 14.0
     assert vehicle.position[1] > 14.0
-    assert "slowed down at the fence" in reasons
+    assert any("fence" in reason for reason in reasons)
 
 
-def test_a_position_beyond_a_polygon_is_kept_inside_of_it() -> None:
+def test_position_beyond_a_polygon_is_clipped() -> None:
     limits = Limits(fence=Fence(((-15.0, -15.0), (15.0, -15.0), (15.0, 15.0), (-15.0, 15.0))))
     vehicle = KinematicVehicle(position=[12.0, 0.0, -5.0])
     setpoint = Setpoint.position((30.0, 0.0, -5.0), vehicle.now_ns)
     sent, why = Envelope(limits).apply(setpoint, vehicle.state, vehicle.now_ns, 0.02)
     assert sent.position_ned_m == pytest.approx((14.5, 0.0, -5.0))
-    assert "kept inside the fence" in why
+    assert any("fence" in reason for reason in why)
 
 
-def test_a_steep_velocity_is_shortened_and_not_bent() -> None:
+def test_steep_velocity_keeps_its_direction() -> None:
     asked = Setpoint.velocity((8.0, 0.0, -8.0), 1)
     sent, why = Envelope(Limits(max_acceleration_mps2=20.0)).apply(asked, KinematicVehicle().state, 1, 0.2)
     assert sent.velocity_ned_mps is not None
@@ -302,7 +298,7 @@ def test_a_steep_velocity_is_shortened_and_not_bent() -> None:
     assert any("climb" in reason for reason in why)
 
 
-def test_home_that_is_not_told_for_a_while_is_where_it_was_and_without_one_a_fence_lets_nothing_fly() -> None:
+def test_last_home_is_kept_and_fence_needs_a_home() -> None:
     fence = Fence(((50.0, -50.0), (150.0, -50.0), (150.0, 50.0), (50.0, 50.0)))
     vehicle = KinematicVehicle(position=[149.0, 0.0, -5.0])
     homeless = replace(vehicle.state, home_position_ned_m=None)
@@ -322,7 +318,7 @@ def test_home_that_is_not_told_for_a_while_is_where_it_was_and_without_one_a_fen
 
 @pytest.mark.parametrize("acceleration_mps2", [2.0, 5.0, 10.0, 20.0])
 @pytest.mark.parametrize("lag_s", [0.2, 0.4])
-def test_strong_braking_does_not_shoot_over_the_fence(acceleration_mps2: float, lag_s: float) -> None:
+def test_strong_braking_does_not_overshoot_the_fence(acceleration_mps2: float, lag_s: float) -> None:
     limits = Limits(
         max_horizontal_speed_mps=20.0,
         max_acceleration_mps2=acceleration_mps2,
@@ -339,7 +335,7 @@ def test_strong_braking_does_not_shoot_over_the_fence(acceleration_mps2: float, 
 def feed_forward(
     acceleration: Vector3, velocity: Vector3 = (0.0, 0.0, 0.0), position: Vector3 = (0.0, 0.0, -5.0)
 ) -> tuple[Vector3 | None, tuple[str, ...]]:
-    """What is left of it for a vehicle with this velocity, which is asked to keep it."""
+    """The limited feed-forward of a vehicle that is commanded its current velocity."""
     vehicle = KinematicVehicle(position=list(position), velocity=list(velocity))
     limits = Limits(fence=Fence(((-20.0, -20.0), (20.0, -20.0), (20.0, 20.0), (-20.0, 20.0))))
     setpoint = Setpoint.velocity(velocity, 1, acceleration_ned_mps2=acceleration)
@@ -347,22 +343,22 @@ def feed_forward(
     return sent.acceleration_ned_mps2, why
 
 
-def test_feed_forward_inside_the_limits_passes_as_it_is() -> None:
+def test_feed_forward_inside_the_limits_is_unchanged() -> None:
     assert feed_forward((0.0, 2.0, 0.0), (4.0, 0.0, 0.0)) == ((0.0, 2.0, 0.0), ())
 
 
-def test_feed_forward_is_no_more_than_the_greatest_acceleration() -> None:
+def test_feed_forward_is_limited_to_max_acceleration() -> None:
     left, _ = feed_forward((0.0, 30.0, 0.0), (4.0, 0.0, 0.0))
     assert left == pytest.approx((0.0, 3.0, 0.0))
     left, _ = feed_forward((0.0, 3.0, 0.0), (0.5, 0.0, 0.0))
     assert left == pytest.approx((0.0, 0.5, 0.0))
 
 
-def test_a_stop_carries_no_feed_forward() -> None:
+def test_stop_has_no_feed_forward() -> None:
     assert feed_forward((0.0, 3.0, 0.0))[0] is None
 
 
-def test_feed_forward_that_leads_away_from_a_fence_is_kept_before_it() -> None:
+def test_feed_forward_away_from_a_fence_is_kept() -> None:
     inwards, _ = feed_forward((-2.0, 0.0, 0.0), (0.0, 4.0, 0.0), (19.0, 0.0, -5.0))
     assert inwards == pytest.approx((-2.0, 0.0, 0.0))
     outwards, why = feed_forward((2.0, 0.0, 0.0), (0.0, 4.0, 0.0), (19.4, 0.0, -5.0))
@@ -380,7 +376,7 @@ def test_feed_forward_that_leads_away_from_a_fence_is_kept_before_it() -> None:
         pytest.param((0.0, 0.0, 3.0), (0.0, 0.0, 0.9), (0.0, 0.0, -20.0), id="faster down than allowed"),
     ],
 )
-def test_feed_forward_does_not_lead_over_a_limit(
+def test_feed_forward_does_not_violate_a_limit(
     acceleration: Vector3, velocity: Vector3, position: Vector3
 ) -> None:
     left, _ = feed_forward(acceleration, velocity, position)
@@ -393,7 +389,7 @@ KNOWN = KinematicVehicle(position=[0.0, 0.0, -5.0]).state
 @pytest.mark.parametrize(
     "state", [replace(KNOWN, velocity_ned_mps=None), replace(KNOWN, position_ned_m=None)]
 )
-def test_feed_forward_of_a_vehicle_whose_motion_is_unknown_is_left_out(state: VehicleState) -> None:
+def test_feed_forward_is_dropped_without_known_motion(state: VehicleState) -> None:
     setpoint = Setpoint.velocity((1.0, 0.0, 0.0), 1, acceleration_ned_mps2=(1.0, 0.0, 0.0))
     sent, why = Envelope().apply(setpoint, state, 1, 0.2)
     assert sent.acceleration_ned_mps2 is None

@@ -1,4 +1,4 @@
-"""Resets of the autopilot's position estimate, and an estimate that is not valid, in flight."""
+"""Resets of the autopilot's position estimate, and invalid estimates, in flight."""
 
 from __future__ import annotations
 
@@ -25,15 +25,13 @@ def airborne(autopilot: str) -> LockstepFlight:
     return LockstepFlight(SimulatedDriver(vehicle), plain_settings())
 
 
-def distance_m(flight: LockstepFlight, place_ned_m: tuple[float, ...]) -> float:
-    return math.dist(flight.vehicle.truth.position_ned_m, place_ned_m)
+def distance_m(flight: LockstepFlight, point_ned_m: tuple[float, ...]) -> float:
+    return math.dist(flight.vehicle.truth.position_ned_m, point_ned_m)
 
 
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 @pytest.mark.parametrize("reset_s", [3.0, 0.5])
-def test_a_goal_stays_where_it_is_on_the_ground_when_the_estimate_is_reset(
-    autopilot: str, reset_s: float
-) -> None:
+def test_goal_keeps_its_ground_position_through_a_reset(autopilot: str, reset_s: float) -> None:
     flight = airborne(autopilot)
     goal = (25.0, 4.0, flight.vehicle.truth.position_ned_m[2])
     identifier = flight.command("goto 25 4")
@@ -56,31 +54,31 @@ def test_a_goal_stays_where_it_is_on_the_ground_when_the_estimate_is_reset(
     assert fastest_mps < 5.5
     assert flight.state.reset_count == before.reset_count + 1
     assert flight.state.reset_offset_ned_m == pytest.approx(RESET_NED_M, abs=0.4)
-    told = [event for event in flight.events if "position estimate" in event.message]
-    assert [event.kind for event in told] == [EventKind.NOTED]
-    assert "goals moved with it" in told[0].message
+    resets = [event for event in flight.events if "position estimate" in event.message]
+    assert [event.kind for event in resets] == [EventKind.NOTED]
+    assert "goals moved" in resets[0].message
 
 
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
-def test_a_hold_stays_in_its_place_through_a_reset_and_the_one_back(autopilot: str) -> None:
+def test_hold_keeps_its_position_through_resets(autopilot: str) -> None:
     flight = airborne(autopilot)
     flight.command("hold")
     flight.run(3.0)
-    place = flight.vehicle.truth.position_ned_m
+    point = flight.vehicle.truth.position_ned_m
     number = flight.vehicle.vehicle.faults.begin(RESET)
     for _ in range(40):
         flight.run(0.1)
-        assert distance_m(flight, place) < 0.8
+        assert distance_m(flight, point) < 0.8
     flight.vehicle.vehicle.faults.end(number)
     for _ in range(40):
         flight.run(0.1)
-        assert distance_m(flight, place) < 0.8
+        assert distance_m(flight, point) < 0.8
     assert flight.state.reset_count == 2
     assert flight.state.reset_offset_ned_m == pytest.approx((0.0, 0.0, 0.0), abs=0.3)
 
 
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
-def test_hard_manoeuvres_are_no_resets(autopilot: str) -> None:
+def test_hard_manoeuvres_are_not_resets(autopilot: str) -> None:
     flight = airborne(autopilot)
     for command in ("goto 20 0 speed=5", "goto 0 0 speed=5", "orbit radius=6 speed=3", "stop"):
         flight.command(command)
@@ -90,8 +88,8 @@ def test_hard_manoeuvres_are_no_resets(autopilot: str) -> None:
 
 
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
-def test_without_gps_a_standing_position_is_not_believed(autopilot: str) -> None:
-    """LOCAL_POSITION_NED still comes; its flags say that it is none."""
+def test_invalid_position_without_gps_is_not_used(autopilot: str) -> None:
+    """LOCAL_POSITION_NED still comes; the estimator's flags mark it as invalid."""
     flight = airborne(autopilot)
     identifier = flight.command("goto 40 0 speed=1")
     flight.run(2.0)
@@ -100,18 +98,18 @@ def test_without_gps_a_standing_position_is_not_believed(autopilot: str) -> None
     outcome = flight.outcome(identifier)
     assert outcome is not None
     assert not outcome.success
-    # a failsafe may be told before the estimator's flags, which come once a second
+    # a failsafe may be reported before the estimator's flags, which come once a second
     assert flight.run_until(lambda: flight.state.position_valid is False, 1.5)
     assert flight.state.position_fresh(flight.now_ns)
     again = flight.command("goto 10 0")
     flight.run(0.5)
     refused = flight.outcome(again)
     assert refused is not None
-    assert "position (the autopilot's estimator reports it as not valid)" in refused.reason
+    assert "estimator" in refused.reason
 
 
-def test_an_estimate_that_is_not_valid_brakes_and_then_ends_the_command() -> None:
-    """Where the autopilot itself stays in offboard mode."""
+def test_invalid_estimate_brakes_and_then_ends_command() -> None:
+    """With an autopilot that stays in offboard mode."""
 
     def invalid(inputs: GuidanceInput) -> GuidanceInput:
         return replace(inputs, state=replace(inputs.state, position_valid=not lost))
@@ -126,5 +124,5 @@ def test_an_estimate_that_is_not_valid_brakes_and_then_ends_the_command() -> Non
     assert setpoint is not None
     assert setpoint.velocity_ned_mps == (0.0, 0.0, 0.0)
     reason = harness.outcome(pending).reason
-    assert reason.startswith("no position or attitude to fly by for ")
-    assert "the autopilot's estimator reports it as not valid" in reason
+    assert reason.startswith("position or attitude lost")
+    assert "estimator" in reason

@@ -1,4 +1,4 @@
-"""A failsafe of the autopilot is told as one, a pilot's change of mode as a pilot's."""
+"""Reasons of a loss of command: autopilot failsafe or pilot."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -27,7 +27,7 @@ from tests.companion.guidance.guidance_harness import GuidanceHarness, engaged, 
         ({"COM_FAIL_ACT_T": 0.0}, "battery emergency", "land"),
     ],
 )
-def test_a_failsafe_of_the_simulated_px4_is_not_a_pilot(
+def test_px4_failsafe_is_not_reported_as_pilot(
     parameters: dict[str, float], fault: str | None, mode: str
 ) -> None:
     settings = plain_settings({"guidance.min_battery_percent": "0"})
@@ -42,7 +42,7 @@ def test_a_failsafe_of_the_simulated_px4_is_not_a_pilot(
     assert flight.outcome(identifier) == Outcome(False, f"autopilot failsafe: {mode} mode")
 
 
-def test_a_mode_that_somebody_else_chooses_is_a_pilot() -> None:
+def test_other_mode_change_is_reported_as_pilot() -> None:
     flight = LockstepFlight.airborne(seed=4)
     identifier = flight.command("goto 30 0")
     flight.run(3.0)
@@ -59,32 +59,32 @@ def test_a_mode_that_somebody_else_chooses_is_a_pilot() -> None:
     ],
 )
 @pytest.mark.parametrize("late_s", [0.0, 0.1, 2.0])
-def test_a_heartbeat_that_comes_first_stops_the_setpoints_and_waits_for_the_reason(
+def test_heartbeat_first_stops_stream_and_waits_for_reason(
     intended: FlightMode, reason: str, late_s: float
 ) -> None:
     changed_ns: list[int] = []
 
-    def tell(inputs: GuidanceInput) -> GuidanceInput:
+    def modify(inputs: GuidanceInput) -> GuidanceInput:
         """CURRENT_MODE, `late_s` after HEARTBEAT."""
         state = inputs.state
-        told = state.mode is FlightMode.RETURN and state.heartbeat_ns - changed_ns[0] >= late_s * 1e9
+        reported = state.mode is FlightMode.RETURN and state.heartbeat_ns - changed_ns[0] >= late_s * 1e9
         return replace(
             inputs,
             state=replace(
                 state,
-                intended_mode=intended if told else FlightMode.OFFBOARD,
-                intended_beside=state.mode if told else FlightMode.OFFBOARD,
+                intended_mode=intended if reported else FlightMode.OFFBOARD,
+                intended_beside=state.mode if reported else FlightMode.OFFBOARD,
             ),
         )
 
-    harness = GuidanceHarness(flying(), inputs=tell)
+    harness = GuidanceHarness(flying(), inputs=modify)
     future = engaged(harness, OrbitBehaviour())
     harness.autopilot.change_mode(FlightMode.RETURN)
     changed_ns.append(harness.vehicle.now_ns)
     harness.run(0.02)
     sent = len(harness.autopilot.setpoints)
     harness.run(max(late_s, 0.02))
-    if late_s > REASON_WAIT_S:  # it was never told: whoever it was, it was not us
+    if late_s > REASON_WAIT_S:  # never reported: not requested by us
         reason = "the pilot took over: return mode"
     assert future.result() == Outcome(False, reason)
     assert len(harness.autopilot.setpoints) == sent
@@ -93,10 +93,10 @@ def test_a_heartbeat_that_comes_first_stops_the_setpoints_and_waits_for_the_reas
     assert len(harness.autopilot.setpoints) == sent
 
 
-def said(name: str, text: str) -> Callable[[GuidanceInput], GuidanceInput]:
-    """A failsafe of PX4's that shows HOLD, and the event with which PX4 says so."""
+def failsafe_inputs(name: str, text: str) -> Callable[[GuidanceInput], GuidanceInput]:
+    """A PX4 failsafe that shows HOLD, and its event."""
 
-    def tell(inputs: GuidanceInput) -> GuidanceInput:
+    def modify(inputs: GuidanceInput) -> GuidanceInput:
         state = inputs.state
         offboard = FlightMode.OFFBOARD
         reports: tuple[Report, ...] = (Report(state.heartbeat_ns - 5_000_000_000, 4, "Low battery"),)
@@ -105,10 +105,10 @@ def said(name: str, text: str) -> Callable[[GuidanceInput], GuidanceInput]:
                 Report(state.heartbeat_ns, 3, "No manual control input", "arming_check", modes=0b111),
                 Report(state.heartbeat_ns, 2, text, "default", name),
             )
-        told = replace(state, intended_mode=offboard, intended_beside=state.mode, reports=reports)
-        return replace(inputs, state=told)
+        changed = replace(state, intended_mode=offboard, intended_beside=state.mode, reports=reports)
+        return replace(inputs, state=changed)
 
-    return tell
+    return modify
 
 
 @pytest.mark.parametrize(
@@ -118,11 +118,9 @@ def said(name: str, text: str) -> Callable[[GuidanceInput], GuidanceInput]:
         ("commander_failsafe_enter_generic_hold", "Failsafe activated: switching to RTL in 5 seconds", []),
     ],
 )
-def test_a_hold_that_px4_means_to_keep_is_confirmed_and_one_before_a_return_is_not(
-    name: str, text: str, asks: list[str]
-) -> None:
-    """PX4 leaves its hold for a return when setpoints cease, unless hold is what was asked for last."""
-    harness = GuidanceHarness(flying(), inputs=said(name, text))
+def test_lasting_hold_is_confirmed_one_before_rtl_is_not(name: str, text: str, asks: list[str]) -> None:
+    """PX4 leaves its hold for a return when setpoints stop, unless hold was requested last."""
+    harness = GuidanceHarness(flying(), inputs=failsafe_inputs(name, text))
     future = harness.command(OrbitBehaviour(radius_m=5.0))
     harness.until(lambda: harness.guidance.phase == "offboard", 5.0)
     harness.run(0.2)
@@ -136,20 +134,22 @@ def test_a_hold_that_px4_means_to_keep_is_confirmed_and_one_before_a_return_is_n
 
 
 @pytest.mark.parametrize("late_s", [0.1, 0.25])
-def test_a_hold_is_confirmed_when_its_event_comes_after_its_cause(late_s: float) -> None:
-    """PX4 names what is wrong before it says what it does about it; the latter may come later."""
+def test_hold_is_confirmed_when_its_event_comes_late(late_s: float) -> None:
+    """PX4 reports the cause first; the event of the failsafe may come later."""
     changed_ns: list[int] = []
 
-    def tell(inputs: GuidanceInput) -> GuidanceInput:
+    def modify(inputs: GuidanceInput) -> GuidanceInput:
         state = inputs.state
         reports: tuple[Report, ...] = (Report(state.heartbeat_ns, 4, "Geofence violation", "arming_check"),)
         if changed_ns and harness.vehicle.now_ns - changed_ns[0] >= late_s * 1e9:
             name = "commander_failsafe_enter_generic"
             reports += (Report(changed_ns[0], 2, "Failsafe activated: switching to Hold", "default", name),)
-        told = replace(state, intended_mode=FlightMode.OFFBOARD, intended_beside=state.mode, reports=reports)
-        return replace(inputs, state=told)
+        changed = replace(
+            state, intended_mode=FlightMode.OFFBOARD, intended_beside=state.mode, reports=reports
+        )
+        return replace(inputs, state=changed)
 
-    harness = GuidanceHarness(flying(), inputs=tell)
+    harness = GuidanceHarness(flying(), inputs=modify)
     harness.command(OrbitBehaviour(radius_m=5.0))
     harness.until(lambda: harness.guidance.phase == "offboard", 5.0)
     harness.run(0.2)

@@ -1,4 +1,4 @@
-"""Several vehicles from one process: each its driver, guidance and zenoh session, and keys of its own."""
+"""Several vehicles in one process, each with its own driver, guidance, zenoh session and keys."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ VEHICLES = int(os.environ.get("FORMATION_VEHICLES", "3"))
 
 
 class Companion:
-    """One vehicle's service, without a camera."""
+    """The service of one vehicle, without a camera."""
 
     def __init__(self, name: str, member: FleetMember, zenoh_port: int, known_ports: list[int]) -> None:
         self.name = name
@@ -40,14 +40,14 @@ class Companion:
             name,
             on_event=lambda level, text: None,
             on_command=self.flight.loop.execute,
-            listeners=[(topics.POSE, lambda data: self.poses.hear(data, time.monotonic_ns()))],
+            listeners=[(topics.POSE, lambda data: self.poses.on_message(data, time.monotonic_ns()))],
         )
 
     async def command(self, text: str) -> dict[str, Any]:
         return await self.flight.loop.execute(text)
 
-    def around(self) -> Neighbourhood:
-        return self.poses.around(self.driver.state, time.monotonic_ns())
+    def neighbourhood(self) -> Neighbourhood:
+        return self.poses.neighbourhood(self.driver.state, time.monotonic_ns())
 
     async def publish(self) -> None:
         while True:
@@ -86,7 +86,7 @@ async def until(condition: Callable[[], object], timeout_s: float = 60.0) -> Non
             await asyncio.sleep(0.02)
 
 
-async def test_vehicles_of_one_process_share_their_poses_and_fly_in_formation() -> None:
+async def test_vehicles_share_poses_and_fly_in_formation() -> None:
     with running_simulator(vehicles=VEHICLES, spacing=7.0, ready_after=0.0) as simulator:
         async with companions(simulator, VEHICLES) as fleet:
             leader, followers = fleet[0], fleet[1:]
@@ -94,20 +94,22 @@ async def test_vehicles_of_one_process_share_their_poses_and_fly_in_formation() 
             await until(
                 lambda: all(m.driver.state.ready_to_arm and m.driver.state.home_position_ned_m for m in fleet)
             )
-            # Everybody hears everybody else and nobody itself, each on a key of its own.
-            await until(lambda: all({v.name for v in m.around().vehicles} == names - {m.name} for m in fleet))
-            # The grid of the fleet, though each has its own local origin.
-            second = next(v for v in leader.around().vehicles if v.name == "vehicle2")
+            # Every vehicle receives all others, but not itself, each on its own key.
+            await until(
+                lambda: all({v.name for v in m.neighbourhood().vehicles} == names - {m.name} for m in fleet)
+            )
+            # Positions of the fleet's grid, although each has its own local origin.
+            second = next(v for v in leader.neighbourhood().vehicles if v.name == "vehicle2")
             first_ned_m = leader.driver.state.position_ned_m
             assert first_ned_m is not None
             assert abs(math.dist(second.position_ned_m[:2], first_ned_m[:2]) - 7.0) < 2.0
 
             refused = await followers[0].command("formation line leader=nobody")
             until_s = time.monotonic() + 30.0
-            while "heard are vehicle1" not in refused["reason"] and time.monotonic() < until_s:
+            while "vehicle1" not in refused["reason"] and time.monotonic() < until_s:
                 await asyncio.sleep(0.02)
                 refused = await followers[0].command("formation line leader=nobody")
-            assert "the pose of nobody (none came; heard are vehicle1" in refused["reason"]
+            assert "pose of nobody" in refused["reason"]
             taken_off = await asyncio.gather(*(member.command("takeoff 5") for member in fleet))
             assert all(outcome["success"] for outcome in taken_off), taken_off
 
@@ -133,7 +135,7 @@ async def test_vehicles_of_one_process_share_their_poses_and_fly_in_formation() 
             def watch() -> bool:
                 here = leader.driver.state.position_ned_m
                 assert here is not None
-                least_m.extend(math.dist(v.position_ned_m, here) for v in leader.around().vehicles)
+                least_m.extend(math.dist(v.position_ned_m, here) for v in leader.neighbourhood().vehicles)
                 return flight.done()
 
             flight = asyncio.ensure_future(leader.command("goto forward=12 right=6 speed=2"))
@@ -141,7 +143,7 @@ async def test_vehicles_of_one_process_share_their_poses_and_fly_in_formation() 
             assert flight.result()["success"], flight.result()
             await until(lambda: max(map(error_m, followers)) < 1.0)
             assert min(least_m) > 3.0
-            # A vehicle whose service ends is not heard any more, and its followers hold.
+            # The poses of a vehicle whose service ends stop, and its followers hold.
             await leader.bus.close()
-            await until(lambda: all("is not heard" in m.guidance.status for m in followers))
+            await until(lambda: all("no pose" in m.guidance.status for m in followers))
             assert all(json.dumps(m.poses.status(time.monotonic_ns())) for m in fleet)

@@ -1,4 +1,4 @@
-"""What guidance asks of a gimbal, in which order, and what it does when that is refused or not answered."""
+"""Gimbal requests of guidance: their order, refusals, and missing answers."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ OWN, STATION = (1, 191), (245, 190)
 
 
 class ControllerHarness:
-    """A controller, stepped every 50 ms; requests are answered at the next step, with `refuse`'s words."""
+    """A controller stepped every 50 ms; requests are answered at the next step, refused as in `refuse`."""
 
     def __init__(self, mounting: GimbalMounting = GimbalMounting()) -> None:  # noqa: B008 - frozen
         self.controller = GimbalController(OWN, mounting)
         self.out = OutputCollector()
         self.vehicle = KinematicVehicle()
         self.began_ns = self.vehicle.now_ns
-        # Only this is known of it: that nobody has it.
+        # Only the control status is known: no owner.
         self.gimbal: GimbalState | None = GimbalState(1, status_ns=self.began_ns, primary_control=NOBODY)
         self.refuse: dict[type, str] = {}
         self.answering = True
@@ -70,7 +70,7 @@ class ControllerHarness:
                     self._answers.append(Answer(request.identifier, refused))
 
     def problem(self) -> str:
-        return self.controller.sight(self.vehicle.now_ns, self.state).problem
+        return self.controller.snapshot(self.vehicle.now_ns, self.state).problem
 
 
 def _words(action: object) -> str:
@@ -86,7 +86,7 @@ def _words(action: object) -> str:
     raise AssertionError(action)
 
 
-def test_it_is_taken_pointed_and_released_for_a_behaviour() -> None:
+def test_control_is_taken_pointed_and_released() -> None:
     harness = ControllerHarness()
     harness.run(None)
     assert harness.asked == []
@@ -99,7 +99,7 @@ def test_it_is_taken_pointed_and_released_for_a_behaviour() -> None:
     assert harness.controller.released
 
 
-def test_what_is_held_when_the_service_ends_is_released() -> None:
+def test_held_control_is_released_when_the_service_ends() -> None:
     harness = ControllerHarness()
     harness.run(DOWN)
     harness.run(DOWN, 2, ending=True)
@@ -107,9 +107,9 @@ def test_what_is_held_when_the_service_ends_is_released() -> None:
     assert harness.controller.released
 
 
-def test_a_refused_aim_is_told_once_and_nothing_more_is_asked() -> None:
+def test_refused_aim_is_logged_once_and_not_repeated() -> None:
     harness = ControllerHarness()
-    harness.refuse[PointGimbal] = "the vehicle refused to point the gimbal (denied)"
+    harness.refuse[PointGimbal] = "pointing denied"
     harness.run(DOWN, 40)
     assert harness.asked == ["take", "point 29° down, 17° to the right"]
     assert len(harness.messages) == 1
@@ -117,16 +117,16 @@ def test_a_refused_aim_is_told_once_and_nothing_more_is_asked() -> None:
     assert "(denied)" in harness.problem()
 
 
-def test_another_client_that_took_it_is_named_at_once() -> None:
+def test_client_that_took_control_is_named() -> None:
     harness = ControllerHarness()
     harness.run(DOWN)
     now_ns = harness.vehicle.now_ns
     taken = replace(harness.state, gimbal=GimbalState(1, status_ns=now_ns, primary_control=STATION))
-    assert harness.controller.sight(now_ns, taken).elsewhere == "245/190"
-    assert harness.controller.sight(now_ns, harness.state).elsewhere == ""
+    assert harness.controller.snapshot(now_ns, taken).controlled_by == "245/190"
+    assert harness.controller.snapshot(now_ns, harness.state).controlled_by == ""
 
 
-def test_what_is_granted_while_the_service_ends_is_released() -> None:
+def test_control_granted_while_ending_is_released() -> None:
     harness = ControllerHarness()
     harness.answering = False
     harness.run(DOWN)
@@ -141,9 +141,7 @@ def test_what_is_granted_while_the_service_ends_is_released() -> None:
 
 
 @pytest.mark.parametrize(("shown", "asked"), [(OWN, ["take", "release"]), (STATION, ["take"])])
-def test_an_unanswered_request_is_released_if_the_manager_shows_it_as_ours(
-    shown: tuple[int, int], asked: list[str]
-) -> None:
+def test_unanswered_request_is_released_if_shown_as_ours(shown: tuple[int, int], asked: list[str]) -> None:
     harness = ControllerHarness()
     harness.answering = False
     harness.run(DOWN)
@@ -155,17 +153,15 @@ def test_an_unanswered_request_is_released_if_the_manager_shows_it_as_ours(
     assert harness.controller.released
 
 
-def test_a_failed_release_is_told() -> None:
+def test_failed_release_is_logged() -> None:
     harness = ControllerHarness()
-    harness.refuse[ReleaseGimbal] = "the vehicle refused to give the gimbal back (failed)"
+    harness.refuse[ReleaseGimbal] = "release failed"
     harness.run(DOWN)
     harness.run(None)
-    assert harness.messages == [
-        "the gimbal could not be given back: the vehicle refused to give the gimbal back (failed)"
-    ]
+    assert harness.messages == ["gimbal: release of control refused: release failed"]
 
 
-def test_a_point_command_that_waits_is_answered_when_the_service_ends() -> None:
+def test_waiting_point_command_is_answered_at_the_end() -> None:
     harness = ControllerHarness()
     now_ns = harness.vehicle.now_ns
     harness.gimbal = GimbalState(
@@ -184,7 +180,7 @@ def test_a_point_command_that_waits_is_answered_when_the_service_ends() -> None:
     assert not harness.out.results[0].outcome.success
 
 
-def test_a_camera_gimbal_that_does_not_answer_is_looked_for_again() -> None:
+def test_missing_camera_gimbal_is_searched_again() -> None:
     harness = ControllerHarness(GimbalMounting(carries_camera=True))
     harness.gimbal = None
     harness.run(None, round(11.0 / 0.05))

@@ -1,7 +1,7 @@
-"""`approach` and `follow` keep the camera's gimbal on their object: flights in lockstep.
+"""`approach` and `follow` with gimbal tracking, in lockstep.
 
-The vehicle stays 10 m up and comes to 2 m: the object ends 75° under the horizon, where a camera that was
-pointed at it in the beginning has long lost it.
+The vehicle stays at 10 m and approaches to 2 m: the object ends 75° below the horizon, outside the view of a
+camera at its initial pitch.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from tests.companion.guidance.gimbal_flight import FOOTPRINT, ON_GIMBAL, PERSON_
 from vision.camera_model import CameraMount
 
 MIDDLE_M = PERSON_M[2] / 2
-# The picture is 64° high; how far from its middle the object may be while vehicle and gimbal move.
+# The image is 64° high; tolerated offset from its centre while vehicle and gimbal move.
 IN_THE_MIDDLE_RAD = math.radians(6.0)
 SECOND_NS = 1_000_000_000
 STATION = (245, 190)
@@ -46,15 +46,15 @@ Each = Callable[[LockstepFlight, Moment], None]
 
 def fly(
     behaviour: Behaviour,
-    thing: SceneObject,
+    scene_object: SceneObject,
     each: Each = lambda flight, moment: None,
     *,
     begin_deg: float = -37.0,
     mount: CameraMount = ON_GIMBAL,
     limit_s: float = 150.0,
 ) -> tuple[LockstepFlight, FlightLog]:
-    """With the gimbal pointed somewhere in the beginning, by default at somebody 12 m away."""
-    flight = gimbal_flight(thing, mount=mount)
+    """Fly with an initial gimbal pitch, by default towards a person 12 m away."""
+    flight = gimbal_flight(scene_object, mount=mount)
     pointed = flight.fly(PointGimbalBehaviour(GimbalAim(math.radians(begin_deg))), 20.0)
     assert pointed.outcome is not None
     assert pointed.outcome.success, pointed.outcome.reason
@@ -72,9 +72,9 @@ def reason(log: FlightLog, success: bool) -> str:
     return log.outcome.reason
 
 
-def off_rad(moment: Moment, thing: SceneObject, camera_rad: float = 0.0) -> float:
-    """Between where the camera looks and the object's true elevation."""
-    pose, (north, east, down) = thing.pose(moment.seconds), moment.truth.position_ned_m
+def off_rad(moment: Moment, scene_object: SceneObject, camera_rad: float = 0.0) -> float:
+    """Angle between the camera's axis and the object's true elevation."""
+    pose, (north, east, down) = scene_object.pose(moment.seconds), moment.truth.position_ned_m
     range_m = math.hypot(pose.north_m - north, pose.east_m - east)
     gimbal = moment.context.state.gimbal
     assert gimbal is not None
@@ -82,7 +82,7 @@ def off_rad(moment: Moment, thing: SceneObject, camera_rad: float = 0.0) -> floa
     return abs(gimbal.pitch_rad + camera_rad - math.atan2(down + MIDDLE_M, range_m))
 
 
-def take(flight: LockstepFlight) -> None:
+def take_control(flight: LockstepFlight) -> None:
     """A ground station takes control of the gimbal."""
     flight.vehicle.send(
         dialect.MAVLink_command_long_message(1, 1, DO_GIMBAL_MANAGER_CONFIGURE, 0, *STATION, -1, -1, 0, 0, 0),
@@ -91,7 +91,7 @@ def take(flight: LockstepFlight) -> None:
 
 
 def primary(flight: LockstepFlight) -> tuple[int, int]:
-    """Who has it."""
+    """The component in primary control."""
     manager = flight.vehicle.vehicle.gimbal_manager
     assert manager is not None
     who: tuple[int, int] = manager.primary
@@ -99,74 +99,76 @@ def primary(flight: LockstepFlight) -> tuple[int, int]:
 
 
 def pitch_deg(state: VehicleState) -> float:
-    """Where the gimbal looks, above the horizon."""
+    """The gimbal's pitch above the horizon."""
     assert state.gimbal is not None
     assert state.gimbal.pitch_rad is not None
     return math.degrees(state.gimbal.pitch_rad)
 
 
-def test_an_approach_keeps_what_a_camera_at_rest_loses() -> None:
-    thing = person(0.0, 12.0)
-    _, still = fly(command("approach person distance=2 retries=0"), thing)
+def test_approach_with_tracking_keeps_the_object_in_view() -> None:
+    scene_object = person(0.0, 12.0)
+    _, still = fly(command("approach person distance=2 retries=0"), scene_object)
     assert "lost the person" in reason(still, False)
 
-    flight, log = fly(command("approach person distance=2 retries=0 gimbal=track"), thing)
+    flight, log = fly(command("approach person distance=2 retries=0 gimbal=track"), scene_object)
     assert reason(log, True)
     assert not log.violations
-    assert thing.range_m(flight.vehicle.truth.position_ned_m, 0.0) == pytest.approx(2.0, abs=0.6)
-    assert max(off_rad(moment, thing) for moment in log.moments[20:]) < IN_THE_MIDDLE_RAD
-    # Nobody holds it any more, and it stays as it was pointed.
+    assert scene_object.range_m(flight.vehicle.truth.position_ned_m, 0.0) == pytest.approx(2.0, abs=0.6)
+    assert max(off_rad(moment, scene_object) for moment in log.moments[20:]) < IN_THE_MIDDLE_RAD
+    # Control is released, and the gimbal keeps its direction.
     flight.run(1.0)
     assert primary(flight) == NOBODY
     assert pitch_deg(flight.state) < -70.0
 
 
-def test_somebody_who_walks_is_followed_from_nearly_above() -> None:
-    thing = SceneObject("person", PERSON_M, lambda seconds: ScenePose(8.0, seconds))
-    _, still = fly(command("follow person distance=2 duration=20"), thing)
+def test_walking_person_is_followed_from_nearly_above() -> None:
+    scene_object = SceneObject("person", PERSON_M, lambda seconds: ScenePose(8.0, seconds))
+    _, still = fly(command("follow person distance=2 duration=20"), scene_object)
     assert "lost the person" in reason(still, False)
 
-    _, log = fly(command("follow person distance=2 duration=20 gimbal=track"), thing)
+    _, log = fly(command("follow person distance=2 duration=20 gimbal=track"), scene_object)
     assert reason(log, True)
-    assert max(off_rad(moment, thing) for moment in log.moments[20:]) < IN_THE_MIDDLE_RAD
+    assert max(off_rad(moment, scene_object) for moment in log.moments[20:]) < IN_THE_MIDDLE_RAD
 
 
-def test_a_camera_that_is_mounted_askew_is_brought_to_the_object() -> None:
+def test_tracking_includes_the_camera_mount_pitch() -> None:
     down_rad = math.radians(-15.0)
-    thing = person(0.0, 12.0)
+    scene_object = person(0.0, 12.0)
     _, log = fly(
         command("approach person distance=3 retries=0 gimbal=track"),
-        thing,
+        scene_object,
         begin_deg=-22.0,
         mount=replace(ON_GIMBAL, pitch_rad=down_rad),
     )
     assert reason(log, True)
-    assert max(off_rad(moment, thing, down_rad) for moment in log.moments[20:]) < IN_THE_MIDDLE_RAD
+    assert max(off_rad(moment, scene_object, down_rad) for moment in log.moments[20:]) < IN_THE_MIDDLE_RAD
 
 
 @pytest.mark.parametrize("word", ["approach", "follow"])
-def test_who_is_cut_off_by_the_pictures_edge_is_looked_at_and_gets_a_range(word: str) -> None:
-    """The picture ends 46° down, above its wheels: it has no range until the gimbal looks at it."""
-    thing = SceneObject("car", (4.0, 1.8, 1.5), person(0.0, 9.0).pose)
-    # an approach ends by itself, long before; who follows has been there for half a minute
-    flight, log = fly(command(f"{word} car distance=4 gimbal=track"), thing, begin_deg=-14.0, limit_s=50.0)
+def test_cut_off_object_gets_a_range_by_pointing_at_it(word: str) -> None:
+    """The image ends 46° down, above its wheels: no range until the gimbal points at it."""
+    scene_object = SceneObject("car", (4.0, 1.8, 1.5), person(0.0, 9.0).pose)
+    # an approach ends by itself long before; a follow has held there for half a minute
+    flight, log = fly(
+        command(f"{word} car distance=4 gimbal=track"), scene_object, begin_deg=-14.0, limit_s=50.0
+    )
     first = next(seen for moment in log.moments for seen in moment.context.targets)
     assert first.position_ned_m is None
     assert pitch_deg(flight.state) < -40.0
-    assert thing.range_m(flight.vehicle.truth.position_ned_m, 0.0) == pytest.approx(4.0, abs=1.0)
+    assert scene_object.range_m(flight.vehicle.truth.position_ned_m, 0.0) == pytest.approx(4.0, abs=1.0)
 
 
 @pytest.mark.parametrize("word", ["approach", "follow"])
-def test_who_takes_the_gimbal_meanwhile_wins(word: str) -> None:
+def test_losing_gimbal_control_ends_the_behaviour(word: str) -> None:
     taken: list[float] = []
 
     def at_three(flight: LockstepFlight, moment: Moment) -> None:
         if moment.seconds >= 3.0 and not taken:
             taken.append(moment.seconds)
-            take(flight)
+            take_control(flight)
 
     flight, log = fly(command(f"{word} person distance=2 gimbal=track"), person(0.0, 12.0), at_three)
-    # What comes first: the manager's word of who has it, or its answer to the next aim.
+    # Depends on what comes first: the manager's status, or its answer to the next aim.
     assert reason(log, False) in (
         f"{word} lost the gimbal: 245/190 has taken control of it",
         f"{word} lost the gimbal: the vehicle refused to point the gimbal ({result_name(2)})",
@@ -178,21 +180,21 @@ def test_who_takes_the_gimbal_meanwhile_wins(word: str) -> None:
 GONE_AFTER_S = 4.0
 
 
-def who_leaves() -> SceneObject:
-    """Somebody who is gone at once."""
+def leaving_person() -> SceneObject:
+    """A person that disappears."""
     near, gone = ScenePose(12.0, 0.0), ScenePose(-200.0, 0.0)
     return SceneObject("person", PERSON_M, lambda seconds: near if seconds < GONE_AFTER_S else gone)
 
 
-def test_what_is_lost_is_looked_for_with_the_gimbal_too_and_only_then_it_is_given_back() -> None:
+def test_lost_object_is_searched_with_the_gimbal() -> None:
     seen: list[tuple[str, float, tuple[int, int]]] = []
     behaviour = command("approach person retries=1 gimbal=track")
 
     def note(flight: LockstepFlight, moment: Moment) -> None:
         seen.append((behaviour.status, pitch_deg(moment.context.state), primary(flight)))
 
-    flight, log = fly(behaviour, who_leaves(), note)
-    assert "looked for it again once" in reason(log, False)
+    flight, log = fly(behaviour, leaving_person(), note)
+    assert "again once" in reason(log, False)
     assert {who for _, _, who in seen[10:]} == {(1, 191)}
     lost_deg = next(pitch for status, pitch, _ in seen if "where it was" in status)
     around = [pitch for status, pitch, _ in seen if "all around" in status]
@@ -203,62 +205,62 @@ def test_what_is_lost_is_looked_for_with_the_gimbal_too_and_only_then_it_is_give
 
 
 @pytest.mark.parametrize("phase", ["where it was", "all around"])
-def test_taken_while_it_is_looked_for_it_ends_too(phase: str) -> None:
+def test_losing_gimbal_control_ends_the_search(phase: str) -> None:
     behaviour = command("approach person retries=2 gimbal=track")
     taken_s: list[float] = []
 
     def in_phase(flight: LockstepFlight, moment: Moment) -> None:
         if not taken_s and phase in behaviour.status:
-            take(flight)
+            take_control(flight)
             taken_s.append(moment.seconds)
 
-    flight, log = fly(behaviour, who_leaves(), in_phase)
-    assert "approach lost the gimbal: " in reason(log, False)
+    flight, log = fly(behaviour, leaving_person(), in_phase)
+    assert "lost the gimbal" in reason(log, False)
     assert flight.seconds - taken_s[0] < 4.0
     assert primary(flight) == STATION
 
 
-def test_a_gimbal_that_does_not_follow_ends_it() -> None:
+def test_stuck_gimbal_ends_follow() -> None:
     def stick(flight: LockstepFlight, moment: Moment) -> None:
-        flight.vehicle.vehicle.parameters.set("MNT_MIN_PITCH", -37.0)  # a stop that it has not told of
+        flight.vehicle.vehicle.parameters.set("MNT_MIN_PITCH", -37.0)  # an end stop that is not reported
 
     behaviour = command("follow person distance=2 duration=60 occlusion=60 gimbal=track")
     _, log = fly(behaviour, person(0.0, 12.0), stick)
-    assert "follow lost the gimbal: it does not follow: asked for -" in reason(log, False)
+    assert "does not follow" in reason(log, False)
 
 
-def test_the_steps_of_a_mission_hand_it_on() -> None:
+def test_gimbal_is_kept_between_mission_steps() -> None:
     table = "".join(
         f'[[step]]\ndo = "approach person distance={distance} gimbal=track"\n' for distance in (6, 3)
     )
-    thing = person(0.0, 12.0)
+    scene_object = person(0.0, 12.0)
     mission = SequenceBehaviour(plan_from(table, "nearer"), lambda behaviour: None)
-    flight, log = fly(mission, thing)
+    flight, log = fly(mission, scene_object)
     assert reason(log, True)
     assert [step.reason[:14] for step in mission.records] == ["reached person"] * 2
-    assert off_rad(log.moments[-1], thing) < IN_THE_MIDDLE_RAD
+    assert off_rad(log.moments[-1], scene_object) < IN_THE_MIDDLE_RAD
     flight.run(1.0)
     assert primary(flight) == NOBODY
 
 
-def flying(gimbal: GimbalState | None, sight: GimbalStatus) -> BehaviourContext:
-    """With everything that an approach wants but, perhaps, a gimbal."""
+def flying(gimbal: GimbalState | None, status: GimbalStatus) -> BehaviourContext:
+    """A context that meets all requirements of an approach, except possibly the gimbal."""
     contexts: list[BehaviourContext] = []
     flight = gimbal_flight(person(0.0, 12.0))
     flight.fly(command("hold"), 2.0, each=lambda moment: contexts.append(moment.context))
     now = contexts[-1]
-    return replace(now, state=replace(now.state, gimbal=gimbal or now.state.gimbal), gimbal=sight)
+    return replace(now, state=replace(now.state, gimbal=gimbal or now.state.gimbal), gimbal=status)
 
 
 @pytest.mark.parametrize("word", ["approach", "follow"])
-def test_without_a_camera_on_a_gimbal_tracking_is_refused_and_the_rest_is_not(word: str) -> None:
+def test_tracking_is_refused_without_a_camera_on_a_gimbal(word: str) -> None:
     now = flying(None, GimbalStatus(carries_camera=False))
     assert check_requirements(command(f"{word} person"), now, ("person",)) is None
     refused = check_requirements(command(f"{word} person gimbal=track"), now, ("person",))
-    assert refused == f"{word} needs the camera on the gimbal (camera.on_gimbal is not set)"
+    assert "camera.on_gimbal" in (refused or "")
     nobody = replace(now, state=replace(now.state, gimbal=None), gimbal=GimbalStatus(carries_camera=True))
     refused = check_requirements(command(f"{word} person gimbal=track"), nobody, ("person",))
-    assert refused == f"{word} needs a gimbal (none answers)"
+    assert "gimbal manager not responding" in (refused or "")
 
 
 def target(elevation_rad: float, range_m: float) -> Target:
@@ -268,8 +270,8 @@ def target(elevation_rad: float, range_m: float) -> Target:
 def context(
     gimbal: GimbalState, now_ns: int = 1, *, problem: str = "", camera_pitch_rad: float = 0.0
 ) -> BehaviourContext:
-    sight = GimbalStatus(True, problem=problem, camera_pitch_rad=camera_pitch_rad)
-    return BehaviourContext(now_ns, replace(VehicleState(), gimbal=gimbal), gimbal=sight)
+    status = GimbalStatus(True, problem=problem, camera_pitch_rad=camera_pitch_rad)
+    return BehaviourContext(now_ns, replace(VehicleState(), gimbal=gimbal), gimbal=status)
 
 
 FREE = GimbalState()
@@ -281,7 +283,7 @@ FREE = GimbalState()
     later_m=st.floats(0.2, 80.0),
     climbed_m=st.floats(-20.0, 20.0),
 )
-def test_it_looks_at_the_height_that_the_detection_told(
+def test_aim_is_at_the_detected_height(
     elevation_deg: float, then_m: float, later_m: float, climbed_m: float
 ) -> None:
     tracking = GimbalTracking()
@@ -289,12 +291,12 @@ def test_it_looks_at_the_height_that_the_detection_told(
     seen = target(math.radians(elevation_deg), then_m)
     assert tracking.keep_on(None, math.nan, (0.0, 0.0, -10.0), now) is None
     assert tracking.aim is None
-    # What was seen from farther away than the vehicle is by now: the height is what counts.
+    # Detected from farther away than now: only the height is used.
     tracking.keep_on(seen, later_m, (0.0, 0.0, -10.0), now)
     above_m = then_m * math.tan(math.radians(elevation_deg))
     assert tracking.aim is not None
     assert tracking.aim.pitch_rad == pytest.approx(math.atan2(above_m, later_m), abs=1e-6)
-    # The same detection, from another height: the object has stayed at its own.
+    # The same detection from another height: the object keeps its height.
     tracking.keep_on(seen, later_m, (0.0, 0.0, -10.0 - climbed_m), now)
     assert tracking.aim.pitch_rad == pytest.approx(math.atan2(above_m - climbed_m, later_m), abs=1e-6)
 
@@ -305,7 +307,7 @@ def test_it_looks_at_the_height_that_the_detection_told(
     low_deg=st.floats(-200.0, 200.0) | st.just(-math.inf),
     high_deg=st.floats(-200.0, 200.0) | st.just(math.inf),
 )
-def test_it_asks_for_nothing_beyond_the_stops(
+def test_aim_stays_within_the_end_stops(
     elevation_deg: float, range_m: float, low_deg: float, high_deg: float
 ) -> None:
     low, high = math.radians(low_deg), math.radians(high_deg)
@@ -322,10 +324,10 @@ def test_it_asks_for_nothing_beyond_the_stops(
     assert tracking.aim is not None
 
 
-def test_what_hindered_the_one_before_is_no_hindrance_in_the_first_turn() -> None:
+def test_previous_problem_is_ignored_in_the_first_update() -> None:
     tracking = GimbalTracking()
-    first = context(FREE, 5 * SECOND_NS, problem="245/190 has taken control of it")
+    first = context(FREE, 5 * SECOND_NS, problem="taken by 245/190")
     tracking.begin(first)
     assert tracking.keep_on(None, math.nan, (0.0, 0.0, -10.0), first) is None
     later = replace(first, now_ns=6 * SECOND_NS)
-    assert tracking.keep_on(None, math.nan, (0.0, 0.0, -10.0), later) == "245/190 has taken control of it"
+    assert tracking.keep_on(None, math.nan, (0.0, 0.0, -10.0), later) == "taken by 245/190"

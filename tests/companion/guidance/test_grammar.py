@@ -58,7 +58,7 @@ NAMES = ("person", "bicycle", "car", "truck", "boat", "dog", "chair", "traffic l
         ("gimbal", Gimbal(0.0, 0.0)),
     ],
 )
-def test_commands_are_read_as_they_are_written(text: str, command: Command) -> None:
+def test_parse_commands(text: str, command: Command) -> None:
     assert parse(text, NAMES) == command
 
 
@@ -77,21 +77,21 @@ def test_commands_are_read_as_they_are_written(text: str, command: Command) -> N
         ("approach person distance=nan", ["distance", "nan"]),
         ("approach person distnce=3", ["unknown argument 'distnce'", "distance"]),
         ("takeoff 500", ["altitude", "1 to 50 m", "500"]),
-        ("takeoff 5 6", ["'6'", "too much"]),
+        ("takeoff 5 6", ["'6'", "unexpected argument"]),
         ("takeoff 5 altitude=6", ["altitude", "twice"]),
-        ("land now=1", ["unknown argument 'now'", "it takes none"]),
+        ("land now=1", ["unknown argument 'now'", "no arguments"]),
         ("land now", ["'now'", "too much"]),
         ('seek "car', ["quote"]),
         ("orbit direction=left", ["direction", "clockwise", "'left'"]),
         ("orbit radius=1 speed=5", ["speed", "1.41 m/s", "5"]),
         ("takeoff=5", ["unknown command 'takeoff=5'"]),
         ("gimbal pitch=-100", ["pitch", "-90 to 90 deg", "-100"]),
-        ("seek car sweep=2", ["sweep must be 5 deg or more from level", "2"]),
+        ("seek car sweep=2", ["sweep", "5 deg", "2"]),
         ("seek car sweep_rate=5", ["sweep_rate needs sweep"]),
-        ("seek car pattern=square radius=20 sweep=-60", ["pattern=square takes no sweep"]),
+        ("seek car pattern=square radius=20 sweep=-60", ["pattern=square", "sweep"]),
     ],
 )
-def test_errors_are_one_line_that_says_what_would_be_right(text: str, parts: list[str]) -> None:
+def test_errors_are_one_line_with_key_and_range(text: str, parts: list[str]) -> None:
     with pytest.raises(GrammarError) as caught:
         parse(text, NAMES)
     message = str(caught.value)
@@ -100,11 +100,11 @@ def test_errors_are_one_line_that_says_what_would_be_right(text: str, parts: lis
         assert part in message
 
 
-def test_without_class_names_any_name_is_taken() -> None:
+def test_any_class_name_is_accepted_without_a_detector() -> None:
     assert parse("seek dragon") == Seek("dragon")
 
 
-def test_a_command_made_in_code_is_held_to_the_same_ranges() -> None:
+def test_command_made_in_code_has_the_same_ranges() -> None:
     with pytest.raises(GrammarError, match="altitude"):
         Takeoff(0.1)
     with pytest.raises(GrammarError, match="class"):
@@ -113,11 +113,11 @@ def test_a_command_made_in_code_is_held_to_the_same_ranges() -> None:
         Seek("car", laps=math.nan)
 
 
-def test_the_help_names_every_command_and_every_argument_with_its_range() -> None:
+def test_help_lists_every_command_and_argument() -> None:
     text = describe()
     for kind in COMMANDS.values():
         assert kind.word in text
-    assert "distance: where to stop, to its surface (1 to 100 m)" in text
+    assert "(1 to 100 m)" in text
     assert "takeoff [altitude=2.5]" in text
 
 
@@ -183,12 +183,12 @@ without_class_name = st.one_of(
 
 
 @given(commands | without_class_name)
-def test_what_is_written_is_read_back(command: Command) -> None:
+def test_text_of_a_command_parses_back(command: Command) -> None:
     assert parse(str(command)) == command
 
 
 @given(commands)
-def test_every_command_has_a_behaviour_of_its_name(command: Command) -> None:
+def test_every_command_builds_a_behaviour_of_its_name(command: Command) -> None:
     behaviour = command.build(NO_CONTEXT)
     assert behaviour.name == command.word
     name = getattr(command, "class_name", "")
@@ -196,18 +196,18 @@ def test_every_command_has_a_behaviour_of_its_name(command: Command) -> None:
 
 
 @given(st.text(max_size=60))
-def test_any_text_gives_a_command_or_a_grammar_error_of_one_line(text: str) -> None:
+def test_any_text_is_a_command_or_a_one_line_error(text: str) -> None:
     try:
         command = parse(text, NAMES)
     except GrammarError as error:
-        said = str(error)
+        text = str(error)
     else:
-        said = str(command)
-    assert said
-    assert "\n" not in said
+        text = str(command)
+    assert text
+    assert "\n" not in text
 
 
-def test_every_field_of_every_command_has_its_place_in_the_grammar() -> None:
+def test_every_field_is_an_argument_of_the_grammar() -> None:
     for kind in COMMANDS.values():
         assert len(arguments_of(kind)) == len(fields(kind))
 
@@ -216,7 +216,7 @@ def test_every_field_of_every_command_has_its_place_in_the_grammar() -> None:
     ("text", "endless"),
     [("hold", True), ("hold 5", False), ("orbit", True), ("orbit laps=2", False), ("land", False)],
 )
-def test_a_command_says_whether_it_ends_by_itself(text: str, endless: bool) -> None:
+def test_endless_commands(text: str, endless: bool) -> None:
     assert parse(text).endless is endless
 
 
@@ -228,6 +228,6 @@ def test_a_command_says_whether_it_ends_by_itself(text: str, endless: bool) -> N
         ("land-on-marker 7 pad=still", "pad=", "target="),
     ],
 )
-def test_a_renamed_argument_names_the_new_one(text: str, old: str, new: str) -> None:
+def test_renamed_argument_names_the_new_one(text: str, old: str, new: str) -> None:
     with pytest.raises(GrammarError, match=f"{old} was renamed to {new} in version"):
         parse(text)

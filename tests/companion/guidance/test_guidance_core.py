@@ -1,4 +1,4 @@
-"""The pilot runs one behaviour at a time: how it engages, goes from one to the next, and ends."""
+"""Guidance core: engaging, replacing and ending behaviours."""
 
 import math
 from collections.abc import Callable
@@ -18,7 +18,7 @@ from tests.companion.guidance.guidance_harness import GuidanceHarness, engaged, 
 
 
 @pytest.mark.parametrize("lag_s", [0.0, 0.05, 1.0])
-def test_setpoints_leave_before_offboard_is_asked_for(lag_s: float) -> None:
+def test_setpoints_are_sent_before_offboard_is_requested(lag_s: float) -> None:
     harness = GuidanceHarness(flying(), lag_s)
     harness.run(0.1 + lag_s)
     harness.command(HoldBehaviour())
@@ -31,7 +31,7 @@ def test_setpoints_leave_before_offboard_is_asked_for(lag_s: float) -> None:
     assert "arm" not in harness.autopilot.requests
 
 
-def test_after_a_behaviour_a_hold_goes_on_until_the_next_command() -> None:
+def test_hold_follows_a_behaviour_until_the_next_command() -> None:
     harness = GuidanceHarness(flying())
     future = engaged(harness, HoldBehaviour(duration_s=1.0))
     assert (harness.outcome(future)).success
@@ -44,7 +44,7 @@ def test_after_a_behaviour_a_hold_goes_on_until_the_next_command() -> None:
     assert "no command" in harness.guidance.status
 
 
-def test_a_new_command_replaces_the_current_one_without_leaving_offboard() -> None:
+def test_new_command_replaces_behaviour_within_offboard() -> None:
     harness = GuidanceHarness(flying())
     future = engaged(harness, HoldBehaviour())
     second = harness.command(OrbitBehaviour(10.0, 2.0))
@@ -57,7 +57,7 @@ def test_a_new_command_replaces_the_current_one_without_leaving_offboard() -> No
 
 @pytest.mark.parametrize("lag_s", [0.0, 1.0])
 @pytest.mark.parametrize("mode", [FlightMode.HOLD, FlightMode.OFFBOARD])
-def test_takeoff_arms_climbs_and_leaves_the_holding_to_the_autopilot(mode: FlightMode, lag_s: float) -> None:
+def test_takeoff_arms_climbs_and_ends_in_autopilot_hold(mode: FlightMode, lag_s: float) -> None:
     harness = GuidanceHarness(parked(mode), lag_s)
     harness.run(1.2)
     assert harness.autopilot.requests == []
@@ -69,7 +69,7 @@ def test_takeoff_arms_climbs_and_leaves_the_holding_to_the_autopilot(mode: Fligh
     assert not harness.guidance.in_command
 
 
-def test_a_takeoff_that_px4_ends_short_is_climbed_to_its_end() -> None:
+def test_takeoff_that_px4_ends_short_is_completed() -> None:
     harness = GuidanceHarness(parked())
     harness.autopilot.takeoff_short_m = 0.6
     harness.run(0.2)
@@ -83,7 +83,7 @@ def test_a_takeoff_that_px4_ends_short_is_climbed_to_its_end() -> None:
 
 @pytest.mark.parametrize("lag_s", [0.0, 1.0])
 @pytest.mark.parametrize("behaviour", [LandBehaviour, ReturnBehaviour])
-def test_landing_from_offboard_ends_disarmed_with_nothing_sent_after_it(
+def test_landing_from_offboard_ends_disarmed_and_silent(
     behaviour: Callable[[], Behaviour], lag_s: float
 ) -> None:
     harness = GuidanceHarness(flying(), lag_s)
@@ -98,7 +98,7 @@ def test_landing_from_offboard_ends_disarmed_with_nothing_sent_after_it(
     assert EventKind.LOST not in kinds(harness)
 
 
-def test_stop_gives_the_vehicle_to_the_autopilot_and_sends_nothing() -> None:
+def test_stop_hands_over_and_stops_streaming() -> None:
     harness = GuidanceHarness(flying(), lag_s=0.5)
     future = engaged(harness)
     outcome = harness.outcome(harness.command(StopBehaviour()), 10.0)
@@ -111,7 +111,7 @@ def test_stop_gives_the_vehicle_to_the_autopilot_and_sends_nothing() -> None:
     assert EventKind.LOST not in kinds(harness)
 
 
-def test_while_a_mode_is_asked_for_out_of_offboard_a_brake_is_sent() -> None:
+def test_brake_is_sent_while_leaving_offboard() -> None:
     harness = GuidanceHarness(flying(), lag_s=0.8)
     engaged(harness, OrbitBehaviour(10.0, 3.0))
     harness.command(LandBehaviour())
@@ -120,7 +120,7 @@ def test_while_a_mode_is_asked_for_out_of_offboard_a_brake_is_sent() -> None:
     assert not harness.autopilot.setpoints[-1].expired(harness.vehicle.now_ns)
 
 
-def test_a_landing_replaced_before_it_shows_is_taken_back() -> None:
+def test_landing_replaced_before_it_shows_is_reverted() -> None:
     harness = GuidanceHarness(flying(), lag_s=1.0)
     engaged(harness)
     harness.command(LandBehaviour())
@@ -151,9 +151,7 @@ class Broken(Behaviour):
 
 
 @pytest.mark.parametrize("after", [0, 20])
-def test_an_exception_in_a_behaviour_is_logged_ends_it_and_holds(
-    after: int, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_exception_in_a_behaviour_is_logged_and_holds(after: int, caplog: pytest.LogCaptureFixture) -> None:
     harness = GuidanceHarness(flying())
     engaged(harness)
     behaviour = Broken(after)
@@ -226,7 +224,7 @@ def test_pilot_wins_while_a_hook_raises() -> None:
 
 
 def test_exception_with_the_answer_does_not_lose_it() -> None:
-    """OFFBOARD is answered in the very step in which a hook raises: the hold that follows is flown."""
+    """OFFBOARD is answered in the same step in which a hook raises: the hold that follows is flown."""
     harness = GuidanceHarness(flying())
     harness.run(0.1)
 
@@ -267,7 +265,7 @@ class Curious(Behaviour):
         return Setpoint.velocity((9.0, 0.0, 0.0), context.now_ns)
 
 
-def test_what_was_sent_is_told_to_the_behaviour_and_published_beside_what_was_asked() -> None:
+def test_sent_setpoint_is_passed_to_the_behaviour() -> None:
     harness = GuidanceHarness(flying())
     behaviour = Curious()
     engaged(harness, behaviour)
@@ -283,14 +281,14 @@ def test_what_was_sent_is_told_to_the_behaviour_and_published_beside_what_was_as
     assert sent.velocity_ned_mps == pytest.approx((5.0, 0.0, 0.0))
 
 
-def test_nothing_is_asked_for_without_a_command() -> None:
+def test_no_requests_without_a_command() -> None:
     harness = GuidanceHarness(parked())
     harness.run(5.0)
     assert harness.autopilot.requests == []
     assert harness.autopilot.setpoints == []
 
 
-def test_closing_ends_the_behaviour_and_the_stream() -> None:
+def test_closing_ends_behaviour_and_stream() -> None:
     harness = GuidanceHarness(flying())
     future = engaged(harness)
     harness.close()
@@ -302,7 +300,7 @@ def test_closing_ends_the_behaviour_and_the_stream() -> None:
 
 
 class Stops(HoldBehaviour):
-    """Ends at once, and tells where the vehicle is to stand."""
+    """Ends at once with a goal to hold."""
 
     name = "stops"
 
@@ -310,14 +308,14 @@ class Stops(HoldBehaviour):
         return Outcome(True, "there", (1.0, 0.5, -5.0)) if dt_s else super().update(dt_s, context)
 
 
-def test_the_hold_that_follows_keeps_the_goal_of_what_has_ended() -> None:
+def test_following_hold_keeps_the_goal_of_the_behaviour() -> None:
     harness = GuidanceHarness(flying())
     harness.run(0.1)
     harness.vehicle.position[0] = 0.6
     assert harness.outcome(harness.command(Stops()), 5.0).success
     harness.run(6.0)
     assert math.dist(harness.vehicle.position, (1.0, 0.5, -5.0)) < 0.1
-    # An operator's hold keeps it too; after a pilot's mode change nothing is left of it.
+    # An operator's hold keeps it too; a pilot's mode change discards it.
     harness.command(HoldBehaviour())
     harness.run(3.0)
     assert math.dist(harness.vehicle.position, (1.0, 0.5, -5.0)) < 0.1

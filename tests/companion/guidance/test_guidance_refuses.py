@@ -1,4 +1,4 @@
-"""What cannot be done is refused and named, by us before the flight or by the autopilot in it."""
+"""Refusals: by guidance before a behaviour begins, or by the autopilot."""
 
 from collections.abc import Callable
 
@@ -22,7 +22,7 @@ from tests.companion.guidance.guidance_harness import GuidanceHarness, engaged, 
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle
 
 
-def test_a_refused_landing_holds_in_offboard() -> None:
+def test_refused_landing_holds_in_offboard() -> None:
     harness = GuidanceHarness(flying())
     engaged(harness)
     harness.autopilot.refuse[FlightMode.LAND] = "land refused: no position"
@@ -34,7 +34,7 @@ def test_a_refused_landing_holds_in_offboard() -> None:
     assert not harness.streamer.last_sent.expired(harness.vehicle.now_ns)
 
 
-def test_a_refused_offboard_ends_the_command_and_sends_nothing_more() -> None:
+def test_refused_offboard_ends_command_and_stream() -> None:
     harness = GuidanceHarness(flying())
     harness.autopilot.refuse[FlightMode.OFFBOARD] = "offboard refused"
     harness.run(0.1)
@@ -53,7 +53,7 @@ def test_a_refused_offboard_ends_the_command_and_sends_nothing_more() -> None:
         (flying, lambda: SeekBehaviour("zebra"), ["seek needs", "zebra"]),
     ],
 )
-def test_a_refusal_names_what_is_missing(
+def test_refusal_names_what_is_missing(
     vehicle: Callable[[], KinematicVehicle], behaviour: Callable[[], Behaviour], words: list[str]
 ) -> None:
     harness = GuidanceHarness(vehicle(), class_names=("car", "person"))
@@ -67,16 +67,16 @@ def test_a_refusal_names_what_is_missing(
 
 
 @pytest.mark.parametrize("age_s", [None, 2.0])
-def test_without_perception_seek_is_refused_with_its_age(age_s: float | None) -> None:
+def test_seek_is_refused_without_fresh_perception(age_s: float | None) -> None:
     harness = GuidanceHarness(flying())
     harness.perception_age_s = age_s
     harness.run(0.1)
     reason = harness.command(SeekBehaviour("car")).result().reason
     assert "perception" in reason
-    assert ("2.0 s old" if age_s else "nothing came") in reason
+    assert ("2.0 s old" if age_s else "no detections") in reason
 
 
-def test_a_detector_that_is_late_for_a_moment_does_not_refuse_seek_but_does_not_steer_it_either() -> None:
+def test_late_detector_allows_seek_but_does_not_steer_it() -> None:
     harness = GuidanceHarness(flying())
     harness.perception_age_s = 0.8
     harness.run(0.1)
@@ -91,44 +91,40 @@ def test_a_detector_that_is_late_for_a_moment_does_not_refuse_seek_but_does_not_
 @pytest.mark.parametrize(
     ("behaviour", "where"),
     [
-        (GotoBehaviour(from_home_m=(30.0, 5000.0)), "30.0 m north and 5000.0 m east of home is farther than"),
-        (FollowPathBehaviour([(0.0, 0.0), (0.0, -7000.0)], 3.0), "0.0 m north and -7000.0 m east of home"),
+        (GotoBehaviour(from_home_m=(30.0, 5000.0)), "5000.0 m east"),
+        (FollowPathBehaviour([(0.0, 0.0), (0.0, -7000.0)], 3.0), "-7000.0 m east"),
         (PatrolBehaviour([(0.0, 0.0), (9000.0, 0.0)], ("car",)), "9000.0 m north"),
-        (FigureEightBehaviour(6000.0, 3.0, 1.0), "is farther than guidance.max_distance_m"),
+        (FigureEightBehaviour(6000.0, 3.0, 1.0), "guidance.max_distance_m"),
         (
             GotoBehaviour(from_home_m=(0.0, 0.0), altitude_m=90.0),
-            "90.0 m above home is higher than guidance.max_altitude_m = 50",
+            "guidance.max_altitude_m = 50",
         ),
         (
             GotoBehaviour(from_home_m=(0.0, 0.0), altitude_m=0.2),
-            "0.2 m above home is lower than guidance.min_altitude_m = 1",
+            "guidance.min_altitude_m = 1",
         ),
-        (FollowPathBehaviour([(0.0, 0.0), (5.0, 0.0, 60.0)], 3.0), "60.0 m above home is higher than"),
+        (FollowPathBehaviour([(0.0, 0.0), (5.0, 0.0, 60.0)], 3.0), "60.0 m above"),
     ],
 )
-def test_a_goal_beyond_the_limits_is_refused_and_named_before_anything_is_flown(
-    behaviour: Behaviour, where: str
-) -> None:
+def test_goal_beyond_the_limits_is_refused_before_flight(behaviour: Behaviour, where: str) -> None:
     harness = GuidanceHarness(flying())
     harness.run(0.1)
     outcome = harness.command(behaviour).result()
     assert not outcome.success
-    assert outcome.reason.startswith(f"{behaviour.name} would leave the limits: ")
+    assert outcome.reason.startswith(behaviour.name)
     assert where in outcome.reason
     assert not harness.autopilot.setpoints
 
 
-def test_a_take_off_beyond_the_highest_altitude_is_refused_before_anything_is_armed() -> None:
+def test_takeoff_beyond_max_altitude_is_refused_disarmed() -> None:
     harness = GuidanceHarness(parked())
     harness.run(0.1)
     outcome = harness.command(TakeoffBehaviour(60.0)).result()
-    assert outcome.reason == (
-        "takeoff would leave the limits: 60.0 m above home is higher than guidance.max_altitude_m = 50"
-    )
+    assert "guidance.max_altitude_m = 50" in outcome.reason
     assert not harness.autopilot.requests
 
 
-def test_who_is_too_high_may_still_fly_level() -> None:
+def test_level_flight_above_max_altitude_is_allowed() -> None:
     vehicle = flying()
     vehicle.position[2] = -60.0
     harness = GuidanceHarness(vehicle)
@@ -136,19 +132,17 @@ def test_who_is_too_high_may_still_fly_level() -> None:
     assert not harness.command(GotoBehaviour(from_home_m=(5.0, 0.0))).done()
 
 
-def test_a_goal_outside_the_fence_is_refused_and_one_inside_is_not() -> None:
+def test_goal_outside_the_fence_is_refused() -> None:
     fence = Fence(((-20.0, -20.0), (20.0, -20.0), (20.0, 20.0), (-20.0, 20.0)))
     harness = GuidanceHarness(flying(), options=GuidanceOptions(Limits(fence=fence)))
     harness.run(0.1)
     outcome = harness.command(GotoBehaviour(from_home_m=(30.0, 0.0))).result()
-    assert outcome.reason == (
-        "goto would leave the limits: 30.0 m north and 0.0 m east of home is not inside the fence "
-        "(guidance.fence_include, fence_exclude)"
-    )
+    assert "30.0 m north" in outcome.reason
+    assert "fence_include" in outcome.reason
     assert not harness.command(GotoBehaviour(from_home_m=(10.0, 0.0))).done()
 
 
-def test_a_refusal_leaves_the_current_behaviour_flying() -> None:
+def test_refusal_keeps_the_current_behaviour() -> None:
     harness = GuidanceHarness(flying())
     future = engaged(harness)
     assert harness.command(TakeoffBehaviour()).done()

@@ -15,7 +15,7 @@ from vision.attitude import wrap_angle
 
 
 class AfterGoal(Behaviour):
-    """A behaviour that begins when another has ended with this goal."""
+    """Starts a behaviour after another one that ended with a goal."""
 
     name = "after goal"
 
@@ -29,7 +29,7 @@ class AfterGoal(Behaviour):
         return self._behaviour.update(dt_s, context)
 
 
-def test_hold_keeps_the_place_and_heading_it_began_with() -> None:
+def test_hold_keeps_its_initial_position_and_heading() -> None:
     vehicle = KinematicVehicle(position=[3.0, -2.0, -6.0], yaw_rad=1.2)
     flight = Flight(HoldBehaviour(), vehicle)
     assert flight.run(5.0) is None
@@ -40,27 +40,27 @@ def test_hold_keeps_the_place_and_heading_it_began_with() -> None:
 
 
 @pytest.mark.parametrize(("goal", "held"), [((3.6, -2.0, -6.3), True), ((4.5, -2.0, -6.0), False)])
-def test_hold_keeps_the_goal_before_where_it_is_near(goal: Vector3, held: bool) -> None:
+def test_hold_keeps_the_previous_goal_if_near(goal: Vector3, held: bool) -> None:
     vehicle = KinematicVehicle(position=[3.0, -2.0, -6.0])
     flight = Flight(AfterGoal(HoldBehaviour(8.0), goal), vehicle)
     outcome = flight.run(10.0)
     assert outcome is not None
-    place = goal if held else (3.0, -2.0, -6.0)
-    assert outcome.goal_ned_m == place
-    assert math.dist(vehicle.position, place) < 0.05
+    position = goal if held else (3.0, -2.0, -6.0)
+    assert outcome.goal_ned_m == position
+    assert math.dist(vehicle.position, position) < 0.05
 
 
-def test_hold_brakes_first_and_does_not_fly_back_to_where_it_began() -> None:
+def test_hold_brakes_first_and_does_not_fly_back() -> None:
     vehicle = KinematicVehicle(velocity=[4.0, 0.0, 0.0])
     flight = Flight(HoldBehaviour(), vehicle)
     flight.run(8.0)
-    furthest = max(place[0] for place in flight.track)
+    furthest = max(position[0] for position in flight.track)
     assert vehicle.position[0] > 0.5
     assert furthest - vehicle.position[0] < 0.15
     assert math.hypot(*vehicle.velocity) < 0.05
 
 
-def test_hold_with_a_duration_ends_by_itself() -> None:
+def test_hold_ends_after_its_duration() -> None:
     outcome = Flight(HoldBehaviour(duration_s=2.0)).run(3.0)
     assert outcome is not None
     assert outcome.success
@@ -68,7 +68,7 @@ def test_hold_with_a_duration_ends_by_itself() -> None:
 
 
 @pytest.mark.parametrize("clockwise", [True, False])
-def test_orbit_flies_its_laps_at_its_radius_with_the_nose_to_the_centre(clockwise: bool) -> None:
+def test_orbit_flies_its_laps_facing_the_centre(clockwise: bool) -> None:
     vehicle = KinematicVehicle(yaw_rad=math.pi / 2)
     centre = (0.0, 10.0)
     seen = []
@@ -98,11 +98,11 @@ def test_orbit_flies_its_laps_at_its_radius_with_the_nose_to_the_centre(clockwis
     assert (turned > 0) is clockwise
 
 
-def test_orbit_about_an_object_comes_onto_the_circle_from_afar() -> None:
+def test_orbit_reaches_a_distant_circle() -> None:
     car = SeenObject("car", 30.0, 4.0)
     vehicle = KinematicVehicle()
     flight = Flight(OrbitBehaviour(8.0, 3.0, laps=1.0, class_name="car"), vehicle, [car])
-    # The behaviour begins when the camera has delivered, as the pilot's requirement has it.
+    # The behaviour begins after the first frame, as its requirement demands.
     flight.latency_s = 0.0
     outcome = flight.run(90.0)
     assert outcome is not None
@@ -110,14 +110,14 @@ def test_orbit_about_an_object_comes_onto_the_circle_from_afar() -> None:
     assert math.dist(vehicle.position[:2], (30.0, 4.0)) == pytest.approx(8.0, abs=0.6)
 
 
-def test_orbit_about_an_object_that_is_not_in_sight_ends_with_the_reason() -> None:
+def test_orbit_without_a_visible_object_ends() -> None:
     outcome = Flight(OrbitBehaviour(class_name="boat")).run(5.0)
     assert outcome is not None
     assert not outcome.success
     assert "boat" in outcome.reason
 
 
-def test_an_orbit_pushed_into_its_centre_still_gives_finite_setpoints() -> None:
+def test_orbit_at_its_centre_gives_finite_setpoints() -> None:
     behaviour = OrbitBehaviour(5.0, 1.0)
     vehicle = KinematicVehicle()
     flight = Flight(behaviour, vehicle)

@@ -1,4 +1,4 @@
-"""Markers become places in local NED, whatever the vehicle's attitude was."""
+"""Marker targets in local NED for any attitude, and the pad filter."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def seen(
     on_pads: dict[int, PadMarker] | None = None,
     noise: NDArray[np.float64] | None = None,
 ) -> MarkerTarget:
-    """What a camera looking down makes of a marker lying at `centre` (north, east) on the ground."""
+    """The target of a downward camera for a marker at `centre` (north, east) on the ground."""
     attitude = quaternion_from_euler(roll, pitch, yaw)
     history = StateHistory()
     history.add(
@@ -62,7 +62,7 @@ def seen(
     north=st.floats(-1.0, 1.0), east=st.floats(-1.0, 1.0), height=st.floats(2.0, 9.0),
     heading=st.floats(-3.0, 3.0),
 )  # fmt: skip
-def test_a_banking_vehicle_does_not_swing_its_marker(
+def test_banking_does_not_displace_the_marker(
     roll: float, pitch: float, yaw: float, north: float, east: float, height: float, heading: float
 ) -> None:
     position = (12.0, -7.0, -height)
@@ -77,10 +77,8 @@ def test_a_banking_vehicle_does_not_swing_its_marker(
 
 @settings(max_examples=30, deadline=None)
 @given(heading=st.floats(-3.1, 3.1), seed=st.integers(0, 1000))
-def test_a_marker_beside_the_centre_tells_where_its_pad_is_in_spite_of_noise(
-    heading: float, seed: int
-) -> None:
-    """The small one is seen nearly face on, where its turning is ambiguous."""
+def test_off_centre_marker_gives_the_pad_position(heading: float, seed: int) -> None:
+    """The small marker is seen nearly face on, where its rotation is ambiguous."""
     right, up = 0.3, 0.58
     cosine, sine = math.cos(heading), math.sin(heading)
     centre = (up * cosine - right * sine, up * sine + right * cosine)
@@ -94,7 +92,7 @@ def test_a_marker_beside_the_centre_tells_where_its_pad_is_in_spite_of_noise(
     assert target.pad_ned_m[:2] == pytest.approx((0.0, 0.0), abs=0.06)
 
 
-def test_without_the_pose_of_that_moment_there_is_no_place() -> None:
+def test_without_the_pose_at_capture_there_is_no_target() -> None:
     marker = marker_from_corners(1, CAMERA.project(square(0.5) * (1, -1, 1) + (0, 0, 3.0)), 0.5, CAMERA)
     assert marker is not None
     with pytest.raises(HistoryError, match="no attitude"):
@@ -105,48 +103,46 @@ def test_without_the_pose_of_that_moment_there_is_no_place() -> None:
 @pytest.mark.parametrize(
     ("pitch_deg", "down"), [(-90, True), (-75, True), (-60, False), (-20, False), (0, False)]
 )
-def test_only_a_camera_with_the_ground_below_in_its_picture_looks_down(pitch_deg: float, down: bool) -> None:
+def test_looks_down_needs_nadir_inside_the_image(pitch_deg: float, down: bool) -> None:
     assert looks_down(CAMERA, CameraMount(pitch_rad=math.radians(pitch_deg))) is down
 
 
-def test_what_is_missing_is_named() -> None:
-    assert MarkerSight().unavailable(1.5) == (
-        "perception that looks for markers (markers.dictionary is not set)"
-    )
+def test_missing_marker_detection_is_named() -> None:
+    assert MarkerSight().unavailable(1.5) == ("marker detection (markers.dictionary is not set)")
     nothing = MarkerSight(missing="").unavailable(1.5)
     assert nothing is not None
-    assert "nothing came from it yet" in nothing
+    assert "none received" in nothing
     old = MarkerSight((), 1, 2.0, False, "").unavailable(1.5)
     assert old is not None
-    assert "is 2.0 s old" in old
+    assert "2.0 s old" in old
     assert MarkerSight((), 1, 0.1, True, "").unavailable(1.5) is None
 
 
-def sighting(north: float, stamp_s: float, distance: float = 3.0) -> MarkerTarget:
+def pad_detection(north: float, stamp_s: float, distance: float = 3.0) -> MarkerTarget:
     target = seen((0.0, 0.0, -distance), 0.0, 0.0, 0.0, (0.0, 0.0), 0.0)
-    place = (north, 0.0, 0.0)
+    position = (north, 0.0, 0.0)
     from dataclasses import replace
 
-    return replace(target, captured_ns=round(stamp_s * 1e9), pad_ned_m=place, distance_m=distance)
+    return replace(target, captured_ns=round(stamp_s * 1e9), pad_ned_m=position, distance_m=distance)
 
 
-def test_a_single_wrong_sighting_does_not_move_the_pad_and_many_do() -> None:
-    pad = PadFilter(sighting(1.0, 1.0), moving=False)
+def test_single_outlier_is_rejected_and_many_restart() -> None:
+    pad = PadFilter(pad_detection(1.0, 1.0), moving=False)
     for step in range(10):
-        assert pad.add(sighting(1.0, 1.1 + step * 0.05))
-    assert not pad.add(sighting(3.0, 1.7))
+        assert pad.add(pad_detection(1.0, 1.1 + step * 0.05))
+    assert not pad.add(pad_detection(3.0, 1.7))
     assert pad.at(2_000_000_000)[0] == pytest.approx(1.0, abs=0.01)
-    believed = [pad.add(sighting(3.0, 1.75 + step * 0.05)) for step in range(8)]
+    believed = [pad.add(pad_detection(3.0, 1.75 + step * 0.05)) for step in range(8)]
     assert believed[-1]
     assert pad.at(3_000_000_000)[0] == pytest.approx(3.0, abs=0.1)
 
 
-def test_a_moving_pad_is_where_it_will_be_and_a_still_one_where_it_was() -> None:
+def test_moving_pad_is_predicted_and_a_static_one_is_not() -> None:
     rng = np.random.default_rng(4)
     for moving in (True, False):
-        pad = PadFilter(sighting(0.0, 1.0), moving=moving)
+        pad = PadFilter(pad_detection(0.0, 1.0), moving=moving)
         for step in range(1, 80):
-            pad.add(sighting(0.5 * step * 0.05 + rng.normal(0.0, 0.03), 1.0 + step * 0.05))
+            pad.add(pad_detection(0.5 * step * 0.05 + rng.normal(0.0, 0.03), 1.0 + step * 0.05))
         if moving:
             assert pad.velocity_mps[0] == pytest.approx(0.5, abs=0.12)
             assert pad.at(round(5.45e9))[0] == pytest.approx(0.5 * 4.45, abs=0.15)
@@ -154,7 +150,7 @@ def test_a_moving_pad_is_where_it_will_be_and_a_still_one_where_it_was() -> None
             assert pad.velocity_mps == (0.0, 0.0)
 
 
-def test_old_sightings_are_passed_over() -> None:
-    pad = PadFilter(sighting(1.0, 1.0), moving=False)
-    assert not pad.add(sighting(5.0, 0.9))
+def test_old_detections_are_ignored() -> None:
+    pad = PadFilter(pad_detection(1.0, 1.0), moving=False)
+    assert not pad.add(pad_detection(5.0, 0.9))
     assert pad.count == 1

@@ -1,4 +1,4 @@
-"""Mission files: what is read, what is refused and in which words; and one flown by the whole service."""
+"""Mission files: parsing, errors, and a mission flown by the whole service."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def problems(text: str, names: tuple[str, ...] | None = NAMES) -> list[str]:
     return list(caught.value.problems)
 
 
-def test_the_mission_of_the_demonstration_is_one() -> None:
+def test_demo_mission_is_valid() -> None:
     plan = plan_from(read_mission(find_mission("demo")), "demo", NAMES)
     assert [step.command.split()[0] for step in plan.steps] == ["takeoff", "seek", "approach", "hold", "rtl"]
     assert [step.on_failure for step in plan.steps] == [RTL, RTL, RTL, RTL, ABORT]
@@ -40,11 +40,11 @@ def test_the_mission_of_the_demonstration_is_one() -> None:
 
 
 @pytest.mark.parametrize("path", sorted(MISSIONS_FOLDER.glob("*.toml")), ids=lambda path: path.stem)
-def test_every_mission_that_comes_along_is_right(path: Path) -> None:
+def test_bundled_missions_are_valid(path: Path) -> None:
     assert describe(plan_from(read_mission(path), str(path), NAMES))
 
 
-def test_every_mission_in_the_documents_is_right() -> None:
+def test_missions_in_the_documents_are_valid() -> None:
     blocks = re.findall(r"^```toml\n(.*?)^```", DOCUMENT.read_text(), re.MULTILINE | re.DOTALL)
     missions = [block for block in blocks if "[[step]]" in block]
     assert missions
@@ -53,72 +53,74 @@ def test_every_mission_in_the_documents_is_right() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "parts"),
     [
-        ("", "m.toml: a mission has at least one [[step]]"),
-        ("step = []", "m.toml: step: List should have at least 1 item"),
-        ("[[step]]\nname = 'a'", "m.toml: step 1: do is missing"),
-        ("[[step]]\ndo =", "m.toml: no TOML: "),
-        ("nam = 'x'\n[[step]]\ndo = 'land'", "m.toml: unknown key 'nam'; did you mean name?"),
+        ("", "m.toml|at least one"),
+        ("step = []", "m.toml|step|at least 1 item"),
+        ("[[step]]\nname = 'a'", "m.toml|step 1|do is missing"),
+        ("[[step]]\ndo =", "m.toml|invalid TOML"),
+        ("nam = 'x'\n[[step]]\ndo = 'land'", "m.toml|'nam'|name?"),
         (
             "[[step]]\ndo = 'land'\non_fail = 'rtl'",
-            "m.toml: step 1: unknown key 'on_fail'; did you mean on_fa",
+            "m.toml|step 1|'on_fail'|on_failure",
         ),
-        ("[[step]]\ndo = 'takeof 5'", "m.toml: step 1: unknown command 'takeof'; did you mean takeoff?"),
-        ("[[step]]\ndo = 'takeoff 500'", "m.toml: step 1: takeoff: altitude must be a number from 1 to 50 m"),
-        ("[[step]]\nname = 'find'\ndo = 'seek zebra'", "m.toml: step 1 (find): unknown class 'zebra'; there"),
-        ("[[step]]\ndo = 'hold'", "m.toml: step 1: 'hold' never ends by itself: give it timeout_s"),
-        ("[[step]]\ndo = 'mission demo'", "m.toml: step 1: a mission flies no other mission"),
-        ("[[step]]\ndo = 'land'\ntimeout_s = 0", "m.toml: step 1: timeout_s: Input should be greater than 0"),
-        ("[[step]]\ndo = 'land'\ntimeout_s = nan", "m.toml: step 1: timeout_s: "),
+        ("[[step]]\ndo = 'takeof 5'", "m.toml|step 1|'takeof'|takeoff?"),
+        ("[[step]]\ndo = 'takeoff 500'", "m.toml|step 1|altitude|1 to 50 m"),
+        ("[[step]]\nname = 'find'\ndo = 'seek zebra'", "m.toml|step 1 (find)|'zebra'"),
+        ("[[step]]\ndo = 'hold'", "m.toml|step 1|'hold'|timeout_s"),
+        ("[[step]]\ndo = 'mission demo'", "m.toml|step 1|another mission"),
+        ("[[step]]\ndo = 'land'\ntimeout_s = 0", "m.toml|step 1|timeout_s|greater than 0"),
+        ("[[step]]\ndo = 'land'\ntimeout_s = nan", "m.toml|step 1|timeout_s"),
         (
             "[[step]]\ndo = 'land'\ntimeout_s = '5'",
-            "m.toml: step 1: timeout_s: Input should be a valid number",
+            "m.toml|step 1|timeout_s|valid number",
         ),
-        ("[[step]]\ndo = 'land'\nrepeat = 0", "m.toml: step 1: repeat: Input should be greater than or eq"),
-        ("[[step]]\ndo = 'land'\non_success = 'home'", "m.toml: step 1: on_success: unknown step 'home'; "),
-        ("[[step]]\nname = 'rtl'\ndo = 'rtl'", "m.toml: step 1 (rtl): a step cannot be called 'rtl': that"),
+        ("[[step]]\ndo = 'land'\nrepeat = 0", "m.toml|step 1|repeat|greater than or equal"),
+        ("[[step]]\ndo = 'land'\non_success = 'home'", "m.toml|step 1|on_success|'home'"),
+        ("[[step]]\nname = 'rtl'\ndo = 'rtl'", "m.toml|step 1 (rtl)|'rtl'|reserved"),
         (
             "[[step]]\nname = 'a'\ndo = 'hold 1'\n[[step]]\nname = 'a'\ndo = 'land'",
-            "m.toml: step 2 (a): the name is taken by step 1",
+            "m.toml|step 2 (a)|by step 1",
         ),
         (
             "[[step]]\ndo = 'land'\non_success = 'end'\n[[step]]\nname = 'x'\ndo = 'land'",
-            "m.toml: step 2 (x): is never reached",
+            "m.toml|step 2 (x)|unreachable",
         ),
         (
             "[[step]]\nname = 'a'\ndo = 'hold 1'\non_success = 'a'",
-            "m.toml: step 1 (a): a loop without exit: lead one of its branches out, or limit a step's visits",
+            "m.toml|step 1 (a)|loop without exit",
         ),
     ],
 )
-def test_what_is_wrong_is_one_line_with_file_and_step(text: str, said: str) -> None:
+def test_problem_is_one_line_with_file_and_step(text: str, parts: str) -> None:
     [line] = problems(text)
-    assert line.startswith(said)
+    assert all(part in line for part in parts.split("|")), line
     assert "\n" not in line
 
 
-def test_everything_that_is_wrong_is_told_at_once() -> None:
+def test_all_problems_are_reported_together() -> None:
     text = "[[step]]\ndo = 'fly'\n[[step]]\ndo = 'seek zebra'\non_failure = 'nowhere'\n[[step]]\ndo = 'land'"
     assert [line.split(":")[1].strip() for line in problems(text)] == ["step 1", "step 2", "step 2"]
 
 
 @pytest.mark.parametrize(
-    "way_out",
+    "exit_line",
     ["visits = 3", "on_failure = 'rtl'", "on_failure = 'land'", "on_failure = 'end'", "on_failure = 'out'"],
 )
-def test_a_loop_with_a_way_out_is_allowed(way_out: str) -> None:
+def test_loop_with_an_exit_is_allowed(exit_line: str) -> None:
     text = (
-        f"[[step]]\nname = 'a'\ndo = 'hold 1'\n{way_out}\n"
+        f"[[step]]\nname = 'a'\ndo = 'hold 1'\n{exit_line}\n"
         "[[step]]\ndo = 'hold 2'\non_success = 'a'\non_failure = 'continue'\n"
         "[[step]]\nname = 'out'\ndo = 'land'\n"
     )
-    text = text if "out'" in way_out else text.replace("on_failure = 'continue'\n[[step]]\nname = 'out'", "#")
+    text = (
+        text if "out'" in exit_line else text.replace("on_failure = 'continue'\n[[step]]\nname = 'out'", "#")
+    )
     text = text.replace("#\ndo = 'land'\n", "")
     plan_from(text, "m.toml")
 
 
-def test_a_class_is_written_as_the_detector_writes_it() -> None:
+def test_class_takes_the_detectors_spelling() -> None:
     plan = plan_from("[[step]]\ndo = 'seek Traffic_Light'", "m.toml", NAMES)
     assert plan.steps[0].make().class_names == ("traffic light",)
 
@@ -127,10 +129,10 @@ words = st.sampled_from(["continue", "end", "abort", "rtl", "land", "s0", "s1", 
 
 
 @given(st.lists(st.tuples(words, words, st.booleans()), min_size=1, max_size=4))
-def test_every_plan_that_is_taken_comes_to_an_end_whatever_its_steps_do(
+def test_every_accepted_plan_ends(
     steps: list[tuple[str, str, bool]],
 ) -> None:
-    """From every step some branch leads, however long, to an end; and every step is reached."""
+    """From every step some branch leads to an end, and every step is reachable."""
     text = "".join(
         f"[[step]]\nname = 's{index}'\ndo = 'hold 1'\non_success = '{success}'\non_failure = '{failure}'\n"
         + ("visits = 2\n" if limited else "")
@@ -158,29 +160,27 @@ def test_every_plan_that_is_taken_comes_to_an_end_whatever_its_steps_do(
 
 
 @given(st.text(max_size=200))
-def test_any_text_is_a_mission_or_an_error_with_the_files_name(text: str) -> None:
-    said: tuple[str, ...] = ()
+def test_any_text_is_a_mission_or_an_error_with_file_name(text: str) -> None:
+    problems_found: tuple[str, ...] = ()
     try:
         plan_from(text, "m.toml")
     except MissionError as error:
-        said = error.problems
-    assert all(line.startswith("m.toml: ") for line in said)
+        problems_found = error.problems
+    assert all(line.startswith("m.toml: ") for line in problems_found)
 
 
-def test_a_mission_is_found_by_path_with_or_without_its_ending_or_by_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_mission_is_found_by_path_or_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     own = tmp_path / "own.toml"
     own.write_text("[[step]]\ndo = 'land'\n")
     assert find_mission(str(own)) == own
     assert find_mission("own").resolve() == own
     assert find_mission("demo") == MISSIONS_FOLDER / "demo.toml"
-    with pytest.raises(MissionError, match=r"no mission 'nowhere'.*demo"):
+    with pytest.raises(MissionError, match=r"'nowhere'.*demo"):
         find_mission("nowhere")
 
 
-def test_a_file_that_is_none_is_told_in_plain_words(tmp_path: Path) -> None:
+def test_unreadable_file_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "binary.toml"
     path.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(MissionError, match="cannot be read"):
@@ -190,20 +190,20 @@ def test_a_file_that_is_none_is_told_in_plain_words(tmp_path: Path) -> None:
         read_mission(path)
 
 
-def test_the_command_line_checks_a_mission_and_prints_its_plan(exported_model: Path, tmp_path: Path) -> None:
+def test_cli_checks_a_mission_and_prints_its_plan(exported_model: Path, tmp_path: Path) -> None:
     options = ("--check", "--model", exported_model, "--detector-runtime", "onnxruntime")
     done = companion("mission", "demo", *options, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[:2] == [
         "mission demo: 5 steps",
-        "1. takeoff altitude=4 → find; failing → rtl",
+        "1. takeoff altitude=4 → find; on failure → rtl",
     ]
     (tmp_path / "bad.toml").write_text("[[step]]\nname = 'look'\ndo = 'seek zebra'\n")
     done = companion("mission", "bad.toml", *options, cwd=tmp_path)
     assert done.returncode == 2
     assert done.stdout == ""
     assert done.stderr == (
-        "companion: bad.toml: step 1 (look): unknown class 'zebra'; there are: person, car, boat\n"
+        "companion: bad.toml: step 1 (look): unknown class 'zebra'; known: person, car, boat\n"
     )
     done = companion("mission", "demo", *options[:3], cwd=tmp_path)
     assert done.returncode == 2
@@ -233,9 +233,7 @@ do = "land"
 
 
 @pytest.mark.timeout(120)
-def test_a_mission_sent_to_the_service_is_flown_and_its_steps_are_told(
-    seeing: list[str], tmp_path: Path
-) -> None:
+def test_service_flies_a_mission_and_logs_its_steps(seeing: list[str], tmp_path: Path) -> None:
     (tmp_path / "here").mkdir()
     (tmp_path / "here" / "short.toml").write_text(SHORT)
     flown_at = tmp_path / "service"
@@ -244,7 +242,7 @@ def test_a_mission_sent_to_the_service_is_flown_and_its_steps_are_told(
         running_simulator(speed=2.0) as simulator,
         running_service(simulator.onboard_port, seeing, cwd=flown_at) as service,
     ):
-        # The service cannot see the file: its text goes with the command.
+        # The service cannot access the file: its text is sent with the command.
         done = companion("mission", "short.toml", "--connect", service.endpoint, cwd=tmp_path / "here")
         assert done.returncode == 0, done.stdout + done.stderr
         assert done.stdout.splitlines()[-1] == "done: flown, 4 steps"
@@ -253,25 +251,25 @@ def test_a_mission_sent_to_the_service_is_flown_and_its_steps_are_told(
 
         reply = service.command("mission short")
         assert not reply["success"]
-        assert reply["reason"].startswith("no mission 'short': no such file in")
+        assert "'short' not found" in reply["reason"]
         reply = service.command("mission broken\n[[step]]\ndo = 'seek zebra'\n")
-        assert reply["reason"].startswith("broken: step 1: unknown class 'zebra'")
+        assert reply["reason"].startswith("broken: step 1")
         reply = service.command("hold\n[[step]]\ndo = 'land'\n")
         assert reply["reason"] == "hold: one command at a time; only a mission may have more lines"
         # From the ground its first step is refused, and with it the mission.
         reply = service.command("mission from_the_ground\n[[step]]\ndo = 'hold 3'\n")
-        assert reply["reason"].startswith("mission needs to be in the air")
+        assert "in the air" in reply["reason"]
         assert reply["steps"] == []
 
 
 @pytest.mark.parametrize("name", ["x" * 300, "\0", ".", "/", "a/" * 3000])
-def test_a_name_that_no_file_can_have_is_one_line(name: str) -> None:
+def test_impossible_file_name_is_a_one_line_error(name: str) -> None:
     with pytest.raises(MissionError) as error:
         find_mission(name)
     assert "\n" not in str(error.value)
 
 
-def test_faults_of_tables_and_of_commands_are_told_at_once() -> None:
+def test_table_and_command_problems_are_reported_together() -> None:
     text = '[[step]]\ndo = "takeoff 500"\n[[step]]\ndo = "hovr"\nrepeat = 0\n'
     text += '[[step]]\ndo = "land"\nspeed = 3\n'
     with pytest.raises(MissionError) as failure:

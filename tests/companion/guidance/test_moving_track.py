@@ -1,4 +1,4 @@
-"""Who is followed on after it was hidden: identities of the picture leap, and its like is near."""
+"""Association after an occlusion, with switched track ids and a similar object nearby."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ SPEED_MPS, BEHIND_M, FRAME_S = 3.0, 8.0, 0.1
 
 
 def seen(
-    place: tuple[float, float], vehicle: tuple[float, float, float], seconds: float, identity: int
+    position: tuple[float, float], vehicle: tuple[float, float, float], seconds: float, identity: int
 ) -> Target:
-    north, east = place[0] - vehicle[0], place[1] - vehicle[1]
+    north, east = position[0] - vehicle[0], position[1] - vehicle[1]
     return Target(
         "car",
         0.9,
@@ -26,14 +26,14 @@ def seen(
         -0.3,
         math.hypot(north, east),
         RangeSource.GROUND_PLANE,
-        (*place, 0.0),
+        (*position, 0.0),
         track_id=identity,
         track_score=0.9,
     )
 
 
 class Road:
-    """A car that drives north, and the vehicle behind it. `see` shows places, told from where the car is."""
+    """A car driving north with the vehicle behind it. `see` adds detections relative to the car."""
 
     def __init__(self) -> None:
         self.seconds = 0.0
@@ -48,7 +48,7 @@ class Road:
         return (SPEED_MPS * self.seconds, 0.0, -4.0)
 
     def see(self, for_s: float, **beside: tuple[float, float]) -> None:
-        """`id1=(2.0, 0.0)`: identity 1, two metres before where the car is."""
+        """`id1=(2.0, 0.0)`: track id 1, 2 m ahead of the car."""
         for _ in range(round(for_s / FRAME_S)):
             self.seconds += FRAME_S
             self.track.update(
@@ -61,7 +61,7 @@ class Road:
 
     @property
     def off_m(self) -> float:
-        return math.dist(self.track.place(round(self.seconds * 1e9)), self.car)
+        return math.dist(self.track.position_at(round(self.seconds * 1e9)), self.car)
 
 
 @pytest.fixture
@@ -72,16 +72,16 @@ def road() -> Road:
     return road
 
 
-def test_what_was_taken_for_it_is_left_when_it_comes_out_itself(road: Road) -> None:
+def test_track_switches_back_when_the_object_reappears(road: Road) -> None:
     road.see(1.8)
-    road.see(0.3, id1=(-0.5, 2.4))  # its like, under its identity
+    road.see(0.3, id1=(-0.5, 2.4))  # a similar object with its id
     assert road.off_m > 1.0
     road.see(1.0, id1=(-0.5, 2.4), id37=(0.2, 0.1))
     assert road.track.track_id == 37
     assert road.off_m < 0.5
 
 
-def test_it_is_found_again_under_its_own_identity_too(road: Road) -> None:
+def test_object_is_found_again_with_its_own_id(road: Road) -> None:
     road.see(1.5)
     road.see(0.1, id1=(1.0, 2.2))
     road.see(0.2)
@@ -89,36 +89,36 @@ def test_it_is_found_again_under_its_own_identity_too(road: Road) -> None:
     assert road.off_m < 0.5
 
 
-def test_what_came_out_aside_of_its_way_is_followed_on_while_nobody_fits_better(road: Road) -> None:
+def test_off_path_reappearance_is_kept_without_a_rival(road: Road) -> None:
     road.see(1.5)
     road.see(1.0, id5=(0.3, 1.5), id6=(9.0, 7.0))
     assert road.track.track_id == 5
     assert road.off_m == pytest.approx(1.5, abs=0.4)
 
 
-def test_after_a_while_it_is_no_longer_in_doubt(road: Road) -> None:
+def test_hypothesis_expires(road: Road) -> None:
     road.see(1.5)
     road.see(DOUBT_S + 0.5, id5=(0.0, 2.0))
     road.see(1.0, id5=(0.0, 2.0), id6=(0.0, 0.0))
     assert road.track.track_id == 5
 
 
-def test_an_identity_that_was_away_is_not_believed_far_from_where_it_is_expected(road: Road) -> None:
+def test_returning_id_far_from_prediction_is_rejected(road: Road) -> None:
     road.see(1.3)
     road.see(0.5, id1=(0.5, -3.9))
     assert road.off_m < 0.5
 
 
-def test_a_few_missed_frames_of_one_that_comes_back_where_it_was_expected_are_no_doubt(road: Road) -> None:
+def test_short_gap_at_the_prediction_is_no_occlusion(road: Road) -> None:
     road.see(0.4)
     road.see(0.4, id1=(0.0, 0.0))
-    # It turns aside, and its like comes to where it would have been.
+    # It turns, and a similar object comes to the predicted position.
     for step in range(12):
         road.see(FRAME_S, id1=(0.0, 0.02 * step**2), id9=(0.0, -0.3))
     assert road.track.track_id == 1
 
 
-def test_its_own_identity_is_taken_again_without_a_range_and_in_doubt(road: Road) -> None:
+def test_own_id_is_associated_without_a_range(road: Road) -> None:
     road.see(0.7)
     for doubted in (False, True):
         road.seconds += FRAME_S
@@ -131,7 +131,7 @@ def test_its_own_identity_is_taken_again_without_a_range_and_in_doubt(road: Road
         assert road.track.update([target], road.vehicle)
 
 
-def test_a_slow_detector_is_no_absence() -> None:
+def test_slow_detector_is_no_occlusion() -> None:
     road = Road()
     for _ in range(12):
         road.see(FRAME_S, id1=(0.0, 0.0), id2=(0.0, 4.0))
@@ -143,7 +143,7 @@ def test_a_slow_detector_is_no_absence() -> None:
     assert road.track.track_id == 1
 
 
-def test_a_range_that_comes_from_elsewhere_may_be_off_by_more(road: Road) -> None:
+def test_changed_range_source_widens_the_gate(road: Road) -> None:
     taken = 0
     for _ in range(10):
         road.seconds += FRAME_S
@@ -153,14 +153,14 @@ def test_a_range_that_comes_from_elsewhere_may_be_off_by_more(road: Road) -> Non
     assert road.off_m == pytest.approx(2.0, abs=0.7)
 
 
-def test_what_is_true_now_and_then_is_not_chosen() -> None:
+def test_often_ambiguous_object_is_not_selected() -> None:
     vehicle = (0.0, 0.0, -4.0)
 
     def chosen(doubts: str) -> Target | None:
         choice, found = TargetSelector(), None
         for frame, doubt in enumerate(doubts):
             target = replace(seen((20.0, 0.0), vehicle, frame * FRAME_S, 3), trusted=doubt != "?")
-            found = choice.take([target], 0.0, round(frame * FRAME_S * 1e9))
+            found = choice.update([target], 0.0, round(frame * FRAME_S * 1e9))
         return found
 
     assert chosen("?????.?????????") is None
@@ -168,26 +168,28 @@ def test_what_is_true_now_and_then_is_not_chosen() -> None:
     assert chosen("??..?......") is not None
 
 
-def test_without_ranges_the_one_nearest_to_the_nose_is_meant() -> None:
+def test_without_ranges_the_smallest_angle_is_selected() -> None:
     aside = Target("car", 0.9, 1, math.radians(9.5), -0.3, track_id=None)
     ahead = replace(aside, bearing_rad=math.radians(0.2))
-    assert TargetSelector().take([aside, ahead], 0.0, 1) is ahead
+    assert TargetSelector().update([aside, ahead], 0.0, 1) is ahead
 
 
-def test_of_those_before_the_nose_the_nearest_is_meant() -> None:
+def test_nearest_object_ahead_is_selected() -> None:
     vehicle = (0.0, 0.0, -4.0)
 
-    def chosen(*places: tuple[float, float]) -> tuple[float, float]:
+    def chosen(*positions: tuple[float, float]) -> tuple[float, float]:
         choice = TargetSelector()
         found = None
         for frame in range(round(CHOOSING_S / FRAME_S) + 2):
-            targets = [seen(place, vehicle, frame * FRAME_S, index) for index, place in enumerate(places)]
-            found = choice.take(targets, 0.0, round(frame * FRAME_S * 1e9))
+            targets = [
+                seen(position, vehicle, frame * FRAME_S, index) for index, position in enumerate(positions)
+            ]
+            found = choice.update(targets, 0.0, round(frame * FRAME_S * 1e9))
         assert found is not None
         assert found.position_ned_m is not None
         return found.position_ned_m[:2]
 
     assert chosen((56.0, 1.0), (10.0, 0.9)) == (10.0, 0.9)
-    # Aside of the nose only the direction counts.
+    # Away from the nose only the direction counts.
     assert chosen((30.0, 1.0), (5.0, 5.0)) == (30.0, 1.0)
     assert chosen((5.0, 5.0), (30.0, 12.0)) == (30.0, 12.0)

@@ -1,4 +1,4 @@
-"""How old a pose is, where its vehicle is now, and who counts as there."""
+"""Neighbours: age of poses, prediction, and which vehicles are known."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def state_at(now_ns: int) -> VehicleState:
 
 
 def alpha_of(neighbours: Neighbours, now_ns: int) -> Neighbour:
-    alpha = neighbours.around(state_at(now_ns), now_ns).named("alpha")
+    alpha = neighbours.neighbourhood(state_at(now_ns), now_ns).named("alpha")
     assert alpha is not None
     return alpha
 
@@ -50,33 +50,33 @@ def alpha_of(neighbours: Neighbours, now_ns: int) -> Neighbour:
 @given(
     st.floats(-80, 80), st.floats(-180, 180), st.tuples(*[st.floats(-3000, 3000)] * 2, st.floats(-100, 100))
 )
-def test_a_place_goes_round_the_globe_and_back(latitude: float, longitude: float, place: Vector3) -> None:
+def test_global_conversion_round_trip(latitude: float, longitude: float, position: Vector3) -> None:
     anchor = Anchor(latitude, longitude, 100.0, (3.0, -4.0, 5.0))
-    assert anchor.local(*anchor.globally(place)) == pytest.approx(place, abs=0.01)
+    assert anchor.local(*anchor.globally(position)) == pytest.approx(position, abs=0.01)
 
 
-def test_local_origins_that_differ_do_not_matter() -> None:
+def test_different_local_origins_are_supported() -> None:
     neighbours = Neighbours("beta", "b")
-    neighbours.hear(pose(0), NOW_NS)
-    # The own local origin is somewhere else: here stands at (1, 2, -5) of it.
+    neighbours.ingest(pose(0), NOW_NS)
+    # The own local origin differs: this vehicle is at (1, 2, -5).
     alpha = alpha_of(neighbours, NOW_NS)
     assert alpha.position_ned_m == pytest.approx((11.0, 2.0, -5.0), abs=0.02)
 
 
-def test_the_age_counts_a_delay_though_the_clocks_differ_by_hours() -> None:
+def test_age_includes_the_delay_despite_clock_offset() -> None:
     neighbours, apart_ns = Neighbours("beta", "b"), 7_000 * SECOND
     delays_s = [0.1, 0.03, 0.25]
     for index, delay_s in enumerate(delays_s):
         sent_ns = index * SECOND // 10
-        neighbours.hear(pose(sent_ns), NOW_NS + sent_ns + apart_ns + round(delay_s * 1e9))
+        neighbours.ingest(pose(sent_ns), NOW_NS + sent_ns + apart_ns + round(delay_s * 1e9))
     now_ns = NOW_NS + apart_ns + 2 * SECOND // 10 + round(0.3e9)
-    # The last was sent 0.3 s ago; what is not known is the least delay of all.
+    # The last was sent 0.3 s ago; the minimum delay is unknown.
     assert neighbours.ages_s(now_ns)["alpha"] == pytest.approx(0.3 - 0.03, abs=0.002)
 
 
-def test_a_neighbour_is_brought_forward_by_its_velocity_and_turn_but_not_for_ever() -> None:
+def test_prediction_of_a_neighbour_is_limited() -> None:
     neighbours = Neighbours("beta", "b")
-    neighbours.hear(pose(0), NOW_NS)
+    neighbours.ingest(pose(0), NOW_NS)
     for after_s, north, silent in ((0.5, 12.0, False), (3.0, 13.0, True)):
         now_ns = NOW_NS + round(after_s * 1e9)
         alpha = alpha_of(neighbours, now_ns)
@@ -86,42 +86,42 @@ def test_a_neighbour_is_brought_forward_by_its_velocity_and_turn_but_not_for_eve
         assert alpha.heading_rad == pytest.approx(0.5 + 0.1 * min(after_s, 1.0))
 
 
-def test_who_is_silent_for_half_a_minute_is_forgotten() -> None:
+def test_neighbour_is_removed_after_30_s_of_silence() -> None:
     neighbours = Neighbours("beta", "b")
-    neighbours.hear(pose(0), NOW_NS)
-    assert neighbours.around(state_at(NOW_NS + 29 * SECOND), NOW_NS + 29 * SECOND).vehicles
-    assert not neighbours.around(state_at(NOW_NS + 31 * SECOND), NOW_NS + 31 * SECOND).vehicles
+    neighbours.ingest(pose(0), NOW_NS)
+    assert neighbours.neighbourhood(state_at(NOW_NS + 29 * SECOND), NOW_NS + 29 * SECOND).vehicles
+    assert not neighbours.neighbourhood(state_at(NOW_NS + 31 * SECOND), NOW_NS + 31 * SECOND).vehicles
 
 
-def test_what_comes_late_does_not_replace_what_is_newer() -> None:
+def test_late_pose_does_not_replace_a_newer_one() -> None:
     neighbours = Neighbours("beta", "b")
-    neighbours.hear(pose(2 * SECOND), NOW_NS)
-    neighbours.hear(pose(1 * SECOND, offset=(50.0, 0.0, 0.0)), NOW_NS + 1)
+    neighbours.ingest(pose(2 * SECOND), NOW_NS)
+    neighbours.ingest(pose(1 * SECOND, offset=(50.0, 0.0, 0.0)), NOW_NS + 1)
     assert neighbours.refused == 1
     assert alpha_of(neighbours, NOW_NS).position_ned_m[0] < 12.0
-    # A service that has started anew has a clock of its own.
-    neighbours.hear(pose(5, offset=(50.0, 0.0, 0.0), source="anew"), NOW_NS + 2)
+    # A restarted service has a new clock.
+    neighbours.ingest(pose(5, offset=(50.0, 0.0, 0.0), source="restarted"), NOW_NS + 2)
     assert alpha_of(neighbours, NOW_NS).position_ned_m[0] > 50.0
 
 
-def test_the_own_message_is_nobody_and_a_namesake_is_somebody_else() -> None:
+def test_own_message_is_ignored_and_a_namesake_is_not() -> None:
     neighbours = Neighbours("beta", "b")
-    neighbours.hear(pose(1, "beta", source="b"), NOW_NS)
-    assert not neighbours.around(state_at(NOW_NS), NOW_NS).vehicles
-    neighbours.hear(pose(1, "beta", source="other"), NOW_NS)
-    around = neighbours.around(state_at(NOW_NS), NOW_NS)
-    assert [vehicle.name for vehicle in around.vehicles] == ["beta (other)"]
+    neighbours.ingest(pose(1, "beta", source="b"), NOW_NS)
+    assert not neighbours.neighbourhood(state_at(NOW_NS), NOW_NS).vehicles
+    neighbours.ingest(pose(1, "beta", source="other"), NOW_NS)
+    others = neighbours.neighbourhood(state_at(NOW_NS), NOW_NS)
+    assert [vehicle.name for vehicle in others.vehicles] == ["beta (other)"]
     assert neighbours.namesakes == {"other"}
-    assert around.named("beta") is None
+    assert others.named("beta") is None
 
 
-def test_without_an_own_place_nobody_can_be_placed() -> None:
+def test_without_own_position_there_are_no_neighbours() -> None:
     neighbours = Neighbours("beta", "b")
-    neighbours.hear(pose(1), NOW_NS)
-    around = neighbours.around(replace(state_at(NOW_NS), latitude_deg=math.nan), NOW_NS)
-    assert around.vehicles == ()
-    assert around.problem is not None
-    assert "latitude and longitude" in around.problem
+    neighbours.ingest(pose(1), NOW_NS)
+    others = neighbours.neighbourhood(replace(state_at(NOW_NS), latitude_deg=math.nan), NOW_NS)
+    assert others.vehicles == ()
+    assert others.problem is not None
+    assert "latitude and longitude" in others.problem
 
 
 class Needy(Behaviour):
@@ -133,25 +133,27 @@ class Needy(Behaviour):
         raise NotImplementedError
 
 
-def test_a_behaviour_that_needs_a_neighbour_is_refused_with_its_name() -> None:
+def test_missing_neighbour_is_named_in_the_refusal() -> None:
     neighbours = Neighbours("beta", "b")
 
     def words(now_ns: int) -> str | None:
         state = state_at(now_ns)
         return check_requirements(
-            Needy(), BehaviourContext(now_ns, state, neighbourhood=neighbours.around(state, now_ns)), None
+            Needy(),
+            BehaviourContext(now_ns, state, neighbourhood=neighbours.neighbourhood(state, now_ns)),
+            None,
         )
 
-    assert words(NOW_NS) == "needy needs the pose of alpha (none came; nobody is heard)"
-    neighbours.hear(pose(1, "gamma"), NOW_NS)
-    assert words(NOW_NS) == "needy needs the pose of alpha (none came; heard are gamma)"
-    neighbours.hear(pose(1), NOW_NS)
+    assert "no poses received" in (words(NOW_NS) or "")
+    neighbours.ingest(pose(1, "gamma"), NOW_NS)
+    assert "received: gamma" in (words(NOW_NS) or "")
+    neighbours.ingest(pose(1), NOW_NS)
     assert words(NOW_NS) is None
-    assert words(NOW_NS + 2 * SECOND) == "needy needs the pose of alpha (it is 2.0 s old)"
-    assert missing_neighbours(None, ()) == ["neighbours (this service does not share poses)"]
-    lost = neighbours.around(replace(state_at(NOW_NS), global_ns=0), NOW_NS)
+    assert "alpha (stale: 2.0 s)" in (words(NOW_NS + 2 * SECOND) or "")
+    assert len(missing_neighbours(None, ())) == 1
+    lost = neighbours.neighbourhood(replace(state_at(NOW_NS), global_ns=0), NOW_NS)
     assert "s old" in missing_neighbours(lost, ())[0]
     assert (
-        "another leader than itself"
-        in missing_neighbours(neighbours.around(state_at(NOW_NS), NOW_NS), ("beta",))[0]
+        "other than itself"
+        in missing_neighbours(neighbours.neighbourhood(state_at(NOW_NS), NOW_NS), ("beta",))[0]
     )

@@ -51,42 +51,44 @@ def sent_velocity(harness: GuidanceHarness) -> Vector3:
 
 
 def ahead_m(memory: ObstacleMemory, vehicle: KinematicVehicle) -> float:
-    """What is known ahead when nothing is seen now."""
+    """The remembered distance ahead while nothing is seen."""
     filled = memory.filled(context(sectors(vehicle.now_ns, rest=NAN), vehicle=vehicle)).obstacles
     assert filled is not None
     return filled.distance_m[0]
 
 
 @given(left_m=st.floats(0.0, 50.0), late_s=st.floats(0.1, 2.0))
-def test_the_speed_allowed_always_stops_in_the_way_that_is_left(left_m: float, late_s: float) -> None:
+def test_allowed_speed_stops_within_the_distance(left_m: float, late_s: float) -> None:
     speed = speed_towards(left_m, late_s, 0.7)
     assert speed >= 0.0
     assert speed * late_s + speed**2 / (2 * 0.7) <= left_m + 1e-6
 
 
-def test_a_wall_ahead_takes_what_leads_into_it_and_leaves_what_leads_along_it() -> None:
+def test_wall_limits_velocity_into_it_only() -> None:
     vehicle = KinematicVehicle(velocity=[0.0, 1.0, 0.0])
     now_ns = vehicle.now_ns
-    # A wall 2 m north, at right angles.
+    # A perpendicular wall 2 m north.
     near = {i: 2.0 / math.cos(math.radians(5 * i)) for i in range(-14, 15)}
     envelope = Envelope()
-    envelope.near = ObstacleRules("auto", 2.0).rows(context(sectors(now_ns, near), vehicle=vehicle))
+    envelope.obstacle_constraints = ObstacleRules("auto", 2.0).constraints(
+        context(sectors(now_ns, near), vehicle=vehicle)
+    )
     asked = Setpoint.velocity((2.0, 2.0, 0.0), now_ns)
     sent = envelope.apply(asked, vehicle.state, now_ns, 0.05)
     assert sent.sent.velocity_ned_mps is not None
     assert sent.sent.velocity_ned_mps[0] <= 0.02
     assert sent.sent.velocity_ned_mps[1] > 0.1
-    assert "slowed down before an obstacle" in sent.reasons
+    assert any("obstacle" in reason for reason in sent.reasons)
     away = envelope.apply(Setpoint.velocity((-0.1, 0.0, 0.0), now_ns), vehicle.state, now_ns, 0.05)
     assert away.sent.velocity_ned_mps is not None
     assert away.sent.velocity_ned_mps[0] < 0.0
 
 
-def test_a_place_behind_an_obstacle_is_not_flown_to() -> None:
+def test_position_behind_an_obstacle_is_not_reached() -> None:
     vehicle = KinematicVehicle()
     envelope = Envelope()
     near = sectors(vehicle.now_ns, {0: 3.0, 1: 3.0, -1: 3.0})
-    envelope.near = ObstacleRules("auto", 2.0).rows(context(near, vehicle=vehicle))
+    envelope.obstacle_constraints = ObstacleRules("auto", 2.0).constraints(context(near, vehicle=vehicle))
     sent = envelope.apply(
         Setpoint.position((10.0, 0.0, -5.0), vehicle.now_ns), vehicle.state, vehicle.now_ns, 0.05
     )
@@ -94,38 +96,38 @@ def test_a_place_behind_an_obstacle_is_not_flown_to() -> None:
     assert sent.sent.position_ned_m[0] < 1.0
 
 
-def test_unknown_is_not_limited_unless_the_operator_says_so() -> None:
+def test_unknown_sectors_are_limited_only_by_setting() -> None:
     seen = sectors(KinematicVehicle().now_ns, rest=NAN)
-    assert ObstacleRules("auto").rows(context(seen)) == ()
-    rows = ObstacleRules("auto", max_speed_unobserved_mps=1.0).rows(context(seen))
-    assert len(rows) == SECTORS
-    assert {row[2] for row in rows} == {1.0}
+    assert ObstacleRules("auto").constraints(context(seen)) == ()
+    constraints = ObstacleRules("auto", max_speed_unobserved_mps=1.0).constraints(context(seen))
+    assert len(constraints) == SECTORS
+    assert {one[2] for one in constraints} == {1.0}
 
 
-def test_depth_that_stops_coming_is_named_and_brakes() -> None:
+def test_stale_depth_brakes_with_its_age() -> None:
     vehicle = KinematicVehicle()
     seen = sectors(vehicle.now_ns)
     rules = ObstacleRules("auto")
     assert rules.blind(context(seen, age_s=MAX_AGE_S - 0.1)) is None
-    assert rules.blind(context(seen, age_s=0.7)) == "no depth to fly by: the newest is 0.7 s old"
+    assert "0.7 s old" in (rules.blind(context(seen, age_s=0.7)) or "")
     assert rules.blind(context(None)) is None
-    assert ObstacleRules("required").blind(context(None)) == "no depth to fly by: none came yet"
+    assert "none received" in (ObstacleRules("required").blind(context(None)) or "")
     assert ObstacleRules("off").blind(context(seen, age_s=9.0)) is None
 
 
-def test_required_depth_that_is_missing_is_a_refusal_that_names_it() -> None:
+def test_missing_required_depth_is_refused() -> None:
     goto = GotoBehaviour(from_here_m=(5.0, 0.0))
     rules = ObstacleRules("required")
     why = check_requirements(goto, context(None), None, obstacles=rules)
     assert why is not None
-    assert "needs depth (none came yet" in why
+    assert "needs depth" in why
     assert check_requirements(LandBehaviour(), context(None), None, obstacles=rules) is None
     assert (
         check_requirements(goto, context(sectors(KinematicVehicle().now_ns)), None, obstacles=rules) is None
     )
 
 
-def test_the_pilot_sends_a_brake_while_depth_is_missing() -> None:
+def test_brake_is_sent_while_depth_is_missing() -> None:
     harness = GuidanceHarness(KinematicVehicle(mode=FlightMode.HOLD))
     harness.run(0.1)
     harness.command(GotoBehaviour(from_here_m=(30.0, 0.0)))
@@ -135,18 +137,17 @@ def test_the_pilot_sends_a_brake_while_depth_is_missing() -> None:
     harness.guidance.options = GuidanceOptions(obstacles=ObstacleRules("required"))
     harness.run(0.1)
     assert sent_velocity(harness) == (0.0, 0.0, 0.0)
-    assert harness.guidance.limited_by == ("no depth to fly by: none came yet",)
+    assert [reason[:8] for reason in harness.guidance.limited_by] == ["no depth"]
     harness.guidance.options = GuidanceOptions(obstacles=ObstacleRules("auto"))
     harness.run(1.0)
     assert math.hypot(*sent_velocity(harness)) > 0.5
-    told = [(event.kind, event.message) for event in harness.events][-2:]
-    assert told == [
-        (EventKind.BLIND, "braking: no depth to fly by: none came yet"),
-        (EventKind.NOTED, "depth is back"),
+    assert [event.kind for event in harness.events][-2:] == [
+        EventKind.BLIND,
+        EventKind.NOTED,
     ]
 
 
-def test_what_has_left_the_picture_is_remembered_where_it_stands() -> None:
+def test_obstacle_outside_the_image_is_remembered() -> None:
     memory, vehicle = ObstacleMemory(), KinematicVehicle()
     memory.filled(context(sectors(vehicle.now_ns, {0: 4.0}, rest=NAN), vehicle=vehicle))
     vehicle.position[0] += 1.0
@@ -156,14 +157,14 @@ def test_what_has_left_the_picture_is_remembered_where_it_stands() -> None:
     assert math.isnan(ahead_m(memory, vehicle))
 
 
-def test_the_message_tells_unknown_from_free() -> None:
+def test_message_distinguishes_unknown_from_free() -> None:
     message: dict[str, Any] = {**obstacles_message(sectors(5, {0: 1.234, 1: NAN}), "v")}
     assert message["distance_m"][:3] == [1.23, None, None]
     assert message["known"][:3] == [True, False, True]
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_goto_stops_before_what_stands_in_its_way(seed: int) -> None:
+def test_goto_stops_before_an_obstacle(seed: int) -> None:
     result = run(seed)
     assert result.success, result.reason
     assert result.values["nearest_m"] >= MARGIN_M - ALLOWED_M

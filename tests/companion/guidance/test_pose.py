@@ -1,4 +1,4 @@
-"""What vehicles tell each other of themselves, and what becomes of what is no pose."""
+"""Pose messages: round trip and validation."""
 
 from __future__ import annotations
 
@@ -51,11 +51,11 @@ STATE = VehicleState(
     "pose",
     [POSE, replace(POSE, formation=None), replace(POSE, formation=replace(NOTE, wish=None, structure=None))],
 )
-def test_a_pose_comes_back_from_its_message_as_it_was(pose: Pose) -> None:
+def test_pose_message_round_trip(pose: Pose) -> None:
     assert pose_from_message(json.loads(json.dumps(pose_message(pose)))) == pose
 
 
-def test_a_vehicle_tells_where_it_is_and_how_old_that_is() -> None:
+def test_pose_has_position_and_age() -> None:
     pose = pose_of(STATE, NOW_NS, vehicle="beta", source="s")
     assert pose is not None
     assert (pose.age_s, pose.latitude_deg, pose.altitude_m) == (0.02, 47.4, 493.0)
@@ -76,11 +76,11 @@ def test_a_vehicle_tells_where_it_is_and_how_old_that_is() -> None:
         replace(STATE, velocity_ned_mps=None),
     ],
 )
-def test_a_vehicle_that_does_not_know_its_place_tells_nothing(state: VehicleState) -> None:
+def test_no_pose_without_a_global_position(state: VehicleState) -> None:
     assert pose_of(state, NOW_NS, vehicle="beta", source="s") is None
 
 
-def test_the_heading_turns_by_the_body_rates_through_roll() -> None:
+def test_turn_rate_from_body_rates_and_roll() -> None:
     banked = replace(
         STATE,
         attitude=quaternion_from_euler(math.pi / 6, 0.0, 0.7),
@@ -94,24 +94,22 @@ def test_the_heading_turns_by_the_body_rates_through_roll() -> None:
 @pytest.mark.parametrize(
     ("path", "value", "words"),
     [
-        (("latitude_deg",), 91.0, "latitude_deg must be -90 to 90"),
+        (("latitude_deg",), 91.0, "latitude_deg must be"),
         (("latitude_deg",), math.nan, "latitude_deg must be"),
         (("velocity_ned_mps",), [1.0, 2.0], "three numbers"),
         (("velocity_ned_mps",), [1.0, 2.0, "x"], "velocity_ned_mps must be"),
         (("published_ns",), True, "whole number"),
         (("published_ns",), 2**70, "whole number"),
         (("role",), "king", "role must be one of"),
-        (("vehicle",), "", "1 to 100 characters"),
+        (("vehicle",), "", "100 characters"),
         (("formation", "plan", "shape"), "star", "shape must be one of"),
         (("formation", "plan", "spacing_m"), 0.0, "spacing_m must be"),
-        (("formation", "slots"), {"beta": 0}, "beta must be a whole number from 1"),
+        (("formation", "slots"), {"beta": 0}, "beta must be"),
         (("formation", "slots"), [1], "must be an object"),
         (("formation", "structure", "origin"), [0.0, 0.0, 1e9], "origin must be"),
     ],
 )
-def test_a_message_that_is_no_pose_is_refused_by_name(
-    path: Sequence[str | int], value: object, words: str
-) -> None:
+def test_invalid_field_is_rejected_by_name(path: Sequence[str | int], value: object, words: str) -> None:
     message = json.loads(json.dumps(pose_message(POSE)))
     inner = message
     for key in path[:-1]:
@@ -122,7 +120,7 @@ def test_a_message_that_is_no_pose_is_refused_by_name(
 
 
 @pytest.mark.parametrize("key", list(pose_message(POSE)))
-def test_a_message_without_one_of_its_fields_is_refused(key: str) -> None:
+def test_missing_field_is_rejected(key: str) -> None:
     message = pose_message(POSE)
     del message[key]
     with pytest.raises(PoseError, match=f"{key} is missing"):
@@ -137,7 +135,7 @@ json_value = st.recursive(
 
 
 @given(st.sampled_from(sorted(pose_message(POSE))), json_value)
-def test_whatever_stands_in_a_field_it_is_a_pose_or_refused(key: str, value: object) -> None:
+def test_any_field_value_is_a_pose_or_rejected(key: str, value: object) -> None:
     message = pose_message(POSE)
     message[key] = value
     try:

@@ -1,4 +1,4 @@
-"""Commands register themselves, those of plug-ins too."""
+"""Registration of commands, including those of plug-ins."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class WaitBehaviour(Behaviour):
 
 @pytest.fixture(autouse=True)
 def _table(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
-    """The table of commands and the loaded modules as they were."""
+    """Restores the command table and the loaded modules."""
     before, modules = dict(COMMANDS), set(sys.modules)
     monkeypatch.syspath_prepend(tmp_path)
     yield
@@ -51,7 +51,7 @@ def _table(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
         del sys.modules[name]
 
 
-def test_module_that_is_named_adds_its_command(tmp_path: Path) -> None:
+def test_named_module_adds_its_command(tmp_path: Path) -> None:
     (tmp_path / "plugin_of_a_user.py").write_text(PLUGIN.format(word="wait"))
     assert "wait" not in COMMANDS
     load_plugins(["plugin_of_a_user"])
@@ -98,7 +98,7 @@ def test_plugin_that_cannot_be_loaded_is_named(tmp_path: Path, name: str, source
     assert before == COMMANDS
 
 
-def test_schema_holds_every_command_and_its_ranges() -> None:
+def test_schema_has_every_command_and_its_ranges() -> None:
     schema = json_schema(["car", "dog"])
     json.dumps(schema)
     assert set(schema["$defs"]) == set(COMMANDS)

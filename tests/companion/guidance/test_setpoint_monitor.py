@@ -1,4 +1,4 @@
-"""The comparison of what was sent with how the vehicle moves, on sequences as they are flown."""
+"""Setpoint monitor on synthetic motion sequences."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Velocity = Callable[[float], Vector3]
 
 @dataclass
 class Sequence:
-    """Measurements of one flight: at which second the monitor said that the vehicle does not follow."""
+    """Measurements of one flight, fed to the monitor."""
 
     monitor: SetpointMonitor = field(default_factory=SetpointMonitor)
     state: VehicleState = field(
@@ -30,7 +30,7 @@ class Sequence:
     def fly(
         self, sent: Velocity | Setpoint, active: Velocity, lasting_s: float, *, landing: bool = False
     ) -> float | None:
-        """Until the monitor says so (seconds since the beginning of this part) or the time is over (None)."""
+        """Seconds until the monitor reports that the vehicle does not follow; None: it does not report."""
         for index in range(round(lasting_s / PERIOD_S)):
             part_s = index * PERIOD_S
             self.seconds += PERIOD_S
@@ -61,12 +61,12 @@ def north(speed_mps: float) -> Velocity:
 
 
 def rising(speed_mps: float, within_s: float, delay_s: float = 0.0) -> Velocity:
-    """A first-order answer to a step."""
+    """A first-order step response."""
     return lambda seconds: (speed_mps * (1 - math.exp(-max(0.0, seconds - delay_s) / within_s)), 0.0, 0.0)
 
 
 @pytest.mark.parametrize(("speed_mps", "lasting_s"), [(1.0, 2.5), (2.0, 1.0), (5.0, 1.0)])
-def test_a_vehicle_that_is_stopped_in_flight_does_not_follow(speed_mps: float, lasting_s: float) -> None:
+def test_vehicle_stopped_in_flight_is_detected(speed_mps: float, lasting_s: float) -> None:
     sequence = Sequence()
     assert sequence.fly(north(speed_mps), north(speed_mps), 5.0) is None
     braking = lambda seconds: (max(0.0, speed_mps - 3.0 * seconds), 0.0, 0.0)  # noqa: E731
@@ -76,13 +76,13 @@ def test_a_vehicle_that_is_stopped_in_flight_does_not_follow(speed_mps: float, l
 
 
 @pytest.mark.parametrize(("speed_mps", "at_most_s"), [(1.0, 9.0), (3.0, 4.5)])
-def test_a_vehicle_that_never_starts_does_not_follow(speed_mps: float, at_most_s: float) -> None:
+def test_vehicle_that_never_starts_is_detected(speed_mps: float, at_most_s: float) -> None:
     seen_s = Sequence().fly(north(speed_mps), still, 10.0)
     assert seen_s is not None
     assert seen_s < at_most_s
 
 
-def test_a_vehicle_that_flies_off_a_hold_does_not_follow() -> None:
+def test_vehicle_that_leaves_a_hold_is_detected() -> None:
     sequence = Sequence()
     assert sequence.fly(still, still, 5.0) is None
     seen_s = sequence.fly(still, rising(2.0, 0.6), 5.0)
@@ -90,7 +90,7 @@ def test_a_vehicle_that_flies_off_a_hold_does_not_follow() -> None:
     assert seen_s < 2.0
 
 
-def test_a_vehicle_that_flies_elsewhere_does_not_follow() -> None:
+def test_vehicle_in_another_direction_is_detected() -> None:
     sequence = Sequence()
     assert sequence.fly(north(2.0), north(2.0), 3.0) is None
     seen_s = sequence.fly(north(2.0), lambda seconds: (0.0, 2.0, 0.0), 5.0)
@@ -99,15 +99,15 @@ def test_a_vehicle_that_flies_elsewhere_does_not_follow() -> None:
 
 
 @pytest.mark.parametrize(("speed_mps", "noticed"), [(0.6, True), (0.3, False)])
-def test_a_slow_setpoint_takes_the_long_rule(speed_mps: float, noticed: bool) -> None:
+def test_slow_setpoint_needs_the_long_rule(speed_mps: float, noticed: bool) -> None:
     sequence = Sequence()
     assert sequence.fly(north(speed_mps), north(speed_mps), 5.0) is None
     assert (sequence.fly(north(speed_mps), still, 8.0) is not None) is noticed
 
 
 @pytest.mark.parametrize("within_s", [0.3, 1.0, 1.7])
-def test_steps_and_reversals_of_the_setpoint_are_followed(within_s: float) -> None:
-    """From 3 m/s to -3 m/s, by a vehicle that answers 0.2 s late."""
+def test_setpoint_steps_and_reversals_count_as_following(within_s: float) -> None:
+    """From 3 m/s to -3 m/s, with a delay of 0.2 s."""
     sequence = Sequence()
     assert sequence.fly(north(3.0), rising(3.0, within_s, 0.2), 8.0) is None
     turning = lambda seconds: (3.0 - 2.0 * rising(3.0, within_s, 0.2)(seconds)[0], 0.0, 0.0)  # noqa: E731
@@ -115,19 +115,19 @@ def test_steps_and_reversals_of_the_setpoint_are_followed(within_s: float) -> No
     assert sequence.largest_mps < 0.7
 
 
-def test_px4s_slow_rise_to_3_mps_is_followed() -> None:
+def test_slow_rise_of_px4_to_3_mps_counts_as_following() -> None:
     """Measured in its SIH simulation: 2.65 m/s after 6 s."""
     sequence = Sequence()
     assert sequence.fly(north(3.0), rising(2.65, 1.2), 20.0) is None
     assert sequence.largest_mps < 0.5
 
 
-def test_half_the_speed_in_the_right_direction_is_followed() -> None:
+def test_half_the_speed_counts_as_following() -> None:
     assert Sequence().fly(north(5.0), north(2.5), 20.0) is None
 
 
-def test_a_vehicle_that_swings_about_the_setpoint_is_followed() -> None:
-    """A badly tuned hold: 1.6 m/s to and fro, against setpoints that are a quarter of a period late."""
+def test_oscillation_counts_as_following() -> None:
+    """A badly tuned hold: ±1.6 m/s, against setpoints that are a quarter of a period late."""
     rate_radps = 1.9
 
     def active(seconds: float) -> Vector3:
@@ -141,7 +141,7 @@ def test_a_vehicle_that_swings_about_the_setpoint_is_followed() -> None:
     assert sequence.largest_mps > 0.8
 
 
-def test_a_reset_of_the_estimate_begins_again() -> None:
+def test_estimate_reset_restarts_the_comparison() -> None:
     sequence = Sequence()
     assert sequence.fly(north(3.0), north(3.0), 3.0) is None
     assert sequence.fly(north(3.0), still, 0.9) is None
@@ -149,7 +149,7 @@ def test_a_reset_of_the_estimate_begins_again() -> None:
     assert sequence.fly(north(3.0), still, 1.5) is None
 
 
-def test_a_gap_in_the_telemetry_begins_again() -> None:
+def test_telemetry_gap_restarts_the_comparison() -> None:
     sequence = Sequence()
     assert sequence.fly(north(3.0), north(3.0), 3.0) is None
     assert sequence.fly(north(3.0), still, 0.9) is None
@@ -158,41 +158,41 @@ def test_a_gap_in_the_telemetry_begins_again() -> None:
 
 
 @pytest.mark.parametrize("landed", [LandedState.ON_GROUND, LandedState.TAKING_OFF, LandedState.LANDING])
-def test_nothing_is_compared_on_the_ground(landed: LandedState) -> None:
+def test_no_comparison_on_the_ground(landed: LandedState) -> None:
     sequence = Sequence()
     sequence.state = replace(sequence.state, landed=landed)
     assert sequence.fly(north(3.0), still, 10.0) is None
 
 
-def test_nothing_is_compared_by_an_invalid_estimate() -> None:
+def test_no_comparison_with_an_invalid_estimate() -> None:
     sequence = Sequence()
     sequence.state = replace(sequence.state, position_valid=False)
     assert sequence.fly(north(3.0), still, 10.0) is None
 
 
-def test_standing_on_the_ground_at_a_landing_is_allowed() -> None:
-    """The autopilot takes seconds to tell that it has landed."""
+def test_ground_contact_at_a_landing_is_allowed() -> None:
+    """The autopilot reports the landing seconds later."""
     down: Velocity = lambda seconds: (0.2, 0.1, 0.7)  # noqa: E731
     sequence = Sequence()
     assert sequence.fly(down, lambda seconds: (0.1, 0.1, 0.7), 3.0, landing=True) is None
     assert sequence.fly(down, still, 10.0, landing=True) is None
 
 
-def test_a_landing_that_is_carried_off_is_noticed() -> None:
+def test_landing_that_drifts_away_is_detected() -> None:
     down = lambda seconds: (0.0, 0.0, 0.7)  # noqa: E731
     assert Sequence().fly(down, rising(3.0, 0.5), 5.0, landing=True) is not None
 
 
-def test_a_moving_position_setpoint_is_followed_with_and_without_lag() -> None:
-    """PX4 lags by 1 s times the speed; with feed-forward there is hardly any lag."""
+def test_moving_position_setpoint_with_and_without_lag() -> None:
+    """PX4 lags by 1 s times the speed; with feed-forward there is almost no lag."""
     for lag_m in (3.2, 0.3):
         sequence = Sequence()
         sequence.state = replace(sequence.state, position_ned_m=(-lag_m, 0.0, -5.0))
         for index in range(500):
-            place = Setpoint.position((3.0 * (index + 1) * PERIOD_S, 0.0, -5.0), 0)
-            assert sequence.fly(place, north(3.0), PERIOD_S) is None
+            target = Setpoint.position((3.0 * (index + 1) * PERIOD_S, 0.0, -5.0), 0)
+            assert sequence.fly(target, north(3.0), PERIOD_S) is None
         assert sequence.largest_mps < 1.0
 
 
-def test_standing_away_from_a_position_setpoint_is_noticed() -> None:
+def test_stop_away_from_a_position_setpoint_is_detected() -> None:
     assert Sequence().fly(Setpoint.position((4.0, 0.0, -5.0), 0), still, 5.0) is not None

@@ -84,9 +84,9 @@ def optical_point(
     return mount.body_from_optical.T @ body
 
 
-def test_a_target_bears_its_track_and_may_be_chosen_only_when_that_counts_as_true() -> None:
+def test_target_is_trusted_only_with_a_confirmed_track() -> None:
     tracks: list[dict[str, Any]] = [
-        {},  # nobody looks for tracks
+        {},  # tracking is off
         {"track_id": None, "track_score": None, "track_state": "none"},
         {"track_id": 4, "track_score": 0.6, "track_state": "tentative"},
         {"track_id": 5, "track_score": 0.7, "track_state": "confirmed"},
@@ -109,18 +109,16 @@ def test_a_target_bears_its_track_and_may_be_chosen_only_when_that_counts_as_tru
         ({"class_name": "truck", "confidence": 0.95, "xyxy": [300, 300, 310, 400]}, [True, True]),
         ({"class_name": "car", "confidence": 0.85}, [True, True]),
     ],
-    ids=["much less sure", "nearly as sure", "a little surer", "surer", "beside it", "of its class"],
+    ids=["much lower", "slightly lower", "slightly higher", "higher", "beside it", "same class"],
 )
-def test_one_thing_with_two_names_is_chosen_only_by_the_one_that_is_clearly_surer(
-    other: dict[str, Any], trusted: list[bool]
-) -> None:
+def test_ambiguous_class_is_not_trusted(other: dict[str, Any], trusted: list[bool]) -> None:
     car = detection((310, 300, 330, 400))
     both = [car, detection((311, 300, 331, 400), **other)]
     history = history_of(quaternion_from_euler(0.0, 0.0, 0.0))
     assert [t.trusted for t in targets_from_detections(both, T0, CAMERA, MOUNT, history)] == trusted
 
 
-def test_of_two_names_the_score_of_the_track_counts_not_that_of_a_frame() -> None:
+def test_ambiguity_uses_the_track_score() -> None:
     box = (310, 300, 330, 400)
     tracks: dict[str, Any] = {"track_state": "confirmed"}
     car = detection(box, track_id=1, track_score=0.9, confidence=0.5, **tracks)
@@ -147,9 +145,7 @@ scenes = st.tuples(
 
 @pytest.mark.parametrize("camera", [CAMERA, DISTORTED], ids=["pinhole", "distorted"])
 @given(scene=scenes)
-def test_a_point_on_the_ground_is_found_again_from_the_foot_of_its_box(
-    camera: CameraModel, scene: Scene
-) -> None:
+def test_ground_point_is_recovered_from_the_box_foot(camera: CameraModel, scene: Scene) -> None:
     roll, pitch, yaw, distance, off, height, (north, east) = scene
     attitude = quaternion_from_euler(roll, pitch, yaw)
     home_down = 1.5
@@ -174,7 +170,7 @@ def test_a_point_on_the_ground_is_found_again_from_the_foot_of_its_box(
 
 
 @given(scene=scenes, down=st.floats(-4.0, 4.0))
-def test_a_point_in_space_is_found_again_from_its_depth(scene: Scene, down: float) -> None:
+def test_point_is_recovered_from_its_depth(scene: Scene, down: float) -> None:
     roll, pitch, yaw, distance, off, height, (north, east) = scene
     attitude = quaternion_from_euler(roll, pitch, yaw)
     position = (north, east, -height)
@@ -197,7 +193,7 @@ def test_a_point_in_space_is_found_again_from_its_depth(scene: Scene, down: floa
     assert abs(wrap_angle(target.bearing_rad - bearing)) < 0.2 / (distance - 0.2)
 
 
-def test_the_place_lies_where_the_box_is_and_not_at_the_nearest_corner() -> None:
+def test_position_is_at_the_box_not_the_nearest_corner() -> None:
     history = history_of(quaternion_from_euler(0.0, 0.0, 0.0), position=(0.0, 0.0, -8.0))
     # A wall square to the view, 6 m ahead, of which the right half is in the box.
     level = CameraMount()
@@ -213,7 +209,7 @@ def test_the_place_lies_where_the_box_is_and_not_at_the_nearest_corner() -> None
     assert math.atan2(east, north) == pytest.approx(bearing)
 
 
-def test_a_box_cut_by_the_edge_has_a_less_certain_range() -> None:
+def test_box_cut_by_the_edge_has_a_larger_sigma() -> None:
     history = history_of(quaternion_from_euler(0.0, 0.0, 0.0))
     whole, cut = targets_from_detections(
         [detection((10, 300, 60, 400), (-4, 1, 7)), detection((0, 300, 60, 400), (-4, 1, 7))],
@@ -226,11 +222,11 @@ def test_a_box_cut_by_the_edge_has_a_less_certain_range() -> None:
 
 
 @given(scene=scenes, tall_m=st.floats(0.8, 4.0))
-def test_the_foot_of_what_stands_is_found_again_from_its_known_height(scene: Scene, tall_m: float) -> None:
+def test_foot_is_recovered_from_the_known_height(scene: Scene, tall_m: float) -> None:
     _, pitch, yaw, distance, _, height, (north, east) = scene
-    attitude = quaternion_from_euler(0.0, pitch, yaw)  # so that it is upright in the picture
+    attitude = quaternion_from_euler(0.0, pitch, yaw)  # so that it is upright in the image
     position = (north, east, -height)
-    assume(distance > 0.2 * (height + 5.0))  # from straight above a height is not seen
+    assume(distance > 0.2 * (height + 5.0))  # from straight above the height is not visible
     foot = (north + distance * math.cos(yaw), east + distance * math.sin(yaw), 5.0)
     ends = [
         optical_point(CAMERA, MOUNT, attitude, position, point)
@@ -246,9 +242,9 @@ def test_the_foot_of_what_stands_is_found_again_from_its_known_height(scene: Sce
     assert np.array(position) + found == pytest.approx(foot, abs=0.02 * distance)
 
 
-def test_a_known_height_tells_the_range_where_the_ground_does_not() -> None:
+def test_known_height_gives_a_range_without_ground() -> None:
     history = history_of(quaternion_from_euler(0.0, 0.0, 0.0), position=(0.0, 0.0, -1.5))
-    # 50 px tall before a camera that looks down by 20°, its foot near the horizon.
+    # 50 px tall, in a camera pitched 20° down, its foot near the horizon.
     box = [300, 50, 320, 100]
     ((without,), (known,), (cut,), (other,)) = (
         targets_from_detections([detection(where, name=name)], T0, CAMERA, MOUNT, history, heights)
@@ -266,7 +262,7 @@ def test_a_known_height_tells_the_range_where_the_ground_does_not() -> None:
     assert known.ground_range_m == pytest.approx(1.7 / (top - bottom) + 0.1, rel=0.01)
 
 
-def test_a_known_height_does_not_replace_what_the_ground_or_depth_tells() -> None:
+def test_ground_and_depth_take_priority_over_known_height() -> None:
     history = history_of(quaternion_from_euler(0.0, 0.0, 0.0))
     heights = {"car": 1.5}
     (by_ground, by_depth) = targets_from_detections(
@@ -281,7 +277,7 @@ def test_a_known_height_does_not_replace_what_the_ground_or_depth_tells() -> Non
     assert by_depth.range_source is RangeSource.DEPTH
 
 
-def test_a_box_cut_by_the_lower_edge_has_a_direction_but_no_range() -> None:
+def test_box_cut_by_the_lower_edge_has_no_range() -> None:
     history = history_of(quaternion_from_euler(0, 0, 0.7))
     (target,) = targets_from_detections([detection((300, 300, 339, 479))], T0, CAMERA, MOUNT, history)
     assert target.range_source is RangeSource.NONE
@@ -291,7 +287,7 @@ def test_a_box_cut_by_the_lower_edge_has_a_direction_but_no_range() -> None:
     assert target.elevation_rad < 0
 
 
-def test_a_foot_near_the_horizon_has_no_range() -> None:
+def test_foot_near_the_horizon_has_no_range() -> None:
     level = CameraMount()
     (target,) = targets_from_detections(
         [detection((310, 230, 330, 245))], T0, CAMERA, level, history_of(quaternion_from_euler(0, 0, 0))
@@ -299,13 +295,13 @@ def test_a_foot_near_the_horizon_has_no_range() -> None:
     assert target.range_source is RangeSource.NONE
 
 
-def test_on_the_ground_there_is_no_ground_plane_range() -> None:
+def test_no_ground_plane_range_on_the_ground() -> None:
     history = history_of(quaternion_from_euler(0, 0, 0), (0.0, 0.0, -0.1))
     (target,) = targets_from_detections([detection((310, 300, 330, 400))], T0, CAMERA, MOUNT, history)
     assert target.range_source is RangeSource.NONE
 
 
-def test_a_depth_that_is_no_number_falls_back_to_the_ground() -> None:
+def test_nan_depth_falls_back_to_the_ground() -> None:
     history = history_of(quaternion_from_euler(0, 0, 0))
     (target,) = targets_from_detections(
         [detection((310, 300, 330, 400), (math.nan,) * 3)], T0, CAMERA, MOUNT, history
@@ -313,7 +309,7 @@ def test_a_depth_that_is_no_number_falls_back_to_the_ground() -> None:
     assert target.range_source is RangeSource.GROUND_PLANE
 
 
-def test_the_attitude_is_that_of_the_capture_not_of_now() -> None:
+def test_attitude_is_that_of_the_capture() -> None:
     history = StateHistory()
     for step in range(20):
         yaw = 0.05 * step
@@ -336,7 +332,7 @@ def test_position_and_height_are_interpolated_at_their_own_stamps() -> None:
     assert pose.height_m == pytest.approx(1.5)
 
 
-def test_moments_outside_the_history_are_refused_by_how_much() -> None:
+def test_times_outside_the_history_are_refused() -> None:
     history = history_of(quaternion_from_euler(0, 0, 0))
     history.at(T0 - 190_000_000)
     history.at(T0 + 180_000_000 + 190_000_000)
@@ -348,7 +344,7 @@ def test_moments_outside_the_history_are_refused_by_how_much() -> None:
         StateHistory().at(T0)
 
 
-def test_the_history_is_bounded_and_passes_over_old_stamps() -> None:
+def test_history_is_bounded_and_ignores_old_stamps() -> None:
     history = StateHistory(duration_s=1.0)
     for step in range(1000):
         history.add(state_at(T0 + step * 20_000_000, quaternion_from_euler(0, 0, 0)))
@@ -361,7 +357,7 @@ quaternions = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: sum(v * v for 
 
 
 @given(quaternions, quaternions, st.floats(0, 1))
-def test_slerp_divides_the_shorter_way_in_proportion(
+def test_slerp_is_proportional_along_the_shorter_arc(
     first: Quaternion, second: Quaternion, fraction: float
 ) -> None:
     def angle(a: Quaternion, b: Quaternion) -> float:
@@ -375,14 +371,14 @@ def test_slerp_divides_the_shorter_way_in_proportion(
     assert angle(middle, second) == pytest.approx(whole * (1 - fraction), abs=2e-3)
 
 
-def test_slerp_takes_the_sign_of_quaternions_for_nothing() -> None:
+def test_slerp_ignores_the_sign_of_quaternions() -> None:
     w, x, y, z = quaternion_from_euler(0, 0, 0.8)
     half = slerp(quaternion_from_euler(0, 0, 0.4), (-w, -x, -y, -z), 0.5)
     assert euler_from_quaternion(half)[2] == pytest.approx(0.6)
 
 
 @pytest.mark.parametrize("roll_deg", [-15.0, 15.0])
-def test_a_wide_thing_in_a_rolled_picture_is_not_ranged_by_the_middle_of_its_edge(roll_deg: float) -> None:
+def test_wide_object_in_a_rolled_image_is_ranged_correctly(roll_deg: float) -> None:
     # A wall 6 m wide and 2 m tall, 10 m ahead and square to the camera.
     attitude, position = quaternion_from_euler(math.radians(roll_deg), 0.0, 0.0), np.array((0.0, 0.0, -3.0))
     corners = [(10.0, east, down) for east in (-3.0, 3.0) for down in (-2.0, 0.0)]
@@ -393,7 +389,7 @@ def test_a_wide_thing_in_a_rolled_picture_is_not_ranged_by_the_middle_of_its_edg
     history, unrolled = history_of(attitude, (0.0, 0.0, -3.0)), history_of(level, (0.0, 0.0, -3.0))
     (target,) = targets_from_detections([detection(box)], T0, CAMERA, MOUNT, history)
     (plain,) = targets_from_detections([detection(box)], T0, CAMERA, MOUNT, unrolled)
-    # The ray through the middle of the edge would say 7.9 m.
+    # The ray through the middle of the edge would give 7.9 m.
     assert target.ground_range_m == pytest.approx(10.0 - CONTACT_INSET_M, abs=1.5)
     assert target.range_sigma_m > plain.range_sigma_m + 0.3
     assert abs(target.ground_range_m - (10.0 - CONTACT_INSET_M)) < 2 * target.range_sigma_m

@@ -15,14 +15,14 @@ FRAME_NS = 100_000_000
 
 
 def seen(
-    place: Sequence[float],
+    position: Sequence[float],
     vehicle: Vector3 = (0.0, 0.0, -5.0),
     frame: int = 0,
     *,
     source: RangeSource = RangeSource.GROUND_PLANE,
     name: str = "car",
 ) -> Target:
-    north, east = place[0] - vehicle[0], place[1] - vehicle[1]
+    north, east = position[0] - vehicle[0], position[1] - vehicle[1]
     known = source is not RangeSource.NONE
     return Target(
         name,
@@ -32,31 +32,29 @@ def seen(
         -0.3,
         math.hypot(north, east) if known else math.nan,
         source,
-        (place[0], place[1], 0.0) if known else None,
+        (position[0], position[1], 0.0) if known else None,
         range_sigma_m=0.5 if known else math.nan,
     )
 
 
-def test_range_sigma_of_the_target_decides_how_much_it_counts() -> None:
+def test_range_sigma_weights_the_measurement() -> None:
     vehicle = (0.0, 0.0, -5.0)
-    places = []
+    positions = []
     for sigma_m in (0.2, 3.0):
         track = ObjectTrack(seen((20.0, 0.0)), vehicle)
         assert track.update([replace(seen((21.0, 0.0), frame=1), range_sigma_m=sigma_m)], vehicle)
-        places.append(track.position_ned_m[0])
-    assert places[0] > 20.7
-    assert places[1] < 20.2
+        positions.append(track.position_ned_m[0])
+    assert positions[0] > 20.7
+    assert positions[1] < 20.2
 
 
-def test_a_track_cannot_begin_without_a_place() -> None:
+def test_track_needs_an_initial_position() -> None:
     with pytest.raises(ValueError, match="no range"):
         ObjectTrack(seen((5.0, 0.0), source=RangeSource.NONE), (0.0, 0.0, -5.0))
 
 
 @given(st.floats(-30, 30), st.floats(-30, 30), st.floats(0, 6.28))
-def test_repeated_measurements_draw_the_place_to_the_truth(
-    north: float, east: float, direction: float
-) -> None:
+def test_repeated_measurements_converge(north: float, east: float, direction: float) -> None:
     truth = (north, east)
     start = (north + math.cos(direction), east + math.sin(direction))
     vehicle = (-40.0, -40.0, -5.0)
@@ -66,32 +64,32 @@ def test_repeated_measurements_draw_the_place_to_the_truth(
     assert math.dist(track.position_ned_m[:2], truth) < 0.3
 
 
-def test_a_frame_already_seen_changes_nothing() -> None:
+def test_processed_frame_changes_nothing() -> None:
     vehicle = (0.0, 0.0, -5.0)
     track = ObjectTrack(seen((20.0, 0.0)), vehicle)
     assert not track.update([seen((20.5, 0.0), frame=0)], vehicle)
     assert track.update([seen((20.5, 0.0), frame=1)], vehicle)
-    place = track.position_ned_m
+    position = track.position_ned_m
     assert not track.update([seen((20.5, 0.0), frame=1)], vehicle)
-    assert track.position_ned_m == place
+    assert track.position_ned_m == position
 
 
 @pytest.mark.parametrize("source", list(RangeSource))
-def test_an_object_in_another_direction_is_another_object(source: RangeSource) -> None:
+def test_object_in_another_direction_is_rejected(source: RangeSource) -> None:
     vehicle = (0.0, 0.0, -5.0)
     track = ObjectTrack(seen((20.0, 0.0)), vehicle)
     assert not track.update([seen((18.0, 9.0), frame=1, source=source)], vehicle)
     assert not track.update([seen((20.0, 0.0), frame=2, name="truck")], vehicle)
 
 
-def test_of_two_candidates_the_nearer_one_is_taken() -> None:
+def test_nearer_of_two_candidates_is_associated() -> None:
     vehicle = (0.0, 0.0, -5.0)
     track = ObjectTrack(seen((20.0, 0.0)), vehicle)
     assert track.update([seen((20.0, 1.5), frame=1), seen((20.2, 0.1), frame=1)], vehicle)
     assert track.position_ned_m[1] == pytest.approx(0.05, abs=0.1)
 
 
-def test_a_bearing_alone_corrects_across_and_leaves_the_range() -> None:
+def test_bearing_alone_corrects_only_across() -> None:
     vehicle = (0.0, 0.0, -5.0)
     track = ObjectTrack(seen((20.0, 0.0), source=RangeSource.DEPTH), vehicle)
     for frame in range(1, 20):
@@ -101,7 +99,7 @@ def test_a_bearing_alone_corrects_across_and_leaves_the_range() -> None:
     assert math.hypot(north, east) == pytest.approx(20.0, abs=0.1)
 
 
-def test_a_long_unseen_object_may_have_wandered() -> None:
+def test_long_unseen_object_may_have_moved() -> None:
     vehicle = (0.0, 0.0, -5.0)
     near = ObjectTrack(seen((10.0, 0.0), source=RangeSource.DEPTH), vehicle)
     late = ObjectTrack(seen((10.0, 0.0), source=RangeSource.DEPTH), vehicle)

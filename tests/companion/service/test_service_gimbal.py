@@ -85,7 +85,7 @@ async def test_what_a_camera_on_a_gimbal_sees_is_steered_by_once_it_is_known_whe
     assert service.status()["gimbal"]["problem"] == "no gimbal answers"
     context = step(service, now_ns)
     assert not context.perception_fresh
-    assert context.gimbal.undirected == "the gimbal that carries it: no gimbal answers"
+    assert context.gimbal.direction_fault == "its gimbal: gimbal manager not responding"
 
     take(service, state_at(now_ns + 1, looking_down(now_ns + 1)))
     see(service, now_ns + 1)
@@ -102,7 +102,7 @@ async def test_what_a_camera_on_a_gimbal_sees_is_steered_by_once_it_is_known_whe
     see(service, later_ns)
     assert not service.views[0].targets
     assert "newer than the newest attitude of the gimbal" in service.status()["targets"]["localization_error"]
-    assert "old" in step(service, later_ns).gimbal.undirected
+    assert "old" in step(service, later_ns).gimbal.direction_fault
 
 
 async def test_a_camera_on_the_body_asks_no_gimbal() -> None:
@@ -111,7 +111,7 @@ async def test_a_camera_on_the_body_asks_no_gimbal() -> None:
     see(service, now_ns)
     assert len(service.views[0].targets) == 1
     assert service.status()["gimbal"] is None
-    assert step(service, now_ns).gimbal.undirected == ""
+    assert step(service, now_ns).gimbal.direction_fault == ""
 
 
 def test_a_search_over_an_area_counts_on_what_the_camera_sees_from_where_the_gimbal_points_it() -> None:
