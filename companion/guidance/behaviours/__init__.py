@@ -1,1 +1,1 @@
-"""One file for each way of flying: its command and its behaviour."""
+"""Behaviours: one file each, with command and behaviour."""

@@ -233,7 +233,7 @@ class FormationBehaviour(Behaviour):
             )
             return _Leader((north, east, down), where.velocity_ned_mps, where.heading_rad, 0.0, where.over)
         try:
-            if not structure.begun:
+            if not structure.started:
                 known = max((where for _, where in published.values()), key=lambda w: w.along_m, default=None)
                 if known is not None:
                     structure.take_over(hood.anchor, known)
@@ -340,7 +340,7 @@ class FormationBehaviour(Behaviour):
             self._heading_rad or 0.0,
             self._turn_rate_radps,
         )
-        if assigning and self._structure is not None and self._structure.begun and hood.anchor is not None:
+        if assigning and self._structure is not None and self._structure.started and hood.anchor is not None:
             _, _, heading = self._structure.motion()
             over = self._over_since_ns is not None
             heading = note.heading_rad if heading is None else heading

@@ -47,12 +47,12 @@ class Goto(Command):
             "forward and right": (self.forward_m, self.right_m),
             "latitude and longitude": (self.latitude_deg, self.longitude_deg),
         }
-        begun = [name for name, pair in pairs.items() if pair != (None, None)]
-        if len(begun) != 1:
-            got = " and ".join(begun) if begun else "none of them"
+        given = [name for name, pair in pairs.items() if pair != (None, None)]
+        if len(given) != 1:
+            got = " and ".join(given) if given else "none of them"
             raise GrammarError(f"goto: give exactly one pair of {', '.join(pairs)}; got {got}")
-        if None in pairs[begun[0]]:
-            raise GrammarError(f"goto: give both {begun[0]}; one is missing")
+        if None in pairs[given[0]]:
+            raise GrammarError(f"goto: give both {given[0]}; one is missing")
 
     def build(self, context: BuildContext) -> Behaviour:
         return GotoBehaviour(

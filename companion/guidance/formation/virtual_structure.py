@@ -43,7 +43,7 @@ class VirtualStructure:
         self.along_m = 0.0
 
     @property
-    def begun(self) -> bool:
+    def started(self) -> bool:
         """Whether it has a path."""
         return self._path is not None
 

@@ -6,8 +6,8 @@ bounds join the fence's in one projection (`Fence.limit_velocity`): a wall limit
 along it. Inside the margin the vehicle backs out, at 0.8 m/s at most.
 
 Unseen sectors are unknown, not free. By default the speed into them is not limited: a forward-looking camera
-covers a fifth of the circle, and a vehicle unable to fly sideways or along a bend could not be moved out of
-the way. `guidance.max_speed_unobserved_mps` sets a limit for vehicles that fly where they look.
+covers a fifth of the circle, and a vehicle unable to fly sideways or along a bend could not be flown out of
+danger. `guidance.max_speed_unobserved_mps` sets a limit for vehicles that fly where they look.
 """
 
 from __future__ import annotations

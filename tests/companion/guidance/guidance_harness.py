@@ -273,6 +273,13 @@ class GuidanceHarness:
         return pending.result()
 
 
+def assert_failed(outcome: BehaviourOutput | None, *words: str) -> None:
+    """Assert a failure whose reason contains all words."""
+    assert isinstance(outcome, Outcome)
+    assert not outcome.success
+    assert [word for word in words if word not in outcome.reason] == [], outcome.reason
+
+
 def flying(mode: FlightMode = FlightMode.HOLD) -> KinematicVehicle:
     """In the air."""
     return KinematicVehicle(mode=mode)

@@ -124,5 +124,5 @@ def test_invalid_estimate_brakes_and_then_ends_command() -> None:
     assert setpoint is not None
     assert setpoint.velocity_ned_mps == (0.0, 0.0, 0.0)
     reason = harness.outcome(pending).reason
-    assert reason.startswith("position or attitude lost")
+    assert "attitude lost" in reason
     assert "estimator" in reason

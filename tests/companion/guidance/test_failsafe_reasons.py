@@ -6,14 +6,13 @@ from dataclasses import replace
 import pytest
 
 from companion.bench.lockstep_flight import LockstepFlight, plain_settings
-from companion.guidance.behaviour import Outcome
 from companion.guidance.behaviours.orbit import OrbitBehaviour
 from companion.guidance.core import REASON_WAIT_S
 from companion.guidance.interface import GuidanceInput
 from companion.vehicle.report import Report
 from companion.vehicle.state import FlightMode
 from mavlink_sim.px4.modes import Mode
-from tests.companion.guidance.guidance_harness import GuidanceHarness, engaged, flying
+from tests.companion.guidance.guidance_harness import GuidanceHarness, assert_failed, engaged, flying
 
 
 @pytest.mark.parametrize(
@@ -39,7 +38,7 @@ def test_px4_failsafe_is_not_reported_as_pilot(
     if fault is not None:
         flight.vehicle.vehicle.faults.begin(fault)
     assert flight.run_until(lambda: flight.outcome(identifier), 30.0)
-    assert flight.outcome(identifier) == Outcome(False, f"autopilot failsafe: {mode} mode")
+    assert_failed(flight.outcome(identifier), "autopilot failsafe", f"{mode} mode")
 
 
 def test_other_mode_change_is_reported_as_pilot() -> None:
@@ -48,19 +47,19 @@ def test_other_mode_change_is_reported_as_pilot() -> None:
     flight.run(3.0)
     flight.vehicle.vehicle.autopilot.set_mode(Mode.HOLD)
     flight.run(2.0)
-    assert flight.outcome(identifier) == Outcome(False, "the pilot took over: hold mode")
+    assert_failed(flight.outcome(identifier), "pilot", "hold mode")
 
 
 @pytest.mark.parametrize(
-    ("intended", "reason"),
+    ("intended", "who"),
     [
-        (FlightMode.OFFBOARD, "autopilot failsafe: return mode"),
-        (FlightMode.RETURN, "the pilot took over: return mode"),
+        (FlightMode.OFFBOARD, "autopilot failsafe"),
+        (FlightMode.RETURN, "pilot took over"),
     ],
 )
 @pytest.mark.parametrize("late_s", [0.0, 0.1, 2.0])
 def test_heartbeat_first_stops_stream_and_waits_for_reason(
-    intended: FlightMode, reason: str, late_s: float
+    intended: FlightMode, who: str, late_s: float
 ) -> None:
     changed_ns: list[int] = []
 
@@ -85,8 +84,8 @@ def test_heartbeat_first_stops_stream_and_waits_for_reason(
     sent = len(harness.autopilot.setpoints)
     harness.run(max(late_s, 0.02))
     if late_s > REASON_WAIT_S:  # never reported: not requested by us
-        reason = "the pilot took over: return mode"
-    assert future.result() == Outcome(False, reason)
+        who = "pilot took over"
+    assert_failed(future.result(), who, "return mode")
     assert len(harness.autopilot.setpoints) == sent
     harness.autopilot.change_mode(FlightMode.OFFBOARD)
     harness.run(2.0)
@@ -127,7 +126,7 @@ def test_lasting_hold_is_confirmed_one_before_rtl_is_not(name: str, text: str, a
     harness.autopilot.requests.clear()
     harness.autopilot.change_mode(FlightMode.HOLD)
     harness.run(0.1)
-    assert future.result() == Outcome(False, f"autopilot failsafe: hold mode ({text})")
+    assert_failed(future.result(), "autopilot failsafe", "hold mode", text)
     harness.run(3.0)
     assert harness.autopilot.requests == asks
     assert not harness.guidance.in_command

@@ -143,7 +143,7 @@ async def test_vehicles_share_poses_and_fly_in_formation() -> None:
             assert flight.result()["success"], flight.result()
             await until(lambda: max(map(error_m, followers)) < 1.0)
             assert min(least_m) > 3.0
-            # The poses of a vehicle whose service ends stop, and its followers hold.
+            # When a service ends, its poses stop and its followers hold.
             await leader.bus.close()
             await until(lambda: all("no pose" in m.guidance.status for m in followers))
             assert all(json.dumps(m.poses.status(time.monotonic_ns())) for m in fleet)

@@ -158,7 +158,7 @@ def test_failed_release_is_logged() -> None:
     harness.refuse[ReleaseGimbal] = "release failed"
     harness.run(DOWN)
     harness.run(None)
-    assert harness.messages == ["gimbal: release of control refused: release failed"]
+    assert ["release failed" in message for message in harness.messages] == [True]
 
 
 def test_waiting_point_command_is_answered_at_the_end() -> None:

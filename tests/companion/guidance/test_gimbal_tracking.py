@@ -169,10 +169,7 @@ def test_losing_gimbal_control_ends_the_behaviour(word: str) -> None:
 
     flight, log = fly(command(f"{word} person distance=2 gimbal=track"), person(0.0, 12.0), at_three)
     # Depends on what comes first: the manager's status, or its answer to the next aim.
-    assert reason(log, False) in (
-        f"{word} lost the gimbal: 245/190 has taken control of it",
-        f"{word} lost the gimbal: the vehicle refused to point the gimbal ({result_name(2)})",
-    )
+    assert any(part in reason(log, False) for part in ("245/190 has taken", result_name(2)))
     flight.run(3.0)
     assert primary(flight) == STATION
 
@@ -258,9 +255,9 @@ def test_tracking_is_refused_without_a_camera_on_a_gimbal(word: str) -> None:
     assert check_requirements(command(f"{word} person"), now, ("person",)) is None
     refused = check_requirements(command(f"{word} person gimbal=track"), now, ("person",))
     assert "camera.on_gimbal" in (refused or "")
-    nobody = replace(now, state=replace(now.state, gimbal=None), gimbal=GimbalStatus(carries_camera=True))
-    refused = check_requirements(command(f"{word} person gimbal=track"), nobody, ("person",))
-    assert "gimbal manager not responding" in (refused or "")
+    no_gimbal = replace(now, state=replace(now.state, gimbal=None), gimbal=GimbalStatus(carries_camera=True))
+    refused = check_requirements(command(f"{word} person gimbal=track"), no_gimbal, ("person",))
+    assert "not responding" in (refused or "")
 
 
 def target(elevation_rad: float, range_m: float) -> Target:

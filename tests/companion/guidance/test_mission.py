@@ -202,9 +202,9 @@ def test_cli_checks_a_mission_and_prints_its_plan(exported_model: Path, tmp_path
     done = companion("mission", "bad.toml", *options, cwd=tmp_path)
     assert done.returncode == 2
     assert done.stdout == ""
-    assert done.stderr == (
-        "companion: bad.toml: step 1 (look): unknown class 'zebra'; known: person, car, boat\n"
-    )
+    assert done.stderr.startswith("companion: bad.toml: step 1 (look)")
+    assert "'zebra'" in done.stderr
+    assert done.stderr.count("\n") == 1
     done = companion("mission", "demo", *options[:3], cwd=tmp_path)
     assert done.returncode == 2
     assert ".onnx" in done.stderr
@@ -255,7 +255,7 @@ def test_service_flies_a_mission_and_logs_its_steps(seeing: list[str], tmp_path:
         reply = service.command("mission broken\n[[step]]\ndo = 'seek zebra'\n")
         assert reply["reason"].startswith("broken: step 1")
         reply = service.command("hold\n[[step]]\ndo = 'land'\n")
-        assert reply["reason"] == "hold: one command at a time; only a mission may have more lines"
+        assert reply["reason"].startswith("hold: one command")
         # From the ground its first step is refused, and with it the mission.
         reply = service.command("mission from_the_ground\n[[step]]\ndo = 'hold 3'\n")
         assert "in the air" in reply["reason"]

@@ -157,10 +157,10 @@ def test_often_ambiguous_object_is_not_selected() -> None:
     vehicle = (0.0, 0.0, -4.0)
 
     def chosen(doubts: str) -> Target | None:
-        choice, found = TargetSelector(), None
+        selector, found = TargetSelector(), None
         for frame, doubt in enumerate(doubts):
             target = replace(seen((20.0, 0.0), vehicle, frame * FRAME_S, 3), trusted=doubt != "?")
-            found = choice.update([target], 0.0, round(frame * FRAME_S * 1e9))
+            found = selector.update([target], 0.0, round(frame * FRAME_S * 1e9))
         return found
 
     assert chosen("?????.?????????") is None
@@ -178,13 +178,13 @@ def test_nearest_object_ahead_is_selected() -> None:
     vehicle = (0.0, 0.0, -4.0)
 
     def chosen(*positions: tuple[float, float]) -> tuple[float, float]:
-        choice = TargetSelector()
+        selector = TargetSelector()
         found = None
         for frame in range(round(CHOOSING_S / FRAME_S) + 2):
             targets = [
                 seen(position, vehicle, frame * FRAME_S, index) for index, position in enumerate(positions)
             ]
-            found = choice.update(targets, 0.0, round(frame * FRAME_S * 1e9))
+            found = selector.update(targets, 0.0, round(frame * FRAME_S * 1e9))
         assert found is not None
         assert found.position_ned_m is not None
         return found.position_ned_m[:2]

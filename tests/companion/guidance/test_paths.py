@@ -252,7 +252,7 @@ def test_north_east_agrees_with_the_ellipsoid(
     ("text", "words"),
     [
         ("goto", "exactly one pair"),
-        ("goto 3", "belong together"),
+        ("goto 3", "one is missing"),
         ("goto 3 4 forward=1 right=2", "forward and right"),
         ("goto 3 99999", "-5000 to 5000"),
         ("follow-path", "points is missing"),

@@ -34,6 +34,7 @@ def test_seek_gives_up_after_its_laps() -> None:
     outcome = Flight(SeekBehaviour("car"), vehicle, [SeenObject("person", 5.0, 5.0)]).run(90.0, each)
     assert outcome is not None
     assert not outcome.success
+    assert "2 laps" in outcome.reason
     assert turned[0] / math.tau == pytest.approx(2.0, abs=0.02)
 
 

@@ -12,7 +12,7 @@ from companion.guidance.missions.sequence import Plan, PlannedStep, SequenceBeha
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState
-from tests.companion.guidance.guidance_harness import GuidanceHarness, Pending
+from tests.companion.guidance.guidance_harness import GuidanceHarness, Pending, assert_failed
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle
 
 
@@ -96,7 +96,7 @@ def test_failed_step_ends_the_mission_in_hold() -> None:
         harness, {"do": "hold 1"}, {"do": "hold 60", "name": "long", "timeout_s": 2}, {"do": "land"}
     )
     outcome = harness.outcome(begun(harness, behaviour))
-    assert outcome == Outcome(False, "step 2 of 3 (long): timed out after 2 s: holding")
+    assert_failed(outcome, "step 2 of 3 (long)", "timed out")
     assert harness.guidance.phase == "offboard"
     assert isinstance(harness.guidance.behaviour, HoldBehaviour)
     assert "land" not in harness.autopilot.requests
@@ -139,9 +139,7 @@ def test_refused_step_fails_with_its_requirement() -> None:
         harness, {"do": "takeoff 3"}, {"do": "land"}, {"do": "hold 5", "name": "too late"}, {"do": "land"}
     )
     outcome = harness.outcome(begun(harness, behaviour))
-    assert outcome.reason == (
-        "step 3 of 4 (too late): refused: hold needs to be in the air (disarmed, on ground)"
-    )
+    assert_failed(outcome, "step 3 of 4 (too late)", "in the air")
 
 
 def test_first_step_requirement_refuses_the_mission() -> None:
@@ -195,10 +193,10 @@ def test_refused_offboard_fails_the_step_and_stops_stream() -> None:
 def test_refused_arming_ends_the_mission_on_the_ground() -> None:
     harness = GuidanceHarness(parked())
 
-    harness.autopilot.refuse_arming = "arming refused: no GPS"
+    harness.autopilot.refuse_arming = "no GPS"
     outcome = harness.outcome(begun(harness, mission(harness, {"do": "takeoff 3"})))
     assert not outcome.success
-    assert outcome.reason.endswith("arming refused: no GPS")
+    assert outcome.reason.endswith("no GPS")
     assert harness.guidance.phase == "idle"
     assert not harness.autopilot.setpoints
 
@@ -306,7 +304,7 @@ def test_exception_fails_the_step_and_the_plan_goes_on() -> None:
     behaviour = SequenceBehaviour(plan, harness.guidance.check_requirements)
     outcome = harness.outcome(begun(harness, behaviour))
     assert outcome.success
-    assert behaviour.records[0].reason == "broken failed: ZeroDivisionError: test"
+    assert "ZeroDivisionError" in behaviour.records[0].reason
     assert broken.left
 
 

@@ -156,7 +156,7 @@ def test_changed_yaw_frame_is_not_interpolated() -> None:
 
 
 def test_gimbal_mount_needs_the_gimbal_attitude() -> None:
-    with pytest.raises(ValueError, match="needs the gimbal's attitude"):
+    with pytest.raises(ValueError, match="attitude"):
         MOUNT.ned_from_optical(np.eye(3))
     with pytest.raises(ValueError, match="body_from_optical"):
         _ = MOUNT.body_from_optical

@@ -81,8 +81,8 @@ async def test_what_a_camera_on_a_gimbal_sees_is_steered_by_once_it_is_known_whe
     take(service, state_at(now_ns, None))
     see(service, now_ns)
     assert not service.views[0].targets
-    assert service.status()["targets"]["localization_error"] == "no attitude of the gimbal is known yet"
-    assert service.status()["gimbal"]["problem"] == "no gimbal answers"
+    assert service.status()["targets"]["localization_error"] == "no attitude of the gimbal received yet"
+    assert service.status()["gimbal"]["problem"] == "gimbal manager not responding"
     context = step(service, now_ns)
     assert not context.perception_fresh
     assert context.gimbal.direction_fault == "its gimbal: gimbal manager not responding"
@@ -129,7 +129,8 @@ async def test_a_gimbal_command_without_a_gimbal_is_refused() -> None:
     service.ready = True
     steering = asyncio.create_task(service._loop.run())
     reply = await service.command("gimbal pitch=-30")
-    assert (reply["success"], reply["reason"]) == (False, "gimbal needs a gimbal (none answers)")
+    assert not reply["success"]
+    assert "gimbal manager not responding" in reply["reason"]
     assert service.guidance.behaviour is None
     steering.cancel()
     await asyncio.gather(steering, return_exceptions=True)
@@ -150,11 +151,11 @@ async def test_a_gimbal_that_carries_a_camera_is_looked_for_and_its_loss_is_told
     later_ns = now_ns + 1_000_000_000
     take(service, state_at(later_ns, looking_down(later_ns)))
     service._loop._step(later_ns)
-    assert service.events[-1].text == "the camera's gimbal tells where it looks"
+    assert "direction known" in service.events[-1].text
     lost_ns = later_ns + 10_000_000_000
     take(service, state_at(lost_ns, looking_down(later_ns)))
     service._loop._step(lost_ns)
-    assert service.events[-1].text == "where the camera looks is not known: its attitude is 10.0 s old"
+    assert "direction unknown" in service.events[-1].text
 
 
 def test_a_silent_gimbal_and_one_that_tells_exclude_each_other() -> None:

@@ -98,7 +98,7 @@ async def test_a_fault_on_one_side_does_not_silence_the_other(
     with monkeypatch.context() as broken:
         broken.setattr("companion.service.publisher.labels_message", lambda *_: dict[str, str]()["nothing"])
         view._on_report(result(2))
-        assert view.localization_error == "no attitude of the vehicle is known yet"
+        assert view.localization_error == "no attitude of the vehicle received yet"
         await until(lambda: view.localization_error == "KeyError: 'nothing'")
     assert [record.getMessage() for record in caplog.records if record.exc_info] == [
         "a detection message could not be used",
