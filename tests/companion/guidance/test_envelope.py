@@ -308,7 +308,7 @@ def test_last_home_is_kept_and_fence_needs_a_home() -> None:
     envelope = Envelope(limits)
     sent, why = envelope.apply(out, homeless, 1, 0.02)
     assert sent.velocity_ned_mps == (0.0, 0.0, 0.0)
-    assert "home unknown" in why[0]
+    assert "home position" in why[0]
     first, _ = envelope.apply(out, at_home, 1, 0.02)
     envelope.reset()
     again, _ = envelope.apply(out, homeless, 1, 0.02)

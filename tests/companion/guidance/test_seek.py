@@ -86,7 +86,7 @@ def test_silent_detector_stops_then_ends_the_turn() -> None:
     outcome = flight.run(60.0, each)
     assert outcome is not None
     assert not outcome.success
-    assert "detector" in outcome.reason
+    assert "no detections" in outcome.reason
     assert abs(flight.vehicle.yaw_rate_radps) < 0.01
 
 

@@ -340,7 +340,7 @@ def test_times_outside_the_history_are_refused() -> None:
         history.at(T0 - 300_000_000)
     with pytest.raises(HistoryError, match=r"0\.32 s newer"):
         history.at(T0 + 500_000_000)
-    with pytest.raises(HistoryError, match="known yet"):
+    with pytest.raises(HistoryError, match="received yet"):
         StateHistory().at(T0)
 
 
