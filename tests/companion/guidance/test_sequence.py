@@ -311,21 +311,19 @@ def test_exception_fails_the_step_and_the_plan_goes_on() -> None:
 TARGET = LandingTarget(7, 1, (1.0, 2.0, 0.0), (0.1, 0.2, 4.0), 0.2)
 
 
-class Telling(HoldBehaviour):
+class Noting(HoldBehaviour):
     landing_target = TARGET
 
 
 def test_mission_forwards_notes_and_requirements() -> None:
-    harness, telling = GuidanceHarness(flying()), Telling(1.0)
-    plan = Plan(
-        "test", (PlannedStep("tell", "hold", lambda: telling),), way_down=lambda word: HoldBehaviour()
-    )
+    harness, noting = GuidanceHarness(flying()), Noting(1.0)
+    plan = Plan("test", (PlannedStep("note", "hold", lambda: noting),), way_down=lambda word: HoldBehaviour())
     behaviour = SequenceBehaviour(plan, harness.guidance.check_requirements)
     assert behaviour.landing_target is None
     future = begun(harness, behaviour)
     harness.until(lambda: harness.guidance.phase == "offboard")
     assert behaviour.landing_target == TARGET
     assert [output.landing_target for output in harness.outputs if output.landing_target] == [TARGET], "once"
-    assert behaviour.active is telling
-    assert behaviour.requirements == telling.requirements
+    assert behaviour.active is noting
+    assert behaviour.requirements == noting.requirements
     harness.outcome(future)
