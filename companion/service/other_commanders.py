@@ -36,7 +36,7 @@ class _Other:
 
     via: str
     identity: str
-    heard_ns: int
+    received_ns: int
     started_ns: int
     in_command: bool
 
@@ -85,17 +85,19 @@ class OtherCommanders:
 
     def present(self, state: VehicleState, now_ns: int) -> list[_Other]:
         """Those of which there was news within `GONE_AFTER_S`."""
-        self._by_status = {key: one for key, one in self._by_status.items() if _is_new(one.heard_ns, now_ns)}
+        self._by_status = {
+            key: one for key, one in self._by_status.items() if _is_new(one.received_ns, now_ns)
+        }
         by_heartbeat = [
             _Other(
                 "mavlink",
                 f"{one.address[0]}/{one.address[1]}",
-                one.heard_ns,
-                one.heard_ns - round(one.uptime_s * 1e9),
+                one.received_ns,
+                one.received_ns - round(one.uptime_s * 1e9),
                 one.in_command,
             )
             for one in state.other_commanders
-            if _is_new(one.heard_ns, now_ns)
+            if _is_new(one.received_ns, now_ns)
         ]
         return [*by_heartbeat, *self._by_status.values()]
 
@@ -138,5 +140,5 @@ class OtherCommanders:
         ]
 
 
-def _is_new(heard_ns: int, now_ns: int) -> bool:
-    return now_ns - heard_ns <= GONE_AFTER_S * 1e9
+def _is_new(received_ns: int, now_ns: int) -> bool:
+    return now_ns - received_ns <= GONE_AFTER_S * 1e9

@@ -41,8 +41,8 @@ class Here(OtherCommanders):
 
 def beside(uptime_s: float, *, in_command: bool = False, age_s: float = 0.5) -> VehicleState:
     """Of a vehicle that another service commands."""
-    heard_ns = NOW_NS - round(age_s * S)
-    return VehicleState(other_commanders=(Commander((1, 192), heard_ns, uptime_s, in_command),))
+    received_ns = NOW_NS - round(age_s * S)
+    return VehicleState(other_commanders=(Commander((1, 192), received_ns, uptime_s, in_command),))
 
 
 def status(**changes: Any) -> bytes:
