@@ -110,7 +110,7 @@ class GimbalState:
         if self.attitude is None:
             return "attitude not received"
         if not self.attitude_fresh(now_ns):
-            return f"attitude stale ({(now_ns - self.attitude_ns) / 1e9:.1f} s)"
+            return f"attitude {(now_ns - self.attitude_ns) / 1e9:.1f} s old"
         return None
 
     def nearest_pitch_rad(self, pitch_rad: float) -> float:

@@ -56,7 +56,7 @@ NOW_NS = KinematicVehicle().now_ns
         pytest.param(
             gimbal(NOW_NS - 2_000_000_000),
             CARRIED,
-            "a gimbal that tells where it looks (its attitude is 2.0 s old)",
+            "a gimbal that tells where it looks (attitude 2.0 s old)",
             id="silent",
         ),
         pytest.param(
@@ -180,7 +180,7 @@ def test_a_gimbal_that_falls_silent_ends_the_seek_and_the_reason_is_told() -> No
     ("left", "words"),
     [
         (None, "none answers"),
-        (GimbalState(1, NOW_NS, NOW_NS, NOW_NS), "it has not told its attitude"),
+        (GimbalState(1, NOW_NS, NOW_NS, NOW_NS), "attitude not received"),
         (GimbalState(1, NOW_NS, NOW_NS, NOW_NS, attitude_problem="it says two things"), "it says two things"),
     ],
 )
