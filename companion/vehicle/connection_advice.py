@@ -27,7 +27,7 @@ def no_autopilot_text(
         others: other senders: system id, component id, further fields.
         signer: checks signatures, if any. skipped_bytes: received bytes that are not MAVLink.
     """
-    which = "autopilot" if wanted_system_id is None else f"autopilot of system {wanted_system_id}"
+    origin = "" if wanted_system_id is None else f" from system {wanted_system_id}"
     senders = ", ".join(f"{sender[0]}/{sender[1]}" for sender in sorted(others))
     if senders:
         advice = f"received only system/component {senders}; check the system id and what is connected"
@@ -40,7 +40,7 @@ def no_autopilot_text(
         advice = "nothing received; check that the vehicle is on and sends to this address and port"
     else:
         advice = "nothing received; check that the vehicle is on, and the address or device"
-    return f"no {which} heartbeat on {url} within {timeout_s:g} s: {advice}"
+    return f"no autopilot heartbeat{origin} on {url} within {timeout_s:g} s: {advice}"
 
 
 def no_answer_advice(*, signs: bool, has_key: bool, only_heartbeats: bool) -> str:
