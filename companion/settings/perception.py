@@ -309,7 +309,7 @@ class RecordingSection(Section):
     video: str | None = None
     """file of the annotated video, .webm; unset: none"""
     rate_hz: Annotated[float, Field(ge=0.1, le=240)] = 15.0
-    """frame rate, Hz; one of 640x480 costs some 20 ms of a core with the extra `film`, up to 150 without"""
+    """frame rate, Hz; one of 640x480 costs some 20 ms of a core with the extra `video`, up to 150 without"""
 
     @model_validator(mode="after")
     def _is_webm(self) -> Self:
