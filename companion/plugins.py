@@ -1,6 +1,6 @@
-"""Loading what users add: modules that register commands, detectors and sources when they are imported.
+"""Loads plug-ins: modules that register commands, detectors and sources when they are imported.
 
-The service imports them, and so does every perception worker, where sources and detectors are opened.
+The service imports them, and so does every perception worker, which opens sources and detectors.
 """
 
 from __future__ import annotations
@@ -13,18 +13,18 @@ from importlib.metadata import entry_points
 logger = logging.getLogger(__name__)
 
 ENTRY_POINTS = "companion.plugins"
-"""The group of entry points in which an installed package may give its module a short name."""
+"""The entry point group in which an installed package can give its module a short name."""
 
 
 class PluginError(RuntimeError):
-    """A plug-in cannot be loaded. The message is one line for a person."""
+    """A plug-in cannot be loaded. The message is one line."""
 
 
 def load_plugins(names: Iterable[str]) -> None:
-    """Import the modules that a user named: each the name of an entry point in ENTRY_POINTS, or of a module.
+    """Import modules, each by its name or by the name of an entry point in ENTRY_POINTS.
 
     Raises:
-        PluginError: there is no such module, or it cannot be imported; the traceback is in the log.
+        PluginError: no such module, or it cannot be imported; the traceback is in the log.
     """
     installed = {point.name: point.value for point in entry_points(group=ENTRY_POINTS)}
     for name in names:

@@ -1,7 +1,7 @@
-"""One autopilot on a UDP port, shared by several programs of this computer: its service and its camera.
+"""Shares one autopilot on a UDP port among several programs of this computer: its service and its camera.
 
-Each program listens on a port of its own. What the autopilot sends goes to all of them, what they send goes
-to the autopilot. Nothing is queued: what cannot be sent at once is dropped (`companion.vehicle.byte_link`).
+Each program listens on its own port. The autopilot's messages go to all of them, theirs go to the autopilot.
+Nothing is queued: what cannot be sent at once is dropped (`companion.vehicle.byte_link`).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ logger = logging.getLogger(__name__)
 
 _HEARTBEAT = struct.Struct("<IBBBBB")  # custom_mode, type, autopilot, base_mode, system_status, version
 _FIRST_HEARTBEAT_S = 10.0
-# Heartbeats come once a second: a second autopilot on the port is heard in this time.
+# Heartbeats are sent once a second: a second autopilot on the port is received in this time.
 _LISTEN_S = 1.5
 _MULTIROTORS = frozenset(
     {
@@ -42,7 +42,7 @@ _MULTIROTORS = frozenset(
 
 
 class AutopilotHeartbeat(NamedTuple):
-    """What an autopilot's HEARTBEAT says: MAV_TYPE and MAV_MODE_FLAG, with its system id."""
+    """Fields of an autopilot's HEARTBEAT: system id, MAV_TYPE and MAV_MODE_FLAG."""
 
     system_id: int
     vehicle_type: int
@@ -53,9 +53,9 @@ class Relay:
     """An open relay.
 
     Attributes:
-        url: where the autopilot sends to.
-        heartbeat: the newest of the autopilot until it is checked; None before the first.
-        others: addresses of further autopilots, whose messages are dropped.
+        url: the address the autopilot sends to.
+        heartbeat: the newest heartbeat before the check; None before the first.
+        others: addresses of further autopilots; their messages are dropped.
     """
 
     def __init__(self, url: LinkUrl) -> None:
@@ -71,14 +71,14 @@ class Relay:
 
     @classmethod
     async def open(cls, url: str, ports: Sequence[int]) -> Relay:
-        """A relay between the autopilot that sends to `url` and programs that listen on loopback `ports`.
+        """Open a relay between the autopilot that sends to `url` and programs on loopback `ports`.
 
         Raises:
-            LinkError: the url is not `udpin://HOST:PORT`, or the port is not to be had.
+            LinkError: the url is not `udpin://HOST:PORT`, or the port is not available.
         """
         parsed = parse_link_url(url)
         if parsed.scheme is not LinkScheme.UDP_IN:
-            raise LinkError(f"{url}: expected udpin://HOST:PORT, a UDP port that the autopilot sends to")
+            raise LinkError(f"{url}: expected udpin://HOST:PORT, the UDP port the autopilot sends to")
         relay = cls(parsed)
         try:
             relay._vehicle = await open_link(parsed, relay._from_vehicle)
@@ -100,7 +100,7 @@ class Relay:
         """Wait for the autopilot and check that it is one multirotor, disarmed.
 
         Raises:
-            ValueError: one line that says what was found.
+            ValueError: no autopilot, several, not a multirotor, or armed; one line.
         """
         try:
             async with asyncio.timeout(_FIRST_HEARTBEAT_S):
@@ -108,7 +108,7 @@ class Relay:
         except TimeoutError:
             raise ValueError(
                 f"{self.url}: no autopilot heartbeat within {_FIRST_HEARTBEAT_S:g} s; "
-                "is it running, and does it send to this port?"
+                "check that it is running and sends to this port"
             ) from None
         await asyncio.sleep(_LISTEN_S)
         assert self.heartbeat is not None
@@ -126,7 +126,7 @@ class Relay:
         return self.heartbeat
 
     def _from_vehicle(self, data: bytes, source: Source) -> None:
-        # Reading the messages of the chosen one would take the service's time.
+        # The checked autopilot's messages are not parsed, which would delay them.
         known = source == self._source and self._checked
         heartbeat = None if known else _heartbeat_in(data)
         if heartbeat is not None and source != self._source:
@@ -141,23 +141,23 @@ class Relay:
             program.send(data)
 
     def _on_new_sender(self, source: Source, heartbeat: AutopilotHeartbeat) -> None:
-        """Answer the first autopilot, or the same one when it has restarted and sends from another port.
+        """Select the first autopilot, or the same one after a restart on another port.
 
-        Another autopilot never takes its place: it was not checked, and setpoints are not meant for it.
+        Another autopilot never replaces it: it was not checked, and setpoints are not meant for it.
         """
         silent_s = time.monotonic() - self._received_s
         same = self.heartbeat is None or heartbeat.system_id == self.heartbeat.system_id
         restarted = same and source not in self.others and silent_s > HEARTBEAT_MAX_AGE_S
         if self._source is None or restarted:
             if self._source is not None:
-                logger.warning("%s: the autopilot sends from %s:%s now", self.url, *source[:2])
+                logger.warning("%s: the autopilot now sends from %s:%s", self.url, *source[:2])
             self._source = source
             assert self._vehicle is not None
             self._vehicle.answer_to(source)
         elif source not in self.others:
             self.others.add(source)
             logger.warning(
-                "%s: a second autopilot sends from %s:%s; its messages are dropped", self.url, *source[:2]
+                "%s: a second autopilot sends from %s:%s: its messages are dropped", self.url, *source[:2]
             )
 
     def _from_program(self, data: bytes, _source: Source) -> None:
@@ -166,7 +166,7 @@ class Relay:
 
 
 def _heartbeat_in(data: bytes) -> AutopilotHeartbeat | None:
-    """An autopilot's heartbeat in a datagram; None: there is none."""
+    """Return an autopilot's heartbeat in a datagram; None if there is none."""
     for frame in frames_of(data):
         if (
             frame.message_id == mavlink.MAVLINK_MSG_ID_HEARTBEAT

@@ -315,7 +315,7 @@ class LockstepFlight:
             result = finish()
             if result is None:
                 continue
-            view.take(result)
+            view.update(result)
             markers = self.inputs.on_result(view, result, now_ns)
             seen = seen or view is self.inputs.steering or markers is not None
         return seen

@@ -1,1 +1,1 @@
-"""What is told to the world, and what the world may ask: zenoh."""
+"""Published topics and received commands: zenoh."""

@@ -1,4 +1,4 @@
-"""The other side of the bus, for the command line and for tests: send a command, listen to topics."""
+"""A client of the bus, for the command line and tests: sends commands, subscribes to topics."""
 
 from __future__ import annotations
 
@@ -17,21 +17,22 @@ from companion.bus.topics import ROOT, TOPICS, alive_key, command_key
 from companion.settings import ZenohSection
 
 _DISCOVERY_S = 2.0
-# After the service has gone an answer of its may still be on its way.
+# After the service has gone its last answer may still arrive.
 _LAST_ANSWER_S = 0.3
 
 
 class NoAnswerError(TimeoutError):
-    """No service answered. The message is one line for a person."""
+    """No service answered. The message is one line."""
 
 
 def client_settings(settings: ZenohSection, connect: tuple[str, ...] = ()) -> ZenohSection:
-    """How to reach the service that has these settings: as a client of its router, or of itself.
+    """Return the client settings to reach the service with these settings: by its router, or directly.
 
-    A client, as two peers of one router do not see each other (zenoh routes between peers only if told to).
+    A client, since two peers of one router do not see each other (by default zenoh does not route between
+    peers).
 
     Raises:
-        NoAnswerError: there is no endpoint, or what is given is none.
+        NoAnswerError: there is no valid endpoint.
     """
     endpoints = connect or settings.connect or settings.listen
     try:
@@ -44,16 +45,16 @@ def client_settings(settings: ZenohSection, connect: tuple[str, ...] = ()) -> Ze
     except ValidationError as error:
         where = ", ".join(endpoints) or "no address"
         raise NoAnswerError(
-            f"cannot look for the service at {where}: give --connect an endpoint such as tcp/127.0.0.1:7447"
+            f"no valid endpoint ({where}): set --connect to an endpoint such as tcp/127.0.0.1:7447"
         ) from error
 
 
 @contextmanager
 def open_client(settings: ZenohSection, *, timeout_s: float = 2.0) -> Iterator[zenoh.Session]:
-    """A session connected to somebody.
+    """Open a session that is connected to at least one node.
 
     Raises:
-        NoAnswerError: nobody was there within `timeout_s`.
+        NoAnswerError: no node within `timeout_s`.
     """
     session = _open(settings, time.monotonic() + timeout_s)
     try:
@@ -70,8 +71,8 @@ def _open(settings: ZenohSection, deadline: float) -> zenoh.Session:
             if time.monotonic() > deadline:
                 where = ", ".join(settings.connect) or "the local network"
                 raise NoAnswerError(
-                    f"no zenoh node answers at {where}: is `companion run` running? "
-                    "(--connect names another place)"
+                    f"no zenoh node at {where}: is `companion run` running? "
+                    "(--connect selects another endpoint)"
                 ) from error
         time.sleep(0.1)
 
@@ -79,85 +80,85 @@ def _open(settings: ZenohSection, deadline: float) -> zenoh.Session:
 def send_command(
     session: zenoh.Session, vehicle: str, text: str, *, timeout_s: float = 120.0
 ) -> dict[str, Any]:
-    """Send one command and wait for its outcome: {"success": bool, "reason": str, ...}.
+    """Send one command and wait for its result: {"success": bool, "reason": str, ...}.
 
     Raises:
-        NoAnswerError: no service for this vehicle, it has gone meanwhile, or it did not end in `timeout_s`.
+        NoAnswerError: no service for this vehicle, it has gone meanwhile, or no answer within `timeout_s`.
     """
-    heard: queue.SimpleQueue[zenoh.Sample | zenoh.Reply | None] = queue.SimpleQueue()
-    # The service's own token tells that it is there (just after connecting it may still be on its way), and
-    # that it has gone: a query to a service that was killed is pending until its time is over.
-    watching = session.liveliness().declare_subscriber(alive_key(vehicle), heard.put, history=True)
+    received: queue.SimpleQueue[zenoh.Sample | zenoh.Reply | None] = queue.SimpleQueue()
+    # The service's liveliness token shows whether it is there (it may arrive shortly after connecting), and
+    # when it has gone: a query to a killed service stays pending until its timeout.
+    watching = session.liveliness().declare_subscriber(alive_key(vehicle), received.put, history=True)
     try:
         try:
-            while not _is(heard.get(timeout=_DISCOVERY_S), zenoh.SampleKind.PUT):
+            while not _is(received.get(timeout=_DISCOVERY_S), zenoh.SampleKind.PUT):
                 pass
         except queue.Empty:
             raise NoAnswerError(
-                f"no service for vehicle {vehicle!r} here: is that its vehicle.name? "
-                "`companion echo status` shows who is there"
+                f"no service for vehicle {vehicle!r}: check vehicle.name; "
+                "`companion echo status` lists the services"
             ) from None
-        # Sent once: a command that was heard and not answered may be flying.
-        over_s = time.monotonic() + timeout_s
-        replies = zenoh.handlers.Callback(heard.put, lambda: heard.put(None))
+        # Sent once: a command without an answer may be in progress.
+        deadline_s = time.monotonic() + timeout_s
+        replies = zenoh.handlers.Callback(received.put, lambda: received.put(None))
         session.get(command_key(vehicle), replies, payload=text, timeout=timeout_s)
-        return _answer(heard, vehicle, text, timeout_s, over_s)
+        return _answer(received, vehicle, text, timeout_s, deadline_s)
     finally:
         watching.undeclare()  # type: ignore[no-untyped-call]
 
 
 def _answer(
-    heard: queue.SimpleQueue[zenoh.Sample | zenoh.Reply | None],
+    received: queue.SimpleQueue[zenoh.Sample | zenoh.Reply | None],
     vehicle: str,
     text: str,
     timeout_s: float,
-    over_s: float,
+    deadline_s: float,
 ) -> dict[str, Any]:
-    """The first answer to a query. None in the queue: no more will come. `over_s`: when the query ends."""
+    """Return the first answer to a query. None in the queue: no more replies. `deadline_s`: of the query."""
     wait_s = timeout_s + _LAST_ANSWER_S
     while True:
         try:
-            news = heard.get(timeout=wait_s)
+            item = received.get(timeout=wait_s)
         except queue.Empty:
-            news = None
-        if isinstance(news, zenoh.Reply) and news.ok is not None:
-            answer: dict[str, Any] = json.loads(news.ok.payload.to_string())
+            item = None
+        if isinstance(item, zenoh.Reply) and item.ok is not None:
+            answer: dict[str, Any] = json.loads(item.ok.payload.to_string())
             return answer
-        if _is(news, zenoh.SampleKind.DELETE):
-            wait_s = _LAST_ANSWER_S  # an answer may have left just before
-        elif _is(news, zenoh.SampleKind.PUT):
-            wait_s = timeout_s + _LAST_ANSWER_S  # the network was gone for a moment
-        elif news is None and time.monotonic() >= over_s:
+        if _is(item, zenoh.SampleKind.DELETE):
+            wait_s = _LAST_ANSWER_S  # an answer may have been sent just before
+        elif _is(item, zenoh.SampleKind.PUT):
+            wait_s = timeout_s + _LAST_ANSWER_S  # the network was interrupted
+        elif item is None and time.monotonic() >= deadline_s:
             raise NoAnswerError(
-                f"{text!r}: no answer within {timeout_s:g} s; `companion echo status` tells what it does"
+                f"{text!r}: no answer within {timeout_s:g} s; `companion echo status` shows its state"
             )
-        elif news is None:
+        elif item is None:
             raise NoAnswerError(
-                f"{text!r}: the service of vehicle {vehicle!r} has gone before it answered: it was ended or "
-                "killed, or the network to it broke. The vehicle does what its autopilot is set to do; look "
-                "at it, and at the service's log"
+                f"{text!r}: the service of vehicle {vehicle!r} has gone before its answer: it was stopped or "
+                "killed, or the network was lost. The autopilot's failsafe applies; check the vehicle and "
+                "the service's log"
             )
 
 
-def _is(news: zenoh.Sample | zenoh.Reply | None, kind: zenoh.SampleKind) -> bool:
-    return isinstance(news, zenoh.Sample) and news.kind == kind
+def _is(item: zenoh.Sample | zenoh.Reply | None, kind: zenoh.SampleKind) -> bool:
+    return isinstance(item, zenoh.Sample) and item.kind == kind
 
 
 def check_topic(key: str) -> None:
-    """Raises ValueError for a single word that is no topic: nothing would ever come."""
+    """Raise ValueError for a single word that is not a topic: nothing would ever be received."""
     names = [topic.name for topic in TOPICS]
     if not set("/*") & set(key) and key not in names:
         raise ValueError(
-            f"no topic {key!r}: expected one of {', '.join(names)}, or a zenoh key with / or wildcards"
+            f"unknown topic {key!r}: expected one of {', '.join(names)}, or a zenoh key with / or wildcards"
         )
 
 
 def listen(
     session: zenoh.Session, key: str, on_message: Callable[[str, str], None]
 ) -> zenoh.Subscriber[None]:
-    """Call back, on a thread of zenoh's, with (key, text) of every message on `key` (wildcards allowed).
+    """Call back, on a zenoh thread, with (key, text) of every message on `key` (wildcards allowed).
 
-    Of what is no text, such as a picture, the text is what it is: its encoding, its length, its attachment.
+    For binary data such as images, the text has the encoding, the length and the attachment.
     """
     full = key if key.startswith(f"{ROOT}/") else f"{ROOT}/*/{key}"
 

@@ -1,6 +1,6 @@
-"""What of the queries on the command key is a command at all: size, text and rate, judged before the loop.
+"""Checks the queries on the command key before they reach the loop: size, text and rate.
 
-A refused query is answered on zenoh's thread: it costs the loop that flies nothing, however many come.
+A refused query is answered on zenoh's thread, so it costs the guidance loop nothing.
 """
 
 from __future__ import annotations
@@ -12,18 +12,18 @@ from collections.abc import Callable
 LARGEST_COMMAND_BYTES = 160 * 1024
 """A line, and for a mission its file."""
 COMMANDS_PER_S, BURST = 20.0, 40
-"""Of all senders together; zenoh does not tell who asks. `stop` has an allowance of its own, as large."""
-ALWAYS_HEARD = b"stop"
+"""Of all senders together; zenoh does not identify them. `stop` has a separate allowance of the same size."""
+SEPARATE_ALLOWANCE = b"stop"
 
 
 class CommandIntake:
-    """Says of each query why it is not taken. Called from any thread.
+    """Accepts or refuses queries. Called from any thread.
 
     Args:
-        clock_s: seconds that never go back.
+        clock_s: a monotonic clock, seconds.
 
     Attributes:
-        refused: how many were not taken.
+        refused: number of refused queries.
     """
 
     def __init__(self, clock_s: Callable[[], float] = time.monotonic) -> None:
@@ -32,29 +32,28 @@ class CommandIntake:
         self.refused = 0
 
     def read(self, size: int, payload: Callable[[], bytes]) -> tuple[str | None, str]:
-        """The command's text, or None and why it is not taken.
+        """Return the command's text, or None and the reason of the refusal.
 
         Args:
-            size: of the payload, bytes. payload: called only where the size is allowed.
+            size: of the payload, bytes. payload: called only if the size is allowed.
         """
         if size > LARGEST_COMMAND_BYTES:
-            why = f"it is {size} bytes long; {LARGEST_COMMAND_BYTES} are taken at most"
-            return self._refuse(why)
+            return self._refuse(f"{size} bytes, at most {LARGEST_COMMAND_BYTES} are accepted")
         data = payload()
         with self._lock:
-            allowance = self._stops if data.strip().lower() == ALWAYS_HEARD else self._others
-            taken = allowance.take()
-        if not taken:
-            return self._refuse(f"more than {COMMANDS_PER_S:g} commands a second came; send it again later")
+            allowance = self._stops if data.strip().lower() == SEPARATE_ALLOWANCE else self._others
+            accepted = allowance.take()
+        if not accepted:
+            return self._refuse(f"more than {COMMANDS_PER_S:g} commands a second; send it again later")
         try:
             return data.decode("utf-8"), ""
         except UnicodeDecodeError as error:
-            return self._refuse(f"it is not UTF-8 text: byte {error.start} is 0x{data[error.start]:02x}")
+            return self._refuse(f"not UTF-8 text: byte {error.start} is 0x{data[error.start]:02x}")
 
-    def _refuse(self, why: str) -> tuple[None, str]:
+    def _refuse(self, reason: str) -> tuple[None, str]:
         with self._lock:
             self.refused += 1
-        return None, f"the command was not taken: {why}"
+        return None, f"command refused: {reason}"
 
 
 class _Allowance:

@@ -1,6 +1,6 @@
-"""What goes out on the bus, as plain JSON-able values. Stamps are CLOCK_MONOTONIC nanoseconds of this host.
+"""The published messages as plain JSON-able values. Stamps are CLOCK_MONOTONIC nanoseconds of this host.
 
-These shapes are the public contract with subscribers (`docs/messages.md`): fields are added, never changed.
+They are the public contract with subscribers (`docs/messages.md`): fields are added, never changed.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ def detections_message(
     view: str | None = None,
     clock: ClockOffset | None = None,
 ) -> dict[str, Any]:
-    """One frame's detections, with the three stamps: captured, inferred, published.
+    """Create the message of one frame's detections, with the stamps captured, inferred and published.
 
-    Where the autopilot's clock is known, the capture is told by that too, and how far that may be off.
+    If the autopilot's clock is known, the capture is also given in that clock, with its error.
     """
     return {
         **_of_frame(result, vehicle, published_ns, view),
@@ -42,7 +42,7 @@ def detections_message(
 def tracks_message(
     result: PerceptionResult, vehicle: str, published_ns: int, view: str | None = None
 ) -> dict[str, Any]:
-    """What happened to tracks at one frame; every track in it counts as true, or did so until now."""
+    """Create the message of one frame's track events; every track in it is or was confirmed."""
     return {
         **_of_frame(result, vehicle, published_ns, view),
         "events": [_track_event(event) for event in result.track_events],
@@ -50,7 +50,7 @@ def tracks_message(
 
 
 def _of_frame(result: PerceptionResult, vehicle: str, published_ns: int, view: str | None) -> dict[str, Any]:
-    """What every message about one frame begins with."""
+    """Return the common fields of messages about one frame."""
     return {
         "vehicle": vehicle,
         "camera": view,
@@ -81,12 +81,12 @@ def _track_event(event: TrackEvent) -> dict[str, Any]:
 
 
 def labels_message(result: PerceptionResult) -> str:
-    """The class names of one frame, comma separated, in the detections' order."""
+    """Join the class names of one frame, comma separated, in the detections' order."""
     return ", ".join(result.detections.names) or NO_OBJECTS
 
 
 def vehicle_message(state: VehicleState, now_ns: int) -> dict[str, Any]:
-    """The vehicle's state. Metres, metres a second, radians; NED and, for `attitude_wxyz`, FRD to NED."""
+    """Create the vehicle's message. Metres, metres a second, radians; NED; `attitude_wxyz`: FRD to NED."""
     return {
         "stamp_ns": now_ns,
         "connected": state.connected(now_ns),
@@ -115,7 +115,7 @@ def vehicle_message(state: VehicleState, now_ns: int) -> dict[str, Any]:
 
 
 def _gimbal(gimbal: GimbalState, now_ns: int) -> dict[str, Any]:
-    """Where the gimbal looks: radians; `attitude_wxyz` its FRD to NED, or to NED turned to the heading."""
+    """Return the gimbal's fields: radians; `attitude_wxyz`: FRD to NED, or to NED rotated by the heading."""
     return {
         "attitude_age_s": _age_s(gimbal.attitude_ns, now_ns),
         "attitude_wxyz": _rounded(gimbal.attitude, 5),
@@ -126,7 +126,7 @@ def _gimbal(gimbal: GimbalState, now_ns: int) -> dict[str, Any]:
 
 
 def setpoint_message(setpoint: Setpoint | None) -> dict[str, Any] | None:
-    """A setpoint, or None where there is none."""
+    """Create the message of a setpoint; None for None."""
     if setpoint is None:
         return None
     return {
@@ -148,5 +148,5 @@ def _rounded(values: tuple[float, ...] | None, digits: int = 3) -> list[float] |
 
 
 def _finite(value: float | None) -> float | None:
-    """JSON has no NaN."""
+    """Replace NaN and infinity, which JSON lacks, by None."""
     return value if value is not None and math.isfinite(value) else None

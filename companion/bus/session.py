@@ -1,8 +1,8 @@
-"""The service's zenoh session: publishes the topics, takes commands, says when the router is gone.
+"""The service's zenoh session: publishes the topics, receives commands, reports the loss of the router.
 
-zenoh calls back on threads of its own; whatever comes in hops into the asyncio loop. A publication never
-waits: `DROP` where the network is slow. While the session is not open yet, what is published is counted as
-publish_failed, not queued: old detections are of no use to anybody.
+zenoh calls back on its own threads; received data is passed into the asyncio loop. A publication never waits:
+`DROP` if the network is slow. Before the session is open, publications are counted as publish_failed, not
+queued: old detections are useless.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any
 import zenoh
 
 from companion.bus.command_intake import CommandIntake
-from companion.bus.topics import TOPICS, VIEW_TOPICS, Topic, alive_key, command_key, everybodys_key
+from companion.bus.topics import TOPICS, VIEW_TOPICS, Topic, alive_key, all_vehicles_key, command_key
 from companion.settings import ZenohSection
 
 logger = logging.getLogger(__name__)
@@ -29,16 +29,16 @@ CommandHandler = Callable[[str], Awaitable[dict[str, Any]]]
 _RETRY_MIN_S, _RETRY_MAX_S = 0.5, 5.0
 _WATCH_PERIOD_S = 0.25
 _ANSWER_S = 0.5
-# What goes wrong in a command is logged no more often than this.
+# Minimum interval of logged command failures.
 _LOG_PERIOD_S = 1.0
 
 
 class BusError(ConnectionError):
-    """The zenoh session cannot be opened at all (a busy port, a bad endpoint)."""
+    """The zenoh session cannot be opened (a busy port, a bad endpoint)."""
 
 
 def zenoh_config(settings: ZenohSection) -> zenoh.Config:
-    """zenoh's own configuration for these settings."""
+    """Convert settings into zenoh's configuration."""
     config = zenoh.Config()
     values = {
         "mode": settings.mode,
@@ -48,7 +48,7 @@ def zenoh_config(settings: ZenohSection) -> zenoh.Config:
         "timestamping/enabled": True,
     }
     if settings.mode == "peer":
-        # A peer starts without its router and goes on looking for it.
+        # A peer starts without its router and keeps retrying.
         values["connect/exit_on_failure"] = False
     for key, value in values.items():
         config.insert_json5(key, json.dumps(value))
@@ -60,14 +60,14 @@ class Bus:
 
     Args:
         on_event: called with (level, text) when the network is lost or found.
-        on_command: answers a command's text with a JSON-able reply; called in the loop, one task each.
+        on_command: returns a command's JSON-able reply; called in the loop, one task each.
         views: names of the views that publish besides the first.
-        listeners: topics, each with what is called in the loop with its messages, of any vehicle.
+        listeners: topics, each with a callback in the loop for its messages, of any vehicle.
 
     Attributes:
-        published: path of a topic (`Topic.path`) → messages handed to zenoh.
-        publish_failed: messages that came while there was no session, or that zenoh refused.
-        intake: which commands are taken.
+        published: path of a topic (`Topic.path`) → messages passed to zenoh.
+        publish_failed: messages without a session, or refused by zenoh.
+        intake: accepts or refuses commands.
     """
 
     def __init__(
@@ -104,19 +104,19 @@ class Bus:
 
     @property
     def open(self) -> bool:
-        """The session is there and publications go out."""
+        """Whether the session is open."""
         return self._session is not None
 
     @property
     def connected(self) -> bool:
-        """Every endpoint in `connect` was asked for none, or at least one other node is connected."""
+        """Whether at least one other node is connected, or `connect` is empty."""
         return self.open and (self._connected or not self._settings.connect)
 
     async def start(self) -> None:
-        """Open the session: at once as a peer, as soon as the router answers as a client.
+        """Open the session: at once as a peer, when the router answers as a client.
 
         Raises:
-            BusError: a peer cannot listen where it should.
+            BusError: a peer cannot listen on its endpoints.
         """
         self._loop = asyncio.get_running_loop()
         if self._settings.mode == "peer":
@@ -126,15 +126,15 @@ class Bus:
                 endpoints = ", ".join(self._settings.listen)
                 raise BusError(
                     f"zenoh cannot listen on {endpoints}: {_first_line(error)}. "
-                    "Is a router or another service there? Set zenoh.connect to it and zenoh.listen to none"
+                    "If a router or another service uses it, set zenoh.connect to it and zenoh.listen to none"
                 ) from error
         self._watching = self._spawn(self._watch())
 
     async def close(self) -> None:
-        """End the session; bounded in time."""
+        """Close the session; bounded in time."""
         if self._watching is not None:
             self._watching.cancel()
-        # Answers that are ready go out; those that are not are told so.
+        # Ready answers are sent; pending ones get a failure.
         answers = self._tasks - {self._watching}
         if answers:
             await asyncio.wait(answers, timeout=_ANSWER_S)
@@ -149,18 +149,18 @@ class Bus:
                     await asyncio.to_thread(session.close)
 
     def watched(self, topic: Topic, view: str | None = None) -> bool:
-        """Whether anybody subscribes to this now."""
+        """Whether the topic has a subscriber now."""
         publisher = self._publishers.get(topic.path(view))
         # zenoh's stubs call this a bool.
         return publisher is not None and bool(publisher.matching_status.matching)  # type: ignore[attr-defined]
 
-    def publish_picture(
-        self, topic: Topic, picture: bytes, attachment: dict[str, Any], view: str | None = None
+    def publish_image(
+        self, topic: Topic, image: bytes, attachment: dict[str, Any], view: str | None = None
     ) -> None:
         """Publish bytes that are too large for one packet, with an attachment as JSON.
 
-        zenoh waits a little for room for each piece of such a message, so that is done in a thread. One that
-        comes while the one before is still on its way is not sent.
+        zenoh waits for room for each fragment of such a message, so it is sent in a thread. An image that
+        arrives while the previous one is being sent is dropped.
         """
         path = topic.path(view)
         publisher = self._publishers.get(path)
@@ -168,22 +168,22 @@ class Bus:
             self.publish_failed += 1
             return
         self._sending.add(path)
-        self._spawn(self._send(path, publisher, picture, json.dumps(attachment)))
+        self._spawn(self._send(path, publisher, image, json.dumps(attachment)))
 
-    async def _send(self, path: str, publisher: zenoh.Publisher, picture: bytes, attachment: str) -> None:
+    async def _send(self, path: str, publisher: zenoh.Publisher, image: bytes, attachment: str) -> None:
         try:
-            await asyncio.to_thread(publisher.put, picture, attachment=attachment)
+            await asyncio.to_thread(publisher.put, image, attachment=attachment)
             self.published[path] += 1
         except zenoh.ZError as error:
             self.publish_failed += 1
-            logger.warning("zenoh did not take a message for %s: %s", path, _first_line(error))
+            logger.warning("zenoh refused a message on %s: %s", path, _first_line(error))
         finally:
             self._sending.discard(path)
 
     def publish(self, topic: Topic, value: Any, view: str | None = None) -> None:
-        """Publish a JSON-able value, or a text as it is. Never raises for the network.
+        """Publish a JSON-able value, or a text unchanged. Never raises for the network.
 
-        Where a reader takes nothing zenoh drops the message, after a millisecond at most.
+        For a blocked reader zenoh drops the message, after a millisecond at most.
         """
         path = topic.path(view)
         publisher = self._publishers.get(path)
@@ -195,7 +195,7 @@ class Bus:
             publisher.put(payload)
         except zenoh.ZError as error:
             self.publish_failed += 1
-            logger.warning("zenoh did not take a message for %s: %s", path, _first_line(error))
+            logger.warning("zenoh refused a message on %s: %s", path, _first_line(error))
             return
         self.published[path] += 1
 
@@ -211,11 +211,11 @@ class Bus:
             )
             for topic, view in self._streams
         }
-        # Presence for free: the token goes when we go, however we go.
+        # zenoh removes the token when this process ends, in any way.
         self._token = session.liveliness().declare_token(alive_key(self._vehicle))
         self._queryable = session.declare_queryable(command_key(self._vehicle), self._from_zenoh_thread)
         self._subscribers = [
-            session.declare_subscriber(everybodys_key(topic), partial(self._on_sample, listener))
+            session.declare_subscriber(all_vehicles_key(topic), partial(self._on_sample, listener))
             for topic, listener in self._listeners
         ]
 
@@ -240,7 +240,7 @@ class Bus:
             self._log_failure(text)
             reply["reason"] = f"{type(error).__name__}: {error}"
         finally:
-            # Whatever happens here, the other side is not left waiting: it must not send the command again.
+            # The sender always gets a reply, since it must not send the command again.
             with query:
                 _reply(query, reply)
 
@@ -253,16 +253,16 @@ class Bus:
         self._logged_s, self._unlogged = now_s, 0
 
     async def _watch(self) -> None:
-        """Open the session if it is not (client), then tell when the nodes in `connect` come and go."""
-        delay_s, told = _RETRY_MIN_S, False
+        """Open the session if needed (client), then report connection and loss of the nodes in `connect`."""
+        delay_s, reported = _RETRY_MIN_S, False
         endpoints = ", ".join(self._settings.connect)
         while self._session is None:
             try:
                 self._adopt(await asyncio.to_thread(zenoh.open, zenoh_config(self._settings)))
             except zenoh.ZError:
-                if not told:
-                    self._on_event("warning", f"zenoh: nobody answers at {endpoints}; trying on")
-                    told = True
+                if not reported:
+                    self._on_event("warning", f"zenoh: no peer at {endpoints}, retrying")
+                    reported = True
                 await asyncio.sleep(delay_s)
                 delay_s = min(2 * delay_s, _RETRY_MAX_S)
         if not self._settings.connect:
@@ -270,13 +270,14 @@ class Bus:
         while True:
             info = self._session.info
             connected = bool(list(info.routers_zid()) or list(info.peers_zid()))
-            if connected != self._connected or (not connected and not told):
-                self._connected, told = connected, True
+            if connected != self._connected or (not connected and not reported):
+                self._connected, reported = connected, True
                 if connected:
                     self._on_event("info", f"zenoh: connected to {endpoints}")
                 else:
                     self._on_event(
-                        "warning", f"zenoh: no connection to {endpoints}; nobody gets detections, trying on"
+                        "warning",
+                        f"zenoh: no connection to {endpoints}: messages are not delivered, retrying",
                     )
             await asyncio.sleep(_WATCH_PERIOD_S)
 
@@ -293,7 +294,7 @@ class Bus:
 
 
 def _payload(query: zenoh.Query) -> tuple[int, Callable[[], bytes]]:
-    """Size and bytes of the command: the query's payload, or its parameter `text` (`…/command?text=hold`)."""
+    """Return size and bytes of a command: the query's payload, or its parameter `text` (`…?text=hold`)."""
     payload = query.payload
     if payload is not None and len(payload):
         return len(payload), payload.to_bytes
@@ -306,5 +307,5 @@ def _reply(query: zenoh.Query, reply: dict[str, Any]) -> None:
 
 
 def _first_line(error: BaseException) -> str:
-    """zenoh's errors end with a place in its source; a person needs what stands before."""
+    """Return the text of an error without the source location that zenoh appends."""
     return str(error).splitlines()[0].split(" at /")[0].strip() if str(error) else type(error).__name__

@@ -1,6 +1,7 @@
-"""The one table of what is published: key, encoding, rate, maximum age, quality of service.
+"""The table of published topics: key, encoding, rate, maximum age, quality of service.
 
-A topic's key is `companion/<vehicle>/<name>`. Readers that steer by a topic must refuse it past `max_age_s`.
+A topic's key is `companion/<vehicle>/<name>`. A reader that uses a topic for control must refuse messages
+older than `max_age_s`.
 """
 
 from __future__ import annotations
@@ -18,11 +19,11 @@ class Topic:
     """One stream.
 
     Attributes:
-        rate_hz: nominal; None where it follows the camera or happens on occasion.
-        max_age_s: past this a value says nothing of the present; None where it does not age (events).
+        rate_hz: nominal; None if it follows the camera or is irregular.
+        max_age_s: max age of a valid message; None if it does not age (events).
         encoding: of the payload.
         priority, express: zenoh's quality of service. Congestion control is DROP for every topic: with BLOCK
-            one frozen reader stops the loop that steers, for seconds.
+            one frozen reader stops the guidance loop for seconds.
     """
 
     name: str
@@ -34,11 +35,11 @@ class Topic:
     description: str
 
     def key(self, vehicle: str, view: str | None = None) -> str:
-        """The zenoh key of one vehicle's stream; of a view other than the first, under that view's name."""
+        """Return the zenoh key of one vehicle's stream; views other than the first use the view's name."""
         return f"{ROOT}/{vehicle}/{self.path(view)}"
 
     def path(self, view: str | None = None) -> str:
-        """The key behind the vehicle's name."""
+        """Return the part of the key after the vehicle's name."""
         return self.name if view is None else f"cameras/{view}/{self.name}"
 
 
@@ -47,7 +48,7 @@ _REAL_TIME = zenoh.Priority.REAL_TIME
 _DATA = zenoh.Priority.DATA
 
 DETECTIONS: Final = Topic(
-    "detections", None, 0.5, _JSON, _REAL_TIME, True, "what one frame shows, one message a frame"
+    "detections", None, 0.5, _JSON, _REAL_TIME, True, "the detections of one frame, one message per frame"
 )
 LABELS: Final = Topic(
     "labels",
@@ -65,18 +66,18 @@ TRACKS: Final = Topic(
     _JSON,
     _DATA,
     False,
-    "what happened to tracks at one frame: new, update, lost, end",
+    "the track events of one frame: new, update, lost, end",
 )
 MARKERS: Final = Topic(
-    "markers", None, 0.5, _JSON, _REAL_TIME, True, "the markers in one frame, and where they are"
+    "markers", None, 0.5, _JSON, _REAL_TIME, True, "the markers in one frame, with their positions"
 )
 VEHICLE: Final = Topic("vehicle", 10.0, 0.5, _JSON, _DATA, True, "state of the vehicle")
-SETPOINT: Final = Topic("setpoint", 10.0, 0.5, _JSON, _DATA, True, "the setpoint asked for and the one sent")
-POSE: Final = Topic("pose", 10.0, 1.0, _JSON, _REAL_TIME, True, "where on earth it is, for other vehicles")
+SETPOINT: Final = Topic("setpoint", 10.0, 0.5, _JSON, _DATA, True, "the requested setpoint and the one sent")
+POSE: Final = Topic("pose", 10.0, 1.0, _JSON, _REAL_TIME, True, "global pose, for other vehicles")
 OBSTACLES: Final = Topic(
     "obstacles", None, 0.5, _JSON, _REAL_TIME, True, "distance of the nearest obstacle in 72 directions"
 )
-STATUS: Final = Topic("status", 1.0, 3.0, _JSON, _DATA, False, "how every part of the service is")
+STATUS: Final = Topic("status", 1.0, 3.0, _JSON, _DATA, False, "state of every part of the service")
 EVENTS: Final = Topic(
     "events",
     None,
@@ -84,7 +85,7 @@ EVENTS: Final = Topic(
     _JSON,
     _DATA,
     False,
-    "what happened: modes, behaviours, parts lost and found",
+    "events: modes, behaviours, losses and recoveries",
 )
 
 IMAGE: Final = Topic(
@@ -94,10 +95,10 @@ IMAGE: Final = Topic(
     zenoh.Encoding.IMAGE_JPEG,
     zenoh.Priority.BACKGROUND,
     False,
-    "a frame with its detections drawn, JPEG; made only while somebody subscribes",
+    "a frame with its detections drawn, JPEG; only while there is a subscriber",
 )
 
-# What every view publishes of its own.
+# Topics published by every view.
 VIEW_TOPICS: Final = (DETECTIONS, LABELS, TRACKS, MARKERS, IMAGE)
 
 TOPICS: Final = (
@@ -114,22 +115,22 @@ TOPICS: Final = (
     EVENTS,
 )
 
-# The last name of the queryable that takes a command and answers with its outcome.
+# The last part of the key of the queryable that executes a command and returns its result.
 COMMAND: Final = "command"
 
 NO_OBJECTS = "no objects detected"
 
 
-def everybodys_key(topic: Topic) -> str:
-    """The key expression of one stream of all vehicles."""
+def all_vehicles_key(topic: Topic) -> str:
+    """Return the key expression of one stream of all vehicles."""
     return topic.key("*")
 
 
 def command_key(vehicle: str) -> str:
-    """The queryable that takes commands for one vehicle."""
+    """Return the key of the queryable for one vehicle's commands."""
     return f"{ROOT}/{vehicle}/{COMMAND}"
 
 
 def alive_key(vehicle: str) -> str:
-    """The liveliness token of one vehicle's service; it goes when the service goes, however it goes."""
+    """Return the key of one service's liveliness token; zenoh removes the token when the service ends."""
     return f"{ROOT}/{vehicle}/alive"

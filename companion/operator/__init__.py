@@ -1,1 +1,1 @@
-"""The operator's doors on the board itself."""
+"""The operator's interfaces on the board: console, log output, metrics."""

@@ -1,4 +1,4 @@
-"""Commands typed at the service's own terminal, answered there."""
+"""A console for commands on the service's own terminal."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ async def run_console(
     """Read commands until end of file or `quit`. A command runs while the next is typed.
 
     Answers go to standard error, which must not wait for its reader (`line_output.py`).
-    Never raises: the terminal is a convenience, and whatever goes wrong there, the flight goes on.
+    Never raises: an error of the console must not affect the flight.
     """
     try:
         await _read_commands(command, quit_service, help_text)
     except Exception as error:
         logger.exception("the console failed")
-        on_event("warning", f"the console has ended: {type(error).__name__}: {error}")
+        on_event("warning", f"console ended: {type(error).__name__}: {error}")
 
 
 async def _read_commands(
@@ -46,13 +46,13 @@ async def _read_commands(
         except Exception as error:
             logger.exception("command %r failed", text)
             reply = {"success": False, "reason": f"{type(error).__name__}: {error}"}
-        sign = "done" if reply["success"] else "no"
-        _print(f"{text}: {sign}: {reply['reason']}")
+        result = "done" if reply["success"] else "failed"
+        _print(f"{text}: {result}: {reply['reason']}")
 
     reader = StandardStreamReader()
     loop = asyncio.get_running_loop()
-    # The terminal is opened again: the reader makes it non-blocking, which it must not become for standard
-    # error and for the shell.
+    # The terminal is opened again: the reader makes it non-blocking, which must not affect standard error and
+    # the shell.
     terminal = open(os.ttyname(sys.stdin.fileno()), "rb", buffering=0)  # noqa: ASYNC230, SIM115
     transport, _ = await loop.connect_read_pipe(lambda: StandardStreamReaderProtocol(reader), terminal)
     try:
@@ -72,7 +72,7 @@ async def _read_commands(
 
 
 async def _line_of(reader: asyncio.StreamReader) -> bytes:
-    """The next line; empty at the end of file, or when the terminal was closed (EIO)."""
+    """Return the next line; empty at end of file, or if the terminal was closed (EIO)."""
     try:
         return await reader.readline()
     except OSError:
@@ -84,5 +84,5 @@ def _print(text: str) -> None:
 
 
 def terminal_is_free(source_uri: str) -> bool:
-    """Standard input is a terminal and is not where the frames come from."""
+    """Whether standard input is a terminal and not the source of frames."""
     return source_uri != "-" and sys.stdin is not None and sys.stdin.isatty()

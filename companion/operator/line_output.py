@@ -1,7 +1,7 @@
-"""Standard error for a program that must not wait for whoever reads it.
+"""A standard error that never blocks the program.
 
-A pipe takes 64 KiB, then a write waits for its reader; a terminal that was stopped with Ctrl-S takes less. So
-lines are queued, and one thread writes them.
+A pipe holds 64 KiB, then a write waits for its reader; a terminal stopped with Ctrl-S holds less. So lines
+are queued, and one thread writes them.
 """
 
 from __future__ import annotations
@@ -16,24 +16,24 @@ import time
 from collections import deque
 
 QUEUED_BYTES = 256 * 1024
-"""Of lines that wait for the reader; what comes after them is dropped, and counted."""
+"""Capacity of the queue; further lines are dropped and counted."""
 EXIT_TIMEOUT_S = 1.0
 LONGEST_LINE = 16 * 1024
-"""Characters; what has no end by then is written as a line."""
-# Of one write: with a slow reader, the queue empties in small steps.
+"""Characters; a longer text without a line end is written as a line."""
+# Size of one write: with a slow reader, the queue empties in small steps.
 _WRITE_BYTES = 4096
 
 
 class LineOutput(io.TextIOBase):
-    """A text stream that takes every line at once. May be used from any thread.
+    """A text stream with a queue. Thread-safe; a write never waits.
 
     Args:
-        descriptor: where the lines go; it stays open.
+        descriptor: the output; it stays open.
         capacity_bytes: of the queue.
 
     Attributes:
-        dropped: lines that were not written: the queue was full, or the descriptor refused them.
-        queued_bytes: that wait.
+        dropped: lines not written: the queue was full, or the descriptor refused them.
+        queued_bytes: bytes in the queue.
     """
 
     def __init__(self, descriptor: int, capacity_bytes: int = QUEUED_BYTES) -> None:
@@ -49,7 +49,7 @@ class LineOutput(io.TextIOBase):
 
     @property
     def encoding(self) -> str:  # type: ignore[override]
-        """As of a terminal; a character that is none is written as its escape."""
+        """UTF-8; characters that cannot be encoded are escaped."""
         return "utf-8"
 
     def writable(self) -> bool:
@@ -59,7 +59,7 @@ class LineOutput(io.TextIOBase):
         return os.isatty(self._descriptor)
 
     def write(self, text: str) -> int:
-        """Queue the whole lines in `text`; the rest waits for its end. Never waits, never fails."""
+        """Queue the complete lines in `text` and keep the rest. Never waits, never fails."""
         with self._changed:
             *lines, partial = (self._partial + text).split("\n")
             if len(partial) > LONGEST_LINE:
@@ -87,9 +87,9 @@ class LineOutput(io.TextIOBase):
         self._unreported += count
 
     def end(self, timeout_s: float = EXIT_TIMEOUT_S) -> bool:
-        """Write what is queued, as long as the reader takes it within `timeout_s`; whether all was written.
+        """Write the queued lines within `timeout_s`; returns whether all were written.
 
-        What is written afterwards is dropped.
+        Later writes are dropped.
         """
         deadline_s = time.monotonic() + timeout_s
         with self._changed:
@@ -103,15 +103,15 @@ class LineOutput(io.TextIOBase):
             return not (self._lines or self._writing)
 
     def _run(self) -> None:
-        taken = True
-        while (data := self._next(report=taken)) is not None:
-            taken = self._written(data)
-            if not taken:
+        written = True
+        while (data := self._next(report=written)) is not None:
+            written = self._written(data)
+            if not written:
                 with self._changed:
                     self._drop(1)
 
     def _next(self, *, report: bool) -> bytes | None:
-        """Wait for a line; None at the end. `report`: once the queue is empty, say how many are missing."""
+        """Wait for a line; None at the end. `report`: when the queue is empty, report dropped lines."""
         with self._changed:
             self._writing = False
             self._changed.notify_all()
@@ -119,7 +119,7 @@ class LineOutput(io.TextIOBase):
                 if self._unreported and report:
                     count, self._unreported = self._unreported, 0
                     self._writing = True
-                    return f"companion: {count} lines are missing here: nobody read them\n".encode()
+                    return f"companion: {count} lines dropped: the output was not read\n".encode()
                 if self._ended:
                     return None
                 self._changed.wait()
@@ -132,22 +132,22 @@ class LineOutput(io.TextIOBase):
         while data:
             try:
                 data = data[os.write(self._descriptor, data[:_WRITE_BYTES]) :]
-            except BlockingIOError:  # somebody has made it non-blocking
+            except BlockingIOError:  # another process has made it non-blocking
                 select.select([], [self._descriptor], [])
-            except OSError:  # its reader has gone, or the disk is full: there is nobody to say it to
+            except OSError:  # its reader has gone, or the disk is full
                 return False
         return True
 
 
 def use_for_standard_error() -> LineOutput | None:
-    """From now on nothing that this program prints to standard error waits for its reader.
+    """Replace standard error by a `LineOutput`.
 
-    The end of the program waits for the reader a second at most. None, and nothing changes, where standard
-    error is no descriptor.
+    The exit of the program waits for the reader a second at most. Returns None, and changes nothing, if
+    standard error has no descriptor.
     """
     try:
         descriptor = sys.stderr.fileno()
-    except (AttributeError, OSError):  # closed, or a test's buffer
+    except (AttributeError, OSError):  # closed, or a buffer in a test
         return None
     sys.stderr.flush()
     output = LineOutput(descriptor)

@@ -1,7 +1,7 @@
-"""The service's status as numbers for Prometheus: `GET /metrics` on an address of one's own.
+"""The service's status as Prometheus metrics: `GET /metrics` on a configured address.
 
-Served by prometheus_client in a thread of its own, from the snapshot that was published last, so that whoever
-asks never holds the loop that steers.
+Served by prometheus_client in its own thread, from the last published status, so that a scraper never blocks
+the guidance loop.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Status = dict[str, Any]
 
 
 class MetricsError(RuntimeError):
-    """The endpoint cannot be opened. One line for a person."""
+    """The endpoint cannot be opened. The message is one line."""
 
 
 class MetricsServer:
@@ -27,10 +27,11 @@ class MetricsServer:
 
     Args:
         listen: HOST:PORT; port 0 for a free one.
-        snapshot: the newest status (`Service.status`), None before the first; called in the server's thread.
+        snapshot: returns the newest status (`Service.status`), None before the first; called in the server's
+            thread.
 
     Raises:
-        MetricsError: the library is not installed, or the address cannot be had.
+        MetricsError: the library is not installed, or the address is not available.
     """
 
     def __init__(self, listen: str, snapshot: Callable[[], Status | None]) -> None:
@@ -52,7 +53,7 @@ class MetricsServer:
 
     @property
     def port(self) -> int:
-        """Where it listens."""
+        """The TCP port of the server."""
         return int(self._server.server_port)
 
     def close(self) -> None:
@@ -79,36 +80,36 @@ def _of_service(status: Status) -> Iterator[GaugeMetricFamily | CounterMetricFam
 
     vehicle, pilot, bus = status["vehicle"], status["pilot"], status["bus"]
     for name, meaning, value in (
-        ("healthy", "1 while every part is as it should be", status["healthy"]),
-        ("uptime_seconds", "since the service's start", status["uptime_s"]),
-        ("vehicle_connected", "1 while the autopilot is heard", vehicle["connected"]),
+        ("healthy", "1 while every part works", status["healthy"]),
+        ("uptime_seconds", "time since the service's start", status["uptime_s"]),
+        ("vehicle_connected", "1 while autopilot heartbeats are received", vehicle["connected"]),
         ("vehicle_armed", "1 while the vehicle is armed", vehicle["armed"]),
         ("vehicle_failsafe", "1 while the autopilot is in a failsafe", vehicle["failsafe"]),
-        ("in_command", "1 while the vehicle does what the service asks", pilot["in_command"]),
-        ("bus_connected", "1 while zenoh's endpoints are reached", bus["connected"]),
+        ("in_command", "1 while the service commands the vehicle", pilot["in_command"]),
+        ("bus_connected", "1 while zenoh's endpoints are connected", bus["connected"]),
     ):
         yield GaugeMetricFamily(f"companion_{name}", meaning, value=float(value or 0))
     yield CounterMetricFamily(
-        "companion_setpoints_sent", "setpoints put on the link", value=float(pilot["setpoints_sent"])
+        "companion_setpoints_sent", "setpoints sent to the autopilot", value=float(pilot["setpoints_sent"])
     )
     published = CounterMetricFamily(
-        "companion_messages_published", "messages handed to zenoh", labels=["topic"]
+        "companion_messages_published", "messages passed to zenoh", labels=["topic"]
     )
     for topic, count in bus["published"].items():
         published.add_metric([topic], float(count))
     yield published
     yield CounterMetricFamily(
         "companion_log_lines_dropped",
-        "lines of the log that nobody read in time",
+        "log lines dropped because the output was not read",
         value=float(status["log"]["dropped_lines"]),
     )
     yield GaugeMetricFamily(
         "companion_other_commanders",
-        "other services seen that command the vehicle",
+        "other services on the same vehicle",
         value=float(len(vehicle["other_commanders"])),
     )
     yield CounterMetricFamily(
-        "companion_publish_failed", "messages that zenoh did not take", value=float(bus["publish_failed"])
+        "companion_publish_failed", "messages that were not published", value=float(bus["publish_failed"])
     )
 
 
@@ -117,7 +118,7 @@ def _of_views(views: dict[str, Status]) -> Iterator[GaugeMetricFamily | CounterM
 
     for key, name, meaning in (
         ("frames", "frames_read", "frames read from the source"),
-        ("results", "results", "results that reached the service"),
+        ("results", "results", "results received by the service"),
         ("restarts", "perception_restarts", "perception processes replaced"),
     ):
         counter = CounterMetricFamily(f"companion_{name}", meaning, labels=["camera"])
@@ -125,18 +126,18 @@ def _of_views(views: dict[str, Status]) -> Iterator[GaugeMetricFamily | CounterM
             counter.add_metric([view], float(state[key]))
         yield counter
     frames_skipped = CounterMetricFamily(
-        "companion_frames_skipped", "frames that led to no message", labels=["camera", "reason"]
+        "companion_frames_skipped", "frames without a published result", labels=["camera", "reason"]
     )
     stages = GaugeMetricFamily(
         "companion_stage_milliseconds",
-        "time of one stage, newest 200 results",
+        "duration of one stage, newest 200 results",
         labels=["camera", "stage", "quantile"],
     )
-    age = GaugeMetricFamily("companion_newest_result_age_seconds", "from its capture", labels=["camera"])
-    rate = GaugeMetricFamily("companion_results_per_second", "over the last two seconds", labels=["camera"])
-    running = GaugeMetricFamily(
-        "companion_perception_running", "1 while its process works", labels=["camera"]
+    age = GaugeMetricFamily(
+        "companion_newest_result_age_seconds", "time since its capture", labels=["camera"]
     )
+    rate = GaugeMetricFamily("companion_results_per_second", "over the last two seconds", labels=["camera"])
+    running = GaugeMetricFamily("companion_perception_running", "1 while its process runs", labels=["camera"])
     for view, state in views.items():
         for reason, count in state["frames_skipped"].items():
             frames_skipped.add_metric([view, reason], float(count))

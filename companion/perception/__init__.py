@@ -1,1 +1,1 @@
-"""The worker in which frames live, its supervisor in the service, and what the views see."""
+"""The perception worker process, its supervisor in the service, and the views' results."""

@@ -1,4 +1,4 @@
-"""From settings to the pipeline that looks at frames. The worker and flights in lockstep use it."""
+"""Builds the perception pipeline from the settings, for the worker and for flights in lockstep."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from vision.tracking.camera_motion import Array
 
 
 class CameraTelemetry:
-    """What the vehicle has told that a camera's pictures are seen by.
+    """The vehicle telemetry that the pipeline of one camera uses.
 
     Attributes:
-        attitudes: of the vehicle, the last few seconds. height_m: the newest above home; None: not known.
-        gimbal: the attitudes of the camera's gimbal; empty for a camera that sits on none.
+        attitudes: of the vehicle, the last few seconds. height_m: the newest above home; None: unknown.
+        gimbal: attitudes of the camera's gimbal; empty for a fixed camera.
     """
 
     def __init__(self) -> None:
@@ -45,10 +45,10 @@ def build_pipeline(
     first_track_id: int = 1,
     clock_ns: Callable[[], int] = time.monotonic_ns,
 ) -> Pipeline:
-    """The pipeline as the settings want it.
+    """Build the pipeline of the settings.
 
     Args:
-        source: open. detector: as `load_detector` gives it; None where the settings want none.
+        source: open. detector: from `load_detector`; None if detection is disabled.
         clock_ns: the clock of the frames' stamps.
     """
     return Pipeline(
@@ -66,71 +66,72 @@ def build_pipeline(
 
 
 def tiled(settings: Settings, detector: ObjectDetector | None) -> FrameDetector | None:
-    """The detector as the pipeline uses it."""
-    wanted = settings.detector
-    if detector is None or not wanted.tiles:
+    """Wrap the detector for tiling if the settings enable it."""
+    section = settings.detector
+    if detector is None or not section.tiles:
         return detector
     from vision.tiling import TiledDetector
 
-    return TiledDetector(detector, tile_size=wanted.tile_size, overlap=wanted.tile_overlap)
+    return TiledDetector(detector, tile_size=section.tile_size, overlap=section.tile_overlap)
 
 
 def load_detector(settings: Settings) -> ObjectDetector:
-    """The detector of `detector.kind`, ready; the plug-ins must be loaded.
+    """Load the detector of `detector.kind`; the plug-ins must be loaded before.
 
     Raises:
         ValueError: as `vision.object_detector.open_detector`.
     """
-    wanted = settings.detector
-    if wanted.threads is not None:
-        # Else its resizing takes every core, whatever the network was given.
-        cv2.setNumThreads(wanted.threads)
-    return open_detector(wanted.kind, wanted.loading(_least_confidence(settings)))
+    section = settings.detector
+    if section.threads is not None:
+        # Else OpenCV's resizing uses every core, independent of the network's threads.
+        cv2.setNumThreads(section.threads)
+    return open_detector(section.kind, section.loading(_min_confidence(settings)))
 
 
-def _least_confidence(settings: Settings) -> float:
-    """A tracker wants to see the weak ones too; it leaves out again what `detector.confidence` leaves out."""
-    wanted, tracker = settings.detector.confidence, settings.tracker
-    return min(wanted, tracker.low_confidence) if tracker.enabled else wanted
+def _min_confidence(settings: Settings) -> float:
+    """Return the detector's threshold; the tracker also needs detections below `detector.confidence`."""
+    confidence, tracker = settings.detector.confidence, settings.tracker
+    return min(confidence, tracker.low_confidence) if tracker.enabled else confidence
 
 
 def _tracker(settings: Settings, first_track_id: int) -> Tracker | None:
     if not settings.tracker.enabled or not settings.detector.enabled:
         return None
-    following = settings.tracker.following(settings.detector.confidence)
-    return Tracker(following, first_track_id=first_track_id)
+    tracker_settings = settings.tracker.following(settings.detector.confidence)
+    return Tracker(tracker_settings, first_track_id=first_track_id)
 
 
-def _held_at(
+def _pose_at(
     settings: Settings, telemetry: CameraTelemetry
 ) -> Callable[[int], tuple[CameraMount, Array] | None]:
-    """How the camera was mounted, and (3, 3) `ned_from_body`, at a capture stamp (CLOCK_MONOTONIC ns).
+    """Return a function from a capture stamp (CLOCK_MONOTONIC ns) to mount and (3, 3) `ned_from_body`.
 
-    None without the attitude of that moment: the vehicle's or, for a camera on a gimbal, the gimbal's.
+    It returns None without an attitude at that time: of the vehicle and, for a camera on a gimbal, of the
+    gimbal.
     """
     mount = settings.camera.mount()
 
-    def held_at(captured_ns: int) -> tuple[CameraMount, Array] | None:
+    def pose_at(captured_ns: int) -> tuple[CameraMount, Array] | None:
         ned_from_body = telemetry.attitudes.at(captured_ns)
         if ned_from_body is None or not mount.on_gimbal:
             return None if ned_from_body is None else (mount, ned_from_body)
         ned_from_gimbal = telemetry.gimbal.at(captured_ns)
         return None if ned_from_gimbal is None else (mount.held(ned_from_gimbal), ned_from_body)
 
-    return held_at
+    return pose_at
 
 
 def _view_at(settings: Settings, telemetry: CameraTelemetry) -> Callable[[Frame], CameraView | None]:
-    """Where the camera looked when it took a frame; None without the attitude of that moment."""
+    """Return a function from a frame to the camera's view; None without an attitude at that time."""
     if not settings.tracker.camera_motion:
         return lambda _: None
-    held_at = _held_at(settings, telemetry)
+    pose_at = _pose_at(settings, telemetry)
 
     def view_at(frame: Frame) -> CameraView | None:
-        held = held_at(frame.captured_ns)
-        if held is None:
+        pose = pose_at(frame.captured_ns)
+        if pose is None:
             return None
-        mount, ned_from_body = held
+        mount, ned_from_body = pose
         return CameraView(
             settings.camera.model(frame.width, frame.height), mount.ned_from_optical(ned_from_body)
         )
@@ -139,7 +140,7 @@ def _view_at(settings: Settings, telemetry: CameraTelemetry) -> Callable[[Frame]
 
 
 def _find_markers(settings: Settings) -> Callable[[Frame], tuple[Marker, ...]] | None:
-    """What looks for markers in a frame; None where the settings do not ask for it."""
+    """Return the marker detector of frames; None if markers are disabled."""
     kind = settings.markers.kind()
     if kind is None:
         return None
@@ -150,17 +151,17 @@ def _find_markers(settings: Settings) -> Callable[[Frame], tuple[Marker, ...]] |
 def _obstacles_in(
     settings: Settings, telemetry: CameraTelemetry
 ) -> Callable[[Frame], ObstacleSectors | None]:
-    """How far obstacles are in a frame with depth; None without the attitude of that moment."""
-    held_at = _held_at(settings, telemetry)
+    """Return a function from a depth frame to obstacle distances; None without an attitude at that time."""
+    pose_at = _pose_at(settings, telemetry)
 
     def obstacles_in(frame: Frame) -> ObstacleSectors | None:
         if settings.guidance.obstacles == "off" or frame.depth_m is None:
             return None
-        held = held_at(frame.captured_ns)
-        if held is None:
+        pose = pose_at(frame.captured_ns)
+        if pose is None:
             return None
         camera = settings.camera.model(frame.width, frame.height)
-        return obstacle_sectors(frame.depth_m, frame.captured_ns, camera, *held, telemetry.height_m)
+        return obstacle_sectors(frame.depth_m, frame.captured_ns, camera, *pose, telemetry.height_m)
 
     return obstacles_in
 
@@ -168,22 +169,22 @@ def _obstacles_in(
 def _nearest_in(
     settings: Settings, telemetry: CameraTelemetry
 ) -> Callable[[Frame, NDArray[np.float32]], NDArray[np.float32]]:
-    """The nearest points of the objects in a frame's boxes.
+    """Return a function from a frame's boxes to the nearest points of the objects in them.
 
-    Without the attitude of the capture the vehicle is taken as level. The attitude decides which point of the
-    surface counts as the nearest over ground, not where that point lies in the optical frame.
+    Without an attitude at the capture the vehicle is assumed level. The attitude selects the point of the
+    surface that is nearest over ground, it does not change the point's position in the optical frame.
     """
-    held_at = _held_at(settings, telemetry)
+    pose_at = _pose_at(settings, telemetry)
     mount = settings.camera.mount()
 
     def nearest_in(frame: Frame, xyxy: NDArray[np.float32]) -> NDArray[np.float32]:
         assert frame.depth_m is not None
-        held = held_at(frame.captured_ns)
+        pose = pose_at(frame.captured_ns)
         attitude: Array = np.eye(3)
         used = mount.held(attitude) if mount.on_gimbal else mount
         lens_height_m = None
-        if held is not None:
-            used, attitude = held
+        if pose is not None:
+            used, attitude = pose
             if telemetry.height_m is not None:
                 lens_height_m = telemetry.height_m - float(attitude[2] @ used.position_frd_m)
         camera = settings.camera.model(frame.width, frame.height)

@@ -1,7 +1,7 @@
-"""What the service and the perception worker say to each other over their sockets, and how it is framed.
+"""Messages between the service and the perception worker, and their framing on the sockets.
 
 A message is one of the dataclasses below, pickled, after its length (4 bytes, big-endian). Both ends are this
-program, and nobody else holds the sockets.
+program, and no other process has the sockets.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from vision.camera_model import CameraCalibration
 from vision.pipeline import PerceptionResult
 
 _LENGTH = struct.Struct(">I")
-# Far above any message: a result is a few kilobytes. What claims to be longer is not one of ours.
+# Far above any message: a result is a few kilobytes. A longer one is a protocol error.
 LARGEST_BYTES = 1 << 24
 
 
@@ -29,7 +29,7 @@ LARGEST_BYTES = 1 << 24
 
 @dataclass(frozen=True, slots=True)
 class Begin:
-    """The first message: what to do. Tracks are numbered from `first_track_id` on."""
+    """The first message. Tracks are numbered from `first_track_id` on."""
 
     settings: Settings
     first_track_id: int = 1
@@ -45,7 +45,7 @@ class Hud:
 
 @dataclass(frozen=True, slots=True)
 class Attitude:
-    """The vehicle's attitude (w, x, y, z), body FRD to NED, at a CLOCK_MONOTONIC stamp; its known height."""
+    """The vehicle's attitude (w, x, y, z), body FRD to NED, at a CLOCK_MONOTONIC stamp; height above home."""
 
     stamp_ns: int
     wxyz: Quaternion
@@ -62,7 +62,7 @@ class GimbalAttitude:
 
 @dataclass(frozen=True, slots=True)
 class Watched:
-    """Whether anybody wants pictures."""
+    """Whether preview images are wanted."""
 
     watched: bool
 
@@ -79,9 +79,8 @@ class Stop:
 class Ready:
     """The model is loaded and the source has given its first frame.
 
-    `model` is None without a detector; `precision`, which the network computes in, and `runtime`, what
-    computes it, also for a detector without a network. `reason`: why these, in words. `calibration`: of the
-    camera, where it brings one.
+    `model` is None without a detector; `precision` and `runtime` of the network are None without a network.
+    `reason`: why these were selected, as text. `calibration`: from the camera, if it provides one.
     """
 
     source: str
@@ -95,17 +94,17 @@ class Ready:
 
 @dataclass(frozen=True, slots=True)
 class StartFailed:
-    """The worker cannot do what its settings say. One line."""
+    """The worker cannot start with its settings. One line."""
 
     text: str
 
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """A result, and the counts that go with it.
+    """A result with its counters.
 
     Attributes:
-        replaced: results so far that a newer one replaced before they could be sent.
+        replaced: results so far that were replaced by a newer one before they were sent.
     """
 
     result: PerceptionResult
@@ -115,7 +114,7 @@ class Report:
 
 @dataclass(frozen=True, slots=True)
 class Preview:
-    """One frame for people to look at, JPEG."""
+    """One preview image, JPEG."""
 
     sequence: int
     captured_ns: int
@@ -124,7 +123,7 @@ class Preview:
 
 @dataclass(frozen=True, slots=True)
 class Heartbeat:
-    """The loop runs although no frame was processed. `dropped` and `frames_skipped`: as in a result."""
+    """The loop is alive without a processed frame. `dropped` and `frames_skipped`: as in a result."""
 
     frames: int
     dropped: int = 0
@@ -142,7 +141,7 @@ class LogLine:
 
 @dataclass(frozen=True, slots=True)
 class Ended:
-    """The last message. `finished`: the source has ended, or the service asked; else `text` says why."""
+    """The last message. `finished`: the source has ended, or the service requested it; else an error."""
 
     finished: bool
     text: str
@@ -167,17 +166,17 @@ Message = (
 
 
 class ProtocolError(ConnectionError):
-    """What came over the socket is not a message."""
+    """Received data is not a message."""
 
 
 def packed(message: Message) -> bytes:
-    """A message as bytes, length first."""
+    """Encode a message, length first."""
     body = pickle.dumps(message, protocol=pickle.HIGHEST_PROTOCOL)
     return _LENGTH.pack(len(body)) + body
 
 
 def receive(connection: socket.socket) -> Message | None:
-    """The next message of a blocking socket; None when the other end is closed."""
+    """Receive the next message of a blocking socket; None when the other end is closed."""
     header = _receive_exactly(connection, _LENGTH.size)
     if header is None:
         return None
@@ -186,7 +185,7 @@ def receive(connection: socket.socket) -> Message | None:
 
 
 async def read_message(reader: asyncio.StreamReader) -> Message | None:
-    """The next message of a stream; None when the other end is closed."""
+    """Read the next message of a stream; None when the other end is closed."""
     try:
         header = await reader.readexactly(_LENGTH.size)
         return _unpacked(await reader.readexactly(_length(header)))
@@ -210,12 +209,12 @@ def _receive_exactly(connection: socket.socket, count: int) -> bytes | None:
 def _length(header: bytes) -> int:
     length: int = _LENGTH.unpack(header)[0]
     if length > LARGEST_BYTES:
-        raise ProtocolError(f"a message of {length} bytes is not one of ours")
+        raise ProtocolError(f"message length {length} bytes exceeds {LARGEST_BYTES}")
     return length
 
 
 def _unpacked(body: bytes) -> Message:
     message: Any = pickle.loads(body)
     if not isinstance(message, Message):
-        raise ProtocolError(f"{type(message).__name__} is not a message")
+        raise ProtocolError(f"{type(message).__name__} is not a message type")
     return message

@@ -1,4 +1,4 @@
-"""Pictures for whoever is watching: the newest frame as JPEG, by a thread of its own, only when asked for."""
+"""Preview images: the newest frame as JPEG, encoded in a thread, only while requested."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from vision.frame import Frame
 
 logger = logging.getLogger(__name__)
 
-# The network, in the same process, comes first.
+# The network, in the same process, has priority.
 _NICER = 5
 
 
 class PreviewEncoder:
-    """Encodes at most `rate_hz` frames a second; of those that come meanwhile only the newest waits.
+    """Encodes at most `rate_hz` frames a second; only the newest frame waits.
 
     Attributes:
-        watched: whether anybody wants pictures; while not, a frame costs nothing.
+        watched: whether previews are wanted; if not, a frame costs nothing.
 
     Args:
-        deliver: takes each picture, in the encoder's thread.
+        deliver: called with each preview, in the encoder's thread.
     """
 
     def __init__(self, settings: PreviewSection, deliver: Callable[[Preview], None]) -> None:
@@ -44,7 +44,7 @@ class PreviewEncoder:
         self._thread.start()
 
     def write(self, frame: Frame, detections: Detections) -> None:
-        """Give it one frame, with the newest detections. Never waits."""
+        """Queue a frame with the newest detections. Never waits."""
         if not self.watched or frame.captured_ns < self._due_ns:
             return
         self._due_ns = frame.captured_ns + round(1e9 / self._settings.rate_hz)
@@ -70,8 +70,8 @@ class PreviewEncoder:
                 (frame, detections), self._waiting = self._waiting, None
             try:
                 self._deliver(self._encoded(frame, detections))
-            except Exception:  # one picture that cannot be made must not end those that follow
-                logger.exception("a preview of %dx%d failed", frame.width, frame.height)
+            except Exception:  # a failed preview must not end the thread
+                logger.exception("preview of %dx%d failed", frame.width, frame.height)
 
     def _encoded(self, frame: Frame, detections: Detections) -> Preview:
         image = annotate(frame.image, detections) if self._settings.annotate else frame.image

@@ -1,4 +1,4 @@
-"""The perception worker seen from the service: one process, the sockets to it, and its end."""
+"""The perception worker as seen from the service: one process and the sockets to it."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ from companion.settings import Settings
 
 logger = logging.getLogger(__name__)
 
-# Results that wait in the kernel are old before they are read: room for about ten, no more.
+# Results queued in the kernel are outdated when read: room for about ten.
 _SEND_BUFFER_BYTES = 16384
-# Above this much that the worker has not taken (it is stopped, or busy) no more lines for the video go there.
+# Above this backlog (the worker is stopped or busy) no more overlay lines are sent.
 _UNREAD_BYTES = 65536
-# What a worker and its libraries print: a traceback goes through, a flood is cut.
+# Limits of the worker's printed output: a traceback passes, a flood is cut.
 _PRINTED_LINES_PER_S, _PRINTED_LINE_BYTES = 100, 1000
-# At its death the last lines may take so long to be read.
+# How long the last printed lines may take to be read after its end.
 _LAST_LINES_S = 0.5
 
 
 class PerceptionProcess:
-    """A worker that was started. Make one with `spawn`.
+    """A started worker. Create one with `spawn`.
 
-    What it says and what it is told go by sockets of their own: to write to a worker that has just ended
-    fails, and asyncio then closes that socket with all that was not read yet, the last words among it.
+    Reports and control messages use separate sockets: a write to a worker that has just ended fails, and
+    asyncio then closes that socket and discards unread data, including the worker's last message.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class PerceptionProcess:
     ) -> None:
         self._process = process
         self._reports = reports[0]
-        self._orders = control[1]
+        self._control = control[1]
         self._ends = (reports[1], control[1])
         self._printing = threading.Thread(
             target=log_printed, args=(printed, process.pid), name="worker's standard error", daemon=True
@@ -63,43 +63,48 @@ class PerceptionProcess:
 
     @classmethod
     async def spawn(cls, settings: Settings, standard_input: int, first_track_id: int = 1) -> Self:
-        """Start a fresh interpreter that has nothing of this one but the search path.
+        """Start a new interpreter with this one's module search path.
 
         Args:
-            standard_input: the descriptor that becomes the worker's, or `subprocess.DEVNULL`.
-            first_track_id: the number of its first track.
+            standard_input: descriptor of the worker's standard input, or `subprocess.DEVNULL`.
+            first_track_id: the id of its first track.
 
         Raises:
             OSError: no more processes or descriptors.
         """
-        said, saying = socket.socketpair()
-        told, telling = socket.socketpair()
-        # Not our own standard error: where nobody reads that, the worker would stop at its next line.
+        reports_here, reports_there = socket.socketpair()
+        control_there, control_here = socket.socketpair()
+        # Not our own standard error: if that is not read, the worker would block at its next line.
         printed, printing = os.pipe()
-        with saying, told, contextlib.ExitStack() as always, contextlib.ExitStack() as failing:
+        with (
+            reports_there,
+            control_there,
+            contextlib.ExitStack() as always,
+            contextlib.ExitStack() as failing,
+        ):
             always.callback(os.close, printing)
             failing.callback(os.close, printed)
-            failing.enter_context(said)
-            failing.enter_context(telling)
-            saying.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES)
-            reports = await asyncio.open_connection(sock=said)
+            failing.enter_context(reports_here)
+            failing.enter_context(control_here)
+            reports_there.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES)
+            reports = await asyncio.open_connection(sock=reports_here)
             failing.callback(reports[1].close)
-            control = await asyncio.open_connection(sock=telling)
+            control = await asyncio.open_connection(sock=control_here)
             failing.callback(control[1].close)
             process = await asyncio.create_subprocess_exec(
                 sys.executable,
-                "-P",  # the search path below, and not the working directory, says what is imported
+                "-P",  # import from the search path below, not from the working directory
                 "-m",
                 "companion.perception.worker",
-                str(saying.fileno()),
-                str(told.fileno()),
+                str(reports_there.fileno()),
+                str(control_there.fileno()),
                 str(os.getpid()),
-                pass_fds=(saying.fileno(), told.fileno()),
+                pass_fds=(reports_there.fileno(), control_there.fileno()),
                 stdin=standard_input,
                 stdout=printing,
                 stderr=printing,
                 env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-                # A Ctrl-C in the terminal is for the service, which then asks the worker to end.
+                # Ctrl-C in the terminal is for the service, which then stops the worker.
                 process_group=0,
             )
             failing.pop_all()
@@ -112,21 +117,21 @@ class PerceptionProcess:
         return self._process.pid
 
     async def read(self) -> Message | None:
-        """The next message; None when the worker has closed its end, which it does by dying too."""
+        """Read the next message; None when the worker has closed its end or died."""
         return await read_message(self._reports)
 
-    def show(self, hud: Hud) -> None:
-        """Tell what to draw on the recorded video. Left out while the worker takes no orders."""
-        if self._orders.transport.get_write_buffer_size() < _UNREAD_BYTES:
+    def send_hud(self, hud: Hud) -> None:
+        """Send the overlay of the recorded video; skipped while the worker does not read."""
+        if self._control.transport.get_write_buffer_size() < _UNREAD_BYTES:
             self._put(hud)
 
-    def turn(self, attitude: Attitude | GimbalAttitude) -> None:
-        """Tell how vehicle or gimbal was turned. Left out while an older one waits: a newer will come."""
-        if not self._orders.transport.get_write_buffer_size():
+    def send_attitude(self, attitude: Attitude | GimbalAttitude) -> None:
+        """Send an attitude of vehicle or gimbal; skipped while an older one is unsent."""
+        if not self._control.transport.get_write_buffer_size():
             self._put(attitude)
 
     def watch(self, watched: bool) -> None:
-        """Tell whether anybody wants pictures."""
+        """Send whether previews are wanted."""
         self._put(Watched(watched))
 
     def ask_to_stop(self) -> None:
@@ -139,12 +144,12 @@ class PerceptionProcess:
         self._signal(signal.SIGKILL)
 
     def close(self) -> None:
-        """Hear and tell nothing more."""
+        """Close the sockets."""
         for end in self._ends:
             end.close()
 
-    async def ends_within(self, timeout_s: float) -> bool:
-        """Whether it is dead by then."""
+    async def wait_ended(self, timeout_s: float) -> bool:
+        """Wait for its end; False on timeout."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(timeout_s):
                 await self._process.wait()
@@ -152,7 +157,7 @@ class PerceptionProcess:
         return False
 
     async def wait(self) -> str:
-        """Wait for its death; how it died, in words."""
+        """Wait for its end; returns how it ended, as text."""
         code = await self._process.wait()
         self.close()
         await asyncio.to_thread(self._printing.join, _LAST_LINES_S)
@@ -172,13 +177,13 @@ class PerceptionProcess:
             self._process.send_signal(number)
 
     def _put(self, message: Message) -> None:
-        # A write to a worker that is gone is dropped by the transport; its death shows in `read`.
-        if not self._orders.is_closing():
-            self._orders.write(packed(message))
+        # A write to a dead worker is dropped by the transport; `read` detects its end.
+        if not self._control.is_closing():
+            self._control.write(packed(message))
 
 
 def log_printed(descriptor: int, pid: int) -> None:
-    """Into the log, until its end: what the worker and the libraries in it print."""
+    """Log what the worker and its libraries print, until the pipe is closed."""
     partial, cut, since_s, lines_left = b"", 0, -1.0, 0
     with open(descriptor, "rb", buffering=0) as pipe:
         while data := pipe.read(65536):

@@ -1,19 +1,19 @@
-"""How many attitudes go on to a worker: telemetry may bring more than it needs."""
+"""Limits the rate of attitudes sent to a worker."""
 
 from __future__ import annotations
 
-# At most 50 attitudes a second go to the worker; the tolerance is for telemetry of 50 Hz, which jitters.
+# At most 50 attitudes a second; the tolerance is for the jitter of telemetry at 50 Hz.
 ATTITUDE_PERIOD_S, ATTITUDE_JITTER_S = 0.02, 0.005
 
 
 class RateLimiter:
-    """Lets through at most 50 a second of one row of attitudes."""
+    """Passes at most 50 attitudes of one series a second."""
 
     def __init__(self) -> None:
         self._due_ns = 0
 
     def due(self, stamp_ns: int) -> bool:
-        """Whether the attitude of this stamp (CLOCK_MONOTONIC ns) goes on; the next one's turn follows."""
+        """Whether to send the attitude of this stamp (CLOCK_MONOTONIC ns); if so, schedules the next."""
         if self._due_ns - stamp_ns > ATTITUDE_JITTER_S * 1e9:
             return False
         self._due_ns = max(

@@ -1,10 +1,10 @@
-"""The worker's way out, so that the loop never waits for a service that reads slowly.
+"""Sends the worker's messages without ever blocking its loop on a slow service.
 
-A result leaves at once, from the thread that found it: to wake another for it takes longer than to send it.
-What the socket does not take at once, and everything else, a thread of its own sends.
+A result is sent at once from the thread that produced it: waking another thread takes longer than sending it.
+What the socket does not accept at once, and everything else, is sent by a separate thread.
 
-Of results and heartbeats only the newest waits; an older one is replaced and counted, but what it told of
-tracks that began, got lost or ended goes with the newer. Everything else waits in a queue, bounded too.
+Of results and heartbeats only the newest waits; an older one is replaced and counted, but its track events
+(new, lost, end) are merged into the newer one. Everything else waits in a bounded queue.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ from vision.tracking import TrackEventKind
 
 _QUEUED_LINES = 1000
 _LONGEST_LINE = 2000
-# A service that has not read for so many is no more; what it would be told is not worth all memory.
+# Limit of merged track events, which bounds the memory if the service does not read.
 _WAITING_EVENTS = 1000
 
 
 class ResultSender:
-    """Sends messages over `connection`. Its methods never block, but `close`.
+    """Sends messages over `connection`. Only `close` blocks.
 
     Args:
-        connection: loses its time-out.
-        on_lost: called once, in a thread of its own, when the other end is gone.
+        connection: its timeout is removed.
+        on_lost: called once, in the sender's thread, when the other end is gone.
     """
 
     def __init__(self, connection: socket.socket, on_lost: Callable[[], None]) -> None:
-        connection.settimeout(None)  # with one, Python waits for the socket whatever MSG_DONTWAIT says
+        connection.settimeout(None)  # with a timeout, Python ignores MSG_DONTWAIT and waits
         self._connection = connection
         self._on_lost = on_lost
         self._changed = threading.Condition()
@@ -59,13 +59,13 @@ class ResultSender:
         self._thread.start()
 
     def put(self, message: Message) -> None:
-        """Send this, in order with the others of its kind."""
+        """Send a message, in order with the others of its kind."""
         with self._changed:
             self._queue.append(message)
             self._changed.notify()
 
     def put_newest(self, message: Report | Heartbeat) -> None:
-        """Send this now, or as soon as it can be, unless a newer one comes before.
+        """Send a message now, or as soon as possible unless a newer one replaces it.
 
         A heartbeat never replaces a result.
         """
@@ -80,27 +80,27 @@ class ResultSender:
                 self._changed.notify()
 
     def put_preview(self, preview: Preview) -> None:
-        """Send this when nothing else waits, unless a newer one comes before."""
+        """Send a preview when nothing else waits, unless a newer one replaces it."""
         with self._changed:
             self._preview = preview
             self._changed.notify()
 
     def close(self, last: Ended | StartFailed, timeout_s: float) -> None:
-        """Send what waits and then `last`, for at most `timeout_s`."""
+        """Send the queued messages and then `last`, for at most `timeout_s`."""
         with self._changed:
             self._last = last
             self._changed.notify()
         self._thread.join(timeout_s)
 
     def _send_newest(self) -> bool:
-        """From the thread that calls, if nothing else is under way; False leaves something to the other."""
+        """Send from the calling thread if nothing else is in progress; False if the sender's thread must."""
         if self._busy or self._rest or self._queue or self._last:
             return False
         message = self._take_newest()
         data = packed(message)
         try:
             sent = self._connection.send(data, socket.MSG_DONTWAIT)
-        except OSError:  # full, or the other end is gone: the thread waits for it, or finds out
+        except OSError:  # full, or the other end is gone: left to the sender's thread
             self._newest = message
             return False
         self._rest = data[sent:]
@@ -112,7 +112,7 @@ class ResultSender:
         return replace(newest, replaced=self._replaced) if isinstance(newest, Report) else newest
 
     def _next(self) -> Message | bytes:
-        """What the thread sends now: a message, or the rest of one."""
+        """Wait for what to send next: a message, or the rest of one."""
         with self._changed:
             self._busy = False
             self._changed.wait_for(
@@ -143,7 +143,7 @@ class ResultSender:
 
 
 def _with_events_of(older: Report, newer: Report) -> Report:
-    """The newer report, with the events of the older that are told once only."""
+    """Return the newer report with the older one's events, except updates."""
     once = tuple(event for event in older.result.track_events if event.kind is not TrackEventKind.UPDATE)
     if not once:
         return newer
@@ -152,17 +152,17 @@ def _with_events_of(older: Report, newer: Report) -> Report:
 
 
 class ResultLogHandler(logging.Handler):
-    """Log records as lines to the service; a traceback stays on the worker's standard error."""
+    """Sends log records to the service; a traceback goes only to the worker's standard error."""
 
     def __init__(self, sender: ResultSender) -> None:
         super().__init__()
-        self._outbox = sender
+        self._sender = sender
 
     def emit(self, record: logging.LogRecord) -> None:
         try:
             text = " ".join(record.getMessage().split())[:_LONGEST_LINE]
-            self._outbox.put(LogLine(record.levelno, record.name, text))
+            self._sender.put(LogLine(record.levelno, record.name, text))
             if record.exc_info:
                 traceback.print_exception(record.exc_info[1])
-        except Exception:  # a bad log call must not end perception; logging shows it on standard error
+        except Exception:  # a bad log call must not end perception; logging prints it to standard error
             self.handleError(record)

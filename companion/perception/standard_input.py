@@ -1,9 +1,9 @@
-"""Standard input as a source that outlives its reader: frames go on whole, to one worker after another.
+"""Standard input as a source that survives worker restarts: each worker starts at a whole frame.
 
-What a dead worker had read of a pipe is gone with it, and in a stream of raw pixels nobody can tell where the
-next frame begins. So the service keeps the pipe. A thread moves the bytes on into a pipe of the worker's own
-(`splice(2)`: the kernel moves pages, nothing is copied here) and always knows where in a frame it is. The
-next worker gets the stream's header, if it has one, and then the next whole frame.
+What a dead worker had read from a pipe is lost, and a stream of raw pixels has no frame boundaries to find.
+So the service keeps the pipe. A thread moves the bytes into a separate pipe of the worker (`splice(2)`: the
+kernel moves pages, nothing is copied here) and tracks the position in the frame. The next worker gets the
+stream's header, if any, and then the next whole frame.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ _LONGEST_LINE = 4096
 
 
 class _Framing(NamedTuple):
-    """How the stream is made of frames.
+    """The framing of the stream.
 
     Attributes:
-        header: what every reader needs before its first frame.
-        frame_bytes: of one frame; None where frames tell their own beginning, as MJPEG's do.
-        has_lines: every frame comes after a line of its own.
-        taken: what was read of the first frame while finding this out.
+        header: sent to every reader before its first frame.
+        frame_bytes: of one frame; None if frames are self-delimiting, as in MJPEG.
+        has_lines: every frame is preceded by a line.
+        taken: bytes of the first frame that were read during detection.
     """
 
     header: bytes = b""
@@ -46,7 +46,7 @@ class _Framing(NamedTuple):
     taken: bytes = b""
 
 
-class _End(Exception):  # noqa: N818 - an end, not an error
+class _End(Exception):  # noqa: N818 - end of stream, not an error
     """The writer of standard input has closed it."""
 
 
@@ -54,7 +54,7 @@ class StandardInput:
     """The service's standard input, for its workers. Call `for_worker` before each start.
 
     Args:
-        source: says what the pipe carries.
+        source: the format of the stream.
         descriptor: readable; stays open.
     """
 
@@ -71,10 +71,10 @@ class StandardInput:
         self._thread: threading.Thread | None = None
 
     def for_worker(self) -> int:
-        """A descriptor to be the next worker's standard input. The caller closes it."""
+        """Return a descriptor for the next worker's standard input. The caller closes it."""
         if not self._is_stream:
             if self._file_begins is not None:
-                # Every worker reads a file from where it began, as it does a file that has a name.
+                # Every worker reads a file from its start position, as with a named file.
                 os.lseek(self._descriptor, self._file_begins, os.SEEK_SET)
             return os.dup(self._descriptor)
         reader, writer = os.pipe()
@@ -91,7 +91,7 @@ class StandardInput:
         return reader
 
     def close(self) -> None:
-        """No more workers will come. The thread ends when it next has something to hand on."""
+        """Stop: no more workers. The thread ends at its next data."""
         with self._changed:
             self._closed = True
             self._close_waiting_writer()
@@ -100,7 +100,7 @@ class StandardInput:
     # --- the thread
 
     def _run(self) -> None:
-        with contextlib.suppress(OSError):  # above the user's limit: the default size does
+        with contextlib.suppress(OSError):  # above the user's limit: the default size is used
             fcntl.fcntl(self._descriptor, fcntl.F_SETPIPE_SZ, _CHUNK_BYTES)
         writer: int | None = None
         try:
@@ -113,9 +113,9 @@ class StandardInput:
                         return
                 if framing.has_lines:
                     line = self._line()
-                handed_on = self._forward(line, framing.frame_bytes, writer)
+                forwarded = self._forward(line, framing.frame_bytes, writer)
                 line = b""
-                if not handed_on:
+                if not forwarded:
                     os.close(writer)
                     writer = None
         except _End:
@@ -141,11 +141,11 @@ class StandardInput:
         header = beginning + self._line()
         try:
             return _Framing(header, parse_y4m_header(header.rstrip(b"\n")).frame_bytes, has_lines=True)
-        except StreamError:  # the worker meets it too, and tells it
+        except StreamError:  # the worker detects and reports it too
             return _Framing(taken=header)
 
     def _next_writer(self, header: bytes) -> int | None:
-        """Wait for the next worker's pipe; None when no more will come."""
+        """Wait for the next worker's pipe; None after `close`."""
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._waiting_writer is not None or self._closed)
@@ -155,7 +155,7 @@ class StandardInput:
             os.close(writer)
 
     def _forward(self, line: bytes, frame_bytes: int | None, writer: int) -> bool:
-        """Move one frame. False if the worker has died; the rest of its frame is passed over then."""
+        """Forward one frame. False if the worker has died; the rest of its frame is then discarded."""
         alive = _written(writer, line)
         remaining = 0 if frame_bytes is None else frame_bytes
         try:
@@ -187,7 +187,7 @@ class StandardInput:
             return data
 
     def _move(self, writer: int, count: int) -> int:
-        """Move at most `count` bytes; how many."""
+        """Move at most `count` bytes; returns their number."""
         while True:
             try:
                 moved = os.splice(self._descriptor, writer, min(count, _CHUNK_BYTES))
@@ -197,7 +197,7 @@ class StandardInput:
             except OSError as error:
                 if error.errno != errno.EINVAL:
                     raise
-                data = self._read(min(count, _CHUNK_BYTES))  # a socket of a kind that cannot be spliced
+                data = self._read(min(count, _CHUNK_BYTES))  # a socket type without splice support
                 if not _written(writer, data):
                     raise BrokenPipeError from None
                 return len(data)
@@ -217,7 +217,7 @@ class StandardInput:
 
 
 def _written(writer: int, data: bytes) -> bool:
-    """Write all of it; False if nobody reads that pipe any more."""
+    """Write all data; False if the pipe has no reader."""
     try:
         while data:
             data = data[os.write(writer, data) :]

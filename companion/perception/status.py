@@ -1,4 +1,4 @@
-"""What the service knows of perception at one moment."""
+"""The state of perception at one moment."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from vision.pipeline import PerceptionResult
 
 
 class PerceptionState(StrEnum):
-    """What the supervisor is doing."""
+    """State of the supervisor."""
 
     STOPPED = "stopped"
     STARTING = "starting"
     RUNNING = "running"
     RESTARTING = "restarting"
-    FINISHED = "finished"  # the source came to its end
+    FINISHED = "finished"  # the source has ended
     FAILED = "failed"  # given up
 
 
@@ -34,17 +34,17 @@ class PerceptionStatus:
         newest: the newest result; None before the first.
         age_s: of the newest result, from its capture.
         timing_ms: stage → milliseconds of the newest result.
-        timing_p50_ms, timing_p99_ms: stage → milliseconds that half, and 99 of 100, of the newest 200 results
-            did not exceed. `publish` is the way from the worker onto the bus.
-        dropped: frames lost before they were looked at, and results replaced by newer ones before they left.
+        timing_p50_ms, timing_p99_ms: stage → median and 99th percentile of the newest 200 results,
+            milliseconds. `publish` is the time from the worker's result to its publication.
+        dropped: frames lost before they were processed, and results replaced by newer ones before sending.
         frames_skipped: reason → frames that were not processed, or whose result was replaced by a newer one
             before it was sent (`superseded`); see `PerceptionResult`.
-        stuck_after_s: the silence after which the worker counts as stuck.
-        class_names: what the model knows; empty before the start and without a detector.
-        tracks: objects that are followed now and count as true.
-        runtime: what computes the network; None before the start and without a network.
-        runtime_reason: why that, and why in its precision, in words.
-        problem: the last thing that went wrong, empty if nothing did.
+        stuck_after_s: the silence after which the worker is stuck.
+        class_names: classes of the model; empty before the start and without a detector.
+        tracks: confirmed tracks that have not ended.
+        runtime: runtime of the network; None before the start and without a network.
+        runtime_reason: why this runtime and precision, as text.
+        problem: the last error, empty if none.
     """
 
     state: PerceptionState
@@ -68,7 +68,7 @@ class PerceptionStatus:
     problem: str = ""
 
     def as_dict(self) -> dict[str, Any]:
-        """The same as plain values, ready for JSON; of the newest result only its sequence number."""
+        """Convert to JSON-able values; of the newest result only its sequence number."""
         return {
             "state": self.state.value,
             "pid": self.pid,

@@ -1,7 +1,7 @@
-"""The perception worker's supervisor: starts it, reads it, and starts it again when it is dead or stuck.
+"""The perception worker's supervisor: starts it, reads its messages, restarts it when it is dead or stuck.
 
-Nothing here waits for the worker: what it says is taken as it comes. A worker that is silent for too long is
-killed. At most `MAX_RESTARTS` restarts in `RESTART_WINDOW_S`, then the supervisor gives up and says so.
+Nothing here waits for the worker: its messages are processed as they arrive. A worker that is silent for too
+long is killed. After `MAX_RESTARTS` restarts in `RESTART_WINDOW_S` the supervisor gives up and reports it.
 """
 
 from __future__ import annotations
@@ -55,12 +55,12 @@ _RATE_WINDOW_S = 2.0
 
 
 class PerceptionStartError(RuntimeError):
-    """Perception cannot start as it is set up. The text is one line for a person."""
+    """Perception cannot start with its settings. The message is one line."""
 
 
 @dataclass(frozen=True, slots=True)
 class _End:
-    """How a worker ended. `finished`: in order, and not to be started again."""
+    """The end of a worker. `finished`: normal, and it is not restarted."""
 
     finished: bool
     text: str
@@ -81,14 +81,14 @@ class _Counts:
 class PerceptionSupervisor:
     """Keeps one perception worker running. Everything is called, and calls back, in one asyncio loop.
 
-    The loop must run in a thread that lasts: the kernel ends the worker when the thread that started it ends.
+    The loop must run in a long-lived thread: the kernel ends the worker when the thread that started it ends.
 
     Args:
-        settings: the sections source, detector, recording and log are the worker's.
-        on_result: called with every result. Its sequence numbers go on when a worker is replaced.
-        on_event: called with a level (`info`, `warning`, `error`) and a line for people.
-        on_preview: called with pictures, while `watch(True)`.
-        on_calibration: called when a worker is ready, with what its camera brings; None: nothing.
+        settings: the sections source, detector, recording and log are used by the worker.
+        on_result: called with every result. Sequence numbers continue when a worker is replaced.
+        on_event: called with a level (`info`, `warning`, `error`) and a line of text.
+        on_preview: called with preview images, while `watch(True)`.
+        on_calibration: called when a worker is ready, with its camera's calibration or None.
     """
 
     def __init__(
@@ -111,7 +111,7 @@ class PerceptionSupervisor:
         self._stop_asked = asyncio.Event()
         self._killed = False
         self._process: PerceptionProcess | None = None
-        self._pulse: Watchdog | None = None
+        self._watchdog: Watchdog | None = None
         self._input: StandardInput | None = None
         self._ready: Ready | None = None
         self._hud = Hud((), None)
@@ -126,19 +126,19 @@ class PerceptionSupervisor:
         self._times = StageTimes()
         self._first_sequence = 0
         self._tracks = LiveTracks()
-        self._vehicle_pace, self._gimbal_pace = RateLimiter(), RateLimiter()
+        self._vehicle_limiter, self._gimbal_limiter = RateLimiter(), RateLimiter()
 
     async def start(self) -> None:
         """Start the worker; returns when its model is loaded and its source has given a frame.
 
         Raises:
-            PerceptionStartError: it cannot: no such model, an unknown class, a source that does not open.
+            PerceptionStartError: no such model, an unknown class, or a source that cannot be opened.
         """
         if self._task is not None:
-            raise RuntimeError("a perception supervisor is started once; make another")
+            raise RuntimeError("a perception supervisor can be started only once; create another")
         self._state = PerceptionState.STARTING
         started: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._task = asyncio.create_task(self._keep(started), name="perception supervisor")
+        self._task = asyncio.create_task(self._run(started), name="perception supervisor")
         self._task.add_done_callback(self._on_fault)
         try:
             await asyncio.wait({started, self._task}, return_when=asyncio.FIRST_COMPLETED)
@@ -150,9 +150,9 @@ class PerceptionSupervisor:
             raise PerceptionStartError(self._problem)
 
     async def stop(self) -> None:
-        """End the worker: asked (it finishes the video), then terminated, then killed; in at most 7 s.
+        """Stop the worker: by request (it finishes the video), then SIGTERM, then SIGKILL; in at most 7 s.
 
-        An end that is not in order is a warning: the video may not be whole then.
+        An abnormal end is a warning: the video may be incomplete.
         """
         task = self._task
         if task is None or self._stop_asked.is_set():
@@ -173,61 +173,61 @@ class PerceptionSupervisor:
         self._state = PerceptionState.STOPPED
 
     def send_hud(self, lines: Sequence[str], highlight: str | None = None) -> None:
-        """What to draw on the recorded video from now on.
+        """Set the overlay of the recorded video.
 
         Args:
-            lines: text for the panel.
-            highlight: the class whose surest detection is the one that matters now.
+            lines: text of the panel.
+            highlight: the class whose most confident detection is highlighted.
         """
         self._hud = Hud(tuple(lines), highlight)
         if self._process is not None and self._settings.recording.video is not None:
-            self._process.show(self._hud)
+            self._process.send_hud(self._hud)
 
     def published(self, result: PerceptionResult) -> None:
-        """A result is on the network now: the last of its stages, from when it was known, is over."""
+        """Record the publication of a result: the duration of its last stage, since the inference."""
         self._times.add({"publish": (time.monotonic_ns() - result.inferred_ns) / 1e6})
 
     def watch(self, watched: bool) -> None:
-        """Whether anybody wants pictures; until then none is made."""
+        """Set whether preview images are wanted; initially not."""
         if watched != self._watched:
             self._watched = watched
             if self._process is not None:
                 self._process.watch(watched)
 
     def send_attitude(self, stamp_ns: int, attitude: Quaternion, height_m: float | None = None) -> None:
-        """Where the vehicle was turned to, for tracker and obstacles. At most 50 a second go on; never waits.
+        """Send the vehicle's attitude, for tracker and obstacles; at most 50 a second. Never waits.
 
         Args:
             stamp_ns: CLOCK_MONOTONIC nanoseconds.
             attitude: (w, x, y, z), body FRD to NED.
-            height_m: above home, None where unknown.
+            height_m: above home, None if unknown.
         """
-        if self._needs_attitude and self._process is not None and self._vehicle_pace.due(stamp_ns):
-            self._process.turn(Attitude(stamp_ns, attitude, height_m))
+        if self._needs_attitude and self._process is not None and self._vehicle_limiter.due(stamp_ns):
+            self._process.send_attitude(Attitude(stamp_ns, attitude, height_m))
 
     def send_gimbal(self, stamp_ns: int, attitude: Quaternion) -> None:
-        """Where the gimbal of this camera looked, as `send_attitude`; (w, x, y, z), its FRD to NED."""
-        if self._needs_attitude and self._process is not None and self._gimbal_pace.due(stamp_ns):
-            self._process.turn(GimbalAttitude(stamp_ns, attitude))
+        """Send the gimbal's attitude, as `send_attitude`; (w, x, y, z), gimbal FRD to NED."""
+        if self._needs_attitude and self._process is not None and self._gimbal_limiter.due(stamp_ns):
+            self._process.send_attitude(GimbalAttitude(stamp_ns, attitude))
 
     @property
     def _needs_attitude(self) -> bool:
-        # The tracker removes the camera's turning; ranges from depth need to know where down is.
+        # The tracker compensates the camera's rotation; ranges from depth need the direction of gravity.
         return self._settings.detector.enabled or self._settings.guidance.obstacles != "off"
 
     @property
     def state(self) -> PerceptionState:
-        """What it is doing now."""
+        """The current state."""
         return self._state
 
     @property
     def class_names(self) -> tuple[str, ...]:
-        """What the model knows, id → name; empty before the start and without a detector."""
+        """Classes of the model, id → name; empty before the start and without a detector."""
         return () if self._ready is None else self._ready.class_names
 
     @property
     def status(self) -> PerceptionStatus:
-        """What is known now."""
+        """A snapshot."""
         newest = self._newest
         return PerceptionStatus(
             state=self._state,
@@ -243,7 +243,7 @@ class PerceptionSupervisor:
             timing_p99_ms=self._times.quantile_ms(0.99),
             dropped=self._before.dropped + self._now.dropped,
             frames_skipped=_sum(self._before.frames_skipped, self._now.frames_skipped),
-            stuck_after_s=None if self._pulse is None else self._pulse.stuck_after_s,
+            stuck_after_s=None if self._watchdog is None else self._watchdog.stuck_after_s,
             class_names=self.class_names,
             runtime=None if self._ready is None else self._ready.runtime,
             runtime_reason="" if self._ready is None else self._ready.reason,
@@ -260,16 +260,16 @@ class PerceptionSupervisor:
         return (len(self._arrivals_s) - 1) / (now_s - self._arrivals_s[0])
 
     def _on_fault(self, task: asyncio.Task[None]) -> None:
-        """A fault of ours, or of a callback, ended the supervisor: that must not pass in silence."""
+        """Report an exception of the supervisor or of a callback."""
         if not task.cancelled() and (error := task.exception()) is not None:
             self._state = PerceptionState.FAILED
             self._problem = f"{type(error).__name__}: {error}"
-            logger.error("perception's supervisor failed", exc_info=error)
+            logger.error("perception supervisor failed", exc_info=error)
             self._on_event("error", f"perception failed: {self._problem}")
 
-    # --- worker after worker
+    # --- successive workers
 
-    async def _keep(self, started: asyncio.Future[None]) -> None:
+    async def _run(self, started: asyncio.Future[None]) -> None:
         while True:
             end = await self._run_one(started)
             if self._stop_asked.is_set():
@@ -295,18 +295,18 @@ class PerceptionSupervisor:
             self._restarts += 1
 
     def _after_stop(self, end: _End) -> None:
-        """Say it when a worker that had been seeing did not end as it should have."""
+        """Report a running worker that did not end normally."""
         if end.finished or self._state is not PerceptionState.RUNNING:
             return
-        text = f"did not end in order: {end.text}"
+        text = f"ended abnormally: {end.text}"
         if self._killed:
-            text = f"did not end when asked: {end.text}"
+            text = f"did not end on request: {end.text}"
         if self._settings.recording.video is not None:
-            text += f"; the video {self._settings_of_worker().recording.video} may not be whole"
+            text += f"; the video {self._worker_settings().recording.video} may be incomplete"
         self._on_event("warning", f"perception {text}")
 
     def _after_death(self, end: _End) -> float | None:
-        """Say what was lost; the seconds until the next start, None to give up."""
+        """Report the loss; returns the seconds until the next start, None to give up."""
         now_s = time.monotonic()
         self._lost_s = self._lost_s or now_s
         self._deaths_s.append(now_s)
@@ -316,46 +316,44 @@ class PerceptionSupervisor:
         if deaths > MAX_RESTARTS:
             self._on_event(
                 "error",
-                f"perception failed {deaths} times in {RESTART_WINDOW_S:g} s, the last time: {end.text}; "
-                "it is not started again",
+                f"perception failed {deaths} times in {RESTART_WINDOW_S:g} s, last: {end.text}; "
+                "it is not restarted",
             )
             return None
-        self._on_event(
-            "warning", f"perception lost: {end.text}; starting it again ({deaths} of {MAX_RESTARTS})"
-        )
+        self._on_event("warning", f"perception lost: {end.text}; restarting ({deaths} of {MAX_RESTARTS})")
         return _BACK_OFF_S[min(deaths, len(_BACK_OFF_S)) - 1]
 
     async def _run_one(self, started: asyncio.Future[None]) -> _End:
-        """Start one worker and stay with it until it is dead."""
+        """Start one worker and supervise it until its end."""
         try:
             process = await self._spawn()
         except OSError as error:
-            return _End(False, f"the perception process cannot be started: {error}")
+            return _End(False, f"perception process cannot be started: {error}")
         watchdog = Watchdog(time.monotonic(), self._settings.source.open_timeout_s)
         reading = asyncio.create_task(self._read(process, watchdog, started), name="perception reader")
-        self._process, self._pulse = process, watchdog
+        self._process, self._watchdog = process, watchdog
         try:
-            if self._stop_asked.is_set():  # while it was being started
+            if self._stop_asked.is_set():  # during the start
                 process.ask_to_stop()
             stuck = await self._until_stuck(reading, watchdog)
-            told = None if stuck else reading.result()
-            # A worker that has closed its end has nothing left to do; one that is stuck never will.
-            if stuck or not await process.ends_within(TERMINATE_S):
+            reported = None if stuck else reading.result()
+            # A worker that has closed its end exits soon; a stuck one never does.
+            if stuck or not await process.wait_ended(TERMINATE_S):
                 process.kill()
             died = await process.wait()
-            return stuck or told or _End(False, died)
+            return stuck or reported or _End(False, died)
         finally:
             reading.cancel()
             process.kill()
             process.close()
-            self._process = self._pulse = None
+            self._process = self._watchdog = None
             self._before.add(self._now)
             self._now = _Counts()
             self._tracks.worker_ended()
             self._first_sequence = 0 if self._newest is None else self._newest.sequence + 1
 
     async def _spawn(self) -> PerceptionProcess:
-        settings = self._settings_of_worker()
+        settings = self._worker_settings()
         if settings.source.uri != STANDARD_INPUT:
             return await PerceptionProcess.spawn(settings, asyncio.subprocess.DEVNULL, self._tracks.next_id)
         if self._input is None:
@@ -364,21 +362,21 @@ class PerceptionSupervisor:
         try:
             return await PerceptionProcess.spawn(settings, descriptor, self._tracks.next_id)
         finally:
-            # The worker's copy must be the only one, or its death would not be seen.
+            # The worker's copy must be the only one, else its death is not detected.
             os.close(descriptor)
 
-    def _settings_of_worker(self) -> Settings:
+    def _worker_settings(self) -> Settings:
         video = self._settings.recording.video
         if video is None or self._restarts == 0:
             return self._settings
-        # The video of the worker before is left as it is; the next part goes beside it.
+        # The previous worker's video is kept; the next part gets a new name.
         path = Path(video)
         part = str(path.with_name(f"{path.stem}-{self._restarts + 1}{path.suffix}"))
         recording = self._settings.recording.model_copy(update={"video": part})
         return self._settings.model_copy(update={"recording": recording})
 
     async def _until_stuck(self, reading: asyncio.Task[_End | None], watchdog: Watchdog) -> _End | None:
-        """Wait until nothing more can be read (None), or until the worker is silent for too long."""
+        """Wait until the worker's messages end (None), or until it is silent for too long."""
         while True:
             before_s = time.monotonic()
             await asyncio.wait({reading}, timeout=_TICK_S)
@@ -386,20 +384,20 @@ class PerceptionSupervisor:
                 return None
             now_s = time.monotonic()
             if now_s - before_s > 4 * _TICK_S:
-                # We stood still ourselves; what the worker said meanwhile is still to be read.
-                watchdog.forgive(now_s)
-            # Once it is asked to stop it says nothing more, and `stop` has limits of its own.
+                # This loop was blocked; the worker's messages are still unread.
+                watchdog.reset(now_s)
+            # After the stop request it sends no messages, and `stop` has its own timeouts.
             elif not self._stop_asked.is_set() and watchdog.silent_s(now_s) > watchdog.stuck_after_s:
                 assert self._process is not None
                 text = (
-                    f"process {self._process.pid} is stuck, no message for {watchdog.silent_s(now_s):.1f} s"
+                    f"process {self._process.pid} is stuck: no message for {watchdog.silent_s(now_s):.1f} s"
                 )
                 return _End(False, text)
 
     async def _read(
         self, process: PerceptionProcess, watchdog: Watchdog, started: asyncio.Future[None]
     ) -> _End | None:
-        """Take every message; returns what the worker told of its end, None if it told nothing."""
+        """Process all messages; returns the end reported by the worker, None if it reported none."""
         while True:
             try:
                 message = await process.read()
@@ -407,11 +405,11 @@ class PerceptionSupervisor:
                 return _End(False, str(error))
             if message is None:
                 return None
-            watchdog.heard(time.monotonic())
+            watchdog.on_message(time.monotonic())
             match message:
                 case Report():
-                    self._take(message)
-                    watchdog.resulted(message.result.timing_ms.get("total", 0.0) / 1e3)
+                    self._on_report(message)
+                    watchdog.on_result(message.result.timing_ms.get("total", 0.0) / 1e3)
                 case Ready():
                     watchdog.ready()
                     self._on_ready(message, process)
@@ -425,7 +423,7 @@ class PerceptionSupervisor:
                     self._now.frames = message.frames
                     return _End(message.finished, message.text)
                 case _:
-                    self._note(message)
+                    self._on_other(message)
 
     def _on_ready(self, ready: Ready, process: PerceptionProcess) -> None:
         self._ready = ready
@@ -434,7 +432,7 @@ class PerceptionSupervisor:
         self.send_hud(self._hud.lines, self._hud.highlight)
         process.watch(self._watched)
         if self._lost_s is not None:
-            self._on_event("info", f"perception is back after {time.monotonic() - self._lost_s:.1f} s")
+            self._on_event("info", f"perception restored after {time.monotonic() - self._lost_s:.1f} s")
             self._lost_s = None
             return
         model = "no detector"
@@ -442,10 +440,10 @@ class PerceptionSupervisor:
             model = f"model {ready.model} with {len(ready.class_names)} classes"
             model += f" by {ready.runtime}" if ready.runtime else ""
             model += f" in {ready.precision}" if ready.precision else ""
-        self._on_event("info", f"perception sees {ready.source}, {model} (process {process.pid})")
+        self._on_event("info", f"perception running: {ready.source}, {model} (process {process.pid})")
 
-    def _take(self, report: Report) -> None:
-        result = self._tracks.take(
+    def _on_report(self, report: Report) -> None:
+        result = self._tracks.update(
             replace(report.result, sequence=report.result.sequence + self._first_sequence)
         )
         self._count(report.frames, result.dropped, result.frames_skipped, report.replaced)
@@ -458,15 +456,15 @@ class PerceptionSupervisor:
         self._on_result(result)
 
     def _count(self, frames: int, dropped: int, frames_skipped: Mapping[str, int], superseded: int) -> None:
-        """What the present worker has read and lost so far."""
+        """Set the counts of the current worker."""
         self._now = _Counts(frames, dropped + superseded, {**frames_skipped, "superseded": superseded})
 
-    def _note(self, message: Message) -> None:
+    def _on_other(self, message: Message) -> None:
         if isinstance(message, Heartbeat):
             superseded = self._now.frames_skipped.get("superseded", 0)
             self._count(message.frames, message.dropped, message.frames_skipped, superseded)
         elif isinstance(message, LogLine):
-            # What a person should know is an event; the rest is only for the log. Never both.
+            # Warnings and errors become events, the rest is only logged. Never both.
             if message.level >= logging.WARNING:
                 level = "error" if message.level >= logging.ERROR else "warning"
                 self._on_event(level, message.text)

@@ -1,4 +1,4 @@
-"""How long each stage of perception takes: the median and the slow end of the newest results."""
+"""Durations of the perception stages: quantiles of the newest results."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ WINDOW = 200
 
 
 class StageTimes:
-    """Keeps each stage's newest `WINDOW` times, milliseconds."""
+    """Keeps each stage's newest `WINDOW` durations, milliseconds."""
 
     def __init__(self) -> None:
         self._times: dict[str, deque[float]] = {}
 
     def add(self, timing_ms: Mapping[str, float]) -> None:
-        """Take up one result's times."""
+        """Add one result's durations."""
         for stage, value in timing_ms.items():
             self._times.setdefault(stage, deque(maxlen=WINDOW)).append(value)
 
     def quantile_ms(self, share: float) -> dict[str, float]:
-        """Stage → the time that `share` of the results did not exceed, by nearest rank."""
+        """Return stage → quantile `share` (0..1) by nearest rank."""
         return {stage: _nearest_rank(sorted(values), share) for stage, values in self._times.items()}
 
 

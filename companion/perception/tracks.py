@@ -1,4 +1,4 @@
-"""The tracks of one worker after another: no number comes twice, and what a dead one followed has ended."""
+"""Tracks across worker restarts: ids stay unique, and the tracks of a dead worker end."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from vision.tracking import Track, TrackEvent, TrackEventKind
 
 
 class LiveTracks:
-    """The tracks that count as true and have not ended.
+    """The confirmed tracks that have not ended.
 
     Attributes:
-        next_id: above every number that was seen so far; the next worker's first.
+        next_id: the next worker's first track id, above every id so far.
     """
 
     def __init__(self) -> None:
@@ -23,8 +23,8 @@ class LiveTracks:
     def __len__(self) -> int:
         return len(self._live)
 
-    def take(self, result: PerceptionResult) -> PerceptionResult:
-        """The result, with the ends of what the worker before it had followed."""
+    def update(self, result: PerceptionResult) -> PerceptionResult:
+        """Apply a result; returns it with END events for the previous worker's tracks."""
         stamp_ns = result.captured_ns
         ends = tuple(TrackEvent(TrackEventKind.END, stamp_ns, track) for track in self._orphans)
         self._orphans = ()
@@ -40,6 +40,6 @@ class LiveTracks:
         return replace(result, track_events=ends + result.track_events) if ends else result
 
     def worker_ended(self) -> None:
-        """Nobody follows them any more; that is told with the next worker's first result."""
+        """End all tracks; their END events are added to the next worker's first result."""
         self._orphans += tuple(self._live.values())
         self._live.clear()

@@ -1,6 +1,7 @@
-"""What the service looks through: a camera with its model each, a process each, published under its own name.
+"""Views: each is a camera with its model in a separate process, published under its own name.
 
-The first view is the one of the sections `source`, `camera` and `detector`; it has no name. One view steers.
+The first view uses the sections `source`, `camera` and `detector`; it has no name. One view is the steering
+one.
 """
 
 from __future__ import annotations
@@ -29,20 +30,20 @@ from vision.pipeline import PerceptionResult
 
 logger = logging.getLogger(__name__)
 
-# A view is unwell when its newest result is older than this, and than what is usual for it.
+# A view is unhealthy when its newest result is older than this plus its usual interval.
 _SEEING_S = 1.0
 
 
 class View:
-    """One camera with its model, and what was seen last in it.
+    """One camera with its model, and its newest result.
 
     Attributes:
         name: None for the first.
-        settings: with this view's own sections; `camera` as the camera brings it, where it does.
+        settings: with this view's own sections; `camera` includes the camera's own calibration.
         newest: the newest result; None before the first.
-        targets: where the newest result's objects are, after `place`.
-        localization_error: why they have no place; empty if they have.
-        class_names: what the detector knows; None while there is none to ask.
+        targets: the newest result's localized objects, after `localize`.
+        localization_error: why they could not be localized; empty if they were.
+        class_names: classes of the detector; None before it is loaded.
     """
 
     def __init__(
@@ -54,7 +55,7 @@ class View:
         self.targets: tuple[Target, ...] = ()
         self.localization_error = ""
         self._class_names = class_names
-        self._depth_came = False
+        self._has_depth = False
         self._between_s: deque[float] = deque(maxlen=9)
 
     @property
@@ -62,11 +63,11 @@ class View:
         return self._class_names
 
     def age_s(self, now_ns: int) -> float | None:
-        """Of the newest result, from its capture; None before the first."""
+        """Age of the newest result since its capture; None before the first."""
         return None if self.newest is None else (now_ns - self.newest.captured_ns) / 1e9
 
     def seeing(self, now_ns: int) -> bool:
-        """Results come as they should, or none are to be expected."""
+        """Whether results arrive as expected, or none are expected."""
         if not self.settings.detector.enabled:
             return True
         age_s = self.age_s(now_ns)
@@ -76,7 +77,7 @@ class View:
         return age_s is not None and age_s <= allowed_s + 2 * usual_s
 
     def ranging(self, pitch_rad: float) -> RangeMeans:
-        """What there is to tell how far away something is; everything, before the first result.
+        """Return the available means of range estimation; all of them before the first result.
 
         Args:
             pitch_rad: of the camera above the horizon, with the vehicle level.
@@ -86,10 +87,10 @@ class View:
             return ALL_MEANS
         camera = self.settings.camera.model(newest.width, newest.height)
         heights = frozenset(self.settings.detector.heights())
-        return RangeMeans(self._depth_came, sees_ground(camera, pitch_rad), heights)
+        return RangeMeans(self._has_depth, sees_ground(camera, pitch_rad), heights)
 
-    def place(self, result: PerceptionResult, history: StateHistory) -> None:
-        """Work out where what a result shows is."""
+    def localize(self, result: PerceptionResult, history: StateHistory) -> None:
+        """Set `targets` from a result, or `localization_error`."""
         try:
             self.targets = targets_from_detections(
                 result.detections.records(),
@@ -101,20 +102,20 @@ class View:
             )
             self.localization_error = ""
         except HistoryError as error:
-            # Without the attitude of that moment a box has no direction: seen and published, not steered by.
+            # Without an attitude at the capture a box has no direction: it is published, but not a target.
             self.targets, self.localization_error = (), str(error)
 
-    def take(self, result: PerceptionResult) -> None:
-        """A new result; where its objects are is `place`'s."""
+    def update(self, result: PerceptionResult) -> None:
+        """Set the newest result; `localize` sets its targets."""
         if self.newest is not None:
             self._between_s.append(max(result.captured_ns - self.newest.captured_ns, 0) / 1e9)
         self.newest = result
         if result.obstacles is not None or bool(np.isfinite(result.detections.depth_m).any()):
-            self._depth_came = True
+            self._has_depth = True
 
 
 class WorkerView(View):
-    """A view whose results come from a perception worker, a separate process run by `supervisor`."""
+    """A view whose results are produced by a perception worker, a separate process run by `supervisor`."""
 
     def __init__(
         self,
@@ -136,7 +137,7 @@ class WorkerView(View):
         self.supervisor = PerceptionSupervisor(
             settings,
             on_result=self._on_report,
-            on_event=self._tell,
+            on_event=self._event,
             on_preview=lambda preview: on_preview(self, preview),
             on_calibration=self._adopt,
         )
@@ -153,7 +154,7 @@ class WorkerView(View):
         )
 
     async def start(self) -> None:
-        """Start the worker. Raises PerceptionStartError; the view's name is in its message."""
+        """Start the worker. Raises PerceptionStartError, with the view's name in its message."""
         if self.settings.source.uri == NO_SOURCE:
             return
         try:
@@ -164,7 +165,7 @@ class WorkerView(View):
             raise PerceptionStartError(f"camera {self.name}: {error}") from error
 
     def send_state(self, state: VehicleState, history: StateHistory) -> None:
-        """The worker's tracker needs to know where its camera looked."""
+        """Send the attitudes of vehicle and gimbal to the worker, for its tracker."""
         if state.attitude is not None:
             self.supervisor.send_attitude(state.attitude_ns, state.attitude, state.altitude_m)
         gimbal = state.gimbal
@@ -176,16 +177,16 @@ class WorkerView(View):
                 self.supervisor.send_gimbal(gimbal.attitude_ns, history.gimbal_at(gimbal.attitude_ns))
 
     def _on_report(self, result: PerceptionResult) -> None:
-        self.take(result)
+        self.update(result)
         try:
             self._on_result(self, result)
         except Exception as error:
-            # Perception itself is well: it must not be ended for a fault on this side.
-            logger.exception("a detection message could not be used")
+            # An error in the service must not end perception.
+            logger.exception("a result could not be processed")
             self.targets, self.localization_error = (), f"{type(error).__name__}: {error}"
 
     def _adopt(self, calibration: CameraCalibration | None) -> None:
-        """Go by what the camera brings; the worker does the same with its own copy of the settings."""
+        """Adopt the camera's calibration; the worker does the same with its own copy of the settings."""
         if calibration == self._calibration:
             return
         self._calibration = calibration
@@ -194,14 +195,16 @@ class WorkerView(View):
             adopted = adopt_calibration(self._given, calibration)
             camera = adopted.camera
             if not adopted.conflict:
-                self._tell("info", "lens and mount are those that the camera brings")
+                self._event("info", "using lens and mount of the camera's calibration")
             else:
                 key = "camera" if self.name is None else f"cameras.{self.name}.camera"
-                self._tell("warning", f"{key}: settings win over what the camera brings: {adopted.conflict}")
+                self._event(
+                    "warning", f"{key}: settings override the camera's calibration: {adopted.conflict}"
+                )
         self.settings = self.settings.model_copy(update={"camera": camera})
         self._on_calibration()
 
-    def _tell(self, level: str, text: str) -> None:
+    def _event(self, level: str, text: str) -> None:
         self._on_event(level, text if self.name is None else f"camera {self.name}: {text}")
 
 
@@ -213,9 +216,9 @@ def open_views(
     on_event: Callable[[str, str], None],
     on_calibration: Callable[[], None],
 ) -> tuple[WorkerView, ...]:
-    """Every view there is, the first one first. None is started yet.
+    """Create all views, the first one first, not started yet.
 
-    `on_calibration` is called after a view's `settings.camera` changed to what its camera brings.
+    `on_calibration` is called after a view's `settings.camera` was changed to its camera's calibration.
     """
     own_settings = {name: settings.of_view(name) for name in (None, *settings.cameras)}
     threads = threads_each([own.detector for own in own_settings.values()])
@@ -226,9 +229,9 @@ def open_views(
         if own.detector.threads is None:
             changes["detector"] = own.detector.model_copy(update={"threads": threads})
         if own.source.uri in shared:
-            # Whoever shares it loads a model first.
-            patient_s = own.source.open_timeout_s + START_S
-            changes["source"] = own.source.model_copy(update={"open_timeout_s": patient_s})
+            # The process that shares it loads its model first.
+            timeout_s = own.source.open_timeout_s + START_S
+            changes["source"] = own.source.model_copy(update={"open_timeout_s": timeout_s})
         own = own.model_copy(update=changes)
         views.append(
             WorkerView(
@@ -244,12 +247,11 @@ def open_views(
 
 
 def threads_each(detectors: Sequence[DetectorSection]) -> int:
-    """What every network gets that was not given a number of threads; 1 or more.
+    """Return the threads of each network without a configured number; at least 1.
 
-    All processors but one, less what the others were given, shared out: the service, and whoever talks to it,
-    must not wait for them.
+    All processors but one, less the configured threads, are divided: the service must not wait for them.
     """
-    working = [detector for detector in detectors if detector.enabled]
-    asking = [detector for detector in working if detector.threads is None]
-    taken = sum(detector.threads or 0 for detector in working)
-    return max(1, (len(os.sched_getaffinity(0)) - 1 - taken) // max(1, len(asking)))
+    enabled = [detector for detector in detectors if detector.enabled]
+    automatic = [detector for detector in enabled if detector.threads is None]
+    configured = sum(detector.threads or 0 for detector in enabled)
+    return max(1, (len(os.sched_getaffinity(0)) - 1 - configured) // max(1, len(automatic)))

@@ -1,4 +1,4 @@
-"""What the views see of markers: the newest of each, what is missing, and the message about a frame."""
+"""Markers of all views: the newest of each view, missing conditions, and the published message."""
 
 from __future__ import annotations
 
@@ -24,33 +24,33 @@ class _Seen:
 
 
 class MarkerTracker:
-    """The markers of all views that look for some; any may look down, not only the one that steers."""
+    """The markers of all views with marker detection; not only the steering view may look down."""
 
     def __init__(self, views: Sequence[View]) -> None:
-        self._looking = tuple(view for view in views if view.settings.markers.dictionary is not None)
+        self._detecting = tuple(view for view in views if view.settings.markers.dictionary is not None)
         self._on_pads = {
             view.name: {marker.identifier: marker for marker in view.settings.markers.pad_markers()}
-            for view in self._looking
+            for view in self._detecting
         }
         self._seen: dict[str | None, _Seen] = {}
 
-    def take(
+    def localize(
         self, view: View, result: PerceptionResult, history: StateHistory, vehicle: str, published_ns: int
     ) -> dict[str, Any]:
-        """Work out where the markers of one frame are; returns what is published of it."""
+        """Localize the markers of one frame; returns the message to publish."""
         markers, camera = result.markers or (), view.settings.camera
-        problem, down = "", False
+        error_text, down = "", False
         targets: tuple[MarkerTarget, ...] = ()
         try:
-            # A gimbal first: whether the camera looks down does not depend on the vehicle's place.
+            # The mount first: whether the camera looks down does not depend on the vehicle's position.
             mount = mount_at(camera.mount(), history, result.captured_ns)
             down = looks_down(camera.model(result.width, result.height), mount)
             targets = marker_targets(markers, result.captured_ns, mount, history, self._on_pads[view.name])
         except HistoryError as error:
-            # As with detections: without the attitude of that moment it is seen, and not steered by.
-            problem = str(error)
+            # As with detections: without an attitude at the capture they are published, but not targets.
+            error_text = str(error)
         self._seen[view.name] = _Seen(result.captured_ns, targets, down)
-        placed: Sequence[MarkerTarget | None] = targets or [None] * len(markers)
+        localized: Sequence[MarkerTarget | None] = targets or [None] * len(markers)
         return {
             "vehicle": vehicle,
             "camera": view.name,
@@ -59,13 +59,13 @@ class MarkerTracker:
             "published_ns": published_ns,
             "width": result.width,
             "height": result.height,
-            "localization_error": problem,
-            "markers": [_message(marker, place) for marker, place in zip(markers, placed, strict=True)],
+            "localization_error": error_text,
+            "markers": [_message(*pair) for pair in zip(markers, localized, strict=True)],
         }
 
     def sight(self, now_ns: int, max_age_s: float) -> MarkerSight:
-        """What behaviours see: the markers of the views that look down."""
-        if not self._looking:
+        """Return the markers of the views that look down, for behaviours."""
+        if not self._detecting:
             return MarkerSight()
         down = [seen for seen in self._seen.values() if seen.looks_down]
         if self._seen and not down:
@@ -82,17 +82,17 @@ class MarkerTracker:
         cameras = ", ".join(
             ("camera" if view.name is None else f"cameras.{view.name}.camera")
             + (
-                "'s gimbal does not look down, or does not tell where it looks: gimbal pitch=-90"
+                "'s gimbal does not look down, or its attitude is unknown: use gimbal pitch=-90"
                 if view.settings.camera.on_gimbal
                 else f".mount_pitch_deg is {view.settings.camera.mount_pitch_deg:g}"
             )
-            for view in self._looking
+            for view in self._detecting
         )
         return f"a camera that sees straight down ({cameras})"
 
 
 def _message(marker: Marker, target: MarkerTarget | None) -> dict[str, Any]:
-    """One marker; metres, radians, local NED, pixels. Without a place only what the picture tells."""
+    """Create one marker's message; metres, radians, local NED, pixels. Not localized: image fields only."""
     message: dict[str, Any] = {
         "id": marker.identifier,
         "size_m": marker.size_m,
@@ -101,9 +101,9 @@ def _message(marker: Marker, target: MarkerTarget | None) -> dict[str, Any]:
         "reprojection_px": round(marker.reprojection_px, 3),
         "ambiguity": round(marker.ambiguity, 3),
     }
-    placed = {} if target is None else asdict(target)
+    fields = {} if target is None else asdict(target)
     for name in ("pad", "bearing_rad", "elevation_rad", "distance_m", "ground_range_m", "heading_rad"):
-        message[name] = None if target is None else round(placed[name], 4)
+        message[name] = None if target is None else round(fields[name], 4)
     for name in ("position_ned_m", "pad_ned_m"):
-        message[name] = None if target is None else [round(value, 3) for value in placed[name]]
+        message[name] = None if target is None else [round(value, 3) for value in fields[name]]
     return message

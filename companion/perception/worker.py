@@ -1,7 +1,7 @@
-"""The perception worker: the process in which frames live. `process.py` starts it.
+"""The perception worker: the process that reads and processes frames. `process.py` starts it.
 
-It is given the ends of two sockets, says on one what it sees, takes its orders from the other, and ends when
-their other ends do: frames without anyone to tell are of no use, and a camera can have only one owner.
+It gets two sockets, one for its reports and one for control messages, and exits when their other ends close:
+without the service its results are useless, and a camera can have only one owner.
 """
 
 from __future__ import annotations
@@ -49,25 +49,25 @@ from vision.sources import EndOfStream, Source, SourceError, open_source
 from vision.sources.sharing import FrameSharing
 from vision.video_writer import VideoWriterError
 
-# The loop says at least this often that it turns.
+# Maximum interval of the loop's messages.
 HEARTBEAT_S = 0.25
-# How long the last messages may take to leave, and everything may take to end once the service is gone.
-FAREWELL_S = 2.0
+# Time limits of the last messages, and of the shutdown after the service has gone.
+CLOSE_TIMEOUT_S = 2.0
 _LOADING_PERIOD_S = 2.0
 GRACE_S = 5.0
-# The service's loop, which steers, comes first where they share a core.
+# The service's guidance loop has priority on a shared core.
 NICENESS = 5
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
 class ControlChannel:
-    """What the service wants, taken from its socket by a thread.
+    """The service's control messages, received by a thread.
 
     Attributes:
         stopping: end now.
-        hud: for the recorded video's next frames.
-        telemetry: what the vehicle has told.
-        watched: whether anybody wants pictures.
+        hud: overlay of the recorded video's next frames.
+        telemetry: of the vehicle.
+        watched: whether previews are wanted.
     """
 
     def __init__(self, connection: socket.socket) -> None:
@@ -77,17 +77,17 @@ class ControlChannel:
         self.telemetry = CameraTelemetry()
         self._connection = connection
         self._finished = threading.Event()
-        threading.Thread(target=self._take, name="inbox", daemon=True).start()
+        threading.Thread(target=self._receive, name="control", daemon=True).start()
 
     def stop(self) -> None:
         """End now. Takes no lock: a second signal may come while the first is handled in the same thread."""
         self.stopping = True
 
     def finished(self) -> None:
-        """The work has ended in time."""
+        """Note that the work has ended in time."""
         self._finished.set()
 
-    def _take(self) -> None:
+    def _receive(self) -> None:
         while (message := receive(self._connection)) is not None:
             if isinstance(message, Hud):
                 self.hud = message
@@ -100,7 +100,7 @@ class ControlChannel:
                 self.watched = message.watched
             elif isinstance(message, Stop):
                 self.stop()
-        # The service is gone. Whoever is stuck in a driver by then will not come back from there.
+        # The service is gone. A thread still blocked in a driver after the grace time never returns.
         self.stop()
         if not self._finished.wait(GRACE_S):
             os._exit(1)
@@ -108,7 +108,7 @@ class ControlChannel:
 
 @dataclass(frozen=True, slots=True)
 class Perception:
-    """Everything that was opened."""
+    """The opened parts of the worker."""
 
     source: Source
     detector: ObjectDetector | None
@@ -116,22 +116,22 @@ class Perception:
     preview: PreviewEncoder
 
     def write(self, frame: Frame, detections: Detections) -> None:
-        """Give a frame, after its result has left, to all who keep or show pictures."""
+        """Pass a frame, after its result was sent, to recording and preview."""
         if self.recording is not None:
             self.recording.write(frame, detections)
         self.preview.write(frame, detections)
 
 
 def main(arguments: list[str]) -> int:
-    """Work until the source, the service or the order ends it.
+    """Run until the source ends, the service ends, or a stop is requested.
 
     Args:
-        arguments: the descriptors of the sockets for reports and for orders, and the service's process id.
+        arguments: the descriptors of the report and control sockets, and the service's process id.
     """
-    reports, told, service_pid = (int(argument) for argument in arguments)
+    reports, control_fd, service_pid = (int(argument) for argument in arguments)
     _end_with(service_pid)
     os.nice(NICENESS)
-    connection = socket.socket(fileno=told)
+    connection = socket.socket(fileno=control_fd)
     begin = receive(connection)
     if not isinstance(begin, Begin):
         return 1
@@ -140,17 +140,17 @@ def main(arguments: list[str]) -> int:
     sender = ResultSender(socket.socket(fileno=reports), on_lost=control.stop)
     logging.basicConfig(level=begin.settings.log.level.upper(), handlers=[ResultLogHandler(sender)])
     last = _work(begin, control, sender)
-    sender.close(last, FAREWELL_S)
+    sender.close(last, CLOSE_TIMEOUT_S)
     control.finished()
     return 0 if isinstance(last, Ended) and last.finished else 1
 
 
 def _end_with(service_pid: int) -> None:
-    """Be told by the kernel when the service dies; and a Ctrl-C in the terminal is for the service alone."""
+    """Let the kernel send SIGTERM when the service dies; ignore Ctrl-C, which is for the service."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if sys.platform == "linux":
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
-    if os.getppid() != service_pid:  # it died before the kernel was asked to tell
+    if os.getppid() != service_pid:  # it died before prctl
         os._exit(1)
 
 
@@ -169,10 +169,10 @@ def _work(begin: Begin, control: ControlChannel, sender: ResultSender) -> Ended 
             OSError,
         ) as error:  # CheckpointError is a ValueError
             return StartFailed(_one_line(error))
-        except Exception as error:  # a fault of ours: where it happened goes to standard error
+        except Exception as error:  # a bug: the traceback goes to standard error
             traceback.print_exc()
             return StartFailed(f"perception cannot start: {type(error).__name__}: {_one_line(error)}")
-        # What was loaded stays: looking through it would take the garbage collector the time of a frame.
+        # Loaded objects stay: scanning them would cost the garbage collector the time of a frame.
         gc.collect()
         gc.freeze()
         sender.put(_ready(settings, perception))
@@ -197,24 +197,24 @@ def _work(begin: Begin, control: ControlChannel, sender: ResultSender) -> Ended 
             traceback.print_exc()
             return Ended(False, f"{type(error).__name__}: {_one_line(error)}", pipeline.frames)
         frames = pipeline.frames
-    return Ended(True, "asked to stop", frames)
+    return Ended(True, "stop requested", frames)
 
 
 @contextlib.contextmanager
 def _heartbeat_while_loading(settings: Settings, sender: ResultSender) -> Iterator[None]:
-    """To convert a model for another runtime, and to try which is the fastest, may take minutes.
+    """Send heartbeats while loading: converting a model and selecting a runtime may take minutes.
 
-    What a plug-in's detector does at its start is not known.
+    The loading time of a plug-in's detector is unknown.
     """
     loaded = threading.Event()
 
-    def say() -> None:
+    def send_heartbeats() -> None:
         while not loaded.wait(_LOADING_PERIOD_S):
             sender.put_newest(Heartbeat(0))
 
     others = settings.detector.kind != YOLO or bool(settings.plugins.modules)
     if settings.detector.runtime != "torch" or others:
-        threading.Thread(target=say, name="loading", daemon=True).start()
+        threading.Thread(target=send_heartbeats, name="loading", daemon=True).start()
     try:
         yield
     finally:
@@ -233,7 +233,7 @@ def _open(settings: Settings, stack: contextlib.ExitStack, sender: ResultSender)
         on_frame = stack.enter_context(FrameSharing(settings.source.share)).write
     source = stack.enter_context(open_source(settings.source.uri, settings.source.opening(on_frame)))
     if recording is not None:
-        # Once more, to be finished before the source closes, which may take its time in a driver.
+        # Again, to finish it before the source closes, which may be slow in a driver.
         stack.callback(recording.close)
     preview = PreviewEncoder(settings.preview, sender.put_preview)
     stack.callback(preview.close)
@@ -256,12 +256,12 @@ def _ready(settings: Settings, perception: Perception) -> Ready:
 
 
 def _run(pipeline: Pipeline, perception: Perception, control: ControlChannel, sender: ResultSender) -> None:
-    said_s = time.monotonic()
+    sent_s = time.monotonic()
 
     def deliver(result: PerceptionResult) -> None:
-        nonlocal said_s
+        nonlocal sent_s
         sender.put_newest(Report(result, pipeline.frames, replaced=0))
-        said_s = time.monotonic()
+        sent_s = time.monotonic()
 
     while not control.stopping:
         if perception.recording is not None:
@@ -269,9 +269,9 @@ def _run(pipeline: Pipeline, perception: Perception, control: ControlChannel, se
             perception.recording.highlight = control.hud.highlight
         perception.preview.watched = control.watched
         pipeline.step(HEARTBEAT_S, deliver)
-        if time.monotonic() - said_s >= HEARTBEAT_S:
+        if time.monotonic() - sent_s >= HEARTBEAT_S:
             sender.put_newest(Heartbeat(pipeline.frames, pipeline.dropped, pipeline.frames_skipped))
-            said_s = time.monotonic()
+            sent_s = time.monotonic()
 
 
 def _one_line(error: BaseException) -> str:
@@ -281,5 +281,5 @@ def _one_line(error: BaseException) -> str:
 if __name__ == "__main__":
     code = main(sys.argv[1:])
     sys.stderr.flush()
-    # Without the interpreter's own farewell: a thread that is still in a driver would hold it up or break it.
+    # Skip the interpreter's shutdown: a thread that is still in a driver would block or crash it.
     os._exit(code)

@@ -1,4 +1,4 @@
-"""The service: assembly, supervision, the one loop."""
+"""The companion service: assembly, supervision, the asyncio loop."""
 
 from companion.service.event import Event
 from companion.service.service import Service

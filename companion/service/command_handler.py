@@ -1,4 +1,4 @@
-"""From a command's text to its answer: read, flown by guidance, answered."""
+"""Parses command texts, passes them to guidance and returns their results."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from companion.guidance.missions.sequence import SequenceBehaviour
 
 
 class CommandHandler:
-    """The one place where commands come in.
+    """The entry point of all commands.
 
     Args:
-        read: makes a guidance command of an identifier and a text; raises GrammarError.
-        on_command: called when one waits for guidance's next step.
-        on_event: called with (level, text) for what a person should know.
-        refusal: why a command may not go to guidance, or None.
+        read: parses a guidance command from an identifier and a text; raises GrammarError.
+        on_command: called when a command waits for guidance's next step.
+        on_event: called with (level, text) for the operator.
+        check_requirements: returns why a command may not go to guidance, or None.
     """
 
     def __init__(
@@ -39,7 +39,7 @@ class CommandHandler:
         self._awaited: dict[int, asyncio.Future[Outcome]] = {}
 
     async def execute(self, text: str) -> dict[str, Any]:
-        """Do what a command says; the reply tells how it ended. See `Service.command`."""
+        """Execute a command and return its result. See `Service.command`."""
         try:
             command = self._read(next(self._identifiers), text)
         except GrammarError as error:
@@ -53,7 +53,7 @@ class CommandHandler:
         self._awaited[command.identifier] = ended
         self._new.append(command)
         self._on_command()
-        # A caller who stops waiting does not stop what is flown.
+        # A cancelled caller does not stop the behaviour.
         outcome = await asyncio.shield(ended)
         more: dict[str, Any] = {}
         if isinstance(command.behaviour, SequenceBehaviour):
@@ -64,17 +64,17 @@ class CommandHandler:
         return {"command": command.text, **answer, **more}
 
     def take_commands(self) -> tuple[CommandInput, ...]:
-        """Those that have come since the last call."""
+        """Return the commands received since the last call."""
         commands, self._new = tuple(self._new), []
         return commands
 
     def on_result(self, result: CommandResult) -> None:
-        """Guidance has answered a command."""
+        """Pass on a result from guidance."""
         ended = self._awaited.pop(result.identifier, None)
         if ended is not None and not ended.done():
             ended.set_result(result.outcome)
 
     def close(self, reason: str) -> None:
-        """Answer every command that guidance will not answer any more."""
+        """Fail every command that is still pending."""
         for identifier in list(self._awaited):
             self.on_result(CommandResult(identifier, Outcome(False, reason)))

@@ -1,4 +1,4 @@
-"""What a service tells people of itself."""
+"""Events of the service for the operator."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ logger = logging.getLogger(__package__)
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something a person should know. `level` is info, warning or error."""
+    """A message for the operator. `level` is info, warning or error."""
 
     stamp_ns: int
     level: str
@@ -22,13 +22,13 @@ class Event:
 
 
 class EventLog:
-    """Every event goes into the log, onto the bus and to a listener.
+    """Sends every event to the log, the bus and a listener.
 
     Args:
-        publish: an event as it is published. on_event: called with every event.
+        publish: publishes an event's message. on_event: called with every event.
 
     Attributes:
-        newest: the last hundred.
+        newest: the last hundred events.
     """
 
     def __init__(
@@ -38,7 +38,7 @@ class EventLog:
         self.newest: deque[Event] = deque(maxlen=100)
 
     def add(self, level: str, text: str) -> None:
-        """Something happened. Never raises, whatever the listener does."""
+        """Add an event. Never raises, whatever the listener does."""
         event = Event(time.monotonic_ns(), level, text)
         self.newest.append(event)
         logger.log(getattr(logging, level.upper()), "%s", text)
@@ -47,5 +47,5 @@ class EventLog:
             try:
                 self._on_event(event)
             except Exception:
-                # A listener must not be able to bring the vehicle down.
+                # A listener's error must not end the service.
                 logger.exception("an event listener failed")

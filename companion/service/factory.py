@@ -1,4 +1,4 @@
-"""The parts of a service as its settings want them. A flight in lockstep is made of the same ones."""
+"""Creates the parts of a service from its settings; flights in lockstep use the same functions."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from companion.vehicle.streamer import Streamer
 
 
 def driver_of(settings: Settings) -> Driver:
-    """The link to the autopilot, not open yet."""
+    """Create the driver, not connected yet."""
     return open_driver(
         settings.vehicle.driver,
         settings.vehicle.url,
@@ -33,7 +33,7 @@ def driver_of(settings: Settings) -> Driver:
 
 
 def guidance_options(settings: Settings, own_address: Address) -> GuidanceOptions:
-    """What guidance keeps to. `own_address`: system and component id of our messages."""
+    """Create guidance's options. `own_address`: system and component id of our messages."""
     guidance = settings.guidance
     cameras = [settings.of_view(name).camera for name in (None, *settings.cameras)]
     return GuidanceOptions(
@@ -50,7 +50,7 @@ def guidance_options(settings: Settings, own_address: Address) -> GuidanceOption
 
 
 def gimbal_mounting(cameras: Sequence[CameraSection], steering: CameraSection) -> GimbalMounting:
-    """How the gimbal stands to the cameras of all views and to the one that steers."""
+    """Return which cameras the gimbal carries: any of all cameras, and the steering one."""
     return GimbalMounting(
         carries_camera=any(camera.on_gimbal for camera in cameras),
         carries_steering=steering.on_gimbal,
@@ -61,13 +61,13 @@ def gimbal_mounting(cameras: Sequence[CameraSection], steering: CameraSection) -
 def streamer_of(
     settings: Settings, send: Callable[[Setpoint], None], clock_ns: Callable[[], int] = time.monotonic_ns
 ) -> Streamer:
-    """The streamer. `send` puts a setpoint on the wire."""
+    """Create the streamer. `send` sends a setpoint to the autopilot."""
     guidance = settings.guidance
     return Streamer(send, rate_hz=guidance.setpoint_rate_hz, brake_s=guidance.brake_s, clock_ns=clock_ns)
 
 
 def limits_of(settings: Settings) -> Limits:
-    """The envelope's limits, from the settings of the same names."""
+    """Return the envelope's limits, from the settings of the same names."""
     guidance = settings.guidance
     return Limits(
         max_horizontal_speed_mps=guidance.max_horizontal_speed_mps,

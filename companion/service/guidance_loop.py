@@ -1,6 +1,6 @@
-"""The loop that steers: moves values between guidance, the streamer, the driver and whoever commands.
+"""The guidance loop: exchanges data between guidance, streamer, driver and command sources.
 
-The heartbeat and systemd's watchdog are fed from here, so whoever watches them watches the loop that steers.
+The heartbeat and systemd's watchdog are triggered from here, so they supervise this loop.
 """
 
 from __future__ import annotations
@@ -20,24 +20,24 @@ from companion.service.requests import RequestRunner
 from companion.vehicle.driver import Driver
 from companion.vehicle.streamer import Streamer
 
-# Told with the command's own answer.
+# Reported with the command's own result.
 _ANSWERED = (EventKind.REFUSED, EventKind.ENDED, EventKind.STARTED)
-# A step that takes longer holds up the setpoints of the 50 Hz stream: processor time, and time that passed
-# (longer, because other programs may have the processor).
+# A longer step delays the setpoints of the 50 Hz stream: processor time, and wall-clock time (larger, because
+# other programs may have the processor).
 SLOW_STEP_NS, STALLED_STEP_NS = 5_000_000, 50_000_000
-# Of one behaviour it is said so often.
+# Minimum interval of this warning for one behaviour.
 SLOW_AGAIN_NS = 10_000_000_000
-# The end of the service waits this long for what is held to be given back.
+# How long the shutdown waits for the release of resources such as gimbal control.
 RELEASE_TIMEOUT_S = 3.0
 
 
 class GuidanceLoop:
-    """Steps guidance at its rate, and at once when something has come that it should know.
+    """Steps guidance at its rate, and at once on new input.
 
     Args:
         rate_hz: of guidance.
         on_event: called with (level, text). on_step: called after every step with its time.
-        others: who else commands the vehicle.
+        others: other services that command the vehicle.
     """
 
     def __init__(
@@ -73,16 +73,16 @@ class GuidanceLoop:
         self._slow: tuple[str, int] = ("", 0)
 
     async def execute(self, text: str) -> dict[str, Any]:
-        """Do what a command says; see `Service.command`."""
+        """Execute a command; see `Service.command`."""
         return await self._commands.execute(text)
 
-    def on_seen(self) -> None:
-        """The steering camera has seen something: the setpoint that follows from it leaves at once."""
+    def on_perception(self) -> None:
+        """Step on a new perception result, and send the resulting setpoint at once."""
         self._seen = True
         self._wake.set()
 
     async def run(self) -> None:
-        """Until cancelled."""
+        """Run until cancelled."""
         while True:
             now_ns = time.monotonic_ns()
             seen, self._seen = self._seen, False
@@ -90,19 +90,19 @@ class GuidanceLoop:
             if seen:
                 self._streamer.send_now(now_ns)
             self._on_step(now_ns)
-            await self._something_new_until(now_ns / 1e9 + self._period_s)
+            await self._wait_for_input_until(now_ns / 1e9 + self._period_s)
 
-    def begin_to_end(self) -> None:
-        """From now on take no commands and stream nothing. `run`, where it still runs, goes on."""
+    def begin_shutdown(self) -> None:
+        """Accept no more commands and stream nothing from now on. `run` continues."""
         self._ending = True
         self._step(time.monotonic_ns())
 
-    async def until_released(self) -> None:
-        """After `begin_to_end`: give back what is held, and wait for that, but not for ever."""
+    async def wait_released(self) -> None:
+        """After `begin_shutdown`: release resources, for at most `RELEASE_TIMEOUT_S`."""
         until_s = time.monotonic() + RELEASE_TIMEOUT_S
         try:
             while not self._step(time.monotonic_ns()).released and time.monotonic() < until_s:
-                await self._something_new_until(time.monotonic() + self._period_s)
+                await self._wait_for_input_until(time.monotonic() + self._period_s)
         finally:
             await self._requests.close()
             self._commands.close(ENDING)
@@ -125,17 +125,18 @@ class GuidanceLoop:
         return output
 
     def _warn_slow(self, before: str, used_ns: int, passed_ns: int, now_ns: int) -> None:
-        """Name a behaviour whose update is slow (`before`: the one of before the step, if there was one).
+        """Warn of a behaviour with a slow update (`before`: the behaviour before the step, if any).
 
-        While an update blocks nothing is sent, and the autopilot's failsafe acts."""
+        While an update blocks, nothing is sent, and the autopilot's failsafe acts.
+        """
         name = before or ("" if self.guidance.behaviour is None else self.guidance.behaviour.name)
         if not name or (used_ns < SLOW_STEP_NS and passed_ns < STALLED_STEP_NS):
             return
-        last, told_ns = self._slow
-        if name != last or now_ns - told_ns >= SLOW_AGAIN_NS:
+        last, warned_ns = self._slow
+        if name != last or now_ns - warned_ns >= SLOW_AGAIN_NS:
             self._slow = (name, now_ns)
-            text = f"{used_ns / 1e6:.0f} ms of processor time, {passed_ns / 1e6:.0f} ms in all"
-            self._on_event("warning", f"{name}: slow update ({text}); at most 5 ms are expected")
+            text = f"{used_ns / 1e6:.0f} ms of processor time, {passed_ns / 1e6:.0f} ms elapsed"
+            self._on_event("warning", f"{name}: slow update ({text}); expected at most 5 ms")
 
     def _apply(self, output: GuidanceOutput) -> None:
         if output.setpoint is None:
@@ -154,8 +155,8 @@ class GuidanceLoop:
         for result in output.results:
             self._commands.on_result(result)
 
-    async def _something_new_until(self, due_s: float) -> None:
-        """Return when something has come, or at that time (CLOCK_MONOTONIC seconds)."""
+    async def _wait_for_input_until(self, due_s: float) -> None:
+        """Wait for new input, or until a time (CLOCK_MONOTONIC seconds)."""
         try:
             async with asyncio.timeout(due_s - time.monotonic()):
                 await self._wake.wait()

@@ -1,4 +1,4 @@
-"""With every step of guidance: the link, our heartbeat, systemd's watchdog, the text in the video."""
+"""Periodic work of the guidance loop: link state, heartbeat, systemd's watchdog, video overlay."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from companion.vehicle.driver import CommandRefusedError, Driver, SystemStatus
 
 HEARTBEAT_PERIOD_S = 1.0
 HUD_PERIOD_S = 0.2
-# ArduPilot's default, for which a velocity is flown on; 1 s is advised (docs/safety.md).
+# ArduPilot's default, for which it continues a velocity; 1 s is advised (docs/safety.md).
 LONG_GUIDED_TIMEOUT_S = 3.0
 
 
 class Health:
-    """Fed by the loop that steers: what hangs there stops the heartbeat and the watchdog too.
+    """Called by the guidance loop: when that hangs, the heartbeat and the watchdog stop too.
 
     Args:
-        others: who else commands the vehicle; watched from here.
-        on_event: called with (level, text) for what a person should know.
+        others: other services that command the vehicle; checked from here.
+        on_event: called with (level, text) for the operator.
     """
 
     def __init__(
@@ -39,26 +39,26 @@ class Health:
         self._linked = False
 
     def healthy(self, now_ns: int) -> bool:
-        """Every camera delivers, and the autopilot is there."""
+        """Whether every camera delivers results and the autopilot is connected."""
         return all(view.seeing(now_ns) for view in self._views) and self._driver.state.connected(now_ns)
 
     async def check(self) -> None:
-        """Once, after the link has opened: read what a person should have set in the autopilot."""
+        """Check the autopilot's parameters once, after the link has opened."""
         if self._driver.state.autopilot != "ArduPilot":
             return
         try:
             timeout_s = await self._driver.get_parameter("GUID_TIMEOUT")
         except CommandRefusedError as error:
-            self._on_event("warning", f"GUID_TIMEOUT is not known: {error}")
+            self._on_event("warning", f"GUID_TIMEOUT cannot be read: {error}")
             return
         if timeout_s >= LONG_GUIDED_TIMEOUT_S:
             self._on_event(
                 "warning",
-                f"GUID_TIMEOUT is {timeout_s:g} s: ArduPilot flies on for that long without us; set it to 1",
+                f"GUID_TIMEOUT is {timeout_s:g} s: ArduPilot flies on for that long on silence; set it to 1",
             )
 
     def after_step(self, now_ns: int, guidance: Guidance) -> None:
-        """Once for every step of guidance."""
+        """Run the periodic work; call after every step of guidance."""
         linked = self._driver.state.connected(now_ns)
         if linked != self._linked:
             self._linked = linked

@@ -1,6 +1,6 @@
-"""What guidance is told: the vehicle's states, what the cameras saw and the other vehicles, as one input.
+"""Assembles guidance's input: vehicle state, perception results and other vehicles.
 
-No asyncio and no clock: the service and a flight in lockstep assemble their inputs here.
+No asyncio and no clock: the service and flights in lockstep assemble their inputs here.
 """
 
 from __future__ import annotations
@@ -30,25 +30,25 @@ from vision.pipeline import PerceptionResult
 
 logger = logging.getLogger(__name__)
 
-# Of the line of a command; the longest that is of use is a path of hundreds of points.
+# Maximum length of a command line; a path of hundreds of points fits.
 LONGEST_LINE = 8000
-# A text of the autopilot's that comes again and again is told so often, and so many texts are remembered.
-TELL_AGAIN_S, MOST_TOLD = 10.0, 100
+# Minimum interval of a repeated autopilot text, and the number of texts remembered for that.
+REPEAT_INTERVAL_S, MAX_REMEMBERED = 10.0, 100
 
 
 class InputAssembler:
-    """Gathers what comes in between two steps of guidance.
+    """Collects the input between two steps of guidance.
 
     Args:
-        views: the cameras; the one that `guidance.camera` names steers.
-        on_event: called with (level, text) for what a person should know.
+        views: the cameras; `guidance.camera` names the steering one.
+        on_event: called with (level, text) for the operator.
 
     Raises:
-        PluginError: a module that `plugins.modules` names cannot be loaded.
+        PluginError: a module in `plugins.modules` cannot be loaded.
 
     Attributes:
-        steering: the view whose targets behaviours see.
-        history: where the vehicle was in the last few seconds.
+        steering: the view whose targets behaviours get.
+        history: the vehicle's states of the last few seconds.
         poses: the other vehicles.
     """
 
@@ -66,10 +66,10 @@ class InputAssembler:
         self._mode_changes = 0
         self._on_event = on_event
         self._reported: tuple[Report, ...] = ()
-        self._told_ns: dict[str, int] = {}
+        self._logged_ns: dict[str, int] = {}
 
     def on_state(self, state: VehicleState) -> None:
-        """A new snapshot of the vehicle."""
+        """Process a new snapshot of the vehicle."""
         if state.reports is not self._reported:
             self._log_reports(state)
         if (state.mode, state.armed) != self._shown:
@@ -78,26 +78,26 @@ class InputAssembler:
         self.history.add(state)
 
     def _log_reports(self, state: VehicleState) -> None:
-        """What the autopilot warns of, if it is about the mode that is flown."""
+        """Pass on the autopilot's warnings about its current mode."""
         last_ns = self._reported[-1].stamp_ns if self._reported else 0
         self._reported = state.reports
-        for one in state.warnings_since(last_ns + 1):
-            told_ns = self._told_ns.get(one.text)
-            again = told_ns is None or one.stamp_ns - told_ns >= TELL_AGAIN_S * 1e9
-            if again and among_modes(state.mode, one.modes):
-                self._told_ns[one.text] = one.stamp_ns
-                self._on_event("warning", f"autopilot: {one.text}")
-        if len(self._told_ns) > MOST_TOLD:
-            self._told_ns.clear()
+        for report in state.warnings_since(last_ns + 1):
+            logged_ns = self._logged_ns.get(report.text)
+            due = logged_ns is None or report.stamp_ns - logged_ns >= REPEAT_INTERVAL_S * 1e9
+            if due and among_modes(state.mode, report.modes):
+                self._logged_ns[report.text] = report.stamp_ns
+                self._on_event("warning", f"autopilot: {report.text}")
+        if len(self._logged_ns) > MAX_REMEMBERED:
+            self._logged_ns.clear()
 
     def on_result(self, view: View, result: PerceptionResult, now_ns: int) -> dict[str, Any] | None:
-        """What a view saw in one frame. Returns the message about its markers, where some are looked for."""
+        """Process a view's result; returns the message of its markers if marker detection is on."""
         markers = None
         if result.markers is not None:
             name = self._settings.vehicle.name
-            markers = self._markers.take(view, result, self.history, name, now_ns)
+            markers = self._markers.localize(view, result, self.history, name, now_ns)
         if view is self.steering:
-            view.place(result, self.history)
+            view.localize(result, self.history)
             if result.obstacles is not None:
                 self._obstacles = result.obstacles
         return markers
@@ -112,7 +112,7 @@ class InputAssembler:
         commands: Sequence[CommandInput] = (),
         ending: bool = False,
     ) -> GuidanceInput:
-        """Everything that is known now."""
+        """Assemble the input of one step."""
         steering, newest = self.steering, self.steering.newest
         return GuidanceInput(
             state,
@@ -131,7 +131,7 @@ class InputAssembler:
         )
 
     def camera_pitch_rad(self, state: VehicleState) -> float:
-        """Of the steering camera above the horizon, with the vehicle level."""
+        """Pitch of the steering camera above the horizon, with the vehicle level."""
         camera, gimbal = self.steering.settings.camera, state.gimbal
         held_rad = gimbal.pitch_rad if camera.on_gimbal and gimbal is not None else None
         return math.radians(camera.mount_pitch_deg) + (held_rad or 0.0)
@@ -143,24 +143,22 @@ class InputAssembler:
         state: VehicleState,
         check_requirements: Callable[[Behaviour], str | None],
     ) -> CommandInput:
-        """A command as guidance takes it.
+        """Parse a command for guidance.
 
         Args:
-            text: one line; of a mission that is not on this computer its own lines may follow.
-            check_requirements: guidance's own, asked by a mission at each of its steps.
+            text: one line; a mission's lines may follow, if its file is not on this computer.
+            check_requirements: guidance's own, called by a mission at each of its steps.
 
         Raises:
-            GrammarError: with what is wrong, a line for each problem.
+            GrammarError: one line for each problem.
         """
         text, _, enclosed = text.strip().partition("\n")
         if len(text) > LONGEST_LINE:
-            raise GrammarError(
-                f"a command has at most {LONGEST_LINE} characters in its line, got {len(text)}"
-            )
+            raise GrammarError(f"a command line has at most {LONGEST_LINE} characters, got {len(text)}")
         names = self.steering.class_names
         command = parse(text, names)
         if enclosed and not command.takes_attachment:
-            raise GrammarError(f"{command}: one command at a time; only a mission may have more lines")
+            raise GrammarError(f"{command}: expected one line; only a mission may have more lines")
         if (aim := command.aim) is not None:
             return CommandInput(identifier, str(command), aim=aim, mode_changes=self._mode_changes)
         footprint = Footprint(self.steering.settings.camera.field_rad, -self.camera_pitch_rad(state))
@@ -180,6 +178,6 @@ class InputAssembler:
         except GrammarError:
             raise
         except Exception as error:
-            # A plug-in must not be able to end the service.
+            # A plug-in's error must not end the service.
             logger.exception("%s cannot be built", command.word)
             raise GrammarError(f"{command.word}: {type(error).__name__}: {error}") from error

@@ -1,4 +1,4 @@
-"""Publishes what the service knows: results of the cameras, vehicle, pose, setpoints."""
+"""Publishes the service's data: camera results, vehicle, pose, setpoints."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ logger = logging.getLogger(__package__)
 
 
 class Publisher:
-    """Everything but `status` and `events`, which the service publishes itself."""
+    """Publishes every topic except `status` and `events`, which the service publishes itself."""
 
     def __init__(self, vehicle: str, bus: Bus, driver: Driver, inputs: InputAssembler) -> None:
         self._vehicle, self._bus, self._driver, self._inputs = vehicle, bus, driver, inputs
@@ -38,12 +38,12 @@ class Publisher:
     def publish_result(
         self, view: WorkerView, result: PerceptionResult, markers: dict[str, Any] | None
     ) -> None:
-        """What a view saw in one frame."""
+        """Publish a view's result. Never raises."""
         try:
             self._publish_result(view, result, markers)
         except Exception as error:
-            # It was flown by, and that goes on; that it was not published must not pass in silence.
-            logger.exception("a detection message could not be published")
+            # Guidance has used the result and continues; the failure is logged and in `status`.
+            logger.exception("a result could not be published")
             view.localization_error = f"{type(error).__name__}: {error}"
 
     def _publish_result(
@@ -62,14 +62,14 @@ class Publisher:
         view.supervisor.published(result)
 
     def publish_preview(self, view: WorkerView, preview: Preview) -> None:
-        """A picture for whoever watches, with what it is of."""
+        """Publish a preview image with its stamps."""
         stamps = {"camera": view.name, "sequence": preview.sequence, "captured_ns": preview.captured_ns}
-        self._bus.publish_picture(topics.IMAGE, preview.jpeg, stamps, view.name)
+        self._bus.publish_image(topics.IMAGE, preview.jpeg, stamps, view.name)
 
     async def publish_vehicle(
         self, guidance: Guidance, streamer: Streamer, views: Sequence[WorkerView]
     ) -> None:
-        """The vehicle, its pose for the others, and the setpoints, at the rate of `vehicle`, for ever."""
+        """Publish vehicle, pose and setpoints at the rate of `vehicle`, until cancelled."""
         period_s = 1 / (topics.VEHICLE.rate_hz or 10.0)
         while True:
             now_ns, state = time.monotonic_ns(), self._driver.state

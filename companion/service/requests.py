@@ -1,4 +1,4 @@
-"""Carries guidance's requests out with the driver; what became of each is an answer for its next step."""
+"""Executes guidance's requests with the driver; each result is an answer for guidance's next step."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ logger = logging.getLogger(__name__)
 
 
 class RequestRunner:
-    """Each request is a task of its own. Called from the loop in which the driver lives.
+    """Runs each request as a task, in the driver's loop.
 
     Args:
         on_answer: called when there is a new answer.
@@ -37,13 +37,13 @@ class RequestRunner:
         self._answers: list[Answer] = []
 
     def start(self, request: Request) -> None:
-        """Begin to carry it out."""
+        """Start a request."""
         task = asyncio.get_running_loop().create_task(self._run(request))
         self._tasks[request.identifier] = task
         task.add_done_callback(lambda done: self._on_done(request.identifier, done))
 
     def cancel(self, identifier: int) -> None:
-        """Nobody waits for it any more; what has been sent may still take effect."""
+        """Cancel a request; what has been sent may still take effect."""
         task = self._tasks.get(identifier)
         if task is not None:
             self._cancelled.add(identifier)
@@ -52,18 +52,18 @@ class RequestRunner:
     def _on_done(self, identifier: int, task: asyncio.Task[None]) -> None:
         self._tasks.pop(identifier, None)
         if task.cancelled() and identifier not in self._cancelled:
-            # Not by us: unanswered, guidance would wait for ever.
+            # Not cancelled by us: without an answer guidance would wait forever.
             self._answers.append(Answer(identifier, "the request was cancelled"))
             self._on_answer()
         self._cancelled.discard(identifier)
 
     def take_answers(self) -> tuple[Answer, ...]:
-        """Those that have come since the last call."""
+        """Return the answers since the last call."""
         answers, self._answers = tuple(self._answers), []
         return answers
 
     async def close(self) -> None:
-        """End what is still asked."""
+        """Cancel all pending requests."""
         tasks = list(self._tasks.values())
         for identifier in list(self._tasks):
             self.cancel(identifier)
@@ -72,17 +72,17 @@ class RequestRunner:
     async def _run(self, request: Request) -> None:
         refused: str | None = None
         try:
-            refused = await self._do(request.action)
+            refused = await self._execute(request.action)
         except (CommandRefusedError, LinkError) as error:
             refused = str(error) or type(error).__name__
         except Exception as error:
-            # Unanswered, guidance would wait for ever.
-            logger.exception("%s: the request failed", request.action)
+            # Without an answer guidance would wait forever.
+            logger.exception("%s: request failed", request.action)
             refused = f"{type(error).__name__}: {error}"
         self._answers.append(Answer(request.identifier, refused))
         self._on_answer()
 
-    async def _do(self, action: Action) -> str | None:
+    async def _execute(self, action: Action) -> str | None:
         match action:
             case SetMode(mode):
                 await self._driver.set_mode(mode)
@@ -91,7 +91,7 @@ class RequestRunner:
             case TakeOff(altitude_m):
                 await self._driver.takeoff(altitude_m)
             case FindGimbal():
-                return None if await self._driver.find_gimbal() else "no gimbal answers"
+                return None if await self._driver.find_gimbal() else "gimbal manager not responding"
             case TakeGimbal():
                 await self._driver.take_gimbal()
             case PointGimbal(aim):

@@ -1,4 +1,4 @@
-"""The service put together: link, perception, guidance, streamer, bus. What is lost is told, and found again.
+"""The service: link, perception, guidance, streamer and bus. Lost parts are reported and reconnected.
 
 Everything here runs in one asyncio loop and nothing in it is heavy.
 """
@@ -35,18 +35,18 @@ from vision.pipeline import PerceptionResult
 
 
 class Service:
-    """One vehicle's companion.
+    """The companion service of one vehicle.
 
     Attributes:
-        ready: everything is up, and commands are taken.
+        ready: everything is up, and commands are accepted.
         views: the cameras with their models, the first one first.
         events: the newest, at most a hundred.
 
     Args:
         settings: all of them.
         on_event: called in the loop with every event, besides the log and the bus.
-        console: take commands from the terminal as well.
-        dropped_lines: how many lines of the log were not written, for `status`.
+        console: also accept commands from the terminal.
+        dropped_lines: returns the number of dropped log lines, for `status`.
     """
 
     def __init__(
@@ -103,11 +103,11 @@ class Service:
         self._stop = asyncio.Event()
 
     async def run(self, ready: Callable[[], None] | None = None) -> None:
-        """Start everything, call `ready`, and work until `stop()`; then let the autopilot hold and end.
+        """Start everything, call `ready`, and run until `stop()`; then let the autopilot hold and end.
 
         Raises:
             LinkError: no autopilot. PerceptionStartError: no model, classes or frames. BusError: no network.
-            MetricsError: its library or its address is missing.
+            MetricsError: its library is missing or its address is not available.
         """
         unsubscribe = self.driver.subscribe(self._on_state)
         tasks: list[asyncio.Task[None]] = []
@@ -140,26 +140,26 @@ class Service:
             await asyncio.gather(*tasks, return_exceptions=True)
             if metrics is not None:
                 await asyncio.to_thread(metrics.close)
-            await self.bus.close()  # first: it lets answers go out
+            await self.bus.close()  # first: it sends pending answers
             await asyncio.gather(*(view.supervisor.stop() for view in self.views), self.driver.close())
             self._notifier.close()
 
     def stop(self) -> None:
-        """End `run()`. In flight under our command, the autopilot is asked to hold first."""
+        """End `run()`. In flight under our command, HOLD is requested first."""
         self._stop.set()
 
     async def command(self, text: str) -> dict[str, Any]:
-        """Do what a command says; the reply tells how it ended: success, reason.
+        """Execute a command; returns its result: success, reason.
 
-        A command without an end of its own (`hold`, `orbit` with no laps) is answered when it is in progress.
+        An endless command (`hold`, `orbit` with no laps) is answered when it is in progress.
         """
         if not self.ready or self._ending:
-            reason = "the service is ending" if self._ending else "the service is still starting"
+            reason = "the service is shutting down" if self._ending else "the service is still starting"
             return {"command": text, "success": False, "reason": reason}
         return await self._loop.execute(text)
 
     def status(self) -> dict[str, Any]:
-        """How every part is, as published on `status`."""
+        """The state of every part, as published on `status`."""
         now_ns = time.monotonic_ns()
         return status_message(
             now_ns,
@@ -176,7 +176,7 @@ class Service:
 
     @property
     def perception(self) -> PerceptionSupervisor:
-        """Of the view that steers."""
+        """The supervisor of the steering camera."""
         return next(view for view in self.views if view is self.inputs.steering).supervisor
 
     async def _start(self) -> None:
@@ -195,32 +195,32 @@ class Service:
             await asyncio.gather(*starts, return_exceptions=True)
 
     async def _until_stopped(self, tasks: list[asyncio.Task[None]]) -> None:
-        """Until `stop()`, or until a loop fails: one that steers must not die unseen."""
+        """Wait for `stop()`, or until a loop fails: its error is raised."""
         stopped = asyncio.create_task(self._stop.wait())
         waiting: set[asyncio.Task[Any]] = {stopped, *tasks}
         try:
             while not stopped.done():
                 done, waiting = await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
                 for task in done:
-                    task.result()  # the console may end (end of file); a failure is raised here
+                    task.result()  # raises a failure; the console may end (end of file)
         finally:
             stopped.cancel()
 
     async def _shut_down(self) -> None:
-        """Take no more commands; a vehicle that flies our setpoints goes to the autopilot's own hold."""
+        """Accept no more commands; switch a vehicle that flies our setpoints to the autopilot's HOLD."""
         self._ending = True
         flying = self.streamer.state is not StreamState.SILENT
         try:
-            self._loop.begin_to_end()
+            self._loop.begin_shutdown()
         finally:
             self.streamer.stop()
             try:
                 if flying and self.driver.state.connected(time.monotonic_ns()):
                     await self.driver.set_mode(FlightMode.HOLD, timeout_s=2.0)
             except CommandRefusedError as error:
-                self._event("error", f"leaving: {error}; {self.driver.state.without_setpoints}")
+                self._event("error", f"shutdown: {error}; {self.driver.state.without_setpoints}")
             finally:
-                await self._loop.until_released()
+                await self._loop.wait_released()
 
     async def _publish_status(self) -> None:
         while True:
@@ -239,12 +239,12 @@ class Service:
         self.guidance.gimbal.mounting = gimbal_mounting(cameras, self.inputs.steering.settings.camera)
 
     def _on_result(self, view: WorkerView, result: PerceptionResult) -> None:
-        """Work out where what a view saw is; publish it, when it has been steered by."""
+        """Localize a view's result, let guidance use it, then publish it."""
         markers = None
         try:
             markers = self.inputs.on_result(view, result, time.monotonic_ns())
             if view is self.inputs.steering or markers is not None:
-                self._loop.on_seen()
+                self._loop.on_perception()
         finally:
-            # The guidance loop wakes before it: a subscriber can wait for a millisecond, a setpoint not.
+            # The guidance loop runs first: a subscriber can wait for a millisecond, a setpoint cannot.
             asyncio.get_running_loop().call_soon(self._publisher.publish_result, view, result, markers)

@@ -1,4 +1,4 @@
-"""How every part of a service is, as one message."""
+"""The state of every part of a service as one message."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def status_message(
     others: OtherCommanders,
     dropped_lines: int,
 ) -> dict[str, Any]:
-    """What is published on `status` (`docs/messages.md`).
+    """Create the message published on `status` (`docs/messages.md`).
 
     Args:
         now_ns: CLOCK_MONOTONIC.
@@ -49,7 +49,7 @@ def status_message(
             "armed": state.armed,
             "failsafe": state.failsafe,
             "missing_streams": list(state.missing_streams),
-            "said": [one.text for one in state.reports],
+            "said": [report.text for report in state.reports],
             "other_commanders": others.status(state, now_ns),
         },
         "pilot": {
@@ -78,7 +78,7 @@ def status_message(
 
 
 def hud_lines(state: VehicleState, status: str) -> tuple[str, ...]:
-    """What stands in the recorded video. `status`: guidance's, in words."""
+    """Return the overlay lines of the recorded video. `status`: guidance's, as text."""
     altitude = "-" if state.altitude_m is None else f"{state.altitude_m:.1f} m"
     speed = state.velocity_ned_mps
     horizontal = "-" if speed is None else f"{(speed[0] ** 2 + speed[1] ** 2) ** 0.5:.1f} m/s"

@@ -1,7 +1,7 @@
-"""Tell systemd how the service is: sd_notify(3)'s protocol, a datagram to the socket in NOTIFY_SOCKET.
+"""Notifies systemd of the service's state: sd_notify(3), a datagram to the socket in NOTIFY_SOCKET.
 
-The watchdog is fed from the guidance loop itself, never from a timer of its own: when that loop hangs,
-systemd ends the service and starts it again, and the autopilot has been without setpoints since.
+The watchdog is triggered by the guidance loop itself, never by a separate timer: when that loop hangs,
+systemd restarts the service; the autopilot has received no setpoints since.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ class SystemdNotifier:
             self._socket.setblocking(False)
 
     def ready(self, status: str) -> None:
-        """The service is up."""
+        """Report that the service is up."""
         self._send(f"READY=1\nSTATUS={status}")
 
     def alive(self) -> None:
-        """The loop goes round (WatchdogSec=)."""
+        """Trigger the watchdog (WatchdogSec=)."""
         self._send("WATCHDOG=1")
 
     def status(self, text: str) -> None:
-        """One line for `systemctl status`."""
+        """Set the line of `systemctl status`."""
         self._send(f"STATUS={text}")
 
     def stopping(self) -> None:
-        """The service is on its way down."""
+        """Report that the service is shutting down."""
         self._send("STOPPING=1")
 
     def close(self) -> None:
@@ -54,4 +54,4 @@ class SystemdNotifier:
         try:
             self._socket.sendto(message.encode(), self._address)
         except OSError as error:
-            logger.warning("systemd did not take %r: %s", message.split("=")[0], error)
+            logger.warning("systemd notification %r not sent: %s", message.split("=")[0], error)

@@ -1,8 +1,8 @@
-"""Everything that can be set: one frozen value, a section for each part of the service.
+"""The settings: one frozen value with a section for each part of the service.
 
-Every key is declared once, with its default, its range and one line of help; the file's comments, the flags,
-the checks and their messages (`reading.py`) all come from that declaration. Sections stand in a file named
-after the room they are for.
+Every key is declared once, with its default, range and one line of help; the file's comments, the flags, the
+checks and their messages (`reading.py`) are derived from that declaration. Each file is named after the
+package its sections are for.
 """
 
 from companion.settings.bus import ZenohSection

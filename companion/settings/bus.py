@@ -11,14 +11,14 @@ from companion.settings.texts import ZenohEndpoint
 
 
 class ZenohSection(Section):
-    """The network on which detections are published and commands are taken."""
+    """The network on which detections are published and commands are received."""
 
     mode: Literal["peer", "client"] = "peer"
-    """peer: talks to others directly; client: through the router at `connect`"""
+    """peer: connects to others directly; client: through the router at `connect`"""
     connect: tuple[ZenohEndpoint, ...] = ()
-    """endpoints to connect to, e.g. tcp/192.168.1.5:7447; retried until they answer"""
+    """endpoints to connect to, e.g. tcp/192.168.1.5:7447; retried until connected"""
     listen: tuple[ZenohEndpoint, ...] = ("tcp/127.0.0.1:7447",)
-    """endpoints to listen on (peer only); tcp/0.0.0.0:7447 lets the whole network in"""
+    """endpoints to listen on (peer only); tcp/0.0.0.0:7447 is open to the whole network"""
     multicast_scouting: bool = False
     """find other peers on the local network by multicast"""
 

@@ -1,4 +1,4 @@
-"""The `camera` settings together with what a camera brings itself: its lens and its mount."""
+"""Merges the `camera` settings with a camera's own calibration: its lens and mount."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ _LENS = frozenset(
     ("horizontal_fov_deg", "fx_px", "fy_px", "cx_px", "cy_px", "calibrated_width", "calibrated_height")
 )
 _SAME_SHARE, _SAME_M, _SAME_DEG, _SAME_DISTORTION = 0.005, 0.001, 0.1, 1e-4
-"""Values that differ by less agree: of the frame's width for a lens, of a mount, of a coefficient."""
+"""Tolerances of agreement: share of the frame's width for a lens, mount position and angle, coefficient."""
 
 
 class AdoptedCamera(NamedTuple):
-    """The settings to go by, and in which values they were given otherwise than the camera has them."""
+    """The merged settings, and the given values that differ from the camera's."""
 
     camera: CameraSection
     conflict: str
 
 
 def adopt_calibration(section: CameraSection, calibration: CameraCalibration) -> AdoptedCamera:
-    """Take lens and mount from the camera, but for the keys that were given: those win.
+    """Use the camera's lens and mount, except for keys given in the settings, which take precedence.
 
-    The lens is one thing: with any key of it given, all of it is the settings' own. So is what the angles of
-    the mount count from (`stabilized`, `on_gimbal`); where that differs, the angles are the settings' too.
-    `conflict` names each value that was given and differs, with the camera's; empty: none.
+    The lens is one unit: if any of its keys is given, all come from the settings. The same holds for the
+    reference of the mount's angles (`stabilized`, `on_gimbal`): if it differs, the angles come from the
+    settings too. `conflict` lists each given value that differs, with the camera's; empty: none.
     """
     given = section.model_fields_set
     changes: dict[str, Any] = {}

@@ -1,4 +1,4 @@
-"""One field of the settings: what it takes, in words; its value read from a text, and written as TOML."""
+"""Fields of the settings: description of their values, parsing from text, and formatting as TOML."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _LONGEST_SHOWN = 80
 
 
 def sections_of_file() -> dict[str, type[Section]]:
-    """Name → section, in the order of the file; without further cameras."""
+    """Return name → section, in the order of the file; without further cameras."""
     sections = {}
     for name, field in Settings.model_fields.items():
         if name == "cameras":
@@ -35,16 +35,16 @@ def sections_of_file() -> dict[str, type[Section]]:
 
 
 def fields_of_sections() -> dict[str, dict[str, FieldInfo]]:
-    """Section → name → field, in the order of the file; without further cameras."""
+    """Return section → name → field, in the order of the file; without further cameras."""
     return {name: section.model_fields for name, section in sections_of_file().items()}
 
 
 SECTIONS_OF_VIEW = tuple(ViewSections.model_fields)
-"""The sections that a view has of its own."""
+"""The sections that every view has."""
 
 
 def section_of(table: str) -> str | None:
-    """`detector` and `cameras.down.detector` → `detector`; None where the table is no section."""
+    """Return the section of a table: `detector`, `cameras.down.detector` → `detector`; else None."""
     match table.split("."):
         case [section] if section in fields_of_sections():
             return section
@@ -54,7 +54,7 @@ def section_of(table: str) -> str | None:
 
 
 def plain_type(field: FieldInfo) -> type:
-    """bool, int, float, str or tuple."""
+    """Return bool, int, float, str or tuple."""
     annotation, _ = _without_none(field)
     origin = get_origin(annotation)
     if origin is Literal:
@@ -66,7 +66,7 @@ def plain_type(field: FieldInfo) -> type:
 
 
 def help_line(section: type[Section], name: str) -> str:
-    """A key's line of help and, where it has one, its range."""
+    """Return a key's line of help with its range, if any."""
     field = section.model_fields[name]
     annotation, _ = _without_none(field)
     text = section.help_texts().get(name, "")
@@ -75,7 +75,7 @@ def help_line(section: type[Section], name: str) -> str:
 
 
 def expectation(field: FieldInfo) -> str:
-    """What the field takes, to stand after `must be`."""
+    """Describe the field's values, as text after `must be`."""
     annotation, optional = _without_none(field)
     origin = get_origin(annotation)
     if origin is Literal:
@@ -93,12 +93,12 @@ def expectation(field: FieldInfo) -> str:
 
 
 def expectation_of_key() -> str:
-    """What a view may be called, to stand after `must be`."""
+    """Describe the names of views, as text after `must be`."""
     return PATTERN_MEANINGS[r"^[A-Za-z0-9][A-Za-z0-9_-]*$"]
 
 
 def value_from_text(field: FieldInfo, text: str) -> Any:
-    """A flag's or variable's text as the field's type. Raises ValueError; ranges are not checked here."""
+    """Parse a flag's or variable's text. Raises ValueError; ranges are not checked here."""
     annotation, optional = _without_none(field)
     if optional and text.strip().lower() in _UNSET:
         return None
@@ -115,13 +115,13 @@ def value_from_text(field: FieldInfo, text: str) -> Any:
 
 
 def toml_value(value: Any) -> str:
-    """A value as TOML 1.0 writes it."""
+    """Format a value as TOML 1.0."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, int | float):
         return repr(value)
     if isinstance(value, str):
-        # TOML's basic string is JSON's, but for DEL, which must be escaped too.
+        # TOML's basic string equals JSON's, except that DEL must be escaped too.
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, tuple | list):
         return f"[{', '.join(toml_value(item) for item in value)}]"
@@ -129,16 +129,16 @@ def toml_value(value: Any) -> str:
 
 
 def shown(value: Any) -> str:
-    """A value as it stands in the file, not longer than fits in a message."""
+    """Format a value as in the file, shortened to fit in a message."""
     try:
         text = toml_value(value)
-    except TypeError:  # a table or a date, which no field takes
+    except TypeError:  # a table or a date, which no field accepts
         text = str(value)
     return text if len(text) <= _LONGEST_SHOWN else f"{text[: _LONGEST_SHOWN - 3]}..."
 
 
 def _without_none(field: FieldInfo) -> tuple[Any, bool]:
-    """The annotation without `None`, and whether `None` was in it."""
+    """Return the annotation without `None`, and whether it had `None`."""
     annotation = field.annotation
     if get_origin(annotation) in (Union, types.UnionType):
         options = get_args(annotation)
@@ -150,7 +150,7 @@ def _without_none(field: FieldInfo) -> tuple[Any, bool]:
 def _item_from_text(kind: Any, text: str) -> Any:
     if kind is float:
         return float(text)
-    # A class can be named or numbered.
+    # A class is a name or an id.
     return int(text) if int in get_args(kind) and re.fullmatch("[0-9]+", text) else text
 
 
@@ -162,7 +162,7 @@ def _pattern_meaning(rules: Any) -> str | None:
 
 
 def _span(field: FieldInfo) -> str:
-    """`0 to 1` or `above 0, at most 30`; empty where there is no limit."""
+    """Format the range: `0 to 1` or `above 0, at most 30`; empty without limits."""
     low, high, words = "", "", []
     whole = True
     for rule in field.metadata:

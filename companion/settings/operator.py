@@ -1,4 +1,4 @@
-"""The settings of what people and their monitoring are told."""
+"""The settings of metrics, log and plug-ins."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from companion.settings.texts import HOST_AND_PORT
 
 
 class MetricsSection(Section):
-    """Numbers for a monitoring system."""
+    """Metrics for a monitoring system."""
 
     listen: Annotated[str | None, HOST_AND_PORT] = None
-    """HOST:PORT that serves /metrics in Prometheus' format (extra `metrics`); unset: nothing listens"""
+    """HOST:PORT of the Prometheus endpoint /metrics (extra `metrics`); unset: disabled"""
 
 
 class LogSection(Section):
-    """What is said on standard error."""
+    """The log on standard error."""
 
     level: Literal["debug", "info", "warning", "error"] = "info"
-    """the least severe lines that are printed"""
+    """minimum level of printed lines"""
 
 
 class PluginsSection(Section):
-    """Behaviours, detectors and sources of others. Nothing is loaded that is not named here."""
+    """Third-party behaviours, detectors and sources. Only the modules named here are loaded."""
 
     modules: tuple[str, ...] = ()
     """modules on the Python path, or names of installed plug-ins (entry points `companion.plugins`)"""

@@ -1,4 +1,4 @@
-"""The settings of what is seen: source, lens, detector, tracker, markers; its film and its pictures."""
+"""The settings of perception: source, camera, detector, tracker, markers, recording, preview."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from vision.object_detector import YOLO, DetectorSettings
 from vision.sources.source import SourceSettings
 from vision.tracking.tracks import TrackerSettings
 
-# What `vision.detector` calls the bundled model. Named here too, as settings are read without a detector.
+# The name of the bundled model in `vision.detector`, repeated since settings are read without a detector.
 DEFAULT_MODEL = "default"
-# As `source.uri`: there is no camera, and no perception worker.
+# As `source.uri`: no camera, and no perception worker.
 NO_SOURCE = "none"
 
 
@@ -30,25 +30,25 @@ class SourceSection(Section):
     uri: Annotated[str, Field(min_length=1)] = "/dev/video0"
     """video file, folder of images, /dev/video0, FIFO, - (standard input), rtsp://, http://, udp://; none"""
     width: Annotated[int | None, Field(ge=16, le=16384)] = None
-    """of a frame, pixels; asked of a camera, and needed for raw frames from a pipe"""
+    """frame width, pixels; requested from a camera, required for raw frames from a pipe"""
     height: Annotated[int | None, Field(ge=16, le=16384)] = None
-    """of a frame, pixels, as width"""
+    """frame height, pixels, as width"""
     rate_hz: Annotated[float | None, Field(gt=0, le=1000)] = None
-    """frames a second; asked of a camera, and the pace of images and raw files"""
+    """frame rate, Hz; requested from a camera, playback rate of images and raw files"""
     pixel_format: str | None = None
-    """a camera's four letters (MJPG, YUYV), or what a pipe carries: bgr24, rgb24, gray8, y4m, mjpeg"""
+    """a camera's FourCC (MJPG, YUYV), or the format of a pipe: bgr24, rgb24, gray8, y4m, mjpeg"""
     loop: bool = False
-    """begin a file or folder again when it ends"""
+    """repeat a file or folder"""
     realtime: bool = True
-    """play a file or folder at its own pace, as a camera would; false: every frame, as fast as can be"""
+    """play a file or folder at its frame rate, like a camera; false: every frame, as fast as possible"""
     every_frame: bool | None = None
     """pipes only: true: every frame, the writer waits; false: the newest; unset: true for a regular file"""
     open_timeout_s: Annotated[float, Field(gt=0, le=3600)] = 10.0
-    """how long the first frame may take at start, seconds"""
+    """timeout of the first frame at start, seconds"""
     read_timeout_s: Annotated[float, Field(gt=0, le=3600)] = 5.0
-    """a live source that is silent for so long is opened again, seconds"""
+    """timeout after which a silent live source is reopened, seconds"""
     share: Annotated[str | None, KEY_WORD] = None
-    """also offer the frames to other programs of this computer, and to other cameras of the service, as shm://NAME"""
+    """also share the frames with other local programs and other cameras of the service, as shm://NAME"""
 
     @model_validator(mode="after")
     def _can_be_opened(self) -> Self:
@@ -56,33 +56,33 @@ class SourceSection(Section):
         return self
 
     def opening(self, on_frame: Callable[[Frame], None] | None = None) -> SourceSettings:
-        """The same, as `vision.sources.open_source` takes it. Raises ValueError for a bad pixel format."""
+        """Convert for `vision.sources.open_source`. Raises ValueError for an invalid pixel format."""
         return SourceSettings(**self.model_dump(exclude={"uri", "share"}), on_frame=on_frame)
 
 
 class CameraSection(Section):
-    """Lens and mount; a key not set is the camera's own where it brings one. Body: forward, right, down."""
+    """Lens and mount; unset keys come from the camera's calibration, if any. Body: forward, right, down."""
 
     horizontal_fov_deg: Annotated[float, Field(gt=1, lt=179)] = 80.0
-    """field of view from the left edge to the right, degrees; unused when fx_px is set"""
+    """horizontal field of view, degrees; unused when fx_px is set"""
     mount_forward_m: Annotated[float, Field(ge=-10, le=10)] = 0.0
-    """the camera's place ahead of the autopilot, metres"""
+    """the camera's position forward of the autopilot, metres"""
     mount_right_m: Annotated[float, Field(ge=-10, le=10)] = 0.0
-    """the camera's place to the right of the autopilot, metres"""
+    """the camera's position right of the autopilot, metres"""
     mount_down_m: Annotated[float, Field(ge=-10, le=10)] = 0.0
-    """the camera's place below the autopilot, metres"""
+    """the camera's position below the autopilot, metres"""
     mount_roll_deg: Annotated[float, Field(ge=-180, le=180)] = 0.0
-    """the camera's roll on the body, degrees"""
+    """the camera's roll relative to the body, degrees"""
     mount_pitch_deg: Annotated[float, Field(ge=-90, le=90)] = 0.0
-    """the camera's pitch on the body, degrees; negative looks down"""
+    """the camera's pitch relative to the body, degrees; negative is down"""
     mount_yaw_deg: Annotated[float, Field(ge=-180, le=180)] = 0.0
-    """the camera's yaw on the body, degrees clockwise"""
+    """the camera's yaw relative to the body, degrees clockwise"""
     stabilized: bool = False
-    """a gimbal holds the camera: its roll and pitch count from the horizon, its yaw from the nose"""
+    """a gimbal stabilizes the camera: roll and pitch are relative to the horizon, yaw to the nose"""
     on_gimbal: bool = False
-    """the camera sits on the autopilot's gimbal, which tells where it looks; mount angles count from that"""
+    """the camera is on the autopilot's gimbal, which reports its attitude; mount angles are relative to it"""
     fx_px: Annotated[float | None, Field(gt=0)] = None
-    """calibrated focal length along x, pixels; with it fy_px, cx_px, cy_px and calibrated_* are needed"""
+    """calibrated focal length along x, pixels; requires fy_px, cx_px, cy_px and calibrated_*"""
     fy_px: Annotated[float | None, Field(gt=0)] = None
     """calibrated focal length along y, pixels"""
     cx_px: float | None = None
@@ -90,9 +90,9 @@ class CameraSection(Section):
     cy_px: float | None = None
     """calibrated principal point, pixels from the top"""
     calibrated_width: Annotated[int | None, Field(ge=16, le=16384)] = None
-    """width of the pictures that calibrated the camera, pixels"""
+    """width of the calibration images, pixels"""
     calibrated_height: Annotated[int | None, Field(ge=16, le=16384)] = None
-    """height of the pictures that calibrated the camera, pixels"""
+    """height of the calibration images, pixels"""
     distortion: tuple[float, ...] = ()
     """k1, k2, p1, p2, k3 in OpenCV's order: none, four or five numbers"""
 
@@ -115,7 +115,7 @@ class CameraSection(Section):
         return self
 
     def model(self, width: int, height: int) -> CameraModel:
-        """The camera's model for frames of this size, pixels."""
+        """Return the camera model for frames of this size, pixels."""
         if (
             self.fx_px is None
             or self.fy_px is None
@@ -140,13 +140,13 @@ class CameraSection(Section):
 
     @property
     def field_rad(self) -> float:
-        """What is seen from the left edge to the right, radians: by the calibration where there is one."""
+        """Horizontal field of view, radians; from the calibration, if any."""
         if self.fx_px is None or self.calibrated_width is None:
             return math.radians(self.horizontal_fov_deg)
         return 2 * math.atan(self.calibrated_width / 2 / self.fx_px)
 
     def mount(self) -> CameraMount:
-        """How the camera sits on the body."""
+        """Return the camera's mount on the body."""
         return CameraMount(
             self.mount_forward_m,
             self.mount_right_m,
@@ -160,45 +160,45 @@ class CameraSection(Section):
 
 
 class DetectorSection(Section):
-    """What looks for objects in the frames."""
+    """The object detector."""
 
     enabled: bool = True
-    """false: frames are read and nothing is looked for"""
+    """false: frames are read without detection"""
     kind: Annotated[str, KEY_WORD] = YOLO
-    """yolo, or the kind of a plug-in (plugins.modules), which then gives model, image_size… their meaning"""
+    """yolo, or the kind of a plug-in (plugins.modules), which then defines model, image_size…"""
     model: Annotated[str, Field(min_length=1)] = DEFAULT_MODEL
-    """a checkpoint or an exported file; default: the model of this package, which knows drawn scenes"""
+    """a checkpoint or an exported file; default: the bundled model, trained on rendered scenes"""
     classes: tuple[str | int, ...] = ()
-    """only these classes, by name or id; none: all that the model knows"""
+    """only these classes, by name or id; empty: all classes of the model"""
     confidence: Annotated[float, Field(ge=0, le=1)] = 0.25
-    """the smallest confidence kept"""
+    """minimum confidence of detections"""
     iou: Annotated[float, Field(ge=0, le=1)] = 0.7
-    """boxes of one class that overlap by more than this are one object"""
+    """NMS IoU threshold"""
     image_size: Annotated[int, Field(ge=32, le=4096, multiple_of=32)] = 640
-    """the frame's longer side as the network sees it, pixels"""
+    """longer side of the network's input, pixels"""
     runtime: Literal["auto", "torch", "onnxruntime", "openvino", "tensorrt"] = "torch"
-    """what computes the network; auto takes the fastest installed, measured once on this board"""
+    """inference runtime; auto uses the fastest installed, measured once on this board"""
     precision: Literal["auto", "float32", "bfloat16", "float16"] = "auto"
-    """arithmetic of the network; auto takes bfloat16 where the processor is fast at it"""
+    """arithmetic of the network; auto uses bfloat16 if the processor supports it well"""
     threads: Annotated[int | None, Field(ge=1, le=256)] = None
-    """processor threads of the network; unset: one for every processor but one"""
+    """CPU threads of the network; unset: all processors but one, divided among the cameras"""
     every: Annotated[int, Field(ge=1, le=1000)] = 1
-    """look at every N-th frame only"""
+    """process every Nth frame"""
     rate_hz: Annotated[float | None, Field(gt=0, le=1000)] = None
-    """look at no more than so many frames a second; unset: at all that come"""
+    """maximum rate of processed frames, Hz; unset: no limit"""
     max_age_s: Annotated[float | None, Field(gt=0, le=3600)] = None
-    """do not look at a frame that was captured longer ago, seconds; unset: look at all"""
+    """maximum age of a processed frame since its capture, seconds; unset: no limit"""
     class_heights_m: tuple[Annotated[str, HEIGHT_TEXT], ...] = ("person:1.7", "car:1.5", "bicycle:1.1")
-    """class:metres, how tall they stand: tells the range where neither depth nor the ground does"""
+    """class:metres, known object heights; range estimate where neither depth nor the ground gives one"""
     tiles: bool = False
-    """look at large frames in overlapping tiles too, for small objects; 1080p takes some 14 times as long"""
+    """also detect in tiles of large frames, for small objects; 1080p takes some 14 times as long"""
     tile_size: Annotated[int, Field(ge=64, le=4096)] = 640
-    """side of a tile, pixels of the frame; best as large as image_size"""
+    """side of a tile, pixels of the frame; best equal to image_size"""
     tile_overlap: Annotated[float, Field(ge=0, le=0.8)] = 0.2
-    """of neighbouring tiles, share of a tile"""
+    """overlap of neighbouring tiles, share of a tile"""
 
     @model_validator(mode="after")
-    def _heights_that_stand(self) -> Self:
+    def _valid_heights(self) -> Self:
         if len(self.heights()) < len(self.class_heights_m):
             raise ValueError(f"class_heights_m: a class is given twice in {', '.join(self.class_heights_m)}")
         for name, height_m in self.heights().items():
@@ -209,7 +209,7 @@ class DetectorSection(Section):
         return self
 
     def loading(self, confidence: float) -> DetectorSettings:
-        """The same, as `vision.object_detector.open_detector` takes it, with this least confidence."""
+        """Convert for `vision.object_detector.open_detector`, with this minimum confidence."""
         return DetectorSettings(
             model=self.model,
             classes=self.classes or None,
@@ -222,34 +222,34 @@ class DetectorSection(Section):
         )
 
     def selection(self) -> Selection:
-        """Which frames are looked at."""
+        """Return the selection of processed frames."""
         return Selection(self.every, self.rate_hz, self.max_age_s)
 
     def heights(self) -> dict[str, float]:
-        """Class name → metres."""
+        """Return class name → metres."""
         pairs = (text.rpartition(":") for text in self.class_heights_m)
         return {name: float(height) for name, _, height in pairs}
 
 
 class TrackerSection(Section):
-    """Which detection is which object from frame to frame, and which objects count as true."""
+    """Multi-object tracking, and the confirmation of tracks."""
 
     enabled: bool = True
-    """give every object an identity; false: every frame stands for itself, and all that is seen counts"""
+    """enable tracking; false: frames are independent, and all detections are used"""
     high_confidence: Annotated[float, Field(ge=0, le=1)] = 0.35
-    """a detection this sure can begin a track (never less than detector.confidence)"""
+    """minimum confidence to start a track (at least detector.confidence)"""
     low_confidence: Annotated[float, Field(ge=0, le=1)] = 0.1
-    """a detection this sure can continue a track, and is then kept in spite of detector.confidence"""
+    """minimum confidence to continue a track; such detections are kept despite detector.confidence"""
     confirm_score: Annotated[float, Field(ge=0, le=1)] = 0.4
-    """a track counts as true when the median of its confidences reaches this; only such can be flown to"""
+    """minimum median confidence of a confirmed track; only confirmed tracks are targets"""
     min_hits: Annotated[int, Field(ge=1, le=1000)] = 3
-    """and when it was seen in so many frames"""
+    """minimum detections of a confirmed track"""
     coast_timeout_s: Annotated[float, Field(gt=0, le=60)] = 0.5
-    """unseen for so long, a track is lost, seconds"""
+    """time without detections after which a track is lost, seconds"""
     max_age_s: Annotated[float, Field(gt=0, le=600)] = 2.0
-    """unseen for so long, a track has ended: what comes then is another, seconds"""
+    """time without detections after which a track ends; a later detection starts a new one; seconds"""
     camera_motion: bool = True
-    """remove the camera's turning by the vehicle's attitude; false for recorded films"""
+    """compensate the camera's rotation by the vehicle's attitude; false for recorded videos"""
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -257,21 +257,21 @@ class TrackerSection(Section):
         return self
 
     def following(self, confidence: float) -> TrackerSettings:
-        """The same, as `vision.tracking` takes it, beside a detector with this `confidence`."""
+        """Convert for `vision.tracking`, with the detector's `confidence`."""
         values = self.model_dump(exclude={"enabled", "camera_motion"})
         values["high_confidence"] = max(self.high_confidence, confidence)
         return TrackerSettings(keep_confidence=confidence, **values)
 
 
 class MarkersSection(Section):
-    """Printed markers (ArUco, AprilTag) that are looked for in the frames, to land on."""
+    """Detection of printed markers (ArUco, AprilTag), to land on."""
 
     dictionary: str | None = None
-    """OpenCV's name of it without DICT_: APRILTAG_36h11, 4X4_50; unset: no markers are looked for"""
+    """OpenCV's dictionary name without DICT_: APRILTAG_36h11, 4X4_50; unset: no marker detection"""
     size_m: Annotated[float, Field(ge=0.01, le=50)] = 0.5
     """side of a marker's black square, metres"""
     others: tuple[Annotated[str, MARKER_TEXT], ...] = ()
-    """of another size: ID:SIZE; on the pad of marker PAD: ID:SIZE@PAD, off its centre ID:SIZE@PAD:RIGHT:UP"""
+    """other sizes: ID:SIZE; on the pad of marker PAD: ID:SIZE@PAD, off its centre ID:SIZE@PAD:RIGHT:UP"""
 
     @model_validator(mode="after")
     def _can_be_found(self) -> Self:
@@ -283,33 +283,33 @@ class MarkersSection(Section):
         return self
 
     def kind(self) -> MarkerKind | None:
-        """What is looked for; None: nothing. Raises ValueError for what cannot be."""
+        """Return the markers to detect; None: disabled. Raises ValueError for invalid settings."""
         sizes = {identifier: size for identifier, size, _ in map(_other_marker, self.others)}
         if len(sizes) < len(self.others):
             raise ValueError(f"others: an id is given twice in {', '.join(self.others)}")
         return None if self.dictionary is None else MarkerKind(self.dictionary, self.size_m, sizes)
 
     def pad_markers(self) -> tuple[PadMarker, ...]:
-        """Those that lie on the pad of another."""
+        """Return the markers on the pad of another one."""
         return tuple(pad for _, _, pad in map(_other_marker, self.others) if pad is not None)
 
 
 def _other_marker(text: str) -> tuple[int, float, PadMarker | None]:
-    own, _, place = text.partition("@")
+    own, _, on_pad = text.partition("@")
     identifier, size = own.split(":")
-    if not place:
+    if not on_pad:
         return int(identifier), float(size), None
-    pad, *offset = place.split(":")
+    pad, *offset = on_pad.split(":")
     return int(identifier), float(size), PadMarker(int(identifier), int(pad), *map(float, offset))
 
 
 class RecordingSection(Section):
-    """What is kept on disk."""
+    """Recordings on disk."""
 
     video: str | None = None
-    """a .webm file to write the annotated video to; unset: none"""
+    """file of the annotated video, .webm; unset: none"""
     rate_hz: Annotated[float, Field(ge=0.1, le=240)] = 15.0
-    """frames a second; 640x480 costs some 20 ms of a core each with the extra `film`, up to 150 without"""
+    """frame rate, Hz; one of 640x480 costs some 20 ms of a core with the extra `video`, up to 150 without"""
 
     @model_validator(mode="after")
     def _is_webm(self) -> Self:
@@ -319,13 +319,13 @@ class RecordingSection(Section):
 
 
 class PreviewSection(Section):
-    """Pictures on the network: JPEG, only while somebody subscribes to them."""
+    """Preview images on the network: JPEG, only while there is a subscriber."""
 
     rate_hz: Annotated[float, Field(gt=0, le=60)] = 5.0
-    """pictures a second, at most"""
+    """maximum rate, Hz"""
     quality: Annotated[int, Field(ge=1, le=100)] = 80
-    """of the JPEG, as its encoders count"""
+    """JPEG quality"""
     width: Annotated[int, Field(ge=16, le=4096)] = 1280
-    """larger frames are shrunk to this width, pixels"""
+    """maximum width, pixels; larger frames are scaled down"""
     annotate: bool = True
-    """draw what was detected"""
+    """draw the detections"""

@@ -1,6 +1,6 @@
-"""Reading the settings: a TOML file, then the environment, then flags; the later wins. And printing them.
+"""Reads and prints settings: a TOML file, then the environment, then flags; the later takes precedence.
 
-Whatever is wrong is told at once, one line a problem: the key, what was expected, what came, and from where.
+All problems are reported at once, one line each: the key, what was expected, what was found, and where.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ RENAMED = {
 
 
 class ConfigurationError(ValueError):
-    """Settings that cannot be used. `problems` has one line each; the text is those lines."""
+    """Invalid settings. `problems` has one line each; the message is those lines."""
 
     def __init__(self, *problems: str) -> None:
         super().__init__("\n".join(problems))
@@ -60,12 +60,12 @@ class ConfigurationError(ValueError):
 
 
 class Flag(NamedTuple):
-    """One value that can be set.
+    """One setting as a flag.
 
     Attributes:
         key: dotted: `detector.image_size` is `image_size` in the section `[detector]`.
         type: bool, int, float, str, or tuple (its items separated by commas).
-        default: None where the value may be left unset.
+        default: None if unset by default.
         help: one line, with the range.
     """
 
@@ -76,7 +76,7 @@ class Flag(NamedTuple):
 
 
 def flags() -> list[Flag]:
-    """Every value there is, in the order of the file."""
+    """Return all settings as flags, in the order of the file."""
     return [
         Flag(f"{table}.{name}", plain_type(field), field.default, help_line(section, name))
         for table, section in sections_of_file().items()
@@ -85,7 +85,7 @@ def flags() -> list[Flag]:
 
 
 def default_path() -> Path | None:
-    """The file that is read when none is named: the first of `DEFAULT_PATHS` that exists."""
+    """Return the file that is read by default: the first of `DEFAULT_PATHS` that exists."""
     return next((path for path in DEFAULT_PATHS if path.exists()), None)
 
 
@@ -94,12 +94,12 @@ def load_settings(
     overrides: Mapping[str, str] | None = None,
     environment: Mapping[str, str] | None = None,
 ) -> Settings:
-    """The settings in effect.
+    """Load the settings in effect.
 
     Args:
-        path: the TOML file; None: `default_path()`, and the defaults alone if there is none.
-        overrides: dotted key → text, as flags give them. An empty text or `none` unsets what may be unset,
-            and commas separate the items of a list.
+        path: the TOML file; None: `default_path()`, or only the defaults if there is none.
+        overrides: dotted key → text, from flags. An empty text or `none` unsets an optional value; commas
+            separate the items of a list.
         environment: `COMPANION_SECTION_KEY` → text; None: the process's own.
 
     Raises:
@@ -116,7 +116,7 @@ def load_settings(
 
 
 def to_toml(settings: Settings) -> str:
-    """The settings as a TOML file with a comment on every key; `load_settings` reads the same back."""
+    """Format the settings as a TOML file with a comment on every key; `load_settings` reads it back."""
     paragraphs = [_table(section, getattr(settings, section)) for section in sections_of_file()]
     for view, sections in settings.cameras.items():
         paragraphs += [
@@ -130,15 +130,15 @@ def _table(name: str, section: Section) -> str:
     for key in type(section).model_fields:
         value = getattr(section, key)
         lines.append(f"# {help_line(type(section), key)}")
-        # TOML has no null: what is unset stands there as a comment.
+        # TOML has no null: an unset key is a comment.
         lines.append(f"# {key} =" if value is None else f"{key} = {toml_value(value)}")
     return "\n".join(lines) + "\n"
 
 
 class _Reading:
-    """Values gathered key by key, each with where it came from, and the problems met on the way.
+    """Collects values by key, each with its origin, and the problems found.
 
-    A table is what stands between brackets in the file: `detector`, or `cameras.down.detector`.
+    A table is the name in brackets in the file: `detector`, or `cameras.down.detector`.
     """
 
     def __init__(self) -> None:
@@ -162,7 +162,7 @@ class _Reading:
             if not variable.startswith(ENVIRONMENT_PREFIX):
                 continue
             section, _, name = variable.removeprefix(ENVIRONMENT_PREFIX).lower().partition("_")
-            # Other variables may begin with the prefix too; only those that name a section are ours.
+            # Other variables may have the prefix too; only those with a section name are settings.
             if section in self._fields:
                 self.take_text(f"{section}.{name}", environment[variable], f"given as {variable}")
 
@@ -182,10 +182,10 @@ class _Reading:
     def settings(self) -> Settings:
         values: dict[str, Any] = {}
         for table, items in self._values.items():
-            place = values
+            section = values
             for word in table.split("."):
-                place = place.setdefault(word, {})
-            place.update(items)
+                section = section.setdefault(word, {})
+            section.update(items)
         try:
             settings = Settings.model_validate(values)
         except ValidationError as error:
@@ -252,8 +252,8 @@ class _Reading:
         table, rest = ".".join(parts[:depth]), parts[depth:]
         if not rest:  # a rule about several keys of the section, or of several sections
             origins = {origin for key, origin in self._origins.items() if key.startswith(f"{table}.")}
-            said = f" ({', '.join(sorted(origins))})" if table else ""
-            return f"{table}{': ' if table else ''}{details['ctx']['error']}{said}"
+            suffix = f" ({', '.join(sorted(origins))})" if table else ""
+            return f"{table}{': ' if table else ''}{details['ctx']['error']}{suffix}"
         key = f"{table}.{rest[0]}"
         value = shown(self._values[table][rest[0]])
         section = section_of(table)
@@ -271,15 +271,15 @@ def _read_toml(path: Path) -> dict[str, Any]:
         line = error.object[: error.start].count(b"\n") + 1
         raise ConfigurationError(f"{path}, line {line}: not UTF-8 text, which TOML must be") from error
     except tomllib.TOMLDecodeError as error:
-        reason, _, place = str(error).rpartition(" (at ")
-        raise ConfigurationError(f"{path}, {place.removesuffix(')')}: {reason}") from error
+        reason, _, position = str(error).rpartition(" (at ")
+        raise ConfigurationError(f"{path}, {position.removesuffix(')')}: {reason}") from error
 
 
 def _nearest(word: str, known: Iterable[str]) -> str:
-    """The known words nearest to one that is not known, for the end of a message."""
+    """Return the known words nearest to an unknown one, as the end of a message."""
     known = list(known)
     section, _, name = word.partition(".")
-    # The right name in the wrong section comes before a wrong name.
+    # A right name in the wrong section has priority over a wrong name.
     close = [key for key in known if name and key.partition(".")[2] == name]
     close = close or difflib.get_close_matches(word, known, n=1, cutoff=0.85)
     close = close or difflib.get_close_matches(word, known, n=3, cutoff=0.6)

@@ -11,18 +11,18 @@ from pydantic import BaseModel, ConfigDict
 
 
 class Section(BaseModel):
-    """One table of the file. Values are never changed and never guessed from another type.
+    """One table of the file. Values are immutable and never converted from another type.
 
-    The text below a key is its line of help.
+    The string below a key is its line of help.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
     @classmethod
     def help_texts(cls) -> dict[str, str]:
-        """Key → the text below it; empty where the program is installed without its source.
+        """Return key → the string below it; empty if the program is installed without its source.
 
-        Read once for all sections of a file: pydantic (`use_attribute_docstrings`) reads it again for each.
+        Read once for all sections of a file; pydantic (`use_attribute_docstrings`) would read it for each.
         """
         texts: dict[str, str] = {}
         for base in reversed(cls.__mro__):
@@ -33,7 +33,7 @@ class Section(BaseModel):
 
 @functools.cache
 def _texts_below_keys(module: str) -> dict[str, dict[str, str]]:
-    """Class → key → the string that stands below it in the source."""
+    """Return class → key → the string below it in the source."""
     try:
         source = inspect.getsource(sys.modules[module])
     except OSError:

@@ -1,4 +1,4 @@
-"""All sections together, and the rules that bind several of them."""
+"""All sections together, and the rules across several of them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from companion.settings.vehicle import VehicleSection
 
 
 class ViewSections(Section):
-    """A further camera or model, with a process of its own, published as cameras/NAME."""
+    """A further camera or model, in its own process, published as cameras/NAME."""
 
     source: SourceSection = SourceSection()
     camera: CameraSection = CameraSection()
@@ -35,7 +35,7 @@ class ViewSections(Section):
 
 
 class Settings(Section):
-    """Everything that can be set."""
+    """All settings."""
 
     vehicle: VehicleSection = VehicleSection()
     source: SourceSection = SourceSection()
@@ -56,9 +56,7 @@ class Settings(Section):
     def _views_fit_together(self) -> Self:
         if self.guidance.camera is not None and self.guidance.camera not in self.cameras:
             known = ", ".join(self.cameras) or "none"
-            raise ValueError(
-                f"guidance.camera: there is no camera {self.guidance.camera!r} (cameras: {known})"
-            )
+            raise ValueError(f"guidance.camera: no camera {self.guidance.camera!r} (cameras: {known})")
         openers: dict[str, str] = {}
         sharers: dict[str, str] = {}
         for key, source in self.sources().items():
@@ -72,22 +70,22 @@ class Settings(Section):
             if source.share is None:
                 continue
             if uri == f"shm://{source.share}":
-                raise ValueError(f"{key}.share: {source.share!r} is where its own frames come from")
+                raise ValueError(f"{key}.share: {source.share!r} is the source of its own frames")
             if source.share in sharers:
                 raise ValueError(f"{key}.share and {sharers[source.share]}.share are both {source.share!r}")
             sharers[source.share] = key
         return self
 
     @model_validator(mode="after")
-    def _films_are_files_of_their_own(self) -> Self:
-        films = [self.recording.video, *(sections.recording.video for sections in self.cameras.values())]
-        named = [film for film in films if film is not None]
+    def _videos_are_distinct(self) -> Self:
+        videos = [self.recording.video, *(sections.recording.video for sections in self.cameras.values())]
+        named = [video for video in videos if video is not None]
         if len(set(named)) < len(named):
-            raise ValueError(f"every camera needs a recording.video of its own, got {', '.join(named)}")
+            raise ValueError(f"every camera needs a different recording.video, got {', '.join(named)}")
         return self
 
     @model_validator(mode="after")
-    def _tracks_outlive_the_pause_between_frames(self) -> Self:
+    def _tracks_outlive_the_frame_interval(self) -> Self:
         cameras: dict[str, Settings | ViewSections] = {"": self}
         cameras |= {f"cameras.{name}.": sections for name, sections in self.cameras.items()}
         for prefix, view in cameras.items():
@@ -100,13 +98,13 @@ class Settings(Section):
         return self
 
     def sources(self) -> dict[str, SourceSection]:
-        """Key of the section → where that view's frames come from, the first view first."""
+        """Return key of the section → source of that view, the first view first."""
         return {"source": self.source} | {
             f"cameras.{name}.source": sections.source for name, sections in self.cameras.items()
         }
 
     def of_view(self, name: str | None) -> Settings:
-        """What the worker of one view goes by: the same, with that view's own sections. None: the first."""
+        """Return the settings of one view's worker, with that view's own sections. None: the first."""
         if name is None:
             return self.model_copy(update={"cameras": {}})
         sections = self.cameras[name]

@@ -1,4 +1,4 @@
-"""Texts that must have a form: names, endpoints, markers; and what each form is called for a person."""
+"""Text formats of settings: names, endpoints, markers; and their descriptions for messages."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pydantic import StringConstraints
 KEY_WORD = StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=64)
 KeyWord = Annotated[str, KEY_WORD]
 HOST_AND_PORT = StringConstraints(pattern=r"^[^\s:]+:[0-9]{1,5}$", max_length=300)
-# The same without a dot, as `cameras.NAME.source` is a key.
+# The same without a dot, since `cameras.NAME.source` is a key.
 VIEW_NAME = StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$", max_length=64)
 ViewName = Annotated[str, VIEW_NAME]
 VehicleUrl = Annotated[
@@ -18,14 +18,14 @@ VehicleUrl = Annotated[
 ]
 # CLASS:METRES.
 HEIGHT_TEXT = StringConstraints(pattern=r"^.+:[0-9]*\.?[0-9]+$", max_length=80)
-# ID:SIZE of a marker of its own size; with @PAD, and :RIGHT:UP where it does not lie on the pad's centre.
+# ID:SIZE of a marker; with @PAD if it is on a pad, and :RIGHT:UP if it is off the pad's centre.
 MARKER_TEXT = StringConstraints(pattern=r"^[0-9]+:[0-9.]+(@[0-9]+(:-?[0-9.]+:-?[0-9.]+)?)?$", max_length=80)
 ZenohEndpoint = Annotated[
     str,
     StringConstraints(pattern=r"^(tcp|udp|tls|quic|ws|serial|unixsock-stream|unixpipe|vsock)/.+$"),
 ]
 
-# What a pattern means, in words, for a person whose value did not match it.
+# Pattern → description, for messages about values that do not match.
 PATTERN_MEANINGS = {
     r"^[A-Za-z0-9][A-Za-z0-9_.-]*$": "a word of letters, digits, `_`, `-` and `.`",
     r"^[^\s:]+:[0-9]{1,5}$": "HOST:PORT such as 127.0.0.1:9100",

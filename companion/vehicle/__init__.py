@@ -1,1 +1,1 @@
-"""The vehicle: its state, what we ask of it, and the drivers that speak to it."""
+"""The vehicle: its state, commands, setpoints, and the drivers that exchange MAVLink with it."""

@@ -1,6 +1,6 @@
 """ArduPilot Copter's flight modes in HEARTBEAT.custom_mode and MAV_CMD_DO_SET_MODE (parameter 2).
 
-Names here are PX4's, by what the vehicle does: GUIDED is OFFBOARD, LOITER is POSITION, BRAKE is HOLD.
+The names are PX4's, mapped by behaviour: GUIDED is OFFBOARD, LOITER is POSITION, BRAKE is HOLD.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ _REQUESTS = {mode: number for number, mode in reversed(_MODES.items())}
 
 
 def mode_of_custom_mode(custom_mode: int) -> FlightMode:
-    """The mode that a custom_mode shows; UNKNOWN for what has no name here."""
+    """Return the mode of a custom_mode; UNKNOWN for modes without an equivalent here."""
     return _MODES.get(custom_mode, FlightMode.UNKNOWN)
 
 
 def custom_mode_of_mode(mode: FlightMode) -> int:
-    """The number to ask for. Raises ValueError for a mode that Copter does not have."""
+    """Return the custom_mode to request. Raises ValueError for a mode that Copter does not have."""
     if mode not in _REQUESTS:
-        raise ValueError(f"ArduPilot has no mode {mode!s} to ask for; it has: {', '.join(_REQUESTS)}")
+        raise ValueError(f"ArduPilot has no mode {mode!s}; available: {', '.join(_REQUESTS)}")
     return _REQUESTS[mode]

@@ -1,22 +1,22 @@
-"""ArduPilot Copter's ways, told in PX4's terms, so that everything above the driver flies both.
+"""ArduPilot Copter's behaviour mapped to PX4's terms, so that the code above the driver supports both.
 
-What differs, and what is made of it:
+Differences from PX4, and how they are handled:
 
-* GUIDED is one mode for what PX4 tells apart: waiting armed, taking off, holding, flying setpoints. It is
-  shown as what we asked it for last (HOLD, TAKEOFF, then HOLD again at the top, OFFBOARD). A vehicle that
-  somebody else put into GUIDED shows OFFBOARD.
-* HOLD is BRAKE in the air. BRAKE cannot be armed in, so on the ground HOLD is GUIDED.
-* A take-off is to a height above home, in GUIDED, armed.
+* GUIDED is one mode where PX4 has several: armed and waiting, taking off, holding, flying setpoints. It is
+  reported as the mode requested last (HOLD, TAKEOFF, HOLD again at the take-off altitude, OFFBOARD). GUIDED
+  that was set by another station is reported as OFFBOARD.
+* HOLD is BRAKE in the air. BRAKE does not allow arming, so on the ground HOLD is GUIDED.
+* A take-off goes to a height above home, in GUIDED, armed.
 * **There is no failsafe that leaves GUIDED when setpoints stop.** A velocity is flown for GUID_TIMEOUT (3 s)
-  more, then the vehicle stands still, in GUIDED; a position is flown to and held for ever. So the braking
-  setpoint that our streamer sends before it falls silent is what stops the vehicle, and RTL or LAND on our
-  silence is for FS_GCS_ENABLE with SYSID_MYGCS (MAV_GCS_SYSID since 4.7) set to our system id.
-* A setpoint without any yaw turns the nose into the direction of flight (WP_YAW_BEHAVIOR); ours keep the
-  heading, so they go out with a yaw rate of zero.
+  more, then the vehicle stops, in GUIDED; a position is flown to and held indefinitely. So the braking
+  setpoint that the streamer sends before it stops sending is what stops the vehicle. RTL or LAND on our
+  silence needs FS_GCS_ENABLE with SYSID_MYGCS (MAV_GCS_SYSID since 4.7) set to our system id.
+* A setpoint without yaw turns the nose into the direction of flight (WP_YAW_BEHAVIOR). Ours keep the heading,
+  so they are sent with a yaw rate of zero.
 * HOME_POSITION's local position is always zero; it is computed from GPS_GLOBAL_ORIGIN.
-* EKF_STATUS_REPORT says what PX4's ESTIMATOR_STATUS says, with the same flags. No message counts resets of
-  the estimate: they are found by the jump of the position.
-* Hardly any stream comes unasked; parameters travel as numbers, whatever their type.
+* EKF_STATUS_REPORT has the flags of PX4's ESTIMATOR_STATUS. No message counts estimator resets: they are
+  detected by the jump of the position.
+* Hardly any stream is sent without a request; parameters are sent as numbers, whatever their type.
 """
 
 from __future__ import annotations
@@ -39,15 +39,15 @@ _METRES_PER_UNIT = math.radians(1e-7) * _EARTH_RADIUS_M  # of latitude
 
 
 class ArduPilotProfile(AutopilotProfile):
-    """See the module."""
+    """ArduPilot Copter; see the module docstring."""
 
     name = "ArduPilot"
     parameters_bytewise = False
-    takes_off_by_home = False
+    takeoff_needs_home = False
     has_events = False
     requested = (HOME_POSITION_ID, GPS_GLOBAL_ORIGIN_ID)
-    rates_hz = {  # noqa: RUF012 - a table, never changed
-        0: 5.0,  # HEARTBEAT: there is no other word of the mode
+    rates_hz = {  # noqa: RUF012 - a constant table
+        0: 5.0,  # HEARTBEAT: no other message reports the mode
         31: 50.0,  # ATTITUDE_QUATERNION
         32: 30.0,  # LOCAL_POSITION_NED
         33: 5.0,  # GLOBAL_POSITION_INT
@@ -60,17 +60,17 @@ class ArduPilotProfile(AutopilotProfile):
     optional = (EKF_STATUS_REPORT_ID,)
 
     def __init__(self) -> None:
-        self._use = FlightMode.OFFBOARD  # what GUIDED is for
+        self._guided_use = FlightMode.OFFBOARD  # what GUIDED is reported as
         self._seen_guided = False
         self._origin: Fields | None = None
 
     def translate(self, name: str, fields: Fields, state: VehicleState) -> list[tuple[str, Fields]]:
         if name in ("HEARTBEAT", "CURRENT_MODE"):
             return [(name, {**fields, "flight_mode": self._mode(fields["custom_mode"])})]
-        if name == "EXTENDED_SYS_STATE" and self._use is FlightMode.TAKEOFF:
+        if name == "EXTENDED_SYS_STATE" and self._guided_use is FlightMode.TAKEOFF:
             if fields["landed_state"] == _IN_AIR and state.landed is LandedState.TAKING_OFF:
-                self._use = FlightMode.HOLD  # at the top it waits for setpoints
-                return [(name, fields), _shows(FlightMode.HOLD)]
+                self._guided_use = FlightMode.HOLD  # take-off finished: it waits for setpoints
+                return [(name, fields), _mode_message(FlightMode.HOLD)]
         elif name == "GPS_GLOBAL_ORIGIN":
             self._origin = fields
         elif name == "HOME_POSITION":
@@ -82,13 +82,13 @@ class ArduPilotProfile(AutopilotProfile):
     def _mode(self, custom_mode: int) -> FlightMode:
         if custom_mode == GUIDED:
             self._seen_guided = True
-            return self._use
-        if self._seen_guided:  # whatever GUIDED shows next, we have not asked for
-            self.forget()
+            return self._guided_use
+        if self._seen_guided:  # GUIDED was left: the next GUIDED was not requested by us
+            self.clear_request()
         return mode_of_custom_mode(custom_mode)
 
     def _local(self, home: Fields) -> dict[str, float | None]:
-        """Home in local NED, whose origin is the EKF's; none while that is not known."""
+        """Home in local NED, metres from the EKF origin; None values while the origin is unknown."""
         origin = self._origin
         if origin is None:
             return {"x": None, "y": None, "z": None}
@@ -102,25 +102,25 @@ class ArduPilotProfile(AutopilotProfile):
     def mode_request(self, mode: FlightMode, state: VehicleState) -> tuple[FlightMode, int, int]:
         flying = state.armed and state.landed is not LandedState.ON_GROUND
         if mode is FlightMode.OFFBOARD or (mode is FlightMode.HOLD and not flying):
-            self._use, self._seen_guided = mode, False
+            self._guided_use, self._seen_guided = mode, False
             return mode, GUIDED, 0
         return mode, custom_mode_of_mode(mode), 0
 
     def takeoff_parameters(self, altitude_m: float, state: VehicleState) -> tuple[float, ...]:
         if not state.armed:
-            raise CommandRefusedError("ArduPilot takes off armed: arm it first")
+            raise CommandRefusedError("ArduPilot must be armed before take-off: arm it first")
         return (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, altitude_m)
 
-    def takes_off(self) -> list[tuple[str, Fields]]:
-        self._use = FlightMode.TAKEOFF
-        return [_shows(FlightMode.TAKEOFF)]
+    def on_takeoff_accepted(self) -> list[tuple[str, Fields]]:
+        self._guided_use = FlightMode.TAKEOFF
+        return [_mode_message(FlightMode.TAKEOFF)]
 
-    def forget(self) -> None:
-        self._use, self._seen_guided = FlightMode.OFFBOARD, False
+    def clear_request(self) -> None:
+        self._guided_use, self._seen_guided = FlightMode.OFFBOARD, False
 
     def setpoint_fields(self, fields: dict[str, Any]) -> dict[str, Any]:
-        # Copter adds an acceleration to the velocity it is to fly, again and again: when setpoints end, for
-        # GUID_TIMEOUT (3 s). So it is given none.
+        # Copter integrates the acceleration into the velocity setpoint, and goes on for GUID_TIMEOUT (3 s)
+        # after setpoints end. So no acceleration is sent.
         fields = {**fields, "type_mask": fields["type_mask"] | IGNORE_ACCELERATION}
         fields.update(dict.fromkeys(("afx", "afy", "afz"), 0.0))
         if not fields["type_mask"] & IGNORE_YAW or not fields["type_mask"] & IGNORE_YAW_RATE:
@@ -128,5 +128,5 @@ class ArduPilotProfile(AutopilotProfile):
         return {**fields, "type_mask": fields["type_mask"] & ~IGNORE_YAW_RATE, "yaw_rate": 0.0}
 
 
-def _shows(mode: FlightMode) -> tuple[str, Fields]:
+def _mode_message(mode: FlightMode) -> tuple[str, Fields]:
     return ("CURRENT_MODE", {"flight_mode": mode})

@@ -1,4 +1,4 @@
-"""`driver = "auto"`: MAVSDK's driver where a PX4 answers, pymavlink's for ArduPilot."""
+"""`driver = "auto"`: the MAVSDK driver for PX4, the pymavlink driver for ArduPilot."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ logger = logging.getLogger(__name__)
 
 
 class AutoDriver:
-    """See `companion.vehicle.driver.Driver`.
+    """Choose the driver by the autopilot that answers. See `companion.vehicle.driver.Driver`.
 
-    The driver that listens hands its open link to the one that flies. So the endpoint is opened once: no
-    other program can take it, and whom to answer stays known.
+    The listening driver passes its open link to the chosen one. So the endpoint is opened once: no other
+    program can bind it in between, and the peer address is kept.
 
     Args:
-        listener: not connected; flies every autopilot but PX4.
-        make_for_px4: makes the driver for PX4, not connected. It takes its time to load, so it is called in a
-            thread, and only when a PX4 has answered. What it raises of ImportError and OSError is said, and
-            the listener flies.
+        listener: not connected; used for every autopilot except PX4.
+        make_for_px4: creates the driver for PX4, not connected. It is slow to load, so it is called in a
+            thread, and only after a PX4 heartbeat. Its ImportError or OSError is logged, and the listener is
+            used.
     """
 
     def __init__(self, listener: AutopilotDriver, make_for_px4: Callable[[], AutopilotDriver]) -> None:
@@ -37,7 +37,7 @@ class AutoDriver:
 
     @property
     def library(self) -> str:
-        """See Driver. "auto" until an autopilot has answered."""
+        """See Driver. "auto" until an autopilot heartbeat was received."""
         return self._driver.library if self.state.autopilot is not None else "auto"
 
     async def connect(self, timeout_s: float) -> None:
@@ -57,13 +57,13 @@ class AutoDriver:
             driver = await asyncio.to_thread(self._make_for_px4)
         except (ImportError, OSError) as error:
             logger.warning(
-                "%s: MAVSDK cannot be loaded (%s); the %s driver is used",
+                "%s: MAVSDK cannot be loaded (%s); using the %s driver",
                 self._listener.url,
                 error,
                 self._listener.library,
             )
             return
-        driver.take_over(self._listener)
+        driver.adopt_link(self._listener)
         self._driver = driver
 
     async def close(self) -> None:

@@ -1,7 +1,7 @@
-"""What both drivers share: finding the autopilot, its state, the meaning of the commands.
+"""Common base of the drivers: connection, vehicle state, commands.
 
-A driver built on this adds how messages are encoded and decoded, and how a command and a parameter travel.
-All of it runs in one asyncio loop, and every byte leaves from that loop: when it hangs, nothing is sent.
+A subclass adds the encoding and decoding of messages, and the command and parameter protocols. Everything
+runs in one asyncio loop, and every byte is sent from that loop: when it hangs, nothing is sent.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Any
 from companion.vehicle.autopilot_profile import ARDUPILOT, PX4, AutopilotProfile, Px4Profile
 from companion.vehicle.byte_link import ByteLink, Source, open_link
 from companion.vehicle.commander import ONBOARD_CONTROLLER, commander_mode, read_commander
-from companion.vehicle.connection_advice import unsupported_autopilot, why_no_answer, why_no_autopilot
+from companion.vehicle.connection_advice import no_answer_advice, no_autopilot_text, unsupported_autopilot
 from companion.vehicle.driver import CommandRefusedError, LinkError, NoAnswerError, SystemStatus
 from companion.vehicle.flight_commands import FlightCommands
 from companion.vehicle.framing import Frame, Framer, is_signed, pack_frame
@@ -55,7 +55,7 @@ _TIMESYNC_PERIOD_S = 0.5
 
 
 class AutopilotDriver(ABC):
-    """The part of a driver above the encoding. See `companion.vehicle.driver.Driver` for the promises."""
+    """The part of a driver above the encoding. `companion.vehicle.driver.Driver` has the contract."""
 
     library: str
     flown_autopilots: frozenset[int] = frozenset({PX4})  # MAV_AUTOPILOT
@@ -89,8 +89,8 @@ class AutopilotDriver(ABC):
         self._autopilot_kind: int | None = None
         self._source: Source = None
         self._newest_heartbeat: Frame | None = None
-        self._asked_ns = 0
-        self._first_heard = asyncio.Event()
+        self._timesync_sent_ns = 0
+        self._heartbeat_received = asyncio.Event()
         self._others: set[tuple[Any, ...]] = set()
         self._signs = False  # the autopilot's frames are signed
         self._only_heartbeats = True
@@ -106,27 +106,30 @@ class AutopilotDriver(ABC):
         self._own_heartbeats: deque[tuple[int, int]] = deque(maxlen=8)  # (sequence number, custom_mode)
         self._tasks: list[asyncio.Task[None]] = []
 
-    # --- the encoding: what a driver adds -------------------------------------------------------------
+    # --- the encoding, implemented by subclasses ------------------------------------------------------
 
     @abstractmethod
     async def _attach(self, timeout_s: float) -> None:
-        """The autopilot was heard: get ready to exchange messages with it. Raises LinkError."""
+        """Prepare to exchange messages, after the first heartbeat. Raises LinkError."""
 
     @abstractmethod
     async def _detach(self) -> None:
-        """Undo `_attach`, also a half done one. Never raises."""
+        """Undo `_attach`, also after a failed one. Never raises."""
 
     @abstractmethod
-    def _take_frames(self, frames: list[Frame]) -> None:
-        """Decode frames of the chosen system; call `_heard.handle` with what they say."""
+    def _on_frames(self, frames: list[Frame]) -> None:
+        """Decode frames of the selected system and pass them to `_telemetry.handle`."""
 
     @abstractmethod
     def _send_message(self, name: str, fields: dict[str, Any]) -> None:
-        """Put one message on the wire."""
+        """Send one message."""
 
     @abstractmethod
     async def _exchange_command(self, command: int, parameters: tuple[float, ...]) -> int:
-        """Send a COMMAND_LONG, again until acknowledged; its MAV_RESULT. Raises CommandRefusedError."""
+        """Send a COMMAND_LONG, repeated until acknowledged, and return its MAV_RESULT.
+
+        Raises CommandRefusedError.
+        """
 
     @abstractmethod
     async def get_parameter(self, name: str) -> float:
@@ -139,21 +142,21 @@ class AutopilotDriver(ABC):
     # --- connection ---------------------------------------------------------------------------------
 
     async def connect(self, timeout_s: float) -> None:
-        """See Driver. A UDP listener stays silent; on other links our heartbeat asks for an answer."""
+        """See Driver. A UDP listener sends nothing first; on other links our heartbeat prompts a reply."""
         deadline = time.monotonic() + timeout_s
         await self.listen(timeout_s)
         await self.start(max(deadline - time.monotonic(), 1.0))
 
     async def listen(self, timeout_s: float) -> int | None:
-        """The first half of `connect`: open the link and wait for a heartbeat. Its MAV_AUTOPILOT."""
+        """First half of `connect`: open the link, wait for a heartbeat, return its MAV_AUTOPILOT."""
         if self._link is not None:
-            raise LinkError(f"{self.url}: this driver is connected already")
+            raise LinkError(f"{self.url}: this driver is already connected")
         self._reset()
         try:
             async with asyncio.timeout(timeout_s):
                 self._link = await open_link(self.url, self._received)
         except TimeoutError as error:
-            raise LinkError(f"{self.url}: no answer to opening it within {timeout_s:g} s") from error
+            raise LinkError(f"{self.url}: could not be opened within {timeout_s:g} s") from error
         try:
             await self._first_heartbeat(timeout_s)
         except BaseException:
@@ -161,12 +164,12 @@ class AutopilotDriver(ABC):
             raise
         return self._autopilot_kind
 
-    def take_over(self, other: AutopilotDriver) -> None:
-        """Go on with the link on which another driver, which listened, has heard the autopilot."""
+    def adopt_link(self, other: AutopilotDriver) -> None:
+        """Continue on the open link of another driver that has received an autopilot heartbeat."""
         self._reset()
         link, other._link = other._link, None
         if link is None or other._newest_heartbeat is None:
-            raise LinkError(f"{self.url}: the driver that listened has heard no autopilot")
+            raise LinkError(f"{self.url}: the listening driver has received no autopilot heartbeat")
         self._link, link.received = link, self._received
         self._framer, self._signer, self._others = other._framer, other._signer, other._others
         self._sequence = other._sequence
@@ -174,11 +177,11 @@ class AutopilotDriver(ABC):
         self._heartbeat_from(other._newest_heartbeat, other._source)
 
     def share_subscribers(self, other: AutopilotDriver) -> None:
-        """Call back whoever has subscribed to the state of another driver."""
+        """Also notify the subscribers of another driver."""
         self._telemetry.share_subscribers(other._telemetry)
 
     async def start(self, timeout_s: float) -> None:
-        """The second half of `connect`: exchange messages with the autopilot that was heard."""
+        """Second half of `connect`: exchange messages with the autopilot that was found."""
         try:
             if self._autopilot_kind not in self.flown_autopilots:
                 raise LinkError(unsupported_autopilot(self.url, self._system_id, self._autopilot_kind))
@@ -187,14 +190,16 @@ class AutopilotDriver(ABC):
             await self.close()
             raise
         name = self._telemetry.profile.name
-        logger.info("%s: %s, system %s, answers: %s driver", self.url, name, self._system_id, self.library)
+        logger.info(
+            "%s: connected to %s, system %s: %s driver", self.url, name, self._system_id, self.library
+        )
         self._streams = StreamRequests(self.url, self._telemetry, self._command)
         for loop, what in (
-            (self._keep(self._streams), "supervisor"),
-            (self._streams.keep(), "streams"),
+            (self._supervise(self._streams), "supervisor"),
+            (self._streams.run(), "streams"),
             (self._synchronise(), "clock"),
-            (self._gimbal_commands.keep(), "gimbal"),
-            *([(self._reports.learn_events(), "events")] if self._telemetry.profile.has_events else []),
+            (self._gimbal_commands.run(), "gimbal"),
+            *([(self._reports.load_events(), "events")] if self._telemetry.profile.has_events else []),
         ):
             self._tasks.append(asyncio.create_task(loop, name=f"{what} of {self.url}"))
 
@@ -214,13 +219,13 @@ class AutopilotDriver(ABC):
     async def _first_heartbeat(self, timeout_s: float) -> None:
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(timeout_s):
-                while not self._first_heard.is_set():
+                while not self._heartbeat_received.is_set():
                     if self.url.scheme is not LinkScheme.UDP_IN:
                         self.send_heartbeat(SystemStatus.ACTIVE)
-                    await _happens(self._first_heard, 1.0)
-        if not self._first_heard.is_set():
+                    await _wait_event(self._heartbeat_received, 1.0)
+        if not self._heartbeat_received.is_set():
             raise LinkError(
-                why_no_autopilot(
+                no_autopilot_text(
                     self.url,
                     timeout_s,
                     wanted_system_id=self._wanted_system_id,
@@ -245,7 +250,7 @@ class AutopilotDriver(ABC):
             if frame.system_id == self._system_id and source == self._source:
                 if frame.component_id == AUTOPILOT_COMPONENT:
                     self._only_heartbeats &= frame.message_id == HEARTBEAT_ID
-                    # PX4 signs what it sends and takes unsigned messages all the same.
+                    # PX4 signs what it sends, and still accepts unsigned messages.
                     self._signs |= is_signed(frame.raw)
                     if self._streams is not None:
                         self._streams.monitor.received(frame.message_id)
@@ -254,11 +259,11 @@ class AutopilotDriver(ABC):
                     elif frame.message_id == _SYSTEM_TIME_ID:
                         _, boot_ms = _SYSTEM_TIME.unpack(frame.padded(_SYSTEM_TIME.size))
                         self._telemetry.watch_clock("SYSTEM_TIME", boot_ms, time.monotonic_ns())
-                    elif self._reports.take(frame):
+                    elif self._reports.on_frame(frame):
                         continue
                 ours.append(frame)
         if ours and self._autopilot_kind in self.flown_autopilots:
-            self._take_frames(ours)
+            self._on_frames(ours)
 
     def _heartbeat_from(self, frame: Frame, source: Source) -> None:
         custom_mode, mav_type, autopilot, base_mode, system_status, _ = _HEARTBEAT.unpack(
@@ -269,21 +274,21 @@ class AutopilotDriver(ABC):
         wanted = self._wanted_system_id if self._system_id is None else self._system_id
         if not is_autopilot or wanted not in (None, frame.system_id):
             self._note_other(sender, "system/component %d/%d is also on this link")
-            # What a network sends back to us is our own: the same number and content as one that we sent.
+            # A heartbeat with the sequence number and content of one that we sent is our own, echoed.
             sent = (frame.sequence, custom_mode) in self._own_heartbeats
             echo = sender == self.own_address and sent
             commander = read_commander(mav_type, custom_mode, sender, time.monotonic_ns())
             if commander is not None and frame.system_id == self._own_system_id and not echo:
-                self._telemetry.take_commander(commander)
+                self._telemetry.on_commander(commander)
             return
         if self._system_id is None:
             self._system_id, self._autopilot_kind = frame.system_id, autopilot
             self._telemetry.profile = profile_of(autopilot)
             self._telemetry.state = replace(self._telemetry.state, autopilot=self._telemetry.profile.name)
         elif source != self._source and self._telemetry.state.connected(time.monotonic_ns()):
-            # Obeying whoever spoke last would fly two vehicles by turns.
+            # Following the latest sender would command two vehicles alternately.
             self._note_other(
-                (*sender, source), "a second autopilot %d/%d sends from %s; it is ignored: give it its own id"
+                (*sender, source), "a second autopilot %d/%d sends from %s: ignored; set a unique MAV_SYS_ID"
             )
             return
         self._source = source
@@ -292,24 +297,24 @@ class AutopilotDriver(ABC):
         self._newest_heartbeat = frame
         fields = {"custom_mode": custom_mode, "base_mode": base_mode, "system_status": system_status}
         self._telemetry.handle("HEARTBEAT", fields)
-        self._first_heard.set()
+        self._heartbeat_received.set()
 
     def _no_answer(self, text: str) -> NoAnswerError:
-        """The error for a command or a parameter that the autopilot has not answered."""
+        """Build the error for a command or parameter request without an answer."""
         has_key = self._signer is not None
-        advice = why_no_answer(signs=self._signs, has_key=has_key, only_heartbeats=self._only_heartbeats)
+        advice = no_answer_advice(signs=self._signs, has_key=has_key, only_heartbeats=self._only_heartbeats)
         return NoAnswerError(f"{text}; {advice}" if advice else text)
 
     def _time_from(self, frame: Frame) -> None:
-        """An answer to `_synchronise`; the autopilot's own questions have no `tc1`."""
+        """Process the reply to `_synchronise`; the autopilot's own requests have `tc1` = 0."""
         now_ns = time.monotonic_ns()
-        boot_ns, asked_ns, system, component = _TIMESYNC.unpack(frame.padded(_TIMESYNC.size))
-        # Older autopilots do not say whom they answer; our own stamp tells.
+        boot_ns, sent_ns, system, component = _TIMESYNC.unpack(frame.padded(_TIMESYNC.size))
+        # Older autopilots leave the target 0; our own stamp identifies the reply.
         for_us = (system, component) in ((0, 0), (self._own_system_id, self._own_component_id))
-        if not (boot_ns > 0 and asked_ns == self._asked_ns and for_us):
+        if not (boot_ns > 0 and sent_ns == self._timesync_sent_ns and for_us):
             return
         self._telemetry.watch_clock("TIMESYNC", boot_ns // 1_000_000, now_ns)
-        if self._telemetry.clock.answer(asked_ns, boot_ns, now_ns):
+        if self._telemetry.clock.answer(sent_ns, boot_ns, now_ns):
             self._telemetry.state = replace(self._telemetry.state, clock=self._telemetry.clock.offset(now_ns))
 
     def _note_other(self, sender: tuple[Any, ...], text: str) -> None:
@@ -328,7 +333,7 @@ class AutopilotDriver(ABC):
 
     def _warn_other_autopilot(self) -> None:
         logger.error(
-            "%s: two autopilots send as system %s from one address: give each an id of its own",
+            "%s: two autopilots send as system %s from one address: set a unique MAV_SYS_ID on each",
             self.url,
             self._system_id,
         )
@@ -339,10 +344,10 @@ class AutopilotDriver(ABC):
         if self._link is None:
             return
         ready = frame if self._signer is None else self._signer.signed(frame)
-        # A process that was stopped goes on where it was, perhaps after a setpoint was found to be fresh; and
-        # PX4 would go back to OFFBOARD for it.
-        made_ms = _setpoint_made_ms(frame)
-        if made_ms is not None and (self._boot_ms() - made_ms) & 0xFFFF_FFFF > LEAVES_WITHIN_S * 1e3:
+        # A stopped process resumes where it was, perhaps after the freshness check of a setpoint; sending it
+        # would return PX4 to OFFBOARD.
+        stamp_ms = _setpoint_stamp_ms(frame)
+        if stamp_ms is not None and (self._boot_ms() - stamp_ms) & 0xFFFF_FFFF > LEAVES_WITHIN_S * 1e3:
             self._warn_stale_setpoint()
             return
         self._link.send(ready)
@@ -351,7 +356,7 @@ class AutopilotDriver(ABC):
         return (time.monotonic_ns() - self._started_ns) // 1_000_000 & 0xFFFF_FFFF
 
     def _warn_stale_setpoint(self) -> None:
-        logger.warning("%s: a setpoint is not sent: its time was over before it left", self.url)
+        logger.warning("%s: setpoint dropped: it expired before it was sent", self.url)
 
     def _next_sequence(self) -> int:
         sequence, self._sequence = self._sequence, (self._sequence + 1) & 0xFF
@@ -381,13 +386,13 @@ class AutopilotDriver(ABC):
         """See Driver."""
         if self._link is None or self._system_id is None:
             return
-        made_ms = self._boot_ms()
-        # after the stamp: a stop between the two shows at one of them
+        stamp_ms = self._boot_ms()
+        # Checked after the stamp: if the process is stopped between the two, one of them detects it.
         if setpoint.expired(time.monotonic_ns()):
             self._warn_stale_setpoint()
             return
         setpoint = setpoint.moved(self._telemetry.state.reset_offset_ned_m)
-        zero = (0.0, 0.0, 0.0)  # the type mask says what counts
+        zero = (0.0, 0.0, 0.0)  # ignored by the type mask
         kinematics = (
             *(setpoint.position_ned_m or zero),
             *(setpoint.velocity_ned_mps or zero),
@@ -397,7 +402,7 @@ class AutopilotDriver(ABC):
             "SET_POSITION_TARGET_LOCAL_NED",
             self._telemetry.profile.setpoint_fields(
                 {
-                    "time_boot_ms": made_ms,
+                    "time_boot_ms": stamp_ms,
                     "target_system": self._system_id,
                     "target_component": AUTOPILOT_COMPONENT,
                     "coordinate_frame": _FRAME_LOCAL_NED,
@@ -421,9 +426,9 @@ class AutopilotDriver(ABC):
     # --- commands -----------------------------------------------------------------------------------
 
     async def _command(self, command: int, *parameters: float, fill: float = 0.0) -> int:
-        """One command at a time of each kind, as the command protocol wants it. Its MAV_RESULT."""
+        """Send a command and return its MAV_RESULT; one at a time per kind, as the protocol requires."""
         if self._link is None:
-            raise CommandRefusedError(f"{self.url}: not connected, so command {command} cannot be sent")
+            raise CommandRefusedError(f"{self.url}: not connected; command {command} was not sent")
         lock = self._command_locks.setdefault(command, asyncio.Lock())
         async with lock:
             return await self._exchange_command(command, (*parameters, *[fill] * (7 - len(parameters))))
@@ -455,7 +460,7 @@ class AutopilotDriver(ABC):
 
     async def take_gimbal(self) -> None:
         """See Driver."""
-        await self._gimbal_commands.take()
+        await self._gimbal_commands.take_control()
 
     async def point_gimbal(self, aim: GimbalAim) -> None:
         """See Driver."""
@@ -463,59 +468,59 @@ class AutopilotDriver(ABC):
 
     async def give_gimbal_back(self) -> None:
         """See Driver."""
-        await self._gimbal_commands.give_back()
+        await self._gimbal_commands.release_control()
 
     def _ack_is_ours(self, fields: Fields) -> bool:
-        """MAVLink 1 and broadcasting autopilots leave the target 0."""
+        """Whether a COMMAND_ACK is for us; MAVLink 1 and broadcasting autopilots leave the target 0."""
         target = (fields.get("target_system", 0), fields.get("target_component", 0))
         return target[0] in (0, self._own_system_id) and target[1] in (0, self._own_component_id)
 
-    # --- keeping the link ---------------------------------------------------------------------------
+    # --- link supervision ---------------------------------------------------------------------------
 
-    async def _keep(self, streams: StreamRequests) -> None:
-        """Say when the autopilot goes silent, restarts and comes back, and ask for its streams anew then."""
+    async def _supervise(self, streams: StreamRequests) -> None:
+        """Log when the autopilot goes silent, restarts and returns, and request its streams again then."""
         while True:
             self._telemetry.restarted.clear()
             streams.restart()
-            self._gimbal_commands.look_for_one()
-            if not await self._silence():
+            self._gimbal_commands.request_search()
+            if not await self._wait_silent():
                 logger.warning("%s: system %s has restarted", self.url, self._system_id)
                 continue
             logger.error(
-                "%s: system %s is silent: no heartbeat for %g s",
+                "%s: system %s: no heartbeat for %g s",
                 self.url,
                 self._system_id,
                 HEARTBEAT_MAX_AGE_S,
             )
             await self._telemetry.until(lambda: self._telemetry.state.connected(time.monotonic_ns()), None)
-            logger.warning("%s: system %s is back", self.url, self._system_id)
+            logger.warning("%s: system %s: heartbeat received again", self.url, self._system_id)
 
     async def _synchronise(self) -> None:
-        """Ask the autopilot for its time, for ever."""
+        """Send TIMESYNC requests until cancelled."""
         while True:
-            self._asked_ns = time.monotonic_ns()
-            question = _TIMESYNC.pack(0, self._asked_ns, self._system_id or 0, AUTOPILOT_COMPONENT)
-            self._transmit_payload(_TIMESYNC_ID, question)
+            self._timesync_sent_ns = time.monotonic_ns()
+            request = _TIMESYNC.pack(0, self._timesync_sent_ns, self._system_id or 0, AUTOPILOT_COMPONENT)
+            self._transmit_payload(_TIMESYNC_ID, request)
             await asyncio.sleep(_TIMESYNC_PERIOD_S)
 
-    async def _silence(self) -> bool:
-        """Wait until the newest heartbeat is too old (True) or the autopilot's clock began anew (False)."""
+    async def _wait_silent(self) -> bool:
+        """Wait until the newest heartbeat is too old (True) or the autopilot has restarted (False)."""
         while self._telemetry.state.connected(time.monotonic_ns()):
             left_s = (self._telemetry.state.heartbeat_ns - time.monotonic_ns()) / 1e9 + HEARTBEAT_MAX_AGE_S
-            if await _happens(self._telemetry.restarted, max(left_s, 0.0) + 1e-3):
+            if await _wait_event(self._telemetry.restarted, max(left_s, 0.0) + 1e-3):
                 return False
         return True
 
 
-def _setpoint_made_ms(frame: bytes) -> int | None:
-    """`time_boot_ms` of a SET_POSITION_TARGET_LOCAL_NED, in MAVLink 2; None of any other frame."""
+def _setpoint_stamp_ms(frame: bytes) -> int | None:
+    """Return `time_boot_ms` of a MAVLink 2 SET_POSITION_TARGET_LOCAL_NED; None for any other frame."""
     if int.from_bytes(frame[7:10], "little") != _SETPOINT_ID:
         return None
     return int.from_bytes(frame[10 : 10 + min(4, frame[1])], "little")
 
 
 def profile_of(autopilot: int) -> AutopilotProfile:
-    """The ways of a MAV_AUTOPILOT; PX4's for one that is not flown at all."""
+    """Return the profile of a MAV_AUTOPILOT; PX4's for an unsupported one."""
     if autopilot == ARDUPILOT:
         from companion.vehicle.ardupilot_profile import ArduPilotProfile
 
@@ -523,8 +528,8 @@ def profile_of(autopilot: int) -> AutopilotProfile:
     return Px4Profile()
 
 
-async def _happens(event: asyncio.Event, timeout_s: float) -> bool:
-    # Not asyncio.wait_for: until Python 3.12 it loses a cancellation that comes together with the event.
+async def _wait_event(event: asyncio.Event, timeout_s: float) -> bool:
+    # Not asyncio.wait_for: before Python 3.12 it loses a cancellation that coincides with the event.
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(timeout_s):
             await event.wait()

@@ -1,6 +1,6 @@
-"""What a driver must know of the autopilot it speaks to: modes, streams, take-off, how parameters travel.
+"""Autopilot profiles: modes, streams, take-off and parameter encoding of each firmware.
 
-`Px4Profile` here, `ArduPilotProfile` in `ardupilot_profile.py`; the first heartbeat decides which.
+`Px4Profile` here, `ArduPilotProfile` in `ardupilot_profile.py`; the first heartbeat selects one.
 """
 
 from __future__ import annotations
@@ -24,16 +24,18 @@ ODOMETRY_ID = 331
 
 
 class AutopilotProfile(ABC):
-    """One autopilot's ways. Whoever is asked for a mode or a take-off may remember it (`forget` undoes it).
+    """The firmware-specific behaviour of one autopilot.
+
+    A profile may remember the requested mode or take-off; `clear_request` undoes that.
 
     Attributes:
-        name: for people. rates_hz: what is read, by message id, and the rate that is asked for.
-        expected_hz: the rate that comes of it, where that is another one.
-        optional: of these the messages that not every version has.
-        requested: messages that are requested besides while home is not known.
-        parameters_bytewise: integer parameters travel as their bytes; else as numbers.
-        takes_off_by_home: a take-off is commanded as an altitude AMSL, which home's altitude is needed for.
-        has_events: it speaks by EVENT, with metadata; else by STATUSTEXT alone.
+        name: for display. rates_hz: message id → requested rate, Hz, of the messages that are used.
+        expected_hz: message id → resulting rate, where it differs from the requested one.
+        optional: ids in `rates_hz` that not every version has.
+        requested: ids that are also requested once, while home is unknown.
+        parameters_bytewise: integer parameters are sent as their bytes; else as numbers.
+        takeoff_needs_home: NAV_TAKEOFF takes an altitude AMSL, which needs home's altitude.
+        has_events: it reports by EVENT, with metadata; else by STATUSTEXT only.
     """
 
     name: str
@@ -42,50 +44,50 @@ class AutopilotProfile(ABC):
     optional: tuple[int, ...] = ()
     requested: tuple[int, ...] = (HOME_POSITION_ID,)
     parameters_bytewise: bool
-    takes_off_by_home: bool
+    takeoff_needs_home: bool
     has_events: bool
 
     def translate(self, name: str, fields: Fields, state: VehicleState) -> list[tuple[str, Fields]]:
-        """A message of the autopilot in PX4's terms: what is to be taken in for it, often itself."""
+        """Return the messages, in PX4's terms, to apply for one message; by default that message."""
         return [(name, fields)]
 
     @abstractmethod
     def mode_request(self, mode: FlightMode, state: VehicleState) -> tuple[FlightMode, int, int]:
-        """The mode that will be shown, and DO_SET_MODE's parameters 2 and 3.
+        """Return the mode that will be reported, and DO_SET_MODE's parameters 2 and 3.
 
-        Raises ValueError for a mode that cannot be asked for.
+        Raises ValueError for a mode that cannot be requested.
         """
 
     @abstractmethod
     def takeoff_parameters(self, altitude_m: float, state: VehicleState) -> tuple[float, ...]:
-        """NAV_TAKEOFF's parameters for a height above home. Raises CommandRefusedError."""
+        """Return NAV_TAKEOFF's parameters for a height above home, metres. Raises CommandRefusedError."""
 
-    def takes_off(self) -> list[tuple[str, Fields]]:
-        """A take-off was accepted; what is to be taken in for that."""
+    def on_takeoff_accepted(self) -> list[tuple[str, Fields]]:
+        """Return the messages to apply after an accepted take-off."""
         return []
 
-    def forget(self) -> None:  # noqa: B027 - PX4 shows what was asked for by itself
-        """What was asked for was refused."""
+    def clear_request(self) -> None:  # noqa: B027 - PX4 reports its mode by itself
+        """Drop the remembered request after a refusal."""
 
     def setpoint_fields(self, fields: dict[str, Any]) -> dict[str, Any]:
-        """SET_POSITION_TARGET_LOCAL_NED, so that this autopilot understands it as PX4 does."""
+        """Adapt the fields of SET_POSITION_TARGET_LOCAL_NED to this autopilot."""
         return fields
 
 
 class Px4Profile(AutopilotProfile):
-    """PX4's. Its onboard link has most of the streams unasked."""
+    """PX4. Its onboard link sends most of the streams without a request."""
 
     name = "PX4"
     parameters_bytewise = True
-    takes_off_by_home = True
+    takeoff_needs_home = True
     has_events = True
-    rates_hz = {  # noqa: RUF012 - a table, never changed
+    rates_hz = {  # noqa: RUF012 - a constant table
         31: 50.0,  # ATTITUDE_QUATERNION
         32: 30.0,  # LOCAL_POSITION_NED
         33: 5.0,  # GLOBAL_POSITION_INT
         1: 2.0,  # SYS_STATUS
         245: 5.0,  # EXTENDED_SYS_STATE
-        CURRENT_MODE_ID: 10.0,  # HEARTBEAT alone shows a mode up to 1 s late; this comes when it changes
+        CURRENT_MODE_ID: 10.0,  # sent on change; HEARTBEAT reports a mode up to 1 s late
         HOME_POSITION_ID: 0.5,
         ESTIMATOR_STATUS_ID: 5.0,
         ODOMETRY_ID: 5.0,  # for its reset_counter
@@ -100,7 +102,7 @@ class Px4Profile(AutopilotProfile):
     def takeoff_parameters(self, altitude_m: float, state: VehicleState) -> tuple[float, ...]:
         if state.home_altitude_amsl_m is None:
             raise CommandRefusedError(
-                "take-off needs home's altitude, and the vehicle has not told it (no position yet?)"
+                "home position not received: take-off needs home's altitude (no position estimate yet?)"
             )
-        nan = math.nan  # here, with this heading
+        nan = math.nan  # at the present position and heading
         return (nan, nan, nan, nan, nan, nan, state.home_altitude_amsl_m + altitude_m)

@@ -1,7 +1,7 @@
-"""The link's bytes: UDP, TCP or a serial line, in the asyncio loop, without threads.
+"""Byte transport of the link: UDP, TCP or a serial line, in the asyncio loop, without threads.
 
-A link opened once stays: a TCP peer or a serial device that goes away is opened again until `close`.
-What cannot be sent at once is dropped, never queued: an old setpoint must not arrive late.
+A TCP peer or a serial device that is lost is reopened until `close`. What cannot be sent at once is dropped,
+never queued: an old setpoint must not arrive late.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ Source = Any
 Received = Callable[[bytes, Source], None]
 
 _READ_BYTES = 65535
-_READS_A_TURN = 64  # then other work of the loop has its turn
+_MAX_READS_PER_CALLBACK = 64  # then other work of the loop runs
 _REOPEN_S = 0.5
-# The rest of a frame that waits longer for its line is given up.
-_REST_S = 0.3
+# The unsent rest of a frame is dropped after this time.
+_PARTIAL_FRAME_S = 0.3
 
 
 class ByteLink(Protocol):
-    """An open link. `received(data, source)` is given when it is opened, and may be replaced."""
+    """An open link. Received data goes to `received(data, source)`, which may be replaced."""
 
     datagrams: bool
     received: Received
@@ -46,7 +46,7 @@ class ByteLink(Protocol):
         """Send now or drop. Never raises and never waits."""
 
     def answer_to(self, source: Source) -> None:
-        """Where to send from now on. Only a listening UDP link has a choice."""
+        """Set the peer to send to. Has an effect only on a listening UDP link."""
 
     async def close(self) -> None:
         """Release everything. Never raises; can be called twice."""
@@ -56,7 +56,7 @@ async def open_link(url: LinkUrl, received: Received) -> ByteLink:
     """Open a link.
 
     Raises:
-        LinkError: one line: the endpoint, what is wrong with it, what to do.
+        LinkError: the endpoint cannot be opened; one line with the reason and what to do.
     """
     if url.scheme in (LinkScheme.UDP_IN, LinkScheme.UDP_OUT):
         return await _open_udp(url, received)
@@ -86,24 +86,22 @@ async def _open_udp(url: LinkUrl, received: Received) -> _UdpLink:
         return _UdpLink(url, endpoint, received, peer=address)
     except OSError as error:
         endpoint.close()
-        raise LinkError(_why_not_bound(url, error)) from error
+        raise LinkError(_bind_error_text(url, error)) from error
 
 
 def _reason(error: OSError) -> str:
-    """The system's own words; asyncio puts others in their place."""
+    """Return the system's error text; asyncio replaces it with another."""
     return os.strerror(error.errno) if error.errno is not None and error.errno > 0 else str(error)
 
 
-def _why_not_bound(url: LinkUrl, error: OSError) -> str:
+def _bind_error_text(url: LinkUrl, error: OSError) -> str:
     if error.errno == errno.EADDRINUSE:
         return (
             f"{url}: UDP port {url.address[1]} is in use: another program (a MAVLink router, QGroundControl, "
             "another companion) listens there; stop it or choose another port"
         )
     if error.errno == errno.EADDRNOTAVAIL:
-        return (
-            f"{url}: no interface of this computer has the address {url.address[0]}; 0.0.0.0 listens on all"
-        )
+        return f"{url}: no interface of this computer has the address {url.address[0]}; use 0.0.0.0 for all"
     return f"{url}: the port cannot be opened: {_reason(error)}"
 
 
@@ -116,20 +114,20 @@ class _UdpLink:
         self.received = received
         self._peer = peer
         self._peer_is_fixed = peer is not None
-        self._in_trouble = False
+        self._send_failing = False
         self._loop = asyncio.get_running_loop()
         self._loop.add_reader(endpoint.fileno(), self._readable)
         self.dropped_count = 0
 
     def _readable(self) -> None:
-        for _ in range(_READS_A_TURN):
-            if self._socket.fileno() < 0:  # closed by whoever received
+        for _ in range(_MAX_READS_PER_CALLBACK):
+            if self._socket.fileno() < 0:  # closed by the callback
                 return
             try:
                 data, source = self._socket.recvfrom(_READ_BYTES)
             except BlockingIOError:
                 return
-            except OSError as error:  # an ICMP answer to what we sent: nobody listens there yet
+            except OSError as error:  # ICMP port unreachable: nothing listens at the peer yet
                 logger.debug("%s: %s", self._url, error)
                 continue
             self.received(data, source)
@@ -142,11 +140,11 @@ class _UdpLink:
             self._socket.sendto(data, self._peer)
         except OSError as error:
             self.dropped_count += 1
-            if not self._in_trouble:
-                logger.warning("%s: sending to %s fails: %s", self._url, self._peer, _reason(error))
-            self._in_trouble = True
+            if not self._send_failing:
+                logger.warning("%s: sending to %s failed: %s", self._url, self._peer, _reason(error))
+            self._send_failing = True
         else:
-            self._in_trouble = False
+            self._send_failing = False
 
     def answer_to(self, source: Source) -> None:
         if not self._peer_is_fixed and source != self._peer:
@@ -161,7 +159,7 @@ class _UdpLink:
 
 
 class _StreamLink:
-    """A file descriptor that is read and written when it is ready: a TCP socket or a serial line."""
+    """A TCP socket or a serial line, read and written when its descriptor is ready."""
 
     datagrams = False
 
@@ -170,7 +168,7 @@ class _StreamLink:
         self.received = received
         self._loop = asyncio.get_running_loop()
         self._descriptor = -1
-        self._unsent = b""  # the rest of a frame of which a part has left
+        self._unsent = b""  # the rest of a partially sent frame
         self._unsent_since_s = 0.0
         self._reopening: asyncio.Task[None] | None = None
         self.dropped_count = 0
@@ -187,12 +185,12 @@ class _StreamLink:
         except BlockingIOError:
             return
         except OSError as error:
-            self._lost(_reason(error))
+            self._on_lost(_reason(error))
             return
         if data:
             self.received(data, None)
         else:
-            self._lost("the other end closed it")
+            self._on_lost("closed by the peer")
 
     def send(self, data: bytes) -> None:
         if self._descriptor < 0 or self._unsent:
@@ -207,7 +205,7 @@ class _StreamLink:
             written = 0
         except OSError as error:
             self.dropped_count += 1
-            self._lost(_reason(error))
+            self._on_lost(_reason(error))
             return
         if written == 0 and not self._unsent:
             self.dropped_count += 1
@@ -221,20 +219,20 @@ class _StreamLink:
 
     def _write_rest(self) -> None:
         waited_s = time.monotonic() - self._unsent_since_s
-        if waited_s <= _REST_S:
+        if waited_s <= _PARTIAL_FRAME_S:
             self._write(self._unsent)
             return
-        # We were stopped, or the line was: what may be a setpoint must not be completed now.
-        logger.warning("%s: the rest of a frame waited for %.1f s and is not sent", self._url, waited_s)
+        # This process or the line was stopped. The frame may be a setpoint: it must not be completed now.
+        logger.warning("%s: partial frame dropped after %.1f s", self._url, waited_s)
         self.dropped_count += 1
         self._unsent = b""
         self._loop.remove_writer(self._descriptor)
 
     def answer_to(self, source: Source) -> None:
-        """A stream has one other end."""
+        """Does nothing: a stream has one peer."""
 
-    def _lost(self, reason: str) -> None:
-        logger.error("%s: lost: %s; opening it again", self._url, reason)
+    def _on_lost(self, reason: str) -> None:
+        logger.error("%s: link lost: %s; reopening", self._url, reason)
         self._release()
         self._reopening = self._loop.create_task(self._reopen())
 
@@ -245,7 +243,7 @@ class _StreamLink:
                 await self.open()
             except LinkError as error:
                 logger.debug("%s", error)
-        logger.info("%s: open again", self._url)
+        logger.info("%s: link reopened", self._url)
 
     def _release(self) -> None:
         if self._descriptor >= 0:
@@ -273,7 +271,7 @@ async def _open_tcp(url: LinkUrl) -> int:
     except OSError as error:
         reason = _reason(error)
         raise LinkError(
-            f"{url}: cannot connect: {reason}; is a vehicle or a router listening there?"
+            f"{url}: cannot connect: {reason}; check that a vehicle or a router listens there"
         ) from error
     finally:
         endpoint.close()  # does nothing to a detached descriptor
@@ -284,11 +282,11 @@ async def _open_serial(url: LinkUrl) -> int:
     speed = getattr(termios, f"B{baud}", None)
     if speed is None:
         rates = sorted(int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit())
-        raise LinkError(f"{url}: this system has no baud rate {baud}; it has {rates}")
+        raise LinkError(f"{url}: baud rate {baud} is not supported; supported: {rates}")
     descriptor = -1
     try:
         descriptor = os.open(device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
-        # A second reader would steal bytes: TIOCEXCL stops who opens it after us, flock who asks as we do.
+        # A second reader would take bytes. TIOCEXCL blocks later opens, flock other users of flock.
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         fcntl.ioctl(descriptor, termios.TIOCEXCL)
         tty.setraw(descriptor)
@@ -300,15 +298,15 @@ async def _open_serial(url: LinkUrl) -> int:
         if descriptor >= 0:
             with contextlib.suppress(OSError):
                 os.close(descriptor)
-        raise LinkError(_why_no_serial(url, error)) from error
+        raise LinkError(_serial_error_text(url, error)) from error
     return descriptor
 
 
-def _why_no_serial(url: LinkUrl, error: Exception) -> str:
+def _serial_error_text(url: LinkUrl, error: Exception) -> str:
     device, _ = url.address
     number = error.args[0] if error.args else None
     if number == errno.ENOENT:
-        return f"{url}: there is no device {device}; is it plugged in?"
+        return f"{url}: no device {device}; check that it is plugged in"
     if number == errno.EACCES:
         return (
             f"{url}: no permission to open {device}; add the user to the group that owns it (often dialout)"

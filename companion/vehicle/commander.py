@@ -1,12 +1,12 @@
-"""Another service like ours on the same vehicle, known by its HEARTBEAT.
+"""Detects another companion service on the same vehicle by its HEARTBEAT.
 
-That an onboard controller is there says nothing of what it does: MAVROS, a camera or a logger sends the same
-type and may have the same component id. So a service that commands writes who it is into `custom_mode`, which
-MAVLink leaves to the sender and no autopilot reads of an onboard controller:
+The type does not identify it: MAVROS, a camera or a logger sends the same type and may have the same
+component id. So this service identifies itself in `custom_mode`, which MAVLink leaves to the sender and no
+autopilot reads from an onboard controller:
 
     bits 31..20  0xC0D
-    bit  19      it is in command now
-    bits 18..0   for how long it has run, seconds (at most 6 days)
+    bit  19      in command now
+    bits 18..0   uptime, seconds (at most 6 days)
 """
 
 from __future__ import annotations
@@ -23,29 +23,29 @@ _LONGEST_S = _IN_COMMAND - 1
 
 @dataclass(frozen=True, slots=True)
 class Commander:
-    """Another service.
+    """Another companion service.
 
     Attributes:
         address: system and component id of its messages.
-        heard_ns: when its newest heartbeat came, CLOCK_MONOTONIC.
-        uptime_s: for how long it had run then. in_command: it commanded the vehicle then.
+        received_ns: arrival of its newest heartbeat, CLOCK_MONOTONIC.
+        uptime_s, in_command: as reported in that heartbeat.
     """
 
     address: Address
-    heard_ns: int
+    received_ns: int
     uptime_s: float
     in_command: bool
 
 
 def commander_mode(uptime_s: float, in_command: bool) -> int:
-    """The `custom_mode` of our own heartbeat."""
+    """Encode the `custom_mode` of our own heartbeat."""
     seconds = min(int(uptime_s), _LONGEST_S)
     return _MARK << _MARK_SHIFT | (_IN_COMMAND if in_command else 0) | seconds
 
 
-def read_commander(mav_type: int, custom_mode: int, address: Address, heard_ns: int) -> Commander | None:
-    """Who sent a heartbeat; None: no service of ours."""
+def read_commander(mav_type: int, custom_mode: int, address: Address, received_ns: int) -> Commander | None:
+    """Decode the sender of a heartbeat; None if it is not a companion service."""
     if mav_type != ONBOARD_CONTROLLER or custom_mode >> _MARK_SHIFT != _MARK:
         return None
     uptime_s = float(custom_mode & _LONGEST_S)
-    return Commander(address, heard_ns, uptime_s, bool(custom_mode & _IN_COMMAND))
+    return Commander(address, received_ns, uptime_s, bool(custom_mode & _IN_COMMAND))

@@ -1,4 +1,4 @@
-"""Why a driver is not connected or not answered, in one line for the person who set it up."""
+"""One-line explanations of a failed connection or a missing answer, for the person who set it up."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from companion.vehicle.signing import FrameSigner
 _AUTOPILOT_NAMES = {0: "a generic autopilot", 3: "ArduPilot"}
 
 
-def why_no_autopilot(
+def no_autopilot_text(
     url: LinkUrl,
     timeout_s: float,
     *,
@@ -21,33 +21,34 @@ def why_no_autopilot(
     signer: FrameSigner | None,
     skipped_bytes: int,
 ) -> str:
-    """No heartbeat of an autopilot came within `timeout_s`; what did come tells the likely reason.
+    """Explain a missing autopilot heartbeat by what was received instead.
 
     Args:
-        others: who else was heard: system, component, and what more is known of each.
-        signer: what checks signatures, if any. skipped_bytes: that were no MAVLink.
+        others: other senders: system id, component id, further fields.
+        signer: checks signatures, if any. skipped_bytes: received bytes that are not MAVLink.
     """
-    which = "autopilot" if wanted_system_id is None else f"autopilot of system {wanted_system_id}"
-    heard = ", ".join(f"{sender[0]}/{sender[1]}" for sender in sorted(others))
-    if heard:
-        advice = f"heard only system/component {heard}; check the system id and what is connected"
+    origin = "" if wanted_system_id is None else f" from system {wanted_system_id}"
+    senders = ", ".join(f"{sender[0]}/{sender[1]}" for sender in sorted(others))
+    if senders:
+        advice = f"received only system/component {senders}; check the system id and what is connected"
     elif signer is not None and signer.refused:
         reasons = ", ".join(f"{count} {reason}" for reason, count in signer.refused.items())
-        advice = f"its frames were refused by signing ({reasons}); check that both ends have the same key"
+        advice = f"its frames failed the signature check ({reasons}); both ends need the same key"
     elif skipped_bytes:
-        advice = f"{skipped_bytes} bytes came that are not MAVLink; check the baud rate and what is connected"
+        advice = f"received {skipped_bytes} bytes that are not MAVLink; check the baud rate and the device"
     elif url.scheme is LinkScheme.UDP_IN:
-        advice = "nothing came at all; check that the vehicle is on and sends to this address and port"
+        advice = "nothing received; check that the vehicle is on and sends to this address and port"
     else:
-        advice = "nothing came at all; check that the vehicle is on, and the address or device"
-    return f"no {which} answered on {url} within {timeout_s:g} s: {advice}"
+        advice = "nothing received; check that the vehicle is on, and the address or device"
+    return f"no autopilot heartbeat{origin} on {url} within {timeout_s:g} s: {advice}"
 
 
-def why_no_answer(*, signs: bool, has_key: bool, only_heartbeats: bool) -> str:
-    """What may be behind an autopilot that is heard and does not answer; empty where nothing tells.
+def no_answer_advice(*, signs: bool, has_key: bool, only_heartbeats: bool) -> str:
+    """Explain a missing answer of a connected autopilot; empty if nothing hints at the reason.
 
     Args:
-        signs: its messages are signed. has_key: ours are. only_heartbeats: nothing else of it has come.
+        signs: its messages are signed. has_key: ours are signed.
+        only_heartbeats: nothing but heartbeats was received.
     """
     if signs and not has_key:
         return (
@@ -57,19 +58,19 @@ def why_no_answer(*, signs: bool, has_key: bool, only_heartbeats: bool) -> str:
     if not only_heartbeats:
         return ""
     if has_key:
-        return "nothing but heartbeats comes from the autopilot: check that it hears this link"
+        return "only heartbeats received from the autopilot: check that it receives on this link"
     return (
-        "nothing but heartbeats comes from the autopilot: check that it hears this link, and whether it "
-        "wants signed messages (vehicle.signing_key_file)"
+        "only heartbeats received from the autopilot: check that it receives on this link, and whether it "
+        "requires signed messages (vehicle.signing_key_file)"
     )
 
 
 def unsupported_autopilot(url: LinkUrl, system_id: int | None, kind: int | None) -> str:
-    """An autopilot of a kind (MAV_AUTOPILOT) that this driver does not fly."""
+    """Explain that a driver does not support an autopilot (`kind`: MAV_AUTOPILOT)."""
     name = _AUTOPILOT_NAMES.get(kind or 0, f"MAV_AUTOPILOT {kind}")
     if kind == ARDUPILOT:
         return (
-            f"{url}: the mavsdk driver flies PX4 alone, and system {system_id} is {name}; "
+            f"{url}: the mavsdk driver supports PX4 only, system {system_id} is {name}; "
             'set vehicle.driver = "pymavlink" or "auto"'
         )
-    return f"{url}: only PX4 and ArduPilot are flown, and system {system_id} is {name}"
+    return f"{url}: only PX4 and ArduPilot are supported, system {system_id} is {name}"

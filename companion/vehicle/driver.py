@@ -1,7 +1,7 @@
-"""What every driver of a vehicle must do. One contract test runs against all of them.
+"""The interface of the vehicle drivers. One contract test runs against all of them.
 
-A driver sends what it is told, once. It repeats nothing by itself: no setpoint, no heartbeat. What repeats
-lives in the loop that does the work, so that it stops when that loop stops (see `streamer.py`).
+A driver sends each message once. It repeats nothing by itself: no setpoint, no heartbeat. The repetition is
+done by the guidance loop, so that it stops when that loop stops (see `streamer.py`).
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from companion.vehicle.state import FlightMode, VehicleState
 
 
 class LinkError(ConnectionError):
-    """The link could not be opened, or no autopilot answers on it. The message is one line for a person."""
+    """The link cannot be opened, or no autopilot answers on it. The message is one line."""
 
 
 class CommandRefusedError(RuntimeError):
-    """The vehicle refused, or did not do in time, what was asked. The message says what and why."""
+    """The vehicle refused a request or did not fulfil it in time. The message says what and why."""
 
 
 class NoAnswerError(CommandRefusedError):
-    """The vehicle is heard, and has not answered. The message says what may be the reason."""
+    """The vehicle is connected and has not answered. The message gives a likely reason."""
 
 
 class SystemStatus(IntEnum):
@@ -44,13 +44,13 @@ class Driver(Protocol):
 
     @property
     def library(self) -> str:
-        """Which library speaks MAVLink: "mavsdk", "pymavlink", or "auto" while that is not chosen yet."""
+        """The MAVLink library: "mavsdk", "pymavlink", or "auto" before it is chosen."""
 
     async def connect(self, timeout_s: float) -> None:
         """Open the link and wait for the autopilot's first heartbeat.
 
         Raises:
-            LinkError: the endpoint cannot be opened (busy port, no such device, bad url) or nothing answers.
+            LinkError: the endpoint cannot be opened (busy port, no such device, bad url), or no heartbeat.
         """
 
     async def close(self) -> None:
@@ -58,69 +58,70 @@ class Driver(Protocol):
 
     @property
     def state(self) -> VehicleState:
-        """The newest snapshot. A new object whenever a message changed it."""
+        """The newest snapshot; a new object for every change."""
 
     def subscribe(self, callback: Callable[[VehicleState], None]) -> Callable[[], None]:
-        """Call back in the loop with every new snapshot; returns what ends the subscription."""
+        """Call back in the loop with every new snapshot; returns a function that unsubscribes."""
 
     async def arm(self) -> None:
-        """Arm, and return when the vehicle shows that it is armed. Raises CommandRefusedError."""
+        """Arm, and return when the vehicle reports armed. Raises CommandRefusedError."""
 
     async def disarm(self) -> None:
-        """Disarm (never forced in the air), and return when shown. Raises CommandRefusedError."""
+        """Disarm (never forced in the air), and return when reported. Raises CommandRefusedError."""
 
     async def set_mode(self, mode: FlightMode, *, timeout_s: float = 3.0) -> None:
-        """Ask for a flight mode, and return when the vehicle SHOWS it (heartbeat or CURRENT_MODE).
+        """Request a flight mode, and return when the vehicle REPORTS it (HEARTBEAT or CURRENT_MODE).
 
-        The acknowledgement alone is not believed: PX4 >= 1.16 first acknowledges every DO_SET_MODE.
-        Raises CommandRefusedError with what the vehicle shows instead.
+        The acknowledgement is not sufficient: PX4 >= 1.16 first acknowledges every DO_SET_MODE.
+        Raises CommandRefusedError with the mode that is reported instead.
         """
 
     async def takeoff(self, altitude_m: float) -> None:
-        """Ask for the autopilot's own take-off to a height above home. Must be armed before or after.
+        """Request the autopilot's own take-off to a height above home, metres. Arm before or after.
 
-        Raises CommandRefusedError, also when home's altitude is not known yet.
+        Raises CommandRefusedError, also when home's altitude is unknown.
         """
 
     def send_setpoint(self, setpoint: Setpoint) -> None:
-        """Put one SET_POSITION_TARGET_LOCAL_NED on the wire, now. Never raises for a lost link."""
+        """Send one SET_POSITION_TARGET_LOCAL_NED now. Never raises for a lost link."""
 
     def send_landing_target(self, target: LandingTarget) -> None:
-        """Put one LANDING_TARGET on the wire, now, in the frame that this autopilot takes."""
+        """Send one LANDING_TARGET now, in the frame that this autopilot accepts."""
 
     def send_heartbeat(
         self, status: SystemStatus, *, uptime_s: float = 0.0, in_command: bool = False
     ) -> None:
-        """Put one HEARTBEAT of MAV_TYPE_ONBOARD_CONTROLLER on the wire, now.
+        """Send one HEARTBEAT of MAV_TYPE_ONBOARD_CONTROLLER now.
 
-        Another service on the same vehicle reads in it for how long this one has run, and whether it is in
-        command (`companion.vehicle.commander`).
+        It carries uptime and whether this service is in command, for another service on the same vehicle
+        (`companion.vehicle.commander`).
         """
 
     @property
     def own_address(self) -> Address:
-        """Whom our messages say they are from: system and component id."""
+        """System and component id of our messages."""
 
     async def find_gimbal(self) -> bool:
-        """Ask the autopilot for its gimbal and for the streams of it. False: none answers. Never raises.
+        """Request the gimbal manager's information and its streams. False: no answer. Never raises.
 
-        Asked by itself when the link opens, when the autopilot restarts and when a gimbal is heard.
+        Done automatically when the link opens, when the autopilot restarts, and when a gimbal's message is
+        received.
         """
 
     async def take_gimbal(self) -> None:
-        """Take primary control of the gimbal, whoever has it. Raises CommandRefusedError."""
+        """Take primary control of the gimbal, also from another owner. Raises CommandRefusedError."""
 
     async def point_gimbal(self, aim: GimbalAim) -> None:
-        """Let the gimbal look there; returns when that is accepted, before it has turned.
+        """Point the gimbal; returns when the command is accepted, before the gimbal has turned.
 
-        Raises CommandRefusedError, also when another has taken control of it.
+        Raises CommandRefusedError, also when another owner has primary control.
         """
 
     async def give_gimbal_back(self) -> None:
-        """Give primary control back, if it is ours; the gimbal stays as it is. Raises CommandRefusedError."""
+        """Release primary control if it is ours; the gimbal keeps its aim. Raises CommandRefusedError."""
 
     async def get_parameter(self, name: str) -> float:
-        """The value of one parameter. Raises CommandRefusedError if there is none of that name."""
+        """Return the value of one parameter. Raises CommandRefusedError if it does not exist."""
 
     async def set_parameter(self, name: str, value: float) -> None:
-        """Set one parameter, keeping its type, and return when the vehicle echoed it."""
+        """Set one parameter, keeping its type, and return when the vehicle has echoed it."""

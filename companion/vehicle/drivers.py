@@ -1,4 +1,4 @@
-"""Opens the driver that was asked for."""
+"""Creates the driver of a given kind."""
 
 from __future__ import annotations
 
@@ -22,23 +22,21 @@ def open_driver(
     own_component_id: int = 191,
     signing_key: bytes | None = None,
 ) -> Driver:
-    """A driver, not connected yet.
+    """Create a driver, not connected yet.
 
     Args:
-        kind: which library speaks MAVLink. Both keep the same contract; "auto" takes the one that fits the
-            autopilot that answers.
+        kind: the MAVLink library. Both have the same contract; "auto" chooses by the autopilot that answers.
         url: `udpin://HOST:PORT`, `udpout://HOST:PORT`, `tcp://HOST:PORT` or `serial:///dev/X:BAUD`.
-        system_id: the autopilot's MAVLink system id; None takes the first autopilot heard.
-        own_system_id, own_component_id: whom our messages say they are from; 191 is
-            MAV_COMP_ID_ONBOARD_COMPUTER.
-        signing_key: 32 bytes of MAVLink 2 signing; None: nothing is signed and everything is taken.
+        system_id: the autopilot's MAVLink system id; None: the first autopilot received.
+        own_system_id, own_component_id: of our messages; 191 is MAV_COMP_ID_ONBOARD_COMPUTER.
+        signing_key: 32 bytes of MAVLink 2 signing; None: nothing is signed and everything is accepted.
 
     Raises:
-        LinkUrlError: the url has none of these shapes (a ValueError and a LinkError).
-        ValueError: no such kind, or an id outside 1..255.
+        LinkUrlError: the url has none of these forms (a ValueError and a LinkError).
+        ValueError: unknown kind, or an id outside 1..255.
     """
     if kind not in get_args(DriverKind):
-        raise ValueError(f"there is no driver {kind!r}; there are: {', '.join(get_args(DriverKind))}")
+        raise ValueError(f"unknown driver {kind!r}; expected one of {', '.join(get_args(DriverKind))}")
     for name, number in (("system_id", system_id), ("own_system_id", own_system_id)):
         if number is not None and not 1 <= number <= 255:
             raise ValueError(f"{name} must be 1..255, got {number}")
@@ -46,7 +44,7 @@ def open_driver(
         raise ValueError(f"own_component_id must be 1..255, got {own_component_id}")
     link_url = parse_link_url(url)
 
-    # Imported here: each library takes its time to load, and one of them is enough.
+    # Imported here: each library is slow to load, and one of them is enough.
     def mavsdk_driver() -> AutopilotDriver:
         from companion.vehicle.mavsdk_driver import MavsdkDriver
 

@@ -1,4 +1,4 @@
-"""What PX4's events say in words: MAVLink's events metadata (https://mavlink.io/en/services/events.html)."""
+"""Texts of PX4's events, from MAVLink's events metadata (https://mavlink.io/en/services/events.html)."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ _LAYOUTS = {
     "int64_t": "<q",
     "float": "<f",
 }
-# {argument, from 1}{decimals}{unit}; braces that are text are escaped.
+# {argument, from 1}{decimals}{unit}; literal braces are escaped.
 _ARGUMENT = re.compile(r"(?<!\\)\{(\d+)(?::\.(\d+))?([^}]*)\}")
 _TAG = re.compile(r"(?<!\\)<[^>]*>")
 _UNITS = {"m": " m", "m_v": " m", "m^2": " m²", "m/s": " m/s", "C": " °C"}
 _MODES_TYPE = "navigation_mode_group_t"
-_QUIETEST_LEVEL = 7  # MAV_SEVERITY_DEBUG; above it are messages between machines
+_MAX_LEVEL = 7  # MAV_SEVERITY_DEBUG; above it are messages between machines
 
 
 class Event(NamedTuple):
-    """EVENT (410) as it came. `log_levels`: the lower four bits are for people; `arguments`: 40 bytes."""
+    """The fields of EVENT (410). `log_levels`: external level in the lower 4 bits; `arguments`: 40 bytes."""
 
     identifier: int
     sequence: int
@@ -42,10 +42,10 @@ class EventCatalogue:
     """The events of one autopilot's metadata.
 
     Args:
-        metadata: the events JSON; None: there is none, so events have numbers for names.
+        metadata: the events JSON; None: not available, so events are reported by number.
 
     Raises:
-        ValueError: it is no such JSON.
+        ValueError: `metadata` is not events JSON.
     """
 
     def __init__(self, metadata: bytes | None) -> None:
@@ -64,32 +64,32 @@ class EventCatalogue:
                     for identifier, event in content.get("events", {}).items():
                         self._events[int(number) << 24 | int(identifier)] = (group, event)
         except (KeyError, TypeError, AttributeError, UnicodeDecodeError) as error:
-            raise ValueError(f"no events metadata: {type(error).__name__}: {error}") from error
+            raise ValueError(f"not events metadata: {type(error).__name__}: {error}") from error
 
     def report(self, event: Event, now_ns: int) -> Report | None:
-        """It in words. None: it is not for people (summaries, and levels beyond debug)."""
+        """Convert an event to a report. None for summaries and for levels beyond debug."""
         level = event.log_levels & 0x0F
         group, known = self._events.get(event.identifier, ("", {}))
-        if level > _QUIETEST_LEVEL or known.get("type") == "summary":
+        if level > _MAX_LEVEL or known.get("type") == "summary":
             return None
         if "message" not in known:
-            return Report(now_ns, level, f"event {event.identifier:#010x}, which its metadata does not name")
+            return Report(now_ns, level, f"event {event.identifier:#010x} (not in the metadata)")
         arguments = known.get("arguments", ())
         values = self._values(arguments, event.arguments)
         of_modes = bool(arguments) and arguments[0]["type"].endswith(_MODES_TYPE)
         modes = int.from_bytes(event.arguments[:4], "little") if of_modes else ALL_MODES
 
-        def written(match: re.Match[str]) -> str:
+        def formatted(match: re.Match[str]) -> str:
             number = int(match[1]) - 1
             return _value(values[number], match[2], match[3]) if number < len(values) else "?"
 
-        text = _ARGUMENT.sub(written, _TAG.sub("", str(known["message"])))
+        text = _ARGUMENT.sub(formatted, _TAG.sub("", str(known["message"])))
         return Report(
             now_ns, level, re.sub(r"\\(.)", r"\1", text).strip(), group, str(known.get("name", "")), modes
         )
 
     def _values(self, arguments: Any, packed: bytes) -> list[str | float]:
-        """The arguments in their order; what the metadata does not describe ends them."""
+        """Decode the arguments in order, up to the first that the metadata does not describe."""
         values: list[str | float] = []
         offset = 0
         for argument in arguments:

@@ -1,4 +1,4 @@
-"""Read one file of an autopilot by MAVLink FTP (https://mavlink.io/en/services/ftp.html)."""
+"""Reads one file of an autopilot by MAVLink FTP (https://mavlink.io/en/services/ftp.html)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ FTP_ID = 110  # FILE_TRANSFER_PROTOCOL
 _TERMINATE, _RESET, _OPEN, _READ, _ACK, _NAK = 1, 2, 4, 5, 128, 129
 _END_OF_FILE = 6
 _ERRORS = {1: "failed", 2: "failed: errno", 4: "wrong session", 5: "no free session", 10: "no such file"}
-# target network, system, component; sequence, session, opcode, size, opcode asked, burst, padding, offset
+# target network, system, component; sequence, session, opcode, size, request opcode, burst, padding, offset
 _HEADER = struct.Struct("<3BHBBBBBBI")
 _DATA = 239
 _ATTEMPTS, _ATTEMPT_S = 6, 0.5
@@ -21,15 +21,15 @@ LARGEST_FILE = 4 * 1024 * 1024
 
 
 class FileReadError(OSError):
-    """The file could not be read. The message says which and why."""
+    """The file cannot be read. The message says which and why."""
 
 
 class FileReader:
-    """One file at a time.
+    """Reads one file at a time.
 
     Args:
-        send: puts one payload of FILE_TRANSFER_PROTOCOL on the wire.
-        target: system and component id of the autopilot.
+        send: sends one payload of FILE_TRANSFER_PROTOCOL.
+        target: returns system and component id of the autopilot.
     """
 
     def __init__(self, send: Callable[[int, bytes], None], target: Callable[[], tuple[int, int]]) -> None:
@@ -37,36 +37,36 @@ class FileReader:
         self._sequence = 0
         self._answer: asyncio.Future[bytes] | None = None
 
-    def take(self, frame: Frame) -> None:
-        """An answer of the autopilot."""
+    def on_frame(self, frame: Frame) -> None:
+        """Process a reply of the autopilot."""
         payload = frame.padded(_HEADER.size + _DATA)
         sequence = _HEADER.unpack_from(payload)[3]
         if self._answer is not None and not self._answer.done() and sequence == self._sequence + 1 & 0xFFFF:
             self._answer.set_result(payload)
 
     async def read(self, path: str) -> bytes:
-        """The content of a file. Raises FileReadError."""
-        await self._ask(path, _RESET)  # a session that was left open would stay so
-        session, opened = await self._ask(path, _OPEN, path.encode())
+        """Return the content of a file. Raises FileReadError."""
+        await self._request(path, _RESET)  # closes sessions that were left open
+        session, opened = await self._request(path, _OPEN, path.encode())
         size = int.from_bytes(opened[:4], "little")
         if size > LARGEST_FILE:
-            raise FileReadError(f"{path}: {size} bytes, more than the {LARGEST_FILE} that are read")
+            raise FileReadError(f"{path}: {size} bytes exceed the limit of {LARGEST_FILE}")
         content = b""
         try:
             while len(content) < size:
-                _, part = await self._ask(path, _READ, session=session, offset=len(content), size=_DATA)
+                _, part = await self._request(path, _READ, session=session, offset=len(content), size=_DATA)
                 if not part:
-                    raise FileReadError(f"{path}: it ends after {len(content)} of {size} bytes")
+                    raise FileReadError(f"{path}: truncated after {len(content)} of {size} bytes")
                 content += part
         finally:
             with contextlib.suppress(FileReadError):
-                await self._ask(path, _TERMINATE, session=session)
+                await self._request(path, _TERMINATE, session=session)
         return content
 
-    async def _ask(
+    async def _request(
         self, path: str, opcode: int, data: bytes = b"", *, session: int = 0, offset: int = 0, size: int = 0
     ) -> tuple[int, bytes]:
-        """One request, repeated until it is answered: the session and the answer's data."""
+        """Send one request, repeated until answered; returns the session and the reply's data."""
         self._sequence = self._sequence + 2 & 0xFFFF
         system, component = self._target()
         header = _HEADER.pack(
@@ -79,7 +79,7 @@ class FileReader:
             if self._answer.done():
                 break
         else:
-            raise FileReadError(f"{path}: the autopilot does not answer by MAVLink FTP")
+            raise FileReadError(f"{path}: no MAVLink FTP answer from the autopilot")
         payload = self._answer.result()
         _, _, _, _, answered, code, length, _, _, _, _ = _HEADER.unpack_from(payload)
         part = payload[_HEADER.size : _HEADER.size + min(length, _DATA)]

@@ -1,4 +1,4 @@
-"""Arming, modes and take-off: asked of an autopilot, and believed when it shows them."""
+"""Arming, modes and take-off: requested from the autopilot, confirmed by its telemetry."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ _NAV_TAKEOFF = 22
 _COMPONENT_ARM_DISARM = 400
 _REQUEST_MESSAGE = 512
 _RUN_PREARM_CHECKS = 401
-_REASONS_S = 0.5  # so long what it says of its checks is waited for
-_SHOWN_TIMEOUT_S = 3.0  # HEARTBEAT comes once a second
+_REASONS_S = 0.5  # how long to wait for the reports of failing checks
+_SHOWN_TIMEOUT_S = 3.0  # HEARTBEAT is sent once a second
 
 
 class FlightCommands:
-    """What a driver asks of its autopilot. All methods raise CommandRefusedError; see Driver.
+    """The flight commands of a driver. All methods raise CommandRefusedError; see Driver.
 
     Args:
-        url: of the link, for messages. telemetry: what the autopilot shows.
-        command: sends one command with its parameters; the MAV_RESULT.
-        ack_is_ours: whether a COMMAND_ACK with these fields answers us.
+        url: of the link, for messages. telemetry: the autopilot's state.
+        command: sends one command with its parameters and returns the MAV_RESULT.
+        ack_is_ours: whether a COMMAND_ACK with these fields is addressed to us.
     """
 
     def __init__(
@@ -46,13 +46,13 @@ class FlightCommands:
         self._command, self._ack_is_ours = command, ack_is_ours
 
     async def arm_or_disarm(self, armed: bool, system_id: int | None) -> None:
-        """Return when the vehicle shows it. `system_id`: whose."""
+        """Arm or disarm, and return when the vehicle reports it. `system_id`: for messages."""
         telemetry = self._telemetry
         word = "arm" if armed else "disarm"
         if armed and telemetry.two_autopilots(time.monotonic_ns()):
             raise CommandRefusedError(
-                f"{self._url}: two autopilots answer as system {system_id}, so neither is armed; "
-                "give each an id of its own (MAV_SYS_ID)"
+                f"{self._url}: two autopilots answer as system {system_id}: arming refused; "
+                "set a unique MAV_SYS_ID on each"
             )
         asked_ns = time.monotonic_ns()
         result = await self._command(_COMPONENT_ARM_DISARM, 1.0 if armed else 0.0)
@@ -68,27 +68,29 @@ class FlightCommands:
             raise CommandRefusedError(f"the vehicle refused to {word} ({result_name(result)}): {reason}")
         if not await telemetry.until(lambda: telemetry.state.armed is armed, _SHOWN_TIMEOUT_S):
             raise CommandRefusedError(
-                f"the vehicle accepted to {word} but does not show it after {_SHOWN_TIMEOUT_S:g} s"
+                f"the vehicle accepted to {word} but did not report it within {_SHOWN_TIMEOUT_S:g} s"
             )
 
     async def _failing_checks(self, asked_ns: int) -> str:
-        """What keeps it from arming, in its own words; empty if it does not say."""
+        """Return the autopilot's texts of the failing pre-arm checks; empty if it reports none."""
         telemetry = self._telemetry
         if telemetry.profile.has_events:
-            # PX4 tells its checks when they change, and all of them when it is asked to run them.
+            # PX4 reports its checks when they change, and all of them after RUN_PREARM_CHECKS.
             with contextlib.suppress(CommandRefusedError):
                 await self._command(_RUN_PREARM_CHECKS)
         await telemetry.until(lambda: False, _REASONS_S)
         state = telemetry.state
-        said = [
-            one for one in state.reports if one.stamp_ns >= asked_ns and among_modes(state.mode, one.modes)
+        reports = [
+            report
+            for report in state.reports
+            if report.stamp_ns >= asked_ns and among_modes(state.mode, report.modes)
         ]
-        # PX4 tells as information what keeps it from some modes alone, such as a missing mission.
-        failing = [one for one in said if one.of_a_check] or [one for one in said if one.of_some_modes]
-        return words_of(failing)
+        # PX4 reports at level info what prevents only some modes, such as a missing mission.
+        failing = [report for report in reports if report.is_check]
+        return words_of(failing or [report for report in reports if report.is_mode_check])
 
     async def set_mode(self, mode: FlightMode, *, timeout_s: float = 3.0) -> None:
-        """Return when the vehicle shows the mode."""
+        """Request a mode, and return when the vehicle reports it."""
         telemetry = self._telemetry
         shown_mode, main, sub = telemetry.profile.mode_request(mode, telemetry.state)
         refusals: list[int] = []
@@ -112,26 +114,26 @@ class FlightCommands:
                 refusals.append(result)
             await telemetry.until(lambda: bool(refusals) or shown(), max(deadline - time.monotonic(), 0.0))
         if refusals:
-            telemetry.profile.forget()
+            telemetry.profile.clear_request()
             hint = " (is a setpoint stream running?)" if mode is FlightMode.OFFBOARD else ""
             raise CommandRefusedError(
                 f"the vehicle refused mode {mode} ({result_name(refusals[0])}){hint}: "
-                f"it shows {telemetry.state.mode}"
+                f"its mode is {telemetry.state.mode}"
             )
         if not shown():
-            telemetry.profile.forget()
+            telemetry.profile.clear_request()
             raise CommandRefusedError(
                 f"the vehicle did not enter mode {mode} within {timeout_s:g} s: "
-                f"it shows {telemetry.state.mode}"
+                f"its mode is {telemetry.state.mode}"
             )
 
     async def takeoff(self, altitude_m: float) -> None:
-        """The autopilot's own take-off, to a height above home."""
+        """Request the autopilot's own take-off to a height above home, metres."""
         telemetry = self._telemetry
         if not (math.isfinite(altitude_m) and altitude_m > 0.0):
-            raise CommandRefusedError(f"a take-off altitude must be above 0 m, got {altitude_m}")
-        if telemetry.profile.takes_off_by_home:
-            await self._on_home_position()
+            raise CommandRefusedError(f"the take-off altitude must be above 0 m, got {altitude_m}")
+        if telemetry.profile.takeoff_needs_home:
+            await self._update_home()
         result = await self._command(
             _NAV_TAKEOFF, *telemetry.profile.takeoff_parameters(altitude_m, telemetry.state)
         )
@@ -139,21 +141,21 @@ class FlightCommands:
             raise CommandRefusedError(
                 f"the vehicle refused to take off ({result_name(result)}) in mode {telemetry.state.mode}"
             )
-        for told, fields in telemetry.profile.takes_off():
-            telemetry.take_in(told, fields)
+        for name, fields in telemetry.profile.on_takeoff_accepted():
+            telemetry.apply(name, fields)
 
-    async def _on_home_position(self) -> None:
-        """Let home be told as it is now: PX4 moves it when it arms, and tells it every two seconds only."""
-        telemetry, told = self._telemetry, False
+    async def _update_home(self) -> None:
+        """Request HOME_POSITION: PX4 moves home when it arms, and sends it every two seconds only."""
+        telemetry, received = self._telemetry, False
 
         def watch(name: str, _fields: Fields) -> None:
-            nonlocal told
-            told |= name == "HOME_POSITION"
+            nonlocal received
+            received |= name == "HOME_POSITION"
 
         async with telemetry.watching(watch):
             result = await self._command(_REQUEST_MESSAGE, HOME_POSITION_ID)
-            if not await telemetry.until(lambda: told, _SHOWN_TIMEOUT_S):
+            if not await telemetry.until(lambda: received, _SHOWN_TIMEOUT_S):
                 raise CommandRefusedError(
-                    "take-off needs home's altitude, and the vehicle has not told it "
-                    f"({result_name(result)}; no position yet?)"
+                    "home position not received: take-off needs home's altitude "
+                    f"({result_name(result)}; no position estimate yet?)"
                 )

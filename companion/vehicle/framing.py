@@ -1,7 +1,7 @@
-"""MAVLink frames out of any bytes, and back (https://mavlink.io/en/guide/serialization.html).
+"""MAVLink framing and packing (https://mavlink.io/en/guide/serialization.html).
 
-Frames are cut and checked before anything decodes them, so that noise on the line costs the frames it hit
-and nothing more, and messages nobody reads are never decoded.
+Frames are separated and checked before anything decodes them, so that noise on the line costs only the frames
+it hit, and unused messages are never decoded.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ CRC_EXTRA: dict[int, int] = {
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One whole frame as it came.
+    """One complete frame.
 
     Attributes:
-        checked: its checksum was verified; False only for message ids we have no definition of.
+        checked: the checksum was verified; False only for message ids without a definition here.
         raw: every byte, from the magic to the checksum or signature.
-        payload: as sent, so in MAVLink 2 without its trailing zeros.
+        payload: as sent, so in MAVLink 2 without trailing zeros.
     """
 
     message_id: int
@@ -52,19 +52,19 @@ class Frame:
     payload: bytes
 
     def padded(self, length: int) -> bytes:
-        """The payload with the zeros that MAVLink 2 cuts off, cut to what we know of."""
+        """Return the payload padded with MAVLink 2's trailing zeros, or truncated, to `length` bytes."""
         return self.payload[:length].ljust(length, b"\0")
 
 
 class Framer:
-    """Cuts a stream of bytes into frames. Resynchronises at the next magic byte after anything broken."""
+    """Splits a stream of bytes into frames. Resynchronises at the next magic byte after an error."""
 
     def __init__(self) -> None:
         self._tail = b""
         self.skipped_bytes = 0
 
     def feed(self, data: bytes, *, datagram: bool) -> list[Frame]:
-        """The frames that `data` completes. No frame reaches from one datagram into the next."""
+        """Return the frames that `data` completes. A frame never spans two datagrams."""
         buffer = data if datagram else self._tail + data
         frames: list[Frame] = []
         position = 0
@@ -75,7 +75,7 @@ class Framer:
                     break
                 length = 0
             frame = _read_frame(buffer[position : position + length]) if length else None
-            # Without a checksum to go by, noise that looks like a header must not swallow what follows it.
+            # Without a checksum, noise that looks like a header must not consume the frames that follow.
             following = buffer[position + length : position + length + 1]
             if frame is None or not (frame.checked or not following or following[0] in _MAGICS):
                 self.skipped_bytes += 1
@@ -88,14 +88,14 @@ class Framer:
 
 
 def pack_frame(message_id: int, payload: bytes, *, system_id: int, component_id: int, sequence: int) -> bytes:
-    """A MAVLink 2 frame, unsigned, trailing zeros of the payload cut off."""
+    """Pack an unsigned MAVLink 2 frame, with trailing zeros of the payload removed."""
     payload = payload.rstrip(b"\0") or b"\0"
     header = bytes((MAGIC_V2, len(payload), 0, 0, sequence, system_id, component_id))
     return _with_checksum(header + message_id.to_bytes(3, "little") + payload, message_id)
 
 
 def with_sequence(frame: Frame, sequence: int) -> bytes:
-    """The same frame with another sequence number. One that is signed or cannot be checked stays as it is."""
+    """Return the frame's bytes with another sequence number; signed or unchecked frames are unchanged."""
     signed = frame.raw[0] == MAGIC_V2 and frame.raw[2] & _FLAG_SIGNED
     if signed or not frame.checked:
         return frame.raw
@@ -105,12 +105,12 @@ def with_sequence(frame: Frame, sequence: int) -> bytes:
 
 
 def is_signed(raw: bytes) -> bool:
-    """Whether a whole frame carries a signature."""
+    """Whether a complete frame carries a signature."""
     return raw[0] == MAGIC_V2 and bool(raw[2] & _FLAG_SIGNED)
 
 
 def marked_signed(raw: bytes) -> bytes:
-    """An unsigned MAVLink 2 frame with the flag of a signed one set: its signature is over that.
+    """Set the signed flag of an unsigned MAVLink 2 frame; the signature covers the flag.
 
     Raises KeyError for a message id without a definition here.
     """
@@ -119,12 +119,12 @@ def marked_signed(raw: bytes) -> bytes:
 
 
 def frames_of(data: bytes) -> Iterator[Frame]:
-    """The frames of one datagram."""
+    """Yield the frames of one datagram."""
     yield from Framer().feed(data, datagram=True)
 
 
 def _frame_length(buffer: bytes, position: int) -> int | None:
-    """Length of the frame that starts here; 0: none starts here; None: not enough bytes yet."""
+    """Return the length of the frame at `position`; 0: no frame; None: not enough bytes yet."""
     magic = buffer[position]
     if magic not in _MAGICS:
         return 0
@@ -135,14 +135,14 @@ def _frame_length(buffer: bytes, position: int) -> int | None:
         length += _HEADER_V1
     else:
         flags = buffer[position + 2]
-        if flags & ~_FLAG_SIGNED:  # a receiver must drop what it does not understand
+        if flags & ~_FLAG_SIGNED:  # a receiver must drop frames with unknown flags
             return 0
         length += _HEADER_V2 + (_SIGNATURE if flags & _FLAG_SIGNED else 0)
     return length if len(buffer) - position >= length else None
 
 
 def _read_frame(raw: bytes) -> Frame | None:
-    """The frame, or None when its checksum is wrong."""
+    """Parse a frame; None when its checksum is wrong."""
     if raw[0] == MAGIC_V2:
         header, sequence, system_id, component_id = _HEADER_V2, raw[4], raw[5], raw[6]
         message_id = int.from_bytes(raw[7:10], "little")

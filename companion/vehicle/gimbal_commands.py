@@ -1,7 +1,7 @@
-"""Finding a gimbal's manager in the autopilot, and what is asked of it: control, and where to look.
+"""Commands to the autopilot's gimbal manager: discovery, primary control, pointing.
 
-What is asked goes as commands, not as GIMBAL_MANAGER_SET_PITCHYAW: PX4 does not take that message, and a
-command is answered, with DENIED when somebody else has taken control.
+Aims are sent as commands, not as GIMBAL_MANAGER_SET_PITCHYAW: PX4 does not support that message, and a
+command is answered, with DENIED when another component has primary control.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ logger = logging.getLogger(__name__)
 _SET_MESSAGE_INTERVAL, _REQUEST_MESSAGE = 511, 512
 PITCHYAW, CONFIGURE = 1000, 1001  # MAV_CMD_DO_GIMBAL_MANAGER_…
 _INFORMATION_ID = 280
-# GIMBAL_DEVICE_ATTITUDE_STATUS, as often as the vehicle's own attitude; GIMBAL_MANAGER_STATUS.
+# GIMBAL_DEVICE_ATTITUDE_STATUS, at the rate of the vehicle's attitude; GIMBAL_MANAGER_STATUS.
 _RATES_HZ = {285: 50.0, 281: 5.0}
-_TOLD_TIMEOUT_S = 1.0
+_INFORMATION_TIMEOUT_S = 1.0
 _PAUSE_S = 5.0
 UNCHANGED, RELEASE = -1.0, -3.0
-# GIMBAL_MANAGER_FLAGS: roll and pitch against the horizon, yaw against the nose.
+# GIMBAL_MANAGER_FLAGS: roll and pitch relative to the horizon, yaw relative to the nose.
 _ROLL_LOCK, _PITCH_LOCK, _YAW_IN_VEHICLE_FRAME = 4, 8, 32
 FOLLOWING_NOSE = float(_ROLL_LOCK | _PITCH_LOCK | _YAW_IN_VEHICLE_FRAME)
 
 
 class GimbalCommands:
-    """What a driver asks of its autopilot's gimbal manager.
+    """The gimbal commands of a driver.
 
     Args:
-        url: of the link, for messages. telemetry: what the autopilot shows.
-        command: sends one command with its parameters; the MAV_RESULT.
-        own_address: from whom our commands come.
+        url: of the link, for messages. telemetry: the autopilot's state.
+        command: sends one command with its parameters and returns the MAV_RESULT.
+        own_address: system and component id of our commands.
     """
 
     def __init__(
@@ -50,69 +50,73 @@ class GimbalCommands:
         self._url, self._telemetry, self._command = url, telemetry, command
         self._own_address = own_address
         self._finding = asyncio.Lock()
-        self._wanted = False
+        self._search_requested = False
 
     async def find(self) -> bool:
-        """Ask for the manager and, where one answers, for its streams. False: none answers."""
+        """Request the manager's information and, if it answers, its streams. False: no answer."""
         async with self._finding:
             try:
                 if not self._known():
                     result = await self._command(_REQUEST_MESSAGE, _INFORMATION_ID)
-                    if result != ACCEPTED or not await self._telemetry.until(self._known, _TOLD_TIMEOUT_S):
+                    if result != ACCEPTED or not await self._telemetry.until(
+                        self._known, _INFORMATION_TIMEOUT_S
+                    ):
                         return False
-                    logger.info("%s: the autopilot has a gimbal", self._url)
+                    logger.info("%s: gimbal manager found", self._url)
                 for message_id, rate_hz in _RATES_HZ.items():
                     result = await self._command(_SET_MESSAGE_INTERVAL, message_id, round(1e6 / rate_hz))
                     if result != ACCEPTED:
                         logger.info(
-                            "%s: the autopilot does not send message %d at the rate wanted (%s)",
+                            "%s: requested rate of message %d refused (%s)",
                             self._url,
                             message_id,
                             result_name(result),
                         )
             except CommandRefusedError as error:
-                logger.debug("%s: looking for a gimbal: %s", self._url, error)
+                logger.debug("%s: gimbal discovery: %s", self._url, error)
             return self._known()
 
-    def look_for_one(self) -> None:
-        """Let `keep` ask soon: the link has opened, or the autopilot has restarted."""
-        self._wanted = True
+    def request_search(self) -> None:
+        """Let `run` search again: the link has opened, or the autopilot has restarted."""
+        self._search_requested = True
 
-    async def keep(self) -> None:
-        """Ask when told to, and when a gimbal is heard that has not told what it can do; for ever.
+    async def run(self) -> None:
+        """Search on request, and when a gimbal reports without known information; until cancelled.
 
-        Not in the task that watches the link: whoever does not answer takes seconds not to.
+        Not in the task that supervises the link: a missing answer takes seconds to time out.
         """
+
+        def search_due() -> bool:
+            return self._search_requested or (self._telemetry.state.gimbal is not None and not self._known())
+
         while True:
-            await self._telemetry.until(
-                lambda: self._wanted or (self._telemetry.state.gimbal is not None and not self._known()), None
-            )
-            self._wanted = False
+            await self._telemetry.until(search_due, None)
+            self._search_requested = False
             if not await self.find():
                 await asyncio.sleep(_PAUSE_S)
 
-    async def take(self) -> None:
+    async def take_control(self) -> None:
         """Take primary control. Raises CommandRefusedError."""
         system, component = self._own_address
-        await self._demand(
+        await self._send_command(
             "control of the gimbal", CONFIGURE, float(system), float(component), UNCHANGED, UNCHANGED
         )
 
-    async def give_back(self) -> None:
-        """Give primary control back, if it is ours. Raises CommandRefusedError."""
-        await self._demand("to give the gimbal back", CONFIGURE, RELEASE, RELEASE, UNCHANGED, UNCHANGED)
+    async def release_control(self) -> None:
+        """Release primary control if it is ours. Raises CommandRefusedError."""
+        await self._send_command("to release the gimbal", CONFIGURE, RELEASE, RELEASE, UNCHANGED, UNCHANGED)
 
     async def point(self, aim: GimbalAim) -> None:
-        """Let it look there. Raises CommandRefusedError, also when somebody else has control of it."""
+        """Point the gimbal. Raises CommandRefusedError, also when another component has control."""
         pitch, yaw = math.degrees(aim.pitch_rad), math.degrees(aim.yaw_rad)
         nan = math.nan
-        await self._demand("to point the gimbal", PITCHYAW, pitch, yaw, nan, nan, FOLLOWING_NOSE)
+        await self._send_command("to point the gimbal", PITCHYAW, pitch, yaw, nan, nan, FOLLOWING_NOSE)
 
     def _known(self) -> bool:
         gimbal = self._telemetry.state.gimbal
         return gimbal is not None and gimbal.information_ns > 0
 
-    async def _demand(self, what: str, number: int, *parameters: float) -> None:
+    async def _send_command(self, what: str, number: int, *parameters: float) -> None:
         gimbal = self._telemetry.state.gimbal
         device = 0.0 if gimbal is None else float(gimbal.device)
         filled = (*parameters, *[0.0] * (6 - len(parameters)), device)

@@ -1,6 +1,6 @@
-"""The messages of a gimbal into the vehicle's next snapshot. Pure, as `telemetry`.
+"""Applies a gimbal's messages to the vehicle state. Pure functions, as in `telemetry`.
 
-Of several gimbals the first that is heard is the vehicle's.
+With several gimbals, the first one received is used.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ ATTITUDE_STATUS = "GIMBAL_DEVICE_ATTITUDE_STATUS"
 # GIMBAL_DEVICE_FLAGS
 _NEUTRAL, _YAW_LOCK, _YAW_IN_VEHICLE_FRAME, _YAW_IN_EARTH_FRAME = 2, 16, 32, 64
 _UNKNOWN_YAW = (
-    "its attitude says neutral and locked to north at once, so nobody can tell what its yaw counts from "
-    "(PX4 does for gimbals on servo outputs, which measure nothing)"
+    "gimbal yaw reference ambiguous: its flags are neutral and yaw lock at once "
+    "(PX4 sends this for gimbals on servo outputs, which measure nothing)"
 )
 
 
 def apply_information(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:
-    """GIMBAL_MANAGER_INFORMATION: what the gimbal can do."""
-    gimbal = _told(state, fields)
+    """Apply GIMBAL_MANAGER_INFORMATION: the gimbal's end stops."""
+    gimbal = _gimbal_of(state, fields)
     if gimbal is None:
         return state
     low, high = _number(fields["pitch_min"]), _number(fields["pitch_max"])
@@ -42,8 +42,8 @@ def apply_information(state: VehicleState, fields: Fields, now_ns: int) -> Vehic
 
 
 def apply_status(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:
-    """GIMBAL_MANAGER_STATUS: who may move the gimbal."""
-    gimbal = _told(state, fields)
+    """Apply GIMBAL_MANAGER_STATUS: the owner of primary control."""
+    gimbal = _gimbal_of(state, fields)
     if gimbal is None:
         return state
     primary = (int(fields["primary_control_sysid"]), int(fields["primary_control_compid"]))
@@ -51,8 +51,8 @@ def apply_status(state: VehicleState, fields: Fields, now_ns: int) -> VehicleSta
 
 
 def apply_attitude(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:
-    """GIMBAL_DEVICE_ATTITUDE_STATUS: where the gimbal looks."""
-    gimbal = _told(state, fields)
+    """Apply GIMBAL_DEVICE_ATTITUDE_STATUS."""
+    gimbal = _gimbal_of(state, fields)
     if gimbal is None:
         return state
     frame = _yaw_frame(int(fields["flags"]))
@@ -68,7 +68,7 @@ def apply_attitude(state: VehicleState, fields: Fields, now_ns: int) -> VehicleS
 
 
 def from_gimbal_device(state: VehicleState, name: str, component_id: int) -> bool:
-    """Whether a message of another component than the autopilot's is the vehicle's gimbal's attitude."""
+    """Whether a message of a component other than the autopilot is the used gimbal's attitude."""
     return (
         name == ATTITUDE_STATUS
         and state.gimbal is not None
@@ -77,8 +77,8 @@ def from_gimbal_device(state: VehicleState, name: str, component_id: int) -> boo
     )
 
 
-def _told(state: VehicleState, fields: Fields) -> GimbalState | None:
-    """The gimbal that a message is about; None: another one than the vehicle's."""
+def _gimbal_of(state: VehicleState, fields: Fields) -> GimbalState | None:
+    """Return the gimbal that a message is about; None for another than the used one."""
     device = int(fields.get("gimbal_device_id") or 0)
     gimbal = state.gimbal
     if gimbal is None:
@@ -91,19 +91,19 @@ def _told(state: VehicleState, fields: Fields) -> GimbalState | None:
 
 
 def _yaw_frame(flags: int) -> YawFrame | None:
-    """What the yaw in an attitude counts from; None: the flags do not tell."""
+    """Return the yaw reference of an attitude; None if the flags are ambiguous."""
     if flags & _YAW_IN_EARTH_FRAME:
         return None if flags & _YAW_IN_VEHICLE_FRAME else YawFrame.NORTH
     if flags & _YAW_IN_VEHICLE_FRAME:
         return YawFrame.NOSE
-    # Older devices say neither; the lock decides, and a neutral gimbal (which overrides locks) has none.
+    # Older devices set neither flag: the yaw lock decides, which a neutral gimbal overrides.
     if flags & _YAW_LOCK:
         return None if flags & _NEUTRAL else YawFrame.NORTH
     return YawFrame.NOSE
 
 
 def _unit(values: Any) -> Quaternion | None:
-    """A unit quaternion; None for what is none."""
+    """Normalize a quaternion; None if it is invalid."""
     if not isinstance(values, list | tuple) or len(values) != 4:
         return None
     w, x, y, z = (_number(value) for value in values)
@@ -114,7 +114,7 @@ def _unit(values: Any) -> Quaternion | None:
 
 
 def _number(value: float | None) -> float:
-    """JSON has no NaN: there it is None."""
+    """Convert to float; None is NaN, which JSON lacks."""
     return math.nan if value is None else float(value)
 
 

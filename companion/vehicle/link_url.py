@@ -1,4 +1,4 @@
-"""Where the autopilot is: `udpin://HOST:PORT`, `udpout://HOST:PORT`, `tcp://HOST:PORT`, `serial:///dev/X:BAUD`."""
+"""Link urls: `udpin://HOST:PORT`, `udpout://HOST:PORT`, `tcp://HOST:PORT`, `serial:///dev/X:BAUD`."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ _SERIAL = re.compile(r"serial://(?P<device>/[^\s:]+(?::[^\s:]+)*?):(?P<baud>\d{1
 
 
 class LinkUrlError(LinkError, ValueError):
-    """The text is no link url. Both a ValueError (of a setting) and a LinkError (of a connection)."""
+    """The text is not a link url. Both a ValueError (of a setting) and a LinkError (of a connection)."""
 
 
 class LinkScheme(StrEnum):
-    """How the bytes travel."""
+    """The transport of a link."""
 
-    UDP_IN = "udpin"  # listen; answer whoever sends the autopilot's heartbeats
+    UDP_IN = "udpin"  # listen; send to the source of the autopilot's heartbeats
     UDP_OUT = "udpout"  # send to a known address
     TCP = "tcp"  # connect to a listener
     SERIAL = "serial"  # 8N1, no flow control
@@ -39,17 +39,17 @@ class LinkUrl:
     address: tuple[str, int]
 
     def __str__(self) -> str:
-        place, number = self.address
-        if ":" in place and self.scheme is not LinkScheme.SERIAL:
-            place = f"[{place}]"
-        return f"{self.scheme}://{place}:{number}"
+        host, number = self.address
+        if ":" in host and self.scheme is not LinkScheme.SERIAL:
+            host = f"[{host}]"
+        return f"{self.scheme}://{host}:{number}"
 
 
 def parse_link_url(text: str) -> LinkUrl:
-    """Read a link url.
+    """Parse a link url.
 
     Raises:
-        LinkUrlError: the text is none of the four shapes; the message names the fault and gives examples.
+        LinkUrlError: the text has none of the four forms; the message has the reason and examples.
     """
     if match := _NETWORK.fullmatch(text):
         port = int(match["port"])
@@ -62,10 +62,10 @@ def parse_link_url(text: str) -> LinkUrl:
         return LinkUrl(LinkScheme.SERIAL, (match["device"], int(match["baud"])))
     scheme, separator, _ = text.partition("://")
     if separator and scheme in set(LinkScheme):
-        shape = "serial:///dev/NAME:BAUD" if scheme == LinkScheme.SERIAL else f"{scheme}://HOST:PORT"
-        raise LinkUrlError(f"link {text!r} is not of the shape {shape}; examples: {EXAMPLES}")
+        form = "serial:///dev/NAME:BAUD" if scheme == LinkScheme.SERIAL else f"{scheme}://HOST:PORT"
+        raise LinkUrlError(f"link {text!r}: expected {form}; examples: {EXAMPLES}")
     if scheme == "udp" and separator:
         raise LinkUrlError(
-            f"link {text!r}: say udpin:// to listen or udpout:// to send; examples: {EXAMPLES}"
+            f"link {text!r}: use udpin:// to listen or udpout:// to send; examples: {EXAMPLES}"
         )
-    raise LinkUrlError(f"link {text!r} is not a link url; examples: {EXAMPLES}")
+    raise LinkUrlError(f"link {text!r}: not a link url; examples: {EXAMPLES}")

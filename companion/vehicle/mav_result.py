@@ -1,4 +1,4 @@
-"""MAV_RESULT: how an autopilot answers a command (MAVLink common)."""
+"""MAV_RESULT: the result of a command (MAVLink common)."""
 
 from __future__ import annotations
 
@@ -15,5 +15,5 @@ RESULT_NAMES = {
 
 
 def result_name(result: int) -> str:
-    """In words."""
+    """Return a MAV_RESULT as text."""
     return RESULT_NAMES.get(result, f"MAV_RESULT {result}")

@@ -1,11 +1,10 @@
-"""The driver on MAVSDK 4: its command and parameter protocols, its message definitions, our bytes.
+"""The driver on MAVSDK 4: its command and parameter protocols and message definitions, our link.
 
-MAVSDK runs here on its `raw://` connection: what arrives on our link is handed to it, and what it wants to
-send is handed back and leaves from our asyncio loop. So nothing of its C++ threads reaches the vehicle by
-itself: a program that hangs is silent. Its own HEARTBEAT (once a second; MAVSDK 4.1 for Python has no way to
-turn it off) is dropped there, so the only heartbeats on the wire are those of `send_heartbeat`. Its offboard
-plugin, which repeats the last setpoint from such a thread, is not used: setpoints go one by one through
-`mavlink_direct`.
+MAVSDK runs on its `raw://` connection: received bytes are passed to it, and the bytes it sends come back and
+are sent from our asyncio loop. So its C++ threads send nothing to the vehicle by themselves: a program that
+hangs is silent. Its own HEARTBEAT (once a second; MAVSDK 4.1 for Python cannot turn it off) is dropped, so
+the only heartbeats on the wire are those of `send_heartbeat`. Its offboard plugin, which repeats the last
+setpoint from such a thread, is not used: setpoints are sent one by one through `mavlink_direct`.
 """
 
 from __future__ import annotations
@@ -43,8 +42,8 @@ _SUBSCRIBED = sorted(TELEMETRY_MESSAGES - {"HEARTBEAT"} | {"COMMAND_ACK"})
 # After a hang of the loop: neither a setpoint nor a repeated command may arrive late.
 _STALE_NS = round(DEFAULT_LIFETIME_S * 1e9)
 _PARAM_REASONS = {
-    ParamResult.DOES_NOT_EXIST: "there is no such parameter",
-    ParamResult.TIMEOUT: "the vehicle does not answer: no such parameter, or the link is down",
+    ParamResult.DOES_NOT_EXIST: "no such parameter",
+    ParamResult.TIMEOUT: "no answer from the vehicle: no such parameter, or the link is down",
     ParamResult.PARAM_NAME_TOO_LONG: "the name has more than 16 characters",
     ParamResult.VALUE_OUT_OF_RANGE: "the value is out of range",
 }
@@ -67,14 +66,14 @@ class MavsdkDriver(AutopilotDriver):
         configuration = mavsdk.Configuration.create_manual(self._own_system_id, self._own_component_id, False)
         self._mavsdk = mavsdk.Mavsdk(configuration)
         configuration.destroy()
-        self._mavsdk.subscribe_raw_bytes_to_be_sent(self._library_sends)  # first: it complains of no taker
+        self._mavsdk.subscribe_raw_bytes_to_be_sent(self._library_sends)  # first: else it logs an error
         self._mavsdk.add_any_connection_with_handle("raw://")
         found: asyncio.Future[Any] = self._loop.create_future()
         self._search = self._mavsdk.first_autopilot_async(
             timeout_s, lambda system: self._hop(_resolve, found, system)
         )
         if self._newest_heartbeat is not None:
-            self._take_frames([self._newest_heartbeat])  # the next one may be a second away
+            self._on_frames([self._newest_heartbeat])  # the next one may take a second
         system = await found
         if system is None:
             raise LinkError(f"{self.url}: MAVSDK did not find the autopilot within {timeout_s:g} s")
@@ -82,7 +81,7 @@ class MavsdkDriver(AutopilotDriver):
         for name in _SUBSCRIBED:
             direct.subscribe_message(name, lambda message, _: self._hop(self._message, message))
         if not hasattr(direct, "_callbacks"):  # see `_destroy`
-            logger.warning("%s: with this MAVSDK, closing while a command is under way may crash", self.url)
+            logger.warning("%s: with this MAVSDK, closing during a command may crash", self.url)
         self._parameters = Param(system)
         self._direct = direct
 
@@ -95,19 +94,19 @@ class MavsdkDriver(AutopilotDriver):
         for future in list(self._awaited):  # MAVSDK forgets them when it is destroyed
             if not future.done():
                 future.set_exception(
-                    CommandRefusedError(f"{self.url}: the link was closed before an answer came")
+                    CommandRefusedError(f"{self.url}: the link was closed before an answer was received")
                 )
-        # A parameter request that is under way holds the one thread; destroying waits its turn behind it.
+        # A parameter request in progress occupies the only thread; destroying waits for it.
         await self._loop.run_in_executor(self._blocking, _destroy, library, search, direct)
         self._blocking.shutdown(wait=False)
 
     # --- between MAVSDK's threads and our loop ------------------------------------------------------
 
     def _hop(self, call: Callable[..., None], *arguments: object) -> None:
-        """From any thread into the loop."""
+        """Call a function in the loop, from any thread."""
         try:
             self._loop.call_soon_threadsafe(call, *arguments)
-        except RuntimeError:  # the loop is closed: nobody is left to tell
+        except RuntimeError:  # the loop is closed
             logger.debug("%s: dropped a call of MAVSDK after the loop had closed", self.url)
 
     def _library_sends(self, data: bytes) -> None:
@@ -115,15 +114,15 @@ class MavsdkDriver(AutopilotDriver):
 
     def _transmit_for_library(self, data: bytes, handed_over_ns: int) -> None:
         if time.monotonic_ns() - handed_over_ns > _STALE_NS:
-            logger.warning("%s: the loop hung; what MAVSDK wanted to send meanwhile is dropped", self.url)
+            logger.warning("%s: the loop hung; dropped what MAVSDK sent meanwhile", self.url)
             return
         for frame in frames_of(data):
-            # Renumbered without the dropped ones, so that the vehicle does not count them as lost.
+            # Renumbered, so that the vehicle does not count the dropped heartbeats as lost.
             if frame.message_id != HEARTBEAT_ID:
                 own = frame.component_id == self._own_component_id
                 self._transmit(with_sequence(frame, self._next_sequence()) if own else frame.raw)
 
-    def _take_frames(self, frames: list[Frame]) -> None:
+    def _on_frames(self, frames: list[Frame]) -> None:
         if self._mavsdk is not None:
             self._mavsdk.pass_received_raw_bytes(b"".join(frame.raw for frame in frames))
 
@@ -148,7 +147,7 @@ class MavsdkDriver(AutopilotDriver):
         try:
             self._direct.send_message(self._direct_message(name, fields))
         except MavlinkDirectError as error:
-            logger.error("%s: MAVSDK does not send %s: %s", self.url, name, error.result.name)
+            logger.error("%s: MAVSDK did not send %s: %s", self.url, name, error.result.name)
 
     def _direct_message(self, name: str, fields: dict[str, Any]) -> MavlinkMessage:
         return MavlinkMessage(
@@ -172,7 +171,7 @@ class MavsdkDriver(AutopilotDriver):
         for number, value in enumerate(parameters, start=1):
             fields[f"param{number}"] = None if value != value else float(value)  # JSON has no NaN
         if self._direct is None:
-            raise CommandRefusedError(f"{self.url}: not connected, so command {command} is not sent")
+            raise CommandRefusedError(f"{self.url}: not connected; command {command} was not sent")
         answered: asyncio.Future[tuple[MavlinkDirectResult, MavlinkMessage]] = self._loop.create_future()
         self._awaited.add(answered)
         answered.add_done_callback(self._awaited.discard)
@@ -182,7 +181,7 @@ class MavsdkDriver(AutopilotDriver):
         )
         result, ack = await answered
         if result != MavlinkDirectResult.SUCCESS:
-            raise self._no_answer(f"the vehicle does not answer command {command} ({result.name.lower()})")
+            raise self._no_answer(f"no answer to command {command} ({result.name.lower()})")
         return int(json.loads(ack.fields_json)["result"])
 
     async def get_parameter(self, name: str) -> float:
@@ -195,13 +194,13 @@ class MavsdkDriver(AutopilotDriver):
         before = await self._read_parameter(name)
         if isinstance(before, int):
             if not float(value).is_integer() or not -(2**31) <= value < 2**31:
-                raise CommandRefusedError(f"parameter {name} is an integer and cannot take {value}")
+                raise CommandRefusedError(f"parameter {name} is an integer and cannot hold {value}")
             await self._with_parameters(name, Param.set_param_int, name, int(value))
         else:
             await self._with_parameters(name, Param.set_param_float, name, float(value))
 
     async def _read_parameter(self, name: str) -> int | float:
-        """An int for an integer parameter, a float for a real one."""
+        """Return an int for an integer parameter, a float for a real one."""
         try:
             return float(await self._with_parameters(name, Param.get_param_float, name))
         except _WrongTypeError:
@@ -209,12 +208,12 @@ class MavsdkDriver(AutopilotDriver):
 
     async def _with_parameters(self, name: str, call: Callable[..., Any], *arguments: object) -> Any:
         if self._parameters is None:
-            raise CommandRefusedError(f"{self.url}: not connected, so parameter {name} cannot be reached")
+            raise CommandRefusedError(f"{self.url}: not connected; parameter {name} is not available")
         try:
             return await self._in_thread(call, self._parameters, *arguments)
         except ParamError as error:
             if error.result in (ParamResult.WRONG_TYPE, ParamResult.TYPE_MISMATCH):
-                raise _WrongTypeError(f"parameter {name}: its type is another one") from error
+                raise _WrongTypeError(f"parameter {name}: wrong type") from error
             if error.result is ParamResult.TIMEOUT:
                 raise self._no_answer(f"parameter {name}: {_PARAM_REASONS[error.result]}") from error
             reason = _PARAM_REASONS.get(error.result, error.result.name.lower())
@@ -222,18 +221,18 @@ class MavsdkDriver(AutopilotDriver):
 
 
 def _destroy(library: mavsdk.Mavsdk, search: ctypes.c_void_p | None, direct: MavlinkDirect | None) -> None:
-    if search is not None:  # first of all: a system that is found from here on would outlive the library
+    if search is not None:  # first: a system found from here on would outlive the library
         library.cancel_first_autopilot(search)
-    # MAVSDK 4.1 frees what its C++ calls back, for subscriptions and for commands under way, before it stops
-    # the thread that calls: an answer in that moment ends the process. So it is held until the thread ends.
-    # (A driver that is never closed is destroyed by MAVSDK at exit, without that.)
-    called_back = [*getattr(direct, "_callbacks", ()), *getattr(direct, "_subscriptions", {}).values()]
+    # MAVSDK 4.1 frees the callbacks of subscriptions and pending commands before it stops the thread that
+    # calls them: an answer at that moment crashes the process. So they are held until the thread has ended.
+    # (A driver that is never closed is destroyed by MAVSDK at exit, without this.)
+    callbacks = [*getattr(direct, "_callbacks", ()), *getattr(direct, "_subscriptions", {}).values()]
     library.destroy()
-    called_back.clear()
+    callbacks.clear()
 
 
 class _WrongTypeError(CommandRefusedError):
-    """The parameter is an integer where a real was asked for, or the other way round."""
+    """The parameter is an integer where a real was requested, or vice versa."""
 
 
 def _resolve(future: asyncio.Future[Any], result: object) -> None:
@@ -242,11 +241,11 @@ def _resolve(future: asyncio.Future[Any], result: object) -> None:
 
 
 def _log_through_python() -> None:
-    """MAVSDK would print to standard output, which may be somebody's JSON."""
+    """Redirect MAVSDK's log: by default it prints to standard output, which may carry JSON."""
     levels = {
         mavsdk.LogLevel.DEBUG: logging.DEBUG,
-        mavsdk.LogLevel.INFO: logging.DEBUG,  # its everyday remarks
-        mavsdk.LogLevel.WARN: logging.INFO,  # it also warns of what it handles
+        mavsdk.LogLevel.INFO: logging.DEBUG,  # routine remarks
+        mavsdk.LogLevel.WARN: logging.INFO,  # also for conditions that it handles
         mavsdk.LogLevel.ERROR: logging.WARNING,
     }
 

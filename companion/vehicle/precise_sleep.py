@@ -1,8 +1,8 @@
-"""A sleep as exact as the kernel's clock: the event loop's own timers are good to a millisecond at best.
+"""A sleep with microsecond accuracy; the event loop's own timers have a resolution of a millisecond.
 
 asyncio waits in epoll_wait(2), whose timeout is in whole milliseconds, rounded up: a sleep is late by up to
-one. A timerfd(2) is a file that becomes readable at its moment, to the microsecond, and the loop watches
-files anyway. Where there is none (not Linux) the loop's sleep is used.
+one. A timerfd(2) is a file that becomes readable at its time, to the microsecond, and the loop watches it.
+Without timerfd (not Linux) the loop's sleep is used.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ class _Itimerspec(ctypes.Structure):
 
 @asynccontextmanager
 async def precise_sleep() -> AsyncIterator[Sleep]:
-    """Yields `sleep(seconds)`, for one task at a time. A time that is over returns at the next turn."""
+    """Yield `sleep(seconds)`, for one task at a time. A past time returns in the next loop iteration."""
     try:
         timer = _Timer()
     except (OSError, AttributeError) as error:
         if sys.platform.startswith("linux"):
-            logger.warning("no timerfd (%s): setpoints leave by the event loop's coarser timers", error)
+            logger.warning("no timerfd (%s): using the event loop's coarser timers for setpoints", error)
         yield asyncio.sleep
         return
     try:
-        asyncio.get_running_loop().add_reader(timer.descriptor, timer.ring)
+        asyncio.get_running_loop().add_reader(timer.descriptor, timer.on_readable)
         yield timer.sleep
     finally:
         asyncio.get_running_loop().remove_reader(timer.descriptor)
@@ -50,36 +50,36 @@ async def precise_sleep() -> AsyncIterator[Sleep]:
 
 
 class _Timer:
-    """A timerfd. Raises OSError where the kernel gives none, AttributeError where the C library has none."""
+    """A timerfd. Raises OSError if the kernel refuses it, AttributeError if the C library lacks it."""
 
     def __init__(self) -> None:
         self._libc = ctypes.CDLL(None, use_errno=True)
         self.descriptor: int = self._libc.timerfd_create(_CLOCK_MONOTONIC, os.O_NONBLOCK | os.O_CLOEXEC)
         if self.descriptor < 0:
             raise _error("timerfd_create")
-        self._rung = asyncio.Event()
+        self._expired = asyncio.Event()
         self._asleep = False
 
-    def ring(self) -> None:
-        """The file is readable."""
-        # Armed anew in the same turn of the loop, it is not any more.
+    def on_readable(self) -> None:
+        """Handle the expiry of the timer."""
+        # Rearmed in the same loop iteration, the file is no longer readable.
         with contextlib.suppress(BlockingIOError):
             os.read(self.descriptor, 8)
-            self._rung.set()
+            self._expired.set()
 
     async def sleep(self, seconds: float) -> None:
-        """Return when they are over. Raises RuntimeError: another task sleeps on this timer."""
+        """Sleep. Raises RuntimeError if another task sleeps on this timer."""
         if self._asleep:
-            raise RuntimeError("this timer is for one task at a time")
+            raise RuntimeError("another task already sleeps on this timer")
         self._asleep = True
         try:
-            self._rung.clear()
+            self._expired.clear()
             # All zero would stop the timer instead.
             whole, nanoseconds = divmod(max(1, round(seconds * 1e9)), 1_000_000_000)
             setting = _Itimerspec(value=_Timespec(whole, nanoseconds))
             if self._libc.timerfd_settime(self.descriptor, 0, ctypes.byref(setting), None) < 0:
                 raise _error("timerfd_settime")
-            await self._rung.wait()
+            await self._expired.wait()
         finally:
             self._asleep = False
 

@@ -9,7 +9,7 @@ from companion.vehicle.state import FlightMode
 
 _AUTO = 4
 
-# (main mode, sub mode) that PX4 shows
+# (main mode, sub mode) as PX4 reports it
 _MODES: dict[tuple[int, int], FlightMode] = {
     (1, 0): FlightMode.MANUAL,
     (2, 0): FlightMode.ALTITUDE,
@@ -31,20 +31,20 @@ _REQUESTS = {mode: numbers for numbers, mode in reversed(_MODES.items())}
 
 
 def mode_of_custom_mode(custom_mode: int) -> FlightMode:
-    """The mode that a custom_mode shows; UNKNOWN for what has no name here."""
+    """Return the mode of a custom_mode; UNKNOWN for modes not listed here."""
     return _MODES.get(((custom_mode >> 16) & 0xFF, (custom_mode >> 24) & 0xFF), FlightMode.UNKNOWN)
 
 
 def custom_mode_of_mode(mode: FlightMode) -> int:
-    """The custom_mode PX4 shows for a mode. Raises ValueError for UNKNOWN."""
+    """Return the custom_mode PX4 reports for a mode. Raises ValueError for UNKNOWN."""
     main, sub = request_of_mode(mode)
     return main << 16 | sub << 24
 
 
 def request_of_mode(mode: FlightMode) -> tuple[int, int]:
-    """(main mode, sub mode), params 2 and 3 of MAV_CMD_DO_SET_MODE. Raises ValueError for UNKNOWN."""
+    """Return (main mode, sub mode), params 2 and 3 of MAV_CMD_DO_SET_MODE. Raises ValueError for UNKNOWN."""
     if mode not in _REQUESTS:
-        raise ValueError(f"{mode!s} is not a mode that can be asked for; known: {', '.join(_REQUESTS)}")
+        raise ValueError(f"mode {mode!s} cannot be requested; known: {', '.join(_REQUESTS)}")
     return _REQUESTS[mode]
 
 
@@ -67,6 +67,6 @@ _NAVIGATION_STATES = {
 
 
 def among_modes(mode: FlightMode, modes: int) -> bool:
-    """Whether a mode is among those of a `Report`; one that has no number here always is."""
+    """Whether a `Report.modes` bit mask includes a mode; True for modes without a number here."""
     state = _NAVIGATION_STATES.get(mode)
     return state is None or bool(modes >> state & 1)

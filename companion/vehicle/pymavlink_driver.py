@@ -1,4 +1,4 @@
-"""The driver that speaks MAVLink by pymavlink's message definitions, on our own asyncio link."""
+"""The driver on pymavlink's message definitions and our own asyncio link."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ logger = logging.getLogger(__name__)
 
 _PARAM_VALUE_ID, _PARAM_SET_ID = 22, 23
 _GIMBAL_ATTITUDE_ID = 285
-# By the wire's order: the value's bytes as they are, not through a float.
+# In wire order: the value's bytes unchanged, not converted through a float.
 _PARAM_SET = struct.Struct("<4sBB16sB")
 _EKF_STATUS_REPORT = struct.Struct("<5fH")  # five variances, flags; airspeed_variance is not read
 _CURRENT_MODE = struct.Struct("<II")  # custom_mode, intended_custom_mode; standard_mode is not read
@@ -34,7 +34,7 @@ _DECODED_IDS = {
     in TELEMETRY_MESSAGES | {"COMMAND_ACK", "PARAM_VALUE", "PARAM_ERROR", "GPS_GLOBAL_ORIGIN"}
 } - {HEARTBEAT_ID}
 
-# Command protocol: 5 attempts half a second apart; after IN_PROGRESS no more attempts, only patience.
+# Command protocol: 5 attempts half a second apart; after IN_PROGRESS it only waits.
 _ATTEMPTS = 5
 _ATTEMPT_S = 0.5
 _PROGRESS_S = 10.0
@@ -43,14 +43,14 @@ _PROGRESS_S = 10.0
 _REAL32 = 9
 _PARAM_LAYOUT = {1: "<B3x", 2: "<b3x", 3: "<H2x", 4: "<h2x", 5: "<I", 6: "<i", _REAL32: "<f"}
 _PARAM_ERRORS = {
-    1: "there is no such parameter",
-    2: "its value is out of range",
+    1: "no such parameter",
+    2: "value out of range",
     3: "permission denied",
     4: "no such component",
-    5: "it is read-only",
-    6: "its type is not supported",
-    7: "its type is another one",
-    8: "reading it failed",
+    5: "read-only",
+    6: "type not supported",
+    7: "wrong type",
+    8: "read failed",
 }
 
 
@@ -79,17 +79,17 @@ class PymavlinkDriver(AutopilotDriver):
         self._codec = mavlink.MAVLink(None, own_system_id, own_component_id)
 
     async def _attach(self, timeout_s: float) -> None:
-        """Nothing to wait for."""
+        """No preparation needed."""
 
     async def _detach(self) -> None:
-        """Nothing is held."""
+        """No resources to release."""
 
     # --- encoding -----------------------------------------------------------------------------------
 
-    def _take_frames(self, frames: list[Frame]) -> None:
+    def _on_frames(self, frames: list[Frame]) -> None:
         for frame in frames:
-            autopilots = frame.component_id == AUTOPILOT_COMPONENT
-            if not autopilots and frame.message_id != _GIMBAL_ATTITUDE_ID:
+            from_autopilot = frame.component_id == AUTOPILOT_COMPONENT
+            if not from_autopilot and frame.message_id != _GIMBAL_ATTITUDE_ID:
                 continue
             if frame.message_id == CURRENT_MODE_ID:
                 shown, intended = _CURRENT_MODE.unpack(frame.padded(_CURRENT_MODE.size))
@@ -107,9 +107,9 @@ class PymavlinkDriver(AutopilotDriver):
                     continue
                 fields = message.to_dict()
                 if frame.message_id == _PARAM_VALUE_ID:
-                    # An integer's bytes read as a float may be a signalling NaN, which the reading changes.
+                    # An integer's bytes decoded as float may be a signalling NaN, which decoding changes.
                     fields["value_bytes"] = frame.padded(4)
-                if autopilots:
+                if from_autopilot:
                     self._telemetry.handle(message.get_type(), fields)
                 else:
                     self._telemetry.handle_device(message.get_type(), fields, frame.component_id)
@@ -131,19 +131,21 @@ class PymavlinkDriver(AutopilotDriver):
         async with self._telemetry.watching(watch):
             for attempt in range(_ATTEMPTS):
                 if self._link is None:
-                    raise CommandRefusedError(f"{self.url}: the link was closed before an answer came")
+                    raise CommandRefusedError(
+                        f"{self.url}: the link was closed before an answer was received"
+                    )
                 self._send_command(command, parameters, attempt)
                 result = await _next_result(results, _ATTEMPT_S)
                 while result == IN_PROGRESS:
                     result = await _next_result(results, _PROGRESS_S)
                     if result is None:
                         raise CommandRefusedError(
-                            f"the vehicle began command {command} and said nothing for {_PROGRESS_S:g} s"
+                            f"command {command} in progress, but no further answer for {_PROGRESS_S:g} s"
                         )
                 if result is not None:
                     return result
         raise self._no_answer(
-            f"the vehicle does not answer command {command} ({_ATTEMPTS} times asked, {_ATTEMPT_S:g} s apart)"
+            f"no answer to command {command} ({_ATTEMPTS} attempts, {_ATTEMPT_S:g} s apart)"
         )
 
     def _send_command(self, command: int, parameters: tuple[float, ...], attempt: int) -> None:
@@ -176,10 +178,10 @@ class PymavlinkDriver(AutopilotDriver):
             lambda fields: bool(fields["value_bytes"] == wanted),
         )
         if echo is None:
-            raise CommandRefusedError(f"the vehicle did not take {value} for parameter {name}")
+            raise CommandRefusedError(f"parameter {name}: the vehicle did not accept {value}")
 
     async def _read_parameter(self, name: str) -> tuple[float, int]:
-        """Value and MAV_PARAM_TYPE."""
+        """Return value and MAV_PARAM_TYPE."""
         request = {
             "target_system": self._system_id or 0,
             "target_component": AUTOPILOT_COMPONENT,
@@ -191,20 +193,20 @@ class PymavlinkDriver(AutopilotDriver):
         )
         if fields is None:
             raise self._no_answer(
-                f"the vehicle does not answer for parameter {name}: no such parameter, or the link is down"
+                f"parameter {name}: no answer from the vehicle: no such parameter, or the link is down"
             )
         kind = fields["param_type"]
         if kind not in _PARAM_LAYOUT:
-            raise CommandRefusedError(f"parameter {name} has type {kind}, which no autopilot here uses")
+            raise CommandRefusedError(f"parameter {name}: MAV_PARAM_TYPE {kind} is not supported")
         layout = _PARAM_LAYOUT[kind if self._telemetry.profile.parameters_bytewise else _REAL32]
         return float(struct.unpack(layout, fields["value_bytes"])[0]), kind
 
     async def _exchange_parameter(
         self, name: str, send: Callable[[], None], awaited: Callable[[Fields], bool]
     ) -> Fields | None:
-        """Send until a PARAM_VALUE of that name is the awaited one; None when none came."""
+        """Send until the awaited PARAM_VALUE of that name is received; None if it is not."""
         if self._link is None:
-            raise CommandRefusedError(f"{self.url}: not connected, so parameter {name} cannot be reached")
+            raise CommandRefusedError(f"{self.url}: not connected; parameter {name} is not available")
         answer: asyncio.Future[Fields] = asyncio.get_running_loop().create_future()
 
         def watch(message: str, fields: Fields) -> None:
@@ -236,15 +238,15 @@ def _parameter_id(name: str) -> bytes:
     try:
         encoded = name.encode("ascii")
     except UnicodeEncodeError as error:
-        raise CommandRefusedError(f"{name!r} is no parameter name: it must be ASCII") from error
+        raise CommandRefusedError(f"parameter name {name!r}: must be ASCII") from error
     if not 1 <= len(encoded) <= 16:
-        raise CommandRefusedError(f"{name!r} is no parameter name: it must have 1 to 16 characters")
+        raise CommandRefusedError(f"parameter name {name!r}: must have 1 to 16 characters")
     return encoded
 
 
 def _parameter_bytes(name: str, value: float, kind: int, *, bytewise: bool) -> bytes:
     if kind != _REAL32 and not float(value).is_integer():
-        raise CommandRefusedError(f"parameter {name} is an integer and cannot take {value}")
+        raise CommandRefusedError(f"parameter {name} is an integer and cannot hold {value}")
     try:
         packed = struct.pack(_PARAM_LAYOUT[kind], value if kind == _REAL32 else int(value))
         return packed if bytewise else struct.pack("<f", value)

@@ -1,4 +1,4 @@
-"""One thing an autopilot said of itself in words."""
+"""A text report of the autopilot (STATUSTEXT or EVENT)."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ from dataclasses import dataclass
 
 ALL_MODES = 0xFFFF_FFFF
 WARNING = 4  # MAV_SEVERITY: from 0 (emergency) to 7 (debug)
-# Groups of PX4's events, and how ArduPilot's and PX4's texts begin, that tell what keeps it from arming.
+# Groups of PX4's events, and prefixes of ArduPilot's and PX4's texts, that report why it cannot arm.
 _CHECK_GROUPS = ("arming_check", "health")
 _CHECK_TEXTS = ("PreArm:", "Arm:", "Preflight Fail:")
 
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """One thing the autopilot said.
+    """One text report of the autopilot.
 
     Attributes:
         stamp_ns: CLOCK_MONOTONIC of its arrival.
         level: MAV_SEVERITY, 0 (emergency) to 7 (debug).
-        group: of an event ("default", "arming_check", "health"); empty for a status text.
-        name: of an event, as its metadata calls it; empty for a status text.
-        modes: which modes it is about; bit n is PX4's navigation state n.
+        group: event group ("default", "arming_check", "health"); empty for a status text.
+        name: event name in the metadata; empty for a status text.
+        modes: affected modes; bit n is PX4's navigation state n.
     """
 
     stamp_ns: int
@@ -32,16 +32,16 @@ class Report:
     modes: int = ALL_MODES
 
     @property
-    def of_a_check(self) -> bool:
-        """It tells what keeps the vehicle from arming."""
+    def is_check(self) -> bool:
+        """Whether it reports why the vehicle cannot arm."""
         return self.level <= WARNING and (self.group in _CHECK_GROUPS or self.text.startswith(_CHECK_TEXTS))
 
     @property
-    def of_some_modes(self) -> bool:
-        """It is of a check, whatever its level, that not every mode needs."""
+    def is_mode_check(self) -> bool:
+        """Whether it is a check, at any level, that only some modes require."""
         return self.group in _CHECK_GROUPS and self.modes != ALL_MODES
 
 
 def words_of(reports: Iterable[Report]) -> str:
-    """Their texts, each once, in their order."""
+    """Join the distinct texts of reports, in order."""
     return "; ".join(dict.fromkeys(report.text for report in reports))

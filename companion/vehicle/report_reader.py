@@ -1,4 +1,4 @@
-"""STATUSTEXT and EVENT of one autopilot into reports; what events mean is read from the autopilot itself."""
+"""Converts STATUSTEXT and EVENT of one autopilot into reports; event texts are read from the autopilot."""
 
 from __future__ import annotations
 
@@ -37,16 +37,16 @@ _EVENTS_TYPE = 4  # COMP_METADATA_TYPE_EVENTS
 _MFTP = re.compile(r"mftp://(?:\[;comp=\d+\])?/?(.+)")
 _METADATA_S = 3.0
 _WAITING_EVENTS = 40
-_LONGEST_GAP = 20  # PX4 keeps as many events
+_LONGEST_GAP = 20  # PX4 buffers this many events
 
 
 class ReportReader:
-    """Takes the frames that report, and finds out what events mean.
+    """Processes the frames that carry reports, and reads the event metadata.
 
     Args:
-        url: of the link, for the log. telemetry: where reports go.
-        send: puts a message's payload on the wire. command: sends one command; the MAV_RESULT.
-        target: system and component id of the autopilot.
+        url: of the link, for the log. telemetry: receives the reports.
+        send: sends a message's payload. command: sends one command and returns the MAV_RESULT.
+        target: returns system and component id of the autopilot.
     """
 
     def __init__(
@@ -65,28 +65,28 @@ class ReportReader:
         self._newest: int | None = None
         self._metadata: tuple[int, str] | None = None
 
-    def take(self, frame: Frame) -> bool:
-        """A frame of the autopilot; whether it was one of these."""
+    def on_frame(self, frame: Frame) -> bool:
+        """Process a frame of the autopilot; returns whether it was handled here."""
         now_ns = time.monotonic_ns()
         kind = frame.message_id
         if kind == STATUSTEXT_ID:
-            self._telemetry.take_report(self._texts.take(frame, now_ns))
+            self._telemetry.on_report(self._texts.add(frame, now_ns))
         elif kind == EVENT_ID:
             identifier, _, sequence, _, _, levels, arguments = _EVENT.unpack(frame.padded(_EVENT.size))
-            self._take_event(Event(identifier, sequence, levels, arguments), now_ns)
+            self._on_event(Event(identifier, sequence, levels, arguments), now_ns)
         elif kind == CURRENT_EVENT_SEQUENCE_ID:
             self._request_missed(int.from_bytes(frame.padded(2), "little") + 1 & 0xFFFF)
         elif kind == COMPONENT_METADATA_ID:
             _, crc, uri = _METADATA.unpack(frame.padded(_METADATA.size))
             self._metadata = (crc, uri.split(b"\0")[0].decode("ascii", "replace"))
-            self._telemetry.take_in("COMPONENT_METADATA", {})
+            self._telemetry.apply("COMPONENT_METADATA", {})
         elif kind == FTP_ID:
-            self._files.take(frame)
+            self._files.on_frame(frame)
         else:
             return False
         return True
 
-    def _take_event(self, event: Event, now_ns: int) -> None:
+    def _on_event(self, event: Event, now_ns: int) -> None:
         self._request_missed(event.sequence)
         ahead = 1 if self._newest is None else event.sequence - self._newest & 0xFFFF
         if 0 < ahead < 0x8000:
@@ -94,51 +94,51 @@ class ReportReader:
         if self._catalogue is None:
             self._waiting.append((event, now_ns))
         else:
-            self._telemetry.take_report(self._catalogue.report(event, now_ns))
+            self._telemetry.on_report(self._catalogue.report(event, now_ns))
 
     def _request_missed(self, following: int) -> None:
-        """REQUEST_EVENT for what lies between the newest event that came and this number."""
+        """Request the events between the newest received one and this sequence number."""
         if self._newest is None:
-            self._newest = following - 1 & 0xFFFF  # what was before we came is not news
+            self._newest = following - 1 & 0xFFFF  # events before the connection are not requested
             return
         missed = following - self._newest - 1 & 0xFFFF
         if 0 < missed < 0x8000:
             first = following - min(missed, _LONGEST_GAP) & 0xFFFF
             self._send(REQUEST_EVENT_ID, struct.pack("<HHBB", first, following - 1 & 0xFFFF, *self._target()))
 
-    async def learn_events(self) -> None:
-        """Read what the events mean, once. Without it they have numbers for names, and the log says why."""
+    async def load_events(self) -> None:
+        """Read the event metadata once. On failure, log the reason and report events by number."""
         try:
             catalogue = EventCatalogue(await self._read_metadata())
         except (FileReadError, CommandRefusedError, ValueError, lzma.LZMAError) as error:
-            logger.warning("%s: the autopilot's events have no words: %s", self._url, error)
+            logger.warning("%s: event metadata not available, events are numbers: %s", self._url, error)
             catalogue = EventCatalogue(None)
         self._catalogue = catalogue
         while self._waiting:
             event, now_ns = self._waiting.popleft()
-            self._telemetry.take_report(catalogue.report(event, now_ns))
+            self._telemetry.on_report(catalogue.report(event, now_ns))
 
     async def _read_metadata(self) -> bytes:
         self._metadata = None
         await self._command(_REQUEST_MESSAGE, COMPONENT_METADATA_ID)
         if not await self._telemetry.until(lambda: self._metadata is not None, _METADATA_S):
-            raise FileReadError("it tells no COMPONENT_METADATA (PX4 1.13 and newer do)")
+            raise FileReadError("COMPONENT_METADATA not received (PX4 1.13 and newer send it)")
         assert self._metadata is not None
         crc, uri = self._metadata
         general = json.loads(await self._file("general", crc, uri))
         for entry in general["metadataTypes"]:
             if entry["type"] == _EVENTS_TYPE:
                 return await self._file("events", int(entry["fileCrc"]), str(entry["uri"]))
-        raise FileReadError(f"{uri} names no events metadata")
+        raise FileReadError(f"{uri} lists no events metadata")
 
     async def _file(self, what: str, crc: int, uri: str) -> bytes:
-        """From the cache, by its checksum, else from the autopilot."""
+        """Read a metadata file from the cache, by its checksum, else from the autopilot."""
         cached = cache_folder() / f"{what}-{crc:08x}.json"
         if cached.is_file():
             return cached.read_bytes()
         path = _MFTP.fullmatch(uri)
         if path is None:
-            raise FileReadError(f"{uri}: only mftp:// is read")
+            raise FileReadError(f"{uri}: only mftp:// is supported")
         content = await self._files.read(path[1])
         if path[1].endswith(".xz"):
             content = lzma.decompress(content)
@@ -149,11 +149,11 @@ class ReportReader:
             part.write_bytes(content)
             part.replace(cached)
         except OSError as error:
-            logger.info("%s: metadata is not cached, so it is read at every start: %s", self._url, error)
+            logger.info("%s: metadata cannot be cached, it is read at every start: %s", self._url, error)
         return content
 
 
 def cache_folder() -> Path:
-    """Of autopilots' metadata, in `$XDG_CACHE_HOME` or `~/.cache`."""
+    """Return the folder of cached metadata, in `$XDG_CACHE_HOME` or `~/.cache`."""
     home = os.environ.get("XDG_CACHE_HOME", "")
     return (Path(home) if home else Path.home() / ".cache") / "companion" / "metadata"

@@ -1,8 +1,8 @@
-"""A setpoint: where to be or how to move, in local NED, and until when that is meant.
+"""A setpoint: a position or velocity in local NED, with a deadline.
 
-The two shapes that leave this house are the ones PX4 takes in frame MAV_FRAME_LOCAL_NED of
-SET_POSITION_TARGET_LOCAL_NED (MAVLink common, 84): a position or a velocity, each with a yaw or a yaw rate. A
-velocity may come with the acceleration it is about to need (feed-forward).
+The two forms are those that PX4 accepts in frame MAV_FRAME_LOCAL_NED of SET_POSITION_TARGET_LOCAL_NED
+(MAVLink common, 84): a position or a velocity, each with a yaw or a yaw rate. A velocity may have an
+acceleration as feed-forward.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ IGNORE_ACCELERATION = 0b0001_1100_0000
 IGNORE_YAW = 0b0100_0000_0000
 IGNORE_YAW_RATE = 0b1000_0000_0000
 
-# How long a setpoint counts unless its maker says otherwise: a quarter of PX4's default COM_OF_LOSS_T.
+# Default lifetime of a setpoint: below PX4's default COM_OF_LOSS_T (1 s).
 DEFAULT_LIFETIME_S = 0.3
-# Between being chosen and being on the wire; whatever takes longer was held up, perhaps for seconds.
+# Limit between the choice of a setpoint and its sending; a longer delay means the process was stopped.
 LEAVES_WITHIN_S = 0.3
 
 
@@ -30,16 +30,16 @@ class Setpoint:
     """Exactly one of position and velocity; at most one of yaw and yaw rate (none: keep the heading).
 
     Attributes:
-        deadline_ns: CLOCK_MONOTONIC nanoseconds after which this must not be sent any more.
+        deadline_ns: CLOCK_MONOTONIC nanoseconds after which it must not be sent.
         position_ned_m: metres, local NED.
         velocity_ned_mps: metres a second, local NED.
-        acceleration_ned_mps2: feed-forward of a velocity setpoint, m/s², local NED: PX4 adds it to what its
-            velocity controller asks for. ArduPilot is not sent it (`ardupilot_profile`). None: none.
+        acceleration_ned_mps2: feed-forward of a velocity setpoint, m/s², local NED: PX4 adds it to the output
+            of its velocity controller. It is not sent to ArduPilot (`ardupilot_profile`). None: none.
         yaw_rad: heading, clockwise from north.
         yaw_rate_radps: clockwise seen from above.
 
     Raises:
-        ValueError: the shape is none of the above, or a value is not finite.
+        ValueError: the form is none of the above, or a value is not finite.
     """
 
     deadline_ns: int
@@ -51,18 +51,18 @@ class Setpoint:
 
     def __post_init__(self) -> None:
         if (self.position_ned_m is None) == (self.velocity_ned_mps is None):
-            raise ValueError("a setpoint is a position or a velocity: give exactly one of them")
+            raise ValueError("a setpoint needs exactly one of position_ned_m and velocity_ned_mps")
         if self.yaw_rad is not None and self.yaw_rate_radps is not None:
-            raise ValueError("a setpoint has a yaw or a yaw rate, not both")
+            raise ValueError("a setpoint takes yaw_rad or yaw_rate_radps, not both")
         if self.acceleration_ned_mps2 is not None and self.velocity_ned_mps is None:
             raise ValueError(
-                "acceleration_ned_mps2 is the feed-forward of a velocity: give a velocity with it"
+                "acceleration_ned_mps2 is the feed-forward of a velocity: set velocity_ned_mps too"
             )
         values = [*(self.position_ned_m or ()), *(self.velocity_ned_mps or ())]
         values += self.acceleration_ned_mps2 or ()
         values += [value for value in (self.yaw_rad, self.yaw_rate_radps) if value is not None]
         if not all(math.isfinite(value) for value in values):
-            raise ValueError(f"every value of a setpoint must be finite, got {values}")
+            raise ValueError(f"all values of a setpoint must be finite, got {values}")
 
     @classmethod
     def velocity(
@@ -75,7 +75,7 @@ class Setpoint:
         acceleration_ned_mps2: Vector3 | None = None,
         lifetime_s: float = DEFAULT_LIFETIME_S,
     ) -> Setpoint:
-        """Move with this velocity, for `lifetime_s` from now."""
+        """Create a velocity setpoint that expires after `lifetime_s`."""
         return cls(
             now_ns + round(lifetime_s * 1e9),
             velocity_ned_mps=velocity_ned_mps,
@@ -93,17 +93,17 @@ class Setpoint:
         yaw_rad: float | None = None,
         lifetime_s: float = DEFAULT_LIFETIME_S,
     ) -> Setpoint:
-        """Go to and stay at this position."""
+        """Create a position setpoint that expires after `lifetime_s`."""
         return cls(now_ns + round(lifetime_s * 1e9), position_ned_m=position_ned_m, yaw_rad=yaw_rad)
 
     @classmethod
     def brake(cls, now_ns: int, lifetime_s: float = DEFAULT_LIFETIME_S) -> Setpoint:
-        """Stand still where you are and stop turning."""
+        """Create a setpoint that stops the vehicle and its yaw."""
         return cls.velocity((0.0, 0.0, 0.0), now_ns, yaw_rate_radps=0.0, lifetime_s=lifetime_s)
 
     @property
     def type_mask(self) -> int:
-        """POSITION_TARGET_TYPEMASK: the bits of what is to be ignored."""
+        """POSITION_TARGET_TYPEMASK: the bits of the ignored fields."""
         mask = IGNORE_ACCELERATION if self.acceleration_ned_mps2 is None else 0
         mask |= IGNORE_POSITION if self.position_ned_m is None else 0
         mask |= IGNORE_VELOCITY if self.velocity_ned_mps is None else 0
@@ -112,16 +112,16 @@ class Setpoint:
         return mask
 
     def expired(self, now_ns: int) -> bool:
-        """The deadline has passed."""
+        """Whether the deadline has passed."""
         return now_ns > self.deadline_ns
 
     def leaving(self, now_ns: int) -> Setpoint:
-        """The same, for the way from here to the wire: it is to leave now, however long it counts."""
+        """Return a copy to send now: its deadline is at most `LEAVES_WITHIN_S` from now."""
         latest_ns = now_ns + round(LEAVES_WITHIN_S * 1e9)
         return self if self.deadline_ns <= latest_ns else replace(self, deadline_ns=latest_ns)
 
     def moved(self, by_ned_m: Vector3) -> Setpoint:
-        """The same with its position, if it has one, moved by so much."""
+        """Return a copy with its position, if any, translated."""
         if self.position_ned_m is None or by_ned_m == (0.0, 0.0, 0.0):
             return self
         north, east, down = (p + d for p, d in zip(self.position_ned_m, by_ned_m, strict=True))

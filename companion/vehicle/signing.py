@@ -1,7 +1,7 @@
 """MAVLink 2 message signing (https://mavlink.io/en/guide/message_signing.html) of one link.
 
-Every frame that leaves is signed; what comes in unsigned, with another key or a second time is refused and
-counted, except what a telemetry radio says of itself, as the specification advises.
+Every sent frame is signed. Received frames that are unsigned, signed with another key or replayed are refused
+and counted, except a telemetry radio's own messages, as the specification advises.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ _LINK_ID = 0
 
 
 class SigningKeyError(LinkError, ValueError):
-    """The key file cannot be used. The message never holds what is in it."""
+    """The key file cannot be used. The message never contains the key."""
 
 
 def read_key(path: str | Path) -> bytes:
-    """The signing key in a file that its owner alone can read: 32 bytes as they are, or a passphrase.
+    """Read the signing key from a file readable by its owner only: 32 raw bytes, or a passphrase.
 
-    A passphrase is text of any other length; its SHA-256 is the key, as ground stations make it, without the
-    white space at its ends.
+    A passphrase is UTF-8 text of any other length; the key is its SHA-256, without surrounding white space,
+    as in ground stations.
 
     Raises:
-        SigningKeyError: no such file, others can read it, it is not ours, it is empty or no text.
+        SigningKeyError: no such file, readable by others, another owner, empty, or not text.
     """
     path = Path(path)
     try:
@@ -55,11 +55,14 @@ def read_key(path: str | Path) -> bytes:
         mode = stat.S_IMODE(status.st_mode)
         raise SigningKeyError(f"signing key {path}: others can read it (mode {mode:o}): chmod 600 {path}")
     if status.st_uid not in (os.geteuid(), 0):
-        raise SigningKeyError(f"signing key {path}: it belongs to another user; make it your own")
+        raise SigningKeyError(f"signing key {path}: owned by another user; change its owner")
     if len(content) == KEY_LENGTH:
         return content
     if len(content) > MAX_KEY_FILE_BYTES:
-        raise SigningKeyError(f"signing key {path}: more than {MAX_KEY_FILE_BYTES} bytes is no passphrase")
+        raise SigningKeyError(
+            f"signing key {path}: expected {KEY_LENGTH} bytes or a passphrase, got more than "
+            f"{MAX_KEY_FILE_BYTES} bytes"
+        )
     try:
         passphrase = content.decode("utf-8").strip()
     except UnicodeDecodeError:
@@ -73,16 +76,16 @@ def read_key(path: str | Path) -> bytes:
 
 
 class FrameSigner:
-    """Signs what leaves one link and judges what comes in.
+    """Signs the sent frames of one link and checks the received ones.
 
     Attributes:
-        refused: how many frames were refused, by reason.
+        refused: reason → number of refused frames.
     """
 
     def __init__(self, key: bytes) -> None:
         """Raises ValueError for a key of another length than 32 bytes."""
         if len(key) != KEY_LENGTH:
-            raise ValueError(f"a signing key has {KEY_LENGTH} bytes, this one has {len(key)}")
+            raise ValueError(f"a signing key must have {KEY_LENGTH} bytes, got {len(key)}")
         self._key = key
         self._timestamp = 0
         self._newest: dict[tuple[int, int, int], int] = {}
@@ -92,7 +95,7 @@ class FrameSigner:
         return f"FrameSigner({sum(self.refused.values())} refused)"
 
     def signed(self, frame: bytes) -> bytes:
-        """A packed MAVLink 2 frame with its signature; MAVLink 1 cannot be signed and stays as it is."""
+        """Sign a packed MAVLink 2 frame; MAVLink 1 cannot be signed and is returned unchanged."""
         if frame[0] != MAGIC_V2 or is_signed(frame):
             return frame
         now = int((time.time() - _EPOCH_S) * 1e5)
@@ -101,24 +104,24 @@ class FrameSigner:
         return marked + hashlib.sha256(self._key + marked).digest()[:6]
 
     def accepts(self, frame: Frame) -> bool:
-        """Whether a frame that came may be used; if not, it is counted, and the first of a kind logged."""
-        reason = self._objection(frame)
+        """Whether a received frame is accepted; refused ones are counted, the first per reason is logged."""
+        reason = self._refusal_reason(frame)
         if reason is None:
             return True
         self.refused[reason] += 1
         if self.refused[reason] == 1:
             logger.warning(
-                "a frame of %d/%d was refused by signing: %s; more are counted, not told",
+                "frame of %d/%d refused by signing: %s; further ones are only counted",
                 frame.system_id,
                 frame.component_id,
                 reason,
             )
         return False
 
-    def _objection(self, frame: Frame) -> str | None:
+    def _refusal_reason(self, frame: Frame) -> str | None:
         raw = frame.raw
         if not is_signed(raw):
-            return None if _is_of_a_radio(frame) else "unsigned"
+            return None if _is_radio_message(frame) else "unsigned"
         if hashlib.sha256(self._key + raw[:-6]).digest()[:6] != raw[-6:]:
             return "wrong signature"
         stream = (frame.system_id, frame.component_id, raw[-SIGNATURE_LENGTH])
@@ -135,8 +138,8 @@ class FrameSigner:
         return None
 
 
-def _is_of_a_radio(frame: Frame) -> bool:
-    """What a telemetry radio puts on the link knows no key."""
+def _is_radio_message(frame: Frame) -> bool:
+    """Whether a telemetry radio sent the frame: it has no key."""
     if frame.message_id == _RADIO_STATUS_ID:
         return True
     return frame.message_id == _HEARTBEAT_ID and frame.component_id == _TELEMETRY_RADIO

@@ -1,11 +1,10 @@
-"""What is known of the vehicle at one moment. World frame: local NED. Body frame: FRD.
+"""The vehicle's state at one moment. World frame: local NED. Body frame: FRD.
 
-A reset of the autopilot's estimator changes its local coordinates of every place on the ground at once. Here,
-and in everything above the drivers, local NED is the frame in which the vehicle was first heard:
-`telemetry` takes the sum of all resets (`VehicleState.reset_offset_ned_m`) off every position that is
-received, and a driver adds it to every position that it sends. So goals, paths, targets, tracks and the
-history of poses stay where they are on the ground, and none of them handles resets. The autopilot keeps home
-in its own coordinates, so here home moves at a reset.
+A reset of the autopilot's estimator shifts its local coordinates of every point on the ground. Here, and in
+everything above the drivers, local NED is the frame at the first connection: `telemetry` subtracts the sum of
+all resets (`VehicleState.reset_offset_ned_m`) from every received position, and a driver adds it to every
+position that it sends. So goals, paths, targets, tracks and pose histories stay fixed on the ground, and none
+of them handles resets. The autopilot keeps home in its own coordinates, so here home moves at a reset.
 """
 
 from __future__ import annotations
@@ -22,13 +21,13 @@ from companion.vehicle.report import WARNING, Report
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
-# A quadrotor that has not told anything for this long is not where we think it is.
+# A multirotor's position older than this is not used for control.
 TELEMETRY_MAX_AGE_S = 0.5
-# HEARTBEAT comes once a second; three missing is the usual sign of a lost link.
+# HEARTBEAT is sent once a second; three missing ones are the usual criterion of a lost link.
 HEARTBEAT_MAX_AGE_S = 3.0
 _WITHOUT_SETPOINTS = {
-    "PX4": "PX4 leaves OFFBOARD after COM_OF_LOSS_T and does what COM_OBL_RC_ACT says",
-    "ArduPilot": "ArduPilot stands after GUID_TIMEOUT and stays in GUIDED",
+    "PX4": "PX4 leaves OFFBOARD after COM_OF_LOSS_T and performs COM_OBL_RC_ACT",
+    "ArduPilot": "ArduPilot stops after GUID_TIMEOUT and stays in GUIDED",
 }
 
 
@@ -64,11 +63,11 @@ class LandedState(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Odometry:
-    """The newest ODOMETRY, to measure a reset by.
+    """The newest ODOMETRY, the reference for measuring the next reset.
 
     Attributes:
         time_us: the message's own stamp. reset_counter: 0..255.
-        position_ned_m: without `VehicleState.reset_offset_ned_m` of that moment.
+        position_ned_m: with `VehicleState.reset_offset_ned_m` of that time subtracted.
         velocity_ned_mps: the newest of LOCAL_POSITION_NED.
     """
 
@@ -82,34 +81,34 @@ class Odometry:
 class VehicleState:
     """A snapshot. Every group of values has the stamp of its newest message (CLOCK_MONOTONIC ns, 0: never).
 
-    The stamps are those of the measurements once the autopilot's clock is known, and of the arrival before.
+    Stamps are those of the measurement once the autopilot's clock is known, before that of the arrival.
 
     Attributes:
         position_ned_m: metres from the local origin, north, east, down.
         position_boot_ms: the autopilot's own stamp of it.
-        position_valid: whether the estimator says that position and velocity can be flown by, as it said
-            last; None on an autopilot that does not tell (ESTIMATOR_STATUS, EKF_STATUS_REPORT).
-        reset_count: how often the estimate was reset by more than its own wander.
-        reset_offset_ned_m: what those resets have added up to in the autopilot's local coordinates. Its own
-            position is `position_ned_m` plus this.
-        odometry: to measure the next reset by; None while no ODOMETRY comes.
+        position_valid: whether the estimator reports position and velocity as usable; None on an autopilot
+            that does not report it (ESTIMATOR_STATUS, EKF_STATUS_REPORT).
+        reset_count: number of resets larger than the estimate's own drift.
+        reset_offset_ned_m: sum of those resets in the autopilot's local coordinates. Its own position is
+            `position_ned_m` plus this.
+        odometry: reference for measuring the next reset; None without ODOMETRY.
         velocity_ned_mps: metres a second, north, east, down.
-        attitude: (w, x, y, z), turns body FRD into NED.
+        attitude: (w, x, y, z), rotates body FRD into NED.
         angular_velocity_frd_radps: body rates.
         latitude_deg, longitude_deg, altitude_amsl_m: global position, NaN when unknown.
-        home_altitude_amsl_m, home_position_ned_m: of the home position; None until known.
+        home_altitude_amsl_m, home_position_ned_m: of the home position; None until received.
         battery_fraction: 0..1, None when unknown.
         ready_to_arm: the autopilot's own pre-arm checks pass, in its current mode.
         failsafe: the autopilot reports MAV_STATE_CRITICAL or EMERGENCY.
-        intended_mode: what the pilot or a command chose last. A failsafe changes `mode` alone.
-        intended_beside: the `mode` that was shown when the intended one was told. Both are UNKNOWN on an
-            autopilot that does not tell it (CURRENT_MODE: PX4 1.15 and newer).
-        clock: the autopilot's boot clock against CLOCK_MONOTONIC; None until it has told its time.
-        gimbal: where it looks and who may move it; None until one was heard.
-        reports: the newest things it said, the newest last.
-        autopilot: "PX4" or "ArduPilot", None until it was heard.
-        missing_streams: names of the messages that are needed and come below half of their rate.
-        other_commanders: other services that were seen to command the vehicle, however long ago.
+        intended_mode: the mode chosen last by the pilot or a command. A failsafe changes only `mode`.
+        intended_beside: the `mode` reported together with the intended one. Both are UNKNOWN on an autopilot
+            that does not report it (CURRENT_MODE: PX4 1.15 and newer).
+        clock: the autopilot's boot clock against CLOCK_MONOTONIC; None until synchronised.
+        gimbal: attitude and control of the gimbal; None until one is received.
+        reports: the newest text reports, the newest last.
+        autopilot: "PX4" or "ArduPilot", None until its first heartbeat.
+        missing_streams: names of required messages received below half of their rate.
+        other_commanders: other companion services received on the link, of any age.
     """
 
     heartbeat_ns: int = 0
@@ -165,15 +164,15 @@ class VehicleState:
 
     @property
     def without_setpoints(self) -> str:
-        """What the autopilot does when setpoints stop, in words."""
-        return _WITHOUT_SETPOINTS.get(self.autopilot or "", "the autopilot does what it is set to do")
+        """What the autopilot does when setpoints stop, as text."""
+        return _WITHOUT_SETPOINTS.get(self.autopilot or "", "the autopilot performs its configured failsafe")
 
     def connected(self, now_ns: int) -> bool:
-        """A heartbeat came within `HEARTBEAT_MAX_AGE_S`."""
+        """Whether a heartbeat was received within `HEARTBEAT_MAX_AGE_S`."""
         return self.heartbeat_ns > 0 and now_ns - self.heartbeat_ns <= HEARTBEAT_MAX_AGE_S * 1e9
 
     def position_fresh(self, now_ns: int) -> bool:
-        """Position and attitude are known and no older than `TELEMETRY_MAX_AGE_S`."""
+        """Whether position and attitude are known and at most `TELEMETRY_MAX_AGE_S` old."""
         limit_ns = TELEMETRY_MAX_AGE_S * 1e9
         return (
             self.position_ned_m is not None
@@ -183,9 +182,9 @@ class VehicleState:
         )
 
     def position_fault(self, now_ns: int) -> str | None:
-        """Why position and attitude cannot be flown by, in words; None: they can. Fresh is not valid."""
+        """Return why position and attitude are not usable, as text; None if they are. Fresh is not valid."""
         if self.position_ned_m is None or self.attitude is None:
-            return "none came yet"
+            return "not received"
         if not self.position_fresh(now_ns):
             return f"{(now_ns - min(self.position_ns, self.attitude_ns)) / 1e9:.1f} s old"
         if self.position_valid is False:
@@ -193,12 +192,12 @@ class VehicleState:
         return None
 
     def reset_words(self, before: VehicleState) -> str:
-        """By how much the estimate was reset since another snapshot, for people."""
+        """Return the reset of the estimate since another snapshot, as text."""
         north, east, down = (
             now - then for now, then in zip(self.reset_offset_ned_m, before.reset_offset_ned_m, strict=True)
         )
         return f"reset by {north:.1f} m north, {east:.1f} m east, {down:.1f} m down"
 
     def warnings_since(self, stamp_ns: int) -> list[Report]:
-        """What it warned of, or worse, from a moment on (CLOCK_MONOTONIC)."""
-        return [one for one in self.reports if one.stamp_ns >= stamp_ns and one.level <= WARNING]
+        """Return the reports of level warning or worse since a time (CLOCK_MONOTONIC)."""
+        return [report for report in self.reports if report.stamp_ns >= stamp_ns and report.level <= WARNING]

@@ -1,4 +1,4 @@
-"""MAVLink's STATUSTEXT as whole texts (https://mavlink.io/en/messages/common.html#STATUSTEXT)."""
+"""Reassembly of STATUSTEXT (https://mavlink.io/en/messages/common.html#STATUSTEXT)."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ _LONGEST_TEXT = 500
 
 
 class StatusTexts:
-    """STATUSTEXT as whole texts: long ones come in chunks of 50 bytes with one id."""
+    """Reassembles texts from STATUSTEXT: long ones are sent in chunks of 50 bytes with one id."""
 
     def __init__(self) -> None:
         self._id = 0
         self._chunks: list[bytes] = []
 
-    def take(self, frame: Frame, now_ns: int) -> Report | None:
-        """The text that this frame completes. A text whose chunk was lost is dropped when the next begins."""
+    def add(self, frame: Frame, now_ns: int) -> Report | None:
+        """Return the text that a frame completes. A text with a lost chunk is dropped at the next text."""
         severity, chunk, identifier, sequence = _STATUSTEXT.unpack(frame.padded(_STATUSTEXT.size))
         ends = b"\0" in chunk
         if identifier == 0:
@@ -40,5 +40,5 @@ class StatusTexts:
 def _text_report(severity: int, text: bytes, now_ns: int) -> Report | None:
     words = text.split(b"\0")[0].decode("utf-8", "replace").strip()
     if words.endswith("fence breached"):
-        severity = min(severity, WARNING)  # ArduPilot 4.7's NOTICE is the reason of its next change of mode
+        severity = min(severity, WARNING)  # ArduPilot 4.7 sends the reason of its mode change as NOTICE
     return Report(now_ns, severity, words) if words else None

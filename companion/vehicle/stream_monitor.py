@@ -1,7 +1,7 @@
-"""Which streams come too slowly, and when each is to be asked for again. Pure: no link, no clock.
+"""Detects streams below their rate and schedules requests for them. Pure: no link, no clock.
 
-Rates are counted in windows, one after the other: what comes below half of its rate for a window is missing.
-It is asked for, and again after a pause that doubles, until a window is good.
+Rates are measured in consecutive windows: a stream below half of its rate in a window is missing. It is
+requested, and again after a pause that doubles, until a window has enough messages.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 WINDOW_S = 2.0
-_SHARE = 0.5  # of the expected rate
-_MESSAGES_A_WINDOW = 2.0  # expected; a slower stream has a longer window
+_MIN_RATIO = 0.5  # of the expected rate
+_MESSAGES_PER_WINDOW = 2.0  # expected; a slower stream has a longer window
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 2.0, 8.0
 
 
@@ -33,9 +33,9 @@ class StreamMonitor:
     """Counts the messages of each stream. All stamps are of one clock, nanoseconds.
 
     Args:
-        expected_hz: by message id, how often each stream should come.
-        optional: message ids that an autopilot may refuse: then they are not missing.
-        first_window_s: for how long is counted before anything is asked for, after `restart`.
+        expected_hz: message id → expected rate.
+        optional: message ids that an autopilot may refuse; then they are not missing.
+        first_window_s: length of the first window after `restart`, before the first requests.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class StreamMonitor:
         self.restart(now_ns)
 
     def restart(self, now_ns: int) -> None:
-        """The link has opened or come back, or the autopilot has restarted: nothing counts that was asked."""
+        """Start over: the link has opened or returned, or the autopilot has restarted."""
         window_ns = round(self._first_window_s * 1e9)
         self._streams = {
             message_id: _Stream(expected_hz, now_ns, window_ns)
@@ -59,19 +59,19 @@ class StreamMonitor:
         }
 
     def received(self, message_id: int) -> None:
-        """A message of the autopilot has come."""
+        """Count one message of the autopilot."""
         stream = self._streams.get(message_id)
         if stream is not None:
             stream.count += 1
 
     def due(self, now_ns: int) -> list[int]:
-        """The message ids to ask for now. Call it several times a second; `asked` begins the pause."""
+        """Return the message ids to request now. Call several times a second; `asked` starts the pause."""
         for stream in self._streams.values():
             elapsed_ns = now_ns - stream.began_ns
             if elapsed_ns < stream.window_ns:
                 continue
-            stream.is_missing = stream.count < _SHARE * stream.expected_hz * elapsed_ns * 1e-9
-            stream.begin_window(now_ns, max(WINDOW_S, _MESSAGES_A_WINDOW / stream.expected_hz))
+            stream.is_missing = stream.count < _MIN_RATIO * stream.expected_hz * elapsed_ns * 1e-9
+            stream.begin_window(now_ns, max(WINDOW_S, _MESSAGES_PER_WINDOW / stream.expected_hz))
             if not stream.is_missing:
                 stream.ask_at_ns, stream.pause_s = 0, _FIRST_PAUSE_S
         return [
@@ -81,18 +81,18 @@ class StreamMonitor:
         ]
 
     def asked(self, message_id: int, now_ns: int) -> None:
-        """It was asked for; what comes from here on tells whether that helped."""
+        """Note a request: a new window starts, and the pause doubles."""
         stream = self._streams[message_id]
         stream.ask_at_ns = now_ns + round(stream.pause_s * 1e9)
         stream.pause_s = min(2.0 * stream.pause_s, _LONGEST_PAUSE_S)
-        stream.begin_window(now_ns, max(WINDOW_S, _MESSAGES_A_WINDOW / stream.expected_hz))
+        stream.begin_window(now_ns, max(WINDOW_S, _MESSAGES_PER_WINDOW / stream.expected_hz))
 
     def refused(self, message_id: int) -> None:
-        """The autopilot does not have it. An optional stream is not asked for again until `restart`."""
+        """Note a refusal: an optional stream is not requested again until `restart`."""
         if message_id in self._optional:
             self._streams.pop(message_id, None)
 
     @property
     def missing(self) -> tuple[int, ...]:
-        """The message ids that came below half of their rate in their last window."""
+        """The message ids below half of their rate in their last window."""
         return tuple(message_id for message_id, stream in self._streams.items() if stream.is_missing)

@@ -1,4 +1,4 @@
-"""Asks the autopilot for the streams that are needed until they come, and again when they stop."""
+"""Requests the required streams from the autopilot until they arrive, and again when they stop."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ _NAMES = {CURRENT_MODE_ID: "CURRENT_MODE", EKF_STATUS_REPORT_ID: "EKF_STATUS_REP
 
 
 class StreamRequests:
-    """SET_MESSAGE_INTERVAL for what comes too slowly, and home's position until it is known.
+    """Sends SET_MESSAGE_INTERVAL for slow streams, and requests home's position until it is known.
 
     Args:
-        url: of the link, for the log. telemetry: what the autopilot shows; its profile are known.
-        command: sends one command with its parameters; the MAV_RESULT.
+        url: of the link, for the log. telemetry: the autopilot's state, with its profile selected.
+        command: sends one command with its parameters and returns the MAV_RESULT.
     """
 
     def __init__(
@@ -48,33 +48,33 @@ class StreamRequests:
         )
 
     def restart(self) -> None:
-        """The link is back, or the autopilot has restarted."""
+        """Start over: the link has returned, or the autopilot has restarted."""
         self.monitor.restart(time.monotonic_ns())
 
-    async def keep(self) -> None:
-        """Ask for what is missing, for ever. Nothing is asked of an autopilot that is not heard."""
+    async def run(self) -> None:
+        """Request missing streams until cancelled; nothing is requested without a heartbeat."""
         while True:
             await asyncio.sleep(_CHECK_S)
             due = self.monitor.due(time.monotonic_ns())
-            self._show()
+            self._update_state()
             if due and self._telemetry.state.connected(time.monotonic_ns()):
-                await self._ask_for(due)
+                await self._request(due)
 
-    def _show(self) -> None:
-        """What is missing into the state, and into the log when it changes."""
+    def _update_state(self) -> None:
+        """Write the missing streams into the state, and log changes."""
         names = tuple(message_name(message_id) for message_id in self.monitor.missing)
         if names == self._telemetry.state.missing_streams:
             return
         self._telemetry.state = replace(self._telemetry.state, missing_streams=names)
         if not names:
-            logger.info("%s: every stream comes", self._url)
+            logger.info("%s: all streams received", self._url)
             return
-        # At the beginning it is usual: most autopilots send little unasked.
+        # Usual at the start: most autopilots send few streams without a request.
         level = logging.WARNING if self._asked_before else logging.INFO
-        logger.log(level, "%s: missing or too slow, asked for: %s", self._url, ", ".join(names))
+        logger.log(level, "%s: streams missing or too slow, requested: %s", self._url, ", ".join(names))
         self._asked_before = True
 
-    async def _ask_for(self, due: list[int]) -> None:
+    async def _request(self, due: list[int]) -> None:
         profile = self._telemetry.profile
         for message_id in due:
             requests: list[tuple[float, ...]] = [
@@ -88,17 +88,17 @@ class StreamRequests:
                 except CommandRefusedError as error:
                     if not self._unanswered:
                         logger.warning(
-                            "%s: asking for %s: %s; trying on", self._url, message_name(message_id), error
+                            "%s: request for %s: %s; retrying", self._url, message_name(message_id), error
                         )
                     self._unanswered = True
-                    for waiting in due:  # they would fare no better
+                    for waiting in due:  # they would not be answered either
                         self.monitor.asked(waiting, time.monotonic_ns())
                     return
                 self._unanswered = False
                 if number == _SET_MESSAGE_INTERVAL:
-                    self._take_answer(message_id, result)
+                    self._on_answer(message_id, result)
 
-    def _take_answer(self, message_id: int, result: int) -> None:
+    def _on_answer(self, message_id: int, result: int) -> None:
         self.monitor.asked(message_id, time.monotonic_ns())
         if result == ACCEPTED:
             self._refused.discard(message_id)
@@ -107,7 +107,7 @@ class StreamRequests:
         if message_id not in self._refused:
             self._refused.add(message_id)
             logger.info(
-                "%s: the autopilot does not send %s at the rate wanted (%s)",
+                "%s: requested rate of %s refused (%s)",
                 self._url,
                 message_name(message_id),
                 result_name(result),
@@ -115,7 +115,7 @@ class StreamRequests:
 
 
 def message_name(message_id: int) -> str:
-    """MAVLink's name of a message, as people know it."""
+    """Return MAVLink's name of a message."""
     if message_id in _NAMES:
         return _NAMES[message_id]
     message = mavlink.mavlink_map.get(message_id)

@@ -1,12 +1,12 @@
 """The dead-man: sends the newest setpoint at a steady rate while, and only while, it is fresh.
 
 Fresh → the setpoint. Expired → a braking setpoint for `brake_s`. Then silence, so that PX4's own
-loss-of-offboard failsafe acts (COM_OF_LOSS_T, COM_OBL_RC_ACT); ArduPilot has none: it stands, in GUIDED. The
-streamer lives in the same loop as everything else: when that loop hangs or the process is stopped, nothing is
+loss-of-offboard failsafe acts (COM_OF_LOSS_T, COM_OBL_RC_ACT); ArduPilot has none: it stops, in GUIDED. The
+streamer runs in the same loop as everything else: when that loop hangs or the process is stopped, nothing is
 sent, and the autopilot acts in the same way.
 
-Silence is final: PX4 goes back to OFFBOARD by itself when setpoints return, so after a silence as long as its
-failsafe may take, whatever caused it, nothing is sent until `stop()` and a new beginning.
+Silence is final: PX4 returns to OFFBOARD by itself when setpoints resume. So after a silence long enough for
+its failsafe, whatever caused it, nothing is sent until `stop()`.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ logger = logging.getLogger(__name__)
 
 DEFAULT_RATE_HZ = 50.0
 DEFAULT_BRAKE_S = 0.5
-# A gap longer than this in a running stream is a silence. PX4 allows 1 s (COM_OF_LOSS_T); a gap of 0.8 s did
-# nothing to a real one.
+# A gap longer than this in a running stream is a silence. PX4 allows 1 s (COM_OF_LOSS_T); a gap of 0.8 s had
+# no effect on a real PX4.
 SILENCE_S = 0.8
 
 
@@ -40,9 +40,9 @@ class StreamState(StrEnum):
 
 
 class Streamer:
-    """Sends setpoints through `send`, one a tick.
+    """Sends setpoints through `send`, one per tick.
 
-    `tick(now_ns)` is the whole logic and is pure of clocks; `run()` calls it at `rate_hz`.
+    `tick(now_ns)` is the whole logic and reads no clock; `run()` calls it at `rate_hz`.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class Streamer:
         sleeper: Callable[[], AbstractAsyncContextManager[Sleep]] = precise_sleep,
     ) -> None:
         if not rate_hz > 2.0:
-            raise ValueError(f"PX4 needs setpoints faster than 2 Hz, got rate_hz={rate_hz}")
+            raise ValueError(f"rate_hz must be above 2 (PX4's minimum), got {rate_hz}")
         self.send = send
         self._period_ns = round(1e9 / rate_hz)
         self._brake_ns = round(brake_s * 1e9)
@@ -68,21 +68,21 @@ class Streamer:
 
     @property
     def state(self) -> StreamState:
-        """What the last tick did."""
+        """The state after the last tick."""
         return self._state
 
     @property
     def last_sent(self) -> Setpoint | None:
-        """The setpoint that last left; None before the first."""
+        """The setpoint sent last; None before the first."""
         return self._sent
 
     @property
     def last_sent_ns(self) -> int | None:
-        """When it left."""
+        """When it was sent, nanoseconds."""
         return self._sent_ns
 
     def submit(self, setpoint: Setpoint) -> None:
-        """The newest setpoint; it replaces the one before. Not taken after a silence."""
+        """Replace the newest setpoint. Ignored after a silence."""
         if self._state is not StreamState.EXPIRED:
             self._newest = setpoint
 
@@ -92,7 +92,7 @@ class Streamer:
         self._enter(StreamState.SILENT)
 
     def send_now(self, now_ns: int) -> None:
-        """Send the newest setpoint now, between two ticks, if it has not left yet. The ticks do not move."""
+        """Send the newest setpoint now, between two ticks, if not sent yet. The tick times do not change."""
         if self._newest is not self._sent and self._state is StreamState.FRESH:
             self.tick(now_ns)
 
@@ -102,7 +102,7 @@ class Streamer:
         if newest is None or self._state is StreamState.EXPIRED:
             return
         if self._state is StreamState.SILENT and newest.expired(now_ns):
-            # Nothing was flying by us, so there is nothing to brake: a brake would only take command.
+            # We were not in command, so there is nothing to brake: a brake would only take command.
             return
         if self._was_silent(now_ns):
             self._enter(StreamState.EXPIRED)
@@ -116,7 +116,7 @@ class Streamer:
             self._enter(StreamState.EXPIRED)
 
     async def run(self) -> None:
-        """Tick at the rate until cancelled. Missed ticks are skipped, never sent in a burst."""
+        """Tick at `rate_hz` until cancelled. Missed ticks are skipped, never sent in a burst."""
         set_scheduler_slice()
         async with self._sleeper() as sleep:
             due_ns = self._clock_ns()
@@ -129,7 +129,7 @@ class Streamer:
                 await sleep((due_ns - self._clock_ns()) / 1e9)
 
     def _was_silent(self, now_ns: int) -> bool:
-        """The stream was running and then nothing left for too long: this loop did not go round."""
+        """Whether the stream was running and nothing was sent for too long: the loop was blocked."""
         running = self._state in (StreamState.FRESH, StreamState.BRAKING)
         return running and self._sent_ns is not None and now_ns - self._sent_ns > SILENCE_S * 1e9
 
@@ -144,5 +144,5 @@ class Streamer:
         if state is StreamState.BRAKING:
             logger.warning("setpoint expired: braking")
         elif state is StreamState.EXPIRED:
-            logger.error("no fresh setpoint: sending stopped, the autopilot is on its own")
+            logger.error("no fresh setpoint: sending stopped, the autopilot's failsafe applies")
         self._state = state

@@ -1,4 +1,4 @@
-"""One message of the autopilot into the next snapshot of the vehicle. Pure: no link, no clock."""
+"""Applies one message of the autopilot to the vehicle state. Pure: no link, no clock."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ _SAFETY_ARMED = 128  # MAV_MODE_FLAG
 _STATE_CRITICAL, _STATE_EMERGENCY = 5, 6  # MAV_STATE
 _PREARM_CHECK = 0x1000_0000  # MAV_SYS_STATUS_PREARM_CHECK
 _LOCAL_NED = 1  # MAV_FRAME
-# ESTIMATOR_STATUS_FLAGS; EKF_STATUS_REPORT has the same bits. CONST_POS_MODE (128) is no fault: PX4 sets it
-# at rest with a valid position.
+# ESTIMATOR_STATUS_FLAGS; EKF_STATUS_REPORT has the same bits. CONST_POS_MODE (128) is not a fault: PX4 sets
+# it at rest with a valid position.
 _VELOCITY_HORIZ, _POS_HORIZ, _POS_VERT = 2, 8 | 16, 32 | 64
-# A position this far from where the one before and the mean velocity lead is a reset; an estimate of PX4 in
-# its own simulation was 0.03 m from there at most. Over a gap, accelerations of up to 10 m/s2 that neither
-# velocity shows are allowed for; over more than a second no reset can be measured.
+# A position this far from the one predicted by the previous position and the mean velocity is a reset; PX4's
+# estimate in its own simulation deviated by 0.03 m at most. Over a gap, accelerations of up to 10 m/s2 that
+# neither velocity shows are allowed for; over more than a second no reset can be measured.
 _JUMP_M = 0.5
 _JUMP_MPS2 = 2.5
 _LONGEST_GAP_S = 1.0
-# Of a reset that the counter tells: what is less is the estimate's own wander.
-_LEAST_RESET_M = 0.2
+# Of a reset reported by the counter: smaller jumps are the estimate's own drift.
+_MIN_RESET_M = 0.2
 _LANDED = {
     1: LandedState.ON_GROUND,
     2: LandedState.IN_AIR,
@@ -37,15 +37,15 @@ _LANDED = {
 
 
 def apply_message(state: VehicleState, name: str, fields: Fields, now_ns: int) -> VehicleState:
-    """The snapshot after a message.
+    """Return the snapshot after a message.
 
     Args:
         name: the message's name, as in MAVLink common.
-        fields: its fields by name; a float that is not a number may be None (as JSON has it).
-        now_ns: CLOCK_MONOTONIC of its arrival.
+        fields: its fields by name; NaN may be None (as in JSON).
+        now_ns: CLOCK_MONOTONIC of the measurement or arrival.
 
     Returns:
-        A new snapshot, or the same object when the message says nothing new of the vehicle.
+        A new snapshot, or the same object when the message changes nothing.
     """
     step = _STEPS.get(name)
     return state if step is None else step(state, fields, now_ns)
@@ -94,44 +94,46 @@ def _local_position_ned(state: VehicleState, fields: Fields, now_ns: int) -> Veh
         return state
     boot_ms = fields["time_boot_ms"]
     dt_s = (boot_ms - state.position_boot_ms) * 1e-3
-    told = _less(position, state.reset_offset_ned_m)
+    position_ned_m = _subtract(position, state.reset_offset_ned_m)
     if state.position_ned_m is not None and state.velocity_ned_mps is not None:
-        jump = _jump(state.position_ned_m, state.velocity_ned_mps, told, velocity, dt_s)
+        jump = _jump(state.position_ned_m, state.velocity_ned_mps, position_ned_m, velocity, dt_s)
         if jump is not None and math.hypot(*jump) > _JUMP_M + _JUMP_MPS2 * dt_s * dt_s:
-            state, told = _reset_by(state, jump), _less(told, jump)
+            state, position_ned_m = _reset_by(state, jump), _subtract(position_ned_m, jump)
     return replace(
         state,
         position_ns=now_ns,
         position_boot_ms=boot_ms,
-        position_ned_m=told,
+        position_ned_m=position_ned_m,
         velocity_ned_mps=velocity,
     )
 
 
 def _odometry(state: VehicleState, fields: Fields, _now_ns: int) -> VehicleState:
-    """A changed counter tells of a reset that a position alone does not show, or not yet.
+    """Detect, by the reset counter, a reset that LOCAL_POSITION_NED has not shown.
 
-    LOCAL_POSITION_NED may have shown it before: what that made of it is in the offset, and nothing is left.
+    If LOCAL_POSITION_NED has shown it before, it is in the offset already, and no jump is left.
     """
     position, velocity = _vector(fields, "x", "y", "z"), state.velocity_ned_mps
     if position is None or velocity is None or fields["frame_id"] != _LOCAL_NED:
         return state
-    told = _less(position, state.reset_offset_ned_m)
-    seen = Odometry(fields["time_usec"], fields["reset_counter"], told, velocity)
+    position_ned_m = _subtract(position, state.reset_offset_ned_m)
+    seen = Odometry(fields["time_usec"], fields["reset_counter"], position_ned_m, velocity)
     last, state = state.odometry, replace(state, odometry=seen)
     if last is None or last.reset_counter == seen.reset_counter:
         return state
     dt_s = (seen.time_us - last.time_us) * 1e-6
-    jump = _jump(last.position_ned_m, last.velocity_ned_mps, told, velocity, dt_s)
-    if jump is None or math.hypot(*jump) < _LEAST_RESET_M:
+    jump = _jump(last.position_ned_m, last.velocity_ned_mps, position_ned_m, velocity, dt_s)
+    if jump is None or math.hypot(*jump) < _MIN_RESET_M:
         return state
-    return _reset_by(replace(state, odometry=replace(seen, position_ned_m=_less(told, jump))), jump)
+    return _reset_by(
+        replace(state, odometry=replace(seen, position_ned_m=_subtract(position_ned_m, jump))), jump
+    )
 
 
 def _jump(
     before: Vector3, velocity: Vector3, after: Vector3, velocity_after: Vector3, dt_s: float
 ) -> Vector3 | None:
-    """What of the way between two positions their velocities do not explain; None after too long a gap."""
+    """Return the displacement that the velocities do not explain; None after too long a gap."""
     if abs(dt_s) > _LONGEST_GAP_S:
         return None
     north, east, down = (
@@ -142,23 +144,23 @@ def _jump(
 
 
 def _reset_by(state: VehicleState, jump: Vector3) -> VehicleState:
-    """The autopilot's coordinates of every place are other ones; those of home are still the same."""
+    """Add a reset to the offset; home keeps its autopilot coordinates, so it moves here."""
     north, east, down = (o + j for o, j in zip(state.reset_offset_ned_m, jump, strict=True))
     home = state.home_position_ned_m
     return replace(
         state,
         reset_count=state.reset_count + 1,
         reset_offset_ned_m=(north, east, down),
-        home_position_ned_m=None if home is None else _less(home, jump),
+        home_position_ned_m=None if home is None else _subtract(home, jump),
     )
 
 
-def _less(place: Vector3, offset: Vector3) -> Vector3:
-    return (place[0] - offset[0], place[1] - offset[1], place[2] - offset[2])
+def _subtract(position: Vector3, offset: Vector3) -> Vector3:
+    return (position[0] - offset[0], position[1] - offset[1], position[2] - offset[2])
 
 
 def _estimator_status(state: VehicleState, fields: Fields, _now_ns: int) -> VehicleState:
-    """It holds until the next one: age does not make it untrue, and a missing stream is asked for."""
+    """Apply the validity flags; they hold until the next message, since a missing stream is requested."""
     flags = fields["flags"]
     valid = all(flags & group for group in (_VELOCITY_HORIZ, _POS_HORIZ, _POS_VERT))
     return state if valid is state.position_valid else replace(state, position_valid=valid)
@@ -178,7 +180,7 @@ def _home_position(state: VehicleState, fields: Fields, _now_ns: int) -> Vehicle
     home = replace(state, home_altitude_amsl_m=fields["altitude"] * 1e-3)
     local = _vector(fields, "x", "y", "z")
     if local is not None:
-        home = replace(home, home_position_ned_m=_less(local, state.reset_offset_ned_m))
+        home = replace(home, home_position_ned_m=_subtract(local, state.reset_offset_ned_m))
     return state if home == state else home
 
 
@@ -188,7 +190,7 @@ def _sys_status(state: VehicleState, fields: Fields, now_ns: int) -> VehicleStat
 
 
 def _battery_status(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:
-    # Of several batteries the first speaks for the vehicle, as in SYS_STATUS.
+    # Of several batteries only the first is used, as in SYS_STATUS.
     if fields.get("id", 0) != 0 or fields["battery_remaining"] < 0:
         return state
     fraction = min(fields["battery_remaining"] / 100.0, 1.0)
@@ -196,7 +198,7 @@ def _battery_status(state: VehicleState, fields: Fields, now_ns: int) -> Vehicle
 
 
 def _mode(fields: Fields) -> FlightMode:
-    """As a driver has named it (`flight_mode`), else by PX4's number."""
+    """Return the mode set by the profile (`flight_mode`), else decode PX4's custom_mode."""
     named: FlightMode | None = fields.get("flight_mode")
     return mode_of_custom_mode(fields["custom_mode"]) if named is None else named
 
@@ -206,7 +208,7 @@ def _number(value: float | None) -> float:
 
 
 def _vector(fields: Fields, *names: str) -> tuple[float, float, float] | None:
-    """Three finite numbers, or None: an estimate that is not a number is no estimate."""
+    """Return three fields as a vector; None if any is not finite."""
     x, y, z = (_number(fields[name]) for name in names)
     return (x, y, z) if math.isfinite(x) and math.isfinite(y) and math.isfinite(z) else None
 

@@ -89,6 +89,6 @@ def test_the_demonstration_finds_the_car_stops_before_it_and_lands(tmp_path: Pat
     # Whole, from the first frame to the end, and moving.
     assert pictures > 3 * filmed_s
     events = [json.loads(line) for line in (output / "events.jsonl").read_text().splitlines()]
-    (seen_ns,) = [event["stamp_ns"] for event in events if event["text"].startswith("perception sees")]
+    (seen_ns,) = [event["stamp_ns"] for event in events if event["text"].startswith("perception running")]
     flown_ns = max(event["stamp_ns"] for event in events if event["text"].endswith("flown, 5 steps"))
     assert filmed_s > (flown_ns - seen_ns) / 1e9 - 2.0

@@ -1,4 +1,4 @@
-"""`companion` as a person runs it: a process of its own, its output and its exit code."""
+"""Runs `companion` as a separate process, with its output and exit code."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ COLUMNS = {"COLUMNS": "200", "NO_COLOR": "1"}
 
 
 def companion(*arguments: str | Path, cwd: Path, timeout_s: float = 60.0) -> subprocess.CompletedProcess[str]:
-    """Run `companion` in an empty folder, so that no settings file of this machine is found."""
+    """Run `companion` in a given folder and without COMPANION_ variables."""
     command = [sys.executable, "-m", "companion.cli", *(str(argument) for argument in arguments)]
     environment = {key: value for key, value in os.environ.items() if not key.startswith("COMPANION_")}
     return subprocess.run(

@@ -1,4 +1,4 @@
-"""A small model and a small source, made here: no test of the service needs anything from outside."""
+"""A small model and a small source: the service's tests need no external data."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from vision.yolo.description import yolov8_description
 
 @pytest.fixture(scope="session")
 def small_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A network with random weights: real in every way but that it has learnt nothing."""
+    """A network with random weights."""
     path = tmp_path_factory.mktemp("model") / "small.pt"
     model = build(yolov8_description((1 / 3, 0.0625, 256), ("person", "car", "boat"))).eval()
     save_checkpoint(path, model, metadata={"licence": "Apache-2.0"})
@@ -25,7 +25,7 @@ def small_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def exported_model(small_model: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The same for ONNX Runtime: where it does not matter what computes, half of a start is torch's."""
+    """The same for ONNX Runtime: loading torch takes half of a worker's start."""
     for package in ("onnx", "onnxruntime"):
         pytest.importorskip(package, reason=f"{package} is an optional extra")
     path = tmp_path_factory.mktemp("exported") / "small.onnx"
@@ -34,18 +34,18 @@ def exported_model(small_model: Path, tmp_path_factory: pytest.TempPathFactory) 
 
 @pytest.fixture(scope="session")
 def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of twenty small pictures."""
+    """A folder of twenty small images."""
     folder = tmp_path_factory.mktemp("pictures")
     rng = np.random.default_rng(0)
     for index in range(20):
-        picture = cv2.resize(rng.integers(0, 255, (12, 16, 3), dtype=np.uint8), (160, 120))
-        assert cv2.imwrite(str(folder / f"{index:03d}.png"), picture)
+        image = cv2.resize(rng.integers(0, 255, (12, 16, 3), dtype=np.uint8), (160, 120))
+        assert cv2.imwrite(str(folder / f"{index:03d}.png"), image)
     return folder
 
 
 @pytest.fixture
 def filming(pictures: Path) -> list[str]:
-    """Flags for a service that takes the pictures, ten a second, and looks for nothing in them."""
+    """Flags for a service that reads the images, ten a second, without detection."""
     return [
         *("--source", str(pictures), "--source-loop", "true", "--source-rate-hz", "10"),
         *("--detector-enabled", "false", "--guidance-perception-max-age-s", "3"),
@@ -54,7 +54,7 @@ def filming(pictures: Path) -> list[str]:
 
 @pytest.fixture
 def seeing(exported_model: Path, pictures: Path) -> list[str]:
-    """Flags for a service that looks at the pictures, over and over, ten times a second."""
+    """Flags for a service that detects in the images, ten a second."""
     return [
         *("--source", str(pictures), "--source-loop", "true", "--source-rate-hz", "10"),
         *("--model", str(exported_model), "--detector-runtime", "onnxruntime"),

@@ -1,4 +1,4 @@
-"""Driver, streamer and guidance loop before a simulator: the service without network and pictures."""
+"""Driver, streamer and guidance loop with a simulator: the service without network and perception."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ STATION = (245, 190)
 
 
 class LiveFlight:
-    """The parts that fly, as the service runs them.
+    """The service's parts for flight.
 
     Args:
-        ran_s: for how long it has run already.
+        ran_s: its uptime at the start.
 
     Attributes:
-        events: (level, text) of everything that guidance told.
+        events: (level, text) of all events.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class LiveFlight:
         )
 
     def on_step(self, now_ns: int) -> None:
-        """After every step of guidance."""
+        """Called after every step of guidance."""
         self._health.after_step(now_ns, self.guidance)
 
     def _event(self, level: str, text: str) -> None:
@@ -72,7 +72,7 @@ class LiveFlight:
                 await asyncio.sleep(0.01)
 
     async def fly(self, text: str, timeout_s: float = 60.0) -> Outcome:
-        """Give a command and wait for its answer."""
+        """Execute a command and wait for its result."""
         reply = await asyncio.wait_for(self.loop.execute(text), timeout_s)
         return Outcome(reply["success"], reply["reason"])
 
@@ -84,8 +84,8 @@ class LiveFlight:
         try:
             yield
         finally:
-            self.loop.begin_to_end()
-            await self.loop.until_released()
+            self.loop.begin_shutdown()
+            await self.loop.wait_released()
             unsubscribe()
             for task in tasks:
                 task.cancel()
@@ -95,7 +95,7 @@ class LiveFlight:
 
 @contextlib.contextmanager
 def ground_station(port: int) -> Iterator[Any]:
-    """A second MAVLink client, on the ground station's link: a pilot's."""
+    """A second MAVLink client, a ground station on its own link."""
     station = mavutil.mavlink_connection(
         f"udpin:127.0.0.1:{port}", source_system=STATION[0], source_component=STATION[1]
     )

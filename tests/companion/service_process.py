@@ -1,4 +1,4 @@
-"""`companion run` as a process of its own, for integration tests; the same way a user runs it."""
+"""Runs `companion run` as a separate process, for integration tests."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ LINES_NOTED = 40
 
 
 class ServiceProcess:
-    """A running `companion run` or `play`. `lines` is what it printed so far, where standard error goes."""
+    """A running `companion run` or `play`. `lines`: its output so far."""
 
     def __init__(self, process: subprocess.Popen[bytes], endpoint: str) -> None:
         self.process = process
@@ -48,7 +48,7 @@ class ServiceProcess:
         self._queue.put(None)
 
     def wait_for_line(self, text: str, timeout_s: float = 30.0, *, after: int = 0) -> str:
-        """The first line with `text`, from line number `after` on. TimeoutError tells all that was said."""
+        """Wait for the first line with `text`, from line number `after` on. Raises TimeoutError."""
         for line in self.lines[after:]:
             if text in line:
                 return line
@@ -57,9 +57,9 @@ class ServiceProcess:
             try:
                 new = self._queue.get(timeout=max(0.0, deadline - time.monotonic()))
             except queue.Empty:
-                raise TimeoutError(f"{text!r} was not said; said: {self.lines}") from None
+                raise TimeoutError(f"no line with {text!r} in {self.lines}") from None
             if new is None:
-                raise TimeoutError(f"the service ended before it said {text!r}; said: {self.lines}")
+                raise TimeoutError(f"the service ended without a line with {text!r}: {self.lines}")
             self.lines.append(new)
             if text in new:
                 return new
@@ -74,21 +74,21 @@ class ServiceProcess:
             return send_command(session, "vehicle1", text, timeout_s=timeout_s)
 
     def take_off(self, altitude_m: float) -> None:
-        """As soon as the vehicle has told all that a take-off needs to know; it does in its first seconds."""
+        """Take off, as soon as the required telemetry was received."""
         reply = self.command_when_it_can(f"takeoff {altitude_m:g}")
         assert reply["success"], reply
 
     def command_when_it_can(self, text: str, timeout_s: float = 60.0) -> dict[str, Any]:
-        """As `command`, again while it is refused for a need that a busy computer meets a moment late."""
+        """As `command`, repeated while it is refused for a missing requirement, for up to 20 s."""
         deadline_s = time.monotonic() + 20.0
         while True:
             reply = self.command(text, timeout_s)
             if reply["success"] or " needs " not in reply["reason"] or time.monotonic() > deadline_s:
                 return reply
-            time.sleep(0.1)  # as a person would: twenty commands a second are taken
+            time.sleep(0.1)  # twenty commands a second are accepted
 
-    def said_last(self) -> list[str]:
-        """The newest lines, also those that nobody waited for."""
+    def last_lines(self) -> list[str]:
+        """Return the newest lines, including unread ones."""
         with suppress(queue.Empty):
             while (line := self._queue.get_nowait()) is not None:
                 self.lines.append(line)
@@ -119,9 +119,9 @@ def running_service(
     endpoint: str | None = None,
     stdin: int = subprocess.DEVNULL,
 ) -> Iterator[ServiceProcess]:
-    """Start `companion run`, wait until it takes commands, end it afterwards.
+    """Start `companion run`, wait until it accepts commands, stop it afterwards.
 
-    What is raised meanwhile carries what it said last, as a note.
+    An exception in between gets the service's last lines as a note.
     """
     command = [sys.executable, "-m", "companion.cli", "run"]
     command += ["--vehicle-url", f"udpin://127.0.0.1:{onboard_port}", "--detector-threads", "1", *flags]
@@ -133,8 +133,8 @@ def running_service(
     try:
         service.wait_for_line("ready: commands on", START_S)
         yield service
-    except BaseException as error:  # a test's time-out is no Exception
-        error.add_note("\n".join(["the service said last:", *service.said_last()]))
+    except BaseException as error:  # a test's timeout is not an Exception
+        error.add_note("\n".join(["last lines of the service:", *service.last_lines()]))
         raise
     finally:
         service.stop()

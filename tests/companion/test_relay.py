@@ -98,7 +98,7 @@ async def test_messages_reach_both_programs_and_come_back() -> None:
             assert ends.autopilots[0].recvfrom(2048) == (b"from a program", ends.relay.url.address)
 
 
-async def test_nothing_is_sent_before_an_autopilot_was_heard() -> None:
+async def test_nothing_is_sent_before_an_autopilot_heartbeat() -> None:
     async with opened() as ends:
         ends.send(b"no heartbeat")
         ends.send(heartbeat())

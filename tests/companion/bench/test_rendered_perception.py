@@ -145,7 +145,7 @@ async def test_result_is_the_worker_s_result(airborne: LockstepVehicle, segment:
     with SharedFrameWriter(segment, model.width, model.height, depth=True) as writer:
         writer.write(captured.frame)
         worker = await PerceptionProcess.spawn(settings, subprocess.DEVNULL)
-        worker.turn(Attitude(stamp_ns, truth.quaternion, truth.height_m))
+        worker.send_attitude(Attitude(stamp_ns, truth.quaternion, truth.height_m))
         there = None
         while there is None and (message := await worker.read()) is not None:
             if isinstance(message, Report):

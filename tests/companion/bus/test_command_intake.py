@@ -1,4 +1,4 @@
-"""Which queries are commands, and how many of them are taken."""
+"""Which queries are accepted as commands, and at which rate."""
 
 from __future__ import annotations
 
@@ -20,37 +20,37 @@ def read(intake: CommandIntake, data: bytes) -> tuple[str | None, str]:
     return intake.read(len(data), lambda: data)
 
 
-def test_a_burst_is_taken_and_then_only_so_many_a_second() -> None:
+def test_burst_then_limited_rate() -> None:
     clock = Clock()
     intake = CommandIntake(clock)
     assert all(read(intake, b"hold")[0] == "hold" for _ in range(BURST))
     assert read(intake, b"hold")[0] is None
-    taken = 0
+    accepted = 0
     for _ in range(1000):  # ten seconds, a hundred a second
         clock.now_s += 0.01
-        taken += read(intake, b"hold")[0] is not None
-    assert abs(taken - 10.0 * COMMANDS_PER_S) <= 1
-    assert intake.refused == 1001 - taken
+        accepted += read(intake, b"hold")[0] is not None
+    assert abs(accepted - 10.0 * COMMANDS_PER_S) <= 1
+    assert intake.refused == 1001 - accepted
 
 
-def test_stop_is_taken_when_the_others_have_used_up_theirs() -> None:
+def test_stop_has_a_separate_allowance() -> None:
     intake = CommandIntake(Clock())
     for _ in range(2 * BURST):
         read(intake, b"dance")
     assert read(intake, b"STOP ")[0] == "STOP "
 
 
-def test_what_is_too_large_is_not_even_read() -> None:
+def test_too_large_payload_is_not_read() -> None:
     def payload() -> bytes:
-        raise AssertionError("it was read")
+        raise AssertionError("the payload was read")
 
-    text, why = CommandIntake(Clock()).read(LARGEST_COMMAND_BYTES + 1, payload)
+    text, reason = CommandIntake(Clock()).read(LARGEST_COMMAND_BYTES + 1, payload)
     assert text is None
-    assert f"it is {LARGEST_COMMAND_BYTES + 1} bytes long" in why
+    assert f"{LARGEST_COMMAND_BYTES + 1} bytes" in reason
 
 
 @given(st.binary(max_size=200))
-def test_whatever_comes_is_a_text_or_refused_with_words(data: bytes) -> None:
-    text, why = read(CommandIntake(Clock()), data)
-    assert (text is None) == bool(why)
+def test_any_payload_is_text_or_refused(data: bytes) -> None:
+    text, reason = read(CommandIntake(Clock()), data)
+    assert (text is None) == bool(reason)
     assert text is None or text.encode() == data

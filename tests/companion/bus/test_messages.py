@@ -1,4 +1,4 @@
-"""The published shapes are a contract; JSON has neither NaN nor infinity."""
+"""The published messages are a contract; JSON has neither NaN nor infinity."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def result(detections: Detections) -> PerceptionResult:
 
 
 def strictly(value: object) -> Any:
-    """Through JSON as a strict reader sees it."""
+    """Convert through strict JSON."""
     return json.loads(json.dumps(value, allow_nan=False))
 
 
@@ -46,7 +46,7 @@ def one_car(depth_m: float) -> Detections:
     )
 
 
-def test_a_detection_message_has_three_stamps_and_the_class_by_name() -> None:
+def test_detection_message() -> None:
     message = strictly(detections_message(result(one_car(11.5)), "alpha", 3_000))
     assert message == {
         "camera": None,
@@ -78,7 +78,7 @@ def test_a_detection_message_has_three_stamps_and_the_class_by_name() -> None:
     }
 
 
-def test_a_tracked_detection_bears_its_identity_its_median_and_whether_it_counts() -> None:
+def test_tracked_detection_has_id_score_and_state() -> None:
     cars = Detections(
         np.zeros((3, 4), np.float32),
         np.full(3, 0.9, np.float32),
@@ -95,15 +95,15 @@ def test_a_tracked_detection_bears_its_identity_its_median_and_whether_it_counts
     assert tracks == [(7, 0.81, "confirmed"), (8, 0.4, "tentative"), (None, None, "none")]
 
 
-def test_the_capture_is_told_by_the_autopilots_clock_too_once_that_is_known() -> None:
+def test_capture_is_given_in_the_autopilots_clock() -> None:
     clock = ClockOffset(offset_ns=-400, error_ns=25)
     message = strictly(detections_message(result(one_car(11.5)), "alpha", 3_000, clock=clock))
     assert (message["captured_boot_ns"], message["captured_boot_error_ns"]) == (600, 25)
-    told = strictly(vehicle_message(VehicleState(clock=clock), 5_000))
-    assert (told["boot_offset_ns"], told["boot_error_ns"]) == (-400, 25)
+    vehicle = strictly(vehicle_message(VehicleState(clock=clock), 5_000))
+    assert (vehicle["boot_offset_ns"], vehicle["boot_error_ns"]) == (-400, 25)
 
 
-def test_what_happened_to_tracks_is_told_with_all_that_is_known_of_them() -> None:
+def test_tracks_message() -> None:
     track = Track(7, 1, "car", TrackState.CONFIRMED, (10.0, 20.0, 30.123, 60.0), 0.9, 0.81234, 5, 100, 900)
     events = (TrackEvent(TrackEventKind.LOST, 1_000, track),)
     message = strictly(tracks_message(replace(result(one_car(1.0)), track_events=events), "alpha", 3_000))
@@ -134,26 +134,26 @@ def test_what_happened_to_tracks_is_told_with_all_that_is_known_of_them() -> Non
     }
 
 
-def test_an_unknown_range_is_null() -> None:
+def test_unknown_range_is_null() -> None:
     message = strictly(detections_message(result(one_car(math.nan)), "alpha", 3_000))
     (car,) = message["detections"]
     assert car["depth_m"] is None
     assert car["nearest_camera_m"] is None
 
 
-def test_labels_are_names_in_order_or_say_that_there_is_nothing() -> None:
+def test_labels_message() -> None:
     assert labels_message(result(one_car(1.0))) == "car"
     assert labels_message(result(Detections.empty(NAMES))) == NO_OBJECTS
 
 
-def test_a_vehicle_of_which_nothing_is_known_yet_is_valid_json() -> None:
+def test_initial_vehicle_message_is_valid_json() -> None:
     message = strictly(vehicle_message(VehicleState(), 5_000_000_000))
     assert message["connected"] is False
     assert message["position_ned_m"] is None
     assert message["heartbeat_age_s"] is None
 
 
-def test_a_flying_vehicle_is_told_with_height_above_home_and_ages() -> None:
+def test_vehicle_message_in_flight() -> None:
     now_ns = 10_000_000_000
     state = VehicleState(
         heartbeat_ns=now_ns - 500_000_000,
@@ -171,7 +171,7 @@ def test_a_flying_vehicle_is_told_with_height_above_home_and_ages() -> None:
     assert message["mode"] == "offboard"
 
 
-def test_a_setpoint_tells_what_it_does_not_control_as_null() -> None:
+def test_setpoint_message_has_null_for_unset_fields() -> None:
     message = strictly(setpoint_message(Setpoint.velocity((1.0, 0.0, 0.0), 0)))
     assert message["position_ned_m"] is None
     assert message["velocity_ned_mps"] == [1.0, 0.0, 0.0]

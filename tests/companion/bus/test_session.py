@@ -59,7 +59,7 @@ def _route(port: int, ready: Connection) -> None:
 
 @contextmanager
 def router(port: int) -> Iterator[multiprocessing.process.BaseProcess]:
-    """A zenoh router in a process of its own, which can be killed."""
+    """A zenoh router in a separate process, which can be killed."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=_route, args=(port, theirs), daemon=True)
@@ -74,7 +74,7 @@ def router(port: int) -> Iterator[multiprocessing.process.BaseProcess]:
         ours.close()
 
 
-async def test_a_subscriber_receives_what_is_published_and_a_command_is_answered() -> None:
+async def test_publication_and_command() -> None:
     settings = ZenohSection(listen=(f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}",))
     bus = Bus(settings, "alpha", on_event=Events(), on_command=refuse)
     await bus.start()
@@ -99,12 +99,12 @@ async def test_a_subscriber_receives_what_is_published_and_a_command_is_answered
     assert bus.published["labels"] > 0
 
 
-async def test_every_bad_query_gets_one_answer_and_stop_is_heard_in_a_flood() -> None:
+async def test_bad_queries_are_answered_and_stop_passes_a_flood() -> None:
     settings = ZenohSection(listen=(f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}",))
-    heard: list[str] = []
+    received: list[str] = []
 
     async def handle(text: str) -> dict[str, Any]:
-        heard.append(text[:20])
+        received.append(text[:20])
         if text == "break":
             raise ZeroDivisionError("no such luck")
         return {"success": True, "reason": ""}
@@ -133,20 +133,19 @@ async def test_every_bad_query_gets_one_answer_and_stop_is_heard_in_a_flood() ->
         answers = await asyncio.to_thread(other_side)
     finally:
         await bus.close()
-    assert answers["bytes"] == ["the command was not taken: it is not UTF-8 text: byte 0 is 0xff"]
-    assert answers["large"] == [
-        f"the command was not taken: it is 10000000 bytes long; {LARGEST_COMMAND_BYTES} are taken at most"
-    ]
+    (refused_bytes,), (refused_size,) = answers["bytes"], answers["large"]
+    assert "0xff" in refused_bytes
+    assert f"10000000 bytes, at most {LARGEST_COMMAND_BYTES}" in refused_size
     assert answers["empty"] == [""]
     assert answers["raises"] == ["ZeroDivisionError: no such luck"]
     assert len(answers["flood"]) == 150
-    assert "commands a second came" in answers["flood"][-1]
+    assert "commands a second" in answers["flood"][-1]
     assert answers["stop"] == [""]
-    assert heard[-1] == " Stop\n"
+    assert received[-1] == " Stop\n"
     assert bus.intake.refused == 2 + sum(bool(reason) for reason in answers["flood"])
 
 
-async def test_a_busy_port_is_one_clear_line() -> None:
+async def test_busy_port_is_reported_in_one_line() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -166,7 +165,7 @@ def _read(endpoint: str, ready: Connection) -> None:
             received.recv()
 
 
-async def test_a_reader_that_is_frozen_holds_nobody_up() -> None:
+async def test_frozen_reader_does_not_block_publishing() -> None:
     endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     bus = Bus(ZenohSection(listen=(endpoint,)), "alpha", on_event=Events(), on_command=refuse)
     await bus.start()
@@ -184,7 +183,7 @@ async def test_a_reader_that_is_frozen_holds_nobody_up() -> None:
                 started = time.perf_counter()
                 bus.publish(topic, "x" * 20_000)
                 slowest_s = max(slowest_s, time.perf_counter() - started)
-        # zenoh waits five seconds for a reader where it may wait at all; a busy machine is far from that.
+        # With BLOCK zenoh waits five seconds for a reader; a busy machine is far below that.
         assert slowest_s < 2.0
     finally:
         reader.kill()
@@ -193,11 +192,11 @@ async def test_a_reader_that_is_frozen_holds_nobody_up() -> None:
         await bus.close()
 
 
-async def test_a_command_is_sent_once_whatever_becomes_of_it() -> None:
-    heard: list[str] = []
+async def test_failing_command_is_sent_once() -> None:
+    received: list[str] = []
 
     async def fail(text: str) -> dict[str, Any]:
-        heard.append(text)
+        received.append(text)
         raise RuntimeError("broken on purpose")
 
     settings = ZenohSection(listen=(f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}",))
@@ -213,11 +212,11 @@ async def test_a_command_is_sent_once_whatever_becomes_of_it() -> None:
     finally:
         await bus.close()
     assert reply == {"command": "takeoff 5", "success": False, "reason": "RuntimeError: broken on purpose"}
-    assert heard == ["takeoff 5"]
+    assert received == ["takeoff 5"]
 
 
 @pytest.mark.parametrize("mode", ["peer", "client"])
-async def test_a_router_that_is_killed_is_missed_and_found_again(mode: Literal["peer", "client"]) -> None:
+async def test_killed_router_is_reported_and_reconnected(mode: Literal["peer", "client"]) -> None:
     port = free_port(socket.SOCK_STREAM)
     events = Events()
     settings = ZenohSection(mode=mode, connect=(f"tcp/127.0.0.1:{port}",), listen=())
@@ -226,7 +225,7 @@ async def test_a_router_that_is_killed_is_missed_and_found_again(mode: Literal["
     try:
         await until(lambda: bool(events))
         assert not bus.connected
-        bus.publish(topics.LABELS, "car")  # nobody is there: neither blocks nor raises
+        bus.publish(topics.LABELS, "car")  # without a peer: neither blocks nor raises
         with router(port) as process:
             await until(lambda: bus.connected)
             process.kill()
@@ -242,7 +241,7 @@ async def test_a_router_that_is_killed_is_missed_and_found_again(mode: Literal["
         await bus.close()
 
 
-async def test_what_is_published_before_the_session_is_open_is_counted() -> None:
+async def test_publication_before_the_session_is_counted() -> None:
     settings = ZenohSection(mode="client", connect=(f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}",))
     bus = Bus(settings, "alpha", on_event=Events(), on_command=refuse)
     bus.publish(topics.LABELS, "car")
@@ -250,26 +249,26 @@ async def test_what_is_published_before_the_session_is_open_is_counted() -> None
     assert bus.published["labels"] == 0
 
 
-def test_a_client_without_a_service_says_so_in_one_line() -> None:
+def test_client_without_a_service_fails() -> None:
     settings = client_settings(ZenohSection(listen=(f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}",)))
     with (
-        pytest.raises(NoAnswerError, match="is `companion run` running"),
+        pytest.raises(NoAnswerError, match="companion run"),
         open_client(settings, timeout_s=0.5),
     ):
         pass
 
 
-def test_every_topic_has_a_key_of_its_own() -> None:
+def test_topic_keys_are_unique() -> None:
     keys = {topic.key("v") for topic in topics.TOPICS}
     assert len(keys) == len(topics.TOPICS)
 
 
 def _serve(endpoint: str, ready: Connection) -> None:
-    """A service that takes commands and never answers."""
+    """Run a service that receives commands and never answers."""
 
     async def serve() -> None:
         async def think(_text: str) -> dict[str, Any]:
-            ready.send("asked")
+            ready.send("received")
             await asyncio.Event().wait()
             return {}
 
@@ -281,7 +280,7 @@ def _serve(endpoint: str, ready: Connection) -> None:
     asyncio.run(serve())
 
 
-def test_a_service_that_is_killed_is_gone_for_a_waiting_sender() -> None:
+def test_killed_service_fails_a_pending_command() -> None:
     endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
@@ -292,7 +291,7 @@ def test_a_service_that_is_killed_is_gone_for_a_waiting_sender() -> None:
     def kill_when_asked() -> None:
         nonlocal killed_s
         assert ours.poll(WAIT_S)
-        assert ours.recv() == "asked"
+        assert ours.recv() == "received"
         service.kill()
         killed_s = time.monotonic()
 
@@ -302,7 +301,7 @@ def test_a_service_that_is_killed_is_gone_for_a_waiting_sender() -> None:
         killer = threading.Thread(target=kill_when_asked)
         with open_client(client_settings(ZenohSection(listen=(endpoint,)))) as session:
             killer.start()
-            with pytest.raises(NoAnswerError, match="has gone before it answered"):
+            with pytest.raises(NoAnswerError, match="has gone"):
                 send_command(session, "alpha", "orbit", timeout_s=60.0)
         assert time.monotonic() - killed_s < 2.0
         killer.join()
@@ -312,7 +311,7 @@ def test_a_service_that_is_killed_is_gone_for_a_waiting_sender() -> None:
         ours.close()
 
 
-async def test_another_vehicle_s_name_is_no_service_here() -> None:
+async def test_unknown_vehicle_has_no_service() -> None:
     settings = ZenohSection(listen=(f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}",))
     bus = Bus(settings, "alpha", on_event=Events(), on_command=refuse)
     await bus.start()
@@ -321,7 +320,7 @@ async def test_another_vehicle_s_name_is_no_service_here() -> None:
         def other_side() -> None:
             with (
                 open_client(client_settings(settings)) as session,
-                pytest.raises(NoAnswerError, match="no service for vehicle 'beta'"),
+                pytest.raises(NoAnswerError, match="'beta'"),
             ):
                 send_command(session, "beta", "hold")
 

@@ -23,7 +23,7 @@ class FlightWithGimbal(LiveFlight):
 
     def on_step(self, now_ns: int) -> None:
         nothing = Detections.empty(("car",))
-        self._view.take(PerceptionResult(0, now_ns, now_ns, 640, 480, nothing, {}, 0))
+        self._view.update(PerceptionResult(0, now_ns, now_ns, 640, 480, nothing, {}, 0))
 
     @property
     def gimbal(self) -> GimbalState:

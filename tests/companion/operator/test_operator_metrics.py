@@ -1,4 +1,4 @@
-"""The service's numbers, as a monitoring system fetches them."""
+"""The service's Prometheus metrics over HTTP."""
 
 from __future__ import annotations
 
@@ -16,16 +16,14 @@ from tests.companion.service_process import running_service
 
 
 def fetch(port: int) -> dict[str, float]:
-    """Every line of the answer: name with its labels → value."""
+    """Return all metrics: name with its labels → value."""
     with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=10) as answer:
         lines = answer.read().decode().splitlines()
     pairs = (line.rpartition(" ") for line in lines if line and not line.startswith("#"))
     return {name: float(value) for name, _, value in pairs}
 
 
-def test_a_running_service_tells_its_stages_and_what_became_of_every_frame(
-    seeing: list[str], tmp_path: Path
-) -> None:
+def test_metrics_of_a_running_service(seeing: list[str], tmp_path: Path) -> None:
     port = free_port(socket.SOCK_STREAM)
     flags = [*seeing, "--metrics-listen", f"127.0.0.1:{port}", "--detector-rate-hz", "4"]
     with (
@@ -49,7 +47,7 @@ def test_a_running_service_tells_its_stages_and_what_became_of_every_frame(
         fetch(port)
 
 
-def test_before_the_first_status_the_answer_is_empty_and_afterwards_the_port_is_free() -> None:
+def test_metrics_are_empty_before_the_first_status() -> None:
     server = MetricsServer("127.0.0.1:0", lambda: None)
     port = server.port
     assert fetch(port) == {}
@@ -57,25 +55,25 @@ def test_before_the_first_status_the_answer_is_empty_and_afterwards_the_port_is_
     MetricsServer(f"127.0.0.1:{port}", lambda: None).close()
 
 
-def test_an_address_that_is_taken_is_one_clear_line() -> None:
+def test_busy_metrics_address_is_reported() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         where = f"127.0.0.1:{taken.getsockname()[1]}"
-        with pytest.raises(MetricsError, match=f"cannot be served on {where}: .*in use"):
+        with pytest.raises(MetricsError, match=f"{where}: .*in use"):
             MetricsServer(where, lambda: None)
 
 
-def test_without_the_library_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_library_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "prometheus_client", None)
     with pytest.raises(MetricsError, match=r"pip install 'mavlink-companion\[metrics\]'"):
         MetricsServer("127.0.0.1:0", lambda: None)
 
 
-def test_a_scraper_that_reads_nothing_holds_nobody_up() -> None:
+def test_stalled_scraper_does_not_block_others() -> None:
     server = MetricsServer("127.0.0.1:0", lambda: None)
     with (
-        socket.create_connection(("127.0.0.1", server.port)),  # asks nothing
+        socket.create_connection(("127.0.0.1", server.port)),  # sends nothing
         socket.create_connection(("127.0.0.1", server.port)) as stalled,
     ):
         stalled.sendall(b"GET /metrics HTTP/1.1\r\nHost: here\r\n\r\n" * 100)

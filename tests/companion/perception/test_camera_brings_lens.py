@@ -1,4 +1,4 @@
-"""`mavlink-sim --camera front` and a view of `shm://front`, with nothing said about the lens."""
+"""`mavlink-sim --camera front` and a view of `shm://front`, without lens settings."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def front() -> Iterator[str]:
 
 
 def started_view(front: str, **camera: str) -> tuple[WorkerView, list[tuple[str, str]], int]:
-    """A view after its start, what it said, and how often its camera changed."""
+    """Start and stop a view; return it, its events, and how often its camera settings changed."""
     events: list[tuple[str, str]] = []
     changes = 0
 
@@ -59,7 +59,7 @@ def started_view(front: str, **camera: str) -> tuple[WorkerView, list[tuple[str,
 
 
 def ground_range_m(view: WorkerView, true_m: float) -> float:
-    """What the view makes of a ground point so far ahead of a level vehicle; NaN above the horizon."""
+    """The view's range of a ground point at `true_m` ahead of a level vehicle; NaN above the horizon."""
     eye = DEFAULT_MOUNT.position_frd_m
     offset = np.array([[true_m, 0.0, HEIGHT_M]]) - eye
     pixels = DEFAULT_CAMERA.project(offset @ DEFAULT_MOUNT.ned_from_optical(np.eye(3)))
@@ -68,7 +68,7 @@ def ground_range_m(view: WorkerView, true_m: float) -> float:
     return float(PixelRays.of(model, camera.mount(), np.eye(3), pixels).on_ground(HEIGHT_M)[0, 0])
 
 
-def test_a_ground_point_has_its_true_range_without_settings(front: str) -> None:
+def test_ground_point_has_its_true_range_without_settings(front: str) -> None:
     view, events, changes = started_view(front)
     assert changes == 1
     assert [level for level, _ in events if level != "info"] == []
@@ -76,7 +76,7 @@ def test_a_ground_point_has_its_true_range_without_settings(front: str) -> None:
         assert ground_range_m(view, true_m) == pytest.approx(true_m, abs=0.01)
 
 
-def test_a_setting_that_says_otherwise_is_one_warning(front: str) -> None:
+def test_conflicting_setting_is_one_warning(front: str) -> None:
     view, events, _ = started_view(front, horizontal_fov_deg="80", mount_pitch_deg="0")
     ((level, text),) = [event for event in events if event[0] != "info"]
     assert level == "warning"

@@ -1,4 +1,4 @@
-"""The supervisor against real workers: real processes, real files, a real (tiny, untrained) network."""
+"""The supervisor with real workers: real processes, files and a tiny, untrained network."""
 
 from __future__ import annotations
 
@@ -49,14 +49,14 @@ def photos(tmp_path: Path) -> Path:
     return folder
 
 
-class Heard:
-    """What a supervisor told."""
+class Recorder:
+    """Records a supervisor's results and events."""
 
     def __init__(self) -> None:
         self.results: list[PerceptionResult] = []
         self.events: list[tuple[str, str]] = []
 
-    def said(self, words: str) -> bool:
+    def has_event(self, words: str) -> bool:
         return any(words in text for _, text in self.events)
 
 
@@ -84,14 +84,14 @@ def settings_of(source: Path | str, model: Path | None = None, /, **overrides: s
 
 
 @asynccontextmanager
-async def kept(settings: Settings) -> AsyncIterator[tuple[PerceptionSupervisor, Heard]]:
-    heard = Heard()
+async def supervised(settings: Settings) -> AsyncIterator[tuple[PerceptionSupervisor, Recorder]]:
+    recorder = Recorder()
     supervisor = PerceptionSupervisor(
-        settings, on_result=heard.results.append, on_event=lambda *event: heard.events.append(event)
+        settings, on_result=recorder.results.append, on_event=lambda *event: recorder.events.append(event)
     )
     await supervisor.start()
     try:
-        yield supervisor, heard
+        yield supervisor, recorder
     finally:
         await supervisor.stop()
 
@@ -104,25 +104,26 @@ def alive(pid: int) -> bool:
     return state != "Z"
 
 
-async def test_results_come_with_the_models_classes_their_stamps_and_their_timing(
-    photos: Path, tiny_model: Path
-) -> None:
-    async with kept(settings_of(photos, tiny_model, **{"detector.confidence": "0"})) as (supervisor, heard):
-        await until(lambda: len(heard.results) >= 5)
+async def test_results_have_classes_stamps_and_timing(photos: Path, tiny_model: Path) -> None:
+    async with supervised(settings_of(photos, tiny_model, **{"detector.confidence": "0"})) as (
+        supervisor,
+        recorder,
+    ):
+        await until(lambda: len(recorder.results) >= 5)
         status = supervisor.status
-        first = heard.results[0]
+        first = recorder.results[0]
         assert supervisor.class_names == status.class_names == ("car", "person")
         assert status.state is PerceptionState.RUNNING
-        assert status.results == len(heard.results)
+        assert status.results == len(recorder.results)
         assert status.frames >= status.results
         assert status.rate_hz > 0
         assert status.age_s is not None
-        assert status.newest is heard.results[-1]
+        assert status.newest is recorder.results[-1]
         assert (first.width, first.height) == (64, 48)
         assert first.captured_ns < first.inferred_ns < time.monotonic_ns()
         assert {"preprocess", "inference", "postprocess", "range", "total"} <= first.timing_ms.keys()
         assert len(first.detections) > 0
-        sequences = [result.sequence for result in heard.results]
+        sequences = [result.sequence for result in recorder.results]
         assert sequences == sorted(set(sequences))
         pid = status.pid
         assert pid is not None
@@ -131,67 +132,65 @@ async def test_results_come_with_the_models_classes_their_stamps_and_their_timin
     assert supervisor.status.pid is None
 
 
-async def test_a_worker_on_an_exported_model_never_loads_torch(photos: Path, exported_model: Path) -> None:
-    async with kept(settings_of(photos, exported_model)) as (supervisor, heard):
-        await until(lambda: heard.results)
+async def test_worker_with_exported_model_does_not_load_torch(photos: Path, exported_model: Path) -> None:
+    async with supervised(settings_of(photos, exported_model)) as (supervisor, recorder):
+        await until(lambda: recorder.results)
         pid = supervisor.status.pid
         loaded = await asyncio.to_thread(Path(f"/proc/{pid}/maps").read_text)
     assert "onnxruntime" in loaded
     assert "libtorch" not in loaded
 
 
-async def test_without_a_detector_frames_come_and_nothing_is_seen(photos: Path) -> None:
-    async with kept(settings_of(photos)) as (supervisor, heard):
-        await until(lambda: len(heard.results) >= 3)
-        assert all(len(result.detections) == 0 for result in heard.results)
+async def test_without_a_detector_results_are_empty(photos: Path) -> None:
+    async with supervised(settings_of(photos)) as (supervisor, recorder):
+        await until(lambda: len(recorder.results) >= 3)
+        assert all(len(result.detections) == 0 for result in recorder.results)
         assert supervisor.class_names == ()
 
 
-async def test_frames_between_are_left_out_as_asked(photos: Path) -> None:
-    async with kept(settings_of(photos, **{"detector.every": "5"})) as (supervisor, heard):
-        await until(lambda: len(heard.results) >= 4)
+async def test_detector_every_skips_frames(photos: Path) -> None:
+    async with supervised(settings_of(photos, **{"detector.every": "5"})) as (supervisor, recorder):
+        await until(lambda: len(recorder.results) >= 4)
         dropped = supervisor.status.dropped
-        gaps = np.diff([result.sequence for result in heard.results])
+        gaps = np.diff([result.sequence for result in recorder.results])
         assert gaps.min() >= 5
         assert gaps.sum() <= 5 * len(gaps) + dropped
 
 
-async def test_the_end_of_the_source_is_the_end_and_not_a_loss(photos: Path) -> None:
+async def test_end_of_source_finishes_perception(photos: Path) -> None:
     settings = settings_of(photos, **{"source.loop": "false"})
-    async with kept(settings) as (supervisor, heard):
+    async with supervised(settings) as (supervisor, recorder):
         await until(lambda: supervisor.status.state is PerceptionState.FINISHED)
-        assert heard.events[-1][0] == "info"
-        assert "end of stream" in heard.events[-1][1]
+        assert recorder.events[-1][0] == "info"
+        assert "end of stream" in recorder.events[-1][1]
         assert supervisor.status.restarts == 0
         assert supervisor.status.frames + supervisor.status.dropped >= 3
 
 
 @pytest.mark.parametrize(
-    ("overrides", "line"),
+    ("overrides", "named"),
     [
-        ({"source.uri": "/nowhere/street.mp4"}, "/nowhere/street.mp4: no such file"),
-        ({"detector.enabled": "true", "detector.model": "/nowhere/m.pt"}, "/nowhere/m.pt: no such file"),
-        ({"detector.enabled": "true", "detector.kind": "rad"}, "'rad'; known: yolo ("),
-        ({"plugins.modules": "no_such_module"}, "no module 'no_such_module'"),
-        ({"recording.video": "/dev/null/v.webm"}, "/dev/null/v.webm: cannot be written: "),
+        ({"source.uri": "/nowhere/street.mp4"}, "/nowhere/street.mp4"),
+        ({"detector.enabled": "true", "detector.model": "/nowhere/m.pt"}, "/nowhere/m.pt"),
+        ({"detector.enabled": "true", "detector.kind": "rad"}, "'rad'"),
+        ({"plugins.modules": "no_such_module"}, "no_such_module"),
+        ({"recording.video": "/dev/null/v.webm"}, "/dev/null/v.webm"),
     ],
 )
-async def test_what_cannot_start_is_told_in_one_line(
-    photos: Path, overrides: dict[str, str], line: str
-) -> None:
+async def test_start_failure_is_one_line(photos: Path, overrides: dict[str, str], named: str) -> None:
     supervisor = PerceptionSupervisor(
         settings_of(photos, **overrides), on_result=lambda _: None, on_event=lambda *_: None
     )
     with pytest.raises(PerceptionStartError) as caught:
         await supervisor.start()
-    assert line in str(caught.value)
+    assert named in str(caught.value)
     assert "\n" not in str(caught.value)
     assert supervisor.status.state is PerceptionState.FAILED
     assert supervisor.status.pid is None
     await supervisor.stop()
 
 
-async def test_an_unknown_class_is_told_with_the_nearest(photos: Path, exported_model: Path) -> None:
+async def test_unknown_class_suggests_the_nearest(photos: Path, exported_model: Path) -> None:
     settings = settings_of(photos, exported_model, **{"detector.classes": "persn"})
     supervisor = PerceptionSupervisor(settings, on_result=lambda _: None, on_event=lambda *_: None)
     with pytest.raises(PerceptionStartError, match=r"'persn'.*person"):
@@ -199,94 +198,89 @@ async def test_an_unknown_class_is_told_with_the_nearest(photos: Path, exported_
     await supervisor.stop()
 
 
-async def test_a_killed_worker_is_replaced_and_the_sequence_goes_on(photos: Path) -> None:
-    async with kept(settings_of(photos)) as (supervisor, heard):
-        await until(lambda: len(heard.results) >= 3)
+async def test_killed_worker_is_replaced_and_sequence_continues(photos: Path) -> None:
+    async with supervised(settings_of(photos)) as (supervisor, recorder):
+        await until(lambda: len(recorder.results) >= 3)
         pid = supervisor.status.pid
         assert pid is not None
         ended = os.pidfd_open(pid)
         os.kill(pid, signal.SIGKILL)
         assert select.select([ended], [], [], DEADLINE_S)[0]
         os.close(ended)
-        # It is told something before the loop can know of its death, as in flight: that must not cost it its
-        # successor.
+        # Writes before its death is detected, as in flight, must not prevent the restart.
         for watched in (True, False, True):
             supervisor.watch(watched)
         await until(lambda: supervisor.status.state is PerceptionState.RESTARTING)
-        before = len(heard.results)
-        await until(lambda: len(heard.results) > before)
-        assert heard.said(f"perception lost: process {pid} was killed by SIGKILL; starting it again (1 of 5)")
-        assert heard.said("perception is back after")
+        before = len(recorder.results)
+        await until(lambda: len(recorder.results) > before)
+        assert recorder.has_event(f"process {pid} was killed by SIGKILL; restarting (1 of 5)")
+        assert recorder.has_event("perception restored")
         assert supervisor.status.restarts == 1
         assert supervisor.status.pid not in (None, pid)
-        sequences = [result.sequence for result in heard.results]
+        sequences = [result.sequence for result in recorder.results]
         assert sequences == sorted(set(sequences))
 
 
-async def test_a_stopped_worker_is_stuck_and_is_replaced(photos: Path) -> None:
-    async with kept(settings_of(photos)) as (supervisor, heard):
-        await until(lambda: len(heard.results) >= 3)
+async def test_stopped_worker_is_stuck_and_replaced(photos: Path) -> None:
+    async with supervised(settings_of(photos)) as (supervisor, recorder):
+        await until(lambda: len(recorder.results) >= 3)
         pid = supervisor.status.pid
         assert pid is not None
         os.kill(pid, signal.SIGSTOP)
-        await until(lambda: heard.said(f"process {pid} is stuck, no message for"))
+        await until(lambda: recorder.has_event(f"process {pid} is stuck"))
         assert not alive(pid)
-        before = len(heard.results)
-        await until(lambda: len(heard.results) > before)
+        before = len(recorder.results)
+        await until(lambda: len(recorder.results) > before)
         assert supervisor.status.state is PerceptionState.RUNNING
 
 
-async def test_a_worker_that_keeps_dying_is_given_up(photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_repeatedly_dying_worker_is_given_up(photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("companion.perception.supervisor._BACK_OFF_S", (0.01,))
-    async with kept(settings_of(photos)) as (supervisor, heard):
+    async with supervised(settings_of(photos)) as (supervisor, recorder):
         while supervisor.status.state is not PerceptionState.FAILED:
             if supervisor.status.pid is not None and supervisor.status.state is PerceptionState.RUNNING:
                 os.kill(supervisor.status.pid, signal.SIGKILL)
                 await until(lambda: supervisor.status.state is not PerceptionState.RUNNING)
             await asyncio.sleep(0.01)
         assert supervisor.status.restarts == 5
-        assert heard.events[-1][0] == "error"
-        assert "perception failed 6 times in 60 s" in heard.events[-1][1]
+        assert recorder.events[-1][0] == "error"
+        assert "6 times in 60 s" in recorder.events[-1][1]
 
 
-async def test_a_stopped_worker_does_not_hold_up_the_end(
-    photos: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_stopped_worker_does_not_block_stop(photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("companion.perception.supervisor.STOP_S", 0.3)
     monkeypatch.setattr("companion.perception.supervisor.TERMINATE_S", 0.3)
-    async with kept(settings_of(photos)) as (supervisor, heard):
+    async with supervised(settings_of(photos)) as (supervisor, recorder):
         pid = supervisor.status.pid
         assert pid is not None
         os.kill(pid, signal.SIGSTOP)
-    assert heard.said(f"perception did not end when asked: process {pid} was killed by SIGKILL")
+    assert recorder.has_event(f"process {pid} was killed by SIGKILL")
     assert not alive(pid)
 
 
-async def test_an_end_that_costs_the_video_is_said_and_silence_is_none_of_its_reasons(
+async def test_incomplete_video_is_reported_at_stop(
     photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("companion.perception.watchdog.SHORTEST_S", 0.3)
     monkeypatch.setattr("companion.perception.supervisor.STOP_S", 1.5)
     monkeypatch.setattr("companion.perception.supervisor.TERMINATE_S", 0.3)
     video = str(tmp_path / "flight.webm")
-    async with kept(settings_of(photos, **{"recording.video": video})) as (supervisor, heard):
+    async with supervised(settings_of(photos, **{"recording.video": video})) as (supervisor, recorder):
         await until(
             lambda: supervisor.status.stuck_after_s is not None and supervisor.status.stuck_after_s < 1.0
         )
         pid = supervisor.status.pid
         assert pid is not None
-        os.kill(pid, signal.SIGSTOP)  # an encoder that takes long is as silent as this
+        os.kill(pid, signal.SIGSTOP)  # as silent as a slow encoder
         await supervisor.stop()
     assert not alive(pid)
-    assert heard.events[-1] == (
-        "warning",
-        f"perception did not end when asked: process {pid} was killed by SIGKILL; "
-        f"the video {video} may not be whole",
-    )
+    level, text = recorder.events[-1]
+    assert level == "warning"
+    assert f"process {pid} was killed by SIGKILL; the video {video}" in text
 
 
-async def test_a_worker_that_dies_while_it_ends_is_told(photos: Path) -> None:
-    async with kept(settings_of(photos)) as (supervisor, heard):
+async def test_worker_death_during_stop_is_reported(photos: Path) -> None:
+    async with supervised(settings_of(photos)) as (supervisor, recorder):
         pid = supervisor.status.pid
         assert pid is not None
         os.kill(pid, signal.SIGSTOP)
@@ -294,18 +288,18 @@ async def test_a_worker_that_dies_while_it_ends_is_told(photos: Path) -> None:
         await asyncio.sleep(0)
         os.kill(pid, signal.SIGKILL)
         await stopping
-    assert heard.said(f"perception did not end in order: process {pid} was killed by SIGKILL")
+    assert recorder.has_event(f"process {pid} was killed by SIGKILL")
 
 
-async def test_a_worker_that_ends_in_order_is_no_news(photos: Path, tmp_path: Path) -> None:
+async def test_normal_end_is_not_reported(photos: Path, tmp_path: Path) -> None:
     video = tmp_path / "flight.webm"
-    async with kept(settings_of(photos, **{"recording.video": str(video)})) as (_, heard):
-        await until(lambda: len(heard.results) >= 3)
-    assert [level for level, _ in heard.events] == ["info"]
+    async with supervised(settings_of(photos, **{"recording.video": str(video)})) as (_, recorder):
+        await until(lambda: len(recorder.results) >= 3)
+    assert [level for level, _ in recorder.events] == ["info"]
     assert video.stat().st_size > 0
 
 
-async def test_a_start_that_is_cancelled_leaves_no_process(photos: Path, exported_model: Path) -> None:
+async def test_cancelled_start_leaves_no_process(photos: Path, exported_model: Path) -> None:
     supervisor = PerceptionSupervisor(
         settings_of(photos, exported_model), on_result=lambda _: None, on_event=lambda *_: None
     )
@@ -319,23 +313,24 @@ async def test_a_start_that_is_cancelled_leaves_no_process(photos: Path, exporte
     assert not alive(pid)
 
 
-async def test_a_callback_that_fails_is_told_and_leaves_no_process(photos: Path) -> None:
+async def test_failing_callback_is_reported(photos: Path) -> None:
     events: list[tuple[str, str]] = []
 
     def broken(_result: PerceptionResult) -> None:
-        raise ZeroDivisionError("a fault of the service")
+        raise ZeroDivisionError
 
     supervisor = PerceptionSupervisor(
         settings_of(photos), on_result=broken, on_event=lambda *event: events.append(event)
     )
     await supervisor.start()
     await until(lambda: supervisor.status.state is PerceptionState.FAILED)
-    assert events[-1] == ("error", "perception failed: ZeroDivisionError: a fault of the service")
+    assert events[-1][0] == "error"
+    assert "ZeroDivisionError" in events[-1][1]
     assert supervisor.status.pid is None
     await supervisor.stop()
 
 
-async def test_warnings_of_the_worker_are_events_and_lesser_lines_are_log(
+async def test_worker_warnings_are_events_and_other_lines_logged(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, exported_model: Path
 ) -> None:
     folder = tmp_path / "photos"
@@ -343,35 +338,36 @@ async def test_warnings_of_the_worker_are_events_and_lesser_lines_are_log(
     cv2.imwrite(str(folder / "0.png"), np.zeros((48, 64, 3), np.uint8))
     (folder / "1.png").write_bytes(b"\x89PNG broken")
     caplog.set_level("INFO")
-    async with kept(settings_of(folder, exported_model, **{"source.loop": "false"})) as (supervisor, heard):
+    async with supervised(settings_of(folder, exported_model, **{"source.loop": "false"})) as (
+        supervisor,
+        recorder,
+    ):
         await until(lambda: supervisor.status.state is PerceptionState.FINISHED)
-        assert any(level == "warning" and "1.png" in text for level, text in heard.events)
+        assert any(level == "warning" and "1.png" in text for level, text in recorder.events)
         assert any(record.name == "vision.detector" for record in caplog.records)
 
 
-async def test_the_video_is_finished_at_the_end_with_the_lines_of_the_service(
-    photos: Path, tmp_path: Path
-) -> None:
-    path = tmp_path / "film" / "flight.webm"
+async def test_video_is_finished_at_stop(photos: Path, tmp_path: Path) -> None:
+    path = tmp_path / "video" / "flight.webm"
     settings = settings_of(photos, **{"recording.video": str(path)})
-    async with kept(settings) as (supervisor, heard):
+    async with supervised(settings) as (supervisor, recorder):
         supervisor.send_hud(("seek car", "height 5.0 m"), "car")
-        await until(lambda: len(heard.results) >= 20)
+        await until(lambda: len(recorder.results) >= 20)
     with open_source(str(path), SourceSettings()) as source:
         assert len(list(source)) >= 3
 
 
-async def test_a_replaced_worker_films_into_a_file_of_its_own(photos: Path, tmp_path: Path) -> None:
+async def test_replaced_worker_records_into_a_new_file(photos: Path, tmp_path: Path) -> None:
     settings = settings_of(photos, **{"recording.video": str(tmp_path / "flight.webm")})
-    async with kept(settings) as (supervisor, heard):
-        await until(lambda: len(heard.results) >= 3)
+    async with supervised(settings) as (supervisor, recorder):
+        await until(lambda: len(recorder.results) >= 3)
         assert supervisor.status.pid is not None
         os.kill(supervisor.status.pid, signal.SIGKILL)
         await until(
             lambda: supervisor.status.restarts == 1 and supervisor.status.state is PerceptionState.RUNNING
         )
-        before = len(heard.results)
-        await until(lambda: len(heard.results) > before + 3)
+        before = len(recorder.results)
+        await until(lambda: len(recorder.results) > before + 3)
     assert (tmp_path / "flight.webm").exists()
     with open_source(str(tmp_path / "flight-2.webm"), SourceSettings()) as source:
         assert len(list(source)) >= 1
@@ -414,9 +410,7 @@ def wait_for_line(process: subprocess.Popen[str], beginning: str) -> str:
     raise AssertionError(f"it ended without a line {beginning!r}")
 
 
-def test_a_worker_dies_with_a_service_that_is_killed_and_torch_stays_in_the_worker(
-    photos: Path, tiny_model: Path
-) -> None:
+def test_worker_dies_with_a_killed_service(photos: Path, tiny_model: Path) -> None:
     arguments = [f"source.uri={photos}", "source.loop=true", f"detector.model={tiny_model}"]
     with service(subprocess.DEVNULL, *arguments) as process:
         _, pid, torch_in_service = wait_for_line(process, "pid").split()
@@ -439,7 +433,7 @@ RAW = (
 )
 
 
-def test_frames_come_from_the_services_own_standard_input() -> None:
+def test_frames_from_the_services_standard_input() -> None:
     ours, theirs = os.pipe()
     with service(ours, *RAW, "source.every_frame=yes") as process:
         os.close(ours)
@@ -449,14 +443,14 @@ def test_frames_come_from_the_services_own_standard_input() -> None:
         assert wait_for_line(process, "state") == "state finished 20"
 
 
-def test_a_file_as_standard_input_is_read_whole(tmp_path: Path) -> None:
+def test_file_as_standard_input_is_read_whole(tmp_path: Path) -> None:
     path = tmp_path / "frames.bgr"
     path.write_bytes(bytes(64 * 48 * 3 * 7))
     with path.open("rb") as file, service(file.fileno(), *RAW) as process:
         assert wait_for_line(process, "state") == "state finished 7"
 
 
-def test_a_killed_worker_does_not_cost_the_place_in_standard_input() -> None:
+def test_killed_worker_keeps_the_position_in_standard_input() -> None:
     ours, theirs = os.pipe()
     with service(ours, *RAW) as process:
         os.close(ours)
@@ -475,7 +469,7 @@ def test_a_killed_worker_does_not_cost_the_place_in_standard_input() -> None:
                 pid = int(wait_for_line(process, "pid").split()[1])
                 wait_for_line(process, "result")
                 os.kill(pid, signal.SIGKILL)
-                wait_for_line(process, "event perception is back")
+                wait_for_line(process, "event perception restored")
                 wait_for_line(process, "result")
             finally:
                 stop.set()
@@ -483,12 +477,12 @@ def test_a_killed_worker_does_not_cost_the_place_in_standard_input() -> None:
         assert wait_for_line(process, "state").startswith("state finished")
 
 
-async def test_a_supervisor_is_stopped_as_often_as_one_likes_and_started_once(photos: Path) -> None:
+async def test_supervisor_starts_once_and_stops_repeatedly(photos: Path) -> None:
     supervisor = PerceptionSupervisor(settings_of(photos), on_result=lambda _: None, on_event=lambda *_: None)
     await supervisor.stop()
     await supervisor.start()
     await supervisor.stop()
     await supervisor.stop()
     assert supervisor.status.state is PerceptionState.STOPPED
-    with pytest.raises(RuntimeError, match="started once"):
+    with pytest.raises(RuntimeError, match="only once"):
         await supervisor.start()

@@ -1,7 +1,7 @@
 from companion.perception.timing import WINDOW, StageTimes
 
 
-def test_the_median_and_the_slow_end_of_each_stage_are_those_of_the_newest_results() -> None:
+def test_quantiles_are_of_the_newest_results() -> None:
     times = StageTimes()
     assert times.quantile_ms(0.5) == {}
     for _ in range(WINDOW):

@@ -1,4 +1,4 @@
-"""Tracks on their way from the worker to the service, and the vehicle's attitude on its way there."""
+"""Tracks from the worker to the service, and attitudes from the service to the worker."""
 
 from __future__ import annotations
 
@@ -55,53 +55,53 @@ def result(sequence: int, *events: TrackEvent, ids: tuple[int, ...] = ()) -> Per
     return PerceptionResult(sequence, sequence * 1000, 0, 64, 48, detections, {}, 0, events)
 
 
-def ids_in(taken: PerceptionResult) -> list[int]:
-    assert taken.detections.track_id is not None
-    ids: list[int] = taken.detections.track_id.tolist()
+def ids_in(result: PerceptionResult) -> list[int]:
+    assert result.detections.track_id is not None
+    ids: list[int] = result.detections.track_id.tolist()
     return ids
 
 
-def kinds(taken: PerceptionResult) -> list[tuple[TrackEventKind, int]]:
-    return [(event.kind, event.track.track_id) for event in taken.track_events]
+def kinds(result: PerceptionResult) -> list[tuple[TrackEventKind, int]]:
+    return [(event.kind, event.track.track_id) for event in result.track_events]
 
 
-def test_what_a_dead_worker_followed_has_ended_with_the_next_ones_first_result() -> None:
+def test_tracks_of_a_dead_worker_end() -> None:
     tracks = LiveTracks()
-    tracks.take(result(1, event(NEW, 1), event(NEW, 2), event(NEW, 3)))
-    tracks.take(result(2, event(UPDATE, 1), event(LOST, 2), event(END, 3)))
+    tracks.update(result(1, event(NEW, 1), event(NEW, 2), event(NEW, 3)))
+    tracks.update(result(2, event(UPDATE, 1), event(LOST, 2), event(END, 3)))
     assert len(tracks) == 2
     tracks.worker_ended()
     assert len(tracks) == 0
-    first = tracks.take(result(9, event(NEW, 4)))
+    first = tracks.update(result(9, event(NEW, 4)))
     assert kinds(first) == [(END, 1), (END, 2), (NEW, 4)]
     assert [event.stamp_ns for event in first.track_events[:2]] == [9000, 9000]
-    assert kinds(tracks.take(result(10))) == []
+    assert kinds(tracks.update(result(10))) == []
 
 
-def test_two_workers_that_die_before_a_result_lose_nothing() -> None:
+def test_tracks_end_once_after_two_dead_workers() -> None:
     tracks = LiveTracks()
-    tracks.take(result(1, event(NEW, 1)))
+    tracks.update(result(1, event(NEW, 1)))
     tracks.worker_ended()
     tracks.worker_ended()
-    assert kinds(tracks.take(result(2))) == [(END, 1)]
+    assert kinds(tracks.update(result(2))) == [(END, 1)]
 
 
-def test_the_next_worker_numbers_above_every_number_that_was_seen() -> None:
+def test_next_worker_has_new_track_ids() -> None:
     tracks = LiveTracks()
     assert tracks.next_id == 1
-    tracks.take(result(1, ids=(NO_TRACK, 12, 5)))
+    tracks.update(result(1, ids=(NO_TRACK, 12, 5)))
     assert tracks.next_id == 13
-    tracks.take(result(2, event(NEW, 30)))
-    tracks.take(result(3, event(END, 30), ids=(4,)))
+    tracks.update(result(2, event(NEW, 30)))
+    tracks.update(result(3, event(END, 30), ids=(4,)))
     assert tracks.next_id == 31
 
 
-def test_events_of_a_result_that_is_replaced_come_with_the_newer_one() -> None:
+def test_events_of_a_replaced_result_are_merged() -> None:
     ours, theirs = socket.socketpair()
     ours.settimeout(30)
     with ours, theirs:
         sender = ResultSender(theirs, on_lost=lambda: None)
-        # Larger than the socket takes, so that everything after it waits.
+        # Larger than the socket's buffer, so that everything after it waits.
         filler = Detections.empty(tuple(f"{number:01000}" for number in range(2000)))
         sender.put_newest(Report(PerceptionResult(0, 0, 0, 64, 48, filler, {}, 0), 1, 0))
         sender.put_newest(Report(result(1, event(NEW, 1), event(UPDATE, 2)), 2, 0))
@@ -117,7 +117,7 @@ def test_events_of_a_result_that_is_replaced_come_with_the_newer_one() -> None:
     assert kinds(second.result) == [(NEW, 1), (LOST, 2), (UPDATE, 1), (END, 2)]
 
 
-def test_the_worker_takes_attitudes_beside_other_orders() -> None:
+def test_worker_receives_attitudes() -> None:
     ours, theirs = socket.socketpair()
     with ours, theirs:
         control = ControlChannel(theirs)
@@ -153,7 +153,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def settings(tmp_path: Path, model: Path) -> Settings:
-    """A still picture in which an untrained network sees the same nonsense in every frame: tracks of it."""
+    """A still image, in which an untrained network gives the same detections in every frame."""
     folder = tmp_path / "photos"
     folder.mkdir()
     cv2.imwrite(str(folder / "0.png"), np.full((48, 64, 3), 90, np.uint8))
@@ -177,37 +177,34 @@ def settings(tmp_path: Path, model: Path) -> Settings:
 async def until(condition: Callable[[], object]) -> None:
     deadline_s = time.monotonic() + DEADLINE_S
     while not condition():
-        assert time.monotonic() < deadline_s, "it did not happen in time"
+        assert time.monotonic() < deadline_s, "timeout"
         await asyncio.sleep(0.01)
 
 
-async def test_a_worker_tracks_by_the_vehicles_attitude_and_the_one_after_it_takes_other_numbers(
+async def test_worker_tracks_by_attitude_and_restarts_with_new_ids(
     settings: Settings,
 ) -> None:
     results: list[PerceptionResult] = []
     supervisor = PerceptionSupervisor(settings, on_result=results.append, on_event=lambda *_: None)
 
-    def told(kind: TrackEventKind) -> list[int]:
+    def ids_of(kind: TrackEventKind) -> list[int]:
         return [e.track.track_id for r in results for e in r.track_events if e.kind is kind]
 
     def spun() -> bool:
-        """Tell the attitude of a vehicle that looks the other way at once, again and again.
-
-        Whatever the time between two frames, a step of 143 degrees between them leaves nothing in view.
-        """
+        """Send attitudes that alternate by 143 degrees, so that no object stays in view between frames."""
         now_ns = time.monotonic_ns()
         yaw_rad = 2.5 * (now_ns // 500_000_000 % 2)
         supervisor.send_attitude(now_ns, quaternion_from_euler(0.0, 0.0, yaw_rad))
-        return bool(told(END))
+        return bool(ids_of(END))
 
     await supervisor.start()
     try:
         await until(lambda: len(results) >= 5)
-        assert told(NEW)
-        assert told(END) == []
-        assert supervisor.status.tracks == len(told(NEW))
+        assert ids_of(NEW)
+        assert ids_of(END) == []
+        assert supervisor.status.tracks == len(ids_of(NEW))
         assert results[-1].timing_ms["track"] > 0
-        assert set(ids_in(results[-1])) >= set(told(NEW))
+        assert set(ids_in(results[-1])) >= set(ids_of(NEW))
 
         await until(spun)
 
@@ -215,7 +212,7 @@ async def test_a_worker_tracks_by_the_vehicles_attitude_and_the_one_after_it_tak
         assert pid is not None
         os.kill(pid, signal.SIGKILL)
         await until(lambda: supervisor.status.state is PerceptionState.RESTARTING)
-        before, live = len(results), set(told(NEW)) - set(told(END))
+        before, live = len(results), set(ids_of(NEW)) - set(ids_of(END))
         await until(lambda: len(results) > before + 3)
         after = results[before:]
         ends = [e.track.track_id for e in after[0].track_events if e.kind is END]
@@ -226,42 +223,42 @@ async def test_a_worker_tracks_by_the_vehicles_attitude_and_the_one_after_it_tak
         await supervisor.stop()
 
 
-class Turned:
-    """Stands where the process is and keeps what it is told."""
+class AttitudeRecorder:
+    """Replaces the process and records the stamps of the attitudes."""
 
     def __init__(self) -> None:
         self.stamps_ns: list[int] = []
 
-    def turn(self, attitude: Attitude) -> None:
+    def send_attitude(self, attitude: Attitude) -> None:
         self.stamps_ns.append(attitude.stamp_ns)
 
 
-def supervisor_with(told: Turned, **overrides: str) -> PerceptionSupervisor:
+def supervisor_with(recorder: AttitudeRecorder, **overrides: str) -> PerceptionSupervisor:
     settings = load_settings(os.devnull, overrides, {})
     supervisor = PerceptionSupervisor(settings, on_result=lambda _: None, on_event=lambda *_: None)
-    supervisor._process = told  # type: ignore[assignment]
+    supervisor._process = recorder  # type: ignore[assignment]
     return supervisor
 
 
 @pytest.mark.parametrize("rate_hz", [30, 50, 77, 250])
-def test_at_most_fifty_attitudes_a_second_go_to_the_worker_and_none_twice(rate_hz: int) -> None:
-    told = Turned()
-    supervisor = supervisor_with(told)
+def test_attitudes_are_limited_to_fifty_a_second(rate_hz: int) -> None:
+    recorder = AttitudeRecorder()
+    supervisor = supervisor_with(recorder)
     rng = np.random.default_rng(rate_hz)
     for step in range(4 * rate_hz):
         stamp_ns = round((1.0 + step / rate_hz + rng.uniform(0, 0.2) / rate_hz) * 1e9)
-        for _ in range(2):  # other telemetry comes with the same attitude
+        for _ in range(2):  # other telemetry repeats the same attitude
             supervisor.send_attitude(stamp_ns, (1.0, 0.0, 0.0, 0.0))
-    assert (np.diff(told.stamps_ns) > 0).all()
-    assert 0.85 * 4 * min(rate_hz, 50) <= len(told.stamps_ns) <= 4 * min(rate_hz, 50) + 2
+    assert (np.diff(recorder.stamps_ns) > 0).all()
+    assert 0.85 * 4 * min(rate_hz, 50) <= len(recorder.stamps_ns) <= 4 * min(rate_hz, 50) + 2
 
 
 @pytest.mark.parametrize(
     ("detector", "obstacles", "wanted"),
     [("false", "off", False), ("false", "auto", True), ("true", "off", True), ("true", "auto", True)],
 )
-def test_an_attitude_nobody_wants_is_not_sent(detector: str, obstacles: str, wanted: bool) -> None:
-    told = Turned()
-    supervisor = supervisor_with(told, **{"detector.enabled": detector, "guidance.obstacles": obstacles})
+def test_attitude_is_sent_only_if_needed(detector: str, obstacles: str, wanted: bool) -> None:
+    recorder = AttitudeRecorder()
+    supervisor = supervisor_with(recorder, **{"detector.enabled": detector, "guidance.obstacles": obstacles})
     supervisor.send_attitude(1, (1.0, 0.0, 0.0, 0.0))
-    assert told.stamps_ns == ([1] if wanted else [])
+    assert recorder.stamps_ns == ([1] if wanted else [])

@@ -1,4 +1,4 @@
-"""The worker's side of the socket: what it does when the service is slow, silent or gone."""
+"""The worker's side of the sockets: a slow, silent or lost service."""
 
 from __future__ import annotations
 
@@ -63,12 +63,12 @@ def everything(connection: socket.socket) -> list[Message]:
     return messages
 
 
-def test_a_service_that_does_not_read_never_holds_up_the_loop_and_gets_the_newest(
+def test_slow_service_gets_the_newest_result(
     ends: tuple[socket.socket, socket.socket],
 ) -> None:
     service, worker = ends
     sender = ResultSender(worker, on_lost=lambda: None)
-    count = 5000  # far more than the socket takes
+    count = 5000  # far more than the socket holds
     for sequence in range(count):
         sender.put_newest(report(sequence))
     closing = threading.Thread(target=sender.close, args=(Ended(True, "done", count), 30.0))
@@ -82,19 +82,19 @@ def test_a_service_that_does_not_read_never_holds_up_the_loop_and_gets_the_newes
     assert sequences == sorted(set(sequences))
 
 
-def test_a_result_has_left_when_it_was_put(ends: tuple[socket.socket, socket.socket]) -> None:
+def test_result_is_sent_at_once(ends: tuple[socket.socket, socket.socket]) -> None:
     service, worker = ends
     sender = ResultSender(worker, on_lost=lambda: None)
     service.setblocking(False)
     for sequence in range(100):
         sender.put_newest(report(sequence))
-        message = receive(service)  # nothing there would be a BlockingIOError
+        message = receive(service)  # BlockingIOError if nothing was sent
         assert isinstance(message, Report)
         assert (message.result.sequence, message.replaced) == (sequence, 0)
     sender.close(Ended(True, "done", 100), 30.0)
 
 
-def test_what_the_socket_takes_in_part_comes_whole_and_before_what_follows(
+def test_partially_sent_message_is_completed_in_order(
     ends: tuple[socket.socket, socket.socket],
 ) -> None:
     service, worker = ends
@@ -116,7 +116,7 @@ def test_what_the_socket_takes_in_part_comes_whole_and_before_what_follows(
     assert last == Ended(True, "done", 2)
 
 
-def test_a_heartbeat_never_takes_the_place_of_a_result(ends: tuple[socket.socket, socket.socket]) -> None:
+def test_heartbeat_never_replaces_a_result(ends: tuple[socket.socket, socket.socket]) -> None:
     service, worker = ends
     sender = ResultSender(worker, on_lost=lambda: None)
     for _ in range(2000):
@@ -131,7 +131,7 @@ def test_a_heartbeat_never_takes_the_place_of_a_result(ends: tuple[socket.socket
     assert reports[-1].result.sequence == 7
 
 
-def test_the_end_is_told_last_and_lines_keep_their_order(
+def test_end_is_last_and_lines_keep_their_order(
     ends: tuple[socket.socket, socket.socket], capfd: pytest.CaptureFixture[str]
 ) -> None:
     service, worker = ends
@@ -148,10 +148,10 @@ def test_the_end_is_told_last_and_lines_keep_their_order(
     assert second == LogLine(logging.INFO, "vision.test", "second")
     assert third == LogLine(logging.ERROR, "vision.test", "a fault")
     assert last == Ended(False, "broken", 4)
-    assert capfd.readouterr().err == "ValueError: of ours\n"  # where it happened is not for the bus
+    assert capfd.readouterr().err == "ValueError: of ours\n"  # the traceback is not sent to the service
 
 
-def test_a_service_that_is_gone_is_noticed(ends: tuple[socket.socket, socket.socket]) -> None:
+def test_lost_service_is_detected(ends: tuple[socket.socket, socket.socket]) -> None:
     service, worker = ends
     gone = threading.Event()
     sender = ResultSender(worker, on_lost=gone.set)
@@ -161,14 +161,14 @@ def test_a_service_that_is_gone_is_noticed(ends: tuple[socket.socket, socket.soc
     sender.close(Ended(True, "done", 0), 30.0)
 
 
-def test_a_signal_in_the_middle_of_being_told_to_stop_does_no_harm(
+def test_signal_during_stop_is_harmless(
     ends: tuple[socket.socket, socket.socket],
 ) -> None:
     service, worker = ends
     control = ControlChannel(worker)
 
     def signalled(*_: object) -> Any:
-        """At every line: a second signal may find the first one's handler at work."""
+        """Called at every line: a second signal may interrupt the handler of the first."""
         control.stop()
         return signalled
 
@@ -182,11 +182,11 @@ def test_a_signal_in_the_middle_of_being_told_to_stop_does_no_harm(
     assert control.stopping
     service.close()
     for thread in threading.enumerate():
-        if thread.name == "inbox":
+        if thread.name == "control":
             thread.join(30)
 
 
-def test_messages_of_any_size_come_through_in_pieces(ends: tuple[socket.socket, socket.socket]) -> None:
+def test_large_messages_are_received_in_pieces(ends: tuple[socket.socket, socket.socket]) -> None:
     service, worker = ends
     message = Hud(("x" * 300_000,), None)
     sending = threading.Thread(target=worker.sendall, args=(packed(message) * 2,))
@@ -196,24 +196,24 @@ def test_messages_of_any_size_come_through_in_pieces(ends: tuple[socket.socket, 
     sending.join()
 
 
-def test_what_is_no_message_is_refused(ends: tuple[socket.socket, socket.socket]) -> None:
+def test_invalid_message_is_refused(ends: tuple[socket.socket, socket.socket]) -> None:
     service, worker = ends
     worker.sendall(struct.pack(">I", 1 << 31))
     with pytest.raises(ProtocolError, match="2147483648 bytes"):
         receive(service)
 
 
-async def test_an_end_in_the_middle_of_a_message_is_an_end() -> None:
+async def test_end_of_stream_within_a_message() -> None:
     reader = asyncio.StreamReader()
     reader.feed_data(packed(Hud(("a",), "car"))[:-1])
     reader.feed_eof()
     assert await read_message(reader) is None
 
 
-def test_a_worker_without_a_service_ends_at_once() -> None:
+def test_worker_without_a_service_exits() -> None:
     ours, theirs = socket.socketpair()
     with theirs:
-        # The process id is not that of its parent, as when the service died in between.
+        # The process id is not that of its parent, as if the service had died in between.
         end = str(theirs.fileno())
         arguments = [sys.executable, "-m", "companion.perception.worker", end, end, "-1"]
         process = subprocess.run(arguments, pass_fds=[theirs.fileno()], timeout=60, check=False)
@@ -222,33 +222,33 @@ def test_a_worker_without_a_service_ends_at_once() -> None:
 
 
 @pytest.fixture
-def few_pictures(pictures: Path, tmp_path: Path) -> Path:
-    """So few that what is said of them all fits into the socket, where nobody takes it yet."""
-    for picture in sorted(pictures.iterdir())[:3]:
-        shutil.copy(picture, tmp_path)
+def few_images(pictures: Path, tmp_path: Path) -> Path:
+    """Few enough that all their results fit into the unread socket."""
+    for image in sorted(pictures.iterdir())[:3]:
+        shutil.copy(image, tmp_path)
     return tmp_path
 
 
-async def test_the_last_words_of_a_worker_are_read_whatever_it_was_told_after_them(
-    few_pictures: Path,
+async def test_last_message_is_read_after_failed_writes(
+    few_images: Path,
 ) -> None:
-    every_picture = {"source.uri": str(few_pictures), "source.realtime": "false", "detector.enabled": "false"}
-    settings = load_settings(Path(os.devnull), every_picture, environment={})
+    overrides = {"source.uri": str(few_images), "source.realtime": "false", "detector.enabled": "false"}
+    settings = load_settings(Path(os.devnull), overrides, environment={})
     process = await PerceptionProcess.spawn(settings, subprocess.DEVNULL)
-    # Nothing is read until it has ended, as when the service's own loop stands still for a moment.
+    # Nothing is read until it has ended, as when the service's own loop is blocked.
     ended = os.pidfd_open(process.pid)
     assert select.select([ended], [], [], 60.0)[0]
     os.close(ended)
     for count in range(3):
-        process.turn(Attitude(count, (1.0, 0.0, 0.0, 0.0)))
-    heard = []
+        process.send_attitude(Attitude(count, (1.0, 0.0, 0.0, 0.0)))
+    messages = []
     while (message := await process.read()) is not None:
-        heard.append(message)
-    assert heard[-1] == Ended(finished=True, text="end of stream", frames=3)
-    assert "exited with code 0" in await process.wait()
+        messages.append(message)
+    assert messages[-1] == Ended(finished=True, text="end of stream", frames=3)
+    assert "code 0" in await process.wait()
 
 
-def test_what_a_worker_prints_is_logged_and_a_flood_is_cut(caplog: pytest.LogCaptureFixture) -> None:
+def test_printed_lines_are_logged_with_a_limit(caplog: pytest.LogCaptureFixture) -> None:
     reading, writing = os.pipe()
     logging_it = threading.Thread(target=log_printed, args=(reading, 7))
     logging_it.start()
@@ -264,10 +264,10 @@ def test_what_a_worker_prints_is_logged_and_a_flood_is_cut(caplog: pytest.LogCap
     assert max(map(len, lines)) == 1000
 
 
-def test_a_worker_that_may_still_be_loading_is_given_time() -> None:
+def test_loading_worker_has_a_longer_limit() -> None:
     watchdog = Watchdog(100.0, open_timeout_s=10.0)
     assert watchdog.stuck_after_s == START_S + 10.0
-    watchdog.heard(105.0)
+    watchdog.on_message(105.0)
     watchdog.ready()
     assert watchdog.stuck_after_s == FIRST_RESULT_S
     assert watchdog.silent_s(107.5) == 2.5
@@ -277,22 +277,22 @@ def test_a_worker_that_may_still_be_loading_is_given_time() -> None:
     ("step_s", "stuck_after_s"),
     [(0.02, SHORTEST_S), (0.15, SHORTEST_S), (0.25, 5.0), (1.0, 20.0), (4.0, LONGEST_S)],
 )
-def test_what_counts_as_stuck_follows_what_is_usual(step_s: float, stuck_after_s: float) -> None:
+def test_stuck_limit_follows_the_usual_step(step_s: float, stuck_after_s: float) -> None:
     watchdog = Watchdog(0.0, open_timeout_s=10.0)
     for count in range(1, 60):
-        # Signs of life between the results say nothing of how long one takes.
+        # Heartbeats between the results do not affect the usual step.
         for part in range(4):
-            watchdog.heard(count * 10.0 + part)
-        watchdog.resulted(step_s)
+            watchdog.on_message(count * 10.0 + part)
+        watchdog.on_result(step_s)
     assert watchdog.stuck_after_s == pytest.approx(stuck_after_s)
 
 
-def test_silence_while_nobody_listened_is_forgiven() -> None:
+def test_reset_restarts_the_silence() -> None:
     watchdog = Watchdog(0.0, open_timeout_s=10.0)
-    watchdog.forgive(50.0)
+    watchdog.reset(50.0)
     assert watchdog.silent_s(51.0) == 1.0
 
 
-def test_the_service_side_brings_no_torch() -> None:
+def test_supervisor_does_not_import_torch() -> None:
     code = "import companion.perception.supervisor, sys; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], timeout=60, check=False).returncode == 0

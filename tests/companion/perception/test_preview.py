@@ -1,4 +1,4 @@
-"""Pictures leave the perception process only while somebody looks at them."""
+"""Preview images are encoded and published only while there is a subscriber."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ CAR = Detections(
 )
 
 
-def pictures_of(settings: PreviewSection, stamps_ns: list[int], *, watched: bool = True) -> list[Preview]:
+def previews_of(settings: PreviewSection, stamps_ns: list[int], *, watched: bool = True) -> list[Preview]:
     made: list[Preview] = []
     delivered = threading.Semaphore(0)
 
@@ -46,8 +46,8 @@ def pictures_of(settings: PreviewSection, stamps_ns: list[int], *, watched: bool
     return made
 
 
-def test_a_picture_shows_what_was_detected_and_says_which_frame_it_is() -> None:
-    plain, drawn = (pictures_of(PreviewSection(annotate=annotate), [5_000])[0] for annotate in (False, True))
+def test_preview_has_detections_and_frame_number() -> None:
+    plain, drawn = (previews_of(PreviewSection(annotate=annotate), [5_000])[0] for annotate in (False, True))
     assert (drawn.sequence, drawn.captured_ns) == (0, 5_000)
     images = [cv2.imdecode(np.frombuffer(p.jpeg, np.uint8), cv2.IMREAD_COLOR) for p in (plain, drawn)]
     assert images[0] is not None
@@ -57,15 +57,15 @@ def test_a_picture_shows_what_was_detected_and_says_which_frame_it_is() -> None:
     assert np.abs(images[1].astype(int) - 90).max() > 60
 
 
-def test_pictures_come_no_faster_than_asked_for_and_none_while_nobody_looks() -> None:
+def test_previews_are_rate_limited_and_on_demand() -> None:
     stamps_ns = [number * 100_000_000 for number in range(10)]
-    assert [p.sequence for p in pictures_of(PreviewSection(rate_hz=2.5), stamps_ns)] == [0, 4, 8]
-    assert pictures_of(PreviewSection(), stamps_ns, watched=False) == []
+    assert [p.sequence for p in previews_of(PreviewSection(rate_hz=2.5), stamps_ns)] == [0, 4, 8]
+    assert previews_of(PreviewSection(), stamps_ns, watched=False) == []
 
 
-def test_a_subscriber_gets_pictures_and_without_one_none_are_made(seeing: list[str], tmp_path: Path) -> None:
+def test_previews_only_with_a_subscriber(seeing: list[str], tmp_path: Path) -> None:
     statuses: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
-    pictures: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
+    samples: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
 
     def images_published() -> int:
         while not statuses.empty():
@@ -79,15 +79,15 @@ def test_a_subscriber_gets_pictures_and_without_one_none_are_made(seeing: list[s
     ):
         listen(session, "status", lambda _key, text: statuses.put(json.loads(text)))
         assert images_published() == 0
-        with session.declare_subscriber("companion/*/image", pictures.put):
-            sample = pictures.get(timeout=30)
+        with session.declare_subscriber("companion/*/image", samples.put):
+            sample = samples.get(timeout=30)
         image = cv2.imdecode(np.frombuffer(sample.payload.to_bytes(), np.uint8), cv2.IMREAD_COLOR)
         assert image is not None
         assert image.shape == (120, 160, 3)
         assert sample.encoding == zenoh.Encoding.IMAGE_JPEG
         assert sample.attachment is not None
         assert json.loads(sample.attachment.to_string())["camera"] is None
-        # The subscriber has gone: the count comes to rest.
+        # The subscriber has gone: the count stops.
         before, now = images_published(), images_published()
         while now != before:
             before, now = now, images_published()

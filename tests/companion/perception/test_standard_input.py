@@ -1,4 +1,4 @@
-"""Standard input that is handed on whole: real pipes, and readers that go away in the middle of a frame."""
+"""Standard input forwarded in whole frames: real pipes, and readers that stop within a frame."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def write_in_background(writer: int, data: bytes) -> threading.Thread:
     return thread
 
 
-def test_the_bytes_arrive_as_they_were_written(pipe: tuple[int, int]) -> None:
+def test_bytes_arrive_unchanged(pipe: tuple[int, int]) -> None:
     reader, writer = pipe
     data = b"".join(frame(number) for number in range(200))
     worker = StandardInput(RAW, reader).for_worker()
@@ -67,21 +67,19 @@ def test_the_bytes_arrive_as_they_were_written(pipe: tuple[int, int]) -> None:
 
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 40 * FRAME_BYTES), st.booleans())
-def test_the_next_reader_begins_with_a_whole_frame_wherever_the_last_one_stopped(
-    taken: int, is_socket: bool
-) -> None:
-    # Frames enough that the pipe of the reader that goes away cannot swallow them all.
+def test_next_reader_starts_with_a_whole_frame(read_bytes: int, is_socket: bool) -> None:
+    # More frames than the pipe of the lost reader can hold.
     count = 300
     if is_socket:
         ours, theirs = (end.detach() for end in socket.socketpair())
     else:
         ours, theirs = os.pipe()
-    # Numbered over the whole frame, so that a shift of one byte shows.
+    # Numbered over the whole frame, so that a shift of one byte is detected.
     data = b"".join(number.to_bytes(2, "big") * (FRAME_BYTES // 2) for number in range(count))
     standard_input = StandardInput(RAW, ours)
     first = standard_input.for_worker()
     writing = write_in_background(theirs, data)
-    assert read_exactly(first, taken) == data[:taken]
+    assert read_exactly(first, read_bytes) == data[:read_bytes]
     os.close(first)
     second = standard_input.for_worker()
     rest = read_all(second)
@@ -93,7 +91,7 @@ def test_the_next_reader_begins_with_a_whole_frame_wherever_the_last_one_stopped
     assert data.endswith(rest)
 
 
-def test_the_next_reader_of_yuv4mpeg2_gets_the_header_too(pipe: tuple[int, int]) -> None:
+def test_next_reader_of_yuv4mpeg2_gets_the_header(pipe: tuple[int, int]) -> None:
     reader, writer = pipe
     source = SourceSection(uri="-")
     header = b"YUV4MPEG2 W32 H16 F30:1 C420jpeg\n"
@@ -121,7 +119,7 @@ def test_the_next_reader_of_yuv4mpeg2_gets_the_header_too(pipe: tuple[int, int])
         (SourceSection(uri="-", pixel_format="bgr24"), b"raw pixels of no known size"),
     ],
 )
-def test_what_has_no_known_frames_is_handed_on_as_it_is(
+def test_unknown_framing_is_forwarded_unchanged(
     pipe: tuple[int, int], source: SourceSection, data: bytes
 ) -> None:
     reader, writer = pipe
@@ -131,7 +129,7 @@ def test_what_has_no_known_frames_is_handed_on_as_it_is(
     os.close(worker)
 
 
-def test_after_the_end_there_is_nothing_for_the_next_reader(pipe: tuple[int, int]) -> None:
+def test_after_the_end_the_next_reader_gets_nothing(pipe: tuple[int, int]) -> None:
     reader, writer = pipe
     standard_input = StandardInput(RAW, reader)
     first = standard_input.for_worker()
@@ -143,7 +141,7 @@ def test_after_the_end_there_is_nothing_for_the_next_reader(pipe: tuple[int, int
     os.close(second)
 
 
-def test_an_input_that_does_not_block_is_waited_for(pipe: tuple[int, int]) -> None:
+def test_non_blocking_input_is_waited_for(pipe: tuple[int, int]) -> None:
     reader, writer = pipe
     os.set_blocking(reader, False)
     worker = StandardInput(RAW, reader).for_worker()
@@ -152,7 +150,7 @@ def test_an_input_that_does_not_block_is_waited_for(pipe: tuple[int, int]) -> No
     os.close(worker)
 
 
-def test_every_reader_of_a_file_begins_where_the_file_was(tmp_path: Path) -> None:
+def test_every_reader_of_a_file_starts_at_its_position(tmp_path: Path) -> None:
     path = tmp_path / "frames.gray"
     path.write_bytes(b"skip" + frame(1) + frame(2))
     with path.open("rb", buffering=0) as file:
@@ -164,7 +162,7 @@ def test_every_reader_of_a_file_begins_where_the_file_was(tmp_path: Path) -> Non
             os.close(worker)
 
 
-def test_a_closed_standard_input_is_an_error() -> None:
+def test_closed_standard_input_is_an_error() -> None:
     reader, writer = os.pipe()
     os.close(reader)
     os.close(writer)

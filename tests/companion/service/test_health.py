@@ -1,4 +1,4 @@
-"""What is said of the autopilot's own settings when the link has opened."""
+"""The check of the autopilot's parameters when the link has opened."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class FakeDriver:
     async def get_parameter(self, name: str) -> float:
         assert name == "GUID_TIMEOUT"
         if self._guided_timeout_s is None:
-            raise CommandRefusedError("the vehicle does not answer for parameter GUID_TIMEOUT")
+            raise CommandRefusedError("parameter GUID_TIMEOUT: no answer")
         return self._guided_timeout_s
 
 
@@ -33,17 +33,17 @@ class FakeDriver:
     [
         ("ArduPilot", 3.0, ["GUID_TIMEOUT is 3 s"]),
         ("ArduPilot", 1.0, []),
-        ("ArduPilot", None, ["GUID_TIMEOUT is not known"]),
+        ("ArduPilot", None, ["GUID_TIMEOUT cannot"]),
         ("PX4", None, []),
     ],
 )
-async def test_a_long_guided_timeout_is_warned_of(
+async def test_long_guided_timeout_is_warned(
     autopilot: str, guided_timeout_s: float | None, warned: list[str]
 ) -> None:
-    said: list[tuple[str, str]] = []
+    events: list[tuple[str, str]] = []
     driver = cast(Driver, FakeDriver(autopilot, guided_timeout_s))
-    others = OtherCommanders(VehicleSection(), "here", 0, lambda level, text: said.append((level, text)))
-    health = Health(driver, (), SystemdNotifier(), others, lambda level, text: said.append((level, text)))
+    others = OtherCommanders(VehicleSection(), "here", 0, lambda level, text: events.append((level, text)))
+    health = Health(driver, (), SystemdNotifier(), others, lambda level, text: events.append((level, text)))
     await health.check()
-    assert [level for level, _ in said] == ["warning"] * len(warned)
-    assert all(text.startswith(begin) for (_, text), begin in zip(said, warned, strict=True))
+    assert [level for level, _ in events] == ["warning"] * len(warned)
+    assert all(text.startswith(begin) for (_, text), begin in zip(events, warned, strict=True))

@@ -1,4 +1,4 @@
-"""Two services on one vehicle: each names the other, and one of them refuses to fly."""
+"""Two services on one vehicle: each detects the other, and one of them refuses to fly."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ NOW_NS = 1000 * S
 
 
 class Here(OtherCommanders):
-    """A service that has run for 100 s."""
+    """A service with an uptime of 100 s."""
 
     def __init__(self, *, allowed: bool = False) -> None:
-        self.said: list[tuple[str, str]] = []
+        self.events: list[tuple[str, str]] = []
         settings = VehicleSection(allow_other_commander=allowed)
-        super().__init__(settings, "here", NOW_NS - 100 * S, lambda *event: self.said.append(event))
+        super().__init__(settings, "here", NOW_NS - 100 * S, lambda *event: self.events.append(event))
 
-    def why(
+    def refusal(
         self, state: VehicleState, behaviour: Behaviour | None = None, *, in_command: bool = False
     ) -> str | None:
         command = CommandInput(1, "a command", behaviour or HoldBehaviour())
@@ -40,9 +40,9 @@ class Here(OtherCommanders):
 
 
 def beside(uptime_s: float, *, in_command: bool = False, age_s: float = 0.5) -> VehicleState:
-    """Of a vehicle that another service commands."""
-    heard_ns = NOW_NS - round(age_s * S)
-    return VehicleState(other_commanders=(Commander((1, 192), heard_ns, uptime_s, in_command),))
+    """State of a vehicle with another service."""
+    received_ns = NOW_NS - round(age_s * S)
+    return VehicleState(other_commanders=(Commander((1, 192), received_ns, uptime_s, in_command),))
 
 
 def status(**changes: Any) -> bytes:
@@ -59,17 +59,17 @@ def status(**changes: Any) -> bytes:
     ("state", "refused"),
     [
         (VehicleState(), False),
-        (beside(200.0), True),  # it was there first
-        (beside(101.0), True),  # too near to tell
-        (beside(50.0), False),  # we were
+        (beside(200.0), True),  # the other is older
+        (beside(101.0), True),  # same age within the tolerance
+        (beside(50.0), False),  # ours is older
         (beside(50.0, in_command=True), True),
-        (beside(200.0, age_s=4.0), False),  # it has gone
+        (beside(200.0, age_s=4.0), False),  # gone
     ],
 )
-def test_the_later_service_refuses_and_any_beside_one_in_command(state: VehicleState, refused: bool) -> None:
-    assert (Here().why(state) is not None) is refused
-    assert Here(allowed=True).why(state) is None
-    assert Here().why(state, in_command=True) is None
+def test_later_service_refuses_to_engage(state: VehicleState, refused: bool) -> None:
+    assert (Here().refusal(state) is not None) is refused
+    assert Here(allowed=True).refusal(state) is None
+    assert Here().refusal(state, in_command=True) is None
 
 
 @pytest.mark.parametrize(
@@ -82,17 +82,17 @@ def test_the_later_service_refuses_and_any_beside_one_in_command(state: VehicleS
         (StopBehaviour(), False),
     ],
 )
-def test_what_ends_a_flight_is_never_refused(behaviour: Behaviour, refused: bool) -> None:
-    assert (Here().why(beside(200.0), behaviour) is not None) is refused
+def test_commands_that_end_a_flight_are_allowed(behaviour: Behaviour, refused: bool) -> None:
+    assert (Here().refusal(beside(200.0), behaviour) is not None) is refused
 
 
-def test_a_service_of_the_same_name_is_known_by_its_status() -> None:
+def test_other_service_is_detected_by_its_status() -> None:
     here = Here()
     here.on_status(status(), NOW_NS)
     assert here.status(VehicleState(), NOW_NS) == [
         {"via": "zenoh", "identity": "there", "uptime_s": 300.0, "in_command": False}
     ]
-    assert here.why(VehicleState()) is not None
+    assert here.refusal(VehicleState()) is not None
     assert here.status(VehicleState(), NOW_NS + 4 * S) == []
 
 
@@ -109,21 +109,21 @@ def test_a_service_of_the_same_name_is_known_by_its_status() -> None:
         status(vehicle=None),
     ],
 )
-def test_other_vehicles_and_broken_statuses_count_for_nothing(payload: bytes) -> None:
+def test_foreign_and_invalid_statuses_are_ignored(payload: bytes) -> None:
     here = Here()
     here.on_status(payload, NOW_NS)
     assert here.status(VehicleState(), NOW_NS) == []
 
 
-def test_who_comes_and_who_goes_is_said_once() -> None:
+def test_appearance_and_loss_are_reported_once() -> None:
     here = Here()
     for second in range(3):
         here.watch(beside(200.0, age_s=0.0), NOW_NS + second * S)
-    assert [level for level, _ in here.said] == ["error"]
-    assert "1/192 by mavlink" in here.said[0][1]
+    assert [level for level, _ in here.events] == ["error"]
+    assert "1/192 by mavlink" in here.events[0][1]
     for second in range(4, 7):
         here.watch(beside(200.0, age_s=0.0), NOW_NS + second * S)
-    assert [level for level, _ in here.said] == ["error", "info"]
+    assert [level for level, _ in here.events] == ["error", "info"]
 
 
 @pytest.mark.parametrize(("kind", "autopilot"), [("mavsdk", "px4"), ("pymavlink", "ardupilot")])
@@ -143,10 +143,10 @@ async def test_two_services_on_two_links_of_one_vehicle(kind: str, autopilot: st
             for text in ("takeoff 3", "hold"):
                 outcome = await first.fly(text)
                 assert outcome.success, outcome.reason
-            # Both links must show it: a mode that changes after `land` was asked for is another pilot's.
+            # Both links must report it: a mode change after the `land` command counts as another pilot's.
             await second.until(lambda: second.driver.state.mode is FlightMode.OFFBOARD)
             await second.until(lambda: second.driver.state.other_commanders[-1].in_command)
             assert "in command" in (await second.fly("hold")).reason
-            # The one that was refused can still end the flight, as any pilot.
+            # The refused service can still end the flight, as any pilot.
             outcome = await second.fly("land")
             assert outcome.success, outcome.reason

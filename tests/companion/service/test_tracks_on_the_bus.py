@@ -1,4 +1,4 @@
-"""Tracks as a subscriber gets them: a real service, a real vehicle's attitude, a real network of zenoh."""
+"""Published tracks: a real service, a simulated vehicle's attitude, a real zenoh network."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.companion.service_process import running_service
 
 
 def test_identities_and_their_events_are_published(seeing: list[str], tmp_path: Path) -> None:
-    # An untrained network is sure of nothing; whatever it says is taken, where boxes do not overlap.
+    # An untrained network has low confidences; all its non-overlapping boxes are used.
     flags = [
         *seeing,
         *("--confidence", "0", "--detector-iou", "0.05"),

@@ -1,4 +1,4 @@
-"""The `camera` settings against what a camera brings itself."""
+"""The `camera` settings with a calibration from the camera."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def section_of(**values: str) -> CameraSection:
     return load_settings(os.devnull, overrides, environment={}).camera
 
 
-def test_lens_and_mount_are_the_cameras_where_not_given() -> None:
+def test_lens_and_mount_come_from_the_camera() -> None:
     camera, conflict = adopt_calibration(section_of(), CAMERA)
     assert conflict == ""
     assert camera.model(640, 480) == LENS
@@ -41,23 +41,23 @@ def test_distortion_and_gimbal_come_with_the_camera() -> None:
     assert camera.mount().on_gimbal
 
 
-def test_given_values_win_and_a_conflict_names_both() -> None:
+def test_given_values_win_and_conflict_names_both() -> None:
     given = section_of(horizontal_fov_deg="80", mount_pitch_deg="0")
     camera, conflict = adopt_calibration(given, CAMERA)
     assert camera.model(640, 480) == given.model(640, 480)
     assert camera.mount_pitch_deg == 0.0
-    assert camera.mount_forward_m == 0.12  # was not given
+    assert camera.mount_forward_m == 0.12  # not given
     for value in ("80.0°", "70.0°", "mount_pitch_deg 0 (camera: -20)"):
         assert value in conflict
     assert "forward" not in conflict
 
 
-def test_given_values_that_agree_are_no_conflict() -> None:
+def test_agreeing_values_are_no_conflict() -> None:
     given = section_of(horizontal_fov_deg="70", mount_pitch_deg="-20", mount_forward_m="0.12")
     assert adopt_calibration(given, CAMERA).conflict == ""
 
 
-def test_a_lens_alone_leaves_the_mount_to_the_settings() -> None:
+def test_lens_alone_keeps_the_mount_of_the_settings() -> None:
     given = section_of(mount_pitch_deg="-35")
     camera, conflict = adopt_calibration(given, CameraCalibration(LENS))
     assert conflict == ""

@@ -46,7 +46,7 @@ def test_without_a_file_the_defaults_are_in_effect(tmp_path: Path, monkeypatch: 
     assert load_settings(environment={}) == Settings()
 
 
-def test_the_file_in_the_working_directory_is_read_when_none_is_named(
+def test_file_in_the_working_directory_is_the_default(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -55,7 +55,7 @@ def test_the_file_in_the_working_directory_is_read_when_none_is_named(
     assert load_settings(environment={}).vehicle.name == "kestrel"
 
 
-def test_flags_win_over_the_environment_and_the_environment_over_the_file(tmp_path: Path) -> None:
+def test_precedence_is_flags_environment_file(tmp_path: Path) -> None:
     path = written(
         tmp_path / "c.toml", "[detector]\nconfidence = 0.1\niou = 0.1\nthreads = 3\n[source]\nuri = 'a.mp4'\n"
     )
@@ -72,7 +72,7 @@ def test_flags_win_over_the_environment_and_the_environment_over_the_file(tmp_pa
     assert settings.source.uri == "a.mp4"
 
 
-def test_every_flag_can_be_given_its_own_default_as_text() -> None:
+def test_every_flag_accepts_its_default_as_text() -> None:
     overrides = {}
     for flag in flags():
         value = flag.default
@@ -147,13 +147,11 @@ def test_lists_booleans_and_unset_values_are_read_from_text() -> None:
         ),
     ],
 )
-def test_a_bad_value_is_told_in_one_line_with_its_key_its_range_and_what_came(
-    key: str, text: str, expected: str
-) -> None:
+def test_bad_value_has_key_range_and_value(key: str, text: str, expected: str) -> None:
     assert problems(overrides={key: text}) == [f"{key}: {expected} (given as a flag)"]
 
 
-def test_known_heights_are_metres_by_class_and_none_is_without_height() -> None:
+def test_class_heights_are_metres_by_class() -> None:
     text = "person:1.7,dining table:0.75"
     assert load_settings(overrides={"detector.class_heights_m": text}, environment={}).detector.heights() == {
         "person": 1.7,
@@ -183,7 +181,7 @@ def test_known_heights_are_metres_by_class_and_none_is_without_height() -> None:
         ("[detecter]\nconfidence = 1", "unknown section [detecter]"),
     ],
 )
-def test_a_bad_file_names_the_key_and_the_file(tmp_path: Path, toml: str, expected: str) -> None:
+def test_error_in_a_file_names_key_and_file(tmp_path: Path, toml: str, expected: str) -> None:
     path = written(tmp_path / "c.toml", toml)
     (line,) = problems(path)
     assert line.startswith(expected)
@@ -199,12 +197,12 @@ def test_a_bad_file_names_the_key_and_the_file(tmp_path: Path, toml: str, expect
         ("zzz", "known: vehicle, source, camera,"),
     ],
 )
-def test_an_unknown_key_is_answered_with_the_nearest_one(key: str, nearest: str) -> None:
+def test_unknown_key_suggests_the_nearest(key: str, nearest: str) -> None:
     (line,) = problems(overrides={key: "1"})
     assert line.startswith(f"unknown key {key} (given as a flag); {nearest}")
 
 
-def test_an_unknown_variable_of_a_section_of_ours_is_told() -> None:
+def test_unknown_environment_variable_is_reported() -> None:
     (line,) = problems(COMPANION_DETECTOR_CONFIDENSE="1")
     assert line == (
         "unknown key detector.confidense (given as COMPANION_DETECTOR_CONFIDENSE); "
@@ -212,7 +210,7 @@ def test_an_unknown_variable_of_a_section_of_ours_is_told() -> None:
     )
 
 
-def test_every_problem_is_told_at_once(tmp_path: Path) -> None:
+def test_all_problems_are_reported_at_once(tmp_path: Path) -> None:
     path = written(tmp_path / "c.toml", "[detector]\niou = 2\n[zenoh]\nmod = 'peer'\n")
     assert len(problems(path, {"log.level": "loud", "source.loop": "maybe"})) == 4
 
@@ -232,39 +230,39 @@ def test_every_problem_is_told_at_once(tmp_path: Path) -> None:
         ({"zenoh.mode": "client"}, "zenoh: a client needs an endpoint in connect"),
     ],
 )
-def test_keys_that_contradict_each_other_are_told(overrides: dict[str, str], line: str) -> None:
+def test_contradicting_keys_are_reported(overrides: dict[str, str], line: str) -> None:
     (problem,) = problems(overrides=overrides)
     assert problem.startswith(line)
     assert problem.endswith("(given as a flag)")
 
 
 @pytest.mark.parametrize("content", [b"[detector]\nconfidence = \n", b"[detector\n", b"a = b\n"])
-def test_a_syntax_error_names_the_file_and_the_line(tmp_path: Path, content: bytes) -> None:
+def test_syntax_error_names_file_and_line(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "c.toml"
     path.write_bytes(content)
     (line,) = problems(path)
     assert line.startswith(f"{path}, line ")
 
 
-def test_a_file_that_ends_too_early_is_told(tmp_path: Path) -> None:
+def test_truncated_file_is_reported(tmp_path: Path) -> None:
     path = written(tmp_path / "c.toml", "[detector]\nclasses = [")
     (line,) = problems(path)
     assert line.startswith(f"{path}, end of document: ")
 
 
-def test_a_file_that_is_not_text_is_told(tmp_path: Path) -> None:
+def test_binary_file_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "c.toml"
     path.write_bytes(b"[log]\nlevel = '\xff'\n")
     assert problems(path) == [f"{path}, line 2: not UTF-8 text, which TOML must be"]
 
 
-def test_a_named_file_that_is_not_there_is_told(tmp_path: Path) -> None:
+def test_missing_file_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "none.toml"
     assert problems(path) == [f"cannot read the settings file {path}: No such file or directory"]
     assert problems(tmp_path) == [f"cannot read the settings file {tmp_path}: Is a directory"]
 
 
-def test_the_example_file_shows_every_key_with_its_default() -> None:
+def test_example_file_has_every_default() -> None:
     text = (REPOSITORY / "systemd/companion.toml").read_text(encoding="utf-8")
     assert text == to_toml(Settings())
     assert load_settings(REPOSITORY / "systemd/companion.toml", environment={}) == Settings()
@@ -281,7 +279,7 @@ names = st.text(st.characters(codec="utf-8"), min_size=1)
     names,
     st.none() | st.integers(16, 16384),
 )
-def test_printed_settings_are_read_back_the_same(
+def test_printed_settings_round_trip(
     tmp_path_factory: pytest.TempPathFactory,
     uri: str,
     classes: list[str | int],
@@ -304,26 +302,26 @@ def test_printed_settings_are_read_back_the_same(
     assert load_settings(path, environment={}) == settings
 
 
-def test_the_source_section_opens_a_source_with_its_own_values() -> None:
+def test_source_settings_of_the_source_section() -> None:
     opening = load_settings(None, {"source.width": "640", "source.realtime": "no"}, {}).source.opening()
     assert (opening.width, opening.realtime, opening.loop) == (640, False, False)
 
 
-def test_the_bundled_model_has_the_name_that_the_detector_knows() -> None:
+def test_default_model_name_matches_the_detector() -> None:
     assert Settings().detector.model == DEFAULT_MODEL
 
 
-def test_settings_cannot_be_changed() -> None:
+def test_settings_are_frozen() -> None:
     with pytest.raises(ValueError, match="frozen"):
         Settings().detector.confidence = 0.5
 
 
-def test_the_camera_of_a_field_of_view_sees_that_from_edge_to_edge() -> None:
+def test_field_of_view_spans_the_frame() -> None:
     model = Settings().camera.model(640, 480)
     assert math.degrees(2 * math.atan(320 / model.fx)) == pytest.approx(80.0)
 
 
-def test_a_calibration_is_scaled_to_the_frames_size() -> None:
+def test_calibration_is_scaled_to_the_frame_size() -> None:
     overrides = {
         "camera.fx_px": "500",
         "camera.fy_px": "510",
@@ -341,7 +339,7 @@ def test_a_calibration_is_scaled_to_the_frames_size() -> None:
 
 
 @pytest.mark.parametrize(("old", "new"), RENAMED.items())
-def test_a_renamed_key_names_the_new_one(old: str, new: str, tmp_path: Path) -> None:
+def test_renamed_key_names_the_new_one(old: str, new: str, tmp_path: Path) -> None:
     section, _, name = old.partition(".")
     path = tmp_path / "companion.toml"
     path.write_text(f"[{section}]\n{name} = 1\n[cameras.down.{section}]\n{name} = 1\n")
@@ -357,7 +355,7 @@ def test_a_renamed_key_names_the_new_one(old: str, new: str, tmp_path: Path) -> 
         assert any(f"cameras.down.{new} in version" in line for line in failure.value.problems)
 
 
-def test_the_former_name_of_the_cameras_names_the_new_one(tmp_path: Path) -> None:
+def test_renamed_views_section_names_cameras(tmp_path: Path) -> None:
     path = tmp_path / "companion.toml"
     path.write_text('[views.down.source]\nuri = "down.mp4"\n')
     with pytest.raises(ConfigurationError, match=r"\[views\].*was renamed to \[cameras\]"):

@@ -43,13 +43,13 @@ async def driver(kind: DriverKind, port: int, autopilot: FakeAutopilot) -> Async
 
 @pytest.fixture
 def short_measurement(monkeypatch: pytest.MonkeyPatch) -> None:
-    """How long the rates of the streams are measured before any is asked for."""
+    """Shorten the measurement of stream rates before the first requests."""
     monkeypatch.setattr(stream_requests, "_MEASURE_S", 0.3)
 
 
 @pytest.fixture(autouse=True)
 def no_loop_noise(caplog: pytest.LogCaptureFixture) -> Iterator[None]:
-    """Nothing may be left to asyncio's exception handler: no destroyed task, no failed callback."""
+    """Fail on anything logged by asyncio's exception handler: destroyed tasks, failed callbacks."""
     yield
     noise = [
         record.getMessage() for record in caplog.records if record.name == "asyncio" and record.levelno >= 40

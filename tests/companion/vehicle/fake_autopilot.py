@@ -1,4 +1,4 @@
-"""A small real peer on a UDP socket: it says what it is told and keeps what it hears."""
+"""A scripted autopilot on a real UDP socket, which records what it receives."""
 
 from __future__ import annotations
 
@@ -20,55 +20,55 @@ SETPOINT = "SET_POSITION_TARGET_LOCAL_NED"
 
 
 class FakeAutopilot:
-    """Speaks to `port` on loopback, as PX4's onboard link does, and to whoever spoke to it.
+    """Sends to `port` on loopback, as PX4's onboard link does, then to the source of received messages.
 
     Attributes:
-        heard: (decoded message, raw frame) in the order of arrival.
-        answers: message name → what to do when one is heard.
+        received: (decoded message, raw frame) in the order of arrival.
+        answers: message name → called with every received message of that name.
     """
 
     def __init__(self, port: int, *, system_id: int = 1, component_id: int = 1, autopilot: int = 12) -> None:
-        self.heard: list[tuple[Any, bytes]] = []
+        self.received: list[tuple[Any, bytes]] = []
         self.answers: dict[str, Callable[[Any], None]] = {
             "COMMAND_LONG": lambda m: self.acknowledge(m.command)
         }
         self.custom_mode, self.base_mode, self.system_status = HOLD, 29, 3
         self.autopilot = autopilot
-        self.beating = True
+        self.sends_heartbeats = True
         self._port = port
         self._codec = mavlink.MAVLink(None, system_id, component_id)
         self._task: asyncio.Task[None] | None = None
         self.open()
 
     def open(self) -> None:
-        """Take a new socket, so a new source port."""
+        """Open a new socket, with a new source port."""
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.bind(("127.0.0.1", 0))
         self.socket.setblocking(False)
 
-    def say(self, message: Any) -> None:
+    def send(self, message: Any) -> None:
         self.socket.sendto(message.pack(self._codec), ("127.0.0.1", self._port))
         self._codec.seq = (self._codec.seq + 1) % 256
 
-    def say_bytes(self, data: bytes) -> None:
+    def send_bytes(self, data: bytes) -> None:
         self.socket.sendto(data, ("127.0.0.1", self._port))
 
     def heartbeat(self) -> None:
-        self.say(
+        self.send(
             mavlink.MAVLink_heartbeat_message(
                 2, self.autopilot, self.base_mode, self.custom_mode, self.system_status, 3
             )
         )
 
     def acknowledge(self, command: int, result: int = 0) -> None:
-        self.say(mavlink.MAVLink_command_ack_message(command, result, 0, 0, 1, 191))
+        self.send(mavlink.MAVLink_command_ack_message(command, result, 0, 0, 1, 191))
 
     def home(self, altitude_amsl_m: float = 488.0) -> None:
         altitude = round(altitude_amsl_m * 1000)
-        self.say(mavlink.MAVLink_home_position_message(0, 0, altitude, 0.0, 0.0, 0.0, [1, 0, 0, 0], 0, 0, 0))
+        self.send(mavlink.MAVLink_home_position_message(0, 0, altitude, 0.0, 0.0, 0.0, [1, 0, 0, 0], 0, 0, 0))
 
-    def listen(self) -> None:
-        """Take in what has come, now."""
+    def drain(self) -> None:
+        """Process all received messages now."""
         while True:
             try:
                 data, source = self.socket.recvfrom(2048)
@@ -77,14 +77,14 @@ class FakeAutopilot:
             self._port = source[1]
             for frame in frames_of(data):
                 message = self._codec.decode(bytearray(frame.raw))
-                self.heard.append((message, frame.raw))
+                self.received.append((message, frame.raw))
                 self.answers.get(message.get_type(), lambda _: None)(message)
 
     async def _live(self) -> None:
         for turn in range(10**9):
-            if self.beating and turn % 10 == 0:
+            if self.sends_heartbeats and turn % 10 == 0:
                 self.heartbeat()
-            self.listen()
+            self.drain()
             await asyncio.sleep(0.01)
 
     def start(self) -> None:
@@ -96,21 +96,25 @@ class FakeAutopilot:
             await asyncio.gather(self._task, return_exceptions=True)
         self.socket.close()
 
-    def heard_named(self, name: str) -> list[Any]:
-        return [message for message, _ in self.heard if message.get_type() == name]
+    def received_named(self, name: str) -> list[Any]:
+        return [message for message, _ in self.received if message.get_type() == name]
 
-    async def hears(self, name: str, count: int = 1, timeout_s: float = 10.0) -> list[Any]:
-        """The messages of that name, once there are so many."""
-        await wait_until(lambda: len(self.heard_named(name)) >= count, timeout_s, lambda: f"{count} {name}")
-        return self.heard_named(name)
+    async def wait_for(self, name: str, count: int = 1, timeout_s: float = 10.0) -> list[Any]:
+        """Wait for `count` messages of a name and return them."""
+        await wait_until(
+            lambda: len(self.received_named(name)) >= count, timeout_s, lambda: f"{count} {name}"
+        )
+        return self.received_named(name)
 
-    async def hears_command(self, command: int, timeout_s: float = 10.0) -> None:
-        """Returns once a COMMAND_LONG of that number came."""
+    async def wait_for_command(self, command: int, timeout_s: float = 10.0) -> None:
+        """Wait for a COMMAND_LONG of that number."""
 
-        def heard() -> list[int]:
-            return [message.command for message in self.heard_named("COMMAND_LONG")]
+        def commands() -> list[int]:
+            return [message.command for message in self.received_named("COMMAND_LONG")]
 
-        await wait_until(lambda: command in heard(), timeout_s, lambda: f"command {command}, not {heard()}")
+        await wait_until(
+            lambda: command in commands(), timeout_s, lambda: f"command {command}, not {commands()}"
+        )
 
 
 async def wait_until(
@@ -128,7 +132,7 @@ def gimbal_of(state: VehicleState) -> GimbalState:
     return state.gimbal
 
 
-async def state_shows(
+async def wait_for_state(
     driver: Driver, met: Callable[[VehicleState], bool], timeout_s: float = 20.0
 ) -> VehicleState:
     await wait_until(lambda: met(driver.state), timeout_s, lambda: f"another state than {driver.state}")

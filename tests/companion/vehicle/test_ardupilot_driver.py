@@ -1,4 +1,4 @@
-"""The pymavlink driver and an ArduPilot: the built-in Copter, flown by the driver's contract."""
+"""The pymavlink driver with the built-in ArduPilot Copter, by the driver's contract."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from companion.vehicle.drivers import open_driver
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
 from mavlink_sim.testing import RunningSimulator, free_port, running_simulator
-from tests.companion.vehicle.fake_autopilot import SETPOINT, FakeAutopilot, state_shows, wait_until
+from tests.companion.vehicle.fake_autopilot import SETPOINT, FakeAutopilot, wait_for_state, wait_until
 
 
 @asynccontextmanager
 async def copter(speed: float = 4.0) -> AsyncIterator[tuple[Driver, RunningSimulator]]:
-    """A Copter in its own process, and a driver connected to it that knows its home."""
+    """A Copter in its own process, and a connected driver with a known home."""
     with running_simulator(autopilot="ardupilot", ready_after=0.0, speed=speed, seed=3) as simulator:
         driver = open_driver("pymavlink", f"udpin://127.0.0.1:{simulator.onboard_port}")
         await driver.connect(20.0)
         try:
-            await state_shows(driver, lambda state: state.ready_to_arm and known(state))
+            await wait_for_state(driver, lambda state: state.ready_to_arm and known(state))
             yield driver, simulator
         finally:
             await driver.close()
@@ -54,19 +54,19 @@ async def test_streams_parameters_and_modes_on_the_ground() -> None:
         await driver.set_parameter("GUID_TIMEOUT", 1.5)
         assert await driver.get_parameter("RTL_ALT") == 900.0
         assert await driver.get_parameter("GUID_TIMEOUT") == 1.5
-        with pytest.raises(CommandRefusedError, match="RTL_ALT is an integer"):
+        with pytest.raises(CommandRefusedError, match="RTL_ALT"):
             await driver.set_parameter("RTL_ALT", 900.5)
-        with pytest.raises(CommandRefusedError, match="arm it first"):
+        with pytest.raises(CommandRefusedError, match="armed"):
             await driver.takeoff(3.0)
         await driver.set_mode(FlightMode.RETURN)
-        with pytest.raises(CommandRefusedError, match=r"refused to arm .failed"):
+        with pytest.raises(CommandRefusedError, match=r"\(failed\)"):
             await driver.arm()
         await driver.set_mode(FlightMode.HOLD)  # GUIDED: a Copter cannot be armed in BRAKE
         await driver.arm()
         await driver.disarm()
 
 
-async def test_a_flight_by_setpoints_brakes_on_silence_but_stays_in_guided() -> None:
+async def test_copter_brakes_on_silence_and_stays_in_guided() -> None:
     async with copter() as (driver, simulator):
         modes: list[FlightMode] = []
         driver.subscribe(lambda s: modes.append(s.mode) if modes[-1:] != [s.mode] else None)
@@ -74,7 +74,7 @@ async def test_a_flight_by_setpoints_brakes_on_silence_but_stays_in_guided() -> 
         await driver.arm()
         await driver.takeoff(4.0)
         assert driver.state.mode is FlightMode.TAKEOFF
-        await state_shows(driver, lambda s: s.mode is FlightMode.HOLD and s.landed is LandedState.IN_AIR)
+        await wait_for_state(driver, lambda s: s.mode is FlightMode.HOLD and s.landed is LandedState.IN_AIR)
         assert driver.state.altitude_m == pytest.approx(4.0, abs=1.0)
         await driver.set_mode(FlightMode.OFFBOARD)
 
@@ -84,82 +84,82 @@ async def test_a_flight_by_setpoints_brakes_on_silence_but_stays_in_guided() -> 
                 await asyncio.sleep(0.05)
 
         sending = asyncio.create_task(fly())
-        await state_shows(driver, lambda s: (s.velocity_ned_mps or (0.0,))[0] > 1.5)
+        await wait_for_state(driver, lambda s: (s.velocity_ned_mps or (0.0,))[0] > 1.5)
         sending.cancel()
-        # GUID_TIMEOUT's 3 s of simulated time, and the braking
-        state = await state_shows(driver, lambda s: math.hypot(*(s.velocity_ned_mps or (9.0,))) < 0.7)
+        # GUID_TIMEOUT: 3 s of simulated time, then braking.
+        state = await wait_for_state(driver, lambda s: math.hypot(*(s.velocity_ned_mps or (9.0,))) < 0.7)
         assert state.mode is FlightMode.OFFBOARD
-        assert abs(driver.state.yaw_rad or 0.0) < 0.3  # without a yaw asked for it keeps its heading
+        assert abs(driver.state.yaw_rad or 0.0) < 0.3  # without a yaw setpoint it keeps its heading
 
         await driver.set_mode(FlightMode.HOLD)
         assert simulator.wait_for_event("mode BRAKE")
         await driver.set_mode(FlightMode.LAND)
-        await state_shows(driver, lambda s: not s.armed, 30.0)
+        await wait_for_state(driver, lambda s: not s.armed, 30.0)
         assert [str(mode) for mode in modes][-6:] == ["hold", "takeoff", "hold", "offboard", "hold", "land"]
 
 
-async def test_a_pilots_mode_is_seen_and_guided_by_somebody_else_shows_as_offboard() -> None:
+async def test_guided_that_we_did_not_request_is_offboard() -> None:
     async with copter() as (driver, simulator):
         await driver.set_mode(FlightMode.HOLD)
         await driver.arm()
         await driver.takeoff(3.0)
-        await state_shows(driver, lambda s: s.mode is FlightMode.HOLD)
+        await wait_for_state(driver, lambda s: s.mode is FlightMode.HOLD)
         simulator.fault("pilot_takeover mode=POSCTL")
-        await state_shows(driver, lambda s: s.mode is FlightMode.POSITION)  # LOITER
+        await wait_for_state(driver, lambda s: s.mode is FlightMode.POSITION)  # LOITER
     profile = ArduPilotProfile()
     state = VehicleState(armed=True, landed=LandedState.IN_AIR)
     profile.mode_request(FlightMode.HOLD, VehicleState())
-    told = [profile.translate("HEARTBEAT", {"custom_mode": mode}, state) for mode in (0, 4, 5, 4)]
-    assert [fields["flight_mode"] for ((_, fields),) in told] == [
-        FlightMode.STABILIZED,  # the request has not shown yet
+    translated = [profile.translate("HEARTBEAT", {"custom_mode": mode}, state) for mode in (0, 4, 5, 4)]
+    assert [fields["flight_mode"] for ((_, fields),) in translated] == [
+        FlightMode.STABILIZED,  # before the requested mode
         FlightMode.HOLD,
         FlightMode.POSITION,
-        FlightMode.OFFBOARD,  # not ours any more
+        FlightMode.OFFBOARD,  # not requested by us
     ]
 
 
-def test_copter_is_never_given_an_acceleration() -> None:
-    """It would go on adding it to its velocity for GUID_TIMEOUT when our setpoints end."""
+def test_no_acceleration_is_sent_to_copter() -> None:
+    """Copter would integrate it into the velocity for GUID_TIMEOUT after our setpoints end."""
     given = {"type_mask": 0b1000_0000_0111, "vx": 3.0, "afx": 1.0, "afy": -2.0, "afz": 0.0, "yaw_rate": 0.0}
     sent = ArduPilotProfile().setpoint_fields(given)
     assert sent["type_mask"] == 0b1001_1100_0111
     assert (sent["vx"], sent["afx"], sent["afy"], sent["afz"]) == (3.0, 0.0, 0.0, 0.0)
 
 
-async def test_a_quick_reboot_is_noticed_by_timesync_and_streams_come_again(
+async def test_quick_reboot_is_detected_by_timesync(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     async with copter(2.0) as (driver, simulator):
         assert isinstance(driver, AutopilotDriver)
-        # A restart is a clock that goes back by more than messages overtake each other.
+        # A restart is a clock that goes back by more than reordered messages do.
         await wait_until(lambda: driver._telemetry._boot_ms.get("TIMESYNC", 0) > 6_000, 10.0)
         simulator.fault("reboot 1.2")
         await wait_until(lambda: "has restarted" in caplog.text, 10.0)
-        assert "LOCAL_POSITION_NED" not in driver._telemetry._boot_ms  # it has not come again yet
-        await state_shows(driver, known)
-        assert "is silent" not in caplog.text
+        assert "LOCAL_POSITION_NED" not in driver._telemetry._boot_ms  # not received again yet
+        await wait_for_state(driver, known)
+        assert "no heartbeat" not in caplog.text
 
 
-async def test_streams_that_somebody_stops_come_again() -> None:
+async def test_stopped_streams_are_restored() -> None:
     async with copter() as (driver, _):
         assert isinstance(driver, AutopilotDriver)
         stop = {"req_stream_id": mavlink.MAV_DATA_STREAM_ALL, "req_message_rate": 0, "start_stop": 0}
         driver._send_message("REQUEST_DATA_STREAM", {"target_system": 1, "target_component": 1, **stop})
-        await state_shows(driver, lambda s: not s.position_fresh(time.monotonic_ns()))
-        await state_shows(driver, lambda s: "LOCAL_POSITION_NED" in s.missing_streams)
-        await state_shows(driver, known)
+        await wait_for_state(driver, lambda s: not s.position_fresh(time.monotonic_ns()))
+        await wait_for_state(driver, lambda s: "LOCAL_POSITION_NED" in s.missing_streams)
+        await wait_for_state(driver, known)
 
 
-def test_modes_go_by_what_they_do_and_what_is_not_there_cannot_be_asked_for() -> None:
+def test_copter_modes_map_to_px4_names() -> None:
     assert mode_of_custom_mode(4) is FlightMode.OFFBOARD
     assert mode_of_custom_mode(21) is FlightMode.RETURN
     assert mode_of_custom_mode(99) is FlightMode.UNKNOWN
     assert custom_mode_of_mode(FlightMode.POSITION) == 5
-    with pytest.raises(ValueError, match="has no mode takeoff"):
+    with pytest.raises(ValueError, match="takeoff"):
         custom_mode_of_mode(FlightMode.TAKEOFF)
 
 
-async def test_what_goes_on_the_wire_to_an_ardupilot() -> None:
+async def test_messages_sent_to_ardupilot() -> None:
     port = free_port()
     autopilot = FakeAutopilot(port, autopilot=3)
     autopilot.custom_mode, autopilot.base_mode = 4, 217
@@ -168,16 +168,16 @@ async def test_what_goes_on_the_wire_to_an_ardupilot() -> None:
     try:
         await driver.connect(10.0)
         driver.send_setpoint(Setpoint.velocity((1.0, 0.0, 0.0), time.monotonic_ns()))
-        (message,) = await autopilot.hears(SETPOINT)
+        (message,) = await autopilot.wait_for(SETPOINT)
         assert message.type_mask == 0b0101_1100_0111  # a yaw rate of zero: the heading is kept
         assert message.yaw_rate == 0.0
-        autopilot.say(mavlink.MAVLink_gps_global_origin_message(474000000, 85000000, 480_000))
+        autopilot.send(mavlink.MAVLink_gps_global_origin_message(474000000, 85000000, 480_000))
         home = (474000900, 85000000, 485_000)
-        autopilot.say(mavlink.MAVLink_home_position_message(*home, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0))
+        autopilot.send(mavlink.MAVLink_home_position_message(*home, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0))
         await wait_until(lambda: driver.state.home_position_ned_m is not None, 5.0)
         assert driver.state.home_position_ned_m == pytest.approx((10.007, 0.0, -5.0), abs=0.01)
         await driver.set_mode(FlightMode.OFFBOARD)
-        asked = [m for m in await autopilot.hears("COMMAND_LONG") if m.command == 176]
+        asked = [m for m in await autopilot.wait_for("COMMAND_LONG") if m.command == 176]
         assert (asked[-1].param1, asked[-1].param2) == (1.0, 4.0)
     finally:
         await driver.close()

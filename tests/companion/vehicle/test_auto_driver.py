@@ -1,4 +1,4 @@
-"""driver = "auto": which driver flies what answers, over the one link that was opened."""
+"""driver = "auto": the driver is chosen by the autopilot, on the one link that was opened."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from companion.vehicle.link_url import LinkUrl
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import VehicleState
 from mavlink_sim.testing import running_simulator
-from tests.companion.vehicle.fake_autopilot import SETPOINT, FakeAutopilot, state_shows, wait_until
+from tests.companion.vehicle.fake_autopilot import SETPOINT, FakeAutopilot, wait_for_state, wait_until
 
 AUTOPILOTS = [(PX4, "mavsdk", "PX4"), (ARDUPILOT, "pymavlink", "ArduPilot")]
 
@@ -42,7 +42,7 @@ def auto(port: int) -> Driver:
 
 
 @pytest.mark.parametrize(("autopilot", "library", "name"), AUTOPILOTS)
-async def test_the_driver_fits_the_autopilot_that_answers(
+async def test_driver_is_chosen_by_the_autopilot(
     port: int, autopilot: int, library: str, name: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
@@ -52,19 +52,19 @@ async def test_the_driver_fits_the_autopilot_that_answers(
         try:
             await driver.connect(10.0)
             assert (driver.library, driver.state.autopilot) == (library, name)
-            assert f"{name}, system 1, answers: {library} driver" in caplog.text
+            assert f"{name}, system 1: {library} driver" in caplog.text
             driver.send_setpoint(Setpoint.velocity((1.0, 0.0, 0.0), time.monotonic_ns()))
-            (message,) = await fake.hears(SETPOINT)
+            (message,) = await fake.wait_for(SETPOINT)
             assert message.vx == 1.0
         finally:
             await driver.close()
 
 
 @pytest.mark.parametrize(("autopilot", "library", "name"), AUTOPILOTS)
-async def test_one_heartbeat_and_one_socket_are_enough(
+async def test_one_heartbeat_and_one_socket_suffice(
     port: int, autopilot: int, library: str, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nothing is let go: a listener that closed would have to wait for the next heartbeat for its address."""
+    """The socket stays open: a new one would wait for the next heartbeat to learn the peer address."""
     opened: list[LinkUrl] = []
 
     async def counted(url: LinkUrl, received: Received) -> ByteLink:
@@ -75,20 +75,20 @@ async def test_one_heartbeat_and_one_socket_are_enough(
     monkeypatch.setattr(autopilot_driver, "open_link", counted)
     driver = auto(port)
     async with answering(port, autopilot) as fake:
-        fake.beating = False
+        fake.sends_heartbeats = False
         connecting = asyncio.create_task(driver.connect(10.0))
         await wait_until(lambda: bool(opened), 5.0)
         fake.heartbeat()
         await connecting
         try:
             driver.send_setpoint(Setpoint.brake(time.monotonic_ns()))
-            await fake.hears(SETPOINT)
+            await fake.wait_for(SETPOINT)
             assert (len(opened), driver.library) == (1, library)
         finally:
             await driver.close()
 
 
-async def test_a_tcp_peer_is_connected_to_once() -> None:
+async def test_tcp_peer_is_connected_once() -> None:
     peers: list[asyncio.StreamWriter] = []
     closed = asyncio.Event()
 
@@ -111,7 +111,7 @@ async def test_a_tcp_peer_is_connected_to_once() -> None:
         server.close()
 
 
-async def test_who_subscribed_before_is_called_until_it_ends_that(port: int) -> None:
+async def test_subscription_made_before_connect_works_until_ended(port: int) -> None:
     driver, seen = auto(port), list[VehicleState]()
     end = driver.subscribe(seen.append)
     async with answering(port, PX4):
@@ -121,26 +121,26 @@ async def test_who_subscribed_before_is_called_until_it_ends_that(port: int) -> 
             end()
             count = len(seen)
             before_ns = driver.state.heartbeat_ns
-            await state_shows(driver, lambda s: s.heartbeat_ns > before_ns)
+            await wait_for_state(driver, lambda s: s.heartbeat_ns > before_ns)
             assert len(seen) == count
         finally:
             await driver.close()
 
 
-async def test_it_connects_again_and_to_another_autopilot(port: int) -> None:
+async def test_reconnects_to_another_autopilot(port: int) -> None:
     driver = auto(port)
     for autopilot, library, _ in (*AUTOPILOTS, AUTOPILOTS[0]):
         async with answering(port, autopilot):
             await driver.connect(10.0)
             assert driver.library == library
-            with pytest.raises(LinkError, match="connected already"):
+            with pytest.raises(LinkError, match="already"):
                 await driver.connect(1.0)
             assert driver.library == library
             await driver.close()
             await driver.close()
 
 
-async def test_pymavlink_flies_px4_where_mavsdk_cannot_be_loaded(
+async def test_pymavlink_is_used_when_mavsdk_cannot_be_loaded(
     port: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     def broken() -> AutopilotDriver:
@@ -152,16 +152,16 @@ async def test_pymavlink_flies_px4_where_mavsdk_cannot_be_loaded(
     async with answering(port, PX4):
         await driver.connect(10.0)
         await driver.close()
-    assert "MAVSDK cannot be loaded (libmavsdk.so: cannot open" in caplog.text
-    assert "pymavlink driver is used" in caplog.text
+    assert "libmavsdk.so" in caplog.text
+    assert "pymavlink driver" in caplog.text
 
 
-async def test_no_autopilot_and_one_that_is_not_flown_free_the_port(port: int) -> None:
+async def test_failed_connect_frees_the_port(port: int) -> None:
     driver = auto(port)
-    with pytest.raises(LinkError, match="no autopilot answered"):
+    with pytest.raises(LinkError, match=r"no autopilot .*0\.2 s"):
         await driver.connect(0.2)
     async with answering(port, 0):
-        with pytest.raises(LinkError, match="only PX4 and ArduPilot are flown"):
+        with pytest.raises(LinkError, match="only PX4 and ArduPilot"):
             await driver.connect(5.0)
     async with answering(port, PX4):
         await driver.connect(10.0)
@@ -169,12 +169,12 @@ async def test_no_autopilot_and_one_that_is_not_flown_free_the_port(port: int) -
 
 
 @pytest.mark.parametrize("firmware", ["px4", "ardupilot"])
-async def test_both_built_in_vehicles_arm_by_it(firmware: str) -> None:
+async def test_both_built_in_vehicles_arm(firmware: str) -> None:
     with running_simulator(autopilot=firmware, ready_after=0.0, speed=2.0) as simulator:
         driver = auto(simulator.onboard_port)
         await driver.connect(20.0)
         try:
-            await state_shows(driver, lambda s: s.ready_to_arm and s.position_ned_m is not None)
+            await wait_for_state(driver, lambda s: s.ready_to_arm and s.position_ned_m is not None)
             await driver.arm()
             await driver.disarm()
         finally:

@@ -19,8 +19,8 @@ from mavlink_sim.testing import free_port
 from tests.companion.vehicle.fake_autopilot import wait_until
 
 
-class Ear:
-    """Keeps what comes."""
+class Receiver:
+    """Records the received data and its source."""
 
     def __init__(self) -> None:
         self.data = b""
@@ -38,16 +38,16 @@ def udp_peer() -> socket.socket:
     return peer
 
 
-async def test_a_listening_udp_link_answers_whom_it_is_told_to(port: int) -> None:
-    ear = Ear()
-    link = await open_link(parse_link_url(f"udpin://127.0.0.1:{port}"), ear)
+async def test_udp_listener_sends_to_the_set_peer(port: int) -> None:
+    receiver = Receiver()
+    link = await open_link(parse_link_url(f"udpin://127.0.0.1:{port}"), receiver)
     with udp_peer() as first, udp_peer() as second:
         link.send(b"to nobody")
         assert link.dropped_count == 1
         for peer, text in ((first, b"one"), (second, b"two")):
             peer.sendto(text, ("127.0.0.1", port))
-            await wait_until(lambda text=text: ear.data.endswith(text), 5.0)  # type: ignore[misc]  # a lambda with a default
-            link.answer_to(ear.source)
+            await wait_until(lambda text=text: receiver.data.endswith(text), 5.0)  # type: ignore[misc]  # a lambda with a default
+            link.answer_to(receiver.source)
             link.send(b"answer to " + text)
             assert await asyncio.get_running_loop().sock_recv(peer, 100) == b"answer to " + text
     await link.close()
@@ -56,9 +56,9 @@ async def test_a_listening_udp_link_answers_whom_it_is_told_to(port: int) -> Non
     assert link.dropped_count == 2
 
 
-async def test_an_outgoing_udp_link_keeps_its_address_and_outlives_an_absent_listener(port: int) -> None:
-    ear = Ear()
-    link = await open_link(parse_link_url(f"udpout://localhost:{port}"), ear)
+async def test_udp_out_link_keeps_its_peer_without_a_listener(port: int) -> None:
+    receiver = Receiver()
+    link = await open_link(parse_link_url(f"udpout://localhost:{port}"), receiver)
     for _ in range(3):
         link.send(b"anybody?")
         await asyncio.sleep(0)
@@ -70,13 +70,13 @@ async def test_an_outgoing_udp_link_keeps_its_address_and_outlives_an_absent_lis
         data, source = await asyncio.get_running_loop().sock_recvfrom(peer, 100)
         assert data == b"hello"
         peer.sendto(b"hello yourself", source)
-        await wait_until(lambda: ear.data == b"hello yourself", 5.0)
+        await wait_until(lambda: receiver.data == b"hello yourself", 5.0)
     await link.close()
 
 
-async def test_a_tcp_link_reads_writes_and_comes_back_after_a_loss(caplog: pytest.LogCaptureFixture) -> None:
+async def test_tcp_link_is_reopened_after_a_loss(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
-    ear, arrived, writers = Ear(), bytearray(), []
+    receiver, arrived, writers = Receiver(), bytearray(), []
     served: list[asyncio.Task[Any]] = []
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -92,16 +92,16 @@ async def test_a_tcp_link_reads_writes_and_comes_back_after_a_loss(caplog: pytes
 
     server = await asyncio.start_server(serve, "127.0.0.1", 0)
     port = server.sockets[0].getsockname()[1]
-    link = await open_link(parse_link_url(f"tcp://127.0.0.1:{port}"), ear)
-    await wait_until(lambda: ear.data == b"welcome 1", 5.0)
-    assert ear.source is None
+    link = await open_link(parse_link_url(f"tcp://127.0.0.1:{port}"), receiver)
+    await wait_until(lambda: receiver.data == b"welcome 1", 5.0)
+    assert receiver.source is None
     link.send(b"first")
     await wait_until(lambda: bytes(arrived) == b"first", 5.0)
     writers[0].transport.abort()
-    await wait_until(lambda: ear.data == b"welcome 1welcome 2", 10.0)
+    await wait_until(lambda: receiver.data == b"welcome 1welcome 2", 10.0)
     link.send(b" second")
     await wait_until(lambda: bytes(arrived) == b"first second", 5.0)
-    await wait_until(lambda: "open again" in caplog.text, 5.0)
+    await wait_until(lambda: "reopened" in caplog.text, 5.0)
     await link.close()
     await link.close()
     await asyncio.gather(*served)
@@ -109,16 +109,16 @@ async def test_a_tcp_link_reads_writes_and_comes_back_after_a_loss(caplog: pytes
     await server.wait_closed()
 
 
-async def test_the_rest_of_a_frame_that_waited_too_long_is_not_sent_later(
+async def test_delayed_rest_of_a_frame_is_dropped(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """As after SIGSTOP in the middle of a setpoint, on a line that was full."""
-    monkeypatch.setattr("companion.vehicle.byte_link._REST_S", -1.0)
+    """As after SIGSTOP in the middle of a setpoint, on a full line."""
+    monkeypatch.setattr("companion.vehicle.byte_link._PARTIAL_FRAME_S", -1.0)
     listener = socket.socket()
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
     listener.bind(("127.0.0.1", 0))
     listener.listen()
-    link = await open_link(parse_link_url(f"tcp://127.0.0.1:{listener.getsockname()[1]}"), Ear())
+    link = await open_link(parse_link_url(f"tcp://127.0.0.1:{listener.getsockname()[1]}"), Receiver())
     peer, _ = listener.accept()
     peer.setblocking(False)
     size = 1_000_003
@@ -126,7 +126,7 @@ async def test_the_rest_of_a_frame_that_waited_too_long_is_not_sent_later(
     while not link._unsent:
         link.send(bytes(size))
     arrived = 0
-    while "is not sent" not in caplog.text:
+    while "partial frame dropped" not in caplog.text:
         with contextlib.suppress(BlockingIOError):
             arrived += len(peer.recv(1 << 20))
         await asyncio.sleep(0)
@@ -138,20 +138,20 @@ async def test_the_rest_of_a_frame_that_waited_too_long_is_not_sent_later(
         arrived += len(data)
         last = data
     assert last.endswith(b"next")
-    assert (arrived - 4) % size != 0, "half a frame, and no other half"
+    assert (arrived - 4) % size != 0, "the partial frame was completed"
     peer.close()
     listener.close()
 
 
-async def test_a_tcp_link_that_is_full_drops_whole_messages_and_never_half_of_one(
+async def test_full_tcp_link_drops_only_whole_messages(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("companion.vehicle.byte_link._REST_S", 60.0)
+    monkeypatch.setattr("companion.vehicle.byte_link._PARTIAL_FRAME_S", 60.0)
     listener = socket.socket()
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
     listener.bind(("127.0.0.1", 0))
     listener.listen()
-    link = await open_link(parse_link_url(f"tcp://127.0.0.1:{listener.getsockname()[1]}"), Ear())
+    link = await open_link(parse_link_url(f"tcp://127.0.0.1:{listener.getsockname()[1]}"), Receiver())
     peer, _ = listener.accept()
     sent = 0
     while link.dropped_count < 10:
@@ -173,24 +173,26 @@ async def test_a_tcp_link_that_is_full_drops_whole_messages_and_never_half_of_on
     listener.close()
 
 
-async def test_closing_ends_the_attempts_to_reopen() -> None:
+async def test_close_stops_reopening() -> None:
     server = await asyncio.start_server(lambda _r, w: w.close(), "127.0.0.1", 0)
-    link = await open_link(parse_link_url(f"tcp://127.0.0.1:{server.sockets[0].getsockname()[1]}"), Ear())
+    link = await open_link(
+        parse_link_url(f"tcp://127.0.0.1:{server.sockets[0].getsockname()[1]}"), Receiver()
+    )
     server.close()
     await server.wait_closed()
     await link.close()
     await link.close()
 
 
-async def test_a_serial_line_is_raw_both_ways() -> None:
-    ear = Ear()
+async def test_serial_line_is_raw_in_both_directions() -> None:
+    receiver = Receiver()
     master, slave = pty.openpty()
     name = os.ttyname(slave)
     os.close(slave)
-    link = await open_link(parse_link_url(f"serial://{name}:57600"), ear)
+    link = await open_link(parse_link_url(f"serial://{name}:57600"), receiver)
     everything = bytes(range(256))
     os.write(master, everything)
-    await wait_until(lambda: ear.data == everything, 5.0)
+    await wait_until(lambda: receiver.data == everything, 5.0)
     link.send(everything)
     os.set_blocking(master, False)
     echoed = b""
@@ -205,13 +207,13 @@ async def test_a_serial_line_is_raw_both_ways() -> None:
     os.close(master)
 
 
-async def test_a_serial_line_that_hangs_up_is_said_and_tried_again(caplog: pytest.LogCaptureFixture) -> None:
+async def test_serial_hangup_is_logged(caplog: pytest.LogCaptureFixture) -> None:
     master, slave = pty.openpty()
     name = os.ttyname(slave)
     os.close(slave)
-    link = await open_link(parse_link_url(f"serial://{name}:57600"), Ear())
+    link = await open_link(parse_link_url(f"serial://{name}:57600"), Receiver())
     os.close(master)
-    await wait_until(lambda: f"serial://{name}:57600: lost" in caplog.text, 5.0)
+    await wait_until(lambda: f"serial://{name}:57600: link lost" in caplog.text, 5.0)
     link.send(b"into nothing")
     assert link.dropped_count == 1
     await link.close()
@@ -220,33 +222,31 @@ async def test_a_serial_line_that_hangs_up_is_said_and_tried_again(caplog: pytes
 @pytest.mark.parametrize(
     ("url", "message"),
     [
-        ("serial:///dev/no-such-device:57600", "there is no device /dev/no-such-device; is it plugged in"),
-        ("serial:///dev/null:57600", "/dev/null is not a serial device"),
-        ("serial:///dev/null:12345", r"no baud rate 12345; it has \[.*57600"),
-        ("udpin://192.0.2.1:14540", r"no interface of this computer has the address 192\.0\.2\.1"),
-        ("udpin://host.invalid:14540", "the host cannot be resolved"),
+        ("serial:///dev/no-such-device:57600", "no device /dev/no-such-device"),
+        ("serial:///dev/null:57600", "not a serial device"),
+        ("serial:///dev/null:12345", r"12345 .*\[.*57600"),
+        ("udpin://192.0.2.1:14540", r"no interface .*192\.0\.2\.1"),
+        ("udpin://host.invalid:14540", "resolved"),
     ],
 )
-async def test_an_endpoint_that_cannot_be_opened_is_said_in_one_line(url: str, message: str) -> None:
+async def test_open_failure_is_one_line_with_the_url(url: str, message: str) -> None:
     with pytest.raises(LinkError, match=message) as caught:
-        await open_link(parse_link_url(url), Ear())
+        await open_link(parse_link_url(url), Receiver())
     assert str(caught.value).startswith(url)
     assert "\n" not in str(caught.value)
 
 
-async def test_a_tcp_port_nobody_listens_on_is_said() -> None:
-    with pytest.raises(
-        LinkError, match="cannot connect: Connection refused; is a vehicle or a router listening"
-    ):
-        await open_link(parse_link_url(f"tcp://127.0.0.1:{free_port(socket.SOCK_STREAM)}"), Ear())
+async def test_tcp_refusal_is_reported() -> None:
+    with pytest.raises(LinkError, match="Connection refused"):
+        await open_link(parse_link_url(f"tcp://127.0.0.1:{free_port(socket.SOCK_STREAM)}"), Receiver())
 
 
-async def test_a_serial_device_another_program_holds_is_said() -> None:
+async def test_busy_serial_device_is_reported() -> None:
     master, slave = pty.openpty()
     url = parse_link_url(f"serial://{os.ttyname(slave)}:57600")
-    link = await open_link(url, Ear())
+    link = await open_link(url, Receiver())
     with pytest.raises(LinkError, match="another program has"):
-        await open_link(url, Ear())
+        await open_link(url, Receiver())
     await link.close()
     os.close(master)
     os.close(slave)

@@ -1,4 +1,4 @@
-"""The autopilot's clock, learnt from questions and answers."""
+"""The autopilot's clock, estimated from TIMESYNC replies."""
 
 import random
 
@@ -13,7 +13,7 @@ SECOND = 1_000_000_000
 
 
 def asked(sync: ClockSync, at_ns: int, there_ns: int, back_ns: int, offset_ns: int) -> bool:
-    """A question at `at_ns` of our clock that took so long there and back."""
+    """Add a reply to a request sent at `at_ns` with these one-way delays."""
     return sync.answer(at_ns, at_ns + there_ns + offset_ns, at_ns + there_ns + back_ns)
 
 
@@ -22,7 +22,7 @@ def asked(sync: ClockSync, at_ns: int, there_ns: int, back_ns: int, offset_ns: i
     st.lists(st.tuples(st.integers(0, 45 * MS), st.integers(0, 45 * MS)), min_size=1, max_size=18),
     st.floats(-50e-6, 50e-6),
 )
-def test_the_truth_lies_within_the_error_that_is_told(
+def test_true_offset_is_within_the_reported_error(
     offset_ns: int, trips: list[tuple[int, int]], drift: float
 ) -> None:
     sync, at_ns = ClockSync(), SECOND
@@ -36,7 +36,7 @@ def test_the_truth_lies_within_the_error_that_is_told(
     assert known.error_ns <= min(sum(trip) for trip in trips) / 2 + KEPT_S * 1e9 * 100e-6 + 1
 
 
-def test_the_shortest_trip_is_believed_and_the_long_ones_are_not() -> None:
+def test_shortest_round_trip_wins() -> None:
     sync = ClockSync()
     asked(sync, SECOND, 200_000, 200_000, 7 * SECOND)
     asked(sync, 2 * SECOND, 1 * MS, 80 * MS, 7 * SECOND)
@@ -47,7 +47,7 @@ def test_the_shortest_trip_is_believed_and_the_long_ones_are_not() -> None:
     assert not sync.answer(5 * SECOND, 1, 4 * SECOND)
 
 
-def test_what_was_learnt_grows_old() -> None:
+def test_offset_error_grows_and_expires() -> None:
     sync = ClockSync()
     assert sync.offset(SECOND) is None
     asked(sync, SECOND, MS, MS, 5)
@@ -59,7 +59,7 @@ def test_what_was_learnt_grows_old() -> None:
 
 
 @pytest.mark.parametrize("jump_ns", [-3600 * SECOND, -200 * MS, 200 * MS, 3600 * SECOND])
-def test_a_jump_of_the_clock_is_believed_at_the_next_answer(jump_ns: int) -> None:
+def test_clock_jump_is_adopted_at_the_next_reply(jump_ns: int) -> None:
     sync, at_ns = ClockSync(), 10_000 * SECOND
     for step in range(5):
         asked(sync, at_ns + step * SECOND, 2 * MS, 3 * MS, 4 * SECOND)
@@ -69,20 +69,20 @@ def test_a_jump_of_the_clock_is_believed_at_the_next_answer(jump_ns: int) -> Non
     assert abs(known.offset_ns - 4 * SECOND - jump_ns) <= known.error_ns
 
 
-def test_a_stamp_is_that_of_the_measurement_and_without_a_clock_that_of_the_arrival() -> None:
+def test_stamp_falls_back_to_the_arrival() -> None:
     sync, now_ns = ClockSync(), 50 * SECOND
     assert sync.stamp(1_000, now_ns) == now_ns
     asked(sync, now_ns, MS, MS, -40 * SECOND)  # booted at 40 s
     late_ns = 30 * MS
     boot_ms = (now_ns - 40 * SECOND) // MS
     assert abs(sync.stamp(boot_ms, now_ns + late_ns) - now_ns) <= MS
-    # of the future: cut to the arrival as far as the error allows, and another clock beyond it
+    # In the future: clamped to the arrival within the error, another clock beyond it.
     assert sync.stamp(boot_ms + 1, now_ns + MS) <= now_ns + MS
     assert sync.stamp(boot_ms + 5_000, now_ns) == now_ns
     assert sync.offset(now_ns) is None
 
 
-def test_messages_jittered_on_their_way_get_their_own_times_back() -> None:
+def test_stamps_of_jittered_messages_are_restored() -> None:
     rng, sync = random.Random(4), ClockSync()
     offset_ns, worst_ns = -123 * SECOND - 456_789, 0
     for step in range(400):
@@ -95,4 +95,4 @@ def test_messages_jittered_on_their_way_get_their_own_times_back() -> None:
         assert known is not None
         assert abs(stamp_ns - true_ns) <= known.error_ns + MS
         worst_ns = max(worst_ns, abs(stamp_ns - true_ns))
-    assert worst_ns < 35 * MS  # by their arrival they were off by up to 95 ms
+    assert worst_ns < 35 * MS  # the arrivals are off by up to 95 ms

@@ -1,4 +1,4 @@
-"""Another service on the same vehicle, known by its heartbeat."""
+"""Another service on the same vehicle, detected by its heartbeat."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pymavlink.dialects.v20 import common as mavlink
 from companion.vehicle.commander import Commander, commander_mode, read_commander
 from companion.vehicle.driver import Driver, SystemStatus
 from companion.vehicle.state import VehicleState
-from tests.companion.vehicle.fake_autopilot import FakeAutopilot, state_shows
+from tests.companion.vehicle.fake_autopilot import FakeAutopilot, wait_for_state
 
 DAY_S = 24 * 3600.0
 OURS = commander_mode(100.0, True)
@@ -17,40 +17,40 @@ ONBOARD, STATION = mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_TYPE_GCS
 
 
 @given(uptime_s=st.floats(0, 5 * DAY_S), in_command=st.booleans())
-def test_a_heartbeat_tells_uptime_and_command(uptime_s: float, in_command: bool) -> None:
+def test_heartbeat_encodes_uptime_and_command(uptime_s: float, in_command: bool) -> None:
     mode = commander_mode(uptime_s, in_command)
     assert 0 <= mode < 2**32
     assert read_commander(ONBOARD, mode, (1, 191), 7) == Commander((1, 191), 7, int(uptime_s), in_command)
 
 
-def test_an_uptime_of_weeks_stays_the_longest() -> None:
+def test_uptime_is_clamped() -> None:
     one = read_commander(ONBOARD, commander_mode(30 * DAY_S, False), (1, 191), 7)
     assert one is not None
     assert (one.uptime_s, one.in_command) == (2**19 - 1, False)
 
 
 def heartbeat(address: tuple[int, int], mav_type: int, custom_mode: int, sequence: int = 99) -> bytes:
-    """As another system's, or another component's of the vehicle, that the autopilot forwards."""
+    """A heartbeat of another system or component, as forwarded by the autopilot."""
     codec = mavlink.MAVLink(None, *address)
     codec.seq = sequence
     return bytes(mavlink.MAVLink_heartbeat_message(mav_type, 8, 0, custom_mode, 4, 3).pack(codec))
 
 
-async def test_a_service_s_heartbeat_is_in_the_state(driver: Driver, autopilot: FakeAutopilot) -> None:
-    autopilot.say_bytes(heartbeat((1, 191), ONBOARD, OURS))
-    autopilot.say_bytes(heartbeat((1, 192), ONBOARD, commander_mode(3.0, False)))
-    state = await state_shows(driver, lambda state: len(state.other_commanders) == 2)
-    told = [(one.address, one.uptime_s, one.in_command) for one in state.other_commanders]
-    assert told == [((1, 191), 100.0, True), ((1, 192), 3.0, False)]
-    autopilot.say_bytes(heartbeat((1, 191), ONBOARD, commander_mode(101.0, False)))
+async def test_heartbeat_of_a_service_is_in_the_state(driver: Driver, autopilot: FakeAutopilot) -> None:
+    autopilot.send_bytes(heartbeat((1, 191), ONBOARD, OURS))
+    autopilot.send_bytes(heartbeat((1, 192), ONBOARD, commander_mode(3.0, False)))
+    state = await wait_for_state(driver, lambda state: len(state.other_commanders) == 2)
+    others = [(other.address, other.uptime_s, other.in_command) for other in state.other_commanders]
+    assert others == [((1, 191), 100.0, True), ((1, 192), 3.0, False)]
+    autopilot.send_bytes(heartbeat((1, 191), ONBOARD, commander_mode(101.0, False)))
 
-    def renewed(state: VehicleState) -> bool:
-        return [one.uptime_s for one in state.other_commanders] == [3.0, 101.0]
+    def updated(state: VehicleState) -> bool:
+        return [other.uptime_s for other in state.other_commanders] == [3.0, 101.0]
 
-    await state_shows(driver, renewed)
+    await wait_for_state(driver, updated)
 
 
-async def test_who_does_not_command_is_no_commander(driver: Driver, autopilot: FakeAutopilot) -> None:
+async def test_other_heartbeats_are_no_commanders(driver: Driver, autopilot: FakeAutopilot) -> None:
     for address, mav_type, custom_mode in (
         ((245, 190), STATION, 0),
         ((1, 191), ONBOARD, 0),  # MAVROS, or a logger
@@ -58,17 +58,17 @@ async def test_who_does_not_command_is_no_commander(driver: Driver, autopilot: F
         ((1, 100), mavlink.MAV_TYPE_CAMERA, OURS),
         ((2, 191), ONBOARD, OURS),  # another vehicle's
     ):
-        autopilot.say_bytes(heartbeat(address, mav_type, custom_mode))
-    autopilot.say_bytes(heartbeat((1, 193), ONBOARD, OURS))
-    state = await state_shows(driver, lambda state: bool(state.other_commanders))
-    assert [one.address for one in state.other_commanders] == [(1, 193)]
+        autopilot.send_bytes(heartbeat(address, mav_type, custom_mode))
+    autopilot.send_bytes(heartbeat((1, 193), ONBOARD, OURS))
+    state = await wait_for_state(driver, lambda state: bool(state.other_commanders))
+    assert [other.address for other in state.other_commanders] == [(1, 193)]
 
 
-async def test_our_own_heartbeat_sent_back_is_no_commander(driver: Driver, autopilot: FakeAutopilot) -> None:
+async def test_echo_of_our_heartbeat_is_no_commander(driver: Driver, autopilot: FakeAutopilot) -> None:
     driver.send_heartbeat(SystemStatus.ACTIVE, uptime_s=5.0, in_command=True)
-    await autopilot.hears("HEARTBEAT")
-    (raw,) = [raw for message, raw in autopilot.heard if message.get_type() == "HEARTBEAT"]
-    autopilot.say_bytes(raw)
-    autopilot.say_bytes(heartbeat((1, 192), ONBOARD, OURS))
-    state = await state_shows(driver, lambda state: bool(state.other_commanders))
-    assert [one.address for one in state.other_commanders] == [(1, 192)]
+    await autopilot.wait_for("HEARTBEAT")
+    (raw,) = [raw for message, raw in autopilot.received if message.get_type() == "HEARTBEAT"]
+    autopilot.send_bytes(raw)
+    autopilot.send_bytes(heartbeat((1, 192), ONBOARD, OURS))
+    state = await wait_for_state(driver, lambda state: bool(state.other_commanders))
+    assert [other.address for other in state.other_commanders] == [(1, 192)]

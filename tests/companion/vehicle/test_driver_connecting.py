@@ -1,4 +1,4 @@
-"""How both drivers find their autopilot, and what they say where there is none."""
+"""How both drivers find their autopilot, and their errors without one."""
 
 from __future__ import annotations
 
@@ -19,39 +19,42 @@ from tests.companion.vehicle.fake_autopilot import SETPOINT, FakeAutopilot, wait
 pytestmark = pytest.mark.usefixtures("short_measurement")
 
 
-async def test_no_autopilot_is_said_in_one_line(kind: DriverKind, port: int) -> None:
+async def test_missing_autopilot_is_one_line(kind: DriverKind, port: int) -> None:
     driver = open_driver(kind, f"udpin://127.0.0.1:{port}")
     with pytest.raises(LinkError) as caught:
         await driver.connect(0.3)
     text = str(caught.value)
-    assert text.startswith(f"no autopilot answered on udpin://127.0.0.1:{port} within 0.3 s")
+    assert "no autopilot" in text
+    assert f"udpin://127.0.0.1:{port} within 0.3 s" in text
     assert "\n" not in text
     await driver.close()
 
 
-async def test_heartbeats_of_others_are_no_autopilot_but_are_named(kind: DriverKind, port: int) -> None:
+async def test_other_heartbeat_senders_are_named(kind: DriverKind, port: int) -> None:
     station = FakeAutopilot(port, system_id=255, component_id=190, autopilot=8)
     station.start()
     try:
-        with pytest.raises(LinkError, match="heard only system/component 255/190"):
+        with pytest.raises(LinkError, match="only system/component 255/190"):
             await open_driver(kind, f"udpin://127.0.0.1:{port}").connect(0.5)
     finally:
         await station.stop()
 
 
-async def test_the_wanted_system_is_waited_for(kind: DriverKind, port: int, autopilot: FakeAutopilot) -> None:
+async def test_driver_waits_for_the_wanted_system(
+    kind: DriverKind, port: int, autopilot: FakeAutopilot
+) -> None:
     second = FakeAutopilot(port, system_id=7)
     second.start()
     driver = open_driver(kind, f"udpin://127.0.0.1:{port}", system_id=7)
     try:
         await driver.connect(10.0)
         driver.send_setpoint(Setpoint.brake(time.monotonic_ns()))
-        (message,) = await second.hears(SETPOINT)
+        (message,) = await second.wait_for(SETPOINT)
         assert message.target_system == 7
     finally:
         await driver.close()
         await second.stop()
-    with pytest.raises(LinkError, match="no autopilot of system 9 answered"):
+    with pytest.raises(LinkError, match="system 9"):
         await open_driver(kind, f"udpin://127.0.0.1:{port}", system_id=9).connect(0.5)
 
 
@@ -61,12 +64,12 @@ async def test_the_wanted_system_is_waited_for(kind: DriverKind, port: int, auto
         (
             "mavsdk",
             3,
-            'the mavsdk driver flies PX4 alone, and system 1 is ArduPilot; set vehicle.driver = "py',
+            'ArduPilot; set vehicle.driver = "pymavlink"',
         ),
-        ("pymavlink", 0, "only PX4 and ArduPilot are flown, and system 1 is a generic autopilot"),
+        ("pymavlink", 0, "system 1 is a generic autopilot"),
     ],
 )
-async def test_an_autopilot_that_a_driver_cannot_fly_is_refused_in_one_line(
+async def test_unsupported_autopilot_is_refused(
     kind: DriverKind, autopilot_kind: int, reason: str, port: int
 ) -> None:
     other = FakeAutopilot(port, autopilot=autopilot_kind)
@@ -78,14 +81,12 @@ async def test_an_autopilot_that_a_driver_cannot_fly_is_refused_in_one_line(
         await other.stop()
 
 
-async def test_a_busy_port_is_named_with_its_likely_holder(
-    kind: DriverKind, driver: Driver, port: int
-) -> None:
-    with pytest.raises(LinkError, match=rf"UDP port {port} is in use: another program .*QGroundControl"):
+async def test_busy_port_is_reported(kind: DriverKind, driver: Driver, port: int) -> None:
+    with pytest.raises(LinkError, match=rf"{port} is in use: .*QGroundControl"):
         await open_driver(kind, f"udpin://127.0.0.1:{port}").connect(5.0)
 
 
-async def test_closing_twice_frees_the_port_and_the_driver_can_connect_again(
+async def test_driver_can_reconnect_after_closing_twice(
     kind: DriverKind, port: int, autopilot: FakeAutopilot
 ) -> None:
     driver = open_driver(kind, f"udpin://127.0.0.1:{port}")
@@ -113,35 +114,33 @@ async def test_connecting_can_be_cancelled(kind: DriverKind, port: int) -> None:
     await driver.close()
 
 
-async def test_an_autopilot_that_restarted_is_asked_for_its_streams_anew(
-    driver: Driver, autopilot: FakeAutopilot
-) -> None:
+async def test_streams_are_requested_again_after_a_restart(driver: Driver, autopilot: FakeAutopilot) -> None:
     def asked() -> int:
         return sum(
-            m.command == 511 and m.param1 == CURRENT_MODE_ID for m in autopilot.heard_named("COMMAND_LONG")
+            m.command == 511 and m.param1 == CURRENT_MODE_ID for m in autopilot.received_named("COMMAND_LONG")
         )
 
-    autopilot.say(mavlink.MAVLink_local_position_ned_message(60_000, 0, 0, 0, 0, 0, 0))
+    autopilot.send(mavlink.MAVLink_local_position_ned_message(60_000, 0, 0, 0, 0, 0, 0))
     await wait_until(lambda: asked() == 1, 10.0)
-    autopilot.say(mavlink.MAVLink_local_position_ned_message(500, 0, 0, 0, 0, 0, 0))
+    autopilot.send(mavlink.MAVLink_local_position_ned_message(500, 0, 0, 0, 0, 0, 0))
     began_s, before = time.monotonic(), asked()
     await wait_until(lambda: asked() > before, 10.0)
     assert time.monotonic() - began_s < 1.9  # the pause after the first request is 2 s
 
 
 @pytest.mark.parametrize("message_id", [2, 33])  # SYSTEM_TIME, GLOBAL_POSITION_INT
-async def test_a_restart_is_noticed_by_any_message_that_tells_the_time(
+async def test_restart_is_detected_by_any_clocked_message(
     driver: Driver, autopilot: FakeAutopilot, message_id: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     for boot_ms in (60_000, 500):
         if message_id == 2:
-            autopilot.say(mavlink.MAVLink_system_time_message(0, boot_ms))
+            autopilot.send(mavlink.MAVLink_system_time_message(0, boot_ms))
         else:
-            autopilot.say(mavlink.MAVLink_global_position_int_message(boot_ms, 0, 0, 0, 0, 0, 0, 0, 0))
+            autopilot.send(mavlink.MAVLink_global_position_int_message(boot_ms, 0, 0, 0, 0, 0, 0, 0, 0))
     await wait_until(lambda: "has restarted" in caplog.text, 5.0)
 
 
-async def test_a_heartbeat_that_says_it_boots_is_a_restart(
+async def test_booting_heartbeat_is_a_restart(
     driver: Driver, autopilot: FakeAutopilot, caplog: pytest.LogCaptureFixture
 ) -> None:
     autopilot.system_status = mavlink.MAV_STATE_BOOT
@@ -151,12 +150,12 @@ async def test_a_heartbeat_that_says_it_boots_is_a_restart(
     assert caplog.text.count("has restarted") == 1
 
 
-async def test_what_never_comes_is_shown_as_missing(driver: Driver, autopilot: FakeAutopilot) -> None:
+async def test_absent_streams_are_missing(driver: Driver, autopilot: FakeAutopilot) -> None:
     await wait_until(lambda: "LOCAL_POSITION_NED" in driver.state.missing_streams, 5.0)
     assert "CURRENT_MODE" in driver.state.missing_streams
 
 
-async def test_two_drivers_fly_two_vehicles_at_once(
+async def test_two_drivers_control_two_vehicles(
     kind: DriverKind, driver: Driver, autopilot: FakeAutopilot
 ) -> None:
     port = free_port()
@@ -167,49 +166,47 @@ async def test_two_drivers_fly_two_vehicles_at_once(
         await second.connect(10.0)
         driver.send_setpoint(Setpoint.velocity((1.0, 0.0, 0.0), time.monotonic_ns()))
         second.send_setpoint(Setpoint.velocity((2.0, 0.0, 0.0), time.monotonic_ns()))
-        (first_heard,) = await autopilot.hears(SETPOINT)
-        (second_heard,) = await other.hears(SETPOINT)
-        assert (first_heard.vx, first_heard.get_srcComponent()) == (1.0, 191)
-        assert (second_heard.vx, second_heard.get_srcComponent()) == (2.0, 192)
+        (first_message,) = await autopilot.wait_for(SETPOINT)
+        (second_message,) = await other.wait_for(SETPOINT)
+        assert (first_message.vx, first_message.get_srcComponent()) == (1.0, 191)
+        assert (second_message.vx, second_message.get_srcComponent()) == (2.0, 192)
     finally:
         await second.close()
         await other.stop()
 
 
-async def test_a_vehicle_that_waits_to_be_spoken_to_is_spoken_to(kind: DriverKind, port: int) -> None:
-    """udpout: the vehicle listens, and answers whoever sent to it."""
+async def test_udp_out_sends_the_first_heartbeat(kind: DriverKind, port: int) -> None:
+    """udpout: the vehicle listens, and replies to the sender."""
     vehicle = FakeAutopilot(port)
-    vehicle.beating = False
-    vehicle.answers["HEARTBEAT"] = lambda _: setattr(vehicle, "beating", True)
+    vehicle.sends_heartbeats = False
+    vehicle.answers["HEARTBEAT"] = lambda _: setattr(vehicle, "sends_heartbeats", True)
     vehicle.start()
     driver = open_driver(kind, f"udpout://127.0.0.1:{vehicle.socket.getsockname()[1]}")
     try:
         await driver.connect(10.0)
         driver.send_setpoint(Setpoint.brake(time.monotonic_ns()))
-        await vehicle.hears(SETPOINT)
+        await vehicle.wait_for(SETPOINT)
     finally:
         await driver.close()
         await vehicle.stop()
 
 
-def test_a_driver_that_does_not_exist_and_bad_urls_and_ids_are_refused_when_opened() -> None:
-    with pytest.raises(ValueError, match="there is no driver 'dronekit'; there are: auto, mavsdk, pymav"):
-        open_driver("dronekit", "udpin://0.0.0.0:14540")  # type: ignore[arg-type]  # what is refused
-    with pytest.raises(ValueError, match="is not a link url"):
+def test_open_driver_refuses_bad_arguments() -> None:
+    with pytest.raises(ValueError, match=r"'dronekit'.*auto, mavsdk, pymav"):
+        open_driver("dronekit", "udpin://0.0.0.0:14540")  # type: ignore[arg-type]  # refused
+    with pytest.raises(ValueError, match="not a link url"):
         open_driver("mavsdk", "14540")
-    with pytest.raises(ValueError, match=r"system_id must be 1\.\.255, got 0"):
+    with pytest.raises(ValueError, match=r"system_id .*1\.\.255, got 0"):
         open_driver("mavsdk", "udpin://0.0.0.0:14540", system_id=0)
-    with pytest.raises(ValueError, match=r"own_component_id must be 1\.\.255"):
+    with pytest.raises(ValueError, match=r"own_component_id .*1\.\.255"):
         open_driver("pymavlink", "udpin://0.0.0.0:14540", own_component_id=256)
 
 
-async def test_an_autopilot_that_sends_heartbeats_alone_and_does_not_answer_is_named_so(
-    driver: Driver, autopilot: FakeAutopilot
-) -> None:
+async def test_no_answer_with_heartbeats_only_names_signing(driver: Driver, autopilot: FakeAutopilot) -> None:
     autopilot.answers.clear()
-    with pytest.raises(NoAnswerError, match=r"nothing but heartbeats .*vehicle\.signing_key_file"):
+    with pytest.raises(NoAnswerError, match=r"only heartbeats .*vehicle\.signing_key_file"):
         await driver.arm()
-    autopilot.say(mavlink.MAVLink_local_position_ned_message(60_000, 0, 0, 0, 0, 0, 0))
+    autopilot.send(mavlink.MAVLink_local_position_ned_message(60_000, 0, 0, 0, 0, 0, 0))
     await wait_until(lambda: driver.state.position_ned_m is not None, 5.0)
-    with pytest.raises(NoAnswerError, match=r"does not answer command 400 \([^;]*$"):
+    with pytest.raises(NoAnswerError, match=r"command 400 \([^;]*$"):
         await driver.arm()

@@ -1,4 +1,4 @@
-"""Both drivers on links and vehicles that fail: what they promise they still do, or they say why not."""
+"""Both drivers with faults of the link and the vehicle: they fulfil their contract or report why not."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
 from companion.vehicle.streamer import Streamer
 from mavlink_sim.testing import RunningSimulator, running_simulator
-from tests.companion.vehicle.fake_autopilot import state_shows, wait_until
+from tests.companion.vehicle.fake_autopilot import wait_for_state, wait_until
 
 PARAMETERS = {"COM_OF_LOSS_T": 2.0, "COM_OBL_RC_ACT": 4.0}
 
 
 def simulated(**options: Any) -> AbstractContextManager[RunningSimulator]:
-    """A vehicle that can be armed at once, at twice the pace."""
+    """A vehicle that can be armed at once, at twice real time."""
     return running_simulator(**{"speed": 2.0, "ready_after": 0.0, **options})
 
 
@@ -41,7 +41,7 @@ async def connected(kind: DriverKind, simulator: RunningSimulator) -> AsyncItera
 
 
 async def ready(driver: Driver) -> None:
-    await state_shows(
+    await wait_for_state(
         driver,
         lambda s: s.ready_to_arm and s.home_altitude_amsl_m is not None and s.position_ned_m is not None,
     )
@@ -49,7 +49,7 @@ async def ready(driver: Driver) -> None:
 
 @asynccontextmanager
 async def hovering(driver: Driver) -> AsyncIterator[Streamer]:
-    """A setpoint stream of standing still."""
+    """Stream a zero velocity setpoint."""
     streamer = Streamer(driver.send_setpoint, brake_s=0.1)
 
     async def want() -> None:
@@ -74,15 +74,13 @@ async def hovering(driver: Driver) -> AsyncIterator[Streamer]:
         pytest.param(["corrupt 0.05"], id="corrupting"),
     ],
 )
-async def test_on_a_bad_link_commands_and_parameters_still_come_through(
-    kind: DriverKind, faults: list[str]
-) -> None:
+async def test_commands_and_parameters_work_on_a_bad_link(kind: DriverKind, faults: list[str]) -> None:
     with simulated(faults=faults, seed=2) as simulator:
         async with connected(kind, simulator) as driver:
             await ready(driver)
             await driver.set_parameter("COM_OF_LOSS_T", 0.75)
-            # A late duplicate of an answer from before the change may be taken for the first one's answer:
-            # PARAM_VALUE has no number to tell them apart by.
+            # A late duplicate from before the change may be taken for the first answer: PARAM_VALUE has no
+            # sequence number.
             read = [await driver.get_parameter("COM_OF_LOSS_T") for _ in range(3)]
             assert read[-1] == 0.75
             await driver.set_mode(FlightMode.HOLD)
@@ -92,8 +90,8 @@ async def test_on_a_bad_link_commands_and_parameters_still_come_through(
             assert not driver.state.armed
 
 
-async def test_what_corruption_lets_through_is_true(kind: DriverKind) -> None:
-    """No damaged message may reach the state: heights stay near the ground and the mode a mode."""
+async def test_corrupted_messages_do_not_reach_the_state(kind: DriverKind) -> None:
+    """No damaged message may reach the state: the height stays near the ground and the mode is valid."""
     with simulated(faults=["corrupt 0.5 way=out"], seed=3) as simulator:
         async with connected(kind, simulator) as driver:
             seen: list[VehicleState] = []
@@ -106,7 +104,7 @@ async def test_what_corruption_lets_through_is_true(kind: DriverKind) -> None:
                 assert state.battery_fraction is None or state.battery_fraction > 0.5
 
 
-async def test_a_lost_acknowledgement_costs_a_repetition_and_all_of_them_an_answer(kind: DriverKind) -> None:
+async def test_lost_acknowledgement_is_repeated(kind: DriverKind) -> None:
     with simulated() as simulator:
         async with connected(kind, simulator) as driver:
             await ready(driver)
@@ -117,36 +115,34 @@ async def test_a_lost_acknowledgement_costs_a_repetition_and_all_of_them_an_answ
             await driver.disarm()
             simulator.fault("lost_ack command=400")
             await asyncio.to_thread(simulator.wait_for_event, "fault 2 lost_ack")
-            with pytest.raises(CommandRefusedError, match=r"does not answer command 400"):
+            with pytest.raises(CommandRefusedError, match="no answer to command 400"):
                 await driver.arm()
 
 
-async def test_a_refused_mode_is_told_of_at_once(kind: DriverKind) -> None:
+async def test_refused_mode_fails_at_once(kind: DriverKind) -> None:
     with simulated(faults=["refuse_mode LAND"]) as simulator:
         async with connected(kind, simulator) as driver:
             await ready(driver)
             asked_s = time.monotonic()
-            with pytest.raises(CommandRefusedError, match=r"refused mode land \(temporarily rejected\)"):
+            with pytest.raises(CommandRefusedError, match=r"land \(temporarily rejected\)"):
                 await driver.set_mode(FlightMode.LAND)
-            assert time.monotonic() - asked_s < 2.5  # not by the timeout of 3 s
+            assert time.monotonic() - asked_s < 2.5  # before the timeout of 3 s
 
 
-async def test_a_dead_link_is_told_of_and_its_return_too(
-    kind: DriverKind, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_link_loss_and_return_are_logged(kind: DriverKind, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     with simulated() as simulator:
         async with connected(kind, simulator) as driver:
             await ready(driver)
             simulator.fault("link_loss for=10")  # simulated seconds
-            await wait_until(lambda: "is silent" in caplog.text, 10.0)
+            await wait_until(lambda: "no heartbeat" in caplog.text, 10.0)
             assert not driver.state.connected(time.monotonic_ns())
             assert not driver.state.position_fresh(time.monotonic_ns())
-            await wait_until(lambda: "is back" in caplog.text, 10.0)
-            await state_shows(driver, lambda s: s.position_fresh(time.monotonic_ns()))
+            await wait_until(lambda: "received again" in caplog.text, 10.0)
+            await wait_for_state(driver, lambda s: s.position_fresh(time.monotonic_ns()))
 
 
-async def test_late_telemetry_bears_the_time_when_it_was_true(
+async def test_delayed_telemetry_has_measurement_stamps(
     kind: DriverKind,
 ) -> None:
     with simulated(speed=1.0) as simulator:
@@ -159,11 +155,11 @@ async def test_late_telemetry_bears_the_time_when_it_was_true(
             late = []
             driver.subscribe(lambda state: late.append(time.monotonic_ns() - state.position_ns))
             simulator.fault("link_delay 0.3 way=out")
-            # By its arrival it would look fresh for ever.
+            # Stamped by its arrival it would always look fresh.
             await wait_until(lambda: bool(late) and late[-1] > 200_000_000, 5.0)
 
 
-async def test_with_heartbeats_alone_the_vehicle_is_connected_but_its_position_is_stale(
+async def test_heartbeats_only_is_connected_with_a_stale_position(
     kind: DriverKind,
 ) -> None:
     with simulated() as simulator:
@@ -171,53 +167,49 @@ async def test_with_heartbeats_alone_the_vehicle_is_connected_but_its_position_i
             await ready(driver)
             simulator.fault("heartbeat_only")
             await wait_until(lambda: not driver.state.position_fresh(time.monotonic_ns()), 5.0)
-            heard_ns = driver.state.heartbeat_ns
-            await wait_until(lambda: driver.state.heartbeat_ns > heard_ns, 5.0)
+            before_ns = driver.state.heartbeat_ns
+            await wait_until(lambda: driver.state.heartbeat_ns > before_ns, 5.0)
             assert driver.state.connected(time.monotonic_ns())
 
 
-async def test_a_stream_that_somebody_stopped_is_asked_for_until_it_comes(kind: DriverKind) -> None:
+async def test_stopped_stream_is_requested_until_received(kind: DriverKind) -> None:
     with simulated() as simulator:
         async with connected(kind, simulator) as driver:
             await ready(driver)
             never = -1.0
             await driver._command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 32, never)
             await wait_until(lambda: not driver.state.position_fresh(time.monotonic_ns()), 5.0)
-            await state_shows(driver, lambda s: "LOCAL_POSITION_NED" in s.missing_streams)
-            await state_shows(driver, lambda s: s.position_fresh(time.monotonic_ns()))
-            await state_shows(driver, lambda s: not s.missing_streams)
+            await wait_for_state(driver, lambda s: "LOCAL_POSITION_NED" in s.missing_streams)
+            await wait_for_state(driver, lambda s: s.position_fresh(time.monotonic_ns()))
+            await wait_for_state(driver, lambda s: not s.missing_streams)
 
 
-async def test_a_reboot_is_noticed_and_the_vehicle_can_be_used_again(
-    kind: DriverKind, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_vehicle_is_usable_after_a_reboot(kind: DriverKind, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     with simulated() as simulator:
         async with connected(kind, simulator) as driver:
             await ready(driver)
             before = driver.state.home_altitude_amsl_m
             await driver.arm()
-            # A restart is a clock that goes back by more than datagrams overtake each other.
+            # A restart is a clock that goes back by more than reordered datagrams do.
             await wait_until(lambda: driver._telemetry._boot_ms.get("LOCAL_POSITION_NED", 0) > 6_000, 10.0)
             simulator.fault("reboot 2")
-            await state_shows(driver, lambda s: not s.armed)
+            await wait_for_state(driver, lambda s: not s.armed)
             await wait_until(lambda: "has restarted" in caplog.text, 10.0)
-            await state_shows(driver, lambda s: s.ready_to_arm)
+            await wait_for_state(driver, lambda s: s.ready_to_arm)
             await driver.arm()
-            # what was known of home is asked for again
-            await state_shows(driver, lambda s: s.home_altitude_amsl_m is not None)
+            # Home is requested again.
+            await wait_for_state(driver, lambda s: s.home_altitude_amsl_m is not None)
             assert driver.state.home_altitude_amsl_m == pytest.approx(before, abs=0.5)
 
 
-async def test_a_clock_that_jumps_back_costs_one_warning_and_no_data(
-    kind: DriverKind, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_clock_jump_back_is_one_warning(kind: DriverKind, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     with simulated() as simulator:
         async with connected(kind, simulator) as driver:
             await ready(driver)
             simulator.fault("time_jump 1000")
-            # A message that was still on its way from before would not do.
+            # A message sent before the jump does not count.
             await wait_until(
                 lambda: driver._telemetry._boot_ms.get("LOCAL_POSITION_NED", 0) > 1_000_000, 10.0
             )
@@ -227,10 +219,10 @@ async def test_a_clock_that_jumps_back_costs_one_warning_and_no_data(
             await wait_until(lambda: "has restarted" in caplog.text, 10.0)
             await driver.arm()
             assert caplog.text.count("has restarted") == 1
-            assert "is silent" not in caplog.text
+            assert "no heartbeat" not in caplog.text
 
 
-async def test_a_second_autopilot_with_its_own_system_id_changes_nothing(
+async def test_second_autopilot_with_its_own_id_is_ignored(
     kind: DriverKind, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
@@ -245,34 +237,36 @@ async def test_a_second_autopilot_with_its_own_system_id_changes_nothing(
             assert all(abs(state.position_ned_m[1]) < 5.0 for state in seen if state.position_ned_m)
 
 
-async def test_a_second_autopilot_of_the_same_id_is_named(
+async def test_second_autopilot_with_the_same_id_prevents_arming(
     kind: DriverKind, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """From the same address the two cannot be told apart; what can be done is to say it, and not fly."""
+    """At the same address the two are indistinguishable: it is logged, and arming is refused."""
     caplog.set_level(logging.WARNING)
     with simulated() as simulator:
         async with connected(kind, simulator) as driver:
             await ready(driver)
             simulator.fault("second_autopilot")
-            await wait_until(lambda: "two autopilots send as system 1" in caplog.text, 10.0)
+            await wait_until(lambda: "two autopilots" in caplog.text, 10.0)
             assert caplog.text.count("has restarted") <= 1
-            with pytest.raises(CommandRefusedError, match="two autopilots answer as system 1"):
+            with pytest.raises(CommandRefusedError, match="two autopilots"):
                 await driver.arm()
             await wait_until(lambda: not driver.state.position_fresh(time.monotonic_ns()), 5.0)
             simulator.fault("end all")
             await asyncio.to_thread(simulator.wait_for_event, "second_autopilot ends")
             await wait_until(lambda: not driver._telemetry.two_autopilots(time.monotonic_ns()), 10.0)
-            await state_shows(driver, lambda s: s.ready_to_arm)
+            await wait_for_state(driver, lambda s: s.ready_to_arm)
             await driver.arm()
 
 
-async def test_setpoints_that_come_late_and_with_gaps_keep_the_vehicle_in_offboard(kind: DriverKind) -> None:
+async def test_delayed_setpoints_keep_the_vehicle_in_offboard(kind: DriverKind) -> None:
     with simulated(parameters=PARAMETERS, seed=4) as simulator:
         async with connected(kind, simulator) as driver:
             await ready(driver)
             await driver.takeoff(3.0)
             await driver.arm()
-            await state_shows(driver, lambda s: s.landed is LandedState.IN_AIR and s.mode is FlightMode.HOLD)
+            await wait_for_state(
+                driver, lambda s: s.landed is LandedState.IN_AIR and s.mode is FlightMode.HOLD
+            )
             async with hovering(driver) as streamer:
                 await wait_until(lambda: streamer.sent_count > 0, 5.0)
                 await driver.set_mode(FlightMode.OFFBOARD)
@@ -284,7 +278,7 @@ async def test_setpoints_that_come_late_and_with_gaps_keep_the_vehicle_in_offboa
                 await wait_until(lambda: streamer.sent_count > sent + 120, 20.0)
                 assert driver.state.mode is FlightMode.OFFBOARD
                 assert not [event for event in simulator.events[before:] if "failsafe" in event]
-                # nothing gets through any more: the vehicle's own failsafe acts, and is seen afterwards
+                # Nothing is received any more: the vehicle's own failsafe acts.
                 simulator.fault("link_loss for=8")
                 await asyncio.to_thread(
                     simulator.wait_for_event, "failsafe: offboard setpoints lost", since=before
@@ -294,17 +288,16 @@ async def test_setpoints_that_come_late_and_with_gaps_keep_the_vehicle_in_offboa
 @pytest.mark.parametrize(
     ("kind", "autopilot"), [("pymavlink", "px4"), ("mavsdk", "px4"), ("pymavlink", "ardupilot")]
 )
-async def test_a_reset_of_the_estimate_and_its_loss_are_known(kind: DriverKind, autopilot: str) -> None:
+async def test_estimator_reset_and_loss_are_in_the_state(kind: DriverKind, autopilot: str) -> None:
     with simulated(autopilot=autopilot, speed=4.0) as simulator:
         async with connected(kind, simulator) as driver:
-            await state_shows(driver, lambda s: s.position_valid is True and s.position_ned_m is not None)
+            await wait_for_state(driver, lambda s: s.position_valid is True and s.position_ned_m is not None)
             before = driver.state.position_ned_m
             simulator.fault("ekf_reset 5 3 -1")
-            await state_shows(driver, lambda s: s.reset_count == 1)
+            await wait_for_state(driver, lambda s: s.reset_count == 1)
             assert driver.state.reset_offset_ned_m == pytest.approx((5.0, 3.0, -1.0), abs=0.3)
             assert driver.state.position_ned_m == pytest.approx(before, abs=0.6)
             simulator.fault("gps_loss")
-            await state_shows(driver, lambda s: s.position_valid is False, 20.0)
+            await wait_for_state(driver, lambda s: s.position_valid is False, 20.0)
             assert driver.state.position_fresh(time.monotonic_ns())
-            fault = driver.state.position_fault(time.monotonic_ns())
-            assert fault == "the autopilot's estimator reports it as not valid"
+            assert "estimator" in (driver.state.position_fault(time.monotonic_ns()) or "")

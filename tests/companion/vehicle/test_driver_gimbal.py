@@ -1,4 +1,4 @@
-"""One contract, two drivers: a gimbal is found, heard, taken, pointed and given back, over a real socket."""
+"""One contract, two drivers: discovery, control and pointing of a gimbal over a real socket."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from companion.vehicle.gimbal import NOBODY, GimbalAim, YawFrame
 from companion.vehicle.state import VehicleState
 from mavlink_sim.testing import running_simulator
 from tests.companion.live_flight import ground_station
-from tests.companion.vehicle.fake_autopilot import FakeAutopilot, gimbal_of, state_shows, wait_until
+from tests.companion.vehicle.fake_autopilot import FakeAutopilot, gimbal_of, wait_for_state, wait_until
 from vision.attitude import quaternion_from_euler
 
 pytestmark = pytest.mark.usefixtures("short_measurement")
@@ -35,17 +35,19 @@ async def connected(kind: DriverKind, port: int) -> AsyncIterator[Driver]:
         await driver.close()
 
 
-async def test_a_gimbal_is_heard_taken_pointed_and_given_back_and_never_fought_for(kind: DriverKind) -> None:
+async def test_gimbal_control_is_taken_used_and_released(kind: DriverKind) -> None:
     with (
         running_simulator(speed=2.0, gimbal=True) as simulator,
         ground_station(simulator.gcs_port) as station,
     ):
         async with connected(kind, simulator.onboard_port) as driver:
-            state = await state_shows(driver, lambda s: s.gimbal is not None and s.gimbal.information_ns > 0)
+            state = await wait_for_state(
+                driver, lambda s: s.gimbal is not None and s.gimbal.information_ns > 0
+            )
             assert state.gimbal is not None
             assert math.degrees(state.gimbal.lowest_pitch_rad) == pytest.approx(-135.0)
             assert math.degrees(state.gimbal.highest_pitch_rad) == pytest.approx(45.0)
-            state = await state_shows(
+            state = await wait_for_state(
                 driver,
                 lambda s: (
                     gimbal_of(s).attitude_fresh(time.monotonic_ns())
@@ -53,7 +55,7 @@ async def test_a_gimbal_is_heard_taken_pointed_and_given_back_and_never_fought_f
                 ),
             )
             assert gimbal_of(state).yaw_frame is YawFrame.NORTH
-            # Unasked it comes 5 times a second, of a clock that is twice as fast here: 10 take 0.9 s.
+            # Without a request it is sent 5 times a second, at twice real time here: 10 take 0.9 s.
             stamps: list[int] = []
             unsubscribe = driver.subscribe(lambda s: stamps.append(gimbal_of(s).attitude_ns))
             await wait_until(
@@ -61,10 +63,10 @@ async def test_a_gimbal_is_heard_taken_pointed_and_given_back_and_never_fought_f
             )
             unsubscribe()
 
-            with pytest.raises(CommandRefusedError, match=r"refused to point the gimbal \(denied\)"):
+            with pytest.raises(CommandRefusedError, match=r"\(denied\)"):
                 await driver.point_gimbal(GimbalAim(-0.5))
             await driver.take_gimbal()
-            await state_shows(driver, lambda s: gimbal_of(s).primary_control == OURS)
+            await wait_for_state(driver, lambda s: gimbal_of(s).primary_control == OURS)
             aim = GimbalAim(math.radians(-40.0), math.radians(25.0))
             await driver.point_gimbal(aim)
 
@@ -74,29 +76,27 @@ async def test_a_gimbal_is_heard_taken_pointed_and_given_back_and_never_fought_f
                 assert off_rad is not None
                 return off_rad < math.radians(1.0)
 
-            pitch_rad = gimbal_of(await state_shows(driver, aimed)).pitch_rad
+            pitch_rad = gimbal_of(await wait_for_state(driver, aimed)).pitch_rad
             assert pitch_rad is not None
             assert math.degrees(pitch_rad) == pytest.approx(-40.0, abs=1.0)
 
-            # The station takes it: what is shown says so, and what we ask is denied.
+            # The ground station takes control: it is reported, and our command is denied.
             assert await asyncio.to_thread(station.wait_heartbeat, timeout=10)
             station.mav.command_long_send(1, 1, 1001, 0, 245, 190, -1, -1, 0, 0, 0)
-            await state_shows(driver, lambda s: gimbal_of(s).primary_control == (245, 190))
+            await wait_for_state(driver, lambda s: gimbal_of(s).primary_control == (245, 190))
             with pytest.raises(CommandRefusedError, match="denied"):
                 await driver.point_gimbal(GimbalAim(0.0))
-            await driver.give_gimbal_back()  # it is not ours: nothing changes
+            await driver.give_gimbal_back()  # not ours: nothing changes
             since_ns = gimbal_of(driver.state).status_ns
-            state = await state_shows(driver, lambda s: gimbal_of(s).status_ns > since_ns)
+            state = await wait_for_state(driver, lambda s: gimbal_of(s).status_ns > since_ns)
             assert gimbal_of(state).primary_control == (245, 190)
 
             await driver.take_gimbal()
             await driver.give_gimbal_back()
-            await state_shows(driver, lambda s: gimbal_of(s).primary_control == NOBODY)
+            await wait_for_state(driver, lambda s: gimbal_of(s).primary_control == NOBODY)
 
 
-async def test_without_a_gimbal_none_is_found_and_nothing_is_said(
-    kind: DriverKind, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_missing_gimbal_is_not_logged(kind: DriverKind, caplog: pytest.LogCaptureFixture) -> None:
     with running_simulator(speed=4.0) as simulator:
         async with connected(kind, simulator.onboard_port) as driver:
             assert not await driver.find_gimbal()
@@ -118,47 +118,45 @@ def attitude(flags: int, pitch_rad: float, yaw_rad: float, device: int = 0) -> A
     )
 
 
-async def test_a_gimbal_that_appears_later_is_asked_what_it_can_do(
-    driver: Driver, autopilot: FakeAutopilot
-) -> None:
+async def test_late_gimbal_is_queried(driver: Driver, autopilot: FakeAutopilot) -> None:
     def answer(message: Any) -> None:
         autopilot.acknowledge(message.command)
         if (message.command, message.param1) == (512, 280):
-            autopilot.say(information(1))
+            autopilot.send(information(1))
 
-    await autopilot.hears("COMMAND_LONG")
+    await autopilot.wait_for("COMMAND_LONG")
     assert driver.state.gimbal is None
     autopilot.answers["COMMAND_LONG"] = answer
-    autopilot.say(mavlink.MAVLink_gimbal_manager_status_message(9, 0, 1, 0, 0, 0, 0))
-    state = await state_shows(driver, lambda s: s.gimbal is not None and s.gimbal.information_ns > 0)
+    autopilot.send(mavlink.MAVLink_gimbal_manager_status_message(9, 0, 1, 0, 0, 0, 0))
+    state = await wait_for_state(driver, lambda s: s.gimbal is not None and s.gimbal.information_ns > 0)
     assert (gimbal_of(state).device, gimbal_of(state).lowest_pitch_rad) == (1, -1.5)
 
     def asked() -> set[tuple[float, float]]:
-        return {(m.param1, m.param2) for m in autopilot.heard_named("COMMAND_LONG") if m.command == 511}
+        return {(m.param1, m.param2) for m in autopilot.received_named("COMMAND_LONG") if m.command == 511}
 
     await wait_until(lambda: {(285, 20_000), (281, 200_000)} <= asked(), 10.0, asked)
 
 
-async def test_a_gimbal_in_a_component_of_its_own_is_heard_and_its_clock_is_not_believed(
+async def test_separate_gimbal_component_is_stamped_on_arrival(
     driver: Driver, autopilot: FakeAutopilot, port: int
 ) -> None:
     other, gimbal = (FakeAutopilot(port, component_id=component) for component in (171, 154))
-    autopilot.say(information(154))
-    await state_shows(driver, lambda s: s.gimbal is not None)
+    autopilot.send(information(154))
+    await wait_for_state(driver, lambda s: s.gimbal is not None)
     # As PX4 forwards it: from the gimbal's own component, by the same socket.
     for sender in (other, gimbal):
         sender.socket.close()
         sender.socket = autopilot.socket
     before_ns = time.monotonic_ns()
-    other.say(attitude(16, 0.3, 0.0))
-    gimbal.say(attitude(32, -0.7, 0.2))
-    state = await state_shows(driver, lambda s: gimbal_of(s).attitude is not None)
+    other.send(attitude(16, 0.3, 0.0))
+    gimbal.send(attitude(32, -0.7, 0.2))
+    state = await wait_for_state(driver, lambda s: gimbal_of(s).attitude is not None)
     assert gimbal_of(state).pitch_rad == pytest.approx(-0.7, abs=1e-6)
     assert gimbal_of(state).yaw_frame is YawFrame.NOSE
     assert before_ns <= gimbal_of(state).attitude_ns <= time.monotonic_ns()
 
 
-async def test_the_commands_to_a_gimbal_at_a_landing_are_not_ours_to_answer(
+async def test_gimbal_commands_of_the_autopilot_are_not_answered(
     driver: Driver, autopilot: FakeAutopilot
 ) -> None:
     for command, values in (
@@ -167,9 +165,9 @@ async def test_the_commands_to_a_gimbal_at_a_landing_are_not_ours_to_answer(
         (1001, (-3.0, -3.0, -1.0, -1.0, 0.0, 0.0, 0.0)),
     ):
         for confirmation in (0, 1):
-            autopilot.say(mavlink.MAVLink_command_long_message(1, 0, command, confirmation, *values))
-    # What is answered after them is answered: the driver is well, and all before was taken in.
+            autopilot.send(mavlink.MAVLink_command_long_message(1, 0, command, confirmation, *values))
+    # A later command is answered: the driver works, and all messages before it were processed.
     await driver.point_gimbal(GimbalAim(-0.2))
-    await autopilot.hears("COMMAND_LONG")
-    assert not autopilot.heard_named("COMMAND_ACK")
+    await autopilot.wait_for("COMMAND_LONG")
+    assert not autopilot.received_named("COMMAND_ACK")
     assert driver.state.gimbal is None

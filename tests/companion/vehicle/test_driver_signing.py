@@ -1,4 +1,4 @@
-"""MAVLink signing on our side: the key file, what is signed, what is refused; against two other makers."""
+"""MAVLink signing: the key file, signed and refused frames, against pymavlink and the simulator."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from companion.vehicle.drivers import open_driver
 from companion.vehicle.framing import Frame, Framer
 from companion.vehicle.signing import FrameSigner, SigningKeyError, read_key
 from mavlink_sim.testing import running_simulator
-from tests.companion.vehicle.fake_autopilot import state_shows
+from tests.companion.vehicle.fake_autopilot import wait_for_state
 
 KEY = bytes(range(32))
 
@@ -35,7 +35,7 @@ def frames(data: bytes) -> list[Frame]:
 
 
 def heartbeat(system: int = 1, component: int = 1, *, key: bytes | None = None, timestamp: int = 0) -> bytes:
-    """One frame as pymavlink packs it, signed by pymavlink if there is a key."""
+    """One frame packed by pymavlink, signed if there is a key."""
     codec = mavlink.MAVLink(None, system, component)
     if key is not None:
         codec.signing.secret_key = key
@@ -50,7 +50,7 @@ def now() -> int:
     return int.from_bytes(signer.signed(heartbeat())[-12:-6], "little")
 
 
-def test_a_key_is_32_bytes_as_they_are_or_a_passphrases_hash(tmp_path: Path) -> None:
+def test_key_is_32_bytes_or_a_passphrase_hash(tmp_path: Path) -> None:
     assert read_key(key_file(tmp_path, KEY)) == KEY
     assert read_key(key_file(tmp_path, b"correct horse\n")) == hashlib.sha256(b"correct horse").digest()
 
@@ -58,16 +58,16 @@ def test_a_key_is_32_bytes_as_they_are_or_a_passphrases_hash(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("content", "mode", "reason"),
     [
-        (KEY, 0o640, "others can read it"),
-        (KEY, 0o604, "others can read it"),
+        (KEY, 0o640, "chmod 600"),
+        (KEY, 0o604, "chmod 600"),
         (b"", 0o600, "neither"),
         (b" \n", 0o600, "neither"),
         (b"\xff" * 31, 0o600, "neither"),
-        (b"x" * 5000, 0o600, "no passphrase"),
+        (b"x" * 5000, 0o600, "4096 bytes"),
     ],
     ids=["group", "others", "empty", "blank", "bytes", "long"],
 )
-def test_a_key_file_that_cannot_be_used_says_why_and_not_what_is_in_it(
+def test_unusable_key_file_is_refused_with_its_reason(
     tmp_path: Path, content: bytes, mode: int, reason: str
 ) -> None:
     path = key_file(tmp_path, content, mode)
@@ -79,7 +79,7 @@ def test_a_key_file_that_cannot_be_used_says_why_and_not_what_is_in_it(
 
 
 @given(st.binary(min_size=0, max_size=40))
-def test_what_we_sign_is_what_pymavlink_accepts(text: bytes) -> None:
+def test_pymavlink_accepts_our_signature(text: bytes) -> None:
     codec = mavlink.MAVLink(None, 1, 191)
     plain = mavlink.MAVLink_statustext_message(6, text).pack(codec)
     reader = mavlink.MAVLink(None, 1, 1)
@@ -89,10 +89,10 @@ def test_what_we_sign_is_what_pymavlink_accepts(text: bytes) -> None:
     message = reader.decode(bytearray(signed))
     assert message.get_signed()
     assert message.get_type() == "STATUSTEXT"
-    assert FrameSigner(KEY).signed(signed) == signed  # what is signed stays as it is
+    assert FrameSigner(KEY).signed(signed) == signed  # a signed frame is unchanged
 
 
-def test_what_pymavlink_signs_is_accepted_once() -> None:
+def test_replayed_frame_is_refused() -> None:
     signer = FrameSigner(KEY)
     (frame,) = frames(heartbeat(key=KEY, timestamp=now()))
     assert signer.accepts(frame)
@@ -100,7 +100,7 @@ def test_what_pymavlink_signs_is_accepted_once() -> None:
     assert signer.refused == {"replayed": 1}
 
 
-def test_unsigned_foreign_and_old_frames_are_refused_and_a_radios_are_not() -> None:
+def test_unsigned_foreign_and_old_frames_are_refused() -> None:
     signer = FrameSigner(KEY)
     (unsigned,) = frames(heartbeat())
     (foreign,) = frames(heartbeat(key=bytes(32), timestamp=now()))
@@ -114,15 +114,13 @@ def test_unsigned_foreign_and_old_frames_are_refused_and_a_radios_are_not() -> N
     assert signer.accepts(status)
 
 
-def test_timestamps_only_grow() -> None:
+def test_timestamps_increase() -> None:
     signer = FrameSigner(KEY)
     stamps = [int.from_bytes(signer.signed(heartbeat())[-12:-6], "little") for _ in range(200)]
     assert stamps == sorted(set(stamps))
 
 
-def test_neither_the_settings_nor_a_log_show_the_key(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_key_is_not_in_settings_or_log(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.DEBUG)
     path = key_file(tmp_path, b"open sesame")
     settings = load_settings(None, {"vehicle.signing_key_file": str(path)}, {})
@@ -130,13 +128,13 @@ def test_neither_the_settings_nor_a_log_show_the_key(
     assert str(path) in shown
     signer = FrameSigner(read_key(path))
     signer.accepts(frames(heartbeat())[0])
-    told = shown + repr(signer) + caplog.text
-    assert "sesame" not in told
-    assert read_key(path).hex() not in told
+    output = shown + repr(signer) + caplog.text
+    assert "sesame" not in output
+    assert read_key(path).hex() not in output
 
 
 @pytest.mark.parametrize("firmware", ["px4", "ardupilot"])
-async def test_a_signed_link_is_flown_and_another_key_is_named(
+async def test_signed_link_works_and_wrong_key_is_reported(
     tmp_path: Path, firmware: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = tmp_path / "simulator.key"
@@ -144,12 +142,12 @@ async def test_a_signed_link_is_flown_and_another_key_is_named(
     with running_simulator(autopilot=firmware, signing_key=path, ready_after=0.0, speed=4.0) as simulator:
         url = f"udpin://127.0.0.1:{simulator.onboard_port}"
         other = open_driver("pymavlink", url, signing_key=os.urandom(32))
-        with pytest.raises(LinkError, match=r"refused by signing .*wrong signature.*the same key"):
+        with pytest.raises(LinkError, match=r"wrong signature.*same key"):
             await other.connect(2.0)
         driver = open_driver("pymavlink", url, signing_key=KEY)
         await driver.connect(20.0)
         try:
-            await state_shows(driver, lambda state: state.ready_to_arm)
+            await wait_for_state(driver, lambda state: state.ready_to_arm)
             name = "COM_OF_LOSS_T" if firmware == "px4" else "GUID_TIMEOUT"
             assert await driver.get_parameter(name) > 0.0
             await driver.arm()
@@ -159,7 +157,7 @@ async def test_a_signed_link_is_flown_and_another_key_is_named(
         unsigned = open_driver("pymavlink", url)
         await unsigned.connect(20.0)
         try:
-            with pytest.raises(NoAnswerError, match=r"does not answer .*set vehicle\.signing_key_file"):
+            with pytest.raises(NoAnswerError, match=r"no answer .*vehicle\.signing_key_file"):
                 await unsigned.arm()
         finally:
             await unsigned.close()

@@ -1,4 +1,4 @@
-"""What both drivers put on the wire and make of what comes, against a real socket."""
+"""Messages sent and received by both drivers, on a real socket."""
 
 from __future__ import annotations
 
@@ -21,19 +21,17 @@ from tests.companion.vehicle.fake_autopilot import (
     OFFBOARD,
     SETPOINT,
     FakeAutopilot,
-    state_shows,
+    wait_for_state,
     wait_until,
 )
 
 pytestmark = pytest.mark.usefixtures("short_measurement")
 
 
-async def test_a_velocity_setpoint_is_one_message_with_px4s_type_mask(
-    driver: Driver, autopilot: FakeAutopilot
-) -> None:
+async def test_velocity_setpoint_has_px4s_type_mask(driver: Driver, autopilot: FakeAutopilot) -> None:
     now_ns = time.monotonic_ns()
     driver.send_setpoint(Setpoint.velocity((1.5, -2.0, 0.25), now_ns, yaw_rate_radps=0.5))
-    (message,) = await autopilot.hears(SETPOINT)
+    (message,) = await autopilot.wait_for(SETPOINT)
     assert (message.vx, message.vy, message.vz, message.yaw_rate) == (1.5, -2.0, 0.25, 0.5)
     assert message.type_mask == 0b0101_1100_0111
     assert message.coordinate_frame == mavlink.MAV_FRAME_LOCAL_NED
@@ -41,105 +39,97 @@ async def test_a_velocity_setpoint_is_one_message_with_px4s_type_mask(
     assert (message.get_srcSystem(), message.get_srcComponent()) == (1, 191)
 
 
-async def test_a_velocity_takes_its_feed_forward_acceleration_along(
-    driver: Driver, autopilot: FakeAutopilot
-) -> None:
+async def test_velocity_setpoint_has_its_acceleration(driver: Driver, autopilot: FakeAutopilot) -> None:
     now_ns = time.monotonic_ns()
     driver.send_setpoint(
         Setpoint.velocity((1.5, -2.0, 0.25), now_ns, yaw_rad=0.5, acceleration_ned_mps2=(0.5, -0.25, 0.0))
     )
-    (message,) = await autopilot.hears(SETPOINT)
+    (message,) = await autopilot.wait_for(SETPOINT)
     assert (message.vx, message.vy, message.vz, message.yaw) == (1.5, -2.0, 0.25, 0.5)
     assert (message.afx, message.afy, message.afz) == (0.5, -0.25, 0.0)
     assert message.type_mask == 0b1000_0000_0111
 
 
-async def test_a_position_setpoint_keeps_its_yaw_and_ignores_velocity(
-    driver: Driver, autopilot: FakeAutopilot
-) -> None:
+async def test_position_setpoint_ignores_velocity(driver: Driver, autopilot: FakeAutopilot) -> None:
     driver.send_setpoint(Setpoint.position((10.0, 20.0, -5.0), time.monotonic_ns(), yaw_rad=1.25))
-    (message,) = await autopilot.hears(SETPOINT)
+    (message,) = await autopilot.wait_for(SETPOINT)
     assert (message.x, message.y, message.z, message.yaw) == (10.0, 20.0, -5.0, 1.25)
     assert message.type_mask == 0b1001_1111_1000
 
 
-async def test_every_setpoint_leaves_exactly_once_and_nothing_is_repeated(
-    driver: Driver, autopilot: FakeAutopilot
-) -> None:
+async def test_every_setpoint_is_sent_once(driver: Driver, autopilot: FakeAutopilot) -> None:
     for north in range(5):
         driver.send_setpoint(Setpoint.velocity((float(north), 0.0, 0.0), time.monotonic_ns()))
-    await autopilot.hears(SETPOINT, 5)
-    # A repeating sender (MAVSDK's runs at 20 Hz) would have put 20 more before these heartbeats pass.
+    await autopilot.wait_for(SETPOINT, 5)
+    # A repeating sender (MAVSDK's runs at 20 Hz) would have sent 20 more before these heartbeats.
     for count in range(1, 11):
         driver.send_heartbeat(SystemStatus.ACTIVE)
-        await autopilot.hears("HEARTBEAT", count)
+        await autopilot.wait_for("HEARTBEAT", count)
         await asyncio.sleep(0.1)
-    assert [message.vx for message in autopilot.heard_named(SETPOINT)] == [0.0, 1.0, 2.0, 3.0, 4.0]
+    assert [message.vx for message in autopilot.received_named(SETPOINT)] == [0.0, 1.0, 2.0, 3.0, 4.0]
 
 
-async def test_the_only_heartbeats_on_the_wire_are_ours_and_no_sequence_number_is_missing(
-    driver: Driver, autopilot: FakeAutopilot
-) -> None:
+async def test_only_our_heartbeats_are_sent_in_sequence(driver: Driver, autopilot: FakeAutopilot) -> None:
     driver.send_heartbeat(SystemStatus.CRITICAL)
-    # Long enough for MAVSDK's own heartbeat, which comes every second, to have come.
-    await autopilot.hears("COMMAND_LONG", 3)
+    # Long enough for MAVSDK's own heartbeat, which is sent every second.
+    await autopilot.wait_for("COMMAND_LONG", 3)
     await asyncio.sleep(1.2)
     driver.send_heartbeat(SystemStatus.ACTIVE)
-    beats = await autopilot.hears("HEARTBEAT", 2)
+    beats = await autopilot.wait_for("HEARTBEAT", 2)
     assert [(beat.type, beat.autopilot, beat.system_status) for beat in beats] == [(18, 8, 5), (18, 8, 4)]
-    sequences = [message.get_seq() for message, _ in autopilot.heard]
+    sequences = [message.get_seq() for message, _ in autopilot.received]
     assert sequences == [number % 256 for number in range(len(sequences))]
 
 
-async def test_a_loop_that_hangs_sends_nothing(driver: Driver, autopilot: FakeAutopilot) -> None:
+async def test_hung_loop_sends_nothing(driver: Driver, autopilot: FakeAutopilot) -> None:
     driver.send_setpoint(Setpoint.velocity((1.0, 0.0, 0.0), time.monotonic_ns()))
     driver.send_heartbeat(SystemStatus.ACTIVE)
-    await autopilot.hears(SETPOINT)
-    await autopilot.hears("HEARTBEAT")
-    autopilot.listen()  # to what left before the hang
-    before = len(autopilot.heard)
+    await autopilot.wait_for(SETPOINT)
+    await autopilot.wait_for("HEARTBEAT")
+    autopilot.drain()  # what was sent before the hang
+    before = len(autopilot.received)
     time.sleep(1.5)  # noqa: ASYNC251 the hang is what is tested
-    autopilot.listen()
-    assert len(autopilot.heard) == before
+    autopilot.drain()
+    assert len(autopilot.received) == before
 
 
-async def heard_of_a_stream(driver: Driver, autopilot: FakeAutopilot, speed_mps: float) -> set[float]:
-    """Every speed that came, once one has: each setpoint of a stream is fresh, and one held up is dropped."""
+async def received_speeds(driver: Driver, autopilot: FakeAutopilot, speed_mps: float) -> set[float]:
+    """Send fresh setpoints until one is received; return all received speeds (delayed ones are dropped)."""
 
-    def heard() -> bool:
+    def received() -> bool:
         driver.send_setpoint(Setpoint.velocity((speed_mps, 0.0, 0.0), time.monotonic_ns()))
-        return bool(autopilot.heard_named(SETPOINT))
+        return bool(autopilot.received_named(SETPOINT))
 
-    await wait_until(heard, 10.0, lambda: SETPOINT)
-    return {message.vx for message in autopilot.heard_named(SETPOINT)}
+    await wait_until(received, 10.0, lambda: SETPOINT)
+    return {message.vx for message in autopilot.received_named(SETPOINT)}
 
 
-async def test_what_waited_for_a_hung_loop_does_not_arrive_late(
+async def test_messages_queued_during_a_hang_are_dropped(
     port: int, autopilot: FakeAutopilot, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """MAVSDK hands its messages over from a thread of its own, which goes on while the loop hangs."""
+    """MAVSDK passes its messages from its own thread, which continues while the loop hangs."""
     driver = open_driver("mavsdk", f"udpin://127.0.0.1:{port}")
     await driver.connect(10.0)
     try:
         driver.send_setpoint(Setpoint.velocity((1.0, 0.0, 0.0), time.monotonic_ns()))
         time.sleep(0.6)  # noqa: ASYNC251 the hang is what is tested
-        assert await heard_of_a_stream(driver, autopilot, 2.0) == {2.0}
+        assert await received_speeds(driver, autopilot, 2.0) == {2.0}
         assert "the loop hung" in caplog.text
     finally:
         await driver.close()
 
 
-async def test_a_setpoint_whose_time_is_over_when_it_would_leave_does_not(
+async def test_expired_setpoint_is_not_sent(
     driver: Driver, autopilot: FakeAutopilot, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """As after SIGCONT: the streamer had found it fresh, then the process was stopped."""
+    """As after SIGCONT: the process was stopped after the streamer's freshness check."""
     now_ns = time.monotonic_ns()
     driver.send_setpoint(Setpoint.velocity((1.0, 0.0, 0.0), now_ns - 1_000_000_000))
-    await wait_until(lambda: "its time was over before it left" in caplog.text, 10.0, lambda: caplog.text)
-    assert await heard_of_a_stream(driver, autopilot, 2.0) == {2.0}
+    await wait_until(lambda: "setpoint dropped" in caplog.text, 10.0, lambda: caplog.text)
+    assert await received_speeds(driver, autopilot, 2.0) == {2.0}
 
 
-async def test_a_setpoint_that_was_held_up_on_its_way_to_the_wire_does_not_leave(
+async def test_setpoint_delayed_before_sending_is_dropped(
     driver: Driver,
     autopilot: FakeAutopilot,
     caplog: pytest.LogCaptureFixture,
@@ -148,26 +138,26 @@ async def test_a_setpoint_that_was_held_up_on_its_way_to_the_wire_does_not_leave
     now_ms = iter([1000, 1400, 2000, 2010])
     monkeypatch.setattr(driver, "_boot_ms", lambda: next(now_ms))
     driver.send_setpoint(Setpoint.velocity((1.0, 0.0, 0.0), time.monotonic_ns(), lifetime_s=2.0))
-    await wait_until(lambda: "its time was over before it left" in caplog.text, 10.0, lambda: caplog.text)
+    await wait_until(lambda: "setpoint dropped" in caplog.text, 10.0, lambda: caplog.text)
     driver.send_setpoint(Setpoint.velocity((2.0, 0.0, 0.0), time.monotonic_ns()))
-    (message,) = await autopilot.hears(SETPOINT)
+    (message,) = await autopilot.wait_for(SETPOINT)
     assert message.vx == 2.0
 
 
-async def test_the_state_follows_every_kind_of_message(driver: Driver, autopilot: FakeAutopilot) -> None:
+async def test_every_message_updates_the_state(driver: Driver, autopilot: FakeAutopilot) -> None:
     snapshots: list[VehicleState] = []
     unsubscribe = driver.subscribe(snapshots.append)
     half = math.sqrt(0.5)
-    autopilot.say(mavlink.MAVLink_local_position_ned_message(5, 1.0, 2.0, -3.0, 0.5, 0.25, -0.125))
-    autopilot.say(mavlink.MAVLink_attitude_quaternion_message(5, half, 0.0, 0.0, half, 0.1, 0.2, 0.3))
-    autopilot.say(mavlink.MAVLink_extended_sys_state_message(0, 2))
-    autopilot.say(
+    autopilot.send(mavlink.MAVLink_local_position_ned_message(5, 1.0, 2.0, -3.0, 0.5, 0.25, -0.125))
+    autopilot.send(mavlink.MAVLink_attitude_quaternion_message(5, half, 0.0, 0.0, half, 0.1, 0.2, 0.3))
+    autopilot.send(mavlink.MAVLink_extended_sys_state_message(0, 2))
+    autopilot.send(
         mavlink.MAVLink_global_position_int_message(5, 473977500, 85455940, 491500, 3000, 0, 0, 0, 9000)
     )
-    autopilot.say(mavlink.MAVLink_sys_status_message(0, 0, 0x1000_0000, 0, 0, 0, 80, 0, 0, 0, 0, 0, 0))
+    autopilot.send(mavlink.MAVLink_sys_status_message(0, 0, 0x1000_0000, 0, 0, 0, 80, 0, 0, 0, 0, 0, 0))
     autopilot.home()
     autopilot.base_mode = 157
-    state = await state_shows(driver, lambda s: s.armed and s.home_altitude_amsl_m is not None)
+    state = await wait_for_state(driver, lambda s: s.armed and s.home_altitude_amsl_m is not None)
     assert state.position_ned_m == (1.0, 2.0, -3.0)
     assert state.velocity_ned_mps == (0.5, 0.25, -0.125)
     assert state.yaw_rad == pytest.approx(math.pi / 2)
@@ -184,11 +174,11 @@ async def test_the_state_follows_every_kind_of_message(driver: Driver, autopilot
     unsubscribe()
     count = len(snapshots)
     autopilot.custom_mode = OFFBOARD
-    await state_shows(driver, lambda s: s.mode is FlightMode.OFFBOARD)
+    await wait_for_state(driver, lambda s: s.mode is FlightMode.OFFBOARD)
     assert len(snapshots) == count
 
 
-async def test_a_subscriber_that_fails_harms_nobody_else(
+async def test_failing_subscriber_does_not_affect_others(
     driver: Driver, autopilot: FakeAutopilot, caplog: pytest.LogCaptureFixture
 ) -> None:
     def fails(_state: object) -> None:
@@ -198,40 +188,38 @@ async def test_a_subscriber_that_fails_harms_nobody_else(
     driver.subscribe(fails)
     driver.subscribe(seen.append)
     autopilot.custom_mode = OFFBOARD
-    await state_shows(driver, lambda s: s.mode is FlightMode.OFFBOARD)
+    await wait_for_state(driver, lambda s: s.mode is FlightMode.OFFBOARD)
     await wait_until(lambda: bool(seen), 5.0)
-    assert "a subscriber of the state failed" in caplog.text
+    assert "subscriber" in caplog.text
 
 
-async def test_current_mode_shows_a_mode_before_the_heartbeat_does(
-    driver: Driver, autopilot: FakeAutopilot
-) -> None:
-    autopilot.beating = False
+async def test_current_mode_updates_before_the_heartbeat(driver: Driver, autopilot: FakeAutopilot) -> None:
+    autopilot.sends_heartbeats = False
     payload = struct.pack("<IIB", OFFBOARD, OFFBOARD, 0)
-    autopilot.say_bytes(pack_frame(CURRENT_MODE_ID, payload, system_id=1, component_id=1, sequence=9))
-    await state_shows(driver, lambda s: s.mode is FlightMode.OFFBOARD)
+    autopilot.send_bytes(pack_frame(CURRENT_MODE_ID, payload, system_id=1, component_id=1, sequence=9))
+    await wait_for_state(driver, lambda s: s.mode is FlightMode.OFFBOARD)
 
 
-async def test_messages_of_other_systems_and_components_change_nothing(
+async def test_messages_of_other_components_are_ignored(
     driver: Driver, autopilot: FakeAutopilot, port: int
 ) -> None:
-    stranger = FakeAutopilot(port, system_id=2)
+    other_vehicle = FakeAutopilot(port, system_id=2)
     gimbal = FakeAutopilot(port, component_id=154)
     try:
-        for other in (stranger, gimbal):
+        for other in (other_vehicle, gimbal):
             other.custom_mode = MISSION
             other.heartbeat()
-            other.say(mavlink.MAVLink_local_position_ned_message(5, 9.0, 9.0, 9.0, 9.0, 9.0, 9.0))
-        autopilot.say(mavlink.MAVLink_local_position_ned_message(5, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0))
-        state = await state_shows(driver, lambda s: s.position_ned_m is not None)
+            other.send(mavlink.MAVLink_local_position_ned_message(5, 9.0, 9.0, 9.0, 9.0, 9.0, 9.0))
+        autopilot.send(mavlink.MAVLink_local_position_ned_message(5, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0))
+        state = await wait_for_state(driver, lambda s: s.position_ned_m is not None)
         assert state.position_ned_m == (1.0, 1.0, 1.0)
         assert state.mode is FlightMode.HOLD
     finally:
-        await stranger.stop()
+        await other_vehicle.stop()
         await gimbal.stop()
 
 
-async def test_a_second_autopilot_of_the_same_id_is_ignored_and_named(
+async def test_second_autopilot_at_another_address_is_ignored(
     driver: Driver, autopilot: FakeAutopilot, port: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
@@ -239,34 +227,32 @@ async def test_a_second_autopilot_of_the_same_id_is_ignored_and_named(
     try:
         double.custom_mode = MISSION
         double.heartbeat()
-        double.say(mavlink.MAVLink_local_position_ned_message(5, 9.0, 9.0, 9.0, 9.0, 9.0, 9.0))
+        double.send(mavlink.MAVLink_local_position_ned_message(5, 9.0, 9.0, 9.0, 9.0, 9.0, 9.0))
         await wait_until(lambda: "a second autopilot 1/1" in caplog.text, 5.0)
-        autopilot.say(mavlink.MAVLink_local_position_ned_message(5, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0))
-        state = await state_shows(driver, lambda s: s.position_ned_m is not None)
+        autopilot.send(mavlink.MAVLink_local_position_ned_message(5, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0))
+        state = await wait_for_state(driver, lambda s: s.position_ned_m is not None)
         assert state.position_ned_m == (1.0, 1.0, 1.0)
         assert state.mode is FlightMode.HOLD
         driver.send_setpoint(Setpoint.brake(time.monotonic_ns()))
-        await autopilot.hears(SETPOINT)
+        await autopilot.wait_for(SETPOINT)
     finally:
         await double.stop()
 
 
-async def test_an_estimate_that_is_not_a_number_is_no_estimate(
-    driver: Driver, autopilot: FakeAutopilot
-) -> None:
+async def test_nan_estimates_are_ignored(driver: Driver, autopilot: FakeAutopilot) -> None:
     nan = math.nan
-    autopilot.say(mavlink.MAVLink_local_position_ned_message(5, nan, nan, nan, nan, nan, nan))
-    autopilot.say(mavlink.MAVLink_attitude_quaternion_message(5, nan, nan, nan, nan, 0.0, 0.0, 0.0))
-    autopilot.say(mavlink.MAVLink_home_position_message(0, 0, 488000, nan, nan, nan, [nan] * 4, 0, 0, 0))
-    state = await state_shows(driver, lambda s: s.home_altitude_amsl_m == 488.0)
+    autopilot.send(mavlink.MAVLink_local_position_ned_message(5, nan, nan, nan, nan, nan, nan))
+    autopilot.send(mavlink.MAVLink_attitude_quaternion_message(5, nan, nan, nan, nan, 0.0, 0.0, 0.0))
+    autopilot.send(mavlink.MAVLink_home_position_message(0, 0, 488000, nan, nan, nan, [nan] * 4, 0, 0, 0))
+    state = await wait_for_state(driver, lambda s: s.home_altitude_amsl_m == 488.0)
     assert state.position_ned_m is None
     assert state.attitude is None
     assert state.home_position_ned_m is None
 
 
-async def test_noise_between_the_messages_costs_no_message(driver: Driver, autopilot: FakeAutopilot) -> None:
-    autopilot.say_bytes(b"\xfd\xff\x00 no frame at all \xfe\x09")
-    autopilot.say_bytes(bytes(range(256)) * 8)
-    autopilot.say_bytes(b"")
-    autopilot.say(mavlink.MAVLink_local_position_ned_message(5, 1.0, 2.0, 3.0, 0.0, 0.0, 0.0))
-    await state_shows(driver, lambda s: s.position_ned_m == (1.0, 2.0, 3.0))
+async def test_noise_between_messages_loses_none(driver: Driver, autopilot: FakeAutopilot) -> None:
+    autopilot.send_bytes(b"\xfd\xff\x00 no frame at all \xfe\x09")
+    autopilot.send_bytes(bytes(range(256)) * 8)
+    autopilot.send_bytes(b"")
+    autopilot.send(mavlink.MAVLink_local_position_ned_message(5, 1.0, 2.0, 3.0, 0.0, 0.0, 0.0))
+    await wait_for_state(driver, lambda s: s.position_ned_m == (1.0, 2.0, 3.0))

@@ -1,4 +1,4 @@
-"""PX4's events in words, by the metadata that an autopilot serves."""
+"""Texts of PX4's events, by the autopilot's metadata."""
 
 import json
 import struct
@@ -42,7 +42,7 @@ def catalogue() -> EventCatalogue:
     return EventCatalogue(json.dumps({"version": 2, "components": {"1": px4}}).encode())
 
 
-def said(number: int, arguments: bytes = b"", levels: int = ERROR) -> Report | None:
+def report_of(number: int, arguments: bytes = b"", levels: int = ERROR) -> Report | None:
     return catalogue().report(Event(1 << 24 | number, 9, levels, arguments.ljust(40, b"\0")), 5)
 
 
@@ -56,37 +56,37 @@ def said(number: int, arguments: bytes = b"", levels: int = ERROR) -> Report | N
         (4, struct.pack("<H", 5), "parts: gyro, baro"),
         (4, struct.pack("<H", 0), "parts: none"),
         (5, b"", "Landing detected"),
-        (9, b"", "event 0x01000009, which its metadata does not name"),
+        (9, b"", "event 0x01000009 (not in the metadata)"),
     ],
 )
-def test_an_event_in_words(number: int, arguments: bytes, text: str) -> None:
-    report = said(number, arguments)
+def test_event_text(number: int, arguments: bytes, text: str) -> None:
+    report = report_of(number, arguments)
     assert report is not None
     assert (report.text, report.level, report.stamp_ns, report.modes) == (text, 3, 5, ALL_MODES)
 
 
-def test_a_check_tells_its_group_and_which_modes_it_is_about() -> None:
-    report = said(6, struct.pack("<IBB", 0x4000, 0, 2))
+def test_check_has_its_group_and_modes() -> None:
+    report = report_of(6, struct.pack("<IBB", 0x4000, 0, 2))
     assert report == Report(5, 3, "No valid data from Compass 2", "arming_check", "an_event", 0x4000)
     assert report is not None
-    assert report.of_a_check
-    hint = said(6, struct.pack("<IBB", 0x4000, 0, 2), INFO)
+    assert report.is_check
+    hint = report_of(6, struct.pack("<IBB", 0x4000, 0, 2), INFO)
     assert hint is not None
-    assert not hint.of_a_check  # it does not keep the vehicle from arming
+    assert not hint.is_check  # it does not prevent arming
 
 
-def test_what_is_not_for_people_is_not_told() -> None:
-    assert said(7) is None
-    assert said(5, levels=PROTOCOL) is None
+def test_internal_events_are_not_reported() -> None:
+    assert report_of(7) is None
+    assert report_of(5, levels=PROTOCOL) is None
 
 
-def test_without_metadata_events_have_numbers() -> None:
+def test_events_without_metadata_have_numbers() -> None:
     report = EventCatalogue(None).report(Event(0x01ABCDEF, 1, INFO, bytes(40)), 5)
     assert report is not None
-    assert report.text == "event 0x01abcdef, which its metadata does not name"
+    assert report.text.startswith("event 0x01abcdef")
 
 
 @pytest.mark.parametrize("metadata", [b"", b"{", b"[]", b'{"components": 3}', b'{"components": {"1": 3}}'])
-def test_what_is_no_metadata_is_refused(metadata: bytes) -> None:
+def test_invalid_metadata_is_refused(metadata: bytes) -> None:
     with pytest.raises(ValueError, match=r"metadata|JSON|Expecting"):
         EventCatalogue(metadata)

@@ -31,16 +31,14 @@ POSITION = bytes(mavlink.MAVLink_local_position_ned_message(5, 1.0, 2.0, 3.0, 4.
 UNKNOWN = b"\xfd\x03\x00\x00\x07\x01\x01" + (60000).to_bytes(3, "little") + b"abc" + b"\x12\x34"
 
 good_frames = st.sampled_from([HEARTBEAT, HEARTBEAT_V1, POSITION])
-# Without a magic byte in it, noise can swallow nothing of what follows.
+# Noise without a magic byte cannot consume following frames.
 noise = st.binary(max_size=40).map(lambda data: data.replace(b"\xfd", b"\0").replace(b"\xfe", b"\0"))
 
 
 @given(
     parts=st.lists(st.tuples(noise, good_frames), max_size=8), cuts=st.lists(st.integers(0, 400), max_size=12)
 )
-def test_a_stream_gives_its_frames_however_it_is_cut(
-    parts: list[tuple[bytes, bytes]], cuts: list[int]
-) -> None:
+def test_stream_is_framed_however_it_is_split(parts: list[tuple[bytes, bytes]], cuts: list[int]) -> None:
     stream = b"".join(junk + frame for junk, frame in parts)
     framer = Framer()
     found = []
@@ -53,16 +51,16 @@ def test_a_stream_gives_its_frames_however_it_is_cut(
 
 
 @given(st.binary(max_size=700), st.booleans())
-def test_any_bytes_are_survived_and_the_next_frame_is_found(data: bytes, datagram: bool) -> None:
+def test_framer_recovers_from_any_bytes(data: bytes, datagram: bool) -> None:
     framer = Framer()
     framer.feed(data, datagram=datagram)
-    # On a stream a false header may announce as much as the longest frame.
+    # On a stream a false header may announce the longest frame.
     filler = b"" if datagram else bytes(300)
     assert framer.feed(filler + HEARTBEAT, datagram=datagram)[-1].raw == HEARTBEAT
 
 
 @given(st.integers(1, len(POSITION) - 1), st.integers(1, 255))
-def test_a_broken_byte_costs_its_frame_and_not_the_next(at: int, flip: int) -> None:
+def test_corrupt_byte_loses_only_its_frame(at: int, flip: int) -> None:
     broken = bytearray(POSITION)
     broken[at] ^= flip
     found = [frame.raw for frame in frames_of(bytes(broken) + HEARTBEAT)]
@@ -70,29 +68,27 @@ def test_a_broken_byte_costs_its_frame_and_not_the_next(at: int, flip: int) -> N
     assert HEARTBEAT in found
 
 
-def test_no_frame_reaches_from_one_datagram_into_the_next() -> None:
+def test_frame_never_spans_datagrams() -> None:
     framer = Framer()
     assert framer.feed(POSITION[:20], datagram=True) == []
     assert [frame.raw for frame in framer.feed(HEARTBEAT, datagram=True)] == [HEARTBEAT]
 
 
-def test_headers_are_read_of_both_protocol_versions() -> None:
+def test_headers_of_both_protocol_versions() -> None:
     for raw in (HEARTBEAT, HEARTBEAT_V1):
         (frame,) = frames_of(raw)
         assert (frame.message_id, frame.system_id, frame.component_id, frame.checked) == (0, 1, 1, True)
         assert frame.padded(9)[:4] == struct.pack("<I", 0x03040000)
 
 
-def test_a_message_without_a_definition_is_cut_out_unchecked() -> None:
+def test_undefined_message_is_framed_unchecked() -> None:
     (frame,) = frames_of(UNKNOWN)
     assert (frame.message_id, frame.checked, frame.payload) == (60000, False, b"abc")
     assert with_sequence(frame, 99) == UNKNOWN
 
 
 @given(payload=st.binary(min_size=28, max_size=28), sequence=st.integers(0, 255), again=st.integers(0, 255))
-def test_what_we_pack_pymavlink_reads_also_with_another_sequence_number(
-    payload: bytes, sequence: int, again: int
-) -> None:
+def test_pymavlink_reads_what_we_pack(payload: bytes, sequence: int, again: int) -> None:
     raw = pack_frame(32, payload, system_id=9, component_id=8, sequence=sequence)
     (frame,) = frames_of(raw)
     assert (frame.system_id, frame.component_id, frame.sequence) == (9, 8, sequence)
@@ -106,7 +102,7 @@ def test_what_we_pack_pymavlink_reads_also_with_another_sequence_number(
         )
 
 
-def test_a_signed_frame_is_taken_whole_and_never_renumbered() -> None:
+def test_signed_frame_is_never_renumbered() -> None:
     signer = mavlink.MAVLink(None, 1, 1)
     signer.signing.secret_key = b"k" * 32
     signer.signing.sign_outgoing = True
@@ -116,7 +112,7 @@ def test_a_signed_frame_is_taken_whole_and_never_renumbered() -> None:
     assert with_sequence(frame, 77) == raw
 
 
-def test_a_frame_with_a_flag_nobody_knows_is_dropped() -> None:
+def test_frame_with_unknown_flags_is_dropped() -> None:
     strange = bytearray(HEARTBEAT)
     strange[2] = 0x02
     assert [frame.raw for frame in frames_of(bytes(strange) + HEARTBEAT)] == [HEARTBEAT]
@@ -145,10 +141,10 @@ def flight_log() -> Path:
     return log
 
 
-def test_a_real_px4_flight_is_read_to_the_last_frame(flight_log: Path) -> None:
-    """The log is a stamp of 8 bytes and a frame, again and again."""
-    folded_ids = {number for number, m in mavlink.mavlink_map.items() if m.msgname in TELEMETRY_MESSAGES}
-    folded_ids.add(CURRENT_MODE_ID)
+def test_real_px4_log_is_decoded(flight_log: Path) -> None:
+    """The log alternates a stamp of 8 bytes and a frame."""
+    telemetry_ids = {number for number, m in mavlink.mavlink_map.items() if m.msgname in TELEMETRY_MESSAGES}
+    telemetry_ids.add(CURRENT_MODE_ID)
     data = flight_log.read_bytes()
     state = VehicleState()
     modes: list[object] = []
@@ -161,7 +157,7 @@ def test_a_real_px4_flight_is_read_to_the_last_frame(flight_log: Path) -> None:
         (frame,) = frames_of(data[position + 8 : position + 8 + length])
         position += 8 + length
         count += 1
-        if (frame.system_id, frame.component_id) != (1, 1) or frame.message_id not in folded_ids:
+        if (frame.system_id, frame.component_id) != (1, 1) or frame.message_id not in telemetry_ids:
             continue
         name, fields = _decoded(frame)
         state = apply_message(state, name, fields, count)

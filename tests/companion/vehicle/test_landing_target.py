@@ -1,4 +1,4 @@
-"""LANDING_TARGET as bytes: what PX4 and ArduPilot would read of it."""
+"""LANDING_TARGET as bytes, in the forms of PX4 and ArduPilot."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def payload(target: LandingTarget, autopilot: int) -> tuple[float, ...]:
     return LAYOUT.unpack(packed[10 : 10 + length].ljust(LAYOUT.size, b"\0"))
 
 
-def test_px4_is_told_a_valid_place_in_local_ned() -> None:
+def test_px4_gets_a_position_in_local_ned() -> None:
     time_us, *_, distance, _, _, number, frame, x, y, z, q0, q1, q2, q3, kind, valid = payload(TARGET, PX4)
     assert time_us == 5_000_123
     assert (number, frame, kind, valid) == (7, common.MAV_FRAME_LOCAL_NED, 2, 1)
@@ -39,23 +39,25 @@ def test_px4_is_told_a_valid_place_in_local_ned() -> None:
     assert distance == pytest.approx(math.hypot(0.5, 0.25, 4.0))
 
 
-def test_ardupilot_is_told_a_vector_about_its_body_with_the_distance() -> None:
+def test_ardupilot_gets_a_body_vector_and_distance() -> None:
     _, angle_x, angle_y, distance, size_x, size_y, _, frame, x, y, z, *_, valid = payload(TARGET, ARDUPILOT)
     assert (frame, valid) == (common.MAV_FRAME_BODY_FRD, 1)
     assert (x, y, z) == pytest.approx((0.5, -0.25, 4.0))
     assert distance == pytest.approx(math.hypot(x, y, z))
     assert size_x == size_y == pytest.approx(2 * math.atan(0.3 / distance))
-    # From the angles alone ArduPilot makes (-tan y, tan x, 1): the same direction.
+    # From the angles ArduPilot computes (-tan y, tan x, 1): the same direction.
     assert (-math.tan(angle_y) * z, math.tan(angle_x) * z) == pytest.approx((x, y))
 
 
-place = st.floats(-50.0, 50.0)
+coordinate = st.floats(-50.0, 50.0)
 
 
 @given(
-    position=st.tuples(place, place, place), offset=st.tuples(place, place, place), size=st.floats(0.01, 5)
+    position=st.tuples(coordinate, coordinate, coordinate),
+    offset=st.tuples(coordinate, coordinate, coordinate),
+    size=st.floats(0.01, 5),
 )
-def test_any_target_can_be_packed_and_says_where_it_is(
+def test_any_target_is_packed_with_its_position(
     position: tuple[float, float, float], offset: tuple[float, float, float], size: float
 ) -> None:
     target = LandingTarget(1_000_000, 300, position, offset, size)
@@ -66,6 +68,6 @@ def test_any_target_can_be_packed_and_says_where_it_is(
     assert all(math.isfinite(value) for value in (*px4, *ardupilot))
 
 
-def test_what_is_not_finite_is_no_target() -> None:
+def test_non_finite_target_is_refused() -> None:
     with pytest.raises(ValueError, match="must be finite"):
         LandingTarget(0, 1, (math.nan, 0.0, 0.0), (0.0, 0.0, 1.0), 0.5)

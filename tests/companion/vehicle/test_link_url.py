@@ -24,9 +24,7 @@ from companion.vehicle.link_url import LinkScheme, LinkUrl, LinkUrlError, parse_
         ),
     ],
 )
-def test_every_shape_is_read_and_written_back(
-    text: str, scheme: LinkScheme, address: tuple[str, int]
-) -> None:
+def test_every_form_round_trips(text: str, scheme: LinkScheme, address: tuple[str, int]) -> None:
     url = parse_link_url(text)
     assert url == LinkUrl(scheme, address)
     assert parse_link_url(str(url)) == url
@@ -35,24 +33,24 @@ def test_every_shape_is_read_and_written_back(
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "is not a link url"),
-        ("14540", "is not a link url"),
-        ("/dev/ttyAMA0", "is not a link url"),
-        ("udp://:14540", "say udpin:// to listen or udpout:// to send"),
-        ("udpin:127.0.0.1:14540", "is not a link url"),
-        ("udpin://14540", r"is not of the shape udpin://HOST:PORT"),
-        ("udpin://127.0.0.1", r"is not of the shape udpin://HOST:PORT"),
-        ("udpin://127.0.0.1:0", r"the port must be 1\.\.65535, got 0"),
-        ("udpin://127.0.0.1:65536", r"the port must be 1\.\.65535, got 65536"),
-        ("udpin://127.0.0.1:14540;rm", "is not of the shape"),
-        ("tcp://a b:1", "is not of the shape"),
-        ("serial://ttyAMA0:57600", r"is not of the shape serial:///dev/NAME:BAUD"),
-        ("serial:///dev/ttyAMA0", r"is not of the shape serial:///dev/NAME:BAUD"),
-        ("serial:///dev/ttyAMA0:0", "baud rate must be above 0"),
-        ("http://127.0.0.1:80", "is not a link url"),
+        ("", "not a link url"),
+        ("14540", "not a link url"),
+        ("/dev/ttyAMA0", "not a link url"),
+        ("udp://:14540", "udpin:// .*udpout://"),
+        ("udpin:127.0.0.1:14540", "not a link url"),
+        ("udpin://14540", "udpin://HOST:PORT"),
+        ("udpin://127.0.0.1", "udpin://HOST:PORT"),
+        ("udpin://127.0.0.1:0", r"port .*1\.\.65535, got 0"),
+        ("udpin://127.0.0.1:65536", r"port .*1\.\.65535, got 65536"),
+        ("udpin://127.0.0.1:14540;rm", "udpin://HOST:PORT"),
+        ("tcp://a b:1", "tcp://HOST:PORT"),
+        ("serial://ttyAMA0:57600", "serial:///dev/NAME:BAUD"),
+        ("serial:///dev/ttyAMA0", "serial:///dev/NAME:BAUD"),
+        ("serial:///dev/ttyAMA0:0", "above 0"),
+        ("http://127.0.0.1:80", "not a link url"),
     ],
 )
-def test_anything_else_is_refused_in_one_line_with_examples(text: str, message: str) -> None:
+def test_other_texts_are_refused_in_one_line(text: str, message: str) -> None:
     with pytest.raises(LinkUrlError, match=message) as caught:
         parse_link_url(text)
     assert isinstance(caught.value, ValueError)
@@ -61,7 +59,7 @@ def test_anything_else_is_refused_in_one_line_with_examples(text: str, message: 
 
 
 @given(st.text())
-def test_no_text_breaks_the_reader(text: str) -> None:
+def test_parser_survives_any_text(text: str) -> None:
     try:
         url = parse_link_url(text)
     except LinkUrlError:

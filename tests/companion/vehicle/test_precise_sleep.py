@@ -1,4 +1,4 @@
-"""The sleep of the setpoint stream: never too short, never without an end, nothing left behind."""
+"""The sleep of the setpoint stream: never too short, always ends, releases its timer."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from companion.vehicle.precise_sleep import precise_sleep
 
 
 @pytest.mark.parametrize("seconds", [0.02, 0.0005, 1e-9, 0.0, -1.0])
-async def test_it_lasts_as_long_as_asked_and_what_is_over_returns(seconds: float) -> None:
+async def test_sleep_is_never_too_short(seconds: float) -> None:
     async with precise_sleep() as sleep, asyncio.timeout(20):
         for _ in range(3):
             started = time.monotonic()
@@ -21,7 +21,7 @@ async def test_it_lasts_as_long_as_asked_and_what_is_over_returns(seconds: float
             assert time.monotonic() - started >= seconds
 
 
-async def test_others_run_meanwhile_and_a_hang_does_not_cost_the_next_one() -> None:
+async def test_sleep_works_after_a_hang_of_the_loop() -> None:
     turns = 0
 
     async def count() -> None:
@@ -36,23 +36,23 @@ async def test_others_run_meanwhile_and_a_hang_does_not_cost_the_next_one() -> N
         assert turns > 1
         waiting = asyncio.ensure_future(sleep(0.01))
         await asyncio.sleep(0)
-        time.sleep(0.05)  # noqa: ASYNC251  (the loop hangs while the timer rings)
+        time.sleep(0.05)  # noqa: ASYNC251  (the loop hangs while the timer expires)
         await waiting
         await sleep(0.01)
     counting.cancel()
 
 
 def timers() -> int:
-    """How many timer files this process has open."""
+    """Count the open timer files of this process."""
     count = 0
     for name in os.listdir("/proc/self/fd"):
-        with contextlib.suppress(FileNotFoundError):  # another thread may close a file of its own meanwhile
+        with contextlib.suppress(FileNotFoundError):  # another thread may close a file meanwhile
             count += os.readlink(f"/proc/self/fd/{name}") == "anon_inode:[timerfd]"
     return count
 
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="needs Linux's /proc")
-async def test_cancelled_or_not_its_file_is_closed() -> None:
+async def test_timer_file_is_closed_after_cancellation() -> None:
     before = timers()
 
     async def use() -> None:
@@ -68,22 +68,22 @@ async def test_cancelled_or_not_its_file_is_closed() -> None:
     assert timers() == before
 
 
-async def test_it_is_for_one_task_at_a_time() -> None:
+async def test_timer_is_for_one_task() -> None:
     async with precise_sleep() as sleep:
         first = asyncio.ensure_future(sleep(30))
         await asyncio.sleep(0)
-        with pytest.raises(RuntimeError, match="one task at a time"):
+        with pytest.raises(RuntimeError, match="another task"):
             await sleep(0.001)
         first.cancel()
 
 
-async def test_a_sleep_cancelled_as_it_ends_leaves_the_next_one_its_time(
+async def test_cancelled_sleep_does_not_shorten_the_next(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     async with precise_sleep() as sleep, asyncio.timeout(20):
         first = asyncio.ensure_future(sleep(0.005))
         await asyncio.sleep(0)
-        time.sleep(0.02)  # noqa: ASYNC251  (it rings while the loop hangs)
+        time.sleep(0.02)  # noqa: ASYNC251  (it expires while the loop hangs)
         first.cancel()
         started = time.monotonic()
         second = asyncio.ensure_future(sleep(0.05))
@@ -93,7 +93,7 @@ async def test_a_sleep_cancelled_as_it_ends_leaves_the_next_one_its_time(
     assert not caplog.records
 
 
-async def test_without_such_a_timer_the_loops_own_is_used_and_said(
+async def test_without_timerfd_the_loop_sleep_is_used(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     class NoTimers:

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from companion.vehicle.px4_modes import custom_mode_of_mode, mode_of_custom_mode, request_of_mode
 from companion.vehicle.state import FlightMode
 
-# As a real PX4 shows them.
+# As a real PX4 reports them.
 SHOWN = {
     0x00010000: FlightMode.MANUAL,
     0x00020000: FlightMode.ALTITUDE,
@@ -27,27 +27,27 @@ SHOWN = {
 
 
 @pytest.mark.parametrize(("custom_mode", "mode"), SHOWN.items())
-def test_what_px4_shows_is_named(custom_mode: int, mode: FlightMode) -> None:
+def test_px4_custom_modes_are_named(custom_mode: int, mode: FlightMode) -> None:
     assert mode_of_custom_mode(custom_mode) is mode
 
 
 @pytest.mark.parametrize("mode", sorted(set(FlightMode) - {FlightMode.UNKNOWN}))
-def test_what_is_asked_for_is_what_will_be_shown(mode: FlightMode) -> None:
+def test_requested_mode_round_trips(mode: FlightMode) -> None:
     main, sub = request_of_mode(mode)
     assert mode_of_custom_mode(main << 16 | sub << 24) is mode
     assert mode_of_custom_mode(custom_mode_of_mode(mode)) is mode
 
 
-def test_position_is_asked_for_in_its_plain_shape() -> None:
+def test_position_request_has_sub_mode_zero() -> None:
     assert request_of_mode(FlightMode.POSITION) == (3, 0)
 
 
 @given(st.integers(0, 2**32 - 1))
-def test_no_number_is_too_strange_for_a_mode(custom_mode: int) -> None:
+def test_any_custom_mode_is_decoded(custom_mode: int) -> None:
     mode = mode_of_custom_mode(custom_mode)
     assert mode is FlightMode.UNKNOWN or custom_mode & 0xFFFF0000 in SHOWN or mode is FlightMode.READY
 
 
-def test_unknown_cannot_be_asked_for() -> None:
-    with pytest.raises(ValueError, match=r"unknown is not a mode that can be asked for; known: .*hold"):
+def test_unknown_mode_cannot_be_requested() -> None:
+    with pytest.raises(ValueError, match=r"unknown .*hold"):
         request_of_mode(FlightMode.UNKNOWN)

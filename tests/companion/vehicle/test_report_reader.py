@@ -37,42 +37,42 @@ def event(sequence: int, identifier: int = 0x01000005) -> Frame:
     return frame(EVENT_ID, struct.pack("<IIHBBB40s", identifier, 0, sequence, 0, 0, 0x62, bytes(40)))
 
 
-def test_a_short_text_is_told_at_once_without_its_tab() -> None:
-    assert StatusTexts().take(text(b"Arm: Need Position Estimate\t"), 7) == Report(
+def test_short_text_is_reported_without_its_tab() -> None:
+    assert StatusTexts().add(text(b"Arm: Need Position Estimate\t"), 7) == Report(
         7, 2, "Arm: Need Position Estimate"
     )
-    assert StatusTexts().take(text(b"\t"), 7) is None
+    assert StatusTexts().add(text(b"\t"), 7) is None
 
 
-def test_a_fence_breach_that_is_only_a_notice_is_a_warning() -> None:
-    report = StatusTexts().take(text(b"Circle fence breached", severity=5), 7)
+def test_fence_breach_notice_is_a_warning() -> None:
+    report = StatusTexts().add(text(b"Circle fence breached", severity=5), 7)
     assert report == Report(7, 4, "Circle fence breached")
 
 
-def test_a_long_text_is_put_together() -> None:
+def test_long_text_is_reassembled() -> None:
     texts, words = StatusTexts(), b"x" * 50 + b"y" * 50 + b"z"
-    assert texts.take(text(words[:50], 4, 0), 1) is None
-    assert texts.take(text(words[50:100], 4, 1), 2) is None
-    whole = texts.take(text(words[100:], 4, 2), 3)
+    assert texts.add(text(words[:50], 4, 0), 1) is None
+    assert texts.add(text(words[50:100], 4, 1), 2) is None
+    whole = texts.add(text(words[100:], 4, 2), 3)
     assert whole is not None
     assert whole.text == words.decode()
 
 
-def test_a_text_whose_chunk_was_lost_does_not_become_another() -> None:
+def test_text_with_a_lost_chunk_is_dropped() -> None:
     texts = StatusTexts()
-    assert texts.take(text(b"a" * 50, 4, 0), 1) is None
-    assert texts.take(text(b"c", 4, 2), 2) is None
-    assert texts.take(text(b"b" * 50, 5, 0), 3) is None
-    told = texts.take(text(b"!", 5, 1), 4)
-    assert told is not None
-    assert told.text == "b" * 50 + "!"
+    assert texts.add(text(b"a" * 50, 4, 0), 1) is None
+    assert texts.add(text(b"c", 4, 2), 2) is None
+    assert texts.add(text(b"b" * 50, 5, 0), 3) is None
+    report = texts.add(text(b"!", 5, 1), 4)
+    assert report is not None
+    assert report.text == "b" * 50 + "!"
 
 
 class Autopilot:
-    """Serves one file by MAVLink FTP to a reader, losing every `loses`-th answer.
+    """Serves one file by MAVLink FTP, losing every `loses`-th reply.
 
     Attributes:
-        asked: (message id, payload) of everything it was sent.
+        asked: (message id, payload) of every received message.
     """
 
     def __init__(self, content: bytes = b"", loses: int = 0) -> None:
@@ -95,11 +95,11 @@ class Autopilot:
             "<3BHBBBBBBI", 0, 1, 191, sequence + 1, session, answer, len(data), opcode, 0, 0, offset
         )
         answered = frame(110, (header + data).ljust(254, b"\0"))
-        asyncio.get_running_loop().call_soon(self.reader.take, answered)
+        asyncio.get_running_loop().call_soon(self.reader.on_frame, answered)
 
 
 @pytest.mark.parametrize(("size", "loses"), [(0, 0), (1, 0), (239, 0), (240, 0), (2000, 0), (2000, 4)])
-async def test_a_file_is_read_whole_also_when_answers_are_lost(
+async def test_file_is_read_despite_lost_replies(
     size: int, loses: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("companion.vehicle.file_reader._ATTEMPT_S", 0.02)
@@ -107,21 +107,21 @@ async def test_a_file_is_read_whole_also_when_answers_are_lost(
     assert await Autopilot(content, loses).reader.read("etc/a.json") == content
 
 
-async def test_a_file_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_missing_file_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("companion.vehicle.file_reader._ATTEMPT_S", 0.01)
     with pytest.raises(FileReadError, match=r"etc/b\.json: no such file"):
         await Autopilot().reader.read("etc/b.json")
-    with pytest.raises(FileReadError, match="does not answer by MAVLink FTP"):
+    with pytest.raises(FileReadError, match="no MAVLink FTP answer"):
         await FileReader(lambda *_: None, lambda: (1, 1)).read("etc/b.json")
 
 
 class Link:
-    """A reader of reports whose autopilot accepts everything and tells no metadata."""
+    """A report reader whose autopilot accepts every command and has no metadata."""
 
     def __init__(self) -> None:
         self.sent: list[tuple[int, bytes]] = []
-        self.heard = TelemetryState("udpin://test", lambda: None)
-        self.reader = ReportReader("udpin://test", self.heard, self.send, self.command, lambda: (1, 1))
+        self.telemetry = TelemetryState("udpin://test", lambda: None)
+        self.reader = ReportReader("udpin://test", self.telemetry, self.send, self.command, lambda: (1, 1))
 
     def send(self, message_id: int, payload: bytes) -> None:
         self.sent.append((message_id, payload))
@@ -135,28 +135,28 @@ class Link:
         return [struct.unpack_from("<HH", payload) for payload in asked]
 
 
-async def test_a_lost_event_is_asked_for_and_what_was_before_us_is_not() -> None:
+async def test_lost_events_are_requested() -> None:
     link = Link()
-    link.reader.take(event(65533))
-    link.reader.take(event(65534))
+    link.reader.on_frame(event(65533))
+    link.reader.on_frame(event(65534))
     assert link.missed == []
-    link.reader.take(event(2))
+    link.reader.on_frame(event(2))
     assert link.missed == [(65535, 1)]
-    link.reader.take(frame(CURRENT_EVENT_SEQUENCE_ID, struct.pack("<HB", 2, 0)))
+    link.reader.on_frame(frame(CURRENT_EVENT_SEQUENCE_ID, struct.pack("<HB", 2, 0)))
     assert link.missed == [(65535, 1)]
-    link.reader.take(frame(CURRENT_EVENT_SEQUENCE_ID, struct.pack("<HB", 4, 0)))
+    link.reader.on_frame(frame(CURRENT_EVENT_SEQUENCE_ID, struct.pack("<HB", 4, 0)))
     assert link.missed == [(65535, 1), (3, 4)]
 
 
-async def test_events_that_come_before_their_words_wait_for_them(
+async def test_events_wait_for_the_metadata(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr("companion.vehicle.report_reader._METADATA_S", 0.02)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     link = Link()
-    link.reader.take(event(1))
-    assert link.heard.state.reports == ()
-    await link.reader.learn_events()
-    assert "events have no words: it tells no COMPONENT_METADATA" in caplog.text
-    reports: tuple[Report, ...] = link.heard.state.reports
-    assert [told.text for told in reports] == ["event 0x01000005, which its metadata does not name"]
+    link.reader.on_frame(event(1))
+    assert link.telemetry.state.reports == ()
+    await link.reader.load_events()
+    assert "COMPONENT_METADATA not received" in caplog.text
+    reports: tuple[Report, ...] = link.telemetry.state.reports
+    assert [report.text for report in reports] == ["event 0x01000005 (not in the metadata)"]

@@ -27,7 +27,7 @@ vectors = st.tuples(finite, finite, finite)
         ),
         pytest.param(
             {"position_ned_m": POSITION, "acceleration_ned_mps2": POSITION},
-            "give a velocity",
+            "velocity_ned_mps",
             id="feed-forward of a position",
         ),
         pytest.param(
@@ -43,7 +43,7 @@ vectors = st.tuples(finite, finite, finite)
         ),
     ],
 )
-def test_a_shape_px4_does_not_take_is_refused(values: dict[str, Any], message: str) -> None:
+def test_invalid_setpoint_is_refused(values: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Setpoint(0, **values)
 
@@ -71,7 +71,7 @@ _IGNORE = {
     angle=finite,
     forward=st.none() | vectors,
 )
-def test_the_type_mask_ignores_exactly_what_is_not_given(
+def test_type_mask_ignores_exactly_the_unset_fields(
     vector: tuple[float, float, float],
     is_position: bool,
     turn: str | None,
@@ -98,7 +98,7 @@ def test_the_type_mask_ignores_exactly_what_is_not_given(
 
 
 @given(now_ns=st.integers(0, 2**62), lifetime_s=st.floats(0.001, 1000.0), vector=vectors)
-def test_a_setpoint_lives_as_long_as_it_was_given(
+def test_setpoint_expires_after_its_lifetime(
     now_ns: int, lifetime_s: float, vector: tuple[float, float, float]
 ) -> None:
     for make in (Setpoint.velocity, Setpoint.position):
@@ -109,7 +109,7 @@ def test_a_setpoint_lives_as_long_as_it_was_given(
         assert setpoint.deadline_ns - now_ns == round(lifetime_s * 1e9)
 
 
-def test_a_brake_stands_still_and_does_not_turn() -> None:
+def test_brake_has_zero_velocity_and_yaw_rate() -> None:
     brake = Setpoint.brake(1000)
     assert brake.velocity_ned_mps == (0.0, 0.0, 0.0)
     assert brake.yaw_rate_radps == 0.0

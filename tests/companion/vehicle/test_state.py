@@ -26,7 +26,7 @@ def test_yaw_is_the_heading_at_any_tilt(yaw: float, pitch: float, roll: float) -
     assert VehicleState(attitude=attitude).yaw_rad == pytest.approx(yaw, abs=1e-9)
 
 
-def test_what_was_never_told_is_unknown() -> None:
+def test_initial_state_is_unknown() -> None:
     state = VehicleState()
     assert state.yaw_rad is None
     assert state.altitude_m is None
@@ -34,14 +34,14 @@ def test_what_was_never_told_is_unknown() -> None:
     assert not state.position_fresh(0)
 
 
-def test_altitude_is_above_home_and_above_the_origin_while_home_is_unknown() -> None:
+def test_altitude_is_above_home_or_the_origin() -> None:
     assert VehicleState(position_ned_m=(0.0, 0.0, -5.0)).altitude_m == 5.0
     assert (
         VehicleState(position_ned_m=(0.0, 0.0, -5.0), home_position_ned_m=(1.0, 1.0, -2.0)).altitude_m == 3.0
     )
 
 
-def test_a_link_counts_until_three_heartbeats_are_missing() -> None:
+def test_connected_until_three_heartbeats_are_missing() -> None:
     state = VehicleState(heartbeat_ns=10 * S)
     last_ns = 10 * S + round(HEARTBEAT_MAX_AGE_S * S)
     assert state.connected(last_ns)
@@ -49,7 +49,7 @@ def test_a_link_counts_until_three_heartbeats_are_missing() -> None:
 
 
 @pytest.mark.parametrize("late", ["position_ns", "attitude_ns"])
-def test_a_position_is_fresh_only_with_position_and_attitude(late: str) -> None:
+def test_fresh_needs_position_and_attitude(late: str) -> None:
     stamps: dict[str, Any] = {"position_ns": 10 * S, "attitude_ns": 10 * S}
     known: dict[str, Any] = {"position_ned_m": (0.0, 0.0, 0.0), "attitude": (1.0, 0.0, 0.0, 0.0)}
     now_ns = 10 * S + round(TELEMETRY_MAX_AGE_S * S)
@@ -59,7 +59,7 @@ def test_a_position_is_fresh_only_with_position_and_attitude(late: str) -> None:
         assert not VehicleState(**stamps, **known | {missing: None}).position_fresh(now_ns)
 
 
-def test_no_failsafe_is_claimed_that_the_autopilot_does_not_have() -> None:
+def test_without_setpoints_names_the_autopilots_failsafe() -> None:
     assert "COM_OBL_RC_ACT" in VehicleState(autopilot="PX4").without_setpoints
     of_ardupilot = VehicleState(autopilot="ArduPilot").without_setpoints
     assert "GUID_TIMEOUT" in of_ardupilot

@@ -1,4 +1,4 @@
-"""Which streams are missing and when they are asked for: by stamps, and of a Copter in lockstep."""
+"""Missing streams and their requests: by given stamps, and with a Copter in lockstep."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def ns(seconds: float) -> int:
 
 
 class Listener:
-    """Messages at even rates into a monitor; keeps when what was asked for."""
+    """Feeds messages at even rates into a monitor; records its requests."""
 
     def __init__(self, monitor: StreamMonitor) -> None:
         self.monitor, self.now_s = monitor, 0.0
@@ -35,14 +35,14 @@ class Listener:
                 self.monitor.asked(message_id, ns(self.now_s))
 
 
-def test_what_comes_at_more_than_half_its_rate_is_not_asked_for() -> None:
+def test_stream_above_half_its_rate_is_not_requested() -> None:
     listener = Listener(StreamMonitor({ATTITUDE: 50.0, HOME: 0.5}, 0))
     listener.run(60.0, {ATTITUDE: 26.0, HOME: 0.5})
     assert listener.asked == []
     assert not listener.monitor.missing
 
 
-def test_half_a_rate_for_two_seconds_is_asked_for_again() -> None:
+def test_stream_below_half_its_rate_is_requested() -> None:
     listener = Listener(StreamMonitor({ATTITUDE: 50.0, POSITION: 30.0}, 0))
     listener.run(10.0, {ATTITUDE: 50.0, POSITION: 30.0})
     listener.run(3.1, {ATTITUDE: 24.0, POSITION: 30.0})
@@ -53,7 +53,7 @@ def test_half_a_rate_for_two_seconds_is_asked_for_again() -> None:
     assert len(listener.asked) == 1
 
 
-def test_pauses_double_to_eight_seconds_and_begin_anew_when_it_came() -> None:
+def test_pause_doubles_to_eight_seconds_and_resets() -> None:
     listener = Listener(StreamMonitor({POSITION: 30.0}, 0, first_window_s=1.5))
     listener.run(40.0, {})
     times_s = [when_s for when_s, _ in listener.asked]
@@ -67,7 +67,7 @@ def test_pauses_double_to_eight_seconds_and_begin_anew_when_it_came() -> None:
     assert second - first < 2.1
 
 
-def test_a_restart_forgets_the_pause_and_what_was_missing() -> None:
+def test_restart_resets_pauses_and_missing_streams() -> None:
     listener = Listener(StreamMonitor({POSITION: 30.0}, 0))
     listener.run(20.0, {})
     listener.asked.clear()
@@ -77,7 +77,7 @@ def test_a_restart_forgets_the_pause_and_what_was_missing() -> None:
     assert [message_id for _, message_id in listener.asked] == [POSITION]
 
 
-def test_an_optional_stream_that_is_refused_is_not_missing_a_needed_one_is() -> None:
+def test_refused_optional_stream_is_not_missing() -> None:
     monitor = StreamMonitor({POSITION: 30.0, MODE: 2.0}, 0, optional=(MODE,))
     assert monitor.due(ns(2.0)) == [POSITION, MODE]
     for message_id in (POSITION, MODE):
@@ -90,13 +90,13 @@ def test_an_optional_stream_that_is_refused_is_not_missing_a_needed_one_is() -> 
 
 
 class CopterClient:
-    """Asks a Copter in lockstep for its streams, as the drivers do."""
+    """Requests the streams of a Copter in lockstep, as the drivers do."""
 
     def __init__(self) -> None:
         self.copter = LockstepVehicle(autopilot="ardupilot", seed=1, ready_after_s=0.0)
         self.profile = ArduPilotProfile()
         self.monitor = StreamMonitor(self.profile.rates_hz, 0)
-        self.deaf = False
+        self.loses_requests = False
 
     def run(self, seconds: float) -> None:
         for _ in range(round(seconds / STEP_S)):
@@ -106,7 +106,7 @@ class CopterClient:
             now_ns = ns(self.copter.vehicle.faults.now_s)
             for message_id in self.monitor.due(now_ns):
                 self.monitor.asked(message_id, now_ns)
-                if not self.deaf:
+                if not self.loses_requests:
                     interval_us = round(1e6 / self.profile.rates_hz[message_id])
                     self.copter.send(
                         dialect.MAVLink_command_long_message(
@@ -125,17 +125,17 @@ class CopterClient:
                     )
 
 
-def test_a_copter_that_was_deaf_for_six_seconds_sends_all_streams() -> None:
+def test_copter_sends_all_streams_after_lost_requests() -> None:
     client = CopterClient()
-    client.deaf = True
+    client.loses_requests = True
     client.run(6.0)
     assert POSITION in client.monitor.missing
-    client.deaf = False
+    client.loses_requests = False
     client.run(12.0)
     assert not client.monitor.missing
 
 
-def test_streams_come_again_after_a_quick_reboot_of_a_copter() -> None:
+def test_copter_streams_return_after_a_quick_reboot() -> None:
     client = CopterClient()
     client.run(15.0)
     assert not client.monitor.missing
@@ -148,7 +148,7 @@ def test_streams_come_again_after_a_quick_reboot_of_a_copter() -> None:
     assert counted.count("LOCAL_POSITION_NED") >= 25
 
 
-def test_streams_come_again_after_somebody_stopped_or_slowed_them() -> None:
+def test_copter_streams_return_after_being_stopped() -> None:
     client = CopterClient()
     client.run(15.0)
     for rate_hz, start in ((2, 1), (0, 0)):

@@ -1,4 +1,4 @@
-"""The dead-man's whole logic, under a clock that the test turns."""
+"""The dead-man's whole logic, with a clock set by the test."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def is_brake(setpoint: Setpoint) -> bool:
     return setpoint.velocity_ned_mps == (0.0, 0.0, 0.0) and setpoint.yaw_rate_radps == 0.0
 
 
-def test_a_fresh_setpoint_is_sent_once_a_tick() -> None:
+def test_fresh_setpoint_is_sent_once_per_tick() -> None:
     bench = Bench()
     setpoint = bench.submit(300)
     bench.run(300)
@@ -57,7 +57,7 @@ def test_a_fresh_setpoint_is_sent_once_a_tick() -> None:
     assert bench.streamer.last_sent_ns == 1300 * MS
 
 
-def test_a_hastened_setpoint_leaves_at_once_and_only_once_between_two_ticks() -> None:
+def test_send_now_sends_once_between_two_ticks() -> None:
     bench = Bench()
     first = bench.submit(north_mps=1.0)
     bench.run(40)
@@ -70,7 +70,7 @@ def test_a_hastened_setpoint_leaves_at_once_and_only_once_between_two_ticks() ->
     assert bench.sent == [(1020, first), (1040, first), (1045, second), (1060, second), (1080, second)]
 
 
-def test_haste_begins_no_stream_and_takes_none_up_again() -> None:
+def test_send_now_neither_starts_nor_resumes_a_stream() -> None:
     bench = Bench(brake_ms=500)
     bench.submit(300)
     bench.streamer.send_now(bench.now_ms * MS)
@@ -83,7 +83,7 @@ def test_haste_begins_no_stream_and_takes_none_up_again() -> None:
     assert bench.streamer.sent_count == count
 
 
-def test_an_expired_setpoint_brakes_and_then_falls_silent_for_good(caplog: pytest.LogCaptureFixture) -> None:
+def test_expired_setpoint_brakes_then_stays_silent(caplog: pytest.LogCaptureFixture) -> None:
     bench = Bench(brake_ms=500)
     bench.submit(300)
     bench.run(800)
@@ -93,14 +93,14 @@ def test_an_expired_setpoint_brakes_and_then_falls_silent_for_good(caplog: pytes
     bench.run(200)
     assert bench.streamer.state is StreamState.EXPIRED
     count = bench.streamer.sent_count
-    # PX4 would go back to OFFBOARD by itself; only a new beginning may make it.
+    # PX4 would return to OFFBOARD by itself; only a stop and a new start may do that.
     bench.submit(1000)
     bench.run(500)
     assert bench.streamer.sent_count == count
     assert [record.levelno for record in caplog.records] == [logging.WARNING, logging.ERROR]
 
 
-def test_after_stop_command_can_be_taken_anew() -> None:
+def test_stream_can_restart_after_stop() -> None:
     bench = Bench(brake_ms=100)
     bench.submit(100)
     bench.run(1000)
@@ -111,7 +111,7 @@ def test_after_stop_command_can_be_taken_anew() -> None:
     assert bench.sent[-1] == (bench.now_ms, fresh)
 
 
-def test_braking_ends_when_a_fresh_setpoint_comes() -> None:
+def test_fresh_setpoint_ends_braking() -> None:
     bench = Bench()
     bench.submit(100)
     bench.run(300)
@@ -123,7 +123,7 @@ def test_braking_ends_when_a_fresh_setpoint_comes() -> None:
     assert bench.streamer.state is StreamState.FRESH
 
 
-def test_a_setpoint_that_was_late_from_the_beginning_takes_no_command() -> None:
+def test_first_setpoint_that_is_expired_is_not_sent() -> None:
     bench = Bench()
     bench.submit(100)
     bench.now_ms += 200
@@ -132,7 +132,7 @@ def test_a_setpoint_that_was_late_from_the_beginning_takes_no_command() -> None:
     assert bench.streamer.state is StreamState.SILENT
 
 
-def test_a_loop_that_hung_too_long_sends_nothing_even_when_its_setpoint_is_still_fresh() -> None:
+def test_after_a_long_hang_nothing_is_sent() -> None:
     bench = Bench()
     bench.submit(60_000)
     bench.run(100)
@@ -143,7 +143,7 @@ def test_a_loop_that_hung_too_long_sends_nothing_even_when_its_setpoint_is_still
     assert bench.streamer.sent_count == count
 
 
-def test_stop_sends_nothing_more_and_nothing_is_sent_before_the_first_setpoint() -> None:
+def test_nothing_is_sent_before_submit_or_after_stop() -> None:
     bench = Bench()
     bench.run(200)
     assert bench.sent == []
@@ -166,7 +166,7 @@ STEPS = st.lists(
 
 
 @given(steps=STEPS, brake_ms=st.integers(0, 600))
-def test_whatever_happens_nothing_expired_leaves_and_silence_is_final(
+def test_expired_setpoints_are_never_sent_and_silence_is_final(
     steps: list[tuple[str, int]], brake_ms: int
 ) -> None:
     bench = Bench(brake_ms=brake_ms)
@@ -189,21 +189,19 @@ def test_whatever_happens_nothing_expired_leaves_and_silence_is_final(
             assert not silent
             assert newest is not None
             assert not setpoint.expired(at_ms * MS)
-            assert setpoint.deadline_ns <= at_ms * MS + 300 * MS, (
-                "what is held up on its way may not arrive late"
-            )
+            assert setpoint.deadline_ns <= at_ms * MS + 300 * MS, "a delayed setpoint may arrive late"
             if replace(setpoint, deadline_ns=newest.deadline_ns) != newest:
                 assert is_brake(setpoint)
                 assert 0 < at_ms * MS - newest.deadline_ns <= brake_ms * MS
         silent = silent or bench.streamer.state is StreamState.EXPIRED
 
 
-class TurnedClock:
-    """Stands in for the clock and for sleeping: time passes only by sleeping, or by a hang."""
+class ManualClock:
+    """Replaces clock and sleep: time passes only by sleeping, or by a hang."""
 
-    def __init__(self, turns: int) -> None:
+    def __init__(self, sleeps: int) -> None:
         self.now_ns = 0
-        self.turns = turns
+        self.sleeps_left = sleeps
 
     @asynccontextmanager
     async def sleeper(self) -> AsyncIterator[Callable[[float], Awaitable[None]]]:
@@ -211,13 +209,13 @@ class TurnedClock:
 
     async def sleep(self, delay_s: float) -> None:
         assert delay_s >= 0.0
-        self.turns -= 1
-        if self.turns < 0:
+        self.sleeps_left -= 1
+        if self.sleeps_left < 0:
             raise asyncio.CancelledError
         self.now_ns += round(delay_s * 1e9)
 
 
-async def run_streamer(clock: TurnedClock, send: Callable[[Setpoint], None], **options: float) -> Streamer:
+async def run_streamer(clock: ManualClock, send: Callable[[Setpoint], None], **options: float) -> Streamer:
     streamer = Streamer(send, clock_ns=lambda: clock.now_ns, sleeper=clock.sleeper, **options)
     streamer.submit(Setpoint.velocity((1.0, 0.0, 0.0), 0, lifetime_s=60.0))
     with pytest.raises(asyncio.CancelledError):
@@ -225,8 +223,8 @@ async def run_streamer(clock: TurnedClock, send: Callable[[Setpoint], None], **o
     return streamer
 
 
-async def test_the_rate_is_kept_though_sending_takes_time() -> None:
-    clock, times = TurnedClock(turns=100), []
+async def test_rate_is_kept_when_sending_takes_time() -> None:
+    clock, times = ManualClock(sleeps=100), []
 
     def send(_setpoint: Setpoint) -> None:
         times.append(clock.now_ns)
@@ -236,25 +234,25 @@ async def test_the_rate_is_kept_though_sending_takes_time() -> None:
     assert times == [number * 10 * MS for number in range(101)]
 
 
-async def test_missed_ticks_are_skipped_and_never_made_up_for() -> None:
-    clock, times = TurnedClock(turns=20), []
+async def test_missed_ticks_are_skipped() -> None:
+    clock, times = ManualClock(sleeps=20), []
 
     def send(_setpoint: Setpoint) -> None:
         times.append(clock.now_ns)
         if len(times) == 5:
-            clock.now_ns += 333 * MS  # the loop was held up
+            clock.now_ns += 333 * MS  # the loop was blocked
 
     await run_streamer(clock, send, rate_hz=100.0)
     gaps = [after - before for before, after in itertools.pairwise(times)]
     assert gaps == [10 * MS] * 4 + [340 * MS] + [10 * MS] * 15
 
 
-def test_a_rate_px4_would_not_take_is_refused() -> None:
-    with pytest.raises(ValueError, match="faster than 2 Hz"):
+def test_rate_below_px4s_minimum_is_refused() -> None:
+    with pytest.raises(ValueError, match="rate_hz"):
         Streamer(lambda _: None, rate_hz=2.0)
 
 
-async def test_in_a_real_loop_it_sends_until_cancelled() -> None:
+async def test_streamer_runs_in_a_real_loop_until_cancelled() -> None:
     sent, enough = [], asyncio.Event()
 
     def send(setpoint: Setpoint) -> None:

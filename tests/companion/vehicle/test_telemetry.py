@@ -24,7 +24,7 @@ HEARTBEAT = {"custom_mode": 0x03040000, "base_mode": 29, "system_status": 3}
         pytest.param(1, 0, False, False, id="uninitialised"),
     ],
 )
-def test_the_heartbeat_tells_armed_and_failsafe(
+def test_heartbeat_sets_armed_and_failsafe(
     base_mode: int, system_status: int, armed: bool, failsafe: bool
 ) -> None:
     fields = {"custom_mode": 0x00060000, "base_mode": base_mode, "system_status": system_status}
@@ -33,7 +33,7 @@ def test_the_heartbeat_tells_armed_and_failsafe(
     assert state.mode is FlightMode.OFFBOARD
 
 
-def test_a_message_that_says_nothing_new_returns_the_same_object() -> None:
+def test_message_without_change_returns_the_same_object() -> None:
     state = apply_message(VehicleState(), "HEARTBEAT", HEARTBEAT, 1)
     assert apply_message(state, "VFR_HUD", {"airspeed": 1.0}, 2) is state
     assert apply_message(state, "CURRENT_MODE", {"custom_mode": 0x03040000}, 2) is state
@@ -41,7 +41,7 @@ def test_a_message_that_says_nothing_new_returns_the_same_object() -> None:
     assert apply_message(state, "BATTERY_STATUS", {"id": 1, "battery_remaining": 50}, 2) is state
 
 
-def test_current_mode_leads_and_a_mode_without_a_name_does_not() -> None:
+def test_unknown_current_mode_is_ignored() -> None:
     state = apply_message(VehicleState(), "HEARTBEAT", HEARTBEAT, 1)
     state = apply_message(state, "CURRENT_MODE", {"custom_mode": custom_mode_of_mode(FlightMode.LAND)}, 2)
     assert state.mode is FlightMode.LAND
@@ -59,21 +59,21 @@ def test_current_mode_leads_and_a_mode_without_a_name_does_not() -> None:
         (99, LandedState.UNKNOWN),
     ],
 )
-def test_the_landed_state_is_named(number: int, landed: LandedState) -> None:
+def test_landed_state_is_decoded(number: int, landed: LandedState) -> None:
     state = apply_message(VehicleState(), "EXTENDED_SYS_STATE", {"landed_state": number}, 5)
     assert (state.landed, state.landed_ns) == (landed, 5)
 
 
 @pytest.mark.parametrize("bad", [None, math.nan, math.inf])
 @pytest.mark.parametrize("field", ["x", "y", "z", "vx", "vy", "vz"])
-def test_a_position_with_a_hole_is_not_taken_and_does_not_look_fresh(field: str, bad: float | None) -> None:
-    """NaN by pymavlink; null in MAVSDK's JSON."""
+def test_position_with_a_non_finite_field_is_ignored(field: str, bad: float | None) -> None:
+    """NaN from pymavlink; null in MAVSDK's JSON."""
     whole = dict.fromkeys(("time_boot_ms", "x", "y", "z", "vx", "vy", "vz"), 1.0)
     before = apply_message(VehicleState(), "LOCAL_POSITION_NED", whole, 5)
     assert apply_message(before, "LOCAL_POSITION_NED", whole | {field: bad}, 9) is before
 
 
-def test_an_attitude_is_normalised_and_one_that_is_none_is_not_taken() -> None:
+def test_attitude_is_normalised_or_ignored() -> None:
     rates = {"rollspeed": 0.1, "pitchspeed": 0.2, "yawspeed": 0.3}
     state = apply_message(
         VehicleState(), "ATTITUDE_QUATERNION", {"q1": 1.01, "q2": 0, "q3": 0, "q4": 0, **rates}, 5
@@ -87,7 +87,7 @@ def test_an_attitude_is_normalised_and_one_that_is_none_is_not_taken() -> None:
         )
 
 
-def test_home_is_known_by_its_altitude_even_without_a_local_position() -> None:
+def test_home_altitude_without_local_position() -> None:
     fields = {"altitude": 488_123, "x": None, "y": None, "z": None}
     state = apply_message(VehicleState(), "HOME_POSITION", fields, 5)
     assert state.home_altitude_amsl_m == pytest.approx(488.123)
@@ -100,7 +100,7 @@ def test_home_is_known_by_its_altitude_even_without_a_local_position() -> None:
     ("health", "remaining", "ready", "fraction"),
     [(0x1000_0000, 80, True, 0.8), (0x0FFF_FFFF, 0, False, 0.0), (0, -1, False, None), (0, 120, False, 1.0)],
 )
-def test_sys_status_tells_readiness_and_battery(
+def test_sys_status_sets_readiness_and_battery(
     health: int, remaining: int, ready: bool, fraction: float | None
 ) -> None:
     fields = {"onboard_control_sensors_health": health, "battery_remaining": remaining}
@@ -109,18 +109,18 @@ def test_sys_status_tells_readiness_and_battery(
 
 
 @given(name=st.sampled_from(sorted(TELEMETRY_MESSAGES - {"CURRENT_MODE"})), payload=st.binary(max_size=60))
-def test_no_content_of_a_message_breaks_the_fold(name: str, payload: bytes) -> None:
+def test_apply_message_survives_any_payload(name: str, payload: bytes) -> None:
     definition = getattr(mavlink, f"MAVLink_{name.lower()}_message")
     size = definition.unpacker.size
     values = definition.unpacker.unpack(payload[:size].ljust(size, b"\0"))
     fields = {}
-    for field, place, count in zip(
+    for field, index, count in zip(
         definition.fieldnames,
         definition.orders,
         (definition.lengths[order] for order in definition.orders),
         strict=True,
     ):
-        first = sum(definition.lengths[:place])
+        first = sum(definition.lengths[:index])
         fields[field] = values[first] if count == 1 else list(values[first : first + count])
     state = apply_message(VehicleState(), name, fields, 5)
     for vector in (state.position_ned_m, state.velocity_ned_mps, state.attitude, state.home_position_ned_m):
@@ -138,7 +138,7 @@ def odometry(time_us: int, north_m: float, counter: int) -> dict[str, float]:
     return {"time_usec": time_us, "reset_counter": counter, "frame_id": 1, "x": north_m, "y": 0.0, "z": -5.0}
 
 
-def test_a_jump_of_the_position_is_a_reset_and_leaves_every_place_where_it_was() -> None:
+def test_position_jump_is_a_reset_that_keeps_the_position() -> None:
     home = {"altitude": 10_000, "x": 1.0, "y": 0.0, "z": 0.0}
     state = apply_message(VehicleState(), "HOME_POSITION", home, 0)
     for boot_ms in range(0, 200, 20):
@@ -147,7 +147,7 @@ def test_a_jump_of_the_position_is_a_reset_and_leaves_every_place_where_it_was()
     assert state.position_ned_m == pytest.approx((0.6, 0.0, -5.0))
     assert state.reset_offset_ned_m == pytest.approx((7.0, 0.0, 0.0))
     assert state.reset_count == 1
-    # The autopilot's own home has not moved in its coordinates: it is another place now.
+    # Home keeps its coordinates in the autopilot's frame, so it is another point on the ground now.
     assert state.home_position_ned_m == pytest.approx((-6.0, 0.0, 0.0))
     state = apply_message(state, "HOME_POSITION", {**home, "x": 8.0}, 210)
     assert state.home_position_ned_m == pytest.approx((1.0, 0.0, 0.0))
@@ -156,8 +156,8 @@ def test_a_jump_of_the_position_is_a_reset_and_leaves_every_place_where_it_was()
     assert state.reset_count == 1
 
 
-def test_a_gap_is_no_reset() -> None:
-    """Of less than a second as far as velocities explain the way; over a longer one none can be measured."""
+def test_gap_is_not_a_reset() -> None:
+    """Below a second if the velocities explain the displacement; a longer one cannot be measured."""
     state = apply_message(VehicleState(), "LOCAL_POSITION_NED", at(0, 0.0), 0)
     state = apply_message(state, "LOCAL_POSITION_NED", at(900, 2.7), 1)
     state = apply_message(state, "LOCAL_POSITION_NED", at(9000, 80.0), 2)
@@ -165,7 +165,7 @@ def test_a_gap_is_no_reset() -> None:
 
 
 @pytest.mark.parametrize("first", ["LOCAL_POSITION_NED", "ODOMETRY"])
-def test_a_reset_that_both_messages_show_is_counted_once(first: str) -> None:
+def test_reset_in_both_messages_is_counted_once(first: str) -> None:
     state = apply_message(VehicleState(), "LOCAL_POSITION_NED", at(100, 0.3), 0)
     state = apply_message(state, "ODOMETRY", odometry(100_000, 0.3, 5), 0)
     new = [("LOCAL_POSITION_NED", at(120, 4.36)), ("ODOMETRY", odometry(120_000, 4.36, 6))]
@@ -175,7 +175,7 @@ def test_a_reset_that_both_messages_show_is_counted_once(first: str) -> None:
     assert state.position_ned_m == pytest.approx((0.36, 0.0, -5.0))
 
 
-def test_a_small_reset_is_known_by_its_counter_alone() -> None:
+def test_small_reset_is_detected_by_its_counter() -> None:
     state = apply_message(VehicleState(), "LOCAL_POSITION_NED", at(100, 0.3), 0)
     state = apply_message(state, "ODOMETRY", odometry(100_000, 0.3, 255), 0)
     jumped = apply_message(state, "ODOMETRY", odometry(120_000, 0.36 + 0.4, 0), 1)
@@ -193,6 +193,6 @@ def test_a_small_reset_is_known_by_its_counter_alone() -> None:
         pytest.param(1 | 2 | 4 | 8 | 32, True, id="optical flow: relative position"),
     ],
 )
-def test_flags_of_the_estimator_say_whether_a_position_is_one(flags: int, valid: bool) -> None:
+def test_estimator_flags_set_position_valid(flags: int, valid: bool) -> None:
     state = apply_message(VehicleState(), "ESTIMATOR_STATUS", {"flags": flags}, 1)
     assert state.position_valid is valid
