@@ -19,6 +19,7 @@ from typing import Any
 
 from companion.vehicle.autopilot_profile import ARDUPILOT, PX4, AutopilotProfile, Px4Profile
 from companion.vehicle.byte_link import ByteLink, Source, open_link
+from companion.vehicle.commander import NAME as COMMANDER_NAME
 from companion.vehicle.commander import ONBOARD_CONTROLLER, commander_mode, read_commander
 from companion.vehicle.connection_advice import unsupported_autopilot, why_no_answer, why_no_autopilot
 from companion.vehicle.driver import CommandRefusedError, LinkError, NoAnswerError, SystemStatus
@@ -45,6 +46,8 @@ _AUTOPILOT_INVALID = 8  # MAV_AUTOPILOT: not an autopilot
 _HEARTBEAT = struct.Struct(
     "<IBBBBB"
 )  # custom_mode, type, autopilot, base_mode, system_status, mavlink_version
+_NAMED_VALUE_INT_ID = 252
+_NAMED_VALUE_INT = struct.Struct("<II10s")  # time_boot_ms, value, name
 _FRAME_LOCAL_NED = 1
 _TIMESYNC_ID = 111
 _SYSTEM_TIME_ID = 2
@@ -103,7 +106,7 @@ class AutopilotDriver(ABC):
             lambda: (self._system_id or 0, AUTOPILOT_COMPONENT),
         )
         self._sequence = 0
-        self._own_heartbeats: deque[tuple[int, int]] = deque(maxlen=8)  # (sequence number, custom_mode)
+        self._own_heartbeats: deque[tuple[int, int]] = deque(maxlen=16)  # (sequence number, custom_mode)
         self._tasks: list[asyncio.Task[None]] = []
 
     # --- the encoding: what a driver adds -------------------------------------------------------------
@@ -242,6 +245,10 @@ class AutopilotDriver(ABC):
                 continue
             if frame.message_id == HEARTBEAT_ID:
                 self._heartbeat_from(frame, source)
+            elif frame.message_id == _NAMED_VALUE_INT_ID:
+                _, value, name = _NAMED_VALUE_INT.unpack(frame.padded(_NAMED_VALUE_INT.size))
+                if name.rstrip(b"\0") == COMMANDER_NAME:
+                    self._commander_from(frame, ONBOARD_CONTROLLER, value)
             if frame.system_id == self._system_id and source == self._source:
                 if frame.component_id == AUTOPILOT_COMPONENT:
                     self._only_heartbeats &= frame.message_id == HEARTBEAT_ID
@@ -269,12 +276,7 @@ class AutopilotDriver(ABC):
         wanted = self._wanted_system_id if self._system_id is None else self._system_id
         if not is_autopilot or wanted not in (None, frame.system_id):
             self._note_other(sender, "system/component %d/%d is also on this link")
-            # What a network sends back to us is our own: the same number and content as one that we sent.
-            sent = (frame.sequence, custom_mode) in self._own_heartbeats
-            echo = sender == self.own_address and sent
-            commander = read_commander(mav_type, custom_mode, sender, time.monotonic_ns())
-            if commander is not None and frame.system_id == self._own_system_id and not echo:
-                self._telemetry.take_commander(commander)
+            self._commander_from(frame, mav_type, custom_mode)
             return
         if self._system_id is None:
             self._system_id, self._autopilot_kind = frame.system_id, autopilot
@@ -293,6 +295,15 @@ class AutopilotDriver(ABC):
         fields = {"custom_mode": custom_mode, "base_mode": base_mode, "system_status": system_status}
         self._telemetry.handle("HEARTBEAT", fields)
         self._first_heard.set()
+
+    def _commander_from(self, frame: Frame, mav_type: int, custom_mode: int) -> None:
+        """Another service on this vehicle, if it is one."""
+        sender = (frame.system_id, frame.component_id)
+        # What a network sends back to us is our own: the same number and content as one that we sent.
+        echo = sender == self.own_address and (frame.sequence, custom_mode) in self._own_heartbeats
+        commander = read_commander(mav_type, custom_mode, sender, time.monotonic_ns())
+        if commander is not None and frame.system_id == self._own_system_id and not echo:
+            self._telemetry.take_commander(commander)
 
     def _no_answer(self, text: str) -> NoAnswerError:
         """The error for a command or a parameter that the autopilot has not answered."""
@@ -376,6 +387,10 @@ class AutopilotDriver(ABC):
         payload = _HEARTBEAT.pack(mode, ONBOARD_CONTROLLER, _AUTOPILOT_INVALID, 0, int(status), 3)
         self._own_heartbeats.append((self._sequence, mode))
         self._transmit_payload(HEARTBEAT_ID, payload)
+        if self._autopilot_kind == ARDUPILOT:  # it keeps this heartbeat from another service with our address
+            payload = _NAMED_VALUE_INT.pack(self._boot_ms(), mode, COMMANDER_NAME)
+            self._own_heartbeats.append((self._sequence, mode))
+            self._transmit_payload(_NAMED_VALUE_INT_ID, payload)
 
     def send_setpoint(self, setpoint: Setpoint) -> None:
         """See Driver."""
