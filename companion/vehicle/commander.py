@@ -8,8 +8,8 @@ MAVLink leaves to the sender and no autopilot reads of an onboard controller:
     bit  19      it is in command now
     bits 18..0   for how long it has run, seconds (at most 6 days)
 
-ArduPilot forwards no HEARTBEAT to a link from which one with the same system and component id has come, and all
-services have the same by default. There the same number goes out as a NAMED_VALUE_INT too, which it forwards.
+ArduPilot forwards no HEARTBEAT to a link from which the same system and component id has been heard, and all
+services have the same. There the number goes out as a NAMED_VALUE_INT too, which is forwarded.
 """
 
 from __future__ import annotations

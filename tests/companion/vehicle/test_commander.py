@@ -29,6 +29,14 @@ def test_an_uptime_of_weeks_stays_the_longest() -> None:
     assert (one.uptime_s, one.in_command) == (2**19 - 1, False)
 
 
+def named_value(address: tuple[int, int], value: int, name: bytes = b"companion") -> bytes:
+    """The mark as ArduPilot forwards it from another link, whoever sends heartbeats there."""
+    signed = int.from_bytes(value.to_bytes(4, "little"), "little", signed=True)
+    codec = mavlink.MAVLink(None, *address)
+    codec.seq = 99
+    return bytes(mavlink.MAVLink_named_value_int_message(7, name, signed).pack(codec))
+
+
 def heartbeat(address: tuple[int, int], mav_type: int, custom_mode: int, sequence: int = 99) -> bytes:
     """As another system's, or another component's of the vehicle, that the autopilot forwards."""
     codec = mavlink.MAVLink(None, *address)
@@ -72,3 +80,11 @@ async def test_our_own_heartbeat_sent_back_is_no_commander(driver: Driver, autop
     autopilot.say_bytes(heartbeat((1, 192), ONBOARD, OURS))
     state = await state_shows(driver, lambda state: bool(state.other_commanders))
     assert [one.address for one in state.other_commanders] == [(1, 192)]
+
+
+async def test_a_mark_without_a_heartbeat_is_in_the_state(driver: Driver, autopilot: FakeAutopilot) -> None:
+    autopilot.say_bytes(named_value((1, 193), OURS, b"other"))
+    autopilot.say_bytes(named_value((1, 191), OURS))
+    state = await state_shows(driver, lambda state: bool(state.other_commanders))
+    told = [(one.address, one.uptime_s, one.in_command) for one in state.other_commanders]
+    assert told == [((1, 191), 100.0, True)]
