@@ -142,6 +142,7 @@ def test_a_second_service_of_another_name_refuses(beside: Beside) -> None:
     assert "1/191 by mavlink, not in command" in answer["reason"]
     assert not link.armed
     first.take_off(3.0)
+    first.fly("hold")
     until_s = time.monotonic() + HEARD_S
     while "1/191 by mavlink, in command" not in (answer := beside.answers("vehicle2", "hold")[0])["reason"]:
         assert REFUSED in answer["reason"]
