@@ -95,6 +95,7 @@ class AutopilotDriver(ABC):
         self._asked_ns = 0
         self._first_heard = asyncio.Event()
         self._others: set[tuple[Any, ...]] = set()
+        self._time_sent_ns = 0
         self._signs = False  # the autopilot's frames are signed
         self._only_heartbeats = True
         self._streams: StreamRequests | None = None
@@ -242,6 +243,8 @@ class AutopilotDriver(ABC):
         ours: list[Frame] = []
         for frame in self._framer.feed(data, datagram=link.datagrams):
             if self._signer is not None and not self._signer.accepts(frame):
+                if self._signer.peer_late and self._source is None:
+                    self._send_signed_time(source)
                 continue
             if frame.message_id == HEARTBEAT_ID:
                 self._heartbeat_from(frame, source)
@@ -266,6 +269,14 @@ class AutopilotDriver(ABC):
                 ours.append(frame)
         if ours and self._autopilot_kind in self.flown_autopilots:
             self._take_frames(ours)
+
+    def _send_signed_time(self, source: Source) -> None:
+        """A late peer takes its time from a signed message: PX4, which has no clock, after every restart."""
+        now_ns = time.monotonic_ns()
+        if self._link is not None and now_ns - self._time_sent_ns >= 1e9:
+            self._time_sent_ns = now_ns
+            self._link.answer_to(source)
+            self.send_heartbeat(SystemStatus.ACTIVE)
 
     def _heartbeat_from(self, frame: Frame, source: Source) -> None:
         custom_mode, mav_type, autopilot, base_mode, system_status, _ = _HEARTBEAT.unpack(

@@ -27,6 +27,7 @@ _TIMESTAMP_MASK = (1 << 48) - 1
 _RADIO_STATUS_ID, _HEARTBEAT_ID = 109, 0
 _TELEMETRY_RADIO = 68  # MAV_COMP_ID_TELEMETRY_RADIO
 _LINK_ID = 0
+_OLD = "old timestamp"
 
 
 class SigningKeyError(LinkError, ValueError):
@@ -77,6 +78,7 @@ class FrameSigner:
 
     Attributes:
         refused: how many frames were refused, by reason.
+        peer_late: the newest frame had the right key, and a time of more than a minute ago.
     """
 
     def __init__(self, key: bytes) -> None:
@@ -87,6 +89,7 @@ class FrameSigner:
         self._timestamp = 0
         self._newest: dict[tuple[int, int, int], int] = {}
         self.refused: Counter[str] = Counter()
+        self.peer_late = False
 
     def __repr__(self) -> str:
         return f"FrameSigner({sum(self.refused.values())} refused)"
@@ -103,6 +106,7 @@ class FrameSigner:
     def accepts(self, frame: Frame) -> bool:
         """Whether a frame that came may be used; if not, it is counted, and the first of a kind logged."""
         reason = self._objection(frame)
+        self.peer_late = reason == _OLD
         if reason is None:
             return True
         self.refused[reason] += 1
@@ -127,7 +131,7 @@ class FrameSigner:
         if newest is None:
             now = max(self._timestamp, int((time.time() - _EPOCH_S) * 1e5))
             if timestamp + _ONE_MINUTE < now:
-                return "old timestamp"
+                return _OLD
         elif timestamp <= newest:
             return "replayed"
         self._newest[stream] = timestamp
