@@ -186,9 +186,7 @@ class AutopilotLink:
         # Copter counts from a minute after what it is given, and refuses what is older than a minute.
         since = 0 if key is None else signing_time() - SIGNING_MINUTE
         secret = bytes(32) if key is None else key
-        self.send(
-            dialect.MAVLink_setup_signing_message(self.system_id, 1, [*secret], since)  # type: ignore[no-untyped-call]
-        )
+        self.send(dialect.MAVLink_setup_signing_message(self.system_id, 1, [*secret], since))
         signing = self._pilot.signing
         signing.secret_key, signing.sign_outgoing = key, key is not None
 
