@@ -217,6 +217,9 @@ async def _mission(service: Service, flight: _Flight) -> None:
     reply = await service.command(f"mission {MISSION}")
     if not reply["success"]:
         flight.failure = flight.failure or reply["reason"]
+        if service.guidance.in_command and service.driver.state.armed:
+            # A low battery ended the mission: the service must not end before the return.
+            await service.command("rtl")
     for step in reply.get("steps", ()):
         flight.found = flight.found or (step["title"] == FIND and step["success"])
         if step["title"] == STAND and step["success"]:

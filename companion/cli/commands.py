@@ -14,7 +14,7 @@ import logging
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -196,10 +196,12 @@ def demo(
         return
     from companion.bus.session import BusError
     from companion.demo import run_demo
+    from companion.operator.line_output import LineOutput, use_for_standard_error
     from companion.perception.supervisor import PerceptionStartError
     from companion.sim_session import SimSessionError
     from companion.vehicle.driver import LinkError
 
+    use_for_standard_error()
     logging.basicConfig(level=logging.WARNING, format="companion: %(message)s", stream=sys.stderr)
     # The service's events are printed here with their time; do not log them as well.
     service = logging.getLogger("companion.service")
@@ -208,9 +210,18 @@ def demo(
     with plain_errors(SimSessionError, LinkError, PerceptionStartError, BusError, OSError):
         # PX4 returns at 30 m (RTL_RETURN_ALT), and no parameter of the autopilot is changed.
         limit_s = duration or (_DEMO_S if vehicle_url is None else _DEMO_AUTOPILOT_S)
-        summary = run_demo(
-            output, seed=seed, limit_s=limit_s, say=_print_with_time(), vehicle_url=vehicle_url
-        )
+        started_s = time.monotonic()
+        lines = LineOutput(sys.stdout.fileno())  # a flight does not wait for whoever reads it
+        try:
+            summary = run_demo(
+                output,
+                seed=seed,
+                limit_s=limit_s,
+                say=lambda text: lines.print(f"{time.monotonic() - started_s:6.1f} s  {text}"),
+                vehicle_url=vehicle_url,
+            )
+        finally:
+            lines.end()
     if not summary.success:
         typer.echo(f"the demonstration failed: {summary.failure}; see {output}", err=True)
         raise typer.Exit(EXIT_FAILED)
@@ -240,11 +251,6 @@ def _fly_seeds(text: str, processes: int, *, synthetic: bool, as_json: bool) -> 
         Console(width=None if sys.stdout.isatty() else 160).print(demos_table(flights))
     if not all(flight.success for flight in flights):
         raise typer.Exit(EXIT_FAILED)
-
-
-def _print_with_time() -> Callable[[str], None]:
-    started = time.monotonic()
-    return lambda text: typer.echo(f"{time.monotonic() - started:6.1f} s  {text}")
 
 
 @app.command()

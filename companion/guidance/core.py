@@ -137,6 +137,7 @@ class Guidance:
         self._active: Behaviour | None = None
         self._landing = False
         self._gimbal_user = ""
+        self._failure = ""  # of the step before, in words
 
     @property
     def active(self) -> Behaviour | None:
@@ -215,6 +216,8 @@ class Guidance:
             self.gimbal.update(now_ns, inputs.state, self._active, out)
         except Exception as error:
             self._behaviour_failed(error, context, inputs.stream.sent_count)
+        else:
+            self._failure = ""
         self._answer_endless(inputs)
         return self._output(landing_target)
 
@@ -383,8 +386,11 @@ class Guidance:
     def _behaviour_failed(self, error: Exception, context: BehaviourContext, sent_count: int) -> None:
         """A hook of the behaviour raised: hold. Call it from the exception handler."""
         name = "guidance" if self._behaviour is None else self._behaviour.name
-        logger.exception("%s failed", name)
-        why = f"{name} failed: {type(error).__name__}: {error}"
+        failure = f"{type(error).__name__}: {error}"
+        if failure != self._failure:  # the gimbal's would be logged with every step
+            logger.exception("%s failed", name)
+        self._failure = failure
+        why = f"{name} failed: {failure}"
         if self._yielded is not None:
             self._lose(self._yielded[1])
         elif self.busy:

@@ -19,6 +19,7 @@ from typing import Any
 
 from companion.vehicle.autopilot_profile import ARDUPILOT, PX4, AutopilotProfile, Px4Profile
 from companion.vehicle.byte_link import ByteLink, Source, open_link
+from companion.vehicle.commander import NAME as COMMANDER_NAME
 from companion.vehicle.commander import ONBOARD_CONTROLLER, commander_mode, read_commander
 from companion.vehicle.connection_advice import no_answer_advice, no_autopilot_text, unsupported_autopilot
 from companion.vehicle.driver import CommandRefusedError, LinkError, NoAnswerError, SystemStatus
@@ -45,6 +46,8 @@ _AUTOPILOT_INVALID = 8  # MAV_AUTOPILOT: not an autopilot
 _HEARTBEAT = struct.Struct(
     "<IBBBBB"
 )  # custom_mode, type, autopilot, base_mode, system_status, mavlink_version
+_NAMED_VALUE_INT_ID = 252
+_NAMED_VALUE_INT = struct.Struct("<II10s")  # time_boot_ms, value, name
 _FRAME_LOCAL_NED = 1
 _TIMESYNC_ID = 111
 _SYSTEM_TIME_ID = 2
@@ -92,6 +95,7 @@ class AutopilotDriver(ABC):
         self._timesync_sent_ns = 0
         self._heartbeat_received = asyncio.Event()
         self._others: set[tuple[Any, ...]] = set()
+        self._time_sent_ns = 0
         self._signs = False  # the autopilot's frames are signed
         self._only_heartbeats = True
         self._streams: StreamRequests | None = None
@@ -103,7 +107,7 @@ class AutopilotDriver(ABC):
             lambda: (self._system_id or 0, AUTOPILOT_COMPONENT),
         )
         self._sequence = 0
-        self._own_heartbeats: deque[tuple[int, int]] = deque(maxlen=8)  # (sequence number, custom_mode)
+        self._own_heartbeats: deque[tuple[int, int]] = deque(maxlen=16)  # (sequence number, custom_mode)
         self._tasks: list[asyncio.Task[None]] = []
 
     # --- the encoding, implemented by subclasses ------------------------------------------------------
@@ -244,9 +248,15 @@ class AutopilotDriver(ABC):
         ours: list[Frame] = []
         for frame in self._framer.feed(data, datagram=link.datagrams):
             if self._signer is not None and not self._signer.accepts(frame):
+                if self._signer.peer_late and self._source is None:
+                    self._send_signed_time(source)
                 continue
             if frame.message_id == HEARTBEAT_ID:
                 self._heartbeat_from(frame, source)
+            elif frame.message_id == _NAMED_VALUE_INT_ID:
+                _, value, name = _NAMED_VALUE_INT.unpack(frame.padded(_NAMED_VALUE_INT.size))
+                if name.rstrip(b"\0") == COMMANDER_NAME:
+                    self._commander_from(frame, ONBOARD_CONTROLLER, value)
             if frame.system_id == self._system_id and source == self._source:
                 if frame.component_id == AUTOPILOT_COMPONENT:
                     self._only_heartbeats &= frame.message_id == HEARTBEAT_ID
@@ -265,6 +275,14 @@ class AutopilotDriver(ABC):
         if ours and self._autopilot_kind in self.flown_autopilots:
             self._on_frames(ours)
 
+    def _send_signed_time(self, source: Source) -> None:
+        """Send a signed heartbeat: a peer with an old clock takes its time from it (PX4 after a restart)."""
+        now_ns = time.monotonic_ns()
+        if self._link is not None and now_ns - self._time_sent_ns >= 1e9:
+            self._time_sent_ns = now_ns
+            self._link.answer_to(source)
+            self.send_heartbeat(SystemStatus.ACTIVE)
+
     def _heartbeat_from(self, frame: Frame, source: Source) -> None:
         custom_mode, mav_type, autopilot, base_mode, system_status, _ = _HEARTBEAT.unpack(
             frame.padded(_HEARTBEAT.size)
@@ -274,12 +292,7 @@ class AutopilotDriver(ABC):
         wanted = self._wanted_system_id if self._system_id is None else self._system_id
         if not is_autopilot or wanted not in (None, frame.system_id):
             self._note_other(sender, "system/component %d/%d is also on this link")
-            # A heartbeat with the sequence number and content of one that we sent is our own, echoed.
-            sent = (frame.sequence, custom_mode) in self._own_heartbeats
-            echo = sender == self.own_address and sent
-            commander = read_commander(mav_type, custom_mode, sender, time.monotonic_ns())
-            if commander is not None and frame.system_id == self._own_system_id and not echo:
-                self._telemetry.on_commander(commander)
+            self._commander_from(frame, mav_type, custom_mode)
             return
         if self._system_id is None:
             self._system_id, self._autopilot_kind = frame.system_id, autopilot
@@ -298,6 +311,15 @@ class AutopilotDriver(ABC):
         fields = {"custom_mode": custom_mode, "base_mode": base_mode, "system_status": system_status}
         self._telemetry.handle("HEARTBEAT", fields)
         self._heartbeat_received.set()
+
+    def _commander_from(self, frame: Frame, mav_type: int, custom_mode: int) -> None:
+        """Note another service on this vehicle, if the heartbeat is one's."""
+        sender = (frame.system_id, frame.component_id)
+        # A heartbeat with the sequence number and content of one that we sent is our own, echoed.
+        echo = sender == self.own_address and (frame.sequence, custom_mode) in self._own_heartbeats
+        commander = read_commander(mav_type, custom_mode, sender, time.monotonic_ns())
+        if commander is not None and frame.system_id == self._own_system_id and not echo:
+            self._telemetry.on_commander(commander)
 
     def _no_answer(self, text: str) -> NoAnswerError:
         """Build the error for a command or parameter request without an answer."""
@@ -381,6 +403,10 @@ class AutopilotDriver(ABC):
         payload = _HEARTBEAT.pack(mode, ONBOARD_CONTROLLER, _AUTOPILOT_INVALID, 0, int(status), 3)
         self._own_heartbeats.append((self._sequence, mode))
         self._transmit_payload(HEARTBEAT_ID, payload)
+        if self._autopilot_kind == ARDUPILOT:  # it keeps this heartbeat from another service with our address
+            payload = _NAMED_VALUE_INT.pack(self._boot_ms(), mode, COMMANDER_NAME)
+            self._own_heartbeats.append((self._sequence, mode))
+            self._transmit_payload(_NAMED_VALUE_INT_ID, payload)
 
     def send_setpoint(self, setpoint: Setpoint) -> None:
         """See Driver."""

@@ -7,6 +7,9 @@ autopilot reads from an onboard controller:
     bits 31..20  0xC0D
     bit  19      in command now
     bits 18..0   uptime, seconds (at most 6 days)
+
+ArduPilot forwards no HEARTBEAT to a link from which it has received the same system and component id, and all
+services have the same. So the number is also sent as a NAMED_VALUE_INT, which is forwarded.
 """
 
 from __future__ import annotations
@@ -16,6 +19,7 @@ from dataclasses import dataclass
 from companion.vehicle.gimbal import Address
 
 ONBOARD_CONTROLLER = 18  # MAV_TYPE
+NAME = b"companion"  # of the NAMED_VALUE_INT
 _MARK, _MARK_SHIFT = 0xC0D, 20
 _IN_COMMAND = 1 << 19
 _LONGEST_S = _IN_COMMAND - 1

@@ -27,6 +27,7 @@ _TIMESTAMP_MASK = (1 << 48) - 1
 _RADIO_STATUS_ID, _HEARTBEAT_ID = 109, 0
 _TELEMETRY_RADIO = 68  # MAV_COMP_ID_TELEMETRY_RADIO
 _LINK_ID = 0
+_OLD = "old timestamp"
 
 
 class SigningKeyError(LinkError, ValueError):
@@ -80,6 +81,7 @@ class FrameSigner:
 
     Attributes:
         refused: reason → number of refused frames.
+        peer_late: the newest frame had the right key, and a time of more than a minute ago.
     """
 
     def __init__(self, key: bytes) -> None:
@@ -90,6 +92,7 @@ class FrameSigner:
         self._timestamp = 0
         self._newest: dict[tuple[int, int, int], int] = {}
         self.refused: Counter[str] = Counter()
+        self.peer_late = False
 
     def __repr__(self) -> str:
         return f"FrameSigner({sum(self.refused.values())} refused)"
@@ -106,6 +109,7 @@ class FrameSigner:
     def accepts(self, frame: Frame) -> bool:
         """Whether a received frame is accepted; refused ones are counted, the first per reason is logged."""
         reason = self._refusal_reason(frame)
+        self.peer_late = reason == _OLD
         if reason is None:
             return True
         self.refused[reason] += 1
@@ -130,7 +134,7 @@ class FrameSigner:
         if newest is None:
             now = max(self._timestamp, int((time.time() - _EPOCH_S) * 1e5))
             if timestamp + _ONE_MINUTE < now:
-                return "old timestamp"
+                return _OLD
         elif timestamp <= newest:
             return "replayed"
         self._newest[stream] = timestamp

@@ -63,30 +63,32 @@ def driver(request: pytest.FixtureRequest, link: AutopilotLink) -> str:
 
 
 class Services:
-    """One service at a time, kept from test to test as long as it runs and has the driver that is wanted."""
+    """One service at a time, kept from test to test as long as it runs and was started as is wanted."""
 
     def __init__(self, link: AutopilotLink, folder: Path) -> None:
         self._link, self._folder = link, folder
+        self._started_as: tuple[str | None, ...] = ()
         self._stack = contextlib.ExitStack()
         self._flight: Flight | None = None
 
-    def flight(self, driver: str) -> Flight:
-        """With this driver."""
-        flight = self._flight
-        if flight is None or flight.driver != driver or flight.service.process.poll() is not None:
+    def flags(self, driver: str | None) -> list[str]:
+        """What a service is started with. None: no driver is named."""
+        (self._folder / "frame.ppm").write_bytes(b"P6 4 4 255\n" + bytes(48))
+        flags = ["--source", "frame.ppm", "--source-loop", "true", "--source-rate-hz", "1"]
+        flags += ["--detector-enabled", "false", "--vehicle-system-id", str(self._link.system_id)]
+        flags += ["--guidance-min-battery-percent", "0"]  # simulated batteries are not charged between tests
+        return flags if driver is None else [*flags, "--driver", driver]
+
+    def flight(self, driver: str | None, *more: str) -> Flight:
+        """With this driver, and these flags besides."""
+        flight, wanted = self._flight, (driver, *more)
+        if flight is None or self._started_as != wanted or flight.service.process.poll() is not None:
             self.close()
-            (self._folder / "frame.ppm").write_bytes(b"P6 4 4 255\n" + bytes(48))
-            flags = ["--source", "frame.ppm", "--source-loop", "true", "--source-rate-hz", "1"]
-            flags += ["--detector-enabled", "false", "--driver", driver]
-            flags += ["--vehicle-system-id", str(self._link.system_id)]
-            flags += [
-                "--guidance-min-battery-percent",
-                "0",
-            ]  # simulated batteries are not charged between tests
-            service = running_service(self._link.service_port, flags, cwd=self._folder)
+            service = running_service(self._link.service_port, [*self.flags(driver), *more], cwd=self._folder)
             running = self._stack.enter_context(service)
             session = self._stack.enter_context(running.client())
-            self._flight = flight = Flight(self._link, running, session, driver)
+            self._flight = flight = Flight(self._link, running, session, driver or "no driver named")
+            self._started_as = wanted
         return flight
 
     def close(self) -> None:
@@ -113,3 +115,13 @@ def flight(link: AutopilotLink, driver: str, services: Services) -> Iterator[Fli
     link.until(lambda: link.ready, READY_S, "ready to be armed")
     yield ready
     bring_down(link)
+
+
+@pytest.fixture
+def parameters(flight: Flight) -> Iterator[dict[str, float]]:
+    """What a test sets is written here, and taken back."""
+    before: dict[str, float] = {}
+    yield before
+    flight.link.cut = False
+    for name, value in before.items():
+        flight.link.set_parameter(name, value)

@@ -19,6 +19,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import pytest
 import zenoh
 
 from companion.bus.client import listen, send_command
@@ -35,11 +36,13 @@ HOLD = {PX4: 4 << 16 | 3 << 24, ARDUPILOT: 17}  # ArduPilot's BRAKE
 PARKED = {PX4: HOLD[PX4], ARDUPILOT: 0}  # disarmed: PX4 is never ready in LAND, ArduPilot boots in STABILIZE
 LAND = {PX4: 4 << 16 | 6 << 24, ARDUPILOT: 9}
 STANDING_MPS = 0.3
+SIGNING_EPOCH_S, SIGNING_MINUTE = 1_420_070_400, 6_000_000  # 2015-01-01, and units of 10 us from then on
 PREARM_CHECK = dialect.MAV_SYS_STATUS_PREARM_CHECK
 _ARMED = dialect.MAV_MODE_FLAG_SAFETY_ARMED
 _DOWN = (dialect.MAV_LANDED_STATE_ON_GROUND, dialect.MAV_LANDED_STATE_UNDEFINED)
 _ANSWER_S = 3.0
 READY_S, GROUNDED_S = 180.0, 120.0
+ORBIT_MPS = 2.8
 # Measured: by autopilot and driver, by what was flown.
 FIGURES: dict[str, dict[str, dict[str, float | None]]] = {}
 
@@ -69,8 +72,9 @@ class AutopilotLink:
         modes: (time_s, custom_mode) of every change.
         poses, setpoints_s: everything since the start; when each setpoint of the service came.
         texts: STATUSTEXT of the autopilot. results: the newest MAV_RESULT of each command, whoever gave it.
-        home_ned_m: of its newest HOME_POSITION.
+        home_ned_m: of its newest HOME_POSITION. global_deg: latitude and longitude of its newest position.
         boots: how often its clock has begun again.
+        signed: its newest message bears a signature.
     """
 
     def __init__(self, url: LinkUrl) -> None:
@@ -86,7 +90,9 @@ class AutopilotLink:
         self.armed = self.ready = False
         self.landed = dialect.MAV_LANDED_STATE_UNDEFINED
         self.boots = 0
+        self.signed = False
         self.home_ned_m = (0.0, 0.0, 0.0)
+        self.global_deg = (math.nan, math.nan)
         self._heartbeat_s = -math.inf
         self._boot_ms = 0
         self._yaw_rad = math.nan
@@ -167,8 +173,22 @@ class AutopilotLink:
 
     def send(self, message: Any) -> None:
         """Put one message on the autopilot's link, from 245/190."""
+        self._pilot.signing.timestamp = max(self._pilot.signing.timestamp, signing_time())
         self._to_autopilot(message.pack(self._pilot))
         self._pilot.seq = (self._pilot.seq + 1) % 256
+
+    def set_up_signing(self, key: bytes | None) -> None:
+        """As a ground station does: the autopilot signs with this key from now on, and so does the pilot.
+
+        Args:
+            key: 32 bytes; None ends it.
+        """
+        # Copter counts from a minute after what it is given, and refuses what is older than a minute.
+        since = 0 if key is None else signing_time() - SIGNING_MINUTE
+        secret = bytes(32) if key is None else key
+        self.send(dialect.MAVLink_setup_signing_message(self.system_id, 1, [*secret], since))
+        signing = self._pilot.signing
+        signing.secret_key, signing.sign_outgoing = key, key is not None
 
     def command(self, number: int, *parameters: float) -> None:
         """One COMMAND_LONG; what it does is seen, not what it answers."""
@@ -206,13 +226,13 @@ class AutopilotLink:
     # --- the thread ---------------------------------------------------------------------------------------
 
     def _run(self) -> None:
-        hears, overhears = dialect.MAVLink(None), dialect.MAVLink(None)
-        hears.robust_parsing = overhears.robust_parsing = True
+        receiver, sender = dialect.MAVLink(None), dialect.MAVLink(None)
+        receiver.robust_parsing = sender.robust_parsing = True
         while not self._closing.is_set():
             for ready in select.select([self._far, self._near], [], [], 0.2)[0]:
                 data, sender = ready.recvfrom(65536)
                 if ready is self._near:
-                    sent = overhears.parse_buffer(data) or []
+                    sent = sender.parse_buffer(data) or []
                     now_s = time.monotonic()
                     self.setpoints_s += [now_s for message in sent if message.get_msgId() == 84]
                     if not self.cut:
@@ -221,7 +241,7 @@ class AutopilotLink:
                 self._peer = sender or self._peer
                 if not self.cut:
                     self._near.sendto(data, ("127.0.0.1", self.service_port))
-                messages = hears.parse_buffer(data) or []
+                messages = receiver.parse_buffer(data) or []
                 with self._changed:
                     for message in messages:
                         if message.get_srcComponent() == 1 and self.system_id in (0, message.get_srcSystem()):
@@ -235,6 +255,7 @@ class AutopilotLink:
             self._far.sendto(data, self._peer)
 
     def _note(self, message: Any, now_s: float) -> None:
+        self.signed = bool(message.get_header().incompat_flags & dialect.MAVLINK_IFLAG_SIGNED)
         match message.get_type():
             case "HEARTBEAT":
                 self._heartbeat_s = now_s
@@ -257,6 +278,8 @@ class AutopilotLink:
                 self._boot_ms = message.time_boot_ms
                 place, velocity = (message.x, message.y, message.z), (message.vx, message.vy, message.vz)
                 self.poses.append(Pose(now_s, place, velocity, self._yaw_rad))
+            case "GLOBAL_POSITION_INT":
+                self.global_deg = (message.lat * 1e-7, message.lon * 1e-7)
             case "COMMAND_ACK":
                 self.results[message.command] = message.result
             case "STATUSTEXT":
@@ -298,7 +321,7 @@ class Flight:
     def fly(self, text: str, timeout_s: float = 120.0) -> dict[str, Any]:
         """A command that has to succeed."""
         reply = self.command(text, timeout_s)
-        assert reply["success"], reply
+        assert reply["success"], (reply, [mode for _, mode in self.link.modes[-6:]])
         return reply
 
     def take_off(self, height_m: float) -> None:
@@ -323,6 +346,11 @@ class Flight:
         FIGURES.setdefault(title, {})[name] = rounded
 
 
+def signing_time() -> int:
+    """The time now, as a MAVLink signature tells it."""
+    return round((time.time() - SIGNING_EPOCH_S) * 1e5)
+
+
 def bring_down(link: AutopilotLink) -> None:
     """Land it as a pilot would, whatever the service does; then a mode that it can be armed in."""
     link.cut = False
@@ -330,3 +358,25 @@ def bring_down(link: AutopilotLink) -> None:
         link.set_mode(LAND[link.autopilot or 0])
         link.until(lambda: link.grounded, GROUNDED_S, "landed and disarmed")
     link.set_mode(PARKED[link.autopilot or 0])
+
+
+def set_for_test(link: AutopilotLink, values: dict[str, float]) -> dict[str, float]:
+    """Set parameters; what they were. Skips where the autopilot has no such parameter."""
+    before = {}
+    for name in values:
+        value = link.parameter(name)
+        if value is None:
+            pytest.skip(f"this autopilot has no parameter {name}")
+        before[name] = value
+    for name, value in values.items():
+        link.set_parameter(name, value)
+    return before
+
+
+def orbiting(flight: Flight, height_m: float = 5.0) -> None:
+    """In the air, steadily at speed."""
+    flight.take_off(height_m)
+    flight.fly(f"orbit radius=10 speed={ORBIT_MPS:g}")
+    link = flight.link
+    link.until(lambda: link.poses[-1].speed_mps > 0.9 * ORBIT_MPS, 20.0, "at speed")
+    link.after(1.0)

@@ -5,50 +5,26 @@ from __future__ import annotations
 import math
 import signal
 import time
-from collections.abc import Iterator
 from itertools import pairwise
 
 import pytest
 
-from tests.sitl.sitl_harness import ARDUPILOT, HOLD, OFFBOARD, PX4, STANDING_MPS, AutopilotLink, Flight, Pose
+from tests.sitl.sitl_harness import (
+    ARDUPILOT,
+    HOLD,
+    OFFBOARD,
+    PX4,
+    STANDING_MPS,
+    AutopilotLink,
+    Flight,
+    Pose,
+    orbiting,
+    set_for_test,
+)
 
 pytestmark = [pytest.mark.sitl, pytest.mark.timeout(400)]
 # A setpoint that was being sent when the mode changed; and one heartbeat period for a mode to show.
 IN_TRANSIT_S, WATCHED_S = 0.3, 3.0
-ORBIT_MPS = 2.8
-ORBIT = f"orbit radius=10 speed={ORBIT_MPS:g}"
-
-
-def set_for_test(link: AutopilotLink, values: dict[str, float]) -> dict[str, float]:
-    """Set parameters; what they were. Skips where the autopilot has no such parameter."""
-    before = {}
-    for name in values:
-        value = link.parameter(name)
-        if value is None:
-            pytest.skip(f"this autopilot has no parameter {name}")
-        before[name] = value
-    for name, value in values.items():
-        link.set_parameter(name, value)
-    return before
-
-
-@pytest.fixture
-def parameters(flight: Flight) -> Iterator[dict[str, float]]:
-    """What a test sets is written here, and taken back."""
-    before: dict[str, float] = {}
-    yield before
-    flight.link.cut = False
-    for name, value in before.items():
-        flight.link.set_parameter(name, value)
-
-
-def orbiting(flight: Flight) -> None:
-    """In the air, steadily at speed."""
-    flight.take_off(5.0)
-    flight.fly(ORBIT)
-    link = flight.link
-    link.until(lambda: link.poses[-1].speed_mps > 0.9 * ORBIT_MPS, 20.0, "at speed")
-    link.after(1.0)
 
 
 def standing(link: AutopilotLink, since_s: float) -> tuple[float, float]:

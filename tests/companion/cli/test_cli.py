@@ -285,3 +285,31 @@ def test_help_of_send_has_flight_commands_and_few_settings() -> None:
 def test_echo_of_unknown_topic_lists_topics(tmp_path: Path) -> None:
     line = one_line_of_bad_input(companion("echo", "bogus", cwd=tmp_path))
     assert {topic.name for topic in TOPICS} <= set(re.findall(r"[a-z]+", line))
+
+
+_DEMO_THAT_SAYS_MUCH = """
+import sys
+import companion.demo
+from companion.cli import main
+
+def flight(output, *, say, **_):
+    for _ in range(400):
+        say("x" * 1000)
+    values = dict.fromkeys(companion.demo.Summary.__dataclass_fields__)
+    return companion.demo.Summary(**{**values, "success": False, "failure": "flown"})
+
+companion.demo.run_demo = flight
+sys.argv = ["companion", "demo"]
+main()
+"""
+
+
+def test_demo_does_not_wait_for_its_reader() -> None:
+    command = [sys.executable, "-c", _DEMO_THAT_SAYS_MUCH]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        try:
+            assert process.wait(60) == 1  # nobody has read its output
+            assert "flown" in process.stderr.read()
+        finally:
+            process.kill()

@@ -171,6 +171,26 @@ def test_exception_in_a_behaviour_is_logged_and_holds(after: int, caplog: pytest
     assert math.hypot(*harness.vehicle.velocity) < 0.1
 
 
+def test_a_gimbal_controller_that_fails_is_logged_once(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    harness = GuidanceHarness(flying())
+    engaged(harness)
+
+    def failing(*_: object) -> None:
+        raise ZeroDivisionError("a bug")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(harness.guidance.gimbal, "update", failing)
+        harness.run(1.0)
+    assert len(caplog.records) == 1
+    harness.run(0.1)
+    with monkeypatch.context() as patch:
+        patch.setattr(harness.guidance.gimbal, "update", failing)
+        harness.run(1.0)
+    assert len(caplog.records) == 2
+
+
 HOOKS = ("on_activate", "update", "take_notes", "active", "landing", "gimbal_aim", "landing_target")
 
 

@@ -14,7 +14,7 @@ from pymavlink.dialects.v20 import common as mavlink
 from companion.vehicle.ardupilot_modes import custom_mode_of_mode, mode_of_custom_mode
 from companion.vehicle.ardupilot_profile import ArduPilotProfile
 from companion.vehicle.autopilot_driver import AutopilotDriver
-from companion.vehicle.driver import CommandRefusedError, Driver
+from companion.vehicle.driver import CommandRefusedError, Driver, SystemStatus
 from companion.vehicle.drivers import open_driver
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
@@ -179,6 +179,11 @@ async def test_messages_sent_to_ardupilot() -> None:
         await driver.set_mode(FlightMode.OFFBOARD)
         asked = [m for m in await autopilot.wait_for("COMMAND_LONG") if m.command == 176]
         assert (asked[-1].param1, asked[-1].param2) == (1.0, 4.0)
+        driver.send_heartbeat(SystemStatus.ACTIVE, uptime_s=5.0)
+        (mark,) = await autopilot.wait_for("NAMED_VALUE_INT")
+        heartbeat = (await autopilot.wait_for("HEARTBEAT"))[-1]
+        assert mark.name == "companion"
+        assert mark.value & 0xFFFF_FFFF == heartbeat.custom_mode
     finally:
         await driver.close()
         await autopilot.stop()

@@ -29,6 +29,14 @@ def test_uptime_is_clamped() -> None:
     assert (one.uptime_s, one.in_command) == (2**19 - 1, False)
 
 
+def named_value(address: tuple[int, int], value: int, name: bytes = b"companion") -> bytes:
+    """The mark as ArduPilot forwards it from another link, whoever sends heartbeats there."""
+    signed = int.from_bytes(value.to_bytes(4, "little"), "little", signed=True)
+    codec = mavlink.MAVLink(None, *address)
+    codec.seq = 99
+    return bytes(mavlink.MAVLink_named_value_int_message(7, name, signed).pack(codec))
+
+
 def heartbeat(address: tuple[int, int], mav_type: int, custom_mode: int, sequence: int = 99) -> bytes:
     """A heartbeat of another system or component, as forwarded by the autopilot."""
     codec = mavlink.MAVLink(None, *address)
@@ -72,3 +80,11 @@ async def test_echo_of_our_heartbeat_is_no_commander(driver: Driver, autopilot: 
     autopilot.send_bytes(heartbeat((1, 192), ONBOARD, OURS))
     state = await wait_for_state(driver, lambda state: bool(state.other_commanders))
     assert [other.address for other in state.other_commanders] == [(1, 192)]
+
+
+async def test_named_value_is_a_commander(driver: Driver, autopilot: FakeAutopilot) -> None:
+    autopilot.send_bytes(named_value((1, 193), OURS, b"other"))
+    autopilot.send_bytes(named_value((1, 191), OURS))
+    state = await wait_for_state(driver, lambda state: bool(state.other_commanders))
+    others = [(other.address, other.uptime_s, other.in_command) for other in state.other_commanders]
+    assert others == [((1, 191), 100.0, True)]

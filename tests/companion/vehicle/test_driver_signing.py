@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import hashlib
 import logging
 import os
+import socket
 from pathlib import Path
 
 import pytest
@@ -17,8 +20,8 @@ from companion.vehicle.driver import LinkError, NoAnswerError
 from companion.vehicle.drivers import open_driver
 from companion.vehicle.framing import Frame, Framer
 from companion.vehicle.signing import FrameSigner, SigningKeyError, read_key
-from mavlink_sim.testing import running_simulator
-from tests.companion.vehicle.fake_autopilot import wait_for_state
+from mavlink_sim.testing import free_port, running_simulator
+from tests.companion.vehicle.fake_autopilot import wait_for_state, wait_until
 
 KEY = bytes(range(32))
 
@@ -161,3 +164,37 @@ async def test_signed_link_works_and_wrong_key_is_reported(
                 await unsigned.arm()
         finally:
             await unsigned.close()
+
+
+async def test_a_peer_whose_clock_is_late_is_sent_the_time() -> None:
+    port = free_port()
+    driver = open_driver("pymavlink", f"udpin://127.0.0.1:{port}", signing_key=KEY)
+    connecting = asyncio.create_task(driver.connect(20.0))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as autopilot:
+        autopilot.setblocking(False)
+        autopilot.bind(("127.0.0.1", 0))
+        autopilot.connect(("127.0.0.1", port))
+        answers: list[bytes] = []
+
+        def say(timestamp: int) -> None:
+            with contextlib.suppress(ConnectionError):  # it may not listen yet
+                autopilot.send(heartbeat(key=KEY, timestamp=timestamp))
+
+        def answered() -> bool:
+            say(now() - 7_000_000)
+            with contextlib.suppress(BlockingIOError, ConnectionError):
+                answers.append(autopilot.recv(2048))
+            return bool(answers)
+
+        try:
+            await wait_until(answered, 10.0)
+            assert driver.state.heartbeat_ns == 0
+            (frame,) = frames(answers[0])
+            assert (frame.system_id, frame.component_id) == driver.own_address
+            assert FrameSigner(KEY).accepts(frame)
+            say(int.from_bytes(frame.raw[-12:-6], "little") + 1)
+            await wait_until(lambda: driver.state.heartbeat_ns > 0, 5.0)
+        finally:
+            connecting.cancel()
+            await asyncio.gather(connecting, return_exceptions=True)
+            await driver.close()

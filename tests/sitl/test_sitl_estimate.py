@@ -1,0 +1,127 @@
+"""Loss of GPS and resets of the position estimate, on the autopilot at COMPANION_SITL_URL."""
+
+from __future__ import annotations
+
+import math
+import time
+from itertools import pairwise
+
+import pytest
+
+from tests.sitl.sitl_harness import (
+    ARDUPILOT,
+    PX4,
+    READY_S,
+    AutopilotLink,
+    Flight,
+    bring_down,
+    orbiting,
+    set_for_test,
+)
+
+pytestmark = [pytest.mark.sitl, pytest.mark.timeout(500)]
+NO_GPS = {PX4: {"SIM_GPS_USED": 0.0}, ARDUPILOT: {"SIM_GPS1_ENABLE": 0.0}}
+NO_POSITION = "the position estimate is not valid"
+NOT_VALID = "estimator reports it as not valid"
+# PX4's estimator dead-reckons for EKF2_NOAID_TOUT (5 s), Copter's for some 8 s.
+LOSS_S, RETURN_S = 30.0, 60.0
+# A reset of the estimate, and of what was sent when it came.
+RESET_M, IN_TRANSIT_S = 22.0, 0.3
+METRES_PER_DEGREE = 111_319.0
+
+
+def test_loss_of_gps_in_flight_ends_the_command(flight: Flight, parameters: dict[str, float]) -> None:
+    link = flight.link
+    orbiting(flight, 30.0)
+    lost = flight.said("command lost")
+    flight.service.last_lines()
+    before = len(flight.service.lines)
+    parameters |= set_for_test(link, NO_GPS[link.autopilot or 0])
+    ended_s = link.until(lost, LOSS_S, "reported as lost")
+    silent_from_s = time.monotonic() + IN_TRANSIT_S
+    flight.service.wait_for_line(NO_POSITION, LOSS_S, after=before)
+    reply = flight.command("goto forward=5 right=0")
+    assert not reply["success"]
+    assert NOT_VALID in reply["reason"]
+    assert not [at for at in link.setpoints_s if at > silent_from_s]
+    for name, value in parameters.items():
+        link.set_parameter(name, value)
+    restored_s = time.monotonic()
+    # In the air, before the autopilot has landed by itself: a command is taken again, and flown.
+    while not (reply := flight.command("hold"))["success"]:
+        assert link.armed, reply
+        assert time.monotonic() - restored_s < RETURN_S, reply
+        link.after(0.5)
+    taken_s = time.monotonic() - restored_s
+    flight.fly("goto forward=5 right=0")
+    mode = next(text for text in flight.events if "command lost" in text)
+    flight.note("loss of GPS in an orbit", command_lost_after_s=ended_s, command_taken_after_s=taken_s)
+    assert "autopilot failsafe" in mode
+    bring_down(link)
+    link.until(lambda: link.ready, READY_S, "ready to be armed")
+
+
+def test_without_gps_a_take_off_is_refused(flight: Flight, parameters: dict[str, float]) -> None:
+    link = flight.link
+    flight.service.last_lines()
+    before = len(flight.service.lines)
+    parameters |= set_for_test(link, NO_GPS[link.autopilot or 0])
+
+    def lost() -> bool:
+        """PX4 at rest calls its position valid, and is not ready to be armed; Copter the other way round."""
+        flight.service.last_lines()
+        return not link.ready or any(NO_POSITION in line for line in flight.service.lines[before:])
+
+    refused_s = link.until(lost, LOSS_S, "without a position")
+    reply = flight.command("takeoff 3")
+    assert not reply["success"]
+    assert "position" in reply["reason"] or "GPS" in reply["reason"]
+    assert not link.armed
+    for name, value in parameters.items():
+        link.set_parameter(name, value)
+    restored_s = time.monotonic()
+    link.until(lambda: link.ready, READY_S, "ready to be armed")
+    flight.take_off(3.0)
+    flown_s = time.monotonic() - restored_s
+    flight.fly("land")
+    flight.note("loss of GPS on the ground", lost_after_s=refused_s, flown_after_s=flown_s)
+
+
+def reset_estimate(link: AutopilotLink, parameters: dict[str, float]) -> None:
+    """Have the estimate jump north by about RESET_M, which no motion of the vehicle explains."""
+    if link.autopilot == PX4:
+        degrees = link.global_deg
+        accuracy_m = 0.5  # below 1 m PX4 resets to it instead of weighing it
+        north_deg = degrees[0] + RESET_M / METRES_PER_DEGREE
+        link.command(43003, 0.0, 0.0, accuracy_m, 0.0, north_deg, degrees[1], math.nan)
+    else:
+        parameters |= set_for_test(link, {"SIM_GPS1_GLTCH_X": RESET_M / METRES_PER_DEGREE})
+
+
+def test_a_goal_moves_with_a_reset_of_the_estimate(flight: Flight, parameters: dict[str, float]) -> None:
+    link = flight.link
+    flight.take_off(5.0)
+    flight.fly("hold")
+    link.after(2.0)
+    moved = flight.said("goals moved with it")
+    since_s = time.monotonic()
+
+    def jumps() -> list[tuple[float, float]]:
+        """Metres and time of each step between two positions that is no flight."""
+        steps = [
+            (math.dist(one.position_ned_m, other.position_ned_m), other.time_s)
+            for one, other in pairwise(link.flown(since_s))
+        ]
+        return [step for step in steps if step[0] > RESET_M / 2]
+
+    reset_estimate(link, parameters)
+    link.until(jumps, LOSS_S, "reset")
+    link.until(moved, 5.0, "reported as reset")
+    link.after(3.0)
+    jump_m, at_s = jumps()[0]
+    assert jump_m == pytest.approx(RESET_M, abs=3.0)
+    flown = link.flown(at_s, at_s + 3.0)
+    drift_m = max(math.dist(pose.position_ned_m, flown[0].position_ned_m) for pose in flown)
+    assert drift_m < 1.5
+    assert link.offboard
+    flight.note("reset of the estimate in a hold", jump_m=jump_m, moved_in_3_s_m=drift_m)
