@@ -13,7 +13,6 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from companion.guidance.arguments import ClassName, EnumArgument, GrammarError, Number
     from companion.guidance.behaviour import (
         Behaviour,
         BehaviourContext,
@@ -22,14 +21,20 @@ if TYPE_CHECKING:
         Outcome,
         Requirement,
     )
-    from companion.guidance.command import BuildContext, Command
-    from companion.guidance.registry import behaviour
+    from companion.guidance.command import (
+        BuildContext,
+        ClassName,
+        Command,
+        EnumArgument,
+        GrammarError,
+        Number,
+        behaviour,
+    )
     from companion.service import Service
     from companion.settings import Settings
     from companion.vehicle.setpoint import Setpoint
 
 _MODULES = {
-    "companion.guidance.arguments": ("ClassName", "EnumArgument", "GrammarError", "Number"),
     "companion.guidance.behaviour": (
         "Behaviour",
         "ModeRequest",
@@ -38,8 +43,15 @@ _MODULES = {
         "BehaviourContext",
         "BehaviourOutput",
     ),
-    "companion.guidance.command": ("BuildContext", "Command"),
-    "companion.guidance.registry": ("behaviour",),
+    "companion.guidance.command": (
+        "BuildContext",
+        "ClassName",
+        "Command",
+        "EnumArgument",
+        "GrammarError",
+        "Number",
+        "behaviour",
+    ),
     "companion.service": ("Service",),
     "companion.settings": ("Settings",),
     "companion.vehicle.setpoint": ("Setpoint",),

@@ -34,7 +34,6 @@ FLOORS = {
 }
 # The same inside `companion.guidance`: its folders, and its own files.
 GUIDANCE_FLOORS = {
-    "arguments": 0,
     "gimbal_status": 0,
     "motion": 0,
     "search_pattern": 0,
@@ -45,7 +44,6 @@ GUIDANCE_FLOORS = {
     "command": 4,
     "interface": 4,
     "gimbal": 5,
-    "registry": 5,
     "behaviours": 6,
     "grammar": 6,
     "limits": 7,

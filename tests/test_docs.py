@@ -12,7 +12,7 @@ import typer
 
 from companion.cli import app as companion_app
 from companion.guidance import grammar
-from companion.guidance.registry import COMMANDS
+from companion.guidance.command import COMMANDS
 from mavlink_sim.bench import app as bench_app
 from mavlink_sim.camera.cli import app as camera_app
 from mavlink_sim.cli import app as simulator_app

@@ -1,17 +1,178 @@
-"""Base class of commands: a word, a help text, arguments as fields, and the behaviour to build."""
+"""Commands: the types of their arguments, the base class, and the table that `behaviour` adds them to.
+
+A behaviour is one file. It holds its command (word, arguments with unit, range and help) and the behaviour
+that the command becomes, and registers itself:
+
+    @behaviour("circle", "fly a circle about the point ahead")
+    class Circle(Command):
+        radius_m: Annotated[float, Number("radius", "m", 2.0, 50.0, "of the circle")] = 8.0
+
+        def build(self, context: BuildContext) -> Behaviour:
+            return CircleBehaviour(self.radius_m)
+
+Grammar, help, documentation and JSON Schema are generated from the table. A file outside of this package is
+loaded only if the setting `plugins` names it (`companion.plugins`).
+"""
 
 from __future__ import annotations
 
+import difflib
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, fields
-from typing import Any, ClassVar, get_args, get_type_hints
+from typing import Any, ClassVar, TypeVar, dataclass_transform, get_args, get_type_hints
 
-from companion.guidance.arguments import Argument, check
+from companion.geometry.points import points_from
 from companion.guidance.behaviour import Behaviour
 from companion.guidance.search_pattern import Footprint
 from companion.vehicle.gimbal import GimbalAim
+
+MOST_POINTS = 500
+FARTHEST_M = 5000.0
+
+
+class GrammarError(ValueError):
+    """The text is not a valid command. The message is one line for a person."""
+
+
+@dataclass(frozen=True, slots=True)
+class Number:
+    """A number with its unit and allowed range."""
+
+    key: str
+    unit: str
+    low: float
+    high: float
+    meaning: str
+
+
+@dataclass(frozen=True, slots=True)
+class ClassName:
+    """The name of an object class."""
+
+    key: str
+    meaning: str
+
+
+@dataclass(frozen=True, slots=True)
+class EnumArgument:
+    """One of a fixed set of words."""
+
+    key: str
+    words: tuple[str, ...]
+    meaning: str
+
+
+@dataclass(frozen=True, slots=True)
+class Points:
+    """A list of points, `north,east` or `north,east,height`, metres from home."""
+
+    key: str
+    meaning: str
+
+
+@dataclass(frozen=True, slots=True)
+class FileName:
+    """The name of a file, or a path."""
+
+    key: str
+    meaning: str
+
+
+@dataclass(frozen=True, slots=True)
+class Word:
+    """A free word, such as a vehicle's name."""
+
+    key: str
+    meaning: str
+
+
+@dataclass(frozen=True, slots=True)
+class ClassNames:
+    """Names of object classes, separated by commas."""
+
+    key: str
+    meaning: str
+
+
+Argument = Number | ClassName | EnumArgument | Points | FileName | ClassNames | Word
+
+
+def names_in(text: str) -> tuple[str, ...]:
+    """Split a comma-separated list of names."""
+    return tuple(name.strip() for name in text.split(","))
+
+
+def known_class(text: str, class_names: Sequence[str]) -> str:
+    """The detector's spelling of a class name. Raises GrammarError that suggests the nearest names."""
+    if text in class_names:
+        return text
+    for name in class_names:
+        if _plain(name) == _plain(text):
+            return name
+    raise GrammarError(f"unknown class {text!r}; {nearest(_plain(text), list(class_names))}")
+
+
+def check(word: str, argument: Argument, value: Any, default: Any) -> None:
+    """Validate an argument's value. Raises GrammarError."""
+    match argument:
+        case Number(key, _, low, high):
+            if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+                shown = f"{value:g}" if isinstance(value, float) else repr(value)
+                raise GrammarError(f"{word}: {key} must be {range_of(argument)}, got {shown}")
+        case EnumArgument(key, words):
+            if value not in words:
+                raise GrammarError(f"{word}: {key} must be {' or '.join(words)}, got {value!r}")
+        case Word(key):
+            if not isinstance(value, str) or not re.fullmatch(r"[\w.-]+", value):
+                raise GrammarError(f"{word}: {key} must be a word, got {value!r}")
+        case Points(key):
+            try:
+                points = points_from(str(value))
+            except ValueError as error:
+                raise GrammarError(f"{word}: {key}: {error}") from None
+            if not 1 <= len(points) <= MOST_POINTS:
+                raise GrammarError(f"{word}: {key} must be 1 to {MOST_POINTS} points, got {len(points)}")
+            for point in points:
+                if max(map(abs, point[:2])) > FARTHEST_M or not all(1 <= high <= 500 for high in point[2:]):
+                    raise GrammarError(
+                        f"{word}: {key} must be within {FARTHEST_M:g} m of home and 1 to 500 m high, "
+                        f"got {point}"
+                    )
+        case FileName(key):
+            if not isinstance(value, str) or not value.strip() or not value.isprintable():
+                raise GrammarError(f"{word}: {key} must be a file name or a path, got {value!r}")
+        case ClassNames(key):
+            names = names_in(value) if isinstance(value, str) and value.isprintable() else ()
+            if not names or not all(names):
+                raise GrammarError(f"{word}: {key} must be class names such as person,car, got {value!r}")
+        case ClassName(key):
+            if value == default:
+                return
+            if not isinstance(value, str) or not value.strip() or not value.isprintable():
+                raise GrammarError(f"{word}: {key} must be a class name, got {value!r}")
+
+
+def range_of(argument: Number) -> str:
+    """The allowed range of a number, in words."""
+    return (
+        f"a number from {argument.low:g} to {argument.high:g}{' ' + argument.unit if argument.unit else ''}"
+    )
+
+
+def nearest(word: str, known: list[str]) -> str:
+    """Suggest known words close to an unknown one, or list the known words."""
+    plain = {_plain(name): name for name in known}
+    near = [plain[match] for match in difflib.get_close_matches(_plain(word), list(plain), 3, 0.5)]
+    if near:
+        return f"did you mean {' or '.join(near)}?"
+    more = ", …" if len(known) > 12 else ""
+    return f"known: {', '.join(known[:12])}{more}"
+
+
+def _plain(name: str) -> str:
+    return " ".join(re.split(r"[\s_-]+", name.strip().lower()))
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,3 +264,48 @@ def _plain_number(value: float) -> str:
     """The shortest notation that keeps the value."""
     short = f"{value:g}"
     return short if float(short) == value else repr(value)
+
+
+COMMANDS: dict[str, type[Command]] = {}
+"""Word → command, in the order of registration."""
+
+_WORD = re.compile(r"[a-z][a-z0-9-]*")
+_Kind = TypeVar("_Kind", bound=Command)
+
+
+@dataclass_transform(frozen_default=True)
+def behaviour(word: str, help_text: str) -> Callable[[type[_Kind]], type[_Kind]]:
+    """Turn a command into a frozen dataclass and register it.
+
+    Args:
+        word: name in the grammar: lower-case letters, digits and hyphens.
+        help_text: one line without a full stop.
+
+    Raises:
+        TypeError: a field's type is not annotated with an argument (`Annotated[float, Number(...)]`).
+        ValueError: the word has other characters, or is already registered.
+    """
+
+    def register(kind: type[_Kind]) -> type[_Kind]:
+        if _WORD.fullmatch(word) is None:
+            raise ValueError(f"{kind.__qualname__}: a command must be one lower-case word, got {word!r}")
+        if (other := COMMANDS.get(word)) is not None and not _same(kind, other):
+            raise ValueError(
+                f"{kind.__module__}: command {word!r} is already registered by {other.__module__}; "
+                "choose another word"
+            )
+        made = dataclass(frozen=True)(kind)
+        hints = get_type_hints(made, include_extras=True)
+        for field in fields(made):
+            if not any(isinstance(part, Argument) for part in get_args(hints[field.name])[1:2]):
+                raise TypeError(f"{kind.__qualname__}.{field.name}: expected Annotated[type, argument]")
+        made.word, made.help = word, help_text
+        COMMANDS[word] = made
+        return made
+
+    return register
+
+
+def _same(kind: type[Command], other: type[Command]) -> bool:
+    """Whether it is the same class, of a module that was imported twice."""
+    return (kind.__module__, kind.__qualname__) == (other.__module__, other.__qualname__)

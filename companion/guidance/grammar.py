@@ -17,23 +17,25 @@ from collections.abc import Iterator, Sequence
 from dataclasses import MISSING, dataclass
 from typing import Any
 
-from companion.guidance.arguments import (
+from companion.guidance.command import (
+    COMMANDS,
     Argument,
     ClassName,
     ClassNames,
+    Command,
     EnumArgument,
     FileName,
     GrammarError,
     Number,
     Points,
     Word,
+    arguments_of,
+    default_of,
     known_class,
     names_in,
     nearest,
     range_of,
 )
-from companion.guidance.command import Command, arguments_of, default_of
-from companion.guidance.registry import COMMANDS
 
 
 def parse(text: str, class_names: Sequence[str] | None = None) -> Command:

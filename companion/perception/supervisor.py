@@ -30,11 +30,9 @@ from companion.perception.messages import (
     Report,
     StartFailed,
 )
-from companion.perception.process import PerceptionProcess
-from companion.perception.rate_limiter import RateLimiter
+from companion.perception.process import PerceptionProcess, RateLimiter
 from companion.perception.standard_input import STANDARD_INPUT, StandardInput
-from companion.perception.status import PerceptionState, PerceptionStatus
-from companion.perception.timing import StageTimes
+from companion.perception.status import PerceptionState, PerceptionStatus, StageTimes
 from companion.perception.tracks import LiveTracks
 from companion.perception.watchdog import Watchdog
 from companion.settings import Settings

@@ -8,8 +8,8 @@ from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
 
-from companion.guidance.arguments import GrammarError
 from companion.guidance.behaviour import Outcome
+from companion.guidance.command import GrammarError
 from companion.guidance.interface import CommandInput, CommandResult
 from companion.guidance.missions.sequence import SequenceBehaviour
 

@@ -10,9 +10,8 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from companion.guidance.arguments import GrammarError
 from companion.guidance.behaviour import Behaviour
-from companion.guidance.command import BuildContext, Command
+from companion.guidance.command import BuildContext, Command, GrammarError
 from companion.guidance.grammar import parse
 from companion.guidance.interface import Answer, CommandInput, GuidanceInput, StreamStatus
 from companion.guidance.pose_sharing import PoseSharing

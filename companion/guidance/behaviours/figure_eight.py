@@ -5,13 +5,11 @@ from __future__ import annotations
 import math
 from typing import Annotated
 
-from companion.guidance.arguments import EnumArgument, Number
 from companion.guidance.behaviour import Behaviour, BehaviourContext
 from companion.guidance.behaviours.path_flight import PathFlight
-from companion.guidance.command import BuildContext, Command
+from companion.guidance.command import BuildContext, Command, EnumArgument, Number, behaviour
 from companion.guidance.motion import laps_text, position_and_yaw
 from companion.guidance.path import Path
-from companion.guidance.registry import behaviour
 from companion.vehicle.state import Vector3
 
 _POINTS = 96

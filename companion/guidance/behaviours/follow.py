@@ -5,12 +5,10 @@ from __future__ import annotations
 import math
 from typing import Annotated
 
-from companion.guidance.arguments import ClassName, EnumArgument, Number
 from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome, Requirement
-from companion.guidance.command import BuildContext, Command
+from companion.guidance.command import BuildContext, ClassName, Command, EnumArgument, Number, behaviour
 from companion.guidance.gimbal.tracking import GimbalTracking, GimbalUse
 from companion.guidance.motion import add_velocity_error, correction, in_degrees, position_and_yaw
-from companion.guidance.registry import behaviour
 from companion.guidance.targets.choosing import TargetSelector
 from companion.guidance.targets.moving_track import MovingTrack
 from companion.guidance.targets.target import DOUBTED

@@ -6,13 +6,19 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated, ClassVar
 
 from companion.geometry.points import points_from
-from companion.guidance.arguments import EnumArgument, GrammarError, Number, Points
 from companion.guidance.behaviour import Behaviour, BehaviourContext
 from companion.guidance.behaviours.path_flight import PathFlight
-from companion.guidance.command import BuildContext, Command
+from companion.guidance.command import (
+    BuildContext,
+    Command,
+    EnumArgument,
+    GrammarError,
+    Number,
+    Points,
+    behaviour,
+)
 from companion.guidance.motion import home_of, laps_text, position_and_yaw
 from companion.guidance.path import Path
-from companion.guidance.registry import behaviour
 from companion.vehicle.state import Vector3
 
 

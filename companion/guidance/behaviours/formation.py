@@ -15,16 +15,23 @@ from typing import Annotated
 
 from companion.geometry.formation import SHAPES, Vector3, slot_motion
 from companion.geometry.points import points_from
-from companion.guidance.arguments import EnumArgument, GrammarError, Number, Points, Word
 from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome, Requirement
-from companion.guidance.command import BuildContext, Command
+from companion.guidance.command import (
+    BuildContext,
+    Command,
+    EnumArgument,
+    GrammarError,
+    Number,
+    Points,
+    Word,
+    behaviour,
+)
 from companion.guidance.formation.group import Agreement, Group
 from companion.guidance.formation.neighbours import Neighbour, Neighbourhood
 from companion.guidance.formation.pose import FormationNote, Plan, Structure
 from companion.guidance.formation.separation import MARGIN_M, avoid, repulsion
 from companion.guidance.formation.virtual_structure import VirtualStructure
 from companion.guidance.motion import add_velocity_error, home_of, position_and_yaw, stopping_speed
-from companion.guidance.registry import behaviour
 from companion.vehicle.setpoint import Setpoint
 from vision.attitude import wrap_angle
 

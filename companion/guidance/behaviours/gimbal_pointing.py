@@ -8,12 +8,10 @@ from __future__ import annotations
 import math
 from typing import Annotated
 
-from companion.guidance.arguments import Number
 from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome, Requirement
 from companion.guidance.behaviours.hold import HoldBehaviour
-from companion.guidance.command import BuildContext, Command
+from companion.guidance.command import BuildContext, Command, Number, behaviour
 from companion.guidance.gimbal.controller import POINT_TIMEOUT_S, POINTED_RAD, direction_text
-from companion.guidance.registry import behaviour
 from companion.vehicle.gimbal import GimbalAim
 
 

@@ -6,13 +6,11 @@ import math
 from typing import Annotated
 
 from companion.geometry.geodesy import north_east
-from companion.guidance.arguments import GrammarError, Number
 from companion.guidance.behaviour import Behaviour, BehaviourContext
 from companion.guidance.behaviours.path_flight import PathFlight
-from companion.guidance.command import BuildContext, Command
+from companion.guidance.command import BuildContext, Command, GrammarError, Number, behaviour
 from companion.guidance.motion import home_of, position_and_yaw
 from companion.guidance.path import Path
-from companion.guidance.registry import behaviour
 from companion.vehicle.state import Vector3
 
 NEAREST_M = 0.05

@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 from typing import Annotated
 
-from companion.guidance.arguments import Number
 from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome, Requirement
-from companion.guidance.command import BuildContext, Command
+from companion.guidance.command import BuildContext, Command, Number, behaviour
 from companion.guidance.motion import (
     HOLD_VELOCITY_GAIN,
     PositionController,
@@ -16,7 +15,6 @@ from companion.guidance.motion import (
     speed_of,
     stopping_point,
 )
-from companion.guidance.registry import behaviour
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
 

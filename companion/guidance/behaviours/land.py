@@ -12,8 +12,7 @@ from companion.guidance.behaviour import (
     Outcome,
     Requirement,
 )
-from companion.guidance.command import BuildContext, Command
-from companion.guidance.registry import behaviour
+from companion.guidance.command import BuildContext, Command, behaviour
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
 
 # MPC_LAND_SPEED is 0.7 m/s by default, plus landing detection and PX4's delay to disarm (COM_DISARM_LAND).

@@ -13,7 +13,6 @@ from collections.abc import Callable, Mapping
 from enum import StrEnum
 from typing import Annotated, ClassVar
 
-from companion.guidance.arguments import EnumArgument, GrammarError, Number
 from companion.guidance.behaviour import (
     Behaviour,
     BehaviourContext,
@@ -23,9 +22,8 @@ from companion.guidance.behaviour import (
     Requirement,
 )
 from companion.guidance.behaviours.marker_search import MarkerSearch
-from companion.guidance.command import BuildContext, Command
+from companion.guidance.command import BuildContext, Command, EnumArgument, GrammarError, Number, behaviour
 from companion.guidance.motion import correction, position_and_yaw, towards
-from companion.guidance.registry import behaviour
 from companion.guidance.targets.pad_filter import PadFilter
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint

@@ -5,9 +5,16 @@ from __future__ import annotations
 import math
 from typing import Annotated
 
-from companion.guidance.arguments import ClassName, EnumArgument, GrammarError, Number
 from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome, Requirement
-from companion.guidance.command import BuildContext, Command
+from companion.guidance.command import (
+    BuildContext,
+    ClassName,
+    Command,
+    EnumArgument,
+    GrammarError,
+    Number,
+    behaviour,
+)
 from companion.guidance.motion import (
     STOPPING_MPS2,
     correction,
@@ -16,7 +23,6 @@ from companion.guidance.motion import (
     position_and_yaw,
     stopping_speed,
 )
-from companion.guidance.registry import behaviour
 from companion.guidance.targets.target import Target
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3

@@ -8,14 +8,22 @@ from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 from companion.geometry.points import points_from
-from companion.guidance.arguments import ClassNames, EnumArgument, GrammarError, Number, Points, names_in
 from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome, Requirement
 from companion.guidance.behaviours.approach import ApproachBehaviour
 from companion.guidance.behaviours.confirmation import DetectionConfirmer, YawAligner
 from companion.guidance.behaviours.follow_path import FollowPathBehaviour
-from companion.guidance.command import BuildContext, Command
+from companion.guidance.command import (
+    BuildContext,
+    ClassNames,
+    Command,
+    EnumArgument,
+    GrammarError,
+    Number,
+    Points,
+    behaviour,
+    names_in,
+)
 from companion.guidance.motion import ground_speed, home_of, position_and_yaw, stay_at
-from companion.guidance.registry import behaviour
 from companion.guidance.targets.target import Target
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3

@@ -5,16 +5,22 @@ from __future__ import annotations
 import math
 from typing import Annotated
 
-from companion.guidance.arguments import ClassName, EnumArgument, GrammarError, Number
 from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome, Requirement
 from companion.guidance.behaviours.confirmation import DetectionConfirmer, YawAligner
 from companion.guidance.behaviours.path_flight import PathFlight
 from companion.guidance.behaviours.seek import BLIND_TIMEOUT_S, SeekBehaviour, found_text
-from companion.guidance.command import BuildContext, Command
+from companion.guidance.command import (
+    BuildContext,
+    ClassName,
+    Command,
+    EnumArgument,
+    GrammarError,
+    Number,
+    behaviour,
+)
 from companion.guidance.gimbal.sweep import LEAST_SWEEP_DEG, USUAL_RATE_DPS, GimbalSweep
 from companion.guidance.motion import ground_speed, position_and_yaw, stay_at
 from companion.guidance.path import Path
-from companion.guidance.registry import behaviour
 from companion.guidance.search_pattern import Footprint, expanding_square, field_of_view_rad, lawnmower
 from companion.guidance.targets.target import DOUBTED
 from companion.vehicle.setpoint import Setpoint

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, ModeRequest, Outcome
-from companion.guidance.command import BuildContext, Command
-from companion.guidance.registry import behaviour
+from companion.guidance.command import BuildContext, Command, behaviour
 from companion.vehicle.state import FlightMode
 
 TIMEOUT_S = 5.0

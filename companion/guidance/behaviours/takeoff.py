@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from companion.guidance.arguments import Number
 from companion.guidance.behaviour import (
     Behaviour,
     BehaviourContext,
@@ -13,9 +12,8 @@ from companion.guidance.behaviour import (
     Outcome,
     Requirement,
 )
-from companion.guidance.command import BuildContext, Command
+from companion.guidance.command import BuildContext, Command, Number, behaviour
 from companion.guidance.motion import ARRIVED_M, ARRIVED_MPS, PositionController
-from companion.guidance.registry import behaviour
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, Vector3, VehicleState
 

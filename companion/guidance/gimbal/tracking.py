@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from typing import Annotated
 
-from companion.guidance.arguments import EnumArgument
 from companion.guidance.behaviour import BehaviourContext
+from companion.guidance.command import EnumArgument
 from companion.guidance.gimbal.sweep import BEHIND_RAD, PATIENCE_S, gap_text
 from companion.guidance.targets.target import Target
 from companion.vehicle.gimbal import GimbalAim

@@ -25,9 +25,16 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from companion.guidance.arguments import FileName, GrammarError, nearest
 from companion.guidance.behaviour import Behaviour
-from companion.guidance.command import NO_CONTEXT, BuildContext, Command
+from companion.guidance.command import (
+    NO_CONTEXT,
+    BuildContext,
+    Command,
+    FileName,
+    GrammarError,
+    behaviour,
+    nearest,
+)
 from companion.guidance.grammar import parse
 from companion.guidance.missions.sequence import (
     ABORT,
@@ -39,7 +46,6 @@ from companion.guidance.missions.sequence import (
     PlannedStep,
     SequenceBehaviour,
 )
-from companion.guidance.registry import behaviour
 from companion.guidance.search_pattern import Footprint
 
 MISSIONS_FOLDER = Path(__file__).parent

@@ -22,7 +22,7 @@ from typer.testing import CliRunner
 from companion.bus.topics import NO_OBJECTS, TOPICS
 from companion.cli import commands as companion_commands
 from companion.cli.commands import app
-from companion.guidance.registry import COMMANDS
+from companion.guidance.command import COMMANDS
 from mavlink_sim.testing import free_port
 from tests.companion.command_line import companion
 

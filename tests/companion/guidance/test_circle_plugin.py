@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from companion.bench.lockstep_flight import LockstepFlight, plain_settings
-from companion.guidance.registry import COMMANDS
+from companion.guidance.command import COMMANDS
 from mavlink_sim.testing import RunningSimulator
 from tests.companion.service_process import running_service
 

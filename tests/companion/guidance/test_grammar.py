@@ -18,10 +18,8 @@ from companion.guidance import (
     Stop,
     Takeoff,
 )
-from companion.guidance.arguments import GrammarError
-from companion.guidance.command import NO_CONTEXT, Command, arguments_of
+from companion.guidance.command import COMMANDS, NO_CONTEXT, Command, GrammarError, arguments_of
 from companion.guidance.grammar import describe, parse
-from companion.guidance.registry import COMMANDS
 
 NAMES = ("person", "bicycle", "car", "truck", "boat", "dog", "chair", "traffic light", "fire_hydrant")
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 import pytest
 
 from benchmarks.flights_land import land
-from companion.guidance.arguments import GrammarError
 from companion.guidance.behaviour import BehaviourContext, Requirement
 from companion.guidance.behaviours.land_on_marker import LandOnMarkerBehaviour
 from companion.guidance.behaviours.marker_search import CLIMB_M, MarkerSearch
-from companion.guidance.command import NO_CONTEXT
+from companion.guidance.command import NO_CONTEXT, GrammarError
 from companion.guidance.grammar import parse
 from companion.guidance.requirements import check_requirements
 from companion.vehicle.state import LandedState, VehicleState

@@ -13,12 +13,11 @@ from hypothesis import strategies as st
 
 from companion.geometry.geodesy import north_east
 from companion.guidance import grammar
-from companion.guidance.arguments import GrammarError
 from companion.guidance.behaviour import Behaviour, BehaviourContext, Outcome
 from companion.guidance.behaviours.figure_eight import FigureEightBehaviour, lemniscate
 from companion.guidance.behaviours.follow_path import FollowPath, FollowPathBehaviour
 from companion.guidance.behaviours.goto import GotoBehaviour
-from companion.guidance.command import NO_CONTEXT
+from companion.guidance.command import NO_CONTEXT, GrammarError
 from companion.guidance.limits.envelope import Limits
 from companion.guidance.path import ACCELERATION_MPS2, Path, PathFollower
 from companion.vehicle.setpoint import Setpoint

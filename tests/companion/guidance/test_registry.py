@@ -9,18 +9,17 @@ from pathlib import Path
 
 import pytest
 
-from companion.guidance.command import NO_CONTEXT
+from companion.guidance.command import COMMANDS, NO_CONTEXT
 from companion.guidance.grammar import describe, json_schema, markdown, parse
-from companion.guidance.registry import COMMANDS
 from companion.plugins import PluginError, load_plugins
 
 PLUGIN = """
 from typing import Annotated
 
-from companion.guidance.arguments import Number
+from companion.guidance.command import Number
 from companion.guidance.behaviour import Behaviour, Outcome
 from companion.guidance.command import Command
-from companion.guidance.registry import behaviour
+from companion.guidance.command import behaviour
 
 
 @behaviour("{word}", "wait for some time")

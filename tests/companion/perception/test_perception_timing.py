@@ -1,4 +1,4 @@
-from companion.perception.timing import WINDOW, StageTimes
+from companion.perception.status import WINDOW, StageTimes
 
 
 def test_quantiles_are_of_the_newest_results() -> None:
