@@ -104,7 +104,6 @@ class LockstepVehicle:
 
     Attributes:
         vehicle: the vehicle itself, with everything that is inside (`airframe`, `autopilot`, `parameters`).
-            Where it did not start at SIH's home, calls to these reckon places in `with vehicle.turn():`.
         events: what happened so far, one readable line each ("armed", "mode HOLD", "landed"…).
         newest: of each link, the newest message of each type that it sent.
         dropped: of each link, how many messages were let go because nobody took them.

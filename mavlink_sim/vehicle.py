@@ -10,8 +10,7 @@ import heapq
 import itertools
 import math
 import random
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping
 from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,7 +21,7 @@ from mavlink_sim.flight.transmitter import Transmitter
 from mavlink_sim.physics.airframe import Multirotor, Vector
 from mavlink_sim.physics.contact import HARD_LANDING_MPS, Collision
 from mavlink_sim.physics.estimate_errors import FallibleEstimate
-from mavlink_sim.physics.geography import geographic, start_of_vehicle
+from mavlink_sim.physics.geography import LocalFrame
 from mavlink_sim.physics.gimbal import Gimbal
 from mavlink_sim.px4.modes import Mode
 from mavlink_sim.px4.parameters import Parameters
@@ -164,6 +163,7 @@ class Vehicle:
         self.clock_ns: Callable[[], int] = self._simulated_clock_ns
         self.utc_ns: Callable[[], int] = self._simulated_utc_ns
         self.start_ned_m = start_ned_m
+        self.local_frame = LocalFrame(*start_ned_m)
         self._on_event = on_event or _no_observer
         self.ready_after_s = ready_after_s
         self.faults = Faults(self, seed, self._on_event)
@@ -181,7 +181,11 @@ class Vehicle:
         self._boot_us = 0
         self._steps_to_control = 0
         self.autopilot = self.autopilot_class(
-            self.estimate, self.parameters, ready_after_s=self.ready_after_s, on_event=self._on_event
+            self.estimate,
+            self.parameters,
+            local_frame=self.local_frame,
+            ready_after_s=self.ready_after_s,
+            on_event=self._on_event,
         )
         self.autopilot.position_valid = self.estimate.position_valid
         self.events = EventBuffer()
@@ -217,7 +221,7 @@ class Vehicle:
     @property
     def home_altitude_m(self) -> float:
         """Of home above mean sea level."""
-        return geographic(self.autopilot.home.position)[2]
+        return self.local_frame.geographic(self.autopilot.home.position)[2]
 
     @property
     def gimbal(self) -> Gimbal | None:
@@ -304,10 +308,6 @@ class Vehicle:
 
     def handle(self, link_name: str, message: Any) -> None:
         """Take in one MAVLink message (of any pymavlink dialect) that arrived on a link."""
-        with self.turn():
-            self._take_in(link_name, message)
-
-    def _take_in(self, link_name: str, message: Any) -> None:
         link = self.links[link_name]
         source = (message.get_srcSystem(), message.get_srcComponent())
         if source == (self.system_id, AUTOPILOT_COMPONENT):
@@ -340,21 +340,11 @@ class Vehicle:
 
     def step(self, dt_s: float) -> None:
         """Advance time by any amount, in physics steps of 4 ms; a remainder waits for the next call."""
-        with self.turn():
-            self._leftover_s += dt_s
-            while self._leftover_s >= STEP_S - 1e-9:
-                self._leftover_s -= STEP_S
-                self._step()
-            self.estimate.look()
-
-    @contextmanager
-    def turn(self) -> Iterator[None]:
-        """Meanwhile places are reckoned in its local frame (`physics.geography`)."""
-        before = start_of_vehicle.set(self.start_ned_m)
-        try:
-            yield
-        finally:
-            start_of_vehicle.reset(before)
+        self._leftover_s += dt_s
+        while self._leftover_s >= STEP_S - 1e-9:
+            self._leftover_s -= STEP_S
+            self._step()
+        self.estimate.look()
 
     def after(self, delay_s: float, action: Callable[[], object]) -> None:
         """Do something in a later step."""

@@ -28,6 +28,7 @@ from mavlink_sim.flight import manual_flight
 from mavlink_sim.flight import tasks as flight
 from mavlink_sim.flight.position_control import TrajectorySetpoint
 from mavlink_sim.physics.airframe import Multirotor, Vector
+from mavlink_sim.physics.geography import LocalFrame
 from mavlink_sim.px4.modes import (
     CUSTOM_MODE_ENABLED,
     GUIDED_ENABLED,
@@ -87,10 +88,13 @@ class CopterAutopilot(Autopilot):
         airframe: Multirotor,
         parameters: Parameters,
         *,
+        local_frame: LocalFrame,
         ready_after_s: float,
         on_event: Callable[[str], None],
     ) -> None:
-        super().__init__(airframe, parameters, ready_after_s=ready_after_s, on_event=on_event)
+        super().__init__(
+            airframe, parameters, local_frame=local_frame, ready_after_s=ready_after_s, on_event=on_event
+        )
         self.mode = self.intended_mode = CopterMode.STABILIZE
         self.mode_changes = 0
         self._next_prearm_s = PREARM_DISPLAY_PERIOD_S / 2

@@ -17,7 +17,7 @@ from mavlink_sim.ardupilot.targets import GLOBAL_RELATIVE_ALT, GLOBAL_TERRAIN_AL
 from mavlink_sim.autopilot.commander import ACCEPTED, TEMPORARILY_REJECTED
 from mavlink_sim.flight.setpoints import GLOBAL_RELATIVE_ALT_INT, GLOBAL_TERRAIN_ALT_INT
 from mavlink_sim.physics.airframe import Vector
-from mavlink_sim.physics.geography import HOME_ALTITUDE_M, local
+from mavlink_sim.physics.geography import HOME_ALTITUDE_M
 from mavlink_sim.px4.modes import CUSTOM_MODE_ENABLED
 from mavlink_sim.services.commands import (
     ARM_DISARM,
@@ -190,7 +190,7 @@ def _place(vehicle: CopterVehicle, command: Command, frame: int) -> Vector | Non
         return None
     if frame in _ABOVE_HOME:
         altitude += HOME_ALTITUDE_M - vehicle.copter.home.position[2]
-    return local(latitude, longitude, altitude)
+    return vehicle.local_frame.local(latitude, longitude, altitude)
 
 
 def _set_home(vehicle: CopterVehicle, link: Link, command: Command, frame: int) -> int:

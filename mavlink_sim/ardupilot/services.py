@@ -45,7 +45,7 @@ def _local_target(vehicle: CopterVehicle, link: Link, message: Any) -> None:
 def _global_target(vehicle: CopterVehicle, link: Link, message: Any) -> None:
     guided = vehicle.copter.guided
     if guided is not None:
-        guided.fly(targets.global_target(message, vehicle.copter.home.position))
+        guided.fly(targets.global_target(message, vehicle.local_frame, vehicle.copter.home.position))
 
 
 def _attitude_target(vehicle: CopterVehicle, link: Link, message: Any) -> None:

@@ -25,7 +25,7 @@ from mavlink_sim.flight.setpoints import (
     YAW_RATE_IGNORE,
 )
 from mavlink_sim.physics.airframe import Vector
-from mavlink_sim.physics.geography import HOME_ALTITUDE_M, local
+from mavlink_sim.physics.geography import HOME_ALTITUDE_M, LocalFrame
 
 NAN = math.nan
 LOCAL_OFFSET_NED = 7  # MAV_FRAME_LOCAL_OFFSET_NED
@@ -71,7 +71,7 @@ def local_target(message: Any, position: Vector, yaw_rad: float) -> GuidedTarget
     return _combined(message, place, heading)
 
 
-def global_target(message: Any, home: Vector) -> GuidedTarget:
+def global_target(message: Any, local_frame: LocalFrame, home: Vector) -> GuidedTarget:
     """The target of a SET_POSITION_TARGET_GLOBAL_INT message, `home` in local NED."""
     frame, mask = int(message.coordinate_frame), int(message.type_mask)
     if _asks_for_force(mask):
@@ -87,7 +87,7 @@ def global_target(message: Any, home: Vector) -> GuidedTarget:
             altitude = HOME_ALTITUDE_M - home[2] + float(message.alt)
         else:
             return STOP
-        place = local(latitude, longitude, altitude)
+        place = local_frame.local(latitude, longitude, altitude)
     return _combined(message, place, 0.0)
 
 

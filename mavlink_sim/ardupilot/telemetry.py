@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 from pymavlink.dialects.v20 import ardupilotmega
 
-from mavlink_sim.physics.geography import geographic
 from mavlink_sim.services import system_streams, telemetry
 from mavlink_sim.wire.messages import dialect
 
@@ -53,7 +52,7 @@ def _home_position(vehicle: CopterVehicle) -> Any:
     """Its local position counts from the EKF's origin; its attitude is not known."""
     if not vehicle.copter.sensors_ready:
         return None
-    latitude, longitude, altitude = geographic(vehicle.copter.home.position)
+    latitude, longitude, altitude = vehicle.local_frame.geographic(vehicle.copter.home.position)
     return dialect.MAVLink_home_position_message(
         round(latitude * 1e7),
         round(longitude * 1e7),

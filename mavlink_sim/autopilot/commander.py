@@ -23,6 +23,7 @@ from mavlink_sim.flight.position_control import Demand, PositionController, Traj
 from mavlink_sim.flight.precision_landing import Precision
 from mavlink_sim.missions.navigator import Navigator
 from mavlink_sim.physics.airframe import Multirotor, Vector
+from mavlink_sim.physics.geography import LocalFrame
 from mavlink_sim.px4.modes import (
     MANUAL_MODES,
     MODES_PREVENTING_ARMING,
@@ -73,6 +74,7 @@ class Autopilot:
         airframe: Multirotor,
         parameters: Parameters,
         *,
+        local_frame: LocalFrame,
         ready_after_s: float,
         on_event: Callable[[str], None],
     ) -> None:
@@ -104,7 +106,7 @@ class Autopilot:
         self._last_setpoint_s = self._refusal_told_s = -math.inf
         self._setpoint_needs_position = False
         self._rates_alone = False  # the newest offboard setpoint was of body rates
-        self.navigator = Navigator(self, airframe, parameters, on_event)
+        self.navigator = Navigator(self, airframe, parameters, local_frame, on_event)
         # collision prevention: it may reduce what the sticks ask for in Position mode
         self.stick_guard: manual_flight.AccelerationGuard | None = self.navigator.guard_sticks
 

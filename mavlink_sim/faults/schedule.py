@@ -313,8 +313,7 @@ class Faults:
         if one.fault.duration_s is not None:
             one.ends_s = self.now_s + one.fault.duration_s
         try:
-            with self.vehicle.turn():
-                EFFECTS[one.fault.kind.name](self.vehicle, one)
+            EFFECTS[one.fault.kind.name](self.vehicle, one)
         except FaultError:
             del self.known[one.number]
             raise
@@ -327,9 +326,8 @@ class Faults:
             return
         if one.active:
             one.active = False
-            with self.vehicle.turn():
-                for undo in reversed(one.undo):
-                    undo()
+            for undo in reversed(one.undo):
+                undo()
             self._on_event(f"fault {one} ends")
 
 

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 from mavlink_sim.flight.position_control import NAN, NOTHING, TrajectorySetpoint
 from mavlink_sim.flight.tasks import Task, Trajectory
 from mavlink_sim.physics.airframe import Multirotor, Vector
-from mavlink_sim.physics.geography import geographic
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.messages import dialect
 
@@ -237,7 +236,7 @@ def orbit_execution_status(vehicle: Vehicle) -> Any:
     if not isinstance(task, Orbit) or task.refused:
         return None
     north, east, _ = task.centre
-    latitude, longitude, altitude = geographic((north, east, task.down_m))
+    latitude, longitude, altitude = vehicle.local_frame.geographic((north, east, task.down_m))
     return dialect.MAVLink_orbit_execution_status_message(
         vehicle.boot_us,
         math.copysign(task.radius_m, task.speed_mps),

@@ -12,7 +12,7 @@ from typing import Any
 from mavlink_sim.flight.attitude_control import AttitudeSetpoint, RatesSetpoint
 from mavlink_sim.flight.position_control import NAN, NOTHING, TrajectorySetpoint
 from mavlink_sim.physics.airframe import Vector
-from mavlink_sim.physics.geography import HOME_ALTITUDE_M, local
+from mavlink_sim.physics.geography import HOME_ALTITUDE_M, LocalFrame
 
 LOCAL_NED = 1  # MAV_FRAME_LOCAL_NED
 BODY_NED = 8  # MAV_FRAME_BODY_NED
@@ -79,7 +79,10 @@ def trajectory_setpoint(
 
 
 def global_trajectory_setpoint(
-    message: Any, home_altitude_m: float | None, ground_altitude_m: float = HOME_ALTITUDE_M
+    message: Any,
+    frame: LocalFrame,
+    home_altitude_m: float | None,
+    ground_altitude_m: float = HOME_ALTITUDE_M,
 ) -> TrajectorySetpoint | None:
     """The setpoint of a SET_POSITION_TARGET_GLOBAL_INT message; None where PX4 drops it without a word.
 
@@ -89,6 +92,7 @@ def global_trajectory_setpoint(
     wrong sign: a home 2 m above the origin puts the goal 4 m too low.
 
     Args:
+        frame: the vehicle's local frame.
         home_altitude_m: of home, AMSL; None before the vehicle knows its position: then no position is taken.
         ground_altitude_m: of the terrain below the vehicle, AMSL.
 
@@ -96,19 +100,21 @@ def global_trajectory_setpoint(
         SetpointRejectedError: a position in another frame, or force setpoints.
     """
     mask = int(message.type_mask)
-    frame = int(message.coordinate_frame)
+    mav_frame = int(message.coordinate_frame)
     position = NOTHING
     if not mask & sum(POSITION_IGNORE):
         if home_altitude_m is None:
             return None
         altitude = float(message.alt)
-        if frame == GLOBAL_RELATIVE_ALT_INT:
+        if mav_frame == GLOBAL_RELATIVE_ALT_INT:
             altitude = 2.0 * HOME_ALTITUDE_M - home_altitude_m + altitude
-        elif frame == GLOBAL_TERRAIN_ALT_INT:
+        elif mav_frame == GLOBAL_TERRAIN_ALT_INT:
             altitude += ground_altitude_m
-        elif frame != GLOBAL_INT:
-            raise SetpointRejectedError(f"SET_POSITION_TARGET_GLOBAL_INT invalid coordinate frame {frame}")
-        position = _finite(local(message.lat_int / 1e7, message.lon_int / 1e7, altitude))
+        elif mav_frame != GLOBAL_INT:
+            raise SetpointRejectedError(
+                f"SET_POSITION_TARGET_GLOBAL_INT invalid coordinate frame {mav_frame}"
+            )
+        position = _finite(frame.local(message.lat_int / 1e7, message.lon_int / 1e7, altitude))
     velocity = _kept((message.vx, message.vy, message.vz), mask, VELOCITY_IGNORE)
     acceleration = _kept((message.afx, message.afy, message.afz), mask, ACCELERATION_IGNORE)
     if mask & FORCE and _any_finite(acceleration):

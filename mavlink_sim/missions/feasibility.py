@@ -8,6 +8,7 @@ from mavlink_sim.missions import items as mission_items
 from mavlink_sim.missions.geofence import Geofence
 from mavlink_sim.missions.items import MissionItem
 from mavlink_sim.physics.airframe import Vector
+from mavlink_sim.physics.geography import LocalFrame
 from mavlink_sim.px4.parameters import Parameters
 
 # Commands that the transfer takes but no mission may hold: CONDITION_DELAY, CONDITION_DISTANCE and this one.
@@ -30,6 +31,7 @@ def complaints(
     parameters: Parameters,
     fence: Geofence,
     home: Vector,
+    frame: LocalFrame,
     *,
     landed: bool,
 ) -> tuple[bool, list[str]]:
@@ -45,9 +47,9 @@ def complaints(
         broken = _broken_item(index, item, landed=landed)
         if broken:
             return False, [*said, broken]
-    distant = _far_first_waypoint(items, parameters, home)
+    distant = _far_first_waypoint(items, parameters, home, frame)
     failures = [
-        *_takeoffs(items, home),
+        *_takeoffs(items, home, frame),
         *(
             ["Mission rejected: Mission contains VTOL items but vehicle is not a VTOL\t"]
             if _vtol(items)
@@ -55,7 +57,7 @@ def complaints(
         ),
         *_required_ends(items, int(parameters.number("MIS_TKO_LAND_REQ")), landed=landed),
     ]
-    outside = _outside_fence(items, fence, home)
+    outside = _outside_fence(items, fence, home, frame)
     failures += outside
     return not failures, [*distant, *failures]
 
@@ -72,22 +74,24 @@ def _vtol(items: tuple[MissionItem, ...]) -> bool:
     return any(item.command in _VTOL for item in items)
 
 
-def _far_first_waypoint(items: tuple[MissionItem, ...], parameters: Parameters, home: Vector) -> list[str]:
+def _far_first_waypoint(
+    items: tuple[MissionItem, ...], parameters: Parameters, home: Vector, frame: LocalFrame
+) -> list[str]:
     limit = parameters.number("MIS_DIST_1WP")
     first = next((item for item in items if item.has_position), None)
     if limit <= 0.0 or first is None:
         return []
-    away = math.dist(first.place(home)[:2], home[:2])
+    away = math.dist(first.place(home, frame)[:2], home[:2])
     if not limit <= away < math.inf:
         return []
     return [f"First waypoint far away from home: {int(away)}m. Correct mission loaded?\t"]
 
 
-def _takeoffs(items: tuple[MissionItem, ...], home: Vector) -> list[str]:
+def _takeoffs(items: tuple[MissionItem, ...], home: Vector, frame: LocalFrame) -> list[str]:
     after_a_place = False
     for item in items:
         if item.command in (mission_items.TAKEOFF, mission_items.VTOL_TAKEOFF):
-            if not home[2] - item.place(home)[2] > 0.0:
+            if not home[2] - item.place(home, frame)[2] > 0.0:
                 return ["Mission rejected: Takeoff altitude below home altitude!\t"]
             if after_a_place:
                 return ["Mission rejected: takeoff not first waypoint item\t"]
@@ -114,8 +118,10 @@ def _required_ends(items: tuple[MissionItem, ...], required: int, *, landed: boo
     return []
 
 
-def _outside_fence(items: tuple[MissionItem, ...], fence: Geofence, home: Vector) -> list[str]:
+def _outside_fence(
+    items: tuple[MissionItem, ...], fence: Geofence, home: Vector, frame: LocalFrame
+) -> list[str]:
     for index, item in enumerate(items):
-        if item.has_position and fence.breaches(item.place(home), home):
+        if item.has_position and fence.breaches(item.place(home, frame), home):
             return [f"Geofence violation for waypoint {index + 1}\t"]
     return []

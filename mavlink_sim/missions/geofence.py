@@ -13,7 +13,7 @@ from enum import IntEnum
 from mavlink_sim.missions import items as mission_items
 from mavlink_sim.missions.items import MissionItem
 from mavlink_sim.physics.airframe import Vector
-from mavlink_sim.physics.geography import local
+from mavlink_sim.physics.geography import LocalFrame
 from mavlink_sim.px4.parameters import Parameters
 
 Point = tuple[float, float]  # north, east, metres
@@ -70,7 +70,7 @@ def inside_polygon(vertices: Sequence[Point], place: Point) -> bool:
     return inside
 
 
-def areas_of(items: Sequence[MissionItem]) -> list[Area]:
+def areas_of(items: Sequence[MissionItem], frame: LocalFrame) -> list[Area]:
     """The areas that an uploaded fence describes. Vertices that are missing at its end are left out."""
     areas: list[Area] = []
     index = 0
@@ -88,22 +88,23 @@ def areas_of(items: Sequence[MissionItem]) -> list[Area]:
                 mission_items.FENCE_CIRCLE_INCLUSION,
                 mission_items.FENCE_POLYGON_INCLUSION,
             )
-            vertices = tuple(_point(vertex) for vertex in items[index : index + count])
+            vertices = tuple(_point(vertex, frame) for vertex in items[index : index + count])
             areas.append(Area(vertices, inclusion, item.parameters[0] if circle else None))
         index += count
     return areas
 
 
-def _point(item: MissionItem) -> Point:
-    north, east, _ = local(item.parameters[4], item.parameters[5], 0.0)
+def _point(item: MissionItem, frame: LocalFrame) -> Point:
+    north, east, _ = frame.local(item.parameters[4], item.parameters[5], 0.0)
     return north, east
 
 
 class Geofence:
     """What the vehicle is held to: uploaded areas and GF_MAX_HOR_DIST, GF_MAX_VER_DIST around home."""
 
-    def __init__(self, parameters: Parameters) -> None:
+    def __init__(self, parameters: Parameters, frame: LocalFrame) -> None:
         self._parameters = parameters
+        self._frame = frame
         self._areas: list[Area] = []
 
     @property
@@ -123,7 +124,7 @@ class Geofence:
         """
         self._areas = []
         complaints = []
-        for area in areas_of(items):
+        for area in areas_of(items, self._frame):
             home_allowed = home is None or area.allows(home[:2])
             here_allowed = flying_at is None or self.action is Action.NONE or area.allows(flying_at[:2])
             if not home_allowed:

@@ -15,7 +15,7 @@ from enum import IntEnum
 from typing import Any
 
 from mavlink_sim.physics.airframe import Vector
-from mavlink_sim.physics.geography import geographic, local
+from mavlink_sim.physics.geography import LocalFrame
 from mavlink_sim.wire.messages import dialect
 
 
@@ -184,12 +184,12 @@ class MissionItem:
             return 0.0
         return max(self.parameters[0], 0.0) if math.isfinite(self.parameters[0]) else 0.0
 
-    def place(self, home: Vector) -> Vector:
+    def place(self, home: Vector, frame: LocalFrame) -> Vector:
         """Local NED metres of the item, altitudes above home taken from `home` (local NED)."""
         latitude, longitude, altitude = self.parameters[4:]
         if self.is_relative:
-            altitude += geographic(home)[2]
-        return local(latitude, longitude, altitude)
+            altitude += frame.geographic(home)[2]
+        return frame.local(latitude, longitude, altitude)
 
 
 def item_of(message: Any) -> MissionItem:

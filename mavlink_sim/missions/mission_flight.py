@@ -15,7 +15,6 @@ from mavlink_sim.flight.precision_landing import Precision
 from mavlink_sim.missions import items as mission_items
 from mavlink_sim.missions.items import MissionItem
 from mavlink_sim.physics.airframe import Multirotor, Vector
-from mavlink_sim.physics.geography import local
 from mavlink_sim.wire.announcements import INFO
 
 if TYPE_CHECKING:
@@ -288,9 +287,9 @@ class MissionFlight(flight.Task):
         here = self._airframe.position
         if item.frame == mission_items.FRAME_MISSION:
             latitude, longitude, altitude = item.parameters[4:]
-            wanted = local(latitude, longitude, altitude)
+            wanted = self._navigator.frame.local(latitude, longitude, altitude)
         else:
-            wanted = item.place(self._navigator.home)
+            wanted = item.place(self._navigator.home, self._navigator.frame)
         x, y, z = (value if math.isfinite(value) else own for value, own in zip(wanted, here, strict=True))
         return (x, y, z)
 

@@ -31,7 +31,7 @@ from mavlink_sim.missions.return_flight import (
     mission_route,
 )
 from mavlink_sim.physics.airframe import Multirotor, Vector
-from mavlink_sim.physics.geography import geographic
+from mavlink_sim.physics.geography import LocalFrame
 from mavlink_sim.px4.modes import Mode
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.announcements import CRITICAL, INFO, Text
@@ -62,6 +62,7 @@ class Navigator:
     """Missions, fence and destinations of one vehicle.
 
     Attributes:
+        frame: the vehicle's local frame.
         plans: what is stored, by type. mission: the mission and the progress in it.
         fence: what the vehicle is held to. obstacles: for collision prevention.
         target: the newest landing target.
@@ -73,15 +74,17 @@ class Navigator:
         autopilot: Autopilot,
         airframe: Multirotor,
         parameters: Parameters,
+        frame: LocalFrame,
         on_event: Callable[[str], None],
     ) -> None:
         self._autopilot = autopilot
         self._airframe = airframe
         self._parameters = parameters
+        self.frame = frame
         self._on_event = on_event
         self.plans: dict[PlanType, Plan] = dict.fromkeys(PlanType, Plan())
         self.mission = Mission()
-        self.fence = Geofence(parameters)
+        self.fence = Geofence(parameters, frame)
         self.obstacles = ObstacleMap()
         self.target: LandingTarget | None = None
         self.uploading: str | None = None
@@ -286,21 +289,21 @@ class Navigator:
         """The task of RTL, by RTL_TYPE and RTL_PLD_MD; says where it leads."""
         position = self._airframe.position
         landing = self._return_landing()
-        route = mission_route(self.mission, self._parameters, self.home)
+        route = mission_route(self.mission, self._parameters, self.home, self.frame)
         if route is not None:
             return RouteReturn(self._airframe, self._parameters, *route, landing)
         rally = self.plans[PlanType.RALLY].items
-        found, words = destination(rally, self.mission, self._parameters, self.home, position)
+        found, words = destination(rally, self.mission, self._parameters, self.home, self.frame, position)
         for text in words:
             self.say(CRITICAL, text)
         yaw_rad = self._autopilot.home.attitude_rad[2] if found.kind is Goal.HOME else math.nan
         direct = ReturnFlight(self._airframe, self._parameters, found.position, yaw_rad, landing)
         height = direct.return_height_m
-        above_sea = geographic(found.position)[2] + height
+        above_sea = self.frame.geographic(found.position)[2] + height
         self.say(INFO, f"RTL: start return at {above_sea:.0f} m ({height:.0f} m above destination)\t")
         if found.kind is not Goal.MISSION_LANDING:
             return direct
-        last = landing_route(self.mission, self.home)
+        last = landing_route(self.mission, self.home, self.frame)
         climb_to_z = found.position[2] - height
         return RouteReturn(self._airframe, self._parameters, *last, landing, climb_to_z)
 
@@ -370,7 +373,7 @@ class Navigator:
         self._checked_with = self._check_key()
         was_valid = self.mission.valid
         self.mission.valid, words = complaints(
-            self.mission.items, self._parameters, self.fence, home, landed=self.landed
+            self.mission.items, self._parameters, self.fence, home, self.frame, landed=self.landed
         )
         for text in words:
             self.say(CRITICAL, text)

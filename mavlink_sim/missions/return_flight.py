@@ -13,6 +13,7 @@ from mavlink_sim.missions import items as mission_items
 from mavlink_sim.missions.items import MissionItem
 from mavlink_sim.missions.plan import Mission
 from mavlink_sim.physics.airframe import Multirotor, Vector
+from mavlink_sim.physics.geography import LocalFrame
 from mavlink_sim.px4.parameters import Parameters
 
 # A rally point this close to home is no alternative to it (MAX_DIST_FROM_HOME_FOR_LAND_APPROACHES).
@@ -44,6 +45,7 @@ def destination(
     mission: Mission,
     parameters: Parameters,
     home: Vector,
+    frame: LocalFrame,
     position: Vector,
 ) -> tuple[Destination, list[str]]:
     """The nearest place that RTL_TYPE allows, and what PX4 complains of on the way.
@@ -57,7 +59,7 @@ def destination(
         nearest = math.dist(home[:2], position[:2])
     landing = mission.landing() if mission.valid else None
     if landing is not None and kind in (1, 3):
-        place = mission.items[landing].place(home)
+        place = mission.items[landing].place(home, frame)
         away = math.dist(place[:2], position[:2])
         if away + WORTH_M < nearest:
             best, nearest = Destination(Goal.MISSION_LANDING, place), away
@@ -68,7 +70,7 @@ def destination(
         if item.frame not in USABLE_FRAMES:
             complaints.append("RTL: unsupported MAV_FRAME\t")
             continue
-        place = item.place(home)
+        place = item.place(home, frame)
         if kind != 5 and math.dist(place[:2], home[:2]) <= TOO_CLOSE_TO_HOME_M:
             continue
         away = math.dist(place[:2], position[:2])
@@ -80,7 +82,7 @@ def destination(
 
 
 def mission_route(
-    mission: Mission, parameters: Parameters, home: Vector
+    mission: Mission, parameters: Parameters, home: Vector, frame: LocalFrame
 ) -> tuple[list[Vector], Vector] | None:
     """The way back along a valid mission (RTL_TYPE 2 and 4) and where it lands; None for the direct way.
 
@@ -91,28 +93,28 @@ def mission_route(
     if kind not in (2, 4) or not mission.valid:
         return None
     start, landing = mission.land_start(), mission.landing()
-    if landing is not None and not all(map(math.isfinite, mission.items[landing].place(home))):
+    if landing is not None and not all(map(math.isfinite, mission.items[landing].place(home, frame))):
         landing = None
     forward = start is not None and landing is not None and mission.current <= landing
     if forward and start is not None and kind == 4:
         forward = start - mission.current < mission.current  # PX4's measure: items left against items flown
     if forward and landing is not None:
-        places = _places(mission.items[mission.current : landing], home)
-        return places, mission.items[landing].place(home)
-    return _places(mission.items[: mission.current], home)[::-1], home
+        places = _places(mission.items[mission.current : landing], home, frame)
+        return places, mission.items[landing].place(home, frame)
+    return _places(mission.items[: mission.current], home, frame)[::-1], home
 
 
-def landing_route(mission: Mission, home: Vector) -> tuple[list[Vector], Vector]:
+def landing_route(mission: Mission, home: Vector, frame: LocalFrame) -> tuple[list[Vector], Vector]:
     """The places of the mission's landing pattern, from DO_LAND_START on, and the landing itself."""
     start, landing = mission.land_start(), mission.landing()
     assert start is not None  # called for a mission's landing alone
     assert landing is not None
-    return _places(mission.items[start:landing], home), mission.items[landing].place(home)
+    return _places(mission.items[start:landing], home, frame), mission.items[landing].place(home, frame)
 
 
-def _places(items: tuple[MissionItem, ...], home: Vector) -> list[Vector]:
+def _places(items: tuple[MissionItem, ...], home: Vector, frame: LocalFrame) -> list[Vector]:
     """Where the items with a place are; those that leave some of it open are left out."""
-    places = [item.place(home) for item in items if item.has_position]
+    places = [item.place(home, frame) for item in items if item.has_position]
     return [place for place in places if all(map(math.isfinite, place))]
 
 

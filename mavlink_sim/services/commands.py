@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 from mavlink_sim.autopilot.commander import ACCEPTED, TEMPORARILY_REJECTED
 from mavlink_sim.flight.orbit import OrbitRequest
-from mavlink_sim.physics.geography import geographic, local
 from mavlink_sim.px4.modes import CUSTOM_MODE_ENABLED, Mode, mode_of
 from mavlink_sim.services import gimbal_protocol, parameter_protocol
 from mavlink_sim.services.mission_start import mission_start
@@ -122,7 +121,7 @@ def _takeoff(vehicle: Vehicle, link: Link, command: Command) -> int:
     if not math.isfinite(altitude):
         return vehicle.autopilot.takeoff(None)
     altitude = min(max(altitude, -MAX_ALTITUDE_M), MAX_ALTITUDE_M)
-    home_altitude = geographic(vehicle.autopilot.home.position)[2]
+    home_altitude = vehicle.local_frame.geographic(vehicle.autopilot.home.position)[2]
     return vehicle.autopilot.takeoff(altitude - home_altitude)
 
 
@@ -136,7 +135,7 @@ def _return_to_launch(vehicle: Vehicle, link: Link, command: Command) -> int:
 
 def _reposition(vehicle: Vehicle, link: Link, command: Command) -> int:
     speed, flags, _, yaw = command.parameters[:4]
-    goal = _place(*command.parameters[4:7])
+    goal = _place(vehicle, *command.parameters[4:7])
     # MAV_DO_REPOSITION_FLAGS_CHANGE_MODE, and no other: the commander refuses the rest. The navigator of PX4
     # does not look at the flags, so a vehicle that holds flies there whatever the answer says.
     if math.isfinite(flags) and int(flags) == 1:
@@ -147,7 +146,7 @@ def _reposition(vehicle: Vehicle, link: Link, command: Command) -> int:
 
 def _change_altitude(vehicle: Vehicle, link: Link, command: Command) -> int:
     altitude = command.parameters[0]  # AMSL; PX4 looks at no frame here either
-    return vehicle.autopilot.reposition(_place(math.nan, math.nan, altitude), math.nan)
+    return vehicle.autopilot.reposition(_place(vehicle, math.nan, math.nan, altitude), math.nan)
 
 
 def _change_speed(vehicle: Vehicle, link: Link, command: Command) -> int:
@@ -158,13 +157,13 @@ def _change_speed(vehicle: Vehicle, link: Link, command: Command) -> int:
 
 def _orbit(vehicle: Vehicle, link: Link, command: Command) -> int:
     radius, speed, yaw_behaviour = command.parameters[:3]
-    centre = _place(*command.parameters[4:7])
+    centre = _place(vehicle, *command.parameters[4:7])
     return vehicle.autopilot.orbit(OrbitRequest(radius, speed, yaw_behaviour, centre))
 
 
-def _place(latitude_deg: float, longitude_deg: float, altitude_m: float) -> Vector:
+def _place(vehicle: Vehicle, latitude_deg: float, longitude_deg: float, altitude_m: float) -> Vector:
     """Local NED, NaN for what is no number. PX4 takes a place not on Earth too; here it lies at the edge."""
-    return local(
+    return vehicle.local_frame.local(
         _within(latitude_deg, 90.0), _within(longitude_deg, 180.0), _within(altitude_m, MAX_ALTITUDE_M)
     )
 
@@ -202,7 +201,7 @@ def _set_home(vehicle: Vehicle, link: Link, command: Command) -> int:
     else:
         roll, pitch, yaw = (math.radians(angle) if math.isfinite(angle) else None for angle in attitude_deg)
         attitude_rad = (roll or 0.0, pitch or 0.0, math.nan if yaw is None else yaw)
-        autopilot.home.is_at(_place(*place), attitude_rad)
+        autopilot.home.is_at(_place(vehicle, *place), attitude_rad)
     return ACCEPTED
 
 

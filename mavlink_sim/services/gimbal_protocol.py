@@ -11,7 +11,6 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from mavlink_sim.flight.position_control import NAN
-from mavlink_sim.physics.geography import local
 from mavlink_sim.physics.gimbal import Aim, Gimbal, Target
 from mavlink_sim.wire.messages import dialect
 from vision.attitude import euler_from_quaternion
@@ -149,7 +148,7 @@ def set_roi_location(vehicle: Vehicle, link: Link, command: Command) -> int:
     if abs(latitude) > 90.0 or abs(longitude) > 180.0:
         return DENIED
     if vehicle.gimbal_manager is not None:
-        vehicle.gimbal_manager.look_at(local(latitude, longitude, altitude))
+        vehicle.gimbal_manager.look_at(vehicle.local_frame.local(latitude, longitude, altitude))
     return ACCEPTED
 
 

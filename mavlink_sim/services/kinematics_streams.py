@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from mavlink_sim.flight import collision_prevention
 from mavlink_sim.physics.airframe import MAX_THRUST_MPS2
-from mavlink_sim.physics.geography import HOME_ALTITUDE_M, geographic
+from mavlink_sim.physics.geography import HOME_ALTITUDE_M
 from mavlink_sim.wire import packing
 from mavlink_sim.wire.messages import dialect
 
@@ -32,7 +32,7 @@ def attitude_quaternion(vehicle: Vehicle) -> Any:
 
 def global_position_int(vehicle: Vehicle) -> Any:
     frame = vehicle.estimate
-    latitude, longitude, altitude = geographic(frame.position)
+    latitude, longitude, altitude = vehicle.local_frame.geographic(frame.position)
     vx, vy, vz = frame.velocity
     return packing.global_position_int(
         vehicle.boot_ms,
@@ -171,7 +171,7 @@ def position_target_global_int(vehicle: Vehicle) -> Any:
     task = vehicle.autopilot.task
     if task is None or task.goal is None:
         return None
-    latitude, longitude, altitude = geographic(task.goal)
+    latitude, longitude, altitude = vehicle.local_frame.geographic(task.goal)
     inner = vehicle.autopilot.controller
     return dialect.MAVLink_position_target_global_int_message(
         vehicle.boot_ms,
@@ -208,7 +208,7 @@ def vfr_hud(vehicle: Vehicle) -> Any:
 
 
 def gps_raw_int(vehicle: Vehicle) -> Any:
-    latitude, longitude, altitude = geographic(vehicle.estimate.gps_position)
+    latitude, longitude, altitude = vehicle.local_frame.geographic(vehicle.estimate.gps_position)
     vx, vy, _ = vehicle.estimate.velocity
     course = round(math.degrees(math.atan2(vy, vx)) % 360.0 * 100) % 36000
     height_mm = round(altitude * 1000)
@@ -234,7 +234,7 @@ def gps_raw_int(vehicle: Vehicle) -> Any:
 
 def open_drone_id_location(vehicle: Vehicle) -> Any:
     frame = vehicle.estimate
-    latitude, longitude, altitude = geographic(frame.position)
+    latitude, longitude, altitude = vehicle.local_frame.geographic(frame.position)
     vx, vy, vz = frame.velocity
     course = round(math.degrees(math.atan2(vy, vx)) % 360.0 * 100) % 36000
     return dialect.MAVLink_open_drone_id_location_message(

@@ -14,7 +14,6 @@ from mavlink_sim.flight.setpoints import (
     global_trajectory_setpoint,
     trajectory_setpoint,
 )
-from mavlink_sim.physics.geography import geographic
 from mavlink_sim.services import (
     commands,
     event_protocol,
@@ -102,9 +101,9 @@ def _setpoint(vehicle: Vehicle, link: Link, message: Any) -> None:
 
 def _global_setpoint(vehicle: Vehicle, link: Link, message: Any) -> None:
     autopilot = vehicle.autopilot
-    home_altitude = geographic(autopilot.home.position)[2] if autopilot.sensors_ready else None
+    home_altitude = vehicle.home_altitude_m if autopilot.sensors_ready else None
     try:
-        setpoint = global_trajectory_setpoint(message, home_altitude)
+        setpoint = global_trajectory_setpoint(message, vehicle.local_frame, home_altitude)
     except SetpointRejectedError as error:
         autopilot.texts.append(Text(CRITICAL, f"{error}\t"))
         return

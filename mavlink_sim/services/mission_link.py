@@ -9,7 +9,6 @@ from mavlink_sim.flight.precision_landing import LandingTarget
 from mavlink_sim.missions import items as mission_items
 from mavlink_sim.missions.items import MissionItem
 from mavlink_sim.missions.navigator import Reached, goes_to_camera
-from mavlink_sim.physics.geography import geographic
 from mavlink_sim.services import commands
 from mavlink_sim.services.links import AUTOPILOT_COMPONENT
 from mavlink_sim.services.mission_messages import mission_current
@@ -53,7 +52,8 @@ def _carry_out(vehicle: Vehicle, item: MissionItem) -> None:
     """An item that is a command: told on every link, as PX4 does, and obeyed if it is the vehicle's own."""
     command, values = item.command, item.parameters
     if item.frame != mission_items.FRAME_MISSION:
-        values = (*values[:6], geographic(item.place(vehicle.autopilot.home.position))[2])
+        position = item.place(vehicle.autopilot.home.position, vehicle.local_frame)
+        values = (*values[:6], vehicle.local_frame.geographic(position)[2])
     target = 0
     if goes_to_camera(command):
         target = CAMERA_COMPONENT

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
-from mavlink_sim.physics.geography import geographic
 from mavlink_sim.px4.modes import LISTED_MODES, Mode
 from mavlink_sim.services import manual_control_service
 from mavlink_sim.wire.messages import current_event_sequence as event_sequence_message
@@ -67,7 +66,7 @@ def estimator_status(vehicle: Vehicle) -> Any:
 
 
 def open_drone_id_system(vehicle: Vehicle) -> Any:
-    latitude, longitude, altitude = geographic(vehicle.autopilot.home.position)
+    latitude, longitude, altitude = vehicle.local_frame.geographic(vehicle.autopilot.home.position)
     since_2019 = max(vehicle.utc_ns() // 10**9 - 1546300800, 0)  # the standard counts from 2019-01-01
     return dialect.MAVLink_open_drone_id_system_message(
         0,
@@ -126,7 +125,7 @@ def home_position(vehicle: Vehicle) -> Any:
     if not vehicle.autopilot.sensors_ready:
         return None  # there is no home before there is a position
     home = vehicle.autopilot.home
-    latitude, longitude, altitude = geographic(home.position)
+    latitude, longitude, altitude = vehicle.local_frame.geographic(home.position)
     return dialect.MAVLink_home_position_message(
         round(latitude * 1e7),
         round(longitude * 1e7),
@@ -193,7 +192,7 @@ def current_event_sequence(vehicle: Vehicle) -> Any:
 
 
 def gps_global_origin(vehicle: Vehicle) -> Any:
-    latitude, longitude, altitude = geographic((0.0, 0.0, 0.0))
+    latitude, longitude, altitude = vehicle.local_frame.geographic((0.0, 0.0, 0.0))
     return dialect.MAVLink_gps_global_origin_message(
         round(latitude * 1e7),
         round(longitude * 1e7),

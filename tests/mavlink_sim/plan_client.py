@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from mavlink_sim.physics.geography import geographic
+from mavlink_sim.physics.geography import SIH_FRAME
 from mavlink_sim.wire.messages import dialect
 from tests.mavlink_sim.conftest import SimHarness
 
@@ -28,7 +28,7 @@ def item(
     values = [*parameters, *([0.0] * 7)][:7]
     x, y, z = round(values[4]), round(values[5]), float(values[6])
     if place is not None:
-        latitude, longitude, _ = geographic((place[0], place[1], 0.0))
+        latitude, longitude, _ = SIH_FRAME.geographic((place[0], place[1], 0.0))
         x, y, z = round(latitude * 1e7), round(longitude * 1e7), place[2]
     if frame is None:
         frame = 2 if place is None else 6

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from mavlink_sim.physics.geography import local
+from mavlink_sim.physics.geography import SIH_FRAME
 from mavlink_sim.wire.messages import dialect
 from tests.mavlink_sim.conftest import SimHarness
 
@@ -111,7 +111,7 @@ def test_a_second_autopilot_of_the_same_system_gives_every_answer_twice(harness:
     harness.fly(0.5)
     assert harness.command(ARM, 1) == [0, 0]
     places = [
-        local(message.lat / 1e7, message.lon / 1e7, 0.0)
+        SIH_FRAME.local(message.lat / 1e7, message.lon / 1e7, 0.0)
         for message in harness.received("GLOBAL_POSITION_INT")
     ]
     assert {round(east) for _, east, _ in places} == {0, 25}

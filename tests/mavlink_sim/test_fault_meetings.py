@@ -10,7 +10,7 @@ import pytest
 
 from mavlink_sim import LockstepVehicle
 from mavlink_sim.missions.items import MissionItem
-from mavlink_sim.physics.geography import local
+from mavlink_sim.physics.geography import SIH_FRAME
 from mavlink_sim.wire.messages import dialect
 from tests.mavlink_sim.conftest import SimHarness
 from tests.mavlink_sim.plan_client import land, takeoff, upload, waypoint
@@ -296,7 +296,7 @@ def test_a_second_autopilot_stands_beside_the_vehicle_and_moves_nothing_of_it(
     harness.forget()
     harness.fly(1.0)
     places = {
-        message.get_srcSystem() if hasattr(message, "_system") else 1: local(
+        message.get_srcSystem() if hasattr(message, "_system") else 1: SIH_FRAME.local(
             message.lat / 1e7, message.lon / 1e7, 0.0
         )
         for message in harness.received("GLOBAL_POSITION_INT")

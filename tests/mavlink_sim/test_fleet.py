@@ -14,7 +14,6 @@ from mavlink_sim import real_time
 from mavlink_sim.cli import main
 from mavlink_sim.fleet import instance_options, places
 from mavlink_sim.lockstep import LockstepVehicle
-from mavlink_sim.physics.geography import geographic
 from mavlink_sim.simulation import SimulationOptions
 from mavlink_sim.testing import free_udp_port_range, running_simulator
 from mavlink_sim.vehicle import Vehicle
@@ -101,8 +100,7 @@ def test_a_place_given_in_degrees_is_flown_to_from_another_start() -> None:
     vehicle.step(25.0)
     north, east, _ = vehicle.truth.position_ned_m
     assert (north, east) == pytest.approx((-10.0, -20.0), abs=0.7)
-    # and who reckons beside it does so from SIH's home
-    assert geographic((0.0, 0.0, -5.0)) == pytest.approx(place)
+    assert vehicle.vehicle.local_frame.local(*place) == pytest.approx((-10.0, -20.0, -5.0))
 
 
 def heard(port: int, wanted: set[int], limit_s: float = 40.0) -> dict[int, dict[str, Any]]:

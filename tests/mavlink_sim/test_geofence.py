@@ -12,7 +12,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from mavlink_sim.missions.geofence import Area, inside_polygon
-from mavlink_sim.physics.geography import geographic
+from mavlink_sim.physics.geography import SIH_FRAME
 from mavlink_sim.wire.announcements import event_identifier
 from tests.mavlink_sim.conftest import SimHarness
 from tests.mavlink_sim.plan_client import circle, listen, polygon, upload
@@ -182,7 +182,7 @@ def test_a_place_outside_the_fence_is_not_flown_to(harness: SimHarness) -> None:
     listen(harness)
     harness.take_off(4.0)
     upload(harness, [circle(0, 0, 8.0)], 1)
-    latitude, longitude, altitude = geographic((20.0, 0.0, -4.0))
+    latitude, longitude, altitude = SIH_FRAME.geographic((20.0, 0.0, -4.0))
     place = (round(latitude * 1e7), round(longitude * 1e7), altitude)
     assert harness.command_int(192, (-1, 1, 0, math.nan), *place) == [0]
     harness.fly(2.0)

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mavlink_sim.physics.geography import geographic
+from mavlink_sim.physics.geography import SIH_FRAME
 from mavlink_sim.physics.gimbal import Aim, Gimbal, Target
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.simulation import Simulation, SimulationOptions
@@ -209,7 +209,7 @@ def test_messages_move_it_too(steered: SimHarness) -> None:
 
 def test_a_location_is_looked_at_and_forgotten(steered: SimHarness) -> None:
     x, y, _ = steered.vehicle.airframe.position
-    latitude, longitude, altitude = geographic((x + 20.0, y + 20.0, 0.0))
+    latitude, longitude, altitude = SIH_FRAME.geographic((x + 20.0, y + 20.0, 0.0))
     place = (0, 0, 0, 0)
     assert steered.command_int(195, place, round(latitude * 1e7), round(longitude * 1e7), altitude) == [0]
     steered.fly(2.0)

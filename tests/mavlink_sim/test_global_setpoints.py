@@ -15,7 +15,7 @@ from mavlink_sim.flight.setpoints import (
     trajectory_setpoint,
 )
 from mavlink_sim.physics.airframe import LINEAR_DRAG_PER_S
-from mavlink_sim.physics.geography import HOME_ALTITUDE_M, geographic
+from mavlink_sim.physics.geography import HOME_ALTITUDE_M, SIH_FRAME
 from mavlink_sim.wire.messages import dialect
 from tests.mavlink_sim.conftest import SimHarness
 
@@ -34,7 +34,7 @@ def globally(
     **fields: float,
 ) -> Any:
     """A setpoint to a local place, given as latitude and longitude; the altitude as it is sent."""
-    latitude, longitude, _ = geographic(place)
+    latitude, longitude, _ = SIH_FRAME.geographic(place)
     values = dict.fromkeys(NAMES, 0.0) | fields
     return dialect.MAVLink_set_position_target_global_int_message(
         0, 1, 1, frame, mask, round(latitude * 1e7), round(longitude * 1e7), altitude_m, **values
@@ -55,14 +55,18 @@ def locally(mask: int, frame: int = 1, **fields: float) -> Any:
     ids=["above sea", "above home", "above ground"],
 )
 def test_the_altitude_counts_from_what_the_frame_says(frame: int, altitude_m: float, down_m: float) -> None:
-    setpoint = global_trajectory_setpoint(globally((3.0, -4.0, 0.0), altitude_m, frame), HOME_ALTITUDE_M)
+    setpoint = global_trajectory_setpoint(
+        globally((3.0, -4.0, 0.0), altitude_m, frame), SIH_FRAME, HOME_ALTITUDE_M
+    )
     assert setpoint is not None
     assert setpoint.position == pytest.approx((3.0, -4.0, down_m), abs=0.02)
     assert all(math.isnan(value) for value in (*setpoint.velocity, *setpoint.acceleration))
 
 
 def test_a_home_above_the_origin_puts_relative_altitudes_too_low_as_in_px4() -> None:
-    setpoint = global_trajectory_setpoint(globally(altitude_m=10.0, frame=6), HOME_ALTITUDE_M + 2.0)
+    setpoint = global_trajectory_setpoint(
+        globally(altitude_m=10.0, frame=6), SIH_FRAME, HOME_ALTITUDE_M + 2.0
+    )
     assert setpoint is not None
     assert setpoint.position[2] == pytest.approx(-8.0)  # 8 m over the origin is 6 m over home
 
@@ -82,7 +86,7 @@ def test_a_position_in_another_frame_is_refused_in_words(harness: SimHarness, fr
 @pytest.mark.parametrize("bit", [1, 2, 4])
 def test_one_ignored_axis_disables_the_whole_position_and_then_any_frame_will_do(bit: int) -> None:
     message = globally((3.0, 4.0, 0.0), 500.0, frame=3, mask=0x1C0 | bit, vx=1.0, vy=2.0, vz=3.0)
-    setpoint = global_trajectory_setpoint(message, HOME_ALTITUDE_M)
+    setpoint = global_trajectory_setpoint(message, SIH_FRAME, HOME_ALTITUDE_M)
     assert setpoint is not None
     assert all(math.isnan(value) for value in setpoint.position)
     assert setpoint.velocity == (1.0, 2.0, 3.0)
@@ -130,7 +134,7 @@ def test_any_global_setpoint_is_dropped_or_finite_where_it_controls(
     fields = dict(zip(NAMES, values, strict=False))
     message = globally((1.0, 2.0, 0.0), values[8], frame, mask, **fields)
     try:
-        setpoint = global_trajectory_setpoint(message, HOME_ALTITUDE_M)
+        setpoint = global_trajectory_setpoint(message, SIH_FRAME, HOME_ALTITUDE_M)
     except SetpointRejectedError:
         assert mask & 512 or (not mask & 7 and frame not in (5, 6, 11))
         return

@@ -19,7 +19,7 @@ from mavsdk.plugins.mission.mission import MissionItem, MissionPlan
 from mavsdk.plugins.mission_raw.mission_raw import MissionItem as RawItem
 from mavsdk.plugins.mission_raw.mission_raw import MissionRawError, MissionRawResult
 
-from mavlink_sim.physics.geography import geographic
+from mavlink_sim.physics.geography import SIH_FRAME
 from mavlink_sim.testing import RunningSimulator, running_simulator
 from tests.mavlink_sim.mavsdk_client import LIMIT_S, MavsdkClient, mavsdk_client, meanwhile, wait_for
 from tests.mavlink_sim.plan_client import item, land, polygon, rally, takeoff, waypoint
@@ -40,7 +40,7 @@ async def flown_by_mavsdk(
 
 
 def place(north: float, east: float) -> tuple[float, float]:
-    latitude, longitude, _ = geographic((north, east, 0.0))
+    latitude, longitude, _ = SIH_FRAME.geographic((north, east, 0.0))
     return latitude, longitude
 
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mavlink_sim.flight.orbit import Orbit
-from mavlink_sim.physics.geography import HOME_ALTITUDE_M, geographic
+from mavlink_sim.physics.geography import HOME_ALTITUDE_M, SIH_FRAME
 from mavlink_sim.wire.messages import dialect
 from tests.mavlink_sim.conftest import SimHarness
 
@@ -25,7 +25,7 @@ def orbit(
     altitude_m: float = NAN,
 ) -> list[int]:
     """Send DO_ORBIT; its answers."""
-    place = (NAN, NAN) if centre is None else geographic(centre)[:2]
+    place = (NAN, NAN) if centre is None else SIH_FRAME.geographic(centre)[:2]
     results: list[int] = harness.command(34, radius_m, speed_mps, yaw_behaviour, NAN, *place, altitude_m)
     return results
 
@@ -181,7 +181,7 @@ def test_the_execution_is_told_while_it_lasts(harness: SimHarness) -> None:
     told = harness.received("ORBIT_EXECUTION_STATUS")
     assert 19 <= len(told) <= 21
     assert 7 <= len(harness.received("ORBIT_EXECUTION_STATUS", "gcs")) <= 9
-    latitude, longitude, _ = geographic(CENTRE)
+    latitude, longitude, _ = SIH_FRAME.geographic(CENTRE)
     last = told[-1]
     assert (last.radius, last.frame) == (-8.0, 0)
     assert (last.x, last.y) == pytest.approx((round(latitude * 1e7), round(longitude * 1e7)), abs=1)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from mavlink_sim.flight.reposition import reposition_goal
 from mavlink_sim.physics.airframe import Multirotor
-from mavlink_sim.physics.geography import HOME_ALTITUDE_M, geographic
+from mavlink_sim.physics.geography import HOME_ALTITUDE_M, SIH_FRAME
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.messages import dialect
 from tests.mavlink_sim.conftest import SimHarness
@@ -35,7 +35,7 @@ def reposition(
     """Send DO_REPOSITION as COMMAND_INT to a local place; its answers."""
     x, y = (NOT_GIVEN, NOT_GIVEN)
     if place is not None:
-        latitude, longitude, _ = geographic((*place, 0.0))
+        latitude, longitude, _ = SIH_FRAME.geographic((*place, 0.0))
         x, y = round(latitude * 1e7), round(longitude * 1e7)
     values = (speed_mps, flags, 0.0, yaw)
     results: list[int] = harness.command_int(192, values, x, y, HOME_ALTITUDE_M + height_m, frame)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from mavlink_sim.missions.items import item_of
 from mavlink_sim.missions.plan import Mission
 from mavlink_sim.missions.return_flight import Goal, destination, mission_route
-from mavlink_sim.physics.geography import geographic
+from mavlink_sim.physics.geography import SIH_FRAME
 from mavlink_sim.px4.parameters import Parameters
 from tests.mavlink_sim.conftest import SimHarness
 from tests.mavlink_sim.plan_client import item, land, listen, message, rally, takeoff, upload, waypoint
@@ -29,7 +29,7 @@ def chosen(
     kind: int, north: float, east: float, points: tuple[Any, ...] = (), mission: Mission | None = None
 ) -> Any:
     found, _ = destination(
-        points, mission or Mission(), Parameters({"RTL_TYPE": kind}), HOME, (north, east, -5.0)
+        points, mission or Mission(), Parameters({"RTL_TYPE": kind}), HOME, SIH_FRAME, (north, east, -5.0)
     )
     return found
 
@@ -72,21 +72,21 @@ def test_no_other_allowed_place_is_much_nearer(north: float, east: float) -> Non
 
 def test_a_rally_point_in_an_integer_frame_is_refused_as_px4_does() -> None:
     points = stored(rally(60, 0, frame=6))
-    found, words = destination(points, Mission(), Parameters(), HOME, (59.0, 0.0, -5.0))
+    found, words = destination(points, Mission(), Parameters(), HOME, SIH_FRAME, (59.0, 0.0, -5.0))
     assert found.kind is Goal.HOME
     assert words == ["RTL: unsupported MAV_FRAME\t"]
 
 
 def test_along_a_mission_it_goes_on_to_the_landing_or_back_home() -> None:
     there = Mission(LANDING.items, current=1, valid=True)
-    places, end = mission_route(there, Parameters({"RTL_TYPE": 2}), HOME) or ([], HOME)
+    places, end = mission_route(there, Parameters({"RTL_TYPE": 2}), HOME, SIH_FRAME) or ([], HOME)
     assert [place[0] for place in places] == [pytest.approx(100.0, abs=0.02)]
     assert end[1] == pytest.approx(30.0, abs=0.02)
     back = Mission(stored(takeoff(5.0), waypoint(30, 0, 5), waypoint(60, 0, 5)), current=2, valid=True)
-    places, end = mission_route(back, Parameters({"RTL_TYPE": 2}), HOME) or ([], (9.0, 9.0, 9.0))
+    places, end = mission_route(back, Parameters({"RTL_TYPE": 2}), HOME, SIH_FRAME) or ([], (9.0, 9.0, 9.0))
     assert [place[0] for place in places] == pytest.approx([30.0, 0.0], abs=0.02)
     assert end == HOME
-    assert mission_route(back, Parameters(), HOME) is None
+    assert mission_route(back, Parameters(), HOME, SIH_FRAME) is None
 
 
 @pytest.fixture
@@ -163,7 +163,7 @@ def test_rtl_leads_to_where_home_was_set_before_arming_or_after(
     if not before:
         harness.take_off(4.0)
     harness.wait_ready()
-    latitude, longitude, altitude = geographic((0.0, 8.0, 0.0))
+    latitude, longitude, altitude = SIH_FRAME.geographic((0.0, 8.0, 0.0))
     assert harness.command(179, 0, 0, 0, 0, latitude, longitude, altitude) == [0]
     if before:
         harness.take_off(4.0)

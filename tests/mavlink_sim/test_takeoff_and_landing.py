@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from mavlink_sim.physics.geography import geographic
+from mavlink_sim.physics.geography import SIH_FRAME
 from tests.mavlink_sim.conftest import SimHarness
 
 NAN = math.nan
@@ -193,7 +193,7 @@ def test_close_to_home_a_return_turns_to_the_heading_of_home(
 ) -> None:
     harness = make_harness(parameters=parameters)
     harness.take_off(5.0)
-    latitude, longitude, altitude = geographic((0.0, 0.0, 0.0))
+    latitude, longitude, altitude = SIH_FRAME.geographic((0.0, 0.0, 0.0))
     assert harness.command(179, 0, 0, 0, heading_deg, latitude, longitude, altitude) == [0]
     at, above = (round(latitude * 1e7) + 540, round(longitude * 1e7)), altitude + 5.0  # 6 m north
     assert harness.command_int(192, (-1, 1, 0, math.radians(120.0)), *at, above) == [0]
