@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 from mavlink_sim.wire.messages import Outgoing, parser
 
 if TYPE_CHECKING:
-    from mavlink_sim.services.links import Link
     from mavlink_sim.vehicle import Vehicle
+    from mavlink_sim.wire.links import Link
 
 
 class LockstepWire:

@@ -165,7 +165,7 @@ class Simulation:
                 files = {f"{name}-{options.system_id}": link for name, link in self.endpoints.items()}
                 self._resources.enter_context(recording(files, options.record))
             self._faults = self._resources.enter_context(
-                fault_injector(self.vehicle, self.endpoints, options, on_event)
+                fault_injector(self.vehicle.faults, options.system_id, self.endpoints, options, on_event)
             )
             fleet_world = FleetWorld(1) if fleet_world is None else fleet_world
             fleet_world.join(self.vehicle, 0 if scene is None else identifier_offset(scene.world))

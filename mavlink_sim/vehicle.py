@@ -29,11 +29,11 @@ from mavlink_sim.releases import NEWEST, release_named
 from mavlink_sim.services import file_transfer, mission_link, parameter_protocol, telemetry
 from mavlink_sim.services.event_protocol import EventBuffer
 from mavlink_sim.services.gimbal_protocol import GimbalManager
-from mavlink_sim.services.links import AUTOPILOT_COMPONENT, Link, forward, target_of
 from mavlink_sim.services.microservices import HANDLERS
 from mavlink_sim.services.vehicle_files import vehicle_files
 from mavlink_sim.wind_model import WindModel
 from mavlink_sim.wire.announcements import CRITICAL, INFO, Text
+from mavlink_sim.wire.links import AUTOPILOT_COMPONENT, Link, forward, target_of
 from mavlink_sim.wire.messages import Outgoing, dialect, link_node_status
 from mavlink_sim.wire.signing import Signing, timestamp_now
 from mavlink_sim.wire.signing import Streams as SigningStreams
@@ -241,6 +241,22 @@ class Vehicle:
     def transmitter(self) -> Transmitter:
         """The pilot's remote control, switched off at first (COM_RC_IN_MODE decides whether it counts)."""
         return self.autopilot.supervision.transmitter
+
+    def obstacle_below_m(self) -> float:
+        """From the legs along the body's down axis to the scene or another vehicle; inf: none."""
+        found = math.inf
+        if self.collision_world is not None:
+            found = self.collision_world.range_below_m()
+        if self.neighbours is not None:
+            found = min(found, self.neighbours.range_below_m())
+        return found
+
+    def second_autopilot(self, system_id: int, seed: int, east_m: float) -> Vehicle:
+        """Another vehicle of the same firmware, ready at once, that starts so far east of this one."""
+        north, east = self.start_ned_m
+        return type(self)(
+            system_id=system_id, seed=seed, ready_after_s=0.0, start_ned_m=(north, east + east_m)
+        )
 
     def mode_parameters(self, mode: Any) -> tuple[float, float]:
         """DO_SET_MODE's parameters 2 and 3 for one of `modes`."""

@@ -34,14 +34,13 @@ from mavlink_sim.services.commands import (
     REQUEST_MESSAGE,
     SET_MESSAGE_INTERVAL,
     UNSUPPORTED,
-    Command,
-    command_of,
 )
+from mavlink_sim.wire.commands import Command, command_of
 from mavlink_sim.wire.messages import dialect
 
 if TYPE_CHECKING:
     from mavlink_sim.ardupilot.copter import CopterVehicle
-    from mavlink_sim.services.links import Link
+    from mavlink_sim.wire.links import Link
 
 FORCE_ARM = 2989.0
 NAV_LOITER_UNLIM = 17

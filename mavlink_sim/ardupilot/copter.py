@@ -11,9 +11,9 @@ from mavlink_sim.ardupilot import services, streams, telemetry
 from mavlink_sim.ardupilot.autopilot import CopterAutopilot
 from mavlink_sim.ardupilot.modes import CopterMode
 from mavlink_sim.ardupilot.parameters import CopterParameters
-from mavlink_sim.services.links import Link
 from mavlink_sim.vehicle import Vehicle
 from mavlink_sim.wire.announcements import Text
+from mavlink_sim.wire.links import Link
 
 
 class CopterVehicle(Vehicle):

@@ -17,7 +17,7 @@ from mavlink_sim.wire.messages import dialect
 
 if TYPE_CHECKING:
     from mavlink_sim.ardupilot.copter import CopterVehicle
-    from mavlink_sim.services.links import Link
+    from mavlink_sim.wire.links import Link
 
 logger = logging.getLogger(__name__)
 

@@ -22,7 +22,7 @@ from mavlink_sim.wire.messages import dialect
 
 if TYPE_CHECKING:
     from mavlink_sim.ardupilot.copter import CopterVehicle
-    from mavlink_sim.services.links import Link
+    from mavlink_sim.wire.links import Link
 
 RATES_IGNORE = ROLL_RATE_IGNORE | PITCH_RATE_IGNORE | BODY_YAW_RATE_IGNORE
 MISSION_UNSUPPORTED = 3  # MAV_MISSION_UNSUPPORTED

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mavlink_sim.ardupilot.copter import CopterVehicle
-    from mavlink_sim.services.links import Link
+    from mavlink_sim.wire.links import Link
 
 MAX_RATE_HZ = 200.0
 MAX_INTERVAL_US = 60_000_000

@@ -5,19 +5,15 @@ from __future__ import annotations
 import math
 import random
 from functools import partial
-from typing import TYPE_CHECKING
 
 from mavlink_sim.autopilot.commander import TEMPORARILY_REJECTED
+from mavlink_sim.faults.context import ActiveFault, FaultTarget
 from mavlink_sim.faults.grammar import FaultError
 from mavlink_sim.flight.tasks import Trajectory
+from mavlink_sim.physics.airframe import Vector
 from mavlink_sim.physics.estimate_errors import ZERO
 from mavlink_sim.px4.modes import Mode, mode_of
 from mavlink_sim.wire.announcements import Text
-
-if TYPE_CHECKING:
-    from mavlink_sim.faults.schedule import ActiveFault
-    from mavlink_sim.physics.airframe import Vector
-    from mavlink_sim.vehicle import Vehicle
 
 DEAD_RECKONING_S = 5.0  # EKF2_NOAID_TOUT
 REACQUISITION_S = 1.0  # from the first fix to a position that is fused again
@@ -43,7 +39,7 @@ _DO_SET_MODE = 176
 # ---- position and estimate
 
 
-def gps_loss(vehicle: Vehicle, one: ActiveFault) -> None:
+def gps_loss(vehicle: FaultTarget, one: ActiveFault) -> None:
     """No fix: dead reckoning drifts for 5 s, then the position is invalid until a moment after the end."""
     estimate, faults = vehicle.estimate, vehicle.faults
     angle = random.Random(one.seed).uniform(0.0, math.tau)
@@ -72,7 +68,7 @@ def gps_loss(vehicle: Vehicle, one: ActiveFault) -> None:
     one.undo.append(undo)
 
 
-def _fuse_again(vehicle: Vehicle, number: int) -> None:
+def _fuse_again(vehicle: FaultTarget, number: int) -> None:
     estimate = vehicle.estimate
     estimate.set_error(number, None)
     if estimate.fix_lost:
@@ -84,7 +80,7 @@ def _fuse_again(vehicle: Vehicle, number: int) -> None:
     vehicle.autopilot.texts.append(Text(INFO, "GNSS data fusion started\t"))
 
 
-def gps_drift(vehicle: Vehicle, one: ActiveFault) -> None:
+def gps_drift(vehicle: FaultTarget, one: ActiveFault) -> None:
     """The receiver's position wanders; the estimate follows it, and the vehicle holds the estimate."""
     values = one.fault.values
     angle = _direction(values["towards"], one.seed)
@@ -108,7 +104,7 @@ def gps_drift(vehicle: Vehicle, one: ActiveFault) -> None:
     one.undo.append(undo)
 
 
-def ekf_reset(vehicle: Vehicle, one: ActiveFault) -> None:
+def ekf_reset(vehicle: FaultTarget, one: ActiveFault) -> None:
     """The estimate jumps; when the fault is ended it jumps back."""
     values = one.fault.values
     error = (values["north"], values["east"], values["down"])
@@ -123,7 +119,7 @@ def ekf_reset(vehicle: Vehicle, one: ActiveFault) -> None:
     one.undo.append(undo)
 
 
-def _jumped(vehicle: Vehicle, resets: int = 1, yaw_rad: float = 0.0) -> None:
+def _jumped(vehicle: FaultTarget, resets: int = 1, yaw_rad: float = 0.0) -> None:
     """What PX4 does at a reset: count it, and go on planning from where the vehicle now thinks it is.
 
     An absolute goal stays where it is, so the vehicle then flies the difference.
@@ -153,7 +149,7 @@ def _attributes(value: object) -> list[object]:
 # ---- power and rotors
 
 
-def battery(vehicle: Vehicle, one: ActiveFault) -> None:
+def battery(vehicle: FaultTarget, one: ActiveFault) -> None:
     """So much charge is left: a number goes on being used while armed, a warning's name holds at it.
 
     It is checked even where CBRK_SUPPLY_CHK switches that off, as it does by default.
@@ -171,7 +167,7 @@ def battery(vehicle: Vehicle, one: ActiveFault) -> None:
     one.undo.append(undo)
 
 
-def motor_failure(vehicle: Vehicle, one: ActiveFault) -> None:
+def motor_failure(vehicle: FaultTarget, one: ActiveFault) -> None:
     """The rotor stops; it turns again when the fault ends."""
     motor = one.fault.values["motor"]
     vehicle.airframe.fail_motor(motor - 1)
@@ -182,14 +178,14 @@ def motor_failure(vehicle: Vehicle, one: ActiveFault) -> None:
 # ---- air
 
 
-def wind(vehicle: Vehicle, one: ActiveFault) -> None:
+def wind(vehicle: FaultTarget, one: ActiveFault) -> None:
     """So much more wind."""
     values = one.fault.values
     vehicle.faults.winds[one.number] = _blowing(values["speed"], _direction(values["from"], one.seed))
     one.undo.append(partial(_calm, vehicle, one))
 
 
-def gust(vehicle: Vehicle, one: ActiveFault) -> None:
+def gust(vehicle: FaultTarget, one: ActiveFault) -> None:
     """One gust of `for` seconds (4 if not given): the wind rises and falls as 1 - cos."""
     values = one.fault.values
     angle = _direction(values["from"], one.seed)
@@ -214,7 +210,7 @@ def _blowing(speed_mps: float, from_rad: float) -> Vector:
     return (-speed_mps * math.cos(from_rad), -speed_mps * math.sin(from_rad), 0.0)
 
 
-def _calm(vehicle: Vehicle, one: ActiveFault) -> None:
+def _calm(vehicle: FaultTarget, one: ActiveFault) -> None:
     vehicle.faults.winds.pop(one.number, None)
     vehicle.reload_wind(vehicle.faults.winds.values())
 
@@ -222,7 +218,7 @@ def _calm(vehicle: Vehicle, one: ActiveFault) -> None:
 # ---- command
 
 
-def pilot_takeover(vehicle: Vehicle, one: ActiveFault) -> None:
+def pilot_takeover(vehicle: FaultTarget, one: ActiveFault) -> None:
     """A pilot's sticks are there and the mode is switched; at the end the sticks go, the mode stays.
 
     Where a remote control counts (COM_RC_IN_MODE other than 4), it is lost then, and NAV_RCL_ACT follows.
@@ -247,7 +243,7 @@ def requested_mode(command: int, parameters: tuple[float, ...]) -> Mode | None:
     return mode_of(int(main), int(sub)) if math.isfinite(main) and math.isfinite(sub) else None
 
 
-def refuse_mode(vehicle: Vehicle, one: ActiveFault) -> None:
+def refuse_mode(vehicle: FaultTarget, one: ActiveFault) -> None:
     """Requests for the mode are refused, all or the next so many."""
     values = one.fault.values
     left = math.inf if values["count"] == "all" else int(values["count"])
@@ -266,7 +262,7 @@ def refuse_mode(vehicle: Vehicle, one: ActiveFault) -> None:
     one.undo.append(partial(vehicle.faults.refusals.pop, one.number))
 
 
-def reboot(vehicle: Vehicle, one: ActiveFault) -> None:
+def reboot(vehicle: FaultTarget, one: ActiveFault) -> None:
     """Power was lost for a moment: `Vehicle.reboot`, deaf and silent until PX4 has started."""
     faults = vehicle.faults
     one.ends_s = min(one.ends_s, faults.now_s + one.fault.values["seconds"])

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING
 
+from mavlink_sim.faults.context import ActiveFault, FaultTarget
 from mavlink_sim.faults.grammar import FaultError
 from mavlink_sim.wire.link_faults import (
     Channel,
@@ -18,12 +18,8 @@ from mavlink_sim.wire.link_faults import (
     Reorder,
 )
 
-if TYPE_CHECKING:
-    from mavlink_sim.faults.schedule import ActiveFault
-    from mavlink_sim.vehicle import Vehicle
 
-
-def chosen_links(vehicle: Vehicle, link: str) -> list[str]:
+def chosen_links(vehicle: FaultTarget, link: str) -> list[str]:
     """The names of the links that are meant. Raises FaultError for one that the vehicle does not have."""
     if not vehicle.links:
         raise FaultError("a fault of the link: this vehicle has no links")
@@ -34,7 +30,7 @@ def chosen_links(vehicle: Vehicle, link: str) -> list[str]:
     return [link]
 
 
-def _channels(vehicle: Vehicle, one: ActiveFault) -> list[tuple[str, Channel]]:
+def _channels(vehicle: FaultTarget, one: ActiveFault) -> list[tuple[str, Channel]]:
     """The directions that are meant, each with the seed of its own random numbers."""
     values = one.fault.values
     found = []
@@ -46,52 +42,52 @@ def _channels(vehicle: Vehicle, one: ActiveFault) -> list[tuple[str, Channel]]:
     return found
 
 
-def _impair(vehicle: Vehicle, one: ActiveFault, make: Callable[[str], Impairment]) -> None:
+def _impair(vehicle: FaultTarget, one: ActiveFault, make: Callable[[str], Impairment]) -> None:
     for seed, channel in _channels(vehicle, one):
         impairment = make(seed)
         channel.impair(impairment)
         one.undo.append(partial(channel.clear, impairment))
 
 
-def link_loss(vehicle: Vehicle, one: ActiveFault) -> None:
+def link_loss(vehicle: FaultTarget, one: ActiveFault) -> None:
     """Nothing gets through, and what was on its way is lost too."""
     for _, channel in _channels(vehicle, one):
         channel.drop_waiting()
     _impair(vehicle, one, lambda seed: Loss(1.0, seed))
 
 
-def link_delay(vehicle: Vehicle, one: ActiveFault) -> None:
+def link_delay(vehicle: FaultTarget, one: ActiveFault) -> None:
     """Everything is late."""
     values = one.fault.values
     _impair(vehicle, one, lambda seed: Delay(values["seconds"], values["jitter"], seed))
 
 
-def link_jitter(vehicle: Vehicle, one: ActiveFault) -> None:
+def link_jitter(vehicle: FaultTarget, one: ActiveFault) -> None:
     """Everything is late, each by another amount."""
     _impair(vehicle, one, lambda seed: Delay(0.0, one.fault.values["seconds"], seed))
 
 
-def packet_loss(vehicle: Vehicle, one: ActiveFault) -> None:
+def packet_loss(vehicle: FaultTarget, one: ActiveFault) -> None:
     """Datagrams get lost."""
     _impair(vehicle, one, lambda seed: Loss(one.fault.values["share"], seed))
 
 
-def duplicate(vehicle: Vehicle, one: ActiveFault) -> None:
+def duplicate(vehicle: FaultTarget, one: ActiveFault) -> None:
     """Datagrams arrive twice."""
     _impair(vehicle, one, lambda seed: Duplication(one.fault.values["share"], seed))
 
 
-def reorder(vehicle: Vehicle, one: ActiveFault) -> None:
+def reorder(vehicle: FaultTarget, one: ActiveFault) -> None:
     """Datagrams overtake each other."""
     values = one.fault.values
     _impair(vehicle, one, lambda seed: Reorder(values["share"], values["hold"], seed))
 
 
-def corrupt(vehicle: Vehicle, one: ActiveFault) -> None:
+def corrupt(vehicle: FaultTarget, one: ActiveFault) -> None:
     """Bytes change on the way."""
     _impair(vehicle, one, lambda seed: Corruption(one.fault.values["share"], seed))
 
 
-def rate_limit(vehicle: Vehicle, one: ActiveFault) -> None:
+def rate_limit(vehicle: FaultTarget, one: ActiveFault) -> None:
     """The line is slow."""
     _impair(vehicle, one, lambda seed: RateLimit(one.fault.values["bytes_per_s"]))

@@ -5,16 +5,13 @@ from __future__ import annotations
 import copy
 import struct
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from mavlink_sim.faults.context import ActiveFault, FaultTarget
 from mavlink_sim.faults.effects_link import chosen_links
+from mavlink_sim.wire.links import Link
 from mavlink_sim.wire.messages import Outgoing, parser
 from mavlink_sim.wire.streams import ONBOARD_RATES_HZ
-
-if TYPE_CHECKING:
-    from mavlink_sim.faults.schedule import ActiveFault
-    from mavlink_sim.services.links import Link
-    from mavlink_sim.vehicle import Vehicle
 
 _U32, _U64 = 2**32, 2**64
 _I64_MAX = 2**63 - 1
@@ -33,7 +30,7 @@ _BOOT_TIME_USEC = {
 SECOND_PLACE_EAST_M = 25.0
 
 
-def heartbeat_only(vehicle: Vehicle, one: ActiveFault) -> None:
+def heartbeat_only(vehicle: FaultTarget, one: ActiveFault) -> None:
     """Streams fall silent; answers to a client still come."""
     names = chosen_links(vehicle, one.fault.values["link"])
 
@@ -47,7 +44,7 @@ def heartbeat_only(vehicle: Vehicle, one: ActiveFault) -> None:
     _gated(vehicle, one, gate)
 
 
-def lost_ack(vehicle: Vehicle, one: ActiveFault) -> None:
+def lost_ack(vehicle: FaultTarget, one: ActiveFault) -> None:
     """COMMAND_ACK is swallowed: every one, or the Nth that would be sent from now on."""
     values = one.fault.values
     names = chosen_links(vehicle, values["link"])
@@ -70,12 +67,12 @@ def lost_ack(vehicle: Vehicle, one: ActiveFault) -> None:
     _gated(vehicle, one, gate)
 
 
-def _gated(vehicle: Vehicle, one: ActiveFault, gate: Any) -> None:
+def _gated(vehicle: FaultTarget, one: ActiveFault, gate: Any) -> None:
     vehicle.faults.gates[one.number] = gate
     one.undo.append(partial(vehicle.faults.gates.pop, one.number))
 
 
-def time_jump(vehicle: Vehicle, one: ActiveFault) -> None:
+def time_jump(vehicle: FaultTarget, one: ActiveFault) -> None:
     """The boot clock is another one, in every stamp and in TIMESYNC; it jumps back when the fault ends."""
     jump_us = round(one.fault.values["seconds"] * 1e6)
     vehicle.faults.boot_offset_us += jump_us
@@ -133,13 +130,10 @@ class _Spoken:
         return getattr(self._message, name)
 
 
-def second_autopilot(vehicle: Vehicle, one: ActiveFault) -> None:
+def second_autopilot(vehicle: FaultTarget, one: ActiveFault) -> None:
     """Another vehicle's autopilot speaks and listens on every link of this one, disarmed on the ground."""
     system = one.fault.values["system"] or vehicle.system_id
-    north, east = vehicle.start_ned_m
-    other = type(vehicle)(
-        system_id=system, seed=one.seed, ready_after_s=0.0, start_ned_m=(north, east + SECOND_PLACE_EAST_M)
-    )
+    other = vehicle.second_autopilot(system, one.seed, SECOND_PLACE_EAST_M)
     codecs = {}
     for name, link in vehicle.links.items():
         other.add_link(name, {stream: link.streams.rate_hz(stream) for stream in ONBOARD_RATES_HZ})
@@ -158,7 +152,7 @@ def second_autopilot(vehicle: Vehicle, one: ActiveFault) -> None:
     one.undo.append(partial(vehicle.faults.second.pop, one.number))
 
 
-def stall(vehicle: Vehicle, one: ActiveFault) -> None:
+def stall(vehicle: FaultTarget, one: ActiveFault) -> None:
     """The vehicle's time stands still or goes slowly; messages to it wait, and are all read afterwards."""
     vehicle.faults.pace = one.fault.values["pace"]
 

@@ -5,15 +5,13 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 from mavlink_sim.faults.console import FaultConsole
+from mavlink_sim.faults.schedule import Faults
 from mavlink_sim.faults.zenoh_control import FaultControl
+from mavlink_sim.wire.endpoint import UdpEndpoint
 from mavlink_sim.wire.faulty_socket import FaultySocket
-
-if TYPE_CHECKING:
-    from mavlink_sim.vehicle import Vehicle
-    from mavlink_sim.wire.endpoint import UdpEndpoint
 
 
 class FaultOptions(Protocol):
@@ -59,7 +57,8 @@ class FaultInjector:
 
 @contextmanager
 def fault_injector(
-    vehicle: Vehicle,
+    faults: Faults,
+    system_id: int,
     endpoints: Mapping[str, UdpEndpoint],
     options: FaultOptions,
     say: Callable[[str], None],
@@ -70,7 +69,6 @@ def fault_injector(
         FaultError: a fault that cannot be.
         ControlError: the control endpoint cannot be opened.
     """
-    faults = vehicle.faults
     sockets = {}
     for name, endpoint in endpoints.items():
         sockets[name] = FaultySocket(endpoint.socket, faults.stage(name), lambda: faults.now_s)
@@ -80,7 +78,7 @@ def fault_injector(
     with ExitStack() as stack:
         console = control = None
         if options.control is not None:
-            control = FaultControl(options.control, vehicle.system_id, faults)
+            control = FaultControl(options.control, system_id, faults)
             stack.callback(control.close)
         if options.console or (options.console is None and _is_terminal()):
             console = FaultConsole(0, faults.command, say)

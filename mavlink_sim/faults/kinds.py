@@ -7,19 +7,15 @@ what grows with time goes into `each_step`. docs/faults.md says what each is lik
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 from mavlink_sim.faults import effects_flight as flight
 from mavlink_sim.faults import effects_link as link
 from mavlink_sim.faults import effects_messages as messages
+from mavlink_sim.faults.context import ActiveFault, FaultTarget
 from mavlink_sim.faults.grammar import REQUIRED, Field, Kind, choice, number, positive, probability, whole
 from mavlink_sim.px4.modes import Mode
 
-if TYPE_CHECKING:
-    from mavlink_sim.faults.schedule import ActiveFault
-    from mavlink_sim.vehicle import Vehicle
-
-Effect = Callable[["Vehicle", "ActiveFault"], None]
+Effect = Callable[[FaultTarget, ActiveFault], None]
 
 
 def _battery(text: str) -> float | str:

@@ -17,54 +17,20 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import Any
 
+from mavlink_sim.faults.context import ActiveFault, FaultTarget, Gate, Refusal
 from mavlink_sim.faults.effects_link import chosen_links
 from mavlink_sim.faults.effects_messages import shifted
 from mavlink_sim.faults.grammar import Fault, FaultError, parse_fault
 from mavlink_sim.faults.kinds import EFFECTS, KINDS
+from mavlink_sim.physics.airframe import Vector
 from mavlink_sim.physics.estimate_errors import as_reported
 from mavlink_sim.wire.link_faults import LinkStage
-
-if TYPE_CHECKING:
-    from mavlink_sim.physics.airframe import Vector
-    from mavlink_sim.services.links import Link
-    from mavlink_sim.vehicle import Vehicle
+from mavlink_sim.wire.links import Link
 
 logger = logging.getLogger(__name__)
-
-# Of a message that the vehicle sends: another one in its place, or None to swallow it.
-Gate = Callable[["Link", Any], Any]
-# Of a command's identifier and parameters: the MAV_RESULT that it is refused with, or None.
-Refusal = Callable[[int, tuple[float, ...]], int | None]
-
-
-@dataclass
-class ActiveFault:
-    """One fault that was asked for.
-
-    Attributes:
-        number: how it is spoken of; counts from 1.
-        seed: of its random numbers.
-        begins_s, ends_s: on the faults' clock; `ends_s` is infinite without a duration.
-        undo: what sets things right again when it ends, last first.
-        each_step: called with the step's seconds while it is active.
-        apart: it is not of the vehicle itself, and goes on while that stands still.
-    """
-
-    number: int
-    fault: Fault
-    seed: int
-    begins_s: float
-    ends_s: float = math.inf
-    active: bool = False
-    undo: list[Callable[[], object]] = field(default_factory=list)
-    each_step: Callable[[float], None] | None = None
-    apart: bool = False
-
-    def __str__(self) -> str:
-        return f"{self.number} {self.fault}"
 
 
 @dataclass(frozen=True)
@@ -91,14 +57,14 @@ class Faults:
         pace: simulated seconds of the vehicle per second of the faults' clock; 0 while it is frozen.
     """
 
-    def __init__(self, vehicle: Vehicle, seed: int, on_event: Callable[[str], None]) -> None:
+    def __init__(self, vehicle: FaultTarget, seed: int, on_event: Callable[[str], None]) -> None:
         self.vehicle = vehicle
         self._on_event = on_event
         self.deaf = False
         self.gates: dict[int, Gate] = {}
         self.refusals: dict[int, Refusal] = {}
         self.boot_offset_us = 0
-        self.second: dict[int, Vehicle] = {}
+        self.second: dict[int, FaultTarget] = {}
         self.winds: dict[int, Vector] = {}
         self.pace = 1.0
         self._seed = seed

@@ -9,16 +9,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import TYPE_CHECKING, Any
 
 from mavlink_sim.flight.position_control import NAN, NOTHING, TrajectorySetpoint
 from mavlink_sim.flight.tasks import Task, Trajectory
 from mavlink_sim.physics.airframe import Multirotor, Vector
 from mavlink_sim.px4.parameters import Parameters
-from mavlink_sim.wire.messages import dialect
-
-if TYPE_CHECKING:
-    from mavlink_sim.vehicle import Vehicle
 
 MIN_RADIUS_M = 1.0
 MAX_CENTRIPETAL_MPS2 = 2.0
@@ -228,20 +223,3 @@ class _Heading:
         self._rate += min(max(math.copysign(rate, left) - self._rate, -change), change)
         self.yaw_rad = math.remainder(self.yaw_rad + self._rate * dt_s, math.tau)
         return self.yaw_rad, self._rate
-
-
-def orbit_execution_status(vehicle: Vehicle) -> Any:
-    """ORBIT_EXECUTION_STATUS (360) while an orbit is flown, else None. Radius positive: clockwise."""
-    task = vehicle.autopilot.task
-    if not isinstance(task, Orbit) or task.refused:
-        return None
-    north, east, _ = task.centre
-    latitude, longitude, altitude = vehicle.local_frame.geographic((north, east, task.down_m))
-    return dialect.MAVLink_orbit_execution_status_message(
-        vehicle.boot_us,
-        math.copysign(task.radius_m, task.speed_mps),
-        0,
-        round(latitude * 1e7),
-        round(longitude * 1e7),
-        altitude,
-    )

@@ -4,23 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
 
 from mavlink_sim.autopilot.commander import ACCEPTED, TEMPORARILY_REJECTED
 from mavlink_sim.flight.orbit import OrbitRequest
+from mavlink_sim.physics.airframe import Vector
 from mavlink_sim.px4.modes import CUSTOM_MODE_ENABLED, Mode, mode_of
 from mavlink_sim.services import gimbal_protocol, parameter_protocol
+from mavlink_sim.services.context import ServiceContext
 from mavlink_sim.services.mission_start import mission_start
 from mavlink_sim.services.system_streams import available_modes
 from mavlink_sim.services.telemetry import MESSAGE_IDS
 from mavlink_sim.wire.announcements import CRITICAL, Text
+from mavlink_sim.wire.commands import Command
+from mavlink_sim.wire.links import Link
 from mavlink_sim.wire.messages import dialect, protocol_version
-
-if TYPE_CHECKING:
-    from mavlink_sim.physics.airframe import Vector
-    from mavlink_sim.services.links import Link
-    from mavlink_sim.vehicle import Vehicle
 
 DENIED = 2  # MAV_RESULT
 UNSUPPORTED = 3
@@ -30,8 +27,6 @@ FORCE_DISARM = 21196
 SPEED_TYPE_GROUNDSPEED = 1
 MAX_ALTITUDE_M = 100_000.0
 MAX_INTERVAL_US = 2**31 - 1  # MESSAGE_INTERVAL carries an int32
-NOT_GIVEN = 2**31 - 1  # x and y of COMMAND_INT
-NAN_AS_INTEGER = 0x7FF80000
 GROUND_STATION_COMPONENT = 190  # MAV_COMP_ID_MISSIONPLANNER
 
 NAV_RETURN_TO_LAUNCH = 20
@@ -53,35 +48,7 @@ AVAILABLE_MODES = 435  # the same with the index of a mode, 0 for all
 _TESTED_FUNCTIONS = (range(1, 13), range(33, 41), range(1000, 2**31))
 
 
-@dataclass(frozen=True, slots=True)
-class Command:
-    """A command; of its parameters, 5 and 6 are latitude and longitude in degrees, 7 is AMSL metres."""
-
-    identifier: int
-    parameters: tuple[float, float, float, float, float, float, float]
-    source_component: int
-    source_system: int = 0
-
-
-def command_of(message: Any) -> Command:
-    """The command of a COMMAND_LONG or COMMAND_INT message."""
-    if message.get_type() == "COMMAND_INT":
-        # both INT32_MAX: "not given", as NaN in COMMAND_LONG. PX4 looks at no frame, z is AMSL in all of them
-        given = (message.x, message.y) != (NOT_GIVEN, NOT_GIVEN)
-        place = (message.x / 1e7, message.y / 1e7) if given else (math.nan, math.nan)
-        tail = (*place, message.z)
-    else:
-        tail = (message.param5, message.param6, message.param7)
-    head = (message.param1, message.param2, message.param3, message.param4)
-    return Command(int(message.command), head + tail, message.get_srcComponent(), message.get_srcSystem())
-
-
-def is_misencoded(message: Any) -> bool:
-    """A COMMAND_INT whose place is a float's NaN put into integers by accident: PX4 denies it."""
-    return message.get_type() == "COMMAND_INT" and (message.x, message.y) == (NAN_AS_INTEGER, NAN_AS_INTEGER)
-
-
-def execute(vehicle: Vehicle, link: Link, command: Command) -> int | None:
+def execute(vehicle: ServiceContext, link: Link, command: Command) -> int | None:
     """Carry out a command. Returns its MAV_RESULT, None where PX4 answers nothing at all."""
     if command.identifier == 0:
         return None
@@ -91,7 +58,7 @@ def execute(vehicle: Vehicle, link: Link, command: Command) -> int | None:
     return UNSUPPORTED if handler is None else handler(vehicle, link, command)
 
 
-def _arm(vehicle: Vehicle, link: Link, command: Command) -> int | None:
+def _arm(vehicle: ServiceContext, link: Link, command: Command) -> int | None:
     wanted, force = command.parameters[:2]
     action = _nearest(wanted) & 0xFF  # PX4 keeps it in a byte
     if action == 1:
@@ -102,7 +69,7 @@ def _arm(vehicle: Vehicle, link: Link, command: Command) -> int | None:
     return None  # it says so in words, and PX4 does not answer
 
 
-def _do_set_mode(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _do_set_mode(vehicle: ServiceContext, link: Link, command: Command) -> int:
     autopilot = vehicle.autopilot
     base, main, sub = command.parameters[:3]
     if not all(map(math.isfinite, (base, main, sub))) or not int(base) & CUSTOM_MODE_ENABLED:
@@ -116,7 +83,7 @@ def _do_set_mode(vehicle: Vehicle, link: Link, command: Command) -> int:
     return autopilot.set_mode(mode, tell=command.source_component == GROUND_STATION_COMPONENT)
 
 
-def _takeoff(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _takeoff(vehicle: ServiceContext, link: Link, command: Command) -> int:
     altitude = command.parameters[6]
     if not math.isfinite(altitude):
         return vehicle.autopilot.takeoff(None)
@@ -125,15 +92,15 @@ def _takeoff(vehicle: Vehicle, link: Link, command: Command) -> int:
     return vehicle.autopilot.takeoff(altitude - home_altitude)
 
 
-def _land(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _land(vehicle: ServiceContext, link: Link, command: Command) -> int:
     return vehicle.autopilot.land()
 
 
-def _return_to_launch(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _return_to_launch(vehicle: ServiceContext, link: Link, command: Command) -> int:
     return vehicle.autopilot.return_home()
 
 
-def _reposition(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _reposition(vehicle: ServiceContext, link: Link, command: Command) -> int:
     speed, flags, _, yaw = command.parameters[:4]
     goal = _place(vehicle, *command.parameters[4:7])
     # MAV_DO_REPOSITION_FLAGS_CHANGE_MODE, and no other: the commander refuses the rest. The navigator of PX4
@@ -144,24 +111,24 @@ def _reposition(vehicle: Vehicle, link: Link, command: Command) -> int:
     return UNSUPPORTED
 
 
-def _change_altitude(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _change_altitude(vehicle: ServiceContext, link: Link, command: Command) -> int:
     altitude = command.parameters[0]  # AMSL; PX4 looks at no frame here either
     return vehicle.autopilot.reposition(_place(vehicle, math.nan, math.nan, altitude), math.nan)
 
 
-def _change_speed(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _change_speed(vehicle: ServiceContext, link: Link, command: Command) -> int:
     kind, speed = command.parameters[:2]
     vehicle.autopilot.change_speed(speed, at_once=_identifier(kind) == SPEED_TYPE_GROUNDSPEED)
     return ACCEPTED
 
 
-def _orbit(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _orbit(vehicle: ServiceContext, link: Link, command: Command) -> int:
     radius, speed, yaw_behaviour = command.parameters[:3]
     centre = _place(vehicle, *command.parameters[4:7])
     return vehicle.autopilot.orbit(OrbitRequest(radius, speed, yaw_behaviour, centre))
 
 
-def _place(vehicle: Vehicle, latitude_deg: float, longitude_deg: float, altitude_m: float) -> Vector:
+def _place(vehicle: ServiceContext, latitude_deg: float, longitude_deg: float, altitude_m: float) -> Vector:
     """Local NED, NaN for what is no number. PX4 takes a place not on Earth too; here it lies at the edge."""
     return vehicle.local_frame.local(
         _within(latitude_deg, 90.0), _within(longitude_deg, 180.0), _within(altitude_m, MAX_ALTITUDE_M)
@@ -172,21 +139,21 @@ def _within(value: float, limit: float) -> float:
     return min(max(value, -limit), limit) if math.isfinite(value) else math.nan
 
 
-def _accept(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _accept(vehicle: ServiceContext, link: Link, command: Command) -> int:
     return ACCEPTED
 
 
-def _run_prearm_checks(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _run_prearm_checks(vehicle: ServiceContext, link: Link, command: Command) -> int:
     if not vehicle.autopilot.armed:
         vehicle.autopilot.report_checks()
     return ACCEPTED
 
 
-def _mission_start(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _mission_start(vehicle: ServiceContext, link: Link, command: Command) -> int:
     return mission_start(vehicle.autopilot, command.parameters[0])
 
 
-def _set_home(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _set_home(vehicle: ServiceContext, link: Link, command: Command) -> int:
     autopilot, estimate = vehicle.autopilot, vehicle.estimate
     use_current, *attitude_deg = command.parameters[:4]
     place = command.parameters[4:7]
@@ -205,16 +172,16 @@ def _set_home(vehicle: Vehicle, link: Link, command: Command) -> int:
     return ACCEPTED
 
 
-def _flight_termination(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _flight_termination(vehicle: ServiceContext, link: Link, command: Command) -> int:
     # CBRK_FLIGHTTERM is engaged on this vehicle: a termination is accepted and has no effect
     return ACCEPTED if command.parameters[0] > 0.5 else DENIED
 
 
-def _preflight_storage(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _preflight_storage(vehicle: ServiceContext, link: Link, command: Command) -> int:
     return parameter_protocol.reset(vehicle, command.parameters[0])
 
 
-def _request_message(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _request_message(vehicle: ServiceContext, link: Link, command: Command) -> int:
     if _identifier(command.parameters[0]) == MESSAGE_INTERVAL:
         return _send_interval(vehicle, link, command.parameters[1])
     if _identifier(command.parameters[0]) == AVAILABLE_MODES:
@@ -228,11 +195,11 @@ def _request_message(vehicle: Vehicle, link: Link, command: Command) -> int:
     return ACCEPTED
 
 
-def _get_home_position(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _get_home_position(vehicle: ServiceContext, link: Link, command: Command) -> int:
     return ACCEPTED if vehicle.send_built(link, "HOME_POSITION") else DENIED
 
 
-def _actuator_test(vehicle: Vehicle, link: Link, command: Command) -> int | None:
+def _actuator_test(vehicle: ServiceContext, link: Link, command: Command) -> int | None:
     """No actuator moves. A function that PX4 does not have is not answered."""
     if vehicle.autopilot.armed or vehicle.parameters.number("COM_MOT_TEST_EN") != 1:
         return DENIED
@@ -240,34 +207,34 @@ def _actuator_test(vehicle: Vehicle, link: Link, command: Command) -> int | None
     return ACCEPTED if any(function in known for known in _TESTED_FUNCTIONS) else None
 
 
-def _calibrate(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _calibrate(vehicle: ServiceContext, link: Link, command: Command) -> int:
     """All zero asks for nothing, and ends a calibration; there is none here."""
     if vehicle.autopilot.armed:
         return TEMPORARILY_REJECTED
     return UNSUPPORTED if any(command.parameters) else ACCEPTED
 
 
-def _reboot(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _reboot(vehicle: ServiceContext, link: Link, command: Command) -> int:
     return UNSUPPORTED if any(command.parameters) else ACCEPTED
 
 
-def _silence(vehicle: Vehicle, link: Link, command: Command) -> None:
+def _silence(vehicle: ServiceContext, link: Link, command: Command) -> None:
     """Commander leaves it to a part of PX4 that is not there."""
 
 
-def _request_capabilities(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _request_capabilities(vehicle: ServiceContext, link: Link, command: Command) -> int:
     if command.parameters[0] != 1.0:
         return DENIED
     vehicle.send_built(link, "AUTOPILOT_VERSION")
     return ACCEPTED
 
 
-def _request_protocol_version(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _request_protocol_version(vehicle: ServiceContext, link: Link, command: Command) -> int:
     link.send(protocol_version())
     return ACCEPTED
 
 
-def _set_message_interval(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _set_message_interval(vehicle: ServiceContext, link: Link, command: Command) -> int:
     name = MESSAGE_IDS.get(_identifier(command.parameters[0]))
     interval = command.parameters[1]
     if name is None or name == "HEARTBEAT" or name not in link.streams or not math.isfinite(interval):
@@ -278,11 +245,11 @@ def _set_message_interval(vehicle: Vehicle, link: Link, command: Command) -> int
     return ACCEPTED
 
 
-def _get_message_interval(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _get_message_interval(vehicle: ServiceContext, link: Link, command: Command) -> int:
     return _send_interval(vehicle, link, command.parameters[0])
 
 
-def _send_interval(vehicle: Vehicle, link: Link, message_id: float) -> int:
+def _send_interval(vehicle: ServiceContext, link: Link, message_id: float) -> int:
     identifier = _identifier(message_id)
     name = MESSAGE_IDS.get(identifier)
     interval = -1 if name is None else link.streams.interval_us(name)  # -1: no such stream, or off
@@ -299,7 +266,7 @@ def _nearest(value: float) -> int:
     return math.floor(abs(value) + 0.5) * (1 if value > 0.0 else -1) if math.isfinite(value) else 0
 
 
-_HANDLERS: dict[int, Callable[[Vehicle, Link, Command], int | None]] = {
+_HANDLERS: dict[int, Callable[[ServiceContext, Link, Command], int | None]] = {
     NAV_RETURN_TO_LAUNCH: _return_to_launch,
     NAV_LAND: _land,
     NAV_TAKEOFF: _takeoff,

@@ -6,15 +6,12 @@ import struct
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from pymavlink.generator.mavcrc import x25crc
 
+from mavlink_sim.wire.links import Link
 from mavlink_sim.wire.messages import event, event_error
-
-if TYPE_CHECKING:
-    from mavlink_sim.services.links import Link
-    from mavlink_sim.vehicle import Vehicle
 
 EVENTS_KEPT = 20  # the size of PX4's event buffer
 REQUEST_EVENT_CRC_EXTRA = 33
@@ -58,7 +55,14 @@ class EventBuffer:
         return (sequence + min(ahead)) & 0xFFFF if ahead else self.sequence
 
 
-def request(vehicle: Vehicle, link: Link, message: Any) -> None:
+class EventContext(Protocol):
+    """What the events interface uses of a vehicle. `events`: the newest ones."""
+
+    system_id: int
+    events: EventBuffer
+
+
+def request(vehicle: EventContext, link: Link, message: Any) -> None:
     """REQUEST_EVENT, unknown to pymavlink's dialects: the events again, or why they cannot be had.
 
     The range may run over 65535. More than 65535 errors nobody asks for: the answers end with the first

@@ -13,14 +13,11 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from mavlink_sim.services.file_system import FileSystem
+from mavlink_sim.wire.links import Link
 from mavlink_sim.wire.messages import dialect
-
-if TYPE_CHECKING:
-    from mavlink_sim.services.links import Link
-    from mavlink_sim.vehicle import Vehicle
 
 logger = logging.getLogger(__name__)
 
@@ -357,7 +354,17 @@ _HANDLERS: dict[int, Callable[[Server, Packet], tuple[int, bytes]]] = {
 }
 
 
-def handle(vehicle: Vehicle, link: Link, message: Any) -> None:
+class FileContext(Protocol):
+    """What MAVLink FTP uses of a vehicle. `files`: what it reaches."""
+
+    files: FileSystem
+
+    @property
+    def now_s(self) -> float:
+        """Seconds since boot."""
+
+
+def handle(vehicle: FileContext, link: Link, message: Any) -> None:
     """FILE_TRANSFER_PROTOCOL from a client."""
     if link.file_transfer is None:
         link.file_transfer = Server(vehicle.files)

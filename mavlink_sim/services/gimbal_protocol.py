@@ -8,18 +8,20 @@ its number is 1 and its messages come from there. One component has primary cont
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
+from mavlink_sim.autopilot.commander import Autopilot
 from mavlink_sim.flight.position_control import NAN
+from mavlink_sim.physics.airframe import Multirotor
+from mavlink_sim.physics.estimate_errors import FallibleEstimate
+from mavlink_sim.physics.geography import LocalFrame
 from mavlink_sim.physics.gimbal import Aim, Gimbal, Target
+from mavlink_sim.px4.parameters import Parameters
+from mavlink_sim.wire.announcements import GimbalCommand
+from mavlink_sim.wire.commands import Command
+from mavlink_sim.wire.links import Link
 from mavlink_sim.wire.messages import dialect
 from vision.attitude import euler_from_quaternion
-
-if TYPE_CHECKING:
-    from mavlink_sim.services.commands import Command
-    from mavlink_sim.services.links import Link
-    from mavlink_sim.vehicle import Vehicle
-    from mavlink_sim.wire.announcements import GimbalCommand
 
 ACCEPTED, DENIED, UNSUPPORTED = 0, 2, 3  # MAV_RESULT
 DEVICE = 1  # gimbal_device_id: implemented by the autopilot's component
@@ -38,6 +40,29 @@ POINTS_AT_GLOBAL_LOCATION = 131072  # GIMBAL_MANAGER_CAP_FLAGS
 UNCHANGED, ITSELF, RELEASED = -1, -2, -3  # of DO_GIMBAL_MANAGER_CONFIGURE
 
 
+class GimbalContext(Protocol):
+    """What the gimbal protocol uses of a vehicle.
+
+    Attributes:
+        gimbal_manager: None without a gimbal. airframe: the motion (truth). estimate: the vehicle's estimate.
+    """
+
+    system_id: int
+    parameters: Parameters
+    autopilot: Autopilot
+    airframe: Multirotor
+    estimate: FallibleEstimate
+    local_frame: LocalFrame
+    gimbal_manager: GimbalManager | None
+
+    @property
+    def boot_ms(self) -> int: ...
+
+    @property
+    def quaternion(self) -> tuple[float, float, float, float]:
+        """The true `ned_from_body`, (w, x, y, z)."""
+
+
 class GimbalManager:
     """Who may move the gimbal, and what they asked for.
 
@@ -47,7 +72,7 @@ class GimbalManager:
         flags: GIMBAL_MANAGER_FLAGS of the newest aim.
     """
 
-    def __init__(self, vehicle: Vehicle) -> None:
+    def __init__(self, vehicle: GimbalContext) -> None:
         self._vehicle = vehicle
         self.gimbal = Gimbal(vehicle.parameters)
         self.primary = (0, 0)
@@ -118,7 +143,7 @@ def _pitch_and_yaw(values: tuple[float, ...], flags: int) -> Target:
 # ---- commands -------------------------------------------------------------------------------------------
 
 
-def configure(vehicle: Vehicle, link: Link, command: Command) -> int | None:
+def configure(vehicle: GimbalContext, link: Link, command: Command) -> int | None:
     """DO_GIMBAL_MANAGER_CONFIGURE. Without a gimbal nobody answers, as in PX4."""
     manager = vehicle.gimbal_manager
     if manager is None:
@@ -128,7 +153,7 @@ def configure(vehicle: Vehicle, link: Link, command: Command) -> int | None:
     return ACCEPTED
 
 
-def pitchyaw(vehicle: Vehicle, link: Link, command: Command) -> int | None:
+def pitchyaw(vehicle: GimbalContext, link: Link, command: Command) -> int | None:
     """DO_GIMBAL_MANAGER_PITCHYAW: denied to all but the one in control."""
     manager = vehicle.gimbal_manager
     if manager is None:
@@ -140,7 +165,7 @@ def pitchyaw(vehicle: Vehicle, link: Link, command: Command) -> int | None:
     return ACCEPTED
 
 
-def set_roi_location(vehicle: Vehicle, link: Link, command: Command) -> int:
+def set_roi_location(vehicle: GimbalContext, link: Link, command: Command) -> int:
     """DO_SET_ROI_LOCATION: accepted with or without a gimbal; latitude, longitude, AMSL metres."""
     latitude, longitude, altitude = command.parameters[4:7]
     if not all(map(math.isfinite, (latitude, longitude, altitude))):
@@ -152,14 +177,14 @@ def set_roi_location(vehicle: Vehicle, link: Link, command: Command) -> int:
     return ACCEPTED
 
 
-def set_roi_none(vehicle: Vehicle, link: Link, command: Command) -> int:
+def set_roi_none(vehicle: GimbalContext, link: Link, command: Command) -> int:
     """DO_SET_ROI_NONE: look ahead again."""
     if vehicle.gimbal_manager is not None:
         vehicle.gimbal_manager.look_ahead()
     return ACCEPTED
 
 
-def set_roi(vehicle: Vehicle, link: Link, command: Command) -> int:
+def set_roi(vehicle: GimbalContext, link: Link, command: Command) -> int:
     """DO_SET_ROI, the old form of both."""
     kind = _whole(command.parameters[0])
     if kind == ROI_LOCATION:
@@ -170,7 +195,7 @@ def set_roi(vehicle: Vehicle, link: Link, command: Command) -> int:
 # ---- messages -------------------------------------------------------------------------------------------
 
 
-def _in_control(vehicle: Vehicle, message: Any) -> GimbalManager | None:
+def _in_control(vehicle: GimbalContext, message: Any) -> GimbalManager | None:
     """The manager, if the sender may move this gimbal."""
     manager = vehicle.gimbal_manager
     if manager is None or message.gimbal_device_id not in (0, DEVICE):
@@ -178,7 +203,7 @@ def _in_control(vehicle: Vehicle, message: Any) -> GimbalManager | None:
     return manager if (message.get_srcSystem(), message.get_srcComponent()) == manager.primary else None
 
 
-def set_attitude(vehicle: Vehicle, link: Link, message: Any) -> None:
+def set_attitude(vehicle: GimbalContext, link: Link, message: Any) -> None:
     """GIMBAL_MANAGER_SET_ATTITUDE (282): a quaternion, of which roll is left out, and rates."""
     manager = _in_control(vehicle, message)
     if manager is None:
@@ -190,14 +215,14 @@ def set_attitude(vehicle: Vehicle, link: Link, message: Any) -> None:
     _aim(manager, flags, pitch, yaw, message.angular_velocity_y, message.angular_velocity_z)
 
 
-def set_pitchyaw(vehicle: Vehicle, link: Link, message: Any) -> None:
+def set_pitchyaw(vehicle: GimbalContext, link: Link, message: Any) -> None:
     """GIMBAL_MANAGER_SET_PITCHYAW (287), radians. (PX4 itself takes the command of that name alone.)"""
     manager = _in_control(vehicle, message)
     if manager is not None:
         _aim(manager, int(message.flags), message.pitch, message.yaw, message.pitch_rate, message.yaw_rate)
 
 
-def set_manual_control(vehicle: Vehicle, link: Link, message: Any) -> None:
+def set_manual_control(vehicle: GimbalContext, link: Link, message: Any) -> None:
     """GIMBAL_MANAGER_SET_MANUAL_CONTROL (288): rates are shares, -1..1, of MNT_RATE_PITCH and _YAW."""
     manager = _in_control(vehicle, message)
     if manager is None:
@@ -226,7 +251,7 @@ def _aim(
 # ---- what the vehicle tells -----------------------------------------------------------------------------
 
 
-def manager_information(vehicle: Vehicle) -> Any:
+def manager_information(vehicle: GimbalContext) -> Any:
     """GIMBAL_MANAGER_INFORMATION; None without a gimbal."""
     manager = vehicle.gimbal_manager
     if manager is None:
@@ -249,7 +274,7 @@ def _limits(gimbal: Gimbal) -> tuple[float, float, float, float, float, float]:
     return (0.0, 0.0, gimbal.lowest_rad, gimbal.highest_rad, -furthest, furthest)
 
 
-def manager_status(vehicle: Vehicle) -> Any:
+def manager_status(vehicle: GimbalContext) -> Any:
     """GIMBAL_MANAGER_STATUS; None without a gimbal."""
     manager = vehicle.gimbal_manager
     if manager is None:
@@ -259,7 +284,7 @@ def manager_status(vehicle: Vehicle) -> Any:
     )
 
 
-def device_information(vehicle: Vehicle) -> Any:
+def device_information(vehicle: GimbalContext) -> Any:
     """GIMBAL_DEVICE_INFORMATION; None without a gimbal."""
     manager = vehicle.gimbal_manager
     if manager is None:
@@ -279,7 +304,7 @@ def device_information(vehicle: Vehicle) -> Any:
     )
 
 
-def device_attitude_status(vehicle: Vehicle) -> Any:
+def device_attitude_status(vehicle: GimbalContext) -> Any:
     """GIMBAL_DEVICE_ATTITUDE_STATUS: the attitude against north; None without a gimbal."""
     manager = vehicle.gimbal_manager
     if manager is None:
@@ -299,7 +324,7 @@ def device_attitude_status(vehicle: Vehicle) -> Any:
     )
 
 
-def mount_orientation(vehicle: Vehicle) -> Any:
+def mount_orientation(vehicle: GimbalContext) -> Any:
     """MOUNT_ORIENTATION, in degrees; None without a gimbal."""
     manager = vehicle.gimbal_manager
     if manager is None:

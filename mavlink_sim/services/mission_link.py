@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mavlink_sim.flight.precision_landing import LandingTarget
 from mavlink_sim.missions import items as mission_items
 from mavlink_sim.missions.items import MissionItem
 from mavlink_sim.missions.navigator import Reached, goes_to_camera
 from mavlink_sim.services import commands
-from mavlink_sim.services.links import AUTOPILOT_COMPONENT
+from mavlink_sim.services.context import ServiceContext
 from mavlink_sim.services.mission_messages import mission_current
 from mavlink_sim.wire.announcements import CRITICAL, Text
+from mavlink_sim.wire.commands import Command
+from mavlink_sim.wire.links import AUTOPILOT_COMPONENT, Link
 from mavlink_sim.wire.messages import dialect
-
-if TYPE_CHECKING:
-    from mavlink_sim.services.links import Link
-    from mavlink_sim.vehicle import Vehicle
 
 CAMERA_COMPONENT = 100  # MAV_COMP_ID_CAMERA
 LOCAL_NED = 1  # MAV_FRAME_LOCAL_NED
@@ -27,7 +25,7 @@ MAX_PLACE_M = 1e6
 _SHOOT = (0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0)
 
 
-def update(vehicle: Vehicle) -> None:
+def update(vehicle: ServiceContext) -> None:
     """Tell the links what happened in this step, send commands on, look after transfers."""
     navigator = vehicle.autopilot.navigator
     while navigator.announcements:
@@ -48,7 +46,7 @@ def update(vehicle: Vehicle) -> None:
         session.update()
 
 
-def _carry_out(vehicle: Vehicle, item: MissionItem) -> None:
+def _carry_out(vehicle: ServiceContext, item: MissionItem) -> None:
     """An item that is a command: told on every link, as PX4 does, and obeyed if it is the vehicle's own."""
     command, values = item.command, item.parameters
     if item.frame != mission_items.FRAME_MISSION:
@@ -64,14 +62,14 @@ def _carry_out(vehicle: Vehicle, item: MissionItem) -> None:
     for link in vehicle.links.values():
         link.send(dialect.MAVLink_command_long_message(vehicle.system_id, target, command, 0, *values))
     if target == 0 and vehicle.links:
-        own = commands.Command(command, values, AUTOPILOT_COMPONENT)
+        own = Command(command, values, AUTOPILOT_COMPONENT)
         commands.execute(vehicle, next(iter(vehicle.links.values())), own)
 
 
 # ---- messages ---------------------------------------------------------------------------------------------
 
 
-def landing_target(vehicle: Vehicle, link: Link, message: Any) -> None:
+def landing_target(vehicle: ServiceContext, link: Link, message: Any) -> None:
     """LANDING_TARGET. PX4 takes a position in LOCAL_NED; angles are for an infrared beacon's estimator."""
     if not message.position_valid:
         return
@@ -84,7 +82,7 @@ def landing_target(vehicle: Vehicle, link: Link, message: Any) -> None:
         vehicle.autopilot.navigator.target = LandingTarget(place, vehicle.autopilot.now_s)
 
 
-def obstacle_distance(vehicle: Vehicle, link: Link, message: Any) -> None:
+def obstacle_distance(vehicle: ServiceContext, link: Link, message: Any) -> None:
     """OBSTACLE_DISTANCE, for collision prevention."""
     increment = message.increment_f if message.increment_f > 0.0 else float(message.increment)
     try:

@@ -7,13 +7,11 @@ see them, one with a newer dialect does.
 from __future__ import annotations
 
 import struct
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mavlink_sim.missions.items import PlanType
+from mavlink_sim.services.context import ServiceContext
 from mavlink_sim.wire.messages import dialect
-
-if TYPE_CHECKING:
-    from mavlink_sim.vehicle import Vehicle
 
 NO_MISSION_TOTAL = 65535
 
@@ -82,7 +80,7 @@ class MissionCurrent(dialect.MAVLink_mission_current_message):  # type: ignore[m
         return packed
 
 
-def mission_current(vehicle: Vehicle) -> MissionCurrent:
+def mission_current(vehicle: ServiceContext) -> MissionCurrent:
     """MISSION_CURRENT as it is now."""
     navigator = vehicle.autopilot.navigator
     mission, plans = navigator.mission, navigator.plans

@@ -8,18 +8,16 @@ from __future__ import annotations
 
 import enum
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mavlink_sim.missions import items as mission_items
 from mavlink_sim.missions.items import ItemRejectedError, MissionItem, PlanType
 from mavlink_sim.missions.plan import Plan
+from mavlink_sim.services.context import ServiceContext
 from mavlink_sim.services.mission_messages import MissionAck, MissionCount
 from mavlink_sim.wire.announcements import CRITICAL, INFO, Text
+from mavlink_sim.wire.links import Link
 from mavlink_sim.wire.messages import dialect
-
-if TYPE_CHECKING:
-    from mavlink_sim.services.links import Link
-    from mavlink_sim.vehicle import Vehicle
 
 RETRY_S = 0.25  # MAVLINK_MISSION_RETRY_TIMEOUT_DEFAULT
 TIMEOUT_S = 5.0  # MAVLINK_MISSION_PROTOCOL_TIMEOUT_DEFAULT
@@ -45,7 +43,7 @@ class Session:
         partner: (system, component) the transfer is or was with.
     """
 
-    def __init__(self, vehicle: Vehicle, link: Link) -> None:
+    def __init__(self, vehicle: ServiceContext, link: Link) -> None:
         self._vehicle = vehicle
         self._navigator = vehicle.autopilot.navigator
         self._link = link
@@ -300,7 +298,7 @@ def _plan_type(message: Any) -> int:
     return int(getattr(message, "mission_type", 0))
 
 
-def session_of(vehicle: Vehicle, link: Link) -> Session:
+def session_of(vehicle: ServiceContext, link: Link) -> Session:
     """The session of a link, made when it is first needed."""
     sessions: dict[str, Session] = vehicle.autopilot.navigator.sessions
     if link.name not in sessions:
@@ -321,7 +319,7 @@ _STEPS = {
 }
 
 
-def handle(vehicle: Vehicle, link: Link, message: Any) -> None:
+def handle(vehicle: ServiceContext, link: Link, message: Any) -> None:
     """Take in any message of the mission protocol that names this vehicle."""
     if message.target_system == vehicle.system_id:  # PX4 takes no broadcasts here
         _STEPS[message.get_type()](session_of(vehicle, link), message)

@@ -6,7 +6,7 @@ import logging
 from collections import deque
 from collections.abc import Iterable
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mavlink_sim.px4.parameters import (
     HASH_CHECK,
@@ -18,11 +18,9 @@ from mavlink_sim.px4.parameters import (
     Parameters,
     decode_wire_value,
 )
+from mavlink_sim.services.context import ServiceContext
+from mavlink_sim.wire.links import Link
 from mavlink_sim.wire.messages import dialect
-
-if TYPE_CHECKING:
-    from mavlink_sim.services.links import Link
-    from mavlink_sim.vehicle import Vehicle
 
 logger = logging.getLogger(__name__)
 
@@ -40,12 +38,12 @@ TEMPORARILY_REJECTED = 1
 UNSUPPORTED = 3
 
 
-def request_list(vehicle: Vehicle, link: Link, message: Any) -> None:
+def request_list(vehicle: ServiceContext, link: Link, message: Any) -> None:
     """PARAM_REQUEST_LIST: the hash, then every parameter at about a thousand a second."""
     vehicle.after(FIRST_ANSWER_S, partial(_begin_list, vehicle, link))
 
 
-def _begin_list(vehicle: Vehicle, link: Link) -> None:
+def _begin_list(vehicle: ServiceContext, link: Link) -> None:
     if not link.parameters_left:  # a list asked for while one runs begins anew without the hash
         _send_hash(link, vehicle.parameters)
     link.parameters_left = deque(vehicle.parameters)
@@ -60,7 +58,7 @@ def continue_list(link: Link, parameters: Parameters, dt_s: float) -> None:
         _send(link, parameters, parameters[link.parameters_left.popleft().name])
 
 
-def request_read(vehicle: Vehicle, link: Link, message: Any) -> None:
+def request_read(vehicle: ServiceContext, link: Link, message: Any) -> None:
     """PARAM_REQUEST_READ, by index or (index -1) by name."""
     index = int(message.param_index)
     name = _text_of(message.param_id)
@@ -74,7 +72,7 @@ def request_read(vehicle: Vehicle, link: Link, message: Any) -> None:
         _send(link, vehicle.parameters, parameter)
 
 
-def set_parameter(vehicle: Vehicle, link: Link, message: Any) -> None:
+def set_parameter(vehicle: ServiceContext, link: Link, message: Any) -> None:
     """PARAM_SET: the value at once, and where it changed once more on every link 15 ms later."""
     name = _text_of(message.param_id)
     if name == HASH_CHECK:
@@ -101,14 +99,14 @@ def set_parameter(vehicle: Vehicle, link: Link, message: Any) -> None:
         vehicle.after(SECOND_ECHO_S, partial(broadcast, vehicle, [name]))
 
 
-def broadcast(vehicle: Vehicle, names: Iterable[str]) -> None:
+def broadcast(vehicle: ServiceContext, names: Iterable[str]) -> None:
     """PARAM_VALUE of changed parameters on every link, as PX4 tells all its clients of a change."""
     for name in names:
         for link in vehicle.links.values():
             _send(link, vehicle.parameters, vehicle.parameters[name])
 
 
-def reset(vehicle: Vehicle, action: float) -> int:
+def reset(vehicle: ServiceContext, action: float) -> int:
     """PREFLIGHT_STORAGE (245), its MAV_RESULT: 2 and 4 reset the parameters; 0, 1 and 3 have nothing to do.
 
     A disarmed vehicle alone does it. PX4 answers no other action at all; it is refused here.

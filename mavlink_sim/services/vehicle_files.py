@@ -12,16 +12,14 @@ import lzma
 import struct
 from collections.abc import Callable, Iterable
 from functools import cache, partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mavlink_sim.px4.parameters import INT32, Parameter, Parameters, default_parameters, is_volatile
+from mavlink_sim.services.context import ServiceContext
 from mavlink_sim.services.file_system import FileSystem
 from mavlink_sim.services.file_transfer import checksum
 from mavlink_sim.wire.event_texts import events_metadata
 from mavlink_sim.wire.messages import component_metadata
-
-if TYPE_CHECKING:
-    from mavlink_sim.vehicle import Vehicle
 
 GENERAL = "etc/extras/component_general.json.xz"
 PARAMETERS = "etc/extras/parameters.json.xz"
@@ -136,7 +134,7 @@ def general_metadata() -> bytes:
     return _json({"version": 1, "metadataTypes": types})
 
 
-def metadata_message(vehicle: Vehicle) -> Any:
+def metadata_message(vehicle: ServiceContext) -> Any:
     """COMPONENT_METADATA: where the general metadata is."""
     return component_metadata(vehicle.boot_ms, checksum(general_metadata()), f"mftp://{GENERAL}")
 

@@ -12,11 +12,6 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from mavlink_sim.services.links import Link
-    from mavlink_sim.vehicle import Vehicle
 
 logger = logging.getLogger(__name__)
 
@@ -166,12 +161,3 @@ def _checksum_change(zeros: int) -> int:
         mixed = (mixed ^ (mixed << 4)) & 0xFF
         crc = (crc >> 8) ^ (mixed << 8) ^ (mixed << 3) ^ (mixed >> 4)
     return crc & 0xFFFF
-
-
-def setup_signing(vehicle: Vehicle, link: Link, message: Any) -> None:
-    """SETUP_SIGNING: PX4 takes a key on its USB port alone and tells nobody; elsewhere it is ignored."""
-    if not link.signing.is_usb:
-        logger.warning("SETUP_SIGNING on link %s is ignored: only the USB link takes a key", link.name)
-        return
-    link.signing.set_up(bytes(message.secret_key), int(message.initial_timestamp))
-    logger.info("link %s has a %s", link.name, "signing key" if link.signing.has_key else "key no more")

@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, Protocol
 
 from mavlink_sim.px4.parameters import Parameter
-from mavlink_sim.services.file_transfer import Server
 from mavlink_sim.wire.announcements import Text
 from mavlink_sim.wire.messages import Outgoing, dialect
 from mavlink_sim.wire.signing import Signing
@@ -19,6 +18,17 @@ GROUND_STATION_TIMEOUT_S = 2.5
 # PX4's CURRENT_MODE tells of its vehicle_status, which is published when it changes and every half second.
 STATUS_PERIOD_S = 0.5
 STATUS_TEXT_LENGTH = 50
+
+
+class FileServer(Protocol):
+    """A MAVLink FTP session with a client of the link (`services.file_transfer.Server`)."""
+
+    @property
+    def idle(self) -> bool: ...
+
+    def answer(self, payload: bytes, source: tuple[int, int], now_s: float) -> bytes | None: ...
+
+    def burst(self, now_s: float) -> list[tuple[tuple[int, int], bytes]]: ...
 
 
 class Link:
@@ -32,7 +42,7 @@ class Link:
         self.ground_station_seen_s = -math.inf
         self.parameters_left: deque[Parameter] = deque()
         self.parameter_credit = 0.0
-        self.file_transfer: Server | None = None  # made when somebody asks
+        self.file_transfer: FileServer | None = None  # made when somebody asks
         self.signing = Signing()
         self.tells_parameter_errors = True
         self.sent = 0
