@@ -8,10 +8,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mavlink_sim.ardupilot import streams
 from mavlink_sim.ardupilot.autopilot import FAILED
+from mavlink_sim.ardupilot.context import CopterContext
 from mavlink_sim.ardupilot.modes import CopterMode, mode_of
 from mavlink_sim.ardupilot.targets import GLOBAL_RELATIVE_ALT, GLOBAL_TERRAIN_ALT, GuidedTarget
 from mavlink_sim.autopilot.commander import ACCEPTED, TEMPORARILY_REJECTED
@@ -36,11 +37,8 @@ from mavlink_sim.services.commands import (
     UNSUPPORTED,
 )
 from mavlink_sim.wire.commands import Command, command_of
+from mavlink_sim.wire.links import Link
 from mavlink_sim.wire.messages import dialect
-
-if TYPE_CHECKING:
-    from mavlink_sim.ardupilot.copter import CopterVehicle
-    from mavlink_sim.wire.links import Link
 
 FORCE_ARM = 2989.0
 NAV_LOITER_UNLIM = 17
@@ -58,14 +56,14 @@ _ABOVE_HOME = (
 )
 
 
-def handle(vehicle: CopterVehicle, link: Link, message: Any) -> None:
+def handle(vehicle: CopterContext, link: Link, message: Any) -> None:
     """COMMAND_LONG or COMMAND_INT: carried out a moment later, then acknowledged to who sent it."""
     command = command_of(message)
     frame = int(getattr(message, "frame", GLOBAL_RELATIVE_ALT))
     vehicle.after(ANSWER_DELAY_S, partial(_answer, vehicle, link, message, command, frame))
 
 
-def _answer(vehicle: CopterVehicle, link: Link, message: Any, command: Command, frame: int) -> None:
+def _answer(vehicle: CopterContext, link: Link, message: Any, command: Command, frame: int) -> None:
     result = vehicle.faults.refuses(command.identifier, command.parameters)
     if result is None:
         handler = _HANDLERS.get(command.identifier)
@@ -81,13 +79,13 @@ def acknowledge(link: Link, message: Any, command: int, result: int) -> None:
     )
 
 
-def set_mode(vehicle: CopterVehicle, link: Link, message: Any) -> None:
+def set_mode(vehicle: CopterContext, link: Link, message: Any) -> None:
     """SET_MODE (11): its acknowledgement names the message's number, not DO_SET_MODE's."""
     result = _mode_result(vehicle, float(message.base_mode), float(message.custom_mode))
     acknowledge(link, message, 11, result)
 
 
-def _mode_result(vehicle: CopterVehicle, base: float, custom: float) -> int:
+def _mode_result(vehicle: CopterContext, base: float, custom: float) -> int:
     if not (math.isfinite(base) and math.isfinite(custom)) or not int(base) & CUSTOM_MODE_ENABLED:
         return DENIED
     mode = mode_of(int(custom))
@@ -97,11 +95,11 @@ def _mode_result(vehicle: CopterVehicle, base: float, custom: float) -> int:
     return vehicle.copter.request_mode(mode)
 
 
-def _do_set_mode(vehicle: CopterVehicle, link: Link, command: Command, frame: int) -> int:
+def _do_set_mode(vehicle: CopterContext, link: Link, command: Command, frame: int) -> int:
     return _mode_result(vehicle, *command.parameters[:2])
 
 
-def _arm(vehicle: CopterVehicle, link: Link, command: Command, frame: int) -> int:
+def _arm(vehicle: CopterContext, link: Link, command: Command, frame: int) -> int:
     arm, magic = command.parameters[:2]
     if arm == 1.0:
         if magic == FORCE_ARM and not vehicle.copter.armed:
@@ -113,7 +111,7 @@ def _arm(vehicle: CopterVehicle, link: Link, command: Command, frame: int) -> in
     return UNSUPPORTED
 
 
-def _takeoff(vehicle: CopterVehicle, link: Link, command: Command, frame: int) -> int:
+def _takeoff(vehicle: CopterContext, link: Link, command: Command, frame: int) -> int:
     if frame not in (GLOBAL_RELATIVE_ALT, GLOBAL_RELATIVE_ALT_INT):
         return DENIED
     height = command.parameters[6]
@@ -124,7 +122,7 @@ def _to_mode(mode: CopterMode) -> Handler:
     return lambda vehicle, link, command, frame: vehicle.copter.request_mode(mode)
 
 
-def _condition_yaw(vehicle: CopterVehicle, link: Link, command: Command, frame: int) -> int:
+def _condition_yaw(vehicle: CopterContext, link: Link, command: Command, frame: int) -> int:
     angle, rate, direction, relative = command.parameters[:4]
     if not 0.0 <= angle <= 360.0 or relative not in (0.0, 1.0):
         return FAILED
@@ -138,7 +136,7 @@ def _condition_yaw(vehicle: CopterVehicle, link: Link, command: Command, frame: 
     return ACCEPTED
 
 
-def _change_speed(vehicle: CopterVehicle, link: Link, command: Command, frame: int) -> int:
+def _change_speed(vehicle: CopterContext, link: Link, command: Command, frame: int) -> int:
     """For GUIDED, RTL and LAND while they last; the vertical speeds go to what the loops fly by."""
     kind, speed = command.parameters[:2]
     if not 0.0 < speed < math.inf or kind not in (0.0, 1.0, 2.0, 3.0):
@@ -155,7 +153,7 @@ def _change_speed(vehicle: CopterVehicle, link: Link, command: Command, frame: i
     return ACCEPTED
 
 
-def _reposition(vehicle: CopterVehicle, link: Link, command: Command, frame: int) -> int:
+def _reposition(vehicle: CopterContext, link: Link, command: Command, frame: int) -> int:
     """DO_REPOSITION, as COMMAND_INT or COMMAND_LONG; changes to GUIDED only if its flag says so."""
     copter = vehicle.copter
     flags = command.parameters[1]
@@ -172,7 +170,7 @@ def _reposition(vehicle: CopterVehicle, link: Link, command: Command, frame: int
     return ACCEPTED
 
 
-def _pause_or_continue(vehicle: CopterVehicle, link: Link, command: Command, frame: int) -> int:
+def _pause_or_continue(vehicle: CopterContext, link: Link, command: Command, frame: int) -> int:
     """DO_PAUSE_CONTINUE, in GUIDED alone here."""
     guided, choice = vehicle.copter.guided, command.parameters[0]
     if choice not in (0.0, 1.0):
@@ -183,7 +181,7 @@ def _pause_or_continue(vehicle: CopterVehicle, link: Link, command: Command, fra
     return ACCEPTED
 
 
-def _place(vehicle: CopterVehicle, command: Command, frame: int) -> Vector | None:
+def _place(vehicle: CopterContext, command: Command, frame: int) -> Vector | None:
     latitude, longitude, altitude = command.parameters[4:7]
     if not (abs(latitude) <= 90.0 and abs(longitude) <= 180.0 and math.isfinite(altitude)):
         return None
@@ -192,7 +190,7 @@ def _place(vehicle: CopterVehicle, command: Command, frame: int) -> Vector | Non
     return vehicle.local_frame.local(latitude, longitude, altitude)
 
 
-def _set_home(vehicle: CopterVehicle, link: Link, command: Command, frame: int) -> int:
+def _set_home(vehicle: CopterContext, link: Link, command: Command, frame: int) -> int:
     here = command.parameters[0] == 1.0
     if here and not vehicle.copter.position_valid:
         return FAILED
@@ -205,14 +203,14 @@ def _set_home(vehicle: CopterVehicle, link: Link, command: Command, frame: int) 
     return ACCEPTED
 
 
-def _get_home(vehicle: CopterVehicle, link: Link, command: Command, frame: int) -> int:
+def _get_home(vehicle: CopterContext, link: Link, command: Command, frame: int) -> int:
     if not vehicle.copter.sensors_ready:
         return FAILED
     vehicle.send_soon(link, "HOME_POSITION")
     return ACCEPTED
 
 
-def _request_message(vehicle: CopterVehicle, link: Link, command: Command, frame: int) -> int:
+def _request_message(vehicle: CopterContext, link: Link, command: Command, frame: int) -> int:
     """The acknowledgement goes first, the message follows."""
     name = vehicle.message_named(command.parameters[0])
     if name is None:
@@ -221,14 +219,14 @@ def _request_message(vehicle: CopterVehicle, link: Link, command: Command, frame
     return ACCEPTED
 
 
-def _request_capabilities(vehicle: CopterVehicle, link: Link, command: Command, frame: int) -> int:
+def _request_capabilities(vehicle: CopterContext, link: Link, command: Command, frame: int) -> int:
     if command.parameters[0] != 1.0:
         return DENIED
     vehicle.send_soon(link, "AUTOPILOT_VERSION")
     return ACCEPTED
 
 
-def _set_message_interval(vehicle: CopterVehicle, link: Link, command: Command, frame: int) -> int:
+def _set_message_interval(vehicle: CopterContext, link: Link, command: Command, frame: int) -> int:
     name = vehicle.message_named(command.parameters[0])
     if name is None or name not in link.streams or not math.isfinite(command.parameters[1]):
         return FAILED
@@ -236,7 +234,7 @@ def _set_message_interval(vehicle: CopterVehicle, link: Link, command: Command, 
     return ACCEPTED
 
 
-def _get_message_interval(vehicle: CopterVehicle, link: Link, command: Command, frame: int) -> int:
+def _get_message_interval(vehicle: CopterContext, link: Link, command: Command, frame: int) -> int:
     name = vehicle.message_named(command.parameters[0])
     if name is None:
         return FAILED
@@ -245,20 +243,20 @@ def _get_message_interval(vehicle: CopterVehicle, link: Link, command: Command, 
     return ACCEPTED
 
 
-def _flight_termination(vehicle: CopterVehicle, link: Link, command: Command, frame: int) -> int:
+def _flight_termination(vehicle: CopterContext, link: Link, command: Command, frame: int) -> int:
     if not command.parameters[0] > 0.5:
         return FAILED
     return vehicle.copter.disarm(force=True)
 
 
-def _run_prearm_checks(vehicle: CopterVehicle, link: Link, command: Command, frame: int) -> int:
+def _run_prearm_checks(vehicle: CopterContext, link: Link, command: Command, frame: int) -> int:
     if vehicle.copter.armed:
         return TEMPORARILY_REJECTED
     vehicle.copter.send_prearm()
     return ACCEPTED
 
 
-Handler = Callable[["CopterVehicle", "Link", Command, int], int]
+Handler = Callable[[CopterContext, Link, Command, int], int]
 
 _HANDLERS: dict[int, Handler] = {
     NAV_LOITER_UNLIM: _to_mode(CopterMode.LOITER),

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from collections import deque
+from typing import Protocol
 
 from mavlink_sim.ardupilot.modes import WITHOUT_POSITION, CopterMode
+from mavlink_sim.autopilot.home import Home
 from mavlink_sim.physics.airframe import Vector
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.announcements import CRITICAL, Text
-
-if TYPE_CHECKING:
-    from mavlink_sim.ardupilot.autopilot import CopterAutopilot
 
 WARNING, NOTICE = 4, 5  # MAV_SEVERITY_WARNING, MAV_SEVERITY_NOTICE
 POSITION_LOST_S = 1.0
@@ -40,6 +39,32 @@ _FENCE_MODES = {
 _GOING_DOWN = (CopterMode.LAND, CopterMode.RTL)
 
 
+class FailsafeAutopilot(Protocol):
+    """What the failsafes use of the autopilot; see `autopilot.CopterAutopilot`."""
+
+    now_s: float
+    armed: bool
+    mode: CopterMode
+    failsafe: bool
+    position_valid: bool
+    home: Home
+    texts: deque[Text]
+
+    @property
+    def landed(self) -> bool: ...
+
+    @property
+    def position(self) -> Vector: ...
+
+    def disarm(self, force: bool = False, by: str = ...) -> int: ...
+
+    def change_mode(self, mode: CopterMode) -> None: ...
+
+    def restart_task(self) -> None: ...
+
+    def announce(self, line: str) -> None: ...
+
+
 class Failsafes:
     """What makes a Copter change its mode by itself.
 
@@ -47,7 +72,7 @@ class Failsafes:
         ground_station_seen_s: the newest heartbeat of SYSID_MYGCS. is_breached: outside the fence.
     """
 
-    def __init__(self, autopilot: CopterAutopilot, parameters: Parameters) -> None:
+    def __init__(self, autopilot: FailsafeAutopilot, parameters: Parameters) -> None:
         self._autopilot = autopilot
         self._parameters = parameters
         self.ground_station_seen_s = math.nan

@@ -9,15 +9,13 @@ from __future__ import annotations
 import logging
 from collections import deque
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mavlink_sim.ardupilot import streams
+from mavlink_sim.ardupilot.context import CopterContext
 from mavlink_sim.px4.parameters import Parameter
+from mavlink_sim.wire.links import Link
 from mavlink_sim.wire.messages import dialect
-
-if TYPE_CHECKING:
-    from mavlink_sim.ardupilot.copter import CopterVehicle
-    from mavlink_sim.wire.links import Link
 
 logger = logging.getLogger(__name__)
 
@@ -25,7 +23,7 @@ NO_INDEX = 65535
 FIRST_ANSWER_S = 0.01
 
 
-def request_list(vehicle: CopterVehicle, link: Link, message: Any) -> None:
+def request_list(vehicle: CopterContext, link: Link, message: Any) -> None:
     """PARAM_REQUEST_LIST: all of them in the order of their indices."""
 
     def begin() -> None:
@@ -35,7 +33,7 @@ def request_list(vehicle: CopterVehicle, link: Link, message: Any) -> None:
     vehicle.after(FIRST_ANSWER_S, begin)
 
 
-def request_read(vehicle: CopterVehicle, link: Link, message: Any) -> None:
+def request_read(vehicle: CopterContext, link: Link, message: Any) -> None:
     """PARAM_REQUEST_READ, by index or (index -1) by name."""
     index = int(message.param_index)
     parameters = vehicle.parameters
@@ -44,7 +42,7 @@ def request_read(vehicle: CopterVehicle, link: Link, message: Any) -> None:
         vehicle.after(0.0, partial(_tell, vehicle, link, parameter, index if index >= 0 else NO_INDEX))
 
 
-def set_parameter(vehicle: CopterVehicle, link: Link, message: Any) -> None:
+def set_parameter(vehicle: CopterContext, link: Link, message: Any) -> None:
     """PARAM_SET: truncated and cut to what the type holds, then told on every link."""
     name = _text_of(message.param_id)
     if name not in vehicle.parameters:
@@ -61,7 +59,7 @@ def set_parameter(vehicle: CopterVehicle, link: Link, message: Any) -> None:
         _tell(vehicle, each, parameter, NO_INDEX)
 
 
-def _tell(vehicle: CopterVehicle, link: Link, parameter: Parameter, index: int) -> None:
+def _tell(vehicle: CopterContext, link: Link, parameter: Parameter, index: int) -> None:
     link.send(
         dialect.MAVLink_param_value_message(
             parameter.name.encode(), parameter.wire_value, parameter.kind, len(vehicle.parameters), index

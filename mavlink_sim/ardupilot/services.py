@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mavlink_sim.ardupilot import commands, landing, parameter_service, streams, targets
+from mavlink_sim.ardupilot.context import CopterContext
 from mavlink_sim.ardupilot.guided import THRUST_AS_THRUST, Attitude
 from mavlink_sim.flight.precision_landing import LandingTarget
 from mavlink_sim.flight.setpoints import (
@@ -18,23 +19,20 @@ from mavlink_sim.flight.setpoints import (
 )
 from mavlink_sim.services import manual_control_service, microservices
 from mavlink_sim.wire.announcements import INFO
+from mavlink_sim.wire.links import Link
 from mavlink_sim.wire.messages import dialect
-
-if TYPE_CHECKING:
-    from mavlink_sim.ardupilot.copter import CopterVehicle
-    from mavlink_sim.wire.links import Link
 
 RATES_IGNORE = ROLL_RATE_IGNORE | PITCH_RATE_IGNORE | BODY_YAW_RATE_IGNORE
 MISSION_UNSUPPORTED = 3  # MAV_MISSION_UNSUPPORTED
 UNIT_TOLERANCE = 1e-3
 
 
-def _heartbeat(vehicle: CopterVehicle, link: Link, message: Any) -> None:
+def _heartbeat(vehicle: CopterContext, link: Link, message: Any) -> None:
     if message.get_srcSystem() == int(vehicle.parameters.number("SYSID_MYGCS")):
         vehicle.copter.watch.ground_station_seen_s = vehicle.now_s
 
 
-def _local_target(vehicle: CopterVehicle, link: Link, message: Any) -> None:
+def _local_target(vehicle: CopterContext, link: Link, message: Any) -> None:
     """Outside GUIDED it is passed over without a word."""
     guided = vehicle.copter.guided
     if guided is not None:
@@ -42,13 +40,13 @@ def _local_target(vehicle: CopterVehicle, link: Link, message: Any) -> None:
         guided.fly(targets.local_target(message, frame.position, frame.yaw_rad))
 
 
-def _global_target(vehicle: CopterVehicle, link: Link, message: Any) -> None:
+def _global_target(vehicle: CopterContext, link: Link, message: Any) -> None:
     guided = vehicle.copter.guided
     if guided is not None:
         guided.fly(targets.global_target(message, vehicle.local_frame, vehicle.copter.home.position))
 
 
-def _attitude_target(vehicle: CopterVehicle, link: Link, message: Any) -> None:
+def _attitude_target(vehicle: CopterContext, link: Link, message: Any) -> None:
     """Attitude, all three body rates, or both, and a thrust; whatever else it says stops the vehicle."""
     guided = vehicle.copter.guided
     if guided is None:
@@ -80,7 +78,7 @@ def _attitude_target(vehicle: CopterVehicle, link: Link, message: Any) -> None:
     guided.fly_attitude(Attitude(quaternion, given, climb))
 
 
-def _landing_target(vehicle: CopterVehicle, link: Link, message: Any) -> None:
+def _landing_target(vehicle: CopterContext, link: Link, message: Any) -> None:
     """LANDING_TARGET counts where precision landing is enabled with type 1 (MAVLink)."""
     value = vehicle.parameters.number
     if not value("PLND_ENABLED") or value("PLND_TYPE") != landing.COMPANION_TYPE:
@@ -96,7 +94,7 @@ def _landing_target(vehicle: CopterVehicle, link: Link, message: Any) -> None:
         vehicle.copter.navigator.target = LandingTarget(place, vehicle.now_s)
 
 
-def _no_mission(vehicle: CopterVehicle, link: Link, message: Any) -> None:
+def _no_mission(vehicle: CopterContext, link: Link, message: Any) -> None:
     """Missions are not modelled: the list is empty, an upload is refused."""
     sender = (message.get_srcSystem(), message.get_srcComponent())
     kind = int(getattr(message, "mission_type", 0))
@@ -106,7 +104,7 @@ def _no_mission(vehicle: CopterVehicle, link: Link, message: Any) -> None:
         link.send(dialect.MAVLink_mission_ack_message(*sender, MISSION_UNSUPPORTED, kind))
 
 
-def _setup_signing(vehicle: CopterVehicle, link: Link, message: Any) -> None:
+def _setup_signing(vehicle: CopterContext, link: Link, message: Any) -> None:
     """SETUP_SIGNING: a disarmed ArduPilot takes the key from any link, for all of its links."""
     if vehicle.copter.armed:
         vehicle.say(3, "ERROR: Won't setup signing when armed")
@@ -115,7 +113,7 @@ def _setup_signing(vehicle: CopterVehicle, link: Link, message: Any) -> None:
         each.signing.set_up(bytes(message.secret_key), int(message.initial_timestamp))
 
 
-Handler = Callable[["CopterVehicle", "Link", Any], None]
+Handler = Callable[[CopterContext, Link, Any], None]
 
 HANDLERS: dict[str, Handler] = {
     "HEARTBEAT": _heartbeat,

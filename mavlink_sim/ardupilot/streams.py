@@ -8,11 +8,10 @@ rate, until anybody on the link asks for that group by REQUEST_DATA_STREAM, and 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from mavlink_sim.ardupilot.copter import CopterVehicle
-    from mavlink_sim.wire.links import Link
+from mavlink_sim.ardupilot.context import CopterContext
+from mavlink_sim.wire.links import Link
 
 MAX_RATE_HZ = 200.0
 MAX_INTERVAL_US = 60_000_000
@@ -49,12 +48,12 @@ ALL_STREAMS = 0  # MAV_DATA_STREAM_ALL
 _GROUP_OF = {name: group for group, (_, names) in GROUPS.items() for name in names}
 
 
-def prefix(vehicle: CopterVehicle, link: Link) -> str:
+def prefix(vehicle: CopterContext, link: Link) -> str:
     """SR0_ or SR1_, of the link."""
     return "SR0_" if link.name == "gcs" else "SR1_"
 
 
-def follow_parameters(vehicle: CopterVehicle, link: Link) -> None:
+def follow_parameters(vehicle: CopterContext, link: Link) -> None:
     """Give every message of a group the group's rate, unless its own was set."""
     own = vehicle.own_intervals[link.name]
     for group, (_, names) in GROUPS.items():
@@ -65,7 +64,7 @@ def follow_parameters(vehicle: CopterVehicle, link: Link) -> None:
                 link.streams.set_interval(name, interval, vehicle.boot_us)
 
 
-def set_interval(vehicle: CopterVehicle, link: Link, name: str, interval_us: float) -> None:
+def set_interval(vehicle: CopterContext, link: Link, name: str, interval_us: float) -> None:
     """-1 switches off, 0 goes back to the group's rate."""
     own = vehicle.own_intervals[link.name]
     own.discard(name)
@@ -82,7 +81,7 @@ def set_interval(vehicle: CopterVehicle, link: Link, name: str, interval_us: flo
     link.streams.set_interval(name, interval, vehicle.boot_us)
 
 
-def forget_requests(vehicle: CopterVehicle) -> None:
+def forget_requests(vehicle: CopterContext) -> None:
     """A reboot: what was asked for by messages is gone, what was set as a parameter stays."""
     for name, rate in vehicle.unsaved_rates.items():
         vehicle.parameters.set(name, rate)
@@ -92,7 +91,7 @@ def forget_requests(vehicle: CopterVehicle) -> None:
         follow_parameters(vehicle, link)
 
 
-def request_data_stream(vehicle: CopterVehicle, link: Link, message: Any) -> None:
+def request_data_stream(vehicle: CopterContext, link: Link, message: Any) -> None:
     """REQUEST_DATA_STREAM: the rate of one group or of all; it replaces what was set for single messages."""
     rate = min(int(message.req_message_rate), int(MAX_RATE_HZ)) if message.start_stop else 0
     for group, (identifier, names) in GROUPS.items():

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega
 
+from mavlink_sim.ardupilot.context import CopterContext
 from mavlink_sim.services import system_streams, telemetry
 from mavlink_sim.wire.messages import dialect
-
-if TYPE_CHECKING:
-    from mavlink_sim.ardupilot.copter import CopterVehicle
 
 QUADROTOR, ARDUPILOTMEGA = 2, 3  # MAV_TYPE, MAV_AUTOPILOT
 VERSION = 0x040500FF  # 4.5.0, an official release
@@ -30,14 +28,14 @@ MILLI_G = 1000.0 / 9.80665
 NOTHING = (0.0, 0.0, 0.0)
 
 
-def _heartbeat(vehicle: CopterVehicle) -> Any:
+def _heartbeat(vehicle: CopterContext) -> Any:
     copter = vehicle.copter
     return dialect.MAVLink_heartbeat_message(
         QUADROTOR, ARDUPILOTMEGA, copter.base_mode, copter.mode.custom_mode, int(copter.system_status), 3
     )
 
 
-def _sys_status(vehicle: CopterVehicle) -> Any:
+def _sys_status(vehicle: CopterContext) -> Any:
     copter = vehicle.copter
     health = SENSORS | BATTERY if copter.sensors_ready and copter.position_valid else BATTERY
     if copter.armed or copter.can_arm:
@@ -48,7 +46,7 @@ def _sys_status(vehicle: CopterVehicle) -> Any:
     )
 
 
-def _home_position(vehicle: CopterVehicle) -> Any:
+def _home_position(vehicle: CopterContext) -> Any:
     """Its local position counts from the EKF's origin; its attitude is not known."""
     if not vehicle.copter.sensors_ready:
         return None
@@ -64,7 +62,7 @@ def _home_position(vehicle: CopterVehicle) -> Any:
     )
 
 
-def _position_target_local_ned(vehicle: CopterVehicle) -> Any:
+def _position_target_local_ned(vehicle: CopterContext) -> Any:
     """In GUIDED alone, with what was asked for; nothing while an attitude is flown."""
     guided = vehicle.copter.guided
     target = None if guided is None else guided.target
@@ -86,7 +84,7 @@ def _position_target_local_ned(vehicle: CopterVehicle) -> Any:
     )
 
 
-def _raw_imu(vehicle: CopterVehicle) -> Any:
+def _raw_imu(vehicle: CopterContext) -> Any:
     frame = vehicle.estimate
     cosine, sine = math.cos(frame.yaw_rad), math.sin(frame.yaw_rad)
     return dialect.MAVLink_raw_imu_message(
@@ -103,7 +101,7 @@ def _int16(value: float) -> int:
     return min(max(round(value), -32768), 32767)
 
 
-def _ekf_status_report(vehicle: CopterVehicle) -> Any:
+def _ekf_status_report(vehicle: CopterContext) -> Any:
     copter = vehicle.copter
     flags = EKF_STARTING
     if copter.sensors_ready:
@@ -111,13 +109,13 @@ def _ekf_status_report(vehicle: CopterVehicle) -> Any:
     return ardupilotmega.MAVLink_ekf_status_report_message(flags, 0.05, 0.02, 0.03, 0.02, 0.0)
 
 
-def _gps_global_origin(vehicle: CopterVehicle) -> Any:
+def _gps_global_origin(vehicle: CopterContext) -> Any:
     if not vehicle.copter.sensors_ready:
         return None
     return telemetry.BUILDERS["GPS_GLOBAL_ORIGIN"](vehicle)
 
 
-def _autopilot_version(vehicle: CopterVehicle) -> Any:
+def _autopilot_version(vehicle: CopterContext) -> Any:
     return dialect.MAVLink_autopilot_version_message(
         capabilities=CAPABILITIES,
         flight_sw_version=VERSION,
@@ -133,11 +131,11 @@ def _autopilot_version(vehicle: CopterVehicle) -> Any:
     )
 
 
-def _mission_current(vehicle: CopterVehicle) -> Any:
+def _mission_current(vehicle: CopterContext) -> Any:
     return dialect.MAVLink_mission_current_message(0)
 
 
-Builder = Callable[["CopterVehicle"], Any]
+Builder = Callable[[CopterContext], Any]
 
 _SHARED = (
     "ATTITUDE",

@@ -135,6 +135,11 @@ class Autopilot:
         self.supervision.pilot_attached = attached
 
     @property
+    def lacks_ground_station(self) -> bool:
+        """NAV_DLL_ACT requires a ground station, and none is connected."""
+        return self.supervision.lacks_ground_station
+
+    @property
     def terminated(self) -> bool:
         """The motors stand still for good; it takes a reboot."""
         return self.supervision.terminated
@@ -372,7 +377,7 @@ class Autopilot:
         self.now_s += dt_s
         self.navigator.update()
         self.supervision.update(dt_s, self._airframe.thrust_mps2)
-        position_failsafe.keep_landing(self)
+        self._keep_landing()
         while self._gimbal_schedule and self._gimbal_schedule[0][0] <= self.now_s:
             self.gimbal_commands.append(self._gimbal_schedule.popleft()[1])
         airframe = self._airframe
@@ -539,11 +544,24 @@ class Autopilot:
         elif self.mode is Mode.PRECLAND:
             self.task = self.navigator.precision_landing(Precision.REQUIRED)
         elif self.mode is Mode.LAND:
-            self.task = position_failsafe.landing_task(self)
+            self.task = self._landing_task()
         elif self.mode is Mode.RTL:
             self.task = self.navigator.return_task()
         else:
             self.task = flight.Hold(airframe, parameters)
+
+    def _landing_task(self) -> flight.Task:
+        return position_failsafe.landing_task(
+            self._airframe, self._parameters, position_valid=self.position_valid
+        )
+
+    def _keep_landing(self) -> None:
+        """A landing continues as a descent when the position is lost, and at one point when it is back."""
+        descending = isinstance(self.task, position_failsafe.Descend)
+        if descending and self.landed:
+            return  # it is down
+        if self.armed and self.mode is Mode.LAND and descending is self.position_valid:
+            self.task = self._landing_task()
 
     def _takeoff_height(self) -> float:
         height = self._takeoff_height_m

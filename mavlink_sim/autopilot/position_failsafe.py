@@ -11,15 +11,11 @@ to come down.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from mavlink_sim.flight.position_control import NAN, NOTHING, TrajectorySetpoint
 from mavlink_sim.flight.tasks import Land, Task
+from mavlink_sim.physics.airframe import Multirotor
 from mavlink_sim.px4.modes import Mode
 from mavlink_sim.px4.parameters import Parameters
-
-if TYPE_CHECKING:
-    from mavlink_sim.autopilot.commander import Autopilot
 
 # ALTCTL, STABILIZED, ACRO and MANUAL are flown without; OFFBOARD depends on its setpoints.
 WITHOUT_POSITION = frozenset({Mode.ALTCTL, Mode.STABILIZED, Mode.ACRO, Mode.MANUAL, Mode.OFFBOARD})
@@ -54,17 +50,8 @@ def asks_for_position(setpoint: object) -> bool:
     return False
 
 
-def landing_task(autopilot: Autopilot) -> Task:
-    """How mode LAND is flown: at one place, or blindly down where there is no position."""
-    if autopilot.position_valid:
-        return Land(autopilot._airframe, autopilot._parameters)
-    return Descend(autopilot._parameters, autopilot._airframe.yaw_rad)
-
-
-def keep_landing(autopilot: Autopilot) -> None:
-    """A landing goes on blindly when the position is lost, and at one place when it is back."""
-    descending = isinstance(autopilot.task, Descend)
-    if descending and autopilot.landed:
-        return  # it is down
-    if autopilot.armed and autopilot.mode is Mode.LAND and descending is autopilot.position_valid:
-        autopilot.task = landing_task(autopilot)
+def landing_task(airframe: Multirotor, parameters: Parameters, *, position_valid: bool) -> Task:
+    """The task of mode LAND: at one point, or a descent without a position."""
+    if position_valid:
+        return Land(airframe, parameters)
+    return Descend(parameters, airframe.yaw_rad)

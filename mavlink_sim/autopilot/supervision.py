@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import math
 import struct
-from typing import TYPE_CHECKING
+from collections import deque
+from typing import Protocol
 
-from mavlink_sim.autopilot.arming_checks import GEOFENCE_CHECKS, failing_checks
+from mavlink_sim.autopilot.arming_checks import GEOFENCE_CHECKS, CheckedAutopilot, failing_checks
 from mavlink_sim.autopilot.failsafe_actions import Action
 from mavlink_sim.autopilot.failsafe_announcements import INFO_LEVELS
 from mavlink_sim.autopilot.failsafe_conditions import Conditions
@@ -22,9 +23,6 @@ from mavlink_sim.physics.battery import Battery, BatteryWarning
 from mavlink_sim.px4.modes import MANUAL_MODES, Mode
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.announcements import CRITICAL, INFO, Text, event_identifier
-
-if TYPE_CHECKING:
-    from mavlink_sim.autopilot.commander import Autopilot
 
 EMERGENCY = 0  # MAV_SEVERITY_EMERGENCY
 WARNING = 4  # MAV_SEVERITY_WARNING
@@ -47,6 +45,33 @@ _BATTERY_TEXTS = {
 }
 
 
+class SupervisedAutopilot(CheckedAutopilot, Protocol):
+    """What the supervision uses of the autopilot; see `commander.Autopilot`."""
+
+    now_s: float
+    armed: bool
+    intended_mode: Mode
+    failsafe: bool
+    texts: deque[Text]
+
+    @property
+    def landed(self) -> bool: ...
+
+    def arm(self, by: str = ...) -> int: ...
+
+    def disarm(self, force: bool = False, by: str = ...) -> int: ...
+
+    def set_mode(self, mode: Mode, tell: bool = False) -> int: ...
+
+    def can_run(self, mode: Mode) -> bool: ...
+
+    def adopt_intention(self, mode: Mode) -> None: ...
+
+    def follow_failsafes(self, mode: Mode) -> None: ...
+
+    def announce(self, line: str) -> None: ...
+
+
 class Supervision:
     """The watch over one vehicle.
 
@@ -59,7 +84,7 @@ class Supervision:
         pilot_attached: sticks are taken for granted, centred, whatever COM_RC_IN_MODE says.
     """
 
-    def __init__(self, autopilot: Autopilot, parameters: Parameters) -> None:
+    def __init__(self, autopilot: SupervisedAutopilot, parameters: Parameters) -> None:
         self._autopilot = autopilot
         self._parameters = parameters
         self.manual_control = ManualControl(parameters)

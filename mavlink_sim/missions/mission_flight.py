@@ -7,19 +7,18 @@ from __future__ import annotations
 
 import enum
 import math
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from mavlink_sim.flight import tasks as flight
 from mavlink_sim.flight.position_control import NAN, TrajectorySetpoint
-from mavlink_sim.flight.precision_landing import Precision
+from mavlink_sim.flight.precision_landing import Precision, PrecisionLanding
 from mavlink_sim.missions import items as mission_items
 from mavlink_sim.missions.items import MissionItem
+from mavlink_sim.missions.plan import Mission
 from mavlink_sim.physics.airframe import Multirotor, Vector
+from mavlink_sim.physics.geography import LocalFrame
+from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.announcements import INFO
-
-if TYPE_CHECKING:
-    from mavlink_sim.missions.navigator import Navigator
-    from mavlink_sim.px4.parameters import Parameters
 
 NAVIGATOR_PERIOD_S = 0.05  # items are looked after at 20 Hz, the trajectory at every step
 # How sharp a corner may be cut: the circle that PX4's trajectory fits into the acceptance radius.
@@ -31,6 +30,37 @@ _WAIT_FOR_COMMAND = frozenset(
 )  # done after MIS_COMMAND_TOUT
 _ROI_LOCATION = 3  # MAV_ROI
 _ROI_NEXT = 1
+
+
+class MissionNavigator(Protocol):
+    """What flying a mission uses of the Navigator; see `navigator.Navigator`."""
+
+    frame: LocalFrame
+    mission: Mission
+
+    @property
+    def now_s(self) -> float: ...
+
+    @property
+    def landed(self) -> bool: ...
+
+    @property
+    def cruise_mps(self) -> float: ...
+
+    @property
+    def home(self) -> Vector: ...
+
+    def reached(self, index: int) -> None: ...
+
+    def current_changed(self) -> None: ...
+
+    def command(self, item: MissionItem) -> None: ...
+
+    def change_speed(self, speed_mps: float) -> None: ...
+
+    def precision_landing(self, precision: Precision, place: Vector | None = None) -> PrecisionLanding: ...
+
+    def say(self, severity: int, text: str) -> None: ...
 
 
 class Stage(enum.Enum):
@@ -50,7 +80,7 @@ class MissionFlight(flight.Task):
         ended: the mission is over, and the vehicle stays at `goal`.
     """
 
-    def __init__(self, navigator: Navigator, airframe: Multirotor, parameters: Parameters) -> None:
+    def __init__(self, navigator: MissionNavigator, airframe: Multirotor, parameters: Parameters) -> None:
         self._navigator = navigator
         self._mission = navigator.mission
         self._airframe = airframe

@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from mavlink_sim.flight import tasks as flight
 from mavlink_sim.flight.collision_prevention import ObstacleMap, Plane, limited_acceleration
@@ -36,9 +36,6 @@ from mavlink_sim.px4.modes import Mode
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.announcements import CRITICAL, INFO, Text
 
-if TYPE_CHECKING:
-    from mavlink_sim.autopilot.commander import Autopilot
-
 FENCE_PERIOD_S = 0.2  # GEOFENCE_CHECK_INTERVAL_US
 REACHED_REPETITIONS = 10  # MISSION_ITEM_REACHED is told again so often, once a second
 REACHED_PERIOD_S = 1.0
@@ -58,6 +55,41 @@ class Reached:
     sequence: int
 
 
+class HomePosition(Protocol):
+    """Home. `position`: local NED metres. `attitude_rad`: roll, pitch, yaw."""
+
+    position: Vector
+    attitude_rad: Vector
+
+
+class Commander(Protocol):
+    """What the Navigator uses of the autopilot it belongs to; see `autopilot.commander.Autopilot`."""
+
+    now_s: float
+    armed: bool
+    mode: Mode
+    cruise_mps: float
+    texts: deque[Text]
+    task: flight.Task | None
+
+    @property
+    def home(self) -> HomePosition: ...
+
+    @property
+    def landed(self) -> bool: ...
+
+    @property
+    def sensors_ready(self) -> bool: ...
+
+    def set_mode(self, mode: Mode, tell: bool = False) -> int: ...
+
+    def hold_at(self, place: Vector) -> None: ...
+
+    def restart_task(self) -> None: ...
+
+    def change_speed(self, speed_mps: float, at_once: bool) -> None: ...
+
+
 class Navigator:
     """Missions, fence and destinations of one vehicle.
 
@@ -71,7 +103,7 @@ class Navigator:
 
     def __init__(
         self,
-        autopilot: Autopilot,
+        autopilot: Commander,
         airframe: Multirotor,
         parameters: Parameters,
         frame: LocalFrame,
