@@ -18,10 +18,10 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mavlink_sim.fleet_world import FleetWorld
     from mavlink_sim.lockstep import CommandRefusedError, LockstepVehicle, NotReachedError, Truth
     from mavlink_sim.testing import RunningSimulator, running_simulator
-    from mavlink_sim.vehicle import Vehicle
+    from mavlink_sim.vehicles.fleet_world import FleetWorld
+    from mavlink_sim.vehicles.vehicle import Vehicle
 
 __all__ = [
     "CommandRefusedError",
@@ -37,12 +37,12 @@ __all__ = [
 
 _HOMES = {
     "CommandRefusedError": "lockstep",
-    "FleetWorld": "fleet_world",
+    "FleetWorld": "vehicles.fleet_world",
     "LockstepVehicle": "lockstep",
     "NotReachedError": "lockstep",
     "RunningSimulator": "testing",
     "Truth": "lockstep",
-    "Vehicle": "vehicle",
+    "Vehicle": "vehicles.vehicle",
     "running_simulator": "testing",
 }
 

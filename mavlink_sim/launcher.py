@@ -16,55 +16,23 @@ input and output, and the end of a socket for the answers. Those are the process
 from __future__ import annotations
 
 import ctypes
-import errno
 import json
 import os
 import selectors
 import signal
 import socket
-import struct
 import sys
 import time
 import traceback
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
+from mavlink_sim.launching import ENDED, FAREWELL_S, LARGEST_REQUEST, STARTED, Request
 from vision.gc_pause import gc_paused
 
-LARGEST_REQUEST = 1 << 17  # less than any socket's buffer
-STARTED = struct.Struct("!i")  # the process's id; below zero: an errno, it could not be forked
-ENDED = struct.Struct("!i")  # the exit code, as `subprocess` has it
-# How long vehicles have to end in order once nobody is there who wants them: a camera may take 5 s.
-FAREWELL_S = 7.0
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 _GONE = (BrokenPipeError, ConnectionResetError)
 _ENDS_OF_A_GROUP = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-
-
-@dataclass(frozen=True, slots=True)
-class Request:
-    """A process that is wanted.
-
-    Attributes:
-        arguments: of `mavlink-sim`.
-        folder: to run in.
-        environment: all of its variables.
-    """
-
-    arguments: list[str]
-    folder: str
-    environment: dict[str, str]
-
-    def send(self, connection: socket.socket, descriptors: list[int]) -> None:
-        """Ask for it; `descriptors` are its standard input, its standard output, and where to answer.
-
-        Raises:
-            OSError: the launcher is gone, or this is more than fits into a packet (EMSGSIZE).
-        """
-        packet = json.dumps(asdict(self)).encode()
-        if len(packet) > LARGEST_REQUEST:
-            raise OSError(errno.EMSGSIZE, f"a request of {len(packet)} bytes is too long")
-        socket.send_fds(connection, [packet], descriptors)
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +76,7 @@ def main(requests: int, program: int) -> None:
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # where that was ignored, no exit code could be had
     with gc_paused():
-        from mavlink_sim import cli
+        from mavlink_sim.cli import main as cli
 
         cli.load()
     with socket.socket(fileno=requests) as connection, selectors.DefaultSelector() as selector:

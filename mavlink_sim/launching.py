@@ -4,22 +4,54 @@ from __future__ import annotations
 
 import atexit
 import errno
+import json
 import os
 import select
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
+from dataclasses import asdict, dataclass
 from typing import TextIO
 
-from mavlink_sim.launcher import ENDED, FAREWELL_S, STARTED, Request
-
+LARGEST_REQUEST = 1 << 17  # less than any socket's buffer
+STARTED = struct.Struct("!i")  # the process's id; below zero: an errno, it could not be forked
+ENDED = struct.Struct("!i")  # the exit code, as `subprocess` has it
+# How long vehicles have to end in order once nobody is there who wants them: a camera may take 5 s.
+FAREWELL_S = 7.0
 # What it takes to end its vehicles, and some more.
 LAUNCHER_ENDS_S = FAREWELL_S + 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """A process that is wanted.
+
+    Attributes:
+        arguments: of `mavlink-sim`.
+        folder: to run in.
+        environment: all of its variables.
+    """
+
+    arguments: list[str]
+    folder: str
+    environment: dict[str, str]
+
+    def send(self, connection: socket.socket, descriptors: list[int]) -> None:
+        """Ask for it; `descriptors` are its standard input, its standard output, and where to answer.
+
+        Raises:
+            OSError: the launcher is gone, or this is more than fits into a packet (EMSGSIZE).
+        """
+        packet = json.dumps(asdict(self)).encode()
+        if len(packet) > LARGEST_REQUEST:
+            raise OSError(errno.EMSGSIZE, f"a request of {len(packet)} bytes is too long")
+        socket.send_fds(connection, [packet], descriptors)
 
 
 class LaunchedProcess:

@@ -23,9 +23,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from mavlink_sim.firmware import PX4, vehicle_class
 from mavlink_sim.lockstep_wire import LockstepWire
-from mavlink_sim.vehicle import STEP_S
+from mavlink_sim.vehicles.firmware import PX4, vehicle_class
+from mavlink_sim.vehicles.vehicle import STEP_S
 from mavlink_sim.wire.messages import Outgoing, dialect
 from mavlink_sim.wire.streams import ONBOARD_RATES_HZ
 

@@ -1,6 +1,6 @@
 """A link of a vehicle in lockstep, as bytes: what a client on a socket would send and get, faults included.
 
->>> from mavlink_sim.vehicle import Vehicle
+>>> from mavlink_sim.vehicles.vehicle import Vehicle
 >>> vehicle = Vehicle()
 >>> _ = vehicle.add_link("onboard")
 >>> link = LockstepLink(vehicle, "onboard")
@@ -13,18 +13,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from mavlink_sim.faults.context import FaultTarget
 from mavlink_sim.wire.messages import parser
-
-if TYPE_CHECKING:
-    from mavlink_sim.vehicle import Vehicle
 
 
 class LockstepLink:
     """The client's end of one link. Call `receive` after every step: it is also what makes time pass here."""
 
-    def __init__(self, vehicle: Vehicle, name: str) -> None:
+    def __init__(self, vehicle: FaultTarget, name: str) -> None:
         self._vehicle = vehicle
         self._name = name
         self._stage = vehicle.faults.stage(name)

@@ -8,19 +8,17 @@ refused here as the datagrams of a real one are.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from mavlink_sim.faults.context import FaultTarget
+from mavlink_sim.wire.links import Link
 from mavlink_sim.wire.messages import Outgoing, parser
-
-if TYPE_CHECKING:
-    from mavlink_sim.vehicle import Vehicle
-    from mavlink_sim.wire.links import Link
 
 
 class LockstepWire:
     """One link's wire. `codec` numbers what the vehicle packs on it."""
 
-    def __init__(self, vehicle: Vehicle, link: Link) -> None:
+    def __init__(self, vehicle: FaultTarget, link: Link) -> None:
         self._vehicle = vehicle
         self._link = link
         self._stage = vehicle.faults.stage(link.name)

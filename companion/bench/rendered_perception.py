@@ -18,9 +18,9 @@ from companion.settings import Settings
 from companion.settings.perception import DetectorSection, TrackerSection
 from mavlink_sim.camera.scene import Scene
 from mavlink_sim.camera.simulated_camera import Captured, SimulatedCamera
-from mavlink_sim.fleet_world import place_in_world
 from mavlink_sim.lockstep import LockstepVehicle
-from mavlink_sim.sim_outputs import camera_turn_rad
+from mavlink_sim.realtime.sim_outputs import camera_turn_rad
+from mavlink_sim.vehicles.fleet_world import place_in_world
 from mavlink_sim.world.aircraft import Aircraft
 from vision.attitude import Quaternion
 from vision.frame import Frame

@@ -2,7 +2,7 @@
 
 Every vehicle has a `Faults`; in lockstep it is used as it is over sockets:
 
->>> from mavlink_sim.vehicle import Vehicle
+>>> from mavlink_sim.vehicles.vehicle import Vehicle
 >>> vehicle = Vehicle()
 >>> number = vehicle.faults.begin("gps_loss at=20 for=10")
 >>> vehicle.faults.end(number)

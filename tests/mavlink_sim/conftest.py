@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 import pytest
 
-from mavlink_sim.vehicle import STEP_S, Vehicle
+from mavlink_sim.vehicles.vehicle import STEP_S, Vehicle
 from mavlink_sim.wire.messages import dialect
 from mavlink_sim.wire.streams import GCS_RATES_HZ, ONBOARD_RATES_HZ
 

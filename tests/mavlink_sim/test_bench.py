@@ -7,7 +7,7 @@ from dataclasses import astuple
 
 import cv2
 
-from mavlink_sim.bench import measure_camera, measure_fleet, measure_lockstep
+from mavlink_sim.cli.bench import measure_camera, measure_fleet, measure_lockstep
 
 
 def test_lockstep_has_a_figure_for_each_way_of_flying() -> None:

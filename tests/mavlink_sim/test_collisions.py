@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mavlink_sim.camera.scene import Path, Scene
-from mavlink_sim.cli import main
+from mavlink_sim.cli.main import main
 from mavlink_sim.lockstep import LockstepVehicle
 from mavlink_sim.physics.airframe import Multirotor, rotation_matrix
 from mavlink_sim.physics.collisions import CollidingMultirotor
@@ -24,8 +24,9 @@ from mavlink_sim.physics.contact import (
     Collision,
     after_contact,
 )
-from mavlink_sim.simulation import Simulation, SimulationOptions
-from mavlink_sim.vehicle import STEP_S
+from mavlink_sim.realtime.options import SimulationOptions
+from mavlink_sim.realtime.simulation import Simulation
+from mavlink_sim.vehicles.vehicle import STEP_S
 from mavlink_sim.wire.messages import dialect
 from mavlink_sim.world.fiducials import Print
 from mavlink_sim.world.obstacles import Obstacles

@@ -13,7 +13,7 @@ import pytest
 
 from mavlink_sim.faults.console import FaultConsole
 from mavlink_sim.faults.schedule import Outcome
-from mavlink_sim.vehicle import Vehicle
+from mavlink_sim.vehicles.vehicle import Vehicle
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import pytest
 
 from mavlink_sim.faults.grammar import FaultError
 from mavlink_sim.lockstep_link import LockstepLink
-from mavlink_sim.vehicle import STEP_S
+from mavlink_sim.vehicles.vehicle import STEP_S
 from mavlink_sim.wire.messages import dialect, parser
 from tests.mavlink_sim.conftest import SimHarness
 

@@ -10,13 +10,13 @@ from typing import Any
 import pytest
 from pymavlink import mavutil
 
-from mavlink_sim import real_time
-from mavlink_sim.cli import main
-from mavlink_sim.fleet import instance_options, places
+from mavlink_sim.cli.main import main
 from mavlink_sim.lockstep import LockstepVehicle
-from mavlink_sim.simulation import SimulationOptions
+from mavlink_sim.realtime import loop
+from mavlink_sim.realtime.fleet import instance_options, places
+from mavlink_sim.realtime.options import SimulationOptions
 from mavlink_sim.testing import free_udp_port_range, running_simulator
-from mavlink_sim.vehicle import Vehicle
+from mavlink_sim.vehicles.vehicle import Vehicle
 
 METRE_DEG = math.degrees(1.0 / 6371000.0)
 
@@ -147,9 +147,9 @@ def test_a_range_of_ports_is_free() -> None:
 
 def test_a_machine_that_is_too_slow_is_told_of_and_how_slow(monkeypatch: pytest.MonkeyPatch) -> None:
     now_s = 100.0
-    monkeypatch.setattr("mavlink_sim.real_time.time.monotonic", lambda: now_s)
+    monkeypatch.setattr("mavlink_sim.realtime.loop.time.monotonic", lambda: now_s)
     told: list[str] = []
-    pace = real_time._Pace(20.0, told.append)
+    pace = loop._Pace(20.0, told.append)
     pace.lose(25.0)
     now_s += 2.0
     pace.tell()

@@ -24,12 +24,12 @@ from mavlink_sim.camera.scene import CameraSettings, Scene
 from mavlink_sim.camera.scene import Path as Way
 from mavlink_sim.camera.shared_poses import SLOTS, SharedPoses
 from mavlink_sim.camera.simulated_camera import Captured, SimulatedCamera, frame_truth
-from mavlink_sim.fleet import Fleet, instance_options
-from mavlink_sim.fleet_world import FleetWorld
-from mavlink_sim.real_time import run_together
-from mavlink_sim.simulation import SimulationOptions
+from mavlink_sim.realtime.fleet import Fleet, instance_options
+from mavlink_sim.realtime.loop import run_together
+from mavlink_sim.realtime.options import SimulationOptions
 from mavlink_sim.testing import running_simulator
-from mavlink_sim.vehicle import Vehicle
+from mavlink_sim.vehicles.fleet_world import FleetWorld
+from mavlink_sim.vehicles.vehicle import Vehicle
 from mavlink_sim.world.aircraft import Aircraft, aircraft_objects, identifier_offset
 from mavlink_sim.world.world import Ground, Light, World, WorldObject
 from vision.camera_model import CameraModel, CameraMount

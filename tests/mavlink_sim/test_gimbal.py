@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from mavlink_sim.physics.geography import SIH_FRAME
 from mavlink_sim.physics.gimbal import Aim, Gimbal, Target
 from mavlink_sim.px4.parameters import Parameters
-from mavlink_sim.simulation import Simulation, SimulationOptions
+from mavlink_sim.realtime.options import SimulationOptions
+from mavlink_sim.realtime.simulation import Simulation
 from mavlink_sim.wire.messages import dialect
 from tests.mavlink_sim.conftest import SimHarness
 from vision.attitude import quaternion_from_euler

@@ -21,7 +21,7 @@ from mavlink_sim.flight.transmitter import CALIBRATION, Sticks
 from mavlink_sim.physics.airframe import GRAVITY_MPS2, MAX_THRUST_MPS2, Multirotor
 from mavlink_sim.px4.modes import Mode
 from mavlink_sim.px4.parameters import Parameters
-from mavlink_sim.vehicle import Vehicle
+from mavlink_sim.vehicles.vehicle import Vehicle
 
 REMOTE_CONTROL = {**CALIBRATION, "COM_RC_IN_MODE": 0}
 

@@ -11,12 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mavlink_sim import FleetWorld, LockstepVehicle
-from mavlink_sim.fleet import Fleet, instance_options
 from mavlink_sim.physics.airframe import GRAVITY_MPS2, Multirotor, Vector
 from mavlink_sim.physics.contact import CRASH_MPS, Collision
 from mavlink_sim.physics.midair import REACH_UP_M, Body, Midair, apart
-from mavlink_sim.simulation import SimulationOptions
-from mavlink_sim.vehicle import STEP_S
+from mavlink_sim.realtime.fleet import Fleet, instance_options
+from mavlink_sim.realtime.options import SimulationOptions
+from mavlink_sim.vehicles.vehicle import STEP_S
 from mavlink_sim.wire.messages import dialect
 
 speeds = st.floats(-8.0, 8.0, allow_subnormal=False)

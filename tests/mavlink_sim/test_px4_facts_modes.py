@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from mavlink_sim.vehicle import STEP_S
+from mavlink_sim.vehicles.vehicle import STEP_S
 from mavlink_sim.wire.messages import dialect
 from tests.mavlink_sim.conftest import SimHarness
 

@@ -112,7 +112,7 @@ for name in ("torch", "cv2", "zenoh", "mavsdk", "pydantic", "aioconsole", "yaml"
     sys.modules[name] = None  # an import of it fails
 sys.argv = ["mavlink-sim", "--help"]
 import mavlink_sim.testing
-from mavlink_sim.cli import main
+from mavlink_sim.cli.main import main
 main()
 """
     finished = subprocess.run(

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 from pymavlink import mavutil
 
-from mavlink_sim.cli import main
+from mavlink_sim.cli.main import main
 from mavlink_sim.testing import free_port, free_udp_ports, running_simulator
 from mavlink_sim.wire.endpoint import PEER_SILENCE_S, PortInUseError, UdpEndpoint
 from mavlink_sim.wire.messages import Outgoing, dialect, parser
@@ -320,7 +320,7 @@ def test_garbage_is_skipped_and_the_message_after_it_read() -> None:
 
 def test_a_vehicle_without_a_camera_needs_no_library_of_pictures_and_no_zenoh() -> None:
     code = (
-        "import sys, mavlink_sim.cli, mavlink_sim.testing; from mavlink_sim import LockstepVehicle\n"
+        "import sys, mavlink_sim.cli.main, mavlink_sim.testing; from mavlink_sim import LockstepVehicle\n"
         "vehicle = LockstepVehicle(gimbal=True); vehicle.take_off()\n"
         "print(*({'numpy', 'cv2', 'zenoh', 'av'} & set(sys.modules)))"
     )

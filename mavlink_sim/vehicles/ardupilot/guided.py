@@ -10,12 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from mavlink_sim.ardupilot.targets import STOP, GuidedTarget
 from mavlink_sim.flight import tasks as flight
 from mavlink_sim.flight.attitude_control import AttitudeSetpoint, RatesSetpoint
 from mavlink_sim.flight.position_control import NAN, NOTHING, TrajectorySetpoint
 from mavlink_sim.physics.airframe import GRAVITY_MPS2, LINEAR_DRAG_PER_S, MAX_THRUST_MPS2, Multirotor, Vector
 from mavlink_sim.px4.parameters import Parameters
+from mavlink_sim.vehicles.ardupilot.targets import STOP, GuidedTarget
 from vision.attitude import Quaternion, quaternion_from_euler
 
 # A target that runs ahead of the vehicle waits for it (ArduPilot's leash).

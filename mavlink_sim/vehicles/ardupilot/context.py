@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from mavlink_sim.ardupilot.autopilot import CopterAutopilot
 from mavlink_sim.services.context import ServiceContext
+from mavlink_sim.vehicles.ardupilot.autopilot import CopterAutopilot
 from mavlink_sim.wire.links import Link
 
 

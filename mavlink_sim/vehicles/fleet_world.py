@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from mavlink_sim.physics.airframe import Vector
 from mavlink_sim.physics.midair import Body, Midair
 from mavlink_sim.physics.neighbours import Neighbours
-from mavlink_sim.vehicle import STEP_S, Vehicle
+from mavlink_sim.vehicles.vehicle import STEP_S, Vehicle
 from mavlink_sim.world.aircraft import Aircraft, aircraft_objects
 
 if TYPE_CHECKING:

@@ -31,7 +31,7 @@ from mavlink_sim.services.event_protocol import EventBuffer
 from mavlink_sim.services.gimbal_protocol import GimbalManager
 from mavlink_sim.services.microservices import HANDLERS
 from mavlink_sim.services.vehicle_files import vehicle_files
-from mavlink_sim.wind_model import WindModel
+from mavlink_sim.vehicles.wind_model import WindModel
 from mavlink_sim.wire.announcements import CRITICAL, INFO, Text
 from mavlink_sim.wire.links import AUTOPILOT_COMPONENT, Link, forward, target_of
 from mavlink_sim.wire.messages import Outgoing, dialect, link_node_status
@@ -41,8 +41,8 @@ from mavlink_sim.wire.streams import EQUIPMENT_RATES_HZ, ONBOARD_RATES_HZ, PX4_C
 
 if TYPE_CHECKING:
     from mavlink_sim.camera.scene import Scene
-    from mavlink_sim.collision_world import CollisionWorld
     from mavlink_sim.physics.neighbours import Neighbours
+    from mavlink_sim.vehicles.collision_world import CollisionWorld
     from mavlink_sim.world.world import World
 
 # When a stepped vehicle boots, as it believes: midnight of the day its PX4 was built.
@@ -142,7 +142,7 @@ class Vehicle:
             self.airframe = Multirotor(seed, gusts_mps=gusts_mps)
         else:
             # imported here: without a scene neither the shapes nor their libraries are needed
-            from mavlink_sim.collision_world import CollisionWorld
+            from mavlink_sim.vehicles.collision_world import CollisionWorld
 
             self.collision_world = CollisionWorld(
                 scene,

@@ -10,11 +10,6 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from mavlink_sim.ardupilot import streams
-from mavlink_sim.ardupilot.autopilot import FAILED
-from mavlink_sim.ardupilot.context import CopterContext
-from mavlink_sim.ardupilot.modes import CopterMode, mode_of
-from mavlink_sim.ardupilot.targets import GLOBAL_RELATIVE_ALT, GLOBAL_TERRAIN_ALT, GuidedTarget
 from mavlink_sim.autopilot.commander import ACCEPTED, TEMPORARILY_REJECTED
 from mavlink_sim.flight.setpoints import GLOBAL_RELATIVE_ALT_INT, GLOBAL_TERRAIN_ALT_INT
 from mavlink_sim.physics.airframe import Vector
@@ -36,6 +31,11 @@ from mavlink_sim.services.commands import (
     SET_MESSAGE_INTERVAL,
     UNSUPPORTED,
 )
+from mavlink_sim.vehicles.ardupilot import streams
+from mavlink_sim.vehicles.ardupilot.autopilot import FAILED
+from mavlink_sim.vehicles.ardupilot.context import CopterContext
+from mavlink_sim.vehicles.ardupilot.modes import CopterMode, mode_of
+from mavlink_sim.vehicles.ardupilot.targets import GLOBAL_RELATIVE_ALT, GLOBAL_TERRAIN_ALT, GuidedTarget
 from mavlink_sim.wire.commands import Command, command_of
 from mavlink_sim.wire.links import Link
 from mavlink_sim.wire.messages import dialect

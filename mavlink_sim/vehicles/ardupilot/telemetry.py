@@ -8,8 +8,8 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega
 
-from mavlink_sim.ardupilot.context import CopterContext
 from mavlink_sim.services import system_streams, telemetry
+from mavlink_sim.vehicles.ardupilot.context import CopterContext
 from mavlink_sim.wire.messages import dialect
 
 QUADROTOR, ARDUPILOTMEGA = 2, 3  # MAV_TYPE, MAV_AUTOPILOT

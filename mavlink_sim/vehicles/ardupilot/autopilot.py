@@ -10,17 +10,6 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from mavlink_sim.ardupilot.failsafes import Failsafes
-from mavlink_sim.ardupilot.guided import Guided
-from mavlink_sim.ardupilot.landing import Land
-from mavlink_sim.ardupilot.modes import (
-    ARMABLE,
-    FLOWN,
-    POSITION_CONTROLLED,
-    WITHOUT_POSITION,
-    CopterMode,
-)
-from mavlink_sim.ardupilot.return_to_launch import ReturnToLaunch
 from mavlink_sim.autopilot.commander import ACCEPTED, IDLE_THRUST_MPS2, Autopilot
 from mavlink_sim.autopilot.ground_contact import TAKEOFF_DETECTION_HEIGHT_M
 from mavlink_sim.autopilot.position_failsafe import Descend
@@ -40,6 +29,17 @@ from mavlink_sim.px4.modes import (
     SystemState,
 )
 from mavlink_sim.px4.parameters import Parameters
+from mavlink_sim.vehicles.ardupilot.failsafes import Failsafes
+from mavlink_sim.vehicles.ardupilot.guided import Guided
+from mavlink_sim.vehicles.ardupilot.landing import Land
+from mavlink_sim.vehicles.ardupilot.modes import (
+    ARMABLE,
+    FLOWN,
+    POSITION_CONTROLLED,
+    WITHOUT_POSITION,
+    CopterMode,
+)
+from mavlink_sim.vehicles.ardupilot.return_to_launch import ReturnToLaunch
 from mavlink_sim.wire.announcements import CRITICAL, INFO
 
 FAILED = 4  # MAV_RESULT

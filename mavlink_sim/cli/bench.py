@@ -105,8 +105,8 @@ def measure_lockstep(seconds: float = 20.0) -> LockstepFigures:
 
 def measure_fleet(vehicles: int = 20, seconds: float = 3.0) -> float:
     """Processor seconds of one core per simulated second of a flying fleet on UDP at full stream rates."""
-    from mavlink_sim.fleet import Fleet, instance_options
-    from mavlink_sim.simulation import SimulationOptions
+    from mavlink_sim.realtime.fleet import Fleet, instance_options
+    from mavlink_sim.realtime.options import SimulationOptions
 
     onboard, gcs = free_udp_ports(2)
     options = SimulationOptions(

@@ -10,7 +10,8 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
-from mavlink_sim.fleet_world import FleetWorld, place_in_world
+from mavlink_sim.realtime.options import SimulationOptions
+from mavlink_sim.vehicles.fleet_world import FleetWorld, place_in_world
 from mavlink_sim.world.aircraft import identifier_offset
 from mavlink_sim.world.truth_file import TruthFile, object_truth
 from vision.attitude import euler_from_quaternion
@@ -20,8 +21,7 @@ if TYPE_CHECKING:
     from mavlink_sim.camera.scene import Scene
     from mavlink_sim.physics.airframe import Vector
     from mavlink_sim.physics.contact import Collision
-    from mavlink_sim.simulation import SimulationOptions
-    from mavlink_sim.vehicle import Vehicle
+    from mavlink_sim.vehicles.vehicle import Vehicle
 
 TRUTH_RATE_HZ = 20.0
 CAMERA_CHECK_S = 0.5

@@ -6,9 +6,6 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from mavlink_sim.ardupilot import commands, landing, parameter_service, streams, targets
-from mavlink_sim.ardupilot.context import CopterContext
-from mavlink_sim.ardupilot.guided import THRUST_AS_THRUST, Attitude
 from mavlink_sim.flight.precision_landing import LandingTarget
 from mavlink_sim.flight.setpoints import (
     ATTITUDE_IGNORE,
@@ -18,6 +15,9 @@ from mavlink_sim.flight.setpoints import (
     THROTTLE_IGNORE,
 )
 from mavlink_sim.services import manual_control_service, microservices
+from mavlink_sim.vehicles.ardupilot import commands, landing, parameter_service, streams, targets
+from mavlink_sim.vehicles.ardupilot.context import CopterContext
+from mavlink_sim.vehicles.ardupilot.guided import THRUST_AS_THRUST, Attitude
 from mavlink_sim.wire.announcements import INFO
 from mavlink_sim.wire.links import Link
 from mavlink_sim.wire.messages import dialect

@@ -7,11 +7,11 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, cast
 
-from mavlink_sim.ardupilot import services, streams, telemetry
-from mavlink_sim.ardupilot.autopilot import CopterAutopilot
-from mavlink_sim.ardupilot.modes import CopterMode
-from mavlink_sim.ardupilot.parameters import CopterParameters
-from mavlink_sim.vehicle import Vehicle
+from mavlink_sim.vehicles.ardupilot import services, streams, telemetry
+from mavlink_sim.vehicles.ardupilot.autopilot import CopterAutopilot
+from mavlink_sim.vehicles.ardupilot.modes import CopterMode
+from mavlink_sim.vehicles.ardupilot.parameters import CopterParameters
+from mavlink_sim.vehicles.vehicle import Vehicle
 from mavlink_sim.wire.announcements import Text
 from mavlink_sim.wire.links import Link
 

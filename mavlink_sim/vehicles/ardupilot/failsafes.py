@@ -6,10 +6,10 @@ import math
 from collections import deque
 from typing import Protocol
 
-from mavlink_sim.ardupilot.modes import WITHOUT_POSITION, CopterMode
 from mavlink_sim.autopilot.home import Home
 from mavlink_sim.physics.airframe import Vector
 from mavlink_sim.px4.parameters import Parameters
+from mavlink_sim.vehicles.ardupilot.modes import WITHOUT_POSITION, CopterMode
 from mavlink_sim.wire.announcements import CRITICAL, Text
 
 WARNING, NOTICE = 4, 5  # MAV_SEVERITY_WARNING, MAV_SEVERITY_NOTICE

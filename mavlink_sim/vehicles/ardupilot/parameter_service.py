@@ -11,9 +11,9 @@ from collections import deque
 from functools import partial
 from typing import Any
 
-from mavlink_sim.ardupilot import streams
-from mavlink_sim.ardupilot.context import CopterContext
 from mavlink_sim.px4.parameters import Parameter
+from mavlink_sim.vehicles.ardupilot import streams
+from mavlink_sim.vehicles.ardupilot.context import CopterContext
 from mavlink_sim.wire.links import Link
 from mavlink_sim.wire.messages import dialect
 

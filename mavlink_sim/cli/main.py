@@ -16,12 +16,12 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from mavlink_sim.camera.video_outputs import STANDARD_OUTPUT
-from mavlink_sim.firmware import AUTOPILOTS, PX4
-from mavlink_sim.fleet import Fleet, instance_options
 from mavlink_sim.physics.midair import REACH_M
 from mavlink_sim.px4.parameters import UnknownParameterError
+from mavlink_sim.realtime.fleet import Fleet, instance_options
+from mavlink_sim.realtime.options import SimulationOptions
 from mavlink_sim.releases import NEWEST, RELEASES
-from mavlink_sim.simulation import SimulationOptions
+from mavlink_sim.vehicles.firmware import AUTOPILOTS, PX4
 from mavlink_sim.wire.endpoint import PortInUseError
 from mavlink_sim.wire.signing import ALWAYS, key_of
 
@@ -329,7 +329,7 @@ def main() -> None:
 
             code = camera_app(sys.argv[2:], prog_name="mavlink-sim camera", standalone_mode=False)
         elif sys.argv[1:2] == ["bench"]:
-            from mavlink_sim.bench import app as bench_app
+            from mavlink_sim.cli.bench import app as bench_app
 
             code = bench_app(sys.argv[2:], prog_name="mavlink-sim bench", standalone_mode=False)
         else:

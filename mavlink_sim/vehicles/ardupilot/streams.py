@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from mavlink_sim.ardupilot.context import CopterContext
+from mavlink_sim.vehicles.ardupilot.context import CopterContext
 from mavlink_sim.wire.links import Link
 
 MAX_RATE_HZ = 200.0

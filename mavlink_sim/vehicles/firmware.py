@@ -1,8 +1,8 @@
-"""Which autopilot a vehicle is like: PX4, or an ArduPilot Copter (`mavlink_sim.ardupilot`)."""
+"""Which autopilot a vehicle is like: PX4, or an ArduPilot Copter (`mavlink_sim.vehicles.ardupilot`)."""
 
 from __future__ import annotations
 
-from mavlink_sim.vehicle import Vehicle
+from mavlink_sim.vehicles.vehicle import Vehicle
 
 PX4, ARDUPILOT = "px4", "ardupilot"
 AUTOPILOTS = (PX4, ARDUPILOT)
@@ -14,7 +14,7 @@ def vehicle_class(autopilot: str) -> type[Vehicle]:
         return Vehicle
     if autopilot == ARDUPILOT:
         # imported here: its message definitions take their time to load
-        from mavlink_sim.ardupilot.copter import CopterVehicle
+        from mavlink_sim.vehicles.ardupilot.copter import CopterVehicle
 
         return CopterVehicle
     raise ValueError(f"autopilot {autopilot!r}: expected one of {', '.join(AUTOPILOTS)}")
