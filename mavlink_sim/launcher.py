@@ -27,7 +27,7 @@ import traceback
 from contextlib import suppress
 from dataclasses import dataclass
 
-from mavlink_sim.launching import ENDED, FAREWELL_S, LARGEST_REQUEST, STARTED, Request
+from mavlink_sim.launching import ENDED, LARGEST_REQUEST, SHUTDOWN_TIMEOUT_S, STARTED, Request
 from vision.gc_pause import gc_paused
 
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
@@ -47,7 +47,7 @@ class _Child:
         with suppress(OSError):  # who asked does not want to know any more, or sees the end of the answers
             socket.send_fds(self.answers, [STARTED.pack(self.pid)], [self.descriptor])
 
-    def take_end(self) -> None:
+    def on_exit(self) -> None:
         """It has ended: take its exit code, and pass that on."""
         _, status = os.waitpid(self.pid, 0)
         with suppress(*_GONE):
@@ -105,7 +105,7 @@ class _Launcher:
             while True:
                 for key, _ in self._selector.select():
                     if key.data is not None:
-                        self._take_end(key.data)
+                        self._on_exit(key.data)
                     elif key.fileobj == self._program:
                         return None
                     else:
@@ -184,10 +184,10 @@ class _Launcher:
         os.environ.clear()
         os.environ.update(request.environment)
 
-    def _take_end(self, child: _Child) -> None:
+    def _on_exit(self, child: _Child) -> None:
         self._selector.unregister(child.descriptor)
         self._children.remove(child)
-        child.take_end()
+        child.on_exit()
 
     def _end_all(self) -> None:
         for child in self._children:
@@ -195,13 +195,13 @@ class _Launcher:
             child.send(signal.SIGCONT)  # it may be suspended
         self._selector.unregister(self._requests)
         self._selector.unregister(self._program)
-        until_s = time.monotonic() + FAREWELL_S
+        until_s = time.monotonic() + SHUTDOWN_TIMEOUT_S
         while self._children and (left_s := until_s - time.monotonic()) > 0.0:
             for key, _ in self._selector.select(left_s):
-                self._take_end(key.data)
+                self._on_exit(key.data)
         for child in [*self._children]:
             child.send(signal.SIGKILL)
-            self._take_end(child)
+            self._on_exit(child)
 
 
 if __name__ == "__main__":

@@ -23,9 +23,9 @@ LARGEST_REQUEST = 1 << 17  # less than any socket's buffer
 STARTED = struct.Struct("!i")  # the process's id; below zero: an errno, it could not be forked
 ENDED = struct.Struct("!i")  # the exit code, as `subprocess` has it
 # How long vehicles have to end in order once nobody is there who wants them: a camera may take 5 s.
-FAREWELL_S = 7.0
+SHUTDOWN_TIMEOUT_S = 7.0
 # What it takes to end its vehicles, and some more.
-LAUNCHER_ENDS_S = FAREWELL_S + 2.0
+LAUNCHER_ENDS_S = SHUTDOWN_TIMEOUT_S + 2.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -177,7 +177,7 @@ class LockstepVehicle:
             self.vehicle.step(dt_s)
         else:
             self._step_and_repeat(dt_s, wired)
-        self._take()
+        self._drain()
 
     def _step_and_repeat(self, dt_s: float, wired: bool) -> None:
         """From one repeated message to the next; each goes out with the first step at or after its time.
@@ -201,9 +201,9 @@ class LockstepVehicle:
             if wired:
                 for wire in self._wires.values():
                     wire.deliver()
-                self._take()
+                self._drain()
 
-    def _take(self) -> None:
+    def _drain(self) -> None:
         for name, waiting in self._waiting.items():
             outgoing = self.vehicle.outgoing(name)
             wire = self._wires[name]
@@ -259,7 +259,7 @@ class LockstepVehicle:
             header = message.get_header()
             header.srcSystem, header.srcComponent = source
             self.vehicle.handle(name, message)
-        self._take()
+        self._drain()
 
     def send_bytes(self, data: bytes, link: str = "") -> int:
         """Hand it bytes off a wire; returns how many whole messages it took out of them and of what was left.
@@ -267,7 +267,7 @@ class LockstepVehicle:
         A fault of the link may hold or lose them, and a link with a signing key may refuse them.
         """
         count = self._wires[link or self._main_link].send_bytes(data)
-        self._take()
+        self._drain()
         return count
 
     def repeat(

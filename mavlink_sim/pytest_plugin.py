@@ -80,9 +80,9 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
 def _section(number: int, folder: Path, simulator: RunningSimulator) -> tuple[str, str]:
     """The report's part on one vehicle, whose log is written now: the test may be all there is to see."""
     log = _write_log(folder, simulator)
-    said = simulator.transcript[-LINES_IN_THE_REPORT:]
+    output = simulator.transcript[-LINES_IN_THE_REPORT:]
     records = "".join(f"traffic: {path}\n" for path in sorted(folder.glob("*.tlog")))
-    return (f"vehicle {number}", f"log:     {log}\n{records}" + "".join(f"{line}\n" for line in said))
+    return (f"vehicle {number}", f"log:     {log}\n{records}" + "".join(f"{line}\n" for line in output))
 
 
 def _write_log(folder: Path, simulator: RunningSimulator) -> Path:

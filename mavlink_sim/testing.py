@@ -148,12 +148,12 @@ class RunningSimulator:
     def _read(self) -> None:
         assert self.process.stdout is not None
         for line in self.process.stdout:
-            self._take(line.rstrip("\n"))
+            self._on_line(line.rstrip("\n"))
         with self._changed:
             self._ended = True
             self._changed.notify_all()
 
-    def _take(self, line: str) -> None:
+    def _on_line(self, line: str) -> None:
         found = READY.match(line)
         with self._changed:
             self.transcript.append(f"{time.monotonic() - self._started_s:9.3f} {line}")

@@ -103,7 +103,7 @@ class Autopilot:
         self._takeoff_height_m: float | None = None
         self.task: flight.Task | None = None
         self._mode_after_disarming = Mode.HOLD
-        self._last_setpoint_s = self._refusal_told_s = -math.inf
+        self._last_setpoint_s = self._refusal_sent_s = -math.inf
         self._setpoint_needs_position = False
         self._rates_alone = False  # the newest offboard setpoint was of body rates
         self.navigator = Navigator(self, airframe, parameters, local_frame, on_event)
@@ -176,8 +176,8 @@ class Autopilot:
     @property
     def base_mode(self) -> int:
         # PX4 goes by the newest setpoint, however old
-        ever_heard = math.isfinite(self._last_setpoint_s)
-        return base_mode(self.mode, self.armed, ever_heard and not self._rates_alone)
+        has_setpoint = math.isfinite(self._last_setpoint_s)
+        return base_mode(self.mode, self.armed, has_setpoint and not self._rates_alone)
 
     @property
     def landed_state(self) -> LandedState:
@@ -201,14 +201,16 @@ class Autopilot:
             return TEMPORARILY_REJECTED
         if not self.can_arm:
             if not self.sensors_ready:
-                self._say(CRITICAL, "Preflight Fail: heading estimate not stable")
-            self._say(CRITICAL, "Arming denied: Resolve system health failures first\t", ARMING_DENIED_EVENT)
+                self._send_text(CRITICAL, "Preflight Fail: heading estimate not stable")
+            self._send_text(
+                CRITICAL, "Arming denied: Resolve system health failures first\t", ARMING_DENIED_EVENT
+            )
             self.report_checks()
             return TEMPORARILY_REJECTED
         self.armed = True
         self.ground.arm(self.now_s)
         self.home.follow(self._airframe, self._parameters)
-        self._say(INFO, f"Armed by {by}\t", (*ARMED_EVENT[:2], bytes([REASONS[by]])))
+        self._send_text(INFO, f"Armed by {by}\t", (*ARMED_EVENT[:2], bytes([REASONS[by]])))
         self._on_event("armed")
         self._start_task()
         return ACCEPTED
@@ -223,15 +225,15 @@ class Autopilot:
             return ACCEPTED
         if not self.landed and not force and not self.supervision.may_disarm_in_the_air(by):
             if by != "stick gesture":
-                self._say(CRITICAL, "Disarming denied: not landed\t")
+                self._send_text(CRITICAL, "Disarming denied: not landed\t")
             return TEMPORARILY_REJECTED
         self._disarm(f"Disarmed by {by}\t", "by command" if by == "external command" else f"by {by}")
         return ACCEPTED
 
-    def set_mode(self, mode: Mode, tell: bool = False) -> int:
-        """MAV_RESULT of a request for a mode; with `tell`, a refusal is also a text."""
+    def set_mode(self, mode: Mode, report: bool = False) -> int:
+        """MAV_RESULT of a request for a mode; with `report`, a refusal is also a text."""
         if self.armed and not self.can_run(mode):
-            if tell:
+            if report:
                 self.report_unavailable(mode)
             return TEMPORARILY_REJECTED
         self._intend(mode)
@@ -251,9 +253,9 @@ class Autopilot:
 
     def report_unavailable(self, mode: Mode) -> None:
         """A mode was refused: PX4 says so at most once a second, whatever the mode."""
-        if self.now_s - self._refusal_told_s > REFUSALS_APART_S:
-            self._refusal_told_s = self.now_s
-            self._say(CRITICAL, f"Switching to {mode.title} is currently not available\t")
+        if self.now_s - self._refusal_sent_s > REFUSALS_APART_S:
+            self._refusal_sent_s = self.now_s
+            self._send_text(CRITICAL, f"Switching to {mode.title} is currently not available\t")
 
     def can_run(self, mode: Mode) -> bool:
         """Whether an armed vehicle may fly in this mode now."""
@@ -271,27 +273,27 @@ class Autopilot:
             return TEMPORARILY_REJECTED
         if altitude_m is None:
             altitude_m = self._parameters.number("MIS_TAKEOFF_ALT")
-            self._say(
+            self._send_text(
                 INFO,
                 f"Using default takeoff altitude: {altitude_m:.1f} m\t",
                 (DEFAULT_ALTITUDE_EVENT, 0x66, struct.pack("<f", altitude_m)),
             )
         elif altitude_m < self.home.position[2] - self._airframe.position[2]:
             # what becomes of a height above ground in a field that is above the sea; it does not descend
-            self._say(CRITICAL, "Already higher than takeoff altitude\t")
+            self._send_text(CRITICAL, "Already higher than takeoff altitude\t")
         self._takeoff_height_m = altitude_m
         self._intend(Mode.TAKEOFF)
         return ACCEPTED
 
     def land(self) -> int:
         """Always taken: without a position it comes down all the same."""
-        self._say(INFO, "Landing at current position\t", LANDING_EVENT)
+        self._send_text(INFO, "Landing at current position\t", LANDING_EVENT)
         return self.force_mode(Mode.LAND)
 
     def return_home(self) -> int:
         if self._refuses(Mode.RTL):
             return TEMPORARILY_REJECTED
-        self._say(INFO, "Returning to launch\t")
+        self._send_text(INFO, "Returning to launch\t")
         self._intend(Mode.RTL)
         return ACCEPTED
 
@@ -314,7 +316,7 @@ class Autopilot:
         airframe, parameters = self._airframe, self._parameters
         goal = reposition.reposition_goal(goal, yaw_rad, airframe, parameters, former)
         if not self.navigator.allows_goal(goal):
-            self._say(CRITICAL, "Reposition is outside geofence\t")
+            self._send_text(CRITICAL, "Reposition is outside geofence\t")
             return
         self.task = reposition.Reposition(airframe, parameters, goal, yaw_rad, self.home.position)
         self.task.cruise_at(speed_mps if speed_mps > 0.0 else self.cruise_mps)
@@ -334,12 +336,12 @@ class Autopilot:
     def orbit(self, request: OrbitRequest) -> int:
         """Mode ORBIT; a radius that cannot be is accepted too, and then the vehicle hovers in that mode."""
         if self.armed and not self.can_run(Mode.ORBIT):
-            self._say(CRITICAL, "Orbit command rejected")
+            self._send_text(CRITICAL, "Orbit command rejected")
             return TEMPORARILY_REJECTED
         if self.mode is not Mode.ORBIT or not isinstance(self.task, Orbit):
             self._intend(Mode.ORBIT)
         if isinstance(self.task, Orbit) and not self.task.apply(request):
-            self._say(CRITICAL, "Orbit radius limit exceeded\t")
+            self._send_text(CRITICAL, "Orbit radius limit exceeded\t")
         return ACCEPTED
 
     def pilot_takes_over(self, mode: Mode = Mode.POSCTL) -> int:
@@ -347,11 +349,11 @@ class Autopilot:
         self.pilot_has_sticks = True
         return self.set_mode(mode)
 
-    def hold_at(self, place: Vector) -> None:
+    def hold_at(self, point: Vector) -> None:
         """Change to HOLD, and stay at a local NED position rather than where braking ends."""
         self._intend(Mode.HOLD)
         if self.armed and self.mode is Mode.HOLD:  # no failsafe has it
-            self.task = flight.Hold(self._airframe, self._parameters, place)
+            self.task = flight.Hold(self._airframe, self._parameters, point)
 
     def restart_task(self) -> None:
         """Begin the current mode's task anew."""
@@ -393,7 +395,7 @@ class Autopilot:
         was_landing = task.landing
         setpoint = task.update(dt_s)
         if task.landing and not was_landing and self.mode is Mode.RTL:
-            self._say(INFO, "RTL: land at destination\t")
+            self._send_text(INFO, "RTL: land at destination\t")
         if self.supervision.motors_stopped:
             self._idle(dt_s, 0.0)
         elif isinstance(task, manual_flight.Stabilized):
@@ -456,7 +458,7 @@ class Autopilot:
         if self.ground.landed:
             if airframe.floor_down_m - airframe.position[2] > TAKEOFF_DETECTION_HEIGHT_M:
                 self.ground.leave(self.now_s)
-                self._say(INFO, "Takeoff detected\t", TAKEOFF_EVENT)
+                self._send_text(INFO, "Takeoff detected\t", TAKEOFF_EVENT)
                 self._on_event("takeoff")
         elif self.ground.presses(self.now_s, self.controller.velocity[2]):
             self._has_landed()
@@ -465,7 +467,7 @@ class Autopilot:
         self.ground.touch_down(self.now_s)
         if not self.armed:  # it fell
             self.home.follow(self._airframe, self._parameters)
-        self._say(INFO, "Landing detected\t", LANDED_EVENT)
+        self._send_text(INFO, "Landing detected\t", LANDED_EVENT)
         self._on_event("landed")
 
     def _disarm_automatically(self) -> None:
@@ -575,11 +577,11 @@ class Autopilot:
         if self.landed:
             self.home.follow(self._airframe, self._parameters)
         code = REASONS.get(reason.removeprefix("by "), 6 if reason == "after landing" else 4)
-        self._say(INFO, text, (DISARMED_EVENT, 0x66, bytes([code])))
+        self._send_text(INFO, text, (DISARMED_EVENT, 0x66, bytes([code])))
         self.supervision.disarmed()
         self._on_event(f"disarmed ({reason})")
         self.intended_mode = self._mode_after_disarming
         self._enter(self.intended_mode)
 
-    def _say(self, severity: int, text: str, event: tuple[int, int, bytes] | None = None) -> None:
+    def _send_text(self, severity: int, text: str, event: tuple[int, int, bytes] | None = None) -> None:
         self.texts.append(Text(severity, text, event))

@@ -101,11 +101,11 @@ class FailsafeMachine:
     """
 
     def __init__(
-        self, parameters: Parameters, can_fly: Callable[[Mode], bool], say: Callable[[Text], None]
+        self, parameters: Parameters, can_fly: Callable[[Mode], bool], announce: Callable[[Text], None]
     ) -> None:
         self._parameters = parameters
         self._can_fly = can_fly
-        self._say = say
+        self._announce = announce
         self.action = Action.NONE
         self.reason = ""
         self.user_took_over = False
@@ -168,7 +168,7 @@ class FailsafeMachine:
             self._remove_settled()
         self._load()
         self._delay_s = max(self._delay_s - dt_s, 0.0)
-        self._check_everything(conditions, armed, intended)
+        self._check_all(conditions, armed, intended)
         self._drop_unchecked()
         if self.action > Action.HOLD or not self._can_fly(Mode.HOLD) or self.user_took_over:
             self._delay_s = 0.0
@@ -181,7 +181,7 @@ class FailsafeMachine:
 
     # ---- the checks -------------------------------------------------------------------------------------
 
-    def _check_everything(self, conditions: Conditions, armed: bool, intended: Mode) -> None:
+    def _check_all(self, conditions: Conditions, armed: bool, intended: Mode) -> None:
         value = self._value
         if armed and not self._was_armed:
             self._manual_control_optional = conditions.manual_control_lost
@@ -342,14 +342,14 @@ class FailsafeMachine:
                 if sticks_request and not self.user_took_over:
                     intended = Mode.POSCTL
                 if not self.user_took_over:
-                    self._say(failsafe_overruled())
+                    self._announce(failsafe_overruled())
                 took_over, delayed = True, Action.NONE
                 action = max(Action.WARN, self._mode_fallback(conditions, intended))
             action, cause = self._possible(action, cause)
             action, delayed = self._softened(action, delayed, intended)
         self._use_delay(dt_s, delayed is not Action.NONE)
         if action > before or (action is not Action.NONE and self._must_notify):
-            self._say(failsafe_entered(intended, action, delayed, cause, self._delay_s))
+            self._announce(failsafe_entered(intended, action, delayed, cause, self._delay_s))
         self._must_notify = False
         if before > Action.WARN >= action and intended is Mode.ORBIT:
             intended = Mode.HOLD  # the circle that it had been flying is forgotten
@@ -377,12 +377,12 @@ class FailsafeMachine:
 
     def _softened(self, action: Action, delayed: Action, intended: Mode) -> tuple[Action, Action]:
         """A vehicle that lands or returns already is not sent to return again."""
-        flown = {
+        flyable = {
             Mode.LAND: {Action.RETURN},
             Mode.RTL: {Action.RETURN},
             Mode.PRECLAND: {Action.RETURN, Action.LAND},
         }.get(intended, set())
-        if (action in flown or delayed in flown) and self._can_fly(intended):
+        if (action in flyable or delayed in flyable) and self._can_fly(intended):
             return Action.WARN, Action.NONE
         return action, delayed
 

@@ -61,7 +61,7 @@ class SupervisedAutopilot(CheckedAutopilot, Protocol):
 
     def disarm(self, force: bool = False, by: str = ...) -> int: ...
 
-    def set_mode(self, mode: Mode, tell: bool = False) -> int: ...
+    def set_mode(self, mode: Mode, report: bool = False) -> int: ...
 
     def can_run(self, mode: Mode) -> bool: ...
 
@@ -106,7 +106,7 @@ class Supervision:
         self._mode_requested = False
         self._ever_had_mode = False
         self._disarmed_s = -math.inf
-        self._told_in_failsafe = (Action.NONE, Mode.HOLD)
+        self._announced_failsafe = (Action.NONE, Mode.HOLD)
 
     def keep_equipment(self, before: Supervision) -> None:
         """A reboot: neither the battery nor what the pilot holds is part of the autopilot."""
@@ -273,13 +273,13 @@ class Supervision:
                 autopilot.announce("the pilot took over using the sticks")
         autopilot.failsafe = machine.in_failsafe
         mode = machine.mode(intended)
-        told = (machine.action, mode)
-        if machine.in_failsafe and told != self._told_in_failsafe:
+        announced = (machine.action, mode)
+        if machine.in_failsafe and announced != self._announced_failsafe:
             autopilot.announce(f"failsafe: {machine.reason}, {mode.name}")
         elif was_in_failsafe and not machine.in_failsafe:
             back = reason == "offboard setpoints lost" and mode is Mode.OFFBOARD and autopilot.armed
             autopilot.announce("offboard setpoints are back" if back else "failsafe over")
-        self._told_in_failsafe = told
+        self._announced_failsafe = announced
         return mode
 
     def _can_fly(self, mode: Mode) -> bool:
@@ -380,7 +380,7 @@ class Supervision:
         elif request.kind is RequestKind.SWITCH_MODE:
             assert request.mode is not None
             autopilot.announce(f"the pilot asks for {request.mode.name}")
-            autopilot.set_mode(request.mode, tell=True)
+            autopilot.set_mode(request.mode, report=True)
         else:
             self._kill(request.kind is RequestKind.KILL)
 

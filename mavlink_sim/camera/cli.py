@@ -296,7 +296,7 @@ class _Run:
             "velocity_ned_mps": [round(value, 4) for value in pose.velocity],
             "yaw_rad": round(euler_from_quaternion(pose.attitude)[2], 5),
             "armed": self._link.systems[self._link.system_id or 0],
-            "objects": [object_truth(thing, here) for thing in self._scene.objects_at(time_s)],
+            "objects": [object_truth(scene_object, here) for scene_object in self._scene.objects_at(time_s)],
         }
 
     def _announce(self) -> None:

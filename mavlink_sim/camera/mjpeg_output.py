@@ -39,7 +39,7 @@ class MjpegOutput:
     """
 
     def __init__(self, host: str, port: int) -> None:
-        self._picture: bytes | None = None
+        self._jpeg: bytes | None = None
         self._stamp_ns = 0
         self._number = 0
         self._clients = 0
@@ -84,7 +84,7 @@ class MjpegOutput:
             logger.error("a frame of %dx%d could not be encoded as JPEG", frame.width, frame.height)
             return
         with self._changed:
-            self._picture, self._stamp_ns, self._number = jpeg.tobytes(), frame.captured_ns, self._number + 1
+            self._jpeg, self._stamp_ns, self._number = jpeg.tobytes(), frame.captured_ns, self._number + 1
             self._changed.notify_all()
 
     def enter(self) -> bool:
@@ -103,11 +103,11 @@ class MjpegOutput:
     def after(self, number: int) -> tuple[bytes, int, int] | None:
         """(picture, stamp in ns, number) of the first picture newer than a number; None when closed."""
         with self._changed:
-            while not self._closed and (self._picture is None or self._number <= number):
+            while not self._closed and (self._jpeg is None or self._number <= number):
                 self._changed.wait()
-            if self._closed or self._picture is None:
+            if self._closed or self._jpeg is None:
                 return None
-            return self._picture, self._stamp_ns, self._number
+            return self._jpeg, self._stamp_ns, self._number
 
     @property
     def number(self) -> int:
@@ -146,16 +146,16 @@ class _Handler(BaseHTTPRequestHandler):
             self.close_connection = True
 
     def _snapshot(self) -> None:
-        picture = self.source.after(self.source.number)
-        if picture is None:
+        entry = self.source.after(self.source.number)
+        if entry is None:
             self.send_error(HTTPStatus.SERVICE_UNAVAILABLE, "the camera has closed")
             return
         self.send_response(HTTPStatus.OK)
         self.send_header("Content-Type", "image/jpeg")
-        self.send_header("Content-Length", str(len(picture[0])))
-        self.send_header("X-Captured-Ns", str(picture[1]))
+        self.send_header("Content-Length", str(len(entry[0])))
+        self.send_header("X-Captured-Ns", str(entry[1]))
         self.end_headers()
-        self.wfile.write(picture[0])
+        self.wfile.write(entry[0])
 
     def _stream(self) -> None:
         # Little is kept in the kernel for a client: what waits there is old.
@@ -165,8 +165,8 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Cache-Control", "no-store")
         self.end_headers()
         number = self.source.number
-        while (picture := self.source.after(number)) is not None:
-            jpeg, stamp_ns, number = picture
+        while (entry := self.source.after(number)) is not None:
+            jpeg, stamp_ns, number = entry
             head = (
                 f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n"
                 f"X-Captured-Ns: {stamp_ns}\r\n\r\n"

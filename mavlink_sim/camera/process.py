@@ -135,9 +135,9 @@ def run_camera(
             if not math.isnan(roll):
                 turned = replace(mount, roll_rad=roll, pitch_rad=pitch, yaw_rad=yaw)
             attitude = matrix_from_quaternion((values[3], values[4], values[5], values[6]))
-            taken = camera.capture(values[:3], attitude, int(stamp_ns), time_s, turned, others=others)
-            if taken is not None:
-                on_the_way.append(taken)
+            frame = camera.capture(values[:3], attitude, int(stamp_ns), time_s, turned, others=others)
+            if frame is not None:
+                on_the_way.append(frame)
 
 
 def _newest(poses: Connection, timeout_s: float | None) -> bytes | None:

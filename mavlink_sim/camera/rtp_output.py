@@ -76,10 +76,10 @@ class RtpOutput:
         if pts <= self._last_pts:
             return  # a stamp that does not go forward cannot be said in RTP
         self._last_pts = pts
-        picture = self._av.VideoFrame.from_ndarray(frame.image, format="bgr24").reformat(format="yuv420p")
-        picture.pts, picture.time_base = pts, Fraction(1, CLOCK_HZ)
+        image = self._av.VideoFrame.from_ndarray(frame.image, format="bgr24").reformat(format="yuv420p")
+        image.pts, image.time_base = pts, Fraction(1, CLOCK_HZ)
         try:
-            for packet in self._stream.encode(picture):
+            for packet in self._stream.encode(image):
                 self._container.mux(packet)
         except OSError as error:  # nobody listens on a port of this host, or the network is away
             if not self._failed:

@@ -17,14 +17,14 @@ from mavlink_sim.camera.depth_camera import DepthSensor
 from mavlink_sim.camera.image_effects import MILD_EFFECTS, ImageEffects
 from mavlink_sim.camera.lens import Shutter
 from mavlink_sim.camera.renderer import DEFAULT_CAMERA, DEFAULT_MOUNT
-from mavlink_sim.world.obstacles import Way
+from mavlink_sim.world.obstacles import ObstacleMotion
 from mavlink_sim.world.world import Vector, World, WorldObject
 from vision.camera_model import CameraModel, CameraMount
 
 Repeat = Literal["loop", "back_and_forth", "once"]
 
 
-class Motion(Way, Protocol):
+class Motion(ObstacleMotion, Protocol):
     """How an object of a scene moves; `Path` is one."""
 
     @property
@@ -63,14 +63,14 @@ class Path:
             raise ValueError("a path's waypoints all lie in one place; give the object a place without path")
 
     @cached_property
-    def _places(self) -> tuple[Vector, ...]:
+    def _waypoints(self) -> tuple[Vector, ...]:
         closed = self.waypoints_ned_m[:1] if self.repeat == "loop" else ()
         return self.waypoints_ned_m + closed
 
     @cached_property
     def _marks(self) -> list[float]:
         """Metres along the way at which each place is reached."""
-        return list(accumulate((math.dist(a, b) for a, b in pairwise(self._places)), initial=0.0))
+        return list(accumulate((math.dist(a, b) for a, b in pairwise(self._waypoints)), initial=0.0))
 
     @property
     def period_s(self) -> float:
@@ -90,21 +90,21 @@ class Path:
                 along, forth = 2.0 * length - along, False
         else:
             along = min(max(along, 0.0), length)
-        leg = min(max(bisect.bisect_right(self._marks, along) - 1, 0), len(self._places) - 2)
-        start, end = self._places[leg], self._places[leg + 1]
+        leg = min(max(bisect.bisect_right(self._marks, along) - 1, 0), len(self._waypoints) - 2)
+        start, end = self._waypoints[leg], self._waypoints[leg + 1]
         span = self._marks[leg + 1] - self._marks[leg]
         share = (along - self._marks[leg]) / span if span > 0.0 else 0.0
-        place = tuple(a + (b - a) * share for a, b in zip(start, end, strict=True))
-        return (place[0], place[1], place[2]), self._heading(leg, forth)
+        position = tuple(a + (b - a) * share for a, b in zip(start, end, strict=True))
+        return (position[0], position[1], position[2]), self._heading(leg, forth)
 
     def _heading(self, leg: int, forth: bool) -> float:
         if self.fixed_yaw_rad is not None:
             return self.fixed_yaw_rad
-        count = len(self._places) - 1
+        count = len(self._waypoints) - 1
         # Legs that lead nowhere on the map take the heading of the one before.
         for back in range(count):
             index = (leg - back) % count if forth else (leg + back) % count
-            start, end = self._places[index], self._places[index + 1]
+            start, end = self._waypoints[index], self._waypoints[index + 1]
             north, east = end[0] - start[0], end[1] - start[1]
             if math.hypot(north, east) > 1e-9:
                 return math.atan2(east, north) if forth else math.atan2(-east, -north)

@@ -41,7 +41,7 @@ def _fail(text: str) -> NoReturn:
     raise typer.Exit(2)
 
 
-def _say(text: str) -> None:
+def _print_line(text: str) -> None:
     print(text, flush=True)
 
 
@@ -63,7 +63,7 @@ def _print_version(wanted: bool) -> None:
     if wanted:
         from importlib.metadata import version
 
-        _say(f"mavlink-sim {version('mavlink-companion')}")
+        _print_line(f"mavlink-sim {version('mavlink-companion')}")
         raise typer.Exit
 
 
@@ -259,7 +259,7 @@ def simulate(
             DEFAULT_SPACING_M if spacing is None else spacing,
             1 if camera_vehicle is None else camera_vehicle,
         )
-        fleet = Fleet(members, on_event=_say)
+        fleet = Fleet(members, on_event=_print_line)
     except PortInUseError as error:
         _fail(str(error))
     except UnknownParameterError as error:
@@ -298,18 +298,18 @@ def _run(fleet: Fleet, ready_file: Path | None) -> None:
             _fail(f"--ready-file: {error}")
     for one, bound in zip(fleet, reports, strict=True):
         options = one.options
-        _say(
+        _print_line(
             f"ready: system {options.system_id}, "
             f"onboard {options.host}:{bound['onboard_bind']} -> {options.onboard_port}, "
             f"ground station {options.host}:{bound['gcs_bind']} -> {options.gcs_port}"
         )
     if len(reports) > 1:
-        _say(f"ready: {len(reports)} vehicles")
+        _print_line(f"ready: {len(reports)} vehicles")
     # What is there stays: to look through it all would hold every vehicle up for some steps.
     gc.collect()
     gc.freeze()
     fleet.run()
-    _say("stopped")
+    _print_line("stopped")
 
 
 def load() -> None:

@@ -125,10 +125,10 @@ def make_dataset(
         for index, captured in enumerate(frames):
             split = "val" if _is_validation(index, options.validation) else "train"
             name = f"{index:06d}"
-            _write_picture(folder / "images" / split / f"{name}.jpg", captured.frame.image)
+            _write_image(folder / "images" / split / f"{name}.jpg", captured.frame.image)
             if options.depth:
                 assert captured.frame.depth_m is not None
-                _write_picture(folder / "depth" / split / f"{name}.png", _millimetres(captured.frame.depth_m))
+                _write_image(folder / "depth" / split / f"{name}.png", _millimetres(captured.frame.depth_m))
             seen = [item for item in captured.rendered.objects if _counts(item, options)]
             labels += len(seen)
             size = (captured.frame.width, captured.frame.height)
@@ -177,7 +177,7 @@ def _scene_frames(scene: Scene, options: DatasetOptions) -> Iterator[Captured]:
     for index in range(options.frames):
         rng = np.random.default_rng((options.seed, index, 7))
         time_s = float(rng.uniform(0.0, min(horizon_s, LONGEST_TIME_S)))
-        position, attitude = _look(rng, scene, scene.objects_at(time_s), options)
+        position, attitude = _viewpoint(rng, scene, scene.objects_at(time_s), options)
         motion = CameraMotion()
         if settings.shutter is not None:
             velocity, turning = rng.normal(0.0, 2.5, 3), rng.normal(0.0, 0.3, 3)
@@ -190,7 +190,7 @@ def _scene_frames(scene: Scene, options: DatasetOptions) -> Iterator[Captured]:
         yield captured
 
 
-def _look(
+def _viewpoint(
     rng: np.random.Generator, scene: Scene, objects: Sequence[WorldObject], options: DatasetOptions
 ) -> tuple[list[float], NDArray[np.float64]]:
     """A position and attitude of the body so that the camera sees an object, anywhere in its picture."""
@@ -235,8 +235,8 @@ def _look(
     )
 
 
-def _write_picture(path: Path, picture: NDArray[Any]) -> None:
-    done, data = cv2.imencode(path.suffix, picture, _QUALITY if path.suffix == ".jpg" else [])
+def _write_image(path: Path, image: NDArray[Any]) -> None:
+    done, data = cv2.imencode(path.suffix, image, _QUALITY if path.suffix == ".jpg" else [])
     if not done:
         raise DatasetError(f"{path} could not be encoded")
     path.write_bytes(data.tobytes())

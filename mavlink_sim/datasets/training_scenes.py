@@ -141,15 +141,15 @@ def flight_frame(rng: np.random.Generator, width: int, height: int) -> Rendered:
     yaw = float(rng.uniform(-math.pi, math.pi))
     attitude = matrix_from_euler(math.radians(float(rng.normal(0.0, 4.0))), -down, yaw)
     ground = _random_ground(rng, painted=0.45)
-    place = rng.uniform(-45.0, 45.0, 2)
+    viewpoint = rng.uniform(-45.0, 45.0, 2)
     if ground.pad or ground.patches:
         # Look at what is painted: a pad, a pond.
         spots = [(patch.north_m, patch.east_m) for patch in ground.patches] + [(0.0, 0.0)] * ground.pad
         spot = spots[int(rng.integers(len(spots)))]
         bearing = yaw + float(rng.uniform(-0.5, 0.5))
         away = altitude / math.tan(down) * float(rng.uniform(0.5, 2.5))
-        place = np.array(spot) - min(away, 40.0) * np.array([math.cos(bearing), math.sin(bearing)])
-    position = (float(place[0]), float(place[1]), -altitude)
+        viewpoint = np.array(spot) - min(away, 40.0) * np.array([math.cos(bearing), math.sin(bearing)])
+    position = (float(viewpoint[0]), float(viewpoint[1]), -altitude)
     light, sky, buffers = _random_light(rng), _random_sky(rng), _buffers(width, height)
     renderer = Renderer(World((), ground, light, sky), camera, CameraMount(), None, buffers)
     objects = _random_objects(rng, renderer, position, attitude, ground, far=True)
@@ -515,8 +515,8 @@ def _shadow_casters(
         appearance, yaw = int(rng.integers(2**31)), float(rng.uniform(-math.pi, math.pi))
         item = WorldObject(1000 + len(casters), class_name, (0.0, 0.0, 0.0), yaw, 1.0, appearance)
         reach = item.height_m * float(rng.uniform(0.5, 1.0)) / max(-sun[2], 0.1)
-        place = (float(shadow[0] + sun[0] * reach), float(shadow[1] + sun[1] * reach), 0.0)
-        item = replace(item, position_ned_m=place)
+        viewpoint = (float(shadow[0] + sun[0] * reach), float(shadow[1] + sun[1] * reach), 0.0)
+        item = replace(item, position_ned_m=viewpoint)
         outline = _outline(item, view)
         # Behind the lens counts as outside, but not right over it.
         outside = outline is None or outline[1] < 0.02

@@ -22,15 +22,15 @@ class FaultConsole:
     Args:
         descriptor: to read; usually 0.
         command: carries out one line.
-        say: prints one line of an answer.
+        report: prints one line of an answer.
     """
 
     def __init__(
-        self, descriptor: int, command: Callable[[str], Outcome], say: Callable[[str], None]
+        self, descriptor: int, command: Callable[[str], Outcome], report: Callable[[str], None]
     ) -> None:
         self._descriptor = descriptor
         self._command = command
-        self._say = say
+        self._report = report
         self._partial = b""
         self._open = True
         self._selector = selectors.DefaultSelector()
@@ -65,7 +65,7 @@ class FaultConsole:
 
     def _answer(self, outcome: Outcome) -> None:
         for line in outcome.text.splitlines():
-            self._say(line if outcome.ok else f"not done: {line}")
+            self._report(line if outcome.ok else f"not done: {line}")
 
     def close(self) -> None:
         """Read no more. The descriptor stays open: it is not ours."""

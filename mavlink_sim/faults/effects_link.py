@@ -36,9 +36,9 @@ def _channels(vehicle: FaultTarget, one: ActiveFault) -> list[tuple[str, Channel
     found = []
     for name in chosen_links(vehicle, values["link"]):
         stage = vehicle.faults.stage(name)
-        for way, channel in (("out", stage.outbound), ("in", stage.inbound)):
-            if values["way"] in ("both", way):
-                found.append((f"{one.seed}:{name}:{way}", channel))
+        for direction, channel in (("out", stage.outbound), ("in", stage.inbound)):
+            if values["way"] in ("both", direction):
+                found.append((f"{one.seed}:{name}:{direction}", channel))
     return found
 
 

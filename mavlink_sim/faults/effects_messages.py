@@ -27,7 +27,7 @@ _BOOT_TIME_USEC = {
     "VIBRATION",
 }
 # The second autopilot starts so far east of where the vehicle did.
-SECOND_PLACE_EAST_M = 25.0
+SECOND_START_EAST_M = 25.0
 
 
 def heartbeat_only(vehicle: FaultTarget, one: ActiveFault) -> None:
@@ -133,7 +133,7 @@ class _Spoken:
 def second_autopilot(vehicle: FaultTarget, one: ActiveFault) -> None:
     """Another vehicle's autopilot speaks and listens on every link of this one, disarmed on the ground."""
     system = one.fault.values["system"] or vehicle.system_id
-    other = vehicle.second_autopilot(system, one.seed, SECOND_PLACE_EAST_M)
+    other = vehicle.second_autopilot(system, one.seed, SECOND_START_EAST_M)
     codecs = {}
     for name, link in vehicle.links.items():
         other.add_link(name, {stream: link.streams.rate_hz(stream) for stream in ONBOARD_RATES_HZ})

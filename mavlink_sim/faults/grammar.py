@@ -112,9 +112,9 @@ def parse_fault(text: str, kinds: Mapping[str, Kind]) -> Fault:
 def make_fault(kind: Kind, positional: list[str], given: Mapping[str, str]) -> Fault:
     """A fault of values in order and values by name, all as text. Raises FaultError."""
     named = dict(given)
-    at_s = _take(kind, named, "at", _seconds)
-    duration_s = _take(kind, named, "for", positive)
-    seed = _take(kind, named, "seed", whole(-(2**63), 2**63))
+    at_s = _timing(kind, named, "at", _seconds)
+    duration_s = _timing(kind, named, "for", positive)
+    seed = _timing(kind, named, "seed", whole(-(2**63), 2**63))
     if duration_s is not None and kind.momentary:
         raise FaultError(f"{kind.name} is over as soon as it began; for= means nothing with it")
     values: dict[str, Any] = {}
@@ -136,7 +136,7 @@ def make_fault(kind: Kind, positional: list[str], given: Mapping[str, str]) -> F
     return Fault(kind, values, at_s, duration_s, seed)
 
 
-def _take(kind: Kind, named: dict[str, str], name: str, read: Callable[[str], Any]) -> Any:
+def _timing(kind: Kind, named: dict[str, str], name: str, read: Callable[[str], Any]) -> Any:
     return _read(kind, name, read, named.pop(name)) if name in named else None
 
 

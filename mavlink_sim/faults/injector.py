@@ -61,7 +61,7 @@ def fault_injector(
     system_id: int,
     endpoints: Mapping[str, UdpEndpoint],
     options: FaultOptions,
-    say: Callable[[str], None],
+    report: Callable[[str], None],
 ) -> Iterator[FaultInjector]:
     """Put the links' stages between the endpoints and their sockets, begin the faults, open the ways in.
 
@@ -81,7 +81,7 @@ def fault_injector(
             control = FaultControl(options.control, system_id, faults)
             stack.callback(control.close)
         if options.console or (options.console is None and _is_terminal()):
-            console = FaultConsole(0, faults.command, say)
+            console = FaultConsole(0, faults.command, report)
             stack.callback(console.close)
         yield FaultInjector(sockets, console, control)
 

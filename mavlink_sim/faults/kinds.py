@@ -34,11 +34,11 @@ def _which(text: str) -> str:
 _positive_whole = whole(1, 1_000_000)
 
 _LINK = Field("link", str, "all", "onboard, gcs, or all")
-_WAY = Field("way", choice("both", "out", "in"), "both", "out: from the vehicle, in: to it, both")
+_DIRECTION = Field("way", choice("both", "out", "in"), "both", "out: from the vehicle, in: to it, both")
 
 
 def _on_links(name: str, summary: str, *fields: Field) -> Kind:
-    return Kind(name, summary, (*fields, _LINK, _WAY))
+    return Kind(name, summary, (*fields, _LINK, _DIRECTION))
 
 
 _TABLE: tuple[tuple[Kind, Effect], ...] = (

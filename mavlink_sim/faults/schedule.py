@@ -195,7 +195,7 @@ class Faults:
         if not self.known:
             return False
         now_s = self.now_s + 1e-9
-        self.vehicle.estimate.look()
+        self.vehicle.estimate.refresh()
         for one in list(self.known.values()):
             if not one.active and one.begins_s <= now_s:
                 self._start_scheduled(one)

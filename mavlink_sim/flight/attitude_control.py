@@ -115,9 +115,11 @@ class AttitudeController:
         """One step of control and of the airframe. Returns the new demand; `demand` is the one before."""
         before = self.target(airframe, outer, demand)
         if isinstance(setpoint, AttitudeSetpoint):
-            told = self.rates(setpoint, airframe)
-            rates = _possible(told, airframe.rates)
-            self._target = AttitudeTarget(unit(setpoint.quaternion) or IDENTITY, told, abs(setpoint.thrust))
+            demanded = self.rates(setpoint, airframe)
+            rates = _possible(demanded, airframe.rates)
+            self._target = AttitudeTarget(
+                unit(setpoint.quaternion) or IDENTITY, demanded, abs(setpoint.thrust)
+            )
         else:
             if setpoint is not self._setpoint:
                 self._rates = _possible(setpoint.rates, airframe.rates)

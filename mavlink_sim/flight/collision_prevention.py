@@ -235,11 +235,11 @@ def _slowed(
 
 def _scale(distance_m: float, keep_m: float, parameters: Parameters) -> float:
     """1 far away, falling with the square to 0 at the distance to keep; nearer it pushes away."""
-    room = distance_m - keep_m
-    if room <= 0.0:
-        return room
+    margin = distance_m - keep_m
+    if margin <= 0.0:
+        return margin
     full = max(keep_m, parameters.number("MPC_VEL_MANUAL") / parameters.positive("MPC_XY_P"))
-    return min((room / full) ** 2, 1.0)
+    return min((margin / full) ** 2, 1.0)
 
 
 def _braking(
@@ -261,8 +261,8 @@ def _braking(
         delay_s = parameters.number("CP_DELAY")
         if distance_cm < obstacles.ranges_cm[sector]:
             delay_s += now_s - obstacles.stamps_s[sector]
-        room = distance_cm / 100.0 - keep_m - speed * delay_s
-        allowed = _speed_to_stop_within(room, parameters) if room >= 0.0 else 0.0
+        margin = distance_cm / 100.0 - keep_m - speed * delay_s
+        allowed = _speed_to_stop_within(margin, parameters) if margin >= 0.0 else 0.0
         demanded = gain * min(allowed - speed, 0.0)
         if demanded < strongest:
             strongest, brake = demanded, (towards[0] * demanded, towards[1] * demanded)

@@ -240,7 +240,7 @@ class Position(Task):
             self._by_velocity(wanted, dt_s)
         else:
             self._by_acceleration(wanted, dt_s)
-        self._lock_place()
+        self._lock_position()
         x, y = (NAN, NAN) if self._locked is None else self._locked
         return TrajectorySetpoint(
             (x, y, z), (*self._velocity, vz), (*self._acceleration, az), self._yaw.locked_rad, rate
@@ -316,7 +316,7 @@ class Position(Task):
         factor = coefficient * self._brake * (share * rooted / speed + 1.0 - share)
         return vx * factor, vy * factor
 
-    def _lock_place(self) -> None:
+    def _lock_position(self) -> None:
         x, y, _ = self._airframe.position
         moving = math.hypot(*self._velocity) > TINY
         if not moving and self._locked is None:

@@ -53,7 +53,7 @@ class PrecisionLanding(flight.TrajectoryTask):
     """Land on the target.
 
     Args:
-        place: where to look for the target first; the altitude to start from.
+        point: where to look for the target first; the altitude to start from.
         newest: gives the newest target, None before the first.
         now_s: gives the time since boot.
 
@@ -68,7 +68,7 @@ class PrecisionLanding(flight.TrajectoryTask):
         precision: Precision,
         newest: Callable[[], LandingTarget | None],
         now_s: Callable[[], float],
-        place: Vector | None = None,
+        point: Vector | None = None,
         on_phase: Callable[[str], None] | None = None,
     ) -> None:
         self._airframe = airframe
@@ -78,7 +78,7 @@ class PrecisionLanding(flight.TrajectoryTask):
         self._now_s = now_s
         self._on_phase = on_phase
         self._trajectory = flight.Trajectory(airframe, parameters)
-        self.goal: Vector = self._trajectory.stopping_point() if place is None else place
+        self.goal: Vector = self._trajectory.stopping_point() if point is None else point
         self._land: flight.Land | None = None
         self._seen: LandingTarget | None = None
         self._is_new = False
@@ -184,10 +184,10 @@ class PrecisionLanding(flight.TrajectoryTask):
         self._land = flight.Land(self._airframe, self._parameters)
         self.goal = self._land.goal or self.goal
 
-    def _land_at(self, place: Vector) -> None:
+    def _land_at(self, point: Vector) -> None:
         if self._land is None:
-            self._land = flight.Land(self._airframe, self._parameters, place)
-        self._land.goal = self.goal = place
+            self._land = flight.Land(self._airframe, self._parameters, point)
+        self._land.goal = self.goal = point
 
     def _resume_flight(self, goal: Vector) -> None:
         if self._land is not None:
@@ -220,8 +220,8 @@ class PrecisionLanding(flight.TrajectoryTask):
         radius = self._parameters.number("PLD_HACC_RAD")
         return all(abs(target.position[axis] - self._airframe.position[axis]) < radius for axis in (0, 1))
 
-    def _horizontal_distance(self, place: Vector) -> float:
-        return math.dist(place[:2], self._airframe.position[:2])
+    def _horizontal_distance(self, point: Vector) -> float:
+        return math.dist(point[:2], self._airframe.position[:2])
 
     def _waited(self, seconds: float) -> bool:
         """Whether this was asked first longer than that ago in this phase."""

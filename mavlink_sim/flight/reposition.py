@@ -77,12 +77,12 @@ def reposition_goal(
     """
     north, east, down = wanted
     here = airframe.position
-    has_place = math.isfinite(north) and math.isfinite(east)
+    has_position = math.isfinite(north) and math.isfinite(east)
     height = down if math.isfinite(down) else here[2]
-    if has_place:
+    if has_position:
         return (north, east, height)
     if math.isfinite(down) or math.isfinite(yaw_rad):
-        place = here if former_goal is None else former_goal
-        return (place[0], place[1], height)
+        point = here if former_goal is None else former_goal
+        return (point[0], point[1], height)
     rest = Trajectory(airframe, parameters).stopping_point()
     return (rest[0], rest[1], height)

@@ -88,13 +88,13 @@ class Trajectory:
         self.velocity = (vx, vy, vz)
         x, y, z = self.position
         # a point that waits for the vehicle must not urge it on either, or the two never meet
-        flown = (vx * pace, vy * pace, vz * pace)
-        self.position = (x + flown[0] * dt_s, y + flown[1] * dt_s, z + flown[2] * dt_s)
+        moved_mps = (vx * pace, vy * pace, vz * pace)
+        self.position = (x + moved_mps[0] * dt_s, y + moved_mps[1] * dt_s, z + moved_mps[2] * dt_s)
         if yaw_rad == yaw_rad:
             turn = math.radians(value("MPC_YAWRAUTO_MAX")) * dt_s
             error = math.remainder(yaw_rad - self.yaw_rad, math.tau)
             self.yaw_rad = math.remainder(self.yaw_rad + min(max(error, -turn), turn), math.tau)
-        return TrajectorySetpoint(self.position, flown, NOTHING, self.yaw_rad)
+        return TrajectorySetpoint(self.position, moved_mps, NOTHING, self.yaw_rad)
 
 
 class Task(ABC):
@@ -188,13 +188,13 @@ class Land(TrajectoryTask):
         self,
         airframe: Multirotor,
         parameters: Parameters,
-        place: Vector | None = None,
+        point: Vector | None = None,
         yaw_rad: float = NAN,
     ) -> None:
         self._airframe = airframe
         self._parameters = parameters
         self._trajectory = Trajectory(airframe, parameters)
-        self.goal = self._trajectory.stopping_point() if place is None else place
+        self.goal = self._trajectory.stopping_point() if point is None else point
         self._yaw_rad = yaw_rad
 
     def update(self, dt_s: float) -> TrajectorySetpoint:
@@ -207,8 +207,8 @@ class Land(TrajectoryTask):
         speed = slow + (fast - slow) * share
         if height < value("MPC_LAND_ALT3"):
             speed = value("MPC_LAND_CRWL")
-        place = (self.goal[0], self.goal[1], self._airframe.position[2])
-        level = self._trajectory.towards(place, dt_s, self._yaw_rad)
+        point = (self.goal[0], self.goal[1], self._airframe.position[2])
+        level = self._trajectory.towards(point, dt_s, self._yaw_rad)
         return TrajectorySetpoint(
             (level.position[0], level.position[1], NAN),
             (level.velocity[0], level.velocity[1], speed),
@@ -283,9 +283,9 @@ class Return(Task):
             return self._land.update(dt_s)
         return self._trajectory.towards(self.goal, dt_s, yaw)
 
-    def landing_task(self, place: Vector, yaw_rad: float) -> TrajectoryTask:
+    def landing_task(self, point: Vector, yaw_rad: float) -> TrajectoryTask:
         """The descent at a place, turned to a heading; NaN: as it is."""
-        return Land(self._airframe, self._parameters, place, yaw_rad)
+        return Land(self._airframe, self._parameters, point, yaw_rad)
 
 
 class Offboard(Task):

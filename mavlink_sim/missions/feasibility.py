@@ -15,7 +15,7 @@ from mavlink_sim.px4.parameters import Parameters
 _NOT_FLYABLE = frozenset({112, 114, mission_items.FENCE_RETURN_POINT})
 _VTOL = frozenset({mission_items.VTOL_TAKEOFF, mission_items.VTOL_LAND, mission_items.VTOL_TRANSITION})
 # Items that are neither an action nor a place to PX4's search for "the first item with a position".
-_COUNTED_AS_PLACES = mission_items.POSITION_COMMANDS | {
+_COUNTED_AS_POSITIONS = mission_items.POSITION_COMMANDS | {
     mission_items.RETURN_TO_LAUNCH,
     mission_items.GATE,
     mission_items.GRIPPER,
@@ -81,21 +81,21 @@ def _far_first_waypoint(
     first = next((item for item in items if item.has_position), None)
     if limit <= 0.0 or first is None:
         return []
-    away = math.dist(first.place(home, frame)[:2], home[:2])
+    away = math.dist(first.local_position(home, frame)[:2], home[:2])
     if not limit <= away < math.inf:
         return []
     return [f"First waypoint far away from home: {int(away)}m. Correct mission loaded?\t"]
 
 
 def _takeoffs(items: tuple[MissionItem, ...], home: Vector, frame: LocalFrame) -> list[str]:
-    after_a_place = False
+    after_position = False
     for item in items:
         if item.command in (mission_items.TAKEOFF, mission_items.VTOL_TAKEOFF):
-            if not home[2] - item.place(home, frame)[2] > 0.0:
+            if not home[2] - item.local_position(home, frame)[2] > 0.0:
                 return ["Mission rejected: Takeoff altitude below home altitude!\t"]
-            if after_a_place:
+            if after_position:
                 return ["Mission rejected: takeoff not first waypoint item\t"]
-        after_a_place = after_a_place or item.command in _COUNTED_AS_PLACES
+        after_position = after_position or item.command in _COUNTED_AS_POSITIONS
     return []
 
 
@@ -122,6 +122,6 @@ def _outside_fence(
     items: tuple[MissionItem, ...], fence: Geofence, home: Vector, frame: LocalFrame
 ) -> list[str]:
     for index, item in enumerate(items):
-        if item.has_position and fence.breaches(item.place(home, frame), home):
+        if item.has_position and fence.breaches(item.local_position(home, frame), home):
             return [f"Geofence violation for waypoint {index + 1}\t"]
     return []

@@ -46,19 +46,19 @@ class Area:
     inclusion: bool
     radius_m: float | None = None
 
-    def allows(self, place: Point) -> bool:
+    def allows(self, point: Point) -> bool:
         """Whether the vehicle may be there."""
         if self.radius_m is None:
-            return inside_polygon(self.vertices, place) == self.inclusion
-        return (math.dist(self.vertices[0], place) < self.radius_m) == self.inclusion
+            return inside_polygon(self.vertices, point) == self.inclusion
+        return (math.dist(self.vertices[0], point) < self.radius_m) == self.inclusion
 
 
-def inside_polygon(vertices: Sequence[Point], place: Point) -> bool:
+def inside_polygon(vertices: Sequence[Point], point: Point) -> bool:
     """Whether a place is inside a polygon that does not cross itself; on the edge either may come out.
 
     The crossing test of W. R. Franklin (PNPOLY). Fewer than three vertices hold nothing.
     """
-    north, east = place
+    north, east = point
     inside = False
     last_north, last_east = vertices[-1] if vertices else (0.0, 0.0)
     for vertex_north, vertex_east in vertices:
@@ -135,19 +135,19 @@ class Geofence:
                 self._areas.append(area)
         return complaints
 
-    def breaches(self, place: Vector, home: Vector | None) -> list[str]:
+    def breaches(self, point: Vector, home: Vector | None) -> list[str]:
         """PX4's words for everything that a place breaks; empty where the vehicle may be there."""
         found = []
         farthest = self._parameters.number("GF_MAX_HOR_DIST")
         highest = self._parameters.number("GF_MAX_VER_DIST")
-        if home is not None and farthest > 0.0 and math.dist(place[:2], home[:2]) >= farthest:
+        if home is not None and farthest > 0.0 and math.dist(point[:2], home[:2]) >= farthest:
             found.append(TOO_FAR)
-        if home is not None and highest > 0.0 and home[2] - place[2] >= highest:
+        if home is not None and highest > 0.0 and home[2] - point[2] >= highest:
             found.append(TOO_HIGH)
-        if not all(area.allows(place[:2]) for area in self._areas):
+        if not all(area.allows(point[:2]) for area in self._areas):
             found.append(OUTSIDE)
         return found
 
-    def allows_goal(self, place: Vector, home: Vector | None) -> bool:
+    def allows_goal(self, point: Vector, home: Vector | None) -> bool:
         """Whether a command may send the vehicle there: only where a breach would do more than warn."""
-        return self.action in (Action.NONE, Action.WARN) or not self.breaches(place, home)
+        return self.action in (Action.NONE, Action.WARN) or not self.breaches(point, home)

@@ -127,7 +127,7 @@ _HEADING_COMMANDS = frozenset(
     {WAYPOINT, LOITER_UNLIMITED, LOITER_TIME, LAND, TAKEOFF, VTOL_TAKEOFF, VTOL_LAND}
 )
 # Commands without a place, frame MAV_FRAME_MISSION: camera, gimbal, trigger and vehicle actions.
-_PLACELESS = frozenset(
+_WITHOUT_POSITION_COMMANDS = frozenset(
     {RETURN_TO_LAUNCH, NAV_DELAY, 112, 114, DO_JUMP, DO_CHANGE_SPEED, 179, 187, DO_LAND_START}
     | {NAV_ROI, SET_ROI_NEXT_WAYPOINT, SET_ROI_NONE, 200, SET_ROI, DIGICAM_CONTROL, 204, 205, 206, GRIPPER}
     | {AUTOTUNE, 214, 260, ARM_DISARM, SET_CAMERA_MODE, 532, SET_CAMERA_SOURCE, GIMBAL_PITCH_YAW, 1001}
@@ -184,7 +184,7 @@ class MissionItem:
             return 0.0
         return max(self.parameters[0], 0.0) if math.isfinite(self.parameters[0]) else 0.0
 
-    def place(self, home: Vector, frame: LocalFrame) -> Vector:
+    def local_position(self, home: Vector, frame: LocalFrame) -> Vector:
         """Local NED metres of the item, altitudes above home taken from `home` (local NED)."""
         latitude, longitude, altitude = self.parameters[4:]
         if self.is_relative:
@@ -202,10 +202,10 @@ def item_of(message: Any) -> MissionItem:
     given = (message.param1, message.param2, message.param3, message.param4)
     if frame in (GLOBAL, GLOBAL_RELATIVE_ALT) or (whole and frame in (GLOBAL_INT, GLOBAL_RELATIVE_ALT_INT)):
         scale = 1e-7 if whole else 1.0
-        command, head = _with_place(command, given)
+        command, head = _with_position(command, given)
         tail = (message.x * scale, message.y * scale, float(message.z))
     elif frame == FRAME_MISSION:
-        command, head = _without_place(command, given)
+        command, head = _without_position(command, given)
         tail = (float(message.x), float(message.y), float(message.z))
     else:
         raise ItemRejectedError(UNSUPPORTED_FRAME, f"frame {frame} is none of 0, 2, 3, 5, 6")
@@ -215,7 +215,7 @@ def item_of(message: Any) -> MissionItem:
 _Head = tuple[float, float, float, float]
 
 
-def _with_place(command: int, given: _Head) -> tuple[int, _Head]:
+def _with_position(command: int, given: _Head) -> tuple[int, _Head]:
     if command not in _KEPT:
         raise ItemRejectedError(UNSUPPORTED, f"command {command} with a place is not supported")
     kept = [value if index in _KEPT[command] else 0.0 for index, value in enumerate(given, start=1)]
@@ -236,8 +236,8 @@ def _with_place(command: int, given: _Head) -> tuple[int, _Head]:
     return command, (kept[0], kept[1], kept[2], kept[3])
 
 
-def _without_place(command: int, given: _Head) -> tuple[int, _Head]:
-    if command not in _PLACELESS:
+def _without_position(command: int, given: _Head) -> tuple[int, _Head]:
+    if command not in _WITHOUT_POSITION_COMMANDS:
         raise ItemRejectedError(UNSUPPORTED, f"command {command} without a place is not supported")
     if command in (NAV_ROI, SET_ROI) and _whole(given[0]) not in (_ROI_NONE, _ROI_NEXT, _ROI_INDEX):
         raise ItemRejectedError(INVALID_PARAM1, f"a region of interest without a place, mode {given[0]}")
@@ -268,7 +268,7 @@ def message_of(
     if item.command == LOITER_TIME:
         head[3] = float(head[3] > 0.0)  # PX4 gives back whether to leave on a tangent, not the heading
     make = dialect.MAVLink_mission_item_int_message if whole else dialect.MAVLink_mission_item_message
-    place = (_int32(x), _int32(y)) if whole else (x, y)
+    point = (_int32(x), _int32(y)) if whole else (x, y)
     return make(
         *target,
         sequence,
@@ -277,7 +277,7 @@ def message_of(
         int(current),
         int(item.autocontinue),
         *head,
-        *place,
+        *point,
         item.parameters[6],
         int(plan),
     )

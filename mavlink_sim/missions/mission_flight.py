@@ -58,9 +58,9 @@ class MissionNavigator(Protocol):
 
     def change_speed(self, speed_mps: float) -> None: ...
 
-    def precision_landing(self, precision: Precision, place: Vector | None = None) -> PrecisionLanding: ...
+    def precision_landing(self, precision: Precision, point: Vector | None = None) -> PrecisionLanding: ...
 
-    def say(self, severity: int, text: str) -> None: ...
+    def send_text(self, severity: int, text: str) -> None: ...
 
 
 class Stage(enum.Enum):
@@ -155,14 +155,14 @@ class MissionFlight(flight.Task):
             self._stage = Stage.FLY
             following = self._mission.next_position(self._mission.current + 1)
             if following is not None:
-                self.goal = self._place(following)
+                self.goal = self._point_of(following)
         else:
             self._stage = Stage.ACT
             self._act(item)
 
     def _fly_to(self, item: MissionItem) -> None:
         landing = item.command == mission_items.LAND
-        place = self._place(item)
+        point = self._point_of(item)
         if self._climb_to_z is not None:
             self._stage = Stage.CLIMB
             self._from_ground = self._navigator.landed
@@ -170,19 +170,19 @@ class MissionFlight(flight.Task):
             self.goal = (x, y, self._climb_to_z)
             self._yaw_rad = NAN
             above = self._navigator.home[2] - self._climb_to_z
-            self._navigator.say(INFO, f"Climb to {above:.1f} meters above home\t")
+            self._navigator.send_text(INFO, f"Climb to {above:.1f} meters above home\t")
             self._climb_to_z = None
-        elif landing and not self._navigator.landed and self._away(place) > self._acceptance():
+        elif landing and not self._navigator.landed and self._away(point) > self._acceptance():
             self._stage = Stage.MOVE_TO_LAND
             self._leave_ground()
-            self.goal = (place[0], place[1], self.goal[2])
+            self.goal = (point[0], point[1], self.goal[2])
             self._yaw_rad = NAN
         elif landing:
             self._descend()
         else:
             self._stage = Stage.FLY
             self._leave_ground()
-            self.goal = place
+            self.goal = point
             self._yaw_rad = NAN if item.command == mission_items.TAKEOFF else item.yaw_rad
 
     def _descend(self) -> None:
@@ -193,7 +193,7 @@ class MissionFlight(flight.Task):
         if precision in (Precision.OPPORTUNISTIC, Precision.REQUIRED) and not self._navigator.landed:
             self._descent = self._navigator.precision_landing(Precision(precision), self.goal)
         else:
-            self._descent = flight.Land(self._airframe, self._parameters, self._place(item))
+            self._descent = flight.Land(self._airframe, self._parameters, self._point_of(item))
 
     def _leave_ground(self) -> None:
         if self._descent is not None:
@@ -206,7 +206,7 @@ class MissionFlight(flight.Task):
 
     def _finish(self) -> None:
         where = "landed" if self._navigator.landed else "loitering"
-        self._navigator.say(INFO, f"Mission finished, {where}\t")
+        self._navigator.send_text(INFO, f"Mission finished, {where}\t")
         self._mission.jumps.clear()
         self._mission.finished = True
 
@@ -216,7 +216,7 @@ class MissionFlight(flight.Task):
             return
         if command in (mission_items.SET_ROI_LOCATION, mission_items.SET_ROI):
             mode = item.parameters[0] if command == mission_items.SET_ROI else _ROI_LOCATION
-            self._roi = self._place(item) if mode == _ROI_LOCATION else None
+            self._roi = self._point_of(item) if mode == _ROI_LOCATION else None
             self._roi_is_next = mode == _ROI_NEXT
         elif command == mission_items.SET_ROI_NEXT_WAYPOINT:
             self._roi, self._roi_is_next = None, True
@@ -241,7 +241,7 @@ class MissionFlight(flight.Task):
         following = self._mission.next_position(self._mission.current)
         if following is None:
             return
-        z = self._place(following)[2]
+        z = self._point_of(following)[2]
         if self._airframe.position[2] - z > self._parameters.number("NAV_MC_ALT_RAD"):
             self._climb_to_z = z
 
@@ -285,7 +285,7 @@ class MissionFlight(flight.Task):
 
     def _has_passed(self, item: MissionItem) -> bool:
         """The vehicle is beyond the gate, seen along the way to the next place."""
-        gate = self._place(item)
+        gate = self._point_of(item)
         x, y, _ = self._airframe.position
         return (x - gate[0]) * (self.goal[0] - gate[0]) + (y - gate[1]) * (self.goal[1] - gate[1]) >= 0.0
 
@@ -309,17 +309,17 @@ class MissionFlight(flight.Task):
     def _acceptance(self) -> float:
         return self._parameters.number("NAV_ACC_RAD")
 
-    def _away(self, place: Vector) -> float:
-        return math.dist(place[:2], self._airframe.position[:2])
+    def _away(self, point: Vector) -> float:
+        return math.dist(point[:2], self._airframe.position[:2])
 
-    def _place(self, item: MissionItem) -> Vector:
+    def _point_of(self, item: MissionItem) -> Vector:
         """Where an item is; what it leaves open (NaN) stays as it is."""
         here = self._airframe.position
         if item.frame == mission_items.FRAME_MISSION:
             latitude, longitude, altitude = item.parameters[4:]
             wanted = self._navigator.frame.local(latitude, longitude, altitude)
         else:
-            wanted = item.place(self._navigator.home, self._navigator.frame)
+            wanted = item.local_position(self._navigator.home, self._navigator.frame)
         x, y, z = (value if math.isfinite(value) else own for value, own in zip(wanted, here, strict=True))
         return (x, y, z)
 
@@ -355,9 +355,9 @@ class MissionFlight(flight.Task):
         if after is None:
             return 0.0
         x, y, _ = self._trajectory.position
-        place = self._place(after)
+        point = self._point_of(after)
         ahead = (self.goal[0] - x, self.goal[1] - y)
-        onward = (place[0] - self.goal[0], place[1] - self.goal[1])
+        onward = (point[0] - self.goal[0], point[1] - self.goal[1])
         if math.hypot(*ahead) < 1e-3 or math.hypot(*onward) < 1e-3:
             return 0.0
         turn = math.remainder(math.atan2(onward[1], onward[0]) - math.atan2(ahead[1], ahead[0]), math.tau)
@@ -390,8 +390,8 @@ class MissionFlight(flight.Task):
             return math.atan2(vy, vx)
         return NAN
 
-    def _towards(self, place: Vector) -> float:
-        if self._away(place) <= self._acceptance():
+    def _towards(self, point: Vector) -> float:
+        if self._away(point) <= self._acceptance():
             return NAN
         x, y, _ = self._airframe.position
-        return math.atan2(place[1] - y, place[0] - x)
+        return math.atan2(point[1] - y, point[0] - x)

@@ -81,9 +81,9 @@ class Commander(Protocol):
     @property
     def sensors_ready(self) -> bool: ...
 
-    def set_mode(self, mode: Mode, tell: bool = False) -> int: ...
+    def set_mode(self, mode: Mode, report: bool = False) -> int: ...
 
-    def hold_at(self, place: Vector) -> None: ...
+    def hold_at(self, point: Vector) -> None: ...
 
     def restart_task(self) -> None: ...
 
@@ -126,7 +126,7 @@ class Navigator:
         self._checked_with: object = None
         self._state = MissionState.NO_MISSION
         self._active = False  # the mission on board was begun
-        self._disarmed_since_flown = False
+        self._disarmed_since_active = False
         self._breaches: list[str] = []
         self._next_fence_check_s = 0.0
         self._held_for_obstacles = False
@@ -186,9 +186,9 @@ class Navigator:
             self._state = MissionState.NOT_STARTED
         return self._state
 
-    def allows_goal(self, place: Vector) -> bool:
+    def allows_goal(self, point: Vector) -> bool:
         """Whether a command (DO_REPOSITION, DO_ORBIT) may send the vehicle to a local NED place."""
-        return self.fence.allows_goal(place, self._known_home())
+        return self.fence.allows_goal(point, self._known_home())
 
     def allowed_acceleration(self, acceleration: Plane, velocity: Plane) -> Plane:
         """Collision prevention for Position mode: what is allowed of the acceleration the sticks ask for.
@@ -224,7 +224,7 @@ class Navigator:
         if plan_type is PlanType.FENCE:
             flying = None if self.landed else self._airframe.position
             for words in self.fence.load(plan.items, self._known_home(), flying):
-                self.say(CRITICAL, words)
+                self.send_text(CRITICAL, words)
             self._checked_with = None
         elif plan_type is PlanType.MISSION:
             self._new_mission(plan, current)
@@ -277,7 +277,7 @@ class Navigator:
         """An item is a command, for this vehicle or another component."""
         self.commands.append(item)
 
-    def say(self, severity: int, text: str) -> None:
+    def send_text(self, severity: int, text: str) -> None:
         self._autopilot.texts.append(Text(severity, text))
 
     # ---- tasks ------------------------------------------------------------------------------------------
@@ -285,29 +285,29 @@ class Navigator:
     def mission_task(self) -> flight.Task:
         """The task of Mode.MISSION, from the current item on."""
         mission = self.mission
-        if self._active and self._disarmed_since_flown and mission.current + 1 == len(mission.items):
+        if self._active and self._disarmed_since_active and mission.current + 1 == len(mission.items):
             mission.current = 0  # flown to its end before
             mission.jumps.clear()
         self._check_mission()
         if not mission.valid:
             then = "refusing takeoff" if self.landed else "loitering"
-            self.say(CRITICAL, f"No valid mission available, {then}\t")
+            self.send_text(CRITICAL, f"No valid mission available, {then}\t")
             return flight.Hold(self._airframe, self._parameters)
-        self.say(INFO, "Executing Mission\t")
-        self._active, self._disarmed_since_flown = True, False
+        self.send_text(INFO, "Executing Mission\t")
+        self._active, self._disarmed_since_active = True, False
         mission.finished, mission.reached = False, -1
         self.current_changed()
         return MissionFlight(self, self._airframe, self._parameters)
 
-    def precision_landing(self, precision: Precision, place: Vector | None = None) -> PrecisionLanding:
-        """The task of landing on a target, beginning above `place` (None: here)."""
+    def precision_landing(self, precision: Precision, point: Vector | None = None) -> PrecisionLanding:
+        """The task of landing on a target, beginning above `point` (None: here)."""
         return PrecisionLanding(
             self._airframe,
             self._parameters,
             precision,
             self.newest_target,
             self.time_s,
-            place,
+            point,
             self._on_event,
         )
 
@@ -327,12 +327,12 @@ class Navigator:
         rally = self.plans[PlanType.RALLY].items
         found, words = destination(rally, self.mission, self._parameters, self.home, self.frame, position)
         for text in words:
-            self.say(CRITICAL, text)
+            self.send_text(CRITICAL, text)
         yaw_rad = self._autopilot.home.attitude_rad[2] if found.kind is Goal.HOME else math.nan
         direct = ReturnFlight(self._airframe, self._parameters, found.position, yaw_rad, landing)
         height = direct.return_height_m
         above_sea = self.frame.geographic(found.position)[2] + height
-        self.say(INFO, f"RTL: start return at {above_sea:.0f} m ({height:.0f} m above destination)\t")
+        self.send_text(INFO, f"RTL: start return at {above_sea:.0f} m ({height:.0f} m above destination)\t")
         if found.kind is not Goal.MISSION_LANDING:
             return direct
         last = landing_route(self.mission, self.home, self.frame)
@@ -343,11 +343,11 @@ class Navigator:
         """Makes the task of RTL's last descent."""
         return partial(self._descent, int(self._parameters.number("RTL_PLD_MD")))
 
-    def _descent(self, mode: int, place: Vector, yaw_rad: float) -> flight.TrajectoryTask:
+    def _descent(self, mode: int, point: Vector, yaw_rad: float) -> flight.TrajectoryTask:
         if mode not in (Precision.OPPORTUNISTIC, Precision.REQUIRED):
-            return flight.Land(self._airframe, self._parameters, place, yaw_rad)
+            return flight.Land(self._airframe, self._parameters, point, yaw_rad)
         z = self._airframe.position[2]
-        return self.precision_landing(Precision(mode), (place[0], place[1], z))
+        return self.precision_landing(Precision(mode), (point[0], point[1], z))
 
     def guard_sticks(self, acceleration: Plane, velocity: Plane) -> Plane:
         """What collision prevention leaves of the sticks' acceleration, m/s² (north, east)."""
@@ -365,7 +365,7 @@ class Navigator:
         """Look after the mission's end, its validity and the fence."""
         autopilot = self._autopilot
         if not autopilot.armed and self._active:
-            self._disarmed_since_flown = True
+            self._disarmed_since_active = True
         task = autopilot.task
         if isinstance(task, MissionFlight) and task.ended and not self.landed:
             autopilot.hold_at(task.goal)
@@ -408,7 +408,7 @@ class Navigator:
             self.mission.items, self._parameters, self.fence, home, self.frame, landed=self.landed
         )
         for text in words:
-            self.say(CRITICAL, text)
+            self.send_text(CRITICAL, text)
         if was_valid != self.mission.valid:
             self._on_event("mission is valid" if self.mission.valid else "mission is not valid")
 
@@ -420,7 +420,7 @@ class Navigator:
         fresh = [words for words in found if words not in self._breaches]
         was_breached, self._breaches = self.is_breached, found
         for words in fresh:
-            self.say(CRITICAL, words)
+            self.send_text(CRITICAL, words)
         if not found or was_breached or not autopilot.armed:
             return
         self._on_event(f"geofence breached: {found[0]}")  # what is done about it is up to the failsafes

@@ -59,10 +59,10 @@ def destination(
         nearest = math.dist(home[:2], position[:2])
     landing = mission.landing() if mission.valid else None
     if landing is not None and kind in (1, 3):
-        place = mission.items[landing].place(home, frame)
-        away = math.dist(place[:2], position[:2])
+        point = mission.items[landing].local_position(home, frame)
+        away = math.dist(point[:2], position[:2])
         if away + WORTH_M < nearest:
-            best, nearest = Destination(Goal.MISSION_LANDING, place), away
+            best, nearest = Destination(Goal.MISSION_LANDING, point), away
     complaints = []
     for item in rally:
         if item.command != mission_items.RALLY_POINT:
@@ -70,12 +70,12 @@ def destination(
         if item.frame not in USABLE_FRAMES:
             complaints.append("RTL: unsupported MAV_FRAME\t")
             continue
-        place = item.place(home, frame)
-        if kind != 5 and math.dist(place[:2], home[:2]) <= TOO_CLOSE_TO_HOME_M:
+        point = item.local_position(home, frame)
+        if kind != 5 and math.dist(point[:2], home[:2]) <= TOO_CLOSE_TO_HOME_M:
             continue
-        away = math.dist(place[:2], position[:2])
+        away = math.dist(point[:2], position[:2])
         if away + WORTH_M < nearest:
-            best, nearest = Destination(Goal.RALLY, place), away
+            best, nearest = Destination(Goal.RALLY, point), away
     if kind == 5 and best.kind is not Goal.RALLY:
         best = Destination(Goal.HERE, position)
     return best, complaints
@@ -93,15 +93,17 @@ def mission_route(
     if kind not in (2, 4) or not mission.valid:
         return None
     start, landing = mission.land_start(), mission.landing()
-    if landing is not None and not all(map(math.isfinite, mission.items[landing].place(home, frame))):
+    if landing is not None and not all(
+        map(math.isfinite, mission.items[landing].local_position(home, frame))
+    ):
         landing = None
     forward = start is not None and landing is not None and mission.current <= landing
     if forward and start is not None and kind == 4:
         forward = start - mission.current < mission.current  # PX4's measure: items left against items flown
     if forward and landing is not None:
-        places = _places(mission.items[mission.current : landing], home, frame)
-        return places, mission.items[landing].place(home, frame)
-    return _places(mission.items[: mission.current], home, frame)[::-1], home
+        points = _points(mission.items[mission.current : landing], home, frame)
+        return points, mission.items[landing].local_position(home, frame)
+    return _points(mission.items[: mission.current], home, frame)[::-1], home
 
 
 def landing_route(mission: Mission, home: Vector, frame: LocalFrame) -> tuple[list[Vector], Vector]:
@@ -109,13 +111,15 @@ def landing_route(mission: Mission, home: Vector, frame: LocalFrame) -> tuple[li
     start, landing = mission.land_start(), mission.landing()
     assert start is not None  # called for a mission's landing alone
     assert landing is not None
-    return _places(mission.items[start:landing], home, frame), mission.items[landing].place(home, frame)
+    return _points(mission.items[start:landing], home, frame), mission.items[landing].local_position(
+        home, frame
+    )
 
 
-def _places(items: tuple[MissionItem, ...], home: Vector, frame: LocalFrame) -> list[Vector]:
+def _points(items: tuple[MissionItem, ...], home: Vector, frame: LocalFrame) -> list[Vector]:
     """Where the items with a place are; those that leave some of it open are left out."""
-    places = [item.place(home, frame) for item in items if item.has_position]
-    return [place for place in places if all(map(math.isfinite, place))]
+    points = [item.local_position(home, frame) for item in items if item.has_position]
+    return [point for point in points if all(map(math.isfinite, point))]
 
 
 class ReturnFlight(flight.Return):
@@ -125,23 +129,23 @@ class ReturnFlight(flight.Return):
         self,
         airframe: Multirotor,
         parameters: Parameters,
-        place: Vector,
+        point: Vector,
         yaw_rad: float,
         make_landing: Callable[[Vector, float], flight.TrajectoryTask],
     ) -> None:
-        super().__init__(airframe, parameters, place, yaw_rad)
+        super().__init__(airframe, parameters, point, yaw_rad)
         self._make_landing = make_landing
 
-    def landing_task(self, place: Vector, yaw_rad: float) -> flight.TrajectoryTask:
+    def landing_task(self, point: Vector, yaw_rad: float) -> flight.TrajectoryTask:
         """The descent at a place, turned to a heading; NaN: as it is."""
-        return self._make_landing(place, yaw_rad)
+        return self._make_landing(point, yaw_rad)
 
 
 class RouteReturn(flight.TrajectoryTask):
     """RTL along the places of a mission, then down at the last one.
 
     Args:
-        places: local NED, in the order of flight. landing: where to land; its height does not matter.
+        points: local NED, in the order of flight. landing: where to land; its height does not matter.
         climb_to_z: NED height to climb to first, and to keep until the first place; None to go at once.
     """
 
@@ -149,7 +153,7 @@ class RouteReturn(flight.TrajectoryTask):
         self,
         airframe: Multirotor,
         parameters: Parameters,
-        places: list[Vector],
+        points: list[Vector],
         landing: Vector,
         make_landing: Callable[[Vector, float], flight.TrajectoryTask],
         climb_to_z: float | None = None,
@@ -161,7 +165,7 @@ class RouteReturn(flight.TrajectoryTask):
         self._landing = landing
         self._descent: flight.TrajectoryTask | None = None
         x, y, z = self._trajectory.stopping_point()
-        self._ahead = [*places, (landing[0], landing[1], math.nan)]
+        self._ahead = [*points, (landing[0], landing[1], math.nan)]
         if climb_to_z is not None:
             z = min(z, climb_to_z)
             first = self._ahead[0]

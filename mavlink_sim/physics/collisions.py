@@ -38,10 +38,10 @@ class CollidingMultirotor(Multirotor):
     """
 
     __slots__ = (
+        "_checked_at",
+        "_clearance_m",
         "_clock",
-        "_looked_at",
         "_obstacles",
-        "_room_m",
         "_start",
         "_support",
     )
@@ -67,8 +67,8 @@ class CollidingMultirotor(Multirotor):
                 f"{gap.obstacle.name} stands: one of them must go elsewhere"
             )
         # nothing is near before it has moved so far from here, less what moves by itself
-        self._looked_at = self.position
-        self._room_m = gap.clear_m
+        self._checked_at = self.position
+        self._clearance_m = gap.clear_m
 
     @property
     def centre_ned_m(self) -> Vector:
@@ -81,13 +81,13 @@ class CollidingMultirotor(Multirotor):
     def advance(self, dt_s: float) -> None:
         super().advance(dt_s)
         x, y, z = self.position
-        fx, fy, fz = self._looked_at
+        fx, fy, fz = self._checked_at
         x, y, z = x - fx, y - fy, z - fz
-        room = self._room_m = self._room_m - self._obstacles.top_speed_mps * dt_s
-        if room < 0.0 or x * x + y * y + z * z > room * room:
-            self._look_around(dt_s)
+        margin = self._clearance_m = self._clearance_m - self._obstacles.top_speed_mps * dt_s
+        if margin < 0.0 or x * x + y * y + z * z > margin * margin:
+            self._sense_obstacles(dt_s)
 
-    def _look_around(self, dt_s: float) -> None:
+    def _sense_obstacles(self, dt_s: float) -> None:
         """Meet what is touched, and find out how far the next thing is."""
         now_s = self._clock()
         self._keep_standing(now_s)
@@ -99,8 +99,8 @@ class CollidingMultirotor(Multirotor):
             self._meet(gap, gap.obstacle, now_s, dt_s)
             known = [*known, gap.obstacle]
             met = True
-        self._looked_at = self.position
-        self._room_m = 0.0 if met else max(gap.clear_m, 0.0)
+        self._checked_at = self.position
+        self._clearance_m = 0.0 if met else max(gap.clear_m, 0.0)
 
     # ---- contact ----------------------------------------------------------------------------------------
 

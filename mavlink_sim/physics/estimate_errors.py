@@ -90,9 +90,9 @@ class FallibleEstimate(Estimate):
         """The estimate jumped."""
         self.reset_counter = (self.reset_counter + resets) & 0xFF
 
-    def look(self) -> None:
+    def refresh(self) -> None:
         """Look at the truth, with every error of this moment."""
-        Estimate.look(self)  # super() would be twice as dear
+        Estimate.refresh(self)  # super() would be twice as dear
         if self.held_xy_m is not None:
             self.position = (*self.held_xy_m, self.position[2])
             self.velocity = (0.0, 0.0, self.velocity[2])
@@ -146,9 +146,9 @@ def as_reported(estimate: FallibleEstimate, message: Any) -> Any:
     amend = _AMENDMENTS.get(message.get_type())
     if amend is None:
         return message
-    told = copy.copy(message)
-    amend(estimate, told)
-    return told
+    reported = copy.copy(message)
+    amend(estimate, reported)
+    return reported
 
 
 def _odometry(estimate: FallibleEstimate, message: Any) -> None:

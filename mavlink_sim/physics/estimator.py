@@ -69,9 +69,9 @@ class Estimate(Multirotor):
     __slots__ = (
         "_drift_left_s",
         "_gps_left_s",
+        "_index",
         "_noise",
         "_noise_source",
-        "_place",
         "_rate_left_s",
         "_slow_left_s",
         "_table",
@@ -97,7 +97,7 @@ class Estimate(Multirotor):
         self._rate_left_s = self._drift_left_s = self._slow_left_s = self._gps_left_s = 0.0
         gauss = self._noise_source.gauss
         p, q, r = RATE_NOISE_RADPS
-        self._place = 0
+        self._index = 0
         self._table = (
             [(gauss(0.0, p), gauss(0.0, q), gauss(0.0, r)) for _ in range(_TABLE_LENGTH)] if noise else []
         )
@@ -119,16 +119,16 @@ class Estimate(Multirotor):
     def update(self, dt_s: float) -> None:
         """Look at the truth again, `dt_s` later."""
         self.age(dt_s)
-        self.look()
+        self.refresh()
 
     def age(self, dt_s: float) -> None:
-        """Let the errors move on; what is read stays as it was at the last `look`."""
+        """Let the errors move on; what is read stays as it was at the last `refresh`."""
         if self._noise:
             self._rate_left_s -= dt_s
             if self._rate_left_s <= 1e-9:
                 self._shake()
 
-    def look(self) -> None:
+    def refresh(self) -> None:
         """Look at the truth, with the errors of this moment."""
         truth = self.truth
         self.on_ground = truth.on_ground
@@ -159,9 +159,9 @@ class Estimate(Multirotor):
     def _shake(self) -> None:
         """White noise on the rates; every third time the errors of velocity and position move on."""
         self._rate_left_s += RATE_STEP_S
-        self._place = place = (self._place + 1) % _TABLE_LENGTH
+        self._index = index = (self._index + 1) % _TABLE_LENGTH
         share = SHARE_ON_GROUND if self.truth.on_ground else 1.0
-        self.rate_error = self._table[place] if share == 1.0 else _scaled(self._table[place], share)
+        self.rate_error = self._table[index] if share == 1.0 else _scaled(self._table[index], share)
         self._drift_left_s -= RATE_STEP_S
         if self._drift_left_s <= 1e-9:
             self._drift(share)

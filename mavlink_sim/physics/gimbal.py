@@ -140,9 +140,9 @@ class Gimbal:
         self.tilt_rad += rise
         if dt_s > 0.0:
             self.pan_rate_radps, self.tilt_rate_radps = turn / dt_s, rise / dt_s
-        self._look(attitude)
+        self._aim_angles(attitude)
 
-    def _look(self, attitude: Quaternion) -> None:
+    def _aim_angles(self, attitude: Quaternion) -> None:
         """The pose that follows from the joints."""
         self.quaternion = _product(attitude, self.body_quaternion)
         x, y, z = _x_axis(self.quaternion)

@@ -46,7 +46,7 @@ class Body:
     stands_on: Body | None = None
 
     @property
-    def place_ned_m(self) -> Vector:
+    def position_ned_m(self) -> Vector:
         """In the world; of the legs' end, as all of them have their middle above it."""
         x, y, z = self.airframe.position
         return (x + self.start_ned_m[0], y + self.start_ned_m[1], z)
@@ -54,17 +54,17 @@ class Body:
 
 def apart(first: Body, second: Body) -> float:
     """How far two are apart, by the distance at which they touch: 1 where they do, less if they overlap."""
-    dx, dy, dz = _difference(first.place_ned_m, second.place_ned_m)
+    dx, dy, dz = _difference(first.position_ned_m, second.position_ned_m)
     return math.sqrt((dx * dx + dy * dy) / REACH_M**2 + dz * dz / REACH_UP_M**2)
 
 
 class Midair:
-    """The airframes of one world. Step all of them, then call `look`."""
+    """The airframes of one world. Step all of them, then call `resolve`."""
 
     def __init__(self) -> None:
         self.bodies: list[Body] = []
         # nobody is looked at again before one of them has moved by half of what all were apart then
-        self._looked_at: list[Vector] = []
+        self._checked_at: list[Vector] = []
         self._free_m = 0.0
 
     def join(self, body: Body) -> None:
@@ -77,16 +77,16 @@ class Midair:
             if other.airframe is body.airframe or other.identifier == body.identifier:
                 raise ValueError(f"{body.name} has joined already: each needs a system id of its own")
             if apart(body, other) < 1.0:
-                away_m = math.dist(body.place_ned_m[:2], other.place_ned_m[:2])
+                away_m = math.dist(body.position_ned_m[:2], other.position_ned_m[:2])
                 raise ValueError(
                     f"{body.name} is {away_m:.2g} m beside {other.name}: they need {REACH_M:g} m from middle "
                     f"to middle, so one of them must start elsewhere"
                 )
         self.bodies.append(body)
-        self._looked_at.append(body.place_ned_m)
+        self._checked_at.append(body.position_ned_m)
         self._free_m = 0.0
 
-    def look(self, step_s: float) -> None:
+    def resolve(self, step_s: float) -> None:
         """Let those meet that touch.
 
         Args:
@@ -97,8 +97,8 @@ class Midair:
             if body.stands_on is not None:
                 _fall_unless_carried(body, body.stands_on)
         limit = (0.5 * self._free_m) ** 2
-        for body, (lx, ly, lz) in zip(self.bodies, self._looked_at, strict=True):
-            x, y, z = body.place_ned_m
+        for body, (lx, ly, lz) in zip(self.bodies, self._checked_at, strict=True):
+            x, y, z = body.position_ned_m
             x, y, z = x - lx, y - ly, z - lz
             if x * x + y * y + z * z >= limit:
                 break
@@ -106,11 +106,11 @@ class Midair:
             return
         self._free_m = math.inf
         for first, second in itertools.combinations(self.bodies, 2):
-            clear_m = math.dist(first.place_ned_m, second.place_ned_m) - REACH_M
+            clear_m = math.dist(first.position_ned_m, second.position_ned_m) - REACH_M
             if clear_m <= 0.0 and apart(first, second) < 1.0:
                 self._meet(first, second, step_s)
             self._free_m = min(self._free_m, max(clear_m, 0.0))
-        self._looked_at = [body.place_ned_m for body in self.bodies]
+        self._checked_at = [body.position_ned_m for body in self.bodies]
 
     def _meet(self, first: Body, second: Body, step_s: float) -> None:
         """Part them, each by its share, and take what they ran into each other with."""
@@ -150,7 +150,7 @@ def _fall_unless_carried(upper: Body, lower: Body) -> None:
 
 def _occlusion(first: Body, second: Body) -> tuple[Vector, Vector]:
     """How far the first has to go, if it alone goes, until the hulls touch; and the second's normal there."""
-    dx, dy, dz = _difference(first.place_ned_m, second.place_ned_m)
+    dx, dy, dz = _difference(first.position_ned_m, second.position_ned_m)
     distance = apart(first, second)
     if distance == 0.0:  # in one place there is no side: one of them goes up
         return (0.0, 0.0, -REACH_UP_M), (0.0, 0.0, -1.0)

@@ -35,10 +35,10 @@ class Neighbours:
 
     def _others(self) -> Iterator[Vector]:
         """From one's own middle to the middle of each of the others."""
-        x, y, z = self._own.place_ned_m
+        x, y, z = self._own.position_ned_m
         for body in self._bodies:
             if body is not self._own:
-                north, east, down = body.place_ned_m
+                north, east, down = body.position_ned_m
                 yield north - x, east - y, down - z
 
     def range_below_m(self) -> float:

@@ -98,10 +98,10 @@ def mixed_thrusts(collective: float, wanted: Vector, rates: Vector, spin: Vector
     reserve = (yaw if yaw >= 0.0 else -yaw) if -YAW_MARGIN < yaw < YAW_MARGIN else YAW_MARGIN
     if base + spread + reserve > 1.0:
         base = max(1.0 - spread - reserve, spread)
-    room = (1.0 - base if base > 0.5 else base) - spread
-    if room < 0.0:
-        room = 0.0
-    yaw = room if yaw > room else -room if yaw < -room else yaw
+    margin = (1.0 - base if base > 0.5 else base) - spread
+    if margin < 0.0:
+        margin = 0.0
+    yaw = margin if yaw > margin else -margin if yaw < -margin else yaw
     return (
         base - roll + pitch + yaw,
         base + roll - pitch + yaw,

@@ -20,7 +20,7 @@ from mavlink_sim.vehicles.fleet_world import FleetWorld
 MAX_VEHICLES = 250  # system ids are 1 to 255, and a ground station needs some
 
 
-def places(count: int, spacing_m: float) -> list[tuple[float, float]]:
+def start_positions(count: int, spacing_m: float) -> list[tuple[float, float]]:
     """Where the vehicles start, (north, east) metres: a square grid, row by row, the first at (0, 0)."""
     columns = math.ceil(math.sqrt(count))
     return [(index // columns * spacing_m, index % columns * spacing_m) for index in range(count)]
@@ -50,7 +50,7 @@ def instance_options(
         if last > 65535:
             raise ValueError(f"{count} vehicles from --{name.replace('_', '-')} on: ports end at 65535")
     fleet = []
-    for index, start in enumerate(places(count, spacing_m)):
+    for index, start in enumerate(start_positions(count, spacing_m)):
         system_id = options.system_id + index
         fleet.append(
             replace(
@@ -92,9 +92,9 @@ class Fleet:
         self._fleet_world = FleetWorld(len(options))
         try:
             for one in options:
-                told = on_event if len(options) == 1 else _named(on_event, one.system_id)
+                on_vehicle_event = on_event if len(options) == 1 else _named(on_event, one.system_id)
                 self.simulations.append(
-                    self._resources.enter_context(Simulation(one, told, self._fleet_world))
+                    self._resources.enter_context(Simulation(one, on_vehicle_event, self._fleet_world))
                 )
         except BaseException:
             self._resources.close()

@@ -62,7 +62,7 @@ class _Pace:
     def lose(self, simulated_s: float) -> None:
         self._lost_s += simulated_s
 
-    def tell(self) -> None:
+    def report(self) -> None:
         passed_s = time.monotonic() - self._since_s
         if passed_s < PACE_PERIOD_S:
             return
@@ -102,7 +102,7 @@ def run_together(
                 pace.lose(lost_s)
                 for simulation in simulations:
                     simulation.let_go(lost_s)
-            pace.tell()
+            pace.report()
             for key, _ in selector.select(first.until_next_step()):
                 simulation, name = key.data
                 simulation.receive(name)

@@ -11,7 +11,7 @@ from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
 from mavlink_sim.realtime.options import SimulationOptions
-from mavlink_sim.vehicles.fleet_world import FleetWorld, place_in_world
+from mavlink_sim.vehicles.fleet_world import FleetWorld, position_in_world
 from mavlink_sim.world.aircraft import identifier_offset
 from mavlink_sim.world.truth_file import TruthFile, object_truth
 from vision.attitude import euler_from_quaternion
@@ -117,7 +117,7 @@ class SimOutputs:
             self._next_frame_s = max(self._next_frame_s + period_s, simulated_s)
             vehicle = self._vehicle
             camera.send_pose(
-                place_in_world(vehicle),
+                position_in_world(vehicle),
                 vehicle.quaternion,
                 stamp_ns,
                 simulated_s,
@@ -161,9 +161,11 @@ class SimOutputs:
         }
 
     def _objects(self, scene: Scene, simulated_s: float, stamp_ns: int) -> list[dict[str, Any]]:
-        here = place_in_world(self._vehicle)
+        here = position_in_world(self._vehicle)
         others = self._fleet_world.objects(self._vehicle, self._identifier_offset, stamp_ns)
-        return [object_truth(thing, here) for thing in (*scene.objects_at(simulated_s), *others)]
+        return [
+            object_truth(scene_object, here) for scene_object in (*scene.objects_at(simulated_s), *others)
+        ]
 
 
 def _collision_truth(collision: Collision | None) -> dict[str, Any] | None:

@@ -80,7 +80,7 @@ def _do_set_mode(vehicle: ServiceContext, link: Link, command: Command) -> int:
         return TEMPORARILY_REJECTED
     if mode is Mode.LAND:
         return autopilot.force_mode(mode)
-    return autopilot.set_mode(mode, tell=command.source_component == GROUND_STATION_COMPONENT)
+    return autopilot.set_mode(mode, report=command.source_component == GROUND_STATION_COMPONENT)
 
 
 def _takeoff(vehicle: ServiceContext, link: Link, command: Command) -> int:
@@ -102,7 +102,7 @@ def _return_to_launch(vehicle: ServiceContext, link: Link, command: Command) -> 
 
 def _reposition(vehicle: ServiceContext, link: Link, command: Command) -> int:
     speed, flags, _, yaw = command.parameters[:4]
-    goal = _place(vehicle, *command.parameters[4:7])
+    goal = _point_of(vehicle, *command.parameters[4:7])
     # MAV_DO_REPOSITION_FLAGS_CHANGE_MODE, and no other: the commander refuses the rest. The navigator of PX4
     # does not look at the flags, so a vehicle that holds flies there whatever the answer says.
     if math.isfinite(flags) and int(flags) == 1:
@@ -113,7 +113,7 @@ def _reposition(vehicle: ServiceContext, link: Link, command: Command) -> int:
 
 def _change_altitude(vehicle: ServiceContext, link: Link, command: Command) -> int:
     altitude = command.parameters[0]  # AMSL; PX4 looks at no frame here either
-    return vehicle.autopilot.reposition(_place(vehicle, math.nan, math.nan, altitude), math.nan)
+    return vehicle.autopilot.reposition(_point_of(vehicle, math.nan, math.nan, altitude), math.nan)
 
 
 def _change_speed(vehicle: ServiceContext, link: Link, command: Command) -> int:
@@ -124,11 +124,13 @@ def _change_speed(vehicle: ServiceContext, link: Link, command: Command) -> int:
 
 def _orbit(vehicle: ServiceContext, link: Link, command: Command) -> int:
     radius, speed, yaw_behaviour = command.parameters[:3]
-    centre = _place(vehicle, *command.parameters[4:7])
+    centre = _point_of(vehicle, *command.parameters[4:7])
     return vehicle.autopilot.orbit(OrbitRequest(radius, speed, yaw_behaviour, centre))
 
 
-def _place(vehicle: ServiceContext, latitude_deg: float, longitude_deg: float, altitude_m: float) -> Vector:
+def _point_of(
+    vehicle: ServiceContext, latitude_deg: float, longitude_deg: float, altitude_m: float
+) -> Vector:
     """Local NED, NaN for what is no number. PX4 takes a place not on Earth too; here it lies at the edge."""
     return vehicle.local_frame.local(
         _within(latitude_deg, 90.0), _within(longitude_deg, 180.0), _within(altitude_m, MAX_ALTITUDE_M)
@@ -156,10 +158,10 @@ def _mission_start(vehicle: ServiceContext, link: Link, command: Command) -> int
 def _set_home(vehicle: ServiceContext, link: Link, command: Command) -> int:
     autopilot, estimate = vehicle.autopilot, vehicle.estimate
     use_current, *attitude_deg = command.parameters[:4]
-    place = command.parameters[4:7]
+    point = command.parameters[4:7]
     if not vehicle.parameters.number("COM_HOME_EN"):
         return DENIED
-    if not use_current > 0.5 and not all(map(math.isfinite, place)):
+    if not use_current > 0.5 and not all(map(math.isfinite, point)):
         return DENIED
     if not autopilot.sensors_ready:  # no origin yet; with one, a lost position is no reason
         return TEMPORARILY_REJECTED
@@ -168,7 +170,7 @@ def _set_home(vehicle: ServiceContext, link: Link, command: Command) -> int:
     else:
         roll, pitch, yaw = (math.radians(angle) if math.isfinite(angle) else None for angle in attitude_deg)
         attitude_rad = (roll or 0.0, pitch or 0.0, math.nan if yaw is None else yaw)
-        autopilot.home.is_at(_place(vehicle, *place), attitude_rad)
+        autopilot.home.is_at(_point_of(vehicle, *point), attitude_rad)
     return ACCEPTED
 
 

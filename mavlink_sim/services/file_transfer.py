@@ -145,7 +145,7 @@ class Server:
         self._files = files
         self._session: _Session | None = None
         self._burst: _Burst | None = None
-        self._heard_s = 0.0
+        self._received_s = 0.0
         self._last_reply: Packet | None = None
 
     @property
@@ -156,7 +156,7 @@ class Server:
     def answer(self, payload: bytes, source: tuple[int, int], now_s: float) -> bytes | None:
         """The reply to a request, None where a burst begins instead. Raises ValueError: no FTP payload."""
         request = Packet.unpack(payload)
-        self._heard_s = now_s
+        self._received_s = now_s
         if request.size <= DATA_BYTES and self._last_reply is not None:
             if (request.sequence + 1) & 0xFFFF == self._last_reply.sequence:
                 return self._last_reply.pack()  # our answer was lost, the client asks again
@@ -189,7 +189,7 @@ class Server:
         """((system, component), payload) of the burst packets that are due; closes a forgotten session."""
         if self._session is None:
             return []
-        if now_s - self._heard_s > SESSION_TIMEOUT_S:
+        if now_s - self._received_s > SESSION_TIMEOUT_S:
             logger.info("the FTP session was closed after %g s without a request", SESSION_TIMEOUT_S)
             self._close()
             self._last_reply = None

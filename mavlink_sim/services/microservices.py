@@ -42,7 +42,7 @@ def _heartbeat(vehicle: ServiceContext, link: Link, message: Any) -> None:
     if message.type == MAV_TYPE_GCS:
         link.ground_station_seen_s = vehicle.autopilot.supervision.ground_station_seen_s = vehicle.now_s
     elif message.type == MAV_TYPE_ONBOARD_CONTROLLER and message.get_srcSystem() == vehicle.system_id:
-        vehicle.companion_heard()
+        vehicle.on_companion_heartbeat()
 
 
 def _command(vehicle: ServiceContext, link: Link, message: Any) -> None:

@@ -20,7 +20,7 @@ from mavlink_sim.wire.messages import dialect
 CAMERA_COMPONENT = 100  # MAV_COMP_ID_CAMERA
 LOCAL_NED = 1  # MAV_FRAME_LOCAL_NED
 HOLD_BEFORE_RETURN_S = 0.05
-MAX_PLACE_M = 1e6
+MAX_POSITION_M = 1e6
 # a single shot goes to PX4's camera trigger as DO_DIGICAM_CONTROL, "shoot"
 _SHOOT = (0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0)
 
@@ -50,7 +50,7 @@ def _carry_out(vehicle: ServiceContext, item: MissionItem) -> None:
     """An item that is a command: told on every link, as PX4 does, and obeyed if it is the vehicle's own."""
     command, values = item.command, item.parameters
     if item.frame != mission_items.FRAME_MISSION:
-        position = item.place(vehicle.autopilot.home.position, vehicle.local_frame)
+        position = item.local_position(vehicle.autopilot.home.position, vehicle.local_frame)
         values = (*values[:6], vehicle.local_frame.geographic(position)[2])
     target = 0
     if goes_to_camera(command):
@@ -77,9 +77,9 @@ def landing_target(vehicle: ServiceContext, link: Link, message: Any) -> None:
         text = Text(CRITICAL, f"Landing target: coordinate frame {message.frame} unsupported\t")
         vehicle.autopilot.texts.append(text)
         return
-    place = (message.x, message.y, message.z)
-    if all(abs(value) < MAX_PLACE_M for value in place):
-        vehicle.autopilot.navigator.target = LandingTarget(place, vehicle.autopilot.now_s)
+    point = (message.x, message.y, message.z)
+    if all(abs(value) < MAX_POSITION_M for value in point):
+        vehicle.autopilot.navigator.target = LandingTarget(point, vehicle.autopilot.now_s)
 
 
 def obstacle_distance(vehicle: ServiceContext, link: Link, message: Any) -> None:

@@ -57,7 +57,7 @@ class Session:
         self._messages: list[Any] = []
         self._identifier = 0
         self._current = -1
-        self._heard_s = -math.inf
+        self._received_s = -math.inf
         self._sent_s = -math.inf
 
     # ---- time -------------------------------------------------------------------------------------------
@@ -67,8 +67,8 @@ class Session:
         if self.state is State.IDLE:
             return
         now = self._vehicle.now_s
-        if now - self._heard_s > TIMEOUT_S:
-            self._say(CRITICAL, "Mission sync timeout\t")
+        if now - self._received_s > TIMEOUT_S:
+            self._send_text(CRITICAL, "Mission sync timeout\t")
             self._stop()
         elif self.state is State.RECEIVING and now - self._sent_s > RETRY_S:
             self._request()
@@ -82,7 +82,7 @@ class Session:
             self._count_again(source)
             return
         if self.state is not State.IDLE:
-            self._say(CRITICAL, "WPM: IGN MISSION_COUNT: Busy\t")
+            self._send_text(CRITICAL, "WPM: IGN MISSION_COUNT: Busy\t")
             self._acknowledge(source, mission_items.ERROR)
             return
         if self._navigator.uploading is not None:  # over another link
@@ -104,7 +104,7 @@ class Session:
         else:
             self._navigator.uploading = self._link.name
             self.state = State.RECEIVING
-            self._heard_s = self._vehicle.now_s
+            self._received_s = self._vehicle.now_s
             self._sequence, self._count, self._current = 0, message.count, -1
             self._items, self._messages = [], []
             self._request()
@@ -113,40 +113,40 @@ class Session:
         if source != self.partner:
             self._acknowledge(source, mission_items.ERROR)
             return
-        self._heard_s = self._vehicle.now_s
+        self._received_s = self._vehicle.now_s
         if self._sequence == 0:  # the first question was lost
             self._request()
         else:
-            self._say(CRITICAL, "WPM: REJ. CMD: Busy\t")
+            self._send_text(CRITICAL, "WPM: REJ. CMD: Busy\t")
             self._acknowledge(source, mission_items.ERROR)
 
     def item(self, message: Any) -> None:
         """MISSION_ITEM_INT or MISSION_ITEM of an upload."""
         self._whole = message.get_type() == "MISSION_ITEM_INT"
         if _source(message) != self.partner:
-            self._say(CRITICAL, "REJ. MIS ITEM: partner id mismatch\t")
+            self._send_text(CRITICAL, "REJ. MIS ITEM: partner id mismatch\t")
             return
         if _plan_type(message) != self._type:
             self._acknowledge(self.partner, mission_items.ERROR)
         elif self.state is State.RECEIVING:
-            self._heard_s = self._vehicle.now_s
+            self._received_s = self._vehicle.now_s
             if message.seq == self._sequence:
-                self._take(message)
+                self._store(message)
         elif self.state is State.SENDING:
-            self._say(CRITICAL, "IGN MISSION_ITEM: Busy\t")
+            self._send_text(CRITICAL, "IGN MISSION_ITEM: Busy\t")
             self._acknowledge(self.partner, mission_items.ERROR)
         elif self._count and message.seq + 1 == self._sequence:
             # the last item once more: our acknowledgement was lost
             self._acknowledge(self.partner, mission_items.ACCEPTED, identifier=self._identifier)
         else:
-            self._say(CRITICAL, "IGN MISSION_ITEM: No transfer\t")
+            self._send_text(CRITICAL, "IGN MISSION_ITEM: No transfer\t")
             self._acknowledge(self.partner, mission_items.ERROR)
 
-    def _take(self, message: Any) -> None:
+    def _store(self, message: Any) -> None:
         try:
             item = mission_items.item_of(message)
         except ItemRejectedError as error:
-            self._say(CRITICAL, "IGN MISSION_ITEM: Invalid item\t")
+            self._send_text(CRITICAL, "IGN MISSION_ITEM: Invalid item\t")
             self._refuse(error.result)
             return
         strange = self._type is PlanType.MISSION and item.command in mission_items.FENCE_AND_RALLY_COMMANDS
@@ -175,7 +175,7 @@ class Session:
             self.state = State.IDLE  # everything was sent, only its acknowledgement never came
         again = self.state is State.SENDING and source == self.partner and plan_type == self._type
         if self.state is not State.IDLE and not again:
-            self._say(INFO, "Mission download request ignored, already active\t")
+            self._send_text(INFO, "Mission download request ignored, already active\t")
             return
         try:
             self._type = PlanType(plan_type)
@@ -184,7 +184,7 @@ class Session:
             return
         plan = self._navigator.plans[self._type]
         self.state, self.partner = State.SENDING, source
-        self._heard_s = self._vehicle.now_s
+        self._received_s = self._vehicle.now_s
         self._sequence, self._count = 0, len(plan.items)
         self._link.send(MissionCount(source, self._count, plan_type, plan.identifier))
 
@@ -192,16 +192,16 @@ class Session:
         """MISSION_REQUEST_INT or MISSION_REQUEST of a download."""
         self._whole = message.get_type() == "MISSION_REQUEST_INT"
         if _source(message) != self.partner:
-            self._say(CRITICAL, "WPM: REJ. CMD: partner id mismatch\t")
+            self._send_text(CRITICAL, "WPM: REJ. CMD: partner id mismatch\t")
             return
         if self.state is State.IDLE:
             return
         if self.state is State.RECEIVING:
-            self._say(CRITICAL, "WPM: REJ. CMD: Busy\t")
+            self._send_text(CRITICAL, "WPM: REJ. CMD: Busy\t")
             return
         if _plan_type(message) != self._type:
             return
-        self._heard_s = self._vehicle.now_s
+        self._received_s = self._vehicle.now_s
         items = self._navigator.plans[self._type].items
         if message.seq == self._sequence < self._count:
             self._sequence += 1
@@ -225,12 +225,12 @@ class Session:
     def _unexpected(self) -> None:
         self.state = State.IDLE
         self._acknowledge(self.partner, mission_items.ERROR)
-        self._say(CRITICAL, "WPM: REJ. CMD: Req. WP was unexpected\t")
+        self._send_text(CRITICAL, "WPM: REJ. CMD: Req. WP was unexpected\t")
 
     def acknowledged(self, message: Any) -> None:
         """MISSION_ACK of the client."""
         if _source(message) != self.partner:
-            self._say(CRITICAL, "REJ. WP CMD: partner id mismatch\t")
+            self._send_text(CRITICAL, "REJ. WP CMD: partner id mismatch\t")
         elif self.state is State.SENDING and _plan_type(message) == self._type:
             self.state = State.IDLE
         elif self.state is State.RECEIVING:
@@ -243,7 +243,7 @@ class Session:
     def clear(self, message: Any) -> None:
         """MISSION_CLEAR_ALL."""
         if self.state is not State.IDLE:
-            self._say(CRITICAL, "WPM: IGN CLEAR CMD: Busy\t")
+            self._send_text(CRITICAL, "WPM: IGN CLEAR CMD: Busy\t")
             return
         plan_type = _plan_type(message)
         for kind in PlanType:
@@ -254,9 +254,9 @@ class Session:
     def set_current(self, message: Any) -> None:
         """MISSION_SET_CURRENT: MISSION_CURRENT tells that it was done."""
         if self.state is not State.IDLE:
-            self._say(CRITICAL, "WPM: IGN WP CURR CMD: Busy\t")
+            self._send_text(CRITICAL, "WPM: IGN WP CURR CMD: Busy\t")
         elif message.seq >= len(self._navigator.mission.items):
-            self._say(CRITICAL, "WPM: WP CURR CMD: Not in list\t")
+            self._send_text(CRITICAL, "WPM: WP CURR CMD: Not in list\t")
         else:
             self._navigator.set_current(message.seq)
 
@@ -286,7 +286,7 @@ class Session:
             self._navigator.uploading = None
         self.state = State.IDLE
 
-    def _say(self, severity: int, text: str) -> None:
+    def _send_text(self, severity: int, text: str) -> None:
         self._vehicle.autopilot.texts.append(Text(severity, text))  # to every link, as all of PX4's texts
 
 

@@ -27,7 +27,7 @@ logger = logging.getLogger(__name__)
 FIRST_ANSWER_S = 0.01
 LIST_RATE_HZ = 1000.0
 SECOND_ECHO_S = 0.015
-TOLD_AT_START_S = 0.98
+SENT_AT_START_S = 0.98
 DOES_NOT_EXIST = 1  # MAV_PARAM_ERROR
 READ_ONLY = 5
 TYPE_UNSUPPORTED = 6
@@ -144,7 +144,7 @@ def _send_hash(link: Link, parameters: Parameters) -> None:
 
 
 def _send_error(link: Link, message: Any, name: str, index: int, error: int) -> None:
-    if not link.tells_parameter_errors:
+    if not link.has_parameter_errors:
         return
     link.send(
         dialect.MAVLink_param_error_message(

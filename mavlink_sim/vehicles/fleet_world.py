@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from mavlink_sim.world.world import WorldObject
 
 
-def place_in_world(vehicle: Vehicle) -> Vector:
+def position_in_world(vehicle: Vehicle) -> Vector:
     """The true position NED in metres, from where the world begins."""
     north, east, down = vehicle.airframe.position
     start_north, start_east = vehicle.start_ned_m
@@ -29,7 +29,7 @@ def as_aircraft(vehicle: Vehicle) -> Aircraft:
     airframe = vehicle.airframe
     return Aircraft(
         vehicle.system_id,
-        place_in_world(vehicle),
+        position_in_world(vehicle),
         airframe.roll_rad,
         airframe.pitch_rad,
         airframe.yaw_rad,
@@ -80,7 +80,7 @@ class FleetWorld:
 
     def meet(self) -> None:
         """Let those that touch run into each other; to be called when all have been stepped by 4 ms."""
-        self._midair.look(STEP_S)
+        self._midair.resolve(STEP_S)
 
     def others(self, vehicle: Vehicle) -> list[Aircraft]:
         """All but this one, as they are at this moment, in the order in which they joined."""

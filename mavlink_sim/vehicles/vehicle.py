@@ -153,8 +153,8 @@ class Vehicle:
                 clock=self._scene_time_s,
             )
             self.airframe = self.collision_world.airframe
-        self.airframe.on_touch = self._touched
-        self.airframe.on_collision = self._collided
+        self.airframe.on_touch = self._on_touch
+        self.airframe.on_collision = self._on_collision
         self._air = None if air_seed is None else WindModel(air_seed, gusts_mps)
         self.estimate = FallibleEstimate(self.airframe, seed, noise)
         self.links: dict[str, Link] = {}
@@ -192,12 +192,12 @@ class Vehicle:
         self._ping_sequence = itertools.count()
         self._companion_seen_s: float | None = None
         self._companion_lost = False
-        self._origin_told = False
+        self._origin_sent = False
         self._later: list[tuple[float, int, Callable[[], object]]] = []
         self._later_count = itertools.count()
-        self.after(parameter_protocol.TOLD_AT_START_S, self._send_parameters)
+        self.after(parameter_protocol.SENT_AT_START_S, self._send_parameters)
         if self._obstacle_sensor:
-            self.after(OBSTACLE_SENSOR_PERIOD_S, self._look_around)
+            self.after(OBSTACLE_SENSOR_PERIOD_S, self._sense_obstacles)
 
     # ---- what is known of it ----------------------------------------------------------------------------
 
@@ -298,7 +298,7 @@ class Vehicle:
             name, self.system_id, Streams(rates, 0.0017 * len(self.links), self.stream_clock_rate)
         )
         link.gate = self.faults.gate
-        link.tells_parameter_errors = self.release.has_parameter_errors
+        link.has_parameter_errors = self.release.has_parameter_errors
         link.signing = Signing(
             link_id=len(self.links) - 1,
             streams=self._signing_streams,
@@ -318,9 +318,9 @@ class Vehicle:
     def outgoing(self, link: str) -> list[Outgoing]:
         """Take everything that waits to be sent on a link."""
         outbox = self.links[link].outbox
-        taken = list(outbox)
+        messages = list(outbox)
         outbox.clear()
-        return taken
+        return messages
 
     def handle(self, link_name: str, message: Any) -> None:
         """Take in one MAVLink message (of any pymavlink dialect) that arrived on a link."""
@@ -360,7 +360,7 @@ class Vehicle:
         while self._leftover_s >= STEP_S - 1e-9:
             self._leftover_s -= STEP_S
             self._step()
-        self.estimate.look()
+        self.estimate.refresh()
 
     def after(self, delay_s: float, action: Callable[[], object]) -> None:
         """Do something in a later step."""
@@ -370,7 +370,7 @@ class Vehicle:
         """What differs from the defaults is told to everyone shortly after the start."""
         parameter_protocol.broadcast(self, [item.name for item in self.parameters.customised()])
 
-    def companion_heard(self) -> None:
+    def on_companion_heartbeat(self) -> None:
         """An onboard controller's heartbeat arrived."""
         self._companion_seen_s = self.now_s
         if self._companion_lost:
@@ -378,26 +378,26 @@ class Vehicle:
             self.autopilot.texts.append(Text(INFO, "Onboard controller regained\t"))
             self._on_event("the companion's heartbeat is back")
 
-    def _touched(self, down_mps: float) -> None:
+    def _on_touch(self, down_mps: float) -> None:
         """The airframe met the ground."""
         if self.airframe.crashed:
             self._on_event(f"crashed at {down_mps:.1f} m/s")
         elif down_mps > HARD_LANDING_MPS:
             self._on_event(f"hard landing at {down_mps:.1f} m/s")
 
-    def _collided(self, collision: Collision) -> None:
+    def _on_collision(self, collision: Collision) -> None:
         """The airframe met something of the scene, or another vehicle."""
         self._on_event(str(collision))
 
-    def _look_around(self) -> None:
+    def _sense_obstacles(self) -> None:
         """What the obstacle sensor measures goes into the map of collision prevention."""
         assert self.collision_world is not None
-        self.estimate.look()
+        self.estimate.refresh()
         autopilot = self.autopilot
         self.collision_world.sense_obstacles(
             autopilot.navigator.obstacles, self.estimate.yaw_rad, autopilot.now_s, self.neighbours
         )
-        self.after(OBSTACLE_SENSOR_PERIOD_S, self._look_around)
+        self.after(OBSTACLE_SENSOR_PERIOD_S, self._sense_obstacles)
 
     def reboot(self) -> None:
         """Power was lost for a moment: the motors are off, and time since boot begins anew.
@@ -412,7 +412,7 @@ class Vehicle:
         self.autopilot.navigator.take_stored(before.navigator)
         self.autopilot.supervision.keep_equipment(before.supervision)
         for link in self.links.values():
-            link.forget()
+            link.reset()
         if self.gimbal_manager is not None:
             gimbal, self.gimbal_manager = self.gimbal_manager.gimbal, GimbalManager(self)
             self.gimbal_manager.gimbal = gimbal
@@ -437,7 +437,7 @@ class Vehicle:
         self._boot_us += STEP_US
         estimate = self.estimate  # it looks at the truth when somebody is about to read it
         if self._later and self._later[0][0] <= self._boot_us / 1e6 + 1e-9:
-            estimate.look()
+            estimate.refresh()
             while self._later and self._later[0][0] <= self._boot_us / 1e6 + 1e-9:
                 heapq.heappop(self._later)[2]()
         if self._wind_revision != self.parameters.revision:
@@ -445,7 +445,7 @@ class Vehicle:
         self._steps_to_control -= 1
         if self._steps_to_control <= 0:
             self._steps_to_control = STEPS_PER_CONTROL
-            estimate.look()
+            estimate.refresh()
             self.autopilot.update(CONTROL_STEP_S)
             mission_link.update(self)
             if self.gimbal_manager is not None:
@@ -455,21 +455,21 @@ class Vehicle:
             self.airframe.blow(self._air.gust_at(self.faults.elapsed_us))
         self.airframe.advance(STEP_S)
         estimate.age(STEP_S)
-        if not self._origin_told and self.autopilot.sensors_ready:
-            self._origin_told = True  # GPS_GLOBAL_ORIGIN is sent when it changes, which is once
+        if not self._origin_sent and self.autopilot.sensors_ready:
+            self._origin_sent = True  # GPS_GLOBAL_ORIGIN is sent when it changes, which is once
             for link in self.links.values():
                 self.send_built(link, "GPS_GLOBAL_ORIGIN")
         if self.autopilot.texts or self.autopilot.gimbal_commands:
-            self._tell()
+            self._send_queued()
         for link in self.links.values():
             if link.streams.next_us <= self._boot_us:
-                estimate.look()
+                estimate.refresh()
                 for name in link.streams.due(self._boot_us):
                     if name == "CURRENT_MODE":
                         link.status_is_due = True
                     else:
                         self.send_built(link, name)
-            if link.status_is_due and link.is_news(self.autopilot.status, self.now_s):
+            if link.status_is_due and link.is_new_status(self.autopilot.status, self.now_s):
                 link.status_is_due = False
                 self.send_built(link, "CURRENT_MODE")
             if link.parameters_left:
@@ -486,7 +486,7 @@ class Vehicle:
             self.autopilot.texts.append(Text(CRITICAL, "Connection to mission computer lost\t"))
             self._on_event("the companion's heartbeat is lost")
 
-    def _tell(self) -> None:
+    def _send_queued(self) -> None:
         """Texts to the links with a ground station, events and gimbal commands to every link."""
         autopilot = self.autopilot
         while autopilot.texts:

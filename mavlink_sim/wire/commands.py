@@ -25,8 +25,8 @@ def command_of(message: Any) -> Command:
     if message.get_type() == "COMMAND_INT":
         # both INT32_MAX: "not given", as NaN in COMMAND_LONG. PX4 looks at no frame, z is AMSL in all of them
         given = (message.x, message.y) != (NOT_GIVEN, NOT_GIVEN)
-        place = (message.x / 1e7, message.y / 1e7) if given else (math.nan, math.nan)
-        tail = (*place, message.z)
+        point = (message.x / 1e7, message.y / 1e7) if given else (math.nan, math.nan)
+        tail = (*point, message.z)
     else:
         tail = (message.param5, message.param6, message.param7)
     head = (message.param1, message.param2, message.param3, message.param4)

@@ -49,7 +49,7 @@ class UdpEndpoint:
                 ) from error
             raise OSError(f"cannot bind UDP {host}:{bind_port}: {error}") from error
         self.peer: tuple[str, int] = (host, peer_port)
-        self._peer_heard_s: float | None = None
+        self._peer_seen_s: float | None = None
         self._codec = parser(system_id)
         self.signing = Signing()
         self._refused = False
@@ -79,20 +79,20 @@ class UdpEndpoint:
                 if message.get_type() != "BAD_DATA" and self.signing.accepts(message.get_msgbuf())
             ]
             if found:
-                self._hear(sender)
+                self._note_sender(sender)
                 messages.extend(found)
                 if self.on_packet is not None:
                     for message in found:
                         self.on_packet(bytes(message.get_msgbuf()))
         return messages
 
-    def _hear(self, sender: tuple[str, int]) -> None:
+    def _note_sender(self, sender: tuple[str, int]) -> None:
         now = time.monotonic()
-        if self._peer_heard_s is None or sender == self.peer or now - self._peer_heard_s > PEER_SILENCE_S:
+        if self._peer_seen_s is None or sender == self.peer or now - self._peer_seen_s > PEER_SILENCE_S:
             if sender != self.peer:
                 logger.info("the link on port %d talks to %s:%d", self.port, *sender)
             self.peer = sender
-            self._peer_heard_s = now
+            self._peer_seen_s = now
 
     def send(self, outgoing: Iterable[Outgoing]) -> None:
         """Send each message; what the network cannot take now is dropped, as a radio would."""

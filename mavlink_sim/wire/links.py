@@ -44,15 +44,15 @@ class Link:
         self.parameter_credit = 0.0
         self.file_transfer: FileServer | None = None  # made when somebody asks
         self.signing = Signing()
-        self.tells_parameter_errors = True
+        self.has_parameter_errors = True
         self.sent = 0
         self.received = 0
         self.gate: Callable[[Link, Any], Any] | None = None  # may change or swallow what is sent
         self._system_id = system_id
         self._text_identifier = 0
         self.status_is_due = False  # CURRENT_MODE has been asked for, and had nothing to tell yet
-        self._status_told: object = None
-        self._status_told_s = -math.inf
+        self._status_sent: object = None
+        self._status_sent_s = -math.inf
 
     def send(self, message: Any) -> None:
         """Queue a message of the vehicle's own."""
@@ -63,11 +63,11 @@ class Link:
         self.sent += 1
         self.outbox.append(Outgoing(message, self._system_id, AUTOPILOT_COMPONENT))
 
-    def is_news(self, status: object, now_s: float) -> bool:
+    def is_new_status(self, status: object, now_s: float) -> bool:
         """Whether CURRENT_MODE has something to tell of this status here, however often it is asked for."""
-        if status == self._status_told and now_s - self._status_told_s < STATUS_PERIOD_S - 1e-6:
+        if status == self._status_sent and now_s - self._status_sent_s < STATUS_PERIOD_S - 1e-6:
             return False
-        self._status_told, self._status_told_s = status, now_s
+        self._status_sent, self._status_sent_s = status, now_s
         return True
 
     def send_text(self, text: Text, now_s: float) -> None:
@@ -85,11 +85,11 @@ class Link:
                 dialect.MAVLink_statustext_message(text.severity, chunk, self._text_identifier, sequence)
             )
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """A reboot: nothing was heard, nothing is under way, the streams have their default rates."""
         self.streams.restart(0)
         self.sent = self.received = self._text_identifier = 0
-        self.status_is_due, self._status_told = False, None
+        self.status_is_due, self._status_sent = False, None
         self.parameter_credit = 0.0
         self.outbox.clear()
         self.components.clear()
@@ -97,7 +97,7 @@ class Link:
         self.parameters_left.clear()
         self.file_transfer = None
 
-    def knows(self, system: int, component: int) -> bool:
+    def has_component(self, system: int, component: int) -> bool:
         """Whether a message to this target is worth sending here (PX4's `component_was_seen`)."""
         if system == 0:
             return bool(self.components)
@@ -120,5 +120,5 @@ def forward(message: Any, source: Link, links: Iterable[Link], system_id: int) -
     if message.get_type() == "SETUP_SIGNING":
         return  # a key is for the one it was told
     for link in links:
-        if link is not source and link.knows(system, component):
+        if link is not source and link.has_component(system, component):
             link.outbox.append(Outgoing(message, message.get_srcSystem(), message.get_srcComponent(), True))

@@ -111,7 +111,7 @@ class Streams:
         self._asked_us: dict[str, int] = {}
         self._default_us = {name: _interval_us(rate) for name, rate in rates_hz.items()}
         self._period_us = dict(self._default_us)  # as it arrives
-        self._order = {name: place for place, name in enumerate(rates_hz)}
+        self._order = {name: index for index, name in enumerate(rates_hz)}
         # a heap of (due, place in the table, name): few of the streams are due at any one time
         self._due = [
             (int(phase_s * 1e6) + period, self._order[name], name)
@@ -167,10 +167,10 @@ class Streams:
             return names
         heap = self._due
         while heap[0][0] <= now_us:
-            due, place, name = heap[0]
+            due, index, name = heap[0]
             period = self._period_us[name]
             following = due + period
-            heapq.heapreplace(heap, (following if following > now_us else now_us + period, place, name))
+            heapq.heapreplace(heap, (following if following > now_us else now_us + period, index, name))
             names.append(name)
         self.next_us = heap[0][0]
         return names

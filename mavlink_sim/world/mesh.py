@@ -33,7 +33,7 @@ class Mesh:
         normals, offsets: (F, 3), (F,) the faces' planes: normal · p = offset.
         face_of: (E,) each edge's face.
         starts, ends: (E, 3) of each edge.
-        ways: (E, 3) from start to end; inverse_lengths: (E,) 1 / |way|².
+        spans: (E, 3) from start to end; inverse_lengths: (E,) 1 / |way|².
         inwards: (E, 3) in the face's plane, at right angles to the edge, into the face.
     """
 
@@ -43,15 +43,15 @@ class Mesh:
     face_of: NDArray[np.intp]
     starts: Points
     ends: Points
-    ways: Points
+    spans: Points
     inverse_lengths: Points
     inwards: Points
 
     def nearest(self, point: Points) -> tuple[Points, float]:
         """The nearest point (3,) of the surface, and how far it is."""
         to = point - self.starts
-        share = np.clip(np.einsum("ij,ij->i", to, self.ways) * self.inverse_lengths, 0.0, 1.0)
-        away = to - share[:, None] * self.ways
+        share = np.clip(np.einsum("ij,ij->i", to, self.spans) * self.inverse_lengths, 0.0, 1.0)
+        away = to - share[:, None] * self.spans
         squares = np.einsum("ij,ij->i", away, away)
         edge = int(squares.argmin())
         best = float(squares[edge])
@@ -89,7 +89,7 @@ class Mesh:
         low, high = self.starts[:, 2], self.ends[:, 2]
         across = np.flatnonzero((low < z) != (high < z))
         share = (z - low[across]) / (high[across] - low[across])
-        points = self.starts[across, :2] + share[:, None] * self.ways[across, :2]
+        points = self.starts[across, :2] + share[:, None] * self.spans[across, :2]
         return points.reshape(-1, 2, 2)  # a convex face is cut by two of its edges, which follow each other
 
 
@@ -122,15 +122,15 @@ def _mesh(faces: list[Points]) -> Mesh:
     ends = np.concatenate([np.roll(points, -1, axis=0) for points in faces])
     face_of = np.repeat(np.arange(len(faces)), counts)
     first = np.cumsum([0, *counts[:-1]])
-    ways = ends - starts
+    spans = ends - starts
     # Newell's method, as `Face.plane`
     normals = np.add.reduceat(np.cross(starts, ends), first)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     middles = np.add.reduceat(starts, first) / np.array(counts)[:, None]
     offsets = np.einsum("ij,ij->i", normals, middles)
-    lengths = np.maximum(np.einsum("ij,ij->i", ways, ways), 1e-18)
-    inwards = np.cross(normals[face_of], ways)
-    return Mesh(first, normals, offsets, face_of, starts, ends, ways, 1.0 / lengths, inwards)
+    lengths = np.maximum(np.einsum("ij,ij->i", spans, spans), 1e-18)
+    inwards = np.cross(normals[face_of], spans)
+    return Mesh(first, normals, offsets, face_of, starts, ends, spans, 1.0 / lengths, inwards)
 
 
 def surface_range_to(item: WorldObject, position_ned_m: Sequence[float]) -> float:
@@ -142,7 +142,7 @@ def surface_range_to(item: WorldObject, position_ned_m: Sequence[float]) -> floa
     cosine, sine = math.cos(item.yaw_rad), math.sin(item.yaw_rad)
     north, east = (position_ned_m[axis] - item.position_ned_m[axis] for axis in (0, 1))
     point = np.array([cosine * north + sine * east, cosine * east - sine * north]) / item.scale
-    ways, to = mesh.ways[:, :2], point - mesh.starts[:, :2]
-    share = (to * ways).sum(axis=1) / np.maximum((ways * ways).sum(axis=1), 1e-12)
-    away = to - np.clip(share, 0.0, 1.0)[:, None] * ways
+    spans, to = mesh.spans[:, :2], point - mesh.starts[:, :2]
+    share = (to * spans).sum(axis=1) / np.maximum((spans * spans).sum(axis=1), 1e-12)
+    away = to - np.clip(share, 0.0, 1.0)[:, None] * spans
     return float(np.hypot(away[:, 0], away[:, 1]).min()) * item.scale

@@ -28,7 +28,7 @@ Segment = tuple[tuple[float, float], tuple[float, float]]
 """The ends of a level line, (north, east) metres."""
 
 
-class Way(Protocol):
+class ObstacleMotion(Protocol):
     """What leads an object along; `camera.scene.Path` is one."""
 
     @property
@@ -66,27 +66,27 @@ class Obstacle:
     Raises ValueError for one that leans, which a scene file cannot make.
     """
 
-    def __init__(self, thing: WorldObject, way: Way | None, flatness: float) -> None:
-        self.identifier = thing.identifier
-        self.name = f"{thing.class_name}-{thing.identifier}"
-        if thing.leans:
+    def __init__(self, scene_object: WorldObject, motion: ObstacleMotion | None, flatness: float) -> None:
+        self.identifier = scene_object.identifier
+        self.name = f"{scene_object.class_name}-{scene_object.identifier}"
+        if scene_object.leans:
             raise ValueError(f"{self.name} leans: only what stands level can be in a vehicle's way")
-        self.moves = way is not None
-        self._way = way
-        self._scale = thing.scale
-        size = thing.size_m if thing.printed is None else thing.printed.board_size_m
-        variant = variant_of(thing.class_name, thing.appearance)
-        self._mesh = mesh_of(thing.class_name, variant, size)
-        self._stretched = mesh_of(thing.class_name, variant, size, flatness)
-        shape = thing.shape
-        self._low: list[float] = (shape.low * thing.scale).tolist()
-        self._high: list[float] = (shape.high * thing.scale).tolist()
+        self.moves = motion is not None
+        self._motion = motion
+        self._scale = scene_object.scale
+        size = scene_object.size_m if scene_object.printed is None else scene_object.printed.board_size_m
+        variant = variant_of(scene_object.class_name, scene_object.appearance)
+        self._mesh = mesh_of(scene_object.class_name, variant, size)
+        self._stretched = mesh_of(scene_object.class_name, variant, size, flatness)
+        shape = scene_object.shape
+        self._low: list[float] = (shape.low * scene_object.scale).tolist()
+        self._high: list[float] = (shape.high * scene_object.scale).tolist()
         reaches = (
             np.hypot(x, y) for x in (self._low[0], self._high[0]) for y in (self._low[1], self._high[1])
         )
         self._reach_m = float(max(reaches))
         self._time_s = math.nan
-        self._put(thing.position_ned_m, thing.yaw_rad)
+        self._put(scene_object.position_ned_m, scene_object.yaw_rad)
 
     def _put(self, position_ned_m: Vector, yaw_rad: float) -> None:
         self._position = position_ned_m
@@ -94,16 +94,16 @@ class Obstacle:
 
     def place(self, time_s: float) -> None:
         """Let it be where it is at a time."""
-        if self._way is not None and time_s != self._time_s:
+        if self._motion is not None and time_s != self._time_s:
             self._time_s = time_s
-            self._put(*self._way.pose_at(time_s))
+            self._put(*self._motion.pose_at(time_s))
 
     def velocity_at(self, time_s: float) -> Vector:
         """NED m/s; how it turns is not in it."""
-        if self._way is None:
+        if self._motion is None:
             return _STILL
         (ax, ay, az), (bx, by, bz) = (
-            self._way.pose_at(time_s + side)[0] for side in (-_VELOCITY_STEP_S, 0.0)
+            self._motion.pose_at(time_s + side)[0] for side in (-_VELOCITY_STEP_S, 0.0)
         )
         return ((bx - ax) / _VELOCITY_STEP_S, (by - ay) / _VELOCITY_STEP_S, (bz - az) / _VELOCITY_STEP_S)
 
@@ -144,14 +144,14 @@ class Obstacle:
         scale = self._scale
         point = np.array([x / scale, y / scale, z / scale * flatness])
         nearest, distance = self._stretched.nearest(point)
-        room = distance * scale - radius_m
-        if room > 0.0:
-            return Gap(self, room / flatness)
+        margin = distance * scale - radius_m
+        if margin > 0.0:
+            return Gap(self, margin / flatness)
         inside = self.box_m(centre) == 0.0 and self._stretched.contains(point)
         if inside:
             out, depth = nearest - point, distance * scale + radius_m
         else:
-            out, depth = point - nearest, -room
+            out, depth = point - nearest, -margin
         dx, dy, dz = (out / distance).tolist() if distance > 1e-9 else (0.0, 0.0, -1.0)
         north, east = self._ned(dx, dy)
         length = math.sqrt(dx * dx + dy * dy + dz * dz * flatness * flatness)
@@ -162,13 +162,13 @@ class Obstacle:
         """Metres from a point along a unit vector to it, inf if it is not in that way."""
         start = self._own(origin)
         north, east = direction[0], direction[1]
-        way = (
+        direction = (
             self._cosine * north + self._sine * east,
             self._cosine * east - self._sine * north,
             direction[2],
         )
         enters, leaves = 0.0, math.inf
-        for begin, step, low, high in zip(start, way, self._low, self._high, strict=True):
+        for begin, step, low, high in zip(start, direction, self._low, self._high, strict=True):
             if abs(step) < 1e-12:
                 if not low <= begin <= high:
                     return math.inf
@@ -177,7 +177,7 @@ class Obstacle:
             enters, leaves = max(enters, min(one, other)), min(leaves, max(one, other))
         if enters > leaves:
             return math.inf
-        return self._mesh.along(np.array(start) / self._scale, np.array(way)) * self._scale
+        return self._mesh.along(np.array(start) / self._scale, np.array(direction)) * self._scale
 
     def outline(self, origin: Vector) -> NDArray[np.float64]:
         """(S, 2, 2) segments in which the level of a point cuts it, (north, east) metres from the point."""
@@ -193,8 +193,8 @@ class Obstacles:
     """All that is in the way.
 
     Args:
-        things: the world's objects at time 0. What is flat on the ground is left out.
-        ways: what leads them, by the object's identifier.
+        objects: the world's objects at time 0. What is flat on the ground is left out.
+        motions: what leads them, by the object's identifier.
         radius_m, half_height_m: of the ellipsoid that stands for a body in `nearest`.
 
     Attributes:
@@ -203,20 +203,20 @@ class Obstacles:
 
     def __init__(
         self,
-        things: Iterable[WorldObject],
-        ways: Mapping[int, Way],
+        objects: Iterable[WorldObject],
+        motions: Mapping[int, ObstacleMotion],
         radius_m: float,
         half_height_m: float,
     ) -> None:
         self.radius_m = radius_m
         self._flatness = radius_m / half_height_m
         self._all = [
-            Obstacle(thing, ways.get(thing.identifier), self._flatness)
-            for thing in things
-            if thing.height_m - thing.position_ned_m[2] > FLAT_M
+            Obstacle(scene_object, motions.get(scene_object.identifier), self._flatness)
+            for scene_object in objects
+            if scene_object.height_m - scene_object.position_ned_m[2] > FLAT_M
         ]
         self._moving = [one for one in self._all if one.moves]
-        speeds = (ways[one.identifier].speed_mps for one in self._moving)
+        speeds = (motions[one.identifier].speed_mps for one in self._moving)
         self.top_speed_mps = max(speeds, default=0.0)
 
     def _placed(self, time_s: float) -> list[Obstacle]:

@@ -42,16 +42,16 @@ class TruthFile:
                 file.close()
 
 
-def object_truth(thing: WorldObject, position_ned_m: Sequence[float]) -> dict[str, Any]:
+def object_truth(scene_object: WorldObject, position_ned_m: Sequence[float]) -> dict[str, Any]:
     """An object as the truth tells it, with its horizontal range from a vehicle at (3,) NED metres."""
     from mavlink_sim.world.world import range_to
 
     entry: dict[str, Any] = {
-        "identifier": thing.identifier,
-        "class_name": thing.class_name,
-        "position_ned_m": [round(float(value), 3) for value in thing.position_ned_m],
-        "range_m": round(float(range_to(thing, position_ned_m)), 3),
+        "identifier": scene_object.identifier,
+        "class_name": scene_object.class_name,
+        "position_ned_m": [round(float(value), 3) for value in scene_object.position_ned_m],
+        "range_m": round(float(range_to(scene_object, position_ned_m)), 3),
     }
-    if thing.system_id is not None:
-        entry["system_id"] = thing.system_id
+    if scene_object.system_id is not None:
+        entry["system_id"] = scene_object.system_id
     return entry

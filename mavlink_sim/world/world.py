@@ -234,8 +234,8 @@ def _hides(cars: list[WorldObject], north: float, east: float, half_width_m: flo
         car_bearing = math.atan2(item.position_ned_m[1], item.position_ned_m[0])
         car_distance = math.hypot(*item.position_ned_m[:2])
         apart = abs(math.remainder(bearing - car_bearing, math.tau))
-        room = math.atan2(half_width_m + 1.0, distance) + math.atan2(3.0, car_distance)
-        if distance < car_distance + 3.0 and apart < room:
+        margin = math.atan2(half_width_m + 1.0, distance) + math.atan2(3.0, car_distance)
+        if distance < car_distance + 3.0 and apart < margin:
             return True
     return False
 

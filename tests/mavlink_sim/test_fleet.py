@@ -13,7 +13,7 @@ from pymavlink import mavutil
 from mavlink_sim.cli.main import main
 from mavlink_sim.lockstep import LockstepVehicle
 from mavlink_sim.realtime import loop
-from mavlink_sim.realtime.fleet import instance_options, places
+from mavlink_sim.realtime.fleet import instance_options, start_positions
 from mavlink_sim.realtime.options import SimulationOptions
 from mavlink_sim.testing import free_udp_port_range, running_simulator
 from mavlink_sim.vehicles.vehicle import Vehicle
@@ -32,7 +32,7 @@ def test_ids_and_ports_count_up_as_in_px4s_sitl() -> None:
 
 
 def test_places_are_a_grid_without_two_in_one() -> None:
-    grid = places(20, 5.0)
+    grid = start_positions(20, 5.0)
     assert grid[0] == (0.0, 0.0)
     assert len(set(grid)) == 20
     assert max(max(place) for place in grid) == 20.0
@@ -152,13 +152,13 @@ def test_a_machine_that_is_too_slow_is_told_of_and_how_slow(monkeypatch: pytest.
     pace = loop._Pace(20.0, told.append)
     pace.lose(25.0)
     now_s += 2.0
-    pace.tell()
+    pace.report()
     assert told == []  # not at every hiccup
     now_s += 3.0
-    pace.tell()
+    pace.report()
     assert told == ["cannot keep up: 15.00 times real time in the last 5 s, not 20; the machine is too busy"]
     now_s += 6.0
-    pace.tell()
+    pace.report()
     assert len(told) == 1  # nothing lost since
 
 

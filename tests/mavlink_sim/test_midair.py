@@ -34,14 +34,14 @@ class World4ms:
         for number, airframe in enumerate(airframes, start=1):
             self.midair.join(Body(airframe, (0.0, 0.0), number, f"vehicle {number}", lambda: self.now_s))
 
-    def look(self) -> None:
-        self.midair.look(STEP_S)
+    def resolve(self) -> None:
+        self.midair.resolve(STEP_S)
 
     def step(self) -> None:
         for airframe in self.airframes:
             airframe.advance(STEP_S)
         self.now_s += STEP_S
-        self.look()
+        self.resolve()
 
     def apart(self) -> float:
         return apart(*self.midair.bodies)
@@ -66,7 +66,7 @@ def test_those_that_overlap_are_parted_and_nothing_comes_of_nothing(
     world = World4ms(first, second)
     put(second, (place[0], place[1], place[2] - 5.0), other)
     touching = world.apart() < 1.0
-    world.look()
+    world.resolve()
     if not touching:
         assert (first.velocity, second.velocity) == (one, other)
         assert first.collisions == second.collisions == 0

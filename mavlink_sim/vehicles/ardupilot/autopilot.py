@@ -164,7 +164,7 @@ class CopterAutopilot(Autopilot):
             return ACCEPTED
         refusal = self._refusal()
         if refusal is not None:
-            self._say(CRITICAL, f"Arm: {refusal}")
+            self._send_text(CRITICAL, f"Arm: {refusal}")
             return FAILED
         self.force_arm()
         return ACCEPTED
@@ -174,7 +174,7 @@ class CopterAutopilot(Autopilot):
         self.armed = True
         self.ground.arm(self.now_s)
         self.home.follow(self._airframe, self._parameters)
-        self._say(INFO, "Arming motors")
+        self._send_text(INFO, "Arming motors")
         self._on_event("armed")
         self._start_task()
 
@@ -189,7 +189,7 @@ class CopterAutopilot(Autopilot):
     def request_mode(self, mode: CopterMode) -> int:
         """MAV_RESULT of a request for a mode. A disarmed vehicle takes every one."""
         if mode not in FLOWN:
-            self._say(WARNING, f"No such mode {int(mode)}")
+            self._send_text(WARNING, f"No such mode {int(mode)}")
             return FAILED
         if mode is not self.mode and self.armed:
             reason = None
@@ -198,7 +198,7 @@ class CopterAutopilot(Autopilot):
             elif mode is CopterMode.AUTO:
                 reason = "init failed"  # there is no mission
             if reason is not None:
-                self._say(WARNING, f"Mode change to {mode.title} failed: {reason}")
+                self._send_text(WARNING, f"Mode change to {mode.title} failed: {reason}")
                 return FAILED
         self.watch.mode_was_chosen()
         self.change_mode(mode)
@@ -212,7 +212,7 @@ class CopterAutopilot(Autopilot):
         self.mode_changes += 1
         self._enter(mode)
 
-    def set_mode(self, mode: Mode, tell: bool = False) -> int:
+    def set_mode(self, mode: Mode, report: bool = False) -> int:
         """A request by PX4's name of a mode, as the shared faults and the pilot's sticks make them."""
         meant = _PILOTS_MODES.get(mode)
         return FAILED if meant is None else self.request_mode(meant)
@@ -261,7 +261,7 @@ class CopterAutopilot(Autopilot):
         """Say what speaks against arming. That the mode does not allow it is said at arming alone."""
         refusal = self._refusal()
         if refusal is not None and "mode not armable" not in refusal:
-            self._say(CRITICAL, f"PreArm: {refusal}")
+            self._send_text(CRITICAL, f"PreArm: {refusal}")
 
     def _fly(self, dt_s: float, task: flight.Task, setpoint: flight.Setpoint) -> None:
         if isinstance(task, manual_flight.Stabilized):
@@ -333,10 +333,10 @@ class CopterAutopilot(Autopilot):
         else:
             self.task = flight.Hold(airframe, parameters)
 
-    def landing_task(self, place: Vector | None = None) -> Land:
+    def landing_task(self, point: Vector | None = None) -> Land:
         """The descent, here or at a place."""
         return Land(
-            self._airframe, self._parameters, self.navigator.newest_target, self.navigator.time_s, place
+            self._airframe, self._parameters, self.navigator.newest_target, self.navigator.time_s, point
         )
 
     def _descent(self) -> Descend:
@@ -355,6 +355,6 @@ class CopterAutopilot(Autopilot):
         self.task = None
         self.failsafe = False
         self.watch.disarmed()
-        self._say(INFO, text)
+        self._send_text(INFO, text)
         self.supervision.disarmed()
         self._on_event(f"disarmed ({reason})")

@@ -90,7 +90,7 @@ def _mode_result(vehicle: CopterContext, base: float, custom: float) -> int:
         return DENIED
     mode = mode_of(int(custom))
     if mode is None:
-        vehicle.say(4, f"No such mode {int(custom)}")
+        vehicle.send_text(4, f"No such mode {int(custom)}")
         return FAILED
     return vehicle.copter.request_mode(mode)
 
@@ -160,13 +160,13 @@ def _reposition(vehicle: CopterContext, link: Link, command: Command, frame: int
     changes = math.isfinite(flags) and bool(int(flags) & CHANGE_MODE)
     if copter.guided is None and not changes:
         return DENIED
-    place = _place(vehicle, command, frame)
-    if place is None:
+    point = _point_of(vehicle, command, frame)
+    if point is None:
         return DENIED
     if copter.guided is None and copter.request_mode(CopterMode.GUIDED) != ACCEPTED:
         return FAILED
     if copter.guided is not None:
-        copter.guided.fly(GuidedTarget(position=place))
+        copter.guided.fly(GuidedTarget(position=point))
     return ACCEPTED
 
 
@@ -181,7 +181,7 @@ def _pause_or_continue(vehicle: CopterContext, link: Link, command: Command, fra
     return ACCEPTED
 
 
-def _place(vehicle: CopterContext, command: Command, frame: int) -> Vector | None:
+def _point_of(vehicle: CopterContext, command: Command, frame: int) -> Vector | None:
     latitude, longitude, altitude = command.parameters[4:7]
     if not (abs(latitude) <= 90.0 and abs(longitude) <= 180.0 and math.isfinite(altitude)):
         return None
@@ -194,11 +194,11 @@ def _set_home(vehicle: CopterContext, link: Link, command: Command, frame: int) 
     here = command.parameters[0] == 1.0
     if here and not vehicle.copter.position_valid:
         return FAILED
-    place = vehicle.copter.position if here else _place(vehicle, command, frame)
-    if place is None:
+    point = vehicle.copter.position if here else _point_of(vehicle, command, frame)
+    if point is None:
         return DENIED
     # ArduPilot locks it either way: arming elsewhere does not move it.
-    vehicle.copter.home.is_at(place, (math.nan,) * 3)
+    vehicle.copter.home.is_at(point, (math.nan,) * 3)
     vehicle.send_home()
     return ACCEPTED
 

@@ -23,10 +23,10 @@ class CopterContext(ServiceContext, Protocol):
     @property
     def copter(self) -> CopterAutopilot: ...
 
-    def say(self, severity: int, text: str) -> None:
+    def send_text(self, severity: int, text: str) -> None:
         """Send a STATUSTEXT on every link."""
 
-    def say_once(self, severity: int, text: str) -> None: ...
+    def send_text_once(self, severity: int, text: str) -> None: ...
 
     def send_home(self) -> None:
         """Send HOME_POSITION on every link."""

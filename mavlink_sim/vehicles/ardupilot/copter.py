@@ -74,14 +74,14 @@ class CopterVehicle(Vehicle):
         streams.follow_parameters(self, link)
         return link
 
-    def say(self, severity: int, text: str) -> None:
+    def send_text(self, severity: int, text: str) -> None:
         """A STATUSTEXT to everyone."""
         self.autopilot.texts.append(Text(severity, text))
 
-    def say_once(self, severity: int, text: str) -> None:
-        if text not in self._said:
-            self._said.add(text)
-            self.say(severity, text)
+    def send_text_once(self, severity: int, text: str) -> None:
+        if text not in self._sent_texts:
+            self._sent_texts.add(text)
+            self.send_text(severity, text)
 
     def send_home(self) -> None:
         """HOME_POSITION to every link, as when it changes."""
@@ -107,8 +107,8 @@ class CopterVehicle(Vehicle):
 
     def _boot(self) -> None:
         super()._boot()
-        self._said: set[str] = set()
-        self._told_mode_changes = 0
+        self._sent_texts: set[str] = set()
+        self._sent_mode_changes = 0
         self._was_armed = False
 
     def reboot(self) -> None:
@@ -125,15 +125,15 @@ class CopterVehicle(Vehicle):
     def _step(self) -> None:
         super()._step()
         copter = self.copter
-        if copter.mode_changes != self._told_mode_changes:
-            self._told_mode_changes = copter.mode_changes
+        if copter.mode_changes != self._sent_mode_changes:
+            self._sent_mode_changes = copter.mode_changes
             for link in self.links.values():
                 self.send_built(link, "HEARTBEAT")
         if copter.armed and not self._was_armed:
             self.send_home()  # home is where it was armed
         self._was_armed = copter.armed
 
-    def _tell(self) -> None:
+    def _send_queued(self) -> None:
         """Texts to every link on which somebody speaks; no events, no commands to a gimbal."""
         while self.autopilot.texts:
             text = self.autopilot.texts.popleft()

@@ -100,7 +100,7 @@ class Failsafes:
         if not circle or not int(value("AVOID_ENABLE")) & STOP_AT_FENCE:
             return velocity
         north, east, _ = (
-            place - home for place, home in zip(autopilot.position, autopilot.home.position, strict=True)
+            point - home for point, home in zip(autopilot.position, autopilot.home.position, strict=True)
         )
         distance_m = max(math.hypot(north, east), 1e-6)
         north, east = north / distance_m, east / distance_m
@@ -120,9 +120,9 @@ class Failsafes:
             return
         self._gcs_lost = lost
         if not lost:
-            self._say("GCS Failsafe Cleared")
+            self._send_text("GCS Failsafe Cleared")
             return
-        self._say("GCS Failsafe")
+        self._send_text("GCS Failsafe")
         autopilot.announce("failsafe: ground station lost")
         if autopilot.landed:
             autopilot.disarm(force=True, by="failsafe")
@@ -168,7 +168,7 @@ class Failsafes:
         autopilot, value = self._autopilot, self._parameters.number
         kinds = int(value("FENCE_TYPE"))
         north, east, down = (
-            place - home for place, home in zip(autopilot.position, autopilot.home.position, strict=True)
+            point - home for point, home in zip(autopilot.position, autopilot.home.position, strict=True)
         )
         if kinds & FENCE_ALTITUDE and -down > value("FENCE_ALT_MAX"):
             return "Max Alt"
@@ -181,5 +181,5 @@ class Failsafes:
         blind = not self._autopilot.position_valid and mode not in WITHOUT_POSITION
         self._autopilot.change_mode(CopterMode.LAND if blind else mode)
 
-    def _say(self, text: str) -> None:
+    def _send_text(self, text: str) -> None:
         self._autopilot.texts.append(Text(WARNING, text))

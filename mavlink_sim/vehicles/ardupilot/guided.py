@@ -200,18 +200,18 @@ class Guided(flight.Task):
         elif self._target.velocity is None:
             setpoint = self._trajectory.towards(self._target.position, dt_s)
         else:
-            setpoint = self._by_moving_place(dt_s, stale)
+            setpoint = self._by_moving_position(dt_s, stale)
         if stale and self._target.velocity is not None:
             self.heading.hold()
         setpoint.yaw_rad = self.heading.advance(dt_s, self._trajectory.velocity)
         return setpoint
 
-    def _by_moving_place(self, dt_s: float, stale: bool) -> TrajectorySetpoint:
+    def _by_moving_position(self, dt_s: float, stale: bool) -> TrajectorySetpoint:
         target = self._target
         assert target.position is not None
         assert target.velocity is not None
         velocity = ZERO if stale else target.velocity
-        x, y, z = (place + speed * dt_s for place, speed in zip(target.position, velocity, strict=True))
+        x, y, z = (point + speed * dt_s for point, speed in zip(target.position, velocity, strict=True))
         self._target = GuidedTarget((x, y, z), velocity, None, target.yaw_rad, target.yaw_rate_radps)
         self._trajectory.velocity = velocity
         return TrajectorySetpoint((x, y, z), velocity, NOTHING)
@@ -239,8 +239,8 @@ class Guided(flight.Task):
         vx, vy, vz = (now + (then - now) * share for now, then in zip(self._followed, velocity, strict=True))
         self._followed = (vx, vy, vz)
         x, y, z = (
-            min(max(place + speed * dt_s, here - LEASH_M), here + LEASH_M)
-            for place, speed, here in zip(
+            min(max(point + speed * dt_s, here - LEASH_M), here + LEASH_M)
+            for point, speed, here in zip(
                 trajectory.position, self._followed, self._airframe.position, strict=True
             )
         )

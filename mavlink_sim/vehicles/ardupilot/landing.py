@@ -87,14 +87,14 @@ class Land(flight.TrajectoryTask):
         parameters: Parameters,
         newest: Callable[[], LandingTarget | None],
         now_s: Callable[[], float],
-        place: Vector | None = None,
+        point: Vector | None = None,
     ) -> None:
         self._airframe = airframe
         self._parameters = parameters
         self._newest = newest
         self._now_s = now_s
         self._trajectory = flight.Trajectory(airframe, parameters)
-        self.goal: Vector = self._trajectory.stopping_point() if place is None else place
+        self.goal: Vector = self._trajectory.stopping_point() if point is None else point
         self.on_target = False
 
     def update(self, dt_s: float) -> TrajectorySetpoint:

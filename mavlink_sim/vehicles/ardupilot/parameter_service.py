@@ -39,7 +39,7 @@ def request_read(vehicle: CopterContext, link: Link, message: Any) -> None:
     parameters = vehicle.parameters
     parameter = parameters.at(index) if index >= 0 else parameters.get(_text_of(message.param_id))
     if parameter is not None:
-        vehicle.after(0.0, partial(_tell, vehicle, link, parameter, index if index >= 0 else NO_INDEX))
+        vehicle.after(0.0, partial(_send_value, vehicle, link, parameter, index if index >= 0 else NO_INDEX))
 
 
 def set_parameter(vehicle: CopterContext, link: Link, message: Any) -> None:
@@ -56,10 +56,10 @@ def set_parameter(vehicle: CopterContext, link: Link, message: Any) -> None:
     for each in vehicle.links.values():
         if name.startswith(streams.prefix(vehicle, each)):
             streams.follow_parameters(vehicle, each)
-        _tell(vehicle, each, parameter, NO_INDEX)
+        _send_value(vehicle, each, parameter, NO_INDEX)
 
 
-def _tell(vehicle: CopterContext, link: Link, parameter: Parameter, index: int) -> None:
+def _send_value(vehicle: CopterContext, link: Link, parameter: Parameter, index: int) -> None:
     link.send(
         dialect.MAVLink_param_value_message(
             parameter.name.encode(), parameter.wire_value, parameter.kind, len(vehicle.parameters), index

@@ -86,12 +86,12 @@ def _landing_target(vehicle: CopterContext, link: Link, message: Any) -> None:
     frame = vehicle.estimate
     height = -vehicle.airframe.position[2]
     try:
-        place = landing.target_position(message, frame.position, frame.quaternion, height)
+        point = landing.target_position(message, frame.position, frame.quaternion, height)
     except landing.UnsupportedTargetError as error:
-        vehicle.say_once(INFO, str(error))
+        vehicle.send_text_once(INFO, str(error))
         return
-    if place is not None:
-        vehicle.copter.navigator.target = LandingTarget(place, vehicle.now_s)
+    if point is not None:
+        vehicle.copter.navigator.target = LandingTarget(point, vehicle.now_s)
 
 
 def _no_mission(vehicle: CopterContext, link: Link, message: Any) -> None:
@@ -107,7 +107,7 @@ def _no_mission(vehicle: CopterContext, link: Link, message: Any) -> None:
 def _setup_signing(vehicle: CopterContext, link: Link, message: Any) -> None:
     """SETUP_SIGNING: a disarmed ArduPilot takes the key from any link, for all of its links."""
     if vehicle.copter.armed:
-        vehicle.say(3, "ERROR: Won't setup signing when armed")
+        vehicle.send_text(3, "ERROR: Won't setup signing when armed")
         return
     for each in vehicle.links.values():
         each.signing.set_up(bytes(message.secret_key), int(message.initial_timestamp))

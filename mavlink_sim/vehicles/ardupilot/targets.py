@@ -39,7 +39,7 @@ _ABSOLUTE = (GLOBAL, GLOBAL_INT)
 # the ground is flat here: above terrain is above home
 _ABOVE_HOME = (GLOBAL_RELATIVE_ALT, GLOBAL_RELATIVE_ALT_INT, GLOBAL_TERRAIN_ALT, GLOBAL_TERRAIN_ALT_INT)
 MAX_SANE = 1000.0  # m/s or m/s²: beyond it, or no number, ArduPilot stops
-MAX_PLACE_M = 1e6
+MAX_POSITION_M = 1e6
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,10 +65,10 @@ def local_target(message: Any, position: Vector, yaw_rad: float) -> GuidedTarget
     if frame not in _LOCAL or _asks_for_force(mask):
         return STOP
     heading = yaw_rad if frame in _BODY else 0.0
-    place = _given((message.x, message.y, message.z), mask, POSITION_IGNORE, heading)
-    if place is not None and frame != LOCAL_NED:
-        place = (place[0] + position[0], place[1] + position[1], place[2] + position[2])
-    return _combined(message, place, heading)
+    point = _given((message.x, message.y, message.z), mask, POSITION_IGNORE, heading)
+    if point is not None and frame != LOCAL_NED:
+        point = (point[0] + position[0], point[1] + position[1], point[2] + position[2])
+    return _combined(message, point, heading)
 
 
 def global_target(message: Any, local_frame: LocalFrame, home: Vector) -> GuidedTarget:
@@ -76,7 +76,7 @@ def global_target(message: Any, local_frame: LocalFrame, home: Vector) -> Guided
     frame, mask = int(message.coordinate_frame), int(message.type_mask)
     if _asks_for_force(mask):
         return STOP
-    place = None
+    point = None
     if not mask & sum(POSITION_IGNORE):
         latitude, longitude = message.lat_int / 1e7, message.lon_int / 1e7
         if abs(latitude) > 90.0 or abs(longitude) > 180.0 or not math.isfinite(message.alt):
@@ -87,24 +87,24 @@ def global_target(message: Any, local_frame: LocalFrame, home: Vector) -> Guided
             altitude = HOME_ALTITUDE_M - home[2] + float(message.alt)
         else:
             return STOP
-        place = local_frame.local(latitude, longitude, altitude)
-    return _combined(message, place, 0.0)
+        point = local_frame.local(latitude, longitude, altitude)
+    return _combined(message, point, 0.0)
 
 
-def _combined(message: Any, place: Vector | None, heading_rad: float) -> GuidedTarget:
+def _combined(message: Any, point: Vector | None, heading_rad: float) -> GuidedTarget:
     mask = int(message.type_mask)
     velocity = _given((message.vx, message.vy, message.vz), mask, VELOCITY_IGNORE, heading_rad)
     acceleration = _given((message.afx, message.afy, message.afz), mask, ACCELERATION_IGNORE, heading_rad)
-    for vector, limit in ((place, MAX_PLACE_M), (velocity, MAX_SANE), (acceleration, MAX_SANE)):
+    for vector, limit in ((point, MAX_POSITION_M), (velocity, MAX_SANE), (acceleration, MAX_SANE)):
         if vector is not None and not all(abs(value) <= limit for value in vector):
             return STOP
-    if place is None and velocity is None and acceleration is None:
+    if point is None and velocity is None and acceleration is None:
         return STOP
-    if place is not None and velocity is None and acceleration is not None:
+    if point is not None and velocity is None and acceleration is not None:
         return STOP
     yaw = NAN if mask & YAW_IGNORE or not math.isfinite(message.yaw) else float(message.yaw) + heading_rad
     rate = NAN if mask & YAW_RATE_IGNORE or not math.isfinite(message.yaw_rate) else float(message.yaw_rate)
-    return GuidedTarget(place, velocity, acceleration, yaw, rate)
+    return GuidedTarget(point, velocity, acceleration, yaw, rate)
 
 
 def _asks_for_force(mask: int) -> bool:
