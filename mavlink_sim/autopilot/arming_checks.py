@@ -1,4 +1,4 @@
-"""PX4's checks before arming, each told by an event; the names and words are PX4 1.17's."""
+"""PX4's checks before arming, each reported by an event; names and texts are PX4 1.17's."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mavlink_sim.px4.modes import MANUAL_MODES, MODES_PREVENTING_ARMING, Mode
 from mavlink_sim.wire.announcements import CRITICAL, Text, event_identifier
 
 _ERROR, _INFO = 0x33, 0x66  # log levels: to the vehicle's own log and to ground stations
-# PX4's health_component_t, as the argument counts them
+# PX4's health_component_t
 _NO_COMPONENT, _MANUAL_CONTROL, _SYSTEM = 0, 7, 20
 _ALL_MODES = 0xFFFF_FFFF
 # PX4's NAVIGATION_STATE of each mode: its bit in the events' `modes`
@@ -39,7 +39,7 @@ GEOFENCE_CHECKS = {
     "check_gf_violation_max_alt": geofence.TOO_HIGH,
     "check_gf_violation_custom_gf": geofence.OUTSIDE,
 }
-_ALTITUDE_CRUISE = 1 << 8  # of the manual modes; this vehicle does not have it
+_ALTITUDE_CRUISE = 1 << 8  # a manual mode that this vehicle does not have
 
 
 class CheckedAutopilot(Protocol):
@@ -63,7 +63,7 @@ class CheckedAutopilot(Protocol):
 
 
 def failing_checks(autopilot: CheckedAutopilot, only: Collection[str] | None = None) -> list[Text]:
-    """An event for each check that fails, whatever the mode; without a text of its own. `only`: of these."""
+    """An event (without text) for each check that fails, whatever the mode. `only`: of these checks."""
     with_position = [mode for mode in Mode if position_failsafe.needs_position(mode)]
     in_wrong_mode = autopilot.mode in MODES_PREVENTING_ARMING
     mission, sticks = autopilot.navigator.mission, autopilot.pilot_has_sticks

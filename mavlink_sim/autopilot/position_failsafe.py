@@ -1,12 +1,11 @@
-"""What PX4 does when the horizontal position is no longer valid (its mode requirements and mode fallback).
+"""PX4's mode requirements and fallback without a valid horizontal position.
 
-A mode that needs a position is refused, and left if it is flown: Position falls to Altitude where a pilot has
-sticks, every other mode to Descend, because Return and Land need a position too. Descend is shown as LAND
-(that is how PX4 encodes it in HEARTBEAT): level, sinking with MPC_LAND_SPEED, drifting with the wind.
-OFFBOARD is left only if its setpoints ask for a position or a velocity; then it counts as lost setpoints.
-When the position comes back in the air, the mode that was wanted is flown again; a vehicle that came down
-blindly stays down. Which mode that makes is the choice of `failsafes`; here is what it has to know, and how
-to come down.
+A mode that needs a position is refused, and left if it is active: Position falls back to Altitude where a
+pilot has sticks, every other mode to Descend, because Return and Land need a position too. Descend is
+reported as LAND in HEARTBEAT, as by PX4: level, sinking with MPC_LAND_SPEED, drifting with the wind. OFFBOARD
+is left only if its setpoints need a position or a velocity; then they count as lost. When the position is
+back in the air, the intended mode is resumed; a vehicle that has descended to the ground stays there.
+`failsafes` selects the mode; this module has the requirements and the descent.
 """
 
 from __future__ import annotations
@@ -17,12 +16,12 @@ from mavlink_sim.physics.airframe import Multirotor
 from mavlink_sim.px4.modes import Mode
 from mavlink_sim.px4.parameters import Parameters
 
-# ALTCTL, STABILIZED, ACRO and MANUAL are flown without; OFFBOARD depends on its setpoints.
+# ALTCTL, STABILIZED, ACRO and MANUAL need none; OFFBOARD depends on its setpoints.
 WITHOUT_POSITION = frozenset({Mode.ALTCTL, Mode.STABILIZED, Mode.ACRO, Mode.MANUAL, Mode.OFFBOARD})
 
 
 class Descend(Task):
-    """Sink without knowing where: level, with MPC_LAND_SPEED, at the heading it had."""
+    """Descend without a position: level, with MPC_LAND_SPEED and constant heading."""
 
     landing = True
 

@@ -15,7 +15,7 @@ from mavlink_sim.wire.link_faults import LinkStage
 from mavlink_sim.wire.links import Link
 from mavlink_sim.wire.messages import Outgoing
 
-# Of a message that the vehicle sends: another one in its place, or None to swallow it.
+# Of a message that the vehicle sends: the one to send instead, or None to drop it.
 Gate = Callable[[Link, Any], Any]
 # Of a command's identifier and parameters: the MAV_RESULT that it is refused with, or None.
 Refusal = Callable[[int, tuple[float, ...]], int | None]
@@ -23,15 +23,15 @@ Refusal = Callable[[int, tuple[float, ...]], int | None]
 
 @dataclass
 class ActiveFault:
-    """One fault that was asked for.
+    """One requested fault.
 
     Attributes:
-        number: how it is spoken of; counts from 1.
+        number: its identifier; counts from 1.
         seed: of its random numbers.
         begins_s, ends_s: on the faults' clock; `ends_s` is infinite without a duration.
-        undo: what sets things right again when it ends, last first.
+        undo: called at the end in reverse order, to restore the state before.
         each_step: called with the step's seconds while it is active.
-        apart: it is not of the vehicle itself, and goes on while that stands still.
+        apart: independent of the vehicle; continues while the vehicle is stalled.
     """
 
     number: int
@@ -49,7 +49,7 @@ class ActiveFault:
 
 
 class FaultState(Protocol):
-    """What `schedule.Faults` keeps for the effects; see there."""
+    """The state of `schedule.Faults` that effects use; see there."""
 
     deaf: bool
     gates: dict[int, Gate]

@@ -1,4 +1,4 @@
-"""Faults of the links: which impairment goes on which direction of which link."""
+"""Effects on the links: the impairments of each direction."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from mavlink_sim.wire.link_faults import (
 
 
 def chosen_links(vehicle: FaultTarget, link: str) -> list[str]:
-    """The names of the links that are meant. Raises FaultError for one that the vehicle does not have."""
+    """The names of the selected links. Raises FaultError for one that the vehicle does not have."""
     if not vehicle.links:
-        raise FaultError("a fault of the link: this vehicle has no links")
+        raise FaultError("link fault: this vehicle has no links")
     if link == "all":
         return list(vehicle.links)
     if link not in vehicle.links:
@@ -31,7 +31,7 @@ def chosen_links(vehicle: FaultTarget, link: str) -> list[str]:
 
 
 def _channels(vehicle: FaultTarget, one: ActiveFault) -> list[tuple[str, Channel]]:
-    """The directions that are meant, each with the seed of its own random numbers."""
+    """The selected directions, each with the seed of its random numbers."""
     values = one.fault.values
     found = []
     for name in chosen_links(vehicle, values["link"]):
@@ -50,44 +50,44 @@ def _impair(vehicle: FaultTarget, one: ActiveFault, make: Callable[[str], Impair
 
 
 def link_loss(vehicle: FaultTarget, one: ActiveFault) -> None:
-    """Nothing gets through, and what was on its way is lost too."""
+    """Drop everything, also what is in transit."""
     for _, channel in _channels(vehicle, one):
         channel.drop_waiting()
     _impair(vehicle, one, lambda seed: Loss(1.0, seed))
 
 
 def link_delay(vehicle: FaultTarget, one: ActiveFault) -> None:
-    """Everything is late."""
+    """Delay everything."""
     values = one.fault.values
     _impair(vehicle, one, lambda seed: Delay(values["seconds"], values["jitter"], seed))
 
 
 def link_jitter(vehicle: FaultTarget, one: ActiveFault) -> None:
-    """Everything is late, each by another amount."""
+    """Delay each datagram by a random time."""
     _impair(vehicle, one, lambda seed: Delay(0.0, one.fault.values["seconds"], seed))
 
 
 def packet_loss(vehicle: FaultTarget, one: ActiveFault) -> None:
-    """Datagrams get lost."""
+    """Lose datagrams."""
     _impair(vehicle, one, lambda seed: Loss(one.fault.values["share"], seed))
 
 
 def duplicate(vehicle: FaultTarget, one: ActiveFault) -> None:
-    """Datagrams arrive twice."""
+    """Duplicate datagrams."""
     _impair(vehicle, one, lambda seed: Duplication(one.fault.values["share"], seed))
 
 
 def reorder(vehicle: FaultTarget, one: ActiveFault) -> None:
-    """Datagrams overtake each other."""
+    """Reorder datagrams."""
     values = one.fault.values
     _impair(vehicle, one, lambda seed: Reorder(values["share"], values["hold"], seed))
 
 
 def corrupt(vehicle: FaultTarget, one: ActiveFault) -> None:
-    """Bytes change on the way."""
+    """Change bytes."""
     _impair(vehicle, one, lambda seed: Corruption(one.fault.values["share"], seed))
 
 
 def rate_limit(vehicle: FaultTarget, one: ActiveFault) -> None:
-    """The line is slow."""
+    """Limit the data rate."""
     _impair(vehicle, one, lambda seed: RateLimit(one.fault.values["bytes_per_s"]))

@@ -1,4 +1,4 @@
-"""Faults of what the vehicle says: silence, lost answers, a jumping clock, a second voice, a standstill."""
+"""Effects on messages: silent streams, lost answers, clock jumps, a second autopilot, a stall."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mavlink_sim.wire.streams import ONBOARD_RATES_HZ
 _U32, _U64 = 2**32, 2**64
 _I64_MAX = 2**63 - 1
 _EVENT_ID, _LINK_NODE_STATUS_ID = 410, 8
-# time_usec of these is the boot time; elsewhere it is the world's, or zero
+# time_usec of these is the boot time; elsewhere it is UTC or zero
 _BOOT_TIME_USEC = {
     "ALTITUDE",
     "ESTIMATOR_STATUS",
@@ -26,12 +26,12 @@ _BOOT_TIME_USEC = {
     "ODOMETRY",
     "VIBRATION",
 }
-# The second autopilot starts so far east of where the vehicle did.
+# Where the second autopilot starts, east of the vehicle's start.
 SECOND_START_EAST_M = 25.0
 
 
 def heartbeat_only(vehicle: FaultTarget, one: ActiveFault) -> None:
-    """Streams fall silent; answers to a client still come."""
+    """Stop the streams; answers to clients are still sent."""
     names = chosen_links(vehicle, one.fault.values["link"])
 
     def gate(link: Link, message: Any) -> Any:
@@ -45,7 +45,7 @@ def heartbeat_only(vehicle: FaultTarget, one: ActiveFault) -> None:
 
 
 def lost_ack(vehicle: FaultTarget, one: ActiveFault) -> None:
-    """COMMAND_ACK is swallowed: every one, or the Nth that would be sent from now on."""
+    """Drop COMMAND_ACK: every one, or the Nth from now on."""
     values = one.fault.values
     names = chosen_links(vehicle, values["link"])
     left = None if values["which"] == "all" else int(values["which"])
@@ -73,7 +73,7 @@ def _gated(vehicle: FaultTarget, one: ActiveFault, gate: Any) -> None:
 
 
 def time_jump(vehicle: FaultTarget, one: ActiveFault) -> None:
-    """The boot clock is another one, in every stamp and in TIMESYNC; it jumps back when the fault ends."""
+    """Shift the boot clock, in every stamp and in TIMESYNC, until the fault ends."""
     jump_us = round(one.fault.values["seconds"] * 1e6)
     vehicle.faults.boot_offset_us += jump_us
 
@@ -84,7 +84,7 @@ def time_jump(vehicle: FaultTarget, one: ActiveFault) -> None:
 
 
 def shifted(message: Any, boot_offset_us: int) -> Any:
-    """The message with its boot times moved, TIMESYNC's among them."""
+    """The message with its boot times shifted, TIMESYNC's too."""
     kind = message.get_type()
     moved = copy.copy(message)
     if kind == "TIMESYNC":
@@ -111,7 +111,7 @@ def shifted(message: Any, boot_offset_us: int) -> Any:
 
 
 class _Spoken:
-    """A message of the second autopilot with its packet, numbered as that autopilot numbers."""
+    """A message of the second autopilot with its packet, with that autopilot's sequence number."""
 
     def __init__(self, message: Any, packet: bytes, system: int) -> None:
         self._message = message
@@ -131,7 +131,7 @@ class _Spoken:
 
 
 def second_autopilot(vehicle: FaultTarget, one: ActiveFault) -> None:
-    """Another vehicle's autopilot speaks and listens on every link of this one, disarmed on the ground."""
+    """Attach the autopilot of another vehicle, disarmed on the ground, to every link of this one."""
     system = one.fault.values["system"] or vehicle.system_id
     other = vehicle.second_autopilot(system, one.seed, SECOND_START_EAST_M)
     codecs = {}
@@ -143,7 +143,7 @@ def second_autopilot(vehicle: FaultTarget, one: ActiveFault) -> None:
         other.step(dt_s)
         for name, codec in codecs.items():
             for item in other.outgoing(name):
-                if not item.forwarded:  # what it would pass on has been on these links already
+                if not item.forwarded:  # what it would forward has been on these links already
                     spoken = _Spoken(item.message, item.pack(codec), system)
                     vehicle.links[name].outbox.append(Outgoing(spoken, system, item.component, True))
 
@@ -153,7 +153,7 @@ def second_autopilot(vehicle: FaultTarget, one: ActiveFault) -> None:
 
 
 def stall(vehicle: FaultTarget, one: ActiveFault) -> None:
-    """The vehicle's time stands still or goes slowly; messages to it wait, and are all read afterwards."""
+    """Stop or slow down the vehicle's time; messages to it wait, and are all read afterwards."""
     vehicle.faults.pace = one.fault.values["pace"]
 
     def undo() -> None:

@@ -11,10 +11,11 @@ from mavlink_sim.physics.airframe import Vector
 from mavlink_sim.physics.geography import LocalFrame
 from mavlink_sim.px4.parameters import Parameters
 
-# Commands that the transfer takes but no mission may hold: CONDITION_DELAY, CONDITION_DISTANCE and this one.
+# Commands that the transfer accepts but no mission may have: CONDITION_DELAY, CONDITION_DISTANCE and this
+# one.
 _NOT_FLYABLE = frozenset({112, 114, mission_items.FENCE_RETURN_POINT})
 _VTOL = frozenset({mission_items.VTOL_TAKEOFF, mission_items.VTOL_LAND, mission_items.VTOL_TRANSITION})
-# Items that are neither an action nor a place to PX4's search for "the first item with a position".
+# Items that count as positions in PX4's search for "the first item with a position".
 _COUNTED_AS_POSITIONS = mission_items.POSITION_COMMANDS | {
     mission_items.RETURN_TO_LAUNCH,
     mission_items.GATE,
@@ -35,9 +36,9 @@ def complaints(
     *,
     landed: bool,
 ) -> tuple[bool, list[str]]:
-    """Whether the mission may be flown, and what PX4 says of it.
+    """Whether the mission may be flown, and PX4's texts about it.
 
-    A far first waypoint is said, and does not forbid the mission (as in PX4 v1.16).
+    A far first waypoint is only a warning (as in PX4 v1.16).
     """
     if not items:
         return False, []

@@ -1,6 +1,6 @@
 """The geofence: polygons and circles to stay in or out of, and the greatest distances from home.
 
-All places are local NED metres; the polygon test counts crossings of a ray (even-odd rule).
+All positions are local NED metres; the polygon test counts crossings of a ray (even-odd rule).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from mavlink_sim.px4.parameters import Parameters
 
 Point = tuple[float, float]  # north, east, metres
 
-# What PX4 says of each kind of breach; the health report sends them without the usual tab.
+# PX4's text of each kind of breach; the health report sends them without the usual tab.
 TOO_FAR = "Geofence: exceeding maximum distance to Home"
 TOO_HIGH = "Geofence: exceeding maximum altitude above Home"
 OUTSIDE = "Geofence: approaching or outside geofence"
@@ -54,9 +54,9 @@ class Area:
 
 
 def inside_polygon(vertices: Sequence[Point], point: Point) -> bool:
-    """Whether a place is inside a polygon that does not cross itself; on the edge either may come out.
+    """Whether a point is inside a polygon that does not cross itself; on the edge the result is undefined.
 
-    The crossing test of W. R. Franklin (PNPOLY). Fewer than three vertices hold nothing.
+    The crossing test of W. R. Franklin (PNPOLY). Fewer than three vertices contain no point.
     """
     north, east = point
     inside = False
@@ -71,7 +71,7 @@ def inside_polygon(vertices: Sequence[Point], point: Point) -> bool:
 
 
 def areas_of(items: Sequence[MissionItem], frame: LocalFrame) -> list[Area]:
-    """The areas that an uploaded fence describes. Vertices that are missing at its end are left out."""
+    """The areas of an uploaded fence. Vertices that are missing at its end are left out."""
     areas: list[Area] = []
     index = 0
     while index < len(items):
@@ -100,7 +100,7 @@ def _point(item: MissionItem, frame: LocalFrame) -> Point:
 
 
 class Geofence:
-    """What the vehicle is held to: uploaded areas and GF_MAX_HOR_DIST, GF_MAX_VER_DIST around home."""
+    """The limits of the vehicle's position: uploaded areas and GF_MAX_HOR_DIST, GF_MAX_VER_DIST from home."""
 
     def __init__(self, parameters: Parameters, frame: LocalFrame) -> None:
         self._parameters = parameters
@@ -114,13 +114,13 @@ class Geofence:
         return Action(value) if value in tuple(Action) else Action.WARN
 
     def load(self, items: Sequence[MissionItem], home: Vector | None, flying_at: Vector | None) -> list[str]:
-        """Take a new fence; areas that home or a flying vehicle breaks from the start are left out.
+        """Load a new fence; areas that home or the flying vehicle breaches at once are left out.
 
         Args:
-            home: None where there is none yet.
-            flying_at: where the vehicle is, None on the ground.
+            home: None before there is one.
+            flying_at: the vehicle's position, None on the ground.
 
-        Returns PX4's words for each area left out.
+        Returns PX4's text for each area left out.
         """
         self._areas = []
         complaints = []
@@ -136,7 +136,7 @@ class Geofence:
         return complaints
 
     def breaches(self, point: Vector, home: Vector | None) -> list[str]:
-        """PX4's words for everything that a place breaks; empty where the vehicle may be there."""
+        """PX4's text for each limit that a position breaches; empty where the vehicle may be there."""
         found = []
         farthest = self._parameters.number("GF_MAX_HOR_DIST")
         highest = self._parameters.number("GF_MAX_VER_DIST")
@@ -149,5 +149,5 @@ class Geofence:
         return found
 
     def allows_goal(self, point: Vector, home: Vector | None) -> bool:
-        """Whether a command may send the vehicle there: only where a breach would do more than warn."""
+        """Whether a command may send the vehicle there; always, if GF_ACTION does not more than warn."""
         return self.action in (Action.NONE, Action.WARN) or not self.breaches(point, home)

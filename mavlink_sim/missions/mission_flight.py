@@ -1,4 +1,4 @@
-"""Flying a mission: the task of Mode.MISSION, item by item as PX4's Navigator does.
+"""Mission flight: the task of Mode.MISSION, item by item as in PX4's Navigator.
 
 Positions are local NED metres.
 """
@@ -20,8 +20,8 @@ from mavlink_sim.physics.geography import LocalFrame
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.announcements import INFO
 
-NAVIGATOR_PERIOD_S = 0.05  # items are looked after at 20 Hz, the trajectory at every step
-# How sharp a corner may be cut: the circle that PX4's trajectory fits into the acceptance radius.
+NAVIGATOR_PERIOD_S = 0.05  # items are processed at 20 Hz, the trajectory at every step
+# Corners below this angle are flown at cruise speed.
 STRAIGHT_ON_RAD = math.radians(1.0)
 # MPC_YAW_MODE
 TOWARDS_WAYPOINT, TOWARDS_HOME, AWAY_FROM_HOME, ALONG_TRAJECTORY, YAW_FIRST = range(5)
@@ -64,13 +64,13 @@ class MissionNavigator(Protocol):
 
 
 class Stage(enum.Enum):
-    """What is done for the current item."""
+    """The stage of the current item."""
 
-    CLIMB = "climb"  # to its altitude first, where the vehicle is
+    CLIMB = "climb"  # to its altitude first, at the current horizontal position
     FLY = "fly"
     MOVE_TO_LAND = "move to land"
     LAND = "land"
-    ACT = "act"  # an item without a place
+    ACT = "act"  # an item without a position
 
 
 class MissionFlight(flight.Task):
@@ -123,7 +123,7 @@ class MissionFlight(flight.Task):
         return self._trajectory.towards(self._aim(), dt_s, self._heading(), **self._climb_speed())
 
     def _climb_speed(self) -> dict[str, float]:
-        """A climb from the ground goes as a take-off does."""
+        """The climb limit: from the ground that of a take-off."""
         if self._stage is Stage.CLIMB and self._navigator.landed:
             return {"max_up_mps": self._parameters.number("MPC_TKO_SPEED")}
         return {}
@@ -146,7 +146,7 @@ class MissionFlight(flight.Task):
             self._end()
 
     def _begin_item(self) -> None:
-        """Turn to the current item."""
+        """Start the current item."""
         item = self._mission.item
         self._arrived_s, self._turned = None, False
         if item.has_position:
@@ -225,13 +225,13 @@ class MissionFlight(flight.Task):
         if command != mission_items.NAV_DELAY:
             self._navigator.command(item)
         if command == mission_items.RETURN_TO_LAUNCH:
-            # reached as it begins (since PX4 v1.17): in a moment another mode flies the vehicle
+            # reached as it begins (since PX4 v1.17): then the mode changes
             self._navigator.reached(self._mission.current)
             if self._mission.current + 1 == len(self._mission.items):
                 self._end()
 
     def _replay_speed(self) -> None:
-        """A mission that is resumed has the speed of the last change before its current item."""
+        """Apply the last speed change before the current item, for a resumed mission."""
         self._navigator.change_speed(0.0)
         for item in self._mission.items[: self._mission.current]:
             if item.command == mission_items.DO_CHANGE_SPEED:
@@ -273,7 +273,7 @@ class MissionFlight(flight.Task):
 
     def _has_acted(self, item: MissionItem, now: float) -> bool:
         if item.command == mission_items.RETURN_TO_LAUNCH or item.command == mission_items.IDLE:
-            return False  # another mode takes over; idling never ends
+            return False  # the mode changes; idling never ends
         if item.command == mission_items.NAV_DELAY or item.command in _WAIT_FOR_COMMAND:
             if self._arrived_s is None:
                 self._arrived_s = now
@@ -284,7 +284,7 @@ class MissionFlight(flight.Task):
         return True
 
     def _has_passed(self, item: MissionItem) -> bool:
-        """The vehicle is beyond the gate, seen along the way to the next place."""
+        """Whether the vehicle has passed the gate on the path to the next waypoint."""
         gate = self._point_of(item)
         x, y, _ = self._airframe.position
         return (x - gate[0]) * (self.goal[0] - gate[0]) + (y - gate[1]) * (self.goal[1] - gate[1]) >= 0.0
@@ -313,7 +313,7 @@ class MissionFlight(flight.Task):
         return math.dist(point[:2], self._airframe.position[:2])
 
     def _point_of(self, item: MissionItem) -> Vector:
-        """Where an item is; what it leaves open (NaN) stays as it is."""
+        """The position of an item; NaN components are those of the vehicle."""
         here = self._airframe.position
         if item.frame == mission_items.FRAME_MISSION:
             latitude, longitude, altitude = item.parameters[4:]
@@ -323,10 +323,10 @@ class MissionFlight(flight.Task):
         x, y, z = (value if math.isfinite(value) else own for value, own in zip(wanted, here, strict=True))
         return (x, y, z)
 
-    # ---- the way ----------------------------------------------------------------------------------------
+    # ---- path -------------------------------------------------------------------------------------------
 
     def _aim(self) -> Vector:
-        """The goal, or a point beyond it that makes the vehicle pass it at speed on its way to the next."""
+        """The goal, or a point beyond it so that the vehicle passes the goal at speed."""
         x, y, z = self.goal
         px, py, _ = self._trajectory.position
         dx, dy = x - px, y - py
@@ -339,7 +339,7 @@ class MissionFlight(flight.Task):
         return (x + dx * beyond, y + dy * beyond, z)
 
     def _passing_speed(self) -> float:
-        """m/s at the current waypoint: 0 where the vehicle stops, else what the corner to the next allows.
+        """The speed at the current waypoint, m/s: 0 where the vehicle stops, else limited by the next corner.
 
         The corner is flown on the circle that touches both legs at the acceptance radius.
         """
@@ -371,7 +371,7 @@ class MissionFlight(flight.Task):
         return min(math.sqrt(max(braking * radius, 0.0)), cruise)
 
     def _heading(self) -> float:
-        """Where to look: a region of interest, the item's heading, else as MPC_YAW_MODE says; NaN: as now."""
+        """The heading: to a region of interest, the item's, else by MPC_YAW_MODE; NaN: unchanged."""
         if self._stage in (Stage.FLY, Stage.ACT):
             interest = self.goal if self._roi_is_next else self._roi
             if interest is not None and self._mission.item.command != mission_items.TAKEOFF:

@@ -1,7 +1,7 @@
-"""PX4's Navigator in small: what is stored of plans, how the mission goes, the geofence, where RTL leads.
+"""PX4's Navigator, reduced: stored plans, mission progress, the geofence, the destination of RTL.
 
-Belongs to one Autopilot, which calls `update` at every step and asks for the tasks of MISSION, RTL, PRECLAND.
-What clients are to hear of it waits in `announcements`, what other components are to do in `commands`.
+Belongs to one Autopilot, which calls `update` at every step and gets the tasks of MISSION, RTL, PRECLAND.
+Messages for clients are queued in `announcements`, commands for other components in `commands`.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.announcements import CRITICAL, INFO, Text
 
 FENCE_PERIOD_S = 0.2  # GEOFENCE_CHECK_INTERVAL_US
-REACHED_REPETITIONS = 10  # MISSION_ITEM_REACHED is told again so often, once a second
+REACHED_REPETITIONS = 10  # MISSION_ITEM_REACHED is repeated this often, once a second
 REACHED_PERIOD_S = 1.0
 ACTIVE, SUSPENDED = 1, 2  # MISSION_CURRENT.mission_mode
 _MISSION_MODES = frozenset({Mode.MISSION, Mode.TAKEOFF, Mode.LAND})
@@ -95,8 +95,8 @@ class Navigator:
 
     Attributes:
         frame: the vehicle's local frame.
-        plans: what is stored, by type. mission: the mission and the progress in it.
-        fence: what the vehicle is held to. obstacles: for collision prevention.
+        plans: the stored plans, by type. mission: the mission and its progress.
+        fence: the geofence. obstacles: for collision prevention.
         target: the newest landing target.
         uploading: name of the link over which a client uploads. sessions: the mission protocol, by link.
     """
@@ -125,7 +125,7 @@ class Navigator:
         self.commands: deque[MissionItem] = deque()
         self._checked_with: object = None
         self._state = MissionState.NO_MISSION
-        self._active = False  # the mission on board was begun
+        self._active = False  # the mission on board was started
         self._disarmed_since_active = False
         self._breaches: list[str] = []
         self._next_fence_check_s = 0.0
@@ -133,7 +133,7 @@ class Navigator:
         self._next_reached_s = 0.0
         self._repetitions = 0
 
-    # ---- what others read -------------------------------------------------------------------------------
+    # ---- state ------------------------------------------------------------------------------------------
 
     @property
     def now_s(self) -> float:
@@ -154,17 +154,17 @@ class Navigator:
 
     @property
     def is_breached(self) -> bool:
-        """The vehicle is where the fence does not allow it, and GF_ACTION is not to ignore that."""
+        """The vehicle breaches the fence, and GF_ACTION does not ignore that."""
         return bool(self._breaches)
 
     @property
     def breaches(self) -> list[str]:
-        """PX4's words for each way in which it is."""
+        """PX4's text for each breach."""
         return self._breaches
 
     @property
     def in_progress(self) -> bool:
-        """A mission is being flown; it is not disarmed by itself then."""
+        """A mission is in progress; automatic disarming is off then."""
         return self._autopilot.mode is Mode.MISSION and not self.mission.finished
 
     @property
@@ -172,7 +172,7 @@ class Navigator:
         return ACTIVE if self._autopilot.mode in _MISSION_MODES else SUSPENDED
 
     def mission_state(self) -> MissionState:
-        """MISSION_CURRENT.mission_state, with PX4's memory: a pause before any item keeps the last state."""
+        """MISSION_CURRENT.mission_state; as in PX4, a pause before any item keeps the last state."""
         mission = self.mission
         if not mission.items or not mission.valid:
             self._state = MissionState.NO_MISSION
@@ -187,13 +187,14 @@ class Navigator:
         return self._state
 
     def allows_goal(self, point: Vector) -> bool:
-        """Whether a command (DO_REPOSITION, DO_ORBIT) may send the vehicle to a local NED place."""
+        """Whether a command (DO_REPOSITION, DO_ORBIT) may send the vehicle to a local NED position."""
         return self.fence.allows_goal(point, self._known_home())
 
     def allowed_acceleration(self, acceleration: Plane, velocity: Plane) -> Plane:
-        """Collision prevention for Position mode: what is allowed of the acceleration the sticks ask for.
+        """Limit the acceleration setpoint of the sticks by collision prevention, in Position mode.
 
-        Both m/s² and m/s, (north, east). Without data for 5 s the vehicle is put into HOLD, as PX4 does.
+        Acceleration m/s², velocity m/s, (north, east). Without data for 5 s the mode changes to HOLD, as in
+        PX4.
         """
         limited = limited_acceleration(
             acceleration, velocity, self._airframe.yaw_rad, self.obstacles, self._parameters, self.now_s
@@ -205,15 +206,15 @@ class Navigator:
         return limited.acceleration
 
     def take_stored(self, before: Navigator) -> None:
-        """A reboot: the plans and the current item are on PX4's card, all else is forgotten."""
+        """Restore the plans and the current item after a reboot: PX4 stores no more."""
         self.plans, self.fence = before.plans, before.fence
         mission = before.mission
         self.mission = Mission(mission.items, mission.current, jumps=mission.jumps)
 
-    # ---- what clients do --------------------------------------------------------------------------------
+    # ---- requests of clients ----------------------------------------------------------------------------
 
     def store(self, plan_type: PlanType, plan: Plan, current: int = -1) -> None:
-        """Take a whole new plan. An identical one changes nothing.
+        """Store a new plan. An identical one changes nothing.
 
         Args:
             current: the mission item marked as current, -1 for none.
@@ -240,7 +241,7 @@ class Navigator:
             self._autopilot.restart_task()
 
     def set_current(self, index: int) -> None:
-        """Fly this item next, or when the mission begins."""
+        """Make this item the current one."""
         if index == self.mission.current or not self.mission.valid:
             return
         if not self.mission.go_to(index):
@@ -251,20 +252,20 @@ class Navigator:
             self._autopilot.restart_task()
 
     def change_speed(self, speed_mps: float) -> None:
-        """DO_CHANGE_SPEED; not above zero: the usual speed again."""
+        """DO_CHANGE_SPEED; not above zero: the default speed."""
         self._autopilot.change_speed(speed_mps if speed_mps > 1e-6 else 0.0, at_once=False)
 
     def forget_reached(self) -> None:
-        """A new mission begins to arrive: nothing of it is reached."""
+        """Reset the reached item, when the upload of a mission begins."""
         self.mission.reached = -1
 
-    # ---- what the flight tasks report -------------------------------------------------------------------
+    # ---- reports of the flight tasks --------------------------------------------------------------------
 
     def current_changed(self) -> None:
         self.announcements.append(Current())
 
     def reached(self, index: int) -> None:
-        """An item is reached. Told once, then again each second for a while."""
+        """Announce a reached item, and repeat that each second for REACHED_REPETITIONS."""
         if index == self.mission.reached:
             return
         self.mission.reached = index
@@ -274,7 +275,7 @@ class Navigator:
         self._on_event(f"mission item {index} reached")
 
     def command(self, item: MissionItem) -> None:
-        """An item is a command, for this vehicle or another component."""
+        """Queue an item that is a command, for this vehicle or another component."""
         self.commands.append(item)
 
     def send_text(self, severity: int, text: str) -> None:
@@ -286,7 +287,7 @@ class Navigator:
         """The task of Mode.MISSION, from the current item on."""
         mission = self.mission
         if self._active and self._disarmed_since_active and mission.current + 1 == len(mission.items):
-            mission.current = 0  # flown to its end before
+            mission.current = 0  # it was completed before
             mission.jumps.clear()
         self._check_mission()
         if not mission.valid:
@@ -318,7 +319,7 @@ class Navigator:
         return self.now_s
 
     def return_task(self) -> flight.Task:
-        """The task of RTL, by RTL_TYPE and RTL_PLD_MD; says where it leads."""
+        """The task of RTL, by RTL_TYPE and RTL_PLD_MD; announces the return height."""
         position = self._airframe.position
         landing = self._return_landing()
         route = mission_route(self.mission, self._parameters, self.home, self.frame)
@@ -340,7 +341,7 @@ class Navigator:
         return RouteReturn(self._airframe, self._parameters, *last, landing, climb_to_z)
 
     def _return_landing(self) -> Callable[[Vector, float], flight.TrajectoryTask]:
-        """Makes the task of RTL's last descent."""
+        """A factory of the task of RTL's final descent."""
         return partial(self._descent, int(self._parameters.number("RTL_PLD_MD")))
 
     def _descent(self, mode: int, point: Vector, yaw_rad: float) -> flight.TrajectoryTask:
@@ -350,7 +351,7 @@ class Navigator:
         return self.precision_landing(Precision(mode), (point[0], point[1], z))
 
     def guard_sticks(self, acceleration: Plane, velocity: Plane) -> Plane:
-        """What collision prevention leaves of the sticks' acceleration, m/s² (north, east)."""
+        """The sticks' acceleration as limited by collision prevention, m/s² (north, east)."""
         limited = limited_acceleration(
             acceleration, velocity, self._airframe.yaw_rad, self.obstacles, self._parameters, self.now_s
         )
@@ -362,7 +363,7 @@ class Navigator:
     # ---- one step ---------------------------------------------------------------------------------------
 
     def update(self) -> None:
-        """Look after the mission's end, its validity and the fence."""
+        """Check the end of the mission, its validity and the fence."""
         autopilot = self._autopilot
         if not autopilot.armed and self._active:
             self._disarmed_since_active = True
@@ -395,7 +396,7 @@ class Navigator:
         return self.home if self._autopilot.sensors_ready else None
 
     def _check_key(self) -> object:
-        """What the mission was last checked with; a change of it is reason to check again."""
+        """The inputs of the mission check; a change requires another check."""
         return self._known_home(), self.plans[PlanType.FENCE].identifier
 
     def _check_mission(self) -> None:
@@ -423,11 +424,11 @@ class Navigator:
             self.send_text(CRITICAL, words)
         if not found or was_breached or not autopilot.armed:
             return
-        self._on_event(f"geofence breached: {found[0]}")  # what is done about it is up to the failsafes
+        self._on_event(f"geofence breached: {found[0]}")  # the failsafes select the action
 
 
 def goes_to_camera(command: int) -> bool:
-    """Whether PX4 passes a mission's command on to the camera component instead of obeying itself."""
+    """Whether PX4 forwards a mission's command to the camera component instead of executing it."""
     return command in _CAMERA_COMMANDS
 
 

@@ -1,4 +1,4 @@
-"""Where RTL leads (RTL_TYPE) and how it lands there (RTL_PLD_MD)."""
+"""The destination of RTL (RTL_TYPE) and its landing (RTL_PLD_MD)."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from mavlink_sim.px4.parameters import Parameters
 
 # A rally point this close to home is no alternative to it (MAX_DIST_FROM_HOME_FOR_LAND_APPROACHES).
 TOO_CLOSE_TO_HOME_M = 10.0
-# Another destination must be that much nearer to be worth it (MIN_DIST_THRESHOLD).
+# Another destination must be nearer by this (MIN_DIST_THRESHOLD).
 WORTH_M = 2.0
 USABLE_FRAMES = frozenset({mission_items.GLOBAL, mission_items.GLOBAL_RELATIVE_ALT})
 
 
 class Goal(enum.Enum):
-    """What kind of place RTL leads to."""
+    """The kind of RTL's destination."""
 
     HOME = "home"
     RALLY = "rally point"
@@ -34,7 +34,7 @@ class Goal(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class Destination:
-    """Local NED metres of the place to land at."""
+    """Where to land, local NED metres."""
 
     kind: Goal
     position: Vector
@@ -48,10 +48,11 @@ def destination(
     frame: LocalFrame,
     position: Vector,
 ) -> tuple[Destination, list[str]]:
-    """The nearest place that RTL_TYPE allows, and what PX4 complains of on the way.
+    """The nearest destination that RTL_TYPE allows, and PX4's texts about unusable ones.
 
     0: home or a rally point. 1: a rally point or the mission's landing. 3: any of the three. 5: rally points
-    alone, without one here. With 2 and 4 the vehicle follows its mission instead (see `mission_route`).
+    only, without one the current position. With 2 and 4 the vehicle follows its mission instead (see
+    `mission_route`).
     """
     kind = int(parameters.number("RTL_TYPE"))
     best, nearest = Destination(Goal.HOME, home), math.inf
@@ -84,10 +85,10 @@ def destination(
 def mission_route(
     mission: Mission, parameters: Parameters, home: Vector, frame: LocalFrame
 ) -> tuple[list[Vector], Vector] | None:
-    """The way back along a valid mission (RTL_TYPE 2 and 4) and where it lands; None for the direct way.
+    """The return along a valid mission (RTL_TYPE 2 and 4) and where it lands; None for the direct return.
 
-    Forward to the mission's landing, past items that wait; without a landing, or with RTL_TYPE 4 where that
-    is nearer, backwards along what was flown and down at home.
+    Forward to the mission's landing, without waiting at items; without a landing, or with RTL_TYPE 4 where
+    that is nearer, backwards along the flown items to a landing at home.
     """
     kind = int(parameters.number("RTL_TYPE"))
     if kind not in (2, 4) or not mission.valid:
@@ -99,7 +100,9 @@ def mission_route(
         landing = None
     forward = start is not None and landing is not None and mission.current <= landing
     if forward and start is not None and kind == 4:
-        forward = start - mission.current < mission.current  # PX4's measure: items left against items flown
+        forward = (
+            start - mission.current < mission.current
+        )  # PX4's measure: remaining items against flown items
     if forward and landing is not None:
         points = _points(mission.items[mission.current : landing], home, frame)
         return points, mission.items[landing].local_position(home, frame)
@@ -107,9 +110,9 @@ def mission_route(
 
 
 def landing_route(mission: Mission, home: Vector, frame: LocalFrame) -> tuple[list[Vector], Vector]:
-    """The places of the mission's landing pattern, from DO_LAND_START on, and the landing itself."""
+    """The points of the mission's landing pattern, from DO_LAND_START on, and the landing itself."""
     start, landing = mission.land_start(), mission.landing()
-    assert start is not None  # called for a mission's landing alone
+    assert start is not None  # called only for a mission's landing
     assert landing is not None
     return _points(mission.items[start:landing], home, frame), mission.items[landing].local_position(
         home, frame
@@ -117,13 +120,13 @@ def landing_route(mission: Mission, home: Vector, frame: LocalFrame) -> tuple[li
 
 
 def _points(items: tuple[MissionItem, ...], home: Vector, frame: LocalFrame) -> list[Vector]:
-    """Where the items with a place are; those that leave some of it open are left out."""
+    """The positions of the items that have one; incomplete ones (NaN) are left out."""
     points = [item.local_position(home, frame) for item in items if item.has_position]
     return [point for point in points if all(map(math.isfinite, point))]
 
 
 class ReturnFlight(flight.Return):
-    """RTL straight to a destination; `make_landing` gives the task of the last descent."""
+    """RTL directly to a destination; `make_landing` creates the task of the final descent."""
 
     def __init__(
         self,
@@ -137,16 +140,16 @@ class ReturnFlight(flight.Return):
         self._make_landing = make_landing
 
     def landing_task(self, point: Vector, yaw_rad: float) -> flight.TrajectoryTask:
-        """The descent at a place, turned to a heading; NaN: as it is."""
+        """The descent at a point, with a heading; NaN: unchanged."""
         return self._make_landing(point, yaw_rad)
 
 
 class RouteReturn(flight.TrajectoryTask):
-    """RTL along the places of a mission, then down at the last one.
+    """RTL along the waypoints of a mission, with a landing at the last one.
 
     Args:
-        points: local NED, in the order of flight. landing: where to land; its height does not matter.
-        climb_to_z: NED height to climb to first, and to keep until the first place; None to go at once.
+        points: local NED, in the order of flight. landing: where to land; its height is ignored.
+        climb_to_z: NED height to climb to first, and to keep until the first point; None: no climb.
     """
 
     def __init__(
@@ -174,7 +177,7 @@ class RouteReturn(flight.TrajectoryTask):
         self._next()
 
     def _next(self) -> None:
-        """Turn to the next place; one without a height is flown to at the height there is."""
+        """Set the next point as the goal; one without a height keeps the current height."""
         x, y, z = self._ahead.pop(0)
         self.goal = (x, y, z if math.isfinite(z) else self.goal[2])
 

@@ -1,4 +1,4 @@
-"""COMMAND_LONG and COMMAND_INT: which commands the vehicle knows, and PX4's MAV_RESULT for each."""
+"""COMMAND_LONG and COMMAND_INT: the supported commands, and PX4's MAV_RESULT of each."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ GET_MESSAGE_INTERVAL = 510
 SET_MESSAGE_INTERVAL = 511
 REQUEST_MESSAGE = 512
 GET_HOME_POSITION = 410
-MESSAGE_INTERVAL = 244  # a message, which REQUEST_MESSAGE asks for with another's number
+MESSAGE_INTERVAL = 244  # a message that REQUEST_MESSAGE requests with another's number
 AVAILABLE_MODES = 435  # the same with the index of a mode, 0 for all
 # ACTUATOR_OUTPUT_FUNCTION: motors 1-12, servos 1-8, and from 1000 on PX4's own numbers
 _TESTED_FUNCTIONS = (range(1, 13), range(33, 41), range(1000, 2**31))
 
 
 def execute(vehicle: ServiceContext, link: Link, command: Command) -> int | None:
-    """Carry out a command. Returns its MAV_RESULT, None where PX4 answers nothing at all."""
+    """Execute a command. Returns its MAV_RESULT, None where PX4 sends no answer."""
     if command.identifier == 0:
         return None
     handler = _HANDLERS.get(command.identifier)
@@ -66,7 +66,7 @@ def _arm(vehicle: ServiceContext, link: Link, command: Command) -> int | None:
     if action == 0:
         return vehicle.autopilot.disarm(force=_nearest(force) == FORCE_DISARM)
     vehicle.autopilot.texts.append(Text(CRITICAL, f"Unsupported ARM_DISARM param: {wanted:.3f}\t"))
-    return None  # it says so in words, and PX4 does not answer
+    return None  # PX4 sends the text and no answer
 
 
 def _do_set_mode(vehicle: ServiceContext, link: Link, command: Command) -> int:
@@ -104,7 +104,7 @@ def _reposition(vehicle: ServiceContext, link: Link, command: Command) -> int:
     speed, flags, _, yaw = command.parameters[:4]
     goal = _point_of(vehicle, *command.parameters[4:7])
     # MAV_DO_REPOSITION_FLAGS_CHANGE_MODE, and no other: the commander refuses the rest. The navigator of PX4
-    # does not look at the flags, so a vehicle that holds flies there whatever the answer says.
+    # ignores the flags, so a vehicle that holds flies there whatever the answer is.
     if math.isfinite(flags) and int(flags) == 1:
         return vehicle.autopilot.reposition(goal, yaw, speed)
     vehicle.autopilot.move_hold_to(goal, yaw, speed)
@@ -112,7 +112,7 @@ def _reposition(vehicle: ServiceContext, link: Link, command: Command) -> int:
 
 
 def _change_altitude(vehicle: ServiceContext, link: Link, command: Command) -> int:
-    altitude = command.parameters[0]  # AMSL; PX4 looks at no frame here either
+    altitude = command.parameters[0]  # AMSL; PX4 ignores the frame here too
     return vehicle.autopilot.reposition(_point_of(vehicle, math.nan, math.nan, altitude), math.nan)
 
 
@@ -131,7 +131,7 @@ def _orbit(vehicle: ServiceContext, link: Link, command: Command) -> int:
 def _point_of(
     vehicle: ServiceContext, latitude_deg: float, longitude_deg: float, altitude_m: float
 ) -> Vector:
-    """Local NED, NaN for what is no number. PX4 takes a place not on Earth too; here it lies at the edge."""
+    """Local NED, NaN for non-finite values. Positions out of range, which PX4 accepts, are clamped."""
     return vehicle.local_frame.local(
         _within(latitude_deg, 90.0), _within(longitude_deg, 180.0), _within(altitude_m, MAX_ALTITUDE_M)
     )
@@ -163,7 +163,7 @@ def _set_home(vehicle: ServiceContext, link: Link, command: Command) -> int:
         return DENIED
     if not use_current > 0.5 and not all(map(math.isfinite, point)):
         return DENIED
-    if not autopilot.sensors_ready:  # no origin yet; with one, a lost position is no reason
+    if not autopilot.sensors_ready:  # no origin yet; with one, a lost position is no reason to refuse
         return TEMPORARILY_REJECTED
     if use_current > 0.5:
         autopilot.home.is_here(estimate)
@@ -202,7 +202,7 @@ def _get_home_position(vehicle: ServiceContext, link: Link, command: Command) ->
 
 
 def _actuator_test(vehicle: ServiceContext, link: Link, command: Command) -> int | None:
-    """No actuator moves. A function that PX4 does not have is not answered."""
+    """No actuator moves. An unknown function is not answered, as in PX4."""
     if vehicle.autopilot.armed or vehicle.parameters.number("COM_MOT_TEST_EN") != 1:
         return DENIED
     function = _identifier(command.parameters[4])
@@ -210,7 +210,7 @@ def _actuator_test(vehicle: ServiceContext, link: Link, command: Command) -> int
 
 
 def _calibrate(vehicle: ServiceContext, link: Link, command: Command) -> int:
-    """All zero asks for nothing, and ends a calibration; there is none here."""
+    """All zero ends a calibration; there is none here."""
     if vehicle.autopilot.armed:
         return TEMPORARILY_REJECTED
     return UNSUPPORTED if any(command.parameters) else ACCEPTED
@@ -221,7 +221,7 @@ def _reboot(vehicle: ServiceContext, link: Link, command: Command) -> int:
 
 
 def _silence(vehicle: ServiceContext, link: Link, command: Command) -> None:
-    """Commander leaves it to a part of PX4 that is not there."""
+    """For a module of PX4 that is not simulated: no answer."""
 
 
 def _request_capabilities(vehicle: ServiceContext, link: Link, command: Command) -> int:
@@ -264,7 +264,7 @@ def _identifier(value: float) -> int:
 
 
 def _nearest(value: float) -> int:
-    """C's lroundf: a half away from zero; of what is no number the lowest byte is 0."""
+    """C's lroundf: a half away from zero; 0 for a non-finite value."""
     return math.floor(abs(value) + 0.5) * (1 if value > 0.0 else -1) if math.isfinite(value) else 0
 
 
@@ -303,9 +303,9 @@ _HANDLERS: dict[int, Callable[[ServiceContext, Link, Command], int | None]] = {
     gimbal_protocol.CONFIGURE: gimbal_protocol.configure,
 }
 
-# PX4's MAVLink receiver accepts these at once, whatever Commander answers a moment later (since v1.16).
+# PX4's MAVLink receiver accepts these at once, before Commander's own answer (since v1.16).
 ANSWERED_TWICE = frozenset({DO_SET_MODE})
-# These never get to Commander's queue.
+# These do not pass Commander's queue.
 ANSWERED_BY_RECEIVER = frozenset(
     {GET_HOME_POSITION, GET_MESSAGE_INTERVAL, SET_MESSAGE_INTERVAL, REQUEST_MESSAGE, 519, 520}
 )

@@ -1,7 +1,7 @@
-"""A file system in memory, for MAVLink FTP: nothing of the host's disk can be reached through it.
+"""A file system in memory, for MAVLink FTP, without access to the host's disk.
 
-Paths are absolute or not, as in PX4: both begin at the root. `..` never leads above it. Errors are OSErrors
-with the errno that POSIX has for the case.
+Absolute and relative paths both begin at the root, as in PX4. `..` never leads above it. Errors are OSErrors
+with the errno of POSIX.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 
 CAPACITY_BYTES = 16 * 1024 * 1024
 MAX_ENTRIES = 2000
-MAX_NAME_BYTES = 220  # with its size it must fit one answer to a list request
+MAX_NAME_BYTES = 220  # with its size it must fit into one answer to a list request
 # A flight controller's card is mounted here; PX4's simulation has the same files at its root.
 STORAGE = ("fs", "microsd")
 
@@ -20,10 +20,10 @@ Path = tuple[str, ...]
 
 
 class FileSystem:
-    """Files that clients write, and files that the vehicle provides, which are read-only and made when read.
+    """Files written by clients, and read-only files provided by the vehicle, which are generated when read.
 
     Args:
-        capacity_bytes: what all written files together may take; more is ENOSPC.
+        capacity_bytes: limit of all written files together; more is ENOSPC.
     """
 
     def __init__(self, capacity_bytes: int = CAPACITY_BYTES) -> None:
@@ -32,17 +32,17 @@ class FileSystem:
         self._provided: dict[Path, Callable[[], bytes]] = {}
         self._directories: set[Path] = {()}
 
-    # ---- what the vehicle offers
+    # ---- provided files
 
     def provide(self, path: str, content: Callable[[], bytes]) -> None:
-        """Offer a read-only file, whose content is asked for whenever it is opened; its folders are made."""
+        """Provide a read-only file, whose content is generated whenever it is opened; its folders are created."""
         parts = resolve(path)
         for depth in range(1, len(parts)):
             self._directories.add(parts[:depth])
         self._provided[parts] = content
 
     def is_protected(self, path: str) -> bool:
-        """Whether this is the vehicle's own: a provided file, or a folder with one in it."""
+        """Whether this is a provided file, or a folder with one in it."""
         parts = resolve(path)
         return any(provided[: len(parts)] == parts for provided in self._provided)
 
@@ -75,7 +75,7 @@ class FileSystem:
     # ---- writing
 
     def create(self, path: str, truncate: bool) -> bytearray:
-        """Open for writing, making the file if there is none. ENOENT (folder), EISDIR, ENOSPC, EROFS."""
+        """Open for writing, creating the file if there is none. ENOENT (folder), EISDIR, ENOSPC, EROFS."""
         parts = self._writable(path)
         if parts in self._directories:
             raise _error(errno.EISDIR, path)
@@ -87,9 +87,9 @@ class FileSystem:
         return self._files[parts]
 
     def resize(self, content: bytearray, size: int) -> None:
-        """Cut a written file off or fill it up with zeros. ENOSPC."""
+        """Truncate a written file or pad it with zeros. ENOSPC."""
         growth = size - len(content)
-        # the sum leaves out what was removed while open, so that buffer is also limited by itself
+        # the sum does not include a file removed while open, so its buffer is limited separately
         if growth > 0 and max(size, growth + sum(map(len, self._files.values()))) > self._capacity_bytes:
             raise _error(errno.ENOSPC, f"{growth} more bytes")
         if growth > 0:
@@ -98,7 +98,7 @@ class FileSystem:
             del content[size:]
 
     def write(self, content: bytearray, offset: int, data: bytes) -> int:
-        """Write into an open file, after zeros where that begins behind its end. ENOSPC."""
+        """Write into an open file, padded with zeros up to the offset. ENOSPC."""
         end = offset + len(data)
         if end > len(content):
             self.resize(content, end)
@@ -136,7 +136,7 @@ class FileSystem:
         self._directories.remove(parts)
 
     def rename(self, old: str, new: str) -> None:
-        """Rename a file or a folder; it takes the place of another file or of an empty folder."""
+        """Rename a file or a folder; it replaces another file or an empty folder."""
         source, target = self._writable(old), self._writable(new)
         for parts, path in ((source, old), (target, new)):
             self._check_parent(parts, path)
@@ -187,7 +187,7 @@ class FileSystem:
         return resolve(path)
 
     def _missing(self, parts: Path, path: str) -> OSError:
-        """What a path that leads nowhere is: ENOTDIR if it leads through a file, else ENOENT."""
+        """The error of a missing path: ENOTDIR if it leads through a file, else ENOENT."""
         through = any(
             parts[:depth] in self._files or parts[:depth] in self._provided for depth in range(len(parts))
         )
@@ -210,7 +210,7 @@ class FileSystem:
 
 
 def resolve(path: str) -> Path:
-    """The names on the way from the root; the storage card's two places are one."""
+    """The components of a path from the root; the two mount points of the storage card are the same."""
     names: list[str] = []
     for name in path.split("/"):
         if name == "..":

@@ -2,7 +2,7 @@
 
 As with the gimbal of PX4's Gazebo simulation, the device is implemented by the autopilot's own component, so
 its number is 1 and its messages come from there. One component has primary control
-(DO_GIMBAL_MANAGER_CONFIGURE); whoever else asks is denied. PX4 knows no secondary control.
+(DO_GIMBAL_MANAGER_CONFIGURE); others are denied. PX4 has no secondary control.
 """
 
 from __future__ import annotations
@@ -64,11 +64,11 @@ class GimbalContext(Protocol):
 
 
 class GimbalManager:
-    """Who may move the gimbal, and what they asked for.
+    """The gimbal, the component in control, and its target.
 
     Attributes:
         gimbal: the device.
-        primary: (system, component) in control; (0, 0) for nobody.
+        primary: (system, component) in control; (0, 0) for none.
         flags: GIMBAL_MANAGER_FLAGS of the newest aim.
     """
 
@@ -83,7 +83,7 @@ class GimbalManager:
         self.gimbal.step(dt_s, vehicle.quaternion, vehicle.estimate.position, vehicle.autopilot.landed)
 
     def configure(self, system: float, component: float, source: tuple[int, int]) -> None:
-        """DO_GIMBAL_MANAGER_CONFIGURE: who has primary control from now on."""
+        """DO_GIMBAL_MANAGER_CONFIGURE: set the component in primary control."""
         own = (self._vehicle.system_id, 1)
         wanted = (_whole(system), _whole(component))
         chosen = [
@@ -93,14 +93,14 @@ class GimbalManager:
         self.primary = (chosen[0], chosen[1])
 
     def aim(self, flags: int, target: Target) -> None:
-        """Do as GIMBAL_MANAGER_FLAGS and a target say; the one in control asks."""
+        """Apply GIMBAL_MANAGER_FLAGS and a target of the component in control."""
         self.flags = flags & (NEUTRAL | ROLL_LOCK | PITCH_LOCK | YAW_LOCK)
         if flags & RETRACT:
-            return  # this gimbal cannot, and PX4 ignores it
+            return  # not supported by this gimbal, and ignored by PX4
         self.gimbal.point(Target() if flags & NEUTRAL else target)
 
     def look_at(self, location: tuple[float, float, float]) -> None:
-        """Keep looking at a place: NED metres. Anybody may ask, as in PX4."""
+        """Track a position, NED metres. Not restricted to the component in control, as in PX4."""
         self.flags = ROLL_LOCK | PITCH_LOCK | YAW_LOCK
         self.gimbal.point(Target(Aim.LOCATION, location=location))
 
@@ -109,7 +109,7 @@ class GimbalManager:
         self.gimbal.point(Target())
 
     def own_command(self, command: GimbalCommand) -> None:
-        """What the autopilot itself asks for when it lands or returns; it asks once, since this answers."""
+        """Execute the autopilot's own command at a landing or return."""
         identifier, _, values = command
         source = (self._vehicle.system_id, 1)
         if identifier == CONFIGURE:
@@ -144,7 +144,7 @@ def _pitch_and_yaw(values: tuple[float, ...], flags: int) -> Target:
 
 
 def configure(vehicle: GimbalContext, link: Link, command: Command) -> int | None:
-    """DO_GIMBAL_MANAGER_CONFIGURE. Without a gimbal nobody answers, as in PX4."""
+    """DO_GIMBAL_MANAGER_CONFIGURE. Without a gimbal there is no answer, as in PX4."""
     manager = vehicle.gimbal_manager
     if manager is None:
         return None
@@ -154,7 +154,7 @@ def configure(vehicle: GimbalContext, link: Link, command: Command) -> int | Non
 
 
 def pitchyaw(vehicle: GimbalContext, link: Link, command: Command) -> int | None:
-    """DO_GIMBAL_MANAGER_PITCHYAW: denied to all but the one in control."""
+    """DO_GIMBAL_MANAGER_PITCHYAW: denied to all but the component in control."""
     manager = vehicle.gimbal_manager
     if manager is None:
         return None
@@ -204,7 +204,7 @@ def _in_control(vehicle: GimbalContext, message: Any) -> GimbalManager | None:
 
 
 def set_attitude(vehicle: GimbalContext, link: Link, message: Any) -> None:
-    """GIMBAL_MANAGER_SET_ATTITUDE (282): a quaternion, of which roll is left out, and rates."""
+    """GIMBAL_MANAGER_SET_ATTITUDE (282): a quaternion, without its roll, and rates."""
     manager = _in_control(vehicle, message)
     if manager is None:
         return
@@ -216,7 +216,7 @@ def set_attitude(vehicle: GimbalContext, link: Link, message: Any) -> None:
 
 
 def set_pitchyaw(vehicle: GimbalContext, link: Link, message: Any) -> None:
-    """GIMBAL_MANAGER_SET_PITCHYAW (287), radians. (PX4 itself takes the command of that name alone.)"""
+    """GIMBAL_MANAGER_SET_PITCHYAW (287), radians. (PX4 itself supports only the command of that name.)"""
     manager = _in_control(vehicle, message)
     if manager is not None:
         _aim(manager, int(message.flags), message.pitch, message.yaw, message.pitch_rate, message.yaw_rate)
@@ -248,7 +248,7 @@ def _aim(
     manager.aim(flags, Target(Aim.ANGLES, pitch, yaw, pitch_rate, yaw_rate, *locked))
 
 
-# ---- what the vehicle tells -----------------------------------------------------------------------------
+# ---- telemetry ------------------------------------------------------------------------------------------
 
 
 def manager_information(vehicle: GimbalContext) -> Any:
@@ -269,7 +269,7 @@ def _capabilities(gimbal: Gimbal) -> int:
 
 
 def _limits(gimbal: Gimbal) -> tuple[float, float, float, float, float, float]:
-    """Lowest and highest roll, pitch and yaw; NaN where there is no stop."""
+    """Lowest and highest roll, pitch and yaw; NaN where there is no limit."""
     furthest = gimbal.furthest_rad if math.isfinite(gimbal.furthest_rad) else NAN
     return (0.0, 0.0, gimbal.lowest_rad, gimbal.highest_rad, -furthest, furthest)
 
@@ -305,7 +305,7 @@ def device_information(vehicle: GimbalContext) -> Any:
 
 
 def device_attitude_status(vehicle: GimbalContext) -> Any:
-    """GIMBAL_DEVICE_ATTITUDE_STATUS: the attitude against north; None without a gimbal."""
+    """GIMBAL_DEVICE_ATTITUDE_STATUS: the attitude relative to north; None without a gimbal."""
     manager = vehicle.gimbal_manager
     if manager is None:
         return None

@@ -1,4 +1,4 @@
-"""Telemetry of motion: attitude, place and speed as the vehicle knows them, and where it wants to be."""
+"""Telemetry of motion: estimated attitude, position and velocity, and the targets of control."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mavlink_sim.wire import packing
 from mavlink_sim.wire.messages import dialect
 
 _NAN = math.nan
-# It works at the rate of the position control.
+# Collision prevention runs at the rate of the position control.
 OBSTACLE_MAP_AGE_S = 0.05
 
 
@@ -115,14 +115,14 @@ def distance_sensor(vehicle: ServiceContext) -> Any:
 
 
 def obstacle_distance(vehicle: ServiceContext) -> Any:
-    """The map of collision prevention, from whatever sensors; while that is at work, as PX4 publishes it."""
+    """The map of collision prevention, of all sensors; only while that is active, as in PX4."""
     found = vehicle.autopilot.navigator.obstacles
     if vehicle.autopilot.now_s - found.used_s > OBSTACLE_MAP_AGE_S:
         return None
     stamp_us = round(found.stamp_s * 1e6) if math.isfinite(found.stamp_s) else 0
     return dialect.MAVLink_obstacle_distance_message(
         stamp_us,
-        0,  # MAV_DISTANCE_SENSOR_LASER, whatever measured
+        0,  # MAV_DISTANCE_SENSOR_LASER, for all sensors
         found.distances_cm.copy(),
         0,  # the increment is in increment_f
         found.min_distance_cm,
@@ -150,7 +150,7 @@ def _type_mask(*groups: tuple[float, float, float]) -> int:
 def position_target_local_ned(vehicle: ServiceContext) -> Any:
     inner = vehicle.autopilot.controller
     if vehicle.autopilot.attitude.active:
-        return None  # PX4's position controller rests meanwhile
+        return None  # PX4's position controller is inactive then
     return packing.position_target_local_ned(
         vehicle.boot_ms,
         1,

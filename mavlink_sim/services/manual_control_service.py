@@ -1,4 +1,4 @@
-"""The pilot's side of MAVLink: joysticks, channels of a remote control, and what is told of them."""
+"""Manual control over MAVLink: joysticks, channels of a remote control, and their telemetry."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ RC_RECEIVER = 0x10000  # MAV_SYS_STATUS_SENSOR_RC_RECEIVER
 
 
 def manual_control(vehicle: ServiceContext, link: Link, message: Any) -> None:
-    """MANUAL_CONTROL (69): a joystick. An axis out of range counts as centred."""
+    """MANUAL_CONTROL (69): a joystick. An axis out of range is taken as centred."""
     if message.target not in (0, vehicle.system_id):
         return
     sticks = Sticks(
@@ -36,7 +36,7 @@ def _axis(value: int) -> float:
 
 
 def rc_channels_override(vehicle: ServiceContext, link: Link, message: Any) -> None:
-    """RC_CHANNELS_OVERRIDE (70): to PX4 simply the channels of a remote control, not an override of one."""
+    """RC_CHANNELS_OVERRIDE (70): for PX4 the channels of a remote control, not an override of one."""
     widths = [int(getattr(message, f"chan{number}_raw")) for number in range(1, CHANNELS + 1)]
     while widths and _is_unused(len(widths), widths[-1]):
         widths.pop()

@@ -1,4 +1,4 @@
-"""How the vehicle answers each message it understands (MAVLink's "microservices")."""
+"""The handler of each received message (MAVLink's "microservices")."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ logger = logging.getLogger(__name__)
 
 MAV_TYPE_GCS = 6
 MAV_TYPE_ONBOARD_CONTROLLER = 18
-# Commander takes commands from a queue, in order, a moment after they arrived: 0-15 ms were measured.
+# Commander processes commands from a queue, in order: 0-15 ms after their arrival were measured.
 COMMANDER_DELAY_S = 0.004
 
 
@@ -132,7 +132,7 @@ def _setup_signing(vehicle: ServiceContext, link: Link, message: Any) -> None:
 
 
 def _ping(vehicle: ServiceContext, link: Link, message: Any) -> None:
-    if message.target_system == 0 and message.target_component == 0:  # else it is an answer
+    if message.target_system == 0 and message.target_component == 0:  # else it is a reply
         link.send(
             dialect.MAVLink_ping_message(
                 message.time_usec, message.seq, message.get_srcSystem(), message.get_srcComponent()

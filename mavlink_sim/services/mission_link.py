@@ -1,4 +1,4 @@
-"""The Navigator's side of the links: announcements, the commands of a mission, targets and obstacles."""
+"""The Navigator's messages: announcements, the commands of a mission, landing targets and obstacles."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _SHOOT = (0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0)
 
 
 def update(vehicle: ServiceContext) -> None:
-    """Tell the links what happened in this step, send commands on, look after transfers."""
+    """Send the announcements of this step, execute mission commands, update transfers."""
     navigator = vehicle.autopilot.navigator
     while navigator.announcements:
         announcement = navigator.announcements.popleft()
@@ -38,7 +38,7 @@ def update(vehicle: ServiceContext) -> None:
     while navigator.commands:
         item = navigator.commands.popleft()
         if item.command == mission_items.RETURN_TO_LAUNCH and navigator.mission.finished:
-            # measured: with its last item the mission is over, and HOLD is flown before the return
+            # measured: after its last item the mission is over, and HOLD is active before the return
             vehicle.after(HOLD_BEFORE_RETURN_S, partial(_carry_out, vehicle, item))
         else:
             _carry_out(vehicle, item)
@@ -47,7 +47,7 @@ def update(vehicle: ServiceContext) -> None:
 
 
 def _carry_out(vehicle: ServiceContext, item: MissionItem) -> None:
-    """An item that is a command: told on every link, as PX4 does, and obeyed if it is the vehicle's own."""
+    """Send an item that is a command on every link, as PX4 does, and execute it if it is for the vehicle."""
     command, values = item.command, item.parameters
     if item.frame != mission_items.FRAME_MISSION:
         position = item.local_position(vehicle.autopilot.home.position, vehicle.local_frame)
@@ -70,7 +70,7 @@ def _carry_out(vehicle: ServiceContext, item: MissionItem) -> None:
 
 
 def landing_target(vehicle: ServiceContext, link: Link, message: Any) -> None:
-    """LANDING_TARGET. PX4 takes a position in LOCAL_NED; angles are for an infrared beacon's estimator."""
+    """LANDING_TARGET. PX4 uses a position in LOCAL_NED; angles are for an infrared beacon's estimator."""
     if not message.position_valid:
         return
     if message.frame != LOCAL_NED:

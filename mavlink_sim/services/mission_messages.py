@@ -1,7 +1,7 @@
 """MISSION_COUNT, MISSION_ACK and MISSION_CURRENT with the plan identifiers ("opaque ids") of PX4 v1.16.
 
-The definitions pymavlink ships do not have these extension fields yet; a client with such a dialect does not
-see them, one with a newer dialect does.
+pymavlink's definitions do not have these extension fields yet; a client with such a dialect does not decode
+them, one with a newer dialect does.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class MissionCurrent(dialect.MAVLink_mission_current_message):  # type: ignore[m
 
 
 def mission_current(vehicle: ServiceContext) -> MissionCurrent:
-    """MISSION_CURRENT as it is now."""
+    """The current MISSION_CURRENT."""
     navigator = vehicle.autopilot.navigator
     mission, plans = navigator.mission, navigator.plans
     return MissionCurrent(

@@ -1,7 +1,7 @@
-"""The mission protocol: up- and download of mission, geofence and rally points, one session a link.
+"""The mission protocol: up- and download of mission, geofence and rally points, one session per link.
 
-Follows PX4's MavlinkMissionManager: it asks for items one by one, repeats a question after 250 ms, gives up
-after 5 s without a word, and lets one client at a time upload, over all links.
+As in PX4's MavlinkMissionManager: it requests items one by one, repeats a request after 250 ms, aborts after
+5 s without a message, and allows one upload at a time, over all links.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ MIN_VERTICES = 3
 
 
 class State(enum.Enum):
-    """What a session is doing."""
+    """The state of a session."""
 
     IDLE = "idle"
     SENDING = "sending"
@@ -63,7 +63,7 @@ class Session:
     # ---- time -------------------------------------------------------------------------------------------
 
     def update(self) -> None:
-        """Ask again, or give up."""
+        """Repeat a request, or abort."""
         if self.state is State.IDLE:
             return
         now = self._vehicle.now_s
@@ -76,7 +76,7 @@ class Session:
     # ---- messages ---------------------------------------------------------------------------------------
 
     def count(self, message: Any) -> None:
-        """MISSION_COUNT: a client wants to upload."""
+        """MISSION_COUNT: a client starts an upload."""
         source = _source(message)
         if self.state is State.RECEIVING:
             self._count_again(source)
@@ -92,7 +92,7 @@ class Session:
         self._navigator.forget_reached()
         try:
             self._type = PlanType(_plan_type(message))
-        except ValueError:  # a kind that PX4 does not know has room for nothing
+        except ValueError:  # an unknown type has no storage
             result = mission_items.NO_SPACE if message.count else mission_items.ACCEPTED
             self._acknowledge(source, result, _plan_type(message))
             return
@@ -114,7 +114,7 @@ class Session:
             self._acknowledge(source, mission_items.ERROR)
             return
         self._received_s = self._vehicle.now_s
-        if self._sequence == 0:  # the first question was lost
+        if self._sequence == 0:  # the first request was lost
             self._request()
         else:
             self._send_text(CRITICAL, "WPM: REJ. CMD: Busy\t")
@@ -136,7 +136,7 @@ class Session:
             self._send_text(CRITICAL, "IGN MISSION_ITEM: Busy\t")
             self._acknowledge(self.partner, mission_items.ERROR)
         elif self._count and message.seq + 1 == self._sequence:
-            # the last item once more: our acknowledgement was lost
+            # the last item again: the acknowledgement was lost
             self._acknowledge(self.partner, mission_items.ACCEPTED, identifier=self._identifier)
         else:
             self._send_text(CRITICAL, "IGN MISSION_ITEM: No transfer\t")
@@ -169,10 +169,10 @@ class Session:
         self._acknowledge(self.partner, mission_items.ACCEPTED, identifier=self._identifier)
 
     def request_list(self, message: Any) -> None:
-        """MISSION_REQUEST_LIST: a client wants to download."""
+        """MISSION_REQUEST_LIST: a client starts a download."""
         source, plan_type = _source(message), _plan_type(message)
         if self.state is State.SENDING and self._sequence == self._count:
-            self.state = State.IDLE  # everything was sent, only its acknowledgement never came
+            self.state = State.IDLE  # everything was sent, but the client's acknowledgement is missing
         again = self.state is State.SENDING and source == self.partner and plan_type == self._type
         if self.state is not State.IDLE and not again:
             self._send_text(INFO, "Mission download request ignored, already active\t")
@@ -234,7 +234,7 @@ class Session:
         elif self.state is State.SENDING and _plan_type(message) == self._type:
             self.state = State.IDLE
         elif self.state is State.RECEIVING:
-            if message.type == mission_items.UNSUPPORTED:  # the client speaks the other kind of item
+            if message.type == mission_items.UNSUPPORTED:  # the client uses the other kind of item
                 self._whole = not self._whole
                 self._request()
             elif message.type == OPERATION_CANCELLED:
@@ -252,7 +252,7 @@ class Session:
         self._acknowledge(_source(message), mission_items.ACCEPTED, plan_type)
 
     def set_current(self, message: Any) -> None:
-        """MISSION_SET_CURRENT: MISSION_CURRENT tells that it was done."""
+        """MISSION_SET_CURRENT, confirmed by MISSION_CURRENT."""
         if self.state is not State.IDLE:
             self._send_text(CRITICAL, "WPM: IGN WP CURR CMD: Busy\t")
         elif message.seq >= len(self._navigator.mission.items):
@@ -260,7 +260,7 @@ class Session:
         else:
             self._navigator.set_current(message.seq)
 
-    # ---- answers ----------------------------------------------------------------------------------------
+    # ---- replies ----------------------------------------------------------------------------------------
 
     def _request(self) -> None:
         make = (
@@ -299,7 +299,7 @@ def _plan_type(message: Any) -> int:
 
 
 def session_of(vehicle: ServiceContext, link: Link) -> Session:
-    """The session of a link, made when it is first needed."""
+    """The session of a link, created with the first message."""
     sessions: dict[str, Session] = vehicle.autopilot.navigator.sessions
     if link.name not in sessions:
         sessions[link.name] = Session(vehicle, link)
@@ -320,8 +320,8 @@ _STEPS = {
 
 
 def handle(vehicle: ServiceContext, link: Link, message: Any) -> None:
-    """Take in any message of the mission protocol that names this vehicle."""
-    if message.target_system == vehicle.system_id:  # PX4 takes no broadcasts here
+    """Process a message of the mission protocol that is addressed to this vehicle."""
+    if message.target_system == vehicle.system_id:  # PX4 ignores broadcasts here
         _STEPS[message.get_type()](session_of(vehicle, link), message)
 
 

@@ -1,4 +1,4 @@
-"""Telemetry of the system: modes, health, battery, clocks, home, and who the vehicle is."""
+"""Telemetry of the system: modes, health, battery, clocks, home, and the vehicle's identity."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def current_mode(vehicle: ServiceContext) -> Any:
 
 def home_position(vehicle: ServiceContext) -> Any:
     if not vehicle.autopilot.sensors_ready:
-        return None  # there is no home before there is a position
+        return None  # no home without a position
     home = vehicle.autopilot.home
     latitude, longitude, altitude = vehicle.local_frame.geographic(home.position)
     return dialect.MAVLink_home_position_message(
@@ -138,7 +138,7 @@ def home_position(vehicle: ServiceContext) -> Any:
 
 
 def flight_information(vehicle: ServiceContext) -> Any:
-    """FLIGHT_INFORMATION; its times are since boot, as PX4's are, and 0 where there is none."""
+    """FLIGHT_INFORMATION; its times are since boot, as in PX4, and 0 if unset."""
     autopilot = vehicle.autopilot
     armed_s = vehicle.now_s - autopilot.ground.armed_for_s(vehicle.now_s) if autopilot.armed else 0.0
     return dialect.MAVLink_flight_information_message(
@@ -150,7 +150,7 @@ def flight_information(vehicle: ServiceContext) -> Any:
 
 
 def available_modes(index: int) -> list[Any]:
-    """AVAILABLE_MODES of one mode by its index from 1, of all with index 0; none: there is no such mode."""
+    """AVAILABLE_MODES of one mode by its index from 1, of all with index 0; empty for an unknown index."""
     chosen = (
         enumerate(LISTED_MODES, 1)
         if index == 0

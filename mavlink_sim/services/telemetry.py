@@ -1,4 +1,4 @@
-"""Which telemetry messages there are, and what builds each."""
+"""The telemetry messages and their builders."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ BUILDERS: dict[str, Builder] = {
     "GPS_GLOBAL_ORIGIN": system_streams.gps_global_origin,
     "OBSTACLE_DISTANCE": kinematics_streams.obstacle_distance,
 }
-# Built on request alone.
+# Built on request only.
 REQUESTED: dict[str, Builder] = {
     "AUTOPILOT_VERSION": system_streams.autopilot_version,
     "COMPONENT_METADATA": metadata_message,

@@ -23,7 +23,7 @@ class Command:
 def command_of(message: Any) -> Command:
     """The command of a COMMAND_LONG or COMMAND_INT message."""
     if message.get_type() == "COMMAND_INT":
-        # both INT32_MAX: "not given", as NaN in COMMAND_LONG. PX4 looks at no frame, z is AMSL in all of them
+        # both INT32_MAX: "not given", as NaN in COMMAND_LONG. PX4 ignores the frame, z is always AMSL
         given = (message.x, message.y) != (NOT_GIVEN, NOT_GIVEN)
         point = (message.x / 1e7, message.y / 1e7) if given else (math.nan, math.nan)
         tail = (*point, message.z)
@@ -34,5 +34,5 @@ def command_of(message: Any) -> Command:
 
 
 def is_misencoded(message: Any) -> bool:
-    """A COMMAND_INT whose place is a float's NaN put into integers by accident: PX4 denies it."""
+    """Whether the position of a COMMAND_INT is a float NaN stored as an integer; PX4 denies it."""
     return message.get_type() == "COMMAND_INT" and (message.x, message.y) == (NAN_AS_INTEGER, NAN_AS_INTEGER)

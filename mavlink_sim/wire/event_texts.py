@@ -1,6 +1,6 @@
-"""What the events metadata says of the events that the vehicle sends: groups, names, words, arguments, enums.
+"""The metadata of the events that the vehicle sends: groups, names, texts, arguments, enums.
 
-Names and words are PX4 1.17's (https://mavlink.io/en/services/events.html).
+Names and texts are PX4 1.17's (https://mavlink.io/en/services/events.html).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _MODE, _ACTION, _CAUSE = (
 _DELAY = ("uint16_t", "seconds")
 Arguments = tuple[tuple[str, str], ...]
 
-# As a recorded flight has them: identifier, name, words, arguments.
+# From a recorded flight: identifier, name, text, arguments.
 _RECORDED: tuple[tuple[int, str, str, Arguments], ...] = (
     (
         announcements.ARMED_EVENT[0],

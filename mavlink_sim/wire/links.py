@@ -1,4 +1,4 @@
-"""The vehicle's MAVLink connections: what each is sent, who was heard on it, what goes to another."""
+"""The vehicle's MAVLink connections: what is sent on each, which components it has, what is forwarded."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mavlink_sim.wire.streams import Streams
 
 AUTOPILOT_COMPONENT = 1  # MAV_COMP_ID_AUTOPILOT1
 GROUND_STATION_TIMEOUT_S = 2.5
-# PX4's CURRENT_MODE tells of its vehicle_status, which is published when it changes and every half second.
+# PX4's CURRENT_MODE reports its vehicle_status, which is published when it changes and every half second.
 STATUS_PERIOD_S = 0.5
 STATUS_TEXT_LENGTH = 50
 
@@ -32,7 +32,7 @@ class FileServer(Protocol):
 
 
 class Link:
-    """One connection: its streams, its outbox, and the components heard on it."""
+    """One connection: its streams, its outbox, and the components received on it."""
 
     def __init__(self, name: str, system_id: int, streams: Streams) -> None:
         self.name = name
@@ -42,15 +42,15 @@ class Link:
         self.ground_station_seen_s = -math.inf
         self.parameters_left: deque[Parameter] = deque()
         self.parameter_credit = 0.0
-        self.file_transfer: FileServer | None = None  # made when somebody asks
+        self.file_transfer: FileServer | None = None  # made with the first request
         self.signing = Signing()
         self.has_parameter_errors = True
         self.sent = 0
         self.received = 0
-        self.gate: Callable[[Link, Any], Any] | None = None  # may change or swallow what is sent
+        self.gate: Callable[[Link, Any], Any] | None = None  # may change or drop what is sent
         self._system_id = system_id
         self._text_identifier = 0
-        self.status_is_due = False  # CURRENT_MODE has been asked for, and had nothing to tell yet
+        self.status_is_due = False  # CURRENT_MODE was requested and has had nothing to report yet
         self._status_sent: object = None
         self._status_sent_s = -math.inf
 
@@ -64,7 +64,7 @@ class Link:
         self.outbox.append(Outgoing(message, self._system_id, AUTOPILOT_COMPONENT))
 
     def is_new_status(self, status: object, now_s: float) -> bool:
-        """Whether CURRENT_MODE has something to tell of this status here, however often it is asked for."""
+        """Whether CURRENT_MODE is due on this link with this status, however often it is requested."""
         if status == self._status_sent and now_s - self._status_sent_s < STATUS_PERIOD_S - 1e-6:
             return False
         self._status_sent, self._status_sent_s = status, now_s
@@ -86,7 +86,7 @@ class Link:
             )
 
     def reset(self) -> None:
-        """A reboot: nothing was heard, nothing is under way, the streams have their default rates."""
+        """A reboot: no component received, no transfer in progress, default stream rates."""
         self.streams.restart(0)
         self.sent = self.received = self._text_identifier = 0
         self.status_is_due, self._status_sent = False, None
@@ -108,17 +108,17 @@ class Link:
 
 
 def target_of(message: Any) -> tuple[int, int]:
-    """(system, component) a message is addressed to; (0, 0) where it has no address."""
+    """(system, component) that a message is addressed to; (0, 0) where it has no address."""
     return getattr(message, "target_system", 0), getattr(message, "target_component", 0)
 
 
 def forward(message: Any, source: Link, links: Iterable[Link], system_id: int) -> None:
-    """PX4's forwarding: broadcasts, and what is for another component, go on to where that was heard."""
+    """PX4's forwarding: broadcasts, and messages to a component, go to the links it was received on."""
     system, component = target_of(message)
     if system not in (0, system_id) or component == AUTOPILOT_COMPONENT:
         return
     if message.get_type() == "SETUP_SIGNING":
-        return  # a key is for the one it was told
+        return  # a key is for its addressee only
     for link in links:
         if link is not source and link.has_component(system, component):
             link.outbox.append(Outgoing(message, message.get_srcSystem(), message.get_srcComponent(), True))

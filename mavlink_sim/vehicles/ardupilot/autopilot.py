@@ -100,7 +100,7 @@ class CopterAutopilot(Autopilot):
         self._next_prearm_s = PREARM_DISPLAY_PERIOD_S / 2
         self.watch = Failsafes(self, parameters)
 
-    # ---- what others read -------------------------------------------------------------------------------
+    # ---- state ------------------------------------------------------------------------------------------
 
     @property
     def has_setpoints(self) -> bool:
@@ -157,7 +157,7 @@ class CopterAutopilot(Autopilot):
             return f"{mode.title} mode not armable"
         return "Motors Emergency Stopped" if self.terminated else None
 
-    # ---- what a client asks for -------------------------------------------------------------------------
+    # ---- requests ---------------------------------------------------------------------------------------
 
     def arm(self, by: str = "external command") -> int:
         if self.armed:
