@@ -70,7 +70,7 @@ class GroundContact:
         return False
 
     def climb_limit_mps(self, now_s: float) -> float:
-        """PX4's take-off ramp: almost no climb while thrust builds up, then to MPC_TKO_SPEED, then no limit."""
+        """PX4's take-off ramp: almost no climb while thrust builds up, then MPC_TKO_SPEED, then no limit."""
         if self._lifting_since_s is None:
             return math.inf
         ramp = max(self._parameters.number("MPC_TKO_RAMP_T"), 0.01)

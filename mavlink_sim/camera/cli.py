@@ -62,10 +62,13 @@ def camera(
     ] = None,
     camera_output: Annotated[
         list[str] | None,
-        typer.Option(help="Frames here too: pipe:PATH, pipe:-, http://HOST:PORT, rtp://HOST:PORT; repeat."),
+        typer.Option(
+            help="Also send frames to pipe:PATH, pipe:-, http://HOST:PORT or rtp://HOST:PORT; repeatable."
+        ),
     ] = None,
     camera_truth: Annotated[
-        Path | None, typer.Option(help="Write what is in each frame to this file, one JSON object a line.")
+        Path | None,
+        typer.Option(help="Write the objects in each frame to this file, one JSON object per line."),
     ] = None,
     truth: Annotated[
         Path | None,

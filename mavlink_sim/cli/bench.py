@@ -1,6 +1,6 @@
-"""`mavlink-sim bench`: how fast this machine flies, in lockstep and as a fleet, and how fast it draws.
+"""`mavlink-sim bench`: the speed of lockstep, fleet and camera on this machine.
 
-Everything is measured in processor time of one core, so that what else the machine does hardly matters.
+Everything is measured in CPU time of one core, so that other load has little effect.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ if TYPE_CHECKING:
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 FLEET_STEP_S = 0.004
-SLICES = 5  # the best slice counts: what was disturbed does not
-LENS = (-0.12, 0.03, 0.0005, -0.0003)  # k1, k2, p1, p2 of a cheap wide lens
+SLICES = 5  # the best slice is used, to exclude disturbances
+LENS = (-0.12, 0.03, 0.0005, -0.0003)  # k1, k2, p1, p2 of a low-cost wide lens
 
 
 @dataclass(frozen=True, slots=True)
 class LockstepFigures:
-    """Simulated seconds per second of one core, flying in OFFBOARD.
+    """Simulated seconds per CPU second, flying in OFFBOARD.
 
     Attributes:
-        quiet: physics and autopilot, a link that streams nothing.
-        onboard: with a companion's full streams, each message taken as an object.
-        onboard_bytes: the same, taken as bytes.
+        quiet: physics and autopilot, a link without streams.
+        onboard: with a companion's full streams, each message read as an object.
+        onboard_bytes: the same, read as bytes.
         both_bytes: with a ground station's link too.
     """
 
@@ -46,13 +46,13 @@ class LockstepFigures:
 
 @dataclass(frozen=True, slots=True)
 class CameraFigures:
-    """Frames a second of one core, 640x480, colour and metric depth, from a vehicle that flies and turns.
+    """Frames per CPU second, 640x480, colour and metric depth, from a vehicle that flies and turns.
 
     Attributes:
-        plain: a pinhole camera over the demonstration's world, which `--camera` shows without a scene.
+        plain: a pinhole camera over the demo world, which `--camera` shows without a scene.
         distorted: the same through a lens with radial and tangential distortion.
-        busy: a pinhole camera over the scene `village`, whose objects are more, and move.
-        crowded: as `plain`, with the 19 other vehicles of a fleet in view, flying.
+        busy: a pinhole camera over the scene `village`, with more and moving objects.
+        crowded: as `plain`, with the 19 other vehicles of a fleet flying in view.
     """
 
     plain: float
@@ -93,7 +93,7 @@ def _times_real_time(links: dict[str, dict[str, float]], seconds: float, packed:
 
 
 def measure_lockstep(seconds: float = 20.0) -> LockstepFigures:
-    """Fly for so many simulated seconds in each way."""
+    """Measure lockstep, with this many simulated seconds for each figure."""
     full = {"onboard": ONBOARD_RATES_HZ}
     return LockstepFigures(
         _times_real_time({"onboard": {}}, seconds, packed=False),
@@ -104,7 +104,7 @@ def measure_lockstep(seconds: float = 20.0) -> LockstepFigures:
 
 
 def measure_fleet(vehicles: int = 20, seconds: float = 3.0) -> float:
-    """Processor seconds of one core per simulated second of a flying fleet on UDP at full stream rates."""
+    """CPU seconds per simulated second of a flying fleet on UDP at full stream rates."""
     from mavlink_sim.realtime.fleet import Fleet, instance_options
     from mavlink_sim.realtime.options import SimulationOptions
 
@@ -133,8 +133,8 @@ def measure_fleet(vehicles: int = 20, seconds: float = 3.0) -> float:
 
 
 def measure_camera(frames: int = 100) -> CameraFigures:
-    """Draw so many frames in each way, but no fewer than one a slice."""
-    import cv2  # the other figures need no OpenCV
+    """Measure the camera, with this many frames for each figure, at least one per slice."""
+    import cv2  # only this figure needs OpenCV
 
     from mavlink_sim.camera.renderer import DEFAULT_CAMERA
 
@@ -167,14 +167,14 @@ def _frames_a_second(scene: str | None, model: CameraModel, frames: int, others:
         yaw_rad, north_m = 0.2 * time_s, 2.0 * time_s
         attitude = matrix_from_quaternion(quaternion_from_euler(0.05, -0.05, yaw_rad))
         fleet = []
-        for index in range(others):  # rows of five before it, which turn as it turns
+        for index in range(others):  # rows of five in front of it, which turn with it
             ahead_m, right_m = 8.0 + 3.0 * (index // 5), 2.0 * (index % 5 - 2)
             north = north_m + ahead_m * math.cos(yaw_rad) - right_m * math.sin(yaw_rad)
             east = ahead_m * math.sin(yaw_rad) + right_m * math.cos(yaw_rad)
             fleet.append(Aircraft(2 + index, (north, east, -3.0), 0.05, -0.05, yaw_rad))
         camera.capture((north_m, 0.0, -5.0), attitude, round(time_s * 1e9), time_s, others=fleet)
 
-    draw(0)  # the ground is painted
+    draw(0)  # the ground is textured
     count = max(frames // SLICES, 1)
     best = math.inf
     for part in range(SLICES):
@@ -192,7 +192,7 @@ def bench(
         float, typer.Option(min=1.0, max=600.0, help="Simulated seconds of each flight.")
     ] = 20.0,
 ) -> None:
-    """Print how fast one core flies a vehicle and draws a camera's frames, and what a fleet costs."""
+    """Print the speed of one core in lockstep and for camera frames, and the load of a fleet."""
     figures = measure_lockstep(seconds)
     print(f"lockstep, physics and autopilot:       {figures.quiet:6.0f} times real time")
     print(f"lockstep, onboard link, messages:      {figures.onboard:6.0f} times real time")

@@ -1,4 +1,4 @@
-"""`mavlink-sim`: a PX4-like multirotor on UDP, one readable line an event."""
+"""`mavlink-sim`: a PX4-like multirotor on UDP, with one readable line per event."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from mavlink_sim.vehicles.firmware import AUTOPILOTS, PX4
 from mavlink_sim.wire.endpoint import PortInUseError
 from mavlink_sim.wire.signing import ALWAYS, key_of
 
-# Tilted by 45 degrees, the airframe (SIH's, with its large drag) holds against little more than this.
+# Tilted by 45 degrees, the airframe (SIH's, with its large drag) can hold against little more wind than this.
 MAX_WIND_MPS = 8.0
 DEFAULT_SPACING_M = 5.0
-MAX_GUSTS_MPS = 4.0  # two standard deviations of it are that wind
+MAX_GUSTS_MPS = 4.0  # two standard deviations are that wind
 
-# click's UsageError, by way of its public subclass: some versions of typer carry a click of their own
+# click's UsageError, through its public subclass: some versions of typer include their own click
 _USAGE_ERROR: Any = typer.BadParameter.__base__
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
@@ -83,22 +83,22 @@ def _check(name: str, value: float, low: float, high: float) -> None:
 
 @app.command(
     epilog="Further commands: mavlink-sim camera (the built-in world seen from any autopilot's vehicle), "
-    "mavlink-sim dataset (labelled pictures for training), mavlink-sim bench (speed of this machine). "
+    "mavlink-sim dataset (labelled images for training), mavlink-sim bench (speed of this machine). "
     "Each has --help."
 )
 def simulate(
-    onboard_port: Annotated[int, typer.Option(help="UDP port the onboard link sends to.")] = 14540,
+    onboard_port: Annotated[int, typer.Option(help="UDP port that the onboard link sends to.")] = 14540,
     onboard_bind: Annotated[
-        int, typer.Option(help="UDP port the onboard link binds; 0: a free one.")
+        int, typer.Option(help="UDP port that the onboard link binds; 0: a free one.")
     ] = 14580,
-    gcs_port: Annotated[int, typer.Option(help="UDP port the ground-station link sends to.")] = 14550,
+    gcs_port: Annotated[int, typer.Option(help="UDP port that the ground-station link sends to.")] = 14550,
     gcs_bind: Annotated[
-        int, typer.Option(help="UDP port the ground-station link binds; 0: a free one.")
+        int, typer.Option(help="UDP port that the ground-station link binds; 0: a free one.")
     ] = 18570,
     host: Annotated[str, typer.Option(help="Address to bind and to send to.")] = "127.0.0.1",
     system_id: Annotated[int, typer.Option(help="MAVLink system id, 1 to 255.")] = 1,
-    seed: Annotated[int, typer.Option(help="Of the wind, the gusts and the world.")] = 0,
-    wind: Annotated[float, typer.Option(help="Steady wind in m/s; the seed chooses its direction.")] = 0.0,
+    seed: Annotated[int, typer.Option(help="Seed of the wind, the gusts and the world.")] = 0,
+    wind: Annotated[float, typer.Option(help="Steady wind in m/s; its direction depends on the seed.")] = 0.0,
     gusts: Annotated[
         float | None,
         typer.Option(
@@ -113,23 +113,26 @@ def simulate(
     ] = None,
     scene: Annotated[
         str | None,
-        typer.Option(help="World, obstacles and camera from this TOML file, or an example's name."),
+        typer.Option(help="TOML file with world, obstacles and camera, or the name of an example."),
     ] = None,
     obstacle_sensor: Annotated[
         bool,
         typer.Option(
-            "--obstacle-sensor", help="With a range sensor all around, for collision prevention (CP_DIST)."
+            "--obstacle-sensor", help="Add a 360-degree range sensor for collision prevention (CP_DIST)."
         ),
     ] = False,
     camera_output: Annotated[
         list[str] | None,
-        typer.Option(help="Frames here too: pipe:PATH, pipe:-, http://HOST:PORT, rtp://HOST:PORT; repeat."),
+        typer.Option(
+            help="Also send frames to pipe:PATH, pipe:-, http://HOST:PORT or rtp://HOST:PORT; repeatable."
+        ),
     ] = None,
     camera_truth: Annotated[
-        Path | None, typer.Option(help="Write what is in each frame to this file, one JSON object a line.")
+        Path | None,
+        typer.Option(help="Write the objects in each frame to this file, one JSON object per line."),
     ] = None,
     truth: Annotated[
-        Path | None, typer.Option(help="Write the true state to this file, one JSON object a line, 20 Hz.")
+        Path | None, typer.Option(help="Write the true state to this file, one JSON object per line, 20 Hz.")
     ] = None,
     record: Annotated[
         Path | None, typer.Option(help="Record each link's traffic into this folder, as LINK-SYSTEM.tlog.")
@@ -137,46 +140,50 @@ def simulate(
     ready_after: Annotated[
         float, typer.Option(help="Seconds after boot until the vehicle can be armed.")
     ] = 3.0,
-    autopilot: Annotated[str, typer.Option(help="Whose profile it has: px4 or ardupilot (Copter).")] = PX4,
+    autopilot: Annotated[
+        str, typer.Option(help="Autopilot firmware to emulate: px4 or ardupilot (Copter).")
+    ] = PX4,
     px4: Annotated[
-        str | None, typer.Option(help=f"PX4 release to be like: {', '.join(RELEASES)}; default: {NEWEST}.")
+        str | None, typer.Option(help=f"PX4 release to emulate: {', '.join(RELEASES)}; default: {NEWEST}.")
     ] = None,
     speed: Annotated[float, typer.Option(help="Simulated seconds per real second.")] = 1.0,
     noise: Annotated[
-        str, typer.Option(help="Sensors and estimates that err as a real vehicle's do: on or off.")
+        str, typer.Option(help="Errors of sensors and estimates as on a real vehicle: on or off.")
     ] = "on",
     vehicles: Annotated[
-        int, typer.Option(help="A fleet of so many: system ids and ports count up from those given.")
+        int, typer.Option(help="Number of vehicles; system ids and ports count up from those given.")
     ] = 1,
     spacing: Annotated[
         float | None, typer.Option(help="Metres between the vehicles of a fleet, on a grid; default: 5.")
     ] = None,
     camera_vehicle: Annotated[
-        int | None, typer.Option(help="Which vehicle of a fleet bears the camera; default: the first.")
+        int | None, typer.Option(help="Vehicle of the fleet that has the camera; default: the first.")
     ] = None,
     param: Annotated[
-        list[str] | None, typer.Option(help="Set a parameter of the autopilot, NAME=VALUE; may be repeated.")
+        list[str] | None, typer.Option(help="Set a parameter of the autopilot, NAME=VALUE; repeatable.")
     ] = None,
-    gimbal: Annotated[bool, typer.Option("--gimbal", help="With a two-axis gimbal.")] = False,
+    gimbal: Annotated[bool, typer.Option("--gimbal", help="Add a two-axis gimbal.")] = False,
     signing_key: Annotated[
         str | None,
-        typer.Option(help="Sign and demand signatures: 64 hexadecimal digits, or a file with the 32 bytes."),
+        typer.Option(
+            help="Sign and require signatures; the key is 64 hexadecimal digits, or a file with the 32 bytes."
+        ),
     ] = None,
     fault: Annotated[
         list[str] | None,
-        typer.Option(help="Let something go wrong, e.g. 'link_delay 0.2 at=20 for=5'; may be repeated."),
+        typer.Option(help="Inject a fault, e.g. 'link_delay 0.2 at=20 for=5'; repeatable."),
     ] = None,
     console: Annotated[
         bool | None,
         typer.Option(help="Read faults from standard input; by default if that is a terminal."),
     ] = None,
     control: Annotated[
-        str | None, typer.Option(help="Take faults over zenoh too, at this endpoint: tcp/127.0.0.1:7447.")
+        str | None, typer.Option(help="Accept faults over zenoh too, at this endpoint: tcp/127.0.0.1:7447.")
     ] = None,
     ready_file: Annotated[
-        Path | None, typer.Option(help="Write pid and ports here as JSON once the vehicle runs.")
+        Path | None, typer.Option(help="File for pid and ports as JSON, written once the vehicle runs.")
     ] = None,
-    verbose: Annotated[bool, typer.Option("--verbose", help="Log the links too.")] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", help="Also log the links.")] = False,
     version: Annotated[
         bool,
         typer.Option("--version", callback=_print_version, is_eager=True, help="Show the version."),
@@ -200,11 +207,11 @@ def simulate(
     if camera_rate is not None:
         _check("camera-rate", camera_rate, 1.0, 120.0)
     if STANDARD_OUTPUT in (camera_output or []):
-        sys.stdout = sys.stderr  # the pictures have standard output to themselves
+        sys.stdout = sys.stderr  # standard output carries only the images
     _check("ready-after", ready_after, 0.0, 600.0)
     _check("speed", speed, 0.05, 20.0)
     if spacing is not None:
-        _check("spacing", spacing, REACH_M, 1000.0)  # nearer than that they would start in one another
+        _check("spacing", spacing, REACH_M, 1000.0)  # closer than that they would overlap at the start
     if noise not in ("on", "off"):
         _fail(f"--noise {noise!r}: expected on or off")
     parameters = _parameters(param or [])
@@ -293,7 +300,7 @@ def _run(fleet: Fleet, ready_file: Path | None) -> None:
         partial = ready_file.with_name(ready_file.name + ".partial")
         try:
             partial.write_text(json.dumps(report) + "\n", encoding="utf-8")
-            partial.replace(ready_file)  # whoever waits for the file finds it whole
+            partial.replace(ready_file)  # a reader never sees a partial file
         except OSError as error:
             _fail(f"--ready-file: {error}")
     for one, bound in zip(fleet, reports, strict=True):
@@ -305,7 +312,7 @@ def _run(fleet: Fleet, ready_file: Path | None) -> None:
         )
     if len(reports) > 1:
         _print_line(f"ready: {len(reports)} vehicles")
-    # What is there stays: to look through it all would hold every vehicle up for some steps.
+    # These objects are permanent: a collection of them would delay every vehicle by some steps.
     gc.collect()
     gc.freeze()
     fleet.run()
@@ -313,12 +320,12 @@ def _run(fleet: Fleet, ready_file: Path | None) -> None:
 
 
 def load() -> None:
-    """Import what would be imported only when arguments are read (by typer: pydantic)."""
+    """Import what typer would import only when it parses arguments (pydantic)."""
     typer.main.get_command(app).make_context("mavlink-sim", [])
 
 
 def main() -> None:
-    """The console script's entry: what cannot be is said in one line, with exit code 2."""
+    """The entry point; a usage error is one line on standard error, with exit code 2."""
     try:
         if sys.argv[1:2] == ["dataset"]:
             from mavlink_sim.datasets.cli import app as dataset_app

@@ -1,4 +1,4 @@
-"""Faults of a vehicle in real time: its sockets, the console and the zenoh key, in one place for the loop."""
+"""Fault injection in real time: the sockets, the console and the zenoh key of one vehicle."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mavlink_sim.wire.faulty_socket import FaultySocket
 
 
 class FaultOptions(Protocol):
-    """What of a simulation's options is about faults."""
+    """The options of a simulation about faults."""
 
     @property
     def faults(self) -> tuple[str, ...]: ...
@@ -26,7 +26,7 @@ class FaultOptions(Protocol):
 
 
 class FaultInjector:
-    """What the loop of a simulation does for faults; see `fault_injector`."""
+    """Fault injection for the loop of a simulation; see `fault_injector`."""
 
     def __init__(
         self,
@@ -39,14 +39,14 @@ class FaultInjector:
         self._control = control
 
     def poll(self) -> None:
-        """Once a turn of the loop: what was typed or asked for."""
+        """Execute commands of the console and of zenoh; call it once per loop."""
         if self._console is not None:
             self._console.poll()
         if self._control is not None:
             self._control.poll()
 
     def delivered(self) -> list[str]:
-        """Once a step: send what is due; the links on which delayed datagrams have arrived."""
+        """Send due datagrams, once per step. Returns the links on which delayed datagrams have arrived."""
         arrived = []
         for name, socket in self._sockets.items():
             socket.pump()
@@ -63,10 +63,10 @@ def fault_injector(
     options: FaultOptions,
     report: Callable[[str], None],
 ) -> Iterator[FaultInjector]:
-    """Put the links' stages between the endpoints and their sockets, begin the faults, open the ways in.
+    """Insert the links' stages before the sockets, begin the faults, open console and zenoh control.
 
     Raises:
-        FaultError: a fault that cannot be.
+        FaultError: an invalid fault.
         ControlError: the control endpoint cannot be opened.
     """
     sockets = {}

@@ -65,7 +65,7 @@ class Mission:
         return self.go_to(self.current + 1)
 
     def positions(self, start: int) -> Iterator[tuple[int, MissionItem]]:
-        """The items with a position from `start` on, in the order of flight, with each DO_JUMP's current state."""
+        """The items with a position from `start` on, in the order of flight, with the current DO_JUMPs."""
         index = self._resolve(start, count=False)
         for _ in self.items:
             if index is None:

@@ -1,6 +1,6 @@
-"""Many vehicles in one process: each with its own system id, ports, seed and place, on one clock.
+"""Many vehicles in one process: each with its own system id, ports, seed and start, on one clock.
 
-Ports and ids go as in PX4's SITL: instance i has system id 1 + i, sends to 14540 + i from 14580 + i, and to
+Ports and ids are as in PX4's SITL: instance i has system id 1 + i, sends to 14540 + i from 14580 + i, and to
 the one ground station at 14550 from 18570 + i.
 """
 
@@ -29,15 +29,15 @@ def start_positions(count: int, spacing_m: float) -> list[tuple[float, float]]:
 def instance_options(
     options: SimulationOptions, count: int, spacing_m: float, camera_vehicle: int = 1
 ) -> list[SimulationOptions]:
-    """What each vehicle of a fleet is told; `options` are the first one's.
+    """The options of each vehicle of a fleet; `options` are the first one's.
 
-    They share one world, wind and gusts, those of the first one's seed; noise and faults are each one's own.
-    A bind port of 0 stays 0 (a free one each). The camera goes to `camera_vehicle` (counted from 1) alone; a
-    truth file gets the system id into its name for all but the first. Faults are every vehicle's, each with
-    its own chance; the console is the first one's, the zenoh key each vehicle's own.
+    They share one world, wind and gusts, those of the first one's seed; noise and faults have separate seeds.
+    A bind port of 0 stays 0 (a free one each). Only `camera_vehicle` (counted from 1) has the camera; the
+    truth files of all but the first have the system id in their name. Every vehicle has the faults; the first
+    one has the console, each has its own zenoh key.
 
     Raises:
-        ValueError: a fleet of that size cannot be (ids, ports), or has no such vehicle for the camera.
+        ValueError: too many vehicles (ids, ports), or no such vehicle for the camera.
     """
     if not 1 <= count <= MAX_VEHICLES:
         raise ValueError(f"{count} vehicles: expected 1 to {MAX_VEHICLES}")
@@ -77,7 +77,7 @@ def _numbered(path: Path | None, system_id: int) -> Path | None:
 
 
 class Fleet:
-    """Vehicles on one clock, in real time, which see one another and cannot fly through each other.
+    """Vehicles on one clock, in real time, which see each other and collide.
 
     Use as a context manager; `run` returns after `stop`.
 

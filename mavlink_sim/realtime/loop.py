@@ -1,4 +1,4 @@
-"""Simulations on the one clock of this computer: steps when they are due, what came taken in before each."""
+"""The real-time loop: simulations on one clock, stepped when due, after processing received messages."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ class Readable(Protocol):
 
 
 class Paced(Protocol):
-    """A simulation as the loop sees it; times are simulated seconds unless they say otherwise."""
+    """A simulation as the loop sees it; times are simulated seconds unless noted."""
 
     @property
     def speed(self) -> float:
-        """Simulated seconds in a second."""
+        """Simulated seconds per second."""
 
     @property
     def endpoints(self) -> Mapping[str, Readable]:
-        """What it receives from, by name."""
+        """Its sockets, by name."""
 
     def start_clock(self, now_ns: int) -> None: ...
 
@@ -38,20 +38,20 @@ class Paced(Protocol):
     def receive(self, name: str) -> None: ...
 
     def steps_due(self, now_ns: int) -> int:
-        """How many steps are to be taken at a monotonic moment; the same for all on one clock."""
+        """The number of steps due at a monotonic time; the same for all on one clock."""
 
     def step(self) -> None:
-        """Take one."""
+        """Take one step."""
 
     def settle(self, *, stepped: bool) -> None:
-        """Send what the steps brought, if there were any, and look what faults are asked for."""
+        """Send the messages of the steps, if there were any, and process fault commands."""
 
     def show(self, now_ns: int) -> None:
-        """Let those who look on see where it is at that moment."""
+        """Update camera and truth file for that time."""
 
 
 class _Pace:
-    """Says, every few seconds, when the machine is too slow for the speed that was asked for."""
+    """Reports, every few seconds, that the machine is too slow for the requested speed."""
 
     def __init__(self, speed: float, on_event: Callable[[str], None]) -> None:
         self._speed = speed
@@ -82,7 +82,7 @@ def run_together(
     on_event: Callable[[str], None],
     stepped_all: Callable[[], None] = lambda: None,
 ) -> None:
-    """The loop: wait for the sockets until the next step is due, take in what came, step, send.
+    """The loop: wait for the sockets until the next step is due, process messages, step, send.
 
     `stepped_all` is called after each step of all of them.
     """
@@ -106,7 +106,7 @@ def run_together(
             for key, _ in selector.select(first.until_next_step()):
                 simulation, name = key.data
                 simulation.receive(name)
-            # one moment for all, so that whoever looks on sees all of them at one simulated time
+            # one time for all, so that cameras show all of them at one simulated time
             now_ns = time.monotonic_ns()
             steps = first.steps_due(now_ns)
             for _ in range(steps):

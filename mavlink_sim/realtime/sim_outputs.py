@@ -1,6 +1,6 @@
-"""What looks on while a vehicle flies: the camera in its own process, and the truth on its file.
+"""The outputs of a simulation: the camera in its own process, and the truth file.
 
-Rendering happens in a process of its own and is never waited for.
+The simulation never waits for rendering.
 """
 
 from __future__ import annotations
@@ -28,34 +28,34 @@ CAMERA_CHECK_S = 0.5
 
 
 def camera_turn_rad(vehicle: Vehicle) -> Vector | None:
-    """Roll, pitch, yaw from the body to a camera on the gimbal; None for one that sits on the body."""
+    """Roll, pitch, yaw from the body to a camera on the gimbal; None for one fixed to the body."""
     gimbal = vehicle.gimbal
     return None if gimbal is None else euler_from_quaternion(gimbal.body_quaternion)
 
 
 def loaded_scene(options: SimulationOptions) -> Scene | None:
-    """What the camera sees and the truth tells of; None if nobody looks and none was asked for.
+    """The scene of camera and truth file; None if neither is used and no scene was requested.
 
     Raises SceneError for a scene that cannot be used.
     """
     if not options.shows_world and options.truth is None and options.scene is None:
         return None
-    # imported here: a vehicle that is alone needs neither the renderer nor its start-up time
+    # imported here: a vehicle without camera needs neither the renderer nor its start-up time
     from mavlink_sim.camera.scene_file import scene_or_demo
 
     return scene_or_demo(options.scene, options.seed if options.world_seed is None else options.world_seed)
 
 
 class SimOutputs:
-    """The camera and the truth file of one vehicle, as its options ask for them; maybe neither.
+    """The camera and the truth file of one vehicle, as set by its options; possibly neither.
 
     Args:
-        vehicle: whom they watch. scene: in what (`loaded_scene`).
-        fleet_world: among whom it flies, and whom they see beside it.
+        vehicle: the vehicle. scene: its surroundings (`loaded_scene`).
+        fleet_world: the other vehicles in view.
         resources: closes what is opened here.
 
     Raises:
-        ValueError: a name, a scene or an address that cannot be. OSError: a file that cannot be written.
+        ValueError: an invalid name, scene or address. OSError: a file cannot be written.
     """
 
     def __init__(
@@ -90,7 +90,7 @@ class SimOutputs:
 
         options = self._options
         if options.camera is not None:
-            segment_path(options.camera)  # raises for a name that cannot be
+            segment_path(options.camera)  # raises for an invalid name
         self._camera_rate_hz = options.camera_rate_hz or scene.camera.rate_hz
         self._camera = CameraProcess(
             scene,
@@ -105,15 +105,15 @@ class SimOutputs:
         self._camera.start()
 
     def show(self, simulated_s: float, stamp_ns: int) -> None:
-        """The pose to the camera and the truth to its file, each at its rate.
+        """Send the pose to the camera and write the truth, each at its rate.
 
         Args:
-            simulated_s: how far the vehicle, and everyone of its fleet_world, has been stepped.
-            stamp_ns: the monotonic moment at which that was due.
+            simulated_s: simulated time of the vehicle and of all in its fleet world.
+            stamp_ns: the monotonic time at which that was due.
         """
         camera = self._camera
         if camera is not None and simulated_s >= self._next_frame_s:
-            period_s = self._options.speed / self._camera_rate_hz  # the rate is one of real time
+            period_s = self._options.speed / self._camera_rate_hz  # the rate is in real time
             self._next_frame_s = max(self._next_frame_s + period_s, simulated_s)
             vehicle = self._vehicle
             camera.send_pose(
@@ -135,7 +135,7 @@ class SimOutputs:
                 self._on_event(why)
 
     def _check_camera(self, camera: CameraProcess) -> None:
-        """Say when the camera begins and when it is lost; the vehicle flies on without it."""
+        """Report the start and the loss of the camera; the simulation continues without it."""
         if not camera.alive:
             self._camera = None
             self._on_event(f"camera {camera.name} is lost: its process ended")
@@ -144,7 +144,7 @@ class SimOutputs:
             self._on_event(f"camera {camera.name} is on")
 
     def truth(self, simulated_s: float, stamp_ns: int) -> dict[str, Any]:
-        """What is really so now: pose, mode, what it ran into, the range to every object, the others too."""
+        """The current truth: pose, mode, collisions, the range to every object and vehicle."""
         airframe, autopilot = self._vehicle.airframe, self._vehicle.autopilot
         return {
             "stamp_ns": stamp_ns,

@@ -1,7 +1,6 @@
-"""A vehicle in real time: UDP links, the camera in its own process, the truth on record.
+"""A vehicle in real time: UDP links, the camera in its own process, the truth file.
 
-One thread, one loop: wait for the sockets until the next physics step is due, take in what came, step, send.
-Rendering happens in a process of its own and is never waited for.
+One thread, one loop: wait for the sockets until the next physics step is due, process messages, step, send.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-# After a stall longer than this the simulation does not race to catch up, it lets the time go.
+# After a stall longer than this the simulation does not catch up but drops the time.
 MAX_BACKLOG_S = 0.25
 
 
@@ -37,12 +36,12 @@ class Simulation:
     """One vehicle running in real time. Use as a context manager; `run` returns after `stop`.
 
     Args:
-        fleet_world: among whom it flies, seeing and seen; None: it is alone.
+        fleet_world: the vehicles of its fleet; None: it is alone.
 
     Raises (when made):
         PortInUseError: a port to bind is taken.
-        FaultError: a fault that cannot be. ControlError: the control endpoint cannot be opened.
-        SceneError: the scene cannot be used. ValueError: a vehicle that cannot be, or not there.
+        FaultError: an invalid fault. ControlError: the control endpoint cannot be opened.
+        SceneError: the scene cannot be used. ValueError: invalid options, or an obstacle at its start.
         OSError: the truth file or the record cannot be written.
     """
 
@@ -124,16 +123,16 @@ class Simulation:
 
     @property
     def speed(self) -> float:
-        """Simulated seconds in a second."""
+        """Simulated seconds per second."""
         return self.options.speed
 
     def _clock_ns(self, now_ns: int | None = None) -> int:
-        """Simulated time at a moment, by default this very one, between the physics steps too."""
+        """Simulated time, ns, at a monotonic time, by default now; continuous between the physics steps."""
         now_ns = time.monotonic_ns() if now_ns is None else now_ns
         return int((now_ns - self._started_ns) * self.options.speed)
 
     def _boot_clock_ns(self) -> int:
-        """The same since the vehicle's boot, without the time that it stood still."""
+        """The same since the vehicle's boot, without the time of stalls."""
         return self._clock_ns() - (self.vehicle.faults.elapsed_us - self.vehicle.boot_us) * 1000
 
     def run(self) -> None:
@@ -141,16 +140,16 @@ class Simulation:
         run_together([self], lambda: self._stopped, self._on_event)
 
     def start_clock(self, now_ns: int) -> None:
-        """From this moment (monotonic) on, time passes."""
+        """Start the clock at a monotonic time."""
         self._started_ns = now_ns - int(self._simulated_s / self.options.speed * 1e9)
 
     def backlog(self) -> float:
-        """Simulated seconds that are hopelessly behind the clock, 0 in good order."""
+        """Simulated seconds too far behind the clock to catch up; 0 normally."""
         behind = self._clock_ns() / 1e9 - self._simulated_s
         return behind - STEP_S if behind > MAX_BACKLOG_S * max(self.options.speed, 1.0) else 0.0
 
     def let_go(self, lost_s: float) -> None:
-        """Give up so many simulated seconds instead of racing after them."""
+        """Drop simulated seconds instead of catching up."""
         self._started_ns += int(lost_s / self.options.speed * 1e9)
 
     def until_next_step(self) -> float:
@@ -159,7 +158,7 @@ class Simulation:
         return max((STEP_S - behind) / self.options.speed, 0.0)
 
     def receive(self, name: str) -> None:
-        """Take in what came on a link, and answer."""
+        """Process the messages received on a link, and send the answers."""
         for message in self.endpoints[name].receive():
             self.vehicle.handle(name, message)
         self.flush()
@@ -171,36 +170,36 @@ class Simulation:
                 endpoint.send(outgoing)
 
     def steps_due(self, now_ns: int) -> int:
-        """How many physics steps are to be taken at a moment (monotonic).
+        """The number of physics steps due at a monotonic time.
 
-        At most a few, so that the sockets are never left waiting long. Vehicles on one clock that are told
-        of the same moments are always at the same simulated time.
+        At most a few, so that the sockets are served often. Vehicles with the same clock and the same times
+        are always at the same simulated time.
         """
         due = self._clock_ns(now_ns) / 1e9 - self._simulated_s
         return min(int(due / STEP_S), max(4, int(4 * self.options.speed)))
 
     def step(self) -> None:
-        """One physics step, and what a fault of the link held back until then."""
+        """Take one physics step, and deliver datagrams delayed by link faults."""
         self.vehicle.step(STEP_S)
         self._simulated_s += STEP_S
         for name in self._faults.delivered():
             self.receive(name)
 
     def settle(self, *, stepped: bool) -> None:
-        """Send what the steps brought, if there were any, and look what faults are asked for."""
+        """Send the messages of the steps, if there were any, and process fault commands."""
         if stepped:
             self.flush()
         self._faults.poll()
 
     def show(self, now_ns: int) -> None:
-        """The pose to the camera and the truth to its file, each at its rate, stamped with the moment."""
+        """Send the pose to the camera and write the truth, each at its rate, with this stamp."""
         self._outputs.show(self._simulated_s, now_ns)
 
     @property
     def camera_turn_rad(self) -> Vector | None:
-        """Roll, pitch, yaw from the body to a camera on the gimbal; None for one that sits on the body."""
+        """Roll, pitch, yaw from the body to a camera on the gimbal; None for one fixed to the body."""
         return camera_turn_rad(self.vehicle)
 
     def truth(self) -> dict[str, Any]:
-        """What is really so now: pose, mode, and the range to every object of the world, the others too."""
+        """The current truth: pose, mode, and the range to every object and vehicle."""
         return self._outputs.truth(self._simulated_s, time.monotonic_ns())

@@ -63,7 +63,8 @@ class EventContext(Protocol):
 
 
 def request(vehicle: EventContext, link: Link, message: Any) -> None:
-    """REQUEST_EVENT, unknown to pymavlink's dialects: repeat the events, or send an error for each missing one.
+    """REQUEST_EVENT, unknown to pymavlink's dialects: repeat the events, or send an error for each missing
+    one.
 
     The range may wrap at 65535. The answers end with the first gap longer than the buffer.
     """

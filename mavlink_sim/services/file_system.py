@@ -35,7 +35,7 @@ class FileSystem:
     # ---- provided files
 
     def provide(self, path: str, content: Callable[[], bytes]) -> None:
-        """Provide a read-only file, whose content is generated whenever it is opened; its folders are created."""
+        """Provide a read-only file, generated whenever it is opened; its folders are created."""
         parts = resolve(path)
         for depth in range(1, len(parts)):
             self._directories.add(parts[:depth])

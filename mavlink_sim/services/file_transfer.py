@@ -25,8 +25,8 @@ _HEADER = struct.Struct("<HBBBBBBI")
 PAYLOAD_BYTES = 251
 DATA_BYTES = PAYLOAD_BYTES - _HEADER.size  # 239
 SESSION_TIMEOUT_S = 10.0
-# The rate of a burst: packets per step (about 480 kB/s), and a pause, with burst_complete set, after 35 kB, as
-# in PX4.
+# The rate of a burst: packets per step (about 480 kB/s), and a pause, with burst_complete set, after 35 kB,
+# as in PX4.
 BURST_PACKETS = 8
 BURST_BYTES = 35_000
 

@@ -1,4 +1,4 @@
-"""A scene around one vehicle: what it runs into, and what its range sensors measure of it."""
+"""A scene around one vehicle: collisions and range measurements."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ class CollisionWorld:
         clock: the scene's time in seconds.
 
     Attributes:
-        scene: the scene. airframe: what moves in it.
+        scene: the scene. airframe: the vehicle's airframe in it.
 
     Raises:
-        SceneError: the scene cannot be used. ValueError: something stands where the vehicle starts.
+        SceneError: the scene cannot be used. ValueError: an obstacle is at the vehicle's start.
     """
 
     def __init__(
@@ -68,11 +68,11 @@ class CollisionWorld:
     def sense_obstacles(
         self, into: ObstacleMap, yaw_rad: float, now_s: float, neighbours: Neighbours | None = None
     ) -> None:
-        """Let the obstacle sensor measure, for collision prevention.
+        """Add a measurement of the obstacle sensor to the map of collision prevention.
 
         Args:
-            into: the vehicle's map. yaw_rad: the heading it believes in. now_s: seconds since its boot.
-            neighbours: what flies beside it.
+            into: the vehicle's map. yaw_rad: its estimated heading. now_s: seconds since its boot.
+            neighbours: the other vehicles.
         """
         airframe = self.airframe
         beside = [] if neighbours is None else neighbours.outlines(MAXIMUM_M)

@@ -1,4 +1,4 @@
-"""Which autopilot a vehicle is like: PX4, or an ArduPilot Copter (`mavlink_sim.vehicles.ardupilot`)."""
+"""The firmwares to emulate: PX4, or an ArduPilot Copter (`mavlink_sim.vehicles.ardupilot`)."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ AUTOPILOTS = (PX4, ARDUPILOT)
 
 
 def vehicle_class(autopilot: str) -> type[Vehicle]:
-    """The class of vehicle with an autopilot's profile. Raises ValueError for one that is not known."""
+    """The vehicle class of a firmware. Raises ValueError for an unknown one."""
     if autopilot == PX4:
         return Vehicle
     if autopilot == ARDUPILOT:
-        # imported here: its message definitions take their time to load
+        # imported here: its message definitions load slowly
         from mavlink_sim.vehicles.ardupilot.copter import CopterVehicle
 
         return CopterVehicle

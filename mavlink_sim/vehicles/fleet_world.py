@@ -1,6 +1,6 @@
-"""The vehicles of a fleet as they see and meet one another: each is a thing in the world of the others.
+"""The vehicles of a fleet in one world: each is an object for the others.
 
-The world begins where the first of them started; each one's own local frame begins at its own start.
+The world's origin is the start of the first vehicle; each local frame has its origin at its vehicle's start.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ if TYPE_CHECKING:
 
 
 def position_in_world(vehicle: Vehicle) -> Vector:
-    """The true position NED in metres, from where the world begins."""
+    """The true position, NED metres in the world frame."""
     north, east, down = vehicle.airframe.position
     start_north, start_east = vehicle.start_ned_m
     return (start_north + north, start_east + east, down)
 
 
 def as_aircraft(vehicle: Vehicle) -> Aircraft:
-    """Where a vehicle is in the world at this moment."""
+    """A vehicle's current pose in the world."""
     airframe = vehicle.airframe
     return Aircraft(
         vehicle.system_id,
@@ -37,13 +37,13 @@ def as_aircraft(vehicle: Vehicle) -> Aircraft:
 
 
 class FleetWorld:
-    """The vehicles that fly in one world.
+    """The vehicles of one world.
 
-    Whoever steps them in lockstep calls `meet` after each step of 4 ms of all, and none can fly through
-    another. A vehicle's `copy` is in no fleet_world.
+    In lockstep, call `meet` after each step of 4 ms of all vehicles, so that they collide. A vehicle's `copy`
+    is in no fleet world.
 
     Args:
-        size: how many there will be.
+        size: the number of vehicles.
     """
 
     def __init__(self, size: int) -> None:
@@ -53,18 +53,20 @@ class FleetWorld:
         self._seen: tuple[int, int, tuple[WorldObject, ...]] | None = None
 
     def join(self, vehicle: Vehicle, offset: int = 0) -> None:
-        """From now on the others see and measure it, and run into it.
+        """Add a vehicle, visible, measurable and an obstacle for the others.
 
         Args:
-            offset: from a system id to its identifier among the world's things (`identifier_offset`), by
-                which the others' collisions with it are told; the same for all.
+            offset: from a system id to its identifier among the world's objects (`identifier_offset`), which
+                the others' collisions with it have; the same for all.
 
         Raises:
-            ValueError: it is in one place with another, has joined before, or is one too many.
+            ValueError: it overlaps another, has joined before, or the world is full.
         """
         number = vehicle.system_id
         if len(self._vehicles) == self.size:
-            raise ValueError(f"vehicle {number}: this fleet_world is of {self.size}, and all have joined")
+            raise ValueError(
+                f"vehicle {number}: this fleet world has room for {self.size} vehicles, and all have joined"
+            )
         faults = vehicle.faults
         body = Body(
             vehicle.airframe,
@@ -79,18 +81,18 @@ class FleetWorld:
         self._seen = None
 
     def meet(self) -> None:
-        """Let those that touch run into each other; to be called when all have been stepped by 4 ms."""
+        """Resolve collisions; to be called when all have been stepped by 4 ms."""
         self._midair.resolve(STEP_S)
 
     def others(self, vehicle: Vehicle) -> list[Aircraft]:
-        """All but this one, as they are at this moment, in the order in which they joined."""
+        """The current poses of all but this one, in the order in which they joined."""
         return [as_aircraft(other) for other in self._vehicles if other is not vehicle]
 
     def objects(self, vehicle: Vehicle, offset: int, stamp_ns: int) -> list[WorldObject]:
         """All but this one as objects of a world (`aircraft_objects`).
 
         Args:
-            stamp_ns: of this moment: whoever asks for the same is told the same, which is made only once.
+            stamp_ns: of now: calls with the same stamp get the same objects, which are built once.
         """
         if len(self._vehicles) < 2:
             return []

@@ -1,7 +1,7 @@
 """One PX4-like vehicle without sockets: messages in by `handle`, time by `step`, messages out by `outgoing`.
 
 Several links may be attached, as on a real vehicle: an onboard computer's and a ground station's. The vehicle
-reads no clock of its own: it can be stepped as fast or as slowly as wanted (lockstep) and repeats itself.
+reads no clock: it can be stepped at any speed (lockstep), and its flights are repeatable.
 """
 
 from __future__ import annotations
@@ -45,14 +45,14 @@ if TYPE_CHECKING:
     from mavlink_sim.vehicles.collision_world import CollisionWorld
     from mavlink_sim.world.world import World
 
-# When a stepped vehicle boots, as it believes: midnight of the day its PX4 was built.
+# UTC at the boot of a stepped vehicle: midnight of the day its PX4 was built.
 BOOT_UTC_NS = 1_773_273_600 * 10**9  # 2026-03-12
 STEP_S = 0.004
 STEP_US = 4000
 # PX4 runs its position control with its estimator, at about 100 Hz, and its attitude control at every step.
 STEPS_PER_CONTROL = 3
 CONTROL_STEP_S = STEPS_PER_CONTROL * STEP_S
-# The air is never still: with these gusts a held position wanders as measured (std 0.26/0.25/0.09 m).
+# Gusts without wind: with these a held position varies as measured (std 0.26/0.25/0.09 m).
 BACKGROUND_GUSTS_MPS = 0.6
 GUST_SHARE_OF_WIND = 0.15
 OBSTACLE_SENSOR_PERIOD_S = 0.1
@@ -66,43 +66,44 @@ class Vehicle:
 
     Args:
         system_id: its MAVLink system; the component is 1.
-        seed: of its own chances, and of wind direction and gusts unless they are shared.
+        seed: of its random numbers, and of wind direction and gusts unless they are shared.
         air_seed: of the wind's direction and gusts, shared by all vehicles of this seed; None: its own.
-        wind_mps: steady horizontal wind, from a direction that the seed chooses.
-        gusts_mps: standard deviation of the gusts per axis; None for the usual amount.
-        noise: whether sensors and estimates err as a real vehicle's do; False: they tell the truth.
+        wind_mps: steady horizontal wind, from a random direction by the seed.
+        gusts_mps: standard deviation of the gusts per axis; None for the default.
+        noise: whether sensors and estimates have a real vehicle's errors; False: they are the truth.
         parameters: PX4 parameters that differ from `parameters.txt`.
         gimbal: with a two-axis gimbal and its parameters.
         ready_after_s: how long after boot the estimator allows arming.
-        px4: the release of PX4 to be like, where they differ (`releases.RELEASES`); None: the newest.
-        start_ned_m: where it starts, north and east of SIH's home; its local NED frame begins there.
-        scene: what stands around and is in its way: a `Scene`, a `World`, a scene file or an example's name,
-            with its origin at SIH's home and its time that of the faults. None: nothing but level ground.
-        obstacle_sensor: with a range sensor that looks around it for collision prevention; needs a scene.
+        px4: the release of PX4 to emulate (`releases.RELEASES`); None: the newest.
+        start_ned_m: where it starts, north and east of SIH's home; the origin of its local NED frame.
+        scene: its obstacles: a `Scene`, a `World`, a scene file or an example's name, with its origin at
+        SIH's
+            home and its time that of the faults. None: only level ground.
+        obstacle_sensor: with a 360° range sensor for collision prevention; needs a scene.
         on_event: called with one readable line per event ("armed", "mode HOLD", "landed"…).
 
     Raises:
-        ValueError: something of the scene stands where it starts, or a sensor without a scene was asked for.
+        ValueError: an obstacle at its start, or a sensor without a scene.
         SceneError: the scene cannot be used.
 
     Attributes:
         airframe: the motion (truth). collision_world: the scene, None without one. neighbours: the other
             vehicles of its fleet, None without a fleet.
-        estimate: what the vehicle knows of it. faults: what goes wrong.
-        autopilot: the decisions. parameters: the parameter set. links: by name.
-        clock_ns: the boot clock that TIMESYNC tells; by default the stepped time.
-        utc_ns: the time of day that SYSTEM_TIME tells; by default stepped too, from a day of 2026.
-        events: the newest EVENTs. files: what MAVLink FTP reaches.
+        estimate: the vehicle's estimate of it. faults: the active and scheduled faults.
+        autopilot: Commander and Navigator. parameters: the parameter set. links: by name.
+        clock_ns: the boot clock of TIMESYNC; by default the stepped time.
+        utc_ns: the time of SYSTEM_TIME; by default stepped too, from a day of 2026.
+        events: the newest EVENTs. files: those of MAVLink FTP.
 
-    What another autopilot does otherwise, a subclass says (see `firmware`): the classes of its autopilot
-    and parameters, who answers which message, and what is sent.
+    Another firmware is a subclass (see `firmware`): the classes of its autopilot and parameters, the handlers
+    of messages, and the telemetry.
     """
 
     autopilot_class: type[Autopilot] = Autopilot
     parameters_class: type[Parameters] = Parameters
     handlers: Mapping[str, Callable[[Any, Link, Any], None]] = HANDLERS
     modes: type[Enum] = Mode
-    # of the clock by which the interval of a SET_MESSAGE_INTERVAL is counted
+    # of the clock by which the interval of a SET_MESSAGE_INTERVAL is measured
     stream_clock_rate = PX4_CLOCK_RATE
 
     def __init__(
@@ -134,7 +135,7 @@ class Vehicle:
         if gusts_mps is None:
             gusts_mps = BACKGROUND_GUSTS_MPS + GUST_SHARE_OF_WIND * wind_mps
         if obstacle_sensor and scene is None:
-            raise ValueError("an obstacle sensor has nothing to measure without a scene: give it one")
+            raise ValueError("obstacle_sensor=True needs a scene: there is nothing to measure without one")
         self.collision_world: CollisionWorld | None = None
         self.neighbours: Neighbours | None = None
         self._obstacle_sensor = obstacle_sensor
@@ -173,11 +174,11 @@ class Vehicle:
         self.gimbal_manager = GimbalManager(self) if gimbal else None
 
     def __getstate__(self) -> dict[str, Any]:
-        """What a copy of it is made of: that is in no fleet_world."""
+        """The state for a copy, which is in no fleet world."""
         return {**vars(self), "neighbours": None}
 
     def _boot(self) -> None:
-        """Everything that begins with power: whatever is set here does not survive a reboot."""
+        """Initialize the state that does not survive a reboot."""
         self._boot_us = 0
         self._steps_to_control = 0
         self.autopilot = self.autopilot_class(
@@ -199,7 +200,7 @@ class Vehicle:
         if self._obstacle_sensor:
             self.after(OBSTACLE_SENSOR_PERIOD_S, self._sense_obstacles)
 
-    # ---- what is known of it ----------------------------------------------------------------------------
+    # ---- state ------------------------------------------------------------------------------------------
 
     @property
     def boot_us(self) -> int:
@@ -230,7 +231,7 @@ class Vehicle:
 
     @property
     def battery_remaining(self) -> float:
-        """0..1, as the autopilot believes it to be."""
+        """0..1, the autopilot's estimate."""
         return self.autopilot.supervision.battery.remaining
 
     @property
@@ -239,7 +240,7 @@ class Vehicle:
 
     @property
     def transmitter(self) -> Transmitter:
-        """The pilot's remote control, switched off at first (COM_RC_IN_MODE decides whether it counts)."""
+        """The pilot's remote control, initially switched off (COM_RC_IN_MODE selects whether it is used)."""
         return self.autopilot.supervision.transmitter
 
     def obstacle_below_m(self) -> float:
@@ -252,7 +253,7 @@ class Vehicle:
         return found
 
     def second_autopilot(self, system_id: int, seed: int, east_m: float) -> Vehicle:
-        """Another vehicle of the same firmware, ready at once, that starts so far east of this one."""
+        """Another vehicle of the same firmware, ready at once, that starts `east_m` east of this one."""
         north, east = self.start_ned_m
         return type(self)(
             system_id=system_id, seed=seed, ready_after_s=0.0, start_ned_m=(north, east + east_m)
@@ -264,11 +265,11 @@ class Vehicle:
 
     @property
     def setpoint_mode(self) -> str:
-        """The name of the mode that flies setpoints."""
+        """The name of the mode for setpoints."""
         return Mode.OFFBOARD.name
 
     def takeoff_plan(self, height_m: float) -> tuple[str | None, float, Callable[[], bool]]:
-        """The mode to be in, NAV_TAKEOFF's altitude for a height above home, and whether it is over."""
+        """The mode required, NAV_TAKEOFF's altitude for a height above home, and whether it is complete."""
         return None, self.home_altitude_m + height_m, self._holds
 
     def _holds(self) -> bool:
@@ -284,7 +285,7 @@ class Vehicle:
         return BOOT_UTC_NS + self.faults.elapsed_us * 1000
 
     def next_ping(self) -> int:
-        """The sequence number of the next PING of its own."""
+        """The sequence number of the vehicle's next PING."""
         return next(self._ping_sequence)
 
     # ---- links ------------------------------------------------------------------------------------------
@@ -293,7 +294,7 @@ class Vehicle:
         """Attach a link with the onboard link's rates, or others (`streams.GCS_RATES_HZ`)."""
         equipment = {name: rates[rates_hz is not None] for name, rates in EQUIPMENT_RATES_HZ.items()}
         rates = equipment | (ONBOARD_RATES_HZ if rates_hz is None else rates_hz)
-        # links start out of step, so that they do not all send everything in the same millisecond
+        # links start with different phases, so that they do not all send in the same millisecond
         link = self.links[name] = Link(
             name, self.system_id, Streams(rates, 0.0017 * len(self.links), self.stream_clock_rate)
         )
@@ -303,7 +304,7 @@ class Vehicle:
             link_id=len(self.links) - 1,
             streams=self._signing_streams,
             policy=self._signing_policy,
-            is_usb=name == "gcs",  # the ground station's link stands for the USB port
+            is_usb=name == "gcs",  # the ground station's link represents the USB port
         )
         return link
 
@@ -316,18 +317,18 @@ class Vehicle:
             link.signing.set_up(key, timestamp_now() if timestamp is None else timestamp)
 
     def outgoing(self, link: str) -> list[Outgoing]:
-        """Take everything that waits to be sent on a link."""
+        """Remove and return everything queued on a link."""
         outbox = self.links[link].outbox
         messages = list(outbox)
         outbox.clear()
         return messages
 
     def handle(self, link_name: str, message: Any) -> None:
-        """Take in one MAVLink message (of any pymavlink dialect) that arrived on a link."""
+        """Process one MAVLink message (of any pymavlink dialect) received on a link."""
         link = self.links[link_name]
         source = (message.get_srcSystem(), message.get_srcComponent())
         if source == (self.system_id, AUTOPILOT_COMPONENT):
-            return  # an echo of our own
+            return  # an echo of the vehicle's own
         if self.faults.intercepts(link_name, message):
             return
         link.received += 1
@@ -340,7 +341,7 @@ class Vehicle:
                 handler(self, link, message)
 
     def send_built(self, link: Link, name: str) -> bool:
-        """Send one telemetry message by name; False if it has nothing to say now."""
+        """Send one telemetry message by name; False if it has nothing to report now."""
         builder = telemetry.BUILDERS.get(name)
         if builder is not None:
             message = builder(self)
@@ -363,15 +364,15 @@ class Vehicle:
         self.estimate.refresh()
 
     def after(self, delay_s: float, action: Callable[[], object]) -> None:
-        """Do something in a later step."""
+        """Call `action` in a later step."""
         heapq.heappush(self._later, (self.now_s + delay_s, next(self._later_count), action))
 
     def _send_parameters(self) -> None:
-        """What differs from the defaults is told to everyone shortly after the start."""
+        """Send the parameters that differ from the defaults on every link, shortly after the start."""
         parameter_protocol.broadcast(self, [item.name for item in self.parameters.customised()])
 
     def on_companion_heartbeat(self) -> None:
-        """An onboard controller's heartbeat arrived."""
+        """Note an onboard controller's heartbeat."""
         self._companion_seen_s = self.now_s
         if self._companion_lost:
             self._companion_lost = False
@@ -379,18 +380,18 @@ class Vehicle:
             self._on_event("the companion's heartbeat is back")
 
     def _on_touch(self, down_mps: float) -> None:
-        """The airframe met the ground."""
+        """Report a hard ground contact."""
         if self.airframe.crashed:
             self._on_event(f"crashed at {down_mps:.1f} m/s")
         elif down_mps > HARD_LANDING_MPS:
             self._on_event(f"hard landing at {down_mps:.1f} m/s")
 
     def _on_collision(self, collision: Collision) -> None:
-        """The airframe met something of the scene, or another vehicle."""
+        """Report a collision with the scene or another vehicle."""
         self._on_event(str(collision))
 
     def _sense_obstacles(self) -> None:
-        """What the obstacle sensor measures goes into the map of collision prevention."""
+        """Add the obstacle sensor's measurement to the map of collision prevention."""
         assert self.collision_world is not None
         self.estimate.refresh()
         autopilot = self.autopilot
@@ -400,11 +401,11 @@ class Vehicle:
         self.after(OBSTACLE_SENSOR_PERIOD_S, self._sense_obstacles)
 
     def reboot(self) -> None:
-        """Power was lost for a moment: the motors are off, and time since boot begins anew.
+        """Reboot after a short power loss: the motors are off, and the time since boot restarts.
 
-        What is stored stays: parameters, plans with the current mission item, signing keys. So does what is
-        no part of the autopilot: the airframe, the battery, the gimbal, what the pilot holds. `autopilot` is
-        another object afterwards.
+        Stored data stay: parameters, plans with the current mission item, signing keys. So does what is no
+        part of the autopilot: the airframe, the battery, the gimbal, the transmitter. `autopilot` is a new
+        object afterwards.
         """
         before = self.autopilot
         self.estimate.restart([one.number for one in self.faults.active])
@@ -418,7 +419,7 @@ class Vehicle:
             self.gimbal_manager.gimbal = gimbal
 
     def reload_wind(self, more: Iterable[Vector] = ()) -> None:
-        """The wind of SIH_WIND_N and SIH_WIND_E, and what else blows."""
+        """Set the wind of SIH_WIND_N and SIH_WIND_E plus additional ones."""
         self._wind_revision = self.parameters.revision
         north, east = (
             min(max(self.parameters.number(name), -MAX_WIND_MPS), MAX_WIND_MPS)
@@ -435,7 +436,7 @@ class Vehicle:
         elif faults.step(STEP_S):
             return
         self._boot_us += STEP_US
-        estimate = self.estimate  # it looks at the truth when somebody is about to read it
+        estimate = self.estimate  # updated from the truth only before it is read
         if self._later and self._later[0][0] <= self._boot_us / 1e6 + 1e-9:
             estimate.refresh()
             while self._later and self._later[0][0] <= self._boot_us / 1e6 + 1e-9:
@@ -456,7 +457,7 @@ class Vehicle:
         self.airframe.advance(STEP_S)
         estimate.age(STEP_S)
         if not self._origin_sent and self.autopilot.sensors_ready:
-            self._origin_sent = True  # GPS_GLOBAL_ORIGIN is sent when it changes, which is once
+            self._origin_sent = True  # GPS_GLOBAL_ORIGIN is sent when it changes: once
             for link in self.links.values():
                 self.send_built(link, "GPS_GLOBAL_ORIGIN")
         if self.autopilot.texts or self.autopilot.gimbal_commands:
@@ -487,7 +488,7 @@ class Vehicle:
             self._on_event("the companion's heartbeat is lost")
 
     def _send_queued(self) -> None:
-        """Texts to the links with a ground station, events and gimbal commands to every link."""
+        """Send texts on links with a ground station, events and gimbal commands on every link."""
         autopilot = self.autopilot
         while autopilot.texts:
             text = autopilot.texts.popleft()
@@ -500,7 +501,7 @@ class Vehicle:
             command, confirmation, values = autopilot.gimbal_commands.popleft()
             if self.gimbal_manager is not None:
                 if confirmation:
-                    continue  # the first one was answered
+                    continue  # a repetition of the first one
                 self.gimbal_manager.own_command((command, confirmation, values))
             for link in self.links.values():
                 link.send(
@@ -509,4 +510,4 @@ class Vehicle:
 
 
 def _no_observer(text: str) -> None:
-    """What happens without a listener."""
+    """The default of `on_event`."""

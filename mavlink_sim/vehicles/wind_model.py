@@ -1,7 +1,7 @@
-"""The air that several vehicles fly in: one wind and the same gusts for all, whatever process each is in.
+"""The wind shared by several vehicles, also in different processes.
 
-A gust is a function of the seed and of simulated time alone (a first-order Gauss-Markov process, as
-`physics` has it for a vehicle by itself), so vehicles need not know of each other to feel the same one.
+A gust is a function of the seed and of simulated time only (a first-order Gauss-Markov process, as in
+`physics` for a single vehicle), so vehicles have the same gusts without communication.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ class WindModel:
     """The gusts of one seed.
 
     Args:
-        seed: the same for all that fly together.
+        seed: the same for all vehicles of a fleet.
         gusts_mps: standard deviation per axis.
     """
 

@@ -23,7 +23,7 @@ _STAMP = struct.Struct(">Q")
 
 
 class TrafficLog:
-    """An open tlog. `record` appends one packet; if the file cannot be written it is closed with a warning."""
+    """An open tlog. `record` appends one packet; on a write error the file is closed with a warning."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file

@@ -304,7 +304,7 @@ def test_what_is_done_to_a_copy_does_nothing_to_the_first() -> None:
 def test_a_vehicle_with_a_fault_on_it_is_not_copied_and_says_which() -> None:
     vehicle = LockstepVehicle({"onboard": {}})
     vehicle.vehicle.faults.begin("gust 6")
-    with pytest.raises(ValueError, match="gust is on this vehicle; end it first"):
+    with pytest.raises(ValueError, match="fault gust is active"):
         vehicle.copy()
     vehicle.vehicle.faults.end()
     vehicle.copy().step(1.0)

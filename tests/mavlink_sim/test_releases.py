@@ -56,5 +56,5 @@ def test_a_release_that_is_not_known_is_refused_by_name() -> None:
 
 
 def test_an_ardupilot_vehicle_in_lockstep_has_no_release_of_px4() -> None:
-    with pytest.raises(ValueError, match=r"PX4 1\.14 means nothing to an ArduPilot"):
+    with pytest.raises(ValueError, match=r"px4 .1\.14."):
         LockstepVehicle(autopilot="ardupilot", px4="1.14")

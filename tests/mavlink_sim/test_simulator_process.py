@@ -140,7 +140,7 @@ def test_what_fails_while_it_runs_carries_what_it_said_last() -> None:
         fail_beside_a_vehicle_that_says("wind speed=3 direction=90")
     (note,) = failure.value.__notes__
     first, *lines = note.splitlines()
-    assert first == "the vehicle said last:"
+    assert first == "last events of the vehicle:"
     assert any("ready: system 1" in line for line in lines)
     assert any("wind" in line for line in lines)
 

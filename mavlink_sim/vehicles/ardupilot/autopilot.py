@@ -1,7 +1,7 @@
 """Copter's decisions: arming checks, modes, failsafes, landed states, disarming. Times: seconds since boot.
 
-It flies the shared control loops and the tasks of this package; what changes the mode by itself is in
-`watch`. Names in capitals are ArduPilot's parameters.
+It uses the shared control loops and the tasks of this package; automatic mode changes are in `failsafes`.
+Names in capitals are ArduPilot's parameters.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ FAILED = 4  # MAV_RESULT
 WARNING = 4  # MAV_SEVERITY_WARNING
 LAND_DETECTION_S = 1.0  # LAND_DETECTOR_TRIGGER_SEC
 PREARM_DISPLAY_PERIOD_S = 30.0
-SPOOL_UP_S = 2.3  # measured: a take-off right after arming comes so much later (ARMING_DELAY_SEC, spool-up)
+SPOOL_UP_S = 2.3  # measured: delay of a take-off right after arming (ARMING_DELAY_SEC, spool-up)
 _BASE_MODE = CUSTOM_MODE_ENABLED | STABILIZE_ENABLED | MANUAL_INPUT_ENABLED
 
-# Modes flown by sticks, by the shared tasks that fly alike.
+# Manual modes and the shared tasks with the same behaviour.
 _BY_STICKS = {
     CopterMode.STABILIZE: Mode.STABILIZED,
     CopterMode.ACRO: Mode.ACRO,
@@ -57,7 +57,7 @@ _BY_STICKS = {
     CopterMode.LOITER: Mode.POSCTL,
     CopterMode.POSHOLD: Mode.POSCTL,
 }
-# What a pilot who takes over with PX4's name of a mode means.
+# The modes for PX4's names in takeovers by a pilot.
 _PILOTS_MODES = {
     Mode.MANUAL: CopterMode.STABILIZE,
     Mode.STABILIZED: CopterMode.STABILIZE,
@@ -76,7 +76,7 @@ class CopterAutopilot(Autopilot):
     """The decisions of one Copter.
 
     Attributes:
-        mode: a CopterMode. mode_changes: counts them, so that a HEARTBEAT can follow at once.
+        mode: a CopterMode. mode_changes: their count, so that a HEARTBEAT can follow at once.
     """
 
     mode: Any
@@ -104,7 +104,7 @@ class CopterAutopilot(Autopilot):
 
     @property
     def has_setpoints(self) -> bool:
-        return False  # there is no stream to be lost: GUIDED is kept without
+        return False  # there is no stream to lose: GUIDED continues without setpoints
 
     @property
     def can_arm(self) -> bool:
@@ -140,11 +140,11 @@ class CopterAutopilot(Autopilot):
 
     @property
     def position(self) -> Vector:
-        """Where it believes to be, local NED."""
+        """The estimated position, local NED."""
         return self._airframe.position
 
     def _refusal(self) -> str | None:
-        """What speaks against arming, in ArduPilot's words without their prefix."""
+        """ArduPilot's reason against arming, without its prefix; None: it can arm."""
         mode: CopterMode = self.mode
         if mode not in WITHOUT_POSITION and not (self.sensors_ready and self.position_valid):
             return "Need Position Estimate"
@@ -187,7 +187,7 @@ class CopterAutopilot(Autopilot):
         return ACCEPTED
 
     def request_mode(self, mode: CopterMode) -> int:
-        """MAV_RESULT of a request for a mode. A disarmed vehicle takes every one."""
+        """MAV_RESULT of a request for a mode. A disarmed vehicle accepts every one."""
         if mode not in FLOWN:
             self._send_text(WARNING, f"No such mode {int(mode)}")
             return FAILED
@@ -205,7 +205,7 @@ class CopterAutopilot(Autopilot):
         return ACCEPTED
 
     def change_mode(self, mode: CopterMode) -> None:
-        """Fly in another mode; the one that is flown already goes on as it was."""
+        """Change the mode; the current one continues unchanged."""
         if mode is self.mode:
             return
         self.intended_mode = mode
@@ -213,7 +213,7 @@ class CopterAutopilot(Autopilot):
         self._enter(mode)
 
     def set_mode(self, mode: Mode, report: bool = False) -> int:
-        """A request by PX4's name of a mode, as the shared faults and the pilot's sticks make them."""
+        """Request a mode by PX4's name, as the shared faults and the pilot's sticks do."""
         meant = _PILOTS_MODES.get(mode)
         return FAILED if meant is None else self.request_mode(meant)
 
@@ -221,7 +221,7 @@ class CopterAutopilot(Autopilot):
         return _PILOTS_MODES.get(mode) in FLOWN
 
     def user_takeoff(self, height_m: float) -> int:
-        """NAV_TAKEOFF: to a height above home, in GUIDED, armed, on the ground, and upwards alone."""
+        """NAV_TAKEOFF: to a height above home, only in GUIDED, armed, on the ground, and upwards."""
         guided = self.guided
         if guided is None or not self.armed or not self.landed:
             return FAILED
@@ -258,7 +258,7 @@ class CopterAutopilot(Autopilot):
             self.send_prearm()
 
     def send_prearm(self) -> None:
-        """Say what speaks against arming. That the mode does not allow it is said at arming alone."""
+        """Send the reason against arming; a mode that does not allow it is reported only at arming."""
         refusal = self._refusal()
         if refusal is not None and "mode not armable" not in refusal:
             self._send_text(CRITICAL, f"PreArm: {refusal}")
@@ -282,7 +282,7 @@ class CopterAutopilot(Autopilot):
         self._detect_flight(vertical)
 
     def _stays_on_ground(self, task: flight.Task) -> bool:
-        """A landed vehicle leaves the ground by a take-off or by its pilot's throttle, by nothing else."""
+        """Whether it stays on the ground: it leaves it only by a take-off or by the pilot's throttle."""
         rises = isinstance(task, Guided) and task.starting
         if self.mode in _BY_STICKS:
             rises = self.supervision.sticks.throttle > manual_flight.TAKEOFF_THROTTLE
@@ -302,7 +302,7 @@ class CopterAutopilot(Autopilot):
         self.ground.touch_down(self.now_s)
         self._on_event("landed")
         if self.guided is not None:
-            self._start_task()  # what it was told in the air does not lift it off again
+            self._start_task()  # a target from before the landing does not cause a take-off
 
     def _disarm_automatically(self) -> None:
         if not self.landed or not self.armed:
@@ -334,7 +334,7 @@ class CopterAutopilot(Autopilot):
             self.task = flight.Hold(airframe, parameters)
 
     def landing_task(self, point: Vector | None = None) -> Land:
-        """The descent, here or at a place."""
+        """The descent, here or at a point."""
         return Land(
             self._airframe, self._parameters, self.navigator.newest_target, self.navigator.time_s, point
         )
@@ -350,7 +350,7 @@ class CopterAutopilot(Autopilot):
             self._start_task()
 
     def _disarm(self, text: str, reason: str) -> None:
-        """The mode stays: a Copter that has landed is still in LAND."""
+        """Disarm; the mode stays: a Copter that has landed is still in LAND."""
         self.armed = False
         self.task = None
         self.failsafe = False

@@ -57,7 +57,7 @@ _ABOVE_HOME = (
 
 
 def handle(vehicle: CopterContext, link: Link, message: Any) -> None:
-    """COMMAND_LONG or COMMAND_INT: carried out a moment later, then acknowledged to who sent it."""
+    """COMMAND_LONG or COMMAND_INT: executed shortly after, then acknowledged to the sender."""
     command = command_of(message)
     frame = int(getattr(message, "frame", GLOBAL_RELATIVE_ALT))
     vehicle.after(ANSWER_DELAY_S, partial(_answer, vehicle, link, message, command, frame))
@@ -137,7 +137,7 @@ def _condition_yaw(vehicle: CopterContext, link: Link, command: Command, frame: 
 
 
 def _change_speed(vehicle: CopterContext, link: Link, command: Command, frame: int) -> int:
-    """For GUIDED, RTL and LAND while they last; the vertical speeds go to what the loops fly by."""
+    """For GUIDED, RTL and LAND until they end; vertical speeds set the parameters of the control loops."""
     kind, speed = command.parameters[:2]
     if not 0.0 < speed < math.inf or kind not in (0.0, 1.0, 2.0, 3.0):
         return DENIED
@@ -197,7 +197,7 @@ def _set_home(vehicle: CopterContext, link: Link, command: Command, frame: int) 
     point = vehicle.copter.position if here else _point_of(vehicle, command, frame)
     if point is None:
         return DENIED
-    # ArduPilot locks it either way: arming elsewhere does not move it.
+    # ArduPilot locks home in both cases: arming elsewhere does not move it.
     vehicle.copter.home.is_at(point, (math.nan,) * 3)
     vehicle.send_home()
     return ACCEPTED
@@ -211,7 +211,7 @@ def _get_home(vehicle: CopterContext, link: Link, command: Command, frame: int) 
 
 
 def _request_message(vehicle: CopterContext, link: Link, command: Command, frame: int) -> int:
-    """The acknowledgement goes first, the message follows."""
+    """Request a message: it follows the acknowledgement."""
     name = vehicle.message_named(command.parameters[0])
     if name is None:
         return FAILED

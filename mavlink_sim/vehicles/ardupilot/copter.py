@@ -1,4 +1,4 @@
-"""A vehicle that speaks and decides as an ArduPilot Copter does."""
+"""A vehicle with the behaviour of an ArduPilot Copter."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class CopterVehicle(Vehicle):
         unsaved_rates: the values in storage of the rates that REQUEST_DATA_STREAM has set over them.
 
     Raises:
-        ValueError: a gimbal, an obstacle sensor or a release of PX4 was asked for.
+        ValueError: a gimbal, an obstacle sensor or a release of PX4 was requested.
     """
 
     autopilot_class = CopterAutopilot
@@ -33,13 +33,13 @@ class CopterVehicle(Vehicle):
 
     def __init__(self, **options: Any) -> None:
         if options.get("gimbal"):
-            raise ValueError("an ArduPilot vehicle has no gimbal here: leave it out, or fly a PX4")
+            raise ValueError("the ArduPilot vehicle has no gimbal: leave it out, or use PX4")
         if options.get("px4") is not None:
-            raise ValueError(f"PX4 {options['px4']} means nothing to an ArduPilot vehicle: leave --px4 out")
-        if options.get("obstacle_sensor"):
             raise ValueError(
-                "an ArduPilot vehicle has no collision prevention here: leave --obstacle-sensor out"
+                f"px4 {options['px4']!r}: the ArduPilot vehicle has no PX4 release; leave --px4 out"
             )
+        if options.get("obstacle_sensor"):
+            raise ValueError("the ArduPilot vehicle has no collision prevention: leave --obstacle-sensor out")
         self.own_intervals: dict[str, set[str]] = {}
         self.unsaved_rates: dict[str, float] = {}
         super().__init__(**options)
@@ -55,7 +55,7 @@ class CopterVehicle(Vehicle):
         return CopterMode.GUIDED.name
 
     def takeoff_plan(self, height_m: float) -> tuple[str | None, float, Callable[[], bool]]:
-        """In GUIDED, to a height that is one above home."""
+        """In GUIDED, to a height above home."""
         return "GUIDED", height_m, self._flies_guided
 
     def _flies_guided(self) -> bool:
@@ -64,18 +64,18 @@ class CopterVehicle(Vehicle):
 
     @property
     def copter(self) -> CopterAutopilot:
-        """The autopilot, by its own class."""
+        """The autopilot as its class."""
         return cast(CopterAutopilot, self.autopilot)
 
     def add_link(self, name: str, rates_hz: dict[str, float] | None = None) -> Link:
-        """Attach a link. Rates of PX4's links mean nothing here: SR0_* and SR1_* do."""
+        """Attach a link. `rates_hz` is ignored: SR0_* and SR1_* set the rates."""
         link = super().add_link(name, streams.RATES_HZ)
         self.own_intervals[name] = set()
         streams.follow_parameters(self, link)
         return link
 
     def send_text(self, severity: int, text: str) -> None:
-        """A STATUSTEXT to everyone."""
+        """Send a STATUSTEXT on every link."""
         self.autopilot.texts.append(Text(severity, text))
 
     def send_text_once(self, severity: int, text: str) -> None:
@@ -84,7 +84,7 @@ class CopterVehicle(Vehicle):
             self.send_text(severity, text)
 
     def send_home(self) -> None:
-        """HOME_POSITION to every link, as when it changes."""
+        """Send HOME_POSITION on every link, as when it changes."""
         for link in self.links.values():
             self.send_built(link, "HOME_POSITION")
 
@@ -102,7 +102,7 @@ class CopterVehicle(Vehicle):
         return message is not None
 
     def send_soon(self, link: Link, name: str) -> None:
-        """In the next step: after the acknowledgement that is sent now."""
+        """Send it in the next step: after the acknowledgement that is sent now."""
         self.after(0.0, partial(self.send_built, link, name))
 
     def _boot(self) -> None:
@@ -112,15 +112,15 @@ class CopterVehicle(Vehicle):
         self._was_armed = False
 
     def reboot(self) -> None:
-        """See Vehicle. What was asked of the streams by messages is forgotten."""
+        """See Vehicle. Rates requested by messages are dropped."""
         super().reboot()
         streams.forget_requests(self)
 
     def _send_parameters(self) -> None:
-        """Nothing is told unasked."""
+        """Nothing is sent unrequested."""
 
     def _check_companion(self) -> None:
-        """A companion's heartbeat is nothing that Copter misses."""
+        """Copter has no check of the companion's heartbeat."""
 
     def _step(self) -> None:
         super()._step()
@@ -134,7 +134,7 @@ class CopterVehicle(Vehicle):
         self._was_armed = copter.armed
 
     def _send_queued(self) -> None:
-        """Texts to every link on which somebody speaks; no events, no commands to a gimbal."""
+        """Send texts on every link with a client; no events, no gimbal commands."""
         while self.autopilot.texts:
             text = self.autopilot.texts.popleft()
             for link in self.links.values():

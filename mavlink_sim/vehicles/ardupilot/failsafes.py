@@ -16,7 +16,7 @@ WARNING, NOTICE = 4, 5  # MAV_SEVERITY_WARNING, MAV_SEVERITY_NOTICE
 POSITION_LOST_S = 1.0
 FENCE_ALTITUDE, FENCE_CIRCLE = 1, 2  # bits of FENCE_TYPE
 STOP_AT_FENCE = 1  # a bit of AVOID_ENABLE
-# Speed towards the circle, less FENCE_MARGIN, for each metre left.
+# Speed towards the circle, less FENCE_MARGIN, per remaining metre.
 AVOIDANCE_GAIN_PER_S = 1.0
 # FS_GCS_ENABLE: 1 RTL, 2 AUTO or RTL, 3 and 4 SMART_RTL, 5 LAND, 7 BRAKE or LAND. There is no SMART_RTL here.
 _GCS_MODES = {
@@ -66,7 +66,7 @@ class FailsafeAutopilot(Protocol):
 
 
 class Failsafes:
-    """What makes a Copter change its mode by itself.
+    """Copter's automatic mode changes.
 
     Attributes:
         ground_station_seen_s: the newest heartbeat of SYSID_MYGCS. is_breached: outside the fence.
@@ -81,7 +81,7 @@ class Failsafes:
         self._position_seen_s = 0.0
 
     def mode_was_chosen(self) -> None:
-        """Somebody asked for a mode: a failsafe whose reason goes on does not fight it."""
+        """Note a mode request: an active failsafe does not override it."""
         self._autopilot.failsafe = self._gcs_lost or self._ekf_lost
 
     def disarmed(self) -> None:
@@ -94,7 +94,7 @@ class Failsafes:
         self._autopilot.failsafe = self._gcs_lost or self._ekf_lost
 
     def avoid_fence(self, velocity: Vector) -> Vector:
-        """A commanded velocity without what would carry the vehicle over the circle; along it all is left."""
+        """A commanded velocity limited towards the fence circle; its tangential component is unchanged."""
         value, autopilot = self._parameters.number, self._autopilot
         circle = value("FENCE_ENABLE") and int(value("FENCE_TYPE")) & FENCE_CIRCLE
         if not circle or not int(value("AVOID_ENABLE")) & STOP_AT_FENCE:
@@ -112,7 +112,7 @@ class Failsafes:
     def _check_ground_station(self) -> None:
         autopilot, value = self._autopilot, self._parameters.number
         if math.isnan(self.ground_station_seen_s):
-            return  # one that never came is not lost
+            return  # without a first heartbeat it is not lost
         action = int(value("FS_GCS_ENABLE"))
         silent_s = autopilot.now_s - self.ground_station_seen_s
         lost = action in _GCS_MODES and autopilot.armed and silent_s > value("FS_GCS_TIMEOUT")
@@ -147,7 +147,7 @@ class Failsafes:
         self._ekf_lost = True
         autopilot.announce("failsafe: position lost")
         if autopilot.mode is CopterMode.LAND:
-            autopilot.restart_task()  # it comes down without its place
+            autopilot.restart_task()  # it descends without a position
         else:
             autopilot.change_mode(CopterMode.LAND)
         autopilot.texts.append(Text(CRITICAL, f"EKF Failsafe: changed to {autopilot.mode.title} Mode"))

@@ -1,8 +1,8 @@
-"""GUIDED: take-off, and what the newest target asks for; what is not renewed for GUID_TIMEOUT ends in a stop.
+"""GUIDED: take-off and the newest target; a target without position stops the vehicle after GUID_TIMEOUT.
 
-A position is flown to and kept, however old it is. A velocity, an acceleration or an attitude that is older
-than GUID_TIMEOUT seconds becomes zero, and the vehicle stands still; it stays in GUIDED. Paused
-(DO_PAUSE_CONTINUE) it stands still too, whatever new targets come.
+A position is flown to and held without a timeout. A velocity, an acceleration or an attitude that is older
+than GUID_TIMEOUT seconds becomes zero, and the vehicle stops; it stays in GUIDED. Paused (DO_PAUSE_CONTINUE)
+it stops too, whatever new targets arrive.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from vision.attitude import Quaternion, quaternion_from_euler
 
 # A target that runs ahead of the vehicle waits for it (ArduPilot's leash).
 LEASH_M = 2.0
-# What is planned of a velocity lags its target, as the vehicle does while it leans: tuned to a real Copter,
-# whose step to 3 m/s passes 1.8 m/s after 1 s, peaks at 3.03 to 3.05 m/s, and stops within 3.2 m.
+# Lag of the planned velocity behind its target, for the time the vehicle takes to tilt: tuned to a real
+# Copter, whose step to 3 m/s passes 1.8 m/s after 1 s, peaks at 3.03 to 3.05 m/s, and stops within 3.2 m.
 VELOCITY_LAG_S = 0.4
-# A take-off asks for what the vehicle gains in this time; it gains at least the least.
+# The setpoint of a take-off leads the vehicle by its travel in this time, at least by the minimum.
 CLIMB_LEAD_S = 0.35
 LEAST_GAIN_MPS2 = 0.1
-TAKEOFF_DONE_M = 0.06  # so near to the height a take-off counts as complete
+TAKEOFF_DONE_M = 0.06  # a take-off is complete within this distance of its height
 CLIMB_GAIN_PER_S = 4.0
-FACING_SPEED_MPS = 1.0  # above it "the direction of flight" is known
-THRUST_AS_THRUST = 8  # GUID_OPTIONS: SET_ATTITUDE_TARGET's thrust is no climb rate
+FACING_SPEED_MPS = 1.0  # above this speed the direction of flight is defined
+THRUST_AS_THRUST = 8  # GUID_OPTIONS: SET_ATTITUDE_TARGET's thrust is a thrust, not a climb rate
 ZERO: Vector = (0.0, 0.0, 0.0)
 
 
 class Heading:
-    """Where the nose goes: a heading, a turning rate, or along the flight (WP_YAW_BEHAVIOR)."""
+    """The heading: a fixed one, a yaw rate, or along the direction of flight (WP_YAW_BEHAVIOR)."""
 
     def __init__(self, parameters: Parameters, yaw_rad: float) -> None:
         self._parameters = parameters
@@ -47,7 +47,7 @@ class Heading:
         self._goal_rad, self._rate_radps, self._slew_radps = yaw_rad, rate_radps, slew_radps
 
     def hold(self) -> None:
-        """Turn no more, if it turned by a rate."""
+        """End a yaw rate."""
         if math.isnan(self._goal_rad) and not math.isnan(self._rate_radps):
             self._rate_radps = 0.0
 
@@ -79,7 +79,7 @@ class Attitude:
 
 
 class Takeoff(flight.Takeoff):
-    """Climb straight up, gaining and losing speed by WPNAV_ACCEL_Z, up to WPNAV_SPEED_UP."""
+    """Climb vertically, accelerating and braking by WPNAV_ACCEL_Z, up to WPNAV_SPEED_UP."""
 
     def _climb(self, dt_s: float, left_m: float) -> float:
         value = self._parameters.number
@@ -92,13 +92,13 @@ class Takeoff(flight.Takeoff):
 
 
 class Guided(flight.Task):
-    """The task of GUIDED. It begins by stopping where it is.
+    """The task of GUIDED. It begins with a stop.
 
     Args:
-        avoid: what ArduPilot's avoidance leaves of a commanded velocity.
+        avoid: limits a commanded velocity by ArduPilot's avoidance.
 
     Attributes:
-        paused: stands still, and goes on with the newest target when this is over.
+        paused: stopped; continues with the newest target afterwards.
     """
 
     def __init__(
@@ -120,10 +120,10 @@ class Guided(flight.Task):
         self._age_s = 0.0
         self.heading = Heading(parameters, airframe.yaw_rad)
 
-    # ---- what is asked of it ----------------------------------------------------------------------------
+    # ---- targets ----------------------------------------------------------------------------------------
 
     def take_off(self, down_m: float) -> None:
-        """Climb straight up to this NED z."""
+        """Climb vertically to this NED z."""
         self._begin()
         self._reached = False
         self._takeoff = Takeoff(self._airframe, self._parameters, down_m)
@@ -131,7 +131,7 @@ class Guided(flight.Task):
         self.heading.take(NAN, 0.0)
 
     def fly(self, target: GuidedTarget) -> None:
-        """A new target in place of whatever went on."""
+        """Set a new target; it replaces the current one."""
         same_kind = self._kind(target) == self._kind(self._target)
         if self._takeoff is not None or self._attitude is not None or not same_kind:
             self._begin()
@@ -149,19 +149,19 @@ class Guided(flight.Task):
 
     @property
     def target(self) -> GuidedTarget | None:
-        """What POSITION_TARGET_LOCAL_NED tells; None while an attitude is flown."""
+        """The target for POSITION_TARGET_LOCAL_NED; None while an attitude is controlled."""
         if self._takeoff is not None:
             return GuidedTarget(position=self._takeoff.goal)
         return None if self._attitude is not None else self._target
 
     @property
     def starting(self) -> bool:
-        """A take-off was asked for: the one thing that leads off the ground."""
+        """A take-off is demanded; nothing else leaves the ground."""
         return self._takeoff is not None
 
     @property
     def is_taking_off(self) -> bool:
-        """On the climb of a take-off."""
+        """During the climb of a take-off."""
         if self._takeoff is None or self._takeoff.goal is None:
             return False
         self._reached |= self._airframe.position[2] - self._takeoff.goal[2] < TAKEOFF_DONE_M
@@ -217,7 +217,7 @@ class Guided(flight.Task):
         return TrajectorySetpoint((x, y, z), velocity, NOTHING)
 
     def _by_velocity(self, dt_s: float, stale: bool) -> TrajectorySetpoint:
-        """A place that moves as asked, within the accelerations, and on a leash."""
+        """A position setpoint that moves with the demanded velocity, within accelerations and leash."""
         value, target, trajectory = self._parameters.number, self._target, self._trajectory
         if stale or (target.velocity is None and target.acceleration is None):
             wanted = ZERO
@@ -265,7 +265,7 @@ class Guided(flight.Task):
 
 
 def _feed_forward(before: Vector, velocity: Vector, dt_s: float) -> Vector:
-    """The acceleration that a target's change of velocity takes, and horizontally what drag takes of it."""
+    """The acceleration of a change of the target velocity, horizontally less the drag."""
     ax, ay, az = ((now - then) / dt_s for then, now in zip(before, velocity, strict=True))
     return (ax + LINEAR_DRAG_PER_S * velocity[0], ay + LINEAR_DRAG_PER_S * velocity[1], az)
 

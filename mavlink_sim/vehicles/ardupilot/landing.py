@@ -1,7 +1,7 @@
-"""LAND: down at one place, or down on the target that LANDING_TARGET reports (PLND_ENABLED, PLND_TYPE 1).
+"""LAND: at one point, or on the target of LANDING_TARGET (PLND_ENABLED, PLND_TYPE 1).
 
-Of LANDING_TARGET ArduPilot takes, with `position_valid` 0, the angles `angle_x` (to the right) and `angle_y`
-(downwards in a picture: backwards on the vehicle) of a camera that looks straight down, and `distance` along
+Of LANDING_TARGET ArduPilot uses, with `position_valid` 0, the angles `angle_x` (to the right) and `angle_y`
+(downwards in the image: backwards on the vehicle) of a camera that looks straight down, and `distance` along
 that line; with `position_valid` 1 a position in MAV_FRAME_BODY_FRD with a `distance`. PX4's frame is refused.
 """
 
@@ -21,10 +21,10 @@ from vision.attitude import Quaternion
 
 BODY_FRD = 12  # MAV_FRAME_BODY_FRD
 COMPANION_TYPE = 1  # PLND_TYPE: MAVLink messages
-MEASUREMENT_LIFETIME_S = 1.0  # a line of sight is forgotten after it
+MEASUREMENT_LIFETIME_S = 1.0  # timeout of a line of sight
 ACCEPTABLE_ERROR_M = 0.15
 SLOWEST_DESCENT_MPS = 0.1
-SLOW_ABOVE_M, SLOW_BELOW_M = 0.35, 2.0  # where a landing on a target waits for the error to shrink
+SLOW_ABOVE_M, SLOW_BELOW_M = 0.35, 2.0  # height at which a landing on a target waits until the error is small
 MAX_DISTANCE_M = 1000.0
 
 
@@ -33,9 +33,9 @@ class UnsupportedTargetError(ValueError):
 
 
 def line_of_sight(message: Any) -> Vector | None:
-    """From the vehicle to the target in body FRD: metres, or of length 1 where no distance is given.
+    """From the vehicle to the target in body FRD: metres, or of length 1 without a distance.
 
-    None for a position without a distance, or for what is no number: ArduPilot passes it over.
+    None for a position without a distance, or for non-finite values: ArduPilot ignores them.
 
     Raises UnsupportedTargetError for a position in another frame than MAV_FRAME_BODY_FRD.
     """
@@ -56,9 +56,10 @@ def line_of_sight(message: Any) -> Vector | None:
 
 
 def target_position(message: Any, position: Vector, quaternion: Quaternion, height_m: float) -> Vector | None:
-    """Where the target is, local NED; None where the line of sight does not lead down.
+    """The position of the target, local NED; None where the line of sight does not point down.
 
-    Without a distance it is where the line meets the ground, `height_m` below by the rangefinder.
+    Without a distance it is the intersection of the line with the ground, `height_m` below by the
+    rangefinder.
     """
     sight = line_of_sight(message)
     if sight is None:
@@ -109,7 +110,7 @@ class Land(flight.TrajectoryTask):
         )
 
     def _look(self) -> None:
-        """Aim at the target while it is in sight; out of sight, go down where it was last."""
+        """Aim at the target while it is in sight; out of sight, descend at its last position."""
         value = self._parameters.number
         self.on_target = False
         if not value("PLND_ENABLED") or value("PLND_TYPE") != COMPANION_TYPE:
@@ -128,7 +129,7 @@ class Land(flight.TrajectoryTask):
         if self.on_target:
             away = math.dist(self.goal[:2], self._airframe.position[:2])
             if away > value("PLND_XY_DIST_MAX") > 0.0:
-                return 0.0  # too far beside it: go there first
+                return 0.0  # horizontal error too large: no descent
             if SLOW_ABOVE_M < height_m < SLOW_BELOW_M:
                 half = slow / 2.0
                 speed = max(half - away * half / ACCEPTABLE_ERROR_M, SLOWEST_DESCENT_MPS)

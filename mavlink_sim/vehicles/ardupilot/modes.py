@@ -55,7 +55,7 @@ _STANDARD_MODES = {
     CopterMode.LAND: 7,
 }
 
-# The modes that can be flown here; a request for another of Copter's is answered as by a build without it.
+# The simulated modes; a request for another one is answered as by a build without it.
 FLOWN = frozenset(
     {
         CopterMode.STABILIZE,
@@ -70,7 +70,7 @@ FLOWN = frozenset(
         CopterMode.BRAKE,
     }
 )
-# Flown without a horizontal position; LAND then comes straight down.
+# Possible without a horizontal position; LAND then descends without holding its position.
 WITHOUT_POSITION = frozenset({CopterMode.STABILIZE, CopterMode.ACRO, CopterMode.ALT_HOLD, CopterMode.LAND})
 ARMABLE = frozenset(
     {
@@ -82,7 +82,7 @@ ARMABLE = frozenset(
         CopterMode.POSHOLD,
     }
 )
-# Position control is at work in these, which HEARTBEAT.base_mode shows as MAV_MODE_FLAG_GUIDED_ENABLED.
+# Modes with position control, shown in HEARTBEAT.base_mode as MAV_MODE_FLAG_GUIDED_ENABLED.
 POSITION_CONTROLLED = frozenset(
     {
         CopterMode.AUTO,
@@ -97,7 +97,7 @@ POSITION_CONTROLLED = frozenset(
 
 
 def mode_of(custom_mode: int) -> CopterMode | None:
-    """The mode of a number, None for one that cannot be flown here."""
+    """The mode of a number, None for one that is not simulated."""
     try:
         mode = CopterMode(custom_mode)
     except ValueError:

@@ -1,7 +1,7 @@
-"""The parameter protocol as ArduPilot speaks it: no hash, no errors; a set is told to every link.
+"""ArduPilot's parameter protocol: no hash, no errors; a changed value is sent on every link.
 
-What cannot be (an unknown name, a number that is none) is passed over in silence. Values are numbers whatever
-their type, and a wrong `param_type` does not matter. An answer to a name, and to a set, has the index 65535.
+Invalid requests (an unknown name, a non-finite value) are ignored. Values are numbers whatever their type,
+and a wrong `param_type` is accepted. An answer to a name, and to a set, has the index 65535.
 """
 
 from __future__ import annotations
@@ -43,14 +43,14 @@ def request_read(vehicle: CopterContext, link: Link, message: Any) -> None:
 
 
 def set_parameter(vehicle: CopterContext, link: Link, message: Any) -> None:
-    """PARAM_SET: truncated and cut to what the type holds, then told on every link."""
+    """PARAM_SET: truncate and clamp the value to its type, then send it on every link."""
     name = _text_of(message.param_id)
     if name not in vehicle.parameters:
         return
     try:
         parameter = vehicle.parameters.set(name, float(message.param_value))
     except ValueError as error:
-        logger.info("PARAM_SET is passed over: %s", error)
+        logger.info("PARAM_SET is ignored: %s", error)
         return
     vehicle.unsaved_rates.pop(name, None)
     for each in vehicle.links.values():

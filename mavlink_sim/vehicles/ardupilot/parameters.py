@@ -1,10 +1,10 @@
-"""Copter's parameters: small, true, and sent as ArduPilot sends them.
+"""Copter's parameters: a subset, encoded as by ArduPilot.
 
-ArduPilot carries every value as a number in the float field, whatever its type (the "C cast" encoding,
+ArduPilot sends every value as a number in the float field, whatever its type (the "C cast" encoding,
 MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST); PX4 puts an integer's bytes there.
 
-The control loops are the PX4-like vehicle's and read its parameters; those lie beneath, unseen by clients,
-and follow Copter's (`_LOOPS`).
+The control loops are the PX4-like vehicle's and read its parameters; those are hidden from clients and follow
+Copter's (`_LOOPS`).
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ def _hundredth(name: str) -> Callable[[Parameters], float]:
 
 
 def _wind(component: Callable[[float], float]) -> Callable[[Parameters], float]:
-    # ArduPilot says where the wind comes from
+    # ArduPilot has the direction that the wind blows from
     return lambda own: -own.number("SIM_WIND_SPD") * component(math.radians(own.number("SIM_WIND_DIR")))
 
 
@@ -131,7 +131,7 @@ _LOOPS: dict[str, Callable[[Parameters], float]] = {
     "MPC_ACC_DOWN_MAX": lambda own: max(own.number("WPNAV_ACCEL_Z"), own.number("PILOT_ACCEL_Z")) / 100.0,
     "MPC_ACC_UP_MAX": lambda own: max(own.number("WPNAV_ACCEL_Z"), own.number("PILOT_ACCEL_Z")) / 100.0,
     "MPC_LAND_SPEED": _hundredth("LAND_SPEED"),
-    "MPC_XY_ERR_MAX": lambda own: 4.0,  # ArduPilot runs faster, and its target leads farther
+    "MPC_XY_ERR_MAX": lambda own: 4.0,  # ArduPilot is faster, and its target has a longer lead
     "MPC_TKO_SPEED": _hundredth("WPNAV_SPEED_UP"),
     "MPC_TKO_RAMP_T": lambda own: TAKEOFF_RAMP_S,
     "MPC_TILTMAX_AIR": _hundredth("ANGLE_MAX"),
@@ -139,18 +139,18 @@ _LOOPS: dict[str, Callable[[Parameters], float]] = {
     "SIH_WIND_N": _wind(math.cos),
     "SIH_WIND_E": _wind(math.sin),
     "MAV_SYS_ID": lambda own: own.number("SYSID_THISMAV"),
-    # ArduPilot demands signatures on every link but the USB port, as soon as there is a key
+    # ArduPilot requires signatures on every link except USB, as soon as there is a key
     "MAV_SIGN_CFG": lambda own: 1.0,
 }
-# Names under which the shared vehicle sets what is Copter's by another name.
+# Names of the shared vehicle and Copter's names for the same.
 _ALIASES = {"MAV_SYS_ID": "SYSID_THISMAV"}
 
 
 class CopterParameters(Parameters):
-    """Copter's set as clients see it; `number` finds the loops' parameters beneath it too."""
+    """Copter's set as clients see it; `number` also finds the hidden parameters of the loops."""
 
     def __init__(self, values: Mapping[str, float] | None = None, gimbal: bool = False) -> None:
-        """Raises UnknownParameterError or ValueError if `values` names or sets something that cannot be."""
+        """Raises UnknownParameterError or ValueError for an unknown name or an invalid value in `values`."""
         self._loops = Parameters()
         self._defaults = {
             name: CopterParameter(name, kind, value if kind == REAL32 else int(value))
@@ -169,7 +169,7 @@ class CopterParameters(Parameters):
         return self._loops.number(name) if own is None else own.value
 
     def set(self, name: str, value: float) -> Parameter:
-        """Set a value, a loop's own (wind by components) too. Raises UnknownParameterError, ValueError."""
+        """Set a value, also of a loop (wind by components). Raises UnknownParameterError, ValueError."""
         name = _ALIASES.get(name, name)
         if name in self._parameters or name not in self._loops:
             changed = self._set_own(name, value)
@@ -186,7 +186,7 @@ class CopterParameters(Parameters):
         return changed
 
     def _set_own(self, name: str, value: float) -> Parameter:
-        """ArduPilot truncates what is for an integer and cuts it to its range."""
+        """Truncate a value for an integer and clamp it to its range, as ArduPilot does."""
         parameter = self[name]
         if not math.isfinite(value):
             raise ValueError(f"parameter {name} needs a finite number, got {value}")

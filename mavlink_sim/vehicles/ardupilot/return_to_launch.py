@@ -11,11 +11,11 @@ from mavlink_sim.physics.airframe import Multirotor, Vector
 from mavlink_sim.px4.parameters import Parameters
 
 ALTITUDE_REACHED_M = 0.5
-LOWEST_RETURN_M = 2.0  # RTL_ALT_MIN: the cone allows no lower
+LOWEST_RETURN_M = 2.0  # RTL_ALT_MIN: the least height in the cone
 
 
 class ReturnToLaunch(flight.TrajectoryTask):
-    """The task of RTL. `landing_task` makes the descent at a place."""
+    """The task of RTL. `landing_task` creates the descent at a point."""
 
     def __init__(
         self,
@@ -40,7 +40,7 @@ class ReturnToLaunch(flight.TrajectoryTask):
         self.goal = (x, y, home[2] - self._height(away_m, home[2] - z))
 
     def _height(self, away_m: float, height_m: float) -> float:
-        """Metres above home to return at: RTL_ALT, lower inside the cone around home, never a descent."""
+        """Return height, metres above home: RTL_ALT, lower inside the cone around home, never a descent."""
         value = self._parameters.number
         height = max(height_m + value("RTL_CLIMB_MIN") / 100.0, value("RTL_ALT") / 100.0)
         slope = value("RTL_CONE_SLOPE")

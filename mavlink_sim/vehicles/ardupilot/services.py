@@ -1,4 +1,4 @@
-"""How a Copter answers each message it understands."""
+"""Copter's handler of each received message."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def _heartbeat(vehicle: CopterContext, link: Link, message: Any) -> None:
 
 
 def _local_target(vehicle: CopterContext, link: Link, message: Any) -> None:
-    """Outside GUIDED it is passed over without a word."""
+    """Outside GUIDED it is silently ignored."""
     guided = vehicle.copter.guided
     if guided is not None:
         frame = vehicle.estimate
@@ -47,7 +47,7 @@ def _global_target(vehicle: CopterContext, link: Link, message: Any) -> None:
 
 
 def _attitude_target(vehicle: CopterContext, link: Link, message: Any) -> None:
-    """Attitude, all three body rates, or both, and a thrust; whatever else it says stops the vehicle."""
+    """Attitude, all three body rates, or both, and a thrust; any other combination stops the vehicle."""
     guided = vehicle.copter.guided
     if guided is None:
         return
@@ -79,7 +79,7 @@ def _attitude_target(vehicle: CopterContext, link: Link, message: Any) -> None:
 
 
 def _landing_target(vehicle: CopterContext, link: Link, message: Any) -> None:
-    """LANDING_TARGET counts where precision landing is enabled with type 1 (MAVLink)."""
+    """LANDING_TARGET: used if precision landing is enabled with type 1 (MAVLink)."""
     value = vehicle.parameters.number
     if not value("PLND_ENABLED") or value("PLND_TYPE") != landing.COMPANION_TYPE:
         return
@@ -95,7 +95,7 @@ def _landing_target(vehicle: CopterContext, link: Link, message: Any) -> None:
 
 
 def _no_mission(vehicle: CopterContext, link: Link, message: Any) -> None:
-    """Missions are not modelled: the list is empty, an upload is refused."""
+    """Missions are not simulated: the list is empty, an upload is refused."""
     sender = (message.get_srcSystem(), message.get_srcComponent())
     kind = int(getattr(message, "mission_type", 0))
     if message.get_type() == "MISSION_REQUEST_LIST":
@@ -105,7 +105,7 @@ def _no_mission(vehicle: CopterContext, link: Link, message: Any) -> None:
 
 
 def _setup_signing(vehicle: CopterContext, link: Link, message: Any) -> None:
-    """SETUP_SIGNING: a disarmed ArduPilot takes the key from any link, for all of its links."""
+    """SETUP_SIGNING: a disarmed ArduPilot accepts the key from any link, for all of its links."""
     if vehicle.copter.armed:
         vehicle.send_text(3, "ERROR: Won't setup signing when armed")
         return

@@ -1,9 +1,8 @@
-"""Which messages a link gets: hardly any unasked, then what REQUEST_DATA_STREAM and
-SET_MESSAGE_INTERVAL ask for.
+"""The streams of a link: almost none by default, then by REQUEST_DATA_STREAM and SET_MESSAGE_INTERVAL.
 
-The groups have a rate each, in the parameters SR0_* (the ground station's link) and SR1_* (the companion's);
-REQUEST_DATA_STREAM sets those until the next reboot. An interval set for one message stands above its group's
-rate, until anybody on the link asks for that group by REQUEST_DATA_STREAM, and until the next reboot.
+Each group has a rate, in the parameters SR0_* (the ground station's link) and SR1_* (the companion's);
+REQUEST_DATA_STREAM sets those until the next reboot. An interval set for one message overrides its group's
+rate until that group is requested by REQUEST_DATA_STREAM on the link, or until the next reboot.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from mavlink_sim.wire.links import Link
 MAX_RATE_HZ = 200.0
 MAX_INTERVAL_US = 60_000_000
 
-# The parameter's ending, MAV_DATA_STREAM, and what it brings (of Copter's list, what this vehicle has).
+# The parameter's suffix, MAV_DATA_STREAM, and its messages (those of Copter's list that this vehicle has).
 GROUPS: dict[str, tuple[int, tuple[str, ...]]] = {
     "RAW_SENS": (1, ("RAW_IMU", "SCALED_PRESSURE")),
     "EXT_STAT": (2, ("SYS_STATUS", "MISSION_CURRENT", "GPS_RAW_INT", "POSITION_TARGET_GLOBAL_INT")),
@@ -30,7 +29,7 @@ GROUPS: dict[str, tuple[int, tuple[str, ...]]] = {
         ("SYSTEM_TIME", "DISTANCE_SENSOR", "BATTERY_STATUS", "EKF_STATUS_REPORT", "VIBRATION"),
     ),
 }
-# In no group: by SET_MESSAGE_INTERVAL or REQUEST_MESSAGE alone.
+# In no group: by SET_MESSAGE_INTERVAL or REQUEST_MESSAGE only.
 SINGLE = (
     "ATTITUDE_QUATERNION",
     "ATTITUDE_TARGET",
@@ -39,7 +38,7 @@ SINGLE = (
     "HOME_POSITION",
     "GPS_GLOBAL_ORIGIN",
 )
-# Unasked: the heartbeat, and a TIMESYNC request every ten seconds.
+# By default: the heartbeat, and a TIMESYNC request every ten seconds.
 UNASKED_HZ = {"HEARTBEAT": 1.0, "TIMESYNC": 0.1}
 RATES_HZ: dict[str, float] = (
     UNASKED_HZ | {name: 0.0 for _, names in GROUPS.values() for name in names} | dict.fromkeys(SINGLE, 0.0)
@@ -65,7 +64,7 @@ def follow_parameters(vehicle: CopterContext, link: Link) -> None:
 
 
 def set_interval(vehicle: CopterContext, link: Link, name: str, interval_us: float) -> None:
-    """-1 switches off, 0 goes back to the group's rate."""
+    """Set the interval of one message; -1: off, 0: the group's rate."""
     own = vehicle.own_intervals[link.name]
     own.discard(name)
     if interval_us == 0.0:
@@ -82,7 +81,7 @@ def set_interval(vehicle: CopterContext, link: Link, name: str, interval_us: flo
 
 
 def forget_requests(vehicle: CopterContext) -> None:
-    """A reboot: what was asked for by messages is gone, what was set as a parameter stays."""
+    """Drop rates requested by messages at a reboot; those set as parameters stay."""
     for name, rate in vehicle.unsaved_rates.items():
         vehicle.parameters.set(name, rate)
     vehicle.unsaved_rates.clear()
@@ -92,7 +91,7 @@ def forget_requests(vehicle: CopterContext) -> None:
 
 
 def request_data_stream(vehicle: CopterContext, link: Link, message: Any) -> None:
-    """REQUEST_DATA_STREAM: the rate of one group or of all; it replaces what was set for single messages."""
+    """REQUEST_DATA_STREAM: the rate of one group or of all; it replaces the intervals of single messages."""
     rate = min(int(message.req_message_rate), int(MAX_RATE_HZ)) if message.start_stop else 0
     for group, (identifier, names) in GROUPS.items():
         if message.req_stream_id in (ALL_STREAMS, identifier):

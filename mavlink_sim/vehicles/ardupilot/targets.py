@@ -1,8 +1,8 @@
 """SET_POSITION_TARGET_LOCAL_NED and SET_POSITION_TARGET_GLOBAL_INT as Copter's GUIDED reads them.
 
-Four local frames: LOCAL_NED counts from the EKF's origin, LOCAL_OFFSET_NED from where the vehicle is,
-BODY_NED and BODY_OFFSET_NED from there along its heading. One ignored axis of position, velocity or
-acceleration disables all three. A message that makes no sense stops the vehicle: it is not passed over.
+Four local frames: LOCAL_NED is relative to the EKF's origin, LOCAL_OFFSET_NED to the vehicle's position,
+BODY_NED and BODY_OFFSET_NED also to its heading. One ignored axis of position, velocity or acceleration
+disables all three. An invalid message is not ignored: it stops the vehicle.
 """
 
 from __future__ import annotations
@@ -38,15 +38,15 @@ _LOCAL = (LOCAL_NED, LOCAL_OFFSET_NED, *_BODY)
 _ABSOLUTE = (GLOBAL, GLOBAL_INT)
 # the ground is flat here: above terrain is above home
 _ABOVE_HOME = (GLOBAL_RELATIVE_ALT, GLOBAL_RELATIVE_ALT_INT, GLOBAL_TERRAIN_ALT, GLOBAL_TERRAIN_ALT_INT)
-MAX_SANE = 1000.0  # m/s or m/s²: beyond it, or no number, ArduPilot stops
+MAX_SANE = 1000.0  # m/s or m/s²: beyond it, or if not finite, ArduPilot stops
 MAX_POSITION_M = 1e6
 
 
 @dataclass(frozen=True, slots=True)
 class GuidedTarget:
-    """What GUIDED is to do: local NED metres and seconds; None: that part is not given.
+    """The target of GUIDED: local NED metres and seconds; None: that part is not set.
 
-    `yaw_rad`, `yaw_rate_radps`: NaN for none; with neither, the nose turns into the direction of flight.
+    `yaw_rad`, `yaw_rate_radps`: NaN for none; with neither, the heading follows the direction of flight.
     """
 
     position: Vector | None = None
@@ -60,7 +60,7 @@ STOP = GuidedTarget(velocity=(0.0, 0.0, 0.0))
 
 
 def local_target(message: Any, position: Vector, yaw_rad: float) -> GuidedTarget:
-    """The target of a SET_POSITION_TARGET_LOCAL_NED message to a vehicle that is there and heads so."""
+    """The target of a SET_POSITION_TARGET_LOCAL_NED message to a vehicle with this position and heading."""
     frame, mask = int(message.coordinate_frame), int(message.type_mask)
     if frame not in _LOCAL or _asks_for_force(mask):
         return STOP
@@ -112,7 +112,7 @@ def _asks_for_force(mask: int) -> bool:
 
 
 def _given(values: Vector, mask: int, ignore: tuple[int, int, int], heading_rad: float) -> Vector | None:
-    """The vector turned by the heading into NED; None where any of its axes is ignored."""
+    """The vector rotated by the heading into NED; None if any of its axes is ignored."""
     if mask & sum(ignore):
         return None
     x, y, z = values

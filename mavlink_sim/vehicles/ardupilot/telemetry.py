@@ -1,4 +1,4 @@
-"""What a Copter's messages say where they differ from a PX4's; the others are shared."""
+"""Copter's telemetry where it differs from PX4's; the other messages are shared."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mavlink_sim.wire.messages import dialect
 
 QUADROTOR, ARDUPILOTMEGA = 2, 3  # MAV_TYPE, MAV_AUTOPILOT
 VERSION = 0x040500FF  # 4.5.0, an official release
-# MAV_PROTOCOL_CAPABILITY of what is here: PARAM_FLOAT, COMMAND_INT, SET_ATTITUDE_TARGET, the two
+# MAV_PROTOCOL_CAPABILITY: PARAM_FLOAT, COMMAND_INT, SET_ATTITUDE_TARGET, the two
 # SET_POSITION_TARGETs, FLIGHT_TERMINATION, MAVLINK2, PARAM_ENCODE_C_CAST.
 CAPABILITIES = 2 | 8 | 64 | 128 | 256 | 2048 | 8192 | 131072
 # gyros, accelerometers, compass, barometer, GPS, attitude, yaw, height and position control, motors, AHRS
@@ -47,7 +47,7 @@ def _sys_status(vehicle: CopterContext) -> Any:
 
 
 def _home_position(vehicle: CopterContext) -> Any:
-    """Its local position counts from the EKF's origin; its attitude is not known."""
+    """HOME_POSITION; its local position is relative to the EKF's origin, its attitude is unknown."""
     if not vehicle.copter.sensors_ready:
         return None
     latitude, longitude, altitude = vehicle.local_frame.geographic(vehicle.copter.home.position)
@@ -63,7 +63,7 @@ def _home_position(vehicle: CopterContext) -> Any:
 
 
 def _position_target_local_ned(vehicle: CopterContext) -> Any:
-    """In GUIDED alone, with what was asked for; nothing while an attitude is flown."""
+    """The target of GUIDED; None in other modes and while an attitude is controlled."""
     guided = vehicle.copter.guided
     target = None if guided is None else guided.target
     if target is None:
