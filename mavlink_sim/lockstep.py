@@ -361,9 +361,9 @@ class LockstepVehicle:
     def set_velocity(self, north_mps: float, east_mps: float, down_mps: float, yaw_rad: float = NAN) -> None:
         """Set a velocity over ground, local NED, metres per second.
 
-        SET_POSITION_TARGET_LOCAL_NED is sent SETPOINT_RATE_HZ times a second while time advances, in OFFBOARD
-        (ArduPilot: GUIDED), until another of these three is called. The first call advances 0.1 s before it
-        requests the mode. A vehicle on the ground has to take off first.
+        SET_POSITION_TARGET_LOCAL_NED is sent SETPOINT_RATE_HZ times per second while time advances, in
+        OFFBOARD (ArduPilot: GUIDED), until another of these three is called. The first call advances 0.1 s
+        before it requests the mode. A vehicle on the ground has to take off first.
 
         Args:
             yaw_rad: heading, clockwise from north; without one it is unchanged.

@@ -252,7 +252,7 @@ class Autopilot:
         return refused
 
     def report_unavailable(self, mode: Mode) -> None:
-        """Report a refused mode, at most once a second as PX4 does."""
+        """Report a refused mode, at most once per second as PX4 does."""
         if self.now_s - self._refusal_sent_s > REFUSALS_APART_S:
             self._refusal_sent_s = self.now_s
             self._send_text(CRITICAL, f"Switching to {mode.title} is currently not available\t")

@@ -1,6 +1,6 @@
 """Scene files: TOML in, a checked `Scene` out. `docs/scenes.md` describes every key.
 
-Angles in the file are degrees, compass-wise from north; places are [north, east, down] in metres, where
+Angles in the file are degrees, clockwise from north; positions are [north, east, down] in metres, where
 `down` is negative above the ground and may be left out.
 """
 
@@ -38,7 +38,7 @@ from vision.camera_model import CameraModel, CameraMount
 
 
 class SceneError(ValueError):
-    """A scene file cannot be used; the text names the file and, a line each, what is wrong in it."""
+    """A scene file cannot be used; the text names the file and, one per line, its problems."""
 
 
 class _Table(BaseModel):
@@ -198,7 +198,7 @@ class _File(_Table):
 
 
 def example_scenes() -> tuple[str, ...]:
-    """Names of the scenes that come with the package; `load_scene` takes them in place of a file."""
+    """Names of the scenes in the package; `load_scene` accepts them instead of a file."""
     folder = resources.files("mavlink_sim") / "scenes"
     return tuple(
         sorted(item.name.removesuffix(".toml") for item in folder.iterdir() if item.name.endswith(".toml"))
@@ -209,7 +209,7 @@ def load_scene(file: str | FilePath) -> Scene:
     """The scene of a file, or one of `example_scenes` by its name.
 
     Raises:
-        SceneError: there is no such file, it is not TOML, or what it says cannot be; every problem is named.
+        SceneError: there is no such file, it is not TOML, or it has invalid values; every problem is named.
     """
     path = FilePath(file)
     if str(file) in example_scenes():
@@ -222,7 +222,7 @@ def load_scene(file: str | FilePath) -> Scene:
     except OSError as error:
         known = ", ".join(example_scenes())
         raise SceneError(
-            f"cannot read the scene file {path}: {error.strerror}; scenes that need no file are: {known}"
+            f"cannot read the scene file {path}: {error.strerror}; scenes in the package: {known}"
         ) from error
     return parse_scene(text, str(path))
 
@@ -233,7 +233,7 @@ def scene_or_demo(file: str | FilePath | None, seed: int) -> Scene:
 
 
 def parse_scene(text: str, origin: str = "scene") -> Scene:
-    """The scene that a text describes; `origin` names it in messages. Raises SceneError."""
+    """The scene of a text; `origin` names it in messages. Raises SceneError."""
     try:
         content = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -247,7 +247,7 @@ def parse_scene(text: str, origin: str = "scene") -> Scene:
 
 
 class _Builder:
-    """Makes the plain values out of a checked file, and names the key for what only they can check."""
+    """Builds the values of a checked file, and adds the key to their errors."""
 
     def __init__(self, origin: str) -> None:
         self._origin = origin
@@ -406,7 +406,7 @@ def _position(values: list[float]) -> Vector:
 
 
 def _explained(details: ErrorDetails) -> str:
-    """One problem in words: the key, what was expected, what was found."""
+    """The text of one problem: the key, what was expected, what was found."""
     key = ""
     for part in details["loc"]:
         key += f"[{part}]" if isinstance(part, int) else f".{part}" if key else str(part)
@@ -425,7 +425,7 @@ def _explained(details: ErrorDetails) -> str:
 
 
 def _keys_at(location: tuple[int | str, ...]) -> list[str]:
-    """The keys that the table at a place in the file may have."""
+    """The allowed keys of a table of the file."""
     table: Any = _File
     for part in location:
         if isinstance(part, str):

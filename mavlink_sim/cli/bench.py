@@ -204,10 +204,10 @@ def bench(
         f"{100 * share / vehicles:.1f} % a vehicle"
     )
     drawn = measure_camera()
-    print(f"camera, 640x480, colour and depth:     {drawn.plain:6.0f} frames a second")
-    print(f"camera, the same through a lens:       {drawn.distorted:6.0f} frames a second")
-    print(f"camera, scene village:                 {drawn.busy:6.0f} frames a second")
-    print(f"camera, a fleet of 20 in view:         {drawn.crowded:6.0f} frames a second")
+    print(f"camera, 640x480, colour and depth:     {drawn.plain:6.0f} frames per second")
+    print(f"camera, the same through a lens:       {drawn.distorted:6.0f} frames per second")
+    print(f"camera, scene village:                 {drawn.busy:6.0f} frames per second")
+    print(f"camera, a fleet of 20 in view:         {drawn.crowded:6.0f} frames per second")
 
 
 if __name__ == "__main__":

@@ -37,7 +37,7 @@ from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.announcements import CRITICAL, INFO, Text
 
 FENCE_PERIOD_S = 0.2  # GEOFENCE_CHECK_INTERVAL_US
-REACHED_REPETITIONS = 10  # MISSION_ITEM_REACHED is repeated this often, once a second
+REACHED_REPETITIONS = 10  # MISSION_ITEM_REACHED is repeated this often, once per second
 REACHED_PERIOD_S = 1.0
 ACTIVE, SUSPENDED = 1, 2  # MISSION_CURRENT.mission_mode
 _MISSION_MODES = frozenset({Mode.MISSION, Mode.TAKEOFF, Mode.LAND})

@@ -1,7 +1,7 @@
-"""The surface of an object as polygons: its nearest point, what a ray meets, where a level cuts it.
+"""The surface of an object as polygons: nearest point, ray intersection, horizontal section.
 
-In the shape's own frame: x forward, y right, z down, metres before the object's scale. The polygons are those
-that are drawn, without what is painted on them, so that what is seen is what is run into and measured.
+In the shape's frame: x forward, y right, z down, metres before the object's scale. The polygons are those
+that are rendered, without decals, so that rendering, collisions and ranges agree.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from mavlink_sim.world.shapes import Shape, shape_of, variant_of
 from mavlink_sim.world.solids import Points, Triple
 from mavlink_sim.world.world import WorldObject
 
-# Where the ray of `contains` goes: not along anything that is built at right angles.
+# The direction of the ray of `contains`: not along any rectangular edge.
 _ASKEW = np.array([0.5413, 0.3127, 0.7805]) / math.sqrt(0.5413**2 + 0.3127**2 + 0.7805**2)
 _PARALLEL = 1e-12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mesh:
-    """Flat convex polygons, looking outwards. Edges are in order, all of one face after those of another.
+    """Flat convex polygons, with outward normals. Edges are in order, face by face.
 
     Attributes:
         first: (F,) the first edge of each face.
         normals, offsets: (F, 3), (F,) the faces' planes: normal · p = offset.
         face_of: (E,) each edge's face.
         starts, ends: (E, 3) of each edge.
-        spans: (E, 3) from start to end; inverse_lengths: (E,) 1 / |way|².
+        spans: (E, 3) from start to end; inverse_lengths: (E,) 1 / |span|².
         inwards: (E, 3) in the face's plane, at right angles to the edge, into the face.
     """
 
@@ -48,7 +48,7 @@ class Mesh:
     inwards: Points
 
     def nearest(self, point: Points) -> tuple[Points, float]:
-        """The nearest point (3,) of the surface, and how far it is."""
+        """The nearest point (3,) of the surface, and its distance."""
         to = point - self.starts
         share = np.clip(np.einsum("ij,ij->i", to, self.spans) * self.inverse_lengths, 0.0, 1.0)
         away = to - share[:, None] * self.spans
@@ -64,13 +64,13 @@ class Mesh:
         return point - away[edge], math.sqrt(best)
 
     def contains(self, point: Points) -> bool:
-        """Whether a point is inside one of the closed solids that it is put together from."""
+        """Whether a point is inside one of its closed solids."""
         crossed, facing, _ = self._crossings(point, _ASKEW)
-        # out of a solid counts one, into one takes one away; the two sides of a sheet cancel each other
+        # leaving a solid adds one, entering one subtracts one; the two sides of a sheet cancel
         return float(np.sign(facing[crossed]).sum()) > 0.5
 
     def along(self, origin: Points, direction: Points) -> float:
-        """How many lengths of `direction` (3,) from a point to the first surface in that way; inf: none."""
+        """The distance, in lengths of `direction` (3,), from a point to the first surface; inf: none."""
         crossed, _, lengths = self._crossings(origin, direction)
         return float(lengths[crossed].min()) if crossed.any() else math.inf
 
@@ -107,7 +107,7 @@ def _faces(shape: Shape) -> list[Points]:
     found = []
     for faces, (begin, end) in zip(shape.faces_of, pairwise(shape.solid_first), strict=True):
         left = end - begin
-        for face in faces:  # decals come last
+        for face in faces:  # decals are last
             if left == 0:
                 break
             points = shape.corners[shape.first[face] : shape.first[face + 1]]

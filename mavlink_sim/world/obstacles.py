@@ -1,6 +1,6 @@
-"""A world's objects as things that are in the way: how near the next one is, what a ray or a scan meets.
+"""A world's objects as obstacles: distance to the nearest one, ray and scan ranges.
 
-What moves is where its path has led it at the time asked for. Everything is NED metres in the world's frame.
+Moving objects are at their position of the given time. Everything is NED metres in the world frame.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from mavlink_sim.world.shapes import variant_of
 from mavlink_sim.world.world import Vector, WorldObject
 
 FLAT_M = 0.05
-"""What reaches less far above the ground is painted on it or lies flat: nobody runs into it."""
+"""Objects lower than this are flat on the ground and no obstacles."""
 _NEAR_M = 0.05
 _VELOCITY_STEP_S = 0.01
 _STILL: Vector = (0.0, 0.0, 0.0)
@@ -29,11 +29,11 @@ Segment = tuple[tuple[float, float], tuple[float, float]]
 
 
 class ObstacleMotion(Protocol):
-    """What leads an object along; `camera.scene.Path` is one."""
+    """The motion of an object; `camera.scene.Path` is one."""
 
     @property
     def speed_mps(self) -> float:
-        """How fast."""
+        """Speed along the path."""
 
     def pose_at(self, time_s: float) -> tuple[Vector, float]:
         """(position NED in metres, yaw in radians) at a time."""
@@ -41,13 +41,13 @@ class ObstacleMotion(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """What is between a body and the obstacle next to it.
+    """The gap between a body and the nearest obstacle.
 
     Attributes:
-        obstacle: that one; None: there is no other.
-        clear_m: so far at least the body may go in any direction without touching it; 0 or less: it touches.
-        normal_ned: unit vector out of the obstacle, where it touches.
-        push_ned_m: the way out of it. Both are nothing unless it touches.
+        obstacle: the nearest one; None: there is none.
+        clear_m: the body can move at least this far in any direction without contact; 0 or less: contact.
+        normal_ned: unit vector out of the obstacle, at the contact.
+        push_ned_m: the displacement out of it. Both are zero without contact.
     """
 
     obstacle: Obstacle | None
@@ -57,7 +57,7 @@ class Gap:
 
 
 class Obstacle:
-    """One object in the way.
+    """One obstacle.
 
     Attributes:
         identifier: of the object. name: its class and identifier, "wall-2".
@@ -70,7 +70,7 @@ class Obstacle:
         self.identifier = scene_object.identifier
         self.name = f"{scene_object.class_name}-{scene_object.identifier}"
         if scene_object.leans:
-            raise ValueError(f"{self.name} leans: only what stands level can be in a vehicle's way")
+            raise ValueError(f"{self.name} leans: only level objects can be obstacles")
         self.moves = motion is not None
         self._motion = motion
         self._scale = scene_object.scale
@@ -93,13 +93,13 @@ class Obstacle:
         self._cosine, self._sine = math.cos(yaw_rad), math.sin(yaw_rad)
 
     def place(self, time_s: float) -> None:
-        """Let it be where it is at a time."""
+        """Move it to its pose at a time."""
         if self._motion is not None and time_s != self._time_s:
             self._time_s = time_s
             self._put(*self._motion.pose_at(time_s))
 
     def velocity_at(self, time_s: float) -> Vector:
-        """NED m/s; how it turns is not in it."""
+        """NED m/s, without its rotation."""
         if self._motion is None:
             return _STILL
         (ax, ay, az), (bx, by, bz) = (
@@ -108,7 +108,7 @@ class Obstacle:
         return ((bx - ax) / _VELOCITY_STEP_S, (by - ay) / _VELOCITY_STEP_S, (bz - az) / _VELOCITY_STEP_S)
 
     def _own(self, point: Vector) -> Vector:
-        """A point in its own frame, metres."""
+        """A point in its frame, metres."""
         north, east = point[0] - self._position[0], point[1] - self._position[1]
         return (
             self._cosine * north + self._sine * east,
@@ -120,7 +120,7 @@ class Obstacle:
         return self._cosine * x - self._sine * y, self._sine * x + self._cosine * y
 
     def far_m(self, point: Vector) -> float:
-        """No more than the metres from a point to it; holds however it is turned."""
+        """A lower bound of the distance from a point, metres, for any yaw."""
         level = math.hypot(point[0] - self._position[0], point[1] - self._position[1]) - self._reach_m
         z = point[2] - self._position[2]
         upright = max(self._low[2] - z, z - self._high[2], 0.0)
@@ -136,9 +136,9 @@ class Obstacle:
         return math.sqrt(beside * beside + across * across + upright * upright)
 
     def gap(self, centre: Vector, radius_m: float, flatness: float) -> Gap:
-        """Between it and an ellipsoid around a point, `flatness` times wider than high.
+        """The gap to an ellipsoid around a point, `flatness` times wider than high.
 
-        Heights stretched by that much, the ellipsoid is a sphere and the nearest surface is met straight on.
+        With heights stretched by that factor, the ellipsoid is a sphere.
         """
         x, y, z = self._own(centre)
         scale = self._scale
@@ -159,7 +159,7 @@ class Obstacle:
         return Gap(self, -depth / flatness, normal, (north * depth, east * depth, dz * depth / flatness))
 
     def along(self, origin: Vector, direction: Vector) -> float:
-        """Metres from a point along a unit vector to it, inf if it is not in that way."""
+        """Metres from a point along a unit vector to it, inf without a hit."""
         start = self._own(origin)
         north, east = direction[0], direction[1]
         direction = (
@@ -180,7 +180,7 @@ class Obstacle:
         return self._mesh.along(np.array(start) / self._scale, np.array(direction)) * self._scale
 
     def outline(self, origin: Vector) -> NDArray[np.float64]:
-        """(S, 2, 2) segments in which the level of a point cuts it, (north, east) metres from the point."""
+        """(S, 2, 2) segments of its section at a point's height, (north, east) metres from the point."""
         z = (origin[2] - self._position[2]) / self._scale
         own = self._mesh.cut(z) * self._scale
         turn = np.array([[self._cosine, self._sine], [-self._sine, self._cosine]])
@@ -190,15 +190,15 @@ class Obstacle:
 
 
 class Obstacles:
-    """All that is in the way.
+    """All obstacles of a world.
 
     Args:
-        objects: the world's objects at time 0. What is flat on the ground is left out.
-        motions: what leads them, by the object's identifier.
-        radius_m, half_height_m: of the ellipsoid that stands for a body in `nearest`.
+        objects: the world's objects at time 0. Those flat on the ground are left out.
+        motions: those of moving objects, by identifier.
+        radius_m, half_height_m: of the ellipsoid of a body in `nearest`.
 
     Attributes:
-        top_speed_mps: nothing moves faster.
+        top_speed_mps: of the fastest obstacle.
     """
 
     def __init__(
@@ -225,7 +225,7 @@ class Obstacles:
         return self._all
 
     def nearest(self, centre: Vector, time_s: float, besides: Collection[Obstacle] = ()) -> Gap:
-        """What the body around a point comes nearest to, `besides` some that are known."""
+        """The smallest gap of the body around a point, except to the obstacles in `besides`."""
         found = Gap(None)
         for one in self._placed(time_s):
             if one in besides:
@@ -245,10 +245,10 @@ class Obstacles:
         return found
 
     def gap_to(self, one: Obstacle, centre: Vector) -> Gap:
-        """The gap between one obstacle, where it is now, and the body around a point."""
+        """The gap between one obstacle, at its current pose, and the body around a point."""
         box_m = one.box_m(centre) - self.radius_m
         if box_m > _NEAR_M:
-            return Gap(one, _NEAR_M)  # no more: at the next corner of its way it may turn
+            return Gap(one, _NEAR_M)  # not more: at the next corner of its path it may turn
         return one.gap(centre, self.radius_m, self._flatness)
 
     def range_along(self, origin: Vector, direction: Vector, time_s: float) -> float:
@@ -263,10 +263,11 @@ class Obstacles:
         time_s: float,
         beside: Sequence[Segment] = (),
     ) -> list[float]:
-        """Metres to the nearest thing at a point's height, in each of `sectors.SECTORS`; inf: out of range.
+        """Metres to the nearest obstacle at a point's height, in each of `sectors.SECTORS`; inf: out of
+        range.
 
-        The first sector lies around `yaw_rad`, the others follow clockwise. `beside`: what else is in the way
-        at that height, from the point.
+        The first sector is centred on `yaw_rad`, the others follow clockwise. `beside`: further segments at
+        that height, from the point.
         """
         cuts = [one.outline(origin) for one in self._placed(time_s) if one.far_m(origin) <= range_m]
         if beside:

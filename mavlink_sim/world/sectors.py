@@ -1,4 +1,4 @@
-"""The nearest of many level segments in each direction, exactly: no thin thing falls between two beams."""
+"""The exact range to horizontal segments in each sector: no thin object is missed between two beams."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ def nearest_in_sectors(segments: NDArray[np.float64]) -> NDArray[np.float64]:
     """(72,) metres to the nearest point of any segment within each sector of 5°, inf where there is none.
 
     Args:
-        segments: (S, 2, 2) ends of each, metres forward and to the right of who looks. Sector 0 is centred
-            on the way ahead, the others follow clockwise (seen from above).
+        segments: (S, 2, 2) ends of each, metres forward and to the right of the sensor. Sector 0 is centred
+            ahead, the others follow clockwise (seen from above).
 
-    Within a sector a segment is nearest at its foot or an end, if they lie in it, or else on a border.
+    Within a sector the nearest point of a segment is its foot or an end, if in the sector, or on a border.
     """
     starts, ends = segments[:, 0], segments[:, 1]
     spans = ends - starts
@@ -32,7 +32,7 @@ def nearest_in_sectors(segments: NDArray[np.float64]) -> NDArray[np.float64]:
     bearings = np.arctan2(points[:, 1], points[:, 0])
     sectors = np.floor(bearings / SECTOR_RAD + 0.5).astype(np.intp) % SECTORS
     np.minimum.at(found, sectors, np.hypot(points[:, 0], points[:, 1]))
-    # where each border (rows) meets each segment (columns): border · distance = start + share · way
+    # where each border (rows) meets each segment (columns): border · distance = start + share · span
     across = _BORDERS[:, :1] * spans[:, 1] - _BORDERS[:, 1:] * spans[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = (starts[:, 0] * spans[:, 1] - starts[:, 1] * spans[:, 0]) / across

@@ -128,7 +128,7 @@ def test_a_folder_with_something_in_it_is_left_alone(tmp_path: Path) -> None:
 
 def test_a_scene_with_no_place_to_look_from_is_refused(tmp_path: Path) -> None:
     full = World((WorldObject(0, "box", (0.0, 0.0, 0.0), size_m=(400.0, 400.0, 50.0)),))
-    with pytest.raises(DatasetError, match="found no place between"):
+    with pytest.raises(DatasetError, match="found no viewpoint"):
         make_dataset(tmp_path / "set", Scene(full), DatasetOptions(1, classes=("box",)))
 
 

@@ -60,7 +60,7 @@ def test_values_may_be_given_in_python(harness: SimHarness) -> None:
 
 @pytest.mark.parametrize(
     ("line", "said"),
-    [("link_loss link=usb", "there are: all, onboard, gcs"), ("wind 3 at=0.5", "at=0.5 is over")],
+    [("link_loss link=usb", "usb"), ("wind 3 at=0.5", "at=0.5")],
 )
 def test_a_fault_that_cannot_begin_is_refused_at_once(harness: SimHarness, line: str, said: str) -> None:
     harness.fly(1.0)

@@ -124,7 +124,7 @@ def test_an_empty_file_is_an_empty_field_with_the_usual_camera() -> None:
         ("[[objects]]\nclass = 'car'\nplace_m = [1, 2]\nsize_m = [1, 1, 1]", r"objects\[0\]: .*own size"),
         (
             "[[objects]]\nclass = 'car'\npath = { waypoints_m = [[0, 0], [0, 0]], speed_mps = 1 }",
-            r"objects\[0\]: a path's waypoints all lie in one place",
+            r"objects\[0\]: a path's waypoints",
         ),
         (
             "[[objects]]\nclass = 'car'\npath = { waypoints_m = [[0, 0], [0, 1]], speed_mps = 0 }",
@@ -219,5 +219,5 @@ def test_a_path_looks_where_it_goes_and_turns_round_on_its_way_back() -> None:
 
 def test_a_path_for_nobody_is_refused() -> None:
     world = World((WorldObject(0, "car", (1.0, 2.0, 0.0)),))
-    with pytest.raises(ValueError, match=r"paths for objects that the scene has not: \[4\]"):
+    with pytest.raises(ValueError, match=r"paths for objects .*\[4\]"):
         Scene(world, {4: Path(((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), 1.0)})
