@@ -186,5 +186,5 @@ def _runs(pid: int) -> bool:
 
 
 def test_a_rate_that_cannot_be_is_refused() -> None:
-    with pytest.raises(ValueError, match="rate must be positive"):
+    with pytest.raises(ValueError, match="rate"):
         CameraProcess(WORLD, rate_hz=0.0)

@@ -47,7 +47,7 @@ def test_faults_are_ended_by_number_by_name_and_all_together(harness: SimHarness
     assert faults.end() == 2
     assert faults.end("all") == 0
     assert faults.listing() == ["no faults"]
-    with pytest.raises(FaultError, match="no fault 1 to end"):
+    with pytest.raises(FaultError, match="fault 1"):
         faults.end(1)
 
 

@@ -107,9 +107,9 @@ def test_faults_come_from_the_command_line_and_the_console_over_real_sockets() -
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--fault", "link_dely 1"], "did you mean link_delay"),
-        (["--fault", "link_loss link=usb"], "there are: all, onboard, gcs"),
-        (["--control", "nonsense"], "--control nonsense: zenoh cannot listen there"),
+        (["--fault", "link_dely 1"], "link_delay"),
+        (["--fault", "link_loss link=usb"], "all, onboard, gcs"),
+        (["--control", "nonsense"], "--control nonsense"),
     ],
 )
 def test_what_cannot_be_is_said_in_one_line(arguments: list[str], said: str) -> None:

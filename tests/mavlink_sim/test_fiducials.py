@@ -114,9 +114,9 @@ def test_the_white_margin_is_one_cell_wide() -> None:
 @pytest.mark.parametrize(
     ("dictionary", "identifier", "size", "says"),
     [
-        ("4X4_51", 0, 0.5, "unknown marker dictionary '4X4_51'; known are .*4X4_50"),
-        ("4X4_50", 50, 0.5, "marker 50 is not in dictionary 4X4_50, which has 0 to 49"),
-        ("4X4_50", 0, 0.0, "size must be 0.01 to 50 m"),
+        ("4X4_51", 0, 0.5, "4X4_51.*4X4_50"),
+        ("4X4_50", 50, 0.5, "50.*4X4_50.*0 to 49"),
+        ("4X4_50", 0, 0.0, "0.01 to 50 m"),
     ],
 )
 def test_a_print_that_cannot_be_is_refused(dictionary: str, identifier: int, size: float, says: str) -> None:
@@ -127,9 +127,9 @@ def test_a_print_that_cannot_be_is_refused(dictionary: str, identifier: int, siz
 def test_only_plates_have_prints_and_only_structures_a_size() -> None:
     with pytest.raises(ValueError, match="plate"):
         WorldObject(0, "plate", (0.0, 0.0, 0.0))
-    with pytest.raises(ValueError, match="a car has its own size"):
+    with pytest.raises(ValueError, match="car"):
         WorldObject(0, "car", (0.0, 0.0, 0.0), size_m=(1.0, 1.0, 1.0))
-    with pytest.raises(ValueError, match="size must be three lengths"):
+    with pytest.raises(ValueError, match="size"):
         WorldObject(0, "wall", (0.0, 0.0, 0.0), size_m=(1.0, 0.0, 1.0))
 
 

@@ -205,7 +205,7 @@ def test_shared_poses_are_those_of_their_number_or_none() -> None:
     assert shared.read(first) == tuple(many(2))
     assert shared.write([]) == first
     assert shared.read(first) == ()
-    with pytest.raises(ValueError, match="250 other aircraft: this camera was made for 249"):
+    with pytest.raises(ValueError, match="250.*249"):
         shared.write(many(250))
 
 
@@ -285,7 +285,7 @@ def depth_within(frame: Frame, xyxy: list[float]) -> float:
 def test_a_camera_made_for_one_vehicle_refuses_others(name: str) -> None:
     camera = CameraProcess(SCENE, shared_name=name)
     try:
-        with pytest.raises(ValueError, match="1 other aircraft: this camera was made for none"):
+        with pytest.raises(ValueError, match="1 other aircraft"):
             camera.send_pose(EYE, (1.0, 0.0, 0.0, 0.0), 1, others=[AHEAD])
     finally:
         camera.stop()

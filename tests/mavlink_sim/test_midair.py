@@ -185,14 +185,14 @@ def test_in_one_place_two_cannot_begin() -> None:
     fleet_world = FleetWorld(3)
     first = LockstepVehicle({"onboard": {}}).vehicle
     fleet_world.join(first)
-    with pytest.raises(ValueError, match="vehicle 1 has joined already"):
+    with pytest.raises(ValueError, match="vehicle 1"):
         fleet_world.join(first)
     near = LockstepVehicle({"onboard": {}}, system_id=2, start_ned_m=(0.0, 0.5)).vehicle
-    with pytest.raises(ValueError, match=r"vehicle 2 is 0.5 m beside vehicle 1: they need 0.6 m"):
+    with pytest.raises(ValueError, match=r"vehicle 2 .*0\.5 m.*vehicle 1.*0\.6 m"):
         fleet_world.join(near)
     fleet_world.join(LockstepVehicle({"onboard": {}}, system_id=3, start_ned_m=(0.0, 0.6)).vehicle)
     fleet_world.join(LockstepVehicle({"onboard": {}}, system_id=4, start_ned_m=(0.0, 1.2)).vehicle)
-    with pytest.raises(ValueError, match="vehicle 5: this fleet_world is of 3"):
+    with pytest.raises(ValueError, match="vehicle 5.*3"):
         fleet_world.join(LockstepVehicle({"onboard": {}}, system_id=5, start_ned_m=(9.0, 0.0)).vehicle)
 
 

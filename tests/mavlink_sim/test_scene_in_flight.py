@@ -102,8 +102,8 @@ def test_a_scene_that_cannot_be_is_explained_in_one_line_and_nothing_starts(tmp_
     scene.write_text("[camera]\nwidth = 'wide'\n", "utf-8")
     command = [sys.executable, "-m", "mavlink_sim", "--onboard-bind", "0", "--gcs-bind", "0"]
     for arguments, says in (
-        (["--scene", str(scene), "--camera", "unborn"], "camera.width: must be a valid integer, got 'wide'"),
-        (["--camera-output", "gopher://x"], "expected one of shm://NAME"),
+        (["--scene", str(scene), "--camera", "unborn"], "camera.width"),
+        (["--camera-output", "gopher://x"], "shm://NAME"),
     ):
         made = subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=DEADLINE_S)
         assert made.returncode == 2

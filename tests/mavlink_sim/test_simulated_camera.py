@@ -141,9 +141,9 @@ def test_motion_is_what_lies_between_two_poses() -> None:
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"loss": 1.0}, "frames lost must be 0 to below 1"),
-        ({"latency_s": -1.0}, "latency must be 0 to 5 s"),
-        ({"rate_hz": 0.0}, "rate must be positive"),
+        ({"loss": 1.0}, "frames lost"),
+        ({"latency_s": -1.0}, "0 to 5 s"),
+        ({"rate_hz": 0.0}, "rate"),
     ],
 )
 def test_a_camera_that_cannot_be_is_refused(changes: dict[str, Any], says: str) -> None:

