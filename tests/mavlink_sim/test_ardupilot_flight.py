@@ -49,8 +49,8 @@ def guided(vehicle: LockstepVehicle, mask: int, *values: float, **options: Any) 
     vehicle.send(target(mask, values, **options))
 
 
-def away(vehicle: LockstepVehicle, place: tuple[float, float, float]) -> float:
-    return math.dist(vehicle.truth.position_ned_m, place)
+def away(vehicle: LockstepVehicle, position: tuple[float, float, float]) -> float:
+    return math.dist(vehicle.truth.position_ned_m, position)
 
 
 def test_it_boots_in_stabilize_and_can_be_armed_there(copter: LockstepVehicle) -> None:
@@ -124,10 +124,10 @@ def test_a_position_counts_from_origin_vehicle_or_heading(
         flying.step(3.0)
         assert flying.truth.yaw_rad == pytest.approx(math.pi / 2, abs=0.1)
     north, east, down = flying.truth.position_ned_m
-    place = asked if frame == 1 else (north + 8.0, east + 3.0, down)
+    position = asked if frame == 1 else (north + 8.0, east + 3.0, down)
     guided(flying, POSITION, *asked, frame=frame)
     flying.step(15.0)
-    assert away(flying, place) < 1.0
+    assert away(flying, position) < 1.0
 
 
 def test_a_velocity_that_is_not_renewed_stops_after_guid_timeout_and_the_mode_stays(
@@ -357,7 +357,9 @@ def test_a_pause_stands_still_whatever_targets_come(flying: LockstepVehicle) -> 
 def landing_target(north: float, east: float, vehicle: LockstepVehicle, *, frame: int, valid: int) -> Any:
     """What a camera fixed to the body, looking down, reports of a plate on the ground."""
     truth = vehicle.truth
-    x, y, z = (place - here for place, here in zip((north, east, 0.3), truth.position_ned_m, strict=True))
+    x, y, z = (
+        position - here for position, here in zip((north, east, 0.3), truth.position_ned_m, strict=True)
+    )
     body = product(product(inverse(truth.quaternion), (0.0, x, y, z)), truth.quaternion)[1:]
     angle_x, angle_y = math.atan2(body[1], body[2]), math.atan2(-body[0], body[2])
     return dialect.MAVLink_landing_target_message(
@@ -383,8 +385,8 @@ def test_land_aims_at_a_landing_target_in_its_own_forms(
         assert flying.now_s < 120.0
     missed = math.dist(flying.truth.position_ned_m[:2], (north, east))
     assert (missed < 0.8) is hits, missed  # in gusts that move a held position by 0.3 m
-    told = [text for _, text in texts(flying)]
-    assert told.count("Plnd: Frame not supported ") == (frame == 1)
+    sent_texts = [text for _, text in texts(flying)]
+    assert sent_texts.count("Plnd: Frame not supported ") == (frame == 1)
 
 
 def test_a_pilot_takes_over_in_loiter_and_a_reboot_begins_anew(flying: LockstepVehicle) -> None:
@@ -407,7 +409,7 @@ def calm() -> LockstepVehicle:
 
 @pytest.mark.parametrize(("armed_for_s", "takes_s"), [(4.0, 5.8), (0.0, 8.15)])
 def test_a_take_off_to_five_metres_takes_as_long_as_measured(
-    calm: LockstepVehicle, armed_for_s: float, takes_s: float
+    calm: LockstepVehicle, armed_for_s: float, duration_s: float
 ) -> None:
     calm.set_mode("GUIDED")
     calm.arm()
@@ -415,7 +417,7 @@ def test_a_take_off_to_five_metres_takes_as_long_as_measured(
     asked_s = calm.now_s
     assert calm.command(TAKEOFF, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 5.0) == "ACCEPTED"
     calm.run_until(lambda truth: calm.vehicle.autopilot.landed_state == 2, 15.0)
-    assert calm.now_s - asked_s == pytest.approx(takes_s, abs=0.4)
+    assert calm.now_s - asked_s == pytest.approx(duration_s, abs=0.4)
     calm.step(4.0)
     assert calm.truth.height_m == pytest.approx(5.0, abs=0.1)
 
@@ -461,11 +463,11 @@ def test_a_circle_by_velocities_is_no_wider_than_measured(calm: LockstepVehicle)
 
 
 def test_the_same_seed_is_the_same_flight() -> None:
-    places = []
+    positions = []
     for _ in range(2):
         vehicle = LockstepVehicle(autopilot="ardupilot", seed=9, wind_mps=3.0, ready_after_s=0.0)
         vehicle.take_off(3.0)
         guided(vehicle, VELOCITY, 1.0, 1.0, 0.0)
         vehicle.step(5.0)
-        places.append(vehicle.truth.position_ned_m)
-    assert places[0] == places[1]
+        positions.append(vehicle.truth.position_ned_m)
+    assert positions[0] == positions[1]

@@ -57,9 +57,9 @@ def test_the_heartbeat_is_an_ardupilots_and_follows_a_change_of_mode_at_once(
     copter.receive()
     assert copter.command(176, 1, 4) == "ACCEPTED"
     copter.step(0.02)
-    told = copter.receive()
-    assert [m.custom_mode for m in told if m.get_type() == "HEARTBEAT"] == [4]
-    acknowledged = [m for m in told if m.get_type() == "COMMAND_ACK"]
+    reported = copter.receive()
+    assert [m.custom_mode for m in reported if m.get_type() == "HEARTBEAT"] == [4]
+    acknowledged = [m for m in reported if m.get_type() == "COMMAND_ACK"]
     assert [(m.command, m.result) for m in acknowledged] == [(176, 0)]  # one, and the real one
     copter.command(400, 1)
     copter.step(1.1)
@@ -162,10 +162,10 @@ def test_home_is_where_it_was_armed_and_its_local_place_is_true(copter: Lockstep
 
 @pytest.mark.parametrize("place", [(1.0,), (0.0, 0.0, 0.0, 0.0, 47.3977432, 8.545594, 488.0)])
 def test_a_home_that_was_set_stays_when_it_is_armed_elsewhere(
-    copter: LockstepVehicle, place: tuple[float, ...]
+    copter: LockstepVehicle, position: tuple[float, ...]
 ) -> None:
     """ArduPilot locks it, whether a place was named or "here"."""
-    assert copter.command(179, *place) == "ACCEPTED"
+    assert copter.command(179, *position) == "ACCEPTED"
     copter.vehicle.airframe.position = (4.0, 0.0, 0.0)
     copter.step(0.1)
     assert copter.command(400, 1) == "ACCEPTED"
@@ -184,9 +184,9 @@ def test_missions_are_refused(copter: LockstepVehicle) -> None:
     copter.send(dialect.MAVLink_mission_count_message(1, 1, 3))
     copter.send(dialect.MAVLink_mission_request_list_message(1, 1))
     copter.step(0.02)
-    told = copter.receive()
-    assert [m.type for m in told if m.get_type() == "MISSION_ACK"] == [3]
-    assert [m.count for m in told if m.get_type() == "MISSION_COUNT"] == [0]
+    reported = copter.receive()
+    assert [m.type for m in reported if m.get_type() == "MISSION_ACK"] == [3]
+    assert [m.count for m in reported if m.get_type() == "MISSION_COUNT"] == [0]
 
 
 def test_a_gimbal_and_a_parameter_of_px4s_are_refused_in_words() -> None:

@@ -62,9 +62,9 @@ def test_disarming_in_the_air_is_refused_without_the_magic_number(harness: SimHa
 def test_a_strange_arming_value_is_told_in_words_and_not_answered(harness: SimHarness) -> None:
     harness.heartbeats.append(("gcs", (245, 190), 6))
     harness.wait_ready()
-    for value, told in ((2.0, "2.000"), (-1.4, "-1.400"), (1.5, "1.500")):
+    for value, texts in ((2.0, "2.000"), (-1.4, "-1.400"), (1.5, "1.500")):
         assert harness.command(400, value) == []
-        assert harness.texts()[-1] == f"Unsupported ARM_DISARM param: {told}\t"
+        assert harness.texts()[-1] == f"Unsupported ARM_DISARM param: {texts}\t"
     assert not harness.armed
 
 

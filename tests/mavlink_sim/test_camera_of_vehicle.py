@@ -142,11 +142,11 @@ def test_two_autopilots_on_one_port_are_refused_by_their_ids(name: str) -> None:
             time.sleep(0.05)
     finally:
         process.kill()
-        _, said = process.communicate()
+        _, events = process.communicate()
         for end in ends:
             end.close()
     assert process.returncode == 2
-    (line,) = said.splitlines()
+    (line,) = events.splitlines()
     assert "4 and 9" in line
 
 
@@ -194,13 +194,13 @@ def test_listen_only_sends_nothing() -> None:
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 def test_frames_are_drawn_from_another_autopilots_pose(name: str, tmp_path: Path, autopilot: str) -> None:
     """Where each frame's eye is, against the simulator's own truth at the frame's stamp; then a lost pose."""
-    seen, flown = tmp_path / "seen.jsonl", tmp_path / "flown.jsonl"
+    seen, flight = tmp_path / "seen.jsonl", tmp_path / "flown.jsonl"
     with running_simulator(
         truth=tmp_path / "truth.jsonl", autopilot=autopilot, noise="off", gusts=0.0
     ) as sim:
         command = [sys.executable, "-m", "mavlink_sim", "camera", "--camera", name, "--camera-rate", "10"]
         command += ["--vehicle-url", f"udpin://127.0.0.1:{sim.gcs_port}", "--origin", "0,0,0"]
-        command += ["--camera-truth", str(seen), "--truth", str(flown)]
+        command += ["--camera-truth", str(seen), "--truth", str(flight)]
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         try:
             assert process.stdout is not None
@@ -218,13 +218,13 @@ def test_frames_are_drawn_from_another_autopilots_pose(name: str, tmp_path: Path
                     time.sleep(0.02)
             os.kill(sim.pid, signal.SIGSTOP)
             try:
-                _, said = process.communicate(timeout=DEADLINE_S)
+                _, events = process.communicate(timeout=DEADLINE_S)
             finally:
                 os.kill(sim.pid, signal.SIGCONT)
         finally:
             process.kill()
     assert process.returncode == 1
-    assert f"stopped {POSE_LOST_S:g} s ago" in said.splitlines()[-1]
+    assert f"stopped {POSE_LOST_S:g} s ago" in events.splitlines()[-1]
     assert not segment_path(name).exists()
     true = [json.loads(line) for line in (tmp_path / "truth.jsonl").read_text().splitlines()]
     for line in seen.read_text().splitlines():
@@ -236,7 +236,7 @@ def test_frames_are_drawn_from_another_autopilots_pose(name: str, tmp_path: Path
         eye = (north + 0.12 * math.cos(yaw_rad), east + 0.12 * math.sin(yaw_rad), min(down, LOWEST_EYE_M))
         assert math.dist(captured["camera_ned_m"], eye) < 0.05
     assert {"stamp_ns", "position_ned_m", "velocity_ned_mps", "yaw_rad", "armed", "objects"} == set(
-        json.loads(flown.read_text().splitlines()[0])
+        json.loads(flight.read_text().splitlines()[0])
     )
 
 
@@ -247,6 +247,6 @@ def test_help_names_the_further_commands(
     with pytest.raises(SystemExit) as ended:
         main()
     assert ended.value.code == 0
-    said = " ".join(capsys.readouterr().out.split())
+    events = " ".join(capsys.readouterr().out.split())
     for command in ("mavlink-sim camera", "mavlink-sim dataset", "mavlink-sim bench"):
-        assert command in said
+        assert command in events

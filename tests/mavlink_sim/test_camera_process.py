@@ -60,13 +60,13 @@ def first_frame(camera: CameraProcess, position: tuple[float, float, float], yaw
     got: list[Frame] = []
     with SharedFrameReader(name) as reader:
 
-        def look() -> bool:
+        def attitude() -> bool:
             frame = reader.latest()
             if frame is not None and frame.captured_ns == stamp_ns:
                 got.append(frame)
             return bool(got)
 
-        until(look, "a frame of the pose sent")
+        until(attitude, "a frame of the pose sent")
     return got[0]
 
 

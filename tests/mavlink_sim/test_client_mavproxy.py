@@ -35,7 +35,7 @@ class Console:
     """A running MAVProxy: type a line, wait for words."""
 
     def __init__(self, device: str, folder: Path) -> None:
-        self.said: list[str] = []
+        self.output: list[str] = []
         self._changed = threading.Condition()
         self.process = subprocess.Popen(
             [
@@ -56,13 +56,13 @@ class Console:
         assert self.process.stdout is not None
         for line in self.process.stdout:
             with self._changed:
-                self.said.append(line.rstrip("\n"))
+                self.output.append(line.rstrip("\n"))
                 self._changed.notify_all()
 
     def type(self, line: str) -> int:
         """Returns how many lines had been said before."""
         assert self.process.stdin is not None
-        before = len(self.said)
+        before = len(self.output)
         self.process.stdin.write(line + "\n")
         self.process.stdin.flush()
         return before
@@ -71,12 +71,12 @@ class Console:
         """The first line, from `since` on, in which the pattern is found."""
 
         def found() -> re.Match[str] | None:
-            return next((hit for line in self.said[since:] if (hit := re.search(pattern, line))), None)
+            return next((hit for line in self.output[since:] if (hit := re.search(pattern, line))), None)
 
         with self._changed:
             self._changed.wait_for(lambda: found() is not None, limit_s)
         hit = found()
-        assert hit is not None, f"no {pattern!r} in {self.said[since:]}"
+        assert hit is not None, f"no {pattern!r} in {self.output[since:]}"
         return hit
 
     def ask(self, line: str, pattern: str, limit_s: float = 10.0) -> re.Match[str]:

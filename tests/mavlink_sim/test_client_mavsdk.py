@@ -107,7 +107,7 @@ async def test_it_flies_by_action_and_by_offboard(simulator: RunningSimulator, s
     )
 
     await action.goto_location(47.3978, 8.5455942, 494.4, 0.0)
-    await wait_for(telemetry.subscribe_position(), lambda place: place.latitude_deg > 47.39777)
+    await wait_for(telemetry.subscribe_position(), lambda position: position.latitude_deg > 47.39777)
     await action.return_to_launch()
     await asyncio.to_thread(simulator.wait_for_event, "mode RTL")
     await action.land()

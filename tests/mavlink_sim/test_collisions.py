@@ -44,14 +44,14 @@ def velocity(north: float, east: float = 0.0, down: float = 0.0) -> Any:
     )
 
 
-def place(north: float, east: float, down: float) -> Any:
+def position(north: float, east: float, down: float) -> Any:
     return dialect.MAVLink_set_position_target_local_ned_message(
         0, 1, 1, 1, 3576, north, east, down, 0, 0, 0, 0, 0, 0, 0, 0
     )
 
 
-def flying(*things: WorldObject, height_m: float = 2.0, **options: Any) -> LockstepVehicle:
-    vehicle = LockstepVehicle({"onboard": {}}, **{"scene": World(things), "gusts_mps": 0.0, **options})
+def flying(*objects: WorldObject, height_m: float = 2.0, **options: Any) -> LockstepVehicle:
+    vehicle = LockstepVehicle({"onboard": {}}, **{"scene": World(objects), "gusts_mps": 0.0, **options})
     vehicle.take_off(height_m)
     return vehicle
 
@@ -66,11 +66,11 @@ def steer(vehicle: LockstepVehicle, setpoint: Any, seconds: float) -> None:
 
 
 def airframe(
-    *things: WorldObject, paths: dict[int, Path] | None = None, start: tuple[float, float] = (0.0, 0.0)
+    *objects: WorldObject, paths: dict[int, Path] | None = None, start: tuple[float, float] = (0.0, 0.0)
 ) -> tuple[CollidingMultirotor, list[float]]:
     """One among things, without a vehicle, and the scene's clock."""
     clock = [0.0]
-    obstacles = Obstacles(things, paths or {}, RADIUS_M, HALF_HEIGHT_M)
+    obstacles = Obstacles(objects, paths or {}, RADIUS_M, HALF_HEIGHT_M)
     return CollidingMultirotor(0, 0.0, obstacles, start, lambda: clock[0]), clock
 
 
@@ -181,7 +181,7 @@ def test_a_vehicle_that_a_wall_turns_flies_on() -> None:
     vehicle = flying(WALL)
     steer(vehicle, velocity(2.0, 0.6), 6.0)
     assert vehicle.truth.collisions >= 1
-    steer(vehicle, place(0.0, 0.0, -2.0), 8.0)
+    steer(vehicle, position(0.0, 0.0, -2.0), 8.0)
     truth = vehicle.truth
     assert not truth.crashed
     assert math.dist(truth.position_ned_m, (0.0, 0.0, -2.0)) < 0.6
@@ -255,23 +255,23 @@ def test_nobody_leaves_a_walled_yard(
 
 def test_it_lands_on_a_roof_stands_and_takes_off_again() -> None:
     vehicle = flying(BLOCK, height_m=4.0)
-    steer(vehicle, place(4.0, 0.0, -4.0), 7.0)
+    steer(vehicle, position(4.0, 0.0, -4.0), 7.0)
     vehicle.land()
     truth = vehicle.truth
     landing = vehicle.events.index("touched down on box-5")
     assert vehicle.events[landing + 1 : landing + 3] == ["landed", "disarmed (after landing)"]
-    said = len(vehicle.events)
+    events_text = len(vehicle.events)
     assert truth.on_ground
     assert truth.landed
     assert truth.position_ned_m[2] == pytest.approx(-1.5, abs=1e-6)
     vehicle.step(20.0)
     assert vehicle.truth.position_ned_m == truth.position_ned_m
-    assert len(vehicle.events) == said
+    assert len(vehicle.events) == events_text
     vehicle.set_mode("HOLD")
     vehicle.take_off(4.0)
     assert vehicle.events[-4:] == ["armed", "mode TAKEOFF", "takeoff", "mode HOLD"]
     assert vehicle.truth.position_ned_m[2] < -3.0
-    steer(vehicle, place(0.0, 4.0, -4.0), 7.0)
+    steer(vehicle, position(0.0, 4.0, -4.0), 7.0)
     vehicle.land()
     assert vehicle.truth.position_ned_m[2] == 0.0
     assert vehicle.truth.collisions == 1
@@ -285,14 +285,14 @@ def test_a_roof_breaks_it_as_the_ground_does() -> None:
     assert body.on_ground
     assert body.position[2] == pytest.approx(-1.5, abs=1e-6)
     assert body.last_collision is not None
-    told: list[Collision] = []
+    events: list[Collision] = []
     body, clock = airframe(BLOCK)
-    body.on_collision = told.append
+    body.on_collision = events.append
     throw(body, (4.0, 0.0, -1.5 - 0.5), (0.0, 0.0, 0.0))
     let_pass(body, clock, 3.0)
     assert not body.crashed
-    assert str(told[0]).startswith("hit box-5 at 2.")  # a hard landing
-    assert told[0].standing
+    assert str(events[0]).startswith("hit box-5 at 2.")  # a hard landing
+    assert events[0].standing
 
 
 def test_over_the_edge_it_falls() -> None:
@@ -310,14 +310,14 @@ def test_over_the_edge_it_falls() -> None:
 def test_what_comes_along_pushes_and_hits() -> None:
     path = Path(((10.0, 0.0, 0.0), (-5.0, 0.0, 0.0)), 3.0, "once", fixed_yaw_rad=0.0)
     body, clock = airframe(WorldObject(1, "box", (10.0, 0.0, 0.0), size_m=(1, 2, 2)), paths={1: path})
-    told: list[Collision] = []
-    body.on_collision = told.append
+    events: list[Collision] = []
+    body.on_collision = events.append
     let_pass(body, clock, 2.9)
     assert body.position == (0.0, 0.0, 0.0)
-    assert not told
+    assert not events
     let_pass(body, clock, 3.0)
     assert body.position[0] < -5.0
-    assert told[0].speed_mps == pytest.approx(3.0, abs=0.01)
+    assert events[0].speed_mps == pytest.approx(3.0, abs=0.01)
     assert not body.crashed
 
 

@@ -55,9 +55,9 @@ def test_yolo_labels_say_what_the_truth_says(tmp_path: Path) -> None:
     assert len(list((folder / described["val"]).glob("*.jpg"))) == 2
     counted = 0
     for entry in truth_of(folder):
-        picture = cv2.imread(str(folder / entry["image"]))
-        assert picture is not None
-        assert picture.shape == (120, 160, 3)
+        raster = cv2.imread(str(folder / entry["image"]))
+        assert raster is not None
+        assert raster.shape == (120, 160, 3)
         depth = cv2.imread(
             str(folder / entry["image"].replace("images", "depth").replace("jpg", "png")),
             cv2.IMREAD_UNCHANGED,
@@ -92,9 +92,9 @@ def test_coco_files_are_read_by_cocos_own_tools(tmp_path: Path) -> None:
         book = coco.COCO(str(folder / "annotations" / f"instances_{split}.json"))
         assert len(book.getImgIds()) == 3
         for image in book.loadImgs(book.getImgIds()):
-            picture = cv2.imread(str(folder / "images" / split / image["file_name"]))
-            assert picture is not None
-            assert picture.shape[:2] == (image["height"], image["width"]) == (128, 160)
+            raster = cv2.imread(str(folder / "images" / split / image["file_name"]))
+            assert raster is not None
+            assert raster.shape[:2] == (image["height"], image["width"]) == (128, 160)
         for item in book.loadAnns(book.getAnnIds()):
             left, top, width, height = item["bbox"]
             assert left >= 0 <= top
@@ -113,10 +113,10 @@ def test_a_seed_gives_the_same_files_again_whatever_the_count(tmp_path: Path, sc
     make_dataset(tmp_path / "two", scene, options)
     assert files(tmp_path / "one") == files(tmp_path / "two")
     make_dataset(tmp_path / "short", scene, DatasetOptions(1, seed=2, size=(96, 96), validation=0.0))
-    pictures = {name: digest for name, digest in files(tmp_path / "short").items() if name.endswith(".jpg")}
-    assert pictures.items() <= files(tmp_path / "one").items()
+    rasters = {name: digest for name, digest in files(tmp_path / "short").items() if name.endswith(".jpg")}
+    assert rasters.items() <= files(tmp_path / "one").items()
     make_dataset(tmp_path / "other", scene, DatasetOptions(1, seed=3, size=(96, 96), validation=0.0))
-    assert not pictures.items() & files(tmp_path / "other").items()
+    assert not rasters.items() & files(tmp_path / "other").items()
 
 
 def test_a_folder_with_something_in_it_is_left_alone(tmp_path: Path) -> None:
@@ -144,8 +144,8 @@ def test_a_scene_with_no_place_to_look_from_is_refused(tmp_path: Path) -> None:
         ({"seed": -1}, "seed"),
     ],
 )
-def test_options_that_cannot_be_are_refused(changes: dict[str, Any], says: str) -> None:
-    with pytest.raises(DatasetError, match=says):
+def test_options_that_cannot_be_are_refused(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(DatasetError, match=message):
         DatasetOptions(**{"frames": 1, **changes})
 
 

@@ -99,6 +99,6 @@ def test_the_same_draws_give_the_same_depth() -> None:
         ({"dropout": 1.0}, "dropout"),
     ],
 )
-def test_a_sensor_that_cannot_be_is_refused(changes: dict[str, float], says: str) -> None:
-    with pytest.raises(ValueError, match=says):
+def test_a_sensor_that_cannot_be_is_refused(changes: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         DepthSensor(**changes)

@@ -27,9 +27,11 @@ class Machine:
 
     def __init__(self, **values: float) -> None:
         parameters = Parameters({"COM_RC_IN_MODE": 0, "COM_RCL_EXCEPT": 0, **values})
-        self.said: list[Text] = []
+        self.announced: list[Text] = []
         self.impossible: set[Mode] = set()
-        self.machine = FailsafeMachine(parameters, lambda mode: mode not in self.impossible, self.said.append)
+        self.machine = FailsafeMachine(
+            parameters, lambda mode: mode not in self.impossible, self.announced.append
+        )
         self.conditions = Conditions(
             manual_control_lost=False, ground_station_lost=False, offboard_signal_lost=False
         )
@@ -57,7 +59,7 @@ class Machine:
 
     @property
     def texts(self) -> list[str]:
-        return [text.text for text in self.said if text.text]
+        return [text.text for text in self.announced if text.text]
 
 
 def test_losing_the_remote_control_holds_five_seconds_and_then_returns() -> None:
@@ -124,7 +126,7 @@ def test_sticks_take_over_from_a_return_but_not_during_the_hold_before_it() -> N
     assert machine.intended is Mode.POSCTL
     assert machine.machine.user_took_over
     assert not machine.machine.in_failsafe
-    assert [text.event[0] for text in machine.said if text.event][-1] == event_identifier(
+    assert [text.event[0] for text in machine.announced if text.event][-1] == event_identifier(
         "failsafe_rc_override"
     )
 
@@ -360,28 +362,28 @@ def test_a_ground_station_that_never_was_is_not_missed_by_default(harness: SimHa
     ],
 )
 def test_sticks_moved_in_an_auto_mode_take_over(
-    make_harness: type[SimHarness], override: int, taken: bool
+    make_harness: type[SimHarness], override: int, taken_over: bool
 ) -> None:
     harness = flying(make_harness, COM_RC_OVERRIDE=override)
     harness.set_mode(4, 3)
     harness.fly(0.5)
     harness.vehicle.transmitter.sticks = Sticks(roll=0.5)
     harness.fly(0.3)
-    assert harness.mode == ("POSCTL" if taken else "HOLD")
-    assert ("Pilot took over using sticks\t" in harness.texts()) is taken
+    assert harness.mode == ("POSCTL" if taken_over else "HOLD")
+    assert ("Pilot took over using sticks\t" in harness.texts()) is taken_over
 
 
 @pytest.mark.parametrize(
     ("override", "taken"), [pytest.param(3, True, id="offboard too"), pytest.param(1, False, id="auto only")]
 )
 def test_sticks_moved_in_offboard_take_over_if_asked_for(
-    make_harness: type[SimHarness], velocity_setpoint: Any, override: int, taken: bool
+    make_harness: type[SimHarness], velocity_setpoint: Any, override: int, taken_over: bool
 ) -> None:
     harness = flying(make_harness, COM_RC_OVERRIDE=override)
     harness.offboard(velocity_setpoint(0.5, 0, 0))
     harness.vehicle.transmitter.sticks = Sticks(yaw=0.6)
     harness.fly(0.5, velocity_setpoint(0.5, 0, 0))
-    assert harness.mode == ("POSCTL" if taken else "OFFBOARD")
+    assert harness.mode == ("POSCTL" if taken_over else "OFFBOARD")
 
 
 def test_sticks_moved_slowly_do_not_take_over(make_harness: type[SimHarness]) -> None:

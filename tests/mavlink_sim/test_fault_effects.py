@@ -110,11 +110,11 @@ def test_a_second_autopilot_of_the_same_system_gives_every_answer_twice(harness:
     begin(harness, "second_autopilot")
     harness.fly(0.5)
     assert harness.command(ARM, 1) == [0, 0]
-    places = [
+    positions = [
         SIH_FRAME.local(message.lat / 1e7, message.lon / 1e7, 0.0)
         for message in harness.received("GLOBAL_POSITION_INT")
     ]
-    assert {round(east) for _, east, _ in places} == {0, 25}
+    assert {round(east) for _, east, _ in positions} == {0, 25}
 
 
 @pytest.mark.streams("everything")
@@ -174,8 +174,8 @@ def test_offboard_by_position_ends_blind_when_gps_is_lost_and_resumes(
     # PX4 goes on sending positions that stand still
     harness.forget()
     harness.until(lambda: not harness.vehicle.faults.active, 9.0, setpoint)
-    places = {(message.x, message.y) for message in harness.received("LOCAL_POSITION_NED")}
-    assert len(places) == 1
+    positions = {(message.x, message.y) for message in harness.received("LOCAL_POSITION_NED")}
+    assert len(positions) == 1
     harness.until(lambda: harness.mode == "OFFBOARD", 2.0, setpoint)
     assert newest(harness, "ODOMETRY").reset_counter > 0
 
@@ -216,8 +216,8 @@ def test_a_drifting_gps_takes_the_vehicle_along(harness: SimHarness) -> None:
     harness.fly(10.0)
     assert harness.vehicle.estimate.position[0] == pytest.approx(0.0, abs=0.7)
     assert harness.vehicle.airframe.position[0] == pytest.approx(-5.0, abs=0.8)
-    fix, told = newest(harness, "GPS_RAW_INT"), newest(harness, "GLOBAL_POSITION_INT")
-    assert fix.lat == pytest.approx(told.lat, abs=60)
+    fix, reported = newest(harness, "GPS_RAW_INT"), newest(harness, "GLOBAL_POSITION_INT")
+    assert fix.lat == pytest.approx(reported.lat, abs=60)
     assert fix.fix_type == 3
 
 

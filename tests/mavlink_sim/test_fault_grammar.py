@@ -54,10 +54,10 @@ def test_words_may_stand_in_any_order(
         ("gps_loss seed=x", "a whole number"),
     ],
 )
-def test_what_cannot_be_is_refused_in_one_line(text: str, said: str) -> None:
+def test_what_cannot_be_is_refused_in_one_line(text: str, message: str) -> None:
     with pytest.raises(FaultError) as refusal:
         parse_fault(text, KINDS)
-    assert said in str(refusal.value)
+    assert message in str(refusal.value)
     assert "\n" not in str(refusal.value)
 
 

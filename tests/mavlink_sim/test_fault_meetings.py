@@ -295,14 +295,14 @@ def test_a_second_autopilot_stands_beside_the_vehicle_and_moves_nothing_of_it(
     begin(harness, "second_autopilot 9")
     harness.forget()
     harness.fly(1.0)
-    places = {
+    positions = {
         message.get_srcSystem() if hasattr(message, "_system") else 1: SIH_FRAME.local(
             message.lat / 1e7, message.lon / 1e7, 0.0
         )
         for message in harness.received("GLOBAL_POSITION_INT")
     }
-    assert places[1][:2] == pytest.approx((100.0, 200.0), abs=0.05)
-    assert places[9][:2] == pytest.approx((100.0, 225.0), abs=0.5)
+    assert positions[1][:2] == pytest.approx((100.0, 200.0), abs=0.05)
+    assert positions[9][:2] == pytest.approx((100.0, 225.0), abs=0.5)
 
 
 def test_a_second_autopilot_goes_on_while_the_vehicle_stands_still(harness: SimHarness) -> None:
@@ -327,8 +327,8 @@ def test_every_rotor_shows_its_own_command_and_a_dead_one_what_it_is_asked_for(h
     begin(harness, "motor_failure 2")
     harness.forget()
     harness.fly(0.5)
-    told = harness.received("SERVO_OUTPUT_RAW")[-1]
-    widths = [told.servo1_raw, told.servo2_raw, told.servo3_raw, told.servo4_raw]
+    reported = harness.received("SERVO_OUTPUT_RAW")[-1]
+    widths = [reported.servo1_raw, reported.servo2_raw, reported.servo3_raw, reported.servo4_raw]
     expected = [1000 + round(1000 * command) for command in harness.vehicle.airframe.rotor_commands]
     assert widths == pytest.approx(expected, abs=150)
     assert len(set(widths)) > 1

@@ -53,7 +53,7 @@ def test_faults_are_ended_by_number_by_name_and_all_together(harness: SimHarness
 
 def test_values_may_be_given_in_python(harness: SimHarness) -> None:
     faults = harness.vehicle.faults
-    faults.begin("packet_loss", 0.25, link="gcs", way="out", duration_s=2.0, seed=5)
+    faults.begin("packet_loss", 0.25, link="gcs", direction="out", duration_s=2.0, seed=5)
     assert str(faults.active[0]) == "1 packet_loss 0.25 link=gcs way=out for=2"
     assert faults.active[0].seed == 5
 
@@ -62,9 +62,9 @@ def test_values_may_be_given_in_python(harness: SimHarness) -> None:
     ("line", "said"),
     [("link_loss link=usb", "usb"), ("wind 3 at=0.5", "at=0.5")],
 )
-def test_a_fault_that_cannot_begin_is_refused_at_once(harness: SimHarness, line: str, said: str) -> None:
+def test_a_fault_that_cannot_begin_is_refused_at_once(harness: SimHarness, line: str, lines: str) -> None:
     harness.fly(1.0)
-    with pytest.raises(FaultError, match=said):
+    with pytest.raises(FaultError, match=lines):
         harness.vehicle.faults.begin(line)
     assert harness.vehicle.faults.listing() == ["no faults"]
 
@@ -149,7 +149,10 @@ def test_one_direction_of_one_link_can_be_meant(harness: SimHarness) -> None:
     harness.vehicle.faults.begin("link_loss link=onboard way=in")
     onboard.send(dialect.MAVLink_timesync_message(0, 77))
     gcs.send(dialect.MAVLink_timesync_message(0, 78), (245, 190))
-    heard_onboard, heard_gcs = decoded(fly(harness, onboard, 0.5)), decoded([(0.0, d) for d in gcs.receive()])
-    assert heard_onboard
-    assert not [m for m in heard_onboard if m.get_type() == "TIMESYNC" and m.ts1 == 77]
-    assert [m for m in heard_gcs if m.get_type() == "TIMESYNC" and m.ts1 == 78]
+    received_onboard, received_gcs = (
+        decoded(fly(harness, onboard, 0.5)),
+        decoded([(0.0, d) for d in gcs.receive()]),
+    )
+    assert received_onboard
+    assert not [m for m in received_onboard if m.get_type() == "TIMESYNC" and m.ts1 == 77]
+    assert [m for m in received_gcs if m.get_type() == "TIMESYNC" and m.ts1 == 78]

@@ -112,12 +112,12 @@ def test_faults_come_from_the_command_line_and_the_console_over_real_sockets() -
         (["--control", "nonsense"], "--control nonsense"),
     ],
 )
-def test_what_cannot_be_is_said_in_one_line(arguments: list[str], said: str) -> None:
+def test_what_cannot_be_is_said_in_one_line(arguments: list[str], answer: str) -> None:
     ports = ["--onboard-bind", "0", "--gcs-bind", "0"]
     command = [sys.executable, "-m", "mavlink_sim", *ports, *arguments]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, stdin=subprocess.DEVNULL)
     assert done.returncode == 2
-    assert said in done.stderr
+    assert answer in done.stderr
     assert "Traceback" not in done.stderr
 
 

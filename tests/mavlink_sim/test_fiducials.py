@@ -119,8 +119,10 @@ def test_the_white_margin_is_one_cell_wide() -> None:
         ("4X4_50", 0, 0.0, "0.01 to 50 m"),
     ],
 )
-def test_a_print_that_cannot_be_is_refused(dictionary: str, identifier: int, size: float, says: str) -> None:
-    with pytest.raises(ValueError, match=says):
+def test_a_print_that_cannot_be_is_refused(
+    dictionary: str, identifier: int, size: float, message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
         Print(dictionary, identifier, size)
 
 
@@ -144,12 +146,12 @@ def test_a_wall_has_the_size_and_place_asked_for() -> None:
 def test_the_shadow_of_something_in_the_air_falls_away_from_the_sun() -> None:
     def dark(height: float) -> np.ndarray:
         block = WorldObject(0, "box", (0.0, 0.0, -height), size_m=(0.4, 0.4, 0.1))
-        pictures = [
+        images = [
             Renderer(World(objects, GROUND), CAMERA, CameraMount()).render((0.0, 0.0, -20.0), DOWN)
             for objects in ((block,), ())
         ]
-        ground = cv2.erode((pictures[0].depth_m > 19.9).astype(np.uint8), np.ones((5, 5))) > 0
-        lost = pictures[1].image.astype(int).sum(axis=2) - pictures[0].image.astype(int).sum(axis=2)
+        ground = cv2.erode((images[0].depth_m > 19.9).astype(np.uint8), np.ones((5, 5))) > 0
+        lost = images[1].image.astype(int).sum(axis=2) - images[0].image.astype(int).sum(axis=2)
         rows, columns = np.nonzero((lost > 20) & ground)
         return np.array([rows.mean(), columns.mean()])
 

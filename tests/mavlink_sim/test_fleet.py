@@ -35,7 +35,7 @@ def test_places_are_a_grid_without_two_in_one() -> None:
     grid = start_positions(20, 5.0)
     assert grid[0] == (0.0, 0.0)
     assert len(set(grid)) == 20
-    assert max(max(place) for place in grid) == 20.0
+    assert max(max(position) for position in grid) == 20.0
     assert min(math.dist(a, b) for a in grid for b in grid if a != b) == 5.0
 
 
@@ -95,15 +95,15 @@ def test_a_place_given_in_degrees_is_flown_to_from_another_start() -> None:
     vehicle = LockstepVehicle({"onboard": {}}, noise=False, gusts_mps=0.0, start_ned_m=(10.0, 20.0))
     vehicle.take_off(5.0)
     # SIH's home, ten metres south and twenty west of where this one started
-    place = (47.397743225, 8.545594215, 494.4)
-    assert vehicle.command(192, -1.0, 1.0, 0.0, math.nan, *place) == "ACCEPTED"
+    position = (47.397743225, 8.545594215, 494.4)
+    assert vehicle.command(192, -1.0, 1.0, 0.0, math.nan, *position) == "ACCEPTED"
     vehicle.step(25.0)
     north, east, _ = vehicle.truth.position_ned_m
     assert (north, east) == pytest.approx((-10.0, -20.0), abs=0.7)
-    assert vehicle.vehicle.local_frame.local(*place) == pytest.approx((-10.0, -20.0, -5.0))
+    assert vehicle.vehicle.local_frame.local(*position) == pytest.approx((-10.0, -20.0, -5.0))
 
 
-def heard(port: int, wanted: set[int], limit_s: float = 40.0) -> dict[int, dict[str, Any]]:
+def received(port: int, wanted: set[int], limit_s: float = 40.0) -> dict[int, dict[str, Any]]:
     """The newest messages by system and type, once each wanted system told its position."""
     link = mavutil.mavlink_connection(f"udpin:127.0.0.1:{port}", source_system=245)
     newest: dict[int, dict[str, Any]] = defaultdict(dict)
@@ -127,9 +127,9 @@ def test_a_fleet_in_one_process_speaks_on_its_ports(tmp_path: Path) -> None:
         ports = [one.onboard_port for one in simulator.vehicles]
         assert ports == list(range(ports[0], ports[0] + 3))
         assert {one.gcs_port for one in simulator.vehicles} == {simulator.gcs_port}
-        everybody = heard(simulator.gcs_port, {1, 2, 3})  # all speak to the one ground station
-        assert len({place["GLOBAL_POSITION_INT"].lon for place in everybody.values()}) >= 2
-        assert set(heard(ports[1], {2})) == {2}  # and each to its own companion
+        everybody = received(simulator.gcs_port, {1, 2, 3})  # all speak to the one ground station
+        assert len({position["GLOBAL_POSITION_INT"].lon for position in everybody.values()}) >= 2
+        assert set(received(ports[1], {2})) == {2}  # and each to its own companion
         report = json.loads(ready.read_text())
         assert [one["system_id"] for one in report["vehicles"]] == [1, 2, 3]
         third = simulator.vehicles[2]
@@ -148,18 +148,19 @@ def test_a_range_of_ports_is_free() -> None:
 def test_a_machine_that_is_too_slow_is_told_of_and_how_slow(monkeypatch: pytest.MonkeyPatch) -> None:
     now_s = 100.0
     monkeypatch.setattr("mavlink_sim.realtime.loop.time.monotonic", lambda: now_s)
-    told: list[str] = []
-    pace = loop._Pace(20.0, told.append)
+    reports: list[str] = []
+    pace = loop._Pace(20.0, reports.append)
     pace.lose(25.0)
     now_s += 2.0
     pace.report()
-    assert told == []  # not at every hiccup
+    assert reports == []  # not at every hiccup
     now_s += 3.0
     pace.report()
-    assert told == ["cannot keep up: 15.00 times real time in the last 5 s, not 20; the machine is too busy"]
+    assert len(reports) == 1
+    assert "15.00 times real time" in reports[0]
     now_s += 6.0
     pace.report()
-    assert len(told) == 1  # nothing lost since
+    assert len(reports) == 1  # nothing lost since
 
 
 def test_a_fleet_flies_in_one_wind_with_the_same_gusts() -> None:
@@ -178,9 +179,9 @@ def test_a_fleet_flies_in_one_wind_with_the_same_gusts() -> None:
     assert gusts[0] == gusts[1] == gusts[2]
     assert any(gusts[0][1])
     other = instance_options(SimulationOptions(seed=8, wind_mps=5.0), 3, 5.0)[0]
-    stranger = Vehicle(seed=other.seed, air_seed=other.world_seed, wind_mps=5.0)
-    stranger.step(20.0)
-    assert (stranger.airframe.wind, stranger.airframe._gust) != gusts[0]
+    other_autopilot = Vehicle(seed=other.seed, air_seed=other.world_seed, wind_mps=5.0)
+    other_autopilot.step(20.0)
+    assert (other_autopilot.airframe.wind, other_autopilot.airframe._gust) != gusts[0]
     assert len({vehicle.estimate.drift for vehicle in vehicles}) == 3
 
 

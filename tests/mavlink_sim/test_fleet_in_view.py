@@ -205,7 +205,7 @@ def test_shared_poses_are_those_of_their_number_or_none() -> None:
     assert shared.read(first) == tuple(many(2))
     assert shared.write([]) == first
     assert shared.read(first) == ()
-    with pytest.raises(ValueError, match="250.*249"):
+    with pytest.raises(ValueError, match=r"250.*249"):
         shared.write(many(250))
 
 
@@ -418,8 +418,8 @@ def test_a_camera_in_a_fleet_watches_another_vehicle_take_off(name: str, tmp_pat
     depth = frame.depth_m
     assert depth is not None
     assert np.isnan(depth[int(top) - 3, int(left) : int(right)]).all()  # the sky above it
-    told = [json.loads(text) for text in (tmp_path / "truth.jsonl").read_text().splitlines()]
-    assert {item.get("system_id") for entry in told for item in entry["objects"]} == {None, 2}
-    told = [json.loads(text) for text in (tmp_path / "truth-2.jsonl").read_text().splitlines()]
-    assert {item.get("system_id") for entry in told for item in entry["objects"]} == {None, 1}
-    assert min(entry["position_ned_m"][2] for entry in told) < -1.0
+    events = [json.loads(text) for text in (tmp_path / "truth.jsonl").read_text().splitlines()]
+    assert {item.get("system_id") for entry in events for item in entry["objects"]} == {None, 2}
+    events = [json.loads(text) for text in (tmp_path / "truth-2.jsonl").read_text().splitlines()]
+    assert {item.get("system_id") for entry in events for item in entry["objects"]} == {None, 1}
+    assert min(entry["position_ned_m"][2] for entry in events) < -1.0

@@ -183,8 +183,8 @@ def test_a_place_outside_the_fence_is_not_flown_to(harness: SimHarness) -> None:
     harness.take_off(4.0)
     upload(harness, [circle(0, 0, 8.0)], 1)
     latitude, longitude, altitude = SIH_FRAME.geographic((20.0, 0.0, -4.0))
-    place = (round(latitude * 1e7), round(longitude * 1e7), altitude)
-    assert harness.command_int(192, (-1, 1, 0, math.nan), *place) == [0]
+    point = (round(latitude * 1e7), round(longitude * 1e7), altitude)
+    assert harness.command_int(192, (-1, 1, 0, math.nan), *point) == [0]
     harness.fly(2.0)
     assert harness.texts()[-1] == "Reposition is outside geofence\t"
     assert math.hypot(*harness.vehicle.airframe.position[:2]) < 1.0

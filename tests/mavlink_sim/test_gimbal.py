@@ -211,8 +211,8 @@ def test_messages_move_it_too(steered: SimHarness) -> None:
 def test_a_location_is_looked_at_and_forgotten(steered: SimHarness) -> None:
     x, y, _ = steered.vehicle.airframe.position
     latitude, longitude, altitude = SIH_FRAME.geographic((x + 20.0, y + 20.0, 0.0))
-    place = (0, 0, 0, 0)
-    assert steered.command_int(195, place, round(latitude * 1e7), round(longitude * 1e7), altitude) == [0]
+    position = (0, 0, 0, 0)
+    assert steered.command_int(195, position, round(latitude * 1e7), round(longitude * 1e7), altitude) == [0]
     steered.fly(2.0)
     assert degrees(steered)[1] == pytest.approx(45.0, abs=1.0)
     assert steered.command(197) == [0]
@@ -226,10 +226,10 @@ def test_the_attitude_told_is_the_gimbals(steered: SimHarness) -> None:
     steered.fly(2.0)
     steered.forget()
     steered.fly(0.3)
-    told = steered.received("GIMBAL_DEVICE_ATTITUDE_STATUS")[-1]
+    reported = steered.received("GIMBAL_DEVICE_ATTITUDE_STATUS")[-1]
     assert steered.vehicle.gimbal is not None
-    assert list(told.q) == pytest.approx(steered.vehicle.gimbal.quaternion, abs=1e-6)
-    assert told.flags & 64
+    assert list(reported.q) == pytest.approx(steered.vehicle.gimbal.quaternion, abs=1e-6)
+    assert reported.flags & 64
     assert steered.received("MOUNT_ORIENTATION")[-1].pitch == pytest.approx(-60.0, abs=0.1)
 
 

@@ -27,14 +27,14 @@ ACCELERATION_ALONE = 0xC3F
 
 
 def globally(
-    place: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0),
     altitude_m: float = 0.0,
     frame: int = 5,
     mask: int = POSITION_ALONE,
     **fields: float,
 ) -> Any:
     """A setpoint to a local place, given as latitude and longitude; the altitude as it is sent."""
-    latitude, longitude, _ = SIH_FRAME.geographic(place)
+    latitude, longitude, _ = SIH_FRAME.geographic(position)
     values = dict.fromkeys(NAMES, 0.0) | fields
     return dialect.MAVLink_set_position_target_global_int_message(
         0, 1, 1, frame, mask, round(latitude * 1e7), round(longitude * 1e7), altitude_m, **values
@@ -145,8 +145,8 @@ def test_any_global_setpoint_is_dropped_or_finite_where_it_controls(
     assert not any(math.isinf(value) for value in (*every, setpoint.yaw_rad, setpoint.yaw_rate_radps))
     if mask & 7:
         assert all(math.isnan(value) for value in setpoint.position)
-    flown = flyable(setpoint)
-    groups = (flown.position, flown.velocity, flown.acceleration)
+    flight = flyable(setpoint)
+    groups = (flight.position, flight.velocity, flight.acceleration)
     for axis in range(3):
         assert any(math.isfinite(group[axis]) for group in groups)
 

@@ -7,7 +7,7 @@ import pytest
 
 from mavlink_sim.camera.image_effects import ImageEffects, Sensor
 
-PICTURES = {
+IMAGES = {
     "black": np.zeros((48, 64, 3), np.uint8),
     "white": np.full((48, 64, 3), 255, np.uint8),
     "every grey": np.arange(48 * 64 * 3, dtype=np.uint32).astype(np.uint8).reshape(48, 64, 3),
@@ -15,15 +15,15 @@ PICTURES = {
 }
 
 
-@pytest.mark.parametrize("name", PICTURES)
+@pytest.mark.parametrize("name", IMAGES)
 @pytest.mark.parametrize("sigma", [0.7, 2.0, 9.0, 100.0])
 def test_noise_is_the_same_whether_a_camera_takes_one_picture_or_many(name: str, sigma: float) -> None:
-    picture, effects = PICTURES[name], ImageEffects(noise_sigma=sigma)
-    one = Sensor(effects).expose(picture, np.random.default_rng(5))
+    image, effects = IMAGES[name], ImageEffects(noise_sigma=sigma)
+    one = Sensor(effects).expose(image, np.random.default_rng(5))
     camera = Sensor(effects)
-    camera.expose(picture, np.random.default_rng(4))
-    assert np.array_equal(camera.expose(picture, np.random.default_rng(5)), one)
-    assert not np.array_equal(camera.expose(picture, np.random.default_rng(6)), one)
+    camera.expose(image, np.random.default_rng(4))
+    assert np.array_equal(camera.expose(image, np.random.default_rng(5)), one)
+    assert not np.array_equal(camera.expose(image, np.random.default_rng(6)), one)
 
 
 def test_noise_has_the_deviation_that_was_asked_for() -> None:

@@ -40,22 +40,22 @@ def flight(seed: int, links: dict[str, dict[str, float]] | None = None) -> tuple
 
 
 @pytest.fixture(scope="module")
-def flown() -> tuple[str, Any]:
+def fly() -> tuple[str, Any]:
     return flight(5)
 
 
-def test_the_same_seed_is_the_same_flight_to_the_last_byte(flown: tuple[str, Any]) -> None:
-    assert flight(5) == flown
+def test_the_same_seed_is_the_same_flight_to_the_last_byte(fly: tuple[str, Any]) -> None:
+    assert flight(5) == fly
 
 
-def test_another_seed_is_another_flight(flown: tuple[str, Any]) -> None:
+def test_another_seed_is_another_flight(fly: tuple[str, Any]) -> None:
     other = flight(6, {"onboard": ONBOARD_RATES_HZ})
-    assert flown[0] != other[0]
-    assert flown[1] != other[1]
+    assert fly[0] != other[0]
+    assert fly[1] != other[1]
 
 
-def test_the_number_of_links_does_not_change_the_flight(flown: tuple[str, Any]) -> None:
-    assert flown[1] == flight(5, {"onboard": {}})[1]
+def test_the_number_of_links_does_not_change_the_flight(fly: tuple[str, Any]) -> None:
+    assert fly[1] == flight(5, {"onboard": {}})[1]
 
 
 def test_another_process_flies_the_same_flight() -> None:
@@ -67,8 +67,8 @@ def test_another_process_flies_the_same_flight() -> None:
     vehicle = LockstepVehicle(seed=3)
     vehicle.take_off()
     own = hashlib.sha256(vehicle.receive_bytes()).hexdigest()
-    told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert told.stdout.strip() == own
+    reported = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert reported.stdout.strip() == own
 
 
 def test_three_lines_fly() -> None:
@@ -113,8 +113,8 @@ def test_bytes_go_in_as_messages_do() -> None:
 def test_a_quiet_link_sends_answers_alone() -> None:
     vehicle = LockstepVehicle({"onboard": {}})
     vehicle.step(6.0)
-    told = {message.get_type() for message in vehicle.receive()}
-    assert told == {"GPS_GLOBAL_ORIGIN"}  # once
+    reported = {message.get_type() for message in vehicle.receive()}
+    assert reported == {"GPS_GLOBAL_ORIGIN"}  # once
     vehicle.step(10.0)
     assert vehicle.receive() == []
     assert vehicle.command(512, 30) == "ACCEPTED"
@@ -154,7 +154,7 @@ def test_the_package_names_what_it_offers() -> None:
     for name in mavlink_sim.__all__:
         assert getattr(mavlink_sim, name) is not None
     with pytest.raises(AttributeError, match="nothing_here"):
-        _ = mavlink_sim.nothing_here
+        _ = mavlink_sim.no_message
 
 
 def test_a_vehicle_that_loses_a_motor_crashes_says_so_and_disarms() -> None:
@@ -248,7 +248,7 @@ def client_reads(data: bytes) -> list[Any]:
 # ---- copies
 
 
-def everything_told(vehicle: LockstepVehicle) -> tuple[Any, ...]:
+def all_messages(vehicle: LockstepVehicle) -> tuple[Any, ...]:
     return vehicle.truth, *(vehicle.receive_bytes(link) for link in vehicle.newest)
 
 
@@ -281,7 +281,7 @@ def test_a_copy_flies_on_as_the_first_does_to_the_last_byte(autopilot: str, opti
     for vehicle in (first, second):
         vehicle.send_bytes(half[9:])
         vehicle.step(6.0)
-    assert everything_told(first) == everything_told(second)
+    assert all_messages(first) == all_messages(second)
     assert first.events == second.events
     assert any("mode LAND" in event for event in second.events)
 
@@ -297,7 +297,7 @@ def test_what_is_done_to_a_copy_does_nothing_to_the_first() -> None:
     assert second.truth.crashed
     for vehicle in (first, alike):
         vehicle.step(2.0)
-    assert everything_told(first) == everything_told(alike)
+    assert all_messages(first) == all_messages(alike)
     assert first.events == alike.events
 
 

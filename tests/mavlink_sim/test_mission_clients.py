@@ -28,7 +28,7 @@ SPEED = 6.0
 
 
 @asynccontextmanager
-async def flown_by_mavsdk(
+async def mavsdk_flight(
     speed: float = 1.0, of_ground_station: bool = False
 ) -> AsyncIterator[tuple[RunningSimulator, MavsdkClient]]:
     """A vehicle in its process and MAVSDK's view of it, ready to arm, on the onboard link or the other."""
@@ -39,13 +39,13 @@ async def flown_by_mavsdk(
             yield simulator, system
 
 
-def place(north: float, east: float) -> tuple[float, float]:
+def position(north: float, east: float) -> tuple[float, float]:
     latitude, longitude, _ = SIH_FRAME.geographic((north, east, 0.0))
     return latitude, longitude
 
 
 def mission_item(north: float, east: float, **options: Any) -> MissionItem:
-    latitude, longitude = place(north, east)
+    latitude, longitude = position(north, east)
     return MissionItem(latitude, longitude, 4.0, is_fly_through=True, acceptance_radius_m=1.0, **options)
 
 
@@ -71,7 +71,7 @@ def raw(items: list[dict[str, Any]]) -> list[RawItem]:
 
 
 async def test_mavsdk_uploads_starts_pauses_and_finishes_a_mission() -> None:
-    async with flown_by_mavsdk(SPEED) as (simulator, system):
+    async with mavsdk_flight(SPEED) as (simulator, system):
         mission = system.plugin(MissionAsync)
         action = system.plugin(ActionAsync)
         telemetry = system.plugin(TelemetryAsync)
@@ -110,7 +110,7 @@ async def test_mavsdk_uploads_starts_pauses_and_finishes_a_mission() -> None:
 
 
 async def test_mavsdk_brings_raw_plans_and_takes_them_back() -> None:
-    async with flown_by_mavsdk() as (_, system):
+    async with mavsdk_flight() as (_, system):
         missions = system.plugin(MissionRawAsync)
         flight = raw([takeoff(4.0), waypoint(5, 5, 4.0), item(93, None, 2.0), land(5, 5)])
         fence = raw(polygon([(-40, -40), (40, -40), (40, 40), (-40, 40)]))
@@ -132,11 +132,11 @@ async def test_mavsdk_brings_raw_plans_and_takes_them_back() -> None:
 
 
 async def test_mavsdk_sets_and_clears_a_geofence() -> None:
-    async with flown_by_mavsdk() as (_, system):
+    async with mavsdk_flight() as (_, system):
         fence = system.plugin(GeofenceAsync)
-        corners = [Point(*place(*corner)) for corner in ((-30, -30), (30, -30), (30, 30), (-30, 30))]
+        corners = [Point(*position(*corner)) for corner in ((-30, -30), (30, -30), (30, 30), (-30, 30))]
         inside = Polygon(corners, FenceType.INCLUSION)
-        around = Circle(Point(*place(0, 0)), 15.0, FenceType.INCLUSION)
+        around = Circle(Point(*position(0, 0)), 15.0, FenceType.INCLUSION)
         await fence.upload_geofence(GeofenceData([inside], [around]))
         back = await fence.download_geofence()
         assert len(back.polygons[0].points) == 4
@@ -148,7 +148,7 @@ async def test_mavsdk_sets_and_clears_a_geofence() -> None:
 
 async def test_mavsdk_flies_out_of_its_geofence_and_is_stopped_and_told() -> None:
     # in real time: texts go to a ground station whose heartbeat comes often enough
-    async with flown_by_mavsdk(1.0, of_ground_station=True) as (simulator, system):
+    async with mavsdk_flight(1.0, of_ground_station=True) as (simulator, system):
         fence, telemetry = system.plugin(GeofenceAsync), system.plugin(TelemetryAsync)
         action, offboard = system.plugin(ActionAsync), system.plugin(OffboardAsync)
         texts: list[str] = []
@@ -158,12 +158,12 @@ async def test_mavsdk_flies_out_of_its_geofence_and_is_stopped_and_told() -> Non
                 async for status in statuses:
                     texts.append(status.text)
 
-        def told(words: str) -> bool:
+        def sent_texts(words: str) -> bool:
             return any(words in text for text in texts)
 
         async with meanwhile(listen()):
             await fence.upload_geofence(
-                GeofenceData([], [Circle(Point(*place(0, 0)), 8.0, FenceType.INCLUSION)])
+                GeofenceData([], [Circle(Point(*position(0, 0)), 8.0, FenceType.INCLUSION)])
             )
             await action.arm()
             await action.takeoff()
@@ -171,12 +171,14 @@ async def test_mavsdk_flies_out_of_its_geofence_and_is_stopped_and_told() -> Non
             await offboard.set_velocity_ned(VelocityNedYaw(3.0, 0.0, 0.0, 0.0))
             await offboard.start()
             await wait_for(telemetry.subscribe_flight_mode(), lambda mode: mode.name == "OFFBOARD")
-            assert not told("Geofence")
+            assert not sent_texts("Geofence")
             await wait_for(telemetry.subscribe_flight_mode(), lambda mode: mode.name == "HOLD")
             outside = await wait_for(telemetry.subscribe_position_velocity_ned())
             assert outside.position.north_m > 7.0
             async with asyncio.timeout(LIMIT_S):
-                while not told("Geofence: approaching or outside geofence") or not told("Failsafe activated"):
+                while not sent_texts("Geofence: approaching or outside geofence") or not sent_texts(
+                    "Failsafe activated"
+                ):
                     await asyncio.sleep(0.05)
             await asyncio.to_thread(simulator.wait_for_event, "failsafe: geofence breached, HOLD")
             stopped = await wait_for(

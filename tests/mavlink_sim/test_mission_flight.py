@@ -43,8 +43,8 @@ def current(harness: SimHarness) -> int:
 def status(harness: SimHarness) -> tuple[int, int, int, int]:
     """The newest MISSION_CURRENT: sequence, total, state, mode."""
     harness.fly(1.1)
-    told = harness.received("MISSION_CURRENT")[-1]
-    return told.seq, told.total, told.mission_state, told.mission_mode
+    texts = harness.received("MISSION_CURRENT")[-1]
+    return texts.seq, texts.total, texts.mission_state, texts.mission_mode
 
 
 def test_a_mission_takes_off_flies_lands_and_disarms(harness: SimHarness) -> None:

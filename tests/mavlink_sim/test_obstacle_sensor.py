@@ -23,17 +23,17 @@ BLOCK = WorldObject(5, "box", (0.0, 3.0, 0.0), size_m=(2.0, 2.0, 1.5))
 LINKS = {"onboard": dict.fromkeys(ONBOARD_RATES_HZ, 0.0), "gcs": GCS_RATES_HZ}
 
 
-def flying(*things: WorldObject, height_m: float = 3.0, **options: Any) -> LockstepVehicle:
-    calm = {"scene": World(things), "gusts_mps": 0.0, "noise": False, "obstacle_sensor": True}
+def flying(*objects: WorldObject, height_m: float = 3.0, **options: Any) -> LockstepVehicle:
+    calm = {"scene": World(objects), "gusts_mps": 0.0, "noise": False, "obstacle_sensor": True}
     vehicle = LockstepVehicle(LINKS, **{**calm, **options})
     vehicle.take_off(height_m)
     return vehicle
 
 
-def piloted(*things: WorldObject, scene: Scene | None = None, **parameters: float) -> LockstepVehicle:
+def piloted(*objects: WorldObject, scene: Scene | None = None, **parameters: float) -> LockstepVehicle:
     """In Position mode, its pilot at the sticks."""
     vehicle = flying(
-        scene=World(things) if scene is None else scene,
+        scene=World(objects) if scene is None else scene,
         parameters={**CALIBRATION, "COM_RC_IN_MODE": 0, "CP_GUIDE_ANG": 0, **parameters},
     )
     vehicle.vehicle.transmitter.on = True
@@ -137,9 +137,9 @@ def test_the_fused_map_streams_to_a_ground_station_while_collision_prevention_wo
     vehicle = piloted(WALL, CP_DIST=1.5)
     vehicle.receive("gcs"), vehicle.receive("onboard")
     vehicle.step(5.0)
-    told = [one for one in vehicle.receive("gcs") if one.get_type() == "OBSTACLE_DISTANCE"]
-    assert len(told) == 5
-    newest = told[-1]
+    reported = [one for one in vehicle.receive("gcs") if one.get_type() == "OBSTACLE_DISTANCE"]
+    assert len(reported) == 5
+    newest = reported[-1]
     assert newest.distances[0] == pytest.approx(100 * FACE_M, abs=30)
     assert (newest.min_distance, newest.max_distance) == (20, 1200)
     assert (newest.increment, newest.increment_f, newest.angle_offset, newest.frame) == (0, 5.0, 0.0, 12)
@@ -158,8 +158,8 @@ def test_a_companion_may_ask_for_it() -> None:
     assert vehicle.command(SET_MESSAGE_INTERVAL, OBSTACLE_DISTANCE, 100_000) == "ACCEPTED"
     vehicle.receive()
     vehicle.step(4.0)
-    told = [one for one in vehicle.receive() if one.get_type() == "OBSTACLE_DISTANCE"]
-    assert len(told) == pytest.approx(39, abs=1)  # 9.85 Hz
+    reported = [one for one in vehicle.receive() if one.get_type() == "OBSTACLE_DISTANCE"]
+    assert len(reported) == pytest.approx(39, abs=1)  # 9.85 Hz
     vehicle.set_mode("HOLD")
     vehicle.step(0.1)
     assert vehicle.command(REQUEST_MESSAGE, OBSTACLE_DISTANCE) == "DENIED"  # PX4 publishes none now

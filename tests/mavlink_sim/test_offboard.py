@@ -168,20 +168,20 @@ def test_a_position_step_of_ten_metres_is_settled_within_six_seconds(
     harness.offboard(position_setpoint(0, 0, -5))
     harness.fly(3.0, position_setpoint(0, 0, -5))
     step = position_setpoint(10, 0, -5)
-    flown: list[tuple[float, float]] = []
+    active: list[tuple[float, float]] = []
 
     def watch() -> bool:
         airframe = harness.vehicle.airframe
-        flown.append((airframe.position[0], airframe.velocity[0]))
+        active.append((airframe.position[0], airframe.velocity[0]))
         return False
 
     harness.until(watch, 6.0, step, must=False)
-    moving = len(flown)
-    assert 4.5 < max(speed for _, speed in flown) < 5.7
-    assert 0.5 < max(north for north, _ in flown) - 10.0 < 1.2
+    moving = len(active)
+    assert 4.5 < max(speed for _, speed in active) < 5.7
+    assert 0.5 < max(north for north, _ in active) - 10.0 < 1.2
     harness.until(watch, 10.0, step, must=False)
-    assert max(abs(north - 10.0) for north, _ in flown[moving:]) < 0.55  # as a real one wanders, holding
-    assert max(abs(speed) for _, speed in flown[moving:]) < 0.25
+    assert max(abs(north - 10.0) for north, _ in active[moving:]) < 0.55  # as a real one wanders, holding
+    assert max(abs(speed) for _, speed in active[moving:]) < 0.25
 
 
 def test_a_velocity_step_nears_its_goal_slowly_and_stops_so(

@@ -25,8 +25,8 @@ def orbit(
     altitude_m: float = NAN,
 ) -> list[int]:
     """Send DO_ORBIT; its answers."""
-    place = (NAN, NAN) if centre is None else SIH_FRAME.geographic(centre)[:2]
-    results: list[int] = harness.command(34, radius_m, speed_mps, yaw_behaviour, NAN, *place, altitude_m)
+    position = (NAN, NAN) if centre is None else SIH_FRAME.geographic(centre)[:2]
+    results: list[int] = harness.command(34, radius_m, speed_mps, yaw_behaviour, NAN, *position, altitude_m)
     return results
 
 
@@ -178,11 +178,11 @@ def test_the_execution_is_told_while_it_lasts(harness: SimHarness) -> None:
     circling(harness, radius_m=-8.0, seconds=15.0)
     harness.forget()
     harness.fly(4.0)
-    told = harness.received("ORBIT_EXECUTION_STATUS")
-    assert 19 <= len(told) <= 21
+    reported = harness.received("ORBIT_EXECUTION_STATUS")
+    assert 19 <= len(reported) <= 21
     assert 7 <= len(harness.received("ORBIT_EXECUTION_STATUS", "gcs")) <= 9
     latitude, longitude, _ = SIH_FRAME.geographic(CENTRE)
-    last = told[-1]
+    last = reported[-1]
     assert (last.radius, last.frame) == (-8.0, 0)
     assert (last.x, last.y) == pytest.approx((round(latitude * 1e7), round(longitude * 1e7)), abs=1)
     assert last.z == pytest.approx(HOME_ALTITUDE_M + harness.height_m, abs=0.1)

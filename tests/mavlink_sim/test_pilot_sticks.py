@@ -244,7 +244,7 @@ def test_losing_and_regaining_the_joystick_is_an_event(make_harness: type[SimHar
     assert any("manual control regained" in line for line in harness.events)
 
 
-def remote_cockpit(make_harness: type[SimHarness], **values: float) -> SimHarness:
+def remote_control(make_harness: type[SimHarness], **values: float) -> SimHarness:
     harness = make_harness(parameters={**REMOTE_CONTROL, **values})
     harness.heartbeats.append(("gcs", GROUND_STATION, 6))
     harness.vehicle.transmitter.on = True
@@ -288,7 +288,7 @@ def test_rc_channels_override_is_a_remote_control_like_any_other(make_harness: t
 
 
 def test_the_mode_switch_changes_the_mode_and_refusals_are_told(make_harness: type[SimHarness]) -> None:
-    harness = remote_cockpit(make_harness, COM_FLTMODE5=3)
+    harness = remote_control(make_harness, COM_FLTMODE5=3)
     transmitter = harness.vehicle.transmitter
     harness.take_off()
     transmitter.select(Mode.POSCTL)
@@ -311,7 +311,7 @@ def test_the_mode_switch_changes_the_mode_and_refusals_are_told(make_harness: ty
 def test_the_kill_switch_stops_the_motors_and_disarms_after_five_seconds(
     make_harness: type[SimHarness],
 ) -> None:
-    harness = remote_cockpit(make_harness, COM_DISARM_LAND=-1)
+    harness = remote_control(make_harness, COM_DISARM_LAND=-1)
     harness.take_off(6.0)
     harness.vehicle.transmitter.kill = True
     harness.until(lambda: "kill switch engaged" in harness.events, 1.0)
@@ -335,7 +335,7 @@ def test_the_kill_switch_stops_the_motors_and_disarms_after_five_seconds(
 def test_a_kill_that_is_taken_back_at_once_lets_the_vehicle_catch_itself(
     make_harness: type[SimHarness],
 ) -> None:
-    harness = remote_cockpit(make_harness)
+    harness = remote_control(make_harness)
     harness.take_off(15.0)
     harness.vehicle.transmitter.kill = True
     harness.fly(0.4)

@@ -53,7 +53,9 @@ async def test_a_joystick_flies_the_vehicle_in_position_mode() -> None:
             await action.arm()
             await manual.start_position_control()
             sticks[2] = 1.0
-            await wait_for(telemetry.subscribe_position(), lambda place: place.relative_altitude_m > 2.0)
+            await wait_for(
+                telemetry.subscribe_position(), lambda position: position.relative_altitude_m > 2.0
+            )
             sticks[:] = [0.8, 0.0, 0.5, 0.0]
             await wait_for(telemetry.subscribe_position_velocity_ned(), lambda p: p.position.north_m > 3.0)
             sticks[:] = [0.0, 0.0, 0.0, 0.0]

@@ -201,7 +201,7 @@ def request_event(harness: SimHarness, first: int, last: int, target: tuple[int,
     harness.fly(0.01)
 
 
-def flown(harness: SimHarness) -> list[Any]:
+def active(harness: SimHarness) -> list[Any]:
     harness.take_off(2.5)
     harness.command(21)
     harness.until(lambda: not harness.armed, 40.0)
@@ -210,14 +210,14 @@ def flown(harness: SimHarness) -> list[Any]:
 
 
 def test_events__on_occurrence_to_every_link_with_numbers_that_grow(harness: SimHarness) -> None:
-    first = flown(harness)
+    first = active(harness)
     assert len(first) >= 5
     assert [message.sequence for message in first] == list(range(1, len(first) + 1))
     assert [message.id for message in harness.received("EVENT", "gcs")] == [message.id for message in first]
 
 
 def test_source_request_event__the_kept_events_come_again_as_they_were(harness: SimHarness) -> None:
-    first = flown(harness)
+    first = active(harness)
     request_event(harness, 2, 4)
     again = harness.received("EVENT")
     assert [(m.id, m.sequence, m.event_time_boot_ms, m.arguments) for m in again] == [
@@ -228,7 +228,7 @@ def test_source_request_event__the_kept_events_come_again_as_they_were(harness: 
 def test_source_response_event_error__for_an_event_that_is_not_kept_with_the_next_that_is(
     harness: SimHarness,
 ) -> None:
-    newest = flown(harness)[-1].sequence
+    newest = active(harness)[-1].sequence
     request_event(harness, 65535, 0)
     errors = harness.received("RESPONSE_EVENT_ERROR")
     assert [(message.sequence, message.sequence_oldest_available) for message in errors] == [
@@ -243,12 +243,12 @@ def test_source_response_event_error__for_an_event_that_is_not_kept_with_the_nex
 
 
 def test_current_event_sequence__0_3_hz_with_the_newest_number(harness: SimHarness) -> None:
-    newest = flown(harness)[-1].sequence
+    newest = active(harness)[-1].sequence
     harness.forget()
     harness.fly(10.0)
-    told = harness.received("CURRENT_EVENT_SEQUENCE")
-    assert len(told) == pytest.approx(3, abs=1)
-    assert {message.sequence for message in told} == {newest}
+    received = harness.received("CURRENT_EVENT_SEQUENCE")
+    assert len(received) == pytest.approx(3, abs=1)
+    assert {message.sequence for message in received} == {newest}
 
 
 # ---- parameters
@@ -264,19 +264,19 @@ def recorded_parameters() -> tuple[int, list[Parameter]]:
     if not PARAMETERS.exists():
         pytest.skip(f"needs the recorded parameters {PARAMETERS}")
     rows = [line.split() for line in PARAMETERS.read_text().splitlines()]
-    told = next(float(value) for name, _, value in rows if name == "_HASH_CHECK")
+    received = next(float(value) for name, _, value in rows if name == "_HASH_CHECK")
     parameters = [
         Parameter(name, int(kind), int(value) if int(kind) == INT32 else float(value))
         for name, kind, value in rows
         if name != "_HASH_CHECK"
     ]
-    return struct.unpack("<I", struct.pack("<f", told))[0], parameters
+    return struct.unpack("<I", struct.pack("<f", received))[0], parameters
 
 
 def test_hash_check__is_reproduced_from_the_887_recorded_parameters() -> None:
-    told, parameters = recorded_parameters()
+    received, parameters = recorded_parameters()
     assert len(parameters) == 887
-    assert parameter_hash(parameters) == told == 0x6AF5A894
+    assert parameter_hash(parameters) == received == 0x6AF5A894
 
 
 def test_hash_check__the_vehicle_itself_answers_what_px4_answered(ready: SimHarness) -> None:
@@ -306,18 +306,18 @@ def test_names_types_and_values_are_those_recorded(ready: SimHarness) -> None:
 
 
 def test_source_hash_check__volatile_parameters_do_not_count(harness: SimHarness) -> None:
-    told, parameters = recorded_parameters()
+    received, parameters = recorded_parameters()
     changed = [
         Parameter(item.name, item.kind, item.value + 1) if is_volatile(item.name) else item
         for item in parameters
     ]
     assert sum(is_volatile(item.name) for item in parameters) == 58
-    assert parameter_hash(changed) == told
+    assert parameter_hash(changed) == received
     everything = 0xFFFFFFFF
     for item in parameters:
         packed = struct.pack("<i" if item.kind == INT32 else "<f", item.value)
         everything = zlib.crc32(item.name.encode() + packed, everything)
-    assert everything ^ 0xFFFFFFFF != told
+    assert everything ^ 0xFFFFFFFF != received
 
 
 def test_request_list__first_after_10_ms_the_hash_then_index_order_about_1000_a_second(

@@ -26,13 +26,13 @@ def names(harness: SimHarness, link: str = "onboard") -> Counter[str]:
 
 
 def test_the_streams_are_the_same_whether_or_not_a_companion_is_heard(make_harness: type[SimHarness]) -> None:
-    alone, heard = make_harness(["everything"]), make_harness(["everything"])
-    heard.heartbeats.append(("onboard", (1, 191), ONBOARD_CONTROLLER))
-    for harness in (alone, heard):
+    alone, received = make_harness(["everything"]), make_harness(["everything"])
+    received.heartbeats.append(("onboard", (1, 191), ONBOARD_CONTROLLER))
+    for harness in (alone, received):
         harness.wait_ready()
         harness.forget()
         harness.fly(10.0)
-    assert names(alone) == names(heard)
+    assert names(alone) == names(received)
 
 
 @pytest.mark.parametrize("flying", [False, True], ids=["disarmed", "in flight"])

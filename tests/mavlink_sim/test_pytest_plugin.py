@@ -102,8 +102,8 @@ def test_logs_go_where_they_are_wanted_and_runs_do_not_overwrite_each_other(
     result.assert_outcomes(failed=1)
     result.stdout.fnmatch_lines(["*- vehicle 1 -*", "*- vehicle 2 -*"])
     folders = sorted(pytester.path.glob("artifacts/*"))
-    said = [(folder / "vehicle.log").read_text() for folder in folders]
-    assert ["ready: system 2" in said[0], "ready: system 3" in said[1]] == [True, True]
+    output = [(folder / "vehicle.log").read_text() for folder in folders]
+    assert ["ready: system 2" in output[0], "ready: system 3" in output[1]] == [True, True]
 
 
 def test_options_come_from_the_marker_and_nearer_ones_count(run: Any) -> None:

@@ -21,14 +21,14 @@ from mavlink_sim.world.world import World
 
 REQUEST_MESSAGE, DISTANCE_SENSOR = 512, 132
 
-places = st.tuples(*[st.floats(-4.0, 4.0)] * 3)
+positions = st.tuples(*[st.floats(-4.0, 4.0)] * 3)
 angles = st.floats(-1.0, 1.0)
 
 
-def body(number: int, place: Vector, start: tuple[float, float] = (0.0, 0.0)) -> Body:
+def body(number: int, position: Vector, start: tuple[float, float] = (0.0, 0.0)) -> Body:
     airframe = Multirotor()
     airframe.on_ground = False
-    airframe.position = place
+    airframe.position = position
     return Body(airframe, start, number, f"vehicle {number}", lambda: 0.0)
 
 
@@ -38,13 +38,13 @@ def inside(point: Vector, middle: Vector) -> float:
     return (x * x + y * y) / RADIUS_M**2 + z * z / HALF_HEIGHT_M**2
 
 
-@given(place=places, roll_rad=angles, pitch_rad=angles)
+@given(position=positions, roll_rad=angles, pitch_rad=angles)
 def test_the_range_below_ends_where_the_first_other_begins(
-    place: Vector, roll_rad: float, pitch_rad: float
+    position: Vector, roll_rad: float, pitch_rad: float
 ) -> None:
-    own, other = body(1, (0.0, 0.0, -9.0)), body(2, (place[0], place[1], place[2] - 9.0))
+    own, other = body(1, (0.0, 0.0, -9.0)), body(2, (position[0], position[1], position[2] - 9.0))
     own.airframe.set_attitude(roll_rad, pitch_rad, 0.3)
-    middle = place  # from the middle of one's own
+    middle = position  # from the middle of one's own
     assume(inside((0.0, 0.0, 0.0), middle) > 1.0)
     found = Neighbours([own, other], own).range_below_m()
     if found == 0.0:  # it begins within one's own hull

@@ -24,7 +24,7 @@ SLOW = pytest.approx(1.8, abs=0.4)
 
 def reposition(
     harness: SimHarness,
-    place: tuple[float, float] | None,
+    goal: tuple[float, float] | None,
     height_m: float = NAN,
     *,
     speed_mps: float = -1.0,
@@ -34,8 +34,8 @@ def reposition(
 ) -> list[int]:
     """Send DO_REPOSITION as COMMAND_INT to a local place; its answers."""
     x, y = (NOT_GIVEN, NOT_GIVEN)
-    if place is not None:
-        latitude, longitude, _ = SIH_FRAME.geographic((*place, 0.0))
+    if goal is not None:
+        latitude, longitude, _ = SIH_FRAME.geographic((*goal, 0.0))
         x, y = round(latitude * 1e7), round(longitude * 1e7)
     values = (speed_mps, flags, 0.0, yaw)
     results: list[int] = harness.command_int(192, values, x, y, HOME_ALTITUDE_M + height_m, frame)

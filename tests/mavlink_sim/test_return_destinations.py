@@ -51,9 +51,9 @@ LANDING = Mission(stored(takeoff(5.0), waypoint(100, 0, 10), land(100, 30)), val
     ],
 )
 def test_the_nearest_place_that_rtl_type_allows_is_chosen(
-    kind: int, place: tuple[float, float], goal: Goal, north: float
+    kind: int, point: tuple[float, float], goal: Goal, north: float
 ) -> None:
-    found = chosen(kind, *place, POINTS, LANDING)
+    found = chosen(kind, *point, POINTS, LANDING)
     assert found.kind is goal
     assert found.position[0] == pytest.approx(north, abs=0.02)
 
@@ -66,7 +66,7 @@ def test_without_any_place_type_five_lands_here_and_type_one_at_home() -> None:
 @given(st.floats(-200, 200), st.floats(-200, 200))
 def test_no_other_allowed_place_is_much_nearer(north: float, east: float) -> None:
     found = chosen(3, north, east, POINTS[:2], LANDING)
-    nearest = min(math.dist((north, east), place) for place in ((0, 0), (60, 0), (0, 60), (100, 30)))
+    nearest = min(math.dist((north, east), point) for point in ((0, 0), (60, 0), (0, 60), (100, 30)))
     assert math.dist((north, east), found.position[:2]) <= nearest + 4.1
 
 
@@ -79,12 +79,12 @@ def test_a_rally_point_in_an_integer_frame_is_refused_as_px4_does() -> None:
 
 def test_along_a_mission_it_goes_on_to_the_landing_or_back_home() -> None:
     there = Mission(LANDING.items, current=1, valid=True)
-    places, end = mission_route(there, Parameters({"RTL_TYPE": 2}), HOME, SIH_FRAME) or ([], HOME)
-    assert [place[0] for place in places] == [pytest.approx(100.0, abs=0.02)]
+    points, end = mission_route(there, Parameters({"RTL_TYPE": 2}), HOME, SIH_FRAME) or ([], HOME)
+    assert [point[0] for point in points] == [pytest.approx(100.0, abs=0.02)]
     assert end[1] == pytest.approx(30.0, abs=0.02)
     back = Mission(stored(takeoff(5.0), waypoint(30, 0, 5), waypoint(60, 0, 5)), current=2, valid=True)
-    places, end = mission_route(back, Parameters({"RTL_TYPE": 2}), HOME, SIH_FRAME) or ([], (9.0, 9.0, 9.0))
-    assert [place[0] for place in places] == pytest.approx([30.0, 0.0], abs=0.02)
+    points, end = mission_route(back, Parameters({"RTL_TYPE": 2}), HOME, SIH_FRAME) or ([], (9.0, 9.0, 9.0))
+    assert [point[0] for point in points] == pytest.approx([30.0, 0.0], abs=0.02)
     assert end == HOME
     assert mission_route(back, Parameters(), HOME, SIH_FRAME) is None
 

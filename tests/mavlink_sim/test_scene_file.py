@@ -134,8 +134,8 @@ def test_an_empty_file_is_an_empty_field_with_the_usual_camera() -> None:
         ("[[plates]]\ndictionary = '4x4_50'\nid = 1\nsize_m = 1\nplace_m = [0, 0]", r"4X4_50"),
     ],
 )
-def test_what_cannot_be_is_explained(text: str, says: str) -> None:
-    with pytest.raises(SceneError, match=says):
+def test_what_cannot_be_is_explained(text: str, message: str) -> None:
+    with pytest.raises(SceneError, match=message):
         parse_scene(text)
 
 
@@ -175,11 +175,11 @@ def test_there_are_examples_and_without_a_scene_the_demo_world() -> None:
     assert scene_or_demo("village", 3).world == load_scene("village").world
 
 
-places = st.tuples(st.floats(-50, 50), st.floats(-50, 50), st.floats(-20, 0))
+positions = st.tuples(st.floats(-50, 50), st.floats(-50, 50), st.floats(-20, 0))
 paths = st.builds(
     Path,
-    st.lists(places, min_size=2, max_size=5, unique=True).map(tuple).filter(
-        lambda way: sum(math.dist(a, b) for a, b in pairwise(way)) > 1.0
+    st.lists(positions, min_size=2, max_size=5, unique=True).map(tuple).filter(
+        lambda direction: sum(math.dist(a, b) for a, b in pairwise(direction)) > 1.0
     ),
     st.floats(0.2, 20.0),
     st.sampled_from(("loop", "back_and_forth", "once")),

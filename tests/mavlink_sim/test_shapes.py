@@ -126,5 +126,5 @@ def test_variants_and_colours_follow_from_the_appearance_alone() -> None:
 
 
 def test_an_unknown_class_is_refused_with_the_known_ones() -> None:
-    with pytest.raises(ValueError, match="'zebra'.*autumn_tree, bale, barrel"):
+    with pytest.raises(ValueError, match=r"'zebra'.*autumn_tree, bale, barrel"):
         shape_of("zebra", 0)

@@ -146,6 +146,6 @@ def test_motion_is_what_lies_between_two_poses() -> None:
         ({"rate_hz": 0.0}, "rate"),
     ],
 )
-def test_a_camera_that_cannot_be_is_refused(changes: dict[str, Any], says: str) -> None:
-    with pytest.raises(ValueError, match=says):
+def test_a_camera_that_cannot_be_is_refused(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         CameraSettings(**changes)

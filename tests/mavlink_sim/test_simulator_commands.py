@@ -84,8 +84,8 @@ def test_available_modes_lists_one_or_all(harness: SimHarness) -> None:
     harness.fly(0.1)
     assert harness.command(512, 435, 0) == [0]
     listed = harness.received("AVAILABLE_MODES")
-    assert [told.mode_index for told in listed] == list(range(1, listed[0].number_modes + 1))
-    assert {told.custom_mode for told in listed} >= {0x00010000, 0x03040000, 0x04040000, 0x00060000}
+    assert [reported.mode_index for reported in listed] == list(range(1, listed[0].number_modes + 1))
+    assert {reported.custom_mode for reported in listed} >= {0x00010000, 0x03040000, 0x04040000, 0x00060000}
     harness.forget()
     assert harness.command(512, 435, 1) == [0]
     (manual,) = harness.received("AVAILABLE_MODES")

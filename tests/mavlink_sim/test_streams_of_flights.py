@@ -75,12 +75,12 @@ def test_all_that_is_said_in_a_flight_can_be_put_on_the_wire(
     harness.take_off(6.0)
     harness.forget()
     flight(harness)
-    assert {told.custom_mode for told in harness.received("HEARTBEAT")} - {HOLD}
+    assert {received.custom_mode for received in harness.received("HEARTBEAT")} - {HOLD}
     codec = parser(1)
     for link in ("onboard", "gcs"):
         for _, item in harness.inbox[link]:
             assert item.pack(codec)
         for kind, names in NUMBERS.items():
-            for told in harness.received(kind, link):
-                assert all(math.isfinite(getattr(told, name)) for name in names), told
+            for received in harness.received(kind, link):
+                assert all(math.isfinite(getattr(received, name)) for name in names), received
     assert len(harness.received("ATTITUDE")) > 300

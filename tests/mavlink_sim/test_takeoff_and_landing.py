@@ -154,9 +154,9 @@ def test_return_close_to_home_stays_low_lands_and_disarms(harness: SimHarness) -
     harness.until(lambda: not harness.armed, 60.0)
     assert highest < 4.5
     assert landed_states(harness)[-2:] == [4, 1]
-    said = harness.texts()
-    assert said[:2] == ["Returning to launch\t", "RTL: start return at 493 m (4 m above destination)\t"]
-    assert said[-3:] == ["RTL: land at destination\t", "Landing detected\t", "Disarmed by landing\t"]
+    texts = harness.texts()
+    assert texts[:2] == ["Returning to launch\t", "RTL: start return at 493 m (4 m above destination)\t"]
+    assert texts[-3:] == ["RTL: land at destination\t", "Landing detected\t", "Disarmed by landing\t"]
 
 
 def test_return_from_afar_climbs_to_the_return_altitude_and_lands_at_home(

@@ -26,12 +26,12 @@ def test_each_line_is_there_when_it_was_written(tmp_path: Path) -> None:
 @needs_full
 def test_a_full_disk_is_told_once_and_ends_the_file() -> None:
     file = TruthFile(FULL)
-    assert file.write("line") == "the truth is no longer written to /dev/full: No space left on device"
+    assert "/dev/full" in (file.write("line") or "")
     assert file.write("line") is None
 
 
 @needs_full
 def test_the_vehicle_flies_on_when_its_truth_is_no_longer_written() -> None:
     with running_simulator(truth=FULL) as simulator:
-        simulator.wait_for_event("the truth is no longer written to /dev/full: No space left on device")
+        simulator.wait_for_event("/dev/full")
         assert simulator.process.poll() is None

@@ -153,12 +153,12 @@ def test_drawn_pose_is_the_vehicles_in_a_manoeuvre() -> None:
     moved_m = math.dist(truths[0][1], truths[-1][1])
     assert moved_m > 8.0
     errors_m, errors_deg = [], []
-    for now_ns, place, quaternion in truths:
+    for now_ns, position, quaternion in truths:
         if not span[0] <= now_ns <= span[1]:
             continue
         stamp_ns = history.monotonic_ns(now_ns) - BOOTED_NS  # what the frame's stamp says, less the boot
         pose = history.at(now_ns)
-        errors_m.append(math.dist(pose.position, place) + 3.6 * abs(stamp_ns - now_ns) / 1e9)
+        errors_m.append(math.dist(pose.position, position) + 3.6 * abs(stamp_ns - now_ns) / 1e9)
         cosine = abs(sum(a * b for a, b in zip(pose.attitude, quaternion, strict=True)))
         errors_deg.append(math.degrees(2 * math.acos(min(cosine, 1.0))))
     assert len(errors_m) > 500

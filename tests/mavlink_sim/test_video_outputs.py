@@ -33,7 +33,7 @@ SIZE = (160, 120)
 SETTINGS = SourceSettings(width=SIZE[0], height=SIZE[1], open_timeout_s=20.0, read_timeout_s=20.0)
 
 
-def picture(number: int) -> Frame:
+def image(number: int) -> Frame:
     """A blue picture with a mark; the same each time, as streams are compared by colour."""
     image = np.full((SIZE[1], SIZE[0], 3), (200, 90, 20), np.uint8)
     image[40:80, 60:100] = (20, 220, 60)
@@ -52,7 +52,7 @@ def feeding() -> Iterator[Callable[[FrameOutput], None]]:
         def run() -> None:
             number = 0
             while not stop.wait(1 / 60):
-                output.write(picture(number))
+                output.write(image(number))
                 number += 1
 
         threads.append(threading.Thread(target=run, daemon=True))
@@ -81,8 +81,8 @@ def first_frame(uri: str, settings: SourceSettings = SETTINGS) -> Frame:
     raise AssertionError(f"no frame from {uri}")
 
 
-def looks_right(frame: Frame, tolerance: int) -> bool:
-    wanted = picture(0).image
+def matches_image(frame: Frame, tolerance: int) -> bool:
+    wanted = image(0).image
     away = np.abs(frame.image[[10, 60], [10, 80]].astype(int) - wanted[[10, 60], [10, 80]])
     return frame.image.shape == wanted.shape and bool(away.max() <= tolerance)
 
@@ -99,8 +99,8 @@ def looks_right(frame: Frame, tolerance: int) -> bool:
         ("shm://a/b", "plain file name"),
     ],
 )
-def test_an_address_that_cannot_be_is_refused(address: str, says: str) -> None:
-    with pytest.raises(ValueError, match=says):
+def test_an_address_that_cannot_be_is_refused(address: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         check_output(address)
 
 
@@ -112,7 +112,7 @@ def test_a_fifo_carries_whole_pictures_to_our_own_source(
         feeding(output)
         for _ in range(2):  # a second reader after the first
             frame = first_frame(str(path), replace(SETTINGS, pixel_format="bgr24"))
-            assert np.array_equal(frame.image, picture(0).image)
+            assert np.array_equal(frame.image, image(0).image)
     assert not path.exists()
 
 
@@ -125,7 +125,7 @@ def test_a_reader_that_hangs_delays_nobody_and_one_that_was_there_before_keeps_i
     output = PipeOutput(str(path))
     try:
         for number in range(400):
-            output.write(picture(number))
+            output.write(image(number))
         until(lambda: output._thread.dropped > 300, "frames dropped for a reader that takes none")
     finally:
         output.close()
@@ -171,14 +171,14 @@ def test_motion_jpeg_is_read_by_our_own_source_and_by_opencv(feeding: Callable[[
     with closing(MjpegOutput("127.0.0.1", 0)) as output:
         feeding(output)
         address = f"http://127.0.0.1:{output.port}/"
-        assert looks_right(first_frame(address), 12)
+        assert matches_image(first_frame(address), 12)
         capture = cv2.VideoCapture(address, cv2.CAP_FFMPEG)
         try:
             done, image = capture.read()
         finally:
             capture.release()
         assert done
-        assert looks_right(Frame(np.asarray(image, np.uint8), 0, 0), 12)
+        assert matches_image(Frame(np.asarray(image, np.uint8), 0, 0), 12)
 
 
 def test_a_snapshot_is_one_picture_and_elsewhere_is_nothing(feeding: Callable[[FrameOutput], None]) -> None:
@@ -191,7 +191,7 @@ def test_a_snapshot_is_one_picture_and_elsewhere_is_nothing(feeding: Callable[[F
             assert answer.status == 200
             assert int(answer.headers["X-Captured-Ns"]) >= 1_000_000_000
             image = cv2.imdecode(np.frombuffer(answer.read(), np.uint8), cv2.IMREAD_COLOR)
-            assert looks_right(Frame(np.asarray(image, np.uint8), 0, 0), 12)
+            assert matches_image(Frame(np.asarray(image, np.uint8), 0, 0), 12)
         with closing(http.client.HTTPConnection("127.0.0.1", output.port, timeout=DEADLINE_S)) as connection:
             connection.request("GET", "/passwords")
             assert connection.getresponse().status == 404
@@ -209,7 +209,7 @@ def test_a_client_that_takes_nothing_does_not_stop_the_others(feeding: Callable[
         until(lambda: output.clients == 3, "three clients served")
         before = output.number
         until(lambda: output.number > before + 20, "pictures made while three clients hang")
-        assert looks_right(first_frame(f"http://127.0.0.1:{output.port}/"), 12)
+        assert matches_image(first_frame(f"http://127.0.0.1:{output.port}/"), 12)
         for client in stuck:
             client.close()
         until(lambda: output.clients == 0, "the clients counted out again")
@@ -232,7 +232,7 @@ def test_too_many_clients_are_told_so(feeding: Callable[[FrameOutput], None]) ->
 def test_nothing_is_encoded_while_nobody_looks() -> None:
     with closing(MjpegOutput("127.0.0.1", 0)) as output:
         for number in range(10):
-            output.write(picture(number))
+            output.write(image(number))
         assert output.number == 0
 
 
@@ -250,7 +250,7 @@ def test_h264_in_rtp_is_decoded_by_our_own_source(feeding: Callable[[FrameOutput
 
             def good() -> bool:
                 frame = source.read(0.5)
-                return frame is not None and looks_right(frame, 25)
+                return frame is not None and matches_image(frame, 25)
 
             until(good, "a picture that looks right")
 
@@ -264,7 +264,7 @@ def test_rtp_packets_are_h264_of_payload_type_96_on_a_90_khz_clock() -> None:
         with closing(open_output(f"rtp://127.0.0.1:{port}", *SIZE, 30.0)) as output:
             stamps, kinds = [], set()
             for number in range(3):
-                output.write(picture(number))
+                output.write(image(number))
                 while True:
                     packet = receiver.recv(65536)
                     assert packet[0] >> 6 == 2  # RTP's version, RFC 3550
@@ -295,10 +295,10 @@ def test_the_newest_frame_wins_when_the_taker_is_slow() -> None:
         go.wait(DEADLINE_S)
 
     thread = NewestFrame("slow", take)
-    thread.put(picture(0))
+    thread.put(image(0))
     until(lambda: taken == [0], "the first frame taken")
     for number in range(1, 50):
-        thread.put(picture(number))
+        thread.put(image(number))
     go.set()
     until(lambda: len(taken) == 2, "the next frame taken")
     thread.close()
