@@ -150,7 +150,7 @@ def test_two_autopilots_on_one_port_are_refused_by_their_ids(name: str) -> None:
     assert "4 and 9" in line
 
 
-def test_a_silent_autopilot_is_asked_for_attitude_and_position() -> None:
+def test_missing_pose_messages_are_requested() -> None:
     port = free_port()
     vehicle = UdpEndpoint("127.0.0.1", 0, port)
     link = AutopilotLink(f"udpin://127.0.0.1:{port}")

@@ -70,7 +70,7 @@ def first_frame(camera: CameraProcess, position: tuple[float, float, float], yaw
     return got[0]
 
 
-def test_a_frame_shows_what_the_pose_sees_and_bears_its_stamp(camera: CameraProcess) -> None:
+def test_frame_shows_its_pose_and_has_its_stamp(camera: CameraProcess) -> None:
     frame = first_frame(camera, (1.0, 0.0, -2.0), 0.0)
     here = Renderer(WORLD, CAMERA, CameraMount()).render((1.0, 0.0, -2.0), np.eye(3))
     assert frame.depth_m is not None
@@ -115,7 +115,7 @@ def _ignores_interrupts(pid: int) -> bool:
 
 
 @pytest.mark.parametrize("painting", [False, True], ids=["while it is imported", "while it paints"])
-def test_a_camera_that_is_still_starting_ends_at_once_and_without_a_word(
+def test_starting_camera_stops_quickly_and_silently(
     name: str, painting: bool, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
 ) -> None:
     vast = World((), Ground(("meadow", "grass", "rows"), 0, 2048, 0.05))  # seconds of painting
@@ -185,6 +185,6 @@ def _runs(pid: int) -> bool:
         return False
 
 
-def test_a_rate_that_cannot_be_is_refused() -> None:
+def test_invalid_rate_refused() -> None:
     with pytest.raises(ValueError, match="rate"):
         CameraProcess(WORLD, rate_hz=0.0)

@@ -142,9 +142,7 @@ def test_it_connects_sets_parameters_and_flies(simulator: RunningSimulator, cons
     console.wait_for("DISARMED")
 
 
-def test_its_takeoff_goes_to_a_height_above_the_sea_as_px4_takes_it(
-    simulator: RunningSimulator, console: Console
-) -> None:
+def test_takeoff_altitude_is_amsl_as_in_px4(simulator: RunningSimulator, console: Console) -> None:
     console.wait_for(r"Received (\d+) parameters")
     console.ask("arm throttle", "COMPONENT_ARM_DISARM: ACCEPTED")
     since = console.type(f"takeoff {HOME_ALTITUDE_M + 4.0}")

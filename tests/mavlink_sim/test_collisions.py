@@ -101,7 +101,7 @@ def test_a_wall_stops_a_vehicle_and_leaves_it_flying() -> None:
     assert vehicle.truth.position_ned_m[0] < 4.0
 
 
-def test_without_a_scene_there_is_nothing_of_this_and_the_flight_is_the_same_to_the_bit() -> None:
+def test_without_scene_flight_is_bit_equal() -> None:
     plain = flying(scene=None, seed=4, gusts_mps=None)
     among = flying(WorldObject(0, "wall", (500.0, 0.0, 0.0)), seed=4, gusts_mps=None)
     assert type(plain.vehicle.airframe) is Multirotor
@@ -150,7 +150,7 @@ def test_a_bounce_takes_speed_and_friction_slows_along_the_wall() -> None:
 LEVEL = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
 
-def test_what_it_slides_along_turns_it() -> None:
+def test_sliding_contact_rotates_vehicle() -> None:
     """A wall to the north, the nose north: going east its nose is held back, so that it turns west."""
     into, velocity, rates = after_contact((3.0, 2.0, 0.0), (0.0, 0.0, 0.0), LEVEL, (-1.0, 0.0, 0.0))
     assert into == pytest.approx(3.0)
@@ -168,7 +168,7 @@ def test_what_it_slides_along_turns_it() -> None:
     assert rates == pytest.approx((0.0, 0.0, -0.5 * RADIUS_M / INERTIA_Z_KGM2))
 
 
-def test_a_wall_turns_the_vehicle_that_scrapes_along_it() -> None:
+def test_scraping_a_wall_yaws_vehicle() -> None:
     for east_mps in (-2.0, 2.0):
         body, clock = airframe(WALL)
         throw(body, (FACE_M - RADIUS_M - 0.05, 0.0, -2.0), (3.0, east_mps, 0.0))
@@ -177,7 +177,7 @@ def test_a_wall_turns_the_vehicle_that_scrapes_along_it() -> None:
         assert body.rates[2] * east_mps < -1.0
 
 
-def test_a_vehicle_that_a_wall_turns_flies_on() -> None:
+def test_vehicle_recovers_from_wall_contact() -> None:
     vehicle = flying(WALL)
     steer(vehicle, velocity(2.0, 0.6), 6.0)
     assert vehicle.truth.collisions >= 1
@@ -193,7 +193,7 @@ triple = st.tuples(st.floats(-8, 8), st.floats(-8, 8), st.floats(-8, 8))
 
 
 @given(triple, triple, unit, st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: math.hypot(*q) > 0.1))
-def test_no_contact_gives_energy_and_the_touching_point_does_not_go_in(
+def test_contact_adds_no_energy_and_no_penetration(
     velocity: Any, rates: Any, normal: Any, quaternion: Any
 ) -> None:
     normal = tuple(value / math.hypot(*normal) for value in normal)
@@ -223,7 +223,7 @@ def test_no_contact_gives_energy_and_the_touching_point_does_not_go_in(
     st.floats(-math.pi, math.pi),
     st.tuples(st.floats(-1.2, 1.2), st.floats(-1.2, 1.2)),
 )
-def test_nobody_leaves_a_walled_yard(
+def test_vehicle_cannot_leave_walled_yard(
     heading: float, speed: float, climb: float, yaw: float, start: tuple[float, float]
 ) -> None:
     sides = [
@@ -295,7 +295,7 @@ def test_a_roof_breaks_it_as_the_ground_does() -> None:
     assert events[0].standing
 
 
-def test_over_the_edge_it_falls() -> None:
+def test_falls_over_roof_edge() -> None:
     body, clock = airframe(BLOCK)
     throw(body, (4.0, 0.0, -1.5), (0.0, 0.0, 0.2))
     let_pass(body, clock, 0.5)
@@ -307,7 +307,7 @@ def test_over_the_edge_it_falls() -> None:
     assert body.floor_down_m == 0.0
 
 
-def test_what_comes_along_pushes_and_hits() -> None:
+def test_moving_obstacle_pushes_and_hits() -> None:
     path = Path(((10.0, 0.0, 0.0), (-5.0, 0.0, 0.0)), 3.0, "once", fixed_yaw_rad=0.0)
     body, clock = airframe(WorldObject(1, "box", (10.0, 0.0, 0.0), size_m=(1, 2, 2)), paths={1: path})
     events: list[Collision] = []
@@ -321,7 +321,7 @@ def test_what_comes_along_pushes_and_hits() -> None:
     assert not body.crashed
 
 
-def test_it_rides_on_what_it_stands_on() -> None:
+def test_rides_on_moving_support() -> None:
     path = Path(((4.0, 0.0, 0.0), (4.0, 9.0, 0.0)), 1.5, "once", fixed_yaw_rad=0.0)
     body, clock = airframe(BLOCK, paths={5: path})
     throw(body, (4.0, 0.0, -1.55), (0.0, 0.0, 0.0))
@@ -332,7 +332,7 @@ def test_it_rides_on_what_it_stands_on() -> None:
     assert body.velocity[1] == pytest.approx(1.5, abs=0.01)
 
 
-def test_a_vehicle_that_starts_elsewhere_meets_things_where_they_are() -> None:
+def test_obstacles_respect_start_offset() -> None:
     body, clock = airframe(WALL, start=(5.0, 0.0))
     throw(body, (0.0, 0.0, -4.0), (5.0, 0.0, 0.0))
     let_pass(body, clock, 0.8)
@@ -340,14 +340,14 @@ def test_a_vehicle_that_starts_elsewhere_meets_things_where_they_are() -> None:
     assert body.position[0] < FACE_M - 5.0 - RADIUS_M + 0.01
 
 
-def test_a_vehicle_cannot_start_in_something() -> None:
+def test_start_inside_obstacle_refused() -> None:
     with pytest.raises(ValueError, match=r"north 4 m, east 0 m.*box-5"):
         LockstepVehicle(scene=World((BLOCK,)), start_ned_m=(4.0, 0.0))
     flat = WorldObject(0, "plate", (0.0, 0.0, 0.0), printed=Print("4X4_50", 1, 1.0))
     assert LockstepVehicle(scene=World((flat,))).truth.collisions == 0
 
 
-def test_a_fleet_that_would_start_in_something_is_refused_in_one_line(
+def test_fleet_start_inside_obstacle_is_one_line(
     tmp_path: FilePath, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     scene = tmp_path / "block.toml"
@@ -369,7 +369,7 @@ def test_the_examples_can_be_flown_in(name: str) -> None:
     assert not vehicle.truth.crashed
 
 
-def test_the_scene_of_a_simulation_is_in_the_way_and_the_truth_tells_of_it(tmp_path: FilePath) -> None:
+def test_simulation_scene_collides_and_truth_has_it(tmp_path: FilePath) -> None:
     scene = tmp_path / "block.toml"
     scene.write_text('[[objects]]\nclass = "box"\nplace_m = [4, 0]\nsize_m = [2, 2, 1.5]\n', "utf-8")
     events: list[str] = []
@@ -389,14 +389,14 @@ def test_the_scene_of_a_simulation_is_in_the_way_and_the_truth_tells_of_it(tmp_p
     assert any(event.startswith("hit box-0 at ") for event in events)
 
 
-def test_the_demo_world_is_there_to_be_looked_at_alone(tmp_path: FilePath) -> None:
+def test_demo_world_has_no_obstacles(tmp_path: FilePath) -> None:
     options = SimulationOptions(onboard_bind=0, gcs_bind=0, truth=tmp_path / "truth.jsonl")
     with Simulation(options, lambda text: None) as simulation:
         assert simulation.truth()["objects"]
         assert simulation.vehicle.collision_world is None
 
 
-def test_a_scene_may_be_given_as_what_it_is() -> None:
+def test_scene_object_accepted() -> None:
     scene = Scene(World((WALL,)))
     for form in (scene, scene.world, "obstacle_course"):
         vehicle = LockstepVehicle(scene=form)

@@ -43,7 +43,7 @@ def truth_of(folder: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (folder / "truth.jsonl").read_text("utf-8").splitlines()]
 
 
-def test_yolo_labels_say_what_the_truth_says(tmp_path: Path) -> None:
+def test_yolo_labels_match_truth(tmp_path: Path) -> None:
     folder = tmp_path / "set"
     done: list[int] = []
     options = DatasetOptions(8, seed=3, validation=0.25, depth=True, altitude_m=(2.0, 8.0))
@@ -83,7 +83,7 @@ def test_yolo_labels_say_what_the_truth_says(tmp_path: Path) -> None:
     assert labels >= 6
 
 
-def test_coco_files_are_read_by_cocos_own_tools(tmp_path: Path) -> None:
+def test_coco_files_read_by_pycocotools(tmp_path: Path) -> None:
     coco = pytest.importorskip("pycocotools.coco", reason="COCO's own reader is not installed")
     folder = tmp_path / "set"
     labels = make_dataset(folder, None, DatasetOptions(6, layout="coco", size=(160, 128), validation=0.5))
@@ -119,14 +119,14 @@ def test_a_seed_gives_the_same_files_again_whatever_the_count(tmp_path: Path, sc
     assert not rasters.items() & files(tmp_path / "other").items()
 
 
-def test_a_folder_with_something_in_it_is_left_alone(tmp_path: Path) -> None:
+def test_non_empty_folder_refused(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("mine")
     with pytest.raises(DatasetError, match="empty folder"):
         make_dataset(tmp_path, SCENE, DatasetOptions(1))
     assert files(tmp_path).keys() == {"mine.txt"}
 
 
-def test_a_scene_with_no_place_to_look_from_is_refused(tmp_path: Path) -> None:
+def test_scene_without_viewpoint_refused(tmp_path: Path) -> None:
     full = World((WorldObject(0, "box", (0.0, 0.0, 0.0), size_m=(400.0, 400.0, 50.0)),))
     with pytest.raises(DatasetError, match="found no viewpoint"):
         make_dataset(tmp_path / "set", Scene(full), DatasetOptions(1, classes=("box",)))
@@ -144,7 +144,7 @@ def test_a_scene_with_no_place_to_look_from_is_refused(tmp_path: Path) -> None:
         ({"seed": -1}, "seed"),
     ],
 )
-def test_options_that_cannot_be_are_refused(changes: dict[str, Any], message: str) -> None:
+def test_invalid_options_refused(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(DatasetError, match=message):
         DatasetOptions(**{"frames": 1, **changes})
 
@@ -161,7 +161,7 @@ height = 96
 """
 
 
-def test_the_command_writes_a_data_set_and_says_what_it_wrote(tmp_path: Path) -> None:
+def test_command_writes_data_set_and_reports_counts(tmp_path: Path) -> None:
     scene = tmp_path / "field.toml"
     scene.write_text(SCENE_FILE, "utf-8")
     command = [sys.executable, "-m", "mavlink_sim", "dataset", str(tmp_path / "set"), "--scene", str(scene)]

@@ -38,7 +38,7 @@ def holding(seconds: float, **options: Any) -> tuple[dict[str, list[Any]], list[
     return reported, truths, vehicle
 
 
-def test_a_held_position_is_told_as_the_real_vehicle_told_it() -> None:
+def test_held_position_error_matches_real_vehicle() -> None:
     spreads, farthest = [], []
     for seed in range(6):
         reported, _, _ = holding(40.0, seed=seed)
@@ -54,7 +54,7 @@ def test_a_held_position_is_told_as_the_real_vehicle_told_it() -> None:
     assert max(farthest) < 0.9
 
 
-def test_the_truth_is_another_place_than_what_is_told_and_not_far_from_it() -> None:
+def test_estimate_differs_slightly_from_truth() -> None:
     reported, truths, vehicle = holding(40.0, seed=4)
     errors = []
     for one in reported["LOCAL_POSITION_NED"]:
@@ -67,7 +67,7 @@ def test_the_truth_is_another_place_than_what_is_told_and_not_far_from_it() -> N
     assert math.dist(vehicle.vehicle.estimate.position, vehicle.truth.position_ned_m) > 0.0
 
 
-def test_the_estimate_has_no_steps_and_the_receiver_is_noisier_than_it() -> None:
+def test_estimate_has_no_steps_and_receiver_is_noisier_than_it() -> None:
     reported, _, _ = holding(20.0, seed=2, gusts_mps=0.0)
     positions = [one.x for one in reported["LOCAL_POSITION_NED"]]
     assert max(abs(b - a) for a, b in itertools.pairwise(positions)) < 0.05
@@ -94,7 +94,7 @@ def test_on_the_ground_it_hardly_drifts() -> None:
     assert 0.0 < max(abs(one.x) for one in positions) < 0.1
 
 
-def test_without_noise_the_vehicle_knows_the_truth() -> None:
+def test_without_noise_estimate_is_truth() -> None:
     reported, truths, vehicle = holding(2.0, seed=4, noise=False)
     truth, last = truths[-1], reported["LOCAL_POSITION_NED"][-1]
     assert (last.x, last.y, last.z) == pytest.approx(truth.position_ned_m, abs=0.05)
@@ -108,7 +108,7 @@ def test_without_noise_the_vehicle_knows_the_truth() -> None:
 
 
 @pytest.mark.parametrize("noise", [True, False])
-def test_an_offset_moves_what_is_believed_and_so_the_vehicle(noise: bool) -> None:
+def test_estimate_offset_moves_vehicle(noise: bool) -> None:
     _, _, vehicle = holding(0.5, seed=4, noise=noise, gusts_mps=0.0)
     before = vehicle.truth.position_ned_m
     vehicle.vehicle.estimate.offset = (2.0, 0.0, 0.0)
@@ -117,7 +117,7 @@ def test_an_offset_moves_what_is_believed_and_so_the_vehicle(noise: bool) -> Non
     assert vehicle.vehicle.estimate.position[0] == pytest.approx(0.0, abs=0.5)
 
 
-def test_the_attitude_it_tells_is_one_attitude() -> None:
+def test_attitude_and_quaternion_agree() -> None:
     airframe = Multirotor()
     airframe.set_attitude(0.4, -0.3, 2.0)
     estimate = Estimate(airframe, seed=3)
@@ -131,7 +131,7 @@ def test_the_attitude_it_tells_is_one_attitude() -> None:
     assert estimate.yaw_rad == pytest.approx(2.5, abs=0.05)
 
 
-def test_what_is_asked_of_it_moves_the_true_airframe_when_time_passes() -> None:
+def test_demands_reach_true_airframe() -> None:
     airframe = Multirotor()
     estimate = Estimate(airframe, noise=False)
     estimate.step(0.004, 2.0 * GRAVITY_MPS2, 0.0, 0.0, 0.0)

@@ -28,9 +28,7 @@ def command() -> Callable[[str], Outcome]:
     return vehicle.faults.command
 
 
-def test_lines_are_carried_out_when_they_are_whole(
-    command: Callable[[str], Outcome], lines: list[str]
-) -> None:
+def test_lines_executed_when_complete(command: Callable[[str], Outcome], lines: list[str]) -> None:
     reading, writing = os.pipe()
     console = FaultConsole(reading, command, lines.append)
     console.poll()  # nothing typed: nothing waits
@@ -53,7 +51,7 @@ def test_lines_are_carried_out_when_they_are_whole(
     os.close(reading)
 
 
-def test_a_file_is_read_whole(command: Callable[[str], Outcome], lines: list[str], tmp_path: Path) -> None:
+def test_file_is_read_completely(command: Callable[[str], Outcome], lines: list[str], tmp_path: Path) -> None:
     path = tmp_path / "faults"
     path.write_text("link_loss for=3\nstall at=9")
     descriptor = os.open(path, os.O_RDONLY)
@@ -65,7 +63,7 @@ def test_a_file_is_read_whole(command: Callable[[str], Outcome], lines: list[str
     os.close(descriptor)
 
 
-def test_a_terminal_is_read_and_may_go_away(command: Callable[[str], Outcome], lines: list[str]) -> None:
+def test_terminal_is_read_and_may_close(command: Callable[[str], Outcome], lines: list[str]) -> None:
     controller, terminal = pty.openpty()
     tty.setraw(terminal)
     console = FaultConsole(terminal, command, lines.append)
@@ -80,9 +78,7 @@ def test_a_terminal_is_read_and_may_go_away(command: Callable[[str], Outcome], l
     os.close(terminal)
 
 
-def test_bytes_that_are_no_text_and_lines_without_end_do_no_harm(
-    command: Callable[[str], Outcome], lines: list[str]
-) -> None:
+def test_binary_and_endless_lines_are_harmless(command: Callable[[str], Outcome], lines: list[str]) -> None:
     reading, writing = os.pipe()
     console = FaultConsole(reading, command, lines.append)
     os.write(writing, b"\xff\xfe\x00\n")

@@ -24,7 +24,7 @@ from mavlink_sim.faults.kinds import EFFECTS, KINDS
         ("stall for=2 at=1", "stall", {"pace": 0.0}, 1.0, 2.0),
     ],
 )
-def test_words_may_stand_in_any_order(
+def test_words_in_any_order(
     text: str, name: str, values: dict[str, object], at_s: float | None, duration_s: float | None
 ) -> None:
     fault = parse_fault(text, KINDS)
@@ -54,7 +54,7 @@ def test_words_may_stand_in_any_order(
         ("gps_loss seed=x", "a whole number"),
     ],
 )
-def test_what_cannot_be_is_refused_in_one_line(text: str, message: str) -> None:
+def test_invalid_faults_refused_in_one_line(text: str, message: str) -> None:
     with pytest.raises(FaultError) as refusal:
         parse_fault(text, KINDS)
     assert message in str(refusal.value)

@@ -33,7 +33,7 @@ def drain(endpoint: socket.socket) -> None:
         endpoint.recv(2048)
 
 
-def test_a_socket_goes_through_its_stage_and_back_to_itself() -> None:
+def test_socket_uses_stage_only_while_engaged() -> None:
     now_s = 0.0
     stage = LinkStage()
     with bound() as near, bound() as far:
@@ -76,7 +76,7 @@ def test_a_socket_goes_through_its_stage_and_back_to_itself() -> None:
         assert link.recvfrom(100)[0] == b"five"
 
 
-def test_faults_come_from_the_command_line_and_the_console_over_real_sockets() -> None:
+def test_faults_from_command_line_and_console() -> None:
     with bound() as client:
         port = client.getsockname()[1]
         with running_simulator(onboard_port=port, faults=["corrupt 0.5 way=out", "at=1 wind 3"]) as simulator:
@@ -112,7 +112,7 @@ def test_faults_come_from_the_command_line_and_the_console_over_real_sockets() -
         (["--control", "nonsense"], "--control nonsense"),
     ],
 )
-def test_what_cannot_be_is_said_in_one_line(arguments: list[str], answer: str) -> None:
+def test_invalid_options_are_one_line(arguments: list[str], answer: str) -> None:
     ports = ["--onboard-bind", "0", "--gcs-bind", "0"]
     command = [sys.executable, "-m", "mavlink_sim", *ports, *arguments]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, stdin=subprocess.DEVNULL)
@@ -132,7 +132,7 @@ def client(port: int) -> zenoh.Session:
     return zenoh.open(config)
 
 
-def test_faults_come_over_zenoh_and_are_answered() -> None:
+def test_faults_over_zenoh_are_answered() -> None:
     port = free_port(socket.SOCK_STREAM)
     with (
         running_simulator(control=f"tcp/127.0.0.1:{port}", system_id=3) as simulator,

@@ -62,9 +62,7 @@ def test_every_dictionary_is_found_by_opencv(dictionary: str) -> None:
     north=st.floats(-0.5, 0.5),
     identifier=st.integers(0, 49),
 )
-def test_a_lying_marker_is_found_within_a_pixel_of_where_it_lies(
-    yaw: float, height: float, north: float, identifier: int
-) -> None:
+def test_lying_marker_found_within_a_pixel(yaw: float, height: float, north: float, identifier: int) -> None:
     plate = WorldObject(0, "plate", (north, 0.2, 0.0), yaw, printed=Print("4X4_50", identifier, 0.6))
     renderer = Renderer(World((plate,), GROUND), CAMERA, CameraMount())
     image = renderer.render((0.0, 0.0, -height), DOWN).image
@@ -78,7 +76,7 @@ def test_a_lying_marker_is_found_within_a_pixel_of_where_it_lies(
 
 @settings(max_examples=10, deadline=None)
 @given(turn=st.floats(-0.9, 0.9), distance=st.floats(2.0, 6.0), lift=st.floats(0.0, 1.5))
-def test_a_standing_marker_is_found_where_it_stands(turn: float, distance: float, lift: float) -> None:
+def test_standing_marker_found_at_its_position(turn: float, distance: float, lift: float) -> None:
     plate = WorldObject(
         0, "plate", (distance, 0.1, -lift), math.pi + turn, printed=Print("APRILTAG_36h11", 7, 0.7, True)
     )
@@ -96,7 +94,7 @@ def test_a_standing_marker_is_found_where_it_stands(turn: float, distance: float
     assert np.abs(found[7] - wanted).max() < 1.8
 
 
-def test_a_standing_marker_shows_nothing_from_behind() -> None:
+def test_standing_marker_invisible_from_behind() -> None:
     plate = WorldObject(0, "plate", (3.0, 0.0, 0.0), 0.0, printed=Print("4X4_50", 7, 0.8, True))
     rendered = Renderer(World((plate,), GROUND), CAMERA, CameraMount()).render((0.0, 0.0, -0.5), np.eye(3))
     assert [item.world_object.identifier for item in rendered.objects] == [0]
@@ -119,9 +117,7 @@ def test_the_white_margin_is_one_cell_wide() -> None:
         ("4X4_50", 0, 0.0, "0.01 to 50 m"),
     ],
 )
-def test_a_print_that_cannot_be_is_refused(
-    dictionary: str, identifier: int, size: float, message: str
-) -> None:
+def test_invalid_print_refused(dictionary: str, identifier: int, size: float, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Print(dictionary, identifier, size)
 
@@ -135,7 +131,7 @@ def test_only_plates_have_prints_and_only_structures_a_size() -> None:
         WorldObject(0, "wall", (0.0, 0.0, 0.0), size_m=(1.0, 0.0, 1.0))
 
 
-def test_a_wall_has_the_size_and_place_asked_for() -> None:
+def test_wall_has_given_size_and_position() -> None:
     wall = WorldObject(0, "wall", (5.0, 0.0, 0.0), math.pi, size_m=(3.0, 0.2, 0.5))
     assert wall.footprint_m == pytest.approx((-0.1, 0.1, -1.5, 1.5))
     assert wall.height_m == pytest.approx(0.5)
@@ -143,7 +139,7 @@ def test_a_wall_has_the_size_and_place_asked_for() -> None:
     assert rendered.depth_m[180, 240] == pytest.approx(4.9, abs=0.01)
 
 
-def test_the_shadow_of_something_in_the_air_falls_away_from_the_sun() -> None:
+def test_shadow_of_raised_object_is_away_from_sun() -> None:
     def dark(height: float) -> np.ndarray:
         block = WorldObject(0, "box", (0.0, 0.0, -height), size_m=(0.4, 0.4, 0.1))
         images = [

@@ -31,7 +31,7 @@ def test_ids_and_ports_count_up_as_in_px4s_sitl() -> None:
     assert [one.seed for one in members] == list(range(10, 30))
 
 
-def test_places_are_a_grid_without_two_in_one() -> None:
+def test_start_positions_are_a_grid() -> None:
     grid = start_positions(20, 5.0)
     assert grid[0] == (0.0, 0.0)
     assert len(set(grid)) == 20
@@ -39,7 +39,7 @@ def test_places_are_a_grid_without_two_in_one() -> None:
     assert min(math.dist(a, b) for a in grid for b in grid if a != b) == 5.0
 
 
-def test_the_camera_is_on_one_vehicle_and_each_has_its_own_truth_file() -> None:
+def test_camera_on_one_vehicle_and_each_has_its_own_truth_file() -> None:
     options = SimulationOptions(camera="eye", truth=Path("truth.jsonl"))
     members = instance_options(options, 3, 5.0)
     assert [one.camera for one in members] == ["eye", None, None]
@@ -59,7 +59,7 @@ def test_the_camera_is_on_one_vehicle_and_each_has_its_own_truth_file() -> None:
     ],
     ids=["none", "ids", "ports", "camera", "spacing", "noise"],
 )
-def test_a_fleet_that_cannot_be_is_refused_in_one_line(
+def test_invalid_fleet_is_one_line(
     arguments: list[str],
     words: list[str],
     monkeypatch: pytest.MonkeyPatch,
@@ -73,7 +73,7 @@ def test_a_fleet_that_cannot_be_is_refused_in_one_line(
     assert all(word in line for word in words)
 
 
-def test_each_has_its_own_home_and_a_local_frame_that_begins_there() -> None:
+def test_each_vehicle_has_its_home_and_local_frame() -> None:
     first = LockstepVehicle(noise=False)
     second = LockstepVehicle(noise=False, start_ned_m=(10.0, 20.0))
     for vehicle in (first, second):  # in turns, as a fleet's are
@@ -91,7 +91,7 @@ def test_each_has_its_own_home_and_a_local_frame_that_begins_there() -> None:
     assert (origin.latitude, origin.longitude) == (there.lat, there.lon) == (home.latitude, home.longitude)
 
 
-def test_a_place_given_in_degrees_is_flown_to_from_another_start() -> None:
+def test_global_position_reached_from_another_start() -> None:
     vehicle = LockstepVehicle({"onboard": {}}, noise=False, gusts_mps=0.0, start_ned_m=(10.0, 20.0))
     vehicle.take_off(5.0)
     # SIH's home, ten metres south and twenty west of where this one started
@@ -120,7 +120,7 @@ def received(port: int, wanted: set[int], limit_s: float = 40.0) -> dict[int, di
     raise AssertionError(f"heard {sorted(newest)} of {sorted(wanted)}")
 
 
-def test_a_fleet_in_one_process_speaks_on_its_ports(tmp_path: Path) -> None:
+def test_fleet_sends_on_its_ports(tmp_path: Path) -> None:
     ready = tmp_path / "ready.json"
     with running_simulator(vehicles=3, spacing=50.0, ready_file=ready) as simulator:
         assert [one.system_id for one in simulator.vehicles] == [1, 2, 3]
@@ -145,7 +145,7 @@ def test_a_range_of_ports_is_free() -> None:
     assert 1024 < start <= 65531
 
 
-def test_a_machine_that_is_too_slow_is_told_of_and_how_slow(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_slow_machine_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     now_s = 100.0
     monkeypatch.setattr("mavlink_sim.realtime.loop.time.monotonic", lambda: now_s)
     reports: list[str] = []

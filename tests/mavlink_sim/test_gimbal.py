@@ -45,7 +45,7 @@ def sight(device: Gimbal) -> Any:
 
 @settings(deadline=None, max_examples=30)
 @given(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5), angles, st.floats(-1.3, 0.2), angles)
-def test_locked_angles_are_kept_whatever_the_vehicle_does(
+def test_locked_angles_independent_of_vehicle(
     roll: float, pitch: float, yaw: float, aim_pitch: float, aim_yaw: float
 ) -> None:
     device = gimbal(MNT_MAX_PITCH=90, MNT_MIN_PITCH=-180)
@@ -83,7 +83,7 @@ def test_its_two_poses_agree(roll: float, pitch: float, yaw: float, tilt: float,
     assert np.allclose(whole, matrix_from_quaternion(device.quaternion), atol=1e-9)
 
 
-def test_it_looks_at_a_place_and_keeps_looking_as_the_vehicle_passes() -> None:
+def test_tracks_location_while_vehicle_passes() -> None:
     device = gimbal()
     device.point(Target(Aim.LOCATION, location=(10.0, 0.0, 0.0)))
     for north in (0.0, 5.0, 10.0, 15.0):
@@ -92,7 +92,7 @@ def test_it_looks_at_a_place_and_keeps_looking_as_the_vehicle_passes() -> None:
         assert sight(device) == pytest.approx(towards / np.linalg.norm(towards), abs=1e-3)
 
 
-def test_the_stops_hold() -> None:
+def test_limits_are_respected() -> None:
     device = gimbal(MNT_MAX_PITCH=30, MNT_MIN_PITCH=-60, MNT_RANGE_YAW=180)
     device.point(Target(Aim.ANGLES, 1.5, 3.0))
     settled(device)
@@ -105,7 +105,7 @@ def test_the_stops_hold() -> None:
     assert math.degrees(settled(device, landed=True).tilt_rad) == pytest.approx(-10.0)
 
 
-def test_it_takes_its_time_and_turns_at_a_rate_until_that_is_silent() -> None:
+def test_slews_and_rate_ends_without_repeats() -> None:
     device = gimbal()
     device.point(Target(Aim.ANGLES, -1.5, 0.0))
     for _ in range(50):
@@ -148,7 +148,7 @@ def degrees(harness: SimHarness) -> tuple[float, float]:
     return math.degrees(device.pitch_rad), math.degrees(device.yaw_rad)
 
 
-def test_a_vehicle_as_delivered_has_no_gimbal(harness: SimHarness) -> None:
+def test_no_gimbal_by_default(harness: SimHarness) -> None:
     harness.wait_ready()
     assert harness.vehicle.gimbal is None
     assert harness.command(512, 280) == [2]
@@ -157,7 +157,7 @@ def test_a_vehicle_as_delivered_has_no_gimbal(harness: SimHarness) -> None:
     assert "MNT_MODE_OUT" not in harness.vehicle.parameters
 
 
-def test_the_gimbal_is_told(make_harness: type[SimHarness]) -> None:
+def test_gimbal_telemetry_is_sent(make_harness: type[SimHarness]) -> None:
     harness = make_harness(gimbal=True)
     harness.wait_ready()
     assert harness.command(512, 280) == [0]
@@ -208,7 +208,7 @@ def test_messages_move_it_too(steered: SimHarness) -> None:
     assert degrees(steered)[1] - before == pytest.approx(30.0, abs=2.0)  # MNT_RATE_YAW
 
 
-def test_a_location_is_looked_at_and_forgotten(steered: SimHarness) -> None:
+def test_roi_location_set_and_cleared(steered: SimHarness) -> None:
     x, y, _ = steered.vehicle.airframe.position
     latitude, longitude, altitude = SIH_FRAME.geographic((x + 20.0, y + 20.0, 0.0))
     position = (0, 0, 0, 0)
@@ -221,7 +221,7 @@ def test_a_location_is_looked_at_and_forgotten(steered: SimHarness) -> None:
     assert steered.command(195, 0, 0, 0, 0, NAN, NAN, NAN) == [2]
 
 
-def test_the_attitude_told_is_the_gimbals(steered: SimHarness) -> None:
+def test_reported_attitude_is_the_gimbals(steered: SimHarness) -> None:
     assert steered.command(1000, -60, 30, NAN, NAN, 12) == [0]
     steered.fly(2.0)
     steered.forget()
@@ -233,7 +233,7 @@ def test_the_attitude_told_is_the_gimbals(steered: SimHarness) -> None:
     assert steered.received("MOUNT_ORIENTATION")[-1].pitch == pytest.approx(-60.0, abs=0.1)
 
 
-def test_landing_turns_it_forward_and_its_commands_are_not_repeated(steered: SimHarness) -> None:
+def test_landing_centres_gimbal_once(steered: SimHarness) -> None:
     assert steered.command(1000, -45, 0, NAN, NAN, 12) == [0]
     steered.take_off()
     steered.forget()

@@ -54,7 +54,7 @@ def locally(mask: int, frame: int = 1, **fields: float) -> Any:
     [(5, HOME_ALTITUDE_M + 7.0, -7.0), (6, 7.0, -7.0), (11, 7.0, -7.0)],
     ids=["above sea", "above home", "above ground"],
 )
-def test_the_altitude_counts_from_what_the_frame_says(frame: int, altitude_m: float, down_m: float) -> None:
+def test_altitude_reference_follows_frame(frame: int, altitude_m: float, down_m: float) -> None:
     setpoint = global_trajectory_setpoint(
         globally((3.0, -4.0, 0.0), altitude_m, frame), SIH_FRAME, HOME_ALTITUDE_M
     )
@@ -63,7 +63,7 @@ def test_the_altitude_counts_from_what_the_frame_says(frame: int, altitude_m: fl
     assert all(math.isnan(value) for value in (*setpoint.velocity, *setpoint.acceleration))
 
 
-def test_a_home_above_the_origin_puts_relative_altitudes_too_low_as_in_px4() -> None:
+def test_relative_altitude_error_with_raised_home_as_in_px4() -> None:
     setpoint = global_trajectory_setpoint(
         globally(altitude_m=10.0, frame=6), SIH_FRAME, HOME_ALTITUDE_M + 2.0
     )
@@ -72,7 +72,7 @@ def test_a_home_above_the_origin_puts_relative_altitudes_too_low_as_in_px4() -> 
 
 
 @pytest.mark.parametrize("frame", [0, 1, 3, 8, 10])
-def test_a_position_in_another_frame_is_refused_in_words(harness: SimHarness, frame: int) -> None:
+def test_position_in_unsupported_frame_refused(harness: SimHarness, frame: int) -> None:
     harness.heartbeats.append(("gcs", (245, 190), 6))
     harness.wait_ready()
     harness.fly(0.1)
@@ -84,7 +84,7 @@ def test_a_position_in_another_frame_is_refused_in_words(harness: SimHarness, fr
 
 
 @pytest.mark.parametrize("bit", [1, 2, 4])
-def test_one_ignored_axis_disables_the_whole_position_and_then_any_frame_will_do(bit: int) -> None:
+def test_ignored_axis_disables_position_in_any_frame(bit: int) -> None:
     message = globally((3.0, 4.0, 0.0), 500.0, frame=3, mask=0x1C0 | bit, vx=1.0, vy=2.0, vz=3.0)
     setpoint = global_trajectory_setpoint(message, SIH_FRAME, HOME_ALTITUDE_M)
     assert setpoint is not None
@@ -92,7 +92,7 @@ def test_one_ignored_axis_disables_the_whole_position_and_then_any_frame_will_do
     assert setpoint.velocity == (1.0, 2.0, 3.0)
 
 
-def test_force_is_refused_in_words_and_nothing_at_all_without_any(harness: SimHarness) -> None:
+def test_force_setpoint_refused(harness: SimHarness) -> None:
     harness.heartbeats.append(("gcs", (245, 190), 6))
     harness.wait_ready()
     harness.fly(0.1)
@@ -104,7 +104,7 @@ def test_force_is_refused_in_words_and_nothing_at_all_without_any(harness: SimHa
     assert not harness.vehicle.autopilot.has_setpoints
 
 
-def test_before_the_vehicle_knows_its_place_a_global_position_is_dropped(harness: SimHarness) -> None:
+def test_global_position_dropped_without_own_position(harness: SimHarness) -> None:
     harness.fly(0.1)
     assert not harness.vehicle.autopilot.sensors_ready
     harness.send(globally(altitude_m=500.0))
@@ -128,7 +128,7 @@ def test_the_force_bit_matters_only_with_an_acceleration(mask: int, refused: boo
     st.integers(0, 65535),
     st.lists(st.floats(width=32), min_size=9, max_size=9),
 )
-def test_any_global_setpoint_is_dropped_or_finite_where_it_controls(
+def test_any_global_setpoint_dropped_or_finite_where_it_controls(
     frame: int, mask: int, values: list[float]
 ) -> None:
     fields = dict(zip(NAMES, values, strict=False))
@@ -175,7 +175,7 @@ def test_a_global_position_is_flown_to_in_each_frame(
     [lambda: locally(ACCELERATION_ALONE, afx=1.0), lambda: globally(mask=ACCELERATION_ALONE, afx=1.0)],
     ids=["local", "global"],
 )
-def test_an_acceleration_alone_gains_the_velocity_that_drag_leaves_of_it(
+def test_acceleration_only_reaches_drag_limited_velocity(
     harness: SimHarness, make: Callable[[], Any]
 ) -> None:
     harness.take_off(10.0)
@@ -228,7 +228,7 @@ def test_height_by_position_and_the_rest_by_velocity(harness: SimHarness) -> Non
     assert harness.received("POSITION_TARGET_LOCAL_NED")[-1].type_mask == 3
 
 
-def test_place_by_position_and_height_by_acceleration(harness: SimHarness) -> None:
+def test_position_control_with_vertical_acceleration(harness: SimHarness) -> None:
     harness.take_off(10.0)
     mixed = locally(0xCFC, x=2.0, y=0.0, afz=-0.4)
     harness.offboard(mixed)
@@ -244,9 +244,7 @@ def test_place_by_position_and_height_by_acceleration(harness: SimHarness) -> No
     [{"mask": 0xDDF, "vz": -1.0}, {"mask": 0xDFE, "x": 30.0}, {"mask": 0xDD7, "vx": 2.0, "vz": 0.0}],
     ids=["height alone", "north alone", "north and height"],
 )
-def test_what_leaves_an_axis_open_stops_the_vehicle_but_counts_as_a_signal(
-    harness: SimHarness, fields: dict[str, Any]
-) -> None:
+def test_incomplete_setpoint_stops_but_keeps_signal(harness: SimHarness, fields: dict[str, Any]) -> None:
     harness.take_off(6.0)
     before = harness.vehicle.airframe.position
     incomplete = locally(**fields)

@@ -59,9 +59,7 @@ def put(airframe: Multirotor, position: Vector, velocity: Vector) -> None:
 
 
 @given(position=st.tuples(offsets, offsets, offsets), one=velocities, other=velocities)
-def test_those_that_overlap_are_parted_and_nothing_comes_of_nothing(
-    position: Vector, one: Vector, other: Vector
-) -> None:
+def test_overlapping_bodies_are_separated(position: Vector, one: Vector, other: Vector) -> None:
     first, second = flying((0.0, 0.0, -5.0), one), flying((9.0, 0.0, -5.0), other)
     world = World4ms(first, second)
     put(second, (position[0], position[1], position[2] - 5.0), other)
@@ -92,7 +90,7 @@ def test_those_that_overlap_are_parted_and_nothing_comes_of_nothing(
     thrusts=st.lists(st.floats(0.0, 20.0), min_size=5, max_size=5),
     tilts=st.lists(st.floats(-1.5, 1.5), min_size=5, max_size=5),
 )
-def test_nobody_passes_by_unseen_between_two_looks(
+def test_no_contact_missed_between_calls(
     positions: list[Vector], directions: list[Vector], thrusts: list[float], tilts: list[float]
 ) -> None:
     """Those that are far off are not looked at, however they accelerate, and nothing is missed by it."""
@@ -117,7 +115,7 @@ def test_nobody_passes_by_unseen_between_two_looks(
 
 
 @pytest.mark.parametrize("speed_mps", [2.0, 3.0])
-def test_two_that_meet_head_on_bounce_or_break(speed_mps: float) -> None:
+def test_head_on_collision_bounces_or_breaks(speed_mps: float) -> None:
     first = flying((0.0, 0.0, -20.0), (speed_mps, 0.0, 0.0))
     second = flying((0.601, 0.0, -20.0), (-speed_mps, 0.0, 0.0))
     events: list[Collision] = []
@@ -134,7 +132,7 @@ def test_two_that_meet_head_on_bounce_or_break(speed_mps: float) -> None:
     assert first.velocity[0] < 0.0 < second.velocity[0]
 
 
-def test_one_that_sinks_onto_another_stands_on_it_until_that_one_leaves() -> None:
+def test_vehicle_stands_on_another_until_it_leaves() -> None:
     below, above = Multirotor(), flying((0.1, 0.0, -1.0), (0.0, 0.0, 0.4))
     world = World4ms(below, above)
     above.thrust_mps2 = GRAVITY_MPS2 - 0.4  # its drag at 0.4 m/s does the rest
@@ -158,7 +156,7 @@ def test_one_that_sinks_onto_another_stands_on_it_until_that_one_leaves() -> Non
     assert (above.on_ground, above.position[2]) == (True, 0.0)  # it fell
 
 
-def test_one_that_falls_on_another_bounces_off_and_neither_is_pushed_into_the_ground() -> None:
+def test_falling_vehicle_bounces_off_another() -> None:
     below, above = Multirotor(), flying((0.1, 0.0, -1.0), (0.0, 0.0, 2.0))
     world = World4ms(below, above)
     for _ in range(500):
@@ -171,7 +169,7 @@ def test_one_that_falls_on_another_bounces_off_and_neither_is_pushed_into_the_gr
     assert above.last_collision.speed_mps > 2.0
 
 
-def test_two_that_slide_into_each_other_on_the_ground_stop_there() -> None:
+def test_sliding_vehicles_stop_each_other() -> None:
     first, second = Multirotor(), Multirotor()
     second.position = (1.0, 0.0, 0.0)
     world = World4ms(first, second)
@@ -183,7 +181,7 @@ def test_two_that_slide_into_each_other_on_the_ground_stop_there() -> None:
     assert first.position[2] == second.position[2] == 0.0
 
 
-def test_in_one_place_two_cannot_begin() -> None:
+def test_overlapping_start_refused() -> None:
     fleet_world = FleetWorld(3)
     first = LockstepVehicle({"onboard": {}}).vehicle
     fleet_world.join(first)
@@ -204,7 +202,7 @@ def position(north: float, east: float, down: float) -> Any:
     )
 
 
-def test_two_in_lockstep_do_not_fly_through_each_other() -> None:
+def test_lockstep_vehicles_collide() -> None:
     pair = [
         LockstepVehicle(
             {"onboard": {}}, system_id=number, seed=number, gusts_mps=0.0, start_ned_m=(start, 0.0)
@@ -231,7 +229,7 @@ def test_two_in_lockstep_do_not_fly_through_each_other() -> None:
     assert any("vehicle 1 at" in event for event in pair[1].events)
 
 
-def test_one_that_lands_on_another_has_landed() -> None:
+def test_landing_on_another_vehicle_is_landed() -> None:
     pair = [
         LockstepVehicle(
             {"onboard": {}}, system_id=number, start_ned_m=(start, 0.0), noise=False, gusts_mps=0.0
@@ -260,7 +258,7 @@ def test_one_that_lands_on_another_has_landed() -> None:
 
 
 @pytest.mark.parametrize("speed", [1.0, 20.0])
-def test_a_fleet_in_real_time_tells_who_ran_into_whom(speed: float) -> None:
+def test_real_time_fleet_reports_collisions(speed: float) -> None:
     events_text: list[str] = []
     options = SimulationOptions(onboard_bind=0, gcs_bind=0, noise=False, gusts_mps=0.0, speed=speed)
 

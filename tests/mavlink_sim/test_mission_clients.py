@@ -109,7 +109,7 @@ async def test_mavsdk_uploads_starts_pauses_and_finishes_a_mission() -> None:
         assert (await mission.download_mission()).mission_items == []
 
 
-async def test_mavsdk_brings_raw_plans_and_takes_them_back() -> None:
+async def test_mavsdk_uploads_and_downloads_raw_plans() -> None:
     async with mavsdk_flight() as (_, system):
         missions = system.plugin(MissionRawAsync)
         flight = raw([takeoff(4.0), waypoint(5, 5, 4.0), item(93, None, 2.0), land(5, 5)])
@@ -146,7 +146,7 @@ async def test_mavsdk_sets_and_clears_a_geofence() -> None:
         assert not (await fence.download_geofence()).circles
 
 
-async def test_mavsdk_flies_out_of_its_geofence_and_is_stopped_and_told() -> None:
+async def test_mavsdk_geofence_breach_holds_and_reports() -> None:
     # in real time: texts go to a ground station whose heartbeat comes often enough
     async with mavsdk_flight(1.0, of_ground_station=True) as (simulator, system):
         fence, telemetry = system.plugin(GeofenceAsync), system.plugin(TelemetryAsync)

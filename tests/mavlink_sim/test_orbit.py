@@ -58,7 +58,7 @@ def circling(harness: SimHarness, seconds: float = 20.0, **options: Any) -> Any:
     ("radius_m", "speed_mps", "clockwise"),
     [(8.0, 3.0, True), (-8.0, 3.0, False), (8.0, -3.0, False), (-8.0, -3.0, True)],
 )
-def test_it_circles_at_the_radius_and_speed_in_the_direction_of_the_signs(
+def test_it_circles_at_radius_and_speed_in_direction_of_signs(
     harness: SimHarness, radius_m: float, speed_mps: float, clockwise: bool
 ) -> None:
     circling(harness, radius_m=radius_m, speed_mps=speed_mps)
@@ -74,7 +74,7 @@ def test_it_circles_at_the_radius_and_speed_in_the_direction_of_the_signs(
     assert harness.height_m == pytest.approx(6.0, abs=0.9)
 
 
-def test_the_mode_is_shown_as_orbit_and_cannot_be_armed_in(harness: SimHarness) -> None:
+def test_orbit_mode_reported_and_prevents_arming(harness: SimHarness) -> None:
     circling(harness, seconds=2.0)
     assert harness.command(512, 436) == [0]
     mode = harness.received("CURRENT_MODE")[-1]
@@ -82,7 +82,7 @@ def test_the_mode_is_shown_as_orbit_and_cannot_be_armed_in(harness: SimHarness) 
     assert (harness.heartbeat().custom_mode, harness.heartbeat().base_mode) == (0x01030000, 145)
 
 
-def test_disarmed_the_mode_is_taken_and_arming_is_refused(harness: SimHarness) -> None:
+def test_disarmed_orbit_accepted_and_arming_refused(harness: SimHarness) -> None:
     harness.wait_ready()
     assert orbit(harness) == [0]
     assert harness.heartbeat().base_mode == 17
@@ -117,7 +117,7 @@ def test_each_heading_behaviour(harness: SimHarness, behaviour: int) -> None:
     assert max(errors) < math.radians(15.0)
 
 
-def test_unchanged_keeps_the_heading_of_the_orbit_before_and_at_first_takes_the_parameter(
+def test_unchanged_keeps_heading_of_previous_orbit(
     make_harness: type[SimHarness],
 ) -> None:
     harness = make_harness(parameters={"MC_ORBIT_YAW_MOD": 3})
@@ -134,7 +134,7 @@ def test_the_altitude_is_approached_with_the_circle(harness: SimHarness) -> None
     assert harness.height_m == pytest.approx(10.0, abs=0.9)
 
 
-def test_without_a_centre_it_goes_round_where_it_was(harness: SimHarness) -> None:
+def test_without_centre_orbits_its_position(harness: SimHarness) -> None:
     harness.take_off(6.0)
     x, y, _ = harness.vehicle.airframe.position
     assert orbit(harness, radius_m=5.0, speed_mps=NAN, centre=None) == [0]
@@ -150,9 +150,7 @@ def test_the_speed_is_limited_by_the_centripetal_acceleration(harness: SimHarnes
 
 
 @pytest.mark.parametrize("radius_m", [0.0, 0.5, -0.9, 1001.0])
-def test_a_radius_out_of_the_limits_is_accepted_and_told_and_the_vehicle_hovers(
-    harness: SimHarness, radius_m: float
-) -> None:
+def test_invalid_radius_accepted_reported_and_hovers(harness: SimHarness, radius_m: float) -> None:
     harness.heartbeats.append(("gcs", (245, 190), 6))
     circling(harness, seconds=0.1, radius_m=radius_m)
     assert harness.texts()[-1] == "Orbit radius limit exceeded\t"
@@ -164,7 +162,7 @@ def test_a_radius_out_of_the_limits_is_accepted_and_told_and_the_vehicle_hovers(
     assert harness.received("ORBIT_EXECUTION_STATUS") == []
 
 
-def test_a_new_request_changes_the_orbit_that_is_flown(harness: SimHarness) -> None:
+def test_new_request_changes_orbit(harness: SimHarness) -> None:
     circling(harness, seconds=15.0)
     assert orbit(harness, radius_m=-15.0, speed_mps=NAN, centre=None) == [0]
     harness.fly(15.0)
@@ -173,7 +171,7 @@ def test_a_new_request_changes_the_orbit_that_is_flown(harness: SimHarness) -> N
 
 
 @pytest.mark.streams("POSITION_TARGET_GLOBAL_INT", "POSITION_TARGET_LOCAL_NED")
-def test_the_execution_is_told_while_it_lasts(harness: SimHarness) -> None:
+def test_execution_status_sent_during_orbit(harness: SimHarness) -> None:
     harness.heartbeats.append(("gcs", (245, 190), 6))
     circling(harness, radius_m=-8.0, seconds=15.0)
     harness.forget()
@@ -196,7 +194,7 @@ def test_the_execution_is_told_while_it_lasts(harness: SimHarness) -> None:
     assert harness.command(512, 360) == [2]
 
 
-def test_a_place_that_is_not_on_earth_is_taken_as_px4_takes_it(harness: SimHarness) -> None:
+def test_position_out_of_range_accepted_as_in_px4(harness: SimHarness) -> None:
     harness.take_off(6.0)
     assert harness.command(34, 8, 3, 0, NAN, 91.0, 8.0, NAN) == [0]
     assert harness.mode == "ORBIT"
@@ -211,9 +209,7 @@ numbers = st.one_of(st.floats(width=32), st.sampled_from([0.0, 1.0, 5.0, -20.0, 
 
 @settings(max_examples=12, deadline=None)
 @given(st.lists(st.lists(numbers, min_size=7, max_size=7), min_size=1, max_size=4))
-def test_no_request_makes_the_flight_absurd(
-    make_harness: type[SimHarness], requests: list[list[float]]
-) -> None:
+def test_any_request_stays_finite(make_harness: type[SimHarness], requests: list[list[float]]) -> None:
     harness = make_harness(["everything"], ready_after_s=0.0)
     airframe = harness.vehicle.airframe
     airframe.position, airframe.on_ground = (0.0, 0.0, -5.0), False

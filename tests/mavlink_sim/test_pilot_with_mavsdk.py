@@ -63,7 +63,7 @@ async def test_a_joystick_flies_the_vehicle_in_position_mode() -> None:
         await asyncio.to_thread(simulator.wait_for_event, "disarmed (after landing)")
 
 
-async def test_the_gimbal_and_the_battery_are_read_and_the_gimbal_is_turned() -> None:
+async def test_gimbal_and_battery_are_read_and_gimbal_is_turned() -> None:
     async with connected(speed=4.0, gimbal=True) as (_, system):
         gimbal, telemetry = system.plugin(GimbalAsync), system.plugin(TelemetryAsync)
         listed = await wait_for(gimbal.subscribe_gimbal_list(), lambda update: bool(update.gimbals))

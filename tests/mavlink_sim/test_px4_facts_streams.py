@@ -25,7 +25,7 @@ def names(harness: SimHarness, link: str = "onboard") -> Counter[str]:
     return Counter(item.message.get_type() for _, item in harness.inbox[link])
 
 
-def test_the_streams_are_the_same_whether_or_not_a_companion_is_heard(make_harness: type[SimHarness]) -> None:
+def test_streams_independent_of_companion_heartbeat(make_harness: type[SimHarness]) -> None:
     alone, received = make_harness(["everything"]), make_harness(["everything"])
     received.heartbeats.append(("onboard", (1, 191), ONBOARD_CONTROLLER))
     for harness in (alone, received):
@@ -49,7 +49,7 @@ def test_the_onboard_link_carries_29_kilobytes_a_second(make_harness: type[SimHa
     assert size == pytest.approx(29_000, rel=0.05)
 
 
-def test_what_the_common_dialect_does_not_know_is_what_it_does_not_know_of_px4(harness: SimHarness) -> None:
+def test_unknown_messages_of_common_dialect_match_px4(harness: SimHarness) -> None:
     harness.take_off()
     harness.command(519, 1)
     codec, reader = parser(), common.MAVLink(None)
@@ -61,9 +61,7 @@ def test_what_the_common_dialect_does_not_know_is_what_it_does_not_know_of_px4(h
     assert {8, 300, 380, 410, 411, 436} <= unknown <= UNKNOWN_TO_COMMON
 
 
-def test_a_place_to_fly_to_is_told_in_modes_that_have_one_and_not_in_offboard(
-    harness: SimHarness, velocity_setpoint: Any
-) -> None:
+def test_position_target_global_sent_except_in_offboard(harness: SimHarness, velocity_setpoint: Any) -> None:
     harness.wait_ready()
     assert "POSITION_TARGET_GLOBAL_INT" not in names(harness)  # not on the ground
     harness.take_off(4.0)
@@ -79,9 +77,7 @@ def test_a_place_to_fly_to_is_told_in_modes_that_have_one_and_not_in_offboard(
         assert 9 <= names(harness)["POSITION_TARGET_GLOBAL_INT"] <= 10
 
 
-def test_a_heartbeat_comes_once_a_second_whatever_happens(
-    harness: SimHarness, velocity_setpoint: Any
-) -> None:
+def test_heartbeat_at_1_hz_always(harness: SimHarness, velocity_setpoint: Any) -> None:
     harness.wait_ready()
     harness.forget()
     started = harness.now_s
@@ -121,7 +117,7 @@ def test_the_old_request_for_a_data_stream_is_ignored(harness: SimHarness) -> No
     assert "COMMAND_ACK" not in names(harness)
 
 
-def test_its_own_time_synchronisation_and_pings_are_requests_to_all(harness: SimHarness) -> None:
+def test_timesync_and_ping_are_broadcast_requests(harness: SimHarness) -> None:
     harness.fly(5.0)
     requests = harness.received("TIMESYNC")
     assert len(requests) == pytest.approx(49, abs=1)
@@ -131,7 +127,7 @@ def test_its_own_time_synchronisation_and_pings_are_requests_to_all(harness: Sim
     assert [ping.seq for ping in pings] == list(range(pings[0].seq, pings[0].seq + len(pings)))
 
 
-def test_a_ground_stations_heartbeat_reaches_the_companion_under_the_ground_stations_name(
+def test_ground_station_heartbeat_keeps_its_source(
     harness: SimHarness,
 ) -> None:
     harness.heartbeats += [("gcs", (245, 190), GCS), ("onboard", (1, 191), ONBOARD_CONTROLLER)]

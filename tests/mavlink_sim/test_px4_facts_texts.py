@@ -29,7 +29,7 @@ def received(make_harness: type[SimHarness]) -> SimHarness:
     return harness
 
 
-def test_a_flight_by_command_is_told_in_px4s_words(received: SimHarness) -> None:
+def test_texts_of_a_flight_by_command(received: SimHarness) -> None:
     received.wait_ready()
     received.command(400, 1)
     received.command(22, *[float("nan")] * 7)
@@ -48,7 +48,7 @@ def test_a_flight_by_command_is_told_in_px4s_words(received: SimHarness) -> None
     ]
 
 
-def test_a_return_is_told_in_px4s_words_all_as_information(received: SimHarness) -> None:
+def test_texts_of_a_return_are_info(received: SimHarness) -> None:
     received.take_off(4.0)
     received.fly(4.0)
     received.forget()
@@ -64,7 +64,7 @@ def test_a_return_is_told_in_px4s_words_all_as_information(received: SimHarness)
     ]
 
 
-def test_disarming_is_told_with_its_reason(received: SimHarness) -> None:
+def test_disarming_text_has_reason(received: SimHarness) -> None:
     received.wait_ready()
     received.command(400, 1)
     received.command(400, 0)
@@ -77,7 +77,7 @@ def test_disarming_is_told_with_its_reason(received: SimHarness) -> None:
     ]
 
 
-def test_what_is_refused_is_told_as_critical_and_only_the_preflight_text_has_no_tab(
+def test_refusal_texts_are_critical_and_end_with_tab(
     received: SimHarness,
 ) -> None:
     received.fly(0.1)
@@ -105,9 +105,7 @@ def test_what_is_refused_is_told_as_critical_and_only_the_preflight_text_has_no_
     assert {severity for severity, _ in texts} == {INFO, CRITICAL}
 
 
-def test_the_loss_of_setpoints_and_of_the_companion_are_told(
-    received: SimHarness, velocity_setpoint: Any
-) -> None:
+def test_texts_of_setpoint_and_companion_loss(received: SimHarness, velocity_setpoint: Any) -> None:
     received.heartbeats.append(("onboard", (1, 191), 18))
     received.take_off(4.0)
     stream = velocity_setpoint(0, 0, 0)
@@ -128,7 +126,7 @@ def test_the_loss_of_setpoints_and_of_the_companion_are_told(
     ]
 
 
-def test_a_take_off_to_a_height_above_ground_instead_of_the_sea_goes_nowhere_and_says_why(
+def test_takeoff_below_current_altitude_sends_text(
     received: SimHarness,
 ) -> None:
     received.wait_ready()
@@ -141,7 +139,7 @@ def test_a_take_off_to_a_height_above_ground_instead_of_the_sea_goes_nowhere_and
     assert sent(received)[-1] == (INFO, "Disarmed by auto preflight disarming\t")
 
 
-def test_a_text_of_more_than_fifty_characters_comes_in_chunks_with_one_number(received: SimHarness) -> None:
+def test_text_over_50_characters_is_chunked(received: SimHarness) -> None:
     received.fly(0.1)
     received.command(400, 1)
     received.fly(0.05)
@@ -152,7 +150,7 @@ def test_a_text_of_more_than_fifty_characters_comes_in_chunks_with_one_number(re
     assert len(chunks[0].text) == 50
 
 
-def test_texts_follow_the_ground_stations_heartbeat_to_whatever_link_it_arrives_on(
+def test_texts_follow_ground_station_heartbeat(
     make_harness: type[SimHarness],
 ) -> None:
     harness = make_harness()

@@ -73,7 +73,7 @@ def test_the_depth_of_the_ground_is_the_analytic_depth(pose: tuple[float, ...]) 
     yaw=st.floats(-math.pi, math.pi),
     class_name=st.sampled_from(CLASS_NAMES),
 )
-def test_a_box_holds_the_object_and_no_more_than_its_bounding_box(
+def test_visible_box_within_bounding_box(
     bearing: float, distance: float, height: float, yaw: float, class_name: str
 ) -> None:
     item = scene_object(0, class_name, distance * math.cos(bearing), distance * math.sin(bearing), yaw)
@@ -118,7 +118,7 @@ def test_the_depth_on_a_box_is_that_of_its_front() -> None:
     assert rendered.depth_m[59, 80] == pytest.approx(9.0 + rear, abs=0.01)
 
 
-def test_the_nearer_thing_hides_the_farther_whatever_their_order() -> None:
+def test_nearer_object_hides_farther_in_any_order() -> None:
     near, far = scene_object(0, "truck", 8.0, yaw=math.pi / 2), scene_object(1, "chair", 18.0)
     for objects in ((near, far), (far, near)):
         rendered = Renderer(world_of(*objects), CAMERA, CameraMount()).render((0.0, 0.0, -1.5), LEVEL)
@@ -126,7 +126,7 @@ def test_the_nearer_thing_hides_the_farther_whatever_their_order() -> None:
         assert seen(rendered, 0).visible_fraction > 0.9
 
 
-def test_a_thing_half_hidden_is_half_visible() -> None:
+def test_half_hidden_object_is_half_visible() -> None:
     wall, car = (
         scene_object(0, "truck", 10.0, 4.0, math.pi / 2),
         scene_object(1, "car", 20.0, 0.0, math.pi / 2),
@@ -141,7 +141,7 @@ def test_a_thing_half_hidden_is_half_visible() -> None:
     assert 0.15 < part.visible_fraction < 0.85
 
 
-def test_a_thing_cut_by_the_edge_of_the_image_counts_what_is_outside_as_hidden() -> None:
+def test_outside_part_of_object_is_hidden() -> None:
     half_width = math.tan(math.radians(35.0)) * 15.0
     rendered = Renderer(world_of(scene_object(0, "crate", 15.0, half_width)), CAMERA, CameraMount()).render(
         (0.0, 0.0, -1.0), LEVEL
@@ -158,14 +158,14 @@ def test_nothing_behind_the_camera_is_drawn() -> None:
 
 
 @pytest.mark.parametrize("distance", [0.0, 0.6, 1.5, 2.4])
-def test_a_camera_inside_or_beside_a_thing_still_draws(distance: float) -> None:
+def test_camera_inside_object_draws(distance: float) -> None:
     renderer = Renderer(world_of(scene_object(0, "truck", 0.0)), CAMERA, CameraMount())
     for yaw in np.linspace(-math.pi, math.pi, 9):
         rendered = renderer.render((distance, 0.3, -1.4), matrix_from_euler(0.1, -0.2, float(yaw)))
         assert np.nanmin(rendered.depth_m) > 0.0
 
 
-def test_looking_straight_down_a_car_is_seen_from_above_at_its_size() -> None:
+def test_looking_straight_down_car_seen_from_above_at_its_size() -> None:
     car = scene_object(0, "car", 0.0)
     height = 20.0
     down = matrix_from_euler(0.0, -math.pi / 2, 0.0)
@@ -218,7 +218,7 @@ def test_haze_takes_the_colour_of_what_is_far() -> None:
     assert change[119] < 10
 
 
-def test_a_thing_casts_its_shadow_away_from_the_sun() -> None:
+def test_shadow_points_away_from_sun() -> None:
     light = Light(sun_azimuth_rad=0.0, sun_elevation_rad=math.radians(35))
     down = matrix_from_euler(0.0, -math.pi / 2, 0.0)
 
@@ -237,7 +237,7 @@ def test_a_thing_casts_its_shadow_away_from_the_sun() -> None:
     assert abs(darker[top - 4, middle].mean()) < 3
 
 
-def test_what_a_renderer_drew_before_does_not_show() -> None:
+def test_frames_are_independent() -> None:
     small = Ground(("meadow",), 0, 256, 0.1, pad=True, road_east_m=8.0)
     renderer = Renderer(replace(demo_world(2), ground=small), CAMERA, DEFAULT_MOUNT)
     first = renderer.render((0.0, 0.0, -4.0), LEVEL)
@@ -248,7 +248,7 @@ def test_what_a_renderer_drew_before_does_not_show() -> None:
     assert first.image is not again.image
 
 
-def test_what_moves_is_drawn_as_if_it_had_always_been_there() -> None:
+def test_moved_object_drawn_as_new() -> None:
     parked = scene_object(0, "truck", 14.0, 1.0)
     directions = [(8.0, -1.0, 0.0, 0.4), (9.5, 0.5, 0.0, 0.4), (9.5, 0.5, -1.5, 0.4), (9.5, 0.5, 0.0, -1.0)]
     renderer = Renderer(world_of(parked, scene_object(1, "person", 7.0, 0.0, 0.4)), CAMERA, DEFAULT_MOUNT)
@@ -276,7 +276,7 @@ def test_buffers_of_another_size_are_refused() -> None:
         Renderer(world_of(), CAMERA, buffers=Buffers(64, 48))
 
 
-def test_effects_change_the_picture_as_named() -> None:
+def test_effects_change_image_as_named() -> None:
     def image(effects: ImageEffects | None) -> np.ndarray:
         rendered = Renderer(world_of(), CAMERA, DEFAULT_MOUNT, effects).render((0.0, 0.0, -4.0), LEVEL)
         return rendered.image.astype(float)

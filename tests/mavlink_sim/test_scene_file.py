@@ -65,7 +65,7 @@ maximum_m = 12
 """
 
 
-def test_every_key_arrives_where_it_belongs() -> None:
+def test_every_key_is_applied() -> None:
     scene = parse_scene(FULL)
     world, camera = scene.world, scene.camera
     assert scene.name == "everything"
@@ -134,7 +134,7 @@ def test_an_empty_file_is_an_empty_field_with_the_usual_camera() -> None:
         ("[[plates]]\ndictionary = '4x4_50'\nid = 1\nsize_m = 1\nplace_m = [0, 0]", r"4X4_50"),
     ],
 )
-def test_what_cannot_be_is_explained(text: str, message: str) -> None:
+def test_invalid_scenes_explained(text: str, message: str) -> None:
     with pytest.raises(SceneError, match=message):
         parse_scene(text)
 
@@ -148,12 +148,12 @@ def test_every_problem_is_named_at_once() -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(st.text(max_size=200))
-def test_any_text_is_a_scene_or_an_error_that_says_so(text: str) -> None:
+def test_any_text_is_a_scene_or_scene_error(text: str) -> None:
     with contextlib.suppress(SceneError):
         assert isinstance(parse_scene(text), Scene)
 
 
-def test_a_file_that_is_not_there_is_told_with_the_scenes_that_need_none(tmp_path: FilePath) -> None:
+def test_missing_file_error_lists_examples(tmp_path: FilePath) -> None:
     with pytest.raises(SceneError, match=r"cannot read .*field.toml: No such file.*village"):
         load_scene(tmp_path / "field.toml")
     (tmp_path / "field.toml").write_bytes(b"name = '\xff'")
@@ -162,7 +162,7 @@ def test_a_file_that_is_not_there_is_told_with_the_scenes_that_need_none(tmp_pat
 
 
 @pytest.mark.parametrize("name", example_scenes())
-def test_an_example_is_whole_and_crosses_to_another_process(name: str) -> None:
+def test_example_is_complete_and_picklable(name: str) -> None:
     scene = load_scene(name)
     assert scene.world.objects
     again = pickle.loads(pickle.dumps(scene))
@@ -188,7 +188,7 @@ paths = st.builds(
 
 
 @given(paths, st.floats(0.0, 300.0), st.floats(0.0, 0.5))
-def test_nothing_on_a_path_goes_faster_than_its_speed(path: Path, time_s: float, step_s: float) -> None:
+def test_path_never_exceeds_its_speed(path: Path, time_s: float, step_s: float) -> None:
     (before, _), (after, _) = path.pose_at(time_s), path.pose_at(time_s + step_s)
     assert math.dist(before, after) <= path.speed_mps * step_s + 1e-6
 
@@ -202,7 +202,7 @@ def test_a_path_repeats_after_its_period_unless_it_ends(path: Path, time_s: floa
         assert math.dist(now, later) < 1e-5
 
 
-def test_a_path_looks_where_it_goes_and_turns_round_on_its_way_back() -> None:
+def test_path_heading_reverses_on_return() -> None:
     path = Path(((0.0, 0.0, 0.0), (0.0, 10.0, 0.0)), 1.0, "back_and_forth")
     position, yaw_rad = path.pose_at(2.0)
     assert position == (0.0, 2.0, 0.0)
@@ -217,7 +217,7 @@ def test_a_path_looks_where_it_goes_and_turns_round_on_its_way_back() -> None:
     assert Path(rising.waypoints_ned_m, 1.0, fixed_yaw_rad=0.3).pose_at(3.0)[1] == 0.3
 
 
-def test_a_path_for_nobody_is_refused() -> None:
+def test_path_for_unknown_object_refused() -> None:
     world = World((WorldObject(0, "car", (1.0, 2.0, 0.0)),))
     with pytest.raises(ValueError, match=r"paths for objects .*\[4\]"):
         Scene(world, {4: Path(((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), 1.0)})

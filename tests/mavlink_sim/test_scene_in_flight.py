@@ -45,7 +45,7 @@ maximum_m = 15
 """
 
 
-def test_a_scene_is_flown_in_and_its_camera_read_in_three_ways(tmp_path: Path) -> None:
+def test_scene_flight_with_three_camera_outputs(tmp_path: Path) -> None:
     scene, truth, seen = tmp_path / "field.toml", tmp_path / "truth.jsonl", tmp_path / "seen.jsonl"
     scene.write_text(SCENE, "utf-8")
     name = f"test-scene-{os.getpid()}-{secrets.token_hex(4)}"
@@ -97,7 +97,7 @@ def test_a_scene_is_flown_in_and_its_camera_read_in_three_ways(tmp_path: Path) -
     assert flight[0]["objects"][1]["position_ned_m"] != flight[-1]["objects"][1]["position_ned_m"]
 
 
-def test_a_scene_that_cannot_be_is_explained_in_one_line_and_nothing_starts(tmp_path: Path) -> None:
+def test_invalid_scene_explained_and_not_started(tmp_path: Path) -> None:
     scene = tmp_path / "field.toml"
     scene.write_text("[camera]\nwidth = 'wide'\n", "utf-8")
     command = [sys.executable, "-m", "mavlink_sim", "--onboard-bind", "0", "--gcs-bind", "0"]

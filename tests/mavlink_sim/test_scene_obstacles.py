@@ -73,9 +73,7 @@ def surface(scene_object: WorldObject) -> NDArray[np.float64]:
 
 @settings(max_examples=30, deadline=None)
 @given(objects, points())
-def test_the_nearest_point_is_as_near_as_the_nearest_of_many(
-    scene_object: WorldObject, point: NDArray[np.float64]
-) -> None:
+def test_nearest_point_matches_brute_force(scene_object: WorldObject, point: NDArray[np.float64]) -> None:
     mesh = mesh_of(scene_object.class_name, scene_object.appearance)
     nearest, distance = mesh.nearest(point)
     assert np.linalg.norm(nearest - point) == pytest.approx(distance, abs=1e-9)
@@ -121,7 +119,7 @@ def test_a_ray_ends_where_the_surface_is(
 
 @settings(max_examples=30, deadline=None)
 @given(objects, points())
-def test_the_gap_is_room_to_move_in_and_the_push_leads_out(
+def test_gap_is_free_and_push_resolves_contact(
     scene_object: WorldObject, centre: NDArray[np.float64]
 ) -> None:
     found = obstacles(scene_object)
@@ -154,7 +152,7 @@ def test_the_gap_is_room_to_move_in_and_the_push_leads_out(
         lambda rows: np.array(rows).reshape(-1, 2, 2)
     )
 )
-def test_each_sector_has_the_nearest_of_what_lies_in_it(segments: NDArray[np.float64]) -> None:
+def test_each_sector_has_its_nearest_point(segments: NDArray[np.float64]) -> None:
     assume(np.abs(segments).max() > 1e-3)
     shares = np.linspace(0.0, 1.0, 1001)[:, None]
     sampled = np.concatenate([start + shares * (end - start) for start, end in segments])
@@ -173,7 +171,7 @@ def test_each_sector_has_the_nearest_of_what_lies_in_it(segments: NDArray[np.flo
 
 @settings(max_examples=20, deadline=None)
 @given(objects, points(6.0), st.floats(-math.pi, math.pi))
-def test_a_scan_sees_what_is_at_its_height_and_nothing_else(
+def test_scan_measures_only_at_its_height(
     scene_object: WorldObject, origin: NDArray[np.float64], yaw: float
 ) -> None:
     ranges = obstacles(scene_object).ranges_around(to_vector(origin), yaw, 12.0, 0.0)
@@ -195,7 +193,7 @@ def test_a_scan_sees_what_is_at_its_height_and_nothing_else(
         assert min(rays) >= ranges[sector] - 1e-6
 
 
-def test_what_moves_is_where_its_path_has_led_it() -> None:
+def test_moving_obstacle_follows_its_path() -> None:
     path = Path(((10.0, 0.0, 0.0), (0.0, 0.0, 0.0)), 2.0, "once", fixed_yaw_rad=0.0)
     found = obstacles(WorldObject(3, "box", (10.0, 0.0, 0.0)), paths={3: path})
     assert found.top_speed_mps == 2.0
@@ -208,7 +206,7 @@ def test_what_moves_is_where_its_path_has_led_it() -> None:
     assert gap.obstacle.velocity_at(9.0) == (0.0, 0.0, 0.0)
 
 
-def test_what_lies_flat_on_the_ground_is_not_in_the_way_and_a_raised_plate_is() -> None:
+def test_flat_plate_is_no_obstacle_raised_one_is() -> None:
     marker = Print("4X4_50", 3, 0.5)
     lying = WorldObject(0, "plate", (0.0, 0.0, 0.0), printed=marker)
     raised = WorldObject(1, "plate", (0.0, 0.0, -1.0), printed=marker)
@@ -219,13 +217,13 @@ def test_what_lies_flat_on_the_ground_is_not_in_the_way_and_a_raised_plate_is() 
     assert obstacles(standing).range_along((1.0, 0.0, -0.3), (-1.0, 0.0, 0.0), 0.0) == pytest.approx(0.998)
 
 
-def test_nothing_in_the_way_is_said_as_that() -> None:
+def test_no_obstacle_gives_infinite_gap() -> None:
     nothing = obstacles()
     assert nothing.nearest((0.0, 0.0, -1.0), 0.0).clear_m == math.inf
     assert nothing.range_along((0.0, 0.0, -1.0), (0.0, 0.0, 1.0), 0.0) == math.inf
     assert nothing.ranges_around((0.0, 0.0, -1.0), 0.3, 12.0, 0.0) == [math.inf] * SECTORS
 
 
-def test_what_leans_is_refused_by_name_rather_than_met_upright() -> None:
+def test_leaning_obstacle_refused() -> None:
     with pytest.raises(ValueError, match="box-4 leans"):
         obstacles(WorldObject(4, "box", (3.0, 0.0, 0.0), roll_rad=0.5))

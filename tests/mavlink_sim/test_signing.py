@@ -84,7 +84,7 @@ frames = st.one_of(
 
 @settings(max_examples=50)
 @given(frames)
-def test_pymavlink_reads_and_believes_what_is_signed_here(message: Any) -> None:
+def test_pymavlink_accepts_signed_frames(message: Any) -> None:
     signing = vehicle_signing(timestamp=START)
     reader = client(timestamp=START)
     reader.signing.allow_unsigned_callback = None
@@ -103,7 +103,7 @@ def test_a_message_outside_pymavlinks_dialects_is_signed_too() -> None:
     assert crc.crc.to_bytes(2, "little") == signing.signed(frame)[-15:-13]
 
 
-def test_a_rightly_signed_frame_is_accepted_once() -> None:
+def test_valid_signed_frame_accepted_once() -> None:
     signing = vehicle_signing()
     frame = heartbeat(client())
     assert signing.accepts(frame)
@@ -134,7 +134,7 @@ def test_a_replay_on_another_link_of_the_vehicle_is_refused() -> None:
     assert not two.accepts(frame)
 
 
-def test_there_is_room_for_sixteen_streams() -> None:
+def test_sixteen_streams_are_stored() -> None:
     signing = vehicle_signing()
     answers = [signing.accepts(heartbeat(client(link_id=number))) for number in range(17)]
     assert answers == [True] * 16 + [False]
@@ -180,7 +180,7 @@ def test_any_bit_changed_makes_the_signature_wrong() -> None:
             assert not vehicle_signing().accepts(bytes(damaged))
 
 
-def test_setup_signing_is_taken_on_the_usb_link_alone(harness: SimHarness) -> None:
+def test_setup_signing_only_on_usb_link(harness: SimHarness) -> None:
     message = dialect.MAVLink_setup_signing_message(1, 1, KEY, START)
     harness.send(message, "onboard")
     assert not any(link.signing.has_key for link in harness.vehicle.links.values())
@@ -217,7 +217,7 @@ def test_an_endpoint_refuses_and_counts_over_a_real_socket() -> None:
 @pytest.mark.parametrize(
     ("text", "words"), [("00" * 31, "31"), ("nothing", "neither"), ("", "0")], ids=["short", "word", "empty"]
 )
-def test_what_is_no_key_is_refused_without_repeating_it(text: str, words: str) -> None:
+def test_invalid_key_refused_without_repeating_it(text: str, words: str) -> None:
     with pytest.raises(ValueError, match=words):
         key_of(text)
 
@@ -266,7 +266,7 @@ def test_mavutil_with_the_key_flies(ports: tuple[int, int]) -> None:
 
 
 @pytest.mark.parametrize("key", [None, OTHER_KEY], ids=["unsigned", "wrong_key"])
-def test_mavutil_without_the_key_is_not_heard(ports: tuple[int, int], key: bytes | None) -> None:
+def test_mavutil_without_key_is_ignored(ports: tuple[int, int], key: bytes | None) -> None:
     link = mavutil.mavlink_connection(f"udpin:127.0.0.1:{ports[0]}", source_system=1, source_component=191)
     try:
         assert link.wait_heartbeat(timeout=20) is not None

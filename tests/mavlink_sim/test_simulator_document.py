@@ -98,14 +98,14 @@ def test_the_example_for_pytest_passes(pytester: pytest.Pytester, monkeypatch: p
     result.assert_outcomes(passed=1)
 
 
-def test_the_example_for_continuous_integration_is_a_list_of_steps() -> None:
+def test_example_for_continuous_integration_is_list_of_steps() -> None:
     (block,) = blocks("yaml")
     steps = yaml.safe_load(block)
     assert all("run" in step or "uses" in step for step in steps)
     assert "--vehicle-logs=" in steps[1]["run"]
 
 
-def test_the_vehicle_needs_nothing_but_what_the_document_names() -> None:
+def test_vehicle_needs_only_documented_packages() -> None:
     code = """
 import sys
 for name in ("torch", "cv2", "zenoh", "mavsdk", "pydantic", "aioconsole", "yaml"):

@@ -68,7 +68,7 @@ class Companion:
         return -float(self.newest["LOCAL_POSITION_NED"].z)
 
 
-def test_pymavlink_flies_offboard_loses_the_stream_and_comes_home() -> None:
+def test_pymavlink_flies_offboard_loses_stream_and_comes_home() -> None:
     with running_simulator(speed=SPEED) as simulator:
         companion = Companion(simulator.onboard_port)
         companion.until(lambda: companion.newest["HEARTBEAT"].system_status == 3)

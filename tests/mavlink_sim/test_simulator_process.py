@@ -76,7 +76,7 @@ def test_a_bad_value_gives_one_clear_line_and_code_two(
         assert word in line
 
 
-def test_a_ready_file_that_cannot_be_written_gives_one_clear_line_and_code_two() -> None:
+def test_unwritable_ready_file_is_one_line_and_code_2() -> None:
     finished = run("--onboard-bind", "0", "--gcs-bind", "0", "--ready-file", "/nonexistent/folder/ready")
     assert finished.returncode == 2
     assert len(finished.stderr.strip().splitlines()) == 1
@@ -93,7 +93,7 @@ def test_a_taken_port_gives_one_clear_line_and_code_two() -> None:
     assert f"127.0.0.1:{port}" in line
 
 
-def test_the_version_is_told() -> None:
+def test_version_is_printed() -> None:
     finished = run("--version")
     assert (finished.returncode, finished.stdout) == (0, f"mavlink-sim {version('mavlink-companion')}\n")
 
@@ -114,13 +114,13 @@ def wander_m(truth: Path, **options: Any) -> float:
     return max(math.dist(position[:2], positions[0][:2]) for position in positions)
 
 
-def test_without_wind_gusts_and_noise_the_air_is_still(tmp_path: Path) -> None:
+def test_without_wind_gusts_and_noise_it_is_still(tmp_path: Path) -> None:
     assert wander_m(tmp_path / "still.jsonl", wind=0, gusts=0, noise=False) < 0.001
     assert wander_m(tmp_path / "usual.jsonl", noise="off") > 0.05
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_it_in_good_order(number: signal.Signals) -> None:
+def test_signal_ends_it_cleanly(number: signal.Signals) -> None:
     with running_simulator() as simulator:
         simulator.process.send_signal(number)
         assert simulator.wait_for_event("stopped", 20.0) == "stopped"
@@ -134,7 +134,7 @@ def fail_with_running_vehicle(fault: str) -> None:
         pytest.fail("timeout")
 
 
-def test_what_fails_while_it_runs_carries_what_it_said_last() -> None:
+def test_failure_note_has_last_events() -> None:
     with pytest.raises(pytest.fail.Exception, match="timeout") as failure:
         fail_with_running_vehicle("wind speed=3 direction=90")
     (note,) = failure.value.__notes__
@@ -144,7 +144,7 @@ def test_what_fails_while_it_runs_carries_what_it_said_last() -> None:
     assert any("wind" in line for line in lines)
 
 
-def test_the_ready_file_tells_pid_and_ports(tmp_path: Path) -> None:
+def test_ready_file_has_pid_and_ports(tmp_path: Path) -> None:
     ready = tmp_path / "ready.json"
     with running_simulator(ready_file=ready) as simulator:
         assert json.loads(ready.read_text()) == {
@@ -166,7 +166,7 @@ def test_both_links_send_from_the_start_and_answer() -> None:
             link.close()
 
 
-def test_the_clock_runs_as_fast_as_asked() -> None:
+def test_clock_runs_at_given_speed() -> None:
     with running_simulator(speed=8.0) as simulator:
         link = mavutil.mavlink_connection(f"udpin:127.0.0.1:{simulator.onboard_port}", source_system=245)
         first = link.recv_match(type="ATTITUDE", blocking=True, timeout=20)
@@ -218,7 +218,7 @@ def camera_process(pid: int) -> int:
     raise AssertionError("the simulator has no camera process")
 
 
-def test_the_camera_is_announced_and_its_loss_told_while_the_vehicle_flies_on(tmp_path: Path) -> None:
+def test_camera_start_and_loss_reported_vehicle_continues(tmp_path: Path) -> None:
     name = f"camera-{tmp_path.parent.name}-{tmp_path.name}-{os.getpid()}"
     with running_simulator(camera=name, camera_rate=10.0) as simulator:
         simulator.wait_for_event(f"camera {name} is on", 60.0)
@@ -269,7 +269,7 @@ def test_an_endpoint_says_which_port_is_taken() -> None:
         first.close()
 
 
-def test_an_endpoint_answers_its_first_correspondent_until_that_one_falls_silent(
+def test_endpoint_keeps_first_peer_until_silent(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     silent_peer = free_port()
@@ -317,7 +317,7 @@ def test_garbage_is_skipped_and_the_message_after_it_read() -> None:
     assert set(found) == {"HEARTBEAT"}
 
 
-def test_a_vehicle_without_a_camera_needs_no_library_of_pictures_and_no_zenoh() -> None:
+def test_without_camera_no_opencv_and_no_zenoh() -> None:
     code = (
         "import sys, mavlink_sim.cli.main, mavlink_sim.testing; from mavlink_sim import LockstepVehicle\n"
         "vehicle = LockstepVehicle(gimbal=True); vehicle.take_off()\n"

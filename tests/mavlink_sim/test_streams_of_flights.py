@@ -67,7 +67,7 @@ def sticks(harness: SimHarness) -> None:
 @pytest.mark.parametrize(
     "flight", [mission, return_to_a_rally_point, precision_landing, geofence, orbit, sticks]
 )
-def test_all_that_is_said_in_a_flight_can_be_put_on_the_wire(
+def test_every_message_of_flights_can_be_packed(
     make_harness: type[SimHarness], flight: Callable[[Any], None]
 ) -> None:
     joystick = {"COM_RC_IN_MODE": 1} if flight is sticks else {}

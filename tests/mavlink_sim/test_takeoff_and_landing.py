@@ -38,9 +38,7 @@ def test_take_off_climbs_to_two_and_a_half_metres_and_holds(harness: SimHarness)
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_in_moving_air_too_hold_begins_after_6_5_to_9_s_at_1_8_to_2_2_m(
-    make_harness: type[SimHarness], seed: int
-) -> None:
+def test_takeoff_with_gusts_ends_as_measured(make_harness: type[SimHarness], seed: int) -> None:
     harness = make_harness(noise=True, gusts_mps=None, seed=seed)
     harness.wait_ready()
     assert harness.command(400, 1) == [0]
@@ -62,7 +60,7 @@ def test_a_higher_take_off_holds_as_soon_as_measured(
     assert least_s <= harness.until(lambda: harness.mode == "HOLD") + 0.04 <= most_s
 
 
-def test_it_is_in_air_as_hold_begins_and_not_before(harness: SimHarness) -> None:
+def test_in_air_only_when_hold_begins(harness: SimHarness) -> None:
     harness.wait_ready()
     harness.command(400, 1)
     harness.command(22, NAN, 0, 0, NAN, NAN, NAN, NAN)
@@ -94,7 +92,7 @@ def test_take_off_is_accepted_before_arming_and_waits_for_it(harness: SimHarness
     assert harness.height_m > 1.5
 
 
-def test_the_mode_take_off_alone_takes_off_once_armed(harness: SimHarness) -> None:
+def test_takeoff_mode_takes_off_once_armed(harness: SimHarness) -> None:
     harness.wait_ready()
     assert harness.set_mode(4, 2) == [0, 0]
     assert harness.command(400, 1) == [0]
@@ -111,7 +109,7 @@ def test_take_off_while_flying_is_accepted_and_does_not_descend(harness: SimHarn
     assert harness.mode == "HOLD"
 
 
-def test_landing_touches_down_softly_and_disarms_two_seconds_later(harness: SimHarness) -> None:
+def test_landing_touches_down_softly_and_disarms_2_s_later(harness: SimHarness) -> None:
     harness.take_off(4.0)
     harness.fly(4.0)
     harness.forget()
@@ -125,7 +123,7 @@ def test_landing_touches_down_softly_and_disarms_two_seconds_later(harness: SimH
     assert landed_states(harness) == [4, 1]
 
 
-def test_after_a_landing_the_mode_chosen_before_it_comes_back(harness: SimHarness) -> None:
+def test_mode_before_landing_restored(harness: SimHarness) -> None:
     harness.take_off()
     harness.command(21)
     harness.until(lambda: not harness.armed, 30.0)
@@ -159,7 +157,7 @@ def test_return_close_to_home_stays_low_lands_and_disarms(harness: SimHarness) -
     assert texts[-3:] == ["RTL: land at destination\t", "Landing detected\t", "Disarmed by landing\t"]
 
 
-def test_return_from_afar_climbs_to_the_return_altitude_and_lands_at_home(
+def test_return_from_afar_climbs_first_and_lands_at_home(
     make_harness: type[SimHarness],
 ) -> None:
     harness = make_harness(parameters={"RTL_RETURN_ALT": 12.0})
@@ -247,7 +245,7 @@ def test_hold_brakes_and_stays(harness: SimHarness, velocity_setpoint: Any) -> N
     assert 1.0 < harness.vehicle.airframe.position[0] - before < 8.0
 
 
-def test_a_gimbal_is_looked_after_at_every_landing(harness: SimHarness) -> None:
+def test_gimbal_commands_sent_at_every_landing(harness: SimHarness) -> None:
     harness.take_off(4.0)
     harness.forget()
     harness.command(21)

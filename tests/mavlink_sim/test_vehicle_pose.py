@@ -92,7 +92,7 @@ def test_simulator_truth_replaces_the_estimate() -> None:
     assert history.monotonic_ns(90 * MS) == 90 * MS
 
 
-def test_a_clock_that_starts_again_starts_the_history_again() -> None:
+def test_clock_restart_resets_history() -> None:
     history = history_of(position(90_000, 1.0), attitude_quaternion(90_000, 0.0))
     history.add(position(500, 3.0), BOOTED_NS + 99_000 * MS)
     history.add(attitude_quaternion(500, 0.0), BOOTED_NS + 99_000 * MS)
@@ -100,12 +100,12 @@ def test_a_clock_that_starts_again_starts_the_history_again() -> None:
     assert history.monotonic_ns(500 * MS) == BOOTED_NS + 99_000 * MS
 
 
-def test_values_that_are_not_finite_are_no_pose() -> None:
+def test_non_finite_values_are_no_pose() -> None:
     history = history_of(position(1000, math.nan), attitude_quaternion(1000, math.nan))
     assert history.span_ns is None
 
 
-def test_clock_goes_by_the_message_delayed_least() -> None:
+def test_clock_uses_least_delayed_message() -> None:
     rng = np.random.default_rng(5)
     clock = BootClock()
     errors = []

@@ -99,14 +99,12 @@ def matches_image(frame: Frame, tolerance: int) -> bool:
         ("shm://a/b", "plain file name"),
     ],
 )
-def test_an_address_that_cannot_be_is_refused(address: str, message: str) -> None:
+def test_invalid_address_refused(address: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         check_output(address)
 
 
-def test_a_fifo_carries_whole_pictures_to_our_own_source(
-    tmp_path: Path, feeding: Callable[[FrameOutput], None]
-) -> None:
+def test_fifo_carries_complete_images(tmp_path: Path, feeding: Callable[[FrameOutput], None]) -> None:
     path = tmp_path / "camera"
     with closing(open_output(f"pipe:{path}", *SIZE, 30.0)) as output:
         feeding(output)
@@ -116,7 +114,7 @@ def test_a_fifo_carries_whole_pictures_to_our_own_source(
     assert not path.exists()
 
 
-def test_a_reader_that_hangs_delays_nobody_and_one_that_was_there_before_keeps_its_fifo(
+def test_hanging_reader_delays_no_other(
     tmp_path: Path,
 ) -> None:
     path = tmp_path / "camera"
@@ -133,7 +131,7 @@ def test_a_reader_that_hangs_delays_nobody_and_one_that_was_there_before_keeps_i
     assert path.exists()
 
 
-def test_a_path_that_is_no_fifo_is_refused_and_left_alone(tmp_path: Path) -> None:
+def test_non_fifo_path_refused_and_unchanged(tmp_path: Path) -> None:
     path = tmp_path / "notes"
     path.write_text("mine")
     with pytest.raises(ValueError, match="FIFO"):
@@ -155,7 +153,7 @@ print("ended", file=sys.stderr)
 """
 
 
-def test_standard_output_carries_raw_pictures_until_its_reader_goes() -> None:
+def test_standard_output_carries_images_until_closed() -> None:
     with subprocess.Popen(
         [sys.executable, "-c", STDOUT_WRITER], stdout=subprocess.PIPE, stderr=subprocess.PIPE
     ) as child:
@@ -167,7 +165,7 @@ def test_standard_output_carries_raw_pictures_until_its_reader_goes() -> None:
         assert child.wait(DEADLINE_S) == 0
 
 
-def test_motion_jpeg_is_read_by_our_own_source_and_by_opencv(feeding: Callable[[FrameOutput], None]) -> None:
+def test_motion_jpeg_read_by_own_source_and_opencv(feeding: Callable[[FrameOutput], None]) -> None:
     with closing(MjpegOutput("127.0.0.1", 0)) as output:
         feeding(output)
         address = f"http://127.0.0.1:{output.port}/"
@@ -181,7 +179,7 @@ def test_motion_jpeg_is_read_by_our_own_source_and_by_opencv(feeding: Callable[[
         assert matches_image(Frame(np.asarray(image, np.uint8), 0, 0), 12)
 
 
-def test_a_snapshot_is_one_picture_and_elsewhere_is_nothing(feeding: Callable[[FrameOutput], None]) -> None:
+def test_snapshot_is_one_image_other_paths_404(feeding: Callable[[FrameOutput], None]) -> None:
     with closing(MjpegOutput("127.0.0.1", 0)) as output:
         feeding(output)
         connection = http.client.HTTPConnection("127.0.0.1", output.port, timeout=DEADLINE_S)
@@ -197,7 +195,7 @@ def test_a_snapshot_is_one_picture_and_elsewhere_is_nothing(feeding: Callable[[F
             assert connection.getresponse().status == 404
 
 
-def test_a_client_that_takes_nothing_does_not_stop_the_others(feeding: Callable[[FrameOutput], None]) -> None:
+def test_stalled_client_does_not_stop_others(feeding: Callable[[FrameOutput], None]) -> None:
     with closing(MjpegOutput("127.0.0.1", 0)) as output:
         feeding(output)
         stuck = []
@@ -215,7 +213,7 @@ def test_a_client_that_takes_nothing_does_not_stop_the_others(feeding: Callable[
         until(lambda: output.clients == 0, "the clients counted out again")
 
 
-def test_too_many_clients_are_told_so(feeding: Callable[[FrameOutput], None]) -> None:
+def test_too_many_clients_refused(feeding: Callable[[FrameOutput], None]) -> None:
     with closing(MjpegOutput("127.0.0.1", 0)) as output:
         feeding(output)
         clients = [socket.create_connection(("127.0.0.1", output.port)) for _ in range(MAX_CLIENTS)]
@@ -229,7 +227,7 @@ def test_too_many_clients_are_told_so(feeding: Callable[[FrameOutput], None]) ->
             client.close()
 
 
-def test_nothing_is_encoded_while_nobody_looks() -> None:
+def test_no_encoding_without_clients() -> None:
     with closing(MjpegOutput("127.0.0.1", 0)) as output:
         for number in range(10):
             output.write(image(number))
@@ -241,7 +239,7 @@ def test_a_taken_port_is_an_error_at_once() -> None:
         open_output(f"http://127.0.0.1:{output.port}", *SIZE, 30.0)
 
 
-def test_h264_in_rtp_is_decoded_by_our_own_source(feeding: Callable[[FrameOutput], None]) -> None:
+def test_h264_in_rtp_decoded_by_own_source(feeding: Callable[[FrameOutput], None]) -> None:
     pytest.importorskip("av", reason="PyAV encodes the stream; it is not installed")
     port = free_port()
     with closing(open_output(f"rtp://127.0.0.1:{port}", *SIZE, 10.0)) as output:
@@ -255,7 +253,7 @@ def test_h264_in_rtp_is_decoded_by_our_own_source(feeding: Callable[[FrameOutput
             until(good, "a picture that looks right")
 
 
-def test_rtp_packets_are_h264_of_payload_type_96_on_a_90_khz_clock() -> None:
+def test_rtp_packets_are_h264_of_payload_type_96_on_90_khz_clock() -> None:
     pytest.importorskip("av", reason="PyAV encodes the stream; it is not installed")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
         receiver.bind(("127.0.0.1", 0))
@@ -286,7 +284,7 @@ def test_h264_of_odd_sides_is_refused() -> None:
         open_output("rtp://127.0.0.1:5600", 161, 120, 30.0)
 
 
-def test_the_newest_frame_wins_when_the_taker_is_slow() -> None:
+def test_newest_frame_wins_with_slow_consumer() -> None:
     taken: list[int] = []
     go = threading.Event()
 
