@@ -23,7 +23,7 @@ def item(
 ) -> dict[str, Any]:
     """An item. `position`: (north, east, height above home) metres; without it MAV_FRAME_MISSION.
 
-    `parameters`: 1 to 4, then 5 to 7 for an item without a place.
+    `parameters`: 1 to 4, then 5 to 7 for an item without a position.
     """
     values = [*parameters, *([0.0] * 7)][:7]
     x, y, z = round(values[4]), round(values[5]), float(values[6])
@@ -79,7 +79,7 @@ def message(sequence: int, fields: dict[str, Any], current: int = 0) -> Any:
 
 
 def newest(harness: SimHarness, kind: str, before: int) -> Any:
-    """The one message of a kind that came after the `before`th, waited for."""
+    """Wait for the message of a kind after the `before`th."""
     if len(harness.received(kind)) <= before:
         harness.until(lambda: len(harness.received(kind)) > before, 1.0)
     return harness.received(kind)[before]

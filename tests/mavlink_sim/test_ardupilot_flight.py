@@ -1,4 +1,4 @@
-"""A Copter's decisions: arming, GUIDED and what it is told, the ways down, the failsafes."""
+"""Copter: arming, GUIDED and its targets, landing, failsafes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ KEEP_HEADING = 0b010000000000  # clears the ignore bit of the yaw rate, which is
 
 @pytest.fixture
 def copter() -> LockstepVehicle:
-    """Ready to be armed, in STABILIZE, with a companion that is heard."""
+    """Ready to be armed, in STABILIZE, with a companion's heartbeat."""
     vehicle = LockstepVehicle(autopilot="ardupilot", seed=4, ready_after_s=0.0)
     vehicle.send(dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
     vehicle.step(0.1)
@@ -38,7 +38,7 @@ def texts(vehicle: LockstepVehicle) -> list[tuple[int, str]]:
 
 
 def target(mask: int, values: tuple[float, ...], frame: int = 1, yaw: float = 0.0, rate: float = 0.0) -> Any:
-    """SET_POSITION_TARGET_LOCAL_NED with its values put where the mask says that they count."""
+    """SET_POSITION_TARGET_LOCAL_NED with the values in the fields that the mask enables."""
     groups: list[tuple[float, ...]] = [(0.0,) * 3] * 3
     groups[(POSITION, VELOCITY, ACCELERATION).index(mask | 0b110000000000)] = values
     flat = [value for group in groups for value in group]
@@ -306,7 +306,7 @@ def test_lost_ground_station_returns_with_fs_gcs_enable(flying: LockstepVehicle)
     flying.step(6.5)
     assert flying.truth.mode == "RTL"
     assert (4, "GCS Failsafe") in texts(flying)
-    flying.set_mode("BRAKE")  # somebody who asks for a mode has it
+    flying.set_mode("BRAKE")  # a requested mode overrides the failsafe
     flying.step(2.0)
     assert flying.truth.mode == "BRAKE"
 
@@ -353,7 +353,7 @@ def test_pause_stops_vehicle_despite_new_targets(flying: LockstepVehicle) -> Non
 
 
 def landing_target(north: float, east: float, vehicle: LockstepVehicle, *, frame: int, valid: int) -> Any:
-    """What a camera fixed to the body, looking down, reports of a plate on the ground."""
+    """LANDING_TARGET of a camera fixed to the body, looking down at a plate on the ground."""
     truth = vehicle.truth
     x, y, z = (
         position - here for position, here in zip((north, east, 0.3), truth.position_ned_m, strict=True)
@@ -397,7 +397,7 @@ def test_pilot_takes_over_in_loiter_and_reboot_resets(flying: LockstepVehicle) -
     assert flying.truth.mode == "STABILIZE"
 
 
-# ---- measured of a real Copter, in still air
+# ---- measured on a real Copter, without wind
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""What a Copter's links say: heartbeats, streams, parameters, texts; and a whole flight by mavutil."""
+"""Copter's messages: heartbeats, streams, parameters, texts; and a whole flight by mavutil."""
 
 from __future__ import annotations
 
@@ -162,7 +162,7 @@ def test_home_is_arming_position_with_true_local_position(copter: LockstepVehicl
 
 @pytest.mark.parametrize("place", [(1.0,), (0.0, 0.0, 0.0, 0.0, 47.3977432, 8.545594, 488.0)])
 def test_commanded_home_is_kept_at_arming(copter: LockstepVehicle, position: tuple[float, ...]) -> None:
-    """ArduPilot locks it, whether a place was named or "here"."""
+    """ArduPilot locks home, set to a position or to "here"."""
     assert copter.command(179, *position) == "ACCEPTED"
     copter.vehicle.airframe.position = (4.0, 0.0, 0.0)
     copter.step(0.1)
@@ -197,7 +197,7 @@ def test_gimbal_and_px4_parameter_refused() -> None:
 
 
 def test_a_whole_flight_by_mavutil(tmp_path: Path) -> None:
-    """As the tutorials for ArduPilot fly: modes by name, arm, take off, go, come home."""
+    """A flight as in ArduPilot's tutorials: modes by name, arm, take off, go to a point, return."""
     with running_simulator(autopilot="ardupilot", ready_after=0.0, speed=6.0) as simulator:
         link = mavutil.mavlink_connection(
             simulator.pymavlink_device, source_system=255, dialect="ardupilotmega"

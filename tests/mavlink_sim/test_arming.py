@@ -1,4 +1,4 @@
-"""Arming, disarming, readiness, and what HEARTBEAT and SYS_STATUS tell of them."""
+"""Arming, disarming, readiness, and their report in HEARTBEAT and SYS_STATUS."""
 
 import math
 from typing import Any
@@ -124,7 +124,7 @@ def test_an_offboard_stream_makes_offboard_ready(harness: SimHarness, velocity_s
     harness.offboard(velocity_setpoint(0, 0, 0))
     assert prearm(harness)
     harness.fly(1.1)  # the stream has stopped
-    assert harness.heartbeat().base_mode == 17  # the newest setpoint counts here, however old
+    assert harness.heartbeat().base_mode == 17  # the newest setpoint is used here, however old
     assert not prearm(harness)
     assert harness.heartbeat().system_status == 0
     assert harness.command(400, 1) == [REJECTED]

@@ -1,4 +1,4 @@
-"""SET_ATTITUDE_TARGET: which of it counts, and how attitudes and rates are flown."""
+"""SET_ATTITUDE_TARGET: the fields used, and the control of attitudes and rates."""
 
 import math
 from types import SimpleNamespace
@@ -69,7 +69,7 @@ def test_any_controlling_setpoint_keeps_offboard_alive(harness: SimHarness, mask
     harness.send(attitude(mask=mask))
     harness.fly(0.05)
     assert harness.vehicle.autopilot.has_setpoints is counts
-    assert harness.texts() == []  # what counts for nothing is dropped without a word
+    assert harness.texts() == []  # an unused setpoint is dropped silently
 
 
 @pytest.mark.parametrize(("system", "component", "counts"), [(1, 0, True), (0, 0, True), (2, 1, False)])
@@ -267,7 +267,7 @@ def test_attitude_target_has_correcting_rates_in_position_mode(
     harness.fly(0.11, position_setpoint(0, 0, -5, 1.4))
     echo = harness.received("ATTITUDE_TARGET")[0]
     assert echo.q[3] == pytest.approx(math.sin(0.7), abs=0.01)
-    assert echo.body_yaw_rate > 1.0  # a PX4 told 2.5 rad/s at the beginning of such a turn
+    assert echo.body_yaw_rate > 1.0  # a PX4 reported 2.5 rad/s at the beginning of such a turn
 
 
 @pytest.mark.parametrize(("setpoint", "base"), [(attitude(), 145), (rates(0, 0, 0), 129)])

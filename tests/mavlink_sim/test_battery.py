@@ -1,4 +1,4 @@
-"""How the battery drains, what is told of it, and what its warnings do."""
+"""The battery: discharge, telemetry, warnings and their failsafes."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_a_battery_of_known_capacity_has_a_current_and_sags() -> None:
     assert loaded.volts < rest.volts - 1.0
     assert battery.time_remaining_s == pytest.approx(0.742 * 3600 / 15.5, rel=0.1)
     battery.step(10.0, False, 0.0)
-    assert battery.charge < 0.75  # what is used stays used
+    assert battery.charge < 0.75  # the used charge is not restored
 
 
 @given(

@@ -1,4 +1,4 @@
-"""The figures of `mavlink-sim bench` mean something; how large they are is the machine's affair."""
+"""The figures of `mavlink-sim bench` are plausible; their size depends on the machine."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Distortion and shutter: every pixel sees what geometry says it sees, and the boxes follow."""
+"""Distortion and shutter: pixels and boxes agree with the geometry."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_point_on_ground_is_seen_where_camera_model_projects_it(
     offsets = np.column_stack([middle[0] + north, middle[1] + east, np.full(len(north), 6.0)])
     optical = offsets @ (attitude @ mount.body_from_optical)
     pixels = camera.project(optical)
-    # Far outside the picture the polynomial may bend points back into it.
+    # Far outside the image the polynomial may bend points back into it.
     plane = np.hypot(*(optical[:, :2] / optical[:, 2:]).T)
     inside = (pixels > 1).all(axis=1) & (pixels < (158, 118)).all(axis=1) & (optical[:, 2] > 0) & (plane < 1)
     assert inside.any()
@@ -102,7 +102,7 @@ def test_under_a_turning_rolling_shutter_uprights_lean(rate_radps: float) -> Non
     near = np.nan_to_num(rendered.depth_m, nan=99.0) < 6.2
     near[70:] = False  # below, the ground is near too
     columns = pole_columns(near)
-    # From the first row to the 70th the camera turns on: to the right, so that things move to the left.
+    # From the first row to the 70th the camera turns to the right, so that objects move to the left.
     expected = -rate_radps * 0.03 * 70 / 120 * PLAIN.fx
     assert columns[-1] - columns[0] == pytest.approx(expected, abs=1.2)
 

@@ -1,4 +1,4 @@
-"""`mavlink-sim camera` as a process: frames from another autopilot's pose, and what it refuses."""
+"""`mavlink-sim camera` as a process: frames from another autopilot's pose, and usage errors."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from vision.shared_frame import SHARED_MEMORY_DIRECTORY, SharedFrameReader, segm
 pytestmark = pytest.mark.skipif(not SHARED_MEMORY_DIRECTORY.is_dir(), reason="needs Linux's /dev/shm")
 DEADLINE_S = 120.0
 LOWEST_EYE_M = -0.05
-"""The renderer lifts an eye that stands on the ground by so much (NED)."""
+"""The renderer's least height of the camera (NED)."""
 
 
 @pytest.fixture
@@ -61,7 +61,7 @@ def test_a_tcp_connection_that_ends_is_an_error_at_once() -> None:
 
 
 def received(endpoint: UdpEndpoint, link: AutopilotLink, count: int) -> list[Any]:
-    """What comes at the vehicle's end while the link is served, until there are `count`."""
+    """The messages received at the vehicle's end while the link is served, until there are `count`."""
     messages: list[Any] = []
     deadline_s = time.monotonic() + 20.0
     while len(messages) < count:

@@ -1,4 +1,4 @@
-"""The camera in a process of its own: frames for poses, and an end when nobody is there any more."""
+"""The camera in its own process: frames for poses, and its end with its parent."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""MAVProxy as a ground station, driven by what a person would type.
+"""MAVProxy as a ground station, driven by typed commands.
 
 MAVProxy is GPL, and asks for matplotlib, VTK and another OpenCV; it is a tool of this test alone, for which
 `pip install --no-deps MAVProxy pyserial` is enough. Without it the test is skipped.
@@ -32,7 +32,7 @@ TAKEOFF, MISSION, LAND = "4 2", "4 4", "4 6"
 
 
 class Console:
-    """A running MAVProxy: type a line, wait for words."""
+    """A running MAVProxy: type a line, wait for output."""
 
     def __init__(self, device: str, folder: Path) -> None:
         self.output: list[str] = []
@@ -60,7 +60,7 @@ class Console:
                 self._changed.notify_all()
 
     def type(self, line: str) -> int:
-        """Returns how many lines had been said before."""
+        """Returns the number of lines printed before."""
         assert self.process.stdin is not None
         before = len(self.output)
         self.process.stdin.write(line + "\n")
@@ -80,7 +80,7 @@ class Console:
         return hit
 
     def ask(self, line: str, pattern: str, limit_s: float = 10.0) -> re.Match[str]:
-        """Type a line, again and again if it takes a while to be true, until the answer comes."""
+        """Type a line, repeatedly if needed, until the answer is printed."""
         deadline = time.monotonic() + limit_s
         while True:
             since = self.type(line)
@@ -93,7 +93,7 @@ class Console:
     def end(self) -> None:
         assert self.process.stdin is not None
         assert self.process.stdout is not None
-        self.process.kill()  # asked kindly, it waits for one more line of input
+        self.process.kill()  # with SIGTERM it waits for one more line of input
         self.process.wait()
         self._reader.join(10.0)
         self.process.stdin.close()

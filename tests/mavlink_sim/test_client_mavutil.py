@@ -1,4 +1,4 @@
-"""pymavlink's mavutil, mavparm and mavftp as a client: the vehicle must be what they take a PX4 for."""
+"""pymavlink's mavutil, mavparm and mavftp as a client."""
 
 from __future__ import annotations
 

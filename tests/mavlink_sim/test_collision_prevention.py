@@ -225,7 +225,7 @@ def test_message_fills_map_and_offboard_ignores_it(
 class Wall:
     """A wall north of a hovering vehicle whose pilot flies by remote control, and a sensor that sees it.
 
-    `at_m`: north of where the vehicle was when the wall was put up.
+    `at_m`: north of the vehicle's position when the wall was added.
     """
 
     def __init__(self, make_harness: type[SimHarness], at_m: float, **values: float) -> None:
@@ -246,7 +246,7 @@ class Wall:
         return self.start_m + self.at_m - self.north_m
 
     def fly(self, seconds: float, setpoint: Any = None, *, seen: bool = True, **sticks: float) -> None:
-        """Let time pass with these sticks; the sensor tells at 10 Hz, ahead and 20° to the sides."""
+        """Advance time with these sticks; the sensor sends at 10 Hz, ahead and 20° to the sides."""
         self.vehicle.transmitter.sticks = Sticks(**sticks)
         for _ in range(round(seconds * 10)):
             distances = [FAR_CM] * SECTORS
@@ -269,7 +269,7 @@ def test_full_stick_towards_a_wall_stops_before_it(make_harness: type[SimHarness
     assert wall.harness.mode == "POSCTL"
     assert 0.7 < wall.distance_m < 2.5
     assert abs(wall.vehicle.airframe.velocity[0]) < 0.2
-    wall.fly(2.0, pitch=-1.0)  # and away from it as fast as the pilot likes
+    wall.fly(2.0, pitch=-1.0)  # and away from it without a limit
     assert wall.distance_m > 3.5
 
 

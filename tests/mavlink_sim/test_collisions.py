@@ -1,4 +1,4 @@
-"""What a scene's things do to a vehicle that meets them."""
+"""Collisions of a vehicle with the objects of a scene."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def steer(vehicle: LockstepVehicle, setpoint: Any, seconds: float) -> None:
 def airframe(
     *objects: WorldObject, paths: dict[int, Path] | None = None, start: tuple[float, float] = (0.0, 0.0)
 ) -> tuple[CollidingMultirotor, list[float]]:
-    """One among things, without a vehicle, and the scene's clock."""
+    """An airframe among obstacles, without a vehicle, and the scene's clock."""
     clock = [0.0]
     obstacles = Obstacles(objects, paths or {}, RADIUS_M, HALF_HEIGHT_M)
     return CollidingMultirotor(0, 0.0, obstacles, start, lambda: clock[0]), clock
@@ -157,7 +157,7 @@ def test_sliding_contact_rotates_vehicle() -> None:
     # Friction stops the touching point: by a quarter it slows the middle, by the rest it turns.
     assert velocity == pytest.approx((-0.75, 1.5, 0.0))
     assert rates == pytest.approx((0.0, 0.0, -0.5 * RADIUS_M / INERTIA_Z_KGM2))
-    # Faster along it friction is all that it can be: 0.3 of the push of 3.75 Ns.
+    # Faster along it friction is at its limit: 0.3 of the push of 3.75 Ns.
     _, velocity, rates = after_contact((3.0, 0.0, 8.0), (0.0, 0.0, 0.0), LEVEL, (-1.0, 0.0, 0.0))
     assert velocity == pytest.approx((-0.75, 0.0, 8.0 - 1.125))
     assert rates == pytest.approx((0.0, 1.125 * RADIUS_M / INERTIA_XY_KGM2, 0.0))  # nose up

@@ -1,4 +1,4 @@
-"""Data sets: labels that lie on what they name, in the layouts that trainers read."""
+"""Data sets: correct labels in the layouts of training tools."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ def test_occluded_pixels_have_no_depth() -> None:
     depth = flat(10.0)
     depth[:, 30:40] = 2.0
     got = measured_depth(depth, FOCAL_PX, QUIET, rng())
-    # Disparities 10 and 2: the strip of 8 pixels to the left of the near thing.
+    # Disparities 10 and 2: the strip of 8 pixels to the left of the near object.
     assert np.isnan(got[:, 23:30]).all()
     assert np.isfinite(got[:, :21]).all()
     assert np.isfinite(got[:, 30:]).all()

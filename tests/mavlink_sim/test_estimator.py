@@ -1,4 +1,4 @@
-"""What the vehicle believes of its motion, and what it tells."""
+"""The vehicle's estimate of its motion, and its telemetry."""
 
 import itertools
 import math
@@ -19,7 +19,7 @@ HERE = dialect.MAVLink_set_position_target_local_ned_message(
 
 
 def holding(seconds: float, **options: Any) -> tuple[dict[str, list[Any]], list[Any], LockstepVehicle]:
-    """A vehicle in OFFBOARD at one place: what it told by type, and the truth at the same time."""
+    """A vehicle holding its position in OFFBOARD: its messages by type, and the truth at the same time."""
     vehicle = LockstepVehicle({"onboard": REPORTED}, **options)
     vehicle.take_off(5.0)
     vehicle.repeat(HERE, 10.0)

@@ -1,4 +1,4 @@
-"""PX4's failsafe rules: the state machine by itself, and on the vehicle."""
+"""PX4's failsafe rules: the state machine alone, and on the vehicle."""
 
 from __future__ import annotations
 
@@ -169,7 +169,7 @@ def test_no_rc_loss_if_armed_without_rc() -> None:
     machine.run(0.1)
     machine.conditions.manual_control_lost = True
     machine.run(0.1)
-    assert machine.machine.in_failsafe  # once it was there, it is missed
+    assert machine.machine.in_failsafe  # a loss needs a first heartbeat
 
 
 def test_worst_failsafe_wins_then_the_next_one() -> None:

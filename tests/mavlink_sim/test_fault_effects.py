@@ -1,4 +1,4 @@
-"""What each fault does to the vehicle, in lockstep."""
+"""The effect of each fault on the vehicle, in lockstep."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def begin(harness: SimHarness, line: str) -> int:
     return harness.vehicle.faults.begin(line)
 
 
-# ---- what is said
+# ---- messages
 
 
 @pytest.mark.streams("everything")
@@ -281,7 +281,7 @@ def test_a_battery_warning_holds_and_has_its_failsafe_by_default(
     harness.heartbeats.append(("gcs", (245, 190), 6))  # texts go to a ground station that speaks
     harness.take_off(30.0)
     begin(harness, f"battery {warning}")
-    harness.fly(12.0)  # an unhurried client's time to see it
+    harness.fly(12.0)  # time for a client to receive it
     assert text in harness.texts()
     assert newest(harness, "SYS_STATUS").battery_remaining == percent
     assert newest(harness, "BATTERY_STATUS").charge_state == charge_state

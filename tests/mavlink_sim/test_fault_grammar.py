@@ -1,4 +1,4 @@
-"""One grammar for the command line, the console, zenoh and Python; what cannot be is said in one line."""
+"""The grammar of faults; invalid input is one line."""
 
 from __future__ import annotations
 

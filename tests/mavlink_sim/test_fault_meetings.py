@@ -1,4 +1,4 @@
-"""Where faults meet each other, failsafes, missions and reboots."""
+"""Combinations of faults, failsafes, missions and reboots."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def position_comes_back(harness: SimHarness) -> None:
 
 
 def breach_the_fence(harness: SimHarness, action: int, waits_s: float = 0.0) -> None:
-    """Too high for a moment; what GF_ACTION asks for then lasts longer than the breach."""
+    """A short breach; the action of GF_ACTION lasts longer than the breach."""
     parameters = harness.vehicle.parameters
     parameters.set("COM_FAIL_ACT_T", waits_s)
     parameters.set("GF_ACTION", action)
@@ -154,7 +154,7 @@ def test_home_here_uses_estimate(harness: SimHarness) -> None:
 
 
 def test_refuse_mode_does_not_affect_mission(harness: SimHarness) -> None:
-    """DO_SET_MODE among the items of a mission is PX4's own affair."""
+    """DO_SET_MODE in a mission is not refused by the fault."""
     harness.take_off(5.0)
     begin(harness, "refuse_mode any")
     assert harness.set_mode(4, 5) == [0, 1]
@@ -274,7 +274,7 @@ def test_lockstep_repeats_through_reboot_and_stall() -> None:
     assert vehicle.vehicle.links["onboard"].received == 4
 
 
-# ---- the clock and other voices
+# ---- the clock and a second autopilot
 
 
 @pytest.mark.streams("ATTITUDE", "TIMESYNC")

@@ -1,4 +1,4 @@
-"""Faults begin, end and are told of when they should; the same seed has the same faults."""
+"""Begin, end and report of faults; the same seed gives the same faults."""
 
 from __future__ import annotations
 

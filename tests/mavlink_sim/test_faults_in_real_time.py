@@ -28,7 +28,7 @@ def bound() -> socket.socket:
 
 
 def drain(endpoint: socket.socket) -> None:
-    """Read until nothing comes for its time-out."""
+    """Read until nothing arrives within its timeout."""
     while True:
         endpoint.recv(2048)
 

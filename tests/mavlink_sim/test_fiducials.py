@@ -1,4 +1,4 @@
-"""Marker plates: found by OpenCV's own detector, where geometry puts them."""
+"""Marker plates: found by OpenCV's detector at their geometric position."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ class Client:
     def repeat(
         self, opcode: int, data: bytes = b"", offset: int = 0, session: int = 0, size: int = -1
     ) -> list[Packet]:
-        """The same again under the same number, as after a lost answer."""
+        """Repeat it with the same number, as after a lost answer."""
         payload = struct.pack(
             "<HBBBBBBI", self.sequence, session, opcode, len(data) if size < 0 else size, 0, 0, 0, offset
         )
@@ -324,7 +324,7 @@ def test_the_metadata_is_found_through_component_metadata(harness: SimHarness) -
     assert [entry["name"] for entry in listed] == [parameter.name for parameter in default_parameters()]
 
 
-# ---- clients nobody here wrote
+# ---- other clients
 
 
 @pytest.fixture(scope="module")

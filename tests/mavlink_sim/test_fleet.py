@@ -1,4 +1,4 @@
-"""Many vehicles in one process: ids, ports, places, seeds, one clock."""
+"""Many vehicles in one process: ids, ports, start positions, seeds, one clock."""
 
 import json
 import math
@@ -104,7 +104,7 @@ def test_global_position_reached_from_another_start() -> None:
 
 
 def received(port: int, wanted: set[int], limit_s: float = 40.0) -> dict[int, dict[str, Any]]:
-    """The newest messages by system and type, once each wanted system told its position."""
+    """The newest messages by system and type, once each given system has sent its position."""
     link = mavutil.mavlink_connection(f"udpin:127.0.0.1:{port}", source_system=245)
     newest: dict[int, dict[str, Any]] = defaultdict(dict)
     deadline = time.monotonic() + limit_s
@@ -117,7 +117,7 @@ def received(port: int, wanted: set[int], limit_s: float = 40.0) -> dict[int, di
                 return dict(newest)
     finally:
         link.close()
-    raise AssertionError(f"heard {sorted(newest)} of {sorted(wanted)}")
+    raise AssertionError(f"received {sorted(newest)} of {sorted(wanted)}")
 
 
 def test_fleet_sends_on_its_ports(tmp_path: Path) -> None:
@@ -127,7 +127,7 @@ def test_fleet_sends_on_its_ports(tmp_path: Path) -> None:
         ports = [one.onboard_port for one in simulator.vehicles]
         assert ports == list(range(ports[0], ports[0] + 3))
         assert {one.gcs_port for one in simulator.vehicles} == {simulator.gcs_port}
-        everybody = received(simulator.gcs_port, {1, 2, 3})  # all speak to the one ground station
+        everybody = received(simulator.gcs_port, {1, 2, 3})  # all send to one ground station
         assert len({position["GLOBAL_POSITION_INT"].lon for position in everybody.values()}) >= 2
         assert set(received(ports[1], {2})) == {2}  # and each to its own companion
         report = json.loads(ready.read_text())
@@ -153,7 +153,7 @@ def test_too_slow_machine_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     pace.lose(25.0)
     now_s += 2.0
     pace.report()
-    assert reports == []  # not at every hiccup
+    assert reports == []  # not for every short delay
     now_s += 3.0
     pace.report()
     assert len(reports) == 1

@@ -1,4 +1,4 @@
-"""The other vehicles of a fleet are things in what a vehicle's camera sees, and in every truth."""
+"""The other vehicles of a fleet in a vehicle's camera and in every truth file."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def drones(taken: Captured) -> list[dict[str, Any]]:
     return [item for item in frame_truth(taken)["objects"] if item["class_name"] == "drone"]
 
 
-# ---- the picture
+# ---- the image
 
 
 def test_other_vehicle_drawn_with_depth_and_truth() -> None:
@@ -84,7 +84,7 @@ def test_other_vehicle_drawn_with_depth_and_truth() -> None:
     depth = taken.frame.depth_m
     assert depth is not None
     own = depth[top:bottom, left:right]
-    own = own[own < 20.0]  # what is seen between its arms is far behind it
+    own = own[own < 20.0]  # the background between its arms is far away
     assert own.size == entry["pixel_count"]
     assert own.min() > 6.0 - HALF_DIAGONAL_M
     assert own.max() < 6.0 + HALF_DIAGONAL_M
@@ -164,7 +164,7 @@ def test_vehicle_shadow_follows_sun(roll_rad: float, pitch_rad: float) -> None:
     assert len(rows) > 20
     throw_m = 3.11 / math.tan(light.sun_elevation_rad)  # from the middle of its height
     scale_px = CAMERA.fx / 6.0
-    away_north = -throw_m * math.cos(light.sun_azimuth_rad) * scale_px  # up in a picture of what is below
+    away_north = -throw_m * math.cos(light.sun_azimuth_rad) * scale_px  # up in an image of the ground
     away_east = -throw_m * math.sin(light.sun_azimuth_rad) * scale_px
     assert rows.mean() == pytest.approx(CAMERA.cy - away_north, abs=2.0)
     assert columns.mean() == pytest.approx(CAMERA.cx + away_east, abs=2.0)
@@ -217,7 +217,7 @@ def name() -> Iterator[str]:
 
 
 class Lines:
-    """JSON lines from a named pipe, taken as they come."""
+    """JSON lines from a named pipe, as they arrive."""
 
     def __init__(self, path: Path) -> None:
         os.mkfifo(path)
@@ -225,7 +225,7 @@ class Lines:
         self._rest = b""
 
     def until(self, condition: Callable[[dict[str, Any]], bool], what: str) -> dict[str, Any]:
-        """The first line to come that meets a condition."""
+        """The first line that meets a condition."""
         deadline = time.monotonic() + DEADLINE_S
         while (left_s := deadline - time.monotonic()) > 0.0:
             line, newline, rest = self._rest.partition(b"\n")
@@ -307,7 +307,7 @@ def test_vehicle_sees_all_others_in_world_frame() -> None:
 
 
 def test_all_vehicles_drawn_at_one_time(tmp_path: Path) -> None:
-    """Each one's truth and what the other says of it at the same moment are the same, to the millimetre."""
+    """Each vehicle's truth and the other's entry of it at the same time agree to the millimetre."""
     options = SimulationOptions(
         onboard_bind=0, gcs_bind=0, ready_after_s=0.0, noise=False, truth=tmp_path / "truth.jsonl", speed=4.0
     )

@@ -1,4 +1,4 @@
-"""The geofence: what is inside, what is refused, and what happens at a breach."""
+"""The geofence: inside and outside, refusals, breaches."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_point_in_star_polygon_matches_opencv(
     ]
     contour = np.array(corners, dtype=np.float32)
     distance = cv2.pointPolygonTest(contour, (north, east), True)
-    assume(abs(distance) > 0.01)  # on the edge either answer will do
+    assume(abs(distance) > 0.01)  # on the edge both results are valid
     assert inside_polygon(corners, (north, east)) == (distance > 0)
 
 
@@ -171,7 +171,7 @@ def test_offboard_does_not_resume_after_breach(harness: SimHarness, velocity_set
     harness.offboard(home)  # the user may, on purpose, still outside
     harness.until(lambda: harness.vehicle.airframe.position[0] < 6.0, 10.0, home)
     assert harness.mode == "OFFBOARD"
-    harness.until(lambda: harness.mode == "HOLD", 10.0, north)  # and the next breach counts anew
+    harness.until(lambda: harness.mode == "HOLD", 10.0, north)  # and the next breach is a new one
 
 
 def test_goal_outside_fence_refused(harness: SimHarness) -> None:

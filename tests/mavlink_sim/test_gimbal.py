@@ -118,7 +118,7 @@ def test_slews_and_rate_ends_without_repeats() -> None:
     assert (device.pan_rad, device.tilt_rad) == pytest.approx((0.2, -0.1), abs=0.01)
     assert device.angular_velocity((0.0, 0.0, 0.0))[1] == pytest.approx(-0.1, abs=1e-6)
     settled(device)
-    assert device.pan_rad == pytest.approx(0.4, abs=0.01)  # 2 s after the last word it stands
+    assert device.pan_rad == pytest.approx(0.4, abs=0.01)  # 2 s after the last message it stops
 
 
 def test_a_rate_against_a_stop_does_not_wind_up() -> None:
@@ -186,7 +186,7 @@ def test_only_the_one_in_control_moves_it(make_harness: type[SimHarness]) -> Non
     assert harness.command(1001, *GROUND_STATION, -1, -1, source=GROUND_STATION, link="gcs") == [0]
     assert harness.vehicle.gimbal_manager is not None
     assert harness.vehicle.gimbal_manager.primary == GROUND_STATION
-    assert harness.command(1001, -3, -3, -1, -1) == [0]  # not ours to release
+    assert harness.command(1001, -3, -3, -1, -1) == [0]  # not released by another component
     assert harness.vehicle.gimbal_manager.primary == GROUND_STATION
     assert harness.command(1001, -3, -3, -1, -1, source=GROUND_STATION, link="gcs") == [0]
     assert harness.vehicle.gimbal_manager.primary == (0, 0)

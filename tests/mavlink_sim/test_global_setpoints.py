@@ -1,4 +1,4 @@
-"""SET_POSITION_TARGET_GLOBAL_INT, accelerations, and what is flown of mixed setpoints."""
+"""SET_POSITION_TARGET_GLOBAL_INT, accelerations and mixed setpoints."""
 
 import math
 from collections.abc import Callable
@@ -33,7 +33,7 @@ def globally(
     mask: int = POSITION_ALONE,
     **fields: float,
 ) -> Any:
-    """A setpoint to a local place, given as latitude and longitude; the altitude as it is sent."""
+    """A setpoint at a local position, as latitude and longitude; the altitude as sent."""
     latitude, longitude, _ = SIH_FRAME.geographic(position)
     values = dict.fromkeys(NAMES, 0.0) | fields
     return dialect.MAVLink_set_position_target_global_int_message(
@@ -109,7 +109,7 @@ def test_global_position_dropped_without_own_position(harness: SimHarness) -> No
     assert not harness.vehicle.autopilot.sensors_ready
     harness.send(globally(altitude_m=500.0))
     assert not harness.vehicle.autopilot.has_setpoints
-    harness.send(globally(mask=0xDC7, vx=1.0))  # a velocity needs no place
+    harness.send(globally(mask=0xDC7, vx=1.0))  # a velocity needs no position
     assert harness.vehicle.autopilot.has_setpoints
 
 
@@ -205,7 +205,7 @@ def test_a_body_acceleration_is_turned_by_the_whole_attitude() -> None:
 
 
 def test_an_acceleration_beside_a_velocity_is_a_feed_forward(harness: SimHarness) -> None:
-    """With drag at 1/s, 2 m/s need 2 m/s² of thrust: given ahead, little is left to correct."""
+    """With drag at 1/s, 2 m/s need 2 m/s² of thrust: with that feed-forward the error is small."""
     harness.take_off(10.0)
     errors = []
     for ahead in (0.0, 2.0):

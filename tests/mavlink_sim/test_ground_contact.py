@@ -1,4 +1,4 @@
-"""When a vehicle is meant to leave the ground, has left it, and has landed again."""
+"""Detection of take-off and landing."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_hold_stays_and_takeoff_rises() -> None:
 
 def test_ramp_restarts_with_each_takeoff() -> None:
     _, ground = contact()
-    assert ground.climb_limit_mps(0.0) == math.inf  # no take-off under way
+    assert ground.climb_limit_mps(0.0) == math.inf  # no take-off in progress
     assert ground.rests(1.0, rises=False)
     assert not ground.rests(2.0, rises=True)
     ramp = [ground.climb_limit_mps(2.0 + step / 10) for step in range(20)]
@@ -69,7 +69,7 @@ def test_landed_after_continuous_ground_contact(detection_s: float) -> None:
     ground.leave(1.0)
     assert not ground.presses(0.0, 1.0)
     assert not ground.presses(detection_s - 0.1, 1.0)
-    assert not ground.presses(detection_s, math.nan)  # nothing is wanted, and the rotors carry it
+    assert not ground.presses(detection_s, math.nan)  # no setpoint, and the rotors carry it
     assert not ground.presses(detection_s + 0.1, 1.0)
     airframe.thrust_mps2 = 0.4 * GRAVITY_MPS2
     assert ground.presses(2.0 * detection_s + 0.1, math.nan)  # or they do not

@@ -1,4 +1,4 @@
-"""The ground is drawn strip by strip, out of an atlas of mip levels: how it is cut does not show."""
+"""The ground is drawn in strips from an atlas of mip levels, independent of their size."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def drawn(width: int, height: int, strip_rows: int, pose: tuple[float, float, fl
 def test_image_is_independent_of_strips(
     size: tuple[int, int], rows: int, pose: tuple[float, float, float]
 ) -> None:
-    """But for the last bit of a coordinate, which here and there chooses another mip level."""
+    """Equal except for single pixels, where the last bit of a coordinate selects another mip level."""
     width, height = size
     whole, cut = (drawn(width, height, strip_rows, pose) for strip_rows in (height, rows))
     assert cut.image.shape == (height, width, 3)

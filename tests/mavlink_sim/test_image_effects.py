@@ -1,4 +1,4 @@
-"""What a sensor does to the pictures of one camera."""
+"""What a sensor does to the images of one camera."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Vehicles of one program are forks of one launcher: what they are, how they end, and what ends them."""
+"""The vehicles of one program as forks of its launcher: their environment and their end."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from mavlink_sim.launching import LaunchedProcess, can_launch, start_simulator
 from mavlink_sim.testing import vehicle
 
 ROOT = Path(__file__).parents[2]
-# Of a vehicle that nobody speaks to.
+# The options of a vehicle without clients.
 SILENT = ["--onboard-bind", "0", "--gcs-bind", "0", "--onboard-port", "9", "--gcs-port", "9", "--no-console"]
 
 pytestmark = pytest.mark.skipif(not can_launch(), reason="a launcher takes Linux with pidfd_open")
@@ -44,7 +44,7 @@ def ends(pid: int, timeout_s: float = 20.0) -> bool:
 
 @pytest.fixture
 def own_launchers(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Launchers of this test alone: they may be killed, or start with other variables."""
+    """Launchers of this test only: they may be killed, or start with other variables."""
     launchers: list[launching._LauncherOfOurs] = []
     monkeypatch.setattr(launching, "_launchers", launchers)
     yield

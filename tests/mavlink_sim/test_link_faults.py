@@ -1,4 +1,4 @@
-"""The link stage invents nothing, loses nothing uncounted, and keeps order where it should."""
+"""The link stage adds nothing, counts every loss, and keeps the order without `Reorder`."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ TRAFFIC = st.lists(st.tuples(st.floats(0.0, 0.2), st.integers(4, 300)), max_size
 def carry(
     impairments: list[Impairment], traffic: list[tuple[float, int]]
 ) -> tuple[Channel, list[bytes], list[tuple[float, bytes]]]:
-    """Send traffic through a channel, looking every time something enters; what went in and came out when."""
+    """Send traffic through a channel, polling at every input; returns inputs and outputs with times."""
     channel = Channel()
     for impairment in impairments:
         channel.impair(impairment)

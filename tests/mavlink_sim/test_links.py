@@ -1,4 +1,4 @@
-"""Status texts, events and forwarding: what goes out on which link."""
+"""Status texts, events and forwarding per link."""
 
 from typing import Any
 
@@ -94,7 +94,7 @@ def test_heartbeat_forwarded_byte_for_byte(
     harness: SimHarness,
 ) -> None:
     harness.send(heartbeat(), "gcs", (245, 190))
-    assert harness.inbox["onboard"] == []  # nobody was heard there yet
+    assert harness.inbox["onboard"] == []  # no component received there yet
     harness.send(dialect.MAVLink_heartbeat_message(ONBOARD_CONTROLLER, 8, 0, 0, 4, 3), "onboard")
     harness.forget()
     message = heartbeat()

@@ -1,4 +1,4 @@
-"""The vehicle in one's own process: stepped, spoken to, looked at."""
+"""The vehicle in lockstep: step, messages, truth, copies."""
 
 import hashlib
 import itertools
@@ -153,7 +153,7 @@ def test_the_time_of_day_is_stepped_too() -> None:
 def test_package_exports_public_names() -> None:
     for name in mavlink_sim.__all__:
         assert getattr(mavlink_sim, name) is not None
-    with pytest.raises(AttributeError, match="nothing_here"):
+    with pytest.raises(AttributeError, match="no_message"):
         _ = mavlink_sim.no_message
 
 
@@ -273,7 +273,7 @@ def test_copy_flies_byte_equal(autopilot: str, options: dict[str, Any]) -> None:
     first.vehicle.faults.begin("gps_loss for=0.5")
     first.vehicle.faults.begin("wind 4 at=60")
     first.step(0.7)
-    # in the middle of things: a fix that comes back, a command that is not carried out yet, half a message
+    # with pending state: a fix that returns, a command not yet executed, half a message
     half = dialect.MAVLink_command_long_message(1, 1, 512, 0, 242, 0, 0, 0, 0, 0, 0).pack(parser())
     first.send_bytes(half[:9])
     first.send(dialect.MAVLink_command_long_message(1, 1, 21, 0, 0, 0, 0, math.nan, 0, 0, 0))

@@ -1,4 +1,4 @@
-"""The modes flown by sticks: how fast, how far, how level."""
+"""The manual modes: speeds, distances, attitudes."""
 
 from __future__ import annotations
 
@@ -228,7 +228,7 @@ def test_altitude_tilts_drifts_on_and_holds_its_height() -> None:
     assert math.degrees(pilot.airframe.roll_rad) == pytest.approx(35.0, abs=2.0)
     pilot.fly(1.0)
     assert abs(math.degrees(pilot.airframe.roll_rad)) < 2.0
-    assert pilot.speed_mps > 1.0  # nothing brakes but the air
+    assert pilot.speed_mps > 1.0  # only drag brakes
     assert pilot.height_m == pytest.approx(height_m, abs=0.7)
 
 

@@ -1,4 +1,4 @@
-"""Vehicles of one world that meet in the air."""
+"""Collisions between vehicles of one world."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_overlapping_bodies_are_separated(position: Vector, one: Vector, other: 
 def test_no_contact_missed_between_calls(
     positions: list[Vector], directions: list[Vector], thrusts: list[float], tilts: list[float]
 ) -> None:
-    """Those that are far off are not looked at, however they accelerate, and nothing is missed by it."""
+    """Distant bodies are not checked, whatever their acceleration, and no contact is missed."""
 
     def first_meeting(*, always: bool) -> tuple[int, list[int]] | None:
         bodies = [flying((20.0 * number, 0.0, -50.0), (0.0, 0.0, 0.0)) for number in range(len(positions))]
@@ -246,7 +246,7 @@ def test_landing_on_another_vehicle_is_landed() -> None:
         -2.95,
         0.0,
         airframe.position[2],
-    )  # above the other, a hand's breadth beside its middle
+    )  # above the other, 0.1 m beside its centre
     upper.send(dialect.MAVLink_command_long_message(2, 1, 21, 0, 0, 0, 0, 0, math.nan, math.nan, math.nan))
     for _ in range(10_000):
         upper.step(STEP_S)

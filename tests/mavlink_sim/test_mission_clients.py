@@ -1,4 +1,4 @@
-"""Missions, fences and rally points by MAVSDK over UDP: a client that nobody here wrote."""
+"""Missions, fences and rally points by MAVSDK over UDP."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ def mission_item(north: float, east: float, **options: Any) -> MissionItem:
 async def uploaded(upload: Callable[[list[RawItem]], Awaitable[None]], items: list[RawItem]) -> None:
     """Upload a plan, more than once if need be.
 
-    On a busy machine an answer may come after the vehicle asked again (250 ms); the second answer then meets
-    the next upload, and PX4 takes it for an error.
+    On a busy machine an answer may arrive after the vehicle repeated its request (250 ms); the second answer
+    then arrives during the next upload, and PX4 treats it as an error.
     """
     for attempt in range(4):
         try:

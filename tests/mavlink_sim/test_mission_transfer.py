@@ -68,7 +68,7 @@ def test_uploaded_mission_downloaded_as_px4_stores_it(harness: SimHarness) -> No
     assert [(m.x, m.y, m.z) for m in got] == [(i["x"], i["y"], i["z"]) for i in plan]
     # a waypoint keeps its time, radius and heading (from 0 to 360°), and loses its third parameter
     assert (got[1].param1, got[1].param2, got[1].param3, got[1].param4) == (2.5, 1.5, 0.0, 270.0)
-    assert got[3].param4 == 1.0  # PX4 gives back "leave on a tangent" where a heading was
+    assert got[3].param4 == 1.0  # PX4 returns "leave on a tangent" instead of a heading
     assert (got[4].param1, got[4].param2) == (1.0, 2.0)
 
 
@@ -180,7 +180,7 @@ def test_unsupported_item_ends_upload(
 ) -> None:
     harness.wait_ready()
     assert upload(harness, [fields, fields], plan) == result
-    assert upload(harness, [takeoff(5.0)]) == 0  # the next client is welcome
+    assert upload(harness, [takeoff(5.0)]) == 0  # the next client is accepted
 
 
 @pytest.mark.parametrize(("plan", "most"), [(0, 10000), (1, 64), (2, 32)])
@@ -291,7 +291,7 @@ def test_plans_have_identifiers_that_newer_clients_can_read(harness: SimHarness)
     packed = MissionCurrent(1, 2, 3, 1, 11, 12, 13).pack(parser())
     payload = packed[10:-2].ljust(18, b"\0")  # MAVLink 2 leaves out the zeros at the end
     assert struct.unpack("<HHBBIII", payload) == (1, 2, 3, 1, 11, 12, 13)
-    (seen,) = dialect.MAVLink(None).parse_buffer(packed)  # an older client reads the rest
+    (seen,) = dialect.MAVLink(None).parse_buffer(packed)  # an older client decodes the rest
     assert (seen.seq, seen.total, seen.mission_state) == (1, 2, 3)
 
 

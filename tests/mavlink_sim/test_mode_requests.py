@@ -71,7 +71,7 @@ def test_refusal_text_goes_to_requesting_ground_station(harness: SimHarness) -> 
     harness.heartbeats.append(("gcs", (245, 190), 6))
     harness.take_off()
     harness.forget()
-    harness.set_mode(6)  # asked by the companion: no words
+    harness.set_mode(6)  # requested by the companion: no text
     assert harness.texts() == []
     harness.set_mode(6, source=(245, 190), link="gcs")
     assert harness.texts() == ["Switching to Offboard is currently not available\t"]
@@ -106,7 +106,7 @@ def test_a_mode_change_is_not_announced_by_an_extra_heartbeat(harness: SimHarnes
 def test_current_mode_sent_at_2_hz_and_on_change(
     harness: SimHarness,
 ) -> None:
-    """However often it is asked for: a real PX4 asked for 20 a second sent 1.75 to 2."""
+    """Whatever the requested rate: a real PX4 asked for 20 Hz sent 1.75 to 2."""
     harness.fly(0.1)
     assert harness.command(511, 436, 50_000) == [0]
     harness.fly(0.7)
@@ -127,6 +127,6 @@ def test_another_system_may_change_the_mode(harness: SimHarness, velocity_setpoi
     stream = velocity_setpoint(1, 0, 0)
     harness.offboard(stream)
     assert harness.set_mode(4, 3, source=(245, 190), link="gcs") == [0, 0]
-    harness.fly(5.0, stream)  # the companion goes on sending, in vain
+    harness.fly(5.0, stream)  # the companion continues to send
     assert harness.mode == "HOLD"
     assert abs(harness.vehicle.airframe.velocity[0]) < 0.2

@@ -1,4 +1,4 @@
-"""What the range sensors measure of a scene, and what collision prevention makes of it."""
+"""The range sensors in a scene, and collision prevention with them."""
 
 from __future__ import annotations
 

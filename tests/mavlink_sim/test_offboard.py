@@ -1,4 +1,4 @@
-"""OFFBOARD: which setpoints count, how they are flown, and what happens when they stop."""
+"""OFFBOARD: the setpoints used, their control, and their loss."""
 
 import math
 from collections.abc import Callable
@@ -176,7 +176,9 @@ def test_position_step_of_ten_metres_settled_within_six_seconds(
     assert 4.5 < max(speed for _, speed in active) < 5.7
     assert 0.5 < max(north for north, _ in active) - 10.0 < 1.2
     harness.until(watch, 10.0, step, must=False)
-    assert max(abs(north - 10.0) for north, _ in active[moving:]) < 0.55  # as a real one wanders, holding
+    assert (
+        max(abs(north - 10.0) for north, _ in active[moving:]) < 0.55
+    )  # the measured variation while holding
     assert max(abs(speed) for _, speed in active[moving:]) < 0.25
 
 

@@ -1,4 +1,4 @@
-"""DO_ORBIT: the circle, the heading on it, its limits, and what is told of it."""
+"""DO_ORBIT: the circle, the heading on it, its limits, and its telemetry."""
 
 import math
 from typing import Any
@@ -91,7 +91,7 @@ def test_disarmed_orbit_accepted_and_arming_refused(harness: SimHarness) -> None
     assert harness.command(400, 1) == [0]
     assert orbit(harness) == [0]
     harness.fly(5.0)
-    assert harness.height_m == 0.0  # an orbit takes nobody off the ground
+    assert harness.height_m == 0.0  # an orbit does not take off
 
 
 def test_set_mode_with_the_orbit_numbers_is_position_mode(harness: SimHarness) -> None:
@@ -111,7 +111,7 @@ def test_each_heading_behaviour(harness: SimHarness, behaviour: int) -> None:
         harness.fly(0.5)
         seen.append(harness.vehicle.airframe.yaw_rad)
         inward = angle_rad(harness) + math.pi
-        # clockwise, the tangent is a quarter turn ahead of the way out
+        # clockwise, the tangent is a quarter turn ahead of the radius
         wanted.append({0: inward, 1: initial, 3: inward - math.pi / 2}.get(behaviour, seen[0]))
     errors = [abs(math.remainder(a - b, math.tau)) for a, b in zip(seen, wanted, strict=True)]
     assert max(errors) < math.radians(15.0)

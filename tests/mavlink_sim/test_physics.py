@@ -56,7 +56,7 @@ def test_velocity_limit_cuts_feed_forward_first() -> None:
     setpoint = TrajectorySetpoint(position=(9.0 / 0.95, 0.0, -5.0), velocity=(0.0, 20.0, 0.0))
     controller.update(STEP_S, setpoint, (0.0, 0.0, -5.0), (0.0,) * 3, (0.0,) * 3, 0.0)
     x, y, _ = controller.velocity
-    assert x == pytest.approx(9.0)  # MPC_XY_P asks for 9 m/s, all of it is granted
+    assert x == pytest.approx(9.0)  # MPC_XY_P demands 9 m/s, which is within the limit
     assert math.hypot(x, y) == pytest.approx(12.0)
 
 
@@ -153,7 +153,7 @@ def test_absurd_setpoints_keep_motion_finite(
 
 
 def axis(airframe: Multirotor) -> tuple[float, float, float]:
-    """Where the body's down axis points, NED."""
+    """The body's down axis, NED."""
     matrix = airframe.matrix
     return (matrix[2], matrix[5], matrix[8])
 

@@ -1,4 +1,4 @@
-"""Joysticks and remote controls: which sticks count, what they say, and what a pilot can do with them."""
+"""Joysticks and remote controls: the source used, channels, and the pilot's requests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""MAVSDK, a client nobody here wrote: flies by joystick, turns the gimbal, reads battery and remote."""
+"""MAVSDK: joystick, gimbal, battery and remote control."""
 
 from __future__ import annotations
 

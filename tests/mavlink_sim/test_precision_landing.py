@@ -1,4 +1,4 @@
-"""Landing on a target: seen, lost and never there."""
+"""Landing on a target: in sight, lost and missing."""
 
 from __future__ import annotations
 

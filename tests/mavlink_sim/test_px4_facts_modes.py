@@ -1,4 +1,4 @@
-"""Measured of a real PX4: what commands answer, what modes do on the ground, what a lost stream leads to."""
+"""Measured on a real PX4: answers to commands, modes on the ground, loss of the setpoint stream."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def test_stream_of_0_9_hz_is_lost_for_50_ms(harness: SimHarness, velocity_setpoi
     harness.take_off(4.0)
     stream = velocity_setpoint(0, 0, 0)
     harness.offboard(stream)
-    harness.command(511, 436, 4_000)  # told when it changes
+    harness.command(511, 436, 4_000)  # sent when it changes
     harness.until(lambda: bool(harness.received("CURRENT_MODE")), 1.0, stream)
     lost = []
 

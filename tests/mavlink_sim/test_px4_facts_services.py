@@ -1,6 +1,6 @@
-"""What was measured of a real PX4, of its services: every statement a test that quotes it.
+"""Measured on a real PX4: requests, TIMESYNC, PING, events, parameters; one test per statement.
 
-Requests, TIMESYNC, PING, events, parameters. "Source" marks what was read in PX4 instead of measured.
+"Source" marks what is from PX4's source instead of measured.
 """
 
 import os
@@ -188,7 +188,7 @@ def test_ping_addressed_1_1__not_answered_own_ping_1_hz(ready: SimHarness) -> No
 
 
 def request_event(harness: SimHarness, first: int, last: int, target: tuple[int, int] = (1, 1)) -> None:
-    """REQUEST_EVENT as a client whose dialect has it packs it, read as one whose dialect lacks it."""
+    """REQUEST_EVENT packed by a dialect that has it, decoded by one that lacks it."""
     payload = struct.pack("<HHBB", first, last, *target)
     body = struct.pack("<BBBBBBHB", len(payload), 0, 0, 0, 1, 191, 412, 0) + payload
     crc = dialect.x25crc(body)
@@ -258,7 +258,7 @@ def name_of(message: Any) -> str:
 
 
 def recorded_parameters() -> tuple[int, list[Parameter]]:
-    """The recorded _HASH_CHECK and the parameters it was made of."""
+    """The recorded _HASH_CHECK and its parameters."""
     if not PARAMETERS.exists():
         pytest.skip(f"needs the recorded parameters {PARAMETERS}")
     rows = [line.split() for line in PARAMETERS.read_text().splitlines()]

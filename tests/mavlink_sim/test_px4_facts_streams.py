@@ -1,4 +1,4 @@
-"""What was measured of a real PX4's links: what they carry, how much of it, and who hears it."""
+"""Measured on a real PX4's links: messages, data rate, forwarding."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ GCS = 6
 ONBOARD_CONTROLLER = 18
 # Messages of PX4 that pip's pymavlink 2.4.50 does not have in its `common` dialect.
 UNKNOWN_TO_COMMON = {8, 300, 380, 395, 397, 410, 411, 435, 436}
-SIGNATURE_BYTES = 13  # the vehicle that was measured signed what it sent
+SIGNATURE_BYTES = 13  # the measured vehicle signed its messages
 
 
 def names(harness: SimHarness, link: str = "onboard") -> Counter[str]:
@@ -41,7 +41,7 @@ def test_the_onboard_link_carries_29_kilobytes_a_second(make_harness: type[SimHa
     harness = make_harness(["everything"], noise=True, gusts_mps=None)
     if flying:
         harness.take_off()
-    harness.fly(6.0)  # until the last PARAM_VALUE that comes unasked
+    harness.fly(6.0)  # until the last unrequested PARAM_VALUE
     harness.forget()
     harness.fly(20.0)
     codec = parser()

@@ -1,4 +1,4 @@
-"""Every STATUSTEXT that was seen of a real PX4: its words, its severity, its closing tab, its chunks."""
+"""Every STATUSTEXT recorded from a real PX4: text, severity, closing tab, chunks."""
 
 from __future__ import annotations
 

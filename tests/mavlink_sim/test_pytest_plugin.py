@@ -1,4 +1,4 @@
-"""The pytest plugin, by pytest runs of their own: what other people's tests get from it."""
+"""The pytest plugin, in separate pytest runs."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ ARMING = """
 
 @pytest.fixture
 def run(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Runs pytest in a process of its own over a test file, with this plugin and no other."""
+    """Runs pytest in its own process over a test file, with only this plugin."""
     monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
 

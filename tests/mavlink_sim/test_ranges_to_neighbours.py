@@ -1,4 +1,4 @@
-"""What the range sensors of one vehicle measure of the others of its fleet_world."""
+"""The range sensors of one vehicle with the others of its fleet world."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def beside(one: LockstepVehicle, other: LockstepVehicle) -> None:
 
 
 def below_m(vehicle: LockstepVehicle) -> float:
-    """What its DISTANCE_SENSOR tells."""
+    """The value of its DISTANCE_SENSOR."""
     assert vehicle.command(REQUEST_MESSAGE, DISTANCE_SENSOR) == "ACCEPTED"
     return float(vehicle.newest["onboard"]["DISTANCE_SENSOR"].current_distance) / 100.0
 

@@ -1,4 +1,4 @@
-"""Pictures: depth against geometry, boxes against projection, who stands before whom."""
+"""Rendering: depth against geometry, boxes against projection, occlusion."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_the_depth_of_the_ground_is_the_analytic_depth(pose: tuple[float, ...]) 
     depth = rendered.depth_m[rows.ravel(), columns.ravel()]
     met = np.isfinite(ground[:, 0]) & np.isfinite(depth)
     again = PixelRays.of(CAMERA, DEFAULT_MOUNT, attitude, pixels[met]).at_depth(depth[met])
-    # A float32 reciprocal loses relative accuracy in proportion to how far the ground is.
+    # A float32 reciprocal loses relative accuracy in proportion to the distance.
     span = np.linalg.norm(ground[met], axis=1)
     assert np.all(np.linalg.norm(again - ground[met], axis=1) <= 1e-4 * span * (1 + span / eye_height))
     upwards = (CAMERA.rays(pixels) @ (attitude @ DEFAULT_MOUNT.body_from_optical).T)[:, 2] < -1e-6
@@ -232,7 +232,7 @@ def test_shadow_points_away_from_sun() -> None:
     )
     left, top, right, bottom = (int(value) for value in seen(rendered, 0).xyxy)
     middle = (left + right) // 2
-    # North is up in the picture, the sun is in the north.
+    # North is up in the image, the sun is in the north.
     assert darker[bottom + 2, middle].mean() > 20
     assert abs(darker[top - 4, middle].mean()) < 3
 

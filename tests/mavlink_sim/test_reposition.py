@@ -1,4 +1,4 @@
-"""DO_REPOSITION, DO_CHANGE_ALTITUDE and DO_CHANGE_SPEED: where auto modes fly to, and how fast."""
+"""DO_REPOSITION, DO_CHANGE_ALTITUDE and DO_CHANGE_SPEED: goals and speeds of auto modes."""
 
 import math
 from typing import Any
@@ -32,7 +32,7 @@ def reposition(
     yaw: float = NAN,
     frame: int = 5,
 ) -> list[int]:
-    """Send DO_REPOSITION as COMMAND_INT to a local place; its answers."""
+    """Send DO_REPOSITION as COMMAND_INT to a local position; its answers."""
     x, y = (NOT_GIVEN, NOT_GIVEN)
     if goal is not None:
         latitude, longitude, _ = SIH_FRAME.geographic((*goal, 0.0))
@@ -123,7 +123,7 @@ def test_without_values_it_stops(harness: SimHarness) -> None:
 
 @pytest.mark.parametrize("flags", [0.0, 2.0, 3.0, NAN])
 def test_without_mode_flag_unsupported_but_flown_in_hold(harness: SimHarness, flags: float) -> None:
-    """As a PX4 v1.17 in SIH did: its commander refuses, and its navigator flies."""
+    """As measured on PX4 v1.17 in SIH: its commander refuses, and its navigator flies."""
     harness.take_off(5.0)
     assert reposition(harness, (9.0, 0.0), 5.0, flags=flags) == [3]
     harness.fly(12.0)
@@ -260,7 +260,7 @@ def test_a_speed_change_is_accepted_in_any_state(harness: SimHarness, values: tu
     assert harness.command(178, *values) == [0]
 
 
-# ---- how many answers
+# ---- number of answers
 
 
 def test_older_release_single_answer_to_set_mode(make_harness: type[SimHarness]) -> None:

@@ -1,4 +1,4 @@
-"""Where RTL leads: home, a rally point, the mission's landing, or back along the mission."""
+"""The destination of RTL: home, a rally point, the mission's landing, or back along the mission."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ def test_rally_point_return_with_start_offset(
     harness.take_off(4.0)
     harness.vehicle.airframe.position = (12.0, 3.0, -4.0)
     harness.fly(0.01)
-    harness.vehicle.faults.begin("pilot_takeover RTL")  # by who is no part of the vehicle
+    harness.vehicle.faults.begin("pilot_takeover RTL")  # by a component outside the vehicle
     lands_at(harness, 14, 0)
 
 

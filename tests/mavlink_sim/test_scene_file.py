@@ -1,4 +1,4 @@
-"""Scene files: what they say is what is seen, and what they cannot say is explained."""
+"""Scene files: their values, and the errors of invalid ones."""
 
 from __future__ import annotations
 

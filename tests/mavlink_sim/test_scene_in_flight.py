@@ -1,4 +1,4 @@
-"""`mavlink-sim` with a scene: its things in the truth, its camera at several outputs at once."""
+"""`mavlink-sim` with a scene: its objects in the truth, its camera at several outputs."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_scene_flight_with_three_camera_outputs(tmp_path: Path) -> None:
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as vehicle:
         assert vehicle.stdout is not None
         try:
-            raw = vehicle.stdout.read(160 * 120 * 3)  # standard output has pictures and nothing else
+            raw = vehicle.stdout.read(160 * 120 * 3)  # standard output carries only images
             piped = np.frombuffer(raw, np.uint8).reshape(120, 160, 3)
             with urllib.request.urlopen(
                 f"http://127.0.0.1:{port}/snapshot.jpg", timeout=DEADLINE_S

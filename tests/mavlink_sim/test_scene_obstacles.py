@@ -1,4 +1,4 @@
-"""The geometry of what is in the way, held against sampling it by brute force."""
+"""The geometry of obstacles, compared with brute-force sampling."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def test_gap_is_free_and_push_resolves_contact(
     sampled = surface(scene_object)
 
     def depth(middle: NDArray[np.float64]) -> float:
-        """How deep any point of the surface is inside the ellipsoid, 0..1 (its middle); less: outside."""
+        """Depth of the surface in the ellipsoid, 0..1 (its centre); negative: outside."""
         return 1.0 - float(np.linalg.norm((sampled - middle) / radii, axis=1).min())
 
     if gap.clear_m > 0.0:
@@ -157,7 +157,7 @@ def test_each_sector_has_its_nearest_point(segments: NDArray[np.float64]) -> Non
     shares = np.linspace(0.0, 1.0, 1001)[:, None]
     sampled = np.concatenate([start + shares * (end - start) for start, end in segments])
     distance = np.hypot(sampled[:, 0], sampled[:, 1])
-    assume(distance.min() > 0.1)  # nearer a sample's bearing says nothing
+    assume(distance.min() > 0.1)  # nearer, a sample's bearing is undefined
     spacing = max(float(np.linalg.norm(end - start)) for start, end in segments) / 1000
     positions = np.arctan2(sampled[:, 1], sampled[:, 0]) / (math.tau / SECTORS)
     exact = nearest_in_sectors(segments)

@@ -1,4 +1,4 @@
-"""Objects: their real sizes, their outward faces, the order in which they are painted."""
+"""Objects: realistic sizes, outward faces, painting order."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_separate_boxes_painted_far_to_near(seed: int, eye: tuple[float, float, 
 
 
 def _covers(near: np.ndarray, far: np.ndarray, eye: np.ndarray) -> bool:
-    """Whether some ray from the eye meets box `near` before box `far` (boxes along the axes)."""
+    """Whether a ray from the eye meets box `near` before box `far` (axis-aligned boxes)."""
     low, high = near.min(axis=0), near.max(axis=0)
     for weight in (0.05, 0.5, 0.95):
         for target in far * weight + far.mean(axis=0) * (1 - weight):

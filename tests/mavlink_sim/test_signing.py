@@ -1,4 +1,4 @@
-"""MAVLink 2 signing: what PX4's rules accept, refuse and count; pymavlink on the other side."""
+"""MAVLink 2 signing by PX4's rules, with pymavlink as the client."""
 
 import hashlib
 import time
@@ -158,7 +158,7 @@ def test_mav_sign_cfg_decides_about_unsigned_frames(policy: int, is_usb: bool, a
     one = client(None)
     mavlink_1 = bytes(dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3).pack(one, force_mavlink1=True))
     assert signing.accepts(mavlink_1) is accepted
-    assert signing.accepts(heartbeat(client(OTHER_KEY))) is accepted  # PX4 asks the same question of these
+    assert signing.accepts(heartbeat(client(OTHER_KEY))) is accepted  # PX4 has the same check of these
     assert signing.refused == ({} if accepted else {"unsigned": 2, "wrong signature": 1})
 
 
@@ -190,7 +190,7 @@ def test_setup_signing_only_on_usb_link(harness: SimHarness) -> None:
     harness.send(dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
     harness.send(dialect.MAVLink_setup_signing_message(0, 0, KEY, START), "gcs", (245, 190))
     harness.fly(0.1)
-    assert not harness.received("SETUP_SIGNING")  # a key is passed on to nobody
+    assert not harness.received("SETUP_SIGNING")  # a key is not forwarded
     harness.send(dialect.MAVLink_setup_signing_message(1, 1, bytes(32), 0), "gcs", (245, 190))
     assert not harness.vehicle.links["gcs"].signing.has_key
 
@@ -277,7 +277,7 @@ def test_mavutil_without_key_is_ignored(ports: tuple[int, int], key: bytes | Non
             link.recv_match(type="ATTITUDE", blocking=True, timeout=5)
         link.setup_signing(KEY, sign_outgoing=True, allow_unsigned_callback=refused_unsigned)
         link.mav.ping_send(0, 78, 0, 0)
-        while True:  # the answers come in order: one to the first would have been here before
+        while True:  # answers arrive in order: one to the first would be here already
             answer = link.recv_match(type="PING", blocking=True, timeout=20)
             assert answer is not None
             if answer.target_system == 1:

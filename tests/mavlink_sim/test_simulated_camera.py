@@ -1,4 +1,4 @@
-"""A scene's camera in process: frames with their truth, things that move, frames that get lost."""
+"""A scene's camera in-process: frames with their truth, moving objects, lost frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Commands that are not about flying: who is answered, and with which MAV_RESULT."""
+"""Commands other than flight commands: the addressees answered, and the MAV_RESULT."""
 
 import pytest
 from hypothesis import given, settings

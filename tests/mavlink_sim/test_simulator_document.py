@@ -1,4 +1,4 @@
-"""What docs/simulator.md says can be typed is typed here, and what it says of installing is tried."""
+"""Runs the commands and examples of docs/simulator.md, and checks its list of packages."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ OF_THE_VEHICLE = [line for line in COMMANDS if line.startswith("mavlink-sim") an
 @pytest.mark.parametrize("line", OF_THE_VEHICLE)
 def test_every_command_of_the_vehicle_starts_it(line: str, tmp_path: Path) -> None:
     words = shlex.split(line)[1:]
-    if "--camera" in words:  # a name of this test alone
+    if "--camera" in words:  # a name only of this test
         words[words.index("--camera") + 1] = f"document-{tmp_path.parent.name}-{tmp_path.name}"
     ports = [str(port) for port in free_udp_ports(2)]
     elsewhere = ["--onboard-bind", "0", "--gcs-bind", "0", "--onboard-port", ports[0], "--gcs-port", ports[1]]

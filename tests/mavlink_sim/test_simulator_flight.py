@@ -84,7 +84,7 @@ def test_pymavlink_flies_offboard_loses_stream_and_comes_home() -> None:
         companion.until(lambda: companion.mode() == 0x00060000, ahead)
         companion.until(lambda: companion.newest["LOCAL_POSITION_NED"].x > 5.0, ahead)
 
-        # no more setpoints: the failsafe takes over, returns and lands, and nobody commands anything
+        # no more setpoints: the failsafe returns and lands without any command
         companion.until(lambda: companion.newest["CURRENT_MODE"].custom_mode == 0x05040000)
         assert companion.newest["CURRENT_MODE"].intended_custom_mode == 0x00060000
         companion.until(lambda: companion.newest["HEARTBEAT"].system_status == 5)

@@ -1,4 +1,4 @@
-"""`mavlink-sim` as a process: its options, its ports, its words, its end."""
+"""`mavlink-sim` as a process: options, ports, output, exit."""
 
 import json
 import math
@@ -99,7 +99,7 @@ def test_version_is_printed() -> None:
 
 
 def wander_m(truth: Path, **options: Any) -> float:
-    """How far a vehicle that holds its position gets from where it began to, horizontally, within 10 s."""
+    """The greatest horizontal distance of a vehicle from its hold position within 10 s."""
     with running_simulator(truth=truth, speed=10.0, ready_after=0.0, **options) as simulator:
         link = mavutil.mavlink_connection(f"udpin:127.0.0.1:{simulator.onboard_port}", source_system=245)
         link.wait_heartbeat(timeout=20)
@@ -174,7 +174,7 @@ def test_clock_runs_at_given_speed() -> None:
         last = first
         while last.time_boot_ms - first.time_boot_ms < 8000:
             last = link.recv_match(type="ATTITUDE", blocking=True, timeout=20)
-        # only one side can be bounded: a busy machine makes it slower, nothing may make it faster
+        # only an upper bound: a busy machine makes it slower, nothing may make it faster
         assert time.monotonic() - started > 0.6
         link.close()
 
@@ -211,7 +211,7 @@ def test_the_truth_is_on_record_line_by_line(tmp_path: Path) -> None:
 
 
 def camera_process(pid: int) -> int:
-    """The process that draws for a simulator."""
+    """The camera process of a simulator."""
     for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
         if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes():
             return int(child)
@@ -229,7 +229,7 @@ def test_camera_start_and_loss_reported_vehicle_continues(tmp_path: Path) -> Non
                 frame = reader.latest()
         assert frame is not None
         assert frame.image.shape == (480, 640, 3)
-        assert frame.image.std() > 5.0  # a picture, not a blank
+        assert frame.image.std() > 5.0  # not a blank image
         assert 0 <= time.monotonic_ns() - frame.captured_ns < 60e9
         os.kill(camera_process(simulator.pid), signal.SIGKILL)
         simulator.wait_for_event(f"camera {name} is lost", 20.0)

@@ -60,7 +60,7 @@ async def test_mavsdk_flies_every_kind_of_setpoint(vehicle: RunningSimulator) ->
         )
         await wait_for(telemetry.subscribe_heading(), lambda heading: abs(heading.heading_deg - 90) < 5)
 
-        # round a place at a radius
+        # an orbit
         centre = SIH_FRAME.geographic((4.0, 4.0, 0.0))
         await action.do_orbit(
             6.0,

@@ -1,4 +1,4 @@
-"""Which messages arrive on which link, how often, and in the form a real vehicle sends them."""
+"""The messages of each link, their rates, and their fields as on a real vehicle."""
 
 import math
 import os
@@ -26,7 +26,7 @@ def counts(harness: SimHarness, link: str, seconds: float) -> Counter[str]:
     return Counter(item.message.get_type() for _, item in harness.inbox[link])
 
 
-# As counted of a real PX4, disarmed, over 20 s; none of the vehicle's own tables is asked.
+# As counted on a real PX4, disarmed, over 20 s; independent of the vehicle's tables.
 MEASURED_ONBOARD_HZ = {
     "ATTITUDE": 98.5,
     **dict.fromkeys(("ATTITUDE_QUATERNION", "GLOBAL_POSITION_INT", "HIGHRES_IMU"), 49.0),
@@ -57,7 +57,7 @@ def settled(harness: SimHarness) -> SimHarness:
 
 def test_the_onboard_streams_have_the_measured_rates(settled: SimHarness) -> None:
     seen = counts(settled, "onboard", 20.0)
-    assert set(seen) == set(MEASURED_ONBOARD_HZ)  # nothing else, and no RC_CHANNELS above all
+    assert set(seen) == set(MEASURED_ONBOARD_HZ)  # nothing else, in particular no RC_CHANNELS
     for name, rate in MEASURED_ONBOARD_HZ.items():
         assert seen[name] / 20.0 == pytest.approx(rate, rel=0.01, abs=0.051), name
 
@@ -166,7 +166,7 @@ def test_flight_yields_same_kinds_of_messages_as_real_one(
     harness.until(lambda: not harness.armed, 40.0)
     ours = {item.message.get_type() for _, item in harness.inbox["onboard"]}
     theirs = {NAMES_OF_UNKNOWN.get(name, name) for name in recorded}
-    assert theirs - ours == {"PARAM_VALUE"}  # a few that PX4 sends unasked when a parameter changes
+    assert theirs - ours == {"PARAM_VALUE"}  # a few that PX4 sends unrequested when a parameter changes
     assert ours - theirs == set()
 
 

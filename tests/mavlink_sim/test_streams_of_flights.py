@@ -1,4 +1,4 @@
-"""All that a vehicle says, in every kind of flight, can be put on the wire and is finite where it must be."""
+"""Every message of a vehicle, in every kind of flight, can be packed and is finite where required."""
 
 from __future__ import annotations
 

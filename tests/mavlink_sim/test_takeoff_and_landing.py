@@ -178,7 +178,7 @@ def test_return_from_afar_climbs_first_and_lands_at_home(
     harness.until(done, 90.0)
     assert 11.5 < highest < 13.0
     assert math.hypot(*harness.vehicle.airframe.position[:2]) < 1.0
-    # and lands as it stood when it was armed: so did a real PX4
+    # and lands with the heading at arming, as measured on a real PX4
     assert harness.vehicle.airframe.yaw_rad == pytest.approx(0.0, abs=0.05)
 
 
@@ -210,9 +210,9 @@ def test_return_in_moving_air_ends_at_home_too(
     harness.take_off(6.0)
     away = velocity_setpoint(3, 0, 0)
     harness.offboard(away)
-    harness.fly(6.0, away)  # and then nothing: the failsafe returns
+    harness.fly(6.0, away)  # no more setpoints: the failsafe returns
     harness.until(lambda: not harness.armed, 90.0)
-    # the gusts of the last metres decide: with other seeds it is 0.4 to 3 m
+    # depends on the gusts of the last metres: with other seeds it is 0.4 to 3 m
     assert math.hypot(*harness.vehicle.airframe.position[:2]) < 3.5
 
 
@@ -221,7 +221,7 @@ def test_reposition_flies_there_and_turns_to_the_given_heading(harness: SimHarne
     assert harness.command_int(192, (-1, 1, 0, math.pi / 2), 473978330, 85455942, 497.4) == [0]
     harness.fly(25.0)
     north, east, down = harness.vehicle.airframe.position
-    assert north == pytest.approx(10.0, abs=0.6)  # the integrator lets go slowly
+    assert north == pytest.approx(10.0, abs=0.6)  # the integrator decays slowly
     assert east == pytest.approx(0.0, abs=0.3)
     assert down == pytest.approx(-8.0, abs=0.3)
     assert harness.vehicle.airframe.yaw_rad == pytest.approx(math.pi / 2, abs=0.05)

@@ -1,4 +1,4 @@
-"""Labelled pictures: the same again from the same seed, labels that can be seen."""
+"""Labelled images: repeatable from a seed, visible labels."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_most_images_show_several_objects(scenes: Scenes) -> None:
 
 
 def test_the_focal_length_is_within_what_was_asked() -> None:
-    """A longer lens makes things larger: with only long lenses the boxes grow."""
+    """A longer lens makes objects larger: with only long lenses the boxes grow."""
 
     def mean_side(focal_px: tuple[float, float]) -> float:
         sides: list[float] = []

@@ -1,4 +1,4 @@
-"""The truth on a disk that takes no more."""
+"""The truth file on a full disk."""
 
 from __future__ import annotations
 

@@ -123,7 +123,7 @@ def test_clock_follows_a_simulation_slower_than_real_time() -> None:
     for step in range(2000):
         clock.add(step * 9 * MS, BOOTED_NS + step * 10 * MS)
     lag_ns = BOOTED_NS + 1999 * 10 * MS - clock.monotonic_ns(1999 * 9 * MS)
-    assert 0 <= lag_ns < 0.45e9  # a tenth of two windows, and a little
+    assert 0 <= lag_ns < 0.45e9  # a tenth of two windows, with a margin
 
 
 def test_drawn_pose_is_the_vehicles_in_a_manoeuvre() -> None:
@@ -156,7 +156,7 @@ def test_drawn_pose_is_the_vehicles_in_a_manoeuvre() -> None:
     for now_ns, position, quaternion in truths:
         if not span[0] <= now_ns <= span[1]:
             continue
-        stamp_ns = history.monotonic_ns(now_ns) - BOOTED_NS  # what the frame's stamp says, less the boot
+        stamp_ns = history.monotonic_ns(now_ns) - BOOTED_NS  # the frame's stamp, less the boot
         pose = history.at(now_ns)
         errors_m.append(math.dist(pose.position, position) + 3.6 * abs(stamp_ns - now_ns) / 1e9)
         cosine = abs(sum(a * b for a, b in zip(pose.attitude, quaternion, strict=True)))

@@ -1,4 +1,4 @@
-"""Frames at the outputs, read back as a user would read them: our own sources, FFmpeg, plain sockets."""
+"""Frames at the outputs, read by this project's sources, FFmpeg and plain sockets."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ SETTINGS = SourceSettings(width=SIZE[0], height=SIZE[1], open_timeout_s=20.0, re
 
 
 def image(number: int) -> Frame:
-    """A blue picture with a mark; the same each time, as streams are compared by colour."""
+    """A blue image with a mark; the same each time, as streams are compared by colour."""
     image = np.full((SIZE[1], SIZE[0], 3), (200, 90, 20), np.uint8)
     image[40:80, 60:100] = (20, 220, 60)
     return Frame(
@@ -44,7 +44,7 @@ def image(number: int) -> Frame:
 
 @pytest.fixture
 def feeding() -> Iterator[Callable[[FrameOutput], None]]:
-    """Writes pictures to an output, 60 a second, until the test ends."""
+    """Writes images to an output, 60 a second, until the test ends."""
     stop = threading.Event()
     threads: list[threading.Thread] = []
 
@@ -206,7 +206,7 @@ def test_stalled_client_does_not_stop_others(feeding: Callable[[FrameOutput], No
             stuck.append(client)
         until(lambda: output.clients == 3, "three clients served")
         before = output.number
-        until(lambda: output.number > before + 20, "pictures made while three clients hang")
+        until(lambda: output.number > before + 20, "images made while three clients hang")
         assert matches_image(first_frame(f"http://127.0.0.1:{output.port}/"), 12)
         for client in stuck:
             client.close()
@@ -250,7 +250,7 @@ def test_h264_in_rtp_decoded_by_own_source(feeding: Callable[[FrameOutput], None
                 frame = source.read(0.5)
                 return frame is not None and matches_image(frame, 25)
 
-            until(good, "a picture that looks right")
+            until(good, "an image that looks right")
 
 
 def test_rtp_packets_are_h264_of_payload_type_96_on_90_khz_clock() -> None:
@@ -270,10 +270,10 @@ def test_rtp_packets_are_h264_of_payload_type_96_on_90_khz_clock() -> None:
                     assert len(packet) <= 1400
                     kind = packet[12] & 0x1F
                     kinds.add(packet[13] & 0x1F if kind == 28 else kind)  # FU-A, RFC 6184
-                    if packet[1] & 0x80:  # the last of a picture
+                    if packet[1] & 0x80:  # the last of an image
                         stamps.append(int.from_bytes(packet[4:8], "big"))
                         break
-    # The first picture brings its parameter sets (in an aggregate, or alone) and is a key frame.
+    # The first image brings its parameter sets (in an aggregate, or alone) and is a key frame.
     assert kinds & {7, 24}
     assert [(b - a) % 2**32 for a, b in pairwise(stamps)] == [2970, 2970]
 

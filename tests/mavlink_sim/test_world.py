@@ -1,4 +1,4 @@
-"""Where things stand, and how far they are."""
+"""Positions and ranges of a world's objects."""
 
 from __future__ import annotations
 
