@@ -30,7 +30,7 @@ from companion.vehicle.state import FlightMode, LandedState, Vector3, VehicleSta
 from companion.vehicle.telemetry import TELEMETRY_MESSAGES
 from mavlink_sim import LockstepVehicle
 from mavlink_sim.lockstep import COMPANION
-from mavlink_sim.vehicle import BACKGROUND_GUSTS_MPS, GUST_SHARE_OF_WIND
+from mavlink_sim.vehicles.vehicle import BACKGROUND_GUSTS_MPS, GUST_SHARE_OF_WIND
 from mavlink_sim.wire.streams import ONBOARD_RATES_HZ
 from vision.attitude import quaternion_from_euler, wrap_angle
 

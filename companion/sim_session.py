@@ -47,7 +47,7 @@ _SIMULATOR_START_S = 90.0
 _SIMULATOR_END_S = 5.0
 _ARMABLE_S = 20.0
 _LINES_KEPT = 40
-_CAMERA_LOST = "is lost: its process ended"  # `mavlink_sim.sim_outputs`
+_CAMERA_LOST = "is lost: its process ended"  # `mavlink_sim.realtime.sim_outputs`
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 

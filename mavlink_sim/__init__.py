@@ -1,7 +1,7 @@
-"""A MAVLink vehicle to fly against: PX4-like, in Python, with a camera. Imports nothing of `companion`.
+"""A simulated MAVLink vehicle: PX4-like, in Python, with a camera. Imports nothing of `companion`.
 
-`LockstepVehicle` is one in your own process, stepped by you; `running_simulator` one in a process of its own;
-`mavlink-sim` on the command line is one on UDP.
+`LockstepVehicle` runs in the caller's process and is stepped by the caller; `running_simulator` starts one in
+its own process; `mavlink-sim` on the command line runs one on UDP.
 
 >>> from mavlink_sim import LockstepVehicle
 >>> vehicle = LockstepVehicle(seed=1)
@@ -18,10 +18,10 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mavlink_sim.fleet_world import FleetWorld
     from mavlink_sim.lockstep import CommandRefusedError, LockstepVehicle, NotReachedError, Truth
     from mavlink_sim.testing import RunningSimulator, running_simulator
-    from mavlink_sim.vehicle import Vehicle
+    from mavlink_sim.vehicles.fleet_world import FleetWorld
+    from mavlink_sim.vehicles.vehicle import Vehicle
 
 __all__ = [
     "CommandRefusedError",
@@ -37,18 +37,18 @@ __all__ = [
 
 _HOMES = {
     "CommandRefusedError": "lockstep",
-    "FleetWorld": "fleet_world",
+    "FleetWorld": "vehicles.fleet_world",
     "LockstepVehicle": "lockstep",
     "NotReachedError": "lockstep",
     "RunningSimulator": "testing",
     "Truth": "lockstep",
-    "Vehicle": "vehicle",
+    "Vehicle": "vehicles.vehicle",
     "running_simulator": "testing",
 }
 
 
 def __getattr__(name: str) -> Any:
-    """Import what is asked for: who draws pictures alone shall not load MAVLink's dialect."""
+    """Import on demand: rendering alone must not load MAVLink's dialect."""
     if name == "__version__":
         from importlib.metadata import version
 

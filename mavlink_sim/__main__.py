@@ -3,7 +3,7 @@
 from vision.gc_pause import gc_paused
 
 with gc_paused():
-    from mavlink_sim.cli import main
+    from mavlink_sim.cli.main import main
 
 if __name__ == "__main__":
     main()

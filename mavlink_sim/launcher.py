@@ -1,86 +1,54 @@
-"""Vehicles from a process that has imported all that they take: forks of it, ready in a fraction of the time.
+"""A process that has imported the simulator and forks one process per vehicle, which is faster than a start.
 
-To start Python and to import the simulator is most of what it takes until a vehicle is ready. A test run that
-starts hundreds pays it once: `mavlink_sim.launching` starts `python -m mavlink_sim.launcher`, which imports,
-and forks a process for each vehicle that is wanted. That does what `python -m mavlink_sim` does, in the
-folder, with the variables, standard input and output of who wants it; what Python or a library reads of them
-at its start is the launcher's, as are umask, limits and niceness. It takes Linux.
+Starting Python and importing the simulator is most of the time until a vehicle is ready. A test run that
+starts hundreds pays it once: `mavlink_sim.launching` starts `python -m mavlink_sim.launcher`, which imports
+and forks a process for each request. That acts as `python -m mavlink_sim`, with the folder, environment,
+standard input and output of the requester; what Python or a library reads of them at its start is the
+launcher's, as are umask, limits and niceness. Linux only.
 
-The launcher ends with the program that started it, however that ends, and a vehicle with its launcher.
+The launcher ends with the program that started it, and a vehicle with its launcher.
 
-A request is one packet with a JSON object, and with it come three descriptors: the new process's standard
-input and output, and the end of a socket for the answers. Those are the process's id, with a descriptor of it
-(pidfd), and its exit code when it has ended.
+A request is one packet with a JSON object and three descriptors: the new process's standard input and output,
+and a socket for the answers. Those are the process's id, with a descriptor of it (pidfd), and its exit code
+when it has ended.
 """
 
 from __future__ import annotations
 
 import ctypes
-import errno
 import json
 import os
 import selectors
 import signal
 import socket
-import struct
 import sys
 import time
 import traceback
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
+from mavlink_sim.launching import ENDED, LARGEST_REQUEST, SHUTDOWN_TIMEOUT_S, STARTED, Request
 from vision.gc_pause import gc_paused
 
-LARGEST_REQUEST = 1 << 17  # less than any socket's buffer
-STARTED = struct.Struct("!i")  # the process's id; below zero: an errno, it could not be forked
-ENDED = struct.Struct("!i")  # the exit code, as `subprocess` has it
-# How long vehicles have to end in order once nobody is there who wants them: a camera may take 5 s.
-FAREWELL_S = 7.0
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 _GONE = (BrokenPipeError, ConnectionResetError)
 _ENDS_OF_A_GROUP = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
-    """A process that is wanted.
-
-    Attributes:
-        arguments: of `mavlink-sim`.
-        folder: to run in.
-        environment: all of its variables.
-    """
-
-    arguments: list[str]
-    folder: str
-    environment: dict[str, str]
-
-    def send(self, connection: socket.socket, descriptors: list[int]) -> None:
-        """Ask for it; `descriptors` are its standard input, its standard output, and where to answer.
-
-        Raises:
-            OSError: the launcher is gone, or this is more than fits into a packet (EMSGSIZE).
-        """
-        packet = json.dumps(asdict(self)).encode()
-        if len(packet) > LARGEST_REQUEST:
-            raise OSError(errno.EMSGSIZE, f"a request of {len(packet)} bytes is too long")
-        socket.send_fds(connection, [packet], descriptors)
-
-
-@dataclass(frozen=True, slots=True)
 class _Child:
-    """A process that was forked: `descriptor` is its pidfd, `answers` the socket of who wanted it."""
+    """A forked process: `descriptor` is its pidfd, `answers` the socket of the requester."""
 
     pid: int
     descriptor: int
     answers: socket.socket
 
     def report_start(self) -> None:
-        with suppress(OSError):  # who asked does not want to know any more, or sees the end of the answers
+        with suppress(OSError):  # the requester is gone, or sees the end of the answers
             socket.send_fds(self.answers, [STARTED.pack(self.pid)], [self.descriptor])
 
-    def take_end(self) -> None:
-        """It has ended: take its exit code, and pass that on."""
+    def on_exit(self) -> None:
+        """Collect the exit code of the ended process, and send it to the requester."""
         _, status = os.waitpid(self.pid, 0)
         with suppress(*_GONE):
             self.answers.sendall(ENDED.pack(os.waitstatus_to_exitcode(status)))
@@ -96,19 +64,20 @@ class _Child:
 
 
 def main(requests: int, program: int) -> None:
-    """Be the launcher; and in every fork be the simulator.
+    """Run the launcher; in every fork run the simulator.
 
     Args:
-        requests: the descriptor of the socket on which they come.
-        program: a pidfd of the program that may ask.
+        requests: the descriptor of the request socket.
+        program: a pidfd of the program that sends requests.
     """
-    # What ends a whole terminal or group reaches this one too, which ends its vehicles when the program ends.
+    # Signals to a terminal or process group are ignored; the launcher ends its vehicles when the program
+    # ends.
     for number in _ENDS_OF_A_GROUP:
         signal.signal(number, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-    signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # where that was ignored, no exit code could be had
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # if ignored, there would be no exit codes
     with gc_paused():
-        from mavlink_sim import cli
+        from mavlink_sim.cli import main as cli
 
         cli.load()
     with socket.socket(fileno=requests) as connection, selectors.DefaultSelector() as selector:
@@ -119,25 +88,25 @@ def main(requests: int, program: int) -> None:
 
 
 class _Launcher:
-    """Forks as often as asked."""
+    """Forks one process per request."""
 
     def __init__(self, requests: socket.socket, program: int, selector: selectors.BaseSelector) -> None:
         self._requests = requests
         self._selector = selector
         self._children: list[_Child] = []
         self._pid = os.getpid()
-        # A fork of the program may hold the other end of the socket when the program is long gone.
+        # A fork of the program may keep the other end of the socket open after the program has ended.
         self._program = program
         selector.register(requests, selectors.EVENT_READ)
         selector.register(self._program, selectors.EVENT_READ)
 
     def run(self) -> list[str] | None:
-        """Returns in each fork its arguments; and None once nobody is there to ask for more."""
+        """Serve requests. Returns in each fork its arguments, in the launcher None at the end."""
         try:
             while True:
                 for key, _ in self._selector.select():
                     if key.data is not None:
-                        self._take_end(key.data)
+                        self._on_exit(key.data)
                     elif key.fileobj == self._program:
                         return None
                     else:
@@ -154,7 +123,7 @@ class _Launcher:
     def _serve(self, packet: bytes, descriptors: list[int]) -> list[str] | None:
         """Fork for a request. Returns its arguments in the fork, None in the launcher.
 
-        Who asked for what cannot be sees the end of the answers.
+        After an invalid request the requester sees the end of the answers.
         """
         try:
             request = Request(**json.loads(packet))
@@ -196,7 +165,7 @@ class _Launcher:
         return pid
 
     def _become(self, request: Request, standard_input: int, standard_output: int) -> None:
-        """Be the process that is wanted: nothing that is the launcher's stays open."""
+        """Become the requested process: close everything of the launcher."""
         for child in self._children:
             child.close()
         os.close(self._program)
@@ -208,7 +177,7 @@ class _Launcher:
         for number in (signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, signal.SIG_DFL)
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
-        if os.getppid() != self._pid:  # the launcher ended before the kernel was asked to tell
+        if os.getppid() != self._pid:  # the launcher ended before prctl
             os._exit(1)
         os.chdir(request.folder)
         if not sys.flags.safe_path:
@@ -216,10 +185,10 @@ class _Launcher:
         os.environ.clear()
         os.environ.update(request.environment)
 
-    def _take_end(self, child: _Child) -> None:
+    def _on_exit(self, child: _Child) -> None:
         self._selector.unregister(child.descriptor)
         self._children.remove(child)
-        child.take_end()
+        child.on_exit()
 
     def _end_all(self) -> None:
         for child in self._children:
@@ -227,13 +196,13 @@ class _Launcher:
             child.send(signal.SIGCONT)  # it may be suspended
         self._selector.unregister(self._requests)
         self._selector.unregister(self._program)
-        until_s = time.monotonic() + FAREWELL_S
+        until_s = time.monotonic() + SHUTDOWN_TIMEOUT_S
         while self._children and (left_s := until_s - time.monotonic()) > 0.0:
             for key, _ in self._selector.select(left_s):
-                self._take_end(key.data)
+                self._on_exit(key.data)
         for child in [*self._children]:
             child.send(signal.SIGKILL)
-            self._take_end(child)
+            self._on_exit(child)
 
 
 if __name__ == "__main__":

@@ -1,34 +1,68 @@
-"""`mavlink-sim` in a process of its own: forked by this program's launcher; started, where that cannot be."""
+"""`mavlink-sim` in its own process: forked by this program's launcher, or started without one."""
 
 from __future__ import annotations
 
 import atexit
 import errno
+import json
 import os
 import select
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
+from dataclasses import asdict, dataclass
 from typing import TextIO
 
-from mavlink_sim.launcher import ENDED, FAREWELL_S, STARTED, Request
+LARGEST_REQUEST = 1 << 17  # less than every socket's buffer
+STARTED = struct.Struct("!i")  # the process's id; negative: an errno of the fork
+ENDED = struct.Struct("!i")  # the exit code, as in `subprocess`
+# Time for vehicles to end after SIGTERM: a camera may take 5 s.
+SHUTDOWN_TIMEOUT_S = 7.0
+# The time to end its vehicles, with a margin.
+LAUNCHER_ENDS_S = SHUTDOWN_TIMEOUT_S + 2.0
 
-# What it takes to end its vehicles, and some more.
-LAUNCHER_ENDS_S = FAREWELL_S + 2.0
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """A request for a process.
+
+    Attributes:
+        arguments: of `mavlink-sim`.
+        folder: to run in.
+        environment: all of its environment variables.
+    """
+
+    arguments: list[str]
+    folder: str
+    environment: dict[str, str]
+
+    def send(self, connection: socket.socket, descriptors: list[int]) -> None:
+        """Send it; `descriptors` are the standard input, the standard output, and the socket for answers.
+
+        Raises:
+            OSError: the launcher is gone, or the request does not fit into a packet (EMSGSIZE).
+        """
+        packet = json.dumps(asdict(self)).encode()
+        if len(packet) > LARGEST_REQUEST:
+            raise OSError(
+                errno.EMSGSIZE, f"request of {len(packet)} bytes is too long, the limit is {LARGEST_REQUEST}"
+            )
+        socket.send_fds(connection, [packet], descriptors)
 
 
 class LaunchedProcess:
-    """A process that the launcher has forked, with what tests use of `subprocess.Popen`.
+    """A process forked by the launcher, with the part of `subprocess.Popen` that tests use.
 
     Attributes:
-        stdin, stdout: the other ends of its standard input and output; standard error goes where output goes.
-        returncode: its exit code, or less than nothing the signal that ended it; None until that is known.
-            Where its launcher ended before it: -SIGTERM, the signal that then ends it.
+        stdin, stdout: pipes to its standard input and output; standard error is merged into output.
+        returncode: its exit code, or the negative signal that ended it; None until that is known. If its
+            launcher ended first: -SIGTERM, the signal that then ends it.
     """
 
     def __init__(
@@ -59,7 +93,7 @@ class LaunchedProcess:
     def _code_within(self, timeout_s: float | None) -> int | None:
         until_s = None if timeout_s is None else time.monotonic() + timeout_s
         if self.returncode is None and _readable(self._answers.fileno(), until_s):
-            # It stays there to be read: another thread may be waiting for it too.
+            # Not removed: another thread may be waiting for it too.
             answer = self._answers.recv(ENDED.size, socket.MSG_PEEK)
             if answer:
                 self.returncode = ENDED.unpack(answer)[0]
@@ -68,7 +102,7 @@ class LaunchedProcess:
         return self.returncode
 
     def send_signal(self, number: int) -> None:
-        """Nothing if it has ended."""
+        """Send a signal; no effect if it has ended."""
         if self.poll() is None:
             with suppress(ProcessLookupError):
                 signal.pidfd_send_signal(self._descriptor, number)
@@ -83,7 +117,7 @@ class LaunchedProcess:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        """Close the pipes, and wait for its end; after an exception nobody else may have ended it."""
+        """Close the pipes and wait for its end; after an exception kill it first."""
         if exception[0] is not None:
             self.kill()
         with ExitStack() as stack:
@@ -94,30 +128,30 @@ class LaunchedProcess:
             stack.callback(self.stdout.close)
 
     def _close_input(self) -> None:
-        with suppress(BrokenPipeError):  # what was still to be written has nobody to go to
+        with suppress(BrokenPipeError):  # unwritten input is lost
             self.stdin.close()
 
 
 def _readable(descriptor: int, until_s: float | None) -> bool:
-    """Whether it can be read, now or until a moment (monotonic; None: at some time)."""
+    """Wait until it can be read, at most until a monotonic time (None: no limit)."""
     poll = select.poll()
     poll.register(descriptor, select.POLLIN)
     return bool(poll.poll(None if until_s is None else max(until_s - time.monotonic(), 0.0) * 1e3))
 
 
 class _LauncherOfOurs:
-    """A launcher that this program has started, with Python set up as the variables say now."""
+    """A launcher started by this program, with the current environment of Python."""
 
     def __init__(self) -> None:
         self._owner = os.getpid()
         self._python = _python()
         self._requests, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         program = os.pidfd_open(os.getpid())
-        # It must not hear of a Ctrl-C before it can ignore that.
+        # Block Ctrl-C until the launcher ignores it.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             for end in (self._requests, theirs):
-                end.settimeout(None)  # whatever the program's sockets have by default
+                end.settimeout(None)  # independent of the default timeout of sockets
             passed = [theirs.fileno(), program]
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "mavlink_sim.launcher", *map(str, passed)],
@@ -136,14 +170,14 @@ class _LauncherOfOurs:
 
     @property
     def serves(self) -> bool:
-        """Whether a vehicle of it is what one would be that was started now."""
+        """Whether its vehicles are the same as one started now."""
         return self._python == _python() and self.lives
 
     def start(self, arguments: Sequence[str]) -> LaunchedProcess:
-        """A new process with these arguments of `mavlink-sim`, in this one's folder and environment.
+        """Start a process with these arguments of `mavlink-sim`, in this one's folder and environment.
 
         Raises:
-            OSError: it could not be.
+            OSError: it could not be started.
         """
         request = Request(list(arguments), os.getcwd(), dict(os.environ))
         with ExitStack() as ours, ExitStack() as theirs:
@@ -166,23 +200,23 @@ class _LauncherOfOurs:
                 raise self._ended()
             pid: int = STARTED.unpack(answer)[0]
             if pid < 0:
-                raise OSError(-pid, f"a process for mavlink-sim cannot be forked: {os.strerror(-pid)}")
+                raise OSError(-pid, f"cannot fork a process for mavlink-sim: {os.strerror(-pid)}")
             if not descriptors:
                 os.kill(pid, signal.SIGKILL)
-                raise OSError(errno.EMFILE, "no descriptor is left for a process of mavlink-sim")
+                raise OSError(errno.EMFILE, "no file descriptor left for a process of mavlink-sim")
             os.set_inheritable(descriptors[0], False)
             ours.pop_all()
         return LaunchedProcess(pid, descriptors[0], answers, stdin, stdout)
 
     def _ended(self) -> OSError:
-        """What to say of no answer."""
+        """The error of a missing answer."""
         try:
             return OSError(f"the launcher of mavlink-sim ended with code {self._process.wait(1.0)}")
         except subprocess.TimeoutExpired:
-            return OSError("the launcher of mavlink-sim could not fork; standard error tells why")
+            return OSError("the launcher of mavlink-sim could not fork; see its standard error")
 
     def close(self) -> None:
-        """Let it end, and what it has forked. Nothing happens in a fork of the program."""
+        """End it and its vehicles. No effect in a fork of the program."""
         if self._owner != os.getpid():
             return
         with suppress(OSError):  # not connected: it has ended
@@ -196,7 +230,7 @@ class _LauncherOfOurs:
 
 
 def _python() -> dict[str, str]:
-    """What a launcher has read of the variables when it started."""
+    """The environment variables that a launcher reads at its start."""
     return {name: value for name, value in os.environ.items() if name.startswith("PYTHON")}
 
 
@@ -216,7 +250,7 @@ def _launcher() -> _LauncherOfOurs:
         for launcher in [*_launchers]:
             if launcher.serves:
                 return launcher
-            if not launcher.lives:  # one that lives on may have vehicles that fly
+            if not launcher.lives:  # one that is alive may have running vehicles
                 launcher.close()
                 _launchers.remove(launcher)
         _launchers.append(_LauncherOfOurs())
@@ -224,7 +258,7 @@ def _launcher() -> _LauncherOfOurs:
 
 
 def can_launch() -> bool:
-    """Whether there can be a launcher: on Linux, where nothing keeps pidfd_open from programs."""
+    """Whether a launcher is possible: on Linux, if pidfd_open is permitted."""
     try:
         os.close(os.pidfd_open(os.getpid()))
     except (AttributeError, OSError):
@@ -242,7 +276,7 @@ def start_simulator(arguments: Sequence[str]) -> LaunchedProcess | subprocess.Po
         try:
             return _launcher().start(arguments)
         except OSError as error:
-            if error.errno != errno.EMSGSIZE:  # a hundred kilobytes of variables fit into no packet
+            if error.errno != errno.EMSGSIZE:  # the environment is too large for a packet
                 raise
     return subprocess.Popen(
         [sys.executable, "-m", "mavlink_sim", *arguments],

@@ -1,4 +1,4 @@
-"""A vehicle in your own process, stepped by you: no sockets, no threads, no sleeping, no clock.
+"""A vehicle in the caller's process, stepped by the caller: no sockets, no threads, no sleeping, no clock.
 
 >>> from mavlink_sim import LockstepVehicle
 >>> vehicle = LockstepVehicle(seed=1)
@@ -10,8 +10,8 @@ True
 >>> vehicle.truth.velocity_ned_mps[0] > 1.5
 True
 
-Anything else goes by MAVLink messages, as with a real vehicle: `send` one, `step`, look at what it sent. The
-same seed and the same calls give the same flight, and the same bytes, every time.
+Everything else is done by MAVLink messages, as with a real vehicle: `send` one, `step`, read what it sent.
+The same seed and the same calls give the same flight and the same bytes.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from mavlink_sim.firmware import PX4, vehicle_class
 from mavlink_sim.lockstep_wire import LockstepWire
-from mavlink_sim.vehicle import STEP_S
+from mavlink_sim.vehicles.firmware import PX4, vehicle_class
+from mavlink_sim.vehicles.vehicle import STEP_S
 from mavlink_sim.wire.messages import Outgoing, dialect
 from mavlink_sim.wire.streams import ONBOARD_RATES_HZ
 
@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 
 COMPANION = (1, 191)  # MAV_COMP_ID_ONBOARD_COMPUTER
 ANSWER_LIMIT_S = 1.0
-SECOND_ANSWER_S = 0.04  # Commander's own, after the receiver's
-# What nobody takes is kept up to this many messages a link: a minute of all streams.
+SECOND_ANSWER_S = 0.04  # Commander's answer, after the receiver's
+# Unread messages are kept up to this many per link: a minute of all streams.
 MAX_WAITING = 50_000
 _ARM_DISARM, _TAKEOFF, _LAND, _SET_MODE = 400, 22, 21, 176
 SETPOINT_RATE_HZ = 20.0
@@ -48,7 +48,7 @@ _RESULTS = ("ACCEPTED", "TEMPORARILY_REJECTED", "DENIED", "UNSUPPORTED", "FAILED
 
 
 class NotReachedError(TimeoutError):
-    """What was waited for did not come about within its limit of simulated time."""
+    """A condition was not reached within its limit of simulated time."""
 
 
 class CommandRefusedError(RuntimeError):
@@ -57,15 +57,15 @@ class CommandRefusedError(RuntimeError):
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """What is really so at one moment.
+    """The true state at one time.
 
     Attributes:
         time_s: since boot. position_ned_m, velocity_ned_mps: local NED, its origin at the start.
         quaternion: `ned_from_body` (w, x, y, z). roll_rad, pitch_rad, yaw_rad: the same.
         rates_radps: body FRD.
-        mode: PX4's name of the flight mode. on_ground: touching it, or on top of something.
-        landed: as the land detector has it.
-        collisions: how often it met something of the scene, or another vehicle of its fleet_world.
+        mode: PX4's name of the flight mode. on_ground: touching it, or on top of an obstacle.
+        landed: by the land detector.
+        collisions: count of those with the scene or another vehicle of its fleet world.
         collision: the newest; None before the first.
     """
 
@@ -91,23 +91,22 @@ class Truth:
 
 
 class LockstepVehicle:
-    """A PX4-like quadrotor that moves only while `step` (or a method that says so) runs.
+    """A PX4-like quadrotor that moves only while `step` (or another method documented to step) runs.
 
     Args:
         links: its connections by name, each with the rates of its streams in Hz; None is one link "onboard"
             with a companion's full rates. `streams.GCS_RATES_HZ` is a ground station's; `{}` sends
-            answers alone (and what is told once: the origin, parameters set at the start), the fastest.
-        autopilot: whose profile it has, "px4" or "ardupilot" (`firmware`); the latter's streams are asked
-            for by messages, whatever `links` says.
+            only answers (and once the origin and the parameters set at the start), which is the fastest.
+        autopilot: the firmware to emulate, "px4" or "ardupilot" (`firmware`); the latter's streams are
+            requested by messages, whatever `links` is.
         options: those of `Vehicle`: `seed`, `noise`, `wind_mps`, `gusts_mps`, `parameters`, `system_id`,
             `scene` (a scene file, an example's name, a `Scene` or a `World`), `obstacle_sensor`…
 
     Attributes:
-        vehicle: the vehicle itself, with everything that is inside (`airframe`, `autopilot`, `parameters`).
-            Where it did not start at SIH's home, calls to these reckon places in `with vehicle.turn():`.
-        events: what happened so far, one readable line each ("armed", "mode HOLD", "landed"…).
+        vehicle: the vehicle itself, with its parts (`airframe`, `autopilot`, `parameters`).
+        events: one readable line per event so far ("armed", "mode HOLD", "landed"…).
         newest: of each link, the newest message of each type that it sent.
-        dropped: of each link, how many messages were let go because nobody took them.
+        dropped: of each link, the number of messages dropped because they were not read.
     """
 
     def __init__(
@@ -136,19 +135,20 @@ class LockstepVehicle:
         self._main_link = next(iter(self._waiting), "")
 
     def copy(self) -> LockstepVehicle:
-        """The same vehicle once more, as it is now; from here on each goes its own way.
+        """An independent copy in the current state.
 
-        As long as the same is sent to both they fly alike, bit for bit. It takes a few milliseconds, where
-        flying there again takes the simulation of it all: the way to try several things from one moment, or
-        to begin every episode of a training in the air. `stop` of what `repeat` returned stops the first
-        one's messages only.
+        With the same inputs both fly alike, bit for bit. It takes a few milliseconds: use it to try several
+        continuations of one state, or to begin every episode of a training in the air. `stop` of what
+        `repeat` returned stops the first one's messages only.
 
         Raises:
-            ValueError: a fault is on it, which may hold on to what lies outside.
+            ValueError: a fault is active, which may refer to objects outside.
         """
         if self.vehicle.faults.active:
             names = ", ".join(one.fault.kind.name for one in self.vehicle.faults.active)
-            raise ValueError(f"copy: {names} is on this vehicle; end it first, and begin it anew on each")
+            raise ValueError(
+                f"copy: fault {names} is active; end it first, and begin it again on each vehicle"
+            )
         twin: LockstepVehicle = pickle.loads(pickle.dumps(self))
         return twin
 
@@ -161,14 +161,14 @@ class LockstepVehicle:
 
     @property
     def _elapsed_s(self) -> float:
-        """Since it was made: goes on through a reboot and a standstill."""
+        """Simulated seconds since it was created: independent of reboots and stalls."""
         return self.vehicle.faults.now_s
 
     def step(self, dt_s: float) -> None:
-        """Let simulated time pass, in steps of 4 ms; a remainder waits for the next call.
+        """Advance simulated time, in steps of 4 ms; a remainder waits for the next call.
 
         Raises:
-            ValueError: `dt_s` is negative or no number.
+            ValueError: `dt_s` is negative or not finite.
         """
         if not dt_s >= 0.0:
             raise ValueError(f"step: expected seconds, zero or more, got {dt_s}")
@@ -178,12 +178,13 @@ class LockstepVehicle:
             self.vehicle.step(dt_s)
         else:
             self._step_and_repeat(dt_s, wired)
-        self._take()
+        self._drain()
 
     def _step_and_repeat(self, dt_s: float, wired: bool) -> None:
-        """From one repeated message to the next; each goes out with the first step at or after its time.
+        """Advance from one repeated message to the next; each is sent with the first step at or after its
+        time.
 
-        `wired`: step by step, since a fault may hold, deliver or begin something at any of them.
+        `wired`: step by step, since a fault may delay, deliver or begin something at any of them.
         """
         self._owed_s += dt_s
         left = int(self._owed_s / STEP_S + 1e-6)
@@ -202,14 +203,14 @@ class LockstepVehicle:
             if wired:
                 for wire in self._wires.values():
                     wire.deliver()
-                self._take()
+                self._drain()
 
-    def _take(self) -> None:
+    def _drain(self) -> None:
         for name, waiting in self._waiting.items():
             outgoing = self.vehicle.outgoing(name)
             wire = self._wires[name]
             if wire.matters:
-                if waiting and not waiting[-1].forwarded:  # those came before, and have their numbers before
+                if waiting and not waiting[-1].forwarded:  # those were sent before and have earlier numbers
                     sealed = wire.sealed(waiting)
                     waiting.clear()
                     waiting.extend(sealed)
@@ -228,7 +229,7 @@ class LockstepVehicle:
     def run_until(
         self, condition: Callable[[Truth], bool], limit_s: float = 60.0, every_s: float = 0.02
     ) -> float:
-        """Let time pass until the truth meets a condition. Returns how many simulated seconds that took.
+        """Advance until the truth meets a condition. Returns the simulated seconds that it took.
 
         Raises:
             NotReachedError: not within `limit_s` simulated seconds.
@@ -248,10 +249,9 @@ class LockstepVehicle:
     # ---- messages ---------------------------------------------------------------------------------------
 
     def send(self, message: Any, link: str = "", source: tuple[int, int] = COMPANION) -> None:
-        """Hand it a message (of any pymavlink dialect) as if it came in on a link, the first by default.
+        """Send it a message (of any pymavlink dialect) on a link, the first by default.
 
-        It is not signed: a link with a signing key takes it as MAV_SIGN_CFG
-        says; `send_bytes` is for signed ones.
+        It is not signed: on a link with a signing key MAV_SIGN_CFG decides; `send_bytes` is for signed ones.
         """
         name = link or self._main_link
         if name in self._wires and self._wires[name].matters:
@@ -260,34 +260,34 @@ class LockstepVehicle:
             header = message.get_header()
             header.srcSystem, header.srcComponent = source
             self.vehicle.handle(name, message)
-        self._take()
+        self._drain()
 
     def send_bytes(self, data: bytes, link: str = "") -> int:
-        """Hand it bytes off a wire; returns how many whole messages it took out of them and of what was left.
+        """Send it bytes; returns the number of complete messages in them and in an earlier remainder.
 
-        A fault of the link may hold or lose them, and a link with a signing key may refuse them.
+        A link fault may delay or lose them, and a link with a signing key may refuse them.
         """
         count = self._wires[link or self._main_link].send_bytes(data)
-        self._take()
+        self._drain()
         return count
 
     def repeat(
         self, message: Any, rate_hz: float, link: str = "", source: tuple[int, int] = COMPANION
     ) -> Repeat:
-        """Send this message at a rate for as long as time passes (setpoints, heartbeats); `stop` ends it."""
+        """Send this message at a rate while time advances (setpoints, heartbeats); `stop` ends it."""
         repeated = _Repeated(message, 1.0 / rate_hz, self._elapsed_s, link, source)
         self._repeated.append(repeated)
         return Repeat(self._repeated, repeated)
 
     def receive(self, link: str = "") -> list[Any]:
-        """Every message it sent on a link since the last call, in order: pymavlink messages or like them."""
+        """The messages that it sent on a link since the last call, in order: pymavlink's or equivalent."""
         waiting = self._waiting[link or self._main_link]
         messages = [item.message for item in waiting if item.message.get_type() != "BAD_DATA"]
         waiting.clear()
         return messages
 
     def receive_bytes(self, link: str = "") -> bytes:
-        """The same as the bytes on the wire."""
+        """The same as bytes."""
         name = link or self._main_link
         codec, waiting = self._wires[name].codec, self._waiting[name]
         packed = b"".join(item.pack(codec) for item in waiting)
@@ -297,9 +297,9 @@ class LockstepVehicle:
     # ---- the usual commands -----------------------------------------------------------------------------
 
     def command(self, identifier: int, *parameters: float) -> str:
-        """Send COMMAND_LONG and let time pass until it is answered. Returns the MAV_RESULT's name.
+        """Send COMMAND_LONG and advance until it is answered. Returns the MAV_RESULT's name.
 
-        DO_SET_MODE is answered twice; the second one, the real one, counts.
+        DO_SET_MODE is answered twice; the second answer is returned.
 
         Raises:
             NotReachedError: no answer within a second of simulated time.
@@ -326,7 +326,7 @@ class LockstepVehicle:
         self._demand("arming", _ARM_DISARM, 1.0)
 
     def take_off(self, height_m: float = 2.5, limit_s: float = 60.0) -> None:
-        """Arm, take off to a height above home, and wait until that is over (HOLD; ArduPilot: GUIDED).
+        """Arm, take off to a height above home, and wait until that is complete (HOLD; ArduPilot: GUIDED).
 
         Raises:
             NotReachedError: not within `limit_s`. CommandRefusedError: it refuses.
@@ -339,15 +339,15 @@ class LockstepVehicle:
         self.run_until(lambda truth: is_over(), limit_s)
 
     def land(self, limit_s: float = 120.0) -> None:
-        """Land where it is and wait until it has disarmed itself. Raises as `take_off`."""
+        """Land at its position and wait until it is disarmed. Raises as `take_off`."""
         self._demand("landing", _LAND)
         self.run_until(lambda truth: not truth.armed, limit_s)
 
     def set_mode(self, name: str) -> None:
-        """Ask for a mode by its autopilot's name (PX4: `OFFBOARD`, `HOLD`…; ArduPilot: `GUIDED`…).
+        """Request a mode by its autopilot's name (PX4: `OFFBOARD`, `HOLD`…; ArduPilot: `GUIDED`…).
 
         Raises:
-            ValueError: there is no such mode. CommandRefusedError: it cannot be flown now.
+            ValueError: an unknown mode. CommandRefusedError: it is not available now.
         """
         try:
             mode = self.vehicle.modes[name]
@@ -359,27 +359,27 @@ class LockstepVehicle:
     # ---- setpoints --------------------------------------------------------------------------------------
 
     def set_velocity(self, north_mps: float, east_mps: float, down_mps: float, yaw_rad: float = NAN) -> None:
-        """Fly with this velocity over ground from now on, local NED, metres a second.
+        """Set a velocity over ground, local NED, metres per second.
 
-        SET_POSITION_TARGET_LOCAL_NED goes out SETPOINT_RATE_HZ times a second while time passes, in OFFBOARD
-        (ArduPilot: GUIDED), until another of these three is called. The first call lets 0.1 s pass before it
-        asks for the mode. A vehicle on the ground has to take off first.
+        SET_POSITION_TARGET_LOCAL_NED is sent SETPOINT_RATE_HZ times per second while time advances, in
+        OFFBOARD (ArduPilot: GUIDED), until another of these three is called. The first call advances 0.1 s
+        before it requests the mode. A vehicle on the ground has to take off first.
 
         Args:
-            yaw_rad: heading, clockwise from north; without one it stays as it is.
+            yaw_rad: heading, clockwise from north; without one it is unchanged.
 
         Raises:
-            CommandRefusedError: the mode cannot be flown now; no setpoints are sent.
+            CommandRefusedError: the mode is not available now; no setpoints are sent.
             ValueError: a number is not finite.
         """
         self._set_target(_ONLY_VELOCITY, (0.0, 0.0, 0.0, north_mps, east_mps, down_mps), yaw_rad)
 
     def set_position(self, north_m: float, east_m: float, down_m: float, yaw_rad: float = NAN) -> None:
-        """Fly to this place and stay there, local NED, metres. Otherwise as `set_velocity`."""
+        """Set a position, local NED, metres. Otherwise as `set_velocity`."""
         self._set_target(_ONLY_POSITION, (north_m, east_m, down_m, 0.0, 0.0, 0.0), yaw_rad)
 
     def stop_setpoints(self) -> None:
-        """Send no more setpoints; the vehicle does what it does when they end (PX4: COM_OBL_RC_ACT)."""
+        """Stop the setpoints; the vehicle reacts to their end (PX4: COM_OBL_RC_ACT)."""
         if self._setpoints is not None:
             self._setpoints.stop()
         self._setpoints = None
@@ -406,7 +406,7 @@ class LockstepVehicle:
             self._setpoints.message = message
         else:
             self._setpoints = self.repeat(message, SETPOINT_RATE_HZ)
-            self.step(0.1)  # PX4 takes OFFBOARD only with a stream
+            self.step(0.1)  # PX4 accepts OFFBOARD only with a setpoint stream
         mode = self.vehicle.setpoint_mode
         if self.truth.mode != mode:
             try:
@@ -424,7 +424,7 @@ class LockstepVehicle:
 
     @property
     def truth(self) -> Truth:
-        """What is really so now."""
+        """The current truth."""
         airframe, autopilot = self.vehicle.airframe, self.vehicle.autopilot
         return Truth(
             self.now_s,
@@ -446,7 +446,7 @@ class LockstepVehicle:
 
 
 class _Repeated:
-    """A message that is sent again and again."""
+    """A message that is sent repeatedly."""
 
     def __init__(
         self, message: Any, interval_s: float, next_s: float, link: str, source: tuple[int, int]
@@ -461,7 +461,7 @@ class _Repeated:
 
 
 class Repeat:
-    """A message that is being repeated; `message` may be replaced while it is."""
+    """A repeated message; `message` may be replaced at any time."""
 
     def __init__(self, among: list[_Repeated], repeated: _Repeated) -> None:
         self._among, self._repeated = among, repeated
@@ -475,6 +475,6 @@ class Repeat:
         self._repeated.message = message
 
     def stop(self) -> None:
-        """Send it no more; to stop twice is to stop."""
+        """Stop sending it; a second call has no effect."""
         if self._repeated in self._among:
             self._among.remove(self._repeated)

@@ -1,6 +1,6 @@
-"""A link of a vehicle in lockstep, as bytes: what a client on a socket would send and get, faults included.
+"""A link of a vehicle in lockstep, as bytes: as for a client on a socket, with faults.
 
->>> from mavlink_sim.vehicle import Vehicle
+>>> from mavlink_sim.vehicles.vehicle import Vehicle
 >>> vehicle = Vehicle()
 >>> _ = vehicle.add_link("onboard")
 >>> link = LockstepLink(vehicle, "onboard")
@@ -13,18 +13,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from mavlink_sim.faults.context import FaultTarget
 from mavlink_sim.wire.messages import parser
-
-if TYPE_CHECKING:
-    from mavlink_sim.vehicle import Vehicle
 
 
 class LockstepLink:
-    """The client's end of one link. Call `receive` after every step: it is also what makes time pass here."""
+    """The client's end of one link. Call `receive` after every step: it also advances the link's time."""
 
-    def __init__(self, vehicle: Vehicle, name: str) -> None:
+    def __init__(self, vehicle: FaultTarget, name: str) -> None:
         self._vehicle = vehicle
         self._name = name
         self._stage = vehicle.faults.stage(name)
@@ -32,7 +30,7 @@ class LockstepLink:
         self._sequences: dict[tuple[int, int], int] = {}
 
     def send(self, message: Any, source: tuple[int, int] = (1, 191)) -> None:
-        """Send a message from a (system, component), numbered as that component numbers."""
+        """Send a message from a (system, component), with that component's sequence number."""
         codec = parser(*source)
         codec.seq = self._sequences.get(source, 0)
         self._sequences[source] = (codec.seq + 1) % 256
@@ -44,7 +42,7 @@ class LockstepLink:
         self._deliver()
 
     def receive(self) -> list[bytes]:
-        """The datagrams that have come since the last call; those to the vehicle that are due arrive too."""
+        """The datagrams received since the last call; due datagrams to the vehicle are delivered too."""
         self._deliver()
         now_s = self._vehicle.faults.now_s
         for item in self._vehicle.outgoing(self._name):

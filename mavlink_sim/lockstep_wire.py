@@ -1,26 +1,24 @@
-"""The wire of a vehicle in lockstep: its links as datagrams, through signing and whatever faults are on them.
+"""The wire of a vehicle in lockstep: its links as datagrams, with signing and faults.
 
-Messages go between a `LockstepVehicle` and its client as objects, which is fast and all that a sound link
-needs. While a fault is on a link, or it has a signing key, they are packed, signed, delayed, damaged or
-refused here as the datagrams of a real one are.
+Messages between a `LockstepVehicle` and its client are objects, which is fast and sufficient for a good link.
+While a fault is on a link, or it has a signing key, they are packed, signed, delayed, corrupted or refused
+here as the datagrams of a real one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from mavlink_sim.faults.context import FaultTarget
+from mavlink_sim.wire.links import Link
 from mavlink_sim.wire.messages import Outgoing, parser
-
-if TYPE_CHECKING:
-    from mavlink_sim.services.links import Link
-    from mavlink_sim.vehicle import Vehicle
 
 
 class LockstepWire:
     """One link's wire. `codec` numbers what the vehicle packs on it."""
 
-    def __init__(self, vehicle: Vehicle, link: Link) -> None:
+    def __init__(self, vehicle: FaultTarget, link: Link) -> None:
         self._vehicle = vehicle
         self._link = link
         self._stage = vehicle.faults.stage(link.name)
@@ -31,7 +29,7 @@ class LockstepWire:
 
     @property
     def engaged(self) -> bool:
-        """A fault is on the link, or something is still under way in it."""
+        """A fault is on the link, or datagrams are still in transit."""
         return self._stage.inbound.engaged or self._stage.outbound.engaged
 
     @property
@@ -40,7 +38,7 @@ class LockstepWire:
         return self.engaged or self._link.signing.has_key
 
     def outbound(self, outgoing: Iterable[Outgoing]) -> list[Outgoing]:
-        """What arrives at the client by now, after these were sent; damaged bytes come as BAD_DATA."""
+        """Send messages; returns those that have arrived at the client by now, corrupted ones as BAD_DATA."""
         now_s, channel, signing = self._vehicle.faults.now_s, self._stage.outbound, self._link.signing
         for item in outgoing:
             frame = item.pack(self.codec)
@@ -52,7 +50,7 @@ class LockstepWire:
         ]
 
     def sealed(self, outgoing: Iterable[Outgoing]) -> list[Outgoing]:
-        """The same messages as bytes that are numbered already."""
+        """The same messages as packed bytes with sequence numbers."""
         found = []
         for item in outgoing:
             if item.forwarded:
@@ -67,7 +65,7 @@ class LockstepWire:
         return Outgoing(message, message.get_srcSystem(), message.get_srcComponent(), True)
 
     def send(self, message: Any, source: tuple[int, int]) -> int:
-        """A client sends a message, unsigned. Returns how many the vehicle was handed."""
+        """Send a message of a client, unsigned. Returns the number of messages delivered to the vehicle."""
         sender = self._senders.get(source)
         if sender is None:
             sender = self._senders[source] = parser(*source)
@@ -76,14 +74,14 @@ class LockstepWire:
         return self.send_bytes(frame)
 
     def send_bytes(self, datagram: bytes) -> int:
-        """A client sends a datagram. Returns how many messages the vehicle was handed."""
+        """Send a datagram of a client. Returns the number of messages delivered to the vehicle."""
         if not self._stage.inbound.engaged:
             return self._read(datagram)
         self._stage.inbound.push(self._vehicle.faults.now_s, datagram)
         return self.deliver()
 
     def deliver(self) -> int:
-        """Hand the vehicle what has arrived by now. Returns how many messages."""
+        """Deliver what has arrived by now. Returns the number of messages."""
         arrived = self._stage.inbound.due(self._vehicle.faults.now_s)
         return sum(self._read(datagram) for datagram, _ in arrived)
 

@@ -1,4 +1,4 @@
-"""A pytest plugin: a MAVLink vehicle for a test, started, ready to be armed, and gone afterwards.
+"""A pytest plugin: a MAVLink vehicle for a test, started, ready to be armed, and stopped afterwards.
 
 >>> def test_my_client_arms_it(vehicle):                              # doctest: +SKIP
 ...     my_client.connect(vehicle.mavsdk_url)
@@ -6,7 +6,7 @@
 ...     vehicle.wait_for_event("armed")
 
 `@pytest.mark.vehicle(wind=5, speed=4, parameters={"COM_OF_LOSS_T": 0.5})` sets its options; `make_vehicle`
-makes several. Where a test fails, each vehicle's log and the traffic on its links are kept and named in the
+starts several. If a test fails, each vehicle's log and the traffic on its links are kept and named in the
 report.
 
 This module is loaded at the start of every pytest run on a machine that has mavlink_sim; so it imports
@@ -33,7 +33,7 @@ LINES_IN_THE_REPORT = 20
 
 @dataclass
 class _Flights:
-    """The vehicles of one test, and whether anything of that test failed."""
+    """The vehicles of one test, and whether that test failed."""
 
     kept: list[tuple[Path, RunningSimulator]] = field(default_factory=list)
     failed: bool = False
@@ -48,7 +48,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--vehicle-logs",
         metavar="FOLDER",
         type=Path,
-        help="Where failed tests' vehicles leave log and traffic (default: pytest's temporary folder).",
+        help="Folder for log and traffic of failed tests' vehicles (default: pytest's temporary folder).",
     )
 
 
@@ -78,11 +78,11 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
 
 
 def _section(number: int, folder: Path, simulator: RunningSimulator) -> tuple[str, str]:
-    """The report's part on one vehicle, whose log is written now: the test may be all there is to see."""
+    """The report's section about one vehicle; its log is written here."""
     log = _write_log(folder, simulator)
-    said = simulator.transcript[-LINES_IN_THE_REPORT:]
+    output = simulator.transcript[-LINES_IN_THE_REPORT:]
     records = "".join(f"traffic: {path}\n" for path in sorted(folder.glob("*.tlog")))
-    return (f"vehicle {number}", f"log:     {log}\n{records}" + "".join(f"{line}\n" for line in said))
+    return (f"vehicle {number}", f"log:     {log}\n{records}" + "".join(f"{line}\n" for line in output))
 
 
 def _write_log(folder: Path, simulator: RunningSimulator) -> Path:
@@ -96,7 +96,7 @@ def _write_log(folder: Path, simulator: RunningSimulator) -> Path:
 
 
 def _marked_options(node: pytest.Item) -> dict[str, Any]:
-    """The options of every `vehicle` marker on the test; the nearest counts, parameters add up."""
+    """The options of every `vehicle` marker on the test; the nearest wins, parameters are merged."""
     options: dict[str, Any] = {}
     parameters: dict[str, float] = {}
     for marker in reversed(list(node.iter_markers("vehicle"))):
@@ -136,7 +136,7 @@ def _folder_for(request: pytest.FixtureRequest) -> Path:
 def make_vehicle(request: pytest.FixtureRequest) -> Iterator[Callable[..., RunningSimulator]]:
     """A function that starts a vehicle: `make_vehicle(wind=5, system_id=2)`; all are stopped after the test.
 
-    Options of the test's `vehicle` marker count for each, those given in the call before them.
+    Options of the test's `vehicle` marker apply to each; those of the call override them.
     """
     from mavlink_sim.testing import vehicle
 
@@ -163,9 +163,9 @@ def make_vehicle(request: pytest.FixtureRequest) -> Iterator[Callable[..., Runni
 
 @pytest.fixture
 def vehicle(make_vehicle: Callable[..., RunningSimulator]) -> RunningSimulator:
-    """A MAVLink vehicle with PX4's behaviour, in a process of its own, on free ports, ready to be armed.
+    """A MAVLink vehicle with PX4's behaviour, in its own process, on free ports, ready to be armed.
 
-    `vehicle.mavsdk_url` and `vehicle.pymavlink_device` are what a client connects to, `vehicle.events` is
-    what it said, `vehicle.wait_for_event("armed")` waits for more.
+    `vehicle.mavsdk_url` and `vehicle.pymavlink_device` are the addresses for clients, `vehicle.events` are
+    the printed events, `vehicle.wait_for_event("armed")` waits for one.
     """
     return make_vehicle()

@@ -1,4 +1,4 @@
-"""What differs between PX4's releases, as far as this vehicle shows it. All else is v1.17's behaviour."""
+"""The simulated differences between PX4's releases. Everything else is v1.17's behaviour."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ class Release:
     Attributes:
         name: "1.17".
         software_version: AUTOPILOT_VERSION's, `major << 24 | minor << 16 | patch << 8 | type`.
-        acknowledges_modes_twice: DO_SET_MODE is accepted at once by the MAVLink receiver, whatever Commander
-            answers a moment later (since v1.16; PX4's commit 01abe35563).
-        has_parameter_errors: what is wrong with a parameter request is told by PARAM_ERROR (since v1.17);
-            before that there is silence.
+        acknowledges_modes_twice: DO_SET_MODE is accepted at once by the MAVLink receiver, before Commander's
+            own answer (since v1.16; PX4's commit 01abe35563).
+        has_parameter_errors: an invalid parameter request is answered by PARAM_ERROR (since v1.17); before,
+            it is not answered.
     """
 
     name: str
@@ -38,8 +38,8 @@ NEWEST = "1.17"
 
 
 def release_named(name: str) -> Release:
-    """The release of this name. Raises ValueError for one that is not known."""
+    """The release of this name. Raises ValueError for an unknown one."""
     try:
         return RELEASES[name]
     except KeyError:
-        raise ValueError(f"PX4 {name!r} is not known here; choose one of {', '.join(RELEASES)}") from None
+        raise ValueError(f"PX4 {name!r} is unknown; expected one of {', '.join(RELEASES)}") from None

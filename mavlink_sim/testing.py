@@ -1,4 +1,4 @@
-"""A vehicle in a process of its own, for integration tests.
+"""A vehicle in its own process, for integration tests.
 
 >>> with running_simulator(seed=3, speed=4.0) as simulator:      # doctest: +SKIP
 ...     connect(simulator.mavsdk_url)
@@ -29,17 +29,17 @@ READY = re.compile(r"^ready: system (\d+), onboard \S+:(\d+) -> (\d+), ground st
 FLEET_READY = re.compile(r"^ready: \d+ vehicles")
 
 
-# Between the choice of a port and its use another program may ask for any; Linux gives those from 32768 on.
+# Between the choice of a port and its use another program may request any; Linux assigns those from 32768 on.
 _NOT_GIVEN_AWAY = range(16384, 32768)
 _LINES_NOTED = 30
-_chance = random.SystemRandom()  # tests that run side by side may all have the same seed
+_chance = random.SystemRandom()  # parallel tests may all have the same seed
 
 
 def free_udp_port_range(count: int, host: str = "127.0.0.1") -> int:
-    """The first of so many consecutive UDP ports that nobody is bound to at this moment.
+    """The first of `count` consecutive UDP ports that are free now.
 
     Raises:
-        OSError: none were found in a hundred places.
+        OSError: none were found in a hundred attempts.
     """
     for _ in range(100):
         start = free_port(host=host)
@@ -55,10 +55,10 @@ def free_udp_port_range(count: int, host: str = "127.0.0.1") -> int:
 
 
 def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM, host: str = "127.0.0.1") -> int:
-    """A port (UDP's unless told) that nobody is bound to now, and that nobody is given who asks for any.
+    """A port (UDP by default) that is free now, outside the range that the system assigns.
 
     Raises:
-        OSError: none was found in a thousand places.
+        OSError: none was found in a thousand attempts.
     """
     return _free_ports(1, kind, host)[0]
 
@@ -67,7 +67,7 @@ def free_udp_ports(count: int, host: str = "127.0.0.1") -> list[int]:
     """UDP ports as `free_port` finds them, no two the same.
 
     Raises:
-        OSError: so many were not found in a thousand places.
+        OSError: fewer were found in a thousand attempts.
     """
     return _free_ports(count, socket.SOCK_DGRAM, host)
 
@@ -101,12 +101,12 @@ class FleetMember:
 
 
 class RunningSimulator:
-    """A `mavlink-sim` that is up.
+    """A running `mavlink-sim`.
 
     Attributes:
         onboard_port: the UDP port a companion listens on (`udpin:127.0.0.1:<port>`); the vehicle sends there.
         gcs_port: the same for a ground station.
-        onboard_bind, gcs_bind: the ports the vehicle itself is bound to.
+        onboard_bind, gcs_bind: the ports that the vehicle is bound to.
         vehicles: every vehicle of a fleet in order (the ports above are the first one's).
         events: every line it printed so far, in order, without the ready line.
         transcript: every line it printed, each after the seconds since it was started.
@@ -148,12 +148,12 @@ class RunningSimulator:
     def _read(self) -> None:
         assert self.process.stdout is not None
         for line in self.process.stdout:
-            self._take(line.rstrip("\n"))
+            self._on_line(line.rstrip("\n"))
         with self._changed:
             self._ended = True
             self._changed.notify_all()
 
-    def _take(self, line: str) -> None:
+    def _on_line(self, line: str) -> None:
         found = READY.match(line)
         with self._changed:
             self.transcript.append(f"{time.monotonic() - self._started_s:9.3f} {line}")
@@ -164,7 +164,7 @@ class RunningSimulator:
                 self.gcs_bind, self.gcs_port = first.gcs_bind, first.gcs_port
                 self._ready = len(self.vehicles) == self._count
             elif FLEET_READY.match(line):
-                pass  # each of them has said so
+                pass  # every vehicle has printed it
             else:
                 self.events.append(line)
             self._changed.notify_all()
@@ -177,16 +177,16 @@ class RunningSimulator:
             if self._ended:
                 code = self.process.wait()
                 raise RuntimeError(f"the simulator ended with code {code} before {what}: {self.events}")
-            raise TimeoutError(f"no {what} of the simulator in {timeout_s:g} s; it said {self.events}")
+            raise TimeoutError(f"no {what} of the simulator in {timeout_s:g} s; events: {self.events}")
 
     def wait_until_ready(self, timeout_s: float) -> None:
         self._wait(lambda: self._ready, "ready line", timeout_s)
 
     def wait_for_event(self, text: str, timeout_s: float = 30.0, since: int = 0) -> str:
-        """The first printed line that contains `text`, already printed or yet to come.
+        """Wait for the first printed line that contains `text`, and return it.
 
         Args:
-            since: look only from this index of `events` on (`len(simulator.events)` for the future alone).
+            since: search from this index of `events` on (`len(simulator.events)`: only new lines).
 
         Raises TimeoutError or, if the simulator ended, RuntimeError.
         """
@@ -198,7 +198,7 @@ class RunningSimulator:
         return found()[0]
 
     def kill(self) -> None:
-        """SIGKILL, as when the vehicle vanishes."""
+        """Kill it (SIGKILL), as if the vehicle vanished."""
         self.process.kill()
         self.process.wait()
 
@@ -209,13 +209,13 @@ class RunningSimulator:
         self.process.send_signal(signal.SIGCONT)
 
     def fault(self, line: str) -> None:
-        """Type a line of the faults' grammar on the simulator's console: `link_loss for=3`, `end all`…"""
+        """Send a line of the fault grammar to the simulator's console: `link_loss for=3`, `end all`…"""
         assert self.process.stdin is not None
         self.process.stdin.write(line + "\n")
         self.process.stdin.flush()
 
     def stop(self, timeout_s: float = 10.0) -> int:
-        """End it in good order (SIGTERM; SIGKILL if it does not). Returns the exit code."""
+        """Stop it (SIGTERM, then SIGKILL). Returns the exit code."""
         if self.process.poll() is None:
             self.resume()
             self.process.terminate()
@@ -240,15 +240,15 @@ def running_simulator(
     timeout_s: float = 60.0,
     **options: float | str | Path | None,
 ) -> Iterator[RunningSimulator]:
-    """Start a vehicle, wait until it is up, end it afterwards; on Linux at the latest when this program ends.
+    """Start a vehicle, wait until it runs, stop it afterwards; on Linux at the latest when this program ends.
 
-    What is raised while it runs carries what it said last, as a note (PEP 678).
+    An exception while it runs gets its last events as a note (PEP 678).
 
     Args:
-        onboard_port, gcs_port: where it sends to; None for ports that are free now.
-        onboard_bind, gcs_bind: what it binds; give a former run's port to start it anew in the same place.
+        onboard_port, gcs_port: where it sends to; None for free ports.
+        onboard_bind, gcs_bind: what it binds; pass a former run's port to restart at the same address.
         parameters: PX4 parameters.
-        faults: each as `mavlink-sim --fault` takes it; `RunningSimulator.fault` brings more while it flies.
+        faults: each as for `mavlink-sim --fault`; `RunningSimulator.fault` adds more while it runs.
         timeout_s: for the ready line.
         options: the other options of `mavlink-sim`, with underscores (`seed=1`, `speed=4.0`, `camera="name"`,
             `truth=path`, `wind=3.0`, `gusts=0.0`, `system_id=2`, `vehicles=3`); True for an option without a
@@ -265,7 +265,7 @@ def running_simulator(
         "gcs_bind": gcs_bind,
         **options,
     }
-    if isinstance(options.get("noise"), bool):  # the one option whose value is a word for yes or no
+    if isinstance(options.get("noise"), bool):  # the only option with the values on and off
         arguments["noise"] = "on" if options["noise"] else "off"
     command = []
     for name, value in arguments.items():
@@ -286,8 +286,8 @@ def running_simulator(
         try:
             simulator.wait_until_ready(timeout_s)
             yield simulator
-        except BaseException as error:  # a test's time-out is no Exception
-            error.add_note("\n".join(["the vehicle said last:", *simulator.transcript[-_LINES_NOTED:]]))
+        except BaseException as error:  # a test's timeout is no Exception
+            error.add_note("\n".join(["last events of the vehicle:", *simulator.transcript[-_LINES_NOTED:]]))
             raise
         finally:
             simulator.stop()
@@ -296,8 +296,8 @@ def running_simulator(
                 process.stdin.close()
 
 
-class vehicle:  # noqa: N801 - it is used as a function, like the context managers of the standard library
-    """A vehicle that is up and can be armed at once: `with vehicle() as v:` or `async with vehicle() as v:`.
+class vehicle:  # noqa: N801 - used as a function, like the context managers of the standard library
+    """A running vehicle that can be armed at once: `with vehicle() as v:` or `async with vehicle() as v:`.
 
     Args:
         options: those of `running_simulator`. `ready_after` is 0 here: no wait for the estimator.

@@ -55,21 +55,35 @@ GUIDANCE_FLOORS = {
     "requirements": 8,
     "core": 9,
 }
-# The same for `mavlink_sim`; its modules at the top, and the ArduPilot made of them, stand above every room.
-SIMULATOR_FLOORS = {
+# The same for `mavlink_sim`: its packages and its own files. Imports inside functions and under
+# TYPE_CHECKING count as well.
+SIMULATOR_LAYERS = {
+    "launching": 0,
     "px4": 0,
-    "wire": 0,
+    "releases": 0,
     "world": 0,
     "physics": 1,
-    "camera": 1,
+    "testing": 1,
+    "wire": 1,
+    "camera": 2,
     "flight": 2,
-    "datasets": 2,
+    "pytest_plugin": 2,
+    "datasets": 3,
     "missions": 3,
     "autopilot": 4,
+    "faults": 5,
     "services": 5,
-    "faults": 6,
+    "lockstep_link": 6,
+    "lockstep_wire": 6,
+    "vehicles": 6,
+    "lockstep": 7,
+    "realtime": 7,
+    "__init__": 8,
+    "cli": 8,
+    "__main__": 9,
+    "launcher": 9,
 }
-SIMULATOR_TOP = 7
+MAX_SIMULATOR_LAYERS = 10
 SIMULATOR_MAY_IMPORT = {
     "vision.attitude",
     "vision.camera_model",
@@ -94,24 +108,47 @@ def modules() -> dict[str, Path]:
 
 
 @cache
-def imports_of(name: str, path: Path, *, only_top: bool = False) -> frozenset[str]:
-    """Our own modules that a module imports (inside functions too, unless `only_top`)."""
-    tree = ast.parse(path.read_text())
+def imports_of(name: str, path: Path) -> frozenset[str]:
+    """Our own modules that a module imports, inside functions and under TYPE_CHECKING too."""
     known = modules()
     found: set[str] = set()
-    nodes = _top_level(tree) if only_top else list(ast.walk(tree))
-    for node in nodes:
+    for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
             assert node.level == 0, f"{name} imports relatively; write the whole name"
-            found |= {f"{node.module}.{alias.name}" for alias in node.names} | {node.module}
+            for alias in node.names:
+                submodule = f"{node.module}.{alias.name}"
+                found.add(submodule if submodule in known else node.module)
     return frozenset(module for module in found if module in known and module != name)
 
 
-def _top_level(tree: ast.Module) -> list[ast.stmt]:
-    """Statements that run at import; `if TYPE_CHECKING:` does not."""
-    return [node for node in tree.body if not isinstance(node, ast.If)]
+def circles(package: str) -> set[frozenset[str]]:
+    """The sets of modules of a package that import each other (Tarjan's strongly connected components)."""
+    graph = {name: imports_of(name, path) for name, path in modules().items() if name.startswith(package)}
+    order: dict[str, int] = {}
+    lowest: dict[str, int] = {}
+    stack: list[str] = []
+    found: set[frozenset[str]] = set()
+
+    def visit(name: str) -> None:
+        order[name] = lowest[name] = len(order)
+        stack.append(name)
+        for other in graph[name] & graph.keys():
+            if other not in order:
+                visit(other)
+            if other in stack:
+                lowest[name] = min(lowest[name], lowest[other])
+        if lowest[name] == order[name]:
+            component = stack[stack.index(name) :]
+            del stack[stack.index(name) :]
+            if len(component) > 1:
+                found.add(frozenset(component))
+
+    for name in graph:
+        if name not in order:
+            visit(name)
+    return found
 
 
 def room(module: str) -> str:
@@ -191,37 +228,35 @@ def test_one_file_calls_the_update_of_a_behaviour_besides_behaviours() -> None:
     assert not [caller for caller in callers if "behaviour" in caller[1]], callers
 
 
-def test_rooms_of_the_simulator_import_downwards_only() -> None:
-    def floor(module: str) -> int:
-        return SIMULATOR_FLOORS.get(module.split(".")[1], SIMULATOR_TOP)
+def test_simulator_imports_only_lower_layers() -> None:
+    def entry(module: str) -> str:
+        return module.split(".")[1] if "." in module else "__init__"
 
+    assert len(set(SIMULATOR_LAYERS.values())) <= MAX_SIMULATOR_LAYERS
     for name, path in modules().items():
-        if not name.startswith("mavlink_sim."):
+        if not name.startswith("mavlink_sim"):
             continue
-        for other in imports_of(name, path, only_top=True):
-            if not other.startswith("mavlink_sim.") or other.split(".")[1] == name.split(".")[1]:
-                continue
-            if floor(name) < SIMULATOR_TOP:
-                assert floor(other) < floor(name), f"{name} imports upwards: {other}"
+        here = entry(name)
+        assert here in SIMULATOR_LAYERS, f"{name}: give it a layer here and in docs/architecture.md"
+        for other in imports_of(name, path):
+            if other.startswith("mavlink_sim") and entry(other) != here:
+                assert SIMULATOR_LAYERS[entry(other)] < SIMULATOR_LAYERS[here], f"{name} imports {other}"
 
 
-def test_no_module_imports_itself_in_a_circle() -> None:
-    graph = {name: imports_of(name, path, only_top=True) for name, path in modules().items()}
-    finished: set[str] = set()
+# By imports inside functions, which load slowly.
+CIRCLES = {
+    "companion": set(),
+    "mavlink_sim": set(),
+    "vision": {
+        frozenset({"vision.detector", "vision.object_detector"}),
+        frozenset({"vision.runtimes.autotune", "vision.runtimes.export", "vision.runtimes.selection"}),
+    },
+}
 
-    def visit(name: str, trail: tuple[str, ...]) -> None:
-        if name in trail:
-            pytest.fail(" → ".join([*trail[trail.index(name) :], name]))
-        if name in finished:
-            return
-        for other in graph[name]:
-            # A package's own __init__ may gather its modules.
-            if not name.startswith(f"{other}."):
-                visit(other, (*trail, name))
-        finished.add(name)
 
-    for name in graph:
-        visit(name, ())
+@pytest.mark.parametrize("package", CIRCLES)
+def test_no_circular_imports(package: str) -> None:
+    assert circles(package) == CIRCLES[package]
 
 
 @pytest.mark.parametrize("package", ["companion", "vision", "mavlink_sim"])

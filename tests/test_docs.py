@@ -13,9 +13,9 @@ import typer
 from companion.cli import app as companion_app
 from companion.guidance import grammar
 from companion.guidance.command import COMMANDS
-from mavlink_sim.bench import app as bench_app
 from mavlink_sim.camera.cli import app as camera_app
-from mavlink_sim.cli import app as simulator_app
+from mavlink_sim.cli.bench import app as bench_app
+from mavlink_sim.cli.main import app as simulator_app
 from mavlink_sim.datasets.cli import app as dataset_app
 
 ROOT = Path(__file__).parent.parent

@@ -24,10 +24,10 @@ from pathlib import Path
 
 from pymavlink.generator.mavcrc import x25crc
 
-from mavlink_sim.firmware import AUTOPILOTS, PX4, vehicle_class
 from mavlink_sim.lockstep import LockstepVehicle
 from mavlink_sim.testing import RunningSimulator, running_simulator
-from mavlink_sim.vehicle import STEP_S
+from mavlink_sim.vehicles.firmware import AUTOPILOTS, PX4, vehicle_class
+from mavlink_sim.vehicles.vehicle import STEP_S
 from mavlink_sim.wire.messages import dialect, parser
 from mavlink_sim.wire.signing import ALWAYS, Signing, timestamp_now
 from mavlink_sim.wire.streams import ONBOARD_RATES_HZ

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pymavlink import mavutil
 
 from mavlink_sim.services.system_streams import PREARM_CHECK
-from mavlink_sim.vehicle import STEP_S, Vehicle
+from mavlink_sim.vehicles.vehicle import STEP_S, Vehicle
 from mavlink_sim.wire.messages import parser
 
 RATE_TOLERANCE = 0.05  # of the number of messages of a kind, besides two of them

@@ -18,9 +18,9 @@ from companion.settings import Settings
 from companion.settings.perception import DetectorSection, TrackerSection
 from mavlink_sim.camera.scene import Scene
 from mavlink_sim.camera.simulated_camera import Captured, SimulatedCamera
-from mavlink_sim.fleet_world import place_in_world
 from mavlink_sim.lockstep import LockstepVehicle
-from mavlink_sim.sim_outputs import camera_turn_rad
+from mavlink_sim.realtime.sim_outputs import camera_turn_rad
+from mavlink_sim.vehicles.fleet_world import position_in_world
 from mavlink_sim.world.aircraft import Aircraft
 from vision.attitude import Quaternion
 from vision.frame import Frame
@@ -116,7 +116,9 @@ class RenderedPerception:
             mount = replace(self.scene.camera.mount, roll_rad=roll, pitch_rad=pitch, yaw_rad=yaw)
         attitude = matrix_from_quaternion(vehicle.quaternion)
         time_s = vehicle.faults.now_s if time_s is None else time_s
-        return self._camera.capture(place_in_world(vehicle), attitude, now_ns, time_s, mount, others=others)
+        return self._camera.capture(
+            position_in_world(vehicle), attitude, now_ns, time_s, mount, others=others
+        )
 
     def process(self, frame: Frame, now_ns: int) -> PerceptionResult | None:
         """Run the pipeline on a frame; None: `[detector]` leaves it out (`every`, `rate_hz`, `max_age_s`).

@@ -27,8 +27,8 @@ from companion.vehicle.mav_result import ACCEPTED, IN_PROGRESS, result_name
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import VehicleState
 from companion.vehicle.telemetry import TELEMETRY_MESSAGES, apply_message
-from mavlink_sim.ardupilot.copter import CopterVehicle
 from mavlink_sim.lockstep import COMPANION, LockstepVehicle
+from mavlink_sim.vehicles.ardupilot.copter import CopterVehicle
 from mavlink_sim.wire.messages import dialect
 
 START_NS = 1_000_000_000_000

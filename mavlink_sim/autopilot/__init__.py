@@ -1,1 +1,1 @@
-"""PX4's Commander: arming, modes, failsafes, and the pilot's sticks."""
+"""PX4's Commander: arming, modes, failsafes, manual control."""

@@ -1,21 +1,19 @@
-"""PX4's checks before arming, each told by an event; the names and words are PX4 1.17's."""
+"""PX4's checks before arming, each reported by an event; names and texts are PX4 1.17's."""
 
 from __future__ import annotations
 
 import struct
 from collections.abc import Collection
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from mavlink_sim.autopilot import position_failsafe
 from mavlink_sim.missions import geofence
+from mavlink_sim.missions.navigator import Navigator
 from mavlink_sim.px4.modes import MANUAL_MODES, MODES_PREVENTING_ARMING, Mode
 from mavlink_sim.wire.announcements import CRITICAL, Text, event_identifier
 
-if TYPE_CHECKING:
-    from mavlink_sim.autopilot.commander import Autopilot
-
 _ERROR, _INFO = 0x33, 0x66  # log levels: to the vehicle's own log and to ground stations
-# PX4's health_component_t, as the argument counts them
+# PX4's health_component_t
 _NO_COMPONENT, _MANUAL_CONTROL, _SYSTEM = 0, 7, 20
 _ALL_MODES = 0xFFFF_FFFF
 # PX4's NAVIGATION_STATE of each mode: its bit in the events' `modes`
@@ -41,16 +39,36 @@ GEOFENCE_CHECKS = {
     "check_gf_violation_max_alt": geofence.TOO_HIGH,
     "check_gf_violation_custom_gf": geofence.OUTSIDE,
 }
-_ALTITUDE_CRUISE = 1 << 8  # of the manual modes; this vehicle does not have it
+_ALTITUDE_CRUISE = 1 << 8  # a manual mode that this vehicle does not have
 
 
-def failing_checks(autopilot: Autopilot, only: Collection[str] | None = None) -> list[Text]:
-    """An event for each check that fails, whatever the mode; without a text of its own. `only`: of these."""
+class CheckedAutopilot(Protocol):
+    """What the checks use of the autopilot; see `commander.Autopilot`."""
+
+    mode: Mode
+    position_valid: bool
+    navigator: Navigator
+
+    @property
+    def sensors_ready(self) -> bool: ...
+
+    @property
+    def has_setpoints(self) -> bool: ...
+
+    @property
+    def pilot_has_sticks(self) -> bool: ...
+
+    @property
+    def lacks_ground_station(self) -> bool: ...
+
+
+def failing_checks(autopilot: CheckedAutopilot, only: Collection[str] | None = None) -> list[Text]:
+    """An event (without text) for each check that fails, whatever the mode. `only`: of these checks."""
     with_position = [mode for mode in Mode if position_failsafe.needs_position(mode)]
     in_wrong_mode = autopilot.mode in MODES_PREVENTING_ARMING
     mission, sticks = autopilot.navigator.mission, autopilot.pilot_has_sticks
     breaches = autopilot.navigator.breaches
-    unlinked = autopilot.supervision.lacks_ground_station
+    unlinked = autopilot.lacks_ground_station
     checks = (
         ("check_estimator_heading_not_stable", not autopilot.sensors_ready, _ERROR, None, _NO_COMPONENT),
         ("check_modes_local_pos", not autopilot.position_valid, _ERROR, with_position, _NO_COMPONENT),

@@ -1,6 +1,6 @@
-"""PX4's Commander in small: arming checks, modes, the offboard-loss failsafe, landed states, auto-disarming.
+"""PX4's Commander, reduced: arming checks, modes, the offboard-loss failsafe, landed states, auto-disarming.
 
-`update` runs once a control step. Whatever PX4 would tell a ground station is queued in `texts`.
+`update` runs once per control step. PX4's texts for ground stations are queued in `texts`.
 Times are seconds since boot. Names in capitals are PX4's parameters.
 """
 
@@ -23,6 +23,7 @@ from mavlink_sim.flight.position_control import Demand, PositionController, Traj
 from mavlink_sim.flight.precision_landing import Precision
 from mavlink_sim.missions.navigator import Navigator
 from mavlink_sim.physics.airframe import Multirotor, Vector
+from mavlink_sim.physics.geography import LocalFrame
 from mavlink_sim.px4.modes import (
     MANUAL_MODES,
     MODES_PREVENTING_ARMING,
@@ -57,7 +58,7 @@ PREFLIGHT_DISARM_MARGIN_S = 1.2
 OFFBOARD_LOSS_MARGIN_S = 0.06
 # PX4's land detector needs ground contact, then "maybe landed", then "landed": together about this long.
 LAND_DETECTION_S = 1.5
-# At least so long between two texts that say a mode is not available.
+# Least time between two texts that a mode is not available.
 REFUSALS_APART_S = 1.0
 IDLE_THRUST_MPS2 = 0.6
 
@@ -65,7 +66,7 @@ IDLE_THRUST_MPS2 = 0.6
 class Autopilot:
     """The decisions of one vehicle. `now_s` is the time since boot, advanced by `update`."""
 
-    # so long it presses on the ground until it has landed
+    # time of ground contact until it is landed
     _land_detection_s = LAND_DETECTION_S
 
     def __init__(
@@ -73,6 +74,7 @@ class Autopilot:
         airframe: Multirotor,
         parameters: Parameters,
         *,
+        local_frame: LocalFrame,
         ready_after_s: float,
         on_event: Callable[[str], None],
     ) -> None:
@@ -101,18 +103,18 @@ class Autopilot:
         self._takeoff_height_m: float | None = None
         self.task: flight.Task | None = None
         self._mode_after_disarming = Mode.HOLD
-        self._last_setpoint_s = self._refusal_told_s = -math.inf
+        self._last_setpoint_s = self._refusal_sent_s = -math.inf
         self._setpoint_needs_position = False
         self._rates_alone = False  # the newest offboard setpoint was of body rates
-        self.navigator = Navigator(self, airframe, parameters, on_event)
-        # collision prevention: it may reduce what the sticks ask for in Position mode
+        self.navigator = Navigator(self, airframe, parameters, local_frame, on_event)
+        # collision prevention: may reduce the sticks' setpoint in Position mode
         self.stick_guard: manual_flight.AccelerationGuard | None = self.navigator.guard_sticks
 
-    # ---- what others read -------------------------------------------------------------------------------
+    # ---- state ------------------------------------------------------------------------------------------
 
     @property
     def landed(self) -> bool:
-        """It has landed, as far as it can tell."""
+        """Landed, by the land detector."""
         return self.ground.landed
 
     @property
@@ -125,7 +127,7 @@ class Autopilot:
 
     @property
     def pilot_has_sticks(self) -> bool:
-        """A remote control or a joystick counts, so POSCTL and the like can be flown."""
+        """A remote control or a joystick is valid, so manual modes can be flown."""
         return self.supervision.pilot_has_sticks
 
     @pilot_has_sticks.setter
@@ -133,8 +135,13 @@ class Autopilot:
         self.supervision.pilot_attached = attached
 
     @property
+    def lacks_ground_station(self) -> bool:
+        """NAV_DLL_ACT requires a ground station, and none is connected."""
+        return self.supervision.lacks_ground_station
+
+    @property
     def terminated(self) -> bool:
-        """The motors stand still for good; it takes a reboot."""
+        """Flight termination: the motors are off until a reboot."""
         return self.supervision.terminated
 
     @property
@@ -148,7 +155,7 @@ class Autopilot:
             self.sensors_ready
             and not self.terminated
             and (self.position_valid or not position_failsafe.needs_position(self.mode))
-            and (self.armed or self.mode not in MODES_PREVENTING_ARMING)  # no matter once it is
+            and (self.armed or self.mode not in MODES_PREVENTING_ARMING)  # irrelevant once armed
             and (self.mode is not Mode.MISSION or self.navigator.mission.valid)
             and not self.navigator.is_breached
             and (self.mode is not Mode.OFFBOARD or self.has_setpoints)
@@ -168,9 +175,9 @@ class Autopilot:
 
     @property
     def base_mode(self) -> int:
-        # PX4 goes by the newest setpoint, however old
-        ever_heard = math.isfinite(self._last_setpoint_s)
-        return base_mode(self.mode, self.armed, ever_heard and not self._rates_alone)
+        # PX4 uses the newest setpoint, however old
+        has_setpoint = math.isfinite(self._last_setpoint_s)
+        return base_mode(self.mode, self.armed, has_setpoint and not self._rates_alone)
 
     @property
     def landed_state(self) -> LandedState:
@@ -182,10 +189,10 @@ class Autopilot:
             return LandedState.LANDING
         return LandedState.IN_AIR
 
-    # ---- what a client asks for -------------------------------------------------------------------------
+    # ---- requests ---------------------------------------------------------------------------------------
 
     def arm(self, by: str = "external command") -> int:
-        """MAV_RESULT of an arming request. `by`: PX4's name of who asks, a key of `supervision.REASONS`."""
+        """MAV_RESULT of an arming request. `by`: PX4's name of the source, a key of `supervision.REASONS`."""
         if self.armed:
             return ACCEPTED
         refusal = self.supervision.refuses_arming(by)
@@ -194,20 +201,22 @@ class Autopilot:
             return TEMPORARILY_REJECTED
         if not self.can_arm:
             if not self.sensors_ready:
-                self._say(CRITICAL, "Preflight Fail: heading estimate not stable")
-            self._say(CRITICAL, "Arming denied: Resolve system health failures first\t", ARMING_DENIED_EVENT)
+                self._send_text(CRITICAL, "Preflight Fail: heading estimate not stable")
+            self._send_text(
+                CRITICAL, "Arming denied: Resolve system health failures first\t", ARMING_DENIED_EVENT
+            )
             self.report_checks()
             return TEMPORARILY_REJECTED
         self.armed = True
         self.ground.arm(self.now_s)
         self.home.follow(self._airframe, self._parameters)
-        self._say(INFO, f"Armed by {by}\t", (*ARMED_EVENT[:2], bytes([REASONS[by]])))
+        self._send_text(INFO, f"Armed by {by}\t", (*ARMED_EVENT[:2], bytes([REASONS[by]])))
         self._on_event("armed")
         self._start_task()
         return ACCEPTED
 
     def report_checks(self) -> None:
-        """RUN_PREARM_CHECKS, and a refusal to arm: the checks that fail, by their events."""
+        """Report the failing checks by their events, for RUN_PREARM_CHECKS and a refusal to arm."""
         self.texts.extend(arming_checks.failing_checks(self))
 
     def disarm(self, force: bool = False, by: str = "external command") -> int:
@@ -216,37 +225,37 @@ class Autopilot:
             return ACCEPTED
         if not self.landed and not force and not self.supervision.may_disarm_in_the_air(by):
             if by != "stick gesture":
-                self._say(CRITICAL, "Disarming denied: not landed\t")
+                self._send_text(CRITICAL, "Disarming denied: not landed\t")
             return TEMPORARILY_REJECTED
         self._disarm(f"Disarmed by {by}\t", "by command" if by == "external command" else f"by {by}")
         return ACCEPTED
 
-    def set_mode(self, mode: Mode, tell: bool = False) -> int:
-        """MAV_RESULT of a request for a mode; with `tell`, a refusal is also a text."""
+    def set_mode(self, mode: Mode, report: bool = False) -> int:
+        """MAV_RESULT of a request for a mode; with `report`, a refusal is also a text."""
         if self.armed and not self.can_run(mode):
-            if tell:
+            if report:
                 self.report_unavailable(mode)
             return TEMPORARILY_REJECTED
         self._intend(mode)
         return ACCEPTED
 
     def force_mode(self, mode: Mode) -> int:
-        """The same for one that is always taken: LAND, which without a position is a blind descent."""
+        """Set a mode that is always accepted: LAND, which without a position is a descent."""
         self._intend(mode)
         return ACCEPTED
 
     def _refuses(self, mode: Mode) -> bool:
-        """Whether a command that would switch to this mode is refused; if so, that is told."""
+        """Whether a command that would switch to this mode is refused; a refusal is reported."""
         refused = self.armed and not self.can_run(mode)
         if refused:
             self.report_unavailable(mode)
         return refused
 
     def report_unavailable(self, mode: Mode) -> None:
-        """A mode was refused: PX4 says so at most once a second, whatever the mode."""
-        if self.now_s - self._refusal_told_s > REFUSALS_APART_S:
-            self._refusal_told_s = self.now_s
-            self._say(CRITICAL, f"Switching to {mode.title} is currently not available\t")
+        """Report a refused mode, at most once per second as PX4 does."""
+        if self.now_s - self._refusal_sent_s > REFUSALS_APART_S:
+            self._refusal_sent_s = self.now_s
+            self._send_text(CRITICAL, f"Switching to {mode.title} is currently not available\t")
 
     def can_run(self, mode: Mode) -> bool:
         """Whether an armed vehicle may fly in this mode now."""
@@ -264,27 +273,27 @@ class Autopilot:
             return TEMPORARILY_REJECTED
         if altitude_m is None:
             altitude_m = self._parameters.number("MIS_TAKEOFF_ALT")
-            self._say(
+            self._send_text(
                 INFO,
                 f"Using default takeoff altitude: {altitude_m:.1f} m\t",
                 (DEFAULT_ALTITUDE_EVENT, 0x66, struct.pack("<f", altitude_m)),
             )
         elif altitude_m < self.home.position[2] - self._airframe.position[2]:
-            # what becomes of a height above ground in a field that is above the sea; it does not descend
-            self._say(CRITICAL, "Already higher than takeoff altitude\t")
+            # happens with a height above ground sent as AMSL; the vehicle does not descend
+            self._send_text(CRITICAL, "Already higher than takeoff altitude\t")
         self._takeoff_height_m = altitude_m
         self._intend(Mode.TAKEOFF)
         return ACCEPTED
 
     def land(self) -> int:
-        """Always taken: without a position it comes down all the same."""
-        self._say(INFO, "Landing at current position\t", LANDING_EVENT)
+        """Always accepted: without a position it descends."""
+        self._send_text(INFO, "Landing at current position\t", LANDING_EVENT)
         return self.force_mode(Mode.LAND)
 
     def return_home(self) -> int:
         if self._refuses(Mode.RTL):
             return TEMPORARILY_REJECTED
-        self._say(INFO, "Returning to launch\t")
+        self._send_text(INFO, "Returning to launch\t")
         self._intend(Mode.RTL)
         return ACCEPTED
 
@@ -298,16 +307,16 @@ class Autopilot:
         return ACCEPTED
 
     def move_hold_to(self, goal: Vector, yaw_rad: float, speed_mps: float) -> None:
-        """The same if this is HOLD already, whoever wanted it: neither mode nor intention changes."""
+        """Move the goal if the mode is HOLD already; neither mode nor intention changes."""
         self._move_hold(goal, yaw_rad, speed_mps, self._goal())
 
     def _move_hold(self, goal: Vector, yaw_rad: float, speed_mps: float, former: Vector | None) -> None:
-        if not (self.armed and self.mode is Mode.HOLD):  # not armed, or a failsafe has it
+        if not (self.armed and self.mode is Mode.HOLD):  # not armed, or a failsafe is active
             return
         airframe, parameters = self._airframe, self._parameters
         goal = reposition.reposition_goal(goal, yaw_rad, airframe, parameters, former)
         if not self.navigator.allows_goal(goal):
-            self._say(CRITICAL, "Reposition is outside geofence\t")
+            self._send_text(CRITICAL, "Reposition is outside geofence\t")
             return
         self.task = reposition.Reposition(airframe, parameters, goal, yaw_rad, self.home.position)
         self.task.cruise_at(speed_mps if speed_mps > 0.0 else self.cruise_mps)
@@ -316,42 +325,42 @@ class Autopilot:
         return None if self.task is None else self.task.goal
 
     def change_speed(self, speed_mps: float, at_once: bool) -> None:
-        """Another cruise speed for auto modes until the mode ends; zero or less: MPC_XY_CRUISE again.
+        """Set the cruise speed of auto modes until the mode ends; zero or less: MPC_XY_CRUISE.
 
-        `at_once`: for the goal that is being flown to as well, else from the next one on.
+        `at_once`: for the current goal too, else from the next one on.
         """
         self.cruise_mps = speed_mps if speed_mps > 0.0 else math.nan
         if at_once and speed_mps > 0.0 and self.task is not None:
             self.task.cruise_at(speed_mps)
 
     def orbit(self, request: OrbitRequest) -> int:
-        """Mode ORBIT; a radius that cannot be is accepted too, and then the vehicle hovers in that mode."""
+        """Mode ORBIT; an invalid radius is accepted too, and then the vehicle hovers in that mode."""
         if self.armed and not self.can_run(Mode.ORBIT):
-            self._say(CRITICAL, "Orbit command rejected")
+            self._send_text(CRITICAL, "Orbit command rejected")
             return TEMPORARILY_REJECTED
         if self.mode is not Mode.ORBIT or not isinstance(self.task, Orbit):
             self._intend(Mode.ORBIT)
         if isinstance(self.task, Orbit) and not self.task.apply(request):
-            self._say(CRITICAL, "Orbit radius limit exceeded\t")
+            self._send_text(CRITICAL, "Orbit radius limit exceeded\t")
         return ACCEPTED
 
     def pilot_takes_over(self, mode: Mode = Mode.POSCTL) -> int:
-        """A pilot with a remote control switches the mode, taking the vehicle from a companion."""
+        """A pilot with a remote control switches the mode and takes over from a companion."""
         self.pilot_has_sticks = True
         return self.set_mode(mode)
 
-    def hold_at(self, place: Vector) -> None:
-        """Change to HOLD, and stay at a local NED position rather than where braking ends."""
+    def hold_at(self, point: Vector) -> None:
+        """Change to HOLD at a local NED position instead of the end of braking."""
         self._intend(Mode.HOLD)
-        if self.armed and self.mode is Mode.HOLD:  # no failsafe has it
-            self.task = flight.Hold(self._airframe, self._parameters, place)
+        if self.armed and self.mode is Mode.HOLD:  # no failsafe is active
+            self.task = flight.Hold(self._airframe, self._parameters, point)
 
     def restart_task(self) -> None:
-        """Begin the current mode's task anew."""
+        """Restart the current mode's task."""
         self._start_task()
 
     def offboard_setpoint(self, setpoint: flight.Setpoint) -> None:
-        """A valid setpoint arrived. Outside OFFBOARD it only counts as "signal present"."""
+        """Use a valid setpoint. Outside OFFBOARD it only keeps the signal alive."""
         self._last_setpoint_s = self.now_s
         self._setpoint_needs_position = position_failsafe.asks_for_position(setpoint)
         self._rates_alone = isinstance(setpoint, RatesSetpoint)
@@ -362,7 +371,7 @@ class Autopilot:
 
     @property
     def status(self) -> tuple[object, ...]:
-        """When this changes PX4 publishes its vehicle_status at once; each command counts as a change."""
+        """PX4 publishes its vehicle_status at once when this changes; each command counts as a change."""
         return self.mode, self.intended_mode, self.armed, self.failsafe, self.commands_handled
 
     def update(self, dt_s: float) -> None:
@@ -370,7 +379,7 @@ class Autopilot:
         self.now_s += dt_s
         self.navigator.update()
         self.supervision.update(dt_s, self._airframe.thrust_mps2)
-        position_failsafe.keep_landing(self)
+        self._keep_landing()
         while self._gimbal_schedule and self._gimbal_schedule[0][0] <= self.now_s:
             self.gimbal_commands.append(self._gimbal_schedule.popleft()[1])
         airframe = self._airframe
@@ -386,7 +395,7 @@ class Autopilot:
         was_landing = task.landing
         setpoint = task.update(dt_s)
         if task.landing and not was_landing and self.mode is Mode.RTL:
-            self._say(INFO, "RTL: land at destination\t")
+            self._send_text(INFO, "RTL: land at destination\t")
         if self.supervision.motors_stopped:
             self._idle(dt_s, 0.0)
         elif isinstance(task, manual_flight.Stabilized):
@@ -438,7 +447,7 @@ class Autopilot:
         return self.ground.armed_for_s(self.now_s) < self._parameters.number("COM_SPOOLUP_TIME")
 
     def _rests(self, setpoint: TrajectorySetpoint) -> bool:
-        """Landed with a setpoint that does not ask to climb."""
+        """Whether it is landed with a setpoint that does not climb."""
         if not self.ground.landed:
             return False
         rises = asks_to_rise(self.task, setpoint, self._airframe.position[2]) and not self._spooling()
@@ -449,7 +458,7 @@ class Autopilot:
         if self.ground.landed:
             if airframe.floor_down_m - airframe.position[2] > TAKEOFF_DETECTION_HEIGHT_M:
                 self.ground.leave(self.now_s)
-                self._say(INFO, "Takeoff detected\t", TAKEOFF_EVENT)
+                self._send_text(INFO, "Takeoff detected\t", TAKEOFF_EVENT)
                 self._on_event("takeoff")
         elif self.ground.presses(self.now_s, self.controller.velocity[2]):
             self._has_landed()
@@ -458,7 +467,7 @@ class Autopilot:
         self.ground.touch_down(self.now_s)
         if not self.armed:  # it fell
             self.home.follow(self._airframe, self._parameters)
-        self._say(INFO, "Landing detected\t", LANDED_EVENT)
+        self._send_text(INFO, "Landing detected\t", LANDED_EVENT)
         self._on_event("landed")
 
     def _disarm_automatically(self) -> None:
@@ -483,27 +492,28 @@ class Autopilot:
         self.supervision.mode_was_requested()
         self._enter(self.supervision.run_failsafes())
 
-    # Several want a say in the mode: the user, the geofence, lost setpoints, links, the battery, a lost
-    # position. None of them sets it: all report to `supervision.conditions` or are asked by `can_run`, and
-    # the failsafe machine picks the worst answer. `_enter` gets its choice alone, so no two of them ever
-    # fight over the vehicle.
+    # The user, the geofence, lost setpoints, links, the battery and a lost position all influence the mode.
+    # None of them sets it: they report to `supervision.conditions` or through `can_run`, and the failsafe
+    # state machine selects the worst action. `_enter` gets only that selection.
 
     def adopt_intention(self, mode: Mode) -> None:
-        """This is what the user wants now; the failsafes decide whether it is flown."""
+        """Set the mode that the user wants; the failsafes decide whether it is active."""
         self.intended_mode = mode
         if mode not in MODES_PREVENTING_ARMING:
             self._mode_after_disarming = mode
 
     def follow_failsafes(self, mode: Mode) -> None:
-        """Fly the mode that the failsafes have decided on."""
+        """Enter the mode that the failsafes have selected."""
         if mode is not self.mode and self.landed and isinstance(self.task, position_failsafe.Descend):
-            self.adopt_intention(Mode.LAND)  # it came down blindly: a position is no reason to rise again
+            self.adopt_intention(
+                Mode.LAND
+            )  # it descended without a position: it must not take off again when the position is back
             mode = self.supervision.run_failsafes()
         if mode is not self.mode:
             self._enter(mode)
 
     def announce(self, line: str) -> None:
-        """Tell whoever watches the simulation."""
+        """Report an event of the simulation."""
         self._on_event(line)
 
     def _enter(self, mode: Mode) -> None:
@@ -537,11 +547,24 @@ class Autopilot:
         elif self.mode is Mode.PRECLAND:
             self.task = self.navigator.precision_landing(Precision.REQUIRED)
         elif self.mode is Mode.LAND:
-            self.task = position_failsafe.landing_task(self)
+            self.task = self._landing_task()
         elif self.mode is Mode.RTL:
             self.task = self.navigator.return_task()
         else:
             self.task = flight.Hold(airframe, parameters)
+
+    def _landing_task(self) -> flight.Task:
+        return position_failsafe.landing_task(
+            self._airframe, self._parameters, position_valid=self.position_valid
+        )
+
+    def _keep_landing(self) -> None:
+        """A landing continues as a descent when the position is lost, and at one point when it is back."""
+        descending = isinstance(self.task, position_failsafe.Descend)
+        if descending and self.landed:
+            return  # it is down
+        if self.armed and self.mode is Mode.LAND and descending is self.position_valid:
+            self.task = self._landing_task()
 
     def _takeoff_height(self) -> float:
         height = self._takeoff_height_m
@@ -555,11 +578,11 @@ class Autopilot:
         if self.landed:
             self.home.follow(self._airframe, self._parameters)
         code = REASONS.get(reason.removeprefix("by "), 6 if reason == "after landing" else 4)
-        self._say(INFO, text, (DISARMED_EVENT, 0x66, bytes([code])))
+        self._send_text(INFO, text, (DISARMED_EVENT, 0x66, bytes([code])))
         self.supervision.disarmed()
         self._on_event(f"disarmed ({reason})")
         self.intended_mode = self._mode_after_disarming
         self._enter(self.intended_mode)
 
-    def _say(self, severity: int, text: str, event: tuple[int, int, bytes] | None = None) -> None:
+    def _send_text(self, severity: int, text: str, event: tuple[int, int, bytes] | None = None) -> None:
         self.texts.append(Text(severity, text, event))

@@ -1,4 +1,4 @@
-"""What PX4's parameters ask for when something fails: the failsafe actions and who chooses them."""
+"""PX4's failsafe actions and the parameters that select them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from mavlink_sim.physics.battery import BatteryWarning
 
 
 class Action(IntEnum):
-    """What the vehicle does about it; later ones are worse and win. The values are those of PX4's events."""
+    """The failsafe actions in order of severity; the worst wins. The values are those of PX4's events."""
 
     NONE = 0
     WARN = 1
@@ -25,7 +25,7 @@ class Action(IntEnum):
 
 
 class Cause(IntEnum):
-    """Why, as PX4's events name it."""
+    """The cause, by PX4's events."""
 
     GENERIC = 0
     MANUAL_CONTROL_LOSS = 1
@@ -44,17 +44,17 @@ class Clears(Enum):
 
 
 class Takeover(IntEnum):
-    """How a pilot may end an action; the strictest of all held actions counts."""
+    """How a pilot may end an action; the strictest of all active actions applies."""
 
     ALWAYS = 0
     MODE_SWITCH_ONLY = 1
-    AFTER_DELAY = 2  # becomes one of the two above, by COM_FAIL_ACT_T
+    AFTER_DELAY = 2  # one of the two above, by COM_FAIL_ACT_T
     NEVER = 3
 
 
 @dataclass(frozen=True, slots=True)
 class Response:
-    """What a check asks for when it fails."""
+    """The action of a failed check."""
 
     action: Action
     cause: Cause = Cause.GENERIC

@@ -1,4 +1,4 @@
-"""What PX4 says of its failsafes: the text and the event of each."""
+"""The text and the event of each of PX4's failsafes."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ CRITICAL_LEVELS = 0x42
 
 
 def failsafe_overruled() -> Text:
-    """A pilot has taken over from it."""
+    """The pilot has taken over from a failsafe."""
     return _event("failsafe_rc_override", INFO_LEVELS)
 
 
 def failsafe_entered(intended: Mode, action: Action, delayed: Action, cause: Cause, delay_s: float) -> Text:
-    """What is told when an action begins.
+    """The text and event of an action that begins.
 
     Args:
-        delayed: what follows `action` in `delay_s` seconds; NONE: nothing.
+        delayed: the action that follows `action` in `delay_s` seconds; NONE: no other.
     """
     mode = struct.pack("<I", intended.custom_mode)
     if action is Action.HOLD and delayed is not Action.NONE:

@@ -1,4 +1,4 @@
-"""What can be wrong with a flight: the inputs of the failsafes."""
+"""The inputs of the failsafes."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from mavlink_sim.physics.battery import BatteryWarning
 
 @dataclass(slots=True)
 class Conditions:
-    """What is wrong at this moment; whoever watches something sets its field.
+    """The conditions that are active now; each check sets its field.
 
     Attributes:
-        manual_control_lost: neither a remote control nor a joystick counts.
+        manual_control_lost: neither a remote control nor a joystick is valid.
         ground_station_lost: no ground station's heartbeat (true until the first one).
         battery_warning: of the emptiest battery.
         offboard_signal_lost: no setpoint stream.
-        geofence_breached, mission_failed, wind_exceeded, flight_time_exceeded, motor_failed: as they say.
+        geofence_breached, mission_failed, wind_exceeded, flight_time_exceeded, motor_failed: as named.
         mission_finished: the mission's last item is done.
     """
 
@@ -32,7 +32,7 @@ class Conditions:
     motor_failed: bool = False
 
     def snapshot(self) -> tuple[object, ...]:
-        """All of it, to compare with what was before."""
+        """All fields, to compare with an earlier state."""
         return (
             self.manual_control_lost,
             self.ground_station_lost,

@@ -1,6 +1,6 @@
-"""PX4's failsafe state machine: what is wrong, which action that calls for, when the pilot may overrule it.
+"""PX4's failsafe state machine: conditions, their actions, and when the pilot may override them.
 
-Every check that fails holds one action; the worst of all held actions is taken. Most actions first hold the
+Every failed check has one action; the worst of all active actions is selected. Most actions first hold the
 position for COM_FAIL_ACT_T seconds, so that a pilot can take over. An action ends with its condition, or only
 with the next change of mode or disarming. The rules are those of PX4 v1.16/v1.17. Names in capitals are PX4's
 parameters; times are seconds.
@@ -32,7 +32,9 @@ from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.announcements import Text
 
 MANUAL_CONTROL_DISABLED = 4  # COM_RC_IN_MODE
-DELAY_RECOVERY = 0.25  # a delay that was used up comes back this much slower, so that flicker cannot stall it
+DELAY_RECOVERY = (
+    0.25  # a used delay recovers this much slower, so that a flickering condition cannot extend it
+)
 
 
 @dataclass(slots=True)
@@ -63,9 +65,9 @@ _PARAMETERS = (
     "NAV_DLL_ACT",
     "NAV_RCL_ACT",
 )
-# Actions that fly by themselves, so that a pilot has something to take over from.
+# Actions with autonomous flight, from which a pilot can take over.
 _OVERRULABLE = frozenset({Action.HOLD, Action.RETURN, Action.LAND, Action.DESCEND})
-# If an action cannot be flown, the next one is tried.
+# If an action is not possible, the next one is tried.
 _FALLBACK_ORDER = (
     Action.FALLBACK_POSITION,
     Action.FALLBACK_ALTITUDE,
@@ -92,20 +94,20 @@ _FALLBACKS = {action: Response(action, takeover=Takeover.ALWAYS) for action in A
 
 
 class FailsafeMachine:
-    """The state machine. `can_fly(mode)`: whether a mode could be flown now, sticks apart.
+    """The state machine. `can_fly(mode)`: whether a mode is possible now, apart from the sticks.
 
     Attributes:
-        action: what is being done.
-        reason: in words, why; empty without a failsafe.
-        user_took_over: a pilot has overruled the action.
+        action: the active action.
+        reason: its cause in words; empty without a failsafe.
+        user_took_over: a pilot has overridden the action.
     """
 
     def __init__(
-        self, parameters: Parameters, can_fly: Callable[[Mode], bool], say: Callable[[Text], None]
+        self, parameters: Parameters, can_fly: Callable[[Mode], bool], announce: Callable[[Text], None]
     ) -> None:
         self._parameters = parameters
         self._can_fly = can_fly
-        self._say = say
+        self._announce = announce
         self.action = Action.NONE
         self.reason = ""
         self.user_took_over = False
@@ -113,7 +115,7 @@ class FailsafeMachine:
         self._values: dict[str, int] = {}
         self._held: dict[str, _Held] = {}
         self._failed_before: set[str] = set()
-        self._delay_s = 0.0  # what is left of the hold before the action
+        self._delay_s = 0.0  # remaining hold time before the action
         self._act_delay_s = parameters.number("COM_FAIL_ACT_T")
         self._start_delay_s = self._act_delay_s
         self._was_armed = False
@@ -129,7 +131,7 @@ class FailsafeMachine:
         return self.action > Action.WARN
 
     def mode(self, intended: Mode) -> Mode:
-        """The mode to fly, given the one that the user wants."""
+        """The resulting mode, from the one that the user wants."""
         return _MODE_OF_ACTION.get(self.action, intended)
 
     def update(
@@ -142,11 +144,12 @@ class FailsafeMachine:
         mode_requested: bool = False,
         sticks_request: bool = False,
     ) -> Mode:
-        """One step. Returns the mode the user wants, which a takeover by sticks changes to POSCTL.
+        """Advance one step. Returns the mode that the user wants, which a takeover by sticks changes to
+        POSCTL.
 
         Args:
-            mode_requested: somebody asked for `intended` since the last step, even if it was set before.
-            sticks_request: a pilot moved the sticks enough to want to fly.
+            mode_requested: `intended` was requested since the last step, even if it was set before.
+            sticks_request: a pilot moved the sticks enough for a takeover.
         """
         situation = (
             armed,
@@ -157,7 +160,7 @@ class FailsafeMachine:
             conditions.snapshot(),
         )
         if situation == self._quiet_situation and not (mode_requested or sticks_request):
-            return intended  # all was well, and nothing has changed: the usual case, and a frequent one
+            return intended  # no failsafe before, and no change: the usual case
         if armed != self._was_armed:
             self._remove_settled()
             self.user_took_over = False
@@ -168,7 +171,7 @@ class FailsafeMachine:
             self._remove_settled()
         self._load()
         self._delay_s = max(self._delay_s - dt_s, 0.0)
-        self._check_everything(conditions, armed, intended)
+        self._check_all(conditions, armed, intended)
         self._drop_unchecked()
         if self.action > Action.HOLD or not self._can_fly(Mode.HOLD) or self.user_took_over:
             self._delay_s = 0.0
@@ -181,7 +184,7 @@ class FailsafeMachine:
 
     # ---- the checks -------------------------------------------------------------------------------------
 
-    def _check_everything(self, conditions: Conditions, armed: bool, intended: Mode) -> None:
+    def _check_all(self, conditions: Conditions, armed: bool, intended: Mode) -> None:
         value = self._value
         if armed and not self._was_armed:
             self._manual_control_optional = conditions.manual_control_lost
@@ -220,14 +223,14 @@ class FailsafeMachine:
         return self._values[name]
 
     def _mode_fallback(self, conditions: Conditions, intended: Mode) -> Action:
-        """What replaces a mode that cannot be flown any more."""
+        """The fallback of a mode that is no longer possible."""
         action, wanted = Action.NONE, intended
         if intended is Mode.OFFBOARD and conditions.offboard_signal_lost:
             action, wanted = self._offboard_loss()
             if action < Action.HOLD and conditions.manual_control_lost:
                 action = link_loss_response(self._value("NAV_RCL_ACT"), Cause.GENERIC).action or Action.RETURN
             if action >= Action.HOLD:
-                return action  # it needs no sticks; `_possible` sees whether it can be flown
+                return action  # it needs no sticks; `_possible` checks whether it is possible
         if wanted in (Mode.POSCTL, Mode.POSITION_SLOW) and not self._can_fly(wanted):
             action, wanted = Action.FALLBACK_ALTITUDE, Mode.ALTCTL
         if wanted is Mode.ALTCTL and not self._can_fly(wanted):
@@ -246,7 +249,7 @@ class FailsafeMachine:
             7: (Action.DISARM, Mode.HOLD),
         }.get(self._value("COM_OBL_RC_ACT"), (Action.FALLBACK_POSITION, Mode.POSCTL))
 
-    # ---- the held actions -------------------------------------------------------------------------------
+    # ---- active actions ---------------------------------------------------------------------------------
 
     def _check(self, name: str, failing: bool, response: Response) -> None:
         held = self._held.get(name)
@@ -283,14 +286,14 @@ class FailsafeMachine:
             held.failing = False
 
     def _drop_unchecked(self) -> None:
-        """A check that was not made this time counts as passed."""
+        """End the actions of checks that were not made in this step."""
         for name, held in list(self._held.items()):
             if not held.checked:
                 self._condition_over(name)
             held.checked = False
 
     def _remove_settled(self) -> None:
-        """Actions whose condition is over, and that only waited for a change of mode or for disarming."""
+        """End the actions whose condition is over, and that end with a change of mode or with disarming."""
         for name, held in list(self._held.items()):
             if not held.failing and held.response.clears is UNTIL_MODE_CHANGE:
                 del self._held[name]
@@ -310,7 +313,7 @@ class FailsafeMachine:
         if configured != self._act_delay_s:
             self._act_delay_s = self._start_delay_s = configured
 
-    # ---- the choice -------------------------------------------------------------------------------------
+    # ---- selection --------------------------------------------------------------------------------------
 
     def _select(
         self,
@@ -325,7 +328,7 @@ class FailsafeMachine:
         action, delayed, cause, reason = Action.NONE, Action.NONE, Cause.GENERIC, ""
         took_over = False
         if before is Action.TERMINATE:
-            action, reason = Action.TERMINATE, self.reason  # it takes a reboot
+            action, reason = Action.TERMINATE, self.reason  # until a reboot
         elif armed:
             action, cause, reason, takeover = self._worst()
             if (
@@ -342,17 +345,17 @@ class FailsafeMachine:
                 if sticks_request and not self.user_took_over:
                     intended = Mode.POSCTL
                 if not self.user_took_over:
-                    self._say(failsafe_overruled())
+                    self._announce(failsafe_overruled())
                 took_over, delayed = True, Action.NONE
                 action = max(Action.WARN, self._mode_fallback(conditions, intended))
             action, cause = self._possible(action, cause)
             action, delayed = self._softened(action, delayed, intended)
         self._use_delay(dt_s, delayed is not Action.NONE)
         if action > before or (action is not Action.NONE and self._must_notify):
-            self._say(failsafe_entered(intended, action, delayed, cause, self._delay_s))
+            self._announce(failsafe_entered(intended, action, delayed, cause, self._delay_s))
         self._must_notify = False
         if before > Action.WARN >= action and intended is Mode.ORBIT:
-            intended = Mode.HOLD  # the circle that it had been flying is forgotten
+            intended = Mode.HOLD  # the orbit is dropped
         self.action = action
         self.reason = reason if action > Action.WARN else ""
         self.user_took_over = took_over
@@ -367,22 +370,22 @@ class FailsafeMachine:
         return action, cause, reason, takeover
 
     def _possible(self, action: Action, cause: Cause) -> tuple[Action, Cause]:
-        """The action, or the first later one that can be flown."""
+        """The action, or the first worse one that is possible."""
         if action not in _FALLBACK_ORDER:
             return action, cause
         for candidate in _FALLBACK_ORDER[_FALLBACK_ORDER.index(action) :]:
             if candidate is Action.DESCEND or self._can_fly(_MODE_OF_ACTION[candidate]):
                 return candidate, cause if candidate is action else Cause.GENERIC
-        raise AssertionError("a descent can always be flown")
+        raise AssertionError("a descent is always possible")
 
     def _softened(self, action: Action, delayed: Action, intended: Mode) -> tuple[Action, Action]:
-        """A vehicle that lands or returns already is not sent to return again."""
-        flown = {
+        """Keep a landing or a return that is already in progress."""
+        flyable = {
             Mode.LAND: {Action.RETURN},
             Mode.RTL: {Action.RETURN},
             Mode.PRECLAND: {Action.RETURN, Action.LAND},
         }.get(intended, set())
-        if (action in flown or delayed in flown) and self._can_fly(intended):
+        if (action in flyable or delayed in flyable) and self._can_fly(intended):
             return Action.WARN, Action.NONE
         return action, delayed
 

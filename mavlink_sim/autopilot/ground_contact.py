@@ -1,4 +1,4 @@
-"""Whether a vehicle stands or flies: the ramp of a take-off, and what counts as a landing.
+"""Ground contact: the ramp of a take-off and the land detector.
 
 Times are seconds since boot. MPC_TKO_* are parameters.
 """
@@ -13,27 +13,27 @@ from mavlink_sim.physics.airframe import GRAVITY_MPS2, Multirotor
 from mavlink_sim.px4.parameters import Parameters
 
 TAKEOFF_DETECTION_HEIGHT_M = 0.12
-# As recorded: the vehicle creeps up while the ramp is still raising the thrust to hover, then climbs.
+# As recorded: the vehicle rises slowly while the ramp raises the thrust to hover, then climbs.
 RAMP_THRUST_SHARE = 0.9
 RAMP_CREEP_MPS = 0.2
 
 
 class GroundContact:
-    """What an autopilot knows of the ground beneath it.
+    """The land detector of an autopilot.
 
     Args:
-        detection_s: so long it must press on the ground to have landed.
+        detection_s: time of ground contact until it is landed.
 
     Attributes:
-        landed: it stands, as far as it can tell: from `touch_down` to `leave`.
-        has_flown: it has been in the air since it was armed. left_s: when it left the ground last.
+        landed: from `touch_down` to `leave`.
+        has_flown: it has been in the air since it was armed. left_s: when it last left the ground.
     """
 
     def __init__(self, airframe: Multirotor, parameters: Parameters, detection_s: float) -> None:
         self._airframe = airframe
         self._parameters = parameters
         self._detection_s = detection_s
-        self.landed = airframe.on_ground  # it may boot while it falls
+        self.landed = airframe.on_ground  # it may boot in the air
         self.has_flown = False
         self.left_s: float | None = None
         self._armed_since_s = self._landed_since_s = 0.0
@@ -41,24 +41,24 @@ class GroundContact:
         self._lifting_since_s: float | None = None
 
     def arm(self, now_s: float) -> None:
-        """The motors turn from now on."""
+        """The motors start."""
         self.has_flown = False
         self._armed_since_s = now_s
         self._lifting_since_s = None
 
     def armed_for_s(self, now_s: float) -> float:
-        """Since it was armed last."""
+        """Seconds since it was armed."""
         return now_s - self._armed_since_s
 
     def landed_for_s(self, now_s: float) -> float:
-        """Since it landed last; before that since boot."""
+        """Seconds since it landed; before that since boot."""
         return now_s - self._landed_since_s
 
     def rests(self, now_s: float, *, rises: bool) -> bool:
-        """Whether it stays where it stands, with idling motors; if it is to leave that, the ramp begins.
+        """Whether it stays on the ground, with idling motors; if not, the ramp begins.
 
         Args:
-            rises: it may leave the ground, and is to.
+            rises: a take-off is allowed and demanded.
         """
         if not self.landed:
             return False
@@ -70,7 +70,7 @@ class GroundContact:
         return False
 
     def climb_limit_mps(self, now_s: float) -> float:
-        """PX4's take-off ramp: hardly any climb while thrust builds up, up to MPC_TKO_SPEED, then free."""
+        """PX4's take-off ramp: almost no climb while thrust builds up, then MPC_TKO_SPEED, then no limit."""
         if self._lifting_since_s is None:
             return math.inf
         ramp = max(self._parameters.number("MPC_TKO_RAMP_T"), 0.01)
@@ -83,16 +83,16 @@ class GroundContact:
         return min(max(speed * rise, RAMP_CREEP_MPS), speed)
 
     def leave(self, now_s: float) -> None:
-        """It is in the air."""
+        """It has left the ground."""
         self.landed = False
         self.left_s = now_s
         self.has_flown = True
 
     def presses(self, now_s: float, wanted_down_mps: float) -> bool:
-        """Whether it has been on the ground, and been meant to be, for as long as a landing takes.
+        """Whether it has been on the ground with a setpoint that does not climb for the detection time.
 
         Args:
-            wanted_down_mps: the speed downwards that it is to have; NaN where none is wanted.
+            wanted_down_mps: the downward speed setpoint; NaN without one.
         """
         airframe = self._airframe
         sinking = wanted_down_mps > 0.05 or airframe.thrust_mps2 < 0.5 * GRAVITY_MPS2
@@ -111,12 +111,12 @@ class GroundContact:
 
 
 def asks_to_rise(task: flight.Task | None, setpoint: TrajectorySetpoint, down_m: float) -> bool:
-    """Whether a vehicle that stands at `down_m` (NED) is to leave the ground."""
+    """Whether a vehicle on the ground at `down_m` (NED) is to take off."""
     if isinstance(task, flight.Takeoff):
         return True
     if isinstance(task, flight.Hold | flight.Land | flight.Return):
         return False
-    # where nothing is wanted (NaN) every comparison is False
+    # without a setpoint (NaN) every comparison is False
     return (
         setpoint.velocity[2] < -0.05 or setpoint.position[2] < down_m - 0.1 or setpoint.acceleration[2] < -0.3
     )

@@ -1,4 +1,4 @@
-"""Home: the place that heights are told from and a return leads to, and how the vehicle stands there."""
+"""Home: the reference of relative heights and the destination of a return."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from mavlink_sim.px4.parameters import Parameters
 
 
 class Pose(Protocol):
-    """Where something is, local NED in metres, and how it stands; what flies and its estimate are such."""
+    """A position, local NED in metres, and an attitude; the airframe and its estimate have them."""
 
     @property
     def position(self) -> Vector: ...
@@ -25,29 +25,29 @@ class Pose(Protocol):
 
 
 class Home:
-    """HOME_POSITION, and who has said where it is.
+    """HOME_POSITION, and whether a command has set it.
 
     Attributes:
         position: local NED, metres.
-        attitude_rad: roll, pitch and yaw there; NaN: not known.
+        attitude_rad: roll, pitch and yaw there; NaN: unknown.
     """
 
     def __init__(self, pose: Pose) -> None:
         self.is_here(pose)
 
     def is_here(self, pose: Pose) -> None:
-        """Home is where that is now; `follow` may move it again."""
+        """Set home to a pose; `follow` may move it again."""
         self.position = pose.position
         self.attitude_rad: Vector = (pose.roll_rad, pose.pitch_rad, pose.yaw_rad)
         self._is_manual = False
 
     def is_at(self, position: Vector, attitude_rad: Vector) -> None:
-        """A command has named the place: `follow` leaves it."""
+        """Set home by a command: `follow` does not move it."""
         self.position, self.attitude_rad = position, attitude_rad
         self._is_manual = True
 
     def follow(self, pose: Pose, parameters: Parameters) -> None:
-        """Arming or landing there: home is there now, unless a command has named it or COM_HOME_EN forbids.
+        """Set home at arming or landing, unless a command has set it or COM_HOME_EN forbids it.
 
         (ArduPilot has no such parameter: its home always follows.)
         """

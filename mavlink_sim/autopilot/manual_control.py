@@ -1,8 +1,8 @@
-"""Which sticks count, and what the pilot does with them: PX4's manual_control module.
+"""Selection of the stick source, and the pilot's requests: PX4's manual_control module.
 
-Sources are a remote control and the joysticks of ground stations (MANUAL_CONTROL, one source a link);
-COM_RC_IN_MODE chooses among them, COM_RC_LOSS_T is how long one stays valid. Gestures (MAN_ARM_GESTURE,
-MAN_KILL_GEST_T), switches, and sticks moved faster than COM_RC_STICK_OV come out as requests and `moved`.
+Sources are a remote control and the joysticks of ground stations (MANUAL_CONTROL, one source per link);
+COM_RC_IN_MODE selects among them, COM_RC_LOSS_T is how long one stays valid. Gestures (MAN_ARM_GESTURE,
+MAN_KILL_GEST_T), switches, and sticks moved faster than COM_RC_STICK_OV become requests and `moved`.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from mavlink_sim.px4.modes import Mode
 from mavlink_sim.px4.parameters import Parameters
 
 MOVEMENT_FILTER_S = 0.1
-GESTURE_S = 1.0  # sticks in the corner for this long
+GESTURE_S = 1.0  # duration of the sticks in the corner
 _LOW = -0.8
 _CORNER = 0.9
 _NEAR_CENTRE = 0.1
 
 
 class Source(IntEnum):
-    """Where sticks come from, as PX4 numbers it; a joystick on the vehicle's n-th link is MAVLINK + n."""
+    """The source of sticks, by PX4's numbers; a joystick on the vehicle's n-th link is MAVLINK + n."""
 
     UNKNOWN = 0
     REMOTE_CONTROL = 1
@@ -31,7 +31,7 @@ class Source(IntEnum):
 
 
 class RequestKind(Enum):
-    """What a pilot asks for with sticks or switches."""
+    """The kind of a pilot's request by sticks or switches."""
 
     ARM = "arm"
     DISARM = "disarm"
@@ -42,7 +42,7 @@ class RequestKind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """One request; `by` is PX4's name of the way it was made."""
+    """One request; `by` is PX4's name of its source."""
 
     kind: RequestKind
     by: str
@@ -57,9 +57,9 @@ class ManualControl:
     """The selector. `offer` takes samples, `update` advances time.
 
     Attributes:
-        valid: there are sticks that count.
-        sticks: of the chosen source; all zero without one.
-        source: the chosen one's number.
+        valid: a source is selected.
+        sticks: of the selected source; all zero without one.
+        source: the number of the selected source.
     """
 
     def __init__(self, parameters: Parameters) -> None:
@@ -76,7 +76,7 @@ class ManualControl:
         self._requests: list[Request] = []
 
     def offer(self, sticks: Sticks, source: int, now_s: float) -> bool:
-        """A sample arrived. Returns whether it counts."""
+        """Take a sample. Returns whether its source is selected."""
         self._expire(now_s)
         if not self._matches(source) or self._parameters.number("COM_RC_LOSS_T") <= 0.0:
             return False
@@ -89,7 +89,7 @@ class ManualControl:
         return True
 
     def offer_switches(self, switches: Switches, armed: bool) -> None:
-        """Switch positions of the remote control; they count while its sticks do."""
+        """Take switch positions of the remote control; they are used while its sticks are."""
         if not self.valid or self.source != Source.REMOTE_CONTROL:
             self._switches = None
             return
@@ -117,7 +117,7 @@ class ManualControl:
             self._request(RequestKind.KILL if switches.kill else RequestKind.UNKILL, SWITCH)
 
     def update(self, now_s: float) -> list[Request]:
-        """Let what is old expire. Returns what the pilot asked for since the last call, in order."""
+        """Drop expired samples. Returns the pilot's requests since the last call, in order."""
         self._expire(now_s)
         requests, self._requests = self._requests, []
         return requests
@@ -135,7 +135,7 @@ class ManualControl:
     def return_switch_on(self) -> bool:
         return self._switches is not None and self._switches.back is True
 
-    # ---- choosing ---------------------------------------------------------------------------------------
+    # ---- selection --------------------------------------------------------------------------------------
 
     def _expire(self, now_s: float) -> None:
         if not self.valid:
@@ -173,9 +173,9 @@ class ManualControl:
             return free or remote or (not current_is_remote and source >= current)
         if mode == 8:
             return free or source >= current
-        return False  # 4, and what PX4 does not know: manual control is disabled
+        return False  # 4, and unknown values: manual control is disabled
 
-    # ---- what the pilot does ----------------------------------------------------------------------------
+    # ---- gestures and switches --------------------------------------------------------------------------
 
     def _watch_movement(self, sticks: Sticks, dt_s: float) -> None:
         if dt_s <= 0.0:
@@ -202,7 +202,7 @@ class ManualControl:
         self._gesture(RequestKind.KILL, lower_left and lower_right, kill_s, now_s, kill_s > 0.0)
 
     def _gesture(self, kind: RequestKind, held: bool, hold_s: float, now_s: float, enabled: bool) -> None:
-        """`_gesture_since`: since when the sticks are there, infinity once the request is made."""
+        """Track a gesture; `_gesture_since`: when it began, infinity once the request is made."""
         since = self._gesture_since.get(kind)
         if not held:
             self._gesture_since[kind] = None

@@ -1,32 +1,27 @@
-"""What PX4 does when the horizontal position is no longer valid (its mode requirements and mode fallback).
+"""PX4's mode requirements and fallback without a valid horizontal position.
 
-A mode that needs a position is refused, and left if it is flown: Position falls to Altitude where a pilot has
-sticks, every other mode to Descend, because Return and Land need a position too. Descend is shown as LAND
-(that is how PX4 encodes it in HEARTBEAT): level, sinking with MPC_LAND_SPEED, drifting with the wind.
-OFFBOARD is left only if its setpoints ask for a position or a velocity; then it counts as lost setpoints.
-When the position comes back in the air, the mode that was wanted is flown again; a vehicle that came down
-blindly stays down. Which mode that makes is the choice of `failsafes`; here is what it has to know, and how
-to come down.
+A mode that needs a position is refused, and left if it is active: Position falls back to Altitude where a
+pilot has sticks, every other mode to Descend, because Return and Land need a position too. Descend is
+reported as LAND in HEARTBEAT, as by PX4: level, sinking with MPC_LAND_SPEED, drifting with the wind. OFFBOARD
+is left only if its setpoints need a position or a velocity; then they count as lost. When the position is
+back in the air, the intended mode is resumed; a vehicle that has descended to the ground stays there.
+`failsafes` selects the mode; this module has the requirements and the descent.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from mavlink_sim.flight.position_control import NAN, NOTHING, TrajectorySetpoint
 from mavlink_sim.flight.tasks import Land, Task
+from mavlink_sim.physics.airframe import Multirotor
 from mavlink_sim.px4.modes import Mode
 from mavlink_sim.px4.parameters import Parameters
 
-if TYPE_CHECKING:
-    from mavlink_sim.autopilot.commander import Autopilot
-
-# ALTCTL, STABILIZED, ACRO and MANUAL are flown without; OFFBOARD depends on its setpoints.
+# ALTCTL, STABILIZED, ACRO and MANUAL need none; OFFBOARD depends on its setpoints.
 WITHOUT_POSITION = frozenset({Mode.ALTCTL, Mode.STABILIZED, Mode.ACRO, Mode.MANUAL, Mode.OFFBOARD})
 
 
 class Descend(Task):
-    """Sink without knowing where: level, with MPC_LAND_SPEED, at the heading it had."""
+    """Descend without a position: level, with MPC_LAND_SPEED and constant heading."""
 
     landing = True
 
@@ -54,17 +49,8 @@ def asks_for_position(setpoint: object) -> bool:
     return False
 
 
-def landing_task(autopilot: Autopilot) -> Task:
-    """How mode LAND is flown: at one place, or blindly down where there is no position."""
-    if autopilot.position_valid:
-        return Land(autopilot._airframe, autopilot._parameters)
-    return Descend(autopilot._parameters, autopilot._airframe.yaw_rad)
-
-
-def keep_landing(autopilot: Autopilot) -> None:
-    """A landing goes on blindly when the position is lost, and at one place when it is back."""
-    descending = isinstance(autopilot.task, Descend)
-    if descending and autopilot.landed:
-        return  # it is down
-    if autopilot.armed and autopilot.mode is Mode.LAND and descending is autopilot.position_valid:
-        autopilot.task = landing_task(autopilot)
+def landing_task(airframe: Multirotor, parameters: Parameters, *, position_valid: bool) -> Task:
+    """The task of mode LAND: at one point, or a descent without a position."""
+    if position_valid:
+        return Land(airframe, parameters)
+    return Descend(parameters, airframe.yaw_rad)

@@ -1,16 +1,17 @@
-"""Commander's watch over links, battery and pilot: it feeds the failsafes and does what a pilot asks for.
+"""Commander's supervision of links, battery and pilot: sets the failsafe conditions, executes pilot requests.
 
-The autopilot calls `update` once a step. Whoever finds something wrong (a fence, a motor) sets it in
-`conditions`. Times are seconds since boot. Names in capitals are PX4's parameters.
+The autopilot calls `update` once per step. Other checks (fence, motors) set their field of `conditions`.
+Times are seconds since boot. Names in capitals are PX4's parameters.
 """
 
 from __future__ import annotations
 
 import math
 import struct
-from typing import TYPE_CHECKING
+from collections import deque
+from typing import Protocol
 
-from mavlink_sim.autopilot.arming_checks import GEOFENCE_CHECKS, failing_checks
+from mavlink_sim.autopilot.arming_checks import GEOFENCE_CHECKS, CheckedAutopilot, failing_checks
 from mavlink_sim.autopilot.failsafe_actions import Action
 from mavlink_sim.autopilot.failsafe_announcements import INFO_LEVELS
 from mavlink_sim.autopilot.failsafe_conditions import Conditions
@@ -23,21 +24,18 @@ from mavlink_sim.px4.modes import MANUAL_MODES, Mode
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.announcements import CRITICAL, INFO, Text, event_identifier
 
-if TYPE_CHECKING:
-    from mavlink_sim.autopilot.commander import Autopilot
-
 EMERGENCY = 0  # MAV_SEVERITY_EMERGENCY
 WARNING = 4  # MAV_SEVERITY_WARNING
 ACCEPTED = 0  # MAV_RESULT
 
-PERIOD_S = 0.02  # Commander's own loop is about as fast; requests do not wait for it
+PERIOD_S = 0.02  # Commander's own loop is about as fast; requests are processed immediately
 KILL_EVENT_LEVELS_IN_THE_AIR = 0x62
 # arm_disarm_reason_t of PX4's events
 REASONS = {"stick gesture": 1, "RC switch": 2, "external command": 4, "kill-switch": 8, "failsafe": 14}
 THROTTLE_ABOVE_CENTRE = 0.2
 THROTTLE_LOW = -0.8
 REARMING_GRACE_S = 5.0
-# Modes in which the throttle is a climb rate; in the other modes flown by sticks it is thrust.
+# Modes in which the throttle is a climb rate; in the other manual modes it is thrust.
 CLIMB_RATE_MODES = frozenset({Mode.POSCTL, Mode.POSITION_SLOW, Mode.ALTCTL})
 AUTO_OVERRIDE, OFFBOARD_OVERRIDE = 1, 2  # COM_RC_OVERRIDE
 _BATTERY_TEXTS = {
@@ -47,19 +45,46 @@ _BATTERY_TEXTS = {
 }
 
 
+class SupervisedAutopilot(CheckedAutopilot, Protocol):
+    """What the supervision uses of the autopilot; see `commander.Autopilot`."""
+
+    now_s: float
+    armed: bool
+    intended_mode: Mode
+    failsafe: bool
+    texts: deque[Text]
+
+    @property
+    def landed(self) -> bool: ...
+
+    def arm(self, by: str = ...) -> int: ...
+
+    def disarm(self, force: bool = False, by: str = ...) -> int: ...
+
+    def set_mode(self, mode: Mode, report: bool = False) -> int: ...
+
+    def can_run(self, mode: Mode) -> bool: ...
+
+    def adopt_intention(self, mode: Mode) -> None: ...
+
+    def follow_failsafes(self, mode: Mode) -> None: ...
+
+    def announce(self, line: str) -> None: ...
+
+
 class Supervision:
-    """The watch over one vehicle.
+    """The supervision of one vehicle.
 
     Attributes:
-        manual_control: the sticks that count. transmitter: the pilot's remote control, switched off at first.
-        channels_us: the newest frame of a remote control, empty without one; channels_s: when it came.
+        manual_control: the stick sources. transmitter: the pilot's remote control, initially switched off.
+        channels_us: the newest frame of a remote control, empty without one; channels_s: its time.
         battery, conditions, failsafes: see their modules.
         ground_station_seen_s: its newest heartbeat.
-        killed: the kill switch is engaged, the motors stand still.
-        pilot_attached: sticks are taken for granted, centred, whatever COM_RC_IN_MODE says.
+        killed: the kill switch is engaged, the motors are off.
+        pilot_attached: sticks are assumed to be present and centred, whatever COM_RC_IN_MODE is.
     """
 
-    def __init__(self, autopilot: Autopilot, parameters: Parameters) -> None:
+    def __init__(self, autopilot: SupervisedAutopilot, parameters: Parameters) -> None:
         self._autopilot = autopilot
         self._parameters = parameters
         self.manual_control = ManualControl(parameters)
@@ -81,22 +106,22 @@ class Supervision:
         self._mode_requested = False
         self._ever_had_mode = False
         self._disarmed_s = -math.inf
-        self._told_in_failsafe = (Action.NONE, Mode.HOLD)
+        self._announced_failsafe = (Action.NONE, Mode.HOLD)
 
     def keep_equipment(self, before: Supervision) -> None:
-        """A reboot: neither the battery nor what the pilot holds is part of the autopilot."""
+        """Keep battery and transmitter over a reboot: they are no part of the autopilot."""
         self.battery, self.transmitter = before.battery, before.transmitter
         self.pilot_attached = before.pilot_attached
 
-    # ---- what others read -------------------------------------------------------------------------------
+    # ---- state ------------------------------------------------------------------------------------------
 
     @property
     def sticks(self) -> Sticks:
-        """Of the chosen source; centred without one."""
+        """Of the selected source; centred without one."""
         return self.manual_control.sticks
 
     def read_sticks(self) -> Sticks:
-        """The same, for a task that asks anew at each step."""
+        """`sticks`, as a function for tasks."""
         return self.sticks
 
     @property
@@ -109,12 +134,12 @@ class Supervision:
 
     @property
     def motors_stopped(self) -> bool:
-        """Killed or terminated: no motor turns, whatever the mode asks for."""
+        """Killed or terminated: the motors are off in every mode."""
         return self.killed or self.terminated
 
     @property
     def lacks_ground_station(self) -> bool:
-        """NAV_DLL_ACT wants a ground station, and none is there."""
+        """NAV_DLL_ACT requires a ground station, and none is connected."""
         return self._parameters.number("NAV_DLL_ACT") > 0 and self.conditions.ground_station_lost
 
     @property
@@ -122,7 +147,7 @@ class Supervision:
         return self._arming_problem() is None
 
     def _arming_problem(self) -> tuple[int, str] | None:
-        """(severity, text) of what keeps the vehicle from arming in any mode."""
+        """(severity, text) of what prevents arming in every mode."""
         if self.killed or self.manual_control.kill_switch_on:
             return CRITICAL, "Preflight Fail: Kill switch engaged"
         if self.manual_control.return_switch_on:
@@ -140,14 +165,14 @@ class Supervision:
             return WARNING, "Preflight Fail: No connection to the GCS"
         return None
 
-    # ---- what arrives -----------------------------------------------------------------------------------
+    # ---- inputs -----------------------------------------------------------------------------------------
 
     def joystick(self, sticks: Sticks, link_number: int) -> None:
-        """MANUAL_CONTROL arrived on the vehicle's n-th link (from 0)."""
+        """Take MANUAL_CONTROL of the vehicle's n-th link (from 0)."""
         self.manual_control.offer(sticks, Source.MAVLINK + link_number, self._autopilot.now_s)
 
     def remote_control(self, widths_us: list[int]) -> None:
-        """A frame of a remote control's channels, in microseconds; zero: no such channel."""
+        """Take a frame of a remote control's channels, in microseconds; zero: no such channel."""
         now_s = self._autopilot.now_s
         self.channels_us, self.channels_s = widths_us, now_s
         sticks = read_sticks(widths_us, self._parameters)
@@ -160,7 +185,7 @@ class Supervision:
     # ---- arming -----------------------------------------------------------------------------------------
 
     def refuses_arming(self, by: str) -> Text | None:
-        """Why not to arm now, as a text; None if nothing speaks against it here."""
+        """The text of a refusal to arm; None if the supervision allows it."""
         autopilot = self._autopilot
         manual = autopilot.mode in MANUAL_MODES
         by_pilot = by != "external command"
@@ -180,14 +205,14 @@ class Supervision:
         return None
 
     def may_disarm_in_the_air(self, by: str) -> bool:
-        """COM_DISARM_MAN: by the pilot's own hand, where the throttle is thrust."""
+        """COM_DISARM_MAN: by the pilot's gesture or switch, where the throttle is thrust."""
         autopilot = self._autopilot
         thrust_mode = autopilot.mode in MANUAL_MODES and autopilot.mode not in CLIMB_RATE_MODES
         by_pilot = by in (GESTURE, "RC switch")
         return thrust_mode and by_pilot and self._parameters.number("COM_DISARM_MAN") != 0
 
     def mode_was_requested(self) -> None:
-        """Somebody asked for a mode, be it the one that is set already."""
+        """Note a mode request, also of the current mode."""
         self._mode_requested = self._ever_had_mode = True
 
     def disarmed(self) -> None:
@@ -196,7 +221,7 @@ class Supervision:
     # ---- one step ---------------------------------------------------------------------------------------
 
     def update(self, dt_s: float, thrust_mps2: float) -> None:
-        """Every PERIOD_S: read the remote control, watch everything, act."""
+        """Every PERIOD_S: read the remote control, run the checks, act."""
         self._since_watch_s += dt_s
         if self._since_watch_s < PERIOD_S - 1e-9:
             return
@@ -216,7 +241,7 @@ class Supervision:
         if breached and not self.conditions.geofence_breached:
             autopilot.texts.extend(
                 failing_checks(autopilot, GEOFENCE_CHECKS)
-            )  # PX4 tells a check when it changes
+            )  # PX4 reports a check when it changes
         self.conditions.geofence_breached = breached
         sticks_request = self._check_sticks()
         autopilot.follow_failsafes(self.run_failsafes(dt_s, sticks_request))
@@ -227,9 +252,9 @@ class Supervision:
             autopilot.disarm(force=True, by="failsafe")
 
     def run_failsafes(self, dt_s: float = 0.0, sticks_request: bool = False) -> Mode:
-        """Let the state machine decide. Returns the mode to fly."""
+        """Run the failsafe state machine. Returns the resulting mode."""
         autopilot, machine = self._autopilot, self.failsafes
-        # of this very moment: OFFBOARD is asked for right after the first setpoint, before the next watch
+        # the current value: OFFBOARD is requested right after the first setpoint, before the next check
         self.conditions.offboard_signal_lost = not autopilot.has_setpoints
         was_in_failsafe, reason = machine.in_failsafe, machine.reason
         wanted = autopilot.intended_mode
@@ -248,22 +273,22 @@ class Supervision:
                 autopilot.announce("the pilot took over using the sticks")
         autopilot.failsafe = machine.in_failsafe
         mode = machine.mode(intended)
-        told = (machine.action, mode)
-        if machine.in_failsafe and told != self._told_in_failsafe:
+        announced = (machine.action, mode)
+        if machine.in_failsafe and announced != self._announced_failsafe:
             autopilot.announce(f"failsafe: {machine.reason}, {mode.name}")
         elif was_in_failsafe and not machine.in_failsafe:
             back = reason == "offboard setpoints lost" and mode is Mode.OFFBOARD and autopilot.armed
             autopilot.announce("offboard setpoints are back" if back else "failsafe over")
-        self._told_in_failsafe = told
+        self._announced_failsafe = announced
         return mode
 
     def _can_fly(self, mode: Mode) -> bool:
-        """Whether a mode can be flown, sticks apart: the failsafes treat their loss by itself."""
+        """Whether a mode is possible, apart from the sticks: their loss is a failsafe condition."""
         if mode in MANUAL_MODES or mode is Mode.OFFBOARD:
             return self._autopilot.position_valid or not needs_position(mode)
         return self._autopilot.can_run(mode)
 
-    # ---- watching ---------------------------------------------------------------------------------------
+    # ---- checks -----------------------------------------------------------------------------------------
 
     def _check_manual_control(self) -> None:
         autopilot = self._autopilot
@@ -282,7 +307,7 @@ class Supervision:
             self._manual_control_seen_s = autopilot.now_s
 
     def _check_position(self) -> None:
-        """Which modes can be flown without a position is asked for by `_can_fly`; here it is only told."""
+        """Report a lost position and its return; `_can_fly` has the effect on the modes."""
         autopilot = self._autopilot
         if autopilot.position_valid is not self._had_position:
             self._had_position = autopilot.position_valid
@@ -310,7 +335,7 @@ class Supervision:
         warning = self.battery.checked_warning
         before = self.conditions.battery_warning
         if autopilot.armed:
-            warning = max(warning, before)  # in the air it only gets worse
+            warning = max(warning, before)  # while armed it does not decrease
         if warning is before:
             return
         self.conditions.battery_warning = warning
@@ -320,7 +345,7 @@ class Supervision:
             autopilot.announce(f"battery {warning.name.lower()}: {self.battery.remaining:.0%}")
 
     def _check_sticks(self) -> bool:
-        """Sticks moved in AUTO or OFFBOARD give the vehicle to the pilot. True: a failsafe has to yield."""
+        """Let the pilot take over by moved sticks in AUTO or OFFBOARD. True: from a failsafe."""
         autopilot = self._autopilot
         moved = self.manual_control.take_moved()
         if not self.manual_control.valid:
@@ -329,7 +354,7 @@ class Supervision:
             mapped = self._parameters.number("RC_MAP_FLTMODE") > 0
             by_joystick = self.manual_control.source > Source.REMOTE_CONTROL
             if not self._ever_had_mode and (by_joystick or not mapped):
-                autopilot.set_mode(Mode.POSCTL)  # a pilot's first sticks make Position the mode to start in
+                autopilot.set_mode(Mode.POSCTL)  # Position is the initial mode once sticks are received
             return False
         if not moved or autopilot.mode in MANUAL_MODES:
             return False
@@ -355,7 +380,7 @@ class Supervision:
         elif request.kind is RequestKind.SWITCH_MODE:
             assert request.mode is not None
             autopilot.announce(f"the pilot asks for {request.mode.name}")
-            autopilot.set_mode(request.mode, tell=True)
+            autopilot.set_mode(request.mode, report=True)
         else:
             self._kill(request.kind is RequestKind.KILL)
 
@@ -378,7 +403,7 @@ class Supervision:
         autopilot.announce("kill switch " + ("engaged" if engaged else "disengaged"))
 
     def _event(self, name: str, arguments: bytes = b"") -> None:
-        """Something PX4 says by an event alone."""
+        """Queue an event without text."""
         self._autopilot.texts.append(Text(INFO, "", (event_identifier(name), INFO_LEVELS, arguments)))
 
 

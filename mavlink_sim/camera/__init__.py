@@ -1,1 +1,1 @@
-"""Scenes and the camera in them: drawing, lens, sensor, depth, and where the frames go."""
+"""Scenes and their camera: drawing, lens, sensor, depth, and outputs."""

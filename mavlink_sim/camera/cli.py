@@ -1,4 +1,4 @@
-"""`mavlink-sim camera`: the built-in world drawn from the pose of any autopilot that a link reaches."""
+"""`mavlink-sim camera`: the built-in world rendered from the pose of any autopilot on a link."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from vision.attitude import euler_from_quaternion
 
 VEHICLE_TIMEOUT_S = 10.0
 OTHERS_S = 1.5
-"""After the first heartbeat: one a second comes from each autopilot on the link."""
+"""Time after the first heartbeat: each autopilot on the link sends one per second."""
 POSE_TIMEOUT_S = 60.0
 """An autopilot that has just started has no position before its estimator has converged."""
 POSE_LOST_S = 3.0
@@ -37,7 +37,7 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 
 class CameraError(Exception):
-    """The camera cannot start (exit code 2) or go on (1). The text is one line for a person."""
+    """The camera cannot start (exit code 2) or continue (1). The text is one line for the user."""
 
     def __init__(self, text: str, code: int = 2) -> None:
         super().__init__(text)
@@ -52,44 +52,49 @@ def camera(
     ],
     scene: Annotated[
         str | None,
-        typer.Option(help="World and camera from this TOML file, or an example's name; default: the demo's."),
+        typer.Option(
+            help="TOML file with world and camera, or the name of an example; default: the demo world."
+        ),
     ] = None,
     camera: Annotated[
-        str | None, typer.Option(help="Frames with depth into this shared memory; read it as shm://NAME.")
+        str | None, typer.Option(help="Send frames with depth to this shared memory; read it as shm://NAME.")
     ] = None,
     camera_rate: Annotated[
         float | None, typer.Option(help="Frames per second, 1 to 120; default: the scene's, else 30.")
     ] = None,
     camera_output: Annotated[
         list[str] | None,
-        typer.Option(help="Frames here too: pipe:PATH, pipe:-, http://HOST:PORT, rtp://HOST:PORT; repeat."),
+        typer.Option(
+            help="Also send frames to pipe:PATH, pipe:-, http://HOST:PORT or rtp://HOST:PORT; repeatable."
+        ),
     ] = None,
     camera_truth: Annotated[
-        Path | None, typer.Option(help="Write what is in each frame to this file, one JSON object a line.")
+        Path | None,
+        typer.Option(help="Write the objects in each frame to this file, one JSON object per line."),
     ] = None,
     truth: Annotated[
         Path | None,
         typer.Option(help="Write the pose and the range to every object to this file, JSON lines, 20 Hz."),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Of the demo's world.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the demo world.")] = 0,
     origin: Annotated[
         str | None,
         typer.Option(
-            help="Where the world's origin lies in the autopilot's local frame: N,E,D in metres; "
-            "default: where the vehicle is when the camera starts."
+            help="Origin of the world in the autopilot's local frame: N,E,D in metres; "
+            "default: the vehicle's position when the camera starts."
         ),
     ] = None,
     listen_only: Annotated[
         bool, typer.Option("--listen-only", help="Send nothing, not even requests for the pose.")
     ] = False,
 ) -> None:
-    """Draw the built-in world as seen from any autopilot's vehicle, until interrupted (Ctrl-C).
+    """Render the built-in world from any autopilot's vehicle, until interrupted (Ctrl-C).
 
     Attitude and position come from ATTITUDE_QUATERNION (or ATTITUDE) and LOCAL_POSITION_NED, or from
     HIL_STATE_QUATERNION where a simulator sends it. Exit code 2: it cannot start; 1: the pose stopped.
     """
     if STANDARD_OUTPUT in (camera_output or []):
-        sys.stdout = sys.stderr  # the frames have standard output to themselves
+        sys.stdout = sys.stderr  # standard output carries only the frames
     try:
         if camera_rate is not None and not 1.0 <= camera_rate <= 120.0:
             raise CameraError(f"--camera-rate {camera_rate:g}: expected 1 to 120")
@@ -136,7 +141,7 @@ def _fail(text: str, code: int) -> NoReturn:
 
 
 class _Run:
-    """One autopilot's poses to the camera's process, from the search for it to the end."""
+    """Passes one autopilot's poses to the camera's process, from the search for it to the end."""
 
     def __init__(
         self,
@@ -156,7 +161,7 @@ class _Run:
         self._stamp_ns = 0
 
     def run(self) -> None:
-        """Work until SIGINT or SIGTERM. Raises CameraError."""
+        """Run until SIGINT or SIGTERM. Raises CameraError."""
 
         def stop(_number: int, _frame: FrameType | None) -> None:
             self._stopping = True
@@ -187,7 +192,7 @@ class _Run:
             )
 
     def _until(self, condition: Callable[[], bool], timeout_s: float) -> bool:
-        """Receive until something is so; False: not in time. A signal ends it too."""
+        """Receive until a condition is met; False: not in time. A signal ends it too."""
         deadline_s = time.monotonic() + timeout_s
         while not self._stopping:
             if condition():
@@ -202,12 +207,12 @@ class _Run:
         if not self._until(lambda: bool(link.systems), VEHICLE_TIMEOUT_S):
             raise CameraError(
                 f"no autopilot within {VEHICLE_TIMEOUT_S:g} s: expected its HEARTBEAT on --vehicle-url; "
-                "is it running, and does it send there?"
+                "check that it runs and sends to that address"
             )
         self._until(lambda: len(link.systems) > 1, OTHERS_S)
         if len(link.systems) > 1:
             found = " and ".join(map(str, sorted(link.systems)))
-            raise CameraError(f"autopilots of system ids {found} on one link; give each a port of its own")
+            raise CameraError(f"autopilots of system ids {found} on one link; use a separate port for each")
         if link.systems:
             (link.system_id,) = link.systems
 
@@ -238,14 +243,14 @@ class _Run:
             if span is not None and span[1] != newest_ns:
                 newest_ns, advanced_s = span[1], time.monotonic()
                 if self._start_ns is None or not span[0] <= self._next_ns <= span[1] + 1e9:
-                    self._begin(span[1])  # also after the vehicle's clock has started again
+                    self._begin(span[1])  # also after a restart of the vehicle's clock
                 if span[1] >= self._next_ns:
-                    # Several may be due where poses come more rarely than frames: the newest is drawn.
+                    # Several may be due where poses arrive less often than frames: the newest is drawn.
                     due = int((span[1] - self._next_ns) // period_ns)
                     self._show(self._next_ns + round(due * period_ns))
                     self._next_ns += round((due + 1) * period_ns)
             elif time.monotonic() - advanced_s > POSE_LOST_S:
-                self._receive()  # what came while this process did not run counts
+                self._receive()  # messages received while this process was stopped are used
                 if history.span_ns == span:
                     text = f"the pose of system {self._link.system_id} stopped {POSE_LOST_S:g} s ago"
                     raise CameraError(f"{text}; no more frames are written", 1)
@@ -261,8 +266,8 @@ class _Run:
         self._start_ns = self._next_ns = self._next_truth_ns = boot_ns
 
     def _place_origin(self, position: Vector) -> None:
-        """Put the world's origin below the vehicle, as soon as that is known: it may take off while the
-        camera's process still paints."""
+        """Set the world's origin below the vehicle, as soon as that is known: it may take off while the
+        camera's process still prepares the ground."""
         self._origin = position
         if self._link.systems.get(self._link.system_id or 0):
             print(
@@ -278,7 +283,7 @@ class _Run:
         pose = self._history.at(boot_ns)
         stamp_ns = self._history.monotonic_ns(boot_ns)
         if stamp_ns <= self._stamp_ns:
-            return  # the clocks were matched better since; a frame must not be older than the one before
+            return  # the clock offset has improved; a frame must not be older than the previous one
         self._stamp_ns = stamp_ns
         n, e, d = (value - zero for value, zero in zip(pose.position, self._origin, strict=True))
         time_s = (boot_ns - self._start_ns) / 1e9
@@ -296,7 +301,7 @@ class _Run:
             "velocity_ned_mps": [round(value, 4) for value in pose.velocity],
             "yaw_rad": round(euler_from_quaternion(pose.attitude)[2], 5),
             "armed": self._link.systems[self._link.system_id or 0],
-            "objects": [object_truth(thing, here) for thing in self._scene.objects_at(time_s)],
+            "objects": [object_truth(scene_object, here) for scene_object in self._scene.objects_at(time_s)],
         }
 
     def _announce(self) -> None:

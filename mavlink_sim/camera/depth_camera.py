@@ -1,8 +1,8 @@
-"""What a stereo camera makes of true depth: disparity in steps, noise in it, limits, and pixels without any.
+"""Model of a stereo depth camera: disparity steps and noise, range limits, and pixels without depth.
 
 A stereo pair of baseline b and focal length f (pixels) measures the disparity d = f · b / z and reports it in
 fixed steps, so that the error of z grows with z² (Gallup et al. 2008, "Variable baseline/resolution stereo").
-Depth belongs to the left eye: what the right eye cannot see for something nearer has none.
+Depth is that of the left camera: points hidden from the right camera by a nearer object have none.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ class DepthSensor:
     """A depth camera. The defaults are of the size of a small active stereo camera.
 
     Attributes:
-        baseline_m: between the eyes; 0 gives true depth, without steps, noise or shadows of the eyes.
+        baseline_m: between the cameras; 0 gives true depth, without steps, noise or occlusion.
         step_px: the disparity's resolution.
         noise_px: standard deviation of the disparity.
         minimum_m, maximum_m: range outside which there is no depth.
@@ -55,7 +55,7 @@ class DepthSensor:
 def measured_depth(
     true_depth_m: Plane, focal_px: float, sensor: DepthSensor, rng: np.random.Generator
 ) -> Plane:
-    """The depth (H, W) float32 metres that the sensor reports, NaN where none.
+    """The sensor's depth (H, W), float32 metres, NaN where none.
 
     Args:
         true_depth_m: (H, W) float32, NaN where there is nothing.
@@ -85,23 +85,23 @@ def measured_depth(
 
 
 def _hidden_from_the_right(disparity: Plane) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-    """Pixels over which, seen by the right eye, something nearer to their right has moved."""
+    """Pixels that a nearer object to their right hides from the right camera."""
     at_right = np.arange(disparity.shape[1], dtype=np.float32) - disparity
     leftmost = np.minimum.accumulate(at_right[:, ::-1], axis=1)[:, ::-1]
     hidden = np.zeros(disparity.shape, np.bool_)
-    # Half a pixel of slack: a slanted surface is not its own shadow.
+    # Half a pixel of tolerance: a slanted surface does not hide itself.
     hidden[:, :-1] = leftmost[:, 1:] < at_right[:, :-1] - 0.5
     return hidden
 
 
 @lru_cache(maxsize=1)
 def _noise_bank() -> Plane:
-    """(1024, 1024) normal noise: drawing it anew for each frame would cost more than the frame."""
+    """(1024, 1024) normal noise: drawing it for each frame would take longer than the frame."""
     return np.random.default_rng(98).standard_normal((1024, 1024), np.float32)
 
 
 def _noise(shape: tuple[int, ...], rng: np.random.Generator) -> Plane:
-    """(H, W) float32 normal noise of deviation 1: a piece of the bank, repeated where it is too small."""
+    """(H, W) float32 normal noise of deviation 1: a part of the bank, repeated where it is too small."""
     bank = _noise_bank()
     top, left = (int(start) for start in rng.integers(1024, size=2))
     rows, columns = (top + np.arange(shape[0])) % 1024, (left + np.arange(shape[1])) % 1024
@@ -111,7 +111,7 @@ def _noise(shape: tuple[int, ...], rng: np.random.Generator) -> Plane:
 def _patches(
     shape: tuple[int, ...], share: float, rng: np.random.Generator
 ) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-    """A mask that covers about `share` of the image with spots some pixels wide."""
+    """A mask that covers about `share` of the image with spots of a few pixels."""
     height, width = shape
     coarse = rng.random((-(-height // 6) + 1, -(-width // 6) + 1), np.float32)
     smooth = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR)

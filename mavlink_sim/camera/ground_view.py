@@ -1,9 +1,9 @@
-"""The ground and the sky as a camera sees them, and how far the ground is.
+"""Rendering of ground and sky, with the depth of the ground.
 
 Over level ground the reciprocal of the depth is linear in the pixel: 1/depth = (a·u + b·v + c) / height, and
-the point seen is eye + depth · ray. So every pixel's texel comes from a few passes over arrays: over a strip
-of the picture at a time, so that what they go through stays in the processor's cache. The mip level follows
-the area of a pixel's footprint on the ground.
+the visible point is eye + depth · ray. So every pixel's texel comes from a few passes over arrays, over one
+strip of the image at a time, so that the data stay in the processor's cache. The mip level follows from the
+area of a pixel's footprint on the ground.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ from mavlink_sim.world.world import Ground, Light, Patch, Sky, World
 Matrix = NDArray[np.float64]
 
 NEAREST_INVERSE = 1e-4
-"""Reciprocal depth below which ground counts as the horizon: 10 km."""
+"""Reciprocal depth of the horizon: 10 km."""
 DETAIL_REACH_M = 6.0
 DITHER = 0.5
 STRIP_ROWS = 64
-"""With 640 columns what a strip needs is 1.5 MB; of 32 to 96 rows none was faster."""
+"""With 640 columns a strip needs 1.5 MB; no number of rows from 32 to 96 was faster."""
 HAZE_FROM = 0.03
-"""Share of the visibility up to which haze is too thin to be drawn."""
+"""Share of the visibility up to which haze is not drawn."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,7 +87,7 @@ class Strip:
 
 
 class Buffers:
-    """Scratch arrays for one image size, so that frames need not allocate them anew."""
+    """Scratch arrays for one image size, so that frames need not allocate them."""
 
     def __init__(self, width: int, height: int) -> None:
         self.width, self.height = width, height
@@ -106,7 +106,7 @@ class Buffers:
             yield Strip(self, slice(top, min(top + most, self.height)))
 
     def part(self, strip: Strip, rows: slice) -> Strip:
-        """Some rows of a strip, counted from its first; what its scratch arrays held is not in theirs."""
+        """Some rows of a strip, counted from its first; scratch arrays are not copied."""
         return Strip(self, slice(strip.where.start + rows.start, strip.where.start + rows.stop))
 
 
@@ -147,7 +147,7 @@ def _colour(*channels: float) -> Plane:
 
 
 def _local(kind: str, seed: int, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Plane:
-    """A kind of ground for some rows and columns of the tile, out of a small tile repeated."""
+    """A kind of ground for some rows and columns of the tile, from a small repeated tile."""
     small = _local_tile(kind, seed)
     repeated: Plane = small[np.ix_(rows % LOCAL_TEXELS, columns % LOCAL_TEXELS)]
     return repeated
@@ -212,7 +212,7 @@ def _pad(colours: Plane, north: Plane, east: Plane) -> Plane:
 
 
 def draw_ground(world: World, view: View, buffers: Buffers, inverse_depth: Plane) -> Image:
-    """(H, W, 3) ground, not yet in haze; where the sky is, anything. Fills `inverse_depth` (0 = sky)."""
+    """(H, W, 3) ground without haze; undefined in the sky. Fills `inverse_depth` (0 = sky)."""
     image = np.empty((view.height, view.width, 3), np.uint8)
     ground, atlas = world.ground, ground_atlas(world.ground)
     # 1/depth of the ground, negative above the horizon.
@@ -220,7 +220,7 @@ def draw_ground(world: World, view: View, buffers: Buffers, inverse_depth: Plane
     for strip in buffers.strips():
         inverse = inverse_depth[strip.where]
         _linear(reciprocal, strip, inverse)
-        # It is linear, so the corners tell whether there is any ground.
+        # It is linear, so the corners decide whether there is any ground.
         if inverse[:: len(inverse) - 1 or 1, :: view.width - 1 or 1].max() > NEAREST_INVERSE:
             _draw_strip(ground, atlas, view, buffers, strip, inverse, image[strip.where])
         cv2.threshold(inverse, NEAREST_INVERSE, 0.0, cv2.THRESH_TOZERO, dst=inverse)
@@ -240,7 +240,7 @@ def _draw_strip(
     inverse_depth: Plane,
     image: Image,
 ) -> None:
-    """A strip of the picture in which there is ground, into `image`."""
+    """Draw a strip with ground into `image`."""
     height_m = _height_m(view)
     down = view.ned_from_pixel[2]
     depth = strip.depth
@@ -291,7 +291,7 @@ def _linear(row: Matrix, strip: Strip, out: Plane) -> None:
 
 
 def _fraction(row: Matrix, start: float, strip: Strip, out: Plane) -> None:
-    """The fractional part of start + depth · (row · pixel): where in the tile the ground point lies, 0..1."""
+    """The fractional part of start + depth · (row · pixel): the ground point's position in the tile, 0..1."""
     _linear(row, strip, out)
     out *= strip.depth
     out += np.float32(start - math.floor(start))
@@ -300,7 +300,7 @@ def _fraction(row: Matrix, start: float, strip: Strip, out: Plane) -> None:
 
 
 def _add_detail(view: View, height_m: float, buffers: Buffers, strip: Strip, image: Image) -> None:
-    """Fine structure on ground that is close, where the tile's own texels are larger than pixels."""
+    """Fine structure on close ground, where the tile's texels are larger than pixels."""
     if height_m > DETAIL_REACH_M:
         return
     near = np.flatnonzero(strip.depth.min(axis=1) < DETAIL_REACH_M)
@@ -365,7 +365,7 @@ def draw_sky(sky: Sky, light: Light, view: View, inverse_depth: Plane, image: Im
 
 
 def add_haze(sky: Sky, inverse_depth: Plane, buffers: Buffers, image: Image) -> None:
-    """Fade everything into the horizon's colour with distance, in place. The sky is to be painted after."""
+    """Fade everything into the horizon's colour with distance, in place. Paint the sky afterwards."""
     # OpenCV fills an image with a colour thirty times as fast as an assignment does.
     blue, green, red = (int(min(max(channel, 0.0), 255.0)) for channel in sky.horizon)
     cv2.rectangle(buffers.flat, (0, 0, buffers.width, STRIP_ROWS), (blue, green, red), cv2.FILLED)

@@ -1,4 +1,4 @@
-"""What a lens and a sensor do to a picture: blur, exposure, colour cast, contrast, noise."""
+"""Effects of lens and sensor on an image: blur, exposure, colour cast, contrast, noise."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class ImageEffects:
 
 
 MILD_EFFECTS = ImageEffects(noise_sigma=2.0)
-"""A good camera on a good day."""
+"""A camera without effects."""
 
 
 @lru_cache(maxsize=1)
@@ -57,7 +57,7 @@ def _scaled(noise: NDArray[np.int16], sigma: float) -> NDArray[np.int16]:
 
 
 class Sensor:
-    """Applies the effects to the pictures of one camera."""
+    """Applies the effects to the images of one camera."""
 
     def __init__(self, effects: ImageEffects) -> None:
         self._effects = effects
@@ -65,7 +65,7 @@ class Sensor:
         self._halves: tuple[Image, Image] | None = None
 
     def expose(self, image: Image, rng: np.random.Generator) -> Image:
-        """A new picture (H, W, 3) uint8 with the effects; `rng` chooses the noise."""
+        """A new image (H, W, 3) uint8 with the effects; `rng` draws the noise."""
         effects = self._effects
         if effects.blur_sigma_px > 0.05:
             image = np.asarray(cv2.GaussianBlur(image, (0, 0), effects.blur_sigma_px), np.uint8)
@@ -90,7 +90,9 @@ class Sensor:
         top = int(rng.integers(repeats[0] * bank.shape[0] - height + 1))
         left = int(rng.integers(repeats[1] * bank.shape[1] - width + 1))
         piece = (slice(top, top + height), slice(left, left + width))
-        if not self._has_exposed:  # many a training scene's camera takes one picture: halves would not pay
+        if (
+            not self._has_exposed
+        ):  # many cameras of training scenes capture one image: precomputed halves would not pay
             self._has_exposed = True
             bank = np.tile(bank, repeats) if repeats != (1, 1, 1) else bank
             noise = _scaled(bank[piece], self._effects.noise_sigma)
@@ -102,9 +104,9 @@ class Sensor:
 
 
 def _halves(noise: NDArray[np.int16]) -> tuple[Image, Image]:
-    """What it adds and what it takes away, in eight bits, which saturate as a picture does.
+    """The positive and the negative part of noise, in eight bits, which saturate as an image does.
 
-    A picture takes them up in a third of the time that signed noise takes.
+    Adding them takes a third of the time of signed noise.
     """
     more, less = (np.clip(half, 0, 255).astype(np.uint8) for half in (noise, -noise))
     return more, less

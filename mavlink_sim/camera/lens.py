@@ -1,10 +1,10 @@
-"""From the pinhole picture that is drawn to what a real camera takes: distortion, rolling shutter, blur.
+"""From a rendered pinhole image to that of a real camera: distortion, rolling shutter, blur.
 
-The pinhole picture is drawn a little larger than the camera's; every pixel of the camera then looks up where
-its ray, bent by the lens and turned by the camera's motion until that row was read out, meets it. For the
-rotation this is exact (Forssén and Ringaby 2010, "Rectifying rolling shutter video"); for the translation it
-is exact within a surface, as the depth is taken from the pixel's place in the middle of the readout:
-outlines of near things before far ones lean with the rotation, but not with the translation.
+The pinhole image is drawn a little larger than the camera's; every pixel of the camera is then mapped to the
+intersection of its ray, bent by the lens and rotated by the camera's motion until that row was read out. For
+the rotation this is exact (Forssén and Ringaby 2010, "Rectifying rolling shutter video"); for the translation
+it is exact within a surface, as the depth is that of the pixel in the middle of the readout: outlines of near
+objects before far ones are skewed by the rotation, but not by the translation.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from mavlink_sim.world.textures import Image, Plane
 from vision.camera_model import CameraModel
 
 MARGIN_SHARE = 0.1
-"""Of the width, on every side, drawn beyond the picture where a moving camera's rows look."""
+"""Margin drawn on every side for a moving camera's rows, as a share of the width."""
 MAX_GROWTH = 2.5
 MOST_EXPOSURES = 8
 _ROUND_TRIP_PX = 0.1
@@ -28,10 +28,10 @@ _ROUND_TRIP_PX = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Shutter:
-    """How a picture is taken over time.
+    """The timing of an image.
 
     Attributes:
-        exposure_s: how long each row gathers light; motion during it blurs.
+        exposure_s: exposure time of each row; motion during it blurs.
         readout_s: from the first row's exposure to the last row's, 0 for a global shutter.
     """
 
@@ -46,11 +46,11 @@ class Shutter:
 
 @dataclass(frozen=True, slots=True)
 class CameraMotion:
-    """How the camera moves at the middle of the exposure, in its own optical frame (x right, y down).
+    """The camera's motion at the middle of the exposure, in its optical frame (x right, y down).
 
     Attributes:
         velocity_mps: of the optical centre.
-        angular_velocity_radps: turning of the camera.
+        angular_velocity_radps: of the camera.
     """
 
     velocity_mps: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -63,13 +63,14 @@ class CameraMotion:
 
 
 class Lens:
-    """What one camera makes of pinhole pictures.
+    """The lens and shutter of one camera, applied to pinhole images.
 
     Attributes:
-        drawn: the pinhole camera whose pictures `expose` takes.
+        drawn: the pinhole camera of the images for `expose`.
 
     Raises (when made):
-        ValueError: the distortion cannot be undone over the whole picture, or only by a far larger one.
+        ValueError: the distortion is not invertible over the whole image, or needs a far larger pinhole
+        image.
     """
 
     def __init__(self, camera: CameraModel, shutter: Shutter | None = None) -> None:
@@ -84,7 +85,7 @@ class Lens:
         self._y = plane[:, 1].reshape(shape).astype(np.float32)
         moving = self.shutter.exposure_s > 0.0 or self.shutter.readout_s > 0.0
         margin = math.ceil(MARGIN_SHARE * camera.width) if moving else 1
-        # Whole pixels more on each side, so that where nothing bends or moves no pixel is interpolated.
+        # Whole pixels more on each side, so that without distortion and motion no pixel is interpolated.
         left = math.ceil(-float(self._x.min()) * camera.fx - camera.cx) + margin
         right = math.ceil(float(self._x.max()) * camera.fx + camera.cx) + 1 - camera.width + margin
         top = math.ceil(-float(self._y.min()) * camera.fy - camera.cy) + margin
@@ -92,7 +93,7 @@ class Lens:
         width, height = left + camera.width + right, top + camera.height + bottom
         if width > MAX_GROWTH * camera.width or height > MAX_GROWTH * camera.height:
             raise ValueError(
-                f"the distortion {camera.distortion} bends the picture's edges out to a pinhole picture of "
+                f"the distortion {camera.distortion} needs a pinhole image of "
                 f"{width}x{height}, more than {MAX_GROWTH} times {camera.width}x{camera.height}; "
                 "use weaker coefficients or a longer focal length"
             )
@@ -106,11 +107,11 @@ class Lens:
     def expose(
         self, image: Image, inverse_depth: Plane, labels: NDArray[np.int32], motion: CameraMotion
     ) -> tuple[Image, Plane, NDArray[np.int32], NDArray[np.bool_]]:
-        """The camera's picture of a pinhole picture of the size `drawn`.
+        """The camera's image of a pinhole image of the size `drawn`.
 
         Returns:
             The image (H, W, 3); the reciprocal depth and the labels (H, W) at the middle of each row's
-            exposure, of the nearest pixel; and which pixels of the pinhole picture were seen.
+            exposure, of the nearest pixel; and the mask of the pinhole image's visible pixels.
         """
         shutter = self.shutter
         index, seen, (map_x, map_y) = self._still_index, self._still_seen, self._still_map
@@ -123,7 +124,7 @@ class Lens:
                 seen = self._seen(index)
             if shutter.exposure_s > 0.0:
                 times = self._exposures(motion, still_inverse)
-        # OpenCV 5.0 looks up four channels in half the time of three; 4.10 takes as long as with three.
+        # OpenCV 5.0 remaps four channels in half the time of three; 4.10 takes as long as with three.
         four = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2BGRA), np.uint8)
         if len(times) == 1:
             exposed = _look_up(four, map_x, map_y)
@@ -136,20 +137,20 @@ class Lens:
         return exposed, inverse_depth.reshape(-1).take(index), labels.reshape(-1).take(index), seen
 
     def _seen(self, index: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Which pixels of the pinhole picture the camera looks at."""
+        """The mask of the pinhole image's pixels that the camera sees."""
         seen = np.zeros((self.drawn.height, self.drawn.width), np.uint8)
         seen.reshape(-1)[index] = 1
-        # A pixel of the camera may cover several of the pinhole picture.
+        # A pixel of the camera may cover several of the pinhole image.
         return np.asarray(cv2.dilate(seen, np.ones((3, 3), np.uint8)), np.bool_)
 
     def _nearest(self, map_x: Plane, map_y: Plane) -> NDArray[np.intp]:
-        """(H, W) flat indices of the nearest pixels of the pinhole picture, at its rim if beyond it."""
+        """(H, W) flat indices of the nearest pixels of the pinhole image, at its border if beyond it."""
         columns = np.clip(np.rint(map_x), 0, self.drawn.width - 1).astype(np.intp)
         rows = np.clip(np.rint(map_y), 0, self.drawn.height - 1).astype(np.intp)
         return rows * self.drawn.width + columns
 
     def _moved(self, motion: CameraMotion, time_s: float, inverse_depth: Plane) -> tuple[Plane, Plane]:
-        """Where in the pinhole picture each pixel looks, `time_s` after the middle of its row's exposure."""
+        """The point in the pinhole image of each pixel, `time_s` after the middle of its row's exposure."""
         camera = self.camera
         height = camera.height
         row_times = time_s + self.shutter.readout_s * ((np.arange(height) + 0.5) / height - 0.5)
@@ -169,7 +170,7 @@ class Lens:
         return map_x, map_y
 
     def _exposures(self, motion: CameraMotion, inverse_depth: Plane) -> list[float]:
-        """Moments within the exposure, no farther apart than about a pixel and a half of motion."""
+        """Times within the exposure, at most about a pixel and a half of motion apart."""
         half = self.shutter.exposure_s / 2
         first, last = self._moved(motion, -half, inverse_depth), self._moved(motion, half, inverse_depth)
         step = (slice(None, None, 16), slice(None, None, 16))
@@ -207,7 +208,7 @@ def _undistorted(camera: CameraModel, pixels: NDArray[np.float64]) -> NDArray[np
     worst = float(np.abs(again - pixels).max()) if np.isfinite(again).all() else math.inf
     if not worst < _ROUND_TRIP_PX:
         raise ValueError(
-            f"the distortion {camera.distortion} folds the picture over itself within "
-            f"{camera.width}x{camera.height}: a pixel came back {worst:.1f} px away; use weaker coefficients"
+            f"the distortion {camera.distortion} is not invertible within {camera.width}x{camera.height}: "
+            f"the error of the inverse is {worst:.1f} px; use weaker coefficients"
         )
     return np.asarray(plane, np.float64)

@@ -1,7 +1,7 @@
 """Frames as Motion JPEG over HTTP (`multipart/x-mixed-replace`), for browsers, OpenCV, FFmpeg and VLC.
 
-Each frame is encoded once, and only while somebody listens. Every client has a thread that sends the newest
-picture when the last one has gone out, so a slow client sees fewer pictures and delays nobody.
+Each frame is encoded once, and only with a client. Every client has a thread that sends the newest image when
+the last one has been sent, so a slow client gets fewer images and delays no other.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ logger = logging.getLogger(__name__)
 BOUNDARY = "frame"
 MAX_CLIENTS = 16
 SEND_TIMEOUT_S = 5.0
-"""A client that takes nothing for this long is dropped."""
+"""A client that reads nothing for this long is dropped."""
 JPEG_QUALITY = 85
 
 
 class MjpegOutput:
-    """An HTTP server: `/` streams, `/snapshot.jpg` is one picture.
+    """An HTTP server: `/` streams, `/snapshot.jpg` is one image.
 
     Args:
-        host: address to listen on; "127.0.0.1" lets nobody else in.
-        port: 0 chooses a free one, see `port`.
+        host: address to listen on; "127.0.0.1" accepts only clients of this host.
+        port: 0 selects a free one, see `port`.
 
     Raises:
         OSError: the port is taken.
     """
 
     def __init__(self, host: str, port: int) -> None:
-        self._picture: bytes | None = None
+        self._jpeg: bytes | None = None
         self._stamp_ns = 0
         self._number = 0
         self._clients = 0
@@ -60,7 +60,7 @@ class MjpegOutput:
 
     @property
     def clients(self) -> int:
-        """How many are being served."""
+        """The number of clients."""
         return self._clients
 
     def write(self, frame: Frame) -> None:
@@ -81,14 +81,14 @@ class MjpegOutput:
     def _encode(self, frame: Frame) -> None:
         done, jpeg = cv2.imencode(".jpg", frame.image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         if not done:
-            logger.error("a frame of %dx%d could not be encoded as JPEG", frame.width, frame.height)
+            logger.error("cannot encode a frame of %dx%d as JPEG", frame.width, frame.height)
             return
         with self._changed:
-            self._picture, self._stamp_ns, self._number = jpeg.tobytes(), frame.captured_ns, self._number + 1
+            self._jpeg, self._stamp_ns, self._number = jpeg.tobytes(), frame.captured_ns, self._number + 1
             self._changed.notify_all()
 
     def enter(self) -> bool:
-        """Count a client in; False if there are too many."""
+        """Register a client; False if there are too many."""
         with self._changed:
             if self._clients >= MAX_CLIENTS:
                 return False
@@ -96,22 +96,22 @@ class MjpegOutput:
             return True
 
     def leave(self) -> None:
-        """Count a client out."""
+        """Unregister a client."""
         with self._changed:
             self._clients -= 1
 
     def after(self, number: int) -> tuple[bytes, int, int] | None:
-        """(picture, stamp in ns, number) of the first picture newer than a number; None when closed."""
+        """(image, stamp in ns, number) of the first image newer than a number; None when closed."""
         with self._changed:
-            while not self._closed and (self._picture is None or self._number <= number):
+            while not self._closed and (self._jpeg is None or self._number <= number):
                 self._changed.wait()
-            if self._closed or self._picture is None:
+            if self._closed or self._jpeg is None:
                 return None
-            return self._picture, self._stamp_ns, self._number
+            return self._jpeg, self._stamp_ns, self._number
 
     @property
     def number(self) -> int:
-        """How many pictures have been encoded."""
+        """How many images have been encoded."""
         return self._number
 
 
@@ -129,7 +129,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         if self.path not in ("/", "/stream", "/stream.mjpg", "/snapshot.jpg"):
-            self.send_error(HTTPStatus.NOT_FOUND, "the stream is at /, one picture at /snapshot.jpg")
+            self.send_error(HTTPStatus.NOT_FOUND, "the stream is at /, one image at /snapshot.jpg")
             return
         if not self.source.enter():
             self.send_error(HTTPStatus.SERVICE_UNAVAILABLE, f"{MAX_CLIENTS} clients are served already")
@@ -146,16 +146,16 @@ class _Handler(BaseHTTPRequestHandler):
             self.close_connection = True
 
     def _snapshot(self) -> None:
-        picture = self.source.after(self.source.number)
-        if picture is None:
+        entry = self.source.after(self.source.number)
+        if entry is None:
             self.send_error(HTTPStatus.SERVICE_UNAVAILABLE, "the camera has closed")
             return
         self.send_response(HTTPStatus.OK)
         self.send_header("Content-Type", "image/jpeg")
-        self.send_header("Content-Length", str(len(picture[0])))
-        self.send_header("X-Captured-Ns", str(picture[1]))
+        self.send_header("Content-Length", str(len(entry[0])))
+        self.send_header("X-Captured-Ns", str(entry[1]))
         self.end_headers()
-        self.wfile.write(picture[0])
+        self.wfile.write(entry[0])
 
     def _stream(self) -> None:
         # Little is kept in the kernel for a client: what waits there is old.
@@ -165,8 +165,8 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Cache-Control", "no-store")
         self.end_headers()
         number = self.source.number
-        while (picture := self.source.after(number)) is not None:
-            jpeg, stamp_ns, number = picture
+        while (entry := self.source.after(number)) is not None:
+            jpeg, stamp_ns, number = entry
             head = (
                 f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n"
                 f"X-Captured-Ns: {stamp_ns}\r\n\r\n"

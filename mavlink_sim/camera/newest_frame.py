@@ -25,14 +25,14 @@ class NewestFrame:
         self._thread.start()
 
     def put(self, frame: Frame) -> None:
-        """Hand a frame over; never waits."""
+        """Pass a frame; never blocks."""
         with self._changed:
             self.dropped += self._frame is not None
             self._frame = frame
             self._changed.notify()
 
     def close(self, timeout_s: float = 2.0) -> None:
-        """End the thread after the frame in hand."""
+        """End the thread after the current frame."""
         with self._changed:
             self._closed = True
             self._changed.notify()

@@ -1,8 +1,8 @@
-"""One object as a camera sees it: which face covers each pixel, how far it is, and what colours they have.
+"""One object in a camera: the face, the depth and the colour at each pixel.
 
 Faces are painted as numbers, far to near, into a small image; depth then comes from a table by that number.
-The reciprocal of a plane's depth is linear in the pixel, so depth is exact at every pixel. What is seen in
-the end is coloured by `painting`, all objects at once.
+The reciprocal of a plane's depth is linear in the pixel, so depth is exact at every pixel. `painting` colours
+the visible pixels of all objects at once.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from vision.rotation import matrix_from_euler
 
 NEAR_M = 0.05
 FAR_PX = 30000.0
-"""Corners farther outside the image than this are pulled in: drawing needs bounded integers."""
+"""Corners farther outside the image than this are clipped: drawing needs bounded integers."""
 SUBPIXEL_BITS = 4
 FACE_BITS = 10
 """A label is the object's number << FACE_BITS | face; the first object's number is 1."""
@@ -34,10 +34,10 @@ FACE_BITS = 10
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sighting:
-    """Pixels that an object covers when nothing stands before it.
+    """Pixels of an object without occlusion.
 
     Attributes:
-        left, top, right, bottom: the part of the image it touches; right and bottom are past the end.
+        left, top, right, bottom: its part of the image; right and bottom are past the end.
         pixels: (N,) int64, flat indices into the image.
         faces: (N,) the face covering each.
         inverse_depth: (N,) float32.
@@ -68,7 +68,7 @@ class PlacedObject:
         self.ned_from_object = matrix_from_euler(item.roll_rad, item.pitch_rad, item.yaw_rad)
         self.origin = np.array(item.position_ned_m, np.float64)
         low, high = self.shape.low, self.shape.high
-        if item.leans:  # about its middle: one that lies on its back still lies on the ground, not in it
+        if item.leans:  # about its centre: one that lies on its back is on the ground, not below it
             pivot = np.array([0.0, 0.0, (low[2] + high[2]) / 2 * item.scale])
             self.origin += pivot - self.ned_from_object @ pivot
         self.middle = self.origin + self.ned_from_object @ ((low + high) / 2) * item.scale
@@ -79,7 +79,7 @@ class PlacedObject:
         self._shadow: tuple[NDArray[np.float64], list[int]] | None = None
 
     def moved(self, item: WorldObject) -> PlacedObject | None:
-        """The same thing at another place: what light and shadow it has stays. None if more has changed."""
+        """The same object at another position, with its light and shadow. None if more has changed."""
         if replace(self.item, position_ned_m=item.position_ned_m) != item:
             return None
         twin = copy.copy(self)
@@ -110,7 +110,7 @@ class PlacedObject:
         if self._shadow is None:
             turn, scale = self.ned_from_object, self.item.scale
             base = float(self.origin[2])
-            if self.item.leans:  # along NED's axes: those of the object do not lie on the ground
+            if self.item.leans:  # along the NED axes: those of the object are not horizontal
                 outlines, lowest = self.shape.leaning_shadow(self.sun, turn)
                 base += lowest * scale
                 turn = np.eye(3)
@@ -118,14 +118,14 @@ class PlacedObject:
                 outlines = self.shape.shadow(self.sun @ turn)
             flat = np.concatenate(outlines).astype(np.float64)
             turned = flat @ turn[:2, :2].T * scale + self.origin[:2]
-            if base < 0.0:  # in the air: its shadow falls farther from the sun
+            if base < 0.0:  # in the air: its shadow is farther from the sun
                 turned += self.sun[:2] * (base / max(-float(self.sun[2]), 0.05))
             first = np.cumsum([0] + [len(outline) for outline in outlines]).tolist()
             self._shadow = (np.column_stack([turned, np.zeros(len(turned))]), first)
         return self._shadow
 
     def draw(self, view: View) -> Sighting | None:
-        """What is seen of it from `view` with nothing before it, or None."""
+        """Its pixels from `view` without occlusion, or None."""
         shape, scale = self.shape, self.item.scale
         eye = (view.eye - self.origin) @ self.ned_from_object / scale
         turn = view.pixel_from_ned @ self.ned_from_object * scale
@@ -184,7 +184,7 @@ class PlacedObject:
     def printed_brightness(
         self, printed: Print, view: View, faces: NDArray[np.int64], x: Plane, y: Plane
     ) -> Plane:
-        """(N,) factors of pixels that see these faces of a plate: its print on one of them, 1 elsewhere."""
+        """(N,) factors of the pixels of these faces of a plate: its print on one of them, 1 elsewhere."""
         brightness = np.ones(len(faces), np.float32)
         front = np.flatnonzero((self.shape.normals @ printed_side(printed)).take(faces) > 0.9)
         eye = (view.eye - self.origin) @ self.ned_from_object / self.item.scale
@@ -193,7 +193,7 @@ class PlacedObject:
         return brightness
 
     def _view_colours(self, view: View, facing: NDArray[np.bool_]) -> Plane:
-        """(F, 3) faces' colours with what glossy ones mirror of the sky and the sun."""
+        """(F, 3) faces' colours with reflections of sky and sun on glossy ones."""
         glossy = np.flatnonzero(facing & (self.shape.gloss > 0.0))
         if not len(glossy):
             return self.lit
@@ -220,7 +220,7 @@ class PlacedObject:
 def within_view(
     placed: list[PlacedObject], middles: NDArray[np.float64], radii: NDArray[np.float64], view: View
 ) -> list[PlacedObject]:
-    """Those whose bounding sphere, (N, 3) and (N,) NED, is not certainly outside the image."""
+    """The objects whose bounding sphere, (N, 3) and (N,) NED, may be in the image."""
     if not placed:
         return []
     seen = (middles - view.eye) @ view.pixel_from_ned.T
@@ -237,7 +237,7 @@ def within_view(
 def _clipped(
     corners: Matrix, shape: Shape, facing: NDArray[np.bool_]
 ) -> tuple[Matrix, list[int], NDArray[np.bool_]]:
-    """Projected corners of the faces turned to the eye, cut off at the near plane."""
+    """Projected corners of the faces towards the eye, clipped at the near plane."""
     forward = np.array([0.0, 0.0, 1.0])
     pieces: list[Matrix] = []
     first = [0]

@@ -1,7 +1,7 @@
-"""Objects into a picture: first which of them is nearest at each pixel, then the colour of that one alone.
+"""Draw objects into an image: first the nearest one at each pixel, then only its colour.
 
-The many small objects of a picture cost calls, not pixels: so all pixels of all objects are coloured at once,
-by tables of what differs from object to object.
+For many small objects the calls cost more than the pixels: so all pixels of all objects are coloured at once,
+by tables of the properties of objects.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ _RIM_PX = 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Painted:
-    """The objects of a picture, in the order of their labels: the first one's number is 1.
+    """The objects of an image, in the order of their labels: the first one's number is 1.
 
     Attributes:
-        objects: each with what is seen of it if nothing stands before it.
+        objects: each with its pixels without occlusion.
         labels: (H, W) int32, number << FACE_BITS | face; 0 where there is none.
-        part: rows and columns of the picture with all of them and a rim, to index with.
+        part: rows and columns of the image with all of them and a rim, to index with.
     """
 
     objects: list[tuple[PlacedObject, Sighting]]
@@ -38,12 +38,12 @@ class Painted:
 
 
 def paint_objects(seen: list[PlacedObject], view: View, image: Image, inverse_depth: Plane) -> Painted:
-    """Draw objects where they are nearer than what is there.
+    """Draw objects where they are nearer than the present depth.
 
     Args:
-        seen: those that may be in view.
-        image: (H, W, 3) uint8 BGR, is drawn into.
-        inverse_depth: (H, W) float32, 1/m along the optical axis, 0 in the sky; is drawn into.
+        seen: the objects that may be in view.
+        image: (H, W, 3) uint8 BGR, modified.
+        inverse_depth: (H, W) float32, 1/m along the optical axis, 0 in the sky; modified.
     """
     labels = np.zeros((view.height, view.width), np.int32)
     objects: list[tuple[PlacedObject, Sighting]] = []
@@ -76,7 +76,7 @@ def _part(objects: list[tuple[PlacedObject, Sighting]], view: View) -> tuple[sli
 def _colour(painted: Painted, view: View, image: Image, inverse_depth: Plane) -> None:
     """Give every pixel with an object its face's colour, textured."""
     rows, columns = painted.part
-    # numpy looks through truths in an eighth of the time that numbers take
+    # numpy searches booleans in an eighth of the time of numbers
     where = np.flatnonzero(painted.labels[rows, columns] != 0)
     down, right = np.divmod(where, columns.stop - columns.start)
     down += rows.start

@@ -1,4 +1,4 @@
-"""Raw pictures into a FIFO or standard output."""
+"""Raw images into a FIFO or standard output."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _WAIT_MS = 200
 
 
 class PipeOutput:
-    """Raw bgr24 pictures, one after another, into a FIFO or standard output; whole ones only.
+    """Raw bgr24 images in sequence into a FIFO or standard output; only complete ones.
 
     Raises (when made):
         ValueError: the path is something other than a FIFO.
@@ -68,15 +68,15 @@ class PipeOutput:
         watch.register(self._descriptor, select.POLLOUT)
         while rest and not self._closed.is_set():
             if not watch.poll(_WAIT_MS):
-                continue  # the reader is slow; newer frames take the place of those waiting
+                continue  # the reader is slow; newer frames replace the waiting ones
             try:
                 rest = rest[os.write(self._descriptor, rest[: 1 << 16]) :]
             except BlockingIOError:
                 continue
             except BrokenPipeError:
-                logger.info("the reader of pipe:%s has gone", self.path)
+                logger.info("the reader of pipe:%s has closed it", self.path)
                 self._hang_up()
-                if self.path == "-":  # nobody can come back to it
+                if self.path == "-":  # no reader can reopen it
                     self._closed.set()
                 return
 
@@ -86,7 +86,7 @@ class PipeOutput:
         try:
             self._descriptor = os.open(self.path, os.O_WRONLY | os.O_NONBLOCK | os.O_CLOEXEC)
         except OSError as error:
-            if error.errno not in (errno.ENXIO, errno.ENOENT):  # no reader; the FIFO taken away
+            if error.errno not in (errno.ENXIO, errno.ENOENT):  # no reader, or the FIFO was removed
                 logger.error("pipe:%s cannot be opened: %s", self.path, error.strerror)
                 self._closed.set()
             return False

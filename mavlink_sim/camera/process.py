@@ -1,6 +1,6 @@
-"""The rendered camera in a process of its own: poses go in by a pipe, frames come out at its outputs.
+"""The rendered camera in its own process: poses arrive by a pipe, frames go to its outputs.
 
-The newest pose wins. The process ends when its pipe closes, so it never outlives the one that started it.
+The newest pose is used. The process ends when its pipe closes, so it never outlives the one that started it.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ logger = logging.getLogger(__name__)
 
 POSE = struct.Struct("=3d4dqd3dq")
 """Position NED in metres, quaternion (w, x, y, z) of `ned_from_body`, CLOCK_MONOTONIC nanoseconds, the
-scene's time in seconds, the camera's roll, pitch, yaw on the body (not numbers: as it is mounted), and the
+scene's time in seconds, the camera's roll, pitch, yaw on the body (NaN: as mounted), and the
 number of the other aircraft's poses (-1: there are none)."""
 OUTPUT_FAILED = 2
 """Exit code of the process: one of its outputs could not be opened."""
 EARLY_SHARE = 0.3
-"""A pose that comes this share of a period early is drawn at once: the poses' own rhythm jitters."""
+"""A pose that arrives early by up to this share of a period is drawn at once, to allow for jitter."""
 
 
 def run_camera(
@@ -60,22 +60,24 @@ def run_camera(
     written: Event | None = None,
     on_gimbal: bool = False,
 ) -> None:
-    """Draw a frame for the newest pose, at most `rate_hz` times a second, until `poses` closes.
+    """Draw a frame for the newest pose, at most `rate_hz` times per second, until `poses` closes.
 
-    The frames' `captured_ns` is the stamp of the pose that they were drawn from. The outputs open when the
-    ground has been painted and the first frame can be drawn without delay. `shared_poses` holds the poses of
-    the other aircraft; None if there are none. `written` is set when the first frame is at its outputs.
-    `on_gimbal`: the poses say where the camera looks, and readers get the mount of a camera on a gimbal.
-    An output that cannot be opened is one line on standard error and exit code 2.
+    The frames' `captured_ns` is the stamp of their pose. The outputs open when the ground has been prepared
+    and the first frame can be drawn without delay. `shared_poses` has the poses of the other aircraft; None
+    if there are none. `written` is set when the first frame is at its outputs. `on_gimbal`: the poses include
+    the camera's angles, and readers get the mount of a camera on a gimbal. An output that cannot be opened is
+    one line on standard error and exit code 2.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the starting process stops this one, by the pipe
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # or by this: painting does not look at the pipe
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # or by this: rendering does not read the pipe
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     cv2.setNumThreads(1)
     model, mount = scene.camera.model, scene.camera.mount
     SimulatedCamera(scene).capture((0.0, 0.0, -2.0), np.eye(3), 0)
     camera = SimulatedCamera(scene)
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # from here on outputs have to be closed: the pipe it is
+    signal.signal(
+        signal.SIGTERM, signal.SIG_IGN
+    )  # from here on outputs have to be closed: end only by the pipe
     with ExitStack() as resources:
         level = replace(mount, roll_rad=0.0, pitch_rad=0.0, yaw_rad=0.0, on_gimbal=True)
         calibration = CameraCalibration(model, level if on_gimbal else mount)
@@ -97,7 +99,7 @@ def run_camera(
         on_the_way: deque[Captured] = deque()
 
         def deliver() -> float | None:
-            """Hand on what has arrived; seconds until the next arrival, None if nothing is on the way."""
+            """Output the frames that are due; returns seconds until the next one, None if none is pending."""
             while on_the_way and on_the_way[0].arrives_ns <= time.monotonic_ns():
                 captured = on_the_way.popleft()
                 for sink in sinks:
@@ -129,15 +131,15 @@ def run_camera(
             if shared_poses is not None and number >= 0:
                 others = shared_poses.read(number)
             if others is None:
-                continue  # so old that they were written over: a newer pose is on its way
+                continue  # so old that they were overwritten: a newer pose follows
             due_s = max(due_s + period_s, time.monotonic())
             turned = mount
             if not math.isnan(roll):
                 turned = replace(mount, roll_rad=roll, pitch_rad=pitch, yaw_rad=yaw)
             attitude = matrix_from_quaternion((values[3], values[4], values[5], values[6]))
-            taken = camera.capture(values[:3], attitude, int(stamp_ns), time_s, turned, others=others)
-            if taken is not None:
-                on_the_way.append(taken)
+            frame = camera.capture(values[:3], attitude, int(stamp_ns), time_s, turned, others=others)
+            if frame is not None:
+                on_the_way.append(frame)
 
 
 def _newest(poses: Connection, timeout_s: float | None) -> bytes | None:
@@ -157,16 +159,16 @@ class CameraProcess:
     """Starts, feeds and stops the camera's process.
 
     Args:
-        world: what is seen; a scene brings its own camera, and `camera` and `mount` are not looked at.
-        rate_hz: frames a second at most.
+        world: the world; a scene has its own camera, and `camera` and `mount` are ignored then.
+        rate_hz: frames per second at most.
         shared_name: of the shared memory for colour and depth; None for none.
         outputs: further addresses of `video_outputs`.
-        truth: a file for what is really in each frame, a line of JSON each.
-        most_others: how many other aircraft there can be to see.
-        on_gimbal: every pose comes with the camera's angles (`camera_rpy_rad`).
+        truth: a file for the objects in each frame, one JSON object per line.
+        most_others: greatest number of other aircraft.
+        on_gimbal: every pose includes the camera's angles (`camera_rpy_rad`).
 
     Raises:
-        ValueError: a rate or an address that cannot be, or no output at all.
+        ValueError: an invalid rate or address, or no output at all.
     """
 
     def __init__(
@@ -191,7 +193,7 @@ class CameraProcess:
             check_output(address)
         context = multiprocessing.get_context("spawn")
         self._receiving, self._sending = context.Pipe(duplex=False)
-        # A camera that hangs must not hang the vehicle: a full pipe drops the pose instead.
+        # A camera that hangs must not block the vehicle: with a full pipe the pose is dropped.
         os.set_blocking(self._sending.fileno(), False)
         self._ready, self._written = context.Event(), context.Event()
         self._shared_poses = SharedPoses(context, most_others) if most_others > 0 else None
@@ -216,8 +218,8 @@ class CameraProcess:
         self.dropped_poses = 0
 
     def start(self) -> None:
-        """Start the process; returns at once. Its first frame comes when the ground is painted (seconds)."""
-        # Ctrl-C reaches every process of a terminal; the new one must not complain before it can ignore that
+        """Start the process; does not wait. The first frame follows when the ground is prepared (seconds)."""
+        # Ctrl-C reaches every process of a terminal; it is blocked until the new one ignores it
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             self._process.start()
@@ -242,7 +244,7 @@ class CameraProcess:
 
     @property
     def exit_code(self) -> int | None:
-        """Of the process; None while it runs. `OUTPUT_FAILED`: it said which output cannot be opened."""
+        """Of the process; None while it runs. `OUTPUT_FAILED`: an output could not be opened."""
         return self._process.exitcode
 
     @property
@@ -259,14 +261,14 @@ class CameraProcess:
         camera_rpy_rad: tuple[float, float, float] | None = None,
         others: Sequence[Aircraft] = (),
     ) -> None:
-        """Hand over the vehicle's pose, and those of the others that can be seen; never blocks.
+        """Send the vehicle's pose, and those of the other aircraft; never blocks.
 
         Args:
             quaternion: (w, x, y, z) of `ned_from_body`.
-            stamp_ns: CLOCK_MONOTONIC when the vehicle was there.
+            stamp_ns: CLOCK_MONOTONIC of the pose.
             time_s: the scene's time, which moves its objects; by default the stamp in seconds.
             camera_rpy_rad: a gimbal's roll, pitch, yaw from the body; None leaves the camera as mounted.
-            others: the other aircraft at the moment of the stamp.
+            others: the other aircraft at the time of the stamp.
 
         Raises:
             ValueError: there are more others than `most_others`.
@@ -291,7 +293,7 @@ class CameraProcess:
         except BlockingIOError:
             self.dropped_poses += 1
             if self.dropped_poses == 1:
-                logger.warning("the camera process takes no poses; dropping them")
+                logger.warning("the camera process reads no poses; dropping them")
         except OSError:
             self.dropped_poses += 1
             if self.dropped_poses == 1:
@@ -312,4 +314,4 @@ class CameraProcess:
             self._process.kill()
             self._process.join()
         if self.shared_name is not None:
-            remove_leavings(self.shared_name)  # of one that was killed: they are memory
+            remove_leavings(self.shared_name)  # of a killed process: they use memory

@@ -1,7 +1,7 @@
-"""The camera's picture of a world, drawn in software: colour, depth, and what is seen of each object.
+"""Software rendering of a world: colour, depth, and the visible part of each object.
 
-Ground, then shadows, then objects against a depth buffer, then sky and haze. One call is one frame; nothing
-is kept between frames, so any pose can be drawn at any time.
+Ground, then shadows, then objects with a depth buffer, then sky and haze. One call is one frame; no state is
+kept between frames, so any pose can be drawn at any time.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ DEFAULT_CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(70.0))
 DEFAULT_MOUNT = CameraMount(forward_m=0.12, pitch_rad=math.radians(-20.0))
 
 LOWEST_EYE_M = 0.05
-"""A landed vehicle's camera would touch the ground; the picture is taken from no lower than this."""
+"""Least height of the camera: a landed vehicle's camera would touch the ground."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VisibleObject:
-    """What is seen of one object.
+    """The visible part of one object.
 
     Attributes:
         world_object: the object.
         xyxy: edges of the box around its visible pixels: left, top, and right, bottom past the last pixel.
-        visible_fraction: visible pixels against all that it would cover if nothing stood before it and the
-            image were larger, 0..1.
+        visible_fraction: visible pixels relative to those without occlusion and beyond the image's edges,
+        0..1.
         pixel_count: number of visible pixels.
         range_m: horizontal metres from the camera to its footprint.
     """
@@ -58,7 +58,7 @@ class Rendered:
     Attributes:
         image: (H, W, 3) uint8 BGR.
         depth_m: (H, W) float32 along the optical axis, NaN in the sky and beyond 10 km.
-        objects: those of which at least one pixel is seen, in the world's order.
+        objects: those with at least one visible pixel, in the world's order.
         eye_ned_m: (3,) the optical centre, NED.
     """
 
@@ -83,10 +83,10 @@ _STILL = CameraMotion()
 class Renderer:
     """Draws one world through one camera; `rng` draws the sensor's noise if there are effects.
 
-    A camera with lens distortion or a shutter is drawn through `camera_lens`, which costs more; others are
-    drawn straight away.
+    A camera with lens distortion or a shutter is drawn through `lens`, which takes longer; others are drawn
+    directly.
 
-    Raises ValueError for a distortion that cannot be drawn, and for buffers of another size.
+    Raises ValueError for an unsupported distortion, and for buffers of another size.
     """
 
     def __init__(
@@ -106,7 +106,7 @@ class Renderer:
         self._buffers = buffers or Buffers(self._drawn.width, self._drawn.height)
         if (self._buffers.width, self._buffers.height) != (self._drawn.width, self._drawn.height):
             raise ValueError(
-                f"buffers must have the drawn picture's size {self._drawn.width}x{self._drawn.height}, "
+                f"buffers must have the drawn image's size {self._drawn.width}x{self._drawn.height}, "
                 f"got {self._buffers.width}x{self._buffers.height}"
             )
         self._placed = [PlacedObject(item, world.light, world.sky) for item in world.objects]
@@ -116,7 +116,7 @@ class Renderer:
         self._rng = rng or np.random.default_rng(0)
 
     def place(self, objects: Sequence[WorldObject]) -> None:
-        """Show these objects from now on; those that are the same values as before cost nothing."""
+        """Set the objects; unchanged ones are not prepared again."""
         known = {placed.item: placed for placed in self._placed}
         light, sky = self.world.light, self.world.sky
         if all(placed.item is item for placed, item in zip(self._placed, objects, strict=False)) and len(
@@ -146,7 +146,7 @@ class Renderer:
         """The frame seen when the body is at `position_ned_m` (3,) with attitude `ned_from_body` (3, 3).
 
         Args:
-            mount: where the camera looks now if it is on a gimbal; by default the renderer's own mount.
+            mount: the current one of a camera on a gimbal; by default the renderer's.
             motion: of the camera; only a camera with a shutter shows it.
         """
         view = self.view(position_ned_m, ned_from_body, mount)
@@ -186,7 +186,7 @@ class Renderer:
         ned_from_body: NDArray[np.float64],
         mount: CameraMount | None = None,
     ) -> View:
-        """The camera's pose for a body's pose, with matrices between the drawn picture's pixels and NED."""
+        """The camera's pose for a body's pose, with matrices between the drawn image's pixels and NED."""
         mount = mount or self.mount
         ned_from_optical = mount.ned_from_optical(ned_from_body)
         eye = np.asarray(position_ned_m, np.float64) + ned_from_body @ mount.position_frd_m
@@ -203,7 +203,7 @@ class Renderer:
 
 
 def _soften_edges(image: Image, painted: Painted) -> None:
-    """Blend pixels along the edges of faces with their neighbours, so that edges are not jagged."""
+    """Antialias: blend pixels along the edges of faces with their neighbours."""
     if not painted.objects:
         return
     part, label = image[painted.part], painted.labels[painted.part]
@@ -240,7 +240,7 @@ def _visible(
 
 
 def _found(exposed: NDArray[np.int32]) -> _Found:
-    """The pixels of an exposed picture in which there is any object."""
+    """The pixels of an exposed image with an object."""
     where = np.flatnonzero(exposed != 0)
     rows, columns = np.divmod(where, exposed.shape[1])
     return _Found(exposed.reshape(-1)[where] >> FACE_BITS, columns, rows)
@@ -255,7 +255,7 @@ def _visible_through_lens(
     inside: NDArray[np.bool_],
     view: View,
 ) -> VisibleObject | None:
-    """The box in the exposed picture; the fraction in the drawn one, where a pixel is a pixel everywhere."""
+    """The box in the exposed image; the fraction in the drawn one, where all pixels have the same size."""
     own = found.numbers == number
     columns, rows = found.columns[own], found.rows[own]
     if not len(rows):

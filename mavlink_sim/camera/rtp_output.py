@@ -1,8 +1,8 @@
 """Frames as H.264 in RTP over UDP (RFC 6184), as PX4's Gazebo camera sends them to QGroundControl on 5600.
 
 The encoder is the one in PyAV (`pip install mavlink-companion[rtp]`): baseline-like, no reordering, a key
-frame with its parameter sets every second, so that a reader can come at any time. Nothing is sent back and
-no description of the stream is served: a reader is told "H.264, payload type 96, 90 kHz".
+frame with its parameter sets every second, so that a reader can start at any time. There is no session
+description: configure the reader for "H.264, payload type 96, 90 kHz".
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class RtpOutput:
     """Sends to one host and port, which may be a multicast group.
 
     Raises (when made):
-        ValueError: a size that H.264 with halved colour cannot have.
+        ValueError: a size that H.264 with subsampled colour does not support.
         ModuleNotFoundError: PyAV is not installed, or it has no H.264 encoder.
     """
 
@@ -74,16 +74,16 @@ class RtpOutput:
             self._first_ns = frame.captured_ns
         pts = (frame.captured_ns - self._first_ns) * CLOCK_HZ // 1_000_000_000
         if pts <= self._last_pts:
-            return  # a stamp that does not go forward cannot be said in RTP
+            return  # RTP needs increasing stamps
         self._last_pts = pts
-        picture = self._av.VideoFrame.from_ndarray(frame.image, format="bgr24").reformat(format="yuv420p")
-        picture.pts, picture.time_base = pts, Fraction(1, CLOCK_HZ)
+        image = self._av.VideoFrame.from_ndarray(frame.image, format="bgr24").reformat(format="yuv420p")
+        image.pts, image.time_base = pts, Fraction(1, CLOCK_HZ)
         try:
-            for packet in self._stream.encode(picture):
+            for packet in self._stream.encode(image):
                 self._container.mux(packet)
-        except OSError as error:  # nobody listens on a port of this host, or the network is away
+        except OSError as error:  # no listener on a port of this host, or the network is down
             if not self._failed:
-                logger.warning("sending RTP failed: %s; trying on with every frame", error)
+                logger.warning("sending RTP failed: %s; retrying with every frame", error)
             self._failed = True
         else:
             self._failed = False

@@ -1,6 +1,6 @@
-"""A scene: a world, what moves in it along which path, and the camera that looks at it.
+"""A scene: a world, the paths of its moving objects, and the camera.
 
-Small plain data, as `world` is: it crosses to the camera's process whole.
+Small plain data, as `world`: it is pickled to the camera's process.
 """
 
 from __future__ import annotations
@@ -17,35 +17,36 @@ from mavlink_sim.camera.depth_camera import DepthSensor
 from mavlink_sim.camera.image_effects import MILD_EFFECTS, ImageEffects
 from mavlink_sim.camera.lens import Shutter
 from mavlink_sim.camera.renderer import DEFAULT_CAMERA, DEFAULT_MOUNT
-from mavlink_sim.world.obstacles import Way
+from mavlink_sim.world.obstacles import ObstacleMotion
 from mavlink_sim.world.world import Vector, World, WorldObject
 from vision.camera_model import CameraModel, CameraMount
 
 Repeat = Literal["loop", "back_and_forth", "once"]
 
 
-class Motion(Way, Protocol):
-    """How an object of a scene moves; `Path` is one."""
+class Motion(ObstacleMotion, Protocol):
+    """The motion of an object; `Path` is one."""
 
     @property
     def period_s(self) -> float:
-        """After this time it has been everywhere it goes."""
+        """The time after which it has covered its whole path."""
 
 
 @dataclass(frozen=True)
 class Path:
-    """A way through waypoints at a constant speed.
+    """A path through waypoints at a constant speed.
 
     Attributes:
-        waypoints_ned_m: two or more places.
+        waypoints_ned_m: two or more positions.
         speed_mps: along the straight legs between them.
-        repeat: "loop" goes from the last waypoint to the first again; "back_and_forth" returns the way it
-            came; "once" stays at the last one.
-        start_s: how far along, in seconds, it is at time 0.
-        fixed_yaw_rad: the heading; None looks along the way, and keeps the last heading on a vertical leg.
+        repeat: "loop" continues from the last waypoint to the first; "back_and_forth" reverses; "once" stays
+        at
+            the last one.
+        start_s: the offset along the path at time 0, in seconds.
+        fixed_yaw_rad: the heading; None: along the path, and the last heading on a vertical leg.
 
     Raises:
-        ValueError: fewer than two waypoints, all in one place, or a speed that is not positive.
+        ValueError: fewer than two waypoints, all identical, or a speed that is not positive.
     """
 
     waypoints_ned_m: tuple[Vector, ...]
@@ -60,21 +61,21 @@ class Path:
         if len(self.waypoints_ned_m) < 2:
             raise ValueError(f"a path needs two waypoints or more, got {len(self.waypoints_ned_m)}")
         if not self._marks[-1] > 0.0:
-            raise ValueError("a path's waypoints all lie in one place; give the object a place without path")
+            raise ValueError("a path's waypoints are all identical; use place_m without a path")
 
     @cached_property
-    def _places(self) -> tuple[Vector, ...]:
+    def _waypoints(self) -> tuple[Vector, ...]:
         closed = self.waypoints_ned_m[:1] if self.repeat == "loop" else ()
         return self.waypoints_ned_m + closed
 
     @cached_property
     def _marks(self) -> list[float]:
-        """Metres along the way at which each place is reached."""
-        return list(accumulate((math.dist(a, b) for a, b in pairwise(self._places)), initial=0.0))
+        """Distance along the path of each waypoint, metres."""
+        return list(accumulate((math.dist(a, b) for a, b in pairwise(self._waypoints)), initial=0.0))
 
     @property
     def period_s(self) -> float:
-        """Time for one round, or there and back, or the whole way once."""
+        """Time for one loop, or there and back, or the whole path once."""
         return self._marks[-1] / self.speed_mps * (2.0 if self.repeat == "back_and_forth" else 1.0)
 
     def pose_at(self, time_s: float) -> tuple[Vector, float]:
@@ -90,21 +91,21 @@ class Path:
                 along, forth = 2.0 * length - along, False
         else:
             along = min(max(along, 0.0), length)
-        leg = min(max(bisect.bisect_right(self._marks, along) - 1, 0), len(self._places) - 2)
-        start, end = self._places[leg], self._places[leg + 1]
+        leg = min(max(bisect.bisect_right(self._marks, along) - 1, 0), len(self._waypoints) - 2)
+        start, end = self._waypoints[leg], self._waypoints[leg + 1]
         span = self._marks[leg + 1] - self._marks[leg]
         share = (along - self._marks[leg]) / span if span > 0.0 else 0.0
-        place = tuple(a + (b - a) * share for a, b in zip(start, end, strict=True))
-        return (place[0], place[1], place[2]), self._heading(leg, forth)
+        position = tuple(a + (b - a) * share for a, b in zip(start, end, strict=True))
+        return (position[0], position[1], position[2]), self._heading(leg, forth)
 
     def _heading(self, leg: int, forth: bool) -> float:
         if self.fixed_yaw_rad is not None:
             return self.fixed_yaw_rad
-        count = len(self._places) - 1
-        # Legs that lead nowhere on the map take the heading of the one before.
+        count = len(self._waypoints) - 1
+        # Vertical legs keep the heading of the one before.
         for back in range(count):
             index = (leg - back) % count if forth else (leg + back) % count
-            start, end = self._places[index], self._places[index + 1]
+            start, end = self._waypoints[index], self._waypoints[index + 1]
             north, east = end[0] - start[0], end[1] - start[1]
             if math.hypot(north, east) > 1e-9:
                 return math.atan2(east, north) if forth else math.atan2(-east, -north)
@@ -117,12 +118,12 @@ class CameraSettings:
 
     Attributes:
         model: size, intrinsics, distortion.
-        mount: where it sits and looks; on a gimbal, where it looks until told otherwise.
-        rate_hz: frames a second.
-        shutter: rolling shutter and exposure; None for an instant of all rows at once.
-        effects: what lens and sensor do to colours; None: nothing.
+        mount: its position and attitude on the body; on a gimbal, the initial attitude.
+        rate_hz: frames per second.
+        shutter: rolling shutter and exposure; None for an instantaneous image.
+        effects: of lens and sensor on colours; None: none.
         depth: the depth camera; None for true depth.
-        loss: share of frames that never arrive, 0..1.
+        loss: share of lost frames, 0..1.
         latency_s: from a frame's capture to its arrival.
         seed: of noise, dropouts and losses.
     """
@@ -148,7 +149,7 @@ class CameraSettings:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """A world at time 0, the paths of what moves (by the object's identifier), and the camera."""
+    """A world at time 0, the paths of moving objects (by identifier), and the camera."""
 
     world: World
     paths: Mapping[int, Motion] = field(default_factory=dict)
@@ -158,10 +159,10 @@ class Scene:
     def __post_init__(self) -> None:
         unknown = set(self.paths) - {item.identifier for item in self.world.objects}
         if unknown:
-            raise ValueError(f"paths for objects that the scene has not: {sorted(unknown)}")
+            raise ValueError(f"paths for objects that are not in the scene: {sorted(unknown)}")
 
     def objects_at(self, time_s: float) -> tuple[WorldObject, ...]:
-        """All objects, those with a path where it has led them at a time, in the world's order."""
+        """All objects at a time, those with a path moved along it, in the world's order."""
         if not self.paths:
             return self.world.objects
         return tuple(_moved(item, self.paths.get(item.identifier), time_s) for item in self.world.objects)

@@ -1,6 +1,6 @@
 """Scene files: TOML in, a checked `Scene` out. `docs/scenes.md` describes every key.
 
-Angles in the file are degrees, compass-wise from north; places are [north, east, down] in metres, where
+Angles in the file are degrees, clockwise from north; positions are [north, east, down] in metres, where
 `down` is negative above the ground and may be left out.
 """
 
@@ -38,7 +38,7 @@ from vision.camera_model import CameraModel, CameraMount
 
 
 class SceneError(ValueError):
-    """A scene file cannot be used; the text names the file and, a line each, what is wrong in it."""
+    """A scene file cannot be used; the text names the file and, one per line, its problems."""
 
 
 class _Table(BaseModel):
@@ -61,7 +61,9 @@ def _one_of(names: Iterable[str]) -> AfterValidator:
 Kind = Annotated[str, _one_of(KINDS)]
 ClassName = Annotated[str, _one_of(name for name in OBJECT_NAMES if name != "plate")]
 Number = Annotated[float, Field(strict=False)]
-Place = Annotated[list[Annotated[Number, Field(ge=-10_000, le=10_000)]], Field(min_length=2, max_length=3)]
+Coordinates = Annotated[
+    list[Annotated[Number, Field(ge=-10_000, le=10_000)]], Field(min_length=2, max_length=3)
+]
 Share = Annotated[Number, Field(ge=0, le=1)]
 Degrees = Annotated[Number, Field(ge=-360, le=360)]
 Positive = Annotated[Number, Field(gt=0, le=100_000)]
@@ -76,7 +78,7 @@ Seed = Annotated[int, Field(ge=0, le=2**31 - 1)]
 
 class _Patch(_Table):
     kind: Kind
-    place_m: Place
+    place_m: Coordinates
     radius_m: Positive
 
 
@@ -109,7 +111,7 @@ class _Sky(_Table):
 
 
 class _Path(_Table):
-    waypoints_m: Annotated[list[Place], Field(min_length=2)]
+    waypoints_m: Annotated[list[Coordinates], Field(min_length=2)]
     speed_mps: Annotated[Number, Field(gt=0, le=100)]
     repeat: Literal["loop", "back_and_forth", "once"] = "loop"
     start_s: Annotated[Number, Field(ge=0, le=1e6)] = 0.0
@@ -118,7 +120,7 @@ class _Path(_Table):
 
 class _Object(_Table):
     class_name: Annotated[ClassName, Field(alias="class")]
-    place_m: Place | None = None
+    place_m: Coordinates | None = None
     yaw_deg: Degrees = 0.0
     scale: Annotated[Number, Field(gt=0.05, le=20)] = 1.0
     appearance: Seed = 0
@@ -130,7 +132,7 @@ class _Plate(_Table):
     dictionary: Annotated[str, _one_of(DICTIONARIES)] = "4X4_50"
     id: Annotated[int, Field(ge=0)]
     size_m: Annotated[Number, Field(ge=0.01, le=50)]
-    place_m: Place | None = None
+    place_m: Coordinates | None = None
     yaw_deg: Degrees = 0.0
     standing: bool = False
     path: _Path | None = None
@@ -196,7 +198,7 @@ class _File(_Table):
 
 
 def example_scenes() -> tuple[str, ...]:
-    """Names of the scenes that come with the package; `load_scene` takes them in place of a file."""
+    """Names of the scenes in the package; `load_scene` accepts them instead of a file."""
     folder = resources.files("mavlink_sim") / "scenes"
     return tuple(
         sorted(item.name.removesuffix(".toml") for item in folder.iterdir() if item.name.endswith(".toml"))
@@ -207,7 +209,7 @@ def load_scene(file: str | FilePath) -> Scene:
     """The scene of a file, or one of `example_scenes` by its name.
 
     Raises:
-        SceneError: there is no such file, it is not TOML, or what it says cannot be; every problem is named.
+        SceneError: there is no such file, it is not TOML, or it has invalid values; every problem is named.
     """
     path = FilePath(file)
     if str(file) in example_scenes():
@@ -220,7 +222,7 @@ def load_scene(file: str | FilePath) -> Scene:
     except OSError as error:
         known = ", ".join(example_scenes())
         raise SceneError(
-            f"cannot read the scene file {path}: {error.strerror}; scenes that need no file are: {known}"
+            f"cannot read the scene file {path}: {error.strerror}; scenes in the package: {known}"
         ) from error
     return parse_scene(text, str(path))
 
@@ -231,7 +233,7 @@ def scene_or_demo(file: str | FilePath | None, seed: int) -> Scene:
 
 
 def parse_scene(text: str, origin: str = "scene") -> Scene:
-    """The scene that a text describes; `origin` names it in messages. Raises SceneError."""
+    """The scene of a text; `origin` names it in messages. Raises SceneError."""
     try:
         content = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -245,7 +247,7 @@ def parse_scene(text: str, origin: str = "scene") -> Scene:
 
 
 class _Builder:
-    """Makes the plain values out of a checked file, and names the key for what only they can check."""
+    """Builds the values of a checked file, and adds the key to their errors."""
 
     def __init__(self, origin: str) -> None:
         self._origin = origin
@@ -274,12 +276,12 @@ class _Builder:
         if (item.place_m is None) == (item.path is None):
             got = "both" if item.path is not None else "neither"
             raise self._fail(key, f"must have either place_m = [north, east] or a path, got {got}")
-        position: Vector = (0.0, 0.0, 0.0) if item.place_m is None else _place(item.place_m)
+        position: Vector = (0.0, 0.0, 0.0) if item.place_m is None else _position(item.place_m)
         yaw = math.radians(item.yaw_deg)
         try:
             if item.path is not None:
                 path = Path(
-                    tuple(_place(place) for place in item.path.waypoints_m),
+                    tuple(_position(waypoint) for waypoint in item.path.waypoints_m),
                     item.path.speed_mps,
                     item.path.repeat,
                     item.path.start_s,
@@ -288,15 +290,15 @@ class _Builder:
                 self._paths[identifier] = path
                 position, yaw = path.pose_at(0.0)
             if isinstance(item, _Plate):
-                thing = WorldObject(identifier, "plate", position, yaw, printed=printed)
+                scene_object = WorldObject(identifier, "plate", position, yaw, printed=printed)
             else:
                 size = None if item.size_m is None else (item.size_m[0], item.size_m[1], item.size_m[2])
-                thing = WorldObject(
+                scene_object = WorldObject(
                     identifier, item.class_name, position, yaw, item.scale, item.appearance, size
                 )
         except ValueError as error:
             raise self._fail(key, error) from error
-        self._objects.append(thing)
+        self._objects.append(scene_object)
 
     def _camera(self, table: _Camera) -> CameraSettings:
         if table.horizontal_fov_deg is not None and table.focal_px is not None:
@@ -399,12 +401,12 @@ def _triple(values: list[float]) -> Vector:
     return (float(values[0]), float(values[1]), float(values[2]))
 
 
-def _place(values: list[float]) -> Vector:
+def _position(values: list[float]) -> Vector:
     return (float(values[0]), float(values[1]), float(values[2]) if len(values) == 3 else 0.0)
 
 
 def _explained(details: ErrorDetails) -> str:
-    """One problem in words: the key, what was expected, what was found."""
+    """The text of one problem: the key, what was expected, what was found."""
     key = ""
     for part in details["loc"]:
         key += f"[{part}]" if isinstance(part, int) else f".{part}" if key else str(part)
@@ -423,7 +425,7 @@ def _explained(details: ErrorDetails) -> str:
 
 
 def _keys_at(location: tuple[int | str, ...]) -> list[str]:
-    """The keys that the table at a place in the file may have."""
+    """The allowed keys of a table of the file."""
     table: Any = _File
     for part in location:
         if isinstance(part, str):

@@ -1,4 +1,4 @@
-"""The shadows of objects on the ground, as a camera sees them."""
+"""Rendering of the objects' shadows on the ground."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from mavlink_sim.world.depth_sort import clip_polygon
 from mavlink_sim.world.textures import Image
 
 MAX_SHADOW_SOLIDS_AT_PX = 14.0
-"""A shadow smaller than this is drawn as one outline, not one for each solid."""
+"""A shadow smaller than this is drawn as one outline, not as one per solid."""
 
 Outlines = tuple[NDArray[np.float64], list[int]]
-"""(P, 2) corners in pixels of convex outlines one after another, and where each begins and the last ends."""
+"""(P, 2) corners in pixels of all convex outlines, and the start of each and the end of the last."""
 
 
 class Shadows:
@@ -32,7 +32,7 @@ class Shadows:
         self._radii = np.array([radius_m for _, radius_m in spheres])
 
     def cast(self, view: View, darkness: float, image: Image) -> None:
-        """Darken the ground of `image` by `darkness`, 0..1, where an object keeps the sun off."""
+        """Darken the ground of `image` by `darkness`, 0..1, in the objects' shadows."""
         if darkness <= 0.0:
             return
         mask: Image | None = None
@@ -66,9 +66,9 @@ class Shadows:
 
 
 def _around(placed: PlacedObject) -> tuple[NDArray[np.float64], float]:
-    """Middle (3,) NED and radius in metres of a sphere around a shadow, without knowing its outlines.
+    """Centre (3,) NED and radius in metres of a sphere around a shadow, without its outlines.
 
-    The outlines of what moves have to be made for each frame: only for what may be in view.
+    The outlines of moving objects are computed for each frame, only for those that may be in view.
     """
     lean = placed.sun[:2] / max(-float(placed.sun[2]), 0.05)
     height_m = max(max(float(placed.origin[2]), 0.0) - float(placed.middle[2]), 0.0)
@@ -77,7 +77,7 @@ def _around(placed: PlacedObject) -> tuple[NDArray[np.float64], float]:
 
 
 def _in_view(placed: PlacedObject, view: View) -> Outlines | None:
-    """A shadow's outlines, cut at the near plane, one for all where it is small; None if out of view."""
+    """A shadow's outlines, clipped at the near plane, one for all where it is small; None if out of view."""
     corners, first = placed.shadow
     projected = (corners - view.eye) @ view.pixel_from_ned.T
     depth = projected[:, 2]

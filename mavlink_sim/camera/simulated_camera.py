@@ -1,4 +1,4 @@
-"""A scene seen through its camera: poses in, frames with their truth out. No process, no clock of its own."""
+"""The camera of a scene: poses in, frames with their truth out. No process, no clock."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from vision.camera_model import CameraMount
 from vision.frame import Frame
 
 LONGEST_GAP_S = 0.5
-"""Between two poses farther apart than this nothing is said about the motion."""
+"""The motion between two poses farther apart than this is unknown."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Captured:
-    """One frame and what is really in it.
+    """One frame and its truth.
 
     Attributes:
-        frame: as the camera delivers it.
-        rendered: what it was made of: the objects seen, with their boxes; true depth.
+        frame: as delivered by the camera.
+        rendered: the visible objects with their boxes; true depth.
         time_s: the scene's time.
-        arrives_ns: when it arrives, on the clock of its stamp: the stamp plus the camera's latency.
+        arrives_ns: arrival, on the clock of its stamp: the stamp plus the camera's latency.
     """
 
     frame: Frame
@@ -42,7 +42,7 @@ class Captured:
 class SimulatedCamera:
     """The camera of a scene; the same calls give the same frames.
 
-    `capture` is the in-process way to its frames; `camera_process` runs one in a process of its own.
+    `capture` returns its frames in-process; `process` runs one in its own process.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -73,16 +73,16 @@ class SimulatedCamera:
         motion: CameraMotion | None = None,
         others: Sequence[Aircraft] = (),
     ) -> Captured | None:
-        """The frame at a pose, or None if it is one of those that get lost.
+        """The frame at a pose, or None if it is lost.
 
         Args:
             position_ned_m: (3,) of the vehicle.
             ned_from_body: (3, 3) its attitude.
             stamp_ns: becomes the frame's `captured_ns`.
-            time_s: the scene's time, which says where moving objects are; by default the stamp in seconds.
-            mount: where a camera on a gimbal looks now.
-            motion: of the camera; by default what lies between this call's pose and the last one's.
-            others: the other aircraft as they are at that moment; this one does not see itself.
+            time_s: the scene's time, which positions moving objects; by default the stamp in seconds.
+            mount: the current one of a camera on a gimbal.
+            motion: of the camera; by default that between the last call's pose and this one's.
+            others: the other aircraft at that time; the own one is not visible.
         """
         settings = self.settings
         time_s = stamp_ns / 1e9 if time_s is None else time_s
@@ -129,10 +129,10 @@ def _motion_between(
 
 
 def frame_truth(captured: Captured) -> dict[str, Any]:
-    """What is really in a frame, as plain values for JSON; one entry for each object seen by a pixel or more.
+    """The truth of a frame, as plain values for JSON; one entry for each object with at least one pixel.
 
     `xyxy` are the box's edges in pixels, `range_m` is horizontal from the camera to the footprint,
-    `distance_m` straight from the camera to the object's place. `stamp_ns` and `sequence` are the frame's.
+    `distance_m` is from the camera to the object's position. `stamp_ns` and `sequence` are the frame's.
     """
     eye = captured.rendered.eye_ned_m
     objects = []

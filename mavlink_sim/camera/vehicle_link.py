@@ -1,4 +1,4 @@
-"""A link to an autopilot that is only listened to, but for requests of the messages that a pose needs."""
+"""A receive-only link to an autopilot, apart from requests for the messages of a pose."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from mavlink_sim.wire.endpoint import UdpEndpoint
 from mavlink_sim.wire.messages import Outgoing, dialect, parser
 
 REQUESTED_HZ = {"ATTITUDE_QUATERNION": 50.0, "LOCAL_POSITION_NED": 30.0}
-"""Asked for as PX4's onboard link has them anyway."""
+"""Requested rates: those of PX4's onboard link."""
 ENOUGH_HZ = 15.0
-"""A message that comes as often as this is not asked for."""
+"""A message with at least this rate is not requested."""
 REQUEST_PERIOD_S = 1.0
 CONNECT_S = 5.0
 
@@ -23,7 +23,7 @@ _ADDRESS = re.compile(r"(udpin|udpout|tcp)://([^/:\[\]\s]+):(\d{1,5})/?")
 
 
 class LinkError(ValueError):
-    """A link that cannot be used. The text is one line for a person."""
+    """A link cannot be used. The text is one line for the user."""
 
 
 class _Endpoint(Protocol):
@@ -69,28 +69,28 @@ class _TcpEndpoint:
         except BlockingIOError:
             pass  # requests are repeated every second
         except OSError:
-            self._closed = True  # a request may be lost; a connection that is gone ends the pose
+            self._closed = True  # a request may be lost; a closed connection ends the pose
 
     def close(self) -> None:
         self._socket.close()
 
 
 class AutopilotLink:
-    """What one autopilot sends, and requests for the messages that it does not send.
+    """Receives from one autopilot, and requests the messages that it does not send.
 
     The requests are SET_MESSAGE_INTERVAL, from the vehicle's own system id and MAV_COMP_ID_CAMERA. There are
-    no heartbeats: nobody takes this for a ground station or an onboard controller.
+    no heartbeats, so that it is not mistaken for a ground station or an onboard controller.
 
     Args:
         url: `udpin://HOST:PORT` binds, `udpout://HOST:PORT` sends first, `tcp://HOST:PORT` connects.
         listen_only: never send.
 
     Raises:
-        LinkError: no such address. OSError: the port is taken, or nobody listens there.
+        LinkError: an invalid address. OSError: the port is taken, or there is no listener.
 
     Attributes:
-        systems: of the autopilots that were heard, system id → armed.
-        system_id: of the one whose messages `receive` gives; None: it is not chosen yet.
+        systems: of the autopilots received, system id → armed.
+        system_id: of the one whose messages `receive` returns; None: not yet selected.
     """
 
     def __init__(self, url: str, listen_only: bool = False) -> None:
@@ -135,7 +135,9 @@ class AutopilotLink:
             if message.get_type() == "HEARTBEAT" and message.autopilot != dialect.MAV_AUTOPILOT_INVALID:
                 self.systems[system] = bool(message.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
             elif message.get_type() == "HIL_STATE_QUATERNION":
-                self.systems.setdefault(system, False)  # PX4's link for a simulator's viewer: no heartbeat
+                self.systems.setdefault(
+                    system, False
+                )  # PX4's link for a viewer of the simulator: no heartbeat
             if self.system_id in (None, system):
                 self._counts[message.get_type()] += 1
                 wanted.append(message)
@@ -143,7 +145,7 @@ class AutopilotLink:
         return wanted
 
     def _request(self) -> None:
-        """Once a second ask for each needed message that came too rarely in the second before."""
+        """Once per second request each needed message whose rate in the last second was too low."""
         now_s = time.monotonic()
         elapsed_s = now_s - self._request_s
         if self._listen_only or elapsed_s < REQUEST_PERIOD_S or not (self.systems or self._sends_first):

@@ -1,7 +1,7 @@
-"""The pose of a vehicle between its telemetry messages, by its own clock, and that clock on this host.
+"""The pose of a vehicle interpolated between its telemetry messages, by its clock, and that clock's offset.
 
-Attitude comes from ATTITUDE_QUATERNION, or from ATTITUDE where no quaternion comes; position from
-LOCAL_POSITION_NED. A simulator's own truth, HIL_STATE_QUATERNION, takes the place of both where it is sent.
+Attitude is from ATTITUDE_QUATERNION, or from ATTITUDE without a quaternion; position from LOCAL_POSITION_NED.
+A simulator's truth, HIL_STATE_QUATERNION, replaces both where it is sent.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ Vector = tuple[float, float, float]
 KEPT_S = 3.0
 """Poses older than this are dropped."""
 RESTART_S = 1.0
-"""A clock that goes back by more than this is that of a vehicle that has restarted."""
+"""A clock that goes back by more than this indicates a restart of the vehicle."""
 CLOCK_WINDOW_S = 2.0
-"""The smallest delay of the last one to two of these windows counts: long enough to contain a message that
-was not held up, short enough to follow a simulation that runs a little slower than real time."""
+"""The smallest delay of the last one to two of these windows is used: long enough to contain an undelayed
+message, short enough to follow a simulation that runs a little slower than real time."""
 QUATERNION_LOST_S = 1.0
-"""Without ATTITUDE_QUATERNION for so long ATTITUDE is used."""
+"""Without ATTITUDE_QUATERNION for this time ATTITUDE is used."""
 EARTH_RADIUS_M = 6_371_000.0
 MESSAGES = ("ATTITUDE_QUATERNION", "ATTITUDE", "LOCAL_POSITION_NED", "HIL_STATE_QUATERNION")
 
@@ -37,9 +37,9 @@ class Pose(NamedTuple):
 
 
 class BootClock:
-    """The vehicle's time since boot on CLOCK_MONOTONIC, by the message that was delayed least.
+    """The vehicle's time since boot on CLOCK_MONOTONIC, from the message with the least delay.
 
-    What remains is that smallest delay: below a millisecond on one host.
+    The error is that smallest delay: below a millisecond on one host.
     """
 
     def __init__(self) -> None:
@@ -48,7 +48,7 @@ class BootClock:
         self._offset_ns: int | None = None
 
     def add(self, boot_ns: int, arrived_ns: int) -> None:
-        """A message of time `boot_ns` came at `arrived_ns` (CLOCK_MONOTONIC)."""
+        """Add a message of time `boot_ns` that arrived at `arrived_ns` (CLOCK_MONOTONIC)."""
         offset_ns = arrived_ns - boot_ns
         if self._window_start_ns is None or arrived_ns - self._window_start_ns >= CLOCK_WINDOW_S * 1e9:
             self._window_start_ns = arrived_ns
@@ -60,7 +60,7 @@ class BootClock:
         """CLOCK_MONOTONIC nanoseconds at a time since boot. Raises ValueError before the first message."""
         known = [offset for offset in (self._before_ns, self._offset_ns) if offset is not None]
         if not known:
-            raise ValueError("no message with the vehicle's time has come")
+            raise ValueError("no message with the vehicle's time received")
         return boot_ns + min(known)
 
 
@@ -73,7 +73,7 @@ class _Track:
 
     def add(self, stamp_ns: int, value: tuple[float, ...]) -> None:
         if self.stamps_ns and stamp_ns <= self.stamps_ns[-1]:
-            return  # a duplicate, or one that was overtaken on its way
+            return  # a duplicate, or out of order
         self.stamps_ns.append(stamp_ns)
         self.values.append(value)
         while stamp_ns - self.stamps_ns[0] > KEPT_S * 1e9:
@@ -81,7 +81,7 @@ class _Track:
             self.values.popleft()
 
     def around(self, stamp_ns: int) -> tuple[tuple[float, ...], tuple[float, ...], float]:
-        """The values before and after a time within the track, and how far along between them, 0..1."""
+        """The values before and after a time within the track, and the fraction between them, 0..1."""
         after = bisect_left(self.stamps_ns, stamp_ns)
         if self.stamps_ns[after] == stamp_ns:
             return self.values[after], self.values[after], 0.0
@@ -108,7 +108,7 @@ class PoseHistory:
         self._newest_ns: int | None = None
 
     def add(self, message: Any, arrived_ns: int) -> None:
-        """A message of the vehicle, of any kind, at CLOCK_MONOTONIC nanoseconds."""
+        """Add a message of the vehicle, of any kind, received at CLOCK_MONOTONIC nanoseconds."""
         kind = message.get_type()
         if kind not in MESSAGES or (self.truth and kind != "HIL_STATE_QUATERNION"):
             return
@@ -116,7 +116,7 @@ class PoseHistory:
             if not self.truth:
                 self.truth = True
                 self._restart()
-            # PX4 leaves its time at zero: then the time of arrival is all there is.
+            # PX4 leaves its time at zero: then the time of arrival is used.
             stamp_ns = message.time_usec * 1000 or arrived_ns
         else:
             stamp_ns = message.time_boot_ms * 1_000_000
@@ -160,13 +160,13 @@ class PoseHistory:
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """The messages without which there is no pose yet."""
+        """The messages still missing for a pose."""
         attitude = () if self._attitudes.stamps_ns else ("ATTITUDE_QUATERNION",)
         return attitude + (() if self._motions.stamps_ns else ("LOCAL_POSITION_NED",))
 
     @property
     def span_ns(self) -> tuple[int, int] | None:
-        """From when to when, by the vehicle's clock, its pose is known; None: at no time."""
+        """The interval, by the vehicle's clock, in which its pose is known; None: none."""
         tracks = self._attitudes.stamps_ns, self._motions.stamps_ns
         if not all(tracks):
             return None

@@ -1,14 +1,14 @@
-"""Where a camera's frames go: shared memory, a pipe, Motion JPEG over HTTP, H.264 in RTP. One address each.
+"""The outputs of a camera: shared memory, a pipe, Motion JPEG over HTTP, H.264 in RTP. One address each.
 
-| address | what a reader gets |
+| address | content |
 |---|---|
 | `shm://NAME` | colour, depth and stamps (`vision.shared_frame`) |
-| `pipe:PATH` | raw bgr24 pictures through a FIFO, made if it is not there; `pipe:-` is standard output |
-| `http://HOST:PORT` | Motion JPEG at `/`, one picture at `/snapshot.jpg` |
+| `pipe:PATH` | raw bgr24 images through a FIFO, created if missing; `pipe:-` is standard output |
+| `http://HOST:PORT` | Motion JPEG at `/`, one image at `/snapshot.jpg` |
 | `rtp://HOST:PORT` | H.264 in RTP (RFC 6184), payload type 96, as PX4's Gazebo camera sends to UDP 5600 |
 
-A reader that is slow, hung or gone loses frames; it never delays the camera or another reader. An output is
-imported when it is opened: a vehicle without a camera starts in half the time without their libraries.
+A slow or stopped reader loses frames; it never delays the camera or another reader. An output's module is
+imported when it is opened: a vehicle without a camera starts in half the time without these libraries.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ STANDARD_OUTPUT = "pipe:-"
 
 
 class FrameOutput(Protocol):
-    """Takes frames. `write` returns at once; `close` may be called more than once."""
+    """An output of frames. `write` does not block; `close` may be called more than once."""
 
     def write(self, frame: Frame) -> None: ...
 
@@ -33,7 +33,7 @@ class FrameOutput(Protocol):
 
 
 def check_output(address: str) -> None:
-    """Raise ValueError, saying what is expected, for an address that `open_output` would not know."""
+    """Raise ValueError for an address that `open_output` does not support."""
     parts = urlsplit(address)
     if parts.scheme == "shm":
         from vision.shared_frame import segment_path
@@ -73,12 +73,12 @@ def open_output(
 
     Args:
         width, height: of the frames to come.
-        rate_hz: how many a second, as an encoder needs to know.
-        depth: whether the frames bear depth; only shared memory carries it on.
-        calibration: the camera's lens and mount; only shared memory carries them on.
+        rate_hz: their rate, for encoders.
+        depth: whether the frames have depth; only shared memory transports it.
+        calibration: the camera's lens and mount; only shared memory transports them.
 
     Raises:
-        ValueError: an address that cannot be.
+        ValueError: an invalid address.
         OSError: a port or name that is taken.
         ModuleNotFoundError: RTP without the package that encodes it.
     """

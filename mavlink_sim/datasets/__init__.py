@@ -1,1 +1,1 @@
-"""Labelled pictures drawn from random scenes: to train with and to test with."""
+"""Labelled images of random scenes, for training and testing."""

@@ -1,4 +1,4 @@
-"""`mavlink-sim dataset`: labelled pictures into a folder."""
+"""`mavlink-sim dataset`: write labelled images to a folder."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 
 class Layout(StrEnum):
-    """How the labels are written."""
+    """The format of the labels."""
 
     YOLO = "yolo"
     COCO = "coco"
@@ -28,26 +28,28 @@ class Layout(StrEnum):
 
 @app.command()
 def dataset(
-    out: Annotated[Path, typer.Argument(help="Folder to write: new, or empty.")],
-    frames: Annotated[int, typer.Option(help="How many pictures.")] = 100,
+    out: Annotated[Path, typer.Argument(help="Folder to write to: new or empty.")],
+    frames: Annotated[int, typer.Option(help="How many images.")] = 100,
     scene: Annotated[
         str, typer.Option(help="A scene file, an example's name, or random: the training scenes.")
     ] = "random",
-    layout: Annotated[Layout, typer.Option("--format", help="How the labels are written.")] = Layout.YOLO,
-    seed: Annotated[int, typer.Option(help="The same seed gives the same pictures.")] = 0,
-    depth: Annotated[bool, typer.Option("--depth", help="Depth too: 16-bit PNG in millimetres.")] = False,
-    classes: Annotated[str, typer.Option(help="Classes that get labels, with commas.")] = ",".join(
+    layout: Annotated[Layout, typer.Option("--format", help="Format of the labels.")] = Layout.YOLO,
+    seed: Annotated[int, typer.Option(help="The same seed gives the same images.")] = 0,
+    depth: Annotated[
+        bool, typer.Option("--depth", help="Also write depth: 16-bit PNG in millimetres.")
+    ] = False,
+    classes: Annotated[str, typer.Option(help="Classes to label, separated by commas.")] = ",".join(
         CLASS_NAMES
     ),
-    validation: Annotated[float, typer.Option(help="Share of the pictures for validation.")] = 0.1,
-    min_visible: Annotated[float, typer.Option(help="Share of an object that must be seen.")] = 0.3,
-    min_side: Annotated[float, typer.Option(help="Smallest side of a box that gets a label, pixels.")] = 6.0,
+    validation: Annotated[float, typer.Option(help="Share of the images for validation.")] = 0.1,
+    min_visible: Annotated[float, typer.Option(help="Least visible share of a labelled object.")] = 0.3,
+    min_side: Annotated[float, typer.Option(help="Least side of a labelled box, pixels.")] = 6.0,
     lowest: Annotated[float, typer.Option(help="Lowest camera above the ground, m (scenes).")] = 1.5,
     highest: Annotated[float, typer.Option(help="Highest camera above the ground, m (scenes).")] = 40.0,
-    width: Annotated[int, typer.Option(help="Of random scenes' pictures.")] = RANDOM_SIZE[0],
-    height: Annotated[int, typer.Option(help="Of random scenes' pictures.")] = RANDOM_SIZE[1],
+    width: Annotated[int, typer.Option(help="Of random scenes' images.")] = RANDOM_SIZE[0],
+    height: Annotated[int, typer.Option(help="Of random scenes' images.")] = RANDOM_SIZE[1],
 ) -> None:
-    """Write labelled pictures of a scene, or of random ones, for training and testing detectors."""
+    """Write labelled images of a scene, or of random ones, for training and testing detectors."""
     cv2.setNumThreads(1)
     try:
         options = DatasetOptions(
@@ -69,4 +71,4 @@ def dataset(
     except (DatasetError, SceneError, OSError) as error:
         print(f"mavlink-sim: {error}", file=sys.stderr)
         raise typer.Exit(2) from None
-    print(f"{out}: {frames} pictures, {labels} labels")
+    print(f"{out}: {frames} images, {labels} labels")

@@ -1,7 +1,7 @@
-"""Data sets of rendered pictures with their truth: for training, and for testing what has been trained.
+"""Data sets of rendered images with their truth, for training and testing.
 
-A scene is looked at from random places around its objects; "random" scenes are those that the bundled model
-is trained on (`training_scenes`). Frame i of a seed is the same whatever the number of frames.
+A scene is rendered from random viewpoints around its objects; "random" scenes are those of the bundled
+model's training (`training_scenes`). Frame i of a seed is the same whatever the number of frames.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from vision.rotation import matrix_from_euler
 
 DatasetFormat = Literal["yolo", "coco"]
 DEPTH_UNIT_M = 0.001
-"""Depth pictures are 16-bit PNG in millimetres, 0 where there is none; beyond 65.535 m there is none."""
+"""Depth images are 16-bit PNG in millimetres, 0 for no depth and beyond 65.535 m."""
 MAX_TRIES = 200
 RANDOM_SIZE = (640, 480)
 LONGEST_TIME_S = 600.0
@@ -38,24 +38,24 @@ _QUALITY = (cv2.IMWRITE_JPEG_QUALITY, 95)
 
 
 class DatasetError(ValueError):
-    """A data set cannot be made; the text says why."""
+    """A data set cannot be generated; the text has the reason."""
 
 
 @dataclass(frozen=True, slots=True)
 class DatasetOptions:
-    """What goes into a data set.
+    """The options of a data set.
 
     Attributes:
-        frames: how many pictures.
-        seed: of everything random.
+        frames: number of images.
+        seed: of all random numbers.
         layout: "yolo" or "coco".
-        classes: those that get labels, numbered in this order.
-        depth: write depth pictures too.
-        validation: share of the pictures set apart, spread evenly.
-        min_visible: objects of which less is seen get no label, 0..1.
-        min_side_px: nor do those whose box is smaller.
+        classes: the labelled classes, numbered in this order.
+        depth: write depth images too.
+        validation: share of the images for validation, distributed evenly.
+        min_visible: least visible share of a labelled object, 0..1.
+        min_side_px: least side of a labelled box.
         altitude_m: least and greatest height of the camera above the ground, for scenes.
-        size: width and height of random scenes' pictures; a scene's camera has its own.
+        size: width and height of random scenes' images; a scene's camera has its size.
     """
 
     frames: int
@@ -88,7 +88,7 @@ class DatasetOptions:
         if not 0.0 < self.altitude_m[0] <= self.altitude_m[1] <= 500.0:
             raise DatasetError(f"altitudes must rise within 0 to 500 m, got {self.altitude_m}")
         if not all(32 <= side <= 4096 for side in self.size):
-            raise DatasetError(f"a picture's sides must be 32 to 4096 px, got {self.size[0]}x{self.size[1]}")
+            raise DatasetError(f"an image's sides must be 32 to 4096 px, got {self.size[0]}x{self.size[1]}")
 
 
 def make_dataset(
@@ -97,22 +97,22 @@ def make_dataset(
     options: DatasetOptions,
     on_frame: Callable[[int], None] = lambda done: None,
 ) -> int:
-    """Write a data set into a folder that is empty or not there yet; returns the number of labels.
+    """Write a data set into a new or empty folder; returns the number of labels.
 
     `images/train`, `images/val`, and for YOLO `labels/…` with `data.yaml`, for COCO
-    `annotations/instances_{train,val}.json`; `depth/…` if asked for; `truth.jsonl` with all that is in each
-    frame, `image` naming its file.
+    `annotations/instances_{train,val}.json`; `depth/…` if requested; `truth.jsonl` with all objects of each
+    frame, and its file in `image`.
 
     Args:
         scene: None for random scenes.
-        on_frame: told after each frame how many are done.
+        on_frame: called after each frame with the number of frames written.
 
     Raises:
-        DatasetError: the folder holds something, or the scene has no place to look from.
-        OSError: something cannot be written.
+        DatasetError: the folder is not empty, or the scene has no viewpoint.
+        OSError: a file cannot be written.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise DatasetError(f"{folder} is there already and not an empty folder; choose another")
+        raise DatasetError(f"{folder} exists and is not an empty folder; choose another")
     splits = ("train", "val") if options.validation > 0.0 else ("train",)
     kinds = ["images"] + ["labels"] * (options.layout == "yolo") + ["depth"] * options.depth
     for kind in kinds:
@@ -125,10 +125,10 @@ def make_dataset(
         for index, captured in enumerate(frames):
             split = "val" if _is_validation(index, options.validation) else "train"
             name = f"{index:06d}"
-            _write_picture(folder / "images" / split / f"{name}.jpg", captured.frame.image)
+            _write_image(folder / "images" / split / f"{name}.jpg", captured.frame.image)
             if options.depth:
                 assert captured.frame.depth_m is not None
-                _write_picture(folder / "depth" / split / f"{name}.png", _millimetres(captured.frame.depth_m))
+                _write_image(folder / "depth" / split / f"{name}.png", _millimetres(captured.frame.depth_m))
             seen = [item for item in captured.rendered.objects if _counts(item, options)]
             labels += len(seen)
             size = (captured.frame.width, captured.frame.height)
@@ -170,14 +170,14 @@ def _random_frames(options: DatasetOptions) -> Iterator[Captured]:
 
 
 def _scene_frames(scene: Scene, options: DatasetOptions) -> Iterator[Captured]:
-    """The scene through its camera, from random places; frames are never lost here."""
+    """Frames of the scene's camera from random viewpoints; frames are never lost here."""
     settings = replace(scene.camera, loss=0.0, latency_s=0.0, seed=options.seed)
     camera = SimulatedCamera(replace(scene, camera=settings))
     horizon_s = max([60.0, *(path.period_s for path in scene.paths.values())])
     for index in range(options.frames):
         rng = np.random.default_rng((options.seed, index, 7))
         time_s = float(rng.uniform(0.0, min(horizon_s, LONGEST_TIME_S)))
-        position, attitude = _look(rng, scene, scene.objects_at(time_s), options)
+        position, attitude = _viewpoint(rng, scene, scene.objects_at(time_s), options)
         motion = CameraMotion()
         if settings.shutter is not None:
             velocity, turning = rng.normal(0.0, 2.5, 3), rng.normal(0.0, 0.3, 3)
@@ -190,10 +190,10 @@ def _scene_frames(scene: Scene, options: DatasetOptions) -> Iterator[Captured]:
         yield captured
 
 
-def _look(
+def _viewpoint(
     rng: np.random.Generator, scene: Scene, objects: Sequence[WorldObject], options: DatasetOptions
 ) -> tuple[list[float], NDArray[np.float64]]:
-    """A position and attitude of the body so that the camera sees an object, anywhere in its picture."""
+    """A position and attitude of the body with an object anywhere in the camera's image."""
     wanted = [item for item in objects if item.class_name in options.classes] or list(objects)
     model, mount = scene.camera.model, scene.camera.mount
     low, high = options.altitude_m
@@ -230,15 +230,15 @@ def _look(
         position = eye - attitude @ mount.position_frd_m
         return [float(value) for value in position], attitude
     raise DatasetError(
-        f"scene {scene.name}: found no place between {low} and {high} m above the ground to look from; "
-        "its objects fill it"
+        f"scene {scene.name}: found no viewpoint between {low} and {high} m above the ground; "
+        "its objects fill the space"
     )
 
 
-def _write_picture(path: Path, picture: NDArray[Any]) -> None:
-    done, data = cv2.imencode(path.suffix, picture, _QUALITY if path.suffix == ".jpg" else [])
+def _write_image(path: Path, image: NDArray[Any]) -> None:
+    done, data = cv2.imencode(path.suffix, image, _QUALITY if path.suffix == ".jpg" else [])
     if not done:
-        raise DatasetError(f"{path} could not be encoded")
+        raise DatasetError(f"cannot encode {path}")
     path.write_bytes(data.tobytes())
 
 
@@ -249,7 +249,7 @@ def _millimetres(depth_m: Plane) -> NDArray[np.uint16]:
 
 
 def _yolo_line(item: VisibleObject, classes: Sequence[str], size: tuple[int, int]) -> str:
-    """`class x y width height`, of the box's middle and sides as shares of the picture."""
+    """`class x y width height`: the box's centre and size relative to the image."""
     left, top, right, bottom = item.xyxy
     width, height = size
     numbers = (

@@ -1,8 +1,8 @@
-"""Labelled pictures to train the detector with: random places, cameras, light, and things on the ground.
+"""Labelled images for training the detector: random viewpoints, cameras, light, and objects on the ground.
 
-`random_frame` looks from anywhere at large objects, `flight_frame` as a low vehicle does, at near and far
-ones between many distractors, `world_frame` at the default world and the example scenes. `training_frame`
-mixes them. Every draw comes from one generator, so that a seed gives the same pictures again.
+`random_frame` shows large objects from any viewpoint, `flight_frame` near and far ones between many
+distractors from a low vehicle, `world_frame` the default world and the example scenes. `training_frame` mixes
+them. All random numbers are from one generator, so that a seed gives the same images again.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ MAX_OBJECTS = 14
 TILES = 56
 PAINTED_TILES = 6
 BEFORE_LENS_M = 1.2
-"""Nothing is put nearer to the camera than this."""
+"""Least distance of an object from the camera."""
 CLASS_WEIGHTS = {
     "person": 1.5,
     "bicycle": 1.0,
@@ -55,25 +55,25 @@ TRAINING_WORLDS = tuple(range(1_000_000, 1_000_008))
 """Seeds of the default worlds in training. Flights and held-out frames use small seeds."""
 FARTHEST_M = 70.0
 LEARNED_SIDE_PX, LEARNED_AREA_PX = 5.0, 60.0
-"""What is smaller is not learned, neither as an object nor as background."""
+"""Smaller objects are not used in training, neither as objects nor as background."""
 DISTRACTOR_NAMES = (
     *CLUTTER_NAMES,
     *("autumn_tree", "autumn_tree", "tree", "building", "box", "wall", "drone", "plate"),
 )
 ALIKE = (("car", "truck", "boat"), ("person", "bicycle", "dog", "chair"), ("tree", "bush", "autumn_tree"))
 NARROW_SIDE_M = np.array([0.5, 0.5, 1.5, 2.2, 1.7, 0.4, 0.5])
-"""Of each class: how wide it looks at least, from most sides. Smaller than MIN_SIDE_PX is not tried."""
+"""Least apparent width of each class, from most sides. Smaller than MIN_SIDE_PX is not attempted."""
 
 
 FAR_WEIGHTS = np.array([1.3, 1.2, 1.4, 1.2, 1.8, 1.2, 1.2])
-"""Of each class where all distances are alike; boats most, which were taken for cars."""
+"""Weights of the classes where all distances are equally likely; most boats, which were detected as cars."""
 _SIZES_M = {
     "building": ((8.0, 6.0, 3.2), (14.0, 8.0, 6.0), (20.0, 10.0, 4.0), (10.0, 10.0, 9.0)),
     "box": ((1.0, 1.0, 1.0), (4.0, 1.8, 1.4), (2.0, 1.2, 0.6), (0.5, 0.5, 1.7), (6.0, 2.5, 2.6)),
     "wall": ((3.0, 0.24, 1.0), (6.0, 0.3, 2.0), (12.0, 0.3, 2.6), (1.5, 0.2, 1.8)),
     "autumn_tree": ((2.0, 2.0, 3.5), (3.0, 3.4, 5.0), (5.0, 4.0, 6.5), (1.6, 1.2, 1.8), (3.5, 2.5, 2.4)),
 }
-"""Of distractors: different enough to be looked at twice, few enough to be kept."""
+"""Number of distractor variants: enough variety, few enough to be cached."""
 
 
 def random_scene(
@@ -82,16 +82,16 @@ def random_scene(
     height: int = 384,
     focal_px: tuple[float, float] | None = None,
 ) -> tuple[Image, Boxes, ClassIds]:
-    """One labelled picture.
+    """One labelled image.
 
     Args:
-        rng: all that is random is drawn from it.
+        rng: the generator of all random numbers.
         focal_px: least and greatest focal length; by default 0.6 to 1.7 times the width.
 
     Returns:
         The image (height, width, 3) uint8 BGR; boxes (N, 4) float32, left, top, right, bottom edges, pixels;
-        class ids (N,) int64, indices into CLASS_NAMES. Only things of which at least a third is seen
-        (MIN_VISIBLE_FRACTION) and whose box is not tiny are truth.
+        class ids (N,) int64, indices into CLASS_NAMES. Only objects of which at least a third is visible
+        (MIN_VISIBLE_FRACTION) and whose box is not tiny are labelled.
     """
     rendered = random_frame(rng, width, height, focal_px)
     boxes: list[tuple[float, float, float, float]] = []
@@ -105,9 +105,9 @@ def random_scene(
 
 
 def training_scene(rng: np.random.Generator, width: int, height: int) -> tuple[Image, Boxes, ClassIds]:
-    """One picture of the mixture with its labels, as `random_scene`.
+    """One image of the mixture with its labels, as `random_scene`.
 
-    Objects too small or too much hidden to be learned have the id ~class: they are no background either.
+    Objects too small or too much hidden for training have the id ~class: they are no background either.
     """
     rendered = training_frame(rng, width, height)
     boxes: list[tuple[float, float, float, float]] = []
@@ -133,7 +133,7 @@ def training_frame(rng: np.random.Generator, width: int, height: int) -> Rendere
 
 
 def flight_frame(rng: np.random.Generator, width: int, height: int) -> Rendered:
-    """What a low vehicle sees ahead: things 3 to 70 m away, many distractors, painted ground, shadows."""
+    """The view ahead from a low vehicle: objects 3 to 70 m away, many distractors, ground, shadows."""
     low = rng.random() < 0.85
     altitude = float(math.exp(rng.uniform(math.log(1.5), math.log(10.0)) + (0.0 if low else math.log(5.0))))
     camera = _wide_camera(rng, width, height, float(rng.uniform(60.0, 92.0)))
@@ -141,15 +141,15 @@ def flight_frame(rng: np.random.Generator, width: int, height: int) -> Rendered:
     yaw = float(rng.uniform(-math.pi, math.pi))
     attitude = matrix_from_euler(math.radians(float(rng.normal(0.0, 4.0))), -down, yaw)
     ground = _random_ground(rng, painted=0.45)
-    place = rng.uniform(-45.0, 45.0, 2)
+    viewpoint = rng.uniform(-45.0, 45.0, 2)
     if ground.pad or ground.patches:
-        # Look at what is painted: a pad, a pond.
+        # Look at ground features: a pad, a pond.
         spots = [(patch.north_m, patch.east_m) for patch in ground.patches] + [(0.0, 0.0)] * ground.pad
         spot = spots[int(rng.integers(len(spots)))]
         bearing = yaw + float(rng.uniform(-0.5, 0.5))
         away = altitude / math.tan(down) * float(rng.uniform(0.5, 2.5))
-        place = np.array(spot) - min(away, 40.0) * np.array([math.cos(bearing), math.sin(bearing)])
-    position = (float(place[0]), float(place[1]), -altitude)
+        viewpoint = np.array(spot) - min(away, 40.0) * np.array([math.cos(bearing), math.sin(bearing)])
+    position = (float(viewpoint[0]), float(viewpoint[1]), -altitude)
     light, sky, buffers = _random_light(rng), _random_sky(rng), _buffers(width, height)
     renderer = Renderer(World((), ground, light, sky), camera, CameraMount(), None, buffers)
     objects = _random_objects(rng, renderer, position, attitude, ground, far=True)
@@ -161,7 +161,7 @@ def flight_frame(rng: np.random.Generator, width: int, height: int) -> Rendered:
 
 
 def world_frame(rng: np.random.Generator, width: int, height: int) -> Rendered:
-    """A default world or an example scene, its objects in other colours and builds, from a random place."""
+    """A default world or an example scene, with other colours and builds, from a random viewpoint."""
     scenes = _scenes()
     scene = scenes[int(rng.integers(len(scenes)))]
     world = scene.world
@@ -187,7 +187,7 @@ def _scenes() -> tuple[Scene, ...]:
 
 
 def _another(rng: np.random.Generator, item: WorldObject) -> WorldObject:
-    """The object in another build and colour, now and then one of another kind as large."""
+    """The object in another build and colour, occasionally one of another kind of the same size."""
     if item.printed is not None:
         return item
     class_name, size = item.class_name, item.size_m
@@ -202,7 +202,7 @@ def _another(rng: np.random.Generator, item: WorldObject) -> WorldObject:
 def _gaze(
     rng: np.random.Generator, objects: Sequence[WorldObject], camera: CameraModel
 ) -> tuple[tuple[float, float, float], NDArray[np.float64]]:
-    """A place 3 to 60 m from one of the objects, mostly low, and an attitude with it in the picture."""
+    """A position 3 to 60 m from one of the objects, mostly low, and an attitude with it in the image."""
     known = [item for item in objects if item.class_name in CLASS_NAMES]
     across, along = math.atan(camera.width / 2 / camera.fx), math.atan(camera.height / 2 / camera.fy)
     north, east, altitude, yaw, depression = 0.0, 0.0, FARTHEST_M, 0.0, math.pi / 2
@@ -247,10 +247,10 @@ def _wide_camera(
 def random_frame(
     rng: np.random.Generator, width: int, height: int, focal_px: tuple[float, float] | None = None
 ) -> Rendered:
-    """The frame behind `random_scene`, with depth and all that is seen; the same draws, the same picture."""
+    """The frame of `random_scene`, with depth and all visible objects; the same draws, the same image."""
     least, greatest = focal_px or (0.6 * width, 1.7 * width)
     altitude = float(math.exp(rng.uniform(math.log(1.5), math.log(60.0))))
-    # Looking down from higher up with a longer lens, so that people stay visible.
+    # Looking down from a greater height with a longer lens, so that people stay visible.
     lens = rng.beta(1.0 + altitude / 25.0, 1.6)
     focal = float(least * (greatest / least) ** lens)
     camera = CameraModel(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
@@ -272,7 +272,7 @@ def random_frame(
 def render_dataset(
     count: int, seed: int, width: int = 384, height: int = 384
 ) -> Iterator[tuple[Image, Boxes, ClassIds]]:
-    """`count` labelled pictures; picture i of a seed is the same whatever the count."""
+    """`count` labelled images; image i of a seed is the same whatever the count."""
     for index in range(count):
         yield random_scene(np.random.default_rng((seed, index)), width, height)
 
@@ -289,7 +289,7 @@ def _buffers(width: int, height: int) -> Buffers:
 
 
 def _pitch_down(rng: np.random.Generator, altitude_m: float) -> float:
-    """How far the camera looks down: from slightly up to straight down; higher up, mostly down."""
+    """The camera's pitch: from slightly up to straight down; at greater height mostly down."""
     if rng.random() < 0.18:
         return math.radians(float(rng.uniform(75, 90)))
     middle = 12.0 + 14.0 * math.log(max(altitude_m, 1.5) / 1.5)
@@ -409,9 +409,9 @@ def _random_objects(
     ground: Ground,
     far: bool = False,
 ) -> tuple[WorldObject, ...]:
-    """Things put where the camera sees them large enough, and not much hidden by each other.
+    """Objects placed where they are large enough in the image and not much hidden by each other.
 
-    `far`: as many at each distance, small ones too, and every kind of distractor.
+    `far`: equally many at each distance, small ones too, and every kind of distractor.
     """
     view = renderer.view(position, attitude)
     empty = rng.random() < EMPTY_SHARE
@@ -436,7 +436,7 @@ def _random_objects(
             continue
         depth = float(-view.eye[2] / ray[2])
         if far:
-            # The same column, at a distance of its own.
+            # The same column, at another distance.
             depth = math.exp(rng.uniform(math.log(3.0), math.log(FARTHEST_M)))
             ahead = ray[:2] / math.hypot(*ray[:2])
             ray = np.array([*ahead, -view.eye[2] / depth])
@@ -501,7 +501,7 @@ def _random_print(rng: np.random.Generator) -> Print:
 def _shadow_casters(
     rng: np.random.Generator, view: View, light: Light, objects: tuple[WorldObject, ...]
 ) -> tuple[WorldObject, ...]:
-    """Things outside the picture whose shadows reach into it."""
+    """Objects outside the image whose shadows are in it."""
     casters: list[WorldObject] = []
     sun = np.array(light.towards_sun_ned)
     for _ in range(4):
@@ -515,10 +515,10 @@ def _shadow_casters(
         appearance, yaw = int(rng.integers(2**31)), float(rng.uniform(-math.pi, math.pi))
         item = WorldObject(1000 + len(casters), class_name, (0.0, 0.0, 0.0), yaw, 1.0, appearance)
         reach = item.height_m * float(rng.uniform(0.5, 1.0)) / max(-sun[2], 0.1)
-        place = (float(shadow[0] + sun[0] * reach), float(shadow[1] + sun[1] * reach), 0.0)
-        item = replace(item, position_ned_m=place)
+        viewpoint = (float(shadow[0] + sun[0] * reach), float(shadow[1] + sun[1] * reach), 0.0)
+        item = replace(item, position_ned_m=viewpoint)
         outline = _outline(item, view)
-        # Behind the lens counts as outside, but not right over it.
+        # Behind the lens is outside the image, but not directly above it.
         outside = outline is None or outline[1] < 0.02
         clear = range_to(item, (view.eye[0], view.eye[1])) > 1.0
         if outside and clear and not any(_touch(item, other) for other in (*objects, *casters)):
@@ -527,7 +527,7 @@ def _shadow_casters(
 
 
 def _outline(item: WorldObject, view: View) -> tuple[NDArray[np.float64], float] | None:
-    """The box (4,) in the image around the object's bounding box, and the share of it that is inside."""
+    """The box (4,) in the image around the object's bounding box, and its share inside the image."""
     shape = item.shape
     low, high = shape.low * item.scale, shape.high * item.scale
     x, y, z = np.meshgrid((low[0], high[0]), (low[1], high[1]), (low[2], high[2]))
@@ -565,7 +565,7 @@ def _hidden(
     depths: list[float],
     true_class: list[bool],
 ) -> bool:
-    """Whether this thing hides, or is hidden by, another for more than about half."""
+    """Whether this object hides, or is hidden by, another by more than about half."""
     area = float(np.prod(box[2:] - box[:2]))
     for other, other_depth, other_real in zip(boxes, depths, true_class, strict=True):
         shared = np.minimum(box[2:], other[2:]) - np.maximum(box[:2], other[:2])

@@ -1,7 +1,7 @@
-"""Faults while flying, typed on the simulator's console: one line of the grammar each, answered by lines.
+"""Faults from the simulator's console: one line of the grammar each, answered by one or more lines.
 
-The simulator's own loop reads it: the descriptor is polled, so nothing waits for a person. It is left alone
-while the program is in a terminal's background, where reading would stop it.
+The simulator's loop polls the descriptor, so it never blocks. It is not read while the program is in a
+terminal's background, where reading would stop the process.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ LONGEST_LINE_BYTES = 4096
 
 
 class FaultConsole:
-    """Lines from a descriptor (a terminal, a pipe, a file) to a vehicle's faults.
+    """Passes lines from a descriptor (a terminal, a pipe, a file) to a vehicle's faults.
 
     Args:
         descriptor: to read; usually 0.
-        command: carries out one line.
-        say: prints one line of an answer.
+        command: executes one line.
+        report: prints one line of an answer.
     """
 
     def __init__(
-        self, descriptor: int, command: Callable[[str], Outcome], say: Callable[[str], None]
+        self, descriptor: int, command: Callable[[str], Outcome], report: Callable[[str], None]
     ) -> None:
         self._descriptor = descriptor
         self._command = command
-        self._say = say
+        self._report = report
         self._partial = b""
         self._open = True
         self._selector = selectors.DefaultSelector()
@@ -38,10 +38,10 @@ class FaultConsole:
         try:
             self._selector.register(descriptor, selectors.EVENT_READ)
         except PermissionError:
-            self._always_ready = True  # an ordinary file: it can be read, not waited for
+            self._always_ready = True  # a regular file: readable without polling
 
     def poll(self) -> None:
-        """Carry out the lines that have been typed since."""
+        """Execute the lines received since the last call."""
         if not self._open or not (self._always_ready or self._selector.select(0)):
             return
         if in_background(self._descriptor):
@@ -50,7 +50,7 @@ class FaultConsole:
             data = os.read(self._descriptor, LONGEST_LINE_BYTES)
         except BlockingIOError:
             return
-        except OSError:  # the terminal is gone
+        except OSError:  # the terminal was closed
             data = b""
         if not data:
             self._open = False
@@ -65,10 +65,10 @@ class FaultConsole:
 
     def _answer(self, outcome: Outcome) -> None:
         for line in outcome.text.splitlines():
-            self._say(line if outcome.ok else f"not done: {line}")
+            self._report(line if outcome.ok else f"not done: {line}")
 
     def close(self) -> None:
-        """Read no more. The descriptor stays open: it is not ours."""
+        """Stop reading. The descriptor stays open: its owner closes it."""
         self._open = False
         self._selector.close()
 

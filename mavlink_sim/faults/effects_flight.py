@@ -1,23 +1,19 @@
-"""Faults of the vehicle itself: position, estimate, battery, rotors, air, pilot, refused modes, a reboot."""
+"""Effects on the vehicle itself: position, estimate, battery, rotors, wind, pilot, refused modes, reboot."""
 
 from __future__ import annotations
 
 import math
 import random
 from functools import partial
-from typing import TYPE_CHECKING
 
 from mavlink_sim.autopilot.commander import TEMPORARILY_REJECTED
+from mavlink_sim.faults.context import ActiveFault, FaultTarget
 from mavlink_sim.faults.grammar import FaultError
 from mavlink_sim.flight.tasks import Trajectory
+from mavlink_sim.physics.airframe import Vector
 from mavlink_sim.physics.estimate_errors import ZERO
 from mavlink_sim.px4.modes import Mode, mode_of
 from mavlink_sim.wire.announcements import Text
-
-if TYPE_CHECKING:
-    from mavlink_sim.faults.schedule import ActiveFault
-    from mavlink_sim.physics.airframe import Vector
-    from mavlink_sim.vehicle import Vehicle
 
 DEAD_RECKONING_S = 5.0  # EKF2_NOAID_TOUT
 REACQUISITION_S = 1.0  # from the first fix to a position that is fused again
@@ -43,8 +39,8 @@ _DO_SET_MODE = 176
 # ---- position and estimate
 
 
-def gps_loss(vehicle: Vehicle, one: ActiveFault) -> None:
-    """No fix: dead reckoning drifts for 5 s, then the position is invalid until a moment after the end."""
+def gps_loss(vehicle: FaultTarget, one: ActiveFault) -> None:
+    """No fix: dead reckoning drifts for 5 s, then the position is invalid until shortly after the end."""
     estimate, faults = vehicle.estimate, vehicle.faults
     angle = random.Random(one.seed).uniform(0.0, math.tau)
     north, east = DEAD_RECKONING_BIAS_MPS2 * math.cos(angle), DEAD_RECKONING_BIAS_MPS2 * math.sin(angle)
@@ -60,7 +56,7 @@ def gps_loss(vehicle: Vehicle, one: ActiveFault) -> None:
             vehicle.estimate.set_error(one.number, error, (north * since_s, east * since_s, 0.0))
         elif estimate.held_xy_m is None:
             x, y, _ = estimate.position
-            estimate.held_xy_m = (x, y)  # EKF2 fuses a made-up standstill from here on
+            estimate.held_xy_m = (x, y)  # from here on EKF2 fuses an assumed standstill
             estimate.count_reset(2)
             estimate.position_valid = vehicle.autopilot.position_valid = False
 
@@ -72,7 +68,7 @@ def gps_loss(vehicle: Vehicle, one: ActiveFault) -> None:
     one.undo.append(undo)
 
 
-def _fuse_again(vehicle: Vehicle, number: int) -> None:
+def _fuse_again(vehicle: FaultTarget, number: int) -> None:
     estimate = vehicle.estimate
     estimate.set_error(number, None)
     if estimate.fix_lost:
@@ -84,8 +80,8 @@ def _fuse_again(vehicle: Vehicle, number: int) -> None:
     vehicle.autopilot.texts.append(Text(INFO, "GNSS data fusion started\t"))
 
 
-def gps_drift(vehicle: Vehicle, one: ActiveFault) -> None:
-    """The receiver's position wanders; the estimate follows it, and the vehicle holds the estimate."""
+def gps_drift(vehicle: FaultTarget, one: ActiveFault) -> None:
+    """The receiver's position drifts; the estimate follows, and the vehicle holds the estimate."""
     values = one.fault.values
     angle = _direction(values["towards"], one.seed)
     drifted_m = 0.0
@@ -108,8 +104,8 @@ def gps_drift(vehicle: Vehicle, one: ActiveFault) -> None:
     one.undo.append(undo)
 
 
-def ekf_reset(vehicle: Vehicle, one: ActiveFault) -> None:
-    """The estimate jumps; when the fault is ended it jumps back."""
+def ekf_reset(vehicle: FaultTarget, one: ActiveFault) -> None:
+    """The estimate jumps, and jumps back at the end of the fault."""
     values = one.fault.values
     error = (values["north"], values["east"], values["down"])
     yaw_rad = math.radians(values["yaw"])
@@ -123,10 +119,10 @@ def ekf_reset(vehicle: Vehicle, one: ActiveFault) -> None:
     one.undo.append(undo)
 
 
-def _jumped(vehicle: Vehicle, resets: int = 1, yaw_rad: float = 0.0) -> None:
-    """What PX4 does at a reset: count it, and go on planning from where the vehicle now thinks it is.
+def _jumped(vehicle: FaultTarget, resets: int = 1, yaw_rad: float = 0.0) -> None:
+    """React to resets as PX4: count them, and continue planning from the new estimate.
 
-    An absolute goal stays where it is, so the vehicle then flies the difference.
+    An absolute goal is unchanged, so the vehicle then flies the difference.
     """
     vehicle.estimate.update(0.0)
     vehicle.estimate.count_reset(resets)
@@ -136,7 +132,7 @@ def _jumped(vehicle: Vehicle, resets: int = 1, yaw_rad: float = 0.0) -> None:
 
 
 def _trajectories(task: object) -> list[Trajectory]:
-    """Those of a flight task and of the task within it (Return lands by one of its own)."""
+    """The trajectories of a flight task and of the task within it (Return has one for its landing)."""
     found = []
     for value in vars(task).values() if task is not None else ():
         if isinstance(value, Trajectory):
@@ -153,10 +149,10 @@ def _attributes(value: object) -> list[object]:
 # ---- power and rotors
 
 
-def battery(vehicle: Vehicle, one: ActiveFault) -> None:
-    """So much charge is left: a number goes on being used while armed, a warning's name holds at it.
+def battery(vehicle: FaultTarget, one: ActiveFault) -> None:
+    """Set the charge: a number is discharged further while armed, a warning's name is held.
 
-    It is checked even where CBRK_SUPPLY_CHK switches that off, as it does by default.
+    Warnings are active even where CBRK_SUPPLY_CHK switches them off, as it does by default.
     """
     cells = vehicle.autopilot.supervision.battery
     remaining = one.fault.values["remaining"]
@@ -171,7 +167,7 @@ def battery(vehicle: Vehicle, one: ActiveFault) -> None:
     one.undo.append(undo)
 
 
-def motor_failure(vehicle: Vehicle, one: ActiveFault) -> None:
+def motor_failure(vehicle: FaultTarget, one: ActiveFault) -> None:
     """The rotor stops; it turns again when the fault ends."""
     motor = one.fault.values["motor"]
     vehicle.airframe.fail_motor(motor - 1)
@@ -182,15 +178,15 @@ def motor_failure(vehicle: Vehicle, one: ActiveFault) -> None:
 # ---- air
 
 
-def wind(vehicle: Vehicle, one: ActiveFault) -> None:
-    """So much more wind."""
+def wind(vehicle: FaultTarget, one: ActiveFault) -> None:
+    """Add wind."""
     values = one.fault.values
     vehicle.faults.winds[one.number] = _blowing(values["speed"], _direction(values["from"], one.seed))
     one.undo.append(partial(_calm, vehicle, one))
 
 
-def gust(vehicle: Vehicle, one: ActiveFault) -> None:
-    """One gust of `for` seconds (4 if not given): the wind rises and falls as 1 - cos."""
+def gust(vehicle: FaultTarget, one: ActiveFault) -> None:
+    """Add one gust of `for` seconds (4 if not given): the wind rises and falls as 1 - cos."""
     values = one.fault.values
     angle = _direction(values["from"], one.seed)
     began_s = vehicle.faults.now_s
@@ -214,7 +210,7 @@ def _blowing(speed_mps: float, from_rad: float) -> Vector:
     return (-speed_mps * math.cos(from_rad), -speed_mps * math.sin(from_rad), 0.0)
 
 
-def _calm(vehicle: Vehicle, one: ActiveFault) -> None:
+def _calm(vehicle: FaultTarget, one: ActiveFault) -> None:
     vehicle.faults.winds.pop(one.number, None)
     vehicle.reload_wind(vehicle.faults.winds.values())
 
@@ -222,10 +218,10 @@ def _calm(vehicle: Vehicle, one: ActiveFault) -> None:
 # ---- command
 
 
-def pilot_takeover(vehicle: Vehicle, one: ActiveFault) -> None:
-    """A pilot's sticks are there and the mode is switched; at the end the sticks go, the mode stays.
+def pilot_takeover(vehicle: FaultTarget, one: ActiveFault) -> None:
+    """A pilot's sticks become valid and the mode is switched; at the end the sticks are lost, the mode stays.
 
-    Where a remote control counts (COM_RC_IN_MODE other than 4), it is lost then, and NAV_RCL_ACT follows.
+    Where a remote control is used (COM_RC_IN_MODE other than 4), NAV_RCL_ACT follows then.
     """
     mode = Mode[one.fault.values["mode"]]
     had_sticks = vehicle.autopilot.supervision.pilot_attached
@@ -240,15 +236,15 @@ def pilot_takeover(vehicle: Vehicle, one: ActiveFault) -> None:
 
 
 def requested_mode(command: int, parameters: tuple[float, ...]) -> Mode | None:
-    """The mode that a command asks for; None if it asks for none."""
+    """The mode that a command requests; None if it requests none."""
     if command != _DO_SET_MODE:
         return _MODE_OF_COMMAND.get(command)
     main, sub = parameters[1:3]
     return mode_of(int(main), int(sub)) if math.isfinite(main) and math.isfinite(sub) else None
 
 
-def refuse_mode(vehicle: Vehicle, one: ActiveFault) -> None:
-    """Requests for the mode are refused, all or the next so many."""
+def refuse_mode(vehicle: FaultTarget, one: ActiveFault) -> None:
+    """Refuse requests for the mode, all or the given number."""
     values = one.fault.values
     left = math.inf if values["count"] == "all" else int(values["count"])
 
@@ -266,8 +262,8 @@ def refuse_mode(vehicle: Vehicle, one: ActiveFault) -> None:
     one.undo.append(partial(vehicle.faults.refusals.pop, one.number))
 
 
-def reboot(vehicle: Vehicle, one: ActiveFault) -> None:
-    """Power was lost for a moment: `Vehicle.reboot`, deaf and silent until PX4 has started."""
+def reboot(vehicle: FaultTarget, one: ActiveFault) -> None:
+    """A short power loss: `Vehicle.reboot`, without any traffic until PX4 has started."""
     faults = vehicle.faults
     one.ends_s = min(one.ends_s, faults.now_s + one.fault.values["seconds"])
     faults.deaf = True

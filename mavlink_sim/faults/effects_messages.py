@@ -1,25 +1,22 @@
-"""Faults of what the vehicle says: silence, lost answers, a jumping clock, a second voice, a standstill."""
+"""Effects on messages: silent streams, lost answers, clock jumps, a second autopilot, a stall."""
 
 from __future__ import annotations
 
 import copy
 import struct
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from mavlink_sim.faults.context import ActiveFault, FaultTarget
 from mavlink_sim.faults.effects_link import chosen_links
+from mavlink_sim.wire.links import Link
 from mavlink_sim.wire.messages import Outgoing, parser
 from mavlink_sim.wire.streams import ONBOARD_RATES_HZ
-
-if TYPE_CHECKING:
-    from mavlink_sim.faults.schedule import ActiveFault
-    from mavlink_sim.services.links import Link
-    from mavlink_sim.vehicle import Vehicle
 
 _U32, _U64 = 2**32, 2**64
 _I64_MAX = 2**63 - 1
 _EVENT_ID, _LINK_NODE_STATUS_ID = 410, 8
-# time_usec of these is the boot time; elsewhere it is the world's, or zero
+# time_usec of these is the boot time; elsewhere it is UTC or zero
 _BOOT_TIME_USEC = {
     "ALTITUDE",
     "ESTIMATOR_STATUS",
@@ -29,12 +26,12 @@ _BOOT_TIME_USEC = {
     "ODOMETRY",
     "VIBRATION",
 }
-# The second autopilot starts so far east of where the vehicle did.
-SECOND_PLACE_EAST_M = 25.0
+# Where the second autopilot starts, east of the vehicle's start.
+SECOND_START_EAST_M = 25.0
 
 
-def heartbeat_only(vehicle: Vehicle, one: ActiveFault) -> None:
-    """Streams fall silent; answers to a client still come."""
+def heartbeat_only(vehicle: FaultTarget, one: ActiveFault) -> None:
+    """Stop the streams; answers to clients are still sent."""
     names = chosen_links(vehicle, one.fault.values["link"])
 
     def gate(link: Link, message: Any) -> Any:
@@ -47,8 +44,8 @@ def heartbeat_only(vehicle: Vehicle, one: ActiveFault) -> None:
     _gated(vehicle, one, gate)
 
 
-def lost_ack(vehicle: Vehicle, one: ActiveFault) -> None:
-    """COMMAND_ACK is swallowed: every one, or the Nth that would be sent from now on."""
+def lost_ack(vehicle: FaultTarget, one: ActiveFault) -> None:
+    """Drop COMMAND_ACK: every one, or the Nth from now on."""
     values = one.fault.values
     names = chosen_links(vehicle, values["link"])
     left = None if values["which"] == "all" else int(values["which"])
@@ -70,13 +67,13 @@ def lost_ack(vehicle: Vehicle, one: ActiveFault) -> None:
     _gated(vehicle, one, gate)
 
 
-def _gated(vehicle: Vehicle, one: ActiveFault, gate: Any) -> None:
+def _gated(vehicle: FaultTarget, one: ActiveFault, gate: Any) -> None:
     vehicle.faults.gates[one.number] = gate
     one.undo.append(partial(vehicle.faults.gates.pop, one.number))
 
 
-def time_jump(vehicle: Vehicle, one: ActiveFault) -> None:
-    """The boot clock is another one, in every stamp and in TIMESYNC; it jumps back when the fault ends."""
+def time_jump(vehicle: FaultTarget, one: ActiveFault) -> None:
+    """Shift the boot clock, in every stamp and in TIMESYNC, until the fault ends."""
     jump_us = round(one.fault.values["seconds"] * 1e6)
     vehicle.faults.boot_offset_us += jump_us
 
@@ -87,7 +84,7 @@ def time_jump(vehicle: Vehicle, one: ActiveFault) -> None:
 
 
 def shifted(message: Any, boot_offset_us: int) -> Any:
-    """The message with its boot times moved, TIMESYNC's among them."""
+    """The message with its boot times shifted, TIMESYNC's too."""
     kind = message.get_type()
     moved = copy.copy(message)
     if kind == "TIMESYNC":
@@ -114,7 +111,7 @@ def shifted(message: Any, boot_offset_us: int) -> Any:
 
 
 class _Spoken:
-    """A message of the second autopilot with its packet, numbered as that autopilot numbers."""
+    """A message of the second autopilot with its packet, with that autopilot's sequence number."""
 
     def __init__(self, message: Any, packet: bytes, system: int) -> None:
         self._message = message
@@ -133,13 +130,10 @@ class _Spoken:
         return getattr(self._message, name)
 
 
-def second_autopilot(vehicle: Vehicle, one: ActiveFault) -> None:
-    """Another vehicle's autopilot speaks and listens on every link of this one, disarmed on the ground."""
+def second_autopilot(vehicle: FaultTarget, one: ActiveFault) -> None:
+    """Attach the autopilot of another vehicle, disarmed on the ground, to every link of this one."""
     system = one.fault.values["system"] or vehicle.system_id
-    north, east = vehicle.start_ned_m
-    other = type(vehicle)(
-        system_id=system, seed=one.seed, ready_after_s=0.0, start_ned_m=(north, east + SECOND_PLACE_EAST_M)
-    )
+    other = vehicle.second_autopilot(system, one.seed, SECOND_START_EAST_M)
     codecs = {}
     for name, link in vehicle.links.items():
         other.add_link(name, {stream: link.streams.rate_hz(stream) for stream in ONBOARD_RATES_HZ})
@@ -149,7 +143,7 @@ def second_autopilot(vehicle: Vehicle, one: ActiveFault) -> None:
         other.step(dt_s)
         for name, codec in codecs.items():
             for item in other.outgoing(name):
-                if not item.forwarded:  # what it would pass on has been on these links already
+                if not item.forwarded:  # what it would forward has been on these links already
                     spoken = _Spoken(item.message, item.pack(codec), system)
                     vehicle.links[name].outbox.append(Outgoing(spoken, system, item.component, True))
 
@@ -158,8 +152,8 @@ def second_autopilot(vehicle: Vehicle, one: ActiveFault) -> None:
     one.undo.append(partial(vehicle.faults.second.pop, one.number))
 
 
-def stall(vehicle: Vehicle, one: ActiveFault) -> None:
-    """The vehicle's time stands still or goes slowly; messages to it wait, and are all read afterwards."""
+def stall(vehicle: FaultTarget, one: ActiveFault) -> None:
+    """Stop or slow down the vehicle's time; messages to it wait, and are all read afterwards."""
     vehicle.faults.pace = one.fault.values["pace"]
 
     def undo() -> None:

@@ -1,10 +1,10 @@
-"""The one grammar of faults, for the command line, the console, zenoh and Python.
+"""The grammar of faults, for the command line, the console, zenoh and Python.
 
     FAULT [VALUE…] [OPTION=VALUE…] [at=SECONDS] [for=SECONDS] [seed=NUMBER]
 
 Words in any order: `link_delay 0.2`, `at=20 motor_failure 2`, `packet_loss 0.3 link=onboard way=out for=10`.
-`at` counts simulated seconds since the simulator started; without it a fault begins at once. Without `for`
-it lasts until it is ended. Beside faults there are `list`, `help [FAULT]` and `end NUMBER|FAULT|all`.
+`at` is in simulated seconds since the simulator started; without it a fault begins at once. Without `for`
+it lasts until ended. Other commands are `list`, `help [FAULT]` and `end NUMBER|FAULT|all`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any
 
 
 class FaultError(ValueError):
-    """A fault, or what was said of it, that cannot be. The message is one line for a person."""
+    """An invalid fault or an invalid command. The message is one line for the user."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +26,7 @@ class Field:
     """One value of a fault.
 
     Attributes:
-        read: makes the value of its text; raises ValueError with what was expected.
+        read: parses its text; raises ValueError with what was expected.
         default: its value if not given; `REQUIRED` if it must be.
     """
 
@@ -41,12 +41,12 @@ REQUIRED: Any = object()
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """A kind of fault: its name, its values in the order they may be given, one line of what it does."""
+    """A kind of fault: its name, its values in order, one line about its effect."""
 
     name: str
     summary: str
     fields: tuple[Field, ...] = ()
-    momentary: bool = False  # over as soon as it began; cannot have a duration
+    momentary: bool = False  # has no duration
 
     @property
     def usage(self) -> str:
@@ -59,13 +59,13 @@ class Kind:
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """What was asked for.
+    """A parsed fault.
 
     Attributes:
         values: by field name, complete.
         at_s: when it begins, simulated seconds since the start; None: now.
         duration_s: None: until ended.
-        seed: of what is random about it; None: the vehicle's own and its number decide.
+        seed: of its random numbers; None: derived from the vehicle's seed and its number.
     """
 
     kind: Kind
@@ -88,7 +88,7 @@ class Fault:
 
 
 def parse_fault(text: str, kinds: Mapping[str, Kind]) -> Fault:
-    """Read a fault. Raises FaultError."""
+    """Parse a fault. Raises FaultError."""
     words = text.split()
     plain = [word for word in words if "=" not in word]
     if not plain:
@@ -110,13 +110,13 @@ def parse_fault(text: str, kinds: Mapping[str, Kind]) -> Fault:
 
 
 def make_fault(kind: Kind, positional: list[str], given: Mapping[str, str]) -> Fault:
-    """A fault of values in order and values by name, all as text. Raises FaultError."""
+    """Build a fault from positional and named values, all as text. Raises FaultError."""
     named = dict(given)
-    at_s = _take(kind, named, "at", _seconds)
-    duration_s = _take(kind, named, "for", positive)
-    seed = _take(kind, named, "seed", whole(-(2**63), 2**63))
+    at_s = _timing(kind, named, "at", _seconds)
+    duration_s = _timing(kind, named, "for", positive)
+    seed = _timing(kind, named, "seed", whole(-(2**63), 2**63))
     if duration_s is not None and kind.momentary:
-        raise FaultError(f"{kind.name} is over as soon as it began; for= means nothing with it")
+        raise FaultError(f"{kind.name} has no duration; leave for= out")
     values: dict[str, Any] = {}
     left = list(positional)
     for one in kind.fields:
@@ -132,11 +132,11 @@ def make_fault(kind: Kind, positional: list[str], given: Mapping[str, str]) -> F
         values[one.name] = _read(kind, one.name, one.read, text)
     if left or named:
         stray = left[0] if left else f"{next(iter(named))}="
-        raise FaultError(f"{kind.name}: {stray!r} is too much; usage: {kind.usage} [at=S] [for=S] [seed=N]")
+        raise FaultError(f"{kind.name}: unexpected {stray!r}; usage: {kind.usage} [at=S] [for=S] [seed=N]")
     return Fault(kind, values, at_s, duration_s, seed)
 
 
-def _take(kind: Kind, named: dict[str, str], name: str, read: Callable[[str], Any]) -> Any:
+def _timing(kind: Kind, named: dict[str, str], name: str, read: Callable[[str], Any]) -> Any:
     return _read(kind, name, read, named.pop(name)) if name in named else None
 
 
@@ -151,7 +151,7 @@ def _shown(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-# ---- readers of values: each takes a text and raises ValueError with what it expected
+# ---- parsers of values: each takes a text and raises ValueError with what was expected
 
 
 def number(low: float, high: float, unit: str = "") -> Callable[[str], float]:

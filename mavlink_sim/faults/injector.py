@@ -1,23 +1,21 @@
-"""Faults of a vehicle in real time: its sockets, the console and the zenoh key, in one place for the loop."""
+"""Fault injection in real time: the sockets, the console and the zenoh key of one vehicle."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 from mavlink_sim.faults.console import FaultConsole
+from mavlink_sim.faults.schedule import Faults
 from mavlink_sim.faults.zenoh_control import FaultControl
+from mavlink_sim.wire.endpoint import UdpEndpoint
 from mavlink_sim.wire.faulty_socket import FaultySocket
-
-if TYPE_CHECKING:
-    from mavlink_sim.vehicle import Vehicle
-    from mavlink_sim.wire.endpoint import UdpEndpoint
 
 
 class FaultOptions(Protocol):
-    """What of a simulation's options is about faults."""
+    """The options of a simulation about faults."""
 
     @property
     def faults(self) -> tuple[str, ...]: ...
@@ -28,7 +26,7 @@ class FaultOptions(Protocol):
 
 
 class FaultInjector:
-    """What the loop of a simulation does for faults; see `fault_injector`."""
+    """Fault injection for the loop of a simulation; see `fault_injector`."""
 
     def __init__(
         self,
@@ -41,14 +39,14 @@ class FaultInjector:
         self._control = control
 
     def poll(self) -> None:
-        """Once a turn of the loop: what was typed or asked for."""
+        """Execute commands of the console and of zenoh; call it once per loop."""
         if self._console is not None:
             self._console.poll()
         if self._control is not None:
             self._control.poll()
 
     def delivered(self) -> list[str]:
-        """Once a step: send what is due; the links on which delayed datagrams have arrived."""
+        """Send due datagrams, once per step. Returns the links on which delayed datagrams have arrived."""
         arrived = []
         for name, socket in self._sockets.items():
             socket.pump()
@@ -59,18 +57,18 @@ class FaultInjector:
 
 @contextmanager
 def fault_injector(
-    vehicle: Vehicle,
+    faults: Faults,
+    system_id: int,
     endpoints: Mapping[str, UdpEndpoint],
     options: FaultOptions,
-    say: Callable[[str], None],
+    report: Callable[[str], None],
 ) -> Iterator[FaultInjector]:
-    """Put the links' stages between the endpoints and their sockets, begin the faults, open the ways in.
+    """Insert the links' stages before the sockets, begin the faults, open console and zenoh control.
 
     Raises:
-        FaultError: a fault that cannot be.
+        FaultError: an invalid fault.
         ControlError: the control endpoint cannot be opened.
     """
-    faults = vehicle.faults
     sockets = {}
     for name, endpoint in endpoints.items():
         sockets[name] = FaultySocket(endpoint.socket, faults.stage(name), lambda: faults.now_s)
@@ -80,10 +78,10 @@ def fault_injector(
     with ExitStack() as stack:
         console = control = None
         if options.control is not None:
-            control = FaultControl(options.control, vehicle.system_id, faults)
+            control = FaultControl(options.control, system_id, faults)
             stack.callback(control.close)
         if options.console or (options.console is None and _is_terminal()):
-            console = FaultConsole(0, faults.command, say)
+            console = FaultConsole(0, faults.command, report)
             stack.callback(console.close)
         yield FaultInjector(sockets, console, control)
 

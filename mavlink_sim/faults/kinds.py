@@ -1,25 +1,21 @@
-"""Every kind of fault: how it is asked for, and the function that begins it.
+"""All kinds of faults: their grammar and the function that begins each.
 
-A beginning gets the vehicle and its `ActiveFault`, and appends to `undo` what sets right what it changed;
-what grows with time goes into `each_step`. docs/faults.md says what each is like in reality.
+The function gets the vehicle and the `ActiveFault`, and appends to `undo` what restores the state; effects
+that depend on time go into `each_step`. docs/faults.md compares each with reality.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 from mavlink_sim.faults import effects_flight as flight
 from mavlink_sim.faults import effects_link as link
 from mavlink_sim.faults import effects_messages as messages
+from mavlink_sim.faults.context import ActiveFault, FaultTarget
 from mavlink_sim.faults.grammar import REQUIRED, Field, Kind, choice, number, positive, probability, whole
 from mavlink_sim.px4.modes import Mode
 
-if TYPE_CHECKING:
-    from mavlink_sim.faults.schedule import ActiveFault
-    from mavlink_sim.vehicle import Vehicle
-
-Effect = Callable[["Vehicle", "ActiveFault"], None]
+Effect = Callable[[FaultTarget, ActiveFault], None]
 
 
 def _battery(text: str) -> float | str:
@@ -38,11 +34,11 @@ def _which(text: str) -> str:
 _positive_whole = whole(1, 1_000_000)
 
 _LINK = Field("link", str, "all", "onboard, gcs, or all")
-_WAY = Field("way", choice("both", "out", "in"), "both", "out: from the vehicle, in: to it, both")
+_DIRECTION = Field("way", choice("both", "out", "in"), "both", "out: from the vehicle, in: to it, both")
 
 
 def _on_links(name: str, summary: str, *fields: Field) -> Kind:
-    return Kind(name, summary, (*fields, _LINK, _WAY))
+    return Kind(name, summary, (*fields, _LINK, _DIRECTION))
 
 
 _TABLE: tuple[tuple[Kind, Effect], ...] = (
@@ -50,24 +46,24 @@ _TABLE: tuple[tuple[Kind, Effect], ...] = (
     (
         _on_links(
             "link_delay",
-            "everything is late, in order",
+            "delay everything, in order",
             Field("seconds", number(0.0, 60.0, "s"), REQUIRED, "how late"),
-            Field("jitter", number(0.0, 60.0, "s"), 0.0, "up to so many seconds more, each time another"),
+            Field("jitter", number(0.0, 60.0, "s"), 0.0, "random additional delay, up to this many seconds"),
         ),
         link.link_delay,
     ),
     (
         _on_links(
             "link_jitter",
-            "everything is late by a varying amount, in order",
-            Field("seconds", number(0.0, 60.0, "s"), REQUIRED, "at most so late"),
+            "delay everything by a varying amount, in order",
+            Field("seconds", number(0.0, 60.0, "s"), REQUIRED, "greatest delay"),
         ),
         link.link_jitter,
     ),
     (
         _on_links(
             "packet_loss",
-            "datagrams get lost at random",
+            "lose datagrams at random",
             Field("share", probability, REQUIRED, "probability, 0 to 1"),
         ),
         link.packet_loss,
@@ -83,16 +79,16 @@ _TABLE: tuple[tuple[Kind, Effect], ...] = (
     (
         _on_links(
             "reorder",
-            "datagrams overtake each other",
-            Field("share", probability, REQUIRED, "probability of being held back, 0 to 1"),
-            Field("hold", number(0.001, 10.0, "s"), 0.05, "how long it is held back, seconds"),
+            "reorder datagrams",
+            Field("share", probability, REQUIRED, "probability of being delayed, 0 to 1"),
+            Field("hold", number(0.001, 10.0, "s"), 0.05, "delay, seconds"),
         ),
         link.reorder,
     ),
     (
         _on_links(
             "corrupt",
-            "bytes of datagrams are other ones",
+            "change bytes of datagrams",
             Field("share", probability, REQUIRED, "probability for a datagram, 0 to 1"),
         ),
         link.corrupt,
@@ -100,19 +96,19 @@ _TABLE: tuple[tuple[Kind, Effect], ...] = (
     (
         _on_links(
             "rate_limit",
-            "the line carries so many bytes a second, with a radio's small buffer",
+            "limit the bytes per second, with a radio's small buffer",
             Field("bytes_per_s", number(10.0, 1e9, "bytes/s"), REQUIRED, "a 57600 baud radio: 5760"),
         ),
         link.rate_limit,
     ),
-    (Kind("heartbeat_only", "of the vehicle only HEARTBEAT is heard", (_LINK,)), messages.heartbeat_only),
+    (Kind("heartbeat_only", "only HEARTBEAT is sent of all streams", (_LINK,)), messages.heartbeat_only),
     (
         Kind(
             "lost_ack",
             "acknowledgements of commands are not sent",
             (
-                Field("which", _which, "all", "all, or N: the Nth from now alone"),
-                Field("command", whole(0, 65535), 0, "of this MAV_CMD alone; 0: of any"),
+                Field("which", _which, "all", "all, or N: only the Nth from now"),
+                Field("command", whole(0, 65535), 0, "only of this MAV_CMD; 0: of any"),
                 _LINK,
             ),
         ),
@@ -125,11 +121,11 @@ _TABLE: tuple[tuple[Kind, Effect], ...] = (
     (
         Kind(
             "gps_drift",
-            "the measured position wanders off, and the vehicle with it",
+            "the measured position drifts, and the vehicle with it",
             (
                 Field("speed", number(0.01, 50.0, "m/s"), 0.5, "m/s"),
                 Field(
-                    "towards", number(0.0, 360.0, "degrees"), None, "degrees from north; seeded if not given"
+                    "towards", number(0.0, 360.0, "degrees"), None, "degrees from north; by default seeded"
                 ),
                 Field("limit", number(0.1, 10000.0, "m"), 100.0, "metres at most"),
             ),
@@ -139,7 +135,7 @@ _TABLE: tuple[tuple[Kind, Effect], ...] = (
     (
         Kind(
             "ekf_reset",
-            "the estimate jumps, the vehicle does not; reset_counter tells of it",
+            "the estimate jumps, the vehicle does not; reset_counter counts it",
             (
                 Field("north", number(-1000.0, 1000.0, "m"), 2.0, "metres"),
                 Field("east", number(-1000.0, 1000.0, "m"), 0.0, "metres"),
@@ -152,7 +148,7 @@ _TABLE: tuple[tuple[Kind, Effect], ...] = (
     (
         Kind(
             "battery",
-            "so much is left",
+            "remaining charge",
             (Field("remaining", _battery, REQUIRED, "0 to 1, or low, critical, emergency"),),
         ),
         flight.battery,
@@ -168,14 +164,14 @@ _TABLE: tuple[tuple[Kind, Effect], ...] = (
     (
         Kind(
             "wind",
-            "a steady wind blows",
+            "add a steady wind",
             (
                 Field("speed", number(0.0, 40.0, "m/s"), REQUIRED, "m/s"),
                 Field(
                     "from",
                     number(0.0, 360.0, "degrees"),
                     None,
-                    "degrees from north it comes from; else seeded",
+                    "degrees from north that it blows from; by default seeded",
                 ),
             ),
         ),
@@ -191,7 +187,7 @@ _TABLE: tuple[tuple[Kind, Effect], ...] = (
                     "from",
                     number(0.0, 360.0, "degrees"),
                     None,
-                    "degrees from north it comes from; else seeded",
+                    "degrees from north that it blows from; by default seeded",
                 ),
             ),
         ),
@@ -211,7 +207,7 @@ _TABLE: tuple[tuple[Kind, Effect], ...] = (
             "requests for a mode are answered TEMPORARILY_REJECTED",
             (
                 Field("mode", choice("any", *(mode.name for mode in Mode)), "any", "a mode's name, or any"),
-                Field("count", _which, "all", "all, or so many"),
+                Field("count", _which, "all", "all, or a number"),
             ),
         ),
         flight.refuse_mode,
@@ -219,7 +215,7 @@ _TABLE: tuple[tuple[Kind, Effect], ...] = (
     (
         Kind(
             "reboot",
-            "the autopilot restarts: motors off, silent for a while, its clock begins at 0",
+            "the autopilot restarts: motors off, no traffic at first, its clock begins at 0",
             (Field("seconds", positive, 4.0, "of silence"),),
         ),
         flight.reboot,
@@ -228,7 +224,7 @@ _TABLE: tuple[tuple[Kind, Effect], ...] = (
         Kind(
             "time_jump",
             "the boot clock jumps",
-            (Field("seconds", number(-1e5, 1e5, "s"), REQUIRED, "forward, or back if negative"),),
+            (Field("seconds", number(-1e5, 1e5, "s"), REQUIRED, "forward; negative: back"),),
         ),
         messages.time_jump,
     ),
@@ -243,7 +239,7 @@ _TABLE: tuple[tuple[Kind, Effect], ...] = (
     (
         Kind(
             "stall",
-            "the vehicle stands still, or goes at a part of its pace",
+            "stop the vehicle's time, or slow it down",
             (Field("pace", number(0.0, 0.99), 0.0, "simulated seconds per second"),),
         ),
         messages.stall,

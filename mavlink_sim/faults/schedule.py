@@ -1,15 +1,15 @@
-"""What goes wrong with one vehicle, and when: faults begun, ended, scheduled and told of.
+"""The faults of one vehicle: begin, end, schedule and list them.
 
-Every vehicle has a `Faults`; in lockstep it is used as it is over sockets:
+Every vehicle has a `Faults`; it is used alike in lockstep and over sockets:
 
->>> from mavlink_sim.vehicle import Vehicle
+>>> from mavlink_sim.vehicles.vehicle import Vehicle
 >>> vehicle = Vehicle()
 >>> number = vehicle.faults.begin("gps_loss at=20 for=10")
 >>> vehicle.faults.end(number)
 1
 
-Times are simulated seconds since the vehicle was made. They go on through a reboot, a time jump and a stall.
-The grammar is in `fault_grammar`, what each fault does in `fault_kinds` and in docs/faults.md.
+Times are simulated seconds since the vehicle was created, independent of reboots, time jumps and stalls. The
+grammar is in `grammar`, the effect of each fault in `kinds` and in docs/faults.md.
 """
 
 from __future__ import annotations
@@ -17,59 +17,25 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import Any
 
+from mavlink_sim.faults.context import ActiveFault, FaultTarget, Gate, Refusal
 from mavlink_sim.faults.effects_link import chosen_links
 from mavlink_sim.faults.effects_messages import shifted
 from mavlink_sim.faults.grammar import Fault, FaultError, parse_fault
 from mavlink_sim.faults.kinds import EFFECTS, KINDS
+from mavlink_sim.physics.airframe import Vector
 from mavlink_sim.physics.estimate_errors import as_reported
 from mavlink_sim.wire.link_faults import LinkStage
-
-if TYPE_CHECKING:
-    from mavlink_sim.physics.airframe import Vector
-    from mavlink_sim.services.links import Link
-    from mavlink_sim.vehicle import Vehicle
+from mavlink_sim.wire.links import Link
 
 logger = logging.getLogger(__name__)
-
-# Of a message that the vehicle sends: another one in its place, or None to swallow it.
-Gate = Callable[["Link", Any], Any]
-# Of a command's identifier and parameters: the MAV_RESULT that it is refused with, or None.
-Refusal = Callable[[int, tuple[float, ...]], int | None]
-
-
-@dataclass
-class ActiveFault:
-    """One fault that was asked for.
-
-    Attributes:
-        number: how it is spoken of; counts from 1.
-        seed: of its random numbers.
-        begins_s, ends_s: on the faults' clock; `ends_s` is infinite without a duration.
-        undo: what sets things right again when it ends, last first.
-        each_step: called with the step's seconds while it is active.
-        apart: it is not of the vehicle itself, and goes on while that stands still.
-    """
-
-    number: int
-    fault: Fault
-    seed: int
-    begins_s: float
-    ends_s: float = math.inf
-    active: bool = False
-    undo: list[Callable[[], object]] = field(default_factory=list)
-    each_step: Callable[[float], None] | None = None
-    apart: bool = False
-
-    def __str__(self) -> str:
-        return f"{self.number} {self.fault}"
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """The answer to one line of the grammar: whether it was done, and one or more lines for a person."""
+    """The answer to one line of the grammar: whether it succeeded, and one or more lines of text."""
 
     ok: bool
     text: str
@@ -79,26 +45,26 @@ class Faults:
     """The faults of one vehicle.
 
     Attributes:
-        deaf: the vehicle takes in nothing and sends nothing (it reboots).
-        refusals: asked before each command is carried out; by fault number.
-        gates: every message the vehicle sends goes through these; by fault number.
+        deaf: the vehicle neither receives nor sends (it reboots).
+        refusals: called before each command is executed; by fault number.
+        gates: every message that the vehicle sends passes these; by fault number.
         boot_offset_us: added to the boot time in everything that is sent.
         elapsed_us: `now_s` in microseconds.
-        known: those that go on or wait for their time, by number; without any, `step` need not be called
-            if `elapsed_us` is advanced.
+        known: active and scheduled faults, by number; without any, `step` need not be called if `elapsed_us`
+            is advanced.
         second: other autopilots on the same links; by fault number.
         winds: added to the wind, NED m/s; by fault number.
         pace: simulated seconds of the vehicle per second of the faults' clock; 0 while it is frozen.
     """
 
-    def __init__(self, vehicle: Vehicle, seed: int, on_event: Callable[[str], None]) -> None:
+    def __init__(self, vehicle: FaultTarget, seed: int, on_event: Callable[[str], None]) -> None:
         self.vehicle = vehicle
         self._on_event = on_event
         self.deaf = False
         self.gates: dict[int, Gate] = {}
         self.refusals: dict[int, Refusal] = {}
         self.boot_offset_us = 0
-        self.second: dict[int, Vehicle] = {}
+        self.second: dict[int, FaultTarget] = {}
         self.winds: dict[int, Vector] = {}
         self.pace = 1.0
         self._seed = seed
@@ -110,21 +76,21 @@ class Faults:
         self._held: list[tuple[str, Any]] = []
         self._reads_held = False
 
-    # ---- for whoever makes faults -----------------------------------------------------------------------
+    # ---- control ----------------------------------------------------------------------------------------
 
     @property
     def now_s(self) -> float:
-        """Simulated seconds since the vehicle was made."""
+        """Simulated seconds since the vehicle was created."""
         return self.elapsed_us / 1e6
 
     @property
     def active(self) -> list[ActiveFault]:
-        """Those that go on now, oldest first."""
+        """The active faults, oldest first."""
         return [one for one in self.known.values() if one.active]
 
     @property
     def scheduled(self) -> list[ActiveFault]:
-        """Those that have not begun."""
+        """The faults that have not begun."""
         return [one for one in self.known.values() if not one.active]
 
     def begin(
@@ -142,13 +108,13 @@ class Faults:
             fault: a whole line of the grammar, or a fault's name that `values` and `options` complete.
             at_s: when; None: now.
             duration_s: for how long; None: until `end`.
-            seed: of what is random about it; None: follows from the vehicle's seed and the fault's number.
+            seed: of its random numbers; None: derived from the vehicle's seed and the fault's number.
 
         Returns:
             Its number.
 
         Raises:
-            FaultError: there is no such fault, or it cannot have these values.
+            FaultError: an unknown fault, or invalid values.
         """
         if isinstance(fault, str):
             timing = {"at": at_s, "for": duration_s, "seed": seed}
@@ -162,7 +128,7 @@ class Faults:
         number = self._count
         begins_s = self.now_s if fault.at_s is None else fault.at_s
         if begins_s < self.now_s - 1e-9:
-            raise FaultError(f"{fault.kind.name}: at={begins_s:g} is over, it is {self.now_s:.1f} s already")
+            raise FaultError(f"{fault.kind.name}: at={begins_s:g} is in the past, now is {self.now_s:.1f} s")
         own_seed = self._seed * 1_000_003 + number if fault.seed is None else fault.seed
         one = self.known[number] = ActiveFault(number, fault, own_seed, begins_s)
         if begins_s <= self.now_s + 1e-9:
@@ -170,7 +136,7 @@ class Faults:
         return number
 
     def end(self, which: int | str = "all") -> int:
-        """End faults, or take them off the schedule: one number, all of one name, or "all". Returns how many.
+        """End or unschedule faults: one number, all of one name, or "all". Returns how many.
 
         Raises FaultError if there is none.
         """
@@ -181,13 +147,13 @@ class Faults:
             if text == "all" or text == one.fault.kind.name or text == str(one.number)
         ]
         if not chosen and text != "all":
-            raise FaultError(f"there is no fault {text} to end; `list` names those that go on")
+            raise FaultError(f"there is no fault {text} to end; `list` shows the active ones")
         for one in chosen:
             self._finish(one)
         return len(chosen)
 
     def command(self, line: str) -> Outcome:
-        """Carry out a line of the grammar: a fault, `list`, `help [FAULT]`, `end NUMBER|FAULT|all`."""
+        """Execute a line of the grammar: a fault, `list`, `help [FAULT]`, `end NUMBER|FAULT|all`."""
         words = line.split()
         try:
             if not words or words[0] == "list":
@@ -207,7 +173,7 @@ class Faults:
         return Outcome(True, f"fault {one}" + ("" if one.active else f" at {one.begins_s:g} s"))
 
     def listing(self) -> list[str]:
-        """One line for each fault that goes on or waits."""
+        """One line for each active or scheduled fault."""
         lines = []
         for one in self.known.values():
             if one.active:
@@ -220,16 +186,16 @@ class Faults:
     # ---- for the vehicle --------------------------------------------------------------------------------
 
     def stage(self, link: str) -> LinkStage:
-        """What the datagrams of a link go through, whoever carries them."""
+        """The impairments of a link's datagrams."""
         return self._stages.setdefault(link, LinkStage())
 
     def step(self, dt_s: float) -> bool:
-        """Time passes: begin and end what is due. True: the vehicle itself stands still in this step."""
+        """Advance time: begin and end what is due. True: the vehicle is stalled in this step."""
         self.elapsed_us += int(dt_s * 1e6 + 0.5)
         if not self.known:
             return False
         now_s = self.now_s + 1e-9
-        self.vehicle.estimate.look()
+        self.vehicle.estimate.refresh()
         for one in list(self.known.values()):
             if not one.active and one.begins_s <= now_s:
                 self._start_scheduled(one)
@@ -252,8 +218,8 @@ class Faults:
         return False
 
     def intercepts(self, link: str, message: Any) -> bool:
-        """Whether a message that arrived is not for the vehicle to handle now."""
-        if not self._reads_held:  # the others have heard those
+        """Whether the vehicle must not handle a received message now."""
+        if not self._reads_held:  # the others have received those
             for other in self.second.values():
                 other.handle(link, message)
         if self.deaf:
@@ -264,7 +230,7 @@ class Faults:
         return False
 
     def take_in_held(self) -> None:
-        """What lay in the sockets of a frozen vehicle is all read when it goes on."""
+        """Handle the messages that arrived while the vehicle was stalled."""
         held, self._held = self._held, []
         self._reads_held = True
         for link, message in held:
@@ -272,7 +238,7 @@ class Faults:
         self._reads_held = False
 
     def gate(self, link: Link, message: Any) -> Any:
-        """The message that is sent in place of this one; None: nothing."""
+        """The message to send instead of this one; None: nothing."""
         if self.deaf:
             return None
         for gate in self.gates.values():
@@ -287,7 +253,7 @@ class Faults:
         return message
 
     def refuses(self, command: int, parameters: tuple[float, ...]) -> int | None:
-        """The MAV_RESULT that a command is refused with before anybody looks at it."""
+        """The MAV_RESULT of a refusal by a fault, before the command is executed; None: not refused."""
         for refusal in list(self.refusals.values()):
             result = refusal(command, parameters)
             if result is not None:
@@ -295,7 +261,7 @@ class Faults:
         return None
 
     def finish(self, number: int) -> None:
-        """A fault that ends by itself is over."""
+        """End a fault that ends by itself."""
         if number in self.known:
             self._finish(self.known[number])
 
@@ -313,8 +279,7 @@ class Faults:
         if one.fault.duration_s is not None:
             one.ends_s = self.now_s + one.fault.duration_s
         try:
-            with self.vehicle.turn():
-                EFFECTS[one.fault.kind.name](self.vehicle, one)
+            EFFECTS[one.fault.kind.name](self.vehicle, one)
         except FaultError:
             del self.known[one.number]
             raise
@@ -327,9 +292,8 @@ class Faults:
             return
         if one.active:
             one.active = False
-            with self.vehicle.turn():
-                for undo in reversed(one.undo):
-                    undo()
+            for undo in reversed(one.undo):
+                undo()
             self._on_event(f"fault {one} ends")
 
 

@@ -1,10 +1,10 @@
-"""Faults while flying, over zenoh: a queryable at `mavlink_sim/<system id>/fault` that takes the grammar.
+"""Faults over zenoh: a queryable at `mavlink_sim/<system id>/fault` that takes the grammar.
 
 The text is the query's payload or its parameter `fault` (`mavlink_sim/1/fault?fault=link_delay 0.2`). The
 reply is JSON: `{"ok": true, "text": "fault 1 link_delay 0.2", "active": ["1 link_delay 0.2: since 12.3 s"]}`.
 
-zenoh calls on threads of its own; what comes is put aside until the simulator's loop polls. The session
-listens at the endpoint it is given and nowhere else, connects nowhere, and looks for nobody by multicast.
+zenoh calls on its own threads; queries are queued until the simulator's loop polls. The session listens only
+at the given endpoint, connects to no other and has no multicast scouting.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ MAX_WAITING = 100
 
 
 class ControlError(OSError):
-    """The control endpoint cannot be opened. The message is one line for a person."""
+    """The control endpoint cannot be opened. The message is one line for the user."""
 
 
 def fault_key(system_id: int) -> str:
@@ -35,7 +35,7 @@ class FaultControl:
     """The queryable of one vehicle.
 
     Args:
-        endpoint: zenoh's, for example `tcp/127.0.0.1:7447`; it is listened on.
+        endpoint: where zenoh listens, for example `tcp/127.0.0.1:7447`.
 
     Raises:
         ControlError: zenoh is not installed, or cannot listen there.
@@ -43,7 +43,7 @@ class FaultControl:
 
     def __init__(self, endpoint: str, system_id: int, faults: Faults) -> None:
         try:
-            import zenoh  # nobody who does not ask for it waits for it
+            import zenoh  # imported on demand: it is slow
         except ImportError as error:
             raise ControlError("--control needs zenoh: pip install eclipse-zenoh") from error
         self._faults = faults
@@ -58,14 +58,14 @@ class FaultControl:
         self._queryable = self._session.declare_queryable(self.key, self._query)
 
     def _query(self, query: Any) -> None:
-        """On a thread of zenoh's."""
+        """Called on a thread of zenoh."""
         try:
             self._waiting.put_nowait(query)
         except queue.Full:
-            logger.warning("%s: more than %d queries wait; one is dropped", self.key, MAX_WAITING)
+            logger.warning("%s: more than %d queries are queued; one is dropped", self.key, MAX_WAITING)
 
     def poll(self) -> None:
-        """Carry out what has come since, and answer it."""
+        """Execute and answer the queued queries."""
         while True:
             try:
                 query = self._waiting.get_nowait()
@@ -85,7 +85,7 @@ class FaultControl:
         query.reply(self.key, json.dumps(reply).encode(), encoding="application/json")
 
     def close(self) -> None:
-        """Answer no more; the last of the vehicles in this process ends the session."""
+        """Stop answering; the last vehicle in this process closes the session."""
         self._queryable.undeclare()
         session, users = _sessions[self._endpoint]
         if users > 1:
@@ -100,7 +100,7 @@ _sessions: dict[str, tuple[Any, int]] = {}
 
 
 def _shared_session(endpoint: str) -> Any:
-    """A session that listens at the endpoint and nowhere else. Raises zenoh.ZError."""
+    """A session that listens only at the endpoint. Raises zenoh.ZError."""
     import zenoh
 
     session, users = _sessions.get(endpoint, (None, 0))

@@ -1,8 +1,8 @@
-"""Flying by attitude or by body rates: PX4's attitude controller and its ATTITUDE_TARGET.
+"""Control by attitude or by body rates: PX4's attitude controller and its ATTITUDE_TARGET.
 
 The control law is that of Brescianini, Hehn, D'Andrea, "Nonlinear Quadrocopter Attitude Control" (2013): the
 thrust direction is corrected first, the heading with a smaller weight (MC_YAW_WEIGHT). Thrust 0..1 is the
-share of the airframe's greatest thrust, as PX4 hands it to its mixer: MPC_THR_HOVER plays no part, and this
+share of the airframe's greatest thrust, as PX4 passes it to its mixer: MPC_THR_HOVER has no effect, and this
 airframe hovers at 9.81 / 20 = 0.49.
 """
 
@@ -18,7 +18,7 @@ from mavlink_sim.px4.parameters import Parameters
 from vision.attitude import Quaternion, quaternion_from_euler
 
 NAN = math.nan
-MAX_RATE_RADPS = math.radians(2000.0)  # the range of the gyroscopes; a setpoint may ask for any number
+MAX_RATE_RADPS = math.radians(2000.0)  # the range of the gyroscopes; a setpoint may have any number
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,8 +26,8 @@ class AttitudeSetpoint:
     """An attitude to hold.
 
     Attributes:
-        quaternion: `ned_from_body` (w, x, y, z), of any length; one that is no rotation leaves the vehicle
-            turning as it turned; PX4 makes no torque then.
+        quaternion: `ned_from_body` (w, x, y, z), of any length; one that is no rotation keeps the current
+            body rates, as PX4 makes no torque then.
         yaw_rate_radps: feed-forward about the world's down axis; NaN for none.
         thrust: collective, 0..1.
     """
@@ -39,7 +39,7 @@ class AttitudeSetpoint:
 
 @dataclass(frozen=True, slots=True)
 class RatesSetpoint:
-    """Body rates (FRD, rad/s) to turn at; NaN: as the vehicle turned when the setpoint came.
+    """Demanded body rates (FRD, rad/s); NaN: the rate at the time of the setpoint.
 
     `thrust`: collective, 0..1.
     """
@@ -50,7 +50,7 @@ class RatesSetpoint:
 
 @dataclass(frozen=True, slots=True)
 class AttitudeTarget:
-    """What ATTITUDE_TARGET tells: attitude (w, x, y, z), body rates in rad/s, collective thrust 0..1."""
+    """ATTITUDE_TARGET: attitude (w, x, y, z), body rates in rad/s, collective thrust 0..1."""
 
     quaternion: Quaternion
     rates: Vector
@@ -74,7 +74,7 @@ class AttitudeController:
         self._yaw_weight = min(max(value("MC_YAW_WEIGHT"), 0.0), 1.0)
         yaw_gain = value("MC_YAW_P")
         if self._yaw_weight > 1e-4:
-            yaw_gain /= self._yaw_weight  # the weight shall not slow a pure turn down
+            yaw_gain /= self._yaw_weight  # the weight must not slow down a pure yaw
         self._gains = (value("MC_ROLL_P"), value("MC_PITCH_P"), yaw_gain)
 
         def limit(name: str) -> float:
@@ -83,19 +83,19 @@ class AttitudeController:
         self._limits = (limit("MC_ROLLRATE_MAX"), limit("MC_PITCHRATE_MAX"), limit("MC_YAWRATE_MAX"))
 
     def release(self) -> None:
-        """Another controller has the vehicle."""
+        """Another controller is active."""
         if self._target is not None:
             self._target = self._setpoint = None
 
     @property
     def active(self) -> bool:
-        """The vehicle is flown by attitude or rates, so there is no position target."""
+        """Attitude or rates are controlled, so there is no position target."""
         return self._target is not None
 
     def target(self, airframe: Multirotor, outer: PositionController, demand: Demand) -> AttitudeTarget:
-        """For ATTITUDE_TARGET; `demand` is what the position controller `outer` wants, if that one flies.
+        """For ATTITUDE_TARGET; `demand` is the output of the position controller `outer`, if that is active.
 
-        While rates are flown, attitude and thrust stay those of the last attitude setpoint, as in PX4.
+        While rates are controlled, attitude and thrust stay those of the last attitude setpoint, as in PX4.
         """
         if self._target is not None:
             return self._target
@@ -112,19 +112,21 @@ class AttitudeController:
         outer: PositionController,
         demand: Demand,
     ) -> Demand:
-        """One step of control and of the airframe. Returns the new demand; `demand` is the one before."""
+        """One step of control and of the airframe. Returns the new demand; `demand` is the previous one."""
         before = self.target(airframe, outer, demand)
         if isinstance(setpoint, AttitudeSetpoint):
-            told = self.rates(setpoint, airframe)
-            rates = _possible(told, airframe.rates)
-            self._target = AttitudeTarget(unit(setpoint.quaternion) or IDENTITY, told, abs(setpoint.thrust))
+            demanded = self.rates(setpoint, airframe)
+            rates = _possible(demanded, airframe.rates)
+            self._target = AttitudeTarget(
+                unit(setpoint.quaternion) or IDENTITY, demanded, abs(setpoint.thrust)
+            )
         else:
             if setpoint is not self._setpoint:
                 self._rates = _possible(setpoint.rates, airframe.rates)
             rates = self._rates
             self._target = AttitudeTarget(before.quaternion, setpoint.rates, before.thrust)
         self._setpoint = setpoint
-        outer.reset(airframe.yaw_rad)  # so that it begins afresh, with the heading of that moment
+        outer.reset(airframe.yaw_rad)  # so that it restarts with the current heading
         thrust_mps2 = min(max(setpoint.thrust, 0.0), 1.0) * MAX_THRUST_MPS2
         airframe.step_rates(dt_s, thrust_mps2, rates)
         return Demand(thrust_mps2, airframe.roll_rad, airframe.pitch_rad, airframe.rates[2])
@@ -160,10 +162,10 @@ def _possible(rates: Vector, now: Vector) -> Vector:
 
 
 def _weighted(attitude: Quaternion, wanted: Quaternion, yaw_weight: float) -> Quaternion:
-    """The wanted attitude with only a share of its turn about the thrust axis."""
+    """The demanded attitude with only a share of its rotation about the thrust axis."""
     reduced = _shortest(third_axis(attitude), third_axis(wanted))
     if reduced is None:
-        return wanted  # upside down: every way round is as short
+        return wanted  # upside down: every direction is as short
     reduced = product(reduced, attitude)
     about_thrust = product(inverse(reduced), wanted)
     angle = 2.0 * math.atan2(about_thrust[3], about_thrust[0])

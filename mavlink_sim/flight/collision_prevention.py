@@ -1,7 +1,7 @@
-"""Collision prevention in Position mode: what the sticks may still ask for when something is near (CP_DIST).
+"""Collision prevention in Position mode: limits the sticks' acceleration near obstacles (CP_DIST).
 
-OBSTACLE_DISTANCE fills a map of sectors around the vehicle; `limited_acceleration` holds the pilot's
-acceleration setpoint against it. PX4 uses it in Position mode alone, never in OFFBOARD or an auto mode.
+OBSTACLE_DISTANCE fills a map of sectors around the vehicle; `limited_acceleration` limits the pilot's
+acceleration setpoint by it. PX4 uses it in Position mode only, never in OFFBOARD or an auto mode.
 Vectors are (north, east).
 """
 
@@ -30,11 +30,11 @@ SUPPORTED_FRAMES = frozenset({FRAME_GLOBAL, FRAME_LOCAL_NED, FRAME_BODY_FRD})
 
 @dataclass(frozen=True, slots=True)
 class Limited:
-    """What is left of a setpoint.
+    """A limited setpoint.
 
     Attributes:
         acceleration: m/s², (north, east).
-        hold: there was no data for 5 s; PX4 leaves Position mode for HOLD.
+        hold: no data for 5 s; PX4 changes from Position mode to HOLD.
     """
 
     acceleration: Plane
@@ -45,11 +45,11 @@ class ObstacleMap:
     """The newest distance in each of 72 sectors of 5°, sector 0 around the nose, clockwise, in centimetres.
 
     Attributes:
-        distances_cm: UNKNOWN_CM where nothing is known.
-        stamp_s: when the newest message came, seconds since boot.
-        used_s: when collision prevention looked at it last; PX4 publishes the map then, and then alone.
+        distances_cm: UNKNOWN_CM where unknown.
+        stamp_s: time of the newest message, seconds since boot.
+        used_s: when collision prevention last used it; PX4 publishes the map only then.
         min_distance_cm, max_distance_cm: the widest range of any sensor so far.
-        activated_s: when collision prevention was first asked for.
+        activated_s: when collision prevention was first active.
     """
 
     def __init__(self) -> None:
@@ -74,15 +74,15 @@ class ObstacleMap:
         yaw_rad: float,
         now_s: float,
     ) -> None:
-        """Take in an OBSTACLE_DISTANCE message.
+        """Add an OBSTACLE_DISTANCE message.
 
         Args:
             distances_cm: clockwise from the offset; UNKNOWN_CM where not measured, more than the maximum
                 where nothing is in range.
-            offset_deg: where the first lies: of the nose (body frame) or of north.
+            offset_deg: of the first sector from the nose (body frame) or from north.
             yaw_rad: the vehicle's heading now.
 
-        Raises ValueError for a frame PX4 does not take here.
+        Raises ValueError for a frame that PX4 does not support here.
         """
         if frame not in SUPPORTED_FRAMES:
             raise ValueError(f"Obstacle message received in unsupported frame {frame}")
@@ -97,16 +97,16 @@ class ObstacleMap:
             if distances_cm[index] == UNKNOWN_CM:
                 continue
             lower = index * increment_deg + shift - increment_deg / 2.0
-            # every sector that the measured one overlaps; one that only touches its edge is not
+            # every sector that the measured one overlaps; a shared edge is no overlap
             first = math.floor((lower + SECTOR_DEG / 2.0) / SECTOR_DEG + 1e-6)
             last = math.ceil((lower + increment_deg + SECTOR_DEG / 2.0) / SECTOR_DEG - 1e-6) - 1
             for sector in range(first, min(last, first + SECTORS - 1) + 1):
                 self._enter(sector % SECTORS, distances_cm[index], max_distance_cm, now_s)
 
     def _enter(self, sector: int, distance_cm: int, range_cm: int, now_s: float) -> None:
-        """Take a measurement, unless another sensor knows better: nearer things come first."""
+        """Store a measurement, unless another sensor measured a nearer object."""
         known, known_range = self.distances_cm[sector], self.ranges_cm[sector]
-        seen = known < known_range  # something is there
+        seen = known < known_range  # an obstacle
         if distance_cm < range_cm:
             better = not seen or range_cm <= known_range
         else:
@@ -122,7 +122,7 @@ class ObstacleMap:
                 self.distances_cm[sector] = UNKNOWN_CM
 
     def has_data(self, now_s: float) -> bool:
-        """Whether any sector is known now."""
+        """Whether any sector is known."""
         return now_s - self.stamp_s < STALE_S and min(self.distances_cm) < UNKNOWN_CM
 
 
@@ -134,16 +134,16 @@ def limited_acceleration(
     parameters: Parameters,
     now_s: float,
 ) -> Limited:
-    """What Position mode may do of an acceleration that the sticks ask for.
+    """Limit the acceleration setpoint of the sticks in Position mode.
 
     Args:
         acceleration: the sticks' setpoint, m/s² (north, east).
         velocity: the velocity setpoint, m/s (north, east).
         yaw_rad: heading. now_s: seconds since boot.
 
-    With CP_DIST not above zero everything is allowed. Without data nothing is. Otherwise the setpoint is
-    turned by up to CP_GUIDE_ANG towards the freer side, taken back as CP_DIST comes near, and what would not
-    stop in time (CP_DELAY, MPC_JERK_MAX, MPC_ACC_HOR) is braked.
+    With CP_DIST not above zero there is no limit. Without data the result is zero. Otherwise the setpoint is
+    turned by up to CP_GUIDE_ANG towards the freer side, reduced towards CP_DIST, and the vehicle brakes where
+    it would not stop in time (CP_DELAY, MPC_JERK_MAX, MPC_ACC_HOR).
     """
     keep_m = parameters.number("CP_DIST")
     if not keep_m > 0.0:
@@ -181,18 +181,18 @@ def _direction(sector: int, yaw_rad: float) -> Plane:
 
 
 def _may_go(sector: int, obstacles: ObstacleMap, parameters: Parameters) -> bool:
-    """Where nothing is known only CP_GO_NO_DATA allows to go, and only where no sensor ever looked."""
+    """Whether a sector without data may be flown into: with CP_GO_NO_DATA, and if no sensor covers it."""
     if obstacles.distances_cm[sector] < UNKNOWN_CM:
         return True
     return bool(parameters.number("CP_GO_NO_DATA")) and not obstacles.covered[sector]
 
 
 def _guided_sector(asked: int, obstacles: ObstacleMap, parameters: Parameters) -> int:
-    """The sector within CP_GUIDE_ANG of the one asked for that is freest, weighed against the detour."""
+    """The freest sector within CP_GUIDE_ANG of the demanded one, weighted by the detour."""
     keep_cm = parameters.number("CP_DIST") * 100.0
     reach = min(max(math.floor(parameters.number("CP_GUIDE_ANG") / SECTOR_DEG), 0), SECTORS // 2)
     distances = obstacles.distances_cm
-    best, best_cost = asked, 9999.0  # PX4's start value: dearer is never worth a detour
+    best, best_cost = asked, 9999.0  # PX4's start value: a higher cost is never worth a detour
     for sector in range(asked - reach, asked + reach + 1):
         known = distances[sector % SECTORS]
         if known == UNKNOWN_CM:
@@ -213,11 +213,11 @@ def _slowed(
     obstacles: ObstacleMap,
     parameters: Parameters,
 ) -> Plane:
-    """The setpoint with its parts towards and along the nearest obstacle taken back."""
+    """The setpoint with its components towards and along the nearest obstacle reduced."""
     nearest = min(range(SECTORS), key=obstacles.distances_cm.__getitem__)
     towards = _direction(nearest, yaw_rad)
     share = direction[0] * towards[0] + direction[1] * towards[1]
-    if share <= 0.0:  # away from it: as fast as the pilot likes
+    if share <= 0.0:  # away from it: not limited
         return direction[0] * size, direction[1] * size
     normal = (towards[0] * share, towards[1] * share)
     along = (direction[0] - normal[0], direction[1] - normal[1])
@@ -234,12 +234,12 @@ def _slowed(
 
 
 def _scale(distance_m: float, keep_m: float, parameters: Parameters) -> float:
-    """1 far away, falling with the square to 0 at the distance to keep; nearer it pushes away."""
-    room = distance_m - keep_m
-    if room <= 0.0:
-        return room
+    """1 far away, falling with the square to 0 at the distance to keep; negative below it."""
+    margin = distance_m - keep_m
+    if margin <= 0.0:
+        return margin
     full = max(keep_m, parameters.number("MPC_VEL_MANUAL") / parameters.positive("MPC_XY_P"))
-    return min((room / full) ** 2, 1.0)
+    return min((margin / full) ** 2, 1.0)
 
 
 def _braking(
@@ -250,7 +250,7 @@ def _braking(
     parameters: Parameters,
     now_s: float,
 ) -> Plane:
-    """The strongest braking that any sector demands to stop the vehicle before the distance to keep."""
+    """The strongest braking of all sectors that stops the vehicle before the distance to keep."""
     gain = parameters.number("MPC_XY_VEL_P_ACC")
     strongest, brake = 0.0, (0.0, 0.0)
     for sector, distance_cm in enumerate(obstacles.distances_cm):
@@ -261,8 +261,8 @@ def _braking(
         delay_s = parameters.number("CP_DELAY")
         if distance_cm < obstacles.ranges_cm[sector]:
             delay_s += now_s - obstacles.stamps_s[sector]
-        room = distance_cm / 100.0 - keep_m - speed * delay_s
-        allowed = _speed_to_stop_within(room, parameters) if room >= 0.0 else 0.0
+        margin = distance_cm / 100.0 - keep_m - speed * delay_s
+        allowed = _speed_to_stop_within(margin, parameters) if margin >= 0.0 else 0.0
         demanded = gain * min(allowed - speed, 0.0)
         if demanded < strongest:
             strongest, brake = demanded, (towards[0] * demanded, towards[1] * demanded)
@@ -270,7 +270,7 @@ def _braking(
 
 
 def _speed_to_stop_within(distance_m: float, parameters: Parameters) -> float:
-    """m/s from which the vehicle stops in this distance with MPC_ACC_HOR and MPC_JERK_MAX."""
+    """The speed, m/s, from which the vehicle stops in this distance with MPC_ACC_HOR and MPC_JERK_MAX."""
     acceleration = parameters.positive("MPC_ACC_HOR")
     ramp = 4.0 * acceleration * acceleration / parameters.positive("MPC_JERK_MAX")
     return max(0.5 * (math.sqrt(ramp * ramp + 8.0 * acceleration * distance_m) - ramp), 0.0)

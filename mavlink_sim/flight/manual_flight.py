@@ -1,9 +1,9 @@
-"""The modes a pilot flies by sticks, as PX4 does for multirotors: Position, Altitude, Stabilized and Acro.
+"""PX4's manual modes for multirotors: Position, Altitude, Stabilized and Acro.
 
 Position: sticks are accelerations against a drag that limits the speed to MPC_VEL_MANUAL, with the jerk
-limited by MPC_JERK_MAX; let go, the vehicle brakes and holds its place (MPC_POS_MODE 4). Or sticks are
-velocities (MPC_POS_MODE 0). Altitude: sticks are tilt, the height is held. Stabilized and Manual: sticks are
-tilt and thrust. Acro: sticks are turning rates and thrust. Names in capitals are PX4's parameters.
+limited by MPC_JERK_MAX; with centred sticks the vehicle brakes and holds its position (MPC_POS_MODE 4). Or
+sticks are velocities (MPC_POS_MODE 0). Altitude: sticks are tilt, the height is held. Stabilized and Manual:
+sticks are tilt and thrust. Acro: sticks are body rates and thrust. Names in capitals are PX4's parameters.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ MAX_TILT_FOR_ACCELERATION_DEG = 89.0
 
 Plane = tuple[float, float]  # north and east
 StickSource = Callable[[], Sticks]
-# (acceleration that the sticks ask for, velocity now), m/s² and m/s, NED: the acceleration that is allowed
+# (acceleration setpoint of the sticks, velocity), m/s² and m/s, NED -> the allowed acceleration
 AccelerationGuard = Callable[[Plane, Plane], Plane]
 
 
@@ -38,7 +38,7 @@ def expo(value: float, share: float) -> float:
 
 
 def with_dead_zone(value: float, dead_zone: float) -> float:
-    """Zero around the middle, continuous and up to ±1 outside it."""
+    """Zero around the centre, continuous and up to ±1 outside it."""
     bounded, zone = min(max(value, -1.0), 1.0), min(max(dead_zone, 0.0), 0.99)
     if abs(bounded) <= zone:
         return 0.0
@@ -46,13 +46,13 @@ def with_dead_zone(value: float, dead_zone: float) -> float:
 
 
 def super_expo(value: float, share: float, steepness: float) -> float:
-    """Expo with a 1/(1-x) shape on top, for Acro's sticks."""
+    """Expo combined with a 1/(1-x) shape, for Acro's sticks."""
     steepness = min(max(steepness, 0.0), 0.99)
     return expo(value, share) * (1.0 - steepness) / (1.0 - abs(min(max(value, -1.0), 1.0)) * steepness)
 
 
 def within_circle(x: float, y: float) -> Plane:
-    """A stick pushed into a corner is no faster than one pushed to a side."""
+    """Limit the length to 1: a stick in a corner is no faster than one at a side."""
     length = math.hypot(x, y)
     return (x / length, y / length) if length > 1.0 else (x, y)
 
@@ -72,7 +72,7 @@ def interpolated(value: float, low: float, high: float, at_low: float, at_high: 
 
 
 class YawByStick:
-    """Turning by stick (MPC_MAN_Y_MAX, MPC_MAN_Y_TAU), and holding the heading without."""
+    """Yaw by stick (MPC_MAN_Y_MAX, MPC_MAN_Y_TAU); heading hold with a centred stick."""
 
     def __init__(self, parameters: Parameters, fastest_degps: float = math.inf) -> None:
         self._value = parameters.number
@@ -96,7 +96,7 @@ class YawByStick:
 
 
 class HeightByStick:
-    """Climbing by throttle with limited acceleration and jerk; in the middle, the height is held."""
+    """Climb rate by throttle with limited acceleration and jerk; centred, the height is held."""
 
     def __init__(self, airframe: Multirotor, parameters: Parameters, fastest_mps: float = math.inf) -> None:
         self._airframe = airframe
@@ -141,10 +141,10 @@ class HeightByStick:
         return NAN, self._velocity, NAN
 
     def _smooth(self, wanted: float, dt_s: float) -> None:
-        """Towards a velocity with limited jerk, so that the acceleration is over when it is reached."""
+        """Approach a velocity with limited jerk, so that the acceleration is zero when it is reached."""
         jerk = max(self._value("MPC_JERK_MAX"), 0.1)
         change = wanted - self._velocity
-        # upwards is negative z: gaining climb, or losing descent, is an acceleration upwards
+        # upwards is negative z: more climb, or less descent, is an acceleration upwards
         limit = max(self._value("MPC_ACC_UP_MAX" if change < 0.0 else "MPC_ACC_DOWN_MAX"), 0.1)
         target = math.copysign(min(limit, math.sqrt(2.0 * jerk * abs(change))), change)
         step = jerk * dt_s
@@ -157,7 +157,7 @@ class HeightByStick:
 
 
 class Altitude(Task):
-    """ALTCTL: sticks are tilt up to MPC_MAN_TILT_MAX, the height is held, wind carries the vehicle away."""
+    """ALTCTL: sticks are tilt up to MPC_MAN_TILT_MAX; the height is held, not the position."""
 
     def __init__(self, airframe: Multirotor, parameters: Parameters, sticks: StickSource) -> None:
         self._airframe = airframe
@@ -192,7 +192,7 @@ class Altitude(Task):
 
 
 class Position(Task):
-    """POSCTL and POSITION_SLOW: sticks move the vehicle over ground, let go it brakes and stays."""
+    """POSCTL and POSITION_SLOW: sticks move the vehicle over ground; centred, it brakes and holds."""
 
     def __init__(
         self,
@@ -240,7 +240,7 @@ class Position(Task):
             self._by_velocity(wanted, dt_s)
         else:
             self._by_acceleration(wanted, dt_s)
-        self._lock_place()
+        self._lock_position()
         x, y = (NAN, NAN) if self._locked is None else self._locked
         return TrajectorySetpoint(
             (x, y, z), (*self._velocity, vz), (*self._acceleration, az), self._yaw.locked_rad, rate
@@ -272,10 +272,10 @@ class Position(Task):
         self._acceleration = (0.0, 0.0)
 
     def _by_acceleration(self, wanted: Plane, dt_s: float) -> None:
-        """Sticks accelerate, a drag limits: a stick that is held leads to its share of the top speed."""
+        """Sticks are accelerations, limited by a drag: a constant stick gives its share of the top speed."""
         value = self._parameters.positive
         speed = self._speed_mps()
-        # the drag eats half of the acceleration on average, so the sticks ask for twice as much
+        # the drag takes half of the acceleration on average, so the sticks demand twice as much
         strongest = 2.0 * value("MPC_ACC_HOR") * speed / value("MPC_VEL_MANUAL")
         asked = (wanted[0] * strongest, wanted[1] * strongest)
         if self._guard is not None:  # collision prevention
@@ -299,12 +299,12 @@ class Position(Task):
             ax, ay = ax / length * limit, ay / length * limit
         vx, vy = self._velocity
         if released and math.hypot(vx, vy) < 0.05 and math.hypot(ax, ay) < 0.2:
-            self._velocity = self._acceleration = (0.0, 0.0)  # too slow to be worth another swing
+            self._velocity = self._acceleration = (0.0, 0.0)  # too slow for another oscillation
         else:
             self._velocity, self._acceleration = (vx + ax * dt_s, vy + ay * dt_s), (ax, ay)
 
     def _drag(self, coefficient: float, released: bool, dt_s: float) -> Plane:
-        """With the sticks let go the drag grows, below 1 m/s with the root of the speed, so that it stops."""
+        """With centred sticks the drag grows, below 1 m/s with the root of the speed, so that it stops."""
         boost = max(2.0, math.sqrt(self._parameters.positive("MPC_VEL_MANUAL"))) if released else 1.0
         self._brake += dt_s / (dt_s + BRAKE_BLEND_S) * (boost - self._brake)
         vx, vy = self._velocity
@@ -316,7 +316,7 @@ class Position(Task):
         factor = coefficient * self._brake * (share * rooted / speed + 1.0 - share)
         return vx * factor, vy * factor
 
-    def _lock_place(self) -> None:
+    def _lock_position(self) -> None:
         x, y, _ = self._airframe.position
         moving = math.hypot(*self._velocity) > TINY
         if not moving and self._locked is None:
@@ -329,7 +329,7 @@ class Position(Task):
 class Stabilized(Task):
     """STABILIZED, and MANUAL, which is the same on a multirotor: sticks are tilt, yaw rate and thrust.
 
-    There is no position control: `demand` goes straight to the airframe.
+    There is no position control: `demand` goes directly to the airframe.
     """
 
     def __init__(self, airframe: Multirotor, parameters: Parameters, sticks: StickSource) -> None:
@@ -343,7 +343,7 @@ class Stabilized(Task):
     def update(self, dt_s: float) -> TrajectorySetpoint:
         sticks, value, airframe = self._sticks(), self._parameters.number, self._airframe
         if sticks.throttle < -0.9 or airframe.on_ground:
-            self._yaw.locked_rad = NAN  # the arming gesture turns nothing
+            self._yaw.locked_rad = NAN  # the arming gesture has no yaw
         rate = self._yaw.update(0.0 if airframe.on_ground else sticks.yaw, airframe.yaw_rad, dt_s)
         if self._yaw.locked_rad == self._yaw.locked_rad:
             rate += value("MC_YAW_P") * math.remainder(self._yaw.locked_rad - airframe.yaw_rad, math.tau)
@@ -387,7 +387,7 @@ def throttle_curve(stick: float, parameters: Parameters) -> float:
     curve = int(value("MPC_THR_CURVE"))
     if curve == 1:
         return interpolated(stick, -1.0, 1.0, lowest, highest)
-    # by default PX4 takes its estimate of the hover thrust, which in flight is the true one
+    # by default PX4 uses its estimate of the hover thrust, which in flight is the true one
     hover = value("MPC_THR_HOVER") if curve == 2 else GRAVITY_MPS2 / MAX_THRUST_MPS2
     if stick < 0.0:
         return interpolated(stick, -1.0, 0.0, lowest, hover)
@@ -395,7 +395,7 @@ def throttle_curve(stick: float, parameters: Parameters) -> float:
 
 
 def _tilt_to_euler(about_x: float, about_y: float) -> Plane:
-    """(roll, pitch) of one turn about a level axis (a rotation vector); its small yaw is left out."""
+    """(roll, pitch) of one rotation about a level axis (a rotation vector); its small yaw is dropped."""
     angle = math.hypot(about_x, about_y)
     if angle < 1e-9:
         return 0.0, 0.0

@@ -1,7 +1,8 @@
-"""DO_ORBIT: flying round a place, as PX4's orbit mode does it.
+"""DO_ORBIT: a circle around a point, as in PX4's orbit mode.
 
-The vehicle first flies to the nearest point of the circle, facing its centre; then it goes round by velocity,
-the radius held with a gain of 1/s. A request outside the limits leaves it hovering in mode ORBIT, as in PX4.
+The vehicle first flies to the nearest point of the circle, facing its centre; then it follows the circle by
+velocity, with a gain of 1/s on the radius. After a request outside the limits it hovers in mode ORBIT, as in
+PX4.
 """
 
 from __future__ import annotations
@@ -9,24 +10,18 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import TYPE_CHECKING, Any
 
 from mavlink_sim.flight.position_control import NAN, NOTHING, TrajectorySetpoint
 from mavlink_sim.flight.tasks import Task, Trajectory
 from mavlink_sim.physics.airframe import Multirotor, Vector
-from mavlink_sim.physics.geography import geographic
 from mavlink_sim.px4.parameters import Parameters
-from mavlink_sim.wire.messages import dialect
-
-if TYPE_CHECKING:
-    from mavlink_sim.vehicle import Vehicle
 
 MIN_RADIUS_M = 1.0
 MAX_CENTRIPETAL_MPS2 = 2.0
 ON_CIRCLE_M = 2.0
 RADIUS_GAIN_PER_S = 1.0
 DEFAULT_SPEED_MPS = 1.0
-# Nearer to the centre than this no direction leads away from it, and the vehicle goes where its nose points.
+# Nearer to the centre than this the direction is undefined, and the vehicle follows its heading.
 AT_CENTRE_M = 1e-3
 
 
@@ -43,10 +38,10 @@ class YawBehaviour(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class OrbitRequest:
-    """The parameters of DO_ORBIT; NaN: as it was, or as the vehicle is now.
+    """The parameters of DO_ORBIT; NaN: as before, or as the vehicle is now.
 
     Attributes:
-        radius_m: positive is clockwise seen from above. speed_mps: negative turns the direction round.
+        radius_m: positive is clockwise seen from above. speed_mps: negative reverses the direction.
         yaw_behaviour: an ORBIT_YAW_BEHAVIOUR.
         centre: local NED; north and east count together, down is the height to orbit at.
     """
@@ -58,7 +53,7 @@ class OrbitRequest:
 
 
 class Orbit(Task):
-    """Round a centre. `refused` after a request that cannot be flown: then the vehicle stays where it is."""
+    """Orbit a centre. `refused` after a request outside the limits: then the vehicle hovers."""
 
     def __init__(self, airframe: Multirotor, parameters: Parameters) -> None:
         self._airframe = airframe
@@ -77,11 +72,11 @@ class Orbit(Task):
         self._flying = False
         self._height_goal = airframe.position[2]
         self._stay = airframe.position
-        self.down_m = airframe.position[2]  # the height asked for at this moment
+        self.down_m = airframe.position[2]  # the current height setpoint
 
     def apply(self, request: OrbitRequest) -> bool:
-        """Take a request over. False if its radius is outside 1 m..MC_ORBIT_RAD_MAX: "Orbit radius limit
-        exceeded"; the rest of it counts nevertheless."""
+        """Apply a request. False if its radius is outside 1 m..MC_ORBIT_RAD_MAX: "Orbit radius limit
+        exceeded"; the rest of it is applied nevertheless."""
         clockwise, radius, speed = self.speed_mps > 0.0, self.radius_m, abs(self.speed_mps)
         if math.isfinite(request.radius_m):
             clockwise, radius = request.radius_m > 0.0, abs(request.radius_m)
@@ -180,7 +175,7 @@ class Orbit(Task):
         inward = speed * speed / self.radius_m
         correction = RADIUS_GAIN_PER_S * (self.radius_m - distance)
         (x, y, _), (vx, vy, _) = self._airframe.position, self._airframe.velocity
-        self._trajectory.position = (x, y, self._trajectory.position[2])  # it plans the height alone
+        self._trajectory.position = (x, y, self._trajectory.position[2])  # it plans the height only
         self._trajectory.velocity = (vx, vy, self._trajectory.velocity[2])
         level = self._trajectory.towards((x, y, self._height_goal), dt_s)
         yaw, rate = self._yaw(north, east)
@@ -204,7 +199,7 @@ class Orbit(Task):
         if self.yaw_behaviour is YawBehaviour.UNCONTROLLED:
             return NAN, 0.0
         if self.yaw_behaviour is YawBehaviour.STICK_CONTROLLED:
-            return self._heading.yaw_rad, NAN  # nobody moves a stick: it stays
+            return self._heading.yaw_rad, NAN  # no stick input: unchanged
         if self.yaw_behaviour is YawBehaviour.FRONT_TANGENT:
             sign = 1.0 if self._clockwise else -1.0
             return math.atan2(sign * north, -sign * east), around
@@ -223,26 +218,9 @@ class _Heading:
         fastest = math.radians(parameters.positive("MPC_YAWRAUTO_MAX"))
         acceleration = math.radians(parameters.positive("MPC_YAWRAUTO_ACC"))
         left = 0.0 if math.isnan(wanted_rad) else math.remainder(wanted_rad - self.yaw_rad, math.tau)
-        # as fast as still allows to stop there, and no faster than closes the gap in this step
+        # as fast as allows to stop there, and no faster than reaches it in this step
         rate = min(fastest, math.sqrt(2.0 * acceleration * abs(left)), abs(left) / dt_s)
         change = acceleration * dt_s
         self._rate += min(max(math.copysign(rate, left) - self._rate, -change), change)
         self.yaw_rad = math.remainder(self.yaw_rad + self._rate * dt_s, math.tau)
         return self.yaw_rad, self._rate
-
-
-def orbit_execution_status(vehicle: Vehicle) -> Any:
-    """ORBIT_EXECUTION_STATUS (360) while an orbit is flown, else None. Radius positive: clockwise."""
-    task = vehicle.autopilot.task
-    if not isinstance(task, Orbit) or task.refused:
-        return None
-    north, east, _ = task.centre
-    latitude, longitude, altitude = geographic((north, east, task.down_m))
-    return dialect.MAVLink_orbit_execution_status_message(
-        vehicle.boot_us,
-        math.copysign(task.radius_m, task.speed_mps),
-        0,
-        round(latitude * 1e7),
-        round(longitude * 1e7),
-        altitude,
-    )

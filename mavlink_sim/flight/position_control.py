@@ -13,19 +13,19 @@ from mavlink_sim.px4.parameters import Parameters
 
 NAN = math.nan
 NOTHING: Vector = (NAN, NAN, NAN)
-# PX4's is 2. Less, so that a 10 m step overshoots as measured on the real vehicle (0.6-1.15 m), but only so
-# much that it has settled after 6 s; all other gains are PX4's own.
+# PX4's is 2. Less, so that a 10 m step overshoots as measured on the real vehicle (0.6-1.15 m) and still
+# settles within 6 s; all other gains are PX4's.
 ANTI_WINDUP = 1.3
-# Far above what any vehicle can do: keeps absurd setpoints and gains, which PX4 accepts, within arithmetic.
+# Far above what any vehicle can do: avoids overflow with absurd setpoints and gains, which PX4 accepts.
 MAX_DEMAND_MPS2 = 1000.0
 MAX_TILT_DEG = 80.0
 
 
-# Not frozen, though nobody changes them: freezing makes a dataclass three times as dear to make, and each
-# control step makes both.
+# Not frozen, though never changed: a frozen dataclass takes three times as long to create, and each control
+# step creates both.
 @dataclass(slots=True)
 class TrajectorySetpoint:
-    """What a flight task asks of the controller; NaN: not controlled. NED, metres, seconds, radians."""
+    """The setpoint of a flight task; NaN: not controlled. NED, metres, seconds, radians."""
 
     position: Vector = NOTHING
     velocity: Vector = NOTHING
@@ -36,7 +36,7 @@ class TrajectorySetpoint:
 
 @dataclass(slots=True)
 class Demand:
-    """What the airframe is asked for."""
+    """The demand to the airframe."""
 
     thrust_mps2: float
     roll_rad: float
@@ -77,7 +77,7 @@ class PositionController:
         self._yaw_p = value("MC_YAW_P")
 
     def reset(self, yaw_rad: float) -> None:
-        """Forget the integrator and hold this yaw (on the ground)."""
+        """Reset the integrator and hold this yaw (on the ground)."""
         self._integral = (0.0, 0.0, 0.0)
         self.position = self.velocity = NOTHING
         self.acceleration = (0.0, 0.0, 100.0)  # PX4's "idle thrust" setpoint on the ground
@@ -98,7 +98,7 @@ class PositionController:
         if self._revision != self._parameters.revision:
             self._load()
         velocity_setpoint = self._velocity_setpoint(setpoint, position, max_up_mps)
-        # axis by axis rather than in a loop: this is the dearest part of a flight in lockstep
+        # axis by axis instead of a loop: this is the slowest part of a flight in lockstep
         (px, _, pz), (dx, _, dz) = self._velocity_p, self._velocity_d
         ix, iy, iz = self._integral
         ux, uy, uz = velocity_setpoint
@@ -158,10 +158,10 @@ class PositionController:
         return (x, y, z)
 
     def _allocate(self, ax: float, ay: float, az: float) -> tuple[float, float, float, float]:
-        """Collective thrust, and the acceleration that tilt and thrust limits leave of the demand."""
+        """Collective thrust, and the demanded acceleration within the tilt and thrust limits."""
         lift = min(max(GRAVITY_MPS2 - az, 0.12 * MAX_THRUST_MPS2), 0.97 * MAX_THRUST_MPS2)
         sideways = math.hypot(ax, ay)
-        # horizontal demand is met relative to hover (MPC_ACC_DECOUPLE): tilt as if flying level
+        # horizontal demand is relative to hover (MPC_ACC_DECOUPLE): tilt as in level flight
         limit = GRAVITY_MPS2 * self._max_tilt_tan
         scale = limit / sideways if sideways > limit else 1.0
         ax, ay = ax * scale, ay * scale
@@ -196,7 +196,7 @@ class PositionController:
 
 
 def _limited(feed_forward: tuple[float, float], x: float, y: float, limit: float) -> tuple[float, float]:
-    """A horizontal velocity cut to a limit, the part that leads to the position before the feed-forward."""
+    """A horizontal velocity within a limit; the position's part has priority over the feed-forward."""
     ahead_x, ahead_y = (value if value == value else 0.0 for value in feed_forward)
     to_x, to_y = x - ahead_x, y - ahead_y
     to, ahead = math.hypot(to_x, to_y), math.hypot(ahead_x, ahead_y)
@@ -204,14 +204,14 @@ def _limited(feed_forward: tuple[float, float], x: float, y: float, limit: float
         return to_x / to * limit, to_y / to * limit
     if ahead == 0.0:
         return x, y
-    # the share of the feed-forward at which the sum has just the length of the limit
+    # the share of the feed-forward at which the sum has the length of the limit
     along = (to_x * ahead_x + to_y * ahead_y) / ahead
     share = (math.sqrt(along * along + limit * limit - to * to) - along) / ahead
     return to_x + share * ahead_x, to_y + share * ahead_y
 
 
 def _tilt(ax: float, ay: float, yaw_rad: float) -> tuple[float, float]:
-    """(roll, pitch) that point the thrust so that it accelerates by (ax, ay) while carrying the weight."""
+    """(roll, pitch) whose thrust accelerates by (ax, ay) and carries the weight."""
     cosine, sine = math.cos(yaw_rad), math.sin(yaw_rad)
     forward = cosine * ax + sine * ay
     right = -sine * ax + cosine * ay

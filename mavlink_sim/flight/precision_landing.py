@@ -1,7 +1,7 @@
 """Landing on a target that LANDING_TARGET reports: PX4's precision landing (PLD_*).
 
-Start → horizontal approach → descend above the target → final approach; when the target is lost high up it
-goes back to the start, climbs to PLD_SRCH_ALT and searches, and in the end lands where it is.
+Start → horizontal approach → descend above the target → final approach; when the target is lost high above
+ground it returns to the start, climbs to PLD_SRCH_ALT and searches, and finally lands at its position.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from mavlink_sim.px4.parameters import Parameters
 
 SETTLE_S = 2.0  # above the start point or the target, before going on
 SEARCH_SETTLE_S = 1.0
-CLIMB_ON_M = 1.0  # how far a climb goes on after the target came in sight
-LOW_TIMEOUT_S = 0.5  # close to the ground a target is lost sooner
+CLIMB_ON_M = 1.0  # how far a climb continues after the target came in sight
+LOW_TIMEOUT_S = 0.5  # close to the ground a target times out sooner
 
 
 @dataclass(frozen=True, slots=True)
 class LandingTarget:
-    """The newest LANDING_TARGET: local NED metres and when it came, seconds since boot."""
+    """The newest LANDING_TARGET: local NED metres, and its time of arrival, seconds since boot."""
 
     position: Vector
     stamp_s: float
@@ -53,12 +53,12 @@ class PrecisionLanding(flight.TrajectoryTask):
     """Land on the target.
 
     Args:
-        place: where to look for the target first; the altitude to start from.
+        point: where to search for the target first; the altitude to start from.
         newest: gives the newest target, None before the first.
         now_s: gives the time since boot.
 
     Attributes:
-        phase: what it is doing. landing: on the descent.
+        phase: the current state. landing: on the descent.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class PrecisionLanding(flight.TrajectoryTask):
         precision: Precision,
         newest: Callable[[], LandingTarget | None],
         now_s: Callable[[], float],
-        place: Vector | None = None,
+        point: Vector | None = None,
         on_phase: Callable[[str], None] | None = None,
     ) -> None:
         self._airframe = airframe
@@ -78,7 +78,7 @@ class PrecisionLanding(flight.TrajectoryTask):
         self._now_s = now_s
         self._on_phase = on_phase
         self._trajectory = flight.Trajectory(airframe, parameters)
-        self.goal: Vector = self._trajectory.stopping_point() if place is None else place
+        self.goal: Vector = self._trajectory.stopping_point() if point is None else point
         self._land: flight.Land | None = None
         self._seen: LandingTarget | None = None
         self._is_new = False
@@ -135,7 +135,7 @@ class PrecisionLanding(flight.TrajectoryTask):
             self._lost()
 
     def _final(self) -> None:
-        """Down to the ground, wherever it is."""
+        """Descend to the ground at the current position."""
 
     def _searching(self) -> None:
         now = self._now_s()
@@ -166,7 +166,7 @@ class PrecisionLanding(flight.TrajectoryTask):
         self.goal = (self.goal[0], self.goal[1], self._airframe.position[2])
 
     def _lost(self) -> None:
-        """Stay here and begin again, as often as PLD_MAX_SRCH allows."""
+        """Hold here and restart, as often as PLD_MAX_SRCH allows."""
         self._resume_flight(self._airframe.position)
         if self._searches <= self._parameters.number("PLD_MAX_SRCH"):
             self._searches += 1
@@ -184,10 +184,10 @@ class PrecisionLanding(flight.TrajectoryTask):
         self._land = flight.Land(self._airframe, self._parameters)
         self.goal = self._land.goal or self.goal
 
-    def _land_at(self, place: Vector) -> None:
+    def _land_at(self, point: Vector) -> None:
         if self._land is None:
-            self._land = flight.Land(self._airframe, self._parameters, place)
-        self._land.goal = self.goal = place
+            self._land = flight.Land(self._airframe, self._parameters, point)
+        self._land.goal = self.goal = point
 
     def _resume_flight(self, goal: Vector) -> None:
         if self._land is not None:
@@ -208,11 +208,11 @@ class PrecisionLanding(flight.TrajectoryTask):
         return self._age_s() <= self._parameters.number("PLD_BTOUT")
 
     def _can_approach(self) -> bool:
-        """The target must be in sight at this very moment."""
+        """The target is in sight now."""
         return self._is_new and self._target_is_fresh()
 
     def _can_finish(self) -> bool:
-        """Low enough above a target seen lately to go on without it."""
+        """Low enough above a recently seen target to continue without it."""
         height = self._target().position[2] - self._airframe.position[2]
         return self._target_is_fresh() and height < self._parameters.number("PLD_FAPPR_ALT")
 
@@ -220,11 +220,11 @@ class PrecisionLanding(flight.TrajectoryTask):
         radius = self._parameters.number("PLD_HACC_RAD")
         return all(abs(target.position[axis] - self._airframe.position[axis]) < radius for axis in (0, 1))
 
-    def _horizontal_distance(self, place: Vector) -> float:
-        return math.dist(place[:2], self._airframe.position[:2])
+    def _horizontal_distance(self, point: Vector) -> float:
+        return math.dist(point[:2], self._airframe.position[:2])
 
     def _waited(self, seconds: float) -> bool:
-        """Whether this was asked first longer than that ago in this phase."""
+        """Whether the first call in this phase was longer ago than that."""
         if self._arrived_s is None:
             self._arrived_s = self._now_s()
         return self._now_s() - self._arrived_s > seconds

@@ -1,4 +1,4 @@
-"""DO_REPOSITION: flying to a place in mode HOLD, and staying there."""
+"""DO_REPOSITION: flight to a point in mode HOLD."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ AWAY_FROM_HOME = 2
 ALONG_TRAJECTORY = 3
 YAW_FIXED = 5
 
-MIN_COURSE_SPEED_MPS = 0.5  # slower than this the direction of flight says nothing
+MIN_COURSE_SPEED_MPS = 0.5  # below this speed the direction of flight is undefined
 
 
 class Reposition(Task):
     """To a goal in local NED at a cruise speed, nose first (MPC_YAW_MODE) unless a yaw is given.
 
-    Unlike a plain hold it takes off where it is given to an armed vehicle on the ground, as in PX4.
+    Unlike a plain hold it takes off when the armed vehicle is on the ground, as in PX4.
     """
 
     def __init__(
@@ -48,7 +48,7 @@ class Reposition(Task):
         return self._trajectory.towards(self.goal, dt_s, yaw)
 
     def _facing(self) -> float:
-        """The heading of MPC_YAW_MODE; kept when there is nowhere to look any more."""
+        """The heading of MPC_YAW_MODE; kept where that is undefined."""
         mode = int(self._parameters.number("MPC_YAW_MODE"))
         x, y, _ = self._airframe.position
         least = self._parameters.number("NAV_ACC_RAD")
@@ -70,19 +70,19 @@ class Reposition(Task):
 def reposition_goal(
     wanted: Vector, yaw_rad: float, airframe: Multirotor, parameters: Parameters, former_goal: Vector | None
 ) -> Vector:
-    """Where DO_REPOSITION leads, local NED; NaN components of `wanted` are filled in as PX4 does.
+    """The goal of DO_REPOSITION, local NED; NaN components of `wanted` are filled in as PX4 does.
 
-    With a place but no altitude, the present one counts. With an altitude or a yaw alone, the vehicle stays
-    at the place it was flying to. With nothing at all it stops: the goal is where it comes to rest.
+    With a horizontal position but no altitude, the current altitude is kept. With an altitude or a yaw only,
+    the horizontal goal is kept. Without any it stops: the goal is where it comes to rest.
     """
     north, east, down = wanted
     here = airframe.position
-    has_place = math.isfinite(north) and math.isfinite(east)
+    has_position = math.isfinite(north) and math.isfinite(east)
     height = down if math.isfinite(down) else here[2]
-    if has_place:
+    if has_position:
         return (north, east, height)
     if math.isfinite(down) or math.isfinite(yaw_rad):
-        place = here if former_goal is None else former_goal
-        return (place[0], place[1], height)
+        point = here if former_goal is None else former_goal
+        return (point[0], point[1], height)
     rest = Trajectory(airframe, parameters).stopping_point()
     return (rest[0], rest[1], height)

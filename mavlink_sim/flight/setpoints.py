@@ -1,7 +1,7 @@
 """The three offboard setpoint messages as PX4's MAVLink receiver reads them.
 
-SET_POSITION_TARGET_LOCAL_NED, SET_POSITION_TARGET_GLOBAL_INT and SET_ATTITUDE_TARGET become the values that
-the controllers fly: `TrajectorySetpoint`, `AttitudeSetpoint`, `RatesSetpoint`.
+SET_POSITION_TARGET_LOCAL_NED, SET_POSITION_TARGET_GLOBAL_INT and SET_ATTITUDE_TARGET become the inputs of the
+controllers: `TrajectorySetpoint`, `AttitudeSetpoint`, `RatesSetpoint`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 from mavlink_sim.flight.attitude_control import AttitudeSetpoint, RatesSetpoint
 from mavlink_sim.flight.position_control import NAN, NOTHING, TrajectorySetpoint
 from mavlink_sim.physics.airframe import Vector
-from mavlink_sim.physics.geography import HOME_ALTITUDE_M, local
+from mavlink_sim.physics.geography import HOME_ALTITUDE_M, LocalFrame
 
 LOCAL_NED = 1  # MAV_FRAME_LOCAL_NED
 BODY_NED = 8  # MAV_FRAME_BODY_NED
@@ -46,7 +46,7 @@ def trajectory_setpoint(
 ) -> TrajectorySetpoint:
     """The setpoint of a SET_POSITION_TARGET_LOCAL_NED message to a vehicle with this attitude.
 
-    In LOCAL_NED each axis counts unless its ignore bit is set. In BODY_NED the position is always ignored,
+    In LOCAL_NED each axis is used unless its ignore bit is set. In BODY_NED the position is always ignored,
     the velocity is turned by the vehicle's yaw (not by its tilt), the acceleration by its whole attitude, and
     one ignored axis disables all three.
 
@@ -79,36 +79,42 @@ def trajectory_setpoint(
 
 
 def global_trajectory_setpoint(
-    message: Any, home_altitude_m: float | None, ground_altitude_m: float = HOME_ALTITUDE_M
+    message: Any,
+    frame: LocalFrame,
+    home_altitude_m: float | None,
+    ground_altitude_m: float = HOME_ALTITUDE_M,
 ) -> TrajectorySetpoint | None:
-    """The setpoint of a SET_POSITION_TARGET_GLOBAL_INT message; None where PX4 drops it without a word.
+    """The setpoint of a SET_POSITION_TARGET_GLOBAL_INT message; None where PX4 drops it silently.
 
-    The position counts as a whole: one ignored axis disables all three, and then the frame does not matter.
+    The position is used as a whole: one ignored axis disables all three, and then the frame is irrelevant.
     Only the _INT frames are known; velocity and acceleration are NED and each axis has its own ignore bit.
-    Altitudes relative to home are worked out as PX4 does, home altitude minus origin altitude taken with the
-    wrong sign: a home 2 m above the origin puts the goal 4 m too low.
+    Altitudes relative to home are computed as in PX4, with the wrong sign of home altitude minus origin
+    altitude: with a home 2 m above the origin the goal is 4 m too low.
 
     Args:
-        home_altitude_m: of home, AMSL; None before the vehicle knows its position: then no position is taken.
+        frame: the vehicle's local frame.
+        home_altitude_m: of home, AMSL; None before the vehicle has a position: then positions are dropped.
         ground_altitude_m: of the terrain below the vehicle, AMSL.
 
     Raises:
         SetpointRejectedError: a position in another frame, or force setpoints.
     """
     mask = int(message.type_mask)
-    frame = int(message.coordinate_frame)
+    mav_frame = int(message.coordinate_frame)
     position = NOTHING
     if not mask & sum(POSITION_IGNORE):
         if home_altitude_m is None:
             return None
         altitude = float(message.alt)
-        if frame == GLOBAL_RELATIVE_ALT_INT:
+        if mav_frame == GLOBAL_RELATIVE_ALT_INT:
             altitude = 2.0 * HOME_ALTITUDE_M - home_altitude_m + altitude
-        elif frame == GLOBAL_TERRAIN_ALT_INT:
+        elif mav_frame == GLOBAL_TERRAIN_ALT_INT:
             altitude += ground_altitude_m
-        elif frame != GLOBAL_INT:
-            raise SetpointRejectedError(f"SET_POSITION_TARGET_GLOBAL_INT invalid coordinate frame {frame}")
-        position = _finite(local(message.lat_int / 1e7, message.lon_int / 1e7, altitude))
+        elif mav_frame != GLOBAL_INT:
+            raise SetpointRejectedError(
+                f"SET_POSITION_TARGET_GLOBAL_INT invalid coordinate frame {mav_frame}"
+            )
+        position = _finite(frame.local(message.lat_int / 1e7, message.lon_int / 1e7, altitude))
     velocity = _kept((message.vx, message.vy, message.vz), mask, VELOCITY_IGNORE)
     acceleration = _kept((message.afx, message.afy, message.afz), mask, ACCELERATION_IGNORE)
     if mask & FORCE and _any_finite(acceleration):
@@ -121,15 +127,15 @@ def global_trajectory_setpoint(
 def attitude_setpoint(message: Any) -> AttitudeSetpoint | RatesSetpoint | None:
     """The setpoint of a SET_ATTITUDE_TARGET message; None where neither attitude nor rates are given.
 
-    With both an attitude and rates the attitude counts, and the body yaw rate is its feed-forward. Rates
-    count if neither the roll nor the pitch rate is ignored. An ignored throttle is no thrust, as in PX4.
+    With both an attitude and rates the attitude is used, and the body yaw rate is its feed-forward. Rates
+    are used if neither the roll nor the pitch rate is ignored. An ignored throttle is zero thrust, as in PX4.
     """
     mask = int(message.type_mask)
     yaw_rate = NAN if mask & BODY_YAW_RATE_IGNORE else float(message.body_yaw_rate)
     thrust = 0.0 if mask & THROTTLE_IGNORE else _number(message.thrust)
     if not mask & ATTITUDE_IGNORE:
         if mask & THRUST_BODY_SET:
-            # pymavlink's dialects of 2.4.50 know no thrust_body; then the vector is as if sent all zero
+            # pymavlink's dialects of 2.4.50 have no thrust_body; then the vector is zero
             thrust = -_number(getattr(message, "thrust_body", (0.0, 0.0, 0.0))[2])
         w, x, y, z = (float(value) for value in message.q)
         return AttitudeSetpoint((w, x, y, z), yaw_rate, thrust)
@@ -139,11 +145,11 @@ def attitude_setpoint(message: Any) -> AttitudeSetpoint | RatesSetpoint | None:
 
 
 def flyable(setpoint: TrajectorySetpoint) -> TrajectorySetpoint:
-    """The setpoint itself, or "stop and wait" where PX4's position controller cannot fly it.
+    """The setpoint itself, or "stop and wait" where PX4's position controller cannot follow it.
 
     Every axis needs a position, a velocity or an acceleration, and north and east of each come in pairs.
     """
-    # spelt out, as all that is done for every setpoint: a stream of them is a tenth of a flight in lockstep
+    # unrolled for speed: a stream of setpoints takes a tenth of a flight in lockstep
     x, y, z = setpoint.position
     vx, vy, vz = setpoint.velocity
     ax, ay, az = setpoint.acceleration

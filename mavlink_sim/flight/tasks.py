@@ -1,6 +1,6 @@
-"""The flight tasks: what each mode asks of the position controller while it runs.
+"""The flight tasks: the setpoints of each mode.
 
-A task is made when its mode begins and asked for a `TrajectorySetpoint` at every step. Positions: local NED.
+A task is created when its mode begins and returns a `TrajectorySetpoint` at every step. Positions: local NED.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ Setpoint = TrajectorySetpoint | AttitudeSetpoint | RatesSetpoint
 
 # Share of the acceleration limit that the planned braking uses, so that the vehicle can follow it.
 BRAKING_SHARE = 0.6
-# Measured on PX4 after the ramp of a take-off: the climb begins that much later, and gains speed so much
-# faster than the ramp's acceleration (MPC_TKO_SPEED in MPC_TKO_RAMP_T), by which it loses speed again.
+# Measured on PX4 after the ramp of a take-off: the delay of the climb, and the factor by which it accelerates
+# faster than the ramp (MPC_TKO_SPEED in MPC_TKO_RAMP_T), at which it decelerates again.
 CLIMB_LAG_S = 0.75
 CLIMB_GAIN = 2.2
 SLOWEST_CLIMB_MPS = 0.25  # so that a take-off ends
-# Measured: a take-off to 2.5 m is over at 1.8-2.2 m, a little inside NAV_MC_ALT_RAD.
+# Measured: a take-off to 2.5 m ends at 1.8-2.2 m, a little inside NAV_MC_ALT_RAD.
 TAKEOFF_ACCEPTANCE = 0.82
 
 
 class Trajectory:
-    """A point that moves towards a goal within speed and acceleration limits, and waits for the vehicle."""
+    """A point that moves to a goal within speed and acceleration limits, and waits for the vehicle."""
 
     def __init__(self, airframe: Multirotor, parameters: Parameters) -> None:
         self._airframe = airframe
@@ -35,15 +35,15 @@ class Trajectory:
         self.position = airframe.position
         self.velocity = airframe.velocity
         self.yaw_rad = airframe.yaw_rad
-        self.cruise_mps = NAN  # in place of MPC_XY_CRUISE, if above zero
+        self.cruise_mps = NAN  # instead of MPC_XY_CRUISE, if above zero
 
     def keep_height(self) -> None:
-        """Plan on from the vehicle's own height: on the ramp of a take-off it may not follow yet."""
+        """Plan from the vehicle's height: on the ramp of a take-off it does not follow yet."""
         x, y, _ = self.position
         self.position = (x, y, self._airframe.position[2])
 
     def stopping_point(self) -> Vector:
-        """Where the vehicle comes to rest if it brakes now."""
+        """The position where the vehicle comes to rest if it brakes now."""
         braking = BRAKING_SHARE * self._parameters.positive("MPC_ACC_HOR")
         x, y, z = self.position
         vx, vy, vz = self.velocity
@@ -87,42 +87,42 @@ class Trajectory:
         vx, vy, vz = vx + change_x, vy + change_y, vz + min(max(wanted_z - vz, -allowed_z), allowed_z)
         self.velocity = (vx, vy, vz)
         x, y, z = self.position
-        # a point that waits for the vehicle must not urge it on either, or the two never meet
-        flown = (vx * pace, vy * pace, vz * pace)
-        self.position = (x + flown[0] * dt_s, y + flown[1] * dt_s, z + flown[2] * dt_s)
+        # a point that waits must not feed forward its velocity, or the vehicle never reaches it
+        moved_mps = (vx * pace, vy * pace, vz * pace)
+        self.position = (x + moved_mps[0] * dt_s, y + moved_mps[1] * dt_s, z + moved_mps[2] * dt_s)
         if yaw_rad == yaw_rad:
             turn = math.radians(value("MPC_YAWRAUTO_MAX")) * dt_s
             error = math.remainder(yaw_rad - self.yaw_rad, math.tau)
             self.yaw_rad = math.remainder(self.yaw_rad + min(max(error, -turn), turn), math.tau)
-        return TrajectorySetpoint(self.position, flown, NOTHING, self.yaw_rad)
+        return TrajectorySetpoint(self.position, moved_mps, NOTHING, self.yaw_rad)
 
 
 class Task(ABC):
-    """The common face of the flight tasks. `landing` and `finished` are read after each `update`."""
+    """Base of the flight tasks. `landing` and `finished` are read after each `update`."""
 
     landing = False  # on the final descent
     finished = False
     taking_off = False  # climbing from the ground in a mode other than TAKEOFF
-    goal: Vector | None = None  # where an auto mode flies to, for POSITION_TARGET_GLOBAL_INT
+    goal: Vector | None = None  # the goal of an auto mode, for POSITION_TARGET_GLOBAL_INT
 
     @abstractmethod
     def update(self, dt_s: float) -> Setpoint:
-        """Where to be and how to move after another `dt_s` seconds."""
+        """The setpoint after another `dt_s` seconds."""
 
     def cruise_at(self, speed_mps: float) -> None:  # noqa: B027 - a task without a route has no cruise speed
         """Fly the rest of the route at this horizontal speed (DO_CHANGE_SPEED, DO_REPOSITION)."""
 
 
 class TrajectoryTask(Task):
-    """A task that asks for positions and velocities, never for attitudes."""
+    """A task with position and velocity setpoints, never attitudes."""
 
     @abstractmethod
     def update(self, dt_s: float) -> TrajectorySetpoint:
-        """Where to be and how to move after another `dt_s` seconds."""
+        """The setpoint after another `dt_s` seconds."""
 
 
 class Hold(Task):
-    """Brake and stay, or fly to a goal and stay there (DO_REPOSITION, the end of a take-off)."""
+    """Brake and hold, or fly to a goal and hold there (DO_REPOSITION, the end of a take-off)."""
 
     def __init__(
         self,
@@ -169,7 +169,7 @@ class Takeoff(Task):
         return self._parameters.positive("MPC_TKO_SPEED") / self._parameters.positive("MPC_TKO_RAMP_T")
 
     def _climb(self, dt_s: float, left_m: float) -> float:
-        """The speed to climb at, m/s, with so much left to climb; braking as PX4 does below MPC_LAND_ALT1."""
+        """The climb rate, m/s, for the remaining height; braking as PX4 does below MPC_LAND_ALT1."""
         ramp = self._ramp_mps2()
         # PX4's greatest speed from which it can stop within a distance, at a limited jerk
         lag = 4.0 * ramp * ramp / self._parameters.positive("MPC_JERK_AUTO")
@@ -180,7 +180,7 @@ class Takeoff(Task):
 
 
 class Land(TrajectoryTask):
-    """Descend at one place until the ground: MPC_LAND_SPEED low down, MPC_LAND_CRWL in the last metre."""
+    """Descend at one point to the ground: MPC_LAND_SPEED near the ground, MPC_LAND_CRWL in the last metre."""
 
     landing = True
 
@@ -188,13 +188,13 @@ class Land(TrajectoryTask):
         self,
         airframe: Multirotor,
         parameters: Parameters,
-        place: Vector | None = None,
+        point: Vector | None = None,
         yaw_rad: float = NAN,
     ) -> None:
         self._airframe = airframe
         self._parameters = parameters
         self._trajectory = Trajectory(airframe, parameters)
-        self.goal = self._trajectory.stopping_point() if place is None else place
+        self.goal = self._trajectory.stopping_point() if point is None else point
         self._yaw_rad = yaw_rad
 
     def update(self, dt_s: float) -> TrajectorySetpoint:
@@ -207,8 +207,8 @@ class Land(TrajectoryTask):
         speed = slow + (fast - slow) * share
         if height < value("MPC_LAND_ALT3"):
             speed = value("MPC_LAND_CRWL")
-        place = (self.goal[0], self.goal[1], self._airframe.position[2])
-        level = self._trajectory.towards(place, dt_s, self._yaw_rad)
+        point = (self.goal[0], self.goal[1], self._airframe.position[2])
+        level = self._trajectory.towards(point, dt_s, self._yaw_rad)
         return TrajectorySetpoint(
             (level.position[0], level.position[1], NAN),
             (level.velocity[0], level.velocity[1], speed),
@@ -241,7 +241,7 @@ class Return(Task):
         self.goal = (x, y, home[2] - self.return_height_m)
 
     def _return_height(self, distance_m: float, height_m: float) -> float:
-        """Metres above home. Within RTL_MIN_DIST of home a cone (RTL_CONE_ANG) allows to stay lower."""
+        """Metres above home. Within RTL_MIN_DIST of home a cone (RTL_CONE_ANG) allows a lower height."""
         value = self._parameters.number
         height = value("RTL_RETURN_ALT")
         cone = value("RTL_CONE_ANG")
@@ -283,13 +283,13 @@ class Return(Task):
             return self._land.update(dt_s)
         return self._trajectory.towards(self.goal, dt_s, yaw)
 
-    def landing_task(self, place: Vector, yaw_rad: float) -> TrajectoryTask:
-        """The descent at a place, turned to a heading; NaN: as it is."""
-        return Land(self._airframe, self._parameters, place, yaw_rad)
+    def landing_task(self, point: Vector, yaw_rad: float) -> TrajectoryTask:
+        """The descent at a point, with a heading; NaN: unchanged."""
+        return Land(self._airframe, self._parameters, point, yaw_rad)
 
 
 class Offboard(Task):
-    """Follow the newest setpoint; until the first one after the mode began, stay at rest."""
+    """Follow the newest setpoint; before the first one in this mode, stay at rest."""
 
     def __init__(self) -> None:
         self.setpoint: Setpoint = TrajectorySetpoint(velocity=(0.0, 0.0, 0.0))

@@ -1,7 +1,7 @@
-"""A remote control: a transmitter in the pilot's hands, and what the autopilot reads out of its channels.
+"""A remote control: the pilot's transmitter, and how the autopilot reads its channels.
 
-The channels are pulse widths in microseconds, 1000 to 2000, centred at 1500. RC_MAP_* say which channel is
-what, RC_*_TH where a switch begins to be on, COM_FLTMODE1..6 what the six positions of the mode switch mean.
+The channels are pulse widths in microseconds, 1000 to 2000, centred at 1500. RC_MAP_* assign the channels,
+RC_*_TH are the thresholds of the switches, COM_FLTMODE1..6 the modes of the six positions of the mode switch.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ LOWEST_US, CENTRE_US, HIGHEST_US = 1000, 1500, 2000
 DEAD_ZONE_US = 10  # RCn_DZ
 CHANNELS = 18  # of RC_CHANNELS and RC_CHANNELS_OVERRIDE
 MODE_SLOTS = 6
-# RC_MAP_* of the usual order of channels; a vehicle that was never calibrated has none, and hears no sticks.
+# RC_MAP_* of the usual order of channels; a vehicle without calibration has none, and ignores the sticks.
 CALIBRATION: dict[str, float] = {
     "RC_MAP_ROLL": 1,
     "RC_MAP_PITCH": 2,
@@ -73,11 +73,11 @@ class Switches:
 
 
 class Transmitter:
-    """The transmitter in the pilot's hands: change its attributes as a pilot would.
+    """The pilot's transmitter: set its attributes as a pilot would.
 
     Attributes:
         on: it transmits; switched off, the autopilot loses it after COM_RC_LOSS_T.
-        sticks: where they are. mode_slot: the position of the mode switch, 1..6.
+        sticks: their positions. mode_slot: the position of the mode switch, 1..6.
         kill, back, hold, offboard, arm: switches.
     """
 
@@ -89,19 +89,19 @@ class Transmitter:
         self.arm = self.kill = self.back = self.hold = self.offboard = False
 
     def calibrate(self) -> None:
-        """Map the channels as `CALIBRATION` says, as one does once with a ground station."""
+        """Map the channels by `CALIBRATION`, as done once with a ground station."""
         for name, channel in CALIBRATION.items():
             self._parameters.set(name, channel)
 
     def select(self, mode: Mode) -> None:
-        """Turn the mode switch to the position of this mode. Raises ValueError if it has none."""
+        """Set the mode switch to the position of this mode. Raises ValueError if it has none."""
         for slot in range(1, MODE_SLOTS + 1):
             setting = int(self._parameters.number(f"COM_FLTMODE{slot}"))
             if MODE_OF_SETTING.get(setting) is mode:
                 self.mode_slot = slot
                 return
         raise ValueError(
-            f"no position of the mode switch means {mode.name}; set one of COM_FLTMODE1..6 to it"
+            f"no position of the mode switch selects {mode.name}; set one of COM_FLTMODE1..6 to it"
         )
 
     def channels(self) -> list[int]:
@@ -148,9 +148,7 @@ def read_switches(widths_us: Sequence[int], parameters: Parameters) -> Switches:
             return None
         level = parameters.number(threshold)
         fraction = 0.5 * position + 0.5
-        return (
-            fraction > level if level >= 0.0 else fraction < -level
-        )  # a negative one turns the switch round
+        return fraction > level if level >= 0.0 else fraction < -level  # a negative one inverts the switch
 
     mode = _position(widths_us, int(parameters.number("RC_MAP_FLTMODE")))
     return Switches(

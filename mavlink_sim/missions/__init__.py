@@ -1,1 +1,1 @@
-"""PX4's Navigator: plans, how they are flown, the geofence, the way home."""
+"""PX4's Navigator: plans, mission flight, the geofence, the return."""

@@ -8,13 +8,15 @@ from mavlink_sim.missions import items as mission_items
 from mavlink_sim.missions.geofence import Geofence
 from mavlink_sim.missions.items import MissionItem
 from mavlink_sim.physics.airframe import Vector
+from mavlink_sim.physics.geography import LocalFrame
 from mavlink_sim.px4.parameters import Parameters
 
-# Commands that the transfer takes but no mission may hold: CONDITION_DELAY, CONDITION_DISTANCE and this one.
+# Commands that the transfer accepts but no mission may have: CONDITION_DELAY, CONDITION_DISTANCE and this
+# one.
 _NOT_FLYABLE = frozenset({112, 114, mission_items.FENCE_RETURN_POINT})
 _VTOL = frozenset({mission_items.VTOL_TAKEOFF, mission_items.VTOL_LAND, mission_items.VTOL_TRANSITION})
-# Items that are neither an action nor a place to PX4's search for "the first item with a position".
-_COUNTED_AS_PLACES = mission_items.POSITION_COMMANDS | {
+# Items that count as positions in PX4's search for "the first item with a position".
+_COUNTED_AS_POSITIONS = mission_items.POSITION_COMMANDS | {
     mission_items.RETURN_TO_LAUNCH,
     mission_items.GATE,
     mission_items.GRIPPER,
@@ -30,12 +32,13 @@ def complaints(
     parameters: Parameters,
     fence: Geofence,
     home: Vector,
+    frame: LocalFrame,
     *,
     landed: bool,
 ) -> tuple[bool, list[str]]:
-    """Whether the mission may be flown, and what PX4 says of it.
+    """Whether the mission may be flown, and PX4's texts about it.
 
-    A far first waypoint is said, and does not forbid the mission (as in PX4 v1.16).
+    A far first waypoint is only a warning (as in PX4 v1.16).
     """
     if not items:
         return False, []
@@ -45,9 +48,9 @@ def complaints(
         broken = _broken_item(index, item, landed=landed)
         if broken:
             return False, [*said, broken]
-    distant = _far_first_waypoint(items, parameters, home)
+    distant = _far_first_waypoint(items, parameters, home, frame)
     failures = [
-        *_takeoffs(items, home),
+        *_takeoffs(items, home, frame),
         *(
             ["Mission rejected: Mission contains VTOL items but vehicle is not a VTOL\t"]
             if _vtol(items)
@@ -55,7 +58,7 @@ def complaints(
         ),
         *_required_ends(items, int(parameters.number("MIS_TKO_LAND_REQ")), landed=landed),
     ]
-    outside = _outside_fence(items, fence, home)
+    outside = _outside_fence(items, fence, home, frame)
     failures += outside
     return not failures, [*distant, *failures]
 
@@ -72,26 +75,28 @@ def _vtol(items: tuple[MissionItem, ...]) -> bool:
     return any(item.command in _VTOL for item in items)
 
 
-def _far_first_waypoint(items: tuple[MissionItem, ...], parameters: Parameters, home: Vector) -> list[str]:
+def _far_first_waypoint(
+    items: tuple[MissionItem, ...], parameters: Parameters, home: Vector, frame: LocalFrame
+) -> list[str]:
     limit = parameters.number("MIS_DIST_1WP")
     first = next((item for item in items if item.has_position), None)
     if limit <= 0.0 or first is None:
         return []
-    away = math.dist(first.place(home)[:2], home[:2])
+    away = math.dist(first.local_position(home, frame)[:2], home[:2])
     if not limit <= away < math.inf:
         return []
     return [f"First waypoint far away from home: {int(away)}m. Correct mission loaded?\t"]
 
 
-def _takeoffs(items: tuple[MissionItem, ...], home: Vector) -> list[str]:
-    after_a_place = False
+def _takeoffs(items: tuple[MissionItem, ...], home: Vector, frame: LocalFrame) -> list[str]:
+    after_position = False
     for item in items:
         if item.command in (mission_items.TAKEOFF, mission_items.VTOL_TAKEOFF):
-            if not home[2] - item.place(home)[2] > 0.0:
+            if not home[2] - item.local_position(home, frame)[2] > 0.0:
                 return ["Mission rejected: Takeoff altitude below home altitude!\t"]
-            if after_a_place:
+            if after_position:
                 return ["Mission rejected: takeoff not first waypoint item\t"]
-        after_a_place = after_a_place or item.command in _COUNTED_AS_PLACES
+        after_position = after_position or item.command in _COUNTED_AS_POSITIONS
     return []
 
 
@@ -114,8 +119,10 @@ def _required_ends(items: tuple[MissionItem, ...], required: int, *, landed: boo
     return []
 
 
-def _outside_fence(items: tuple[MissionItem, ...], fence: Geofence, home: Vector) -> list[str]:
+def _outside_fence(
+    items: tuple[MissionItem, ...], fence: Geofence, home: Vector, frame: LocalFrame
+) -> list[str]:
     for index, item in enumerate(items):
-        if item.has_position and fence.breaches(item.place(home), home):
+        if item.has_position and fence.breaches(item.local_position(home, frame), home):
             return [f"Geofence violation for waypoint {index + 1}\t"]
     return []

@@ -1,6 +1,6 @@
 """The geofence: polygons and circles to stay in or out of, and the greatest distances from home.
 
-All places are local NED metres; the polygon test counts crossings of a ray (even-odd rule).
+All positions are local NED metres; the polygon test counts crossings of a ray (even-odd rule).
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from enum import IntEnum
 from mavlink_sim.missions import items as mission_items
 from mavlink_sim.missions.items import MissionItem
 from mavlink_sim.physics.airframe import Vector
-from mavlink_sim.physics.geography import local
+from mavlink_sim.physics.geography import LocalFrame
 from mavlink_sim.px4.parameters import Parameters
 
 Point = tuple[float, float]  # north, east, metres
 
-# What PX4 says of each kind of breach; the health report sends them without the usual tab.
+# PX4's text of each kind of breach; the health report sends them without the usual tab.
 TOO_FAR = "Geofence: exceeding maximum distance to Home"
 TOO_HIGH = "Geofence: exceeding maximum altitude above Home"
 OUTSIDE = "Geofence: approaching or outside geofence"
@@ -46,19 +46,19 @@ class Area:
     inclusion: bool
     radius_m: float | None = None
 
-    def allows(self, place: Point) -> bool:
+    def allows(self, point: Point) -> bool:
         """Whether the vehicle may be there."""
         if self.radius_m is None:
-            return inside_polygon(self.vertices, place) == self.inclusion
-        return (math.dist(self.vertices[0], place) < self.radius_m) == self.inclusion
+            return inside_polygon(self.vertices, point) == self.inclusion
+        return (math.dist(self.vertices[0], point) < self.radius_m) == self.inclusion
 
 
-def inside_polygon(vertices: Sequence[Point], place: Point) -> bool:
-    """Whether a place is inside a polygon that does not cross itself; on the edge either may come out.
+def inside_polygon(vertices: Sequence[Point], point: Point) -> bool:
+    """Whether a point is inside a polygon that does not cross itself; on the edge the result is undefined.
 
-    The crossing test of W. R. Franklin (PNPOLY). Fewer than three vertices hold nothing.
+    The crossing test of W. R. Franklin (PNPOLY). Fewer than three vertices contain no point.
     """
-    north, east = place
+    north, east = point
     inside = False
     last_north, last_east = vertices[-1] if vertices else (0.0, 0.0)
     for vertex_north, vertex_east in vertices:
@@ -70,8 +70,8 @@ def inside_polygon(vertices: Sequence[Point], place: Point) -> bool:
     return inside
 
 
-def areas_of(items: Sequence[MissionItem]) -> list[Area]:
-    """The areas that an uploaded fence describes. Vertices that are missing at its end are left out."""
+def areas_of(items: Sequence[MissionItem], frame: LocalFrame) -> list[Area]:
+    """The areas of an uploaded fence. Vertices that are missing at its end are left out."""
     areas: list[Area] = []
     index = 0
     while index < len(items):
@@ -88,22 +88,23 @@ def areas_of(items: Sequence[MissionItem]) -> list[Area]:
                 mission_items.FENCE_CIRCLE_INCLUSION,
                 mission_items.FENCE_POLYGON_INCLUSION,
             )
-            vertices = tuple(_point(vertex) for vertex in items[index : index + count])
+            vertices = tuple(_point(vertex, frame) for vertex in items[index : index + count])
             areas.append(Area(vertices, inclusion, item.parameters[0] if circle else None))
         index += count
     return areas
 
 
-def _point(item: MissionItem) -> Point:
-    north, east, _ = local(item.parameters[4], item.parameters[5], 0.0)
+def _point(item: MissionItem, frame: LocalFrame) -> Point:
+    north, east, _ = frame.local(item.parameters[4], item.parameters[5], 0.0)
     return north, east
 
 
 class Geofence:
-    """What the vehicle is held to: uploaded areas and GF_MAX_HOR_DIST, GF_MAX_VER_DIST around home."""
+    """The limits of the vehicle's position: uploaded areas and GF_MAX_HOR_DIST, GF_MAX_VER_DIST from home."""
 
-    def __init__(self, parameters: Parameters) -> None:
+    def __init__(self, parameters: Parameters, frame: LocalFrame) -> None:
         self._parameters = parameters
+        self._frame = frame
         self._areas: list[Area] = []
 
     @property
@@ -113,17 +114,17 @@ class Geofence:
         return Action(value) if value in tuple(Action) else Action.WARN
 
     def load(self, items: Sequence[MissionItem], home: Vector | None, flying_at: Vector | None) -> list[str]:
-        """Take a new fence; areas that home or a flying vehicle breaks from the start are left out.
+        """Load a new fence; areas that home or the flying vehicle breaches at once are left out.
 
         Args:
-            home: None where there is none yet.
-            flying_at: where the vehicle is, None on the ground.
+            home: None before there is one.
+            flying_at: the vehicle's position, None on the ground.
 
-        Returns PX4's words for each area left out.
+        Returns PX4's text for each area left out.
         """
         self._areas = []
         complaints = []
-        for area in areas_of(items):
+        for area in areas_of(items, self._frame):
             home_allowed = home is None or area.allows(home[:2])
             here_allowed = flying_at is None or self.action is Action.NONE or area.allows(flying_at[:2])
             if not home_allowed:
@@ -134,19 +135,19 @@ class Geofence:
                 self._areas.append(area)
         return complaints
 
-    def breaches(self, place: Vector, home: Vector | None) -> list[str]:
-        """PX4's words for everything that a place breaks; empty where the vehicle may be there."""
+    def breaches(self, point: Vector, home: Vector | None) -> list[str]:
+        """PX4's text for each limit that a position breaches; empty where the vehicle may be there."""
         found = []
         farthest = self._parameters.number("GF_MAX_HOR_DIST")
         highest = self._parameters.number("GF_MAX_VER_DIST")
-        if home is not None and farthest > 0.0 and math.dist(place[:2], home[:2]) >= farthest:
+        if home is not None and farthest > 0.0 and math.dist(point[:2], home[:2]) >= farthest:
             found.append(TOO_FAR)
-        if home is not None and highest > 0.0 and home[2] - place[2] >= highest:
+        if home is not None and highest > 0.0 and home[2] - point[2] >= highest:
             found.append(TOO_HIGH)
-        if not all(area.allows(place[:2]) for area in self._areas):
+        if not all(area.allows(point[:2]) for area in self._areas):
             found.append(OUTSIDE)
         return found
 
-    def allows_goal(self, place: Vector, home: Vector | None) -> bool:
-        """Whether a command may send the vehicle there: only where a breach would do more than warn."""
-        return self.action in (Action.NONE, Action.WARN) or not self.breaches(place, home)
+    def allows_goal(self, point: Vector, home: Vector | None) -> bool:
+        """Whether a command may send the vehicle there; always, if GF_ACTION does not more than warn."""
+        return self.action in (Action.NONE, Action.WARN) or not self.breaches(point, home)

@@ -1,7 +1,7 @@
-"""One item of a mission, a geofence or the rally points: what PX4 keeps of a MISSION_ITEM, and gives back.
+"""One item of a mission, a geofence or the rally points: what PX4 stores of a MISSION_ITEM, and returns.
 
-PX4 does not store the message: it keeps the fields its firmware knows for the command and forgets the rest,
-so a downloaded plan is not byte for byte the uploaded one.
+PX4 does not store the message: it keeps the fields that its firmware knows for the command and drops the
+rest, so a downloaded plan is not byte for byte the uploaded one.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from enum import IntEnum
 from typing import Any
 
 from mavlink_sim.physics.airframe import Vector
-from mavlink_sim.physics.geography import geographic, local
+from mavlink_sim.physics.geography import LocalFrame
 from mavlink_sim.wire.messages import dialect
 
 
@@ -100,7 +100,7 @@ POSITION_COMMANDS = frozenset(
     }
 )
 
-# Which of parameters 1 to 4 PX4 keeps of an item with a place. 4 is a heading, brought into 0-360 degrees.
+# Which of parameters 1 to 4 PX4 keeps of an item with a position. 4 is a heading, wrapped to 0-360 degrees.
 _KEPT: dict[int, tuple[int, ...]] = {
     WAYPOINT: (1, 2, 4),
     LOITER_UNLIMITED: (3, 4),
@@ -126,8 +126,8 @@ _KEPT: dict[int, tuple[int, ...]] = {
 _HEADING_COMMANDS = frozenset(
     {WAYPOINT, LOITER_UNLIMITED, LOITER_TIME, LAND, TAKEOFF, VTOL_TAKEOFF, VTOL_LAND}
 )
-# Commands without a place, frame MAV_FRAME_MISSION: camera, gimbal, trigger and vehicle actions.
-_PLACELESS = frozenset(
+# Commands without a position, frame MAV_FRAME_MISSION: camera, gimbal, trigger and vehicle actions.
+_WITHOUT_POSITION_COMMANDS = frozenset(
     {RETURN_TO_LAUNCH, NAV_DELAY, 112, 114, DO_JUMP, DO_CHANGE_SPEED, 179, 187, DO_LAND_START}
     | {NAV_ROI, SET_ROI_NEXT_WAYPOINT, SET_ROI_NONE, 200, SET_ROI, DIGICAM_CONTROL, 204, 205, 206, GRIPPER}
     | {AUTOTUNE, 214, 260, ARM_DISARM, SET_CAMERA_MODE, 532, SET_CAMERA_SOURCE, GIMBAL_PITCH_YAW, 1001}
@@ -140,7 +140,7 @@ _HASHED_INT = struct.Struct("<BHB4fiif")
 
 
 class ItemRejectedError(ValueError):
-    """PX4 refuses this item. `result` is the MAV_MISSION_RESULT it answers."""
+    """PX4 refuses this item. `result` is the MAV_MISSION_RESULT of the answer."""
 
     def __init__(self, result: int, reason: str) -> None:
         super().__init__(reason)
@@ -154,7 +154,7 @@ class MissionItem:
     Attributes:
         command: MAV_CMD. frame: MAV_FRAME, as it was sent.
         parameters: 1 to 7. With a global frame 5 and 6 are degrees, 7 is metres above sea or above home.
-        autocontinue: go on to the next item by itself.
+        autocontinue: continue with the next item automatically.
     """
 
     command: int
@@ -174,22 +174,22 @@ class MissionItem:
 
     @property
     def yaw_rad(self) -> float:
-        """The heading asked for, NaN for none."""
+        """The demanded heading, NaN for none."""
         return math.radians(self.parameters[3])
 
     @property
     def hold_s(self) -> float:
-        """Seconds to stay; 0 where the command knows no such thing."""
+        """Seconds to stay; 0 where the command has no such parameter."""
         if self.command not in (WAYPOINT, LOITER_TIME, NAV_DELAY):
             return 0.0
         return max(self.parameters[0], 0.0) if math.isfinite(self.parameters[0]) else 0.0
 
-    def place(self, home: Vector) -> Vector:
+    def local_position(self, home: Vector, frame: LocalFrame) -> Vector:
         """Local NED metres of the item, altitudes above home taken from `home` (local NED)."""
         latitude, longitude, altitude = self.parameters[4:]
         if self.is_relative:
-            altitude += geographic(home)[2]
-        return local(latitude, longitude, altitude)
+            altitude += frame.geographic(home)[2]
+        return frame.local(latitude, longitude, altitude)
 
 
 def item_of(message: Any) -> MissionItem:
@@ -202,10 +202,10 @@ def item_of(message: Any) -> MissionItem:
     given = (message.param1, message.param2, message.param3, message.param4)
     if frame in (GLOBAL, GLOBAL_RELATIVE_ALT) or (whole and frame in (GLOBAL_INT, GLOBAL_RELATIVE_ALT_INT)):
         scale = 1e-7 if whole else 1.0
-        command, head = _with_place(command, given)
+        command, head = _with_position(command, given)
         tail = (message.x * scale, message.y * scale, float(message.z))
     elif frame == FRAME_MISSION:
-        command, head = _without_place(command, given)
+        command, head = _without_position(command, given)
         tail = (float(message.x), float(message.y), float(message.z))
     else:
         raise ItemRejectedError(UNSUPPORTED_FRAME, f"frame {frame} is none of 0, 2, 3, 5, 6")
@@ -215,13 +215,13 @@ def item_of(message: Any) -> MissionItem:
 _Head = tuple[float, float, float, float]
 
 
-def _with_place(command: int, given: _Head) -> tuple[int, _Head]:
+def _with_position(command: int, given: _Head) -> tuple[int, _Head]:
     if command not in _KEPT:
-        raise ItemRejectedError(UNSUPPORTED, f"command {command} with a place is not supported")
+        raise ItemRejectedError(UNSUPPORTED, f"command {command} with a position is not supported")
     kept = [value if index in _KEPT[command] else 0.0 for index, value in enumerate(given, start=1)]
     if command in (NAV_ROI, SET_ROI):
         if _whole(given[0]) not in (_ROI_LOCATION, _ROI_NONE):
-            raise ItemRejectedError(INVALID_PARAM1, f"a region of interest with a place, mode {given[0]}")
+            raise ItemRejectedError(INVALID_PARAM1, f"a region of interest with a position, mode {given[0]}")
         command = SET_ROI
     elif command in _HEADING_COMMANDS:
         kept[3] = kept[3] % 360.0 if math.isfinite(kept[3]) else math.nan
@@ -236,11 +236,11 @@ def _with_place(command: int, given: _Head) -> tuple[int, _Head]:
     return command, (kept[0], kept[1], kept[2], kept[3])
 
 
-def _without_place(command: int, given: _Head) -> tuple[int, _Head]:
-    if command not in _PLACELESS:
-        raise ItemRejectedError(UNSUPPORTED, f"command {command} without a place is not supported")
+def _without_position(command: int, given: _Head) -> tuple[int, _Head]:
+    if command not in _WITHOUT_POSITION_COMMANDS:
+        raise ItemRejectedError(UNSUPPORTED, f"command {command} without a position is not supported")
     if command in (NAV_ROI, SET_ROI) and _whole(given[0]) not in (_ROI_NONE, _ROI_NEXT, _ROI_INDEX):
-        raise ItemRejectedError(INVALID_PARAM1, f"a region of interest without a place, mode {given[0]}")
+        raise ItemRejectedError(INVALID_PARAM1, f"a region of interest without a position, mode {given[0]}")
     return SET_ROI if command == NAV_ROI else command, given
 
 
@@ -257,7 +257,7 @@ def message_of(
     current: bool = False,
     whole: bool = True,
 ) -> Any:
-    """MISSION_ITEM_INT (MISSION_ITEM where not `whole`) that gives a stored item to (system, component)."""
+    """MISSION_ITEM_INT (MISSION_ITEM if not `whole`) of a stored item, addressed to (system, component)."""
     frame, x, y = item.frame, item.parameters[4], item.parameters[5]
     if frame != FRAME_MISSION and whole:
         frame = GLOBAL_RELATIVE_ALT_INT if item.is_relative else GLOBAL_INT
@@ -266,9 +266,9 @@ def message_of(
         frame = GLOBAL_RELATIVE_ALT if item.is_relative else GLOBAL
     head = list(item.parameters[:4])
     if item.command == LOITER_TIME:
-        head[3] = float(head[3] > 0.0)  # PX4 gives back whether to leave on a tangent, not the heading
+        head[3] = float(head[3] > 0.0)  # PX4 returns whether to exit on a tangent, not the heading
     make = dialect.MAVLink_mission_item_int_message if whole else dialect.MAVLink_mission_item_message
-    place = (_int32(x), _int32(y)) if whole else (x, y)
+    point = (_int32(x), _int32(y)) if whole else (x, y)
     return make(
         *target,
         sequence,
@@ -277,7 +277,7 @@ def message_of(
         int(current),
         int(item.autocontinue),
         *head,
-        *place,
+        *point,
         item.parameters[6],
         int(plan),
     )

@@ -1,4 +1,4 @@
-"""Flying a mission: the task of Mode.MISSION, item by item as PX4's Navigator does.
+"""Mission flight: the task of Mode.MISSION, item by item as in PX4's Navigator.
 
 Positions are local NED metres.
 """
@@ -7,23 +7,21 @@ from __future__ import annotations
 
 import enum
 import math
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from mavlink_sim.flight import tasks as flight
 from mavlink_sim.flight.position_control import NAN, TrajectorySetpoint
-from mavlink_sim.flight.precision_landing import Precision
+from mavlink_sim.flight.precision_landing import Precision, PrecisionLanding
 from mavlink_sim.missions import items as mission_items
 from mavlink_sim.missions.items import MissionItem
+from mavlink_sim.missions.plan import Mission
 from mavlink_sim.physics.airframe import Multirotor, Vector
-from mavlink_sim.physics.geography import local
+from mavlink_sim.physics.geography import LocalFrame
+from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.announcements import INFO
 
-if TYPE_CHECKING:
-    from mavlink_sim.missions.navigator import Navigator
-    from mavlink_sim.px4.parameters import Parameters
-
-NAVIGATOR_PERIOD_S = 0.05  # items are looked after at 20 Hz, the trajectory at every step
-# How sharp a corner may be cut: the circle that PX4's trajectory fits into the acceptance radius.
+NAVIGATOR_PERIOD_S = 0.05  # items are processed at 20 Hz, the trajectory at every step
+# Corners below this angle are flown at cruise speed.
 STRAIGHT_ON_RAD = math.radians(1.0)
 # MPC_YAW_MODE
 TOWARDS_WAYPOINT, TOWARDS_HOME, AWAY_FROM_HOME, ALONG_TRAJECTORY, YAW_FIRST = range(5)
@@ -34,14 +32,45 @@ _ROI_LOCATION = 3  # MAV_ROI
 _ROI_NEXT = 1
 
 
-class Stage(enum.Enum):
-    """What is done for the current item."""
+class MissionNavigator(Protocol):
+    """What flying a mission uses of the Navigator; see `navigator.Navigator`."""
 
-    CLIMB = "climb"  # to its altitude first, where the vehicle is
+    frame: LocalFrame
+    mission: Mission
+
+    @property
+    def now_s(self) -> float: ...
+
+    @property
+    def landed(self) -> bool: ...
+
+    @property
+    def cruise_mps(self) -> float: ...
+
+    @property
+    def home(self) -> Vector: ...
+
+    def reached(self, index: int) -> None: ...
+
+    def current_changed(self) -> None: ...
+
+    def command(self, item: MissionItem) -> None: ...
+
+    def change_speed(self, speed_mps: float) -> None: ...
+
+    def precision_landing(self, precision: Precision, point: Vector | None = None) -> PrecisionLanding: ...
+
+    def send_text(self, severity: int, text: str) -> None: ...
+
+
+class Stage(enum.Enum):
+    """The stage of the current item."""
+
+    CLIMB = "climb"  # to its altitude first, at the current horizontal position
     FLY = "fly"
     MOVE_TO_LAND = "move to land"
     LAND = "land"
-    ACT = "act"  # an item without a place
+    ACT = "act"  # an item without a position
 
 
 class MissionFlight(flight.Task):
@@ -51,7 +80,7 @@ class MissionFlight(flight.Task):
         ended: the mission is over, and the vehicle stays at `goal`.
     """
 
-    def __init__(self, navigator: Navigator, airframe: Multirotor, parameters: Parameters) -> None:
+    def __init__(self, navigator: MissionNavigator, airframe: Multirotor, parameters: Parameters) -> None:
         self._navigator = navigator
         self._mission = navigator.mission
         self._airframe = airframe
@@ -94,7 +123,7 @@ class MissionFlight(flight.Task):
         return self._trajectory.towards(self._aim(), dt_s, self._heading(), **self._climb_speed())
 
     def _climb_speed(self) -> dict[str, float]:
-        """A climb from the ground goes as a take-off does."""
+        """The climb limit: from the ground that of a take-off."""
         if self._stage is Stage.CLIMB and self._navigator.landed:
             return {"max_up_mps": self._parameters.number("MPC_TKO_SPEED")}
         return {}
@@ -117,7 +146,7 @@ class MissionFlight(flight.Task):
             self._end()
 
     def _begin_item(self) -> None:
-        """Turn to the current item."""
+        """Start the current item."""
         item = self._mission.item
         self._arrived_s, self._turned = None, False
         if item.has_position:
@@ -126,14 +155,14 @@ class MissionFlight(flight.Task):
             self._stage = Stage.FLY
             following = self._mission.next_position(self._mission.current + 1)
             if following is not None:
-                self.goal = self._place(following)
+                self.goal = self._point_of(following)
         else:
             self._stage = Stage.ACT
             self._act(item)
 
     def _fly_to(self, item: MissionItem) -> None:
         landing = item.command == mission_items.LAND
-        place = self._place(item)
+        point = self._point_of(item)
         if self._climb_to_z is not None:
             self._stage = Stage.CLIMB
             self._from_ground = self._navigator.landed
@@ -141,19 +170,19 @@ class MissionFlight(flight.Task):
             self.goal = (x, y, self._climb_to_z)
             self._yaw_rad = NAN
             above = self._navigator.home[2] - self._climb_to_z
-            self._navigator.say(INFO, f"Climb to {above:.1f} meters above home\t")
+            self._navigator.send_text(INFO, f"Climb to {above:.1f} meters above home\t")
             self._climb_to_z = None
-        elif landing and not self._navigator.landed and self._away(place) > self._acceptance():
+        elif landing and not self._navigator.landed and self._away(point) > self._acceptance():
             self._stage = Stage.MOVE_TO_LAND
             self._leave_ground()
-            self.goal = (place[0], place[1], self.goal[2])
+            self.goal = (point[0], point[1], self.goal[2])
             self._yaw_rad = NAN
         elif landing:
             self._descend()
         else:
             self._stage = Stage.FLY
             self._leave_ground()
-            self.goal = place
+            self.goal = point
             self._yaw_rad = NAN if item.command == mission_items.TAKEOFF else item.yaw_rad
 
     def _descend(self) -> None:
@@ -164,7 +193,7 @@ class MissionFlight(flight.Task):
         if precision in (Precision.OPPORTUNISTIC, Precision.REQUIRED) and not self._navigator.landed:
             self._descent = self._navigator.precision_landing(Precision(precision), self.goal)
         else:
-            self._descent = flight.Land(self._airframe, self._parameters, self._place(item))
+            self._descent = flight.Land(self._airframe, self._parameters, self._point_of(item))
 
     def _leave_ground(self) -> None:
         if self._descent is not None:
@@ -177,7 +206,7 @@ class MissionFlight(flight.Task):
 
     def _finish(self) -> None:
         where = "landed" if self._navigator.landed else "loitering"
-        self._navigator.say(INFO, f"Mission finished, {where}\t")
+        self._navigator.send_text(INFO, f"Mission finished, {where}\t")
         self._mission.jumps.clear()
         self._mission.finished = True
 
@@ -187,7 +216,7 @@ class MissionFlight(flight.Task):
             return
         if command in (mission_items.SET_ROI_LOCATION, mission_items.SET_ROI):
             mode = item.parameters[0] if command == mission_items.SET_ROI else _ROI_LOCATION
-            self._roi = self._place(item) if mode == _ROI_LOCATION else None
+            self._roi = self._point_of(item) if mode == _ROI_LOCATION else None
             self._roi_is_next = mode == _ROI_NEXT
         elif command == mission_items.SET_ROI_NEXT_WAYPOINT:
             self._roi, self._roi_is_next = None, True
@@ -196,13 +225,13 @@ class MissionFlight(flight.Task):
         if command != mission_items.NAV_DELAY:
             self._navigator.command(item)
         if command == mission_items.RETURN_TO_LAUNCH:
-            # reached as it begins (since PX4 v1.17): in a moment another mode flies the vehicle
+            # reached as it begins (since PX4 v1.17): then the mode changes
             self._navigator.reached(self._mission.current)
             if self._mission.current + 1 == len(self._mission.items):
                 self._end()
 
     def _replay_speed(self) -> None:
-        """A mission that is resumed has the speed of the last change before its current item."""
+        """Apply the last speed change before the current item, for a resumed mission."""
         self._navigator.change_speed(0.0)
         for item in self._mission.items[: self._mission.current]:
             if item.command == mission_items.DO_CHANGE_SPEED:
@@ -212,7 +241,7 @@ class MissionFlight(flight.Task):
         following = self._mission.next_position(self._mission.current)
         if following is None:
             return
-        z = self._place(following)[2]
+        z = self._point_of(following)[2]
         if self._airframe.position[2] - z > self._parameters.number("NAV_MC_ALT_RAD"):
             self._climb_to_z = z
 
@@ -244,7 +273,7 @@ class MissionFlight(flight.Task):
 
     def _has_acted(self, item: MissionItem, now: float) -> bool:
         if item.command == mission_items.RETURN_TO_LAUNCH or item.command == mission_items.IDLE:
-            return False  # another mode takes over; idling never ends
+            return False  # the mode changes; idling never ends
         if item.command == mission_items.NAV_DELAY or item.command in _WAIT_FOR_COMMAND:
             if self._arrived_s is None:
                 self._arrived_s = now
@@ -255,8 +284,8 @@ class MissionFlight(flight.Task):
         return True
 
     def _has_passed(self, item: MissionItem) -> bool:
-        """The vehicle is beyond the gate, seen along the way to the next place."""
-        gate = self._place(item)
+        """Whether the vehicle has passed the gate on the path to the next waypoint."""
+        gate = self._point_of(item)
         x, y, _ = self._airframe.position
         return (x - gate[0]) * (self.goal[0] - gate[0]) + (y - gate[1]) * (self.goal[1] - gate[1]) >= 0.0
 
@@ -280,24 +309,24 @@ class MissionFlight(flight.Task):
     def _acceptance(self) -> float:
         return self._parameters.number("NAV_ACC_RAD")
 
-    def _away(self, place: Vector) -> float:
-        return math.dist(place[:2], self._airframe.position[:2])
+    def _away(self, point: Vector) -> float:
+        return math.dist(point[:2], self._airframe.position[:2])
 
-    def _place(self, item: MissionItem) -> Vector:
-        """Where an item is; what it leaves open (NaN) stays as it is."""
+    def _point_of(self, item: MissionItem) -> Vector:
+        """The position of an item; NaN components are those of the vehicle."""
         here = self._airframe.position
         if item.frame == mission_items.FRAME_MISSION:
             latitude, longitude, altitude = item.parameters[4:]
-            wanted = local(latitude, longitude, altitude)
+            wanted = self._navigator.frame.local(latitude, longitude, altitude)
         else:
-            wanted = item.place(self._navigator.home)
+            wanted = item.local_position(self._navigator.home, self._navigator.frame)
         x, y, z = (value if math.isfinite(value) else own for value, own in zip(wanted, here, strict=True))
         return (x, y, z)
 
-    # ---- the way ----------------------------------------------------------------------------------------
+    # ---- path -------------------------------------------------------------------------------------------
 
     def _aim(self) -> Vector:
-        """The goal, or a point beyond it that makes the vehicle pass it at speed on its way to the next."""
+        """The goal, or a point beyond it so that the vehicle passes the goal at speed."""
         x, y, z = self.goal
         px, py, _ = self._trajectory.position
         dx, dy = x - px, y - py
@@ -310,7 +339,7 @@ class MissionFlight(flight.Task):
         return (x + dx * beyond, y + dy * beyond, z)
 
     def _passing_speed(self) -> float:
-        """m/s at the current waypoint: 0 where the vehicle stops, else what the corner to the next allows.
+        """The speed at the current waypoint, m/s: 0 where the vehicle stops, else limited by the next corner.
 
         The corner is flown on the circle that touches both legs at the acceptance radius.
         """
@@ -326,9 +355,9 @@ class MissionFlight(flight.Task):
         if after is None:
             return 0.0
         x, y, _ = self._trajectory.position
-        place = self._place(after)
+        point = self._point_of(after)
         ahead = (self.goal[0] - x, self.goal[1] - y)
-        onward = (place[0] - self.goal[0], place[1] - self.goal[1])
+        onward = (point[0] - self.goal[0], point[1] - self.goal[1])
         if math.hypot(*ahead) < 1e-3 or math.hypot(*onward) < 1e-3:
             return 0.0
         turn = math.remainder(math.atan2(onward[1], onward[0]) - math.atan2(ahead[1], ahead[0]), math.tau)
@@ -342,7 +371,7 @@ class MissionFlight(flight.Task):
         return min(math.sqrt(max(braking * radius, 0.0)), cruise)
 
     def _heading(self) -> float:
-        """Where to look: a region of interest, the item's heading, else as MPC_YAW_MODE says; NaN: as now."""
+        """The heading: to a region of interest, the item's, else by MPC_YAW_MODE; NaN: unchanged."""
         if self._stage in (Stage.FLY, Stage.ACT):
             interest = self.goal if self._roi_is_next else self._roi
             if interest is not None and self._mission.item.command != mission_items.TAKEOFF:
@@ -361,8 +390,8 @@ class MissionFlight(flight.Task):
             return math.atan2(vy, vx)
         return NAN
 
-    def _towards(self, place: Vector) -> float:
-        if self._away(place) <= self._acceptance():
+    def _towards(self, point: Vector) -> float:
+        if self._away(point) <= self._acceptance():
             return NAN
         x, y, _ = self._airframe.position
-        return math.atan2(place[1] - y, place[0] - x)
+        return math.atan2(point[1] - y, point[0] - x)

@@ -1,7 +1,7 @@
-"""PX4's Navigator in small: what is stored of plans, how the mission goes, the geofence, where RTL leads.
+"""PX4's Navigator, reduced: stored plans, mission progress, the geofence, the destination of RTL.
 
-Belongs to one Autopilot, which calls `update` at every step and asks for the tasks of MISSION, RTL, PRECLAND.
-What clients are to hear of it waits in `announcements`, what other components are to do in `commands`.
+Belongs to one Autopilot, which calls `update` at every step and gets the tasks of MISSION, RTL, PRECLAND.
+Messages for clients are queued in `announcements`, commands for other components in `commands`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from mavlink_sim.flight import tasks as flight
 from mavlink_sim.flight.collision_prevention import ObstacleMap, Plane, limited_acceleration
@@ -31,16 +31,13 @@ from mavlink_sim.missions.return_flight import (
     mission_route,
 )
 from mavlink_sim.physics.airframe import Multirotor, Vector
-from mavlink_sim.physics.geography import geographic
+from mavlink_sim.physics.geography import LocalFrame
 from mavlink_sim.px4.modes import Mode
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.announcements import CRITICAL, INFO, Text
 
-if TYPE_CHECKING:
-    from mavlink_sim.autopilot.commander import Autopilot
-
 FENCE_PERIOD_S = 0.2  # GEOFENCE_CHECK_INTERVAL_US
-REACHED_REPETITIONS = 10  # MISSION_ITEM_REACHED is told again so often, once a second
+REACHED_REPETITIONS = 10  # MISSION_ITEM_REACHED is repeated this often, once per second
 REACHED_PERIOD_S = 1.0
 ACTIVE, SUSPENDED = 1, 2  # MISSION_CURRENT.mission_mode
 _MISSION_MODES = frozenset({Mode.MISSION, Mode.TAKEOFF, Mode.LAND})
@@ -58,30 +55,68 @@ class Reached:
     sequence: int
 
 
+class HomePosition(Protocol):
+    """Home. `position`: local NED metres. `attitude_rad`: roll, pitch, yaw."""
+
+    position: Vector
+    attitude_rad: Vector
+
+
+class Commander(Protocol):
+    """What the Navigator uses of the autopilot it belongs to; see `autopilot.commander.Autopilot`."""
+
+    now_s: float
+    armed: bool
+    mode: Mode
+    cruise_mps: float
+    texts: deque[Text]
+    task: flight.Task | None
+
+    @property
+    def home(self) -> HomePosition: ...
+
+    @property
+    def landed(self) -> bool: ...
+
+    @property
+    def sensors_ready(self) -> bool: ...
+
+    def set_mode(self, mode: Mode, report: bool = False) -> int: ...
+
+    def hold_at(self, point: Vector) -> None: ...
+
+    def restart_task(self) -> None: ...
+
+    def change_speed(self, speed_mps: float, at_once: bool) -> None: ...
+
+
 class Navigator:
     """Missions, fence and destinations of one vehicle.
 
     Attributes:
-        plans: what is stored, by type. mission: the mission and the progress in it.
-        fence: what the vehicle is held to. obstacles: for collision prevention.
+        frame: the vehicle's local frame.
+        plans: the stored plans, by type. mission: the mission and its progress.
+        fence: the geofence. obstacles: for collision prevention.
         target: the newest landing target.
         uploading: name of the link over which a client uploads. sessions: the mission protocol, by link.
     """
 
     def __init__(
         self,
-        autopilot: Autopilot,
+        autopilot: Commander,
         airframe: Multirotor,
         parameters: Parameters,
+        frame: LocalFrame,
         on_event: Callable[[str], None],
     ) -> None:
         self._autopilot = autopilot
         self._airframe = airframe
         self._parameters = parameters
+        self.frame = frame
         self._on_event = on_event
         self.plans: dict[PlanType, Plan] = dict.fromkeys(PlanType, Plan())
         self.mission = Mission()
-        self.fence = Geofence(parameters)
+        self.fence = Geofence(parameters, frame)
         self.obstacles = ObstacleMap()
         self.target: LandingTarget | None = None
         self.uploading: str | None = None
@@ -90,15 +125,15 @@ class Navigator:
         self.commands: deque[MissionItem] = deque()
         self._checked_with: object = None
         self._state = MissionState.NO_MISSION
-        self._active = False  # the mission on board was begun
-        self._disarmed_since_flown = False
+        self._active = False  # the mission on board was started
+        self._disarmed_since_active = False
         self._breaches: list[str] = []
         self._next_fence_check_s = 0.0
         self._held_for_obstacles = False
         self._next_reached_s = 0.0
         self._repetitions = 0
 
-    # ---- what others read -------------------------------------------------------------------------------
+    # ---- state ------------------------------------------------------------------------------------------
 
     @property
     def now_s(self) -> float:
@@ -119,17 +154,17 @@ class Navigator:
 
     @property
     def is_breached(self) -> bool:
-        """The vehicle is where the fence does not allow it, and GF_ACTION is not to ignore that."""
+        """The vehicle breaches the fence, and GF_ACTION does not ignore that."""
         return bool(self._breaches)
 
     @property
     def breaches(self) -> list[str]:
-        """PX4's words for each way in which it is."""
+        """PX4's text for each breach."""
         return self._breaches
 
     @property
     def in_progress(self) -> bool:
-        """A mission is being flown; it is not disarmed by itself then."""
+        """A mission is in progress; automatic disarming is off then."""
         return self._autopilot.mode is Mode.MISSION and not self.mission.finished
 
     @property
@@ -137,7 +172,7 @@ class Navigator:
         return ACTIVE if self._autopilot.mode in _MISSION_MODES else SUSPENDED
 
     def mission_state(self) -> MissionState:
-        """MISSION_CURRENT.mission_state, with PX4's memory: a pause before any item keeps the last state."""
+        """MISSION_CURRENT.mission_state; as in PX4, a pause before any item keeps the last state."""
         mission = self.mission
         if not mission.items or not mission.valid:
             self._state = MissionState.NO_MISSION
@@ -151,14 +186,15 @@ class Navigator:
             self._state = MissionState.NOT_STARTED
         return self._state
 
-    def allows_goal(self, place: Vector) -> bool:
-        """Whether a command (DO_REPOSITION, DO_ORBIT) may send the vehicle to a local NED place."""
-        return self.fence.allows_goal(place, self._known_home())
+    def allows_goal(self, point: Vector) -> bool:
+        """Whether a command (DO_REPOSITION, DO_ORBIT) may send the vehicle to a local NED position."""
+        return self.fence.allows_goal(point, self._known_home())
 
     def allowed_acceleration(self, acceleration: Plane, velocity: Plane) -> Plane:
-        """Collision prevention for Position mode: what is allowed of the acceleration the sticks ask for.
+        """Limit the acceleration setpoint of the sticks by collision prevention, in Position mode.
 
-        Both m/s² and m/s, (north, east). Without data for 5 s the vehicle is put into HOLD, as PX4 does.
+        Acceleration m/s², velocity m/s, (north, east). Without data for 5 s the mode changes to HOLD, as in
+        PX4.
         """
         limited = limited_acceleration(
             acceleration, velocity, self._airframe.yaw_rad, self.obstacles, self._parameters, self.now_s
@@ -170,15 +206,15 @@ class Navigator:
         return limited.acceleration
 
     def take_stored(self, before: Navigator) -> None:
-        """A reboot: the plans and the current item are on PX4's card, all else is forgotten."""
+        """Restore the plans and the current item after a reboot: PX4 stores no more."""
         self.plans, self.fence = before.plans, before.fence
         mission = before.mission
         self.mission = Mission(mission.items, mission.current, jumps=mission.jumps)
 
-    # ---- what clients do --------------------------------------------------------------------------------
+    # ---- requests of clients ----------------------------------------------------------------------------
 
     def store(self, plan_type: PlanType, plan: Plan, current: int = -1) -> None:
-        """Take a whole new plan. An identical one changes nothing.
+        """Store a new plan. An identical one changes nothing.
 
         Args:
             current: the mission item marked as current, -1 for none.
@@ -189,7 +225,7 @@ class Navigator:
         if plan_type is PlanType.FENCE:
             flying = None if self.landed else self._airframe.position
             for words in self.fence.load(plan.items, self._known_home(), flying):
-                self.say(CRITICAL, words)
+                self.send_text(CRITICAL, words)
             self._checked_with = None
         elif plan_type is PlanType.MISSION:
             self._new_mission(plan, current)
@@ -205,7 +241,7 @@ class Navigator:
             self._autopilot.restart_task()
 
     def set_current(self, index: int) -> None:
-        """Fly this item next, or when the mission begins."""
+        """Make this item the current one."""
         if index == self.mission.current or not self.mission.valid:
             return
         if not self.mission.go_to(index):
@@ -216,20 +252,20 @@ class Navigator:
             self._autopilot.restart_task()
 
     def change_speed(self, speed_mps: float) -> None:
-        """DO_CHANGE_SPEED; not above zero: the usual speed again."""
+        """DO_CHANGE_SPEED; not above zero: the default speed."""
         self._autopilot.change_speed(speed_mps if speed_mps > 1e-6 else 0.0, at_once=False)
 
     def forget_reached(self) -> None:
-        """A new mission begins to arrive: nothing of it is reached."""
+        """Reset the reached item, when the upload of a mission begins."""
         self.mission.reached = -1
 
-    # ---- what the flight tasks report -------------------------------------------------------------------
+    # ---- reports of the flight tasks --------------------------------------------------------------------
 
     def current_changed(self) -> None:
         self.announcements.append(Current())
 
     def reached(self, index: int) -> None:
-        """An item is reached. Told once, then again each second for a while."""
+        """Announce a reached item, and repeat that each second for REACHED_REPETITIONS."""
         if index == self.mission.reached:
             return
         self.mission.reached = index
@@ -239,10 +275,10 @@ class Navigator:
         self._on_event(f"mission item {index} reached")
 
     def command(self, item: MissionItem) -> None:
-        """An item is a command, for this vehicle or another component."""
+        """Queue an item that is a command, for this vehicle or another component."""
         self.commands.append(item)
 
-    def say(self, severity: int, text: str) -> None:
+    def send_text(self, severity: int, text: str) -> None:
         self._autopilot.texts.append(Text(severity, text))
 
     # ---- tasks ------------------------------------------------------------------------------------------
@@ -250,29 +286,29 @@ class Navigator:
     def mission_task(self) -> flight.Task:
         """The task of Mode.MISSION, from the current item on."""
         mission = self.mission
-        if self._active and self._disarmed_since_flown and mission.current + 1 == len(mission.items):
-            mission.current = 0  # flown to its end before
+        if self._active and self._disarmed_since_active and mission.current + 1 == len(mission.items):
+            mission.current = 0  # it was completed before
             mission.jumps.clear()
         self._check_mission()
         if not mission.valid:
             then = "refusing takeoff" if self.landed else "loitering"
-            self.say(CRITICAL, f"No valid mission available, {then}\t")
+            self.send_text(CRITICAL, f"No valid mission available, {then}\t")
             return flight.Hold(self._airframe, self._parameters)
-        self.say(INFO, "Executing Mission\t")
-        self._active, self._disarmed_since_flown = True, False
+        self.send_text(INFO, "Executing Mission\t")
+        self._active, self._disarmed_since_active = True, False
         mission.finished, mission.reached = False, -1
         self.current_changed()
         return MissionFlight(self, self._airframe, self._parameters)
 
-    def precision_landing(self, precision: Precision, place: Vector | None = None) -> PrecisionLanding:
-        """The task of landing on a target, beginning above `place` (None: here)."""
+    def precision_landing(self, precision: Precision, point: Vector | None = None) -> PrecisionLanding:
+        """The task of landing on a target, beginning above `point` (None: here)."""
         return PrecisionLanding(
             self._airframe,
             self._parameters,
             precision,
             self.newest_target,
             self.time_s,
-            place,
+            point,
             self._on_event,
         )
 
@@ -283,39 +319,39 @@ class Navigator:
         return self.now_s
 
     def return_task(self) -> flight.Task:
-        """The task of RTL, by RTL_TYPE and RTL_PLD_MD; says where it leads."""
+        """The task of RTL, by RTL_TYPE and RTL_PLD_MD; announces the return height."""
         position = self._airframe.position
         landing = self._return_landing()
-        route = mission_route(self.mission, self._parameters, self.home)
+        route = mission_route(self.mission, self._parameters, self.home, self.frame)
         if route is not None:
             return RouteReturn(self._airframe, self._parameters, *route, landing)
         rally = self.plans[PlanType.RALLY].items
-        found, words = destination(rally, self.mission, self._parameters, self.home, position)
+        found, words = destination(rally, self.mission, self._parameters, self.home, self.frame, position)
         for text in words:
-            self.say(CRITICAL, text)
+            self.send_text(CRITICAL, text)
         yaw_rad = self._autopilot.home.attitude_rad[2] if found.kind is Goal.HOME else math.nan
         direct = ReturnFlight(self._airframe, self._parameters, found.position, yaw_rad, landing)
         height = direct.return_height_m
-        above_sea = geographic(found.position)[2] + height
-        self.say(INFO, f"RTL: start return at {above_sea:.0f} m ({height:.0f} m above destination)\t")
+        above_sea = self.frame.geographic(found.position)[2] + height
+        self.send_text(INFO, f"RTL: start return at {above_sea:.0f} m ({height:.0f} m above destination)\t")
         if found.kind is not Goal.MISSION_LANDING:
             return direct
-        last = landing_route(self.mission, self.home)
+        last = landing_route(self.mission, self.home, self.frame)
         climb_to_z = found.position[2] - height
         return RouteReturn(self._airframe, self._parameters, *last, landing, climb_to_z)
 
     def _return_landing(self) -> Callable[[Vector, float], flight.TrajectoryTask]:
-        """Makes the task of RTL's last descent."""
+        """A factory of the task of RTL's final descent."""
         return partial(self._descent, int(self._parameters.number("RTL_PLD_MD")))
 
-    def _descent(self, mode: int, place: Vector, yaw_rad: float) -> flight.TrajectoryTask:
+    def _descent(self, mode: int, point: Vector, yaw_rad: float) -> flight.TrajectoryTask:
         if mode not in (Precision.OPPORTUNISTIC, Precision.REQUIRED):
-            return flight.Land(self._airframe, self._parameters, place, yaw_rad)
+            return flight.Land(self._airframe, self._parameters, point, yaw_rad)
         z = self._airframe.position[2]
-        return self.precision_landing(Precision(mode), (place[0], place[1], z))
+        return self.precision_landing(Precision(mode), (point[0], point[1], z))
 
     def guard_sticks(self, acceleration: Plane, velocity: Plane) -> Plane:
-        """What collision prevention leaves of the sticks' acceleration, m/s² (north, east)."""
+        """The sticks' acceleration as limited by collision prevention, m/s² (north, east)."""
         limited = limited_acceleration(
             acceleration, velocity, self._airframe.yaw_rad, self.obstacles, self._parameters, self.now_s
         )
@@ -327,10 +363,10 @@ class Navigator:
     # ---- one step ---------------------------------------------------------------------------------------
 
     def update(self) -> None:
-        """Look after the mission's end, its validity and the fence."""
+        """Check the end of the mission, its validity and the fence."""
         autopilot = self._autopilot
         if not autopilot.armed and self._active:
-            self._disarmed_since_flown = True
+            self._disarmed_since_active = True
         task = autopilot.task
         if isinstance(task, MissionFlight) and task.ended and not self.landed:
             autopilot.hold_at(task.goal)
@@ -360,7 +396,7 @@ class Navigator:
         return self.home if self._autopilot.sensors_ready else None
 
     def _check_key(self) -> object:
-        """What the mission was last checked with; a change of it is reason to check again."""
+        """The inputs of the mission check; a change requires another check."""
         return self._known_home(), self.plans[PlanType.FENCE].identifier
 
     def _check_mission(self) -> None:
@@ -370,10 +406,10 @@ class Navigator:
         self._checked_with = self._check_key()
         was_valid = self.mission.valid
         self.mission.valid, words = complaints(
-            self.mission.items, self._parameters, self.fence, home, landed=self.landed
+            self.mission.items, self._parameters, self.fence, home, self.frame, landed=self.landed
         )
         for text in words:
-            self.say(CRITICAL, text)
+            self.send_text(CRITICAL, text)
         if was_valid != self.mission.valid:
             self._on_event("mission is valid" if self.mission.valid else "mission is not valid")
 
@@ -385,14 +421,14 @@ class Navigator:
         fresh = [words for words in found if words not in self._breaches]
         was_breached, self._breaches = self.is_breached, found
         for words in fresh:
-            self.say(CRITICAL, words)
+            self.send_text(CRITICAL, words)
         if not found or was_breached or not autopilot.armed:
             return
-        self._on_event(f"geofence breached: {found[0]}")  # what is done about it is up to the failsafes
+        self._on_event(f"geofence breached: {found[0]}")  # the failsafes select the action
 
 
 def goes_to_camera(command: int) -> bool:
-    """Whether PX4 passes a mission's command on to the camera component instead of obeying itself."""
+    """Whether PX4 forwards a mission's command to the camera component instead of executing it."""
     return command in _CAMERA_COMMANDS
 
 

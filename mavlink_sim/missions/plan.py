@@ -1,4 +1,4 @@
-"""A plan as it is stored, and how far the vehicle got in its mission."""
+"""A stored plan, and the progress of the mission."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from enum import IntEnum
 from mavlink_sim.missions import items as mission_items
 from mavlink_sim.missions.items import MissionItem
 
-MAX_JUMPS = 10  # PX4's MAX_JUMP_ITERATION: so many DO_JUMP in a row are followed
+MAX_JUMPS = 10  # PX4's MAX_JUMP_ITERATION: number of consecutive DO_JUMP that are followed
 
 
 class MissionState(IntEnum):
@@ -24,7 +24,7 @@ class MissionState(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """The items of a mission, a fence or the rally points, with PX4's identifier of them (0 for none)."""
+    """The items of a mission, a fence or the rally points, with PX4's identifier (0 for none)."""
 
     items: tuple[MissionItem, ...] = ()
     identifier: int = 0
@@ -32,11 +32,11 @@ class Plan:
 
 @dataclass(slots=True)
 class Mission:
-    """The mission on board and where the vehicle is in it.
+    """The mission on board and its progress.
 
     Attributes:
-        current: index of the item being flown. reached: the last one reached, -1 for none.
-        valid: it passed the feasibility checks. finished: it was flown to its end.
+        current: index of the current item. reached: the last one reached, -1 for none.
+        valid: it passed the feasibility checks. finished: it was completed.
         jumps: how often each DO_JUMP was followed.
     """
 
@@ -49,7 +49,7 @@ class Mission:
 
     @property
     def item(self) -> MissionItem:
-        """The item being flown."""
+        """The current item."""
         return self.items[self.current]
 
     def go_to(self, index: int) -> bool:
@@ -61,11 +61,11 @@ class Mission:
         return True
 
     def advance(self) -> bool:
-        """Go on to the next item; False at the end."""
+        """Continue with the next item; False at the end."""
         return self.go_to(self.current + 1)
 
     def positions(self, start: int) -> Iterator[tuple[int, MissionItem]]:
-        """The items with a place from `start` on, in the order of flight, each DO_JUMP as it stands now."""
+        """The items with a position from `start` on, in the order of flight, with the current DO_JUMPs."""
         index = self._resolve(start, count=False)
         for _ in self.items:
             if index is None:
@@ -75,7 +75,7 @@ class Mission:
             index = self._resolve(index + 1, count=False)
 
     def next_position(self, start: int) -> MissionItem | None:
-        """The first item with a place from `start` on."""
+        """The first item with a position from `start` on."""
         return next((item for _, item in self.positions(start)), None)
 
     def land_start(self) -> int | None:

@@ -1,4 +1,4 @@
-"""Where RTL leads (RTL_TYPE) and how it lands there (RTL_PLD_MD)."""
+"""The destination of RTL (RTL_TYPE) and its landing (RTL_PLD_MD)."""
 
 from __future__ import annotations
 
@@ -13,17 +13,18 @@ from mavlink_sim.missions import items as mission_items
 from mavlink_sim.missions.items import MissionItem
 from mavlink_sim.missions.plan import Mission
 from mavlink_sim.physics.airframe import Multirotor, Vector
+from mavlink_sim.physics.geography import LocalFrame
 from mavlink_sim.px4.parameters import Parameters
 
 # A rally point this close to home is no alternative to it (MAX_DIST_FROM_HOME_FOR_LAND_APPROACHES).
 TOO_CLOSE_TO_HOME_M = 10.0
-# Another destination must be that much nearer to be worth it (MIN_DIST_THRESHOLD).
+# Another destination must be nearer by this (MIN_DIST_THRESHOLD).
 WORTH_M = 2.0
 USABLE_FRAMES = frozenset({mission_items.GLOBAL, mission_items.GLOBAL_RELATIVE_ALT})
 
 
 class Goal(enum.Enum):
-    """What kind of place RTL leads to."""
+    """The kind of RTL's destination."""
 
     HOME = "home"
     RALLY = "rally point"
@@ -33,7 +34,7 @@ class Goal(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class Destination:
-    """Local NED metres of the place to land at."""
+    """Where to land, local NED metres."""
 
     kind: Goal
     position: Vector
@@ -44,12 +45,14 @@ def destination(
     mission: Mission,
     parameters: Parameters,
     home: Vector,
+    frame: LocalFrame,
     position: Vector,
 ) -> tuple[Destination, list[str]]:
-    """The nearest place that RTL_TYPE allows, and what PX4 complains of on the way.
+    """The nearest destination that RTL_TYPE allows, and PX4's texts about unusable ones.
 
     0: home or a rally point. 1: a rally point or the mission's landing. 3: any of the three. 5: rally points
-    alone, without one here. With 2 and 4 the vehicle follows its mission instead (see `mission_route`).
+    only, without one the current position. With 2 and 4 the vehicle follows its mission instead (see
+    `mission_route`).
     """
     kind = int(parameters.number("RTL_TYPE"))
     best, nearest = Destination(Goal.HOME, home), math.inf
@@ -57,10 +60,10 @@ def destination(
         nearest = math.dist(home[:2], position[:2])
     landing = mission.landing() if mission.valid else None
     if landing is not None and kind in (1, 3):
-        place = mission.items[landing].place(home)
-        away = math.dist(place[:2], position[:2])
+        point = mission.items[landing].local_position(home, frame)
+        away = math.dist(point[:2], position[:2])
         if away + WORTH_M < nearest:
-            best, nearest = Destination(Goal.MISSION_LANDING, place), away
+            best, nearest = Destination(Goal.MISSION_LANDING, point), away
     complaints = []
     for item in rally:
         if item.command != mission_items.RALLY_POINT:
@@ -68,86 +71,92 @@ def destination(
         if item.frame not in USABLE_FRAMES:
             complaints.append("RTL: unsupported MAV_FRAME\t")
             continue
-        place = item.place(home)
-        if kind != 5 and math.dist(place[:2], home[:2]) <= TOO_CLOSE_TO_HOME_M:
+        point = item.local_position(home, frame)
+        if kind != 5 and math.dist(point[:2], home[:2]) <= TOO_CLOSE_TO_HOME_M:
             continue
-        away = math.dist(place[:2], position[:2])
+        away = math.dist(point[:2], position[:2])
         if away + WORTH_M < nearest:
-            best, nearest = Destination(Goal.RALLY, place), away
+            best, nearest = Destination(Goal.RALLY, point), away
     if kind == 5 and best.kind is not Goal.RALLY:
         best = Destination(Goal.HERE, position)
     return best, complaints
 
 
 def mission_route(
-    mission: Mission, parameters: Parameters, home: Vector
+    mission: Mission, parameters: Parameters, home: Vector, frame: LocalFrame
 ) -> tuple[list[Vector], Vector] | None:
-    """The way back along a valid mission (RTL_TYPE 2 and 4) and where it lands; None for the direct way.
+    """The return along a valid mission (RTL_TYPE 2 and 4) and where it lands; None for the direct return.
 
-    Forward to the mission's landing, past items that wait; without a landing, or with RTL_TYPE 4 where that
-    is nearer, backwards along what was flown and down at home.
+    Forward to the mission's landing, without waiting at items; without a landing, or with RTL_TYPE 4 where
+    that is nearer, backwards along the flown items to a landing at home.
     """
     kind = int(parameters.number("RTL_TYPE"))
     if kind not in (2, 4) or not mission.valid:
         return None
     start, landing = mission.land_start(), mission.landing()
-    if landing is not None and not all(map(math.isfinite, mission.items[landing].place(home))):
+    if landing is not None and not all(
+        map(math.isfinite, mission.items[landing].local_position(home, frame))
+    ):
         landing = None
     forward = start is not None and landing is not None and mission.current <= landing
     if forward and start is not None and kind == 4:
-        forward = start - mission.current < mission.current  # PX4's measure: items left against items flown
+        forward = (
+            start - mission.current < mission.current
+        )  # PX4's measure: remaining items against flown items
     if forward and landing is not None:
-        places = _places(mission.items[mission.current : landing], home)
-        return places, mission.items[landing].place(home)
-    return _places(mission.items[: mission.current], home)[::-1], home
+        points = _points(mission.items[mission.current : landing], home, frame)
+        return points, mission.items[landing].local_position(home, frame)
+    return _points(mission.items[: mission.current], home, frame)[::-1], home
 
 
-def landing_route(mission: Mission, home: Vector) -> tuple[list[Vector], Vector]:
-    """The places of the mission's landing pattern, from DO_LAND_START on, and the landing itself."""
+def landing_route(mission: Mission, home: Vector, frame: LocalFrame) -> tuple[list[Vector], Vector]:
+    """The points of the mission's landing pattern, from DO_LAND_START on, and the landing itself."""
     start, landing = mission.land_start(), mission.landing()
-    assert start is not None  # called for a mission's landing alone
+    assert start is not None  # called only for a mission's landing
     assert landing is not None
-    return _places(mission.items[start:landing], home), mission.items[landing].place(home)
+    return _points(mission.items[start:landing], home, frame), mission.items[landing].local_position(
+        home, frame
+    )
 
 
-def _places(items: tuple[MissionItem, ...], home: Vector) -> list[Vector]:
-    """Where the items with a place are; those that leave some of it open are left out."""
-    places = [item.place(home) for item in items if item.has_position]
-    return [place for place in places if all(map(math.isfinite, place))]
+def _points(items: tuple[MissionItem, ...], home: Vector, frame: LocalFrame) -> list[Vector]:
+    """The positions of the items that have one; incomplete ones (NaN) are left out."""
+    points = [item.local_position(home, frame) for item in items if item.has_position]
+    return [point for point in points if all(map(math.isfinite, point))]
 
 
 class ReturnFlight(flight.Return):
-    """RTL straight to a destination; `make_landing` gives the task of the last descent."""
+    """RTL directly to a destination; `make_landing` creates the task of the final descent."""
 
     def __init__(
         self,
         airframe: Multirotor,
         parameters: Parameters,
-        place: Vector,
+        point: Vector,
         yaw_rad: float,
         make_landing: Callable[[Vector, float], flight.TrajectoryTask],
     ) -> None:
-        super().__init__(airframe, parameters, place, yaw_rad)
+        super().__init__(airframe, parameters, point, yaw_rad)
         self._make_landing = make_landing
 
-    def landing_task(self, place: Vector, yaw_rad: float) -> flight.TrajectoryTask:
-        """The descent at a place, turned to a heading; NaN: as it is."""
-        return self._make_landing(place, yaw_rad)
+    def landing_task(self, point: Vector, yaw_rad: float) -> flight.TrajectoryTask:
+        """The descent at a point, with a heading; NaN: unchanged."""
+        return self._make_landing(point, yaw_rad)
 
 
 class RouteReturn(flight.TrajectoryTask):
-    """RTL along the places of a mission, then down at the last one.
+    """RTL along the waypoints of a mission, with a landing at the last one.
 
     Args:
-        places: local NED, in the order of flight. landing: where to land; its height does not matter.
-        climb_to_z: NED height to climb to first, and to keep until the first place; None to go at once.
+        points: local NED, in the order of flight. landing: where to land; its height is ignored.
+        climb_to_z: NED height to climb to first, and to keep until the first point; None: no climb.
     """
 
     def __init__(
         self,
         airframe: Multirotor,
         parameters: Parameters,
-        places: list[Vector],
+        points: list[Vector],
         landing: Vector,
         make_landing: Callable[[Vector, float], flight.TrajectoryTask],
         climb_to_z: float | None = None,
@@ -159,7 +168,7 @@ class RouteReturn(flight.TrajectoryTask):
         self._landing = landing
         self._descent: flight.TrajectoryTask | None = None
         x, y, z = self._trajectory.stopping_point()
-        self._ahead = [*places, (landing[0], landing[1], math.nan)]
+        self._ahead = [*points, (landing[0], landing[1], math.nan)]
         if climb_to_z is not None:
             z = min(z, climb_to_z)
             first = self._ahead[0]
@@ -168,7 +177,7 @@ class RouteReturn(flight.TrajectoryTask):
         self._next()
 
     def _next(self) -> None:
-        """Turn to the next place; one without a height is flown to at the height there is."""
+        """Set the next point as the goal; one without a height keeps the current height."""
         x, y, z = self._ahead.pop(0)
         self.goal = (x, y, z if math.isfinite(z) else self.goal[2])
 

@@ -2,9 +2,9 @@
 
 World frame NED with its origin on the ground where the vehicle started, body frame FRD. Mass, inertia, drag
 and rotors are those of PX4's own SIH quadrotor (its SIH_* parameters). The attitude is an integrated
-quaternion, so no tilt is special; the attitude and rate loops (`rate_loop`) and the mixer run at every step,
-as on the real vehicle. Plain floats in local names throughout: numpy's scalars, or an object for a vector,
-would make the step several times dearer, and with it everything that is tested in lockstep.
+quaternion, so there is no singular tilt; the attitude and rate loops (`rate_loop`) and the mixer run at every
+step, as on the real vehicle. Plain floats in local names throughout: numpy scalars, or an object for a
+vector, would make the step, and every test in lockstep, several times slower.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ _COUPLING_KGM2 = INERTIA_XY_KGM2 - INERTIA_Z_KGM2
 _TORQUE_PER_THRUST_M = ROTOR_TORQUE_NM / ROTOR_THRUST_MPS2
 
 GUST_TIME_CONSTANT_S = 1.5
-GUST_STEP_S = 0.032  # a fiftieth of the time constant: finer steps would not be seen
+GUST_STEP_S = 0.032  # a fiftieth of the time constant: finer steps have no visible effect
 
 # The ground.
 GEAR_TIME_CONSTANT_S = 0.1
 FRICTION = 0.8
-# Leaning farther than this when it touches, it does not come to stand on its legs.
+# Tilted further than this at contact, it does not come to rest on its legs.
 MAX_STANDING_TILT_COSINE = 0.5
 
 _LEVEL: Matrix = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
@@ -65,16 +65,16 @@ class Multirotor:
         quaternion: `ned_from_body`, (w, x, y, z), of length 1.
         rates: body angular rates about FRD, rad/s.
         rotor_thrusts: of each rotor per vehicle mass, m/s².
-        rotor_commands: what each rotor is asked for, 0..1 of its thrust.
-        rotor_effectiveness: 0..1 for each rotor; 0 is a dead one. See `fail_motor`.
+        rotor_commands: the command of each rotor, 0..1 of its thrust.
+        rotor_effectiveness: 0..1 for each rotor; 0 is a failed one. See `fail_motor`.
         on_ground: touching the ground.
         crashed: it hit the ground too hard or upside down: the rotors are broken.
         touchdown_mps: the downward speed of the last contact with the ground.
         on_touch: called with that speed at every contact.
-        collisions: with things and with others, how many. last_collision: the newest; None before the first.
+        collisions: count, with objects and vehicles. last_collision: the newest; None before the first.
         on_collision: called with each.
-        floor_down_m: NED z of what it stands on or stood on last; 0 is the ground's.
-        wind: NED m/s steady wind; gusts of `gusts_mps` (standard deviation per axis) come on top.
+        floor_down_m: NED z of the surface it stands or last stood on; 0 is the ground.
+        wind: NED m/s steady wind; gusts of `gusts_mps` (standard deviation per axis) are added.
     """
 
     __slots__ = (
@@ -128,14 +128,14 @@ class Multirotor:
         self.gusts_mps = gusts_mps
         self._matrix = _LEVEL
         self._spin: Vector = _STILL  # angular acceleration, rad/s²
-        # collective m/s², body axis of the wanted thrust in the heading frame, yaw rate about the vertical
+        # collective m/s², demanded body thrust axis in the heading frame, yaw rate about the vertical
         self._demand = (0.0, 0.0, 0.0, 1.0, 0.0)
         self._rate_demand: Vector | None = None
         self._gust: Vector = _STILL
         self._gust_left_s = 0.0
         self._random = random.Random(seed)
 
-    # ---- attitude in other words ------------------------------------------------------------------------
+    # ---- other representations of the attitude ----------------------------------------------------------
 
     @property
     def matrix(self) -> Matrix:
@@ -159,7 +159,7 @@ class Multirotor:
         self.set_attitude(self.roll_rad, self.pitch_rad, yaw_rad)
 
     def set_attitude(self, roll_rad: float, pitch_rad: float, yaw_rad: float) -> None:
-        """Put it into an attitude (aerospace sequence)."""
+        """Set the attitude (aerospace sequence)."""
         cr, sr = math.cos(roll_rad / 2), math.sin(roll_rad / 2)
         cp, sp = math.cos(pitch_rad / 2), math.sin(pitch_rad / 2)
         cy, sy = math.cos(yaw_rad / 2), math.sin(yaw_rad / 2)
@@ -183,7 +183,7 @@ class Multirotor:
 
     @property
     def specific_force(self) -> Vector:
-        """What an accelerometer feels, body FRD m/s²."""
+        """The reading of an ideal accelerometer, body FRD m/s²."""
         ax, ay, az = self.acceleration
         az -= GRAVITY_MPS2
         a, b, c, d, e, f, g, h, i = self._matrix
@@ -192,7 +192,7 @@ class Multirotor:
     # ---- demands ----------------------------------------------------------------------------------------
 
     def command(self, thrust_mps2: float, roll_rad: float, pitch_rad: float, yaw_rate_radps: float) -> None:
-        """What to fly from now on: collective thrust, tilt seen from the heading, turn about the vertical."""
+        """Set the demand: collective thrust, tilt relative to the heading, yaw rate about the vertical."""
         cosine = math.cos(roll_rad)
         yaw_rate = min(max(yaw_rate_radps, -MAX_YAW_RATE_RADPS), MAX_YAW_RATE_RADPS)
         self._demand = (
@@ -205,7 +205,7 @@ class Multirotor:
         self._rate_demand = None
 
     def command_rates(self, thrust_mps2: float, rates_radps: Vector) -> None:
-        """What to fly from now on: collective thrust and body rates; NaN: go on turning as asked before."""
+        """Set the demand: collective thrust and body rates; NaN: keep the rate demanded before."""
         self._demand = (thrust_mps2, 0.0, 0.0, 1.0, 0.0)
         before = self._rate_demand or self.rates
         p, q, r = (
@@ -214,7 +214,7 @@ class Multirotor:
         self._rate_demand = (p, q, r)
 
     def fail_motor(self, index: int, effectiveness: float = 0.0) -> None:
-        """Let a rotor (0 to 3) give only this share of what it is asked for; 1 makes it whole again.
+        """Reduce a rotor (0 to 3) to this share of its command; 1 restores it.
 
         Raises:
             ValueError: there is no such rotor, or the share is not within 0 to 1.
@@ -222,7 +222,7 @@ class Multirotor:
         if not 0 <= index < 4:
             raise ValueError(f"motor {index}: this vehicle has motors 0 to 3")
         if not 0.0 <= effectiveness <= 1.0:
-            raise ValueError(f"motor effectiveness {effectiveness}: expected 0 (dead) to 1 (whole)")
+            raise ValueError(f"motor effectiveness {effectiveness}: expected 0 (failed) to 1 (intact)")
         a, b, c, d = (
             effectiveness if rotor == index else known for rotor, known in enumerate(self.rotor_effectiveness)
         )
@@ -353,7 +353,7 @@ class Multirotor:
         self.velocity = (vx, vy, vz)
 
     def blow(self, gust: Vector) -> None:
-        """Let this gust blow, NED m/s, in place of one of its own; to be told again every 32 ms."""
+        """Set the gust, NED m/s, instead of an own one; to be repeated every 32 ms."""
         self._gust = gust
         self._gust_left_s = 1.0
 
@@ -403,10 +403,10 @@ class Multirotor:
             keep = 1.0 - min(1.0, dt_s / GEAR_TIME_CONSTANT_S)
             self.set_attitude(self.roll_rad * keep, self.pitch_rad * keep, self.yaw_rad)
 
-    # ---- things and others ------------------------------------------------------------------------------
+    # ---- collisions -------------------------------------------------------------------------------------
 
     def count(self, collision: Collision) -> None:
-        """It met something; staying in touch is no new meeting, unless it breaks now."""
+        """Record a collision; continued contact is no new one, unless it breaks the rotors now."""
         before_s = self._contacts.get(collision.identifier, -math.inf)
         self._contacts[collision.identifier] = collision.time_s
         if collision.crashed or collision.time_s - before_s > NEW_CONTACT_S:
@@ -416,7 +416,7 @@ class Multirotor:
                 self.on_collision(collision)
 
     def repair(self) -> None:
-        """Whole rotors again, upright where it stands: what a new start of the vehicle finds."""
+        """Restore the rotors and the upright attitude at its position, as for a new start."""
         self.crashed = False
         self.rotor_effectiveness = (1.0, 1.0, 1.0, 1.0)
         if self.on_ground:

@@ -1,11 +1,11 @@
-"""The battery: how it drains, what PX4 measures of it, and the warnings that follow.
+"""The battery: discharge, PX4's measurements of it, and the warnings.
 
-Two models, chosen as on a real vehicle by BAT1_CAPACITY:
+Two models, selected as on a real vehicle by BAT1_CAPACITY:
 
-* unknown (negative, the default): PX4's simulated battery. Its charge goes in SIM_BAT_DRAIN seconds of armed
-  time, never below SIM_BAT_MIN_PCT, and is back when the vehicle is disarmed. There is no current sensor.
-* given in mAh: a battery with a current sensor. The current follows from the thrust, the voltage sags by
-  BAT1_R_INTERNAL a cell, and what is used stays used.
+* unknown (negative, the default): PX4's simulated battery. It is discharged within SIM_BAT_DRAIN seconds of
+  armed time, never below SIM_BAT_MIN_PCT, and full again when disarmed. There is no current sensor.
+* in mAh: a battery with a current sensor. The current follows from the thrust, the voltage sags by
+  BAT1_R_INTERNAL per cell, and the used charge is not restored.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from mavlink_sim.physics.airframe import GRAVITY_MPS2
 from mavlink_sim.px4.parameters import Parameters
 
 SUPPLY_CHECK_OFF = 894281  # CBRK_SUPPLY_CHK's key
-CELL_FILTER_S = 1.0  # as recorded: the charge that is told lags the voltage by about a second
+CELL_FILTER_S = 1.0  # as recorded: the reported charge lags the voltage by about a second
 SIMULATED_CURRENT_A = -1.0  # PX4's simulated battery has no sensor; this is what it reports
 DEFAULT_CELL_RESISTANCE_OHM = 0.005  # PX4's first estimate
 AVIONICS_CURRENT_A = 0.5
-CURRENT_AVERAGE_S = 50.0  # the average behind the time that remains
+CURRENT_AVERAGE_S = 50.0  # the average from which the remaining time is computed
 
 
 class BatteryWarning(IntEnum):
@@ -38,12 +38,12 @@ class Battery:
 
     Attributes:
         charge: the true charge, 0..1.
-        remaining: what the autopilot believes of it, 0..1.
+        remaining: the autopilot's estimate of it, 0..1.
         volts: under load, of all cells. current_a: as measured, -1 without a sensor.
         discharged_mah: used since the start.
-        forced_charge: a fault: the true charge is this, whatever was used; None without one. While there is
-            one, warnings count whatever CBRK_SUPPLY_CHK is.
-        forced_charge_holds: it stays what it is, instead of being used on.
+        forced_charge: the true charge set by a fault; None without one. While it is set, warnings are active
+            whatever CBRK_SUPPLY_CHK is.
+        forced_charge_holds: it is not discharged further.
     """
 
     def __init__(self, parameters: Parameters) -> None:
@@ -83,7 +83,7 @@ class Battery:
 
     @property
     def warning(self) -> BatteryWarning:
-        """By BAT_LOW_THR, BAT_CRIT_THR and BAT_EMERGEN_THR; this is what BATTERY_STATUS tells."""
+        """By BAT_LOW_THR, BAT_CRIT_THR and BAT_EMERGEN_THR; as BATTERY_STATUS reports it."""
         low, critical, emergency = self._thresholds
         if self.remaining < emergency:
             return BatteryWarning.EMERGENCY
@@ -111,7 +111,7 @@ class Battery:
 
     @property
     def time_remaining_s(self) -> int:
-        """At the average current; 0 where it cannot be told."""
+        """At the average current; 0 if unknown."""
         if not self.has_current_sensor:
             return 0
         hours = self.remaining * self._capacity_mah / 1000.0 / max(self._average_current_a, 0.01)
@@ -143,7 +143,7 @@ class Battery:
         self.remaining = self._voltage_charge()
 
     def settle(self) -> None:
-        """Let the autopilot's belief catch up with the true charge at once."""
+        """Set the autopilot's estimate to the true charge."""
         self._cell_v = self._cell_under_no_load()
         self.volts = self._cells * self._cell_v
         self.remaining = self._voltage_charge()

@@ -1,6 +1,6 @@
-"""An airframe among obstacles: it cannot pass through them, breaks on them, and stands on them.
+"""An airframe among obstacles: it collides with them and can stand on them.
 
-Where there is no scene there is the plain `Multirotor`, and nothing of this.
+Without a scene the plain `Multirotor` is used.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _STILL: Vector = (0.0, 0.0, 0.0)
 
 
 class CollidingMultirotor(Multirotor):
-    """A `Multirotor` among obstacles.
+    """A `Multirotor` that collides with obstacles.
 
     Args:
         seed, gusts_mps: as `Multirotor`'s.
@@ -34,14 +34,14 @@ class CollidingMultirotor(Multirotor):
         clock: the scene's time in seconds.
 
     Raises:
-        ValueError: something stands where it starts.
+        ValueError: an obstacle is at its start position.
     """
 
     __slots__ = (
+        "_checked_at",
+        "_clearance_m",
         "_clock",
-        "_looked_at",
         "_obstacles",
-        "_room_m",
         "_start",
         "_support",
     )
@@ -64,15 +64,15 @@ class CollidingMultirotor(Multirotor):
             north, east = start_ned_m
             raise ValueError(
                 f"the vehicle starts at north {north:g} m, east {east:g} m, where the scene's "
-                f"{gap.obstacle.name} stands: one of them must go elsewhere"
+                f"{gap.obstacle.name} stands: move one of them"
             )
-        # nothing is near before it has moved so far from here, less what moves by itself
-        self._looked_at = self.position
-        self._room_m = gap.clear_m
+        # no obstacle is near until it has moved this far from here, less the travel of moving obstacles
+        self._checked_at = self.position
+        self._clearance_m = gap.clear_m
 
     @property
     def centre_ned_m(self) -> Vector:
-        """The middle of its body in the world's frame; its position is where its legs end."""
+        """The centre of its body in the world frame; its position is the end of its legs."""
         x, y, z = self.position
         return (x + self._start[0], y + self._start[1], z - HALF_HEIGHT_M)
 
@@ -81,31 +81,31 @@ class CollidingMultirotor(Multirotor):
     def advance(self, dt_s: float) -> None:
         super().advance(dt_s)
         x, y, z = self.position
-        fx, fy, fz = self._looked_at
+        fx, fy, fz = self._checked_at
         x, y, z = x - fx, y - fy, z - fz
-        room = self._room_m = self._room_m - self._obstacles.top_speed_mps * dt_s
-        if room < 0.0 or x * x + y * y + z * z > room * room:
-            self._look_around(dt_s)
+        margin = self._clearance_m = self._clearance_m - self._obstacles.top_speed_mps * dt_s
+        if margin < 0.0 or x * x + y * y + z * z > margin * margin:
+            self._sense_obstacles(dt_s)
 
-    def _look_around(self, dt_s: float) -> None:
-        """Meet what is touched, and find out how far the next thing is."""
+    def _sense_obstacles(self, dt_s: float) -> None:
+        """Handle contacts, and measure the distance to the next obstacle."""
         now_s = self._clock()
         self._keep_standing(now_s)
         known = self._resting_on
         met = False
-        # in a corner it meets one after the other
+        # in a corner it touches one after the other
         while (gap := self._obstacles.nearest(self.centre_ned_m, now_s, known)).clear_m < -TOUCH_M:
             assert gap.obstacle is not None
             self._meet(gap, gap.obstacle, now_s, dt_s)
             known = [*known, gap.obstacle]
             met = True
-        self._looked_at = self.position
-        self._room_m = 0.0 if met else max(gap.clear_m, 0.0)
+        self._checked_at = self.position
+        self._clearance_m = 0.0 if met else max(gap.clear_m, 0.0)
 
     # ---- contact ----------------------------------------------------------------------------------------
 
     def _meet(self, gap: Gap, obstacle: Obstacle, now_s: float, dt_s: float) -> None:
-        """Get out of it, and bounce off, slide along it or stand on it."""
+        """Resolve the overlap: bounce off, slide along it or stand on it."""
         px, py, pz = gap.push_ned_m
         x, y, z = self.position
         self.position = (x + px, y + py, min(z + pz, 0.0))
@@ -119,7 +119,7 @@ class CollidingMultirotor(Multirotor):
         after = self.velocity = (ux + rx, uy + ry, uz + rz)
         self.rates = rates
         bounces = into > BOUNCE_MPS
-        if not bounces:  # it leans on it: what would accelerate it is held
+        if not bounces:  # in resting contact: the acceleration into it is cancelled
             ax, ay, az = self.acceleration
             self.acceleration = (
                 ax + (after[0] - vx) / dt_s,
@@ -139,11 +139,11 @@ class CollidingMultirotor(Multirotor):
         crashed = self.crashed and not was_crashed
         self.count(Collision(now_s, obstacle.identifier, obstacle.name, into, standing, crashed))
 
-    # ---- standing on something --------------------------------------------------------------------------
+    # ---- standing on an obstacle ------------------------------------------------------------------------
 
     @property
     def _resting_on(self) -> list[Obstacle]:
-        """What it stands on, if neither moves: that need not be looked at again."""
+        """The obstacle it stands on, if neither moves: then no check is needed."""
         support = self._support
         if support is None or support.moves or not self.on_ground or self.velocity != _STILL:
             return []
@@ -154,7 +154,7 @@ class CollidingMultirotor(Multirotor):
         return super()._touch(down_mps, tilt_cosine)
 
     def _keep_standing(self, now_s: float) -> None:
-        """It falls when what it stood on is no longer below it."""
+        """Let it fall when its support is no longer below it."""
         if self._support is None:
             return
         if self.on_ground:

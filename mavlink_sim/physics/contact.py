@@ -1,8 +1,8 @@
-"""What an airframe is to what it touches: a shape, and how it comes out of a contact.
+"""The contact model of an airframe: its shape, and the impulses of a contact.
 
-It counts as an upright ellipsoid of its propellers' reach and a flat body's height, of 1 kg. What it slides
-along turns it, as the impulses of a rigid body do (Mirtich, Canny 1995, "Impulse-based simulation of rigid
-bodies"): first the one along the normal, then the one of friction, neither of which can give it energy.
+The shape is an upright ellipsoid of the propellers' radius and a flat body's height, of 1 kg. A contact
+applies the impulses of a rigid body (Mirtich, Canny 1995, "Impulse-based simulation of rigid bodies"): first
+the one along the normal, then friction; neither adds energy.
 """
 
 from __future__ import annotations
@@ -19,27 +19,27 @@ RADIUS_M = 0.3
 HALF_HEIGHT_M = 0.12
 RESTITUTION = 0.25
 BOUNCE_MPS = 0.8
-# A multirotor's legs take a landing at a walking pace; at 5 m/s something breaks.
+# A multirotor's legs withstand a landing at walking speed; at 5 m/s something breaks.
 HARD_LANDING_MPS = 2.0
 CRASH_MPS = 5.0
-# Propeller guards slide along a wall; legs hold on a roof as on the ground.
+# Propeller guards slide along a wall; legs have the same friction on a roof as on the ground.
 SLIDING_FRICTION = 0.3
-# It stands on what slopes by up to 37 degrees.
+# It can stand on slopes of up to 37 degrees.
 STANDING_COSINE = 0.8
-# Away from a thing for so long, it hits it anew.
+# After this time without contact, the next one is a new collision.
 NEW_CONTACT_S = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class Collision:
-    """One meeting with an obstacle or another vehicle, when it began.
+    """One collision with an obstacle or another vehicle.
 
     Attributes:
-        time_s: the scene's time.
+        time_s: the scene's time at the first contact.
         identifier, name: of the obstacle ("wall-2"), or the other's system id and "vehicle 2".
-        speed_mps: at which they met, along the surface's normal.
-        standing: on top of it: the airframe came to stand there, or bounced.
-        crashed: this broke the rotors.
+        speed_mps: closing speed along the surface normal.
+        standing: on top of it: the airframe came to rest there, or bounced.
+        crashed: it broke the rotors.
     """
 
     time_s: float
@@ -59,7 +59,7 @@ class Collision:
 
 @dataclass(slots=True)
 class Motion:
-    """How a body moves; all in the body's frame (FRD), against what it touches.
+    """The motion of a body relative to what it touches, in the body frame (FRD).
 
     Attributes:
         velocity: m/s. rates: angular, rad/s.
@@ -69,11 +69,11 @@ class Motion:
     rates: Vector
 
     def at(self, arm: Vector) -> Vector:
-        """The velocity of the body's point at `arm` from its middle, metres."""
+        """The velocity of the body's point at `arm` (metres) from its centre."""
         return _sum(self.velocity, _cross(self.rates, arm))
 
     def push(self, arm: Vector, direction: Vector, speed_mps: float, limit_ns: float = math.inf) -> float:
-        """Change the speed of that point along a direction by an impulse, in Ns, which is returned."""
+        """Change the speed of that point along a direction by an impulse. Returns the impulse, Ns."""
         x, y, z = lever = _cross(arm, direction)
         turn = (x / INERTIA_XY_KGM2, y / INERTIA_XY_KGM2, z / INERTIA_Z_KGM2)
         impulse = min(speed_mps / (1.0 + _dot(lever, turn)), limit_ns)
@@ -85,15 +85,15 @@ class Motion:
 def after_contact(
     velocity: Vector, rates: Vector, ned_from_body: Matrix, normal: Vector
 ) -> tuple[float, Vector, Vector]:
-    """What a contact does to an airframe.
+    """The effect of a contact on an airframe.
 
     Args:
-        velocity: NED, m/s, against what is touched. rates: body angular rates, rad/s.
+        velocity: NED, m/s, relative to the touched body. rates: body angular rates, rad/s.
         normal: NED, of the touched surface, of length 1, towards the airframe.
 
     Returns:
-        The speed at which they meet, m/s, and velocity and rates afterwards; they part already if it is
-        negative, and both are as they were.
+        The closing speed, m/s, and velocity and rates afterwards; if the speed is negative they already
+        separate, and both are unchanged.
     """
     out = _turned_back(ned_from_body, normal)
     arm = _turned_back(ned_from_body, _touching_point(normal))
@@ -113,12 +113,12 @@ def after_contact(
 
 
 def back_speed(into_mps: float) -> float:
-    """At which something comes back that met a thing at this speed."""
+    """The rebound speed, m/s, after a contact at this speed."""
     return RESTITUTION * into_mps if into_mps > BOUNCE_MPS else 0.0
 
 
 def _touching_point(normal: Vector) -> Vector:
-    """From its middle to where an upright ellipsoid touches what has this normal, metres."""
+    """From the centre of an upright ellipsoid to its contact point with a surface of this normal, metres."""
     x, y, z = normal
     flat, high = RADIUS_M * RADIUS_M, HALF_HEIGHT_M * HALF_HEIGHT_M
     reach = math.sqrt(flat * (x * x + y * y) + high * z * z)
@@ -126,7 +126,7 @@ def _touching_point(normal: Vector) -> Vector:
 
 
 def _turned(matrix: Matrix, vector: Vector) -> Vector:
-    """The vector, turned by a rotation that is given row by row."""
+    """The vector rotated by a matrix (row by row)."""
     x, y, z = vector
     a, b, c, d, e, f, g, h, i = matrix
     return (a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z)

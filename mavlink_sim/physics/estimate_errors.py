@@ -1,9 +1,9 @@
-"""An estimate that faults can make wrong: it jumps, drifts, turns, or is lost.
+"""An estimate with the errors of faults: it jumps, drifts, rotates, or is lost.
 
 When the horizontal position is lost it behaves as PX4's EKF2 without aiding: dead reckoning for
-EKF2_NOAID_TOUT, then a made-up standstill while height and attitude stay good. PX4 goes on sending
+EKF2_NOAID_TOUT, then an assumed standstill while height and attitude stay valid. PX4 continues to send
 LOCAL_POSITION_NED, GLOBAL_POSITION_INT and ODOMETRY meanwhile: only ESTIMATOR_STATUS, GPS_RAW_INT and the
-mode tell of it.
+mode show it.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ _U16_UNKNOWN = 65535
 
 
 class FallibleEstimate(Estimate):
-    """The estimate of `estimator`, and what faults do to it.
+    """The estimate of `estimator` with the errors of faults.
 
     Attributes:
-        held_xy_m: horizontal position that the estimate is stuck at; None: it follows.
-        reset_counter: how often the estimate jumped, as ODOMETRY tells it (0..255).
-        position_valid: horizontal position and velocity can be flown by.
-        fix_lost: how many reasons there are for GPS to have no fix; 0: it has one.
-        gps_drift: NED metres of the receiver's own error; by fault number.
+        held_xy_m: horizontal position at which the estimate is frozen; None: not frozen.
+        reset_counter: number of resets of the estimate, as in ODOMETRY (0..255).
+        position_valid: horizontal position and velocity are usable for control.
+        fix_lost: number of active faults that take the GPS fix; 0: there is a fix.
+        gps_drift: NED metres of the receiver's error; by fault number.
     """
 
     __slots__ = (
@@ -59,13 +59,13 @@ class FallibleEstimate(Estimate):
 
     @property
     def spoiled(self) -> bool:
-        """Telemetry has to tell of a fault, now or for ever (the reset counter)."""
+        """Whether telemetry shows a fault, now or permanently (the reset counter)."""
         return bool(self.reset_counter or self.fix_lost)
 
     def set_error(
         self, number: int, position_m: Vector | None, velocity_mps: Vector = ZERO, yaw_rad: float = 0.0
     ) -> None:
-        """What a fault adds to the estimate (NED) from its next update on; None: nothing any more."""
+        """Set the error (NED) that a fault adds to the estimate from the next update on; None: none."""
         if position_m is None:
             self._errors.pop(number, None)
         else:
@@ -74,7 +74,7 @@ class FallibleEstimate(Estimate):
         self._yaw_error_rad = sum(error[2] for error in self._errors.values())
 
     def restart(self, faults: Collection[int]) -> None:
-        """A new start of the filter; what the faults of these numbers spoil is spoiled from the beginning."""
+        """Restart the filter; the errors of the faults with these numbers stay."""
         for number in [number for number in self._errors if number not in faults]:
             self.set_error(number, None)
         self.reset_counter = 0
@@ -87,12 +87,12 @@ class FallibleEstimate(Estimate):
             self.update(0.0)
 
     def count_reset(self, resets: int = 1) -> None:
-        """The estimate jumped."""
+        """Count resets of the estimate."""
         self.reset_counter = (self.reset_counter + resets) & 0xFF
 
-    def look(self) -> None:
-        """Look at the truth, with every error of this moment."""
-        Estimate.look(self)  # super() would be twice as dear
+    def refresh(self) -> None:
+        """Update from the truth, with all current errors."""
+        Estimate.refresh(self)  # super() takes twice as long
         if self.held_xy_m is not None:
             self.position = (*self.held_xy_m, self.position[2])
             self.velocity = (0.0, 0.0, self.velocity[2])
@@ -103,7 +103,7 @@ class FallibleEstimate(Estimate):
 
     @property
     def gps_position(self) -> Vector:
-        """Where the GPS receiver believes to be, NED metres: it knows nothing of the filter's errors."""
+        """The GPS receiver's position, NED metres, without the filter's errors."""
         return _sum((self.truth.position, self.gps_error, *self.gps_drift.values()))
 
     @property
@@ -122,7 +122,7 @@ class FallibleEstimate(Estimate):
 
     @quaternion.setter
     def quaternion(self, value: Quaternion) -> None:
-        """Nothing: the attitude is the airframe's own."""
+        """Does nothing: the attitude is the airframe's."""
 
     @property  # type: ignore[misc, unused-ignore]
     def yaw_rad(self) -> float:  # type: ignore[override, misc, unused-ignore]
@@ -138,17 +138,17 @@ def _sum(vectors: Iterable[Vector]) -> Vector:
     return (north, east, down)
 
 
-# ---- what the messages say of it
+# ---- effect on messages
 
 
 def as_reported(estimate: FallibleEstimate, message: Any) -> Any:
-    """The message as PX4 sends it while, or after, the estimate is spoiled."""
+    """The message as PX4 sends it during or after an error of the estimate."""
     amend = _AMENDMENTS.get(message.get_type())
     if amend is None:
         return message
-    told = copy.copy(message)
-    amend(estimate, told)
-    return told
+    reported = copy.copy(message)
+    amend(estimate, reported)
+    return reported
 
 
 def _odometry(estimate: FallibleEstimate, message: Any) -> None:

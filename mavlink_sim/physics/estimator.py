@@ -1,9 +1,9 @@
-"""What the vehicle believes of its motion: the truth with a navigation filter's errors, and noisy sensors.
+"""The vehicle's estimate of its motion: the truth with a navigation filter's errors, and noisy sensors.
 
-The autopilot flies by the estimate and telemetry tells it; only the truth file and the camera see the truth.
-Magnitudes were taken from a PX4 on its own SIH physics: standing and flying telemetry, and the covariances of
-its ODOMETRY. Errors are Gauss-Markov processes drawn from a seed of their own at fixed times, so that neither
-the number of links nor what is asked of them changes a flight.
+Control and telemetry use the estimate; only the truth file and the camera use the truth. Magnitudes are from
+a PX4 on its own SIH physics: telemetry at rest and in flight, and the covariances of its ODOMETRY. Errors are
+Gauss-Markov processes with their own seed at fixed times, so that neither the number of links nor requests on
+them change a flight.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ RATE_STEP_S = 0.008
 DRIFT_STEP_S = 0.024  # velocity and position: steps of a millimetre
 SLOW_STEP_S = 0.048  # attitude, barometer
 GPS_STEP_S = 0.096  # a receiver of 10 Hz
-# White noise is taken from a table, over and over: 8 s of it, which nothing in a flight remembers.
+# White noise is read cyclically from a table of 8 s; no time constant in a flight is as long.
 _TABLE_LENGTH = 1009
 
 _ZERO: Vector = (0.0, 0.0, 0.0)
-# What drives the velocity's error, a step and metre of drift, so that the drift is as wide as named above.
+# Excitation of the velocity error per step and metre of drift, so that the drift has the deviation above.
 _VELOCITY_KEEP = 1.0 - DRIFT_STEP_S / VELOCITY_TIME_CONSTANT_S
 _VELOCITY_SPREAD = math.sqrt(
     (VELOCITY_TIME_CONSTANT_S + POSITION_TIME_CONSTANT_S)
@@ -49,18 +49,18 @@ _VELOCITY_SPREAD = math.sqrt(
 
 
 class Estimate(Multirotor):
-    """The airframe as its autopilot knows it: reads like a `Multirotor`, demands go to the true one.
+    """The airframe as its autopilot estimates it: has a `Multirotor`'s attributes; demands go to the true
+    one.
 
     Args:
         truth: the airframe.
         seed: of the errors.
-        noise: False for a vehicle that knows the truth.
+        noise: False: the estimate is the truth.
 
     Attributes:
         position, velocity, acceleration, quaternion, rates…: the estimates, as `Multirotor`'s.
-        offset: NED metres that the position is wrong by on top (a drifting GPS, an estimator that was reset);
-            velocity_offset: m/s, yaw_offset_rad: the same of velocity and heading. Nothing by default, and in
-            force without noise too.
+        offset: additional position error, NED metres (GPS drift, estimator reset); velocity_offset: m/s,
+            yaw_offset_rad: the same of velocity and heading. Zero by default, also active without noise.
         gps_error: NED metres, of the receiver's newest fix. gps_velocity_error: m/s.
         baro_error_m: of the pressure altitude.
         accelerometer_noise: body FRD m/s².
@@ -69,9 +69,9 @@ class Estimate(Multirotor):
     __slots__ = (
         "_drift_left_s",
         "_gps_left_s",
+        "_index",
         "_noise",
         "_noise_source",
-        "_place",
         "_rate_left_s",
         "_slow_left_s",
         "_table",
@@ -97,7 +97,7 @@ class Estimate(Multirotor):
         self._rate_left_s = self._drift_left_s = self._slow_left_s = self._gps_left_s = 0.0
         gauss = self._noise_source.gauss
         p, q, r = RATE_NOISE_RADPS
-        self._place = 0
+        self._index = 0
         self._table = (
             [(gauss(0.0, p), gauss(0.0, q), gauss(0.0, r)) for _ in range(_TABLE_LENGTH)] if noise else []
         )
@@ -117,19 +117,19 @@ class Estimate(Multirotor):
     # ---- time -------------------------------------------------------------------------------------------
 
     def update(self, dt_s: float) -> None:
-        """Look at the truth again, `dt_s` later."""
+        """Advance the errors by `dt_s` and update from the truth."""
         self.age(dt_s)
-        self.look()
+        self.refresh()
 
     def age(self, dt_s: float) -> None:
-        """Let the errors move on; what is read stays as it was at the last `look`."""
+        """Advance the errors; the attributes stay those of the last `refresh`."""
         if self._noise:
             self._rate_left_s -= dt_s
             if self._rate_left_s <= 1e-9:
                 self._shake()
 
-    def look(self) -> None:
-        """Look at the truth, with the errors of this moment."""
+    def refresh(self) -> None:
+        """Update from the truth, with the current errors."""
         truth = self.truth
         self.on_ground = truth.on_ground
         self.acceleration = truth.acceleration
@@ -157,11 +157,11 @@ class Estimate(Multirotor):
             self.rates = truth.rates
 
     def _shake(self) -> None:
-        """White noise on the rates; every third time the errors of velocity and position move on."""
+        """Draw white noise of the rates; at every third call advance the errors of velocity and position."""
         self._rate_left_s += RATE_STEP_S
-        self._place = place = (self._place + 1) % _TABLE_LENGTH
+        self._index = index = (self._index + 1) % _TABLE_LENGTH
         share = SHARE_ON_GROUND if self.truth.on_ground else 1.0
-        self.rate_error = self._table[place] if share == 1.0 else _scaled(self._table[place], share)
+        self.rate_error = self._table[index] if share == 1.0 else _scaled(self._table[index], share)
         self._drift_left_s -= RATE_STEP_S
         if self._drift_left_s <= 1e-9:
             self._drift(share)
@@ -208,7 +208,7 @@ class Estimate(Multirotor):
             self.gps_error = (dx + gauss(0.0, north), dy + gauss(0.0, east), dz + gauss(0.0, down))
             self.gps_velocity_error = gauss(0.0, GPS_VELOCITY_NOISE_MPS)
 
-    # ---- what it reads ----------------------------------------------------------------------------------
+    # ---- readings ---------------------------------------------------------------------------------------
 
     @property
     def quaternion(self) -> Quaternion:
@@ -234,16 +234,16 @@ class Estimate(Multirotor):
 
     @quaternion.setter
     def quaternion(self, value: Quaternion) -> None:
-        """Nothing: the attitude is the airframe's own."""
+        """Does nothing: the attitude is the airframe's."""
 
     @property
     def floor_down_m(self) -> float:
-        """NED z of what the airframe stands on or stood on last."""
+        """NED z of the surface the airframe stands or last stood on."""
         return self.truth.floor_down_m
 
     @floor_down_m.setter
     def floor_down_m(self, value: float) -> None:
-        """Nothing: it is the airframe that stands."""
+        """Does nothing: the airframe has the surface."""
 
     @property
     def roll_rad(self) -> float:
@@ -277,7 +277,7 @@ class Estimate(Multirotor):
 
     @property
     def gps_position(self) -> Vector:
-        """Where the GPS receiver believes to be, NED metres."""
+        """The GPS receiver's position, NED metres."""
         x, y, z = self.truth.position
         a, b, c = self.gps_error
         d, e, f = self.offset
@@ -288,10 +288,10 @@ class Estimate(Multirotor):
         """The barometer's height above the start."""
         return -self.truth.position[2] + self.baro_error_m
 
-    # ---- what it is asked -------------------------------------------------------------------------------
+    # ---- demands ----------------------------------------------------------------------------------------
 
     def command(self, thrust_mps2: float, roll_rad: float, pitch_rad: float, yaw_rate_radps: float) -> None:
-        """Demand this of the airframe, whose attitude is taken for the estimated one."""
+        """Send the demand to the airframe, whose attitude stands for the estimated one."""
         if self._noise:
             a, b, _ = self.attitude_error
             roll_rad, pitch_rad = roll_rad - a, pitch_rad - b
@@ -301,11 +301,11 @@ class Estimate(Multirotor):
         self.truth.command_rates(thrust_mps2, rates_radps)
 
     def step_rates(self, dt_s: float, thrust_mps2: float, rates: Vector) -> None:
-        """`command_rates` alone, as `step`."""
+        """`command_rates` only, as `step`."""
         self.truth.command_rates(thrust_mps2, rates)
 
     def advance(self, dt_s: float) -> None:
-        """Nothing: only the true airframe moves."""
+        """Does nothing: only the true airframe moves."""
 
     def fail_motor(self, index: int, effectiveness: float = 0.0) -> None:
         self.truth.fail_motor(index, effectiveness)
@@ -313,7 +313,7 @@ class Estimate(Multirotor):
     def step(
         self, dt_s: float, thrust_mps2: float, roll_rad: float, pitch_rad: float, yaw_rate_radps: float
     ) -> None:
-        """`command` alone: it is the vehicle that lets time pass for the true airframe."""
+        """`command` only: the vehicle advances the true airframe."""
         self.command(thrust_mps2, roll_rad, pitch_rad, yaw_rate_radps)
 
 

@@ -1,4 +1,4 @@
-"""Normally distributed random numbers for a sixth of the price of `random.gauss`.
+"""Normally distributed random numbers in a sixth of the time of `random.gauss`.
 
 `NORMAL[random.getrandbits(12)]` draws one of 4096 equally likely quantiles of the standard normal
 distribution: mean 0, standard deviation 1 to a thousandth, nothing beyond 3.7. Noise needs no more.

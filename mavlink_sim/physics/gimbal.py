@@ -1,9 +1,9 @@
-"""A two-axis gimbal: it pans about the body's down axis, then tilts, within its stops and rates.
+"""A two-axis gimbal: it pans about the body's down axis, then tilts, within its limits and rates.
 
 Angles are radians. Pan and tilt are the joints: pan is positive to the right, tilt positive upwards. "Locked"
-angles are kept against the horizon (pitch) or north (yaw) whatever the vehicle does; angles that follow are
-kept against the vehicle. Two axes point the optical axis anywhere, they cannot level the picture: with the
-vehicle rolled and the camera looking forward, the horizon is tilted.
+angles are kept relative to the horizon (pitch) or north (yaw) whatever the vehicle does; "follow" angles are
+kept relative to the vehicle. Two axes point the optical axis anywhere but cannot level the image: with the
+vehicle rolled and the camera forward, the horizon is tilted.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from mavlink_sim.px4.parameters import Parameters
 
 Quaternion = tuple[float, float, float, float]
 
-SLEW_RADPS = math.radians(120.0)  # how fast it turns to a new aim; a small brushless gimbal
-JOINT_RADPS = math.radians(300.0)  # how fast the motors can stabilise
-UNLIMITED_RANGE_DEG = 360.0  # from this MNT_RANGE_YAW on there is no stop
-RATE_TIMEOUT_S = 2.0  # a turning rate that is not repeated ends, as in PX4
+SLEW_RADPS = math.radians(120.0)  # slew rate to a new target, of a small brushless gimbal
+JOINT_RADPS = math.radians(300.0)  # greatest rate of stabilisation
+UNLIMITED_RANGE_DEG = 360.0  # from this MNT_RANGE_YAW on there is no limit
+RATE_TIMEOUT_S = 2.0  # a rate that is not repeated ends, as in PX4
 
 
 class Aim(Enum):
-    """What the gimbal looks at."""
+    """Kind of target."""
 
     NEUTRAL = "neutral"
     ANGLES = "angles"
@@ -33,11 +33,11 @@ class Aim(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """What is asked of the gimbal. NaN: that angle stays as it is, that rate is none.
+    """The target of the gimbal. NaN: keep that angle; no rate.
 
     Attributes:
-        pitch_rad, yaw_rad: where to look; against the world if locked, else against the vehicle.
-        pitch_rate_radps, yaw_rate_radps: how fast to turn; with an angle too, it turns until it is reached.
+        pitch_rad, yaw_rad: relative to the world if locked, else to the vehicle.
+        pitch_rate_radps, yaw_rate_radps: with an angle too, the gimbal turns until that is reached.
         location: NED metres, for Aim.LOCATION.
     """
 
@@ -55,10 +55,10 @@ class Gimbal:
     """One gimbal. `step` moves it.
 
     Attributes:
-        target: what it is to do; set it by `point`.
+        target: set it by `point`.
         pan_rad, tilt_rad: the joints; pan_rate_radps, tilt_rate_radps: how fast they turn.
         pitch_rad, yaw_rad: of the optical axis against horizon and north.
-        lowest_rad, highest_rad, furthest_rad: the stops of tilt, and of pan to either side (infinite: none).
+        lowest_rad, highest_rad, furthest_rad: the limits of tilt, and of pan to either side (infinite: none).
         quaternion: `ned_from_gimbal`, (w, x, y, z), gimbal frame FRD: x along the optical axis.
     """
 
@@ -70,7 +70,7 @@ class Gimbal:
         self.pan_rate_radps = self.tilt_rate_radps = 0.0
         self.pitch_rad = self.yaw_rad = 0.0
         self.quaternion: Quaternion = (1.0, 0.0, 0.0, 0.0)
-        self._aim_pitch_rad = self._aim_yaw_rad = 0.0  # in the frames of `target`, on the way to it
+        self._aim_pitch_rad = self._aim_yaw_rad = 0.0  # in the frames of `target`, slewing towards it
         self._pointed_s = 0.0
         self._now_s = 0.0
         self._load()
@@ -86,7 +86,7 @@ class Gimbal:
 
     @property
     def body_quaternion(self) -> Quaternion:
-        """`body_from_gimbal`, (w, x, y, z): how a camera on it is mounted at this moment."""
+        """`body_from_gimbal`, (w, x, y, z): the current mount of a camera on it."""
         return _product(_about_z(self.pan_rad), _about_y(self.tilt_rad))
 
     def angular_velocity(self, body_rates: Vector) -> Vector:
@@ -96,7 +96,7 @@ class Gimbal:
         return (x, y + self.tilt_rate_radps, z)
 
     def point(self, target: Target) -> None:
-        """Begin to do this."""
+        """Set the target."""
         old = self.target
         self.target = target
         self._pointed_s = self._now_s
@@ -114,7 +114,7 @@ class Gimbal:
         return self.target.aim is Aim.LOCATION or (self.target.aim is Aim.ANGLES and self.target.yaw_locked)
 
     def step(self, dt_s: float, attitude: Quaternion, position: Vector, landed: bool) -> None:
-        """Move for `dt_s`. `attitude`: `ned_from_body` (w, x, y, z); `position`: NED metres."""
+        """Advance by `dt_s`. `attitude`: `ned_from_body` (w, x, y, z); `position`: NED metres."""
         if self._revision != self._parameters.revision:
             self._load()
         self._now_s += dt_s
@@ -140,9 +140,9 @@ class Gimbal:
         self.tilt_rad += rise
         if dt_s > 0.0:
             self.pan_rate_radps, self.tilt_rate_radps = turn / dt_s, rise / dt_s
-        self._look(attitude)
+        self._aim_angles(attitude)
 
-    def _look(self, attitude: Quaternion) -> None:
+    def _aim_angles(self, attitude: Quaternion) -> None:
         """The pose that follows from the joints."""
         self.quaternion = _product(attitude, self.body_quaternion)
         x, y, z = _x_axis(self.quaternion)
@@ -152,7 +152,7 @@ class Gimbal:
         target = self.target
         if target.aim is not Aim.ANGLES:
             return
-        # at a stop, a turning rate must not run ahead of the gimbal
+        # at a limit, a rate must not run ahead of the gimbal
         if target.pitch_rate_radps == target.pitch_rate_radps and self._at_tilt_stop():
             self._aim_pitch_rad = self.pitch_rad if self._pitch_is_locked else self.tilt_rad
         if target.yaw_rate_radps == target.yaw_rate_radps and abs(self.pan_rad) >= self.furthest_rad - 1e-9:
@@ -183,7 +183,7 @@ class Gimbal:
         self._aim_yaw_rad = _moved(self._aim_yaw_rad, yaw, math.nan, False, reach, dt_s, True)
 
     def _joints(self, attitude: Quaternion) -> tuple[float, float]:
-        """(pan, tilt) that look along the aim."""
+        """(pan, tilt) of the aim."""
         if not self._pitch_is_locked and not self._yaw_is_locked:
             return self._aim_yaw_rad, self._aim_pitch_rad
         if self._pitch_is_locked and self._yaw_is_locked:

@@ -1,6 +1,6 @@
-"""Airframes that meet: two upright ellipsoids, of equal mass, that cannot be in one place.
+"""Collisions between airframes: upright ellipsoids of equal mass.
 
-Hull slides on hull without friction; one that comes down on another which stands on the ground stands there.
+Contacts are without friction; an airframe that comes down on another which stands on the ground stands on it.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from mavlink_sim.physics.contact import (
     back_speed,
 )
 
-# Two equal ellipsoids touch where one of twice the size around the first passes through the second's middle.
+# Two equal ellipsoids touch where one of twice the size around the first passes through the second's centre.
 REACH_M, REACH_UP_M = 2.0 * RADIUS_M, 2.0 * HALF_HEIGHT_M
-# Legs reach a little around what they stand on.
+# Legs extend a little beyond the surface they stand on.
 _CARRIED = 1.05
 
 
@@ -32,10 +32,10 @@ class Body:
     """An airframe in the world.
 
     Attributes:
-        start_ned_m: north and east, in the world, of where the airframe's own frame begins.
-        identifier, name: what the others' collisions with it are told by.
-        clock: the time that its own are told with, seconds.
-        stands_on: another that carries it.
+        start_ned_m: north and east, in the world, of the origin of the airframe's frame.
+        identifier, name: of it in the others' collisions.
+        clock: the time of its own collisions, seconds.
+        stands_on: the body below it that carries it.
     """
 
     airframe: Multirotor
@@ -46,59 +46,59 @@ class Body:
     stands_on: Body | None = None
 
     @property
-    def place_ned_m(self) -> Vector:
-        """In the world; of the legs' end, as all of them have their middle above it."""
+    def position_ned_m(self) -> Vector:
+        """Of the end of the legs, in the world; the centre is above it by the same height for all."""
         x, y, z = self.airframe.position
         return (x + self.start_ned_m[0], y + self.start_ned_m[1], z)
 
 
 def apart(first: Body, second: Body) -> float:
-    """How far two are apart, by the distance at which they touch: 1 where they do, less if they overlap."""
-    dx, dy, dz = _difference(first.place_ned_m, second.place_ned_m)
+    """The distance of two bodies relative to that at contact: 1 at contact, less if they overlap."""
+    dx, dy, dz = _difference(first.position_ned_m, second.position_ned_m)
     return math.sqrt((dx * dx + dy * dy) / REACH_M**2 + dz * dz / REACH_UP_M**2)
 
 
 class Midair:
-    """The airframes of one world. Step all of them, then call `look`."""
+    """The airframes of one world. Advance all of them, then call `resolve`."""
 
     def __init__(self) -> None:
         self.bodies: list[Body] = []
-        # nobody is looked at again before one of them has moved by half of what all were apart then
-        self._looked_at: list[Vector] = []
+        # no pair is checked before a body has moved by half of the least distance at the last check
+        self._checked_at: list[Vector] = []
         self._free_m = 0.0
 
     def join(self, body: Body) -> None:
-        """From now on it meets the others.
+        """Add a body.
 
         Raises:
-            ValueError: it is in one place with another, or has joined before.
+            ValueError: it overlaps another, or was added before.
         """
         for other in self.bodies:
             if other.airframe is body.airframe or other.identifier == body.identifier:
-                raise ValueError(f"{body.name} has joined already: each needs a system id of its own")
+                raise ValueError(f"{body.name} has joined already: each needs its own system id")
             if apart(body, other) < 1.0:
-                away_m = math.dist(body.place_ned_m[:2], other.place_ned_m[:2])
+                away_m = math.dist(body.position_ned_m[:2], other.position_ned_m[:2])
                 raise ValueError(
                     f"{body.name} is {away_m:.2g} m beside {other.name}: they need {REACH_M:g} m from middle "
                     f"to middle, so one of them must start elsewhere"
                 )
         self.bodies.append(body)
-        self._looked_at.append(body.place_ned_m)
+        self._checked_at.append(body.position_ned_m)
         self._free_m = 0.0
 
-    def look(self, step_s: float) -> None:
-        """Let those meet that touch.
+    def resolve(self, step_s: float) -> None:
+        """Resolve all contacts.
 
         Args:
-            step_s: since they were looked at before. What moves farther in it than the hulls are thick may be
-                through another unseen.
+            step_s: since the last call. A body that moves by more than its own size in it may pass through
+                another undetected.
         """
         for body in self.bodies:
             if body.stands_on is not None:
                 _fall_unless_carried(body, body.stands_on)
         limit = (0.5 * self._free_m) ** 2
-        for body, (lx, ly, lz) in zip(self.bodies, self._looked_at, strict=True):
-            x, y, z = body.place_ned_m
+        for body, (lx, ly, lz) in zip(self.bodies, self._checked_at, strict=True):
+            x, y, z = body.position_ned_m
             x, y, z = x - lx, y - ly, z - lz
             if x * x + y * y + z * z >= limit:
                 break
@@ -106,14 +106,14 @@ class Midair:
             return
         self._free_m = math.inf
         for first, second in itertools.combinations(self.bodies, 2):
-            clear_m = math.dist(first.place_ned_m, second.place_ned_m) - REACH_M
+            clear_m = math.dist(first.position_ned_m, second.position_ned_m) - REACH_M
             if clear_m <= 0.0 and apart(first, second) < 1.0:
                 self._meet(first, second, step_s)
             self._free_m = min(self._free_m, max(clear_m, 0.0))
-        self._looked_at = [body.place_ned_m for body in self.bodies]
+        self._checked_at = [body.position_ned_m for body in self.bodies]
 
     def _meet(self, first: Body, second: Body, step_s: float) -> None:
-        """Part them, each by its share, and take what they ran into each other with."""
+        """Separate two bodies, each by its share, and exchange their momentum."""
         if first.stands_on is second or second.stands_on is first:
             return
         push, normal = _occlusion(first, second)
@@ -122,7 +122,7 @@ class Midair:
         into = -(before[0] * normal[0] + before[1] * normal[1] + before[2] * normal[2])
         lost = max(into + back_speed(into), 0.0)
         change = (lost * normal[0], lost * normal[1], lost * normal[2])
-        # where they do not bounce one leans on the other, and what would accelerate it is held
+        # without a bounce they are in resting contact: the acceleration into it is cancelled
         held_s = step_s if into <= BOUNCE_MPS else math.inf
         _give(first.airframe, push, change, share, held_s)
         _give(second.airframe, push, change, share - 1.0, held_s)
@@ -140,7 +140,7 @@ class Midair:
 
 
 def _fall_unless_carried(upper: Body, lower: Body) -> None:
-    """It stands no more when it has taken off, or when what carried it is no longer there."""
+    """End the support when it has taken off, or when the body below has moved away."""
     if upper.airframe.on_ground and lower.airframe.on_ground and apart(upper, lower) < _CARRIED:
         return
     upper.stands_on = None
@@ -149,10 +149,10 @@ def _fall_unless_carried(upper: Body, lower: Body) -> None:
 
 
 def _occlusion(first: Body, second: Body) -> tuple[Vector, Vector]:
-    """How far the first has to go, if it alone goes, until the hulls touch; and the second's normal there."""
-    dx, dy, dz = _difference(first.place_ned_m, second.place_ned_m)
+    """How far the first alone has to move until they touch; and the second's normal there."""
+    dx, dy, dz = _difference(first.position_ned_m, second.position_ned_m)
     distance = apart(first, second)
-    if distance == 0.0:  # in one place there is no side: one of them goes up
+    if distance == 0.0:  # coincident centres have no direction: one of them goes up
         return (0.0, 0.0, -REACH_UP_M), (0.0, 0.0, -1.0)
     out = 1.0 / distance - 1.0
     nx, ny, nz = dx / REACH_M**2, dy / REACH_M**2, dz / REACH_UP_M**2
@@ -161,7 +161,7 @@ def _occlusion(first: Body, second: Body) -> tuple[Vector, Vector]:
 
 
 def _share(first: Multirotor, second: Multirotor) -> float:
-    """The first one's part of what parts them: what stands does not give way to what flies."""
+    """The first one's share of the separation: a standing body does not move for a flying one."""
     if first.on_ground == second.on_ground:
         return 0.5
     return 0.0 if first.on_ground else 1.0
@@ -172,7 +172,7 @@ def _difference(first: Vector, second: Vector) -> Vector:
 
 
 def _give(airframe: Multirotor, push: Vector, change: Vector, share: float, held_s: float) -> None:
-    """Move an airframe by its share of a push, and its velocity by its share of a change."""
+    """Apply an airframe's share of a displacement and of a velocity change."""
     x, y, z = airframe.position
     airframe.position = (x + share * push[0], y + share * push[1], min(z + share * push[2], 0.0))
     vx, vy, vz = airframe.velocity

@@ -1,6 +1,6 @@
-"""The other vehicles of a fleet_world as the range sensors of one of them meet them: upright ellipsoids.
+"""The other vehicles of a fleet as the range sensors of one of them measure them: upright ellipsoids.
 
-Everything is NED metres in the world's frame.
+Everything is NED metres in the world frame.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from mavlink_sim.physics.midair import Body
 if TYPE_CHECKING:
     from mavlink_sim.world.obstacles import Segment
 
-# The ellipse that a level cuts is as good as this many sides: 3 mm, where the sensor errs by 20.
+# A horizontal section has this many sides: an error of 3 mm, where the sensor's is 20.
 _CORNERS = [(math.cos(number * math.tau / 24), math.sin(number * math.tau / 24)) for number in range(25)]
 
 
 class Neighbours:
-    """All bodies of a world but one.
+    """All bodies of a world except one.
 
     Args:
-        bodies: all, as they are at any time; one that joins later is among them then.
-        own: the one that looks.
+        bodies: all; may grow later.
+        own: the one with the sensor.
     """
 
     def __init__(self, bodies: Sequence[Body], own: Body) -> None:
@@ -34,21 +34,21 @@ class Neighbours:
         self._own = own
 
     def _others(self) -> Iterator[Vector]:
-        """From one's own middle to the middle of each of the others."""
-        x, y, z = self._own.place_ned_m
+        """From the own centre to the centre of each other body."""
+        x, y, z = self._own.position_ned_m
         for body in self._bodies:
             if body is not self._own:
-                north, east, down = body.place_ned_m
+                north, east, down = body.position_ned_m
                 yield north - x, east - y, down - z
 
     def range_below_m(self) -> float:
-        """From one's own legs along one's own down axis to the first of them; inf: none."""
+        """From the own legs along the own down axis to the first body; inf: none."""
         _, _, x, _, _, y, _, _, z = self._own.airframe.matrix
         found = min((_along(middle, (x, y, z)) for middle in self._others()), default=math.inf)
         return max(found - HALF_HEIGHT_M, 0.0)
 
     def outlines(self, range_m: float) -> list[Segment]:
-        """What one's own level cuts of those within a range: sides, (north, east) from one's own middle."""
+        """The horizontal sections of bodies within a range: sides, (north, east) from the own centre."""
         sides: list[Segment] = []
         for north, east, down in self._others():
             if abs(down) >= HALF_HEIGHT_M or math.hypot(north, east) - RADIUS_M > range_m:
@@ -60,7 +60,7 @@ class Neighbours:
 
 
 def _along(middle: Vector, direction: Vector) -> float:
-    """How far along a unit vector the ellipsoid around a point begins; 0 inside it, inf where it is not."""
+    """The distance along a unit vector to the ellipsoid around a point; 0 inside it, inf without a hit."""
     x, y, z = middle[0] / RADIUS_M, middle[1] / RADIUS_M, middle[2] / HALF_HEIGHT_M
     dx, dy, dz = direction[0] / RADIUS_M, direction[1] / RADIUS_M, direction[2] / HALF_HEIGHT_M
     # |t d - m| = 1

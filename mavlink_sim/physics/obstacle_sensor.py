@@ -1,4 +1,4 @@
-"""A range sensor that looks all around, level, as a rotating lidar does."""
+"""A horizontal 360° range sensor, as a rotating lidar."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ SECTOR_DEG = 5.0
 MINIMUM_M, MAXIMUM_M = 0.2, 12.0
 NOISE_M = 0.02  # standard deviation of each sector's range
 MINIMUM_CM, MAXIMUM_CM = round(100 * MINIMUM_M), round(100 * MAXIMUM_M)
-NOTHING_CM = MAXIMUM_CM + 1  # OBSTACLE_DISTANCE's word for a way that is free
+NOTHING_CM = MAXIMUM_CM + 1  # OBSTACLE_DISTANCE: nothing in range
 
 
 class ObstacleSensor:
-    """Measures how far the nearest obstacle is in each of 72 sectors of 5°, at its own height.
+    """Measures the distance to the nearest obstacle in each of 72 sectors of 5°, at its own height.
 
     Args:
         seed: of its noise. noise: False for true ranges.
@@ -34,7 +34,7 @@ class ObstacleSensor:
 
         Args:
             position_ned_m: of the sensor, in the world's frame. yaw_rad: of the nose, true.
-            beside: what else its level cuts, (north, east) from the sensor.
+            beside: sections of other vehicles, (north, east) from the sensor.
         """
         ranges = self._obstacles.ranges_around(position_ned_m, yaw_rad, MAXIMUM_M, time_s, beside)
         if self._random is not None:

@@ -1,4 +1,4 @@
-"""Quaternions (w, x, y, z) of attitudes in plain floats, which a control loop can afford at every step."""
+"""Quaternions (w, x, y, z) of attitudes in plain floats, fast enough for every control step."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""From a wanted tilt to four rotors: PX4's attitude and rate controllers, and its mixer with saturation.
+"""From a demanded tilt to four rotors: PX4's attitude and rate controllers, and its mixer with saturation.
 
-The gains are PX4's defaults. In the place of its integral parts stands what they come to on this airframe,
-which is balanced: the thrust that keeps a turn going against the drag.
+The gains are PX4's defaults. Its integral parts are replaced by their steady value on this balanced airframe:
+the thrust that keeps a rotation against the drag.
 The attitude loop compares thrust axes (the "reduced attitude" of Brescianini, Hehn, D'Andrea, 2013, which PX4
 uses), so it knows no gimbal lock; the heading is held by the yaw rate that the caller derives.
 """
@@ -33,24 +33,24 @@ YAW_MARGIN = 0.15
 def demanded_rates(
     matrix: Matrix, tilt_x: float, tilt_y: float, tilt_z: float, yaw_rate_radps: float
 ) -> Vector:
-    """Body rates (FRD, rad/s) that turn the thrust axis to where it is wanted.
+    """Body rates (FRD, rad/s) that turn the thrust axis to the demanded direction.
 
     Args:
         matrix: the attitude, `ned_from_body`, row by row.
-        tilt_x, tilt_y, tilt_z: the wanted body down axis in the heading frame (x along the vehicle's heading,
-            z down), a unit vector.
-        yaw_rate_radps: wanted turn about the vertical.
+        tilt_x, tilt_y, tilt_z: the demanded body down axis in the heading frame (x along the vehicle's
+            heading, z down), a unit vector.
+        yaw_rate_radps: demanded yaw rate about the vertical.
     """
     a, b, c, d, e, f, g, h, i = matrix
     heading = math.sqrt(a * a + d * d)
     if heading > 1e-6:
         cosine, sine = a / heading, d / heading
-    else:  # the nose points straight up or down: the right wing still tells the heading
+    else:  # the nose points straight up or down: the heading is that of the right axis
         wing = math.sqrt(b * b + e * e)
         cosine, sine = e / wing, -b / wing
     north = cosine * tilt_x - sine * tilt_y
     east = sine * tilt_x + cosine * tilt_y
-    # the wanted axis seen from the body
+    # the demanded axis in the body frame
     x = a * north + d * east + g * tilt_z
     y = b * north + e * east + h * tilt_z
     z = c * north + f * east + i * tilt_z
@@ -59,7 +59,7 @@ def demanded_rates(
         gain = ATTITUDE_GAIN_PER_S * math.sqrt(2.0 / (1.0 + z))
         p = -gain * y
         q = gain * x
-    else:  # upside down: any way round will do, and standing on the head it must choose one
+    else:  # upside down: every direction is as short; exactly upside down one must be selected
         p = MAX_TILT_RATE_RADPS if y <= 0.0 else -MAX_TILT_RATE_RADPS
         q = 10.0 * ATTITUDE_GAIN_PER_S * x
     limit = MAX_TILT_RATE_RADPS
@@ -69,14 +69,14 @@ def demanded_rates(
 
 
 def mixed_thrusts(collective: float, wanted: Vector, rates: Vector, spin: Vector) -> Rotors:
-    """The rate controller and the mixer: what each rotor should give, 0..1 (order as `Multirotor`).
+    """The rate controller and the mixer: each rotor's command, 0..1 (order as `Multirotor`).
 
-    Where the rotors cannot give everything, collective thrust is lowered first, then tilt is scaled down, and
-    yaw gets what is left (PX4's sequential desaturation without air mode).
+    At saturation, collective thrust is lowered first, then tilt is scaled down, and yaw gets the rest (PX4's
+    sequential desaturation without air mode).
 
     Args:
-        collective: wanted thrust, 0..1.
-        wanted, rates: body rates, rad/s; spin: angular acceleration, rad/s².
+        collective: demanded thrust, 0..1.
+        wanted, rates: body rates, demanded and actual, rad/s; spin: angular acceleration, rad/s².
     """
     roll = RATE_P * (wanted[0] - rates[0]) - RATE_D * spin[0] + RATE_DRAG * wanted[0]
     pitch = RATE_P * (wanted[1] - rates[1]) - RATE_D * spin[1] + RATE_DRAG * wanted[1]
@@ -98,10 +98,10 @@ def mixed_thrusts(collective: float, wanted: Vector, rates: Vector, spin: Vector
     reserve = (yaw if yaw >= 0.0 else -yaw) if -YAW_MARGIN < yaw < YAW_MARGIN else YAW_MARGIN
     if base + spread + reserve > 1.0:
         base = max(1.0 - spread - reserve, spread)
-    room = (1.0 - base if base > 0.5 else base) - spread
-    if room < 0.0:
-        room = 0.0
-    yaw = room if yaw > room else -room if yaw < -room else yaw
+    margin = (1.0 - base if base > 0.5 else base) - spread
+    if margin < 0.0:
+        margin = 0.0
+    yaw = margin if yaw > margin else -margin if yaw < -margin else yaw
     return (
         base - roll + pitch + yaw,
         base + roll - pitch + yaw,

@@ -1,1 +1,1 @@
-"""What PX4 calls things: its flight modes, its parameters and their defaults."""
+"""PX4's flight modes, and its parameters with their defaults."""

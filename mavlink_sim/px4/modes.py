@@ -117,7 +117,7 @@ LISTED_MODES = (
 MANUAL_MODES = frozenset(
     {Mode.MANUAL, Mode.ALTCTL, Mode.POSCTL, Mode.POSITION_SLOW, Mode.ACRO, Mode.STABILIZED}
 )
-# Modes a vehicle can never be armed in; after disarming, the mode chosen before one of these comes back.
+# Modes that never allow arming; after disarming, the mode selected before one of these is restored.
 MODES_PREVENTING_ARMING = frozenset({Mode.RTL, Mode.LAND, Mode.PRECLAND, Mode.ORBIT})
 
 _BY_CUSTOM = {mode.value: mode for mode in Mode}
@@ -131,7 +131,7 @@ def mode_of(main: int, sub: int) -> Mode | None:
 
 
 def base_mode(mode: Mode, armed: bool, has_setpoints: bool) -> int:
-    """HEARTBEAT.base_mode. `has_setpoints`: a setpoint stream is present (it matters in OFFBOARD alone)."""
+    """HEARTBEAT.base_mode. `has_setpoints`: a setpoint stream is present (relevant in OFFBOARD only)."""
     if mode is Mode.OFFBOARD:
         flags = STABILIZE_ENABLED if has_setpoints else 0
     elif mode is Mode.ACRO:

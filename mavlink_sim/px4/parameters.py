@@ -1,7 +1,7 @@
 """The vehicle's parameters: PX4's names, types and values, with integers sent bytewise in the float field.
 
-`parameters.txt` beside this file holds all that a PX4 lists, one `NAME TYPE VALUE` a line. As there, one
-that no part of the vehicle has used yet (`parameters_mission.txt`) can be read and set, but is not listed.
+`parameters.txt` beside this file has all that a PX4 lists, one `NAME TYPE VALUE` per line. As in PX4, a
+parameter that no module has used yet (`parameters_mission.txt`) can be read and set, but is not listed.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ INT32 = 6  # MAV_PARAM_TYPE_INT32
 REAL32 = 9  # MAV_PARAM_TYPE_REAL32
 UINT32 = 5  # MAV_PARAM_TYPE_UINT32, of _HASH_CHECK alone
 HASH_CHECK = "_HASH_CHECK"
-NO_INDEX = 65535  # of what is not listed: _HASH_CHECK, and a parameter that nothing has used yet
+NO_INDEX = 65535  # of what is not listed: _HASH_CHECK, and a parameter that no module has used yet
 _FILE = "parameters.txt"
 _MISSION_FILE = "parameters_mission.txt"
 _GIMBAL_FILE = "parameters_gimbal.txt"
 _TYPES = {"INT32": INT32, "REAL32": REAL32}
-# PX4's `volatile` parameters: the vehicle itself changes them, so they are no part of _HASH_CHECK.
+# PX4's `volatile` parameters: the vehicle itself changes them, so _HASH_CHECK excludes them.
 _VOLATILE = re.compile(
     r"CAL_ACC\d_[XYZ](OFF|SCALE)|CAL_GYRO\d_[XYZ]OFF|CAL_BARO\d_OFF"
     r"|CAL_MAG\d_[XYZ](OFF|SCALE|ODIAG|COMP)|EKF2_MAG_DECL|ASPD_SCALE_\d|SENS_DPRES_OFF"
@@ -81,7 +81,7 @@ def decode_wire_value(kind: int, wire_value: float) -> int | float:
 def default_parameters(gimbal: bool = False) -> list[Parameter]:
     """`parameters.txt` and its additions, with `gimbal` those of one too, in alphabetical order."""
     found = [*_read(_FILE), *_read(_MISSION_FILE), *(_read(_GIMBAL_FILE) if gimbal else ())]
-    unique = {parameter.name: parameter for parameter in found}  # the last of a name counts
+    unique = {parameter.name: parameter for parameter in found}  # the last entry of a name is used
     return sorted(unique.values(), key=lambda parameter: parameter.name)
 
 
@@ -104,9 +104,9 @@ class Parameters:
     """
 
     def __init__(self, values: Mapping[str, float] | None = None, gimbal: bool = False) -> None:
-        """With `gimbal`, the parameters of one are among them.
+        """Start from the defaults, with `gimbal` those of a gimbal too.
 
-        Raises UnknownParameterError or ValueError if `values` names or sets something that cannot be.
+        Raises UnknownParameterError or ValueError for an unknown name or an invalid value in `values`.
         """
         self._defaults = {parameter.name: parameter for parameter in default_parameters(gimbal)}
         self._parameters = dict(self._defaults)
@@ -144,15 +144,15 @@ class Parameters:
         try:
             return self._parameters[name].value
         except KeyError:
-            return self[name].value  # which says what is wrong
+            return self[name].value  # its message names the error
 
     def positive(self, name: str) -> float:
-        """A value to divide by or to take a root of: PX4 accepts any, this stays above zero."""
+        """A value that is safe as a divisor or under a root: above zero, though PX4 accepts any."""
         value = self.number(name)
         return value if value > 0.01 else 0.01
 
     def use(self, *names: str) -> None:
-        """List parameters from now on: a part of the vehicle that reads them has begun its work."""
+        """List these parameters from now on: a module that reads them has started."""
         if not self._unused.isdisjoint(names):
             self._unused.difference_update(names)
             self._number_listed()
@@ -162,7 +162,7 @@ class Parameters:
         return self._parameters[self._names[index]] if 0 <= index < len(self._names) else None
 
     def index(self, name: str) -> int:
-        """Its place in the list, NO_INDEX if it is not there."""
+        """Its index in the list, NO_INDEX if it is not listed."""
         return self._index.get(name, NO_INDEX)
 
     def set(self, name: str, value: float) -> Parameter:
@@ -182,7 +182,7 @@ class Parameters:
         return changed
 
     def reset(self, keep: Collection[str] = ()) -> list[Parameter]:
-        """Back to the values of `default_parameters`, except those to keep. Returns what changed."""
+        """Restore the values of `default_parameters`, except those to keep. Returns what changed."""
         changed = []
         for name, default in self._defaults.items():
             if name not in keep and self._parameters[name].value != default.value:
@@ -192,7 +192,7 @@ class Parameters:
         return changed
 
     def customised(self) -> list[Parameter]:
-        """The parameters whose value is not the default: what PX4 keeps in its file."""
+        """The parameters whose value is not the default: what PX4 stores in its file."""
         return [item for name, item in self._parameters.items() if item.value != self._defaults[name].value]
 
     def hash(self) -> int:

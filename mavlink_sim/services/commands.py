@@ -1,27 +1,23 @@
-"""COMMAND_LONG and COMMAND_INT: which commands the vehicle knows, and PX4's MAV_RESULT for each."""
+"""COMMAND_LONG and COMMAND_INT: the supported commands, and PX4's MAV_RESULT of each."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
 
 from mavlink_sim.autopilot.commander import ACCEPTED, TEMPORARILY_REJECTED
 from mavlink_sim.flight.orbit import OrbitRequest
-from mavlink_sim.physics.geography import geographic, local
+from mavlink_sim.physics.airframe import Vector
 from mavlink_sim.px4.modes import CUSTOM_MODE_ENABLED, Mode, mode_of
 from mavlink_sim.services import gimbal_protocol, parameter_protocol
+from mavlink_sim.services.context import ServiceContext
 from mavlink_sim.services.mission_start import mission_start
 from mavlink_sim.services.system_streams import available_modes
 from mavlink_sim.services.telemetry import MESSAGE_IDS
 from mavlink_sim.wire.announcements import CRITICAL, Text
+from mavlink_sim.wire.commands import Command
+from mavlink_sim.wire.links import Link
 from mavlink_sim.wire.messages import dialect, protocol_version
-
-if TYPE_CHECKING:
-    from mavlink_sim.physics.airframe import Vector
-    from mavlink_sim.services.links import Link
-    from mavlink_sim.vehicle import Vehicle
 
 DENIED = 2  # MAV_RESULT
 UNSUPPORTED = 3
@@ -31,8 +27,6 @@ FORCE_DISARM = 21196
 SPEED_TYPE_GROUNDSPEED = 1
 MAX_ALTITUDE_M = 100_000.0
 MAX_INTERVAL_US = 2**31 - 1  # MESSAGE_INTERVAL carries an int32
-NOT_GIVEN = 2**31 - 1  # x and y of COMMAND_INT
-NAN_AS_INTEGER = 0x7FF80000
 GROUND_STATION_COMPONENT = 190  # MAV_COMP_ID_MISSIONPLANNER
 
 NAV_RETURN_TO_LAUNCH = 20
@@ -48,42 +42,14 @@ GET_MESSAGE_INTERVAL = 510
 SET_MESSAGE_INTERVAL = 511
 REQUEST_MESSAGE = 512
 GET_HOME_POSITION = 410
-MESSAGE_INTERVAL = 244  # a message, which REQUEST_MESSAGE asks for with another's number
+MESSAGE_INTERVAL = 244  # a message that REQUEST_MESSAGE requests with another's number
 AVAILABLE_MODES = 435  # the same with the index of a mode, 0 for all
 # ACTUATOR_OUTPUT_FUNCTION: motors 1-12, servos 1-8, and from 1000 on PX4's own numbers
 _TESTED_FUNCTIONS = (range(1, 13), range(33, 41), range(1000, 2**31))
 
 
-@dataclass(frozen=True, slots=True)
-class Command:
-    """A command; of its parameters, 5 and 6 are latitude and longitude in degrees, 7 is AMSL metres."""
-
-    identifier: int
-    parameters: tuple[float, float, float, float, float, float, float]
-    source_component: int
-    source_system: int = 0
-
-
-def command_of(message: Any) -> Command:
-    """The command of a COMMAND_LONG or COMMAND_INT message."""
-    if message.get_type() == "COMMAND_INT":
-        # both INT32_MAX: "not given", as NaN in COMMAND_LONG. PX4 looks at no frame, z is AMSL in all of them
-        given = (message.x, message.y) != (NOT_GIVEN, NOT_GIVEN)
-        place = (message.x / 1e7, message.y / 1e7) if given else (math.nan, math.nan)
-        tail = (*place, message.z)
-    else:
-        tail = (message.param5, message.param6, message.param7)
-    head = (message.param1, message.param2, message.param3, message.param4)
-    return Command(int(message.command), head + tail, message.get_srcComponent(), message.get_srcSystem())
-
-
-def is_misencoded(message: Any) -> bool:
-    """A COMMAND_INT whose place is a float's NaN put into integers by accident: PX4 denies it."""
-    return message.get_type() == "COMMAND_INT" and (message.x, message.y) == (NAN_AS_INTEGER, NAN_AS_INTEGER)
-
-
-def execute(vehicle: Vehicle, link: Link, command: Command) -> int | None:
-    """Carry out a command. Returns its MAV_RESULT, None where PX4 answers nothing at all."""
+def execute(vehicle: ServiceContext, link: Link, command: Command) -> int | None:
+    """Execute a command. Returns its MAV_RESULT, None where PX4 sends no answer."""
     if command.identifier == 0:
         return None
     handler = _HANDLERS.get(command.identifier)
@@ -92,7 +58,7 @@ def execute(vehicle: Vehicle, link: Link, command: Command) -> int | None:
     return UNSUPPORTED if handler is None else handler(vehicle, link, command)
 
 
-def _arm(vehicle: Vehicle, link: Link, command: Command) -> int | None:
+def _arm(vehicle: ServiceContext, link: Link, command: Command) -> int | None:
     wanted, force = command.parameters[:2]
     action = _nearest(wanted) & 0xFF  # PX4 keeps it in a byte
     if action == 1:
@@ -100,10 +66,10 @@ def _arm(vehicle: Vehicle, link: Link, command: Command) -> int | None:
     if action == 0:
         return vehicle.autopilot.disarm(force=_nearest(force) == FORCE_DISARM)
     vehicle.autopilot.texts.append(Text(CRITICAL, f"Unsupported ARM_DISARM param: {wanted:.3f}\t"))
-    return None  # it says so in words, and PX4 does not answer
+    return None  # PX4 sends the text and no answer
 
 
-def _do_set_mode(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _do_set_mode(vehicle: ServiceContext, link: Link, command: Command) -> int:
     autopilot = vehicle.autopilot
     base, main, sub = command.parameters[:3]
     if not all(map(math.isfinite, (base, main, sub))) or not int(base) & CUSTOM_MODE_ENABLED:
@@ -114,57 +80,59 @@ def _do_set_mode(vehicle: Vehicle, link: Link, command: Command) -> int:
         return TEMPORARILY_REJECTED
     if mode is Mode.LAND:
         return autopilot.force_mode(mode)
-    return autopilot.set_mode(mode, tell=command.source_component == GROUND_STATION_COMPONENT)
+    return autopilot.set_mode(mode, report=command.source_component == GROUND_STATION_COMPONENT)
 
 
-def _takeoff(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _takeoff(vehicle: ServiceContext, link: Link, command: Command) -> int:
     altitude = command.parameters[6]
     if not math.isfinite(altitude):
         return vehicle.autopilot.takeoff(None)
     altitude = min(max(altitude, -MAX_ALTITUDE_M), MAX_ALTITUDE_M)
-    home_altitude = geographic(vehicle.autopilot.home.position)[2]
+    home_altitude = vehicle.local_frame.geographic(vehicle.autopilot.home.position)[2]
     return vehicle.autopilot.takeoff(altitude - home_altitude)
 
 
-def _land(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _land(vehicle: ServiceContext, link: Link, command: Command) -> int:
     return vehicle.autopilot.land()
 
 
-def _return_to_launch(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _return_to_launch(vehicle: ServiceContext, link: Link, command: Command) -> int:
     return vehicle.autopilot.return_home()
 
 
-def _reposition(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _reposition(vehicle: ServiceContext, link: Link, command: Command) -> int:
     speed, flags, _, yaw = command.parameters[:4]
-    goal = _place(*command.parameters[4:7])
+    goal = _point_of(vehicle, *command.parameters[4:7])
     # MAV_DO_REPOSITION_FLAGS_CHANGE_MODE, and no other: the commander refuses the rest. The navigator of PX4
-    # does not look at the flags, so a vehicle that holds flies there whatever the answer says.
+    # ignores the flags, so a vehicle that holds flies there whatever the answer is.
     if math.isfinite(flags) and int(flags) == 1:
         return vehicle.autopilot.reposition(goal, yaw, speed)
     vehicle.autopilot.move_hold_to(goal, yaw, speed)
     return UNSUPPORTED
 
 
-def _change_altitude(vehicle: Vehicle, link: Link, command: Command) -> int:
-    altitude = command.parameters[0]  # AMSL; PX4 looks at no frame here either
-    return vehicle.autopilot.reposition(_place(math.nan, math.nan, altitude), math.nan)
+def _change_altitude(vehicle: ServiceContext, link: Link, command: Command) -> int:
+    altitude = command.parameters[0]  # AMSL; PX4 ignores the frame here too
+    return vehicle.autopilot.reposition(_point_of(vehicle, math.nan, math.nan, altitude), math.nan)
 
 
-def _change_speed(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _change_speed(vehicle: ServiceContext, link: Link, command: Command) -> int:
     kind, speed = command.parameters[:2]
     vehicle.autopilot.change_speed(speed, at_once=_identifier(kind) == SPEED_TYPE_GROUNDSPEED)
     return ACCEPTED
 
 
-def _orbit(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _orbit(vehicle: ServiceContext, link: Link, command: Command) -> int:
     radius, speed, yaw_behaviour = command.parameters[:3]
-    centre = _place(*command.parameters[4:7])
+    centre = _point_of(vehicle, *command.parameters[4:7])
     return vehicle.autopilot.orbit(OrbitRequest(radius, speed, yaw_behaviour, centre))
 
 
-def _place(latitude_deg: float, longitude_deg: float, altitude_m: float) -> Vector:
-    """Local NED, NaN for what is no number. PX4 takes a place not on Earth too; here it lies at the edge."""
-    return local(
+def _point_of(
+    vehicle: ServiceContext, latitude_deg: float, longitude_deg: float, altitude_m: float
+) -> Vector:
+    """Local NED, NaN for non-finite values. Positions out of range, which PX4 accepts, are clamped."""
+    return vehicle.local_frame.local(
         _within(latitude_deg, 90.0), _within(longitude_deg, 180.0), _within(altitude_m, MAX_ALTITUDE_M)
     )
 
@@ -173,49 +141,49 @@ def _within(value: float, limit: float) -> float:
     return min(max(value, -limit), limit) if math.isfinite(value) else math.nan
 
 
-def _accept(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _accept(vehicle: ServiceContext, link: Link, command: Command) -> int:
     return ACCEPTED
 
 
-def _run_prearm_checks(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _run_prearm_checks(vehicle: ServiceContext, link: Link, command: Command) -> int:
     if not vehicle.autopilot.armed:
         vehicle.autopilot.report_checks()
     return ACCEPTED
 
 
-def _mission_start(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _mission_start(vehicle: ServiceContext, link: Link, command: Command) -> int:
     return mission_start(vehicle.autopilot, command.parameters[0])
 
 
-def _set_home(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _set_home(vehicle: ServiceContext, link: Link, command: Command) -> int:
     autopilot, estimate = vehicle.autopilot, vehicle.estimate
     use_current, *attitude_deg = command.parameters[:4]
-    place = command.parameters[4:7]
+    point = command.parameters[4:7]
     if not vehicle.parameters.number("COM_HOME_EN"):
         return DENIED
-    if not use_current > 0.5 and not all(map(math.isfinite, place)):
+    if not use_current > 0.5 and not all(map(math.isfinite, point)):
         return DENIED
-    if not autopilot.sensors_ready:  # no origin yet; with one, a lost position is no reason
+    if not autopilot.sensors_ready:  # no origin yet; with one, a lost position is no reason to refuse
         return TEMPORARILY_REJECTED
     if use_current > 0.5:
         autopilot.home.is_here(estimate)
     else:
         roll, pitch, yaw = (math.radians(angle) if math.isfinite(angle) else None for angle in attitude_deg)
         attitude_rad = (roll or 0.0, pitch or 0.0, math.nan if yaw is None else yaw)
-        autopilot.home.is_at(_place(*place), attitude_rad)
+        autopilot.home.is_at(_point_of(vehicle, *point), attitude_rad)
     return ACCEPTED
 
 
-def _flight_termination(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _flight_termination(vehicle: ServiceContext, link: Link, command: Command) -> int:
     # CBRK_FLIGHTTERM is engaged on this vehicle: a termination is accepted and has no effect
     return ACCEPTED if command.parameters[0] > 0.5 else DENIED
 
 
-def _preflight_storage(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _preflight_storage(vehicle: ServiceContext, link: Link, command: Command) -> int:
     return parameter_protocol.reset(vehicle, command.parameters[0])
 
 
-def _request_message(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _request_message(vehicle: ServiceContext, link: Link, command: Command) -> int:
     if _identifier(command.parameters[0]) == MESSAGE_INTERVAL:
         return _send_interval(vehicle, link, command.parameters[1])
     if _identifier(command.parameters[0]) == AVAILABLE_MODES:
@@ -229,46 +197,46 @@ def _request_message(vehicle: Vehicle, link: Link, command: Command) -> int:
     return ACCEPTED
 
 
-def _get_home_position(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _get_home_position(vehicle: ServiceContext, link: Link, command: Command) -> int:
     return ACCEPTED if vehicle.send_built(link, "HOME_POSITION") else DENIED
 
 
-def _actuator_test(vehicle: Vehicle, link: Link, command: Command) -> int | None:
-    """No actuator moves. A function that PX4 does not have is not answered."""
+def _actuator_test(vehicle: ServiceContext, link: Link, command: Command) -> int | None:
+    """No actuator moves. An unknown function is not answered, as in PX4."""
     if vehicle.autopilot.armed or vehicle.parameters.number("COM_MOT_TEST_EN") != 1:
         return DENIED
     function = _identifier(command.parameters[4])
     return ACCEPTED if any(function in known for known in _TESTED_FUNCTIONS) else None
 
 
-def _calibrate(vehicle: Vehicle, link: Link, command: Command) -> int:
-    """All zero asks for nothing, and ends a calibration; there is none here."""
+def _calibrate(vehicle: ServiceContext, link: Link, command: Command) -> int:
+    """All zero ends a calibration; there is none here."""
     if vehicle.autopilot.armed:
         return TEMPORARILY_REJECTED
     return UNSUPPORTED if any(command.parameters) else ACCEPTED
 
 
-def _reboot(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _reboot(vehicle: ServiceContext, link: Link, command: Command) -> int:
     return UNSUPPORTED if any(command.parameters) else ACCEPTED
 
 
-def _silence(vehicle: Vehicle, link: Link, command: Command) -> None:
-    """Commander leaves it to a part of PX4 that is not there."""
+def _silence(vehicle: ServiceContext, link: Link, command: Command) -> None:
+    """For a module of PX4 that is not simulated: no answer."""
 
 
-def _request_capabilities(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _request_capabilities(vehicle: ServiceContext, link: Link, command: Command) -> int:
     if command.parameters[0] != 1.0:
         return DENIED
     vehicle.send_built(link, "AUTOPILOT_VERSION")
     return ACCEPTED
 
 
-def _request_protocol_version(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _request_protocol_version(vehicle: ServiceContext, link: Link, command: Command) -> int:
     link.send(protocol_version())
     return ACCEPTED
 
 
-def _set_message_interval(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _set_message_interval(vehicle: ServiceContext, link: Link, command: Command) -> int:
     name = MESSAGE_IDS.get(_identifier(command.parameters[0]))
     interval = command.parameters[1]
     if name is None or name == "HEARTBEAT" or name not in link.streams or not math.isfinite(interval):
@@ -279,11 +247,11 @@ def _set_message_interval(vehicle: Vehicle, link: Link, command: Command) -> int
     return ACCEPTED
 
 
-def _get_message_interval(vehicle: Vehicle, link: Link, command: Command) -> int:
+def _get_message_interval(vehicle: ServiceContext, link: Link, command: Command) -> int:
     return _send_interval(vehicle, link, command.parameters[0])
 
 
-def _send_interval(vehicle: Vehicle, link: Link, message_id: float) -> int:
+def _send_interval(vehicle: ServiceContext, link: Link, message_id: float) -> int:
     identifier = _identifier(message_id)
     name = MESSAGE_IDS.get(identifier)
     interval = -1 if name is None else link.streams.interval_us(name)  # -1: no such stream, or off
@@ -296,11 +264,11 @@ def _identifier(value: float) -> int:
 
 
 def _nearest(value: float) -> int:
-    """C's lroundf: a half away from zero; of what is no number the lowest byte is 0."""
+    """C's lroundf: a half away from zero; 0 for a non-finite value."""
     return math.floor(abs(value) + 0.5) * (1 if value > 0.0 else -1) if math.isfinite(value) else 0
 
 
-_HANDLERS: dict[int, Callable[[Vehicle, Link, Command], int | None]] = {
+_HANDLERS: dict[int, Callable[[ServiceContext, Link, Command], int | None]] = {
     NAV_RETURN_TO_LAUNCH: _return_to_launch,
     NAV_LAND: _land,
     NAV_TAKEOFF: _takeoff,
@@ -335,9 +303,9 @@ _HANDLERS: dict[int, Callable[[Vehicle, Link, Command], int | None]] = {
     gimbal_protocol.CONFIGURE: gimbal_protocol.configure,
 }
 
-# PX4's MAVLink receiver accepts these at once, whatever Commander answers a moment later (since v1.16).
+# PX4's MAVLink receiver accepts these at once, before Commander's own answer (since v1.16).
 ANSWERED_TWICE = frozenset({DO_SET_MODE})
-# These never get to Commander's queue.
+# These do not pass Commander's queue.
 ANSWERED_BY_RECEIVER = frozenset(
     {GET_HOME_POSITION, GET_MESSAGE_INTERVAL, SET_MESSAGE_INTERVAL, REQUEST_MESSAGE, 519, 520}
 )

@@ -1,4 +1,4 @@
-"""MAVLink's events interface (https://mavlink.io/en/services/events.html): events sent, kept and repeated."""
+"""MAVLink's events interface (https://mavlink.io/en/services/events.html): send, store and repeat events."""
 
 from __future__ import annotations
 
@@ -6,15 +6,12 @@ import struct
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from pymavlink.generator.mavcrc import x25crc
 
+from mavlink_sim.wire.links import Link
 from mavlink_sim.wire.messages import event, event_error
-
-if TYPE_CHECKING:
-    from mavlink_sim.services.links import Link
-    from mavlink_sim.vehicle import Vehicle
 
 EVENTS_KEPT = 20  # the size of PX4's event buffer
 REQUEST_EVENT_CRC_EXTRA = 33
@@ -42,7 +39,7 @@ class EventBuffer:
     def emit(
         self, links: Iterable[Link], identifier: int, boot_ms: int, levels: int, arguments: bytes
     ) -> None:
-        """Number an event, keep it, send it on every link."""
+        """Number an event, store it, send it on every link."""
         self.sequence = (self.sequence + 1) & 0xFFFF
         kept = Event(self.sequence, identifier, boot_ms, levels, arguments)
         self._kept.append(kept)
@@ -53,16 +50,23 @@ class EventBuffer:
         return next((kept for kept in self._kept if kept.sequence == sequence), None)
 
     def oldest_after(self, sequence: int) -> int:
-        """The number of the first kept event after this one, the newest number where there is none."""
+        """The number of the first stored event after this one, the newest number without one."""
         ahead = [(kept.sequence - sequence) & 0xFFFF for kept in self._kept if kept.sequence != sequence]
         return (sequence + min(ahead)) & 0xFFFF if ahead else self.sequence
 
 
-def request(vehicle: Vehicle, link: Link, message: Any) -> None:
-    """REQUEST_EVENT, unknown to pymavlink's dialects: the events again, or why they cannot be had.
+class EventContext(Protocol):
+    """What the events interface uses of a vehicle. `events`: the newest ones."""
 
-    The range may run over 65535. More than 65535 errors nobody asks for: the answers end with the first
-    gap longer than the buffer, each missing event before it having its own error.
+    system_id: int
+    events: EventBuffer
+
+
+def request(vehicle: EventContext, link: Link, message: Any) -> None:
+    """REQUEST_EVENT, unknown to pymavlink's dialects: repeat the events, or send an error for each missing
+    one.
+
+    The range may wrap at 65535. The answers end with the first gap longer than the buffer.
     """
     frame = bytes(message.get_msgbuf())
     fields = _request_of(frame)
@@ -71,7 +75,7 @@ def request(vehicle: Vehicle, link: Link, message: Any) -> None:
     first, last, system, component = fields
     if system not in (0, vehicle.system_id) or component not in (0, 1):
         return
-    source = (frame[5], frame[6])  # pymavlink does not tell whom an unknown message is from
+    source = (frame[5], frame[6])  # pymavlink does not have the source of an unknown message
     missing = 0
     for ahead in range(((last - first) & 0xFFFF) + 1):
         sequence = (first + ahead) & 0xFFFF

@@ -1,7 +1,7 @@
-"""A file system in memory, for MAVLink FTP: nothing of the host's disk can be reached through it.
+"""A file system in memory, for MAVLink FTP, without access to the host's disk.
 
-Paths are absolute or not, as in PX4: both begin at the root. `..` never leads above it. Errors are OSErrors
-with the errno that POSIX has for the case.
+Absolute and relative paths both begin at the root, as in PX4. `..` never leads above it. Errors are OSErrors
+with the errno of POSIX.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 
 CAPACITY_BYTES = 16 * 1024 * 1024
 MAX_ENTRIES = 2000
-MAX_NAME_BYTES = 220  # with its size it must fit one answer to a list request
+MAX_NAME_BYTES = 220  # with its size it must fit into one answer to a list request
 # A flight controller's card is mounted here; PX4's simulation has the same files at its root.
 STORAGE = ("fs", "microsd")
 
@@ -20,10 +20,10 @@ Path = tuple[str, ...]
 
 
 class FileSystem:
-    """Files that clients write, and files that the vehicle provides, which are read-only and made when read.
+    """Files written by clients, and read-only files provided by the vehicle, which are generated when read.
 
     Args:
-        capacity_bytes: what all written files together may take; more is ENOSPC.
+        capacity_bytes: limit of all written files together; more is ENOSPC.
     """
 
     def __init__(self, capacity_bytes: int = CAPACITY_BYTES) -> None:
@@ -32,64 +32,64 @@ class FileSystem:
         self._provided: dict[Path, Callable[[], bytes]] = {}
         self._directories: set[Path] = {()}
 
-    # ---- what the vehicle offers
+    # ---- provided files
 
     def provide(self, path: str, content: Callable[[], bytes]) -> None:
-        """Offer a read-only file, whose content is asked for whenever it is opened; its folders are made."""
-        place = resolve(path)
-        for depth in range(1, len(place)):
-            self._directories.add(place[:depth])
-        self._provided[place] = content
+        """Provide a read-only file, generated whenever it is opened; its folders are created."""
+        parts = resolve(path)
+        for depth in range(1, len(parts)):
+            self._directories.add(parts[:depth])
+        self._provided[parts] = content
 
     def is_protected(self, path: str) -> bool:
-        """Whether this is the vehicle's own: a provided file, or a folder with one in it."""
-        place = resolve(path)
-        return any(provided[: len(place)] == place for provided in self._provided)
+        """Whether this is a provided file, or a folder with one in it."""
+        parts = resolve(path)
+        return any(provided[: len(parts)] == parts for provided in self._provided)
 
     # ---- reading
 
     def list(self, path: str) -> Iterator[tuple[str, int | None]]:
         """(name, size) of a folder's entries by name; a folder's size is None. ENOENT, ENOTDIR."""
-        place = self._directory(path)
+        parts = self._directory(path)
         entries = {
-            directory[-1]: None for directory in self._directories if directory[:-1] == place != directory
+            directory[-1]: None for directory in self._directories if directory[:-1] == parts != directory
         }
         sizes: dict[str, int | None] = dict(entries)
         for found, content in self._files.items():
-            if found[:-1] == place:
+            if found[:-1] == parts:
                 sizes[found[-1]] = len(content)
         for found, provider in self._provided.items():
-            if found[:-1] == place:
+            if found[:-1] == parts:
                 sizes[found[-1]] = len(provider())
         return iter(sorted(sizes.items()))
 
     def read(self, path: str) -> bytes | bytearray:
         """A file's content: the live buffer of a written one. ENOENT, EISDIR."""
-        place = resolve(path)
-        if place in self._files:
-            return self._files[place]
-        if place in self._provided:
-            return self._provided[place]()
-        raise _error(errno.EISDIR, path) if place in self._directories else self._missing(place, path)
+        parts = resolve(path)
+        if parts in self._files:
+            return self._files[parts]
+        if parts in self._provided:
+            return self._provided[parts]()
+        raise _error(errno.EISDIR, path) if parts in self._directories else self._missing(parts, path)
 
     # ---- writing
 
     def create(self, path: str, truncate: bool) -> bytearray:
-        """Open for writing, making the file if there is none. ENOENT (folder), EISDIR, ENOSPC, EROFS."""
-        place = self._writable(path)
-        if place in self._directories:
+        """Open for writing, creating the file if there is none. ENOENT (folder), EISDIR, ENOSPC, EROFS."""
+        parts = self._writable(path)
+        if parts in self._directories:
             raise _error(errno.EISDIR, path)
-        if place not in self._files:
-            self._check_new(place, path)
-            self._files[place] = bytearray()
+        if parts not in self._files:
+            self._check_new(parts, path)
+            self._files[parts] = bytearray()
         elif truncate:
-            self.resize(self._files[place], 0)
-        return self._files[place]
+            self.resize(self._files[parts], 0)
+        return self._files[parts]
 
     def resize(self, content: bytearray, size: int) -> None:
-        """Cut a written file off or fill it up with zeros. ENOSPC."""
+        """Truncate a written file or pad it with zeros. ENOSPC."""
         growth = size - len(content)
-        # the sum leaves out what was removed while open, so that buffer is also limited by itself
+        # the sum does not include a file removed while open, so its buffer is limited separately
         if growth > 0 and max(size, growth + sum(map(len, self._files.values()))) > self._capacity_bytes:
             raise _error(errno.ENOSPC, f"{growth} more bytes")
         if growth > 0:
@@ -98,7 +98,7 @@ class FileSystem:
             del content[size:]
 
     def write(self, content: bytearray, offset: int, data: bytes) -> int:
-        """Write into an open file, after zeros where that begins behind its end. ENOSPC."""
+        """Write into an open file, padded with zeros up to the offset. ENOSPC."""
         end = offset + len(data)
         if end > len(content):
             self.resize(content, end)
@@ -106,40 +106,40 @@ class FileSystem:
         return len(data)
 
     def truncate(self, path: str, size: int) -> None:
-        place = self._writable(path)
-        if place not in self._files:
-            raise _error(errno.EISDIR, path) if place in self._directories else self._missing(place, path)
-        self.resize(self._files[place], size)
+        parts = self._writable(path)
+        if parts not in self._files:
+            raise _error(errno.EISDIR, path) if parts in self._directories else self._missing(parts, path)
+        self.resize(self._files[parts], size)
 
     def remove(self, path: str) -> None:
-        place = self._writable(path)
-        if place not in self._files:
-            raise _error(errno.EISDIR, path) if place in self._directories else self._missing(place, path)
-        del self._files[place]  # a session that has it open keeps it, as in POSIX
+        parts = self._writable(path)
+        if parts not in self._files:
+            raise _error(errno.EISDIR, path) if parts in self._directories else self._missing(parts, path)
+        del self._files[parts]  # a session that has it open keeps it, as in POSIX
 
     def make_directory(self, path: str) -> None:
-        place = resolve(path)
-        if place in self._directories or place in self._files or place in self._provided:
+        parts = resolve(path)
+        if parts in self._directories or parts in self._files or parts in self._provided:
             raise _error(errno.EEXIST, path)
-        self._check_new(place, path)
-        self._directories.add(place)
+        self._check_new(parts, path)
+        self._directories.add(parts)
 
     def remove_directory(self, path: str) -> None:
-        place = self._writable(path)
-        if place in self._files:
+        parts = self._writable(path)
+        if parts in self._files:
             raise _error(errno.ENOTDIR, path)
-        if place not in self._directories:
-            raise self._missing(place, path)
-        self._check_empty(place, path)
-        if not place:
+        if parts not in self._directories:
+            raise self._missing(parts, path)
+        self._check_empty(parts, path)
+        if not parts:
             raise _error(errno.EBUSY, path)  # the root
-        self._directories.remove(place)
+        self._directories.remove(parts)
 
     def rename(self, old: str, new: str) -> None:
-        """Rename a file or a folder; it takes the place of another file or of an empty folder."""
+        """Rename a file or a folder; it replaces another file or an empty folder."""
         source, target = self._writable(old), self._writable(new)
-        for place, path in ((source, old), (target, new)):
-            self._check_parent(place, path)
+        for parts, path in ((source, old), (target, new)):
+            self._check_parent(parts, path)
         is_folder = source in self._directories
         if not is_folder and source not in self._files:
             raise _error(errno.ENOENT, old)
@@ -159,58 +159,58 @@ class FileSystem:
             self._check_new(target, new)
         depth = len(source)
         self._directories = {
-            target + place[depth:] if place[:depth] == source else place for place in self._directories
+            target + parts[depth:] if parts[:depth] == source else parts for parts in self._directories
         }
         self._files = {
-            target + place[depth:] if place[:depth] == source else place: content
-            for place, content in self._files.items()
-            if place != target
+            target + parts[depth:] if parts[:depth] == source else parts: content
+            for parts, content in self._files.items()
+            if parts != target
         }
 
     # ---- within
 
     def _entries(self) -> Iterator[Path]:
-        yield from (place for place in self._directories if place)
+        yield from (parts for parts in self._directories if parts)
         yield from self._files
         yield from self._provided
 
     def _directory(self, path: str) -> Path:
-        place = resolve(path)
-        if place not in self._directories:
-            known = place in self._files or place in self._provided
-            raise _error(errno.ENOTDIR, path) if known else self._missing(place, path)
-        return place
+        parts = resolve(path)
+        if parts not in self._directories:
+            known = parts in self._files or parts in self._provided
+            raise _error(errno.ENOTDIR, path) if known else self._missing(parts, path)
+        return parts
 
     def _writable(self, path: str) -> Path:
         if self.is_protected(path):
             raise _error(errno.EROFS, path)
         return resolve(path)
 
-    def _missing(self, place: Path, path: str) -> OSError:
-        """What a path that leads nowhere is: ENOTDIR if it leads through a file, else ENOENT."""
+    def _missing(self, parts: Path, path: str) -> OSError:
+        """The error of a missing path: ENOTDIR if it leads through a file, else ENOENT."""
         through = any(
-            place[:depth] in self._files or place[:depth] in self._provided for depth in range(len(place))
+            parts[:depth] in self._files or parts[:depth] in self._provided for depth in range(len(parts))
         )
         return _error(errno.ENOTDIR if through else errno.ENOENT, path)
 
-    def _check_parent(self, place: Path, path: str) -> None:
-        if place[:-1] not in self._directories:
-            raise self._missing(place, path)
+    def _check_parent(self, parts: Path, path: str) -> None:
+        if parts[:-1] not in self._directories:
+            raise self._missing(parts, path)
 
-    def _check_empty(self, place: Path, path: str) -> None:
-        if any(other[:-1] == place for other in self._entries()):
+    def _check_empty(self, parts: Path, path: str) -> None:
+        if any(other[:-1] == parts for other in self._entries()):
             raise _error(errno.ENOTEMPTY, path)
 
-    def _check_new(self, place: Path, path: str) -> None:
-        self._check_parent(place, path)
-        if len(place[-1].encode(errors="surrogateescape")) > MAX_NAME_BYTES:
+    def _check_new(self, parts: Path, path: str) -> None:
+        self._check_parent(parts, path)
+        if len(parts[-1].encode(errors="surrogateescape")) > MAX_NAME_BYTES:
             raise _error(errno.ENAMETOOLONG, path)
         if len(self._files) + len(self._directories) >= MAX_ENTRIES:
             raise _error(errno.ENOSPC, path)
 
 
 def resolve(path: str) -> Path:
-    """The names on the way from the root; the storage card's two places are one."""
+    """The components of a path from the root; the two mount points of the storage card are the same."""
     names: list[str] = []
     for name in path.split("/"):
         if name == "..":

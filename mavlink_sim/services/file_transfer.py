@@ -1,7 +1,7 @@
-"""MAVLink FTP (https://mavlink.io/en/services/ftp.html), as PX4's server answers it: one session a link.
+"""MAVLink FTP (https://mavlink.io/en/services/ftp.html), as in PX4's server: one session per link.
 
-`Server.answer` takes a FILE_TRANSFER_PROTOCOL payload and returns the reply's; `Server.burst` gives what a
-burst read owes now. Files come from a `FileSystem` in memory.
+`Server.answer` takes a FILE_TRANSFER_PROTOCOL payload and returns the reply's; `Server.burst` returns the due
+packets of a burst read. Files are in a `FileSystem` in memory.
 """
 
 from __future__ import annotations
@@ -13,14 +13,11 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from mavlink_sim.services.file_system import FileSystem
+from mavlink_sim.wire.links import Link
 from mavlink_sim.wire.messages import dialect
-
-if TYPE_CHECKING:
-    from mavlink_sim.services.links import Link
-    from mavlink_sim.vehicle import Vehicle
 
 logger = logging.getLogger(__name__)
 
@@ -28,8 +25,8 @@ _HEADER = struct.Struct("<HBBBBBBI")
 PAYLOAD_BYTES = 251
 DATA_BYTES = PAYLOAD_BYTES - _HEADER.size  # 239
 SESSION_TIMEOUT_S = 10.0
-# A burst takes its share of the link: so many packets a step (about 480 kB/s), and a pause, with
-# burst_complete set, after 35 kB, as in PX4.
+# The rate of a burst: packets per step (about 480 kB/s), and a pause, with burst_complete set, after 35 kB,
+# as in PX4.
 BURST_PACKETS = 8
 BURST_BYTES = 35_000
 
@@ -106,7 +103,7 @@ class Packet:
         return cls(sequence, session, opcode, size, requested, bool(burst), offset, data)
 
     def pack(self) -> bytes:
-        """251 bytes, filled up with zeros."""
+        """251 bytes, padded with zeros."""
         header = _HEADER.pack(
             self.sequence & 0xFFFF,
             self.session,
@@ -128,7 +125,7 @@ class Packet:
 @dataclass(slots=True)
 class _Session:
     content: bytes | bytearray
-    size: int  # as it was opened: reading ends there
+    size: int  # size at opening: reading ends there
     readable: bool
     writable: bool
 
@@ -142,27 +139,27 @@ class _Burst:
 
 
 class Server:
-    """The FTP server of one link. `now_s` only has to grow."""
+    """The FTP server of one link. `now_s` must be monotonic."""
 
     def __init__(self, files: FileSystem) -> None:
         self._files = files
         self._session: _Session | None = None
         self._burst: _Burst | None = None
-        self._heard_s = 0.0
+        self._received_s = 0.0
         self._last_reply: Packet | None = None
 
     @property
     def idle(self) -> bool:
-        """Nothing is open: `burst` need not be called."""
+        """No file is open: `burst` need not be called."""
         return self._session is None
 
     def answer(self, payload: bytes, source: tuple[int, int], now_s: float) -> bytes | None:
         """The reply to a request, None where a burst begins instead. Raises ValueError: no FTP payload."""
         request = Packet.unpack(payload)
-        self._heard_s = now_s
+        self._received_s = now_s
         if request.size <= DATA_BYTES and self._last_reply is not None:
             if (request.sequence + 1) & 0xFFFF == self._last_reply.sequence:
-                return self._last_reply.pack()  # our answer was lost, the client asks again
+                return self._last_reply.pack()  # the answer was lost, the client repeats its request
             self._last_reply = None
         try:
             if request.size > DATA_BYTES:
@@ -183,16 +180,16 @@ class Server:
             reason = bytes([Failure.FAIL_ERRNO, number]) if failure is None else bytes([failure])
             reply = _nak(request, reason)
         reply = replace(reply, sequence=(request.sequence + 1) & 0xFFFF, requested=request.opcode)
-        # Longer answers are data, which can be read again without harm.
+        # Longer answers are data, which can be read again.
         if len(reply.data) <= 4 and reply.data[:1] != bytes([Failure.NO_SESSIONS_AVAILABLE]):
             self._last_reply = reply
         return reply.pack()
 
     def burst(self, now_s: float) -> list[tuple[tuple[int, int], bytes]]:
-        """((system, component), payload) of the burst packets that are due; closes a forgotten session."""
+        """((system, component), payload) of the due burst packets; closes a session without requests."""
         if self._session is None:
             return []
-        if now_s - self._heard_s > SESSION_TIMEOUT_S:
+        if now_s - self._received_s > SESSION_TIMEOUT_S:
             logger.info("the FTP session was closed after %g s without a request", SESSION_TIMEOUT_S)
             self._close()
             self._last_reply = None
@@ -217,7 +214,7 @@ class Server:
             self._burst = None
         return replace(packet, data=data, burst_complete=complete).pack()
 
-    # ---- one method a request; each returns the reply's session and data
+    # ---- one method per request; each returns the reply's session and data
 
     def _none(self, request: Packet) -> tuple[int, bytes]:
         return request.session, request.data
@@ -232,7 +229,7 @@ class Server:
         return request.session, b""
 
     def _list(self, request: Packet) -> tuple[int, bytes]:
-        entries = [b"S", b"S"]  # "." and "..", which PX4 counts and does not tell
+        entries = [b"S", b"S"]  # "." and "..", which PX4 counts but does not list
         for name, size in self._files.list(request.text):
             encoded = name.encode(errors="surrogateescape")
             entries.append(b"D" + encoded if size is None else b"F%s\t%d" % (encoded, size))
@@ -317,7 +314,7 @@ class Server:
         old, nul, rest = request.data.partition(b"\0")
         new = rest.split(b"\0", 1)[0]
         if not nul or not new:
-            raise OSError(errno.EINVAL, "two paths are expected, parted by a NUL")
+            raise OSError(errno.EINVAL, "expected two paths separated by a NUL")
         self._files.rename(old.decode(errors="surrogateescape"), new.decode(errors="surrogateescape"))
         return request.session, b""
 
@@ -330,7 +327,7 @@ class Server:
 
 
 def checksum(content: bytes | bytearray) -> int:
-    """MAVLink FTP's CRC-32: the usual polynomial, without inverting before and after."""
+    """MAVLink FTP's CRC-32: the usual polynomial, without inversion before and after."""
     return zlib.crc32(content, 0xFFFFFFFF) ^ 0xFFFFFFFF
 
 
@@ -357,7 +354,17 @@ _HANDLERS: dict[int, Callable[[Server, Packet], tuple[int, bytes]]] = {
 }
 
 
-def handle(vehicle: Vehicle, link: Link, message: Any) -> None:
+class FileContext(Protocol):
+    """What MAVLink FTP uses of a vehicle. `files`: the files it serves."""
+
+    files: FileSystem
+
+    @property
+    def now_s(self) -> float:
+        """Seconds since boot."""
+
+
+def handle(vehicle: FileContext, link: Link, message: Any) -> None:
     """FILE_TRANSFER_PROTOCOL from a client."""
     if link.file_transfer is None:
         link.file_transfer = Server(vehicle.files)
@@ -368,7 +375,7 @@ def handle(vehicle: Vehicle, link: Link, message: Any) -> None:
 
 
 def continue_transfer(link: Link, now_s: float) -> None:
-    """Send what a running burst owes in this step."""
+    """Send the due packets of a running burst."""
     if link.file_transfer is not None and not link.file_transfer.idle:
         for (system, component), payload in link.file_transfer.burst(now_s):
             link.send(dialect.MAVLink_file_transfer_protocol_message(0, system, component, payload))

@@ -2,25 +2,26 @@
 
 As with the gimbal of PX4's Gazebo simulation, the device is implemented by the autopilot's own component, so
 its number is 1 and its messages come from there. One component has primary control
-(DO_GIMBAL_MANAGER_CONFIGURE); whoever else asks is denied. PX4 knows no secondary control.
+(DO_GIMBAL_MANAGER_CONFIGURE); others are denied. PX4 has no secondary control.
 """
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
+from mavlink_sim.autopilot.commander import Autopilot
 from mavlink_sim.flight.position_control import NAN
-from mavlink_sim.physics.geography import local
+from mavlink_sim.physics.airframe import Multirotor
+from mavlink_sim.physics.estimate_errors import FallibleEstimate
+from mavlink_sim.physics.geography import LocalFrame
 from mavlink_sim.physics.gimbal import Aim, Gimbal, Target
+from mavlink_sim.px4.parameters import Parameters
+from mavlink_sim.wire.announcements import GimbalCommand
+from mavlink_sim.wire.commands import Command
+from mavlink_sim.wire.links import Link
 from mavlink_sim.wire.messages import dialect
 from vision.attitude import euler_from_quaternion
-
-if TYPE_CHECKING:
-    from mavlink_sim.services.commands import Command
-    from mavlink_sim.services.links import Link
-    from mavlink_sim.vehicle import Vehicle
-    from mavlink_sim.wire.announcements import GimbalCommand
 
 ACCEPTED, DENIED, UNSUPPORTED = 0, 2, 3  # MAV_RESULT
 DEVICE = 1  # gimbal_device_id: implemented by the autopilot's component
@@ -39,16 +40,39 @@ POINTS_AT_GLOBAL_LOCATION = 131072  # GIMBAL_MANAGER_CAP_FLAGS
 UNCHANGED, ITSELF, RELEASED = -1, -2, -3  # of DO_GIMBAL_MANAGER_CONFIGURE
 
 
+class GimbalContext(Protocol):
+    """What the gimbal protocol uses of a vehicle.
+
+    Attributes:
+        gimbal_manager: None without a gimbal. airframe: the motion (truth). estimate: the vehicle's estimate.
+    """
+
+    system_id: int
+    parameters: Parameters
+    autopilot: Autopilot
+    airframe: Multirotor
+    estimate: FallibleEstimate
+    local_frame: LocalFrame
+    gimbal_manager: GimbalManager | None
+
+    @property
+    def boot_ms(self) -> int: ...
+
+    @property
+    def quaternion(self) -> tuple[float, float, float, float]:
+        """The true `ned_from_body`, (w, x, y, z)."""
+
+
 class GimbalManager:
-    """Who may move the gimbal, and what they asked for.
+    """The gimbal, the component in control, and its target.
 
     Attributes:
         gimbal: the device.
-        primary: (system, component) in control; (0, 0) for nobody.
+        primary: (system, component) in control; (0, 0) for none.
         flags: GIMBAL_MANAGER_FLAGS of the newest aim.
     """
 
-    def __init__(self, vehicle: Vehicle) -> None:
+    def __init__(self, vehicle: GimbalContext) -> None:
         self._vehicle = vehicle
         self.gimbal = Gimbal(vehicle.parameters)
         self.primary = (0, 0)
@@ -59,7 +83,7 @@ class GimbalManager:
         self.gimbal.step(dt_s, vehicle.quaternion, vehicle.estimate.position, vehicle.autopilot.landed)
 
     def configure(self, system: float, component: float, source: tuple[int, int]) -> None:
-        """DO_GIMBAL_MANAGER_CONFIGURE: who has primary control from now on."""
+        """DO_GIMBAL_MANAGER_CONFIGURE: set the component in primary control."""
         own = (self._vehicle.system_id, 1)
         wanted = (_whole(system), _whole(component))
         chosen = [
@@ -69,14 +93,14 @@ class GimbalManager:
         self.primary = (chosen[0], chosen[1])
 
     def aim(self, flags: int, target: Target) -> None:
-        """Do as GIMBAL_MANAGER_FLAGS and a target say; the one in control asks."""
+        """Apply GIMBAL_MANAGER_FLAGS and a target of the component in control."""
         self.flags = flags & (NEUTRAL | ROLL_LOCK | PITCH_LOCK | YAW_LOCK)
         if flags & RETRACT:
-            return  # this gimbal cannot, and PX4 ignores it
+            return  # not supported by this gimbal, and ignored by PX4
         self.gimbal.point(Target() if flags & NEUTRAL else target)
 
     def look_at(self, location: tuple[float, float, float]) -> None:
-        """Keep looking at a place: NED metres. Anybody may ask, as in PX4."""
+        """Track a position, NED metres. Not restricted to the component in control, as in PX4."""
         self.flags = ROLL_LOCK | PITCH_LOCK | YAW_LOCK
         self.gimbal.point(Target(Aim.LOCATION, location=location))
 
@@ -85,7 +109,7 @@ class GimbalManager:
         self.gimbal.point(Target())
 
     def own_command(self, command: GimbalCommand) -> None:
-        """What the autopilot itself asks for when it lands or returns; it asks once, since this answers."""
+        """Execute the autopilot's own command at a landing or return."""
         identifier, _, values = command
         source = (self._vehicle.system_id, 1)
         if identifier == CONFIGURE:
@@ -119,8 +143,8 @@ def _pitch_and_yaw(values: tuple[float, ...], flags: int) -> Target:
 # ---- commands -------------------------------------------------------------------------------------------
 
 
-def configure(vehicle: Vehicle, link: Link, command: Command) -> int | None:
-    """DO_GIMBAL_MANAGER_CONFIGURE. Without a gimbal nobody answers, as in PX4."""
+def configure(vehicle: GimbalContext, link: Link, command: Command) -> int | None:
+    """DO_GIMBAL_MANAGER_CONFIGURE. Without a gimbal there is no answer, as in PX4."""
     manager = vehicle.gimbal_manager
     if manager is None:
         return None
@@ -129,8 +153,8 @@ def configure(vehicle: Vehicle, link: Link, command: Command) -> int | None:
     return ACCEPTED
 
 
-def pitchyaw(vehicle: Vehicle, link: Link, command: Command) -> int | None:
-    """DO_GIMBAL_MANAGER_PITCHYAW: denied to all but the one in control."""
+def pitchyaw(vehicle: GimbalContext, link: Link, command: Command) -> int | None:
+    """DO_GIMBAL_MANAGER_PITCHYAW: denied to all but the component in control."""
     manager = vehicle.gimbal_manager
     if manager is None:
         return None
@@ -141,7 +165,7 @@ def pitchyaw(vehicle: Vehicle, link: Link, command: Command) -> int | None:
     return ACCEPTED
 
 
-def set_roi_location(vehicle: Vehicle, link: Link, command: Command) -> int:
+def set_roi_location(vehicle: GimbalContext, link: Link, command: Command) -> int:
     """DO_SET_ROI_LOCATION: accepted with or without a gimbal; latitude, longitude, AMSL metres."""
     latitude, longitude, altitude = command.parameters[4:7]
     if not all(map(math.isfinite, (latitude, longitude, altitude))):
@@ -149,18 +173,18 @@ def set_roi_location(vehicle: Vehicle, link: Link, command: Command) -> int:
     if abs(latitude) > 90.0 or abs(longitude) > 180.0:
         return DENIED
     if vehicle.gimbal_manager is not None:
-        vehicle.gimbal_manager.look_at(local(latitude, longitude, altitude))
+        vehicle.gimbal_manager.look_at(vehicle.local_frame.local(latitude, longitude, altitude))
     return ACCEPTED
 
 
-def set_roi_none(vehicle: Vehicle, link: Link, command: Command) -> int:
+def set_roi_none(vehicle: GimbalContext, link: Link, command: Command) -> int:
     """DO_SET_ROI_NONE: look ahead again."""
     if vehicle.gimbal_manager is not None:
         vehicle.gimbal_manager.look_ahead()
     return ACCEPTED
 
 
-def set_roi(vehicle: Vehicle, link: Link, command: Command) -> int:
+def set_roi(vehicle: GimbalContext, link: Link, command: Command) -> int:
     """DO_SET_ROI, the old form of both."""
     kind = _whole(command.parameters[0])
     if kind == ROI_LOCATION:
@@ -171,7 +195,7 @@ def set_roi(vehicle: Vehicle, link: Link, command: Command) -> int:
 # ---- messages -------------------------------------------------------------------------------------------
 
 
-def _in_control(vehicle: Vehicle, message: Any) -> GimbalManager | None:
+def _in_control(vehicle: GimbalContext, message: Any) -> GimbalManager | None:
     """The manager, if the sender may move this gimbal."""
     manager = vehicle.gimbal_manager
     if manager is None or message.gimbal_device_id not in (0, DEVICE):
@@ -179,8 +203,8 @@ def _in_control(vehicle: Vehicle, message: Any) -> GimbalManager | None:
     return manager if (message.get_srcSystem(), message.get_srcComponent()) == manager.primary else None
 
 
-def set_attitude(vehicle: Vehicle, link: Link, message: Any) -> None:
-    """GIMBAL_MANAGER_SET_ATTITUDE (282): a quaternion, of which roll is left out, and rates."""
+def set_attitude(vehicle: GimbalContext, link: Link, message: Any) -> None:
+    """GIMBAL_MANAGER_SET_ATTITUDE (282): a quaternion, without its roll, and rates."""
     manager = _in_control(vehicle, message)
     if manager is None:
         return
@@ -191,14 +215,14 @@ def set_attitude(vehicle: Vehicle, link: Link, message: Any) -> None:
     _aim(manager, flags, pitch, yaw, message.angular_velocity_y, message.angular_velocity_z)
 
 
-def set_pitchyaw(vehicle: Vehicle, link: Link, message: Any) -> None:
-    """GIMBAL_MANAGER_SET_PITCHYAW (287), radians. (PX4 itself takes the command of that name alone.)"""
+def set_pitchyaw(vehicle: GimbalContext, link: Link, message: Any) -> None:
+    """GIMBAL_MANAGER_SET_PITCHYAW (287), radians. (PX4 itself supports only the command of that name.)"""
     manager = _in_control(vehicle, message)
     if manager is not None:
         _aim(manager, int(message.flags), message.pitch, message.yaw, message.pitch_rate, message.yaw_rate)
 
 
-def set_manual_control(vehicle: Vehicle, link: Link, message: Any) -> None:
+def set_manual_control(vehicle: GimbalContext, link: Link, message: Any) -> None:
     """GIMBAL_MANAGER_SET_MANUAL_CONTROL (288): rates are shares, -1..1, of MNT_RATE_PITCH and _YAW."""
     manager = _in_control(vehicle, message)
     if manager is None:
@@ -224,10 +248,10 @@ def _aim(
     manager.aim(flags, Target(Aim.ANGLES, pitch, yaw, pitch_rate, yaw_rate, *locked))
 
 
-# ---- what the vehicle tells -----------------------------------------------------------------------------
+# ---- telemetry ------------------------------------------------------------------------------------------
 
 
-def manager_information(vehicle: Vehicle) -> Any:
+def manager_information(vehicle: GimbalContext) -> Any:
     """GIMBAL_MANAGER_INFORMATION; None without a gimbal."""
     manager = vehicle.gimbal_manager
     if manager is None:
@@ -245,12 +269,12 @@ def _capabilities(gimbal: Gimbal) -> int:
 
 
 def _limits(gimbal: Gimbal) -> tuple[float, float, float, float, float, float]:
-    """Lowest and highest roll, pitch and yaw; NaN where there is no stop."""
+    """Lowest and highest roll, pitch and yaw; NaN where there is no limit."""
     furthest = gimbal.furthest_rad if math.isfinite(gimbal.furthest_rad) else NAN
     return (0.0, 0.0, gimbal.lowest_rad, gimbal.highest_rad, -furthest, furthest)
 
 
-def manager_status(vehicle: Vehicle) -> Any:
+def manager_status(vehicle: GimbalContext) -> Any:
     """GIMBAL_MANAGER_STATUS; None without a gimbal."""
     manager = vehicle.gimbal_manager
     if manager is None:
@@ -260,7 +284,7 @@ def manager_status(vehicle: Vehicle) -> Any:
     )
 
 
-def device_information(vehicle: Vehicle) -> Any:
+def device_information(vehicle: GimbalContext) -> Any:
     """GIMBAL_DEVICE_INFORMATION; None without a gimbal."""
     manager = vehicle.gimbal_manager
     if manager is None:
@@ -280,8 +304,8 @@ def device_information(vehicle: Vehicle) -> Any:
     )
 
 
-def device_attitude_status(vehicle: Vehicle) -> Any:
-    """GIMBAL_DEVICE_ATTITUDE_STATUS: the attitude against north; None without a gimbal."""
+def device_attitude_status(vehicle: GimbalContext) -> Any:
+    """GIMBAL_DEVICE_ATTITUDE_STATUS: the attitude relative to north; None without a gimbal."""
     manager = vehicle.gimbal_manager
     if manager is None:
         return None
@@ -300,7 +324,7 @@ def device_attitude_status(vehicle: Vehicle) -> Any:
     )
 
 
-def mount_orientation(vehicle: Vehicle) -> Any:
+def mount_orientation(vehicle: GimbalContext) -> Any:
     """MOUNT_ORIENTATION, in degrees; None without a gimbal."""
     manager = vehicle.gimbal_manager
     if manager is None:

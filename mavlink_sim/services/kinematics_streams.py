@@ -1,38 +1,37 @@
-"""Telemetry of motion: attitude, place and speed as the vehicle knows them, and where it wants to be."""
+"""Telemetry of motion: estimated attitude, position and velocity, and the targets of control."""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mavlink_sim.flight import collision_prevention
+from mavlink_sim.flight.orbit import Orbit
 from mavlink_sim.physics.airframe import MAX_THRUST_MPS2
-from mavlink_sim.physics.geography import HOME_ALTITUDE_M, geographic
+from mavlink_sim.physics.geography import HOME_ALTITUDE_M
+from mavlink_sim.services.context import ServiceContext
 from mavlink_sim.wire import packing
 from mavlink_sim.wire.messages import dialect
 
-if TYPE_CHECKING:
-    from mavlink_sim.vehicle import Vehicle
-
 _NAN = math.nan
-# It works at the rate of the position control.
+# Collision prevention runs at the rate of the position control.
 OBSTACLE_MAP_AGE_S = 0.05
 
 
-def attitude(vehicle: Vehicle) -> Any:
+def attitude(vehicle: ServiceContext) -> Any:
     frame = vehicle.estimate
     return packing.attitude(vehicle.boot_ms, frame.roll_rad, frame.pitch_rad, frame.yaw_rad, *frame.rates)
 
 
-def attitude_quaternion(vehicle: Vehicle) -> Any:
+def attitude_quaternion(vehicle: ServiceContext) -> Any:
     return packing.attitude_quaternion(
         vehicle.boot_ms, *vehicle.estimate.quaternion, *vehicle.estimate.rates, repr_offset_q=[0.0] * 4
     )
 
 
-def global_position_int(vehicle: Vehicle) -> Any:
+def global_position_int(vehicle: ServiceContext) -> Any:
     frame = vehicle.estimate
-    latitude, longitude, altitude = geographic(frame.position)
+    latitude, longitude, altitude = vehicle.local_frame.geographic(frame.position)
     vx, vy, vz = frame.velocity
     return packing.global_position_int(
         vehicle.boot_ms,
@@ -51,7 +50,7 @@ def _pressure_hpa(altitude_m: float) -> float:
     return float(1013.25 * (1.0 - 2.25577e-5 * altitude_m) ** 5.25588)
 
 
-def highres_imu(vehicle: Vehicle) -> Any:
+def highres_imu(vehicle: ServiceContext) -> Any:
     frame = vehicle.estimate
     altitude = HOME_ALTITUDE_M + frame.pressure_height_m
     cosine, sine = math.cos(frame.yaw_rad), math.sin(frame.yaw_rad)
@@ -70,7 +69,7 @@ def highres_imu(vehicle: Vehicle) -> Any:
     )
 
 
-def local_position_ned(vehicle: Vehicle) -> Any:
+def local_position_ned(vehicle: ServiceContext) -> Any:
     frame = vehicle.estimate
     return packing.local_position_ned(vehicle.boot_ms, *frame.position, *frame.velocity)
 
@@ -80,7 +79,7 @@ _POSE_COVARIANCE = [0.041, 0, 0, 0, 0, 0, 0.041, 0, 0, 0, 0, 0.044, 0, 0, 0, 2.3
 _VELOCITY_COVARIANCE = [0.011, 0, 0, 0, 0, 0, 0.012, 0, 0, 0, 0, 0.005, *([0] * 9)]
 
 
-def odometry(vehicle: Vehicle) -> Any:
+def odometry(vehicle: ServiceContext) -> Any:
     frame = vehicle.estimate
     return packing.odometry(
         vehicle.boot_us,
@@ -98,7 +97,7 @@ def odometry(vehicle: Vehicle) -> Any:
     )
 
 
-def altitude(vehicle: Vehicle) -> Any:
+def altitude(vehicle: ServiceContext) -> Any:
     height = -vehicle.estimate.position[2]
     relative = height + vehicle.autopilot.home.position[2]
     return packing.altitude(
@@ -106,27 +105,24 @@ def altitude(vehicle: Vehicle) -> Any:
     )
 
 
-def distance_sensor(vehicle: Vehicle) -> Any:
+def distance_sensor(vehicle: ServiceContext) -> Any:
     frame = vehicle.estimate
     slant = -vehicle.airframe.position[2] / max(math.cos(frame.roll_rad) * math.cos(frame.pitch_rad), 0.1)
-    if vehicle.collision_world is not None:
-        slant = min(slant, vehicle.collision_world.range_below_m())
-    if vehicle.neighbours is not None:
-        slant = min(slant, vehicle.neighbours.range_below_m())
+    slant = min(slant, vehicle.obstacle_below_m())
     return packing.distance_sensor(
         vehicle.boot_ms, 0, 10000, min(round(max(slant, 0.0) * 100), 65534), 0, 0, 25, 0
     )
 
 
-def obstacle_distance(vehicle: Vehicle) -> Any:
-    """The map of collision prevention, from whatever sensors; while that is at work, as PX4 publishes it."""
+def obstacle_distance(vehicle: ServiceContext) -> Any:
+    """The map of collision prevention, of all sensors; only while that is active, as in PX4."""
     found = vehicle.autopilot.navigator.obstacles
     if vehicle.autopilot.now_s - found.used_s > OBSTACLE_MAP_AGE_S:
         return None
     stamp_us = round(found.stamp_s * 1e6) if math.isfinite(found.stamp_s) else 0
     return dialect.MAVLink_obstacle_distance_message(
         stamp_us,
-        0,  # MAV_DISTANCE_SENSOR_LASER, whatever measured
+        0,  # MAV_DISTANCE_SENSOR_LASER, for all sensors
         found.distances_cm.copy(),
         0,  # the increment is in increment_f
         found.min_distance_cm,
@@ -137,7 +133,7 @@ def obstacle_distance(vehicle: Vehicle) -> Any:
     )
 
 
-def attitude_target(vehicle: Vehicle) -> Any:
+def attitude_target(vehicle: ServiceContext) -> Any:
     autopilot = vehicle.autopilot
     target = autopilot.attitude.target(vehicle.estimate, autopilot.controller, autopilot.demand)
     return packing.attitude_target(vehicle.boot_ms, 0, list(target.quaternion), *target.rates, target.thrust)
@@ -151,10 +147,10 @@ def _type_mask(*groups: tuple[float, float, float]) -> int:
     return mask
 
 
-def position_target_local_ned(vehicle: Vehicle) -> Any:
+def position_target_local_ned(vehicle: ServiceContext) -> Any:
     inner = vehicle.autopilot.controller
     if vehicle.autopilot.attitude.active:
-        return None  # PX4's position controller rests meanwhile
+        return None  # PX4's position controller is inactive then
     return packing.position_target_local_ned(
         vehicle.boot_ms,
         1,
@@ -167,11 +163,11 @@ def position_target_local_ned(vehicle: Vehicle) -> Any:
     )
 
 
-def position_target_global_int(vehicle: Vehicle) -> Any:
+def position_target_global_int(vehicle: ServiceContext) -> Any:
     task = vehicle.autopilot.task
     if task is None or task.goal is None:
         return None
-    latitude, longitude, altitude = geographic(task.goal)
+    latitude, longitude, altitude = vehicle.local_frame.geographic(task.goal)
     inner = vehicle.autopilot.controller
     return dialect.MAVLink_position_target_global_int_message(
         vehicle.boot_ms,
@@ -187,17 +183,34 @@ def position_target_global_int(vehicle: Vehicle) -> Any:
     )
 
 
+def orbit_execution_status(vehicle: ServiceContext) -> Any:
+    """ORBIT_EXECUTION_STATUS (360) while an orbit is flown, else None. Radius positive: clockwise."""
+    task = vehicle.autopilot.task
+    if not isinstance(task, Orbit) or task.refused:
+        return None
+    north, east, _ = task.centre
+    latitude, longitude, altitude = vehicle.local_frame.geographic((north, east, task.down_m))
+    return dialect.MAVLink_orbit_execution_status_message(
+        vehicle.boot_us,
+        math.copysign(task.radius_m, task.speed_mps),
+        0,
+        round(latitude * 1e7),
+        round(longitude * 1e7),
+        altitude,
+    )
+
+
 _UNUSED_OUTPUTS = (900,) * 12
 
 
-def servo_output_raw(vehicle: Vehicle) -> Any:
+def servo_output_raw(vehicle: ServiceContext) -> Any:
     widths = [900] * 4
     if vehicle.autopilot.armed:
         widths = [1000 + round(1000 * command) for command in vehicle.airframe.rotor_commands]
     return packing.servo_output_raw(vehicle.boot_us & 0xFFFFFFFF, 0, *widths, *_UNUSED_OUTPUTS)
 
 
-def vfr_hud(vehicle: Vehicle) -> Any:
+def vfr_hud(vehicle: ServiceContext) -> Any:
     frame = vehicle.estimate
     vx, vy, vz = frame.velocity
     throttle = round(100 * frame.thrust_mps2 / MAX_THRUST_MPS2) if vehicle.autopilot.armed else 0
@@ -207,8 +220,8 @@ def vfr_hud(vehicle: Vehicle) -> Any:
     )
 
 
-def gps_raw_int(vehicle: Vehicle) -> Any:
-    latitude, longitude, altitude = geographic(vehicle.estimate.gps_position)
+def gps_raw_int(vehicle: ServiceContext) -> Any:
+    latitude, longitude, altitude = vehicle.local_frame.geographic(vehicle.estimate.gps_position)
     vx, vy, _ = vehicle.estimate.velocity
     course = round(math.degrees(math.atan2(vy, vx)) % 360.0 * 100) % 36000
     height_mm = round(altitude * 1000)
@@ -232,9 +245,9 @@ def gps_raw_int(vehicle: Vehicle) -> Any:
     )
 
 
-def open_drone_id_location(vehicle: Vehicle) -> Any:
+def open_drone_id_location(vehicle: ServiceContext) -> Any:
     frame = vehicle.estimate
-    latitude, longitude, altitude = geographic(frame.position)
+    latitude, longitude, altitude = vehicle.local_frame.geographic(frame.position)
     vx, vy, vz = frame.velocity
     course = round(math.degrees(math.atan2(vy, vx)) % 360.0 * 100) % 36000
     return dialect.MAVLink_open_drone_id_location_message(
@@ -260,6 +273,6 @@ def open_drone_id_location(vehicle: Vehicle) -> Any:
     )
 
 
-def scaled_pressure(vehicle: Vehicle) -> Any:
+def scaled_pressure(vehicle: ServiceContext) -> Any:
     altitude = HOME_ALTITUDE_M + vehicle.estimate.pressure_height_m
     return dialect.MAVLink_scaled_pressure_message(vehicle.boot_ms, _pressure_hpa(altitude), 0.0, 1182)

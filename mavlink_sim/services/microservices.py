@@ -1,10 +1,10 @@
-"""How the vehicle answers each message it understands (MAVLink's "microservices")."""
+"""The handler of each received message (MAVLink's "microservices")."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import logging
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mavlink_sim.autopilot.commander import ACCEPTED
 from mavlink_sim.flight.setpoints import (
@@ -14,7 +14,6 @@ from mavlink_sim.flight.setpoints import (
     global_trajectory_setpoint,
     trajectory_setpoint,
 )
-from mavlink_sim.physics.geography import geographic
 from mavlink_sim.services import (
     commands,
     event_protocol,
@@ -25,32 +24,32 @@ from mavlink_sim.services import (
     mission_transfer,
     parameter_protocol,
 )
-from mavlink_sim.wire import signing
+from mavlink_sim.services.context import Handler, ServiceContext
 from mavlink_sim.wire.announcements import CRITICAL, Text
+from mavlink_sim.wire.commands import Command, command_of, is_misencoded
+from mavlink_sim.wire.links import Link
 from mavlink_sim.wire.messages import dialect
 
-if TYPE_CHECKING:
-    from mavlink_sim.services.links import Link
-    from mavlink_sim.vehicle import Vehicle
+logger = logging.getLogger(__name__)
 
 MAV_TYPE_GCS = 6
 MAV_TYPE_ONBOARD_CONTROLLER = 18
-# Commander takes commands from a queue, in order, a moment after they arrived: 0-15 ms were measured.
+# Commander processes commands from a queue, in order: 0-15 ms after their arrival were measured.
 COMMANDER_DELAY_S = 0.004
 
 
-def _heartbeat(vehicle: Vehicle, link: Link, message: Any) -> None:
+def _heartbeat(vehicle: ServiceContext, link: Link, message: Any) -> None:
     if message.type == MAV_TYPE_GCS:
         link.ground_station_seen_s = vehicle.autopilot.supervision.ground_station_seen_s = vehicle.now_s
     elif message.type == MAV_TYPE_ONBOARD_CONTROLLER and message.get_srcSystem() == vehicle.system_id:
-        vehicle.companion_heard()
+        vehicle.on_companion_heartbeat()
 
 
-def _command(vehicle: Vehicle, link: Link, message: Any) -> None:
-    if commands.is_misencoded(message):
+def _command(vehicle: ServiceContext, link: Link, message: Any) -> None:
+    if is_misencoded(message):
         _acknowledge(link, message, message.command, commands.DENIED)
         return
-    command = commands.command_of(message)
+    command = command_of(message)
     if command.identifier in commands.ANSWERED_TWICE and vehicle.release.acknowledges_modes_twice:
         _acknowledge(link, message, command.identifier, ACCEPTED)
     if command.identifier in commands.ANSWERED_BY_RECEIVER:
@@ -59,7 +58,7 @@ def _command(vehicle: Vehicle, link: Link, message: Any) -> None:
         vehicle.after(COMMANDER_DELAY_S, partial(_execute, vehicle, link, message, command))
 
 
-def _execute(vehicle: Vehicle, link: Link, message: Any, command: commands.Command) -> None:
+def _execute(vehicle: ServiceContext, link: Link, message: Any, command: Command) -> None:
     result = vehicle.faults.refuses(command.identifier, command.parameters)
     if result is None:
         result = commands.execute(vehicle, link, command)
@@ -75,7 +74,7 @@ def _acknowledge(link: Link, message: Any, command: int, result: int) -> None:
     )
 
 
-def _set_mode(vehicle: Vehicle, link: Link, message: Any) -> None:
+def _set_mode(vehicle: ServiceContext, link: Link, message: Any) -> None:
     custom = int(message.custom_mode)
     values = (
         float(message.base_mode),
@@ -86,11 +85,11 @@ def _set_mode(vehicle: Vehicle, link: Link, message: Any) -> None:
         0.0,
         0.0,
     )
-    command = commands.Command(commands.DO_SET_MODE, values, message.get_srcComponent())
+    command = Command(commands.DO_SET_MODE, values, message.get_srcComponent())
     vehicle.after(COMMANDER_DELAY_S, partial(_execute, vehicle, link, message, command))
 
 
-def _setpoint(vehicle: Vehicle, link: Link, message: Any) -> None:
+def _setpoint(vehicle: ServiceContext, link: Link, message: Any) -> None:
     try:
         frame = vehicle.estimate
         setpoint = trajectory_setpoint(message, frame.yaw_rad, frame.roll_rad, frame.pitch_rad)
@@ -100,11 +99,11 @@ def _setpoint(vehicle: Vehicle, link: Link, message: Any) -> None:
     vehicle.autopilot.offboard_setpoint(flyable(setpoint))
 
 
-def _global_setpoint(vehicle: Vehicle, link: Link, message: Any) -> None:
+def _global_setpoint(vehicle: ServiceContext, link: Link, message: Any) -> None:
     autopilot = vehicle.autopilot
-    home_altitude = geographic(autopilot.home.position)[2] if autopilot.sensors_ready else None
+    home_altitude = vehicle.home_altitude_m if autopilot.sensors_ready else None
     try:
-        setpoint = global_trajectory_setpoint(message, home_altitude)
+        setpoint = global_trajectory_setpoint(message, vehicle.local_frame, home_altitude)
     except SetpointRejectedError as error:
         autopilot.texts.append(Text(CRITICAL, f"{error}\t"))
         return
@@ -112,27 +111,34 @@ def _global_setpoint(vehicle: Vehicle, link: Link, message: Any) -> None:
         autopilot.offboard_setpoint(flyable(setpoint))
 
 
-def _attitude_setpoint(vehicle: Vehicle, link: Link, message: Any) -> None:
+def _attitude_setpoint(vehicle: ServiceContext, link: Link, message: Any) -> None:
     setpoint = attitude_setpoint(message)
     if setpoint is not None:
         vehicle.autopilot.offboard_setpoint(setpoint)
 
 
-def _timesync(vehicle: Vehicle, link: Link, message: Any) -> None:
+def _timesync(vehicle: ServiceContext, link: Link, message: Any) -> None:
     if message.tc1 == 0:
         link.send(dialect.MAVLink_timesync_message(vehicle.clock_ns(), message.ts1))
 
 
-def _ping(vehicle: Vehicle, link: Link, message: Any) -> None:
-    if message.target_system == 0 and message.target_component == 0:  # else it is an answer
+def _setup_signing(vehicle: ServiceContext, link: Link, message: Any) -> None:
+    """SETUP_SIGNING: PX4 takes a key on its USB port only and answers nothing; elsewhere it is ignored."""
+    if not link.signing.is_usb:
+        logger.warning("SETUP_SIGNING on link %s is ignored: only the USB link takes a key", link.name)
+        return
+    link.signing.set_up(bytes(message.secret_key), int(message.initial_timestamp))
+    logger.info("link %s: signing key %s", link.name, "set" if link.signing.has_key else "removed")
+
+
+def _ping(vehicle: ServiceContext, link: Link, message: Any) -> None:
+    if message.target_system == 0 and message.target_component == 0:  # else it is a reply
         link.send(
             dialect.MAVLink_ping_message(
                 message.time_usec, message.seq, message.get_srcSystem(), message.get_srcComponent()
             )
         )
 
-
-Handler = Callable[["Vehicle", "Link", Any], None]
 
 HANDLERS: dict[str, Handler] = {
     "HEARTBEAT": _heartbeat,
@@ -153,7 +159,7 @@ HANDLERS: dict[str, Handler] = {
     "PARAM_REQUEST_READ": parameter_protocol.request_read,
     "PARAM_SET": parameter_protocol.set_parameter,
     "FILE_TRANSFER_PROTOCOL": file_transfer.handle,
-    "SETUP_SIGNING": signing.setup_signing,
+    "SETUP_SIGNING": _setup_signing,
     "UNKNOWN_412": event_protocol.request,
     **dict.fromkeys(mission_transfer.MESSAGES, mission_transfer.handle),
     "LANDING_TARGET": mission_link.landing_target,

@@ -1,35 +1,32 @@
-"""The Navigator's side of the links: announcements, the commands of a mission, targets and obstacles."""
+"""The Navigator's messages: announcements, the commands of a mission, landing targets and obstacles."""
 
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mavlink_sim.flight.precision_landing import LandingTarget
 from mavlink_sim.missions import items as mission_items
 from mavlink_sim.missions.items import MissionItem
 from mavlink_sim.missions.navigator import Reached, goes_to_camera
-from mavlink_sim.physics.geography import geographic
 from mavlink_sim.services import commands
-from mavlink_sim.services.links import AUTOPILOT_COMPONENT
+from mavlink_sim.services.context import ServiceContext
 from mavlink_sim.services.mission_messages import mission_current
 from mavlink_sim.wire.announcements import CRITICAL, Text
+from mavlink_sim.wire.commands import Command
+from mavlink_sim.wire.links import AUTOPILOT_COMPONENT, Link
 from mavlink_sim.wire.messages import dialect
-
-if TYPE_CHECKING:
-    from mavlink_sim.services.links import Link
-    from mavlink_sim.vehicle import Vehicle
 
 CAMERA_COMPONENT = 100  # MAV_COMP_ID_CAMERA
 LOCAL_NED = 1  # MAV_FRAME_LOCAL_NED
 HOLD_BEFORE_RETURN_S = 0.05
-MAX_PLACE_M = 1e6
+MAX_POSITION_M = 1e6
 # a single shot goes to PX4's camera trigger as DO_DIGICAM_CONTROL, "shoot"
 _SHOOT = (0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0)
 
 
-def update(vehicle: Vehicle) -> None:
-    """Tell the links what happened in this step, send commands on, look after transfers."""
+def update(vehicle: ServiceContext) -> None:
+    """Send the announcements of this step, execute mission commands, update transfers."""
     navigator = vehicle.autopilot.navigator
     while navigator.announcements:
         announcement = navigator.announcements.popleft()
@@ -41,7 +38,7 @@ def update(vehicle: Vehicle) -> None:
     while navigator.commands:
         item = navigator.commands.popleft()
         if item.command == mission_items.RETURN_TO_LAUNCH and navigator.mission.finished:
-            # measured: with its last item the mission is over, and HOLD is flown before the return
+            # measured: after its last item the mission is over, and HOLD is active before the return
             vehicle.after(HOLD_BEFORE_RETURN_S, partial(_carry_out, vehicle, item))
         else:
             _carry_out(vehicle, item)
@@ -49,11 +46,12 @@ def update(vehicle: Vehicle) -> None:
         session.update()
 
 
-def _carry_out(vehicle: Vehicle, item: MissionItem) -> None:
-    """An item that is a command: told on every link, as PX4 does, and obeyed if it is the vehicle's own."""
+def _carry_out(vehicle: ServiceContext, item: MissionItem) -> None:
+    """Send an item that is a command on every link, as PX4 does, and execute it if it is for the vehicle."""
     command, values = item.command, item.parameters
     if item.frame != mission_items.FRAME_MISSION:
-        values = (*values[:6], geographic(item.place(vehicle.autopilot.home.position))[2])
+        position = item.local_position(vehicle.autopilot.home.position, vehicle.local_frame)
+        values = (*values[:6], vehicle.local_frame.geographic(position)[2])
     target = 0
     if goes_to_camera(command):
         target = CAMERA_COMPONENT
@@ -64,27 +62,27 @@ def _carry_out(vehicle: Vehicle, item: MissionItem) -> None:
     for link in vehicle.links.values():
         link.send(dialect.MAVLink_command_long_message(vehicle.system_id, target, command, 0, *values))
     if target == 0 and vehicle.links:
-        own = commands.Command(command, values, AUTOPILOT_COMPONENT)
+        own = Command(command, values, AUTOPILOT_COMPONENT)
         commands.execute(vehicle, next(iter(vehicle.links.values())), own)
 
 
 # ---- messages ---------------------------------------------------------------------------------------------
 
 
-def landing_target(vehicle: Vehicle, link: Link, message: Any) -> None:
-    """LANDING_TARGET. PX4 takes a position in LOCAL_NED; angles are for an infrared beacon's estimator."""
+def landing_target(vehicle: ServiceContext, link: Link, message: Any) -> None:
+    """LANDING_TARGET. PX4 uses a position in LOCAL_NED; angles are for an infrared beacon's estimator."""
     if not message.position_valid:
         return
     if message.frame != LOCAL_NED:
         text = Text(CRITICAL, f"Landing target: coordinate frame {message.frame} unsupported\t")
         vehicle.autopilot.texts.append(text)
         return
-    place = (message.x, message.y, message.z)
-    if all(abs(value) < MAX_PLACE_M for value in place):
-        vehicle.autopilot.navigator.target = LandingTarget(place, vehicle.autopilot.now_s)
+    point = (message.x, message.y, message.z)
+    if all(abs(value) < MAX_POSITION_M for value in point):
+        vehicle.autopilot.navigator.target = LandingTarget(point, vehicle.autopilot.now_s)
 
 
-def obstacle_distance(vehicle: Vehicle, link: Link, message: Any) -> None:
+def obstacle_distance(vehicle: ServiceContext, link: Link, message: Any) -> None:
     """OBSTACLE_DISTANCE, for collision prevention."""
     increment = message.increment_f if message.increment_f > 0.0 else float(message.increment)
     try:

@@ -1,19 +1,17 @@
 """MISSION_COUNT, MISSION_ACK and MISSION_CURRENT with the plan identifiers ("opaque ids") of PX4 v1.16.
 
-The definitions pymavlink ships do not have these extension fields yet; a client with such a dialect does not
-see them, one with a newer dialect does.
+pymavlink's definitions do not have these extension fields yet; a client with such a dialect does not decode
+them, one with a newer dialect does.
 """
 
 from __future__ import annotations
 
 import struct
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mavlink_sim.missions.items import PlanType
+from mavlink_sim.services.context import ServiceContext
 from mavlink_sim.wire.messages import dialect
-
-if TYPE_CHECKING:
-    from mavlink_sim.vehicle import Vehicle
 
 NO_MISSION_TOTAL = 65535
 
@@ -82,8 +80,8 @@ class MissionCurrent(dialect.MAVLink_mission_current_message):  # type: ignore[m
         return packed
 
 
-def mission_current(vehicle: Vehicle) -> MissionCurrent:
-    """MISSION_CURRENT as it is now."""
+def mission_current(vehicle: ServiceContext) -> MissionCurrent:
+    """The current MISSION_CURRENT."""
     navigator = vehicle.autopilot.navigator
     mission, plans = navigator.mission, navigator.plans
     return MissionCurrent(

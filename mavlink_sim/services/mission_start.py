@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
+from mavlink_sim.autopilot.commander import Autopilot
 from mavlink_sim.px4.modes import Mode
 from mavlink_sim.wire.announcements import CRITICAL, Text
-
-if TYPE_CHECKING:
-    from mavlink_sim.autopilot.commander import Autopilot
 
 ACCEPTED, TEMPORARILY_REJECTED, DENIED = 0, 1, 2  # MAV_RESULT
 

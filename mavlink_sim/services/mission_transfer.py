@@ -1,25 +1,23 @@
-"""The mission protocol: up- and download of mission, geofence and rally points, one session a link.
+"""The mission protocol: up- and download of mission, geofence and rally points, one session per link.
 
-Follows PX4's MavlinkMissionManager: it asks for items one by one, repeats a question after 250 ms, gives up
-after 5 s without a word, and lets one client at a time upload, over all links.
+As in PX4's MavlinkMissionManager: it requests items one by one, repeats a request after 250 ms, aborts after
+5 s without a message, and allows one upload at a time, over all links.
 """
 
 from __future__ import annotations
 
 import enum
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mavlink_sim.missions import items as mission_items
 from mavlink_sim.missions.items import ItemRejectedError, MissionItem, PlanType
 from mavlink_sim.missions.plan import Plan
+from mavlink_sim.services.context import ServiceContext
 from mavlink_sim.services.mission_messages import MissionAck, MissionCount
 from mavlink_sim.wire.announcements import CRITICAL, INFO, Text
+from mavlink_sim.wire.links import Link
 from mavlink_sim.wire.messages import dialect
-
-if TYPE_CHECKING:
-    from mavlink_sim.services.links import Link
-    from mavlink_sim.vehicle import Vehicle
 
 RETRY_S = 0.25  # MAVLINK_MISSION_RETRY_TIMEOUT_DEFAULT
 TIMEOUT_S = 5.0  # MAVLINK_MISSION_PROTOCOL_TIMEOUT_DEFAULT
@@ -31,7 +29,7 @@ MIN_VERTICES = 3
 
 
 class State(enum.Enum):
-    """What a session is doing."""
+    """The state of a session."""
 
     IDLE = "idle"
     SENDING = "sending"
@@ -45,7 +43,7 @@ class Session:
         partner: (system, component) the transfer is or was with.
     """
 
-    def __init__(self, vehicle: Vehicle, link: Link) -> None:
+    def __init__(self, vehicle: ServiceContext, link: Link) -> None:
         self._vehicle = vehicle
         self._navigator = vehicle.autopilot.navigator
         self._link = link
@@ -59,18 +57,18 @@ class Session:
         self._messages: list[Any] = []
         self._identifier = 0
         self._current = -1
-        self._heard_s = -math.inf
+        self._received_s = -math.inf
         self._sent_s = -math.inf
 
     # ---- time -------------------------------------------------------------------------------------------
 
     def update(self) -> None:
-        """Ask again, or give up."""
+        """Repeat a request, or abort."""
         if self.state is State.IDLE:
             return
         now = self._vehicle.now_s
-        if now - self._heard_s > TIMEOUT_S:
-            self._say(CRITICAL, "Mission sync timeout\t")
+        if now - self._received_s > TIMEOUT_S:
+            self._send_text(CRITICAL, "Mission sync timeout\t")
             self._stop()
         elif self.state is State.RECEIVING and now - self._sent_s > RETRY_S:
             self._request()
@@ -78,13 +76,13 @@ class Session:
     # ---- messages ---------------------------------------------------------------------------------------
 
     def count(self, message: Any) -> None:
-        """MISSION_COUNT: a client wants to upload."""
+        """MISSION_COUNT: a client starts an upload."""
         source = _source(message)
         if self.state is State.RECEIVING:
             self._count_again(source)
             return
         if self.state is not State.IDLE:
-            self._say(CRITICAL, "WPM: IGN MISSION_COUNT: Busy\t")
+            self._send_text(CRITICAL, "WPM: IGN MISSION_COUNT: Busy\t")
             self._acknowledge(source, mission_items.ERROR)
             return
         if self._navigator.uploading is not None:  # over another link
@@ -94,7 +92,7 @@ class Session:
         self._navigator.forget_reached()
         try:
             self._type = PlanType(_plan_type(message))
-        except ValueError:  # a kind that PX4 does not know has room for nothing
+        except ValueError:  # an unknown type has no storage
             result = mission_items.NO_SPACE if message.count else mission_items.ACCEPTED
             self._acknowledge(source, result, _plan_type(message))
             return
@@ -106,7 +104,7 @@ class Session:
         else:
             self._navigator.uploading = self._link.name
             self.state = State.RECEIVING
-            self._heard_s = self._vehicle.now_s
+            self._received_s = self._vehicle.now_s
             self._sequence, self._count, self._current = 0, message.count, -1
             self._items, self._messages = [], []
             self._request()
@@ -115,40 +113,40 @@ class Session:
         if source != self.partner:
             self._acknowledge(source, mission_items.ERROR)
             return
-        self._heard_s = self._vehicle.now_s
-        if self._sequence == 0:  # the first question was lost
+        self._received_s = self._vehicle.now_s
+        if self._sequence == 0:  # the first request was lost
             self._request()
         else:
-            self._say(CRITICAL, "WPM: REJ. CMD: Busy\t")
+            self._send_text(CRITICAL, "WPM: REJ. CMD: Busy\t")
             self._acknowledge(source, mission_items.ERROR)
 
     def item(self, message: Any) -> None:
         """MISSION_ITEM_INT or MISSION_ITEM of an upload."""
         self._whole = message.get_type() == "MISSION_ITEM_INT"
         if _source(message) != self.partner:
-            self._say(CRITICAL, "REJ. MIS ITEM: partner id mismatch\t")
+            self._send_text(CRITICAL, "REJ. MIS ITEM: partner id mismatch\t")
             return
         if _plan_type(message) != self._type:
             self._acknowledge(self.partner, mission_items.ERROR)
         elif self.state is State.RECEIVING:
-            self._heard_s = self._vehicle.now_s
+            self._received_s = self._vehicle.now_s
             if message.seq == self._sequence:
-                self._take(message)
+                self._store(message)
         elif self.state is State.SENDING:
-            self._say(CRITICAL, "IGN MISSION_ITEM: Busy\t")
+            self._send_text(CRITICAL, "IGN MISSION_ITEM: Busy\t")
             self._acknowledge(self.partner, mission_items.ERROR)
         elif self._count and message.seq + 1 == self._sequence:
-            # the last item once more: our acknowledgement was lost
+            # the last item again: the acknowledgement was lost
             self._acknowledge(self.partner, mission_items.ACCEPTED, identifier=self._identifier)
         else:
-            self._say(CRITICAL, "IGN MISSION_ITEM: No transfer\t")
+            self._send_text(CRITICAL, "IGN MISSION_ITEM: No transfer\t")
             self._acknowledge(self.partner, mission_items.ERROR)
 
-    def _take(self, message: Any) -> None:
+    def _store(self, message: Any) -> None:
         try:
             item = mission_items.item_of(message)
         except ItemRejectedError as error:
-            self._say(CRITICAL, "IGN MISSION_ITEM: Invalid item\t")
+            self._send_text(CRITICAL, "IGN MISSION_ITEM: Invalid item\t")
             self._refuse(error.result)
             return
         strange = self._type is PlanType.MISSION and item.command in mission_items.FENCE_AND_RALLY_COMMANDS
@@ -171,13 +169,13 @@ class Session:
         self._acknowledge(self.partner, mission_items.ACCEPTED, identifier=self._identifier)
 
     def request_list(self, message: Any) -> None:
-        """MISSION_REQUEST_LIST: a client wants to download."""
+        """MISSION_REQUEST_LIST: a client starts a download."""
         source, plan_type = _source(message), _plan_type(message)
         if self.state is State.SENDING and self._sequence == self._count:
-            self.state = State.IDLE  # everything was sent, only its acknowledgement never came
+            self.state = State.IDLE  # everything was sent, but the client's acknowledgement is missing
         again = self.state is State.SENDING and source == self.partner and plan_type == self._type
         if self.state is not State.IDLE and not again:
-            self._say(INFO, "Mission download request ignored, already active\t")
+            self._send_text(INFO, "Mission download request ignored, already active\t")
             return
         try:
             self._type = PlanType(plan_type)
@@ -186,7 +184,7 @@ class Session:
             return
         plan = self._navigator.plans[self._type]
         self.state, self.partner = State.SENDING, source
-        self._heard_s = self._vehicle.now_s
+        self._received_s = self._vehicle.now_s
         self._sequence, self._count = 0, len(plan.items)
         self._link.send(MissionCount(source, self._count, plan_type, plan.identifier))
 
@@ -194,16 +192,16 @@ class Session:
         """MISSION_REQUEST_INT or MISSION_REQUEST of a download."""
         self._whole = message.get_type() == "MISSION_REQUEST_INT"
         if _source(message) != self.partner:
-            self._say(CRITICAL, "WPM: REJ. CMD: partner id mismatch\t")
+            self._send_text(CRITICAL, "WPM: REJ. CMD: partner id mismatch\t")
             return
         if self.state is State.IDLE:
             return
         if self.state is State.RECEIVING:
-            self._say(CRITICAL, "WPM: REJ. CMD: Busy\t")
+            self._send_text(CRITICAL, "WPM: REJ. CMD: Busy\t")
             return
         if _plan_type(message) != self._type:
             return
-        self._heard_s = self._vehicle.now_s
+        self._received_s = self._vehicle.now_s
         items = self._navigator.plans[self._type].items
         if message.seq == self._sequence < self._count:
             self._sequence += 1
@@ -227,16 +225,16 @@ class Session:
     def _unexpected(self) -> None:
         self.state = State.IDLE
         self._acknowledge(self.partner, mission_items.ERROR)
-        self._say(CRITICAL, "WPM: REJ. CMD: Req. WP was unexpected\t")
+        self._send_text(CRITICAL, "WPM: REJ. CMD: Req. WP was unexpected\t")
 
     def acknowledged(self, message: Any) -> None:
         """MISSION_ACK of the client."""
         if _source(message) != self.partner:
-            self._say(CRITICAL, "REJ. WP CMD: partner id mismatch\t")
+            self._send_text(CRITICAL, "REJ. WP CMD: partner id mismatch\t")
         elif self.state is State.SENDING and _plan_type(message) == self._type:
             self.state = State.IDLE
         elif self.state is State.RECEIVING:
-            if message.type == mission_items.UNSUPPORTED:  # the client speaks the other kind of item
+            if message.type == mission_items.UNSUPPORTED:  # the client uses the other kind of item
                 self._whole = not self._whole
                 self._request()
             elif message.type == OPERATION_CANCELLED:
@@ -245,7 +243,7 @@ class Session:
     def clear(self, message: Any) -> None:
         """MISSION_CLEAR_ALL."""
         if self.state is not State.IDLE:
-            self._say(CRITICAL, "WPM: IGN CLEAR CMD: Busy\t")
+            self._send_text(CRITICAL, "WPM: IGN CLEAR CMD: Busy\t")
             return
         plan_type = _plan_type(message)
         for kind in PlanType:
@@ -254,15 +252,15 @@ class Session:
         self._acknowledge(_source(message), mission_items.ACCEPTED, plan_type)
 
     def set_current(self, message: Any) -> None:
-        """MISSION_SET_CURRENT: MISSION_CURRENT tells that it was done."""
+        """MISSION_SET_CURRENT, confirmed by MISSION_CURRENT."""
         if self.state is not State.IDLE:
-            self._say(CRITICAL, "WPM: IGN WP CURR CMD: Busy\t")
+            self._send_text(CRITICAL, "WPM: IGN WP CURR CMD: Busy\t")
         elif message.seq >= len(self._navigator.mission.items):
-            self._say(CRITICAL, "WPM: WP CURR CMD: Not in list\t")
+            self._send_text(CRITICAL, "WPM: WP CURR CMD: Not in list\t")
         else:
             self._navigator.set_current(message.seq)
 
-    # ---- answers ----------------------------------------------------------------------------------------
+    # ---- replies ----------------------------------------------------------------------------------------
 
     def _request(self) -> None:
         make = (
@@ -288,7 +286,7 @@ class Session:
             self._navigator.uploading = None
         self.state = State.IDLE
 
-    def _say(self, severity: int, text: str) -> None:
+    def _send_text(self, severity: int, text: str) -> None:
         self._vehicle.autopilot.texts.append(Text(severity, text))  # to every link, as all of PX4's texts
 
 
@@ -300,8 +298,8 @@ def _plan_type(message: Any) -> int:
     return int(getattr(message, "mission_type", 0))
 
 
-def session_of(vehicle: Vehicle, link: Link) -> Session:
-    """The session of a link, made when it is first needed."""
+def session_of(vehicle: ServiceContext, link: Link) -> Session:
+    """The session of a link, created with the first message."""
     sessions: dict[str, Session] = vehicle.autopilot.navigator.sessions
     if link.name not in sessions:
         sessions[link.name] = Session(vehicle, link)
@@ -321,9 +319,9 @@ _STEPS = {
 }
 
 
-def handle(vehicle: Vehicle, link: Link, message: Any) -> None:
-    """Take in any message of the mission protocol that names this vehicle."""
-    if message.target_system == vehicle.system_id:  # PX4 takes no broadcasts here
+def handle(vehicle: ServiceContext, link: Link, message: Any) -> None:
+    """Process a message of the mission protocol that is addressed to this vehicle."""
+    if message.target_system == vehicle.system_id:  # PX4 ignores broadcasts here
         _STEPS[message.get_type()](session_of(vehicle, link), message)
 
 

@@ -1,4 +1,4 @@
-"""MAVLink's parameter protocol as PX4 speaks it: the hash first, the list in order, PARAM_ERROR otherwise."""
+"""MAVLink's parameter protocol as in PX4: the hash first, the list in order, PARAM_ERROR for errors."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import logging
 from collections import deque
 from collections.abc import Iterable
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mavlink_sim.px4.parameters import (
     HASH_CHECK,
@@ -18,18 +18,16 @@ from mavlink_sim.px4.parameters import (
     Parameters,
     decode_wire_value,
 )
+from mavlink_sim.services.context import ServiceContext
+from mavlink_sim.wire.links import Link
 from mavlink_sim.wire.messages import dialect
-
-if TYPE_CHECKING:
-    from mavlink_sim.services.links import Link
-    from mavlink_sim.vehicle import Vehicle
 
 logger = logging.getLogger(__name__)
 
 FIRST_ANSWER_S = 0.01
 LIST_RATE_HZ = 1000.0
 SECOND_ECHO_S = 0.015
-TOLD_AT_START_S = 0.98
+SENT_AT_START_S = 0.98
 DOES_NOT_EXIST = 1  # MAV_PARAM_ERROR
 READ_ONLY = 5
 TYPE_UNSUPPORTED = 6
@@ -40,27 +38,27 @@ TEMPORARILY_REJECTED = 1
 UNSUPPORTED = 3
 
 
-def request_list(vehicle: Vehicle, link: Link, message: Any) -> None:
-    """PARAM_REQUEST_LIST: the hash, then every parameter at about a thousand a second."""
+def request_list(vehicle: ServiceContext, link: Link, message: Any) -> None:
+    """PARAM_REQUEST_LIST: the hash, then every parameter at about a thousand per second."""
     vehicle.after(FIRST_ANSWER_S, partial(_begin_list, vehicle, link))
 
 
-def _begin_list(vehicle: Vehicle, link: Link) -> None:
-    if not link.parameters_left:  # a list asked for while one runs begins anew without the hash
+def _begin_list(vehicle: ServiceContext, link: Link) -> None:
+    if not link.parameters_left:  # a request during a list restarts it without the hash
         _send_hash(link, vehicle.parameters)
     link.parameters_left = deque(vehicle.parameters)
     link.parameter_credit = 0.0
 
 
 def continue_list(link: Link, parameters: Parameters, dt_s: float) -> None:
-    """Send the part of a running list that is due after `dt_s` more."""
+    """Send the part of a running list that is due after another `dt_s`."""
     link.parameter_credit += LIST_RATE_HZ * dt_s
     while link.parameter_credit >= 1.0 and link.parameters_left:
         link.parameter_credit -= 1.0
         _send(link, parameters, parameters[link.parameters_left.popleft().name])
 
 
-def request_read(vehicle: Vehicle, link: Link, message: Any) -> None:
+def request_read(vehicle: ServiceContext, link: Link, message: Any) -> None:
     """PARAM_REQUEST_READ, by index or (index -1) by name."""
     index = int(message.param_index)
     name = _text_of(message.param_id)
@@ -74,11 +72,11 @@ def request_read(vehicle: Vehicle, link: Link, message: Any) -> None:
         _send(link, vehicle.parameters, parameter)
 
 
-def set_parameter(vehicle: Vehicle, link: Link, message: Any) -> None:
-    """PARAM_SET: the value at once, and where it changed once more on every link 15 ms later."""
+def set_parameter(vehicle: ServiceContext, link: Link, message: Any) -> None:
+    """PARAM_SET: reply with the value; if it changed, send it again on every link 15 ms later."""
     name = _text_of(message.param_id)
     if name == HASH_CHECK:
-        link.parameters_left.clear()  # the client has a matching cache and wants no list
+        link.parameters_left.clear()  # the client has a matching cache and needs no list
         _send_error(link, message, name, -1, READ_ONLY)
         return
     if name not in vehicle.parameters:
@@ -95,33 +93,33 @@ def set_parameter(vehicle: Vehicle, link: Link, message: Any) -> None:
     try:
         parameter = vehicle.parameters.set(name, decode_wire_value(parameter.kind, message.param_value))
     except ValueError as error:
-        logger.info("PARAM_SET refused, the old value stands: %s", error)
+        logger.info("PARAM_SET refused, the value is unchanged: %s", error)
     _send(link, vehicle.parameters, parameter)
     if parameter.value != before:
         vehicle.after(SECOND_ECHO_S, partial(broadcast, vehicle, [name]))
 
 
-def broadcast(vehicle: Vehicle, names: Iterable[str]) -> None:
-    """PARAM_VALUE of changed parameters on every link, as PX4 tells all its clients of a change."""
+def broadcast(vehicle: ServiceContext, names: Iterable[str]) -> None:
+    """Send PARAM_VALUE of changed parameters on every link, as PX4 does."""
     for name in names:
         for link in vehicle.links.values():
             _send(link, vehicle.parameters, vehicle.parameters[name])
 
 
-def reset(vehicle: Vehicle, action: float) -> int:
-    """PREFLIGHT_STORAGE (245), its MAV_RESULT: 2 and 4 reset the parameters; 0, 1 and 3 have nothing to do.
+def reset(vehicle: ServiceContext, action: float) -> int:
+    """PREFLIGHT_STORAGE (245), its MAV_RESULT: 2 and 4 reset the parameters; 0, 1 and 3 have no effect.
 
-    A disarmed vehicle alone does it. PX4 answers no other action at all; it is refused here.
+    Only while disarmed. PX4 does not answer other actions; here they are refused.
     """
     if vehicle.autopilot.armed:
         return TEMPORARILY_REJECTED
     if action not in (0.0, 1.0, 2.0, 3.0, 4.0):
         return UNSUPPORTED
     if action >= 2.0 and action != 3.0:
-        # the system id is the vehicle's, set anew at every start, and lasts until the next one
+        # the system id is set at every start, and is not stored
         keep = {"MAV_SYS_ID", *(FLIGHT_COUNTERS if action == 2.0 else ())}
         changed = vehicle.parameters.reset(keep)
-        logger.info("%d parameters are back at their defaults", len(changed))
+        logger.info("%d parameters reset to their defaults", len(changed))
     return ACCEPTED
 
 
@@ -146,7 +144,7 @@ def _send_hash(link: Link, parameters: Parameters) -> None:
 
 
 def _send_error(link: Link, message: Any, name: str, index: int, error: int) -> None:
-    if not link.tells_parameter_errors:
+    if not link.has_parameter_errors:
         return
     link.send(
         dialect.MAVLink_param_error_message(

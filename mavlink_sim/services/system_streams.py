@@ -1,19 +1,16 @@
-"""Telemetry of the system: modes, health, battery, clocks, home, and who the vehicle is."""
+"""Telemetry of the system: modes, health, battery, clocks, home, and the vehicle's identity."""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from mavlink_sim.physics.geography import geographic
 from mavlink_sim.px4.modes import LISTED_MODES, Mode
 from mavlink_sim.services import manual_control_service
+from mavlink_sim.services.context import ServiceContext
 from mavlink_sim.wire.messages import current_event_sequence as event_sequence_message
 from mavlink_sim.wire.messages import dialect, time_estimate_to_target
 from vision.attitude import quaternion_from_euler
-
-if TYPE_CHECKING:
-    from mavlink_sim.vehicle import Vehicle
 
 PREARM_CHECK = 0x10000000  # MAV_SYS_STATUS_PREARM_CHECK
 # (present, enabled, health) of SYS_STATUS as recorded from a PX4, before and after its estimator started
@@ -24,22 +21,22 @@ _U16_UNKNOWN = 65535
 _NAN = math.nan
 
 
-def heartbeat(vehicle: Vehicle) -> Any:
+def heartbeat(vehicle: ServiceContext) -> Any:
     autopilot = vehicle.autopilot
     return dialect.MAVLink_heartbeat_message(
         2, 12, autopilot.base_mode, autopilot.mode.custom_mode, int(autopilot.system_status), 3
     )
 
 
-def timesync(vehicle: Vehicle) -> Any:
+def timesync(vehicle: ServiceContext) -> Any:
     return dialect.MAVLink_timesync_message(0, vehicle.clock_ns())
 
 
-def extended_sys_state(vehicle: Vehicle) -> Any:
+def extended_sys_state(vehicle: ServiceContext) -> Any:
     return dialect.MAVLink_extended_sys_state_message(0, int(vehicle.autopilot.landed_state))
 
 
-def sys_status(vehicle: Vehicle) -> Any:
+def sys_status(vehicle: ServiceContext) -> Any:
     autopilot = vehicle.autopilot
     present, enabled, health = SENSORS_READY if autopilot.sensors_ready else SENSORS_STARTING
     if autopilot.can_arm:
@@ -59,15 +56,15 @@ def sys_status(vehicle: Vehicle) -> Any:
     )
 
 
-def estimator_status(vehicle: Vehicle) -> Any:
+def estimator_status(vehicle: ServiceContext) -> Any:
     flags = 895 if vehicle.autopilot.sensors_ready else 164
     return dialect.MAVLink_estimator_status_message(
         vehicle.boot_us, flags, 0.05, 0.05, 0.002, 0.08, 0.001, _NAN, 0.28, 0.19
     )
 
 
-def open_drone_id_system(vehicle: Vehicle) -> Any:
-    latitude, longitude, altitude = geographic(vehicle.autopilot.home.position)
+def open_drone_id_system(vehicle: ServiceContext) -> Any:
+    latitude, longitude, altitude = vehicle.local_frame.geographic(vehicle.autopilot.home.position)
     since_2019 = max(vehicle.utc_ns() // 10**9 - 1546300800, 0)  # the standard counts from 2019-01-01
     return dialect.MAVLink_open_drone_id_system_message(
         0,
@@ -88,15 +85,15 @@ def open_drone_id_system(vehicle: Vehicle) -> Any:
     )
 
 
-def ping(vehicle: Vehicle) -> Any:
+def ping(vehicle: ServiceContext) -> Any:
     return dialect.MAVLink_ping_message(vehicle.boot_us, vehicle.next_ping(), 0, 0)
 
 
-def system_time(vehicle: Vehicle) -> Any:
+def system_time(vehicle: ServiceContext) -> Any:
     return dialect.MAVLink_system_time_message(vehicle.utc_ns() // 1000, vehicle.boot_ms)
 
 
-def battery_status(vehicle: Vehicle) -> Any:
+def battery_status(vehicle: ServiceContext) -> Any:
     battery = vehicle.autopilot.supervision.battery
     if not battery.connected:
         return None
@@ -115,18 +112,18 @@ def battery_status(vehicle: Vehicle) -> Any:
     )
 
 
-def current_mode(vehicle: Vehicle) -> Any:
+def current_mode(vehicle: ServiceContext) -> Any:
     autopilot = vehicle.autopilot
     return dialect.MAVLink_current_mode_message(
         autopilot.mode.standard_mode, autopilot.mode.custom_mode, autopilot.intended_mode.custom_mode
     )
 
 
-def home_position(vehicle: Vehicle) -> Any:
+def home_position(vehicle: ServiceContext) -> Any:
     if not vehicle.autopilot.sensors_ready:
-        return None  # there is no home before there is a position
+        return None  # no home without a position
     home = vehicle.autopilot.home
-    latitude, longitude, altitude = geographic(home.position)
+    latitude, longitude, altitude = vehicle.local_frame.geographic(home.position)
     return dialect.MAVLink_home_position_message(
         round(latitude * 1e7),
         round(longitude * 1e7),
@@ -140,8 +137,8 @@ def home_position(vehicle: Vehicle) -> Any:
     )
 
 
-def flight_information(vehicle: Vehicle) -> Any:
-    """FLIGHT_INFORMATION; its times are since boot, as PX4's are, and 0 where there is none."""
+def flight_information(vehicle: ServiceContext) -> Any:
+    """FLIGHT_INFORMATION; its times are since boot, as in PX4, and 0 if unset."""
     autopilot = vehicle.autopilot
     armed_s = vehicle.now_s - autopilot.ground.armed_for_s(vehicle.now_s) if autopilot.armed else 0.0
     return dialect.MAVLink_flight_information_message(
@@ -153,7 +150,7 @@ def flight_information(vehicle: Vehicle) -> Any:
 
 
 def available_modes(index: int) -> list[Any]:
-    """AVAILABLE_MODES of one mode by its index from 1, of all with index 0; none: there is no such mode."""
+    """AVAILABLE_MODES of one mode by its index from 1, of all with index 0; empty for an unknown index."""
     chosen = (
         enumerate(LISTED_MODES, 1)
         if index == 0
@@ -172,11 +169,11 @@ def available_modes(index: int) -> list[Any]:
     ]
 
 
-def vibration(vehicle: Vehicle) -> Any:
+def vibration(vehicle: ServiceContext) -> Any:
     return dialect.MAVLink_vibration_message(vehicle.boot_us, 0.0, 0.011, 0.11, 0, 0, 0)
 
 
-def time_estimate(vehicle: Vehicle) -> Any:
+def time_estimate(vehicle: ServiceContext) -> Any:
     if vehicle.autopilot.landed:
         return time_estimate_to_target(-1, -1)
     home = vehicle.autopilot.home.position
@@ -188,12 +185,12 @@ def time_estimate(vehicle: Vehicle) -> Any:
     return time_estimate_to_target(round(min(max(seconds, 0.0), 86400.0)), -1)
 
 
-def current_event_sequence(vehicle: Vehicle) -> Any:
+def current_event_sequence(vehicle: ServiceContext) -> Any:
     return event_sequence_message(vehicle.events.sequence)
 
 
-def gps_global_origin(vehicle: Vehicle) -> Any:
-    latitude, longitude, altitude = geographic((0.0, 0.0, 0.0))
+def gps_global_origin(vehicle: ServiceContext) -> Any:
+    latitude, longitude, altitude = vehicle.local_frame.geographic((0.0, 0.0, 0.0))
     return dialect.MAVLink_gps_global_origin_message(
         round(latitude * 1e7),
         round(longitude * 1e7),
@@ -202,7 +199,7 @@ def gps_global_origin(vehicle: Vehicle) -> Any:
     )
 
 
-def autopilot_version(vehicle: Vehicle) -> Any:
+def autopilot_version(vehicle: ServiceContext) -> Any:
     return dialect.MAVLink_autopilot_version_message(
         capabilities=59647,
         flight_sw_version=vehicle.release.software_version,

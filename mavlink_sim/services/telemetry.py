@@ -1,20 +1,12 @@
-"""Which telemetry messages there are, and what builds each."""
+"""The telemetry messages and their builders."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
-
-from mavlink_sim.flight.orbit import orbit_execution_status
 from mavlink_sim.services import gimbal_protocol, kinematics_streams, manual_control_service, system_streams
+from mavlink_sim.services.context import Builder
 from mavlink_sim.services.mission_messages import mission_current
 from mavlink_sim.services.vehicle_files import metadata_message
 from mavlink_sim.wire.messages import dialect
-
-if TYPE_CHECKING:
-    from mavlink_sim.vehicle import Vehicle
-
-Builder = Callable[["Vehicle"], Any]
 
 # LINK_NODE_STATUS is built by the link itself, from its own counters.
 BUILDERS: dict[str, Builder] = {
@@ -31,7 +23,7 @@ BUILDERS: dict[str, Builder] = {
     "ATTITUDE_TARGET": kinematics_streams.attitude_target,
     "POSITION_TARGET_LOCAL_NED": kinematics_streams.position_target_local_ned,
     "POSITION_TARGET_GLOBAL_INT": kinematics_streams.position_target_global_int,
-    "ORBIT_EXECUTION_STATUS": orbit_execution_status,
+    "ORBIT_EXECUTION_STATUS": kinematics_streams.orbit_execution_status,
     "SERVO_OUTPUT_RAW": kinematics_streams.servo_output_raw,
     "VFR_HUD": kinematics_streams.vfr_hud,
     "GPS_RAW_INT": kinematics_streams.gps_raw_int,
@@ -57,7 +49,7 @@ BUILDERS: dict[str, Builder] = {
     "GPS_GLOBAL_ORIGIN": system_streams.gps_global_origin,
     "OBSTACLE_DISTANCE": kinematics_streams.obstacle_distance,
 }
-# Built on request alone.
+# Built on request only.
 REQUESTED: dict[str, Builder] = {
     "AUTOPILOT_VERSION": system_streams.autopilot_version,
     "COMPONENT_METADATA": metadata_message,

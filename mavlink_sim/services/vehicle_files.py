@@ -1,8 +1,8 @@
-"""The files a vehicle offers by MAVLink FTP: its parameters, the metadata that describes it, its log folder.
+"""The files of a vehicle for MAVLink FTP: parameters, component metadata, log folder.
 
 As in PX4: parameters that differ from their defaults in BSON; metadata (https://mavlink.io/en/services/
 component_information.html) as xz-compressed JSON under /etc/extras, found through COMPONENT_METADATA.
-ArduPilot's packed parameters (`@PARAM/param.pck`) PX4 does not have; `offer_packed_parameters` adds them.
+PX4 does not have ArduPilot's packed parameters (`@PARAM/param.pck`); `offer_packed_parameters` adds them.
 """
 
 from __future__ import annotations
@@ -12,16 +12,14 @@ import lzma
 import struct
 from collections.abc import Callable, Iterable
 from functools import cache, partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mavlink_sim.px4.parameters import INT32, Parameter, Parameters, default_parameters, is_volatile
+from mavlink_sim.services.context import ServiceContext
 from mavlink_sim.services.file_system import FileSystem
 from mavlink_sim.services.file_transfer import checksum
 from mavlink_sim.wire.event_texts import events_metadata
 from mavlink_sim.wire.messages import component_metadata
-
-if TYPE_CHECKING:
-    from mavlink_sim.vehicle import Vehicle
 
 GENERAL = "etc/extras/component_general.json.xz"
 PARAMETERS = "etc/extras/parameters.json.xz"
@@ -36,7 +34,7 @@ _PACK_INT32, _PACK_FLOAT = 3, 4
 
 
 def vehicle_files(parameters: Parameters) -> FileSystem:
-    """The files of a new vehicle; those made of the parameters follow them."""
+    """The files of a new vehicle; parameter files are generated from the current values."""
     files = FileSystem()
     files.provide("parameters.bson", partial(_customised, parameters))
     files.provide("parameters_backup.bson", partial(_customised, parameters))
@@ -56,7 +54,7 @@ def _compressed_from(metadata: Callable[[], bytes]) -> bytes:
 
 
 def offer_packed_parameters(files: FileSystem, parameters: Parameters) -> None:
-    """Add `@PARAM/param.pck`, which ArduPilot has and ground stations written for it ask for."""
+    """Add ArduPilot's `@PARAM/param.pck`, which ground stations for ArduPilot request."""
     files.provide("@PARAM/param.pck", partial(packed_parameters, parameters))
 
 
@@ -73,10 +71,10 @@ def bson(parameters: Iterable[Parameter]) -> bytes:
 
 
 def packed_parameters(parameters: Iterable[Parameter]) -> bytes:
-    """ArduPilot's packed parameters (its AP_Filesystem documentation): names share their beginnings.
+    """ArduPilot's packed parameters (its AP_Filesystem documentation), with shared prefixes of names.
 
-    A header (magic, number here, number in all), then of each parameter its type in 4 bits, flags in 4
-    (none), the length shared with the name before in 4 bits, that of the rest less one in 4, the rest, value.
+    A header (magic, number here, total number), then of each parameter its type in 4 bits, flags in 4 (none),
+    the length shared with the previous name in 4 bits, that of the rest less one in 4, the rest, the value.
     """
     listed = list(parameters)
     packed = bytearray(struct.pack("<HHH", _PACK_MAGIC, len(listed), len(listed)))
@@ -118,13 +116,13 @@ def parameter_metadata() -> bytes:
 
 @cache
 def event_metadata() -> bytes:
-    """JSON by MAVLink's events schema: what the vehicle's events are called and say."""
+    """JSON by MAVLink's events schema: names and texts of the vehicle's events."""
     return _json(events_metadata())
 
 
 @cache
 def general_metadata() -> bytes:
-    """JSON by MAVLink's general schema: which other metadata there is, where, with which checksum."""
+    """JSON by MAVLink's general schema: the other metadata files and their checksums."""
     files: list[tuple[int, str, Callable[[], bytes]]] = [
         (PARAMETER_TYPE, PARAMETERS, parameter_metadata),
         (EVENTS_TYPE, EVENTS, event_metadata),
@@ -136,8 +134,8 @@ def general_metadata() -> bytes:
     return _json({"version": 1, "metadataTypes": types})
 
 
-def metadata_message(vehicle: Vehicle) -> Any:
-    """COMPONENT_METADATA: where the general metadata is."""
+def metadata_message(vehicle: ServiceContext) -> Any:
+    """COMPONENT_METADATA: path and checksum of the general metadata."""
     return component_metadata(vehicle.boot_ms, checksum(general_metadata()), f"mftp://{GENERAL}")
 
 
@@ -147,5 +145,5 @@ def _json(value: dict[str, Any]) -> bytes:
 
 @cache
 def _compressed(content: bytes) -> bytes:
-    # CRC32 instead of xz's usual CRC64: the decoders on flight controllers' clients know no other
+    # CRC32 instead of xz's usual CRC64: the decoders of ground stations support no other
     return lzma.compress(content, check=lzma.CHECK_CRC32, preset=6)

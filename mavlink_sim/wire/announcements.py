@@ -1,4 +1,4 @@
-"""What the autopilot says unasked: status texts, their events, and the commands PX4 sends to a gimbal."""
+"""Messages that the autopilot sends unrequested: status texts, their events, PX4's gimbal commands."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ INFO = 6  # MAV_SEVERITY_INFO
 
 @dataclass(frozen=True, slots=True)
 class Text:
-    """A status text, and the event (identifier, log levels, arguments) that says the same, if PX4 has one.
+    """A status text and the event (identifier, log levels, arguments) of the same meaning, if PX4 has one.
 
-    An empty text is not sent: some things PX4 says by an event alone.
+    An empty text is not sent: PX4 reports some facts by an event only.
     """
 
     severity: int
@@ -40,7 +40,7 @@ DEFAULT_ALTITUDE_EVENT = 0x013B2FC7
 
 # command, confirmation, its seven parameters
 GimbalCommand = tuple[int, int, tuple[float, float, float, float, float, float, float]]
-# What PX4 sends at a landing to look after a gimbal: (seconds since it began, command as above).
+# What PX4 sends to a gimbal at a landing: (seconds since the landing began, command as above).
 _TAKE_CONTROL = (1.0, 1.0, -1.0, -1.0, 0.0, 0.0, 0.0)
 GIMBAL_COMMANDS: tuple[tuple[float, GimbalCommand], ...] = (
     (0.24, (1001, 0, _TAKE_CONTROL)),

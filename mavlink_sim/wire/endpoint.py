@@ -1,4 +1,4 @@
-"""UDP endpoints for a vehicle's links: bound like PX4's, sending to a fixed port until somebody answers."""
+"""UDP endpoints of a vehicle's links: bound as PX4's, sending to a fixed port until a peer answers."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mavlink_sim.wire.signing import Signing
 
 logger = logging.getLogger(__name__)
 
-# A peer that was silent this long may be replaced by another one (PX4 itself keeps its first peer for ever).
+# A peer that was silent this long may be replaced by another one (PX4 itself keeps its first peer forever).
 PEER_SILENCE_S = 5.0
 # A socket buffer's worth of full-size datagrams; more in one go means a client that floods us.
 MAX_DATAGRAMS_PER_READ = 200
@@ -28,8 +28,8 @@ class PortInUseError(OSError):
 class UdpEndpoint:
     """One bound UDP socket, non-blocking.
 
-    Sends to `peer_port` from the start, as PX4 does, then to its first correspondent until that falls silent.
-    Each outgoing message is one datagram. `on_packet` is shown every packet, sent or received, if it is set.
+    Sends to `peer_port` from the start, as PX4 does, then to the first peer that sends, until that is silent.
+    Each outgoing message is one datagram. `on_packet` is called with every packet, sent or received.
 
     Raises:
         PortInUseError: `bind_port` is taken; 0 chooses a free one.
@@ -49,7 +49,7 @@ class UdpEndpoint:
                 ) from error
             raise OSError(f"cannot bind UDP {host}:{bind_port}: {error}") from error
         self.peer: tuple[str, int] = (host, peer_port)
-        self._peer_heard_s: float | None = None
+        self._peer_seen_s: float | None = None
         self._codec = parser(system_id)
         self.signing = Signing()
         self._refused = False
@@ -72,30 +72,30 @@ class UdpEndpoint:
             except BlockingIOError:
                 break
             except ConnectionRefusedError:
-                continue  # an ICMP answer to something we sent earlier: nobody listens there now
+                continue  # an ICMP answer to an earlier datagram: no listener there now
             found = [
                 message
                 for message in self._codec.parse_buffer(datagram) or []
                 if message.get_type() != "BAD_DATA" and self.signing.accepts(message.get_msgbuf())
             ]
             if found:
-                self._hear(sender)
+                self._note_sender(sender)
                 messages.extend(found)
                 if self.on_packet is not None:
                     for message in found:
                         self.on_packet(bytes(message.get_msgbuf()))
         return messages
 
-    def _hear(self, sender: tuple[str, int]) -> None:
+    def _note_sender(self, sender: tuple[str, int]) -> None:
         now = time.monotonic()
-        if self._peer_heard_s is None or sender == self.peer or now - self._peer_heard_s > PEER_SILENCE_S:
+        if self._peer_seen_s is None or sender == self.peer or now - self._peer_seen_s > PEER_SILENCE_S:
             if sender != self.peer:
                 logger.info("the link on port %d talks to %s:%d", self.port, *sender)
             self.peer = sender
-            self._peer_heard_s = now
+            self._peer_seen_s = now
 
     def send(self, outgoing: Iterable[Outgoing]) -> None:
-        """Send each message; what the network cannot take now is dropped, as a radio would."""
+        """Send each message; what the network does not accept now is dropped, as by a radio."""
         for item in outgoing:
             packet = item.pack(self._codec)
             if self.signing.has_key and not item.forwarded:

@@ -1,6 +1,6 @@
-"""What the events metadata says of the events that the vehicle sends: groups, names, words, arguments, enums.
+"""The metadata of the events that the vehicle sends: groups, names, texts, arguments, enums.
 
-Names and words are PX4 1.17's (https://mavlink.io/en/services/events.html).
+Names and texts are PX4 1.17's (https://mavlink.io/en/services/events.html).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _MODE, _ACTION, _CAUSE = (
 _DELAY = ("uint16_t", "seconds")
 Arguments = tuple[tuple[str, str], ...]
 
-# As a recorded flight has them: identifier, name, words, arguments.
+# From a recorded flight: identifier, name, text, arguments.
 _RECORDED: tuple[tuple[int, str, str, Arguments], ...] = (
     (
         announcements.ARMED_EVENT[0],
@@ -141,8 +141,8 @@ _ENUMS: dict[str, tuple[str, dict[int, str]]] = {
 def events_metadata() -> dict[str, Any]:
     """The JSON document, by MAVLink's events schema."""
     default = {identifier: (name, words, arguments) for identifier, name, words, arguments in _RECORDED}
-    default |= {event_identifier(name): (name, *said) for name, said in _DEFAULT.items()}
-    checks = {event_identifier(name): (name, *said) for name, said in _ARMING_CHECKS.items()}
+    default |= {event_identifier(name): (name, *text) for name, text in _DEFAULT.items()}
+    checks = {event_identifier(name): (name, *text) for name, text in _ARMING_CHECKS.items()}
     return {
         "version": 2,
         "components": {
@@ -159,7 +159,7 @@ def events_metadata() -> dict[str, Any]:
     }
 
 
-def _events(told: dict[int, tuple[str, str, Arguments]]) -> dict[str, Any]:
+def _events(texts: dict[int, tuple[str, str, Arguments]]) -> dict[str, Any]:
     return {
         str(identifier & 0xFFFFFF): {
             "name": name,
@@ -168,7 +168,7 @@ def _events(told: dict[int, tuple[str, str, Arguments]]) -> dict[str, Any]:
                 {"arguments": [{"type": kind, "name": word} for kind, word in arguments]} if arguments else {}
             ),
         }
-        for identifier, (name, words, arguments) in told.items()
+        for identifier, (name, words, arguments) in texts.items()
     }
 
 

@@ -1,7 +1,7 @@
-"""A datagram socket whose traffic goes through a `LinkStage`: the place where faults of a link act.
+"""A datagram socket whose traffic goes through a `LinkStage`, where faults of a link act.
 
-It takes the place of a socket in an endpoint. While nothing is wrong, a call goes straight to the socket.
-Delayed datagrams leave and arrive when the owner pumps, which it does at every step of simulated time.
+It replaces the socket of an endpoint. Without an impairment, a call goes directly to the socket. Delayed
+datagrams leave and arrive when the owner calls `pump`, at every step of simulated time.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from mavlink_sim.wire.link_faults import LinkStage
 logger = logging.getLogger(__name__)
 
 Address = tuple[str, int]
-# What a kernel would keep for a socket that nobody reads.
+# The receive buffer of a kernel socket.
 MAX_DATAGRAMS_PER_PUMP = 200
 DATAGRAM_BYTES = 65535
 
@@ -49,12 +49,12 @@ class FaultySocket:
 
     @property
     def has_arrivals(self) -> bool:
-        """Delayed datagrams are due to be read, though the real socket has none."""
+        """Whether delayed datagrams are due to be read."""
         self._arrived += self._stage.inbound.due(self._now_s())
         return bool(self._arrived)
 
     def recvfrom(self, size: int) -> tuple[bytes, Address]:
-        """The next datagram that has come through. Raises BlockingIOError if there is none now."""
+        """The next datagram that has passed the stage. Raises BlockingIOError if there is none now."""
         inbound = self._stage.inbound
         if not inbound.engaged and not self._arrived:
             datagram, sender = self.socket.recvfrom(size)
@@ -66,7 +66,7 @@ class FaultySocket:
         return self._arrived.pop(0)
 
     def _take_in(self) -> None:
-        """Move what the real socket has into the stage, and what is due out of it."""
+        """Move received datagrams into the stage, and due datagrams out of it."""
         inbound, now_s = self._stage.inbound, self._now_s()
         for _ in range(MAX_DATAGRAMS_PER_PUMP):
             try:
@@ -74,19 +74,19 @@ class FaultySocket:
             except BlockingIOError:
                 break
             except ConnectionRefusedError:
-                continue  # an ICMP answer to something sent earlier
+                continue  # an ICMP answer to an earlier datagram
             inbound.push(now_s, datagram, sender)
         self._arrived += inbound.due(now_s)
 
     def sendto(self, packet: bytes, address: Address) -> int:
-        """Send, or let it go through the stage. Raises what a socket raises."""
+        """Send, through the stage if it is engaged. Raises what a socket raises."""
         if not self._stage.outbound.engaged:
             return self.socket.sendto(packet, address)
         self._stage.outbound.push(self._now_s(), packet, address)
         return len(packet)
 
     def pump(self) -> None:
-        """Send what is due to leave; what the network cannot take now is lost, as everywhere here."""
+        """Send what is due; what the network does not accept now is lost."""
         outbound = self._stage.outbound
         if not outbound.waiting:
             return

@@ -1,9 +1,9 @@
-"""What a bad link does to packed datagrams: a seeded, deterministic stage between a vehicle and its sockets.
+"""Impairments of packed datagrams: a seeded, deterministic stage between a vehicle and its sockets.
 
-A `Channel` is one direction of one link. Datagrams go in with `push` and come out with `due`, under whatever
-impairments are on it at that moment, always in this order: rate limit, loss, corruption, duplication,
-delay, reordering. Times are seconds of the caller's clock; no clock is read and no socket is touched here.
-Without `Reorder` a channel never changes the order of what it delivers, not even when a delay ends.
+A `Channel` is one direction of one link. Datagrams go in with `push` and come out with `due`, through the
+impairments active at that moment, always in this order: rate limit, loss, corruption, duplication, delay,
+reordering. Times are seconds of the caller's clock; no clock is read and no socket is used here.
+Without `Reorder` a channel keeps the order of datagrams, also when a delay ends.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any
 
-# A telemetry radio buffers about this much before it throws away what it cannot send (SiK: a few kB).
+# A telemetry radio buffers about this much before it drops what it cannot send (SiK: a few kB).
 RADIO_BUFFER_BYTES = 4096
 # A copy of a datagram comes this long after the first, as over a second path of a network.
 DUPLICATE_SPACING_S = 0.003
@@ -22,7 +22,7 @@ DUPLICATE_SPACING_S = 0.003
 
 @dataclass(slots=True)
 class Counts:
-    """What became of the datagrams. Always: entered + duplicated == delivered + lost + waiting."""
+    """Counts of datagrams. Always: entered + duplicated == delivered + lost + waiting."""
 
     entered: int = 0
     delivered: int = 0
@@ -34,7 +34,7 @@ class Counts:
 
 @dataclass(frozen=True, slots=True)
 class _Transit:
-    """One copy of a datagram on its way through the impairments; `at_s` is when it leaves the last one."""
+    """One copy of a datagram in the impairments; `at_s` is when it leaves the last one."""
 
     at_s: float
     data: bytes
@@ -42,17 +42,17 @@ class _Transit:
 
 
 class Impairment(ABC):
-    """One thing that is wrong with a channel. `rank` orders several of them."""
+    """One impairment of a channel. `rank` orders several of them."""
 
     rank = 0
 
     @abstractmethod
     def carry(self, transit: _Transit, counts: Counts) -> list[_Transit]:
-        """What comes out for one datagram that goes in: none, one or more copies, none earlier than it."""
+        """The copies that leave for one datagram that enters: none, one or more, none earlier than it."""
 
 
 class RateLimit(Impairment):
-    """A line of so many bytes a second with a small buffer; what does not fit the buffer is lost."""
+    """A limit in bytes per second with a small buffer; what does not fit the buffer is lost."""
 
     rank = 0
 
@@ -87,7 +87,7 @@ class Loss(Impairment):
 
 
 class Corruption(Impairment):
-    """With a probability, one to four bytes of a datagram are other ones; its length stays."""
+    """With a probability, one to four bytes of a datagram change; its length stays."""
 
     rank = 2
 
@@ -124,7 +124,7 @@ class Duplication(Impairment):
 
 
 class Delay(Impairment):
-    """Every datagram is late by `delay_s` and by up to `jitter_s` more, each by another amount."""
+    """Every datagram is delayed by `delay_s` plus a random time up to `jitter_s`."""
 
     rank = 4
 
@@ -159,7 +159,7 @@ class Channel:
     """One direction of a link.
 
     Attributes:
-        counts: what became of the datagrams that went through while it was engaged.
+        counts: of the datagrams that passed while it was engaged.
     """
 
     def __init__(self) -> None:
@@ -171,26 +171,26 @@ class Channel:
 
     @property
     def engaged(self) -> bool:
-        """Something is wrong with it, or something still waits in it; else it can be left out."""
+        """Whether an impairment is active or datagrams wait in it; else it can be bypassed."""
         return bool(self._impairments or self._waiting)
 
     @property
     def waiting(self) -> int:
-        """Datagrams on their way."""
+        """Datagrams in transit."""
         return len(self._waiting)
 
     def impair(self, impairment: Impairment) -> None:
-        """Put an impairment on; what is on its way already stays as it is."""
+        """Add an impairment; datagrams in transit are not affected."""
         self._impairments.append(impairment)
         self._impairments.sort(key=lambda one: one.rank)
 
     def clear(self, impairment: Impairment) -> None:
-        """Take an impairment off. Does nothing if it is not on."""
+        """Remove an impairment. Does nothing if it is not active."""
         if impairment in self._impairments:
             self._impairments.remove(impairment)
 
     def drop_waiting(self) -> None:
-        """Lose what is on its way, as a link that breaks does."""
+        """Drop the datagrams in transit, as a link that breaks does."""
         self.counts.lost += len(self._waiting)
         self._waiting.clear()
         self._newest_due_s = 0.0
@@ -210,7 +210,7 @@ class Channel:
             heapq.heappush(self._waiting, (due_s, self._pushed, copy.data, tag))
 
     def due(self, now_s: float) -> list[tuple[bytes, Any]]:
-        """Take what has arrived by `now_s`, in the order of arrival, as (datagram, tag)."""
+        """Remove and return what has arrived by `now_s`, in the order of arrival, as (datagram, tag)."""
         arrived: list[tuple[bytes, Any]] = []
         while self._waiting and self._waiting[0][0] <= now_s + 1e-9:
             _, _, data, tag = heapq.heappop(self._waiting)

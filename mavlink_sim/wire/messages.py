@@ -2,9 +2,9 @@
 
 PX4 is built with MAVLink's development dialect. pymavlink's copy of it has CURRENT_MODE (436), but not
 LINK_NODE_STATUS, TIME_ESTIMATE_TO_TARGET, EVENT and CURRENT_EVENT_SEQUENCE; those are defined here from the
-public XML definitions. A client whose dialect lacks one of them sees it as UNKNOWN_<id>, as it does with PX4:
-with pymavlink's `common` that includes CURRENT_MODE (id 436, CRC extra 193, payload `<IIB`: custom mode,
-intended custom mode, standard mode); `development` and `all` decode it.
+public XML definitions. A client whose dialect lacks one of them gets UNKNOWN_<id>, as with PX4. With
+pymavlink's `common` that includes CURRENT_MODE (id 436, CRC extra 193, payload `<IIB`: custom mode, intended
+custom mode, standard mode); `development` and `all` decode it.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ _COMPONENT_METADATA = struct.Struct("<II100s")
 
 
 class Outgoing(NamedTuple):
-    """A message on its way out of the vehicle, with the component it comes from.
+    """A message that the vehicle sends, with the component it comes from.
 
-    `forwarded`: it came in on another link and is passed on byte for byte.
+    `forwarded`: it was received on another link and is sent on byte for byte.
     """
 
     message: Any
@@ -48,7 +48,7 @@ class Outgoing(NamedTuple):
     forwarded: bool = False
 
     def pack(self, codec: Any) -> bytes:
-        """Its bytes, numbered and sealed by a `parser()` of the link it goes out on."""
+        """Its bytes, with the sequence number and checksum of a `parser()` of its link."""
         if self.forwarded:
             return bytes(self.message.get_msgbuf())
         codec.srcSystem, codec.srcComponent = self.system, self.component
@@ -118,7 +118,7 @@ def current_event_sequence(sequence: int) -> Any:
 
 
 def event_error(system: int, component: int, sequence: int, oldest: int) -> Any:
-    """RESPONSE_EVENT_ERROR (413): a requested event is not kept any more."""
+    """RESPONSE_EVENT_ERROR (413): a requested event is no longer stored."""
     return _PackedMessage(
         413,
         "RESPONSE_EVENT_ERROR",
@@ -159,7 +159,7 @@ def protocol_version() -> Any:
 
 
 class _Codec(dialect.MAVLink):  # type: ignore[misc]
-    """One that can be copied: compiled structures cannot be, and are alike in all of them."""
+    """A codec that can be copied: compiled structures cannot be, and are the same in all of them."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         state = {name: value for name, value in vars(self).items() if not isinstance(value, struct.Struct)}

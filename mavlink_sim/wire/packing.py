@@ -1,8 +1,8 @@
-"""MAVLink 2 packets made fast: payloads by one `struct` call, the checksum by the standard library.
+"""Fast packing of MAVLink 2: payloads by one `struct` call, the checksum by the standard library.
 
 pymavlink spends most of its time on the message object and on a checksum in Python. A `Packed` message is its
-payload; the pymavlink object is made of it only if somebody looks inside. A fleet sends some 15000 messages a
-second, nearly all of them of a dozen kinds: `telemetry` makes those with `packer`.
+payload; the pymavlink object is made only when a field is read. A fleet sends some 15000 messages a second,
+nearly all of a dozen kinds: `telemetry` makes those with `packer`.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ _REVERSED = bytes(int(f"{value:08b}"[::-1], 2) for value in range(256))
 
 
 def checksum(data: bytes) -> bytes:
-    """CRC-16/MCRF4XX (MAVLink's X.25) as it stands in a packet: two bytes, the lower first.
+    """CRC-16/MCRF4XX (MAVLink's X.25) as in a packet: two bytes, the lower first.
 
-    `binascii.crc_hqx` has the same polynomial the other way round; so the bits are turned, before and after.
+    `binascii.crc_hqx` has the same polynomial in reversed bit order; so bits are reversed before and after.
     """
     return binascii.crc_hqx(data.translate(_REVERSED), 0xFFFF).to_bytes(2, "big").translate(_REVERSED)
 
 
 class Packed:
-    """A message as its payload; otherwise it reads like the pymavlink message it stands for."""
+    """A message as its payload; it has the attributes of the pymavlink message it represents."""
 
     __slots__ = ("_form", "payload")
 
@@ -44,7 +44,7 @@ class Packed:
 
     @property
     def message(self) -> Any:
-        """The pymavlink message, made anew at every call."""
+        """The pymavlink message, a new one at every call."""
         return self._form.unpacked(self.payload)
 
     def __getattr__(self, name: str) -> Any:
@@ -73,7 +73,7 @@ class Packed:
 
 
 class Form:
-    """What is to be known of one kind of message to pack it."""
+    """The layout of one kind of message."""
 
     __slots__ = ("_class", "crc_extra", "high", "identifier", "low", "name")
 
@@ -103,7 +103,7 @@ def packer(message_class: Any) -> Callable[..., Packed]:
     """A function with the arguments of a pymavlink message class that makes the `Packed` message.
 
     Raises:
-        ValueError: the message has text in it, which no hot message has.
+        ValueError: the message has a text field, which no frequent message has.
     """
     if "char" in message_class.fieldtypes:
         raise ValueError(f"{message_class.msgname} has text; make it with pymavlink's own class")
@@ -117,7 +117,7 @@ def packer(message_class: Any) -> Callable[..., Packed]:
     )
     lengths = dict(zip(message_class.ordered_fieldnames, message_class.array_lengths, strict=True))
     wire = ", ".join(f"*{name}" if lengths[name] else name for name in message_class.ordered_fieldnames)
-    # written as source, as collections.namedtuple does: the order on the wire (by size) costs nothing then
+    # generated source, as in collections.namedtuple: the order on the wire (by size) then costs nothing
     source = f"lambda {head}: _packed(_form, _pack({wire}))"
     names = {
         "_packed": Packed,

@@ -1,6 +1,6 @@
 """MAVLink 2 message signing (https://mavlink.io/en/guide/message_signing.html) by the rules of PX4 v1.17.
 
-Everything here works on packed frames, so that it can stand between any packer and any socket.
+Everything here works on packed frames, so that it can be used between any packer and any socket.
 """
 
 from __future__ import annotations
@@ -12,11 +12,6 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from mavlink_sim.services.links import Link
-    from mavlink_sim.vehicle import Vehicle
 
 logger = logging.getLogger(__name__)
 
@@ -27,7 +22,7 @@ SIGNED = 0x01  # MAVLINK_IFLAG_SIGNED
 MAX_STREAMS = 16  # MAVLINK_MAX_SIGNING_STREAMS
 ONE_MINUTE = 6_000_000  # in units of 10 us
 EPOCH_S = 1_420_070_400  # 2015-01-01, from which signing timestamps count
-# What PX4 takes unsigned whatever MAV_SIGN_CFG says: RADIO_STATUS, ADSB_VEHICLE, COLLISION.
+# What PX4 accepts unsigned whatever MAV_SIGN_CFG is: RADIO_STATUS, ADSB_VEHICLE, COLLISION.
 ALWAYS_ACCEPTED = frozenset({109, 246, 247})
 OPTIONAL, EXCEPT_USB, ALWAYS = 0, 1, 2  # MAV_SIGN_CFG
 
@@ -36,9 +31,9 @@ Streams = dict[tuple[int, int, int], int]
 
 
 def key_of(text: str) -> bytes:
-    """The key in a command-line value: 64 hexadecimal digits, or the path of a file with the 32 bytes.
+    """The key of a command-line value: 64 hexadecimal digits, or the path of a file with the 32 bytes.
 
-    Raises ValueError where it is neither; the message does not repeat the key.
+    Raises ValueError if it is neither; the message does not repeat the key.
     """
     try:
         key = bytes.fromhex(text)
@@ -55,7 +50,7 @@ def key_of(text: str) -> bytes:
 
 
 def timestamp_now() -> int:
-    """Now, as signatures count time: units of 10 us since 2015."""
+    """Now, in the unit of signatures: 10 us since 2015."""
     return int((time.time() - EPOCH_S) * 1e5)
 
 
@@ -64,9 +59,9 @@ class Signing:
 
     Args:
         link_id: this link's number, part of every signature it makes.
-        streams: the table of what was heard, shared by all links of a vehicle.
-        policy: MAV_SIGN_CFG now (0 unsigned frames are welcome, 1 on USB alone, 2 never).
-        is_usb: the link stands for the vehicle's USB port, the only one on which PX4 takes a key.
+        streams: the newest timestamps received, shared by all links of a vehicle.
+        policy: MAV_SIGN_CFG now (unsigned frames: 0 accepted, 1 on USB only, 2 never).
+        is_usb: the link represents the vehicle's USB port, the only one on which PX4 accepts a key.
 
     Attributes:
         refused: how many frames were refused, by reason.
@@ -92,14 +87,14 @@ class Signing:
         return self._key is not None
 
     def set_up(self, key: bytes, timestamp: int) -> None:
-        """Take a key; zeros with timestamp 0 end signing. Raises ValueError for a key of another length."""
+        """Set a key; zeros with timestamp 0 end signing. Raises ValueError for a key of another length."""
         if len(key) != KEY_LENGTH:
             raise ValueError(f"a signing key has {KEY_LENGTH} bytes, got {len(key)}")
         self._key = key if timestamp or any(key) else None
         self._timestamp = timestamp
 
     def signed(self, frame: bytes) -> bytes:
-        """A frame with its signature; a MAVLink 1 frame, or one signed already, as it is."""
+        """A frame with its signature; a MAVLink 1 frame, or one already signed, unchanged."""
         if self._key is None or frame[0] != MAVLINK_2 or frame[2] & SIGNED:
             return frame
         self._timestamp = (self._timestamp + 1) & 0xFFFFFFFFFFFF
@@ -113,7 +108,7 @@ class Signing:
         return bytes(marked) + hashlib.sha256(self._key + marked).digest()[:6]
 
     def accepts(self, frame: bytes) -> bool:
-        """Whether a received frame (its checksum is right) may be acted upon; if not, it is counted."""
+        """Whether a received frame (with a valid checksum) is accepted; if not, it is counted."""
         if self._key is None:
             return True
         reason = self._objection(frame, self._key)
@@ -121,7 +116,7 @@ class Signing:
             return True
         self.refused[reason] += 1
         if self.refused[reason] == 1:
-            logger.warning("a frame was refused by signing: %s; more are counted, not told", reason)
+            logger.warning("frame refused by signing: %s; further ones are only counted", reason)
         return False
 
     def _welcomes_unsigned(self, message: int) -> bool:
@@ -156,7 +151,7 @@ def _message_of(frame: bytes) -> int:
 
 @functools.cache
 def _checksum_change(zeros: int) -> int:
-    """How the X.25 checksum changes when the flag is set: the code is linear, so the payload is no matter.
+    """How the X.25 checksum changes when the flag is set: the code is linear, so independent of the payload.
 
     `zeros`: number of bytes from the flag on that the checksum covers, the message's CRC extra included.
     """
@@ -166,12 +161,3 @@ def _checksum_change(zeros: int) -> int:
         mixed = (mixed ^ (mixed << 4)) & 0xFF
         crc = (crc >> 8) ^ (mixed << 8) ^ (mixed << 3) ^ (mixed >> 4)
     return crc & 0xFFFF
-
-
-def setup_signing(vehicle: Vehicle, link: Link, message: Any) -> None:
-    """SETUP_SIGNING: PX4 takes a key on its USB port alone and tells nobody; elsewhere it is ignored."""
-    if not link.signing.is_usb:
-        logger.warning("SETUP_SIGNING on link %s is ignored: only the USB link takes a key", link.name)
-        return
-    link.signing.set_up(bytes(message.secret_key), int(message.initial_timestamp))
-    logger.info("link %s has a %s", link.name, "signing key" if link.signing.has_key else "key no more")

@@ -1,8 +1,8 @@
-"""How often each kind of link gets each message.
+"""The rate of each message on each kind of link.
 
 `ONBOARD_RATES_HZ` were measured on a PX4's onboard link, `GCS_RATES_HZ` on its ground station's. By that
-PX4's own stamps they are the even rates that it is configured for (100, 50, 30, 10, 8, 5 Hz): its clock ran
-1.5 to 1.8 % slower than that of its listener. An interval that is asked for is counted by the same clock.
+PX4's own stamps they are the rates that it is configured for (100, 50, 30, 10, 8, 5 Hz): its clock ran 1.5 to
+1.8 % slower than the receiver's. A requested interval is measured by the same clock.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import heapq
 
 NEVER_US = 2**63
-# PX4's clock by its listener's: 98.5 Hz came of 100, 9.8 Hz of an interval of 100 ms.
+# PX4's clock by the receiver's: 98.5 Hz for 100 Hz, 9.8 Hz for an interval of 100 ms.
 PX4_CLOCK_RATE = 0.985
 # By the measured rate the interval that PX4 is configured for, where the two differ.
 _CONFIGURED_US = {98.5: 10_000, 49.0: 20_000, 29.5: 33_333, 9.85: 100_000, 7.9: 125_000, 4.95: 200_000}
@@ -49,8 +49,8 @@ ONBOARD_RATES_HZ: dict[str, float] = {
     "VIBRATION": 0.5,
     "TIME_ESTIMATE_TO_TARGET": 0.5,
     "CURRENT_EVENT_SEQUENCE": 0.3,
-    "GPS_GLOBAL_ORIGIN": 0.0,  # on change alone
-    "OBSTACLE_DISTANCE": 0.0,  # to a ground station alone, unless it is asked for
+    "GPS_GLOBAL_ORIGIN": 0.0,  # on change only
+    "OBSTACLE_DISTANCE": 0.0,  # to a ground station only, unless requested
 }
 GCS_RATES_HZ: dict[str, float] = dict.fromkeys(ONBOARD_RATES_HZ, 0.0) | {
     "HEARTBEAT": 1.0,
@@ -86,7 +86,7 @@ GCS_RATES_HZ: dict[str, float] = dict.fromkeys(ONBOARD_RATES_HZ, 0.0) | {
     "OBSTACLE_DISTANCE": 1.0,  # as configured in PX4; sent while collision prevention works
 }
 
-# What comes on top with a remote control or a gimbal, by PX4's source: (onboard link, any other link).
+# Additional streams with a remote control or a gimbal, from PX4's source: (onboard link, any other link).
 EQUIPMENT_RATES_HZ: dict[str, tuple[float, float]] = {
     "RC_CHANNELS": (20.0, 5.0),
     "GIMBAL_DEVICE_ATTITUDE_STATUS": (5.0, 5.0),
@@ -98,11 +98,11 @@ EQUIPMENT_RATES_HZ: dict[str, tuple[float, float]] = {
 class Streams:
     """The schedule of one link. Intervals are microseconds; a stream that is off has interval -1.
 
-    `next_us` is when something is due again: before that, `due` need not be asked.
+    `next_us` is when a message is due again: before that, `due` need not be called.
 
     Args:
-        rates_hz: of each stream, as it arrives. phase_s: when the schedule begins.
-        clock_rate: of the clock by which an interval that is asked for is counted.
+        rates_hz: of each stream, as received. phase_s: when the schedule begins.
+        clock_rate: of the clock by which a requested interval is measured.
     """
 
     def __init__(self, rates_hz: dict[str, float], phase_s: float = 0.0, clock_rate: float = 1.0) -> None:
@@ -111,8 +111,8 @@ class Streams:
         self._asked_us: dict[str, int] = {}
         self._default_us = {name: _interval_us(rate) for name, rate in rates_hz.items()}
         self._period_us = dict(self._default_us)  # as it arrives
-        self._order = {name: place for place, name in enumerate(rates_hz)}
-        # a heap of (due, place in the table, name): few of the streams are due at any one time
+        self._order = {name: index for index, name in enumerate(rates_hz)}
+        # a heap of (due, index in the table, name): few of the streams are due at any one time
         self._due = [
             (int(phase_s * 1e6) + period, self._order[name], name)
             for name, period in self._period_us.items()
@@ -126,14 +126,14 @@ class Streams:
         return name in self._default_us
 
     def interval_us(self, name: str) -> int:
-        """The interval that was asked for or is configured."""
+        """The requested or configured interval."""
         if name in self._asked_us:
             return self._asked_us[name]
         rate = self._rates_hz.get(name, 0.0)
         return _CONFIGURED_US.get(rate, _interval_us(rate))
 
     def rate_hz(self, name: str) -> float:
-        """How often it comes; 0 if it is off."""
+        """Its rate; 0 if it is off."""
         period = self._period_us.get(name, -1)
         return 1e6 / period if period > 0 else 0.0
 
@@ -167,10 +167,10 @@ class Streams:
             return names
         heap = self._due
         while heap[0][0] <= now_us:
-            due, place, name = heap[0]
+            due, index, name = heap[0]
             period = self._period_us[name]
             following = due + period
-            heapq.heapreplace(heap, (following if following > now_us else now_us + period, place, name))
+            heapq.heapreplace(heap, (following if following > now_us else now_us + period, index, name))
             names.append(name)
         self.next_us = heap[0][0]
         return names

@@ -1,8 +1,8 @@
 """A record of a link's traffic as a tlog, the format that ground stations write and pymavlink's tools read.
 
 Each record is the time of day in microseconds (eight bytes, big-endian) and the MAVLink packet as it was on
-the wire, both directions in one file. Every record is written in one piece, so that the file of a vehicle
-that was killed is whole.
+the wire, both directions in one file. Every record is written in one piece, so that the file stays valid if
+the vehicle is killed.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _STAMP = struct.Struct(">Q")
 
 
 class TrafficLog:
-    """An open tlog. `record` takes one packet; a file that cannot be written any more is given up aloud."""
+    """An open tlog. `record` appends one packet; on a write error the file is closed with a warning."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file

@@ -1,1 +1,1 @@
-"""What there is to see: the solids, colours and textures of what stands on the ground."""
+"""The visible world: solids, colours and textures of its objects."""

@@ -1,4 +1,4 @@
-"""Vehicles that fly in a world: each is a thing in what the others see."""
+"""Vehicles as objects of a world, visible for the others."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ AIRCRAFT_CLASS = "drone"
 
 
 class Aircraft(NamedTuple):
-    """Where a vehicle is at one moment.
+    """The pose of a vehicle at one time.
 
     Attributes:
         system_id: its MAVLink system id, 1 to 255.
-        position_ned_m: from the world's origin, of the middle between its feet.
+        position_ned_m: from the world's origin, of the centre between its feet.
         roll_rad, pitch_rad, yaw_rad: its attitude.
     """
 
@@ -28,17 +28,17 @@ class Aircraft(NamedTuple):
 
 
 def identifier_offset(world: World) -> int:
-    """What is added to a vehicle's system id so that no object of the world has its identifier."""
+    """The offset from a vehicle's system id to its identifier, which no object of the world has."""
     return max((item.identifier for item in world.objects), default=-1)
 
 
 def aircraft_objects(aircraft: Iterable[Aircraft], offset: int) -> tuple[WorldObject, ...]:
     """Vehicles as objects of a world, in their order.
 
-    The identifier is the system id plus `offset` (`identifier_offset`): the same for whoever looks, at any
+    The identifier is the system id plus `offset` (`identifier_offset`): the same for all cameras, at any
     time. The colours are drawn from the system id.
     """
-    # imported here: a fleet that nobody looks at needs nothing that draws, not even OpenCV
+    # imported here: a fleet without a camera needs no rendering, not even OpenCV
     from mavlink_sim.world.world import WorldObject
 
     return tuple(

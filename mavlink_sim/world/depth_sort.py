@@ -1,9 +1,9 @@
-"""The order in which an object's solids must be painted so that near ones cover far ones, from any eye.
+"""The painting order of an object's solids, so that near ones cover far ones, from any viewpoint.
 
 A binary space partition (Fuchs, Kedem, Naylor 1980, "On visible surface generation by a priori tree
-structures") whose leaves are whole convex solids: within a leaf the faces turned to the eye never cover each
-other. Nothing is cut: where two solids run a little into each other (a knee, a bumper), each goes to the side
-of the plane on which most of it lies.
+structures") whose leaves are whole convex solids: within a leaf the faces towards the eye never cover each
+other. Solids are not split: where two overlap a little (a knee, a bumper), each is assigned to the side of
+the plane with most of it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from mavlink_sim.world.solids import Points, Solid
 
 TOLERATED_OVERLAP_M = 0.035
 TOLERATED_OVERLAP_SHARE = 0.25
-"""Of a solid's extent along the plane's normal. Tuned by eye: joints of limbs stay whole."""
+"""As a share of a solid's extent along the plane's normal. Tuned visually: joints of limbs stay intact."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,9 +85,9 @@ def depth_sort_tree(solids: list[Solid]) -> DepthSortTree:
 
 
 class _Extents:
-    """How far each solid reaches on either side of each plane that may part them; worked out once.
+    """The extent of each solid on either side of each candidate plane; computed once.
 
-    The planes are those of all faces, and those across the axes where a solid begins, ends or is halved.
+    The planes are those of all faces, and those across the axes at the start, centre and end of a solid.
     """
 
     def __init__(self, solids: list[Solid]) -> None:
@@ -96,7 +96,7 @@ class _Extents:
         self._corners = corners
         lows = np.array([points.min(axis=0) for points in corners])
         highs = np.array([points.max(axis=0) for points in corners])
-        # (S, 3 axes, 3 levels, S): along an axis a solid's reach is its own, less the level of each.
+        # (S, 3 axes, 3 levels, S): along an axis a solid's extent is its own, less the level of each.
         levels = np.stack([lows, highs, (lows + highs) / 2]).transpose(2, 0, 1)
         across_low = lows[:, :, None, None] - levels
         across_high = highs[:, :, None, None] - levels
@@ -116,7 +116,7 @@ class _Extents:
         self._solid_of = np.concatenate([np.tile(np.arange(count), 9), of_faces])
 
     def best_plane(self, group: list[int]) -> tuple[Points, float, list[bool]]:
-        """The plane that parts a group with the least overlap, and which solids lie on its normal's side."""
+        """The plane that separates a group with the least overlap, and the solids on its normal's side."""
         columns = np.flatnonzero(np.isin(self._solid_of, group))
         rows = np.array(group)[:, None]
         low, high = self._low[rows, columns], self._high[rows, columns]
@@ -129,7 +129,7 @@ class _Extents:
         cost[(count == 0) | (count == len(group))] = np.inf
         best = int(np.argmin(cost))
         if not np.isfinite(cost[best]):
-            # Solids around one common middle: no plane parts them, so part them by number.
+            # Solids around a common centre: no plane separates them, so split them by number.
             half = [index >= len(group) // 2 for index in range(len(group))]
             middle = np.concatenate([self._corners[index] for index in group])[:, 2].mean()
             return np.array([0.0, 0.0, -1.0]), float(-middle), half
@@ -138,7 +138,7 @@ class _Extents:
 
 
 def clip_polygon(points: Points, normal: Points, offset: float) -> Points:
-    """The part of a convex polygon (K, D) where normal · p ≥ offset (Sutherland–Hodgman); maybe empty."""
+    """The part of a convex polygon (K, D) where normal · p ≥ offset (Sutherland–Hodgman); may be empty."""
     distance = points @ normal - offset
     kept: list[Points] = []
     for index in range(len(points)):

@@ -1,4 +1,4 @@
-"""Things that stand in a landscape and belong to no class that the detector knows."""
+"""Distractors: objects of no class of the detector."""
 
 from __future__ import annotations
 
@@ -163,7 +163,7 @@ def bale(rng: np.random.Generator) -> Body:
 
 
 def tarpaulin(rng: np.random.Generator) -> Body:
-    """A coloured sheet over something low, or a solar panel on feet."""
+    """A coloured sheet over a low object, or a solar panel on feet."""
     body = Body()
     length, width = _between(rng, 1.2, 3.5), _between(rng, 1.0, 2.0)
     if rng.random() < 0.5:

@@ -1,8 +1,8 @@
-"""ArUco and AprilTag markers printed on plates: which cells are black, and how a camera's pixels see them.
+"""ArUco and AprilTag markers printed on plates: their cells, and their pixels in a camera.
 
-A pixel's brightness is the mean over points spread in it, each looked up in the marker's cells, so that edges
-of cells are as soft as a camera makes them and corners lie where geometry puts them. Markers after
-Garrido-Jurado et al. 2014 and Olson 2011, as OpenCV's dictionaries hold them.
+A pixel's brightness is the mean over sample points, each looked up in the marker's cells, so that edges of
+cells are as soft as in a camera and corners are geometrically exact. Markers of Garrido-Jurado et al. 2014
+and Olson 2011, from OpenCV's dictionaries.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ DICTIONARIES = tuple(
         and not name.endswith("36H12")
     )
 )  # fmt: skip
-"""OpenCV's names without their prefix; of those that it spells twice, the usual spelling."""
+"""OpenCV's names without their prefix; of two spellings the usual one."""
 QUIET_CELLS = 1
 """White cells around the black square: a detector needs them."""
 BLACK = 0.07
-"""How much of the board's brightness printed black throws back."""
+"""Reflectance of printed black relative to the board."""
 MANY_PIXELS, VERY_MANY_PIXELS = 12_000, 60_000
 
 
 @dataclass(frozen=True, slots=True)
 class Print:
-    """What is printed on a plate.
+    """The print on a plate.
 
     Attributes:
         dictionary: one of DICTIONARIES, "4X4_50" or "APRILTAG_36h11".
@@ -44,7 +44,7 @@ class Print:
         standing: on its lower edge, its front along the yaw; else lying face up, its upper edge along it.
 
     Raises:
-        ValueError: no such dictionary or marker, or a size that cannot be.
+        ValueError: an unknown dictionary or marker, or an invalid size.
     """
 
     dictionary: str
@@ -109,7 +109,7 @@ def reflectance(
     Args:
         eye: (3,) the camera in the plate's frame.
         plate_from_pixel: (3, 3) takes (u, v, 1) to a ray in the plate's frame.
-        x, y: (N,) pixels that see the printed face.
+        x, y: (N,) pixels of the printed face.
     """
     cells = marker_cells(printed.dictionary, printed.identifier)
     count, side = len(cells), printed.board_side_m
@@ -133,7 +133,7 @@ def reflectance(
     total = np.zeros(len(x), np.float32)
     flat = cells.ravel()
     u, v = x.astype(np.float64), y.astype(np.float64)
-    # At the pixels' middles; each point in them adds a constant.
+    # At the pixels' centres; each sample point adds a constant.
     depth = below[0] * u + below[1] * v + below[2]
     column_depth = columns[0] * u + columns[1] * v + columns[2]
     row_depth = rows[0] * u + rows[1] * v + rows[2]
@@ -144,7 +144,7 @@ def reflectance(
                 scale = 1.0 / (depth + (below[0] * right + below[1] * lower))
                 column = (column_depth + (columns[0] * right + columns[1] * lower)) * scale
                 row = (row_depth + (rows[0] * right + rows[1] * lower)) * scale
-                # fmax takes the other one where there is no number: a ray along the face
+                # fmax ignores NaN: a ray along the face
                 column = np.fmin(np.fmax(column, 0.0), last).astype(np.int32)
                 row = np.fmin(np.fmax(row, 0.0), last).astype(np.int32)
                 total += flat.take(row * np.int32(count) + column)

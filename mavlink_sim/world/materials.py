@@ -1,4 +1,4 @@
-"""Colours of objects (BGR, 0..255 as painted, before light falls on them), drawn from a seed."""
+"""Colours of objects (BGR, 0..255, without lighting), drawn from a seed."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""The surface of an object as polygons: its nearest point, what a ray meets, where a level cuts it.
+"""The surface of an object as polygons: nearest point, ray intersection, horizontal section.
 
-In the shape's own frame: x forward, y right, z down, metres before the object's scale. The polygons are those
-that are drawn, without what is painted on them, so that what is seen is what is run into and measured.
+In the shape's frame: x forward, y right, z down, metres before the object's scale. The polygons are those
+that are rendered, without decals, so that rendering, collisions and ranges agree.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from mavlink_sim.world.shapes import Shape, shape_of, variant_of
 from mavlink_sim.world.solids import Points, Triple
 from mavlink_sim.world.world import WorldObject
 
-# Where the ray of `contains` goes: not along anything that is built at right angles.
+# The direction of the ray of `contains`: not along any rectangular edge.
 _ASKEW = np.array([0.5413, 0.3127, 0.7805]) / math.sqrt(0.5413**2 + 0.3127**2 + 0.7805**2)
 _PARALLEL = 1e-12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mesh:
-    """Flat convex polygons, looking outwards. Edges are in order, all of one face after those of another.
+    """Flat convex polygons, with outward normals. Edges are in order, face by face.
 
     Attributes:
         first: (F,) the first edge of each face.
         normals, offsets: (F, 3), (F,) the faces' planes: normal · p = offset.
         face_of: (E,) each edge's face.
         starts, ends: (E, 3) of each edge.
-        ways: (E, 3) from start to end; inverse_lengths: (E,) 1 / |way|².
+        spans: (E, 3) from start to end; inverse_lengths: (E,) 1 / |span|².
         inwards: (E, 3) in the face's plane, at right angles to the edge, into the face.
     """
 
@@ -43,15 +43,15 @@ class Mesh:
     face_of: NDArray[np.intp]
     starts: Points
     ends: Points
-    ways: Points
+    spans: Points
     inverse_lengths: Points
     inwards: Points
 
     def nearest(self, point: Points) -> tuple[Points, float]:
-        """The nearest point (3,) of the surface, and how far it is."""
+        """The nearest point (3,) of the surface, and its distance."""
         to = point - self.starts
-        share = np.clip(np.einsum("ij,ij->i", to, self.ways) * self.inverse_lengths, 0.0, 1.0)
-        away = to - share[:, None] * self.ways
+        share = np.clip(np.einsum("ij,ij->i", to, self.spans) * self.inverse_lengths, 0.0, 1.0)
+        away = to - share[:, None] * self.spans
         squares = np.einsum("ij,ij->i", away, away)
         edge = int(squares.argmin())
         best = float(squares[edge])
@@ -64,13 +64,13 @@ class Mesh:
         return point - away[edge], math.sqrt(best)
 
     def contains(self, point: Points) -> bool:
-        """Whether a point is inside one of the closed solids that it is put together from."""
+        """Whether a point is inside one of its closed solids."""
         crossed, facing, _ = self._crossings(point, _ASKEW)
-        # out of a solid counts one, into one takes one away; the two sides of a sheet cancel each other
+        # leaving a solid adds one, entering one subtracts one; the two sides of a sheet cancel
         return float(np.sign(facing[crossed]).sum()) > 0.5
 
     def along(self, origin: Points, direction: Points) -> float:
-        """How many lengths of `direction` (3,) from a point to the first surface in that way; inf: none."""
+        """The distance, in lengths of `direction` (3,), from a point to the first surface; inf: none."""
         crossed, _, lengths = self._crossings(origin, direction)
         return float(lengths[crossed].min()) if crossed.any() else math.inf
 
@@ -89,7 +89,7 @@ class Mesh:
         low, high = self.starts[:, 2], self.ends[:, 2]
         across = np.flatnonzero((low < z) != (high < z))
         share = (z - low[across]) / (high[across] - low[across])
-        points = self.starts[across, :2] + share[:, None] * self.ways[across, :2]
+        points = self.starts[across, :2] + share[:, None] * self.spans[across, :2]
         return points.reshape(-1, 2, 2)  # a convex face is cut by two of its edges, which follow each other
 
 
@@ -107,7 +107,7 @@ def _faces(shape: Shape) -> list[Points]:
     found = []
     for faces, (begin, end) in zip(shape.faces_of, pairwise(shape.solid_first), strict=True):
         left = end - begin
-        for face in faces:  # decals come last
+        for face in faces:  # decals are last
             if left == 0:
                 break
             points = shape.corners[shape.first[face] : shape.first[face + 1]]
@@ -122,15 +122,15 @@ def _mesh(faces: list[Points]) -> Mesh:
     ends = np.concatenate([np.roll(points, -1, axis=0) for points in faces])
     face_of = np.repeat(np.arange(len(faces)), counts)
     first = np.cumsum([0, *counts[:-1]])
-    ways = ends - starts
+    spans = ends - starts
     # Newell's method, as `Face.plane`
     normals = np.add.reduceat(np.cross(starts, ends), first)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     middles = np.add.reduceat(starts, first) / np.array(counts)[:, None]
     offsets = np.einsum("ij,ij->i", normals, middles)
-    lengths = np.maximum(np.einsum("ij,ij->i", ways, ways), 1e-18)
-    inwards = np.cross(normals[face_of], ways)
-    return Mesh(first, normals, offsets, face_of, starts, ends, ways, 1.0 / lengths, inwards)
+    lengths = np.maximum(np.einsum("ij,ij->i", spans, spans), 1e-18)
+    inwards = np.cross(normals[face_of], spans)
+    return Mesh(first, normals, offsets, face_of, starts, ends, spans, 1.0 / lengths, inwards)
 
 
 def surface_range_to(item: WorldObject, position_ned_m: Sequence[float]) -> float:
@@ -142,7 +142,7 @@ def surface_range_to(item: WorldObject, position_ned_m: Sequence[float]) -> floa
     cosine, sine = math.cos(item.yaw_rad), math.sin(item.yaw_rad)
     north, east = (position_ned_m[axis] - item.position_ned_m[axis] for axis in (0, 1))
     point = np.array([cosine * north + sine * east, cosine * east - sine * north]) / item.scale
-    ways, to = mesh.ways[:, :2], point - mesh.starts[:, :2]
-    share = (to * ways).sum(axis=1) / np.maximum((ways * ways).sum(axis=1), 1e-12)
-    away = to - np.clip(share, 0.0, 1.0)[:, None] * ways
+    spans, to = mesh.spans[:, :2], point - mesh.starts[:, :2]
+    share = (to * spans).sum(axis=1) / np.maximum((spans * spans).sum(axis=1), 1e-12)
+    away = to - np.clip(share, 0.0, 1.0)[:, None] * spans
     return float(np.hypot(away[:, 0], away[:, 1]).min()) * item.scale

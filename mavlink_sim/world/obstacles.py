@@ -1,6 +1,6 @@
-"""A world's objects as things that are in the way: how near the next one is, what a ray or a scan meets.
+"""A world's objects as obstacles: distance to the nearest one, ray and scan ranges.
 
-What moves is where its path has led it at the time asked for. Everything is NED metres in the world's frame.
+Moving objects are at their position of the given time. Everything is NED metres in the world frame.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from mavlink_sim.world.shapes import variant_of
 from mavlink_sim.world.world import Vector, WorldObject
 
 FLAT_M = 0.05
-"""What reaches less far above the ground is painted on it or lies flat: nobody runs into it."""
+"""Objects lower than this are flat on the ground and no obstacles."""
 _NEAR_M = 0.05
 _VELOCITY_STEP_S = 0.01
 _STILL: Vector = (0.0, 0.0, 0.0)
@@ -28,12 +28,12 @@ Segment = tuple[tuple[float, float], tuple[float, float]]
 """The ends of a level line, (north, east) metres."""
 
 
-class Way(Protocol):
-    """What leads an object along; `camera.scene.Path` is one."""
+class ObstacleMotion(Protocol):
+    """The motion of an object; `camera.scene.Path` is one."""
 
     @property
     def speed_mps(self) -> float:
-        """How fast."""
+        """Speed along the path."""
 
     def pose_at(self, time_s: float) -> tuple[Vector, float]:
         """(position NED in metres, yaw in radians) at a time."""
@@ -41,13 +41,13 @@ class Way(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """What is between a body and the obstacle next to it.
+    """The gap between a body and the nearest obstacle.
 
     Attributes:
-        obstacle: that one; None: there is no other.
-        clear_m: so far at least the body may go in any direction without touching it; 0 or less: it touches.
-        normal_ned: unit vector out of the obstacle, where it touches.
-        push_ned_m: the way out of it. Both are nothing unless it touches.
+        obstacle: the nearest one; None: there is none.
+        clear_m: the body can move at least this far in any direction without contact; 0 or less: contact.
+        normal_ned: unit vector out of the obstacle, at the contact.
+        push_ned_m: the displacement out of it. Both are zero without contact.
     """
 
     obstacle: Obstacle | None
@@ -57,7 +57,7 @@ class Gap:
 
 
 class Obstacle:
-    """One object in the way.
+    """One obstacle.
 
     Attributes:
         identifier: of the object. name: its class and identifier, "wall-2".
@@ -66,49 +66,49 @@ class Obstacle:
     Raises ValueError for one that leans, which a scene file cannot make.
     """
 
-    def __init__(self, thing: WorldObject, way: Way | None, flatness: float) -> None:
-        self.identifier = thing.identifier
-        self.name = f"{thing.class_name}-{thing.identifier}"
-        if thing.leans:
-            raise ValueError(f"{self.name} leans: only what stands level can be in a vehicle's way")
-        self.moves = way is not None
-        self._way = way
-        self._scale = thing.scale
-        size = thing.size_m if thing.printed is None else thing.printed.board_size_m
-        variant = variant_of(thing.class_name, thing.appearance)
-        self._mesh = mesh_of(thing.class_name, variant, size)
-        self._stretched = mesh_of(thing.class_name, variant, size, flatness)
-        shape = thing.shape
-        self._low: list[float] = (shape.low * thing.scale).tolist()
-        self._high: list[float] = (shape.high * thing.scale).tolist()
+    def __init__(self, scene_object: WorldObject, motion: ObstacleMotion | None, flatness: float) -> None:
+        self.identifier = scene_object.identifier
+        self.name = f"{scene_object.class_name}-{scene_object.identifier}"
+        if scene_object.leans:
+            raise ValueError(f"{self.name} leans: only level objects can be obstacles")
+        self.moves = motion is not None
+        self._motion = motion
+        self._scale = scene_object.scale
+        size = scene_object.size_m if scene_object.printed is None else scene_object.printed.board_size_m
+        variant = variant_of(scene_object.class_name, scene_object.appearance)
+        self._mesh = mesh_of(scene_object.class_name, variant, size)
+        self._stretched = mesh_of(scene_object.class_name, variant, size, flatness)
+        shape = scene_object.shape
+        self._low: list[float] = (shape.low * scene_object.scale).tolist()
+        self._high: list[float] = (shape.high * scene_object.scale).tolist()
         reaches = (
             np.hypot(x, y) for x in (self._low[0], self._high[0]) for y in (self._low[1], self._high[1])
         )
         self._reach_m = float(max(reaches))
         self._time_s = math.nan
-        self._put(thing.position_ned_m, thing.yaw_rad)
+        self._put(scene_object.position_ned_m, scene_object.yaw_rad)
 
     def _put(self, position_ned_m: Vector, yaw_rad: float) -> None:
         self._position = position_ned_m
         self._cosine, self._sine = math.cos(yaw_rad), math.sin(yaw_rad)
 
     def place(self, time_s: float) -> None:
-        """Let it be where it is at a time."""
-        if self._way is not None and time_s != self._time_s:
+        """Move it to its pose at a time."""
+        if self._motion is not None and time_s != self._time_s:
             self._time_s = time_s
-            self._put(*self._way.pose_at(time_s))
+            self._put(*self._motion.pose_at(time_s))
 
     def velocity_at(self, time_s: float) -> Vector:
-        """NED m/s; how it turns is not in it."""
-        if self._way is None:
+        """NED m/s, without its rotation."""
+        if self._motion is None:
             return _STILL
         (ax, ay, az), (bx, by, bz) = (
-            self._way.pose_at(time_s + side)[0] for side in (-_VELOCITY_STEP_S, 0.0)
+            self._motion.pose_at(time_s + side)[0] for side in (-_VELOCITY_STEP_S, 0.0)
         )
         return ((bx - ax) / _VELOCITY_STEP_S, (by - ay) / _VELOCITY_STEP_S, (bz - az) / _VELOCITY_STEP_S)
 
     def _own(self, point: Vector) -> Vector:
-        """A point in its own frame, metres."""
+        """A point in its frame, metres."""
         north, east = point[0] - self._position[0], point[1] - self._position[1]
         return (
             self._cosine * north + self._sine * east,
@@ -120,7 +120,7 @@ class Obstacle:
         return self._cosine * x - self._sine * y, self._sine * x + self._cosine * y
 
     def far_m(self, point: Vector) -> float:
-        """No more than the metres from a point to it; holds however it is turned."""
+        """A lower bound of the distance from a point, metres, for any yaw."""
         level = math.hypot(point[0] - self._position[0], point[1] - self._position[1]) - self._reach_m
         z = point[2] - self._position[2]
         upright = max(self._low[2] - z, z - self._high[2], 0.0)
@@ -136,22 +136,22 @@ class Obstacle:
         return math.sqrt(beside * beside + across * across + upright * upright)
 
     def gap(self, centre: Vector, radius_m: float, flatness: float) -> Gap:
-        """Between it and an ellipsoid around a point, `flatness` times wider than high.
+        """The gap to an ellipsoid around a point, `flatness` times wider than high.
 
-        Heights stretched by that much, the ellipsoid is a sphere and the nearest surface is met straight on.
+        With heights stretched by that factor, the ellipsoid is a sphere.
         """
         x, y, z = self._own(centre)
         scale = self._scale
         point = np.array([x / scale, y / scale, z / scale * flatness])
         nearest, distance = self._stretched.nearest(point)
-        room = distance * scale - radius_m
-        if room > 0.0:
-            return Gap(self, room / flatness)
+        margin = distance * scale - radius_m
+        if margin > 0.0:
+            return Gap(self, margin / flatness)
         inside = self.box_m(centre) == 0.0 and self._stretched.contains(point)
         if inside:
             out, depth = nearest - point, distance * scale + radius_m
         else:
-            out, depth = point - nearest, -room
+            out, depth = point - nearest, -margin
         dx, dy, dz = (out / distance).tolist() if distance > 1e-9 else (0.0, 0.0, -1.0)
         north, east = self._ned(dx, dy)
         length = math.sqrt(dx * dx + dy * dy + dz * dz * flatness * flatness)
@@ -159,16 +159,16 @@ class Obstacle:
         return Gap(self, -depth / flatness, normal, (north * depth, east * depth, dz * depth / flatness))
 
     def along(self, origin: Vector, direction: Vector) -> float:
-        """Metres from a point along a unit vector to it, inf if it is not in that way."""
+        """Metres from a point along a unit vector to it, inf without a hit."""
         start = self._own(origin)
         north, east = direction[0], direction[1]
-        way = (
+        direction = (
             self._cosine * north + self._sine * east,
             self._cosine * east - self._sine * north,
             direction[2],
         )
         enters, leaves = 0.0, math.inf
-        for begin, step, low, high in zip(start, way, self._low, self._high, strict=True):
+        for begin, step, low, high in zip(start, direction, self._low, self._high, strict=True):
             if abs(step) < 1e-12:
                 if not low <= begin <= high:
                     return math.inf
@@ -177,10 +177,10 @@ class Obstacle:
             enters, leaves = max(enters, min(one, other)), min(leaves, max(one, other))
         if enters > leaves:
             return math.inf
-        return self._mesh.along(np.array(start) / self._scale, np.array(way)) * self._scale
+        return self._mesh.along(np.array(start) / self._scale, np.array(direction)) * self._scale
 
     def outline(self, origin: Vector) -> NDArray[np.float64]:
-        """(S, 2, 2) segments in which the level of a point cuts it, (north, east) metres from the point."""
+        """(S, 2, 2) segments of its section at a point's height, (north, east) metres from the point."""
         z = (origin[2] - self._position[2]) / self._scale
         own = self._mesh.cut(z) * self._scale
         turn = np.array([[self._cosine, self._sine], [-self._sine, self._cosine]])
@@ -190,33 +190,33 @@ class Obstacle:
 
 
 class Obstacles:
-    """All that is in the way.
+    """All obstacles of a world.
 
     Args:
-        things: the world's objects at time 0. What is flat on the ground is left out.
-        ways: what leads them, by the object's identifier.
-        radius_m, half_height_m: of the ellipsoid that stands for a body in `nearest`.
+        objects: the world's objects at time 0. Those flat on the ground are left out.
+        motions: those of moving objects, by identifier.
+        radius_m, half_height_m: of the ellipsoid of a body in `nearest`.
 
     Attributes:
-        top_speed_mps: nothing moves faster.
+        top_speed_mps: of the fastest obstacle.
     """
 
     def __init__(
         self,
-        things: Iterable[WorldObject],
-        ways: Mapping[int, Way],
+        objects: Iterable[WorldObject],
+        motions: Mapping[int, ObstacleMotion],
         radius_m: float,
         half_height_m: float,
     ) -> None:
         self.radius_m = radius_m
         self._flatness = radius_m / half_height_m
         self._all = [
-            Obstacle(thing, ways.get(thing.identifier), self._flatness)
-            for thing in things
-            if thing.height_m - thing.position_ned_m[2] > FLAT_M
+            Obstacle(scene_object, motions.get(scene_object.identifier), self._flatness)
+            for scene_object in objects
+            if scene_object.height_m - scene_object.position_ned_m[2] > FLAT_M
         ]
         self._moving = [one for one in self._all if one.moves]
-        speeds = (ways[one.identifier].speed_mps for one in self._moving)
+        speeds = (motions[one.identifier].speed_mps for one in self._moving)
         self.top_speed_mps = max(speeds, default=0.0)
 
     def _placed(self, time_s: float) -> list[Obstacle]:
@@ -225,7 +225,7 @@ class Obstacles:
         return self._all
 
     def nearest(self, centre: Vector, time_s: float, besides: Collection[Obstacle] = ()) -> Gap:
-        """What the body around a point comes nearest to, `besides` some that are known."""
+        """The smallest gap of the body around a point, except to the obstacles in `besides`."""
         found = Gap(None)
         for one in self._placed(time_s):
             if one in besides:
@@ -245,10 +245,10 @@ class Obstacles:
         return found
 
     def gap_to(self, one: Obstacle, centre: Vector) -> Gap:
-        """The gap between one obstacle, where it is now, and the body around a point."""
+        """The gap between one obstacle, at its current pose, and the body around a point."""
         box_m = one.box_m(centre) - self.radius_m
         if box_m > _NEAR_M:
-            return Gap(one, _NEAR_M)  # no more: at the next corner of its way it may turn
+            return Gap(one, _NEAR_M)  # not more: at the next corner of its path it may turn
         return one.gap(centre, self.radius_m, self._flatness)
 
     def range_along(self, origin: Vector, direction: Vector, time_s: float) -> float:
@@ -263,10 +263,11 @@ class Obstacles:
         time_s: float,
         beside: Sequence[Segment] = (),
     ) -> list[float]:
-        """Metres to the nearest thing at a point's height, in each of `sectors.SECTORS`; inf: out of range.
+        """Metres to the nearest obstacle at a point's height, in each of `sectors.SECTORS`; inf: out of
+        range.
 
-        The first sector lies around `yaw_rad`, the others follow clockwise. `beside`: what else is in the way
-        at that height, from the point.
+        The first sector is centred on `yaw_rad`, the others follow clockwise. `beside`: further segments at
+        that height, from the point.
         """
         cuts = [one.outline(origin) for one in self._placed(time_s) if one.far_m(origin) <= range_m]
         if beside:

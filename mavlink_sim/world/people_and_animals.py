@@ -14,14 +14,14 @@ def _between(rng: np.random.Generator, low: float, high: float) -> float:
 
 
 def _swing(pivot: Points, length: float, forward_rad: float, outward: float = 0.0) -> Points:
-    """The end of a limb that hangs from a pivot, swung forward and held `outward` metres to the side."""
+    """The end of a limb at a pivot, swung forward and `outward` metres to the side."""
     drop = math.sqrt(max(length**2 - outward**2, 0.01))
     end: Points = pivot + np.array((drop * math.sin(forward_rad), outward, -drop * math.cos(forward_rad)))
     return end
 
 
 def person(rng: np.random.Generator) -> Body:
-    """A person standing, walking, waving or with spread arms, about 1.75 m tall, looking along +x."""
+    """A person standing, walking, waving or with spread arms, about 1.75 m tall, facing +x."""
     pose = ("stand", "walk", "walk", "wave", "spread", "run")[int(rng.integers(6))]
     tall = _between(rng, 1.58, 1.9)
     build = _between(rng, 0.88, 1.15)
@@ -84,7 +84,7 @@ def person(rng: np.random.Generator) -> Body:
 
 
 def dog(rng: np.random.Generator) -> Body:
-    """A dog standing or trotting, 0.7 to 1.1 m long, looking along +x."""
+    """A dog standing or trotting, 0.7 to 1.1 m long, facing +x."""
     size = _between(rng, 0.85, 1.2)
     stocky = _between(rng, 0.85, 1.2)
     back, length = 0.52 * size, 0.62 * size

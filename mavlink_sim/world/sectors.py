@@ -1,4 +1,4 @@
-"""The nearest of many level segments in each direction, exactly: no thin thing falls between two beams."""
+"""The exact range to horizontal segments in each sector: no thin object is missed between two beams."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ def nearest_in_sectors(segments: NDArray[np.float64]) -> NDArray[np.float64]:
     """(72,) metres to the nearest point of any segment within each sector of 5°, inf where there is none.
 
     Args:
-        segments: (S, 2, 2) ends of each, metres forward and to the right of who looks. Sector 0 is centred
-            on the way ahead, the others follow clockwise (seen from above).
+        segments: (S, 2, 2) ends of each, metres forward and to the right of the sensor. Sector 0 is centred
+            ahead, the others follow clockwise (seen from above).
 
-    Within a sector a segment is nearest at its foot or an end, if they lie in it, or else on a border.
+    Within a sector the nearest point of a segment is its foot or an end, if in the sector, or on a border.
     """
     starts, ends = segments[:, 0], segments[:, 1]
-    ways = ends - starts
+    spans = ends - starts
     found = np.full(SECTORS, math.inf)
-    squares = np.maximum((ways * ways).sum(axis=1), 1e-18)
-    share = np.clip(-(starts * ways).sum(axis=1) / squares, 0.0, 1.0)
-    points = np.concatenate([starts, ends, starts + share[:, None] * ways])
+    squares = np.maximum((spans * spans).sum(axis=1), 1e-18)
+    share = np.clip(-(starts * spans).sum(axis=1) / squares, 0.0, 1.0)
+    points = np.concatenate([starts, ends, starts + share[:, None] * spans])
     bearings = np.arctan2(points[:, 1], points[:, 0])
     sectors = np.floor(bearings / SECTOR_RAD + 0.5).astype(np.intp) % SECTORS
     np.minimum.at(found, sectors, np.hypot(points[:, 0], points[:, 1]))
-    # where each border (rows) meets each segment (columns): border · distance = start + share · way
-    across = _BORDERS[:, :1] * ways[:, 1] - _BORDERS[:, 1:] * ways[:, 0]
+    # where each border (rows) meets each segment (columns): border · distance = start + share · span
+    across = _BORDERS[:, :1] * spans[:, 1] - _BORDERS[:, 1:] * spans[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
-        distance = (starts[:, 0] * ways[:, 1] - starts[:, 1] * ways[:, 0]) / across
+        distance = (starts[:, 0] * spans[:, 1] - starts[:, 1] * spans[:, 0]) / across
         share = (starts[:, 0] * _BORDERS[:, 1:] - starts[:, 1] * _BORDERS[:, :1]) / across
         met = (distance > 0.0) & (share >= 0.0) & (share <= 1.0)
     borders = np.where(met, distance, math.inf).min(axis=1, initial=math.inf)

@@ -1,8 +1,8 @@
-"""What an object of a class looks like: its faces in painting order, its colours, its outline on the ground.
+"""The appearance of an object's class: faces in painting order, colours, outline on the ground.
 
-Shapes are in the object's own frame, FRD-like: x forward, y right, z down, the ground at z = 0. A class has a
-number of variants (size, build, pose); the colours of an object are drawn from its appearance seed apart from
-that, so that two cars of one variant need not look alike.
+Shapes are in the object's frame, FRD-like: x forward, y right, z down, the ground at z = 0. A class has
+several variants (size, build, pose); the colours of an object are drawn separately from its appearance seed,
+so that two cars of one variant may differ.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from mavlink_sim.world.solids import Body, Points, Triple, ground_shadows
 from mavlink_sim.world.structures import DEFAULT_SIZES_M, SIZED_BUILDERS, check_size
 
 CLASS_NAMES = ("person", "bicycle", "car", "truck", "boat", "dog", "chair")
-"""COCO's names of what the detector is to find."""
+"""COCO's names of the detector's classes."""
 
 BUILDERS: dict[str, Callable[[np.random.Generator], Body]] = {
     "person": people_and_animals.person,
@@ -49,27 +49,27 @@ VARIANTS = {"person": 40, "car": 24, "truck": 16, "boat": 16, "bicycle": 12, "do
 DEFAULT_VARIANTS = 6
 
 GLOSS = {"glass": 0.75, "paint": 0.3, "roof": 0.3, "hub": 0.4, "trim": 0.4, "headlight": 0.6, "panel": 0.7}
-"""How much of the sky a slot's surface mirrors at a grazing look; the rest is matt."""
+"""Reflection of the sky by a slot's surface at grazing angles; the rest is matt."""
 
 _UPWARDS = np.array([1.0, 1.0, -1.0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shape:
-    """One variant of a class, ready to be drawn.
+    """One variant of a class, prepared for drawing.
 
     Attributes:
         tree: painting order of the solids; eye and planes in the shape's frame.
         faces_of: for each solid its faces' numbers, decals last.
-        corners: (P, 3) float64, all faces' corners one after another.
-        first: (F + 1,) where each face's corners begin.
+        corners: (P, 3) float64, the corners of all faces.
+        first: (F + 1,) start of each face's corners.
         normals, offsets: (F, 3), (F,) planes of the faces, outwards.
         slots: names of the palette's colours.
         slot_of: (F,) index into `slots`.
         shade: (F,) brightness of each face.
         gloss: (F,) 0..1.
-        solids: (S, 3) corners of the convex solids, one solid after another.
-        solid_first: where each solid's corners begin, and where the last one's end.
+        solids: (S, 3) corners of all convex solids.
+        solid_first: start of each solid's corners, and end of the last one's.
         low, high: (3,) the bounding box.
     """
 
@@ -93,11 +93,12 @@ class Shape:
         return ground_shadows(self.solids * _UPWARDS, self.solid_first, sun * _UPWARDS)
 
     def leaning_shadow(self, sun: Points, turn: Points) -> tuple[list[NDArray[np.float32]], float]:
-        """The same of a shape that leans, its lowest point on the ground, and how far that lies below z = 0.
+        """The same of a shape that leans, with its lowest point on the ground, and the depth of that below z
+        = 0.
 
         Args:
             sun: (3,) towards the sun, in the frame of the outlines.
-            turn: (3, 3) from the shape's frame to that of the outlines.
+            turn: (3, 3) from the shape's frame to the outlines' frame.
         """
         corners = self.solids @ turn.T
         lowest = float(corners[:, 2].max())
@@ -106,15 +107,15 @@ class Shape:
 
 
 def variant_of(class_name: str, appearance: int) -> int:
-    """Which of its class's variants an object with this appearance seed is."""
+    """The variant of an object with this appearance seed."""
     return int(appearance) % VARIANTS.get(class_name, DEFAULT_VARIANTS)
 
 
 @lru_cache(maxsize=512)
 def shape_of(class_name: str, variant: int, size_m: Triple | None = None) -> Shape:
-    """The shape of a class's variant; `size_m` (length, width, height) is for those of `structures` alone.
+    """The shape of a class's variant; `size_m` (length, width, height) is only for those of `structures`.
 
-    Raises ValueError for a class that cannot be drawn, and for a size that it cannot have.
+    Raises ValueError for an unknown class and for an invalid size.
     """
     rng = np.random.default_rng((variant, *class_name.encode()))
     if class_name in SIZED_BUILDERS:
@@ -133,7 +134,7 @@ def shape_of(class_name: str, variant: int, size_m: Triple | None = None) -> Sha
         body = BUILDERS[class_name](rng)
     for solid in body.solids:
         for face in (*solid.faces, *solid.decals):
-            # Mirroring z turns the winding round.
+            # Mirroring z reverses the winding.
             face.points = (face.points * (1.0, 1.0, -1.0))[::-1]
     solids = [solid.corners for solid in body.solids]
     faces = [face for solid in body.solids for face in (*solid.faces, *solid.decals)]

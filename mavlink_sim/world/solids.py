@@ -1,7 +1,7 @@
-"""Convex solids from which objects are put together.
+"""Convex solids, the building blocks of objects.
 
-An object's own frame: x forward, y right, z up, metres, the ground at z = 0. A solid is a list of faces;
-a face is a convex polygon (K, 3). Faces are turned to look outwards from their solid's middle.
+An object's frame: x forward, y right, z up, metres, the ground at z = 0. A solid is a list of faces; a face
+is a convex polygon (K, 3). Faces are oriented outwards from their solid's centre.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ Triple = tuple[float, float, float]
 
 @dataclass(slots=True, eq=False)
 class Face:
-    """One convex polygon and what it is painted with.
+    """One convex polygon and its colour.
 
     Attributes:
-        points: (K, 3) corners; seen from outside in the order that makes `normal` point at the viewer.
+        points: (K, 3) corners, in the order for which `normal` points outwards.
         slot: name of the colour in the object's palette.
         shade: multiplies that colour's brightness.
     """
@@ -51,7 +51,7 @@ class Face:
 
 @dataclass(slots=True, eq=False)
 class Solid:
-    """A convex solid, or a flat sheet: its faces, and the decals lying on them."""
+    """A convex solid, or a flat sheet: its faces and their decals."""
 
     faces: list[Face]
     decals: list[Face] = field(default_factory=list)
@@ -63,7 +63,7 @@ class Solid:
 
 
 class _Surface:
-    """All faces of some solids in arrays: their planes, (F, 3) and (F,), whose they are, what solids span."""
+    """All faces of solids in arrays: planes, (F, 3) and (F,), the solid of each, the extent of the solids."""
 
     def __init__(self, solids: list[Solid]) -> None:
         planes = [[face.plane() for face in solid.faces] for solid in solids]
@@ -84,7 +84,7 @@ class Body:
     def add_solid(
         self, polygons: Sequence[Points], slots: str | Sequence[str], shades: Points | None = None
     ) -> None:
-        """Add a closed convex solid; its faces are turned outwards."""
+        """Add a closed convex solid; its faces are oriented outwards."""
         middle = np.vstack(polygons).mean(axis=0)
         faces = []
         for index, polygon in enumerate(polygons):
@@ -98,9 +98,9 @@ class Body:
         self.solids.append(Solid(faces))
 
     def add_decal(self, polygon: Points, slot: str, outwards: Points | Triple) -> None:
-        """Add one face lying on a solid's face, seen from the side `outwards` points to.
+        """Add one face on a solid's face, visible from the side that `outwards` points to.
 
-        It is given to the solid whose surface it lies nearest to, and painted after that solid's faces.
+        It belongs to the solid with the nearest surface, and is painted after that solid's faces.
         """
         direction = np.asarray(outwards, np.float64)
         decal = Face(np.asarray(polygon, np.float64), slot)
@@ -117,20 +117,20 @@ class Body:
         self.solids[surface.solid[nearest]].decals.append(decal)
 
     def _seen_surface(self) -> _Surface:
-        """That of all solids so far."""
+        """The bounds of all solids so far."""
         if self._surface is None or len(self._surface.low) < len(self.solids):
             self._surface = _Surface(self.solids)
         return self._surface
 
     def add_sheet(self, polygon: Points, slot: str, back_slot: str | None = None) -> None:
-        """Add a thin sheet seen from both sides."""
+        """Add a thin sheet, visible from both sides."""
         points = np.asarray(polygon, np.float64)
         self.solids.append(Solid([Face(points, slot), Face(points[::-1], back_slot or slot)]))
 
     def box(
         self, centre: Triple, size: Triple, slot: str, yaw_rad: float = 0.0, top_slot: str | None = None
     ) -> None:
-        """A box by its middle and its full sizes along x, y, z, turned about the vertical."""
+        """A box by its centre and its sizes along x, y, z, rotated about the vertical."""
         self.loft(
             rectangle(size[0], size[1]),
             rectangle(size[0], size[1]),
@@ -153,9 +153,9 @@ class Body:
         yaw_rad: float = 0.0,
         top_slot: str | None = None,
     ) -> list[Points]:
-        """Between two horizontal polygons (K, 2) with as many corners. Returns the K side polygons.
+        """A solid between two horizontal polygons (K, 2) of K corners each. Returns the K side polygons.
 
-        Sides of four corners must be flat or nearly so; slightly bent ones are split in two.
+        Sides of four corners must be nearly flat; slightly bent ones are split in two.
         """
         c, s = math.cos(yaw_rad), math.sin(yaw_rad)
         turn = np.array([[c, s], [-s, c]])
@@ -180,7 +180,7 @@ class Body:
         slots: Sequence[str] | None = None,
         top_half_width: float | None = None,
     ) -> None:
-        """A convex profile (K, 2) in x, z drawn along y; narrower towards its top if wanted.
+        """A convex profile (K, 2) in x, z extruded along y; optionally narrower towards its top.
 
         Args:
             slots: one per profile edge (edge i runs from corner i to corner i + 1).
@@ -211,7 +211,7 @@ class Body:
         cap_slot: str | None = None,
         squash: float = 1.0,
     ) -> None:
-        """A straight n-sided tube (or cone) between two points; `squash` flattens it across."""
+        """A straight n-sided tube (or cone) between two points; `squash` flattens its section."""
         first, last = np.asarray(start, np.float64), np.asarray(end, np.float64)
         axis = last - first
         axis = axis / max(float(np.linalg.norm(axis)), 1e-9)
@@ -271,7 +271,7 @@ class Body:
 
 
 def flat_pieces(side: Points) -> list[Points]:
-    """A polygon of four corners as it is if flat, or as two triangles."""
+    """A polygon of four corners unchanged if flat, else as two triangles."""
     normal = np.cross(side[1] - side[0], side[2] - side[0])
     length = float(np.linalg.norm(normal))
     if length < 1e-12 or abs(float(normal @ (side[3] - side[0]))) / length < 1e-3:
@@ -311,8 +311,8 @@ def ground_shadows(corners: Points, first: Sequence[int], sun: Points) -> list[N
     """(K, 2) convex outlines on the ground (x, y) of solids' shadows.
 
     Args:
-        corners: (N, 3) of one solid after another, in a frame with z up and the ground at z = 0.
-        first: where each solid's corners begin, and where the last one's end.
+        corners: (N, 3) of all solids, in a frame with z up and the ground at z = 0.
+        first: start of each solid's corners, and end of the last one's.
         sun: (3,) direction towards the sun in the same frame, above the horizon.
     """
     reach = np.maximum(corners[:, 2], 0.0) / max(float(sun[2]), 0.05)

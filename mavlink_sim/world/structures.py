@@ -1,7 +1,7 @@
-"""The solids of a given size that a scene file can add: walls, boxes, buildings, trees, plates, other drones.
+"""Solids with a size for scene files: walls, boxes, buildings, trees, plates, other drones.
 
-Frame and units as in `solids`. These names are apart from `shapes.BUILDERS`, from which training scenes draw
-at random: a name more there would change every picture that follows.
+Frame and units as in `solids`. These names are separate from `shapes.BUILDERS`, from which training scenes
+draw at random: an additional name there would change every following image.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ PLATE_THICKNESS_M = 0.004
 
 
 def wall(rng: np.random.Generator, size_m: Triple) -> Body:
-    """A wall of (length, thickness, height), its face across x, with a coping on top if it is high enough."""
+    """A wall of (length, thickness, height), its face across x, with a coping if it is high enough."""
     length, thickness, height = size_m
     body = Body()
     coping = 0.08 if height > 0.6 else 0.0
@@ -80,7 +80,7 @@ def autumn_tree(rng: np.random.Generator, size_m: Triple) -> Body:
 
 
 def plate(rng: np.random.Generator, size_m: Triple) -> Body:
-    """A thin board; what is printed on it is painted by `plates`."""
+    """A thin board; `fiducials` paints its print."""
     body = Body()
     body.box((0, 0, size_m[2] / 2), size_m, "board")
     return body
@@ -132,7 +132,7 @@ STRUCTURE_NAMES = tuple(SIZED_BUILDERS)
 
 
 def check_size(class_name: str, size_m: Triple) -> None:
-    """Raise ValueError unless a size is three lengths that can be drawn."""
+    """Raise ValueError unless a size is three valid lengths."""
     if len(size_m) != 3 or not all(math.isfinite(side) and 0.001 <= side <= 500.0 for side in size_m):
         raise ValueError(
             f"a {class_name}'s size must be three lengths of 0.001 to 500 m, got {tuple(size_m)}"

@@ -1,6 +1,6 @@
-"""Procedural ground textures, tileable, with their mip levels side by side in one image.
+"""Procedural ground textures, tileable, with their mip levels in one image.
 
-Everything is made from periodic value noise, so that a texture repeats without a seam in both directions.
+Everything is periodic value noise, so that a texture repeats without a seam in both directions.
 """
 
 from __future__ import annotations
@@ -18,20 +18,21 @@ Plane = NDArray[np.float32]
 Colour = tuple[float, float, float]
 
 GUTTER = 2
-"""Texels repeated around every mip level, so that interpolation at its edge sees the opposite edge."""
+"""Texels repeated around every mip level, so that interpolation at its edge uses the opposite edge."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MipAtlas:
     """A square tile and its mip levels in one image.
 
-    Level k, `side = size / 2**k` texels wide, begins at x = 2 * side and y = GUTTER: where a multiple of its
-    side says, and 2 is the least that leaves room for gutters between the levels, down to 4 texels. The room
-    to their left is never touched, so it takes no memory.
+    Level k, `side = size / 2**k` texels wide, begins at x = 2 * side and y = GUTTER: 2 is the least factor
+    with space for gutters between the levels, down to 4 texels. The space to their left is never written, so
+    it takes no memory.
 
     Attributes:
-        pixels: (size + 2 GUTTER, 3 size + GUTTER, 4) uint8, BGR and a channel of no meaning: OpenCV 5.0 looks
-            four channels up almost three times as fast as three.
+        pixels: (size + 2 GUTTER, 3 size + GUTTER, 4) uint8, BGR and an unused channel: OpenCV 5.0 samples
+        four
+            channels almost three times as fast as three.
         size: texels along a side of level 0.
         levels: number of levels.
     """
@@ -74,7 +75,7 @@ def fractal_noise(
 ) -> Plane:
     """(size, size) float32 periodic noise of several octaves, scaled to a standard deviation of 1."""
     total = np.zeros((size, size), np.float32)
-    # Wide bumps are smooth: at a quarter of the size they cost a sixteenth and look the same.
+    # Wide bumps are smooth: a quarter of the size takes a sixteenth of the time and looks the same.
     coarse_size = size // 4
     coarse: Plane | None = None
     amplitude = 1.0
@@ -304,7 +305,7 @@ def blend_by_mask(base: Plane, over: Plane, weight: Plane) -> Plane:
 
 @lru_cache(maxsize=64)
 def mixed_tile(kinds: tuple[str, ...], seed: int, size: int) -> MipAtlas:
-    """A tile of one kind of ground, with blots of the other kinds given, ready to be drawn."""
+    """A tile of one kind of ground with spots of the other given kinds, with its mip levels."""
     rng = np.random.default_rng((seed, 77))
     colours = paint(kinds[0], seed, size)
     for kind in kinds[1:]:
@@ -321,7 +322,7 @@ def cloud_tile(seed: int, size: int = 256) -> Plane:
 
 @lru_cache(maxsize=1)
 def detail_tile(size: int = 512) -> Image:
-    """(size, size) uint8 brightness detail around 128, one texel a centimetre, for ground seen close."""
+    """(size, size) uint8 brightness detail around 128, one texel per centimetre, for close ground."""
     rng = np.random.default_rng(4711)
     level = 128 + 12 * fractal_noise(rng, size, 16, 5, 0.9) + 6 * grain(rng, size)
     return to_image(level.astype(np.float32))

@@ -1,4 +1,4 @@
-"""Lines of truth on a file; a disk that takes no more ends the file, not the flight."""
+"""The truth file; a write error ends the file, not the simulation."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 class TruthFile:
-    """Each line is on its way to the disk when `write` returns.
+    """A file of lines; each is flushed when `write` returns.
 
     Raises:
         OSError: it cannot be opened.
@@ -23,7 +23,7 @@ class TruthFile:
         self._file: IO[str] | None = path.open("w", encoding="utf-8")
 
     def write(self, line: str) -> str | None:
-        """Write one line. Returns why nothing more is written, once, if this was the last attempt."""
+        """Write one line. Returns the error message, once, if writing has ended."""
         if self._file is None:
             return None
         try:
@@ -38,20 +38,20 @@ class TruthFile:
         """May be called more than once."""
         file, self._file = self._file, None
         if file is not None:
-            with suppress(OSError):  # what is left in its buffer has nowhere to go
+            with suppress(OSError):  # the rest of its buffer is lost
                 file.close()
 
 
-def object_truth(thing: WorldObject, position_ned_m: Sequence[float]) -> dict[str, Any]:
-    """An object as the truth tells it, with its horizontal range from a vehicle at (3,) NED metres."""
+def object_truth(scene_object: WorldObject, position_ned_m: Sequence[float]) -> dict[str, Any]:
+    """The truth entry of an object, with its horizontal range from a vehicle at (3,) NED metres."""
     from mavlink_sim.world.world import range_to
 
     entry: dict[str, Any] = {
-        "identifier": thing.identifier,
-        "class_name": thing.class_name,
-        "position_ned_m": [round(float(value), 3) for value in thing.position_ned_m],
-        "range_m": round(float(range_to(thing, position_ned_m)), 3),
+        "identifier": scene_object.identifier,
+        "class_name": scene_object.class_name,
+        "position_ned_m": [round(float(value), 3) for value in scene_object.position_ned_m],
+        "range_m": round(float(range_to(scene_object, position_ned_m)), 3),
     }
-    if thing.system_id is not None:
-        entry["system_id"] = thing.system_id
+    if scene_object.system_id is not None:
+        entry["system_id"] = scene_object.system_id
     return entry

@@ -1,4 +1,4 @@
-"""The solids of things that drive or float: car, truck, bicycle, boat. Frame and units as in `solids`."""
+"""The solids of vehicles: car, truck, bicycle, boat. Frame and units as in `solids`."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ def _between(rng: np.random.Generator, low: float, high: float) -> float:
 def wheel(body: Body, x: float, y: float, radius: float, clear: float, sides: int = 12) -> None:
     """A wheel on the ground.
 
-    Its outer disc stands just outside the vehicle's side at y, and under the vehicle (below `clear`) is the
-    rest of the tyre, so that nothing runs into the vehicle's body.
+    Its outer disc is just outside the vehicle's side at y, and the rest of the tyre is under the vehicle
+    (below `clear`), so that it does not intersect the body.
     """
     side = math.copysign(1.0, y)
     body.tube((x, y, radius), (x, y + side * 0.035, radius), radius, "tyre", sides)
@@ -28,7 +28,7 @@ def wheel(body: Body, x: float, y: float, radius: float, clear: float, sides: in
 
 
 def car(rng: np.random.Generator) -> Body:
-    """A saloon, hatchback, estate or off-roader, about 4.3 × 1.8 × 1.5 m, looking along +x."""
+    """A saloon, hatchback, estate or off-roader, about 4.3 × 1.8 × 1.5 m, facing +x."""
     style = ("saloon", "hatchback", "estate", "tall")[int(rng.integers(4))]
     tall = style == "tall"
     length = _between(rng, 4.15, 4.75) if style != "hatchback" else _between(rng, 3.7, 4.2)
@@ -118,7 +118,7 @@ def car(rng: np.random.Generator) -> Body:
 
 
 def truck(rng: np.random.Generator) -> Body:
-    """A lorry with a box, a tarpaulin, a tank or a flat bed, about 7 × 2.4 × 3 m, looking along +x."""
+    """A lorry with a box, a tarpaulin, a tank or a flat bed, about 7 × 2.4 × 3 m, facing +x."""
     style = ("box", "box", "tarpaulin", "tank", "flat")[int(rng.integers(5))]
     length, width = _between(rng, 6.4, 7.8), _between(rng, 2.25, 2.5)
     height = _between(rng, 2.9, 3.4)
@@ -215,7 +215,7 @@ def truck(rng: np.random.Generator) -> Body:
 
 
 def bicycle(rng: np.random.Generator) -> Body:
-    """A bicycle standing upright, about 1.75 m long, looking along +x."""
+    """An upright bicycle, about 1.75 m long, facing +x."""
     body = Body()
     radius = _between(rng, 0.32, 0.35)
     base = _between(rng, 1.0, 1.1)

@@ -1,7 +1,6 @@
-"""What stands where: objects on level ground, the light on them, the air between. All positions NED, metres.
+"""A world: objects on level ground, light, atmosphere. All positions NED, metres.
 
-A world is small plain data, so that it can cross to the camera's process; pictures are made of it in
-`renderer`.
+A world is small plain data, so that it can be sent to the camera's process; `renderer` draws it.
 """
 
 from __future__ import annotations
@@ -34,20 +33,20 @@ def _footprint(
 
 @dataclass(frozen=True, slots=True)
 class WorldObject:
-    """One thing standing on the ground, or above it.
+    """One object on or above the ground.
 
     Attributes:
         identifier: unique in its world, from 0.
         class_name: a COCO name (`shapes.CLASS_NAMES`), a kind of clutter (`shapes.CLUTTER_NAMES`), or one of
             `structures.STRUCTURE_NAMES`.
-        position_ned_m: the middle of its footprint; z = 0 is the ground, negative is above it.
-        yaw_rad: where its front points, from north over east.
+        position_ned_m: the centre of its footprint; z = 0 is the ground, negative is above it.
+        yaw_rad: direction of its front, from north over east.
         scale: multiplies its natural size.
         appearance: seed of its variant (size, pose) and colours.
         size_m: length, width and height of one of `structures.STRUCTURE_NAMES`; None for its usual size.
-        printed: what a plate shows.
-        roll_rad, pitch_rad: how it leans, about the middle of its height; the footprint does not change.
-        system_id: of a vehicle that flies in this world; None for everything else.
+        printed: the print of a plate.
+        roll_rad, pitch_rad: its lean, about the centre of its height; the footprint does not change.
+        system_id: of a simulated vehicle in this world; None for every other object.
     """
 
     identifier: int
@@ -71,7 +70,7 @@ class WorldObject:
         if not self.scale > 0.0:
             raise ValueError(f"object {self.identifier}: scale must be positive, got {self.scale}")
         if (self.class_name == "plate") != (self.printed is not None):
-            raise ValueError(f"object {self.identifier}: a plate, and nothing else, has a print")
+            raise ValueError(f"object {self.identifier}: a plate must have a print, other classes must not")
         if self.size_m is not None:
             if self.class_name not in STRUCTURE_NAMES or self.printed is not None:
                 raise ValueError(
@@ -81,31 +80,31 @@ class WorldObject:
 
     @property
     def shape(self) -> Shape:
-        """What it looks like, in its own frame and before `scale`."""
+        """Its shape, in its frame and before `scale`."""
         size_m = self.size_m if self.printed is None else self.printed.board_size_m
         return shape_of(self.class_name, variant_of(self.class_name, self.appearance), size_m)
 
     @property
     def footprint_m(self) -> tuple[float, float, float, float]:
-        """(rear, front, left, right) edges of its footprint in its own frame, x forward, y right."""
+        """(rear, front, left, right) edges of its footprint in its frame, x forward, y right."""
         size_m = self.size_m if self.printed is None else self.printed.board_size_m
         return _footprint(self.class_name, variant_of(self.class_name, self.appearance), size_m, self.scale)
 
     @property
     def leans(self) -> bool:
-        """Whether it does not stand level."""
+        """Whether it is not level."""
         return self.roll_rad != 0.0 or self.pitch_rad != 0.0
 
     @property
     def height_m(self) -> float:
-        """How far it reaches above the ground."""
+        """Its height above the ground."""
         shape = self.shape
         return float(-shape.low[2]) * self.scale
 
 
 @dataclass(frozen=True, slots=True)
 class Patch:
-    """A round spot of another ground with an uneven rim."""
+    """A round spot of another ground with an uneven border."""
 
     kind: str
     north_m: float
@@ -115,15 +114,15 @@ class Patch:
 
 @dataclass(frozen=True, slots=True)
 class Ground:
-    """Level ground at z = 0, painted by a tile that repeats for ever.
+    """Level ground at z = 0, textured by a repeated tile.
 
     Attributes:
-        kinds: the tile's ground, and what is blotted on it (`textures.KINDS`).
+        kinds: the tile's ground, and its spots (`textures.KINDS`).
         seed: of the tile.
         tile_texels: side of the tile, a power of two.
         texel_m: size of a texel on the ground.
-        yaw_rad, origin_m: how the tile is turned, and the (north, east) of its corner.
-        patches: spots of other ground; only for a tile not turned.
+        yaw_rad, origin_m: the tile's rotation, and the (north, east) of its corner.
+        patches: spots of other ground; only for a tile without rotation.
         road_east_m: east of a road that runs north, winding; None for no road.
         pad: paint a landing pad with an H at the origin.
         gain: brightness of blue, green, red.
@@ -146,9 +145,9 @@ class Light:
     """The sun and the sky's light.
 
     Attributes:
-        sun_azimuth_rad, sun_elevation_rad: where the sun stands, azimuth from north over east.
+        sun_azimuth_rad, sun_elevation_rad: the sun's direction, azimuth from north over east.
         sun: strength of direct light on surfaces that face it.
-        ambient: strength of the sky's light on surfaces that look up.
+        ambient: strength of the sky's light on surfaces that face up.
         tint: colour of the direct light: blue, green, red.
         shadow: 0..1, how much darker the ground is in a shadow.
     """
@@ -173,10 +172,10 @@ class Light:
 
 @dataclass(frozen=True, slots=True)
 class Sky:
-    """The air and what is above. Colours are BGR, 0..255.
+    """Haze and sky. Colours are BGR, 0..255.
 
     Attributes:
-        visibility_m: distance at which two thirds of a thing's colour are lost in haze.
+        visibility_m: distance at which two thirds of an object's colour are lost in haze.
         horizon, zenith: the sky's colours.
         clouds: cloud cover, 0 none to 1 overcast.
         seed: of the clouds.
@@ -191,7 +190,7 @@ class Sky:
 
 @dataclass(frozen=True, slots=True)
 class World:
-    """Everything that a camera can see."""
+    """Everything visible to a camera."""
 
     objects: tuple[WorldObject, ...] = ()
     ground: Ground = field(default_factory=Ground)
@@ -228,23 +227,23 @@ def _clear_of(placed: list[WorldObject], north: float, east: float, radius_m: fl
 
 
 def _hides(cars: list[WorldObject], north: float, east: float, half_width_m: float) -> bool:
-    """Whether something here would stand between the origin and a car."""
+    """Whether an object here would be between the origin and a car."""
     bearing, distance = math.atan2(east, north), math.hypot(north, east)
     for item in cars:
         car_bearing = math.atan2(item.position_ned_m[1], item.position_ned_m[0])
         car_distance = math.hypot(*item.position_ned_m[:2])
         apart = abs(math.remainder(bearing - car_bearing, math.tau))
-        room = math.atan2(half_width_m + 1.0, distance) + math.atan2(3.0, car_distance)
-        if distance < car_distance + 3.0 and apart < room:
+        margin = math.atan2(half_width_m + 1.0, distance) + math.atan2(3.0, car_distance)
+        if distance < car_distance + 3.0 and apart < margin:
             return True
     return False
 
 
 def demo_world(seed: int = 0) -> World:
-    """A field with a road, a pond, a landing pad at the origin, and everything the detector knows.
+    """A field with a road, a pond, a landing pad at the origin, and objects of all the detector's classes.
 
-    One or two cars stand 18 to 35 m from the origin, at bearings drawn from the seed; nothing stands between
-    them and the origin, and nothing at all within 6 m of it.
+    One or two cars are 18 to 35 m from the origin, at bearings drawn from the seed, with no object between
+    them and the origin, and none within 6 m of it.
     """
     rng = np.random.default_rng((seed, 60))
     placed: list[WorldObject] = []
@@ -273,7 +272,7 @@ def demo_world(seed: int = 0) -> World:
             if ground is not None:
                 patches.append(Patch(ground, north, east, radius_m * 1.5 + 1.0))
             return
-        raise RuntimeError(f"demo_world({seed}): found no free place for a {class_name}")
+        raise RuntimeError(f"demo_world({seed}): found no free position for a {class_name}")
 
     for _ in range(1 + int(rng.integers(2))):
         put("car", 18.0, 35.0, 2.6, "gravel")

@@ -1,4 +1,4 @@
-"""A harness for the vehicle in lockstep: send it messages, let time pass, look at what it answered."""
+"""A harness for the vehicle in lockstep: send messages, advance time, read the answers."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from typing import Any, ClassVar
 
 import pytest
 
-from mavlink_sim.vehicle import STEP_S, Vehicle
+from mavlink_sim.vehicles.vehicle import STEP_S, Vehicle
 from mavlink_sim.wire.messages import dialect
 from mavlink_sim.wire.streams import GCS_RATES_HZ, ONBOARD_RATES_HZ
 
 NAN = math.nan
 COMPANION = (1, 191)
 GROUND_STATION = (245, 190)
-# Most of a flight in lockstep is to build these messages, up to a hundred of each a second. A test names
+# Building these messages, up to a hundred of each per second, is most of a flight in lockstep. A test names
 # those that it reads: `@pytest.mark.streams("ATTITUDE")`, `streams("everything")`.
 FAST_HZ = 5.0
 FAST_STREAMS = {
@@ -34,10 +34,10 @@ class SimHarness:
     """A vehicle with an onboard and a ground-station link, without sockets and without a clock.
 
     Args:
-        streams: which of the fast streams it does not switch off at once, or everything.
+        streams: the fast streams that are not switched off at the start, or everything.
     """
 
-    # Most tests begin in the air: what nobody has touched flies there once, and is copied from then on.
+    # Most tests begin in the air: a vehicle with default options flies there once and is copied afterwards.
     _in_the_air: ClassVar[dict[str, tuple[bytes, dict[str, list[tuple[float, Any]]]]]] = {}
 
     def __init__(self, streams: Collection[str] = (), **options: Any) -> None:
@@ -57,7 +57,7 @@ class SimHarness:
 
     @property
     def events(self) -> list[str]:
-        self._made()  # a list that somebody holds must be the one that fills
+        self._made()  # a list that a test keeps must be the one that is filled
         return self._events
 
     def _made(self) -> Vehicle:
@@ -78,7 +78,7 @@ class SimHarness:
         return self.vehicle.now_s
 
     def fly(self, seconds: float, setpoint: Any = None, rate_hz: float = 20.0) -> None:
-        """Let time pass, sending `setpoint` at a rate and the heartbeats that are switched on."""
+        """Advance time, sending `setpoint` at a rate and the enabled heartbeats."""
         self.until(lambda: False, seconds, setpoint, rate_hz, must=False)
 
     def until(
@@ -89,7 +89,7 @@ class SimHarness:
         rate_hz: float = 20.0,
         must: bool = True,
     ) -> float:
-        """Let time pass until `condition`; returns how long that took."""
+        """Advance time until `condition`; returns the duration."""
         vehicle = self.vehicle
         clock = vehicle.faults  # it goes on through a reboot
         started = clock.now_s
@@ -181,7 +181,7 @@ class SimHarness:
         return self.received("HEARTBEAT")[-1]
 
     def texts(self, link: str = "gcs") -> list[str]:
-        """STATUSTEXTs received, their chunks put together."""
+        """The received STATUSTEXTs, with their chunks joined."""
         whole: list[str] = []
         for message in self.received("STATUSTEXT", link):
             text = message.text.decode() if isinstance(message.text, bytes) else message.text
@@ -210,7 +210,7 @@ class SimHarness:
         self.until(lambda: self.vehicle.autopilot.can_arm, 10.0)
 
     def take_off(self, height_m: float | None = None) -> None:
-        """Arm, take off, wait for HOLD and a moment more."""
+        """Arm, take off, wait for HOLD and a short time more."""
         plain = all(isinstance(value, (str, int, float, tuple, dict)) for value in self._options.values())
         if self._vehicle is not None or self.heartbeats or not plain:
             self._fly_up(height_m)
@@ -221,7 +221,7 @@ class SimHarness:
             inbox = {link: list(messages) for link, messages in self._inbox.items()}
             self._in_the_air[key] = (pickle.dumps((self._vehicle, self._events)), inbox)
             gc.collect()
-            gc.freeze()  # thousands of messages that stay: not to be looked through at every collection
+            gc.freeze()  # thousands of permanent messages: excluded from garbage collection
         stored, inbox = self._in_the_air[key]
         self._vehicle, self._events = pickle.loads(stored)
         self._inbox = defaultdict(list, {link: list(messages) for link, messages in inbox.items()})
@@ -243,7 +243,7 @@ class SimHarness:
 
 
 def velocity(forward: float, right: float, down: float, yaw_rate: float = 0.0, frame: int = 8) -> Any:
-    """A velocity setpoint as the flight recorded from a real vehicle sent them (type mask 1479)."""
+    """A velocity setpoint as in the flight recorded from a real vehicle (type mask 1479)."""
     return dialect.MAVLink_set_position_target_local_ned_message(
         0, 1, 1, frame, 1479, 0, 0, 0, forward, right, down, 0, 0, 0, 0, yaw_rate
     )

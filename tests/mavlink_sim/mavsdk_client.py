@@ -1,9 +1,8 @@
-"""MAVSDK 4 as a client of a vehicle: connected, and taken apart in an order that it survives.
+"""MAVSDK 4 as a client of a vehicle: connected, and destroyed in an order without crashes.
 
-A plugin of MAVSDK destroys itself where its last reference goes, which may be a thread of the pool in which a
-call was made; while another thread destroys the library, that ends the process. And what C++ calls back is
-freed before the thread that calls has ended. So plugins, and what they are called back by, live until the
-library is gone.
+A plugin of MAVSDK is destroyed with its last reference, possibly on a thread of the pool in which a call was
+made; while another thread destroys the library, that ends the process. Callbacks are freed before the calling
+thread has ended. So plugins and callbacks are kept until the library is destroyed.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ class MavsdkClient:
         return made
 
     def trampolines(self) -> list[Any]:
-        """What C++ calls back, in all plugins: copies, as a plugin clears its own when it is destroyed."""
+        """The callbacks of all plugins: copies, as a plugin clears its own when it is destroyed."""
         inner = [plugin._plugin for plugin in self._plugins]
         return [
             [*getattr(one, "_callbacks", ()), *getattr(one, "_subscriptions", {}).values()] for one in inner
@@ -63,7 +62,7 @@ async def mavsdk_client(
 
 @asynccontextmanager
 async def meanwhile(work: Coroutine[Any, Any, None]) -> AsyncIterator[None]:
-    """Let this go on beside; at the end it is cancelled and over. Raises what it raised."""
+    """Run this in the background; it is cancelled at the end. Raises what it raised."""
     task = asyncio.create_task(work)
     try:
         yield

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from mavlink_sim.physics.geography import geographic
+from mavlink_sim.physics.geography import SIH_FRAME
 from mavlink_sim.wire.messages import dialect
 from tests.mavlink_sim.conftest import SimHarness
 
@@ -15,23 +15,23 @@ COMPANION = (1, 191)
 
 def item(
     command: int,
-    place: tuple[float, float, float] | None = None,
+    position: tuple[float, float, float] | None = None,
     *parameters: float,
     frame: int | None = None,
     autocontinue: int = 1,
     plan: int = 0,
 ) -> dict[str, Any]:
-    """An item. `place`: (north, east, height above home) metres; without it MAV_FRAME_MISSION.
+    """An item. `position`: (north, east, height above home) metres; without it MAV_FRAME_MISSION.
 
-    `parameters`: 1 to 4, then 5 to 7 for an item without a place.
+    `parameters`: 1 to 4, then 5 to 7 for an item without a position.
     """
     values = [*parameters, *([0.0] * 7)][:7]
     x, y, z = round(values[4]), round(values[5]), float(values[6])
-    if place is not None:
-        latitude, longitude, _ = geographic((place[0], place[1], 0.0))
-        x, y, z = round(latitude * 1e7), round(longitude * 1e7), place[2]
+    if position is not None:
+        latitude, longitude, _ = SIH_FRAME.geographic((position[0], position[1], 0.0))
+        x, y, z = round(latitude * 1e7), round(longitude * 1e7), position[2]
     if frame is None:
-        frame = 2 if place is None else 6
+        frame = 2 if position is None else 6
     return {
         "frame": frame,
         "command": command,
@@ -79,7 +79,7 @@ def message(sequence: int, fields: dict[str, Any], current: int = 0) -> Any:
 
 
 def newest(harness: SimHarness, kind: str, before: int) -> Any:
-    """The one message of a kind that came after the `before`th, waited for."""
+    """Wait for the message of a kind after the `before`th."""
     if len(harness.received(kind)) <= before:
         harness.until(lambda: len(harness.received(kind)) > before, 1.0)
     return harness.received(kind)[before]
@@ -119,9 +119,9 @@ def download(harness: SimHarness, plan: int = 0) -> list[Any]:
 def reached(harness: SimHarness) -> list[int]:
     """The items reached, in order, repetitions left out."""
     found: list[int] = []
-    for told in harness.received("MISSION_ITEM_REACHED"):
-        if found[-1:] != [told.seq]:
-            found.append(told.seq)
+    for received in harness.received("MISSION_ITEM_REACHED"):
+        if found[-1:] != [received.seq]:
+            found.append(received.seq)
     return found
 
 

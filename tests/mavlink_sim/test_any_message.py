@@ -1,4 +1,4 @@
-"""Whatever a client may send, the vehicle flies on and what it says can be put on the wire."""
+"""Any message of a client: the vehicle continues, and its messages can be packed."""
 
 import struct
 from typing import Any
@@ -15,7 +15,7 @@ OTHERS = {m.id: m for m in dialect.mavlink_map.values() if m.msgname not in HAND
 
 
 def packet(identifier: int, payload: bytes, source: tuple[int, int]) -> bytes:
-    """A MAVLink 2 frame with a payload of our choosing and a right checksum."""
+    """A MAVLink 2 frame with any payload and a valid checksum."""
     body = struct.pack("<BBBBBBHB", len(payload), 0, 0, 0, *source, identifier & 0xFFFF, identifier >> 16)
     body += payload
     crc = dialect.x25crc(body)
@@ -37,7 +37,7 @@ def packets(draw: st.DrawFn, kinds: dict[int, Any]) -> bytes:
 
 
 def _offsets(kind: Any) -> dict[str, int]:
-    """Where each field lies in the payload."""
+    """The position of each field in the payload."""
     found, offset = {}, 0
     for name, code, length in zip(
         kind.ordered_fieldnames, kind.native_format.decode()[1:], kind.lengths, strict=True

@@ -1,4 +1,4 @@
-"""A Copter's decisions: arming, GUIDED and what it is told, the ways down, the failsafes."""
+"""Copter: arming, GUIDED and its targets, landing, failsafes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ KEEP_HEADING = 0b010000000000  # clears the ignore bit of the yaw rate, which is
 
 @pytest.fixture
 def copter() -> LockstepVehicle:
-    """Ready to be armed, in STABILIZE, with a companion that is heard."""
+    """Ready to be armed, in STABILIZE, with a companion's heartbeat."""
     vehicle = LockstepVehicle(autopilot="ardupilot", seed=4, ready_after_s=0.0)
     vehicle.send(dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
     vehicle.step(0.1)
@@ -38,7 +38,7 @@ def texts(vehicle: LockstepVehicle) -> list[tuple[int, str]]:
 
 
 def target(mask: int, values: tuple[float, ...], frame: int = 1, yaw: float = 0.0, rate: float = 0.0) -> Any:
-    """SET_POSITION_TARGET_LOCAL_NED with its values put where the mask says that they count."""
+    """SET_POSITION_TARGET_LOCAL_NED with the values in the fields that the mask enables."""
     groups: list[tuple[float, ...]] = [(0.0,) * 3] * 3
     groups[(POSITION, VELOCITY, ACCELERATION).index(mask | 0b110000000000)] = values
     flat = [value for group in groups for value in group]
@@ -49,8 +49,8 @@ def guided(vehicle: LockstepVehicle, mask: int, *values: float, **options: Any) 
     vehicle.send(target(mask, values, **options))
 
 
-def away(vehicle: LockstepVehicle, place: tuple[float, float, float]) -> float:
-    return math.dist(vehicle.truth.position_ned_m, place)
+def away(vehicle: LockstepVehicle, position: tuple[float, float, float]) -> float:
+    return math.dist(vehicle.truth.position_ned_m, position)
 
 
 def test_it_boots_in_stabilize_and_can_be_armed_there(copter: LockstepVehicle) -> None:
@@ -61,9 +61,7 @@ def test_it_boots_in_stabilize_and_can_be_armed_there(copter: LockstepVehicle) -
 
 
 @pytest.mark.parametrize("mode", [6, 9, 17, 3])
-def test_modes_that_cannot_be_armed_in_are_taken_while_disarmed_and_refuse_arming(
-    copter: LockstepVehicle, mode: int
-) -> None:
+def test_unarmable_modes_accepted_while_disarmed_refuse_arming(copter: LockstepVehicle, mode: int) -> None:
     assert copter.command(SET_MODE, 1, mode) == "ACCEPTED"
     assert copter.command(ARM, 1) == "FAILED"
     name = {6: "RTL", 9: "LAND", 17: "BRAKE", 3: "AUTO"}[mode]
@@ -71,7 +69,7 @@ def test_modes_that_cannot_be_armed_in_are_taken_while_disarmed_and_refuse_armin
     assert copter.command(ARM, 1, 2989) == "ACCEPTED"  # the magic number arms anyhow
 
 
-def test_guided_needs_a_position_estimate_to_be_armed_and_stabilize_does_not() -> None:
+def test_arming_guided_needs_position_stabilize_does_not() -> None:
     vehicle = LockstepVehicle(autopilot="ardupilot", parameters={"ARMING_CHECK": 0})
     vehicle.send(dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
     vehicle.set_mode("GUIDED")
@@ -81,7 +79,7 @@ def test_guided_needs_a_position_estimate_to_be_armed_and_stabilize_does_not() -
     assert vehicle.command(ARM, 1) == "ACCEPTED"
 
 
-def test_a_take_off_needs_guided_and_arming_and_its_height_is_above_home(copter: LockstepVehicle) -> None:
+def test_takeoff_needs_guided_and_arming_height_above_home(copter: LockstepVehicle) -> None:
     copter.arm()
     assert copter.command(TAKEOFF, 0, 0, 0, 0, 0, 0, 5) == "FAILED"
     copter.command(ARM, 0)
@@ -99,7 +97,7 @@ def test_a_take_off_needs_guided_and_arming_and_its_height_is_above_home(copter:
     assert copter.truth.mode == "GUIDED"
 
 
-def test_setpoints_lift_no_vehicle_off_the_ground_and_it_disarms_after_disarm_delay(
+def test_setpoints_do_not_take_off_and_disarm_delay_disarms(
     copter: LockstepVehicle,
 ) -> None:
     copter.set_mode("GUIDED")
@@ -116,7 +114,7 @@ def test_setpoints_lift_no_vehicle_off_the_ground_and_it_disarms_after_disarm_de
     ("frame", "asked", "turns"), [(1, (8.0, 3.0, -6.0), 0), (7, (8.0, 3.0, 0.0), 0), (8, (3.0, -8.0, 0.0), 1),
                                   (9, (3.0, -8.0, 0.0), 1)],
 )  # fmt: skip
-def test_a_position_counts_from_origin_vehicle_or_heading(
+def test_position_relative_to_origin_vehicle_or_heading(
     flying: LockstepVehicle, frame: int, asked: tuple[float, float, float], turns: int
 ) -> None:
     if turns:  # the nose to the east
@@ -124,13 +122,13 @@ def test_a_position_counts_from_origin_vehicle_or_heading(
         flying.step(3.0)
         assert flying.truth.yaw_rad == pytest.approx(math.pi / 2, abs=0.1)
     north, east, down = flying.truth.position_ned_m
-    place = asked if frame == 1 else (north + 8.0, east + 3.0, down)
+    position = asked if frame == 1 else (north + 8.0, east + 3.0, down)
     guided(flying, POSITION, *asked, frame=frame)
     flying.step(15.0)
-    assert away(flying, place) < 1.0
+    assert away(flying, position) < 1.0
 
 
-def test_a_velocity_that_is_not_renewed_stops_after_guid_timeout_and_the_mode_stays(
+def test_stale_velocity_stops_after_guid_timeout_mode_stays(
     flying: LockstepVehicle,
 ) -> None:
     guided(flying, VELOCITY & ~2048, 2.0, 0.0, 0.0)
@@ -144,13 +142,13 @@ def test_a_velocity_that_is_not_renewed_stops_after_guid_timeout_and_the_mode_st
     assert flying.truth.armed
 
 
-def test_a_position_is_kept_however_old_it_is(flying: LockstepVehicle) -> None:
+def test_position_target_never_expires(flying: LockstepVehicle) -> None:
     guided(flying, POSITION, 30.0, 0.0, -6.0)
     flying.step(25.0)
     assert away(flying, (30.0, 0.0, -6.0)) < 1.0
 
 
-def test_without_any_yaw_the_nose_follows_the_flight_and_with_a_rate_of_zero_it_stays(
+def test_heading_follows_flight_and_holds_with_rate_0(
     flying: LockstepVehicle,
 ) -> None:
     sent = flying.repeat(target(VELOCITY & ~2048, (0.0, 3.0, 0.0)), 10.0)
@@ -171,7 +169,7 @@ def test_without_any_yaw_the_nose_follows_the_flight_and_with_a_rate_of_zero_it_
     ],
     ids=["frame", "no number", "too fast", "nothing given"],
 )
-def test_what_makes_no_sense_stops_the_vehicle(flying: LockstepVehicle, message: Any) -> None:
+def test_invalid_target_stops_vehicle(flying: LockstepVehicle, message: Any) -> None:
     sent = flying.repeat(target(VELOCITY, (3.0, 0.0, 0.0)), 10.0)
     flying.step(3.0)
     sent.stop()
@@ -180,7 +178,7 @@ def test_what_makes_no_sense_stops_the_vehicle(flying: LockstepVehicle, message:
     assert math.hypot(*flying.truth.velocity_ned_mps) < 0.8
 
 
-def test_an_acceleration_speeds_up_until_the_timeout(flying: LockstepVehicle) -> None:
+def test_acceleration_target_acts_until_timeout(flying: LockstepVehicle) -> None:
     guided(flying, ACCELERATION, 1.0, 0.0, 0.0)
     flying.step(2.5)
     assert flying.truth.velocity_ned_mps[0] == pytest.approx(2.0, abs=0.8)
@@ -188,7 +186,7 @@ def test_an_acceleration_speeds_up_until_the_timeout(flying: LockstepVehicle) ->
     assert math.hypot(*flying.truth.velocity_ned_mps) < 0.8
 
 
-def test_a_place_on_the_globe_above_home_is_flown_to(flying: LockstepVehicle) -> None:
+def test_global_relative_position_is_reached(flying: LockstepVehicle) -> None:
     scale = math.radians(1.0) * 6371000.0
     latitude = round((47.397743225 + 10.0 / scale) * 1e7)
     flying.send(
@@ -200,7 +198,7 @@ def test_a_place_on_the_globe_above_home_is_flown_to(flying: LockstepVehicle) ->
     assert away(flying, (10.0, 0.0, -9.0)) < 1.0
 
 
-def test_an_attitude_is_flown_with_a_climb_rate_and_levelled_out_after_the_timeout(
+def test_attitude_with_climb_rate_levels_after_timeout(
     flying: LockstepVehicle,
 ) -> None:
     tilt = math.radians(-8.0)
@@ -215,7 +213,7 @@ def test_an_attitude_is_flown_with_a_climb_rate_and_levelled_out_after_the_timeo
     assert flying.truth.pitch_rad == pytest.approx(0.0, abs=0.05)
 
 
-def test_outside_guided_setpoints_are_passed_over(flying: LockstepVehicle) -> None:
+def test_setpoints_ignored_outside_guided(flying: LockstepVehicle) -> None:
     flying.set_mode("BRAKE")
     flying.step(2.0)
     before = flying.truth.position_ned_m
@@ -241,7 +239,7 @@ def test_condition_yaw_turns_and_change_speed_slows_down(flying: LockstepVehicle
     assert flying.command(178, 1.0, 0.0) == "DENIED"
 
 
-def test_land_comes_down_disarms_at_once_and_the_mode_stays_land(flying: LockstepVehicle) -> None:
+def test_land_disarms_after_landing_and_mode_stays_land(flying: LockstepVehicle) -> None:
     flying.land()
     assert flying.truth.on_ground
     assert flying.truth.mode == "LAND"
@@ -268,7 +266,7 @@ def test_rtl_climbs_returns_waits_and_lands_at_home() -> None:
     assert vehicle.truth.mode == "RTL"
 
 
-def test_one_that_landed_long_ago_has_the_whole_disarm_delay_when_it_is_armed_again(
+def test_disarm_delay_restarts_with_arming(
     flying: LockstepVehicle,
 ) -> None:
     flying.set_mode("LAND")
@@ -287,7 +285,7 @@ def test_disarming_in_the_air_needs_the_magic_number(flying: LockstepVehicle) ->
     assert flying.command(ARM, 0, 21196) == "ACCEPTED"
 
 
-def test_auto_without_a_mission_and_modes_that_are_not_there_are_refused(flying: LockstepVehicle) -> None:
+def test_auto_without_mission_and_unknown_modes_refused(flying: LockstepVehicle) -> None:
     texts(flying)
     assert flying.command(SET_MODE, 1, 3) == "FAILED"
     assert flying.command(SET_MODE, 1, 99) == "FAILED"
@@ -299,7 +297,7 @@ def test_auto_without_a_mission_and_modes_that_are_not_there_are_refused(flying:
         flying.set_mode("OFFBOARD")
 
 
-def test_a_silent_ground_station_sends_it_home_if_fs_gcs_enable_says_so(flying: LockstepVehicle) -> None:
+def test_lost_ground_station_returns_with_fs_gcs_enable(flying: LockstepVehicle) -> None:
     flying.vehicle.parameters.set("FS_GCS_ENABLE", 1)
     beat = flying.repeat(dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3), 1.0, source=(255, 190))
     flying.step(8.0)
@@ -308,7 +306,7 @@ def test_a_silent_ground_station_sends_it_home_if_fs_gcs_enable_says_so(flying: 
     flying.step(6.5)
     assert flying.truth.mode == "RTL"
     assert (4, "GCS Failsafe") in texts(flying)
-    flying.set_mode("BRAKE")  # somebody who asks for a mode has it
+    flying.set_mode("BRAKE")  # a requested mode overrides the failsafe
     flying.step(2.0)
     assert flying.truth.mode == "BRAKE"
 
@@ -320,7 +318,7 @@ def test_a_lost_position_leads_to_land(flying: LockstepVehicle) -> None:
     assert flying.command(SET_MODE, 1, 4) in ("FAILED", "TEMPORARILY_REJECTED")
 
 
-def test_the_fence_is_watched(flying: LockstepVehicle) -> None:
+def test_fence_breach_changes_mode(flying: LockstepVehicle) -> None:
     for name, value in (("FENCE_ENABLE", 1), ("FENCE_RADIUS", 12), ("RTL_ALT", 600)):
         flying.vehicle.parameters.set(name, value)
     guided(flying, POSITION, 40.0, 0.0, -6.0)
@@ -339,7 +337,7 @@ def test_velocity_targets_stop_before_the_fence(flying: LockstepVehicle) -> None
     assert flying.truth.mode == "GUIDED"
 
 
-def test_a_pause_stands_still_whatever_targets_come(flying: LockstepVehicle) -> None:
+def test_pause_stops_vehicle_despite_new_targets(flying: LockstepVehicle) -> None:
     flying.repeat(target(VELOCITY, (3.0, 0.0, 0.0)), 10.0)
     flying.step(4.0)
     assert flying.command(PAUSE_CONTINUE, 2) == "DENIED"
@@ -355,9 +353,11 @@ def test_a_pause_stands_still_whatever_targets_come(flying: LockstepVehicle) -> 
 
 
 def landing_target(north: float, east: float, vehicle: LockstepVehicle, *, frame: int, valid: int) -> Any:
-    """What a camera fixed to the body, looking down, reports of a plate on the ground."""
+    """LANDING_TARGET of a camera fixed to the body, looking down at a plate on the ground."""
     truth = vehicle.truth
-    x, y, z = (place - here for place, here in zip((north, east, 0.3), truth.position_ned_m, strict=True))
+    x, y, z = (
+        position - here for position, here in zip((north, east, 0.3), truth.position_ned_m, strict=True)
+    )
     body = product(product(inverse(truth.quaternion), (0.0, x, y, z)), truth.quaternion)[1:]
     angle_x, angle_y = math.atan2(body[1], body[2]), math.atan2(-body[0], body[2])
     return dialect.MAVLink_landing_target_message(
@@ -370,7 +370,7 @@ def landing_target(north: float, east: float, vehicle: LockstepVehicle, *, frame
     [(12, 0, 1, True), (12, 1, 1, True), (1, 1, 1, False), (12, 0, 0, False)],
     ids=["angles", "body position", "PX4's frame", "disabled"],
 )
-def test_land_aims_at_a_landing_target_in_its_own_forms(
+def test_land_uses_landing_target_in_supported_frames(
     flying: LockstepVehicle, frame: int, valid: int, enabled: int, hits: bool
 ) -> None:
     flying.vehicle.parameters.set("PLND_ENABLED", enabled)
@@ -383,11 +383,11 @@ def test_land_aims_at_a_landing_target_in_its_own_forms(
         assert flying.now_s < 120.0
     missed = math.dist(flying.truth.position_ned_m[:2], (north, east))
     assert (missed < 0.8) is hits, missed  # in gusts that move a held position by 0.3 m
-    told = [text for _, text in texts(flying)]
-    assert told.count("Plnd: Frame not supported ") == (frame == 1)
+    sent_texts = [text for _, text in texts(flying)]
+    assert sent_texts.count("Plnd: Frame not supported ") == (frame == 1)
 
 
-def test_a_pilot_takes_over_in_loiter_and_a_reboot_begins_anew(flying: LockstepVehicle) -> None:
+def test_pilot_takes_over_in_loiter_and_reboot_resets(flying: LockstepVehicle) -> None:
     flying.vehicle.faults.begin("pilot_takeover mode=POSCTL")
     flying.step(0.5)
     assert flying.truth.mode == "LOITER"
@@ -397,7 +397,7 @@ def test_a_pilot_takes_over_in_loiter_and_a_reboot_begins_anew(flying: LockstepV
     assert flying.truth.mode == "STABILIZE"
 
 
-# ---- measured of a real Copter, in still air
+# ---- measured on a real Copter, without wind
 
 
 @pytest.fixture
@@ -406,8 +406,8 @@ def calm() -> LockstepVehicle:
 
 
 @pytest.mark.parametrize(("armed_for_s", "takes_s"), [(4.0, 5.8), (0.0, 8.15)])
-def test_a_take_off_to_five_metres_takes_as_long_as_measured(
-    calm: LockstepVehicle, armed_for_s: float, takes_s: float
+def test_takeoff_to_5_m_takes_the_measured_time(
+    calm: LockstepVehicle, armed_for_s: float, duration_s: float
 ) -> None:
     calm.set_mode("GUIDED")
     calm.arm()
@@ -415,12 +415,12 @@ def test_a_take_off_to_five_metres_takes_as_long_as_measured(
     asked_s = calm.now_s
     assert calm.command(TAKEOFF, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 5.0) == "ACCEPTED"
     calm.run_until(lambda truth: calm.vehicle.autopilot.landed_state == 2, 15.0)
-    assert calm.now_s - asked_s == pytest.approx(takes_s, abs=0.4)
+    assert calm.now_s - asked_s == pytest.approx(duration_s, abs=0.4)
     calm.step(4.0)
     assert calm.truth.height_m == pytest.approx(5.0, abs=0.1)
 
 
-def test_a_velocity_step_hardly_overshoots(calm: LockstepVehicle) -> None:
+def test_velocity_step_overshoots_little(calm: LockstepVehicle) -> None:
     calm.take_off(6.0)
     calm.step(3.0)
     sent = calm.repeat(target(VELOCITY, (0.0, 3.0, 0.0)), 20.0)
@@ -437,7 +437,7 @@ def test_a_velocity_step_hardly_overshoots(calm: LockstepVehicle) -> None:
     assert calm.truth.position_ned_m[1] - east < 3.4
 
 
-def test_a_circle_by_velocities_is_no_wider_than_measured(calm: LockstepVehicle) -> None:
+def test_velocity_circle_is_no_wider_than_measured(calm: LockstepVehicle) -> None:
     """A real Copter, whose setpoints lag by another 0.1 s, is 1.25 m outside such a circle."""
     radius_m, speed_mps = 5.0, 3.0
     calm.take_off(6.0)
@@ -461,11 +461,11 @@ def test_a_circle_by_velocities_is_no_wider_than_measured(calm: LockstepVehicle)
 
 
 def test_the_same_seed_is_the_same_flight() -> None:
-    places = []
+    positions = []
     for _ in range(2):
         vehicle = LockstepVehicle(autopilot="ardupilot", seed=9, wind_mps=3.0, ready_after_s=0.0)
         vehicle.take_off(3.0)
         guided(vehicle, VELOCITY, 1.0, 1.0, 0.0)
         vehicle.step(5.0)
-        places.append(vehicle.truth.position_ned_m)
-    assert places[0] == places[1]
+        positions.append(vehicle.truth.position_ned_m)
+    assert positions[0] == positions[1]

@@ -1,4 +1,4 @@
-"""What a Copter's links say: heartbeats, streams, parameters, texts; and a whole flight by mavutil."""
+"""Copter's messages: heartbeats, streams, parameters, texts; and a whole flight by mavutil."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def read(vehicle: LockstepVehicle, name: str) -> Any:
     return found[-1] if found else None
 
 
-def test_the_heartbeat_is_an_ardupilots_and_follows_a_change_of_mode_at_once(
+def test_heartbeat_is_ardupilot_and_sent_at_mode_change(
     copter: LockstepVehicle,
 ) -> None:
     copter.step(1.0)
@@ -57,9 +57,9 @@ def test_the_heartbeat_is_an_ardupilots_and_follows_a_change_of_mode_at_once(
     copter.receive()
     assert copter.command(176, 1, 4) == "ACCEPTED"
     copter.step(0.02)
-    told = copter.receive()
-    assert [m.custom_mode for m in told if m.get_type() == "HEARTBEAT"] == [4]
-    acknowledged = [m for m in told if m.get_type() == "COMMAND_ACK"]
+    reported = copter.receive()
+    assert [m.custom_mode for m in reported if m.get_type() == "HEARTBEAT"] == [4]
+    acknowledged = [m for m in reported if m.get_type() == "COMMAND_ACK"]
     assert [(m.command, m.result) for m in acknowledged] == [(176, 0)]  # one, and the real one
     copter.command(400, 1)
     copter.step(1.1)
@@ -67,7 +67,7 @@ def test_the_heartbeat_is_an_ardupilots_and_follows_a_change_of_mode_at_once(
     assert copter.newest["onboard"]["HEARTBEAT"].system_status == 3  # landed is STANDBY, armed or not
 
 
-def test_set_mode_is_acknowledged_by_its_own_number(copter: LockstepVehicle) -> None:
+def test_set_mode_acknowledged_with_its_own_id(copter: LockstepVehicle) -> None:
     copter.send(dialect.MAVLink_set_mode_message(1, 1, 5))
     copter.step(0.02)
     (answer,) = [m for m in copter.receive() if m.get_type() == "COMMAND_ACK"]
@@ -75,7 +75,7 @@ def test_set_mode_is_acknowledged_by_its_own_number(copter: LockstepVehicle) -> 
     assert copter.truth.mode == "LOITER"
 
 
-def test_next_to_nothing_comes_unasked_and_streams_come_by_group_or_one_by_one(
+def test_streams_only_on_request_by_group_or_message(
     copter: LockstepVehicle,
 ) -> None:
     assert set(kinds(copter, 12.0)) == {"HEARTBEAT", "TIMESYNC"}
@@ -98,7 +98,7 @@ def test_next_to_nothing_comes_unasked_and_streams_come_by_group_or_one_by_one(
     assert set(kinds(copter, 3.0)) <= {"HEARTBEAT", "TIMESYNC", "EXTENDED_SYS_STATE"}
 
 
-def test_a_reboot_drops_the_rates_asked_for_and_keeps_those_set(copter: LockstepVehicle) -> None:
+def test_reboot_drops_requested_rates_keeps_parameters(copter: LockstepVehicle) -> None:
     copter.send(dialect.MAVLink_param_set_message(1, 1, b"SR1_EXTRA2", 4, 9))
     copter.send(dialect.MAVLink_request_data_stream_message(1, 1, 0, 2, 1))
     copter.command(511, 31, 50_000)
@@ -110,7 +110,7 @@ def test_a_reboot_drops_the_rates_asked_for_and_keeps_those_set(copter: Lockstep
     assert counted["VFR_HUD"] == 16
 
 
-def test_parameters_travel_as_numbers_in_the_order_of_the_list_without_a_hash(
+def test_parameters_are_numbers_in_list_order_without_hash(
     copter: LockstepVehicle,
 ) -> None:
     copter.send(dialect.MAVLink_param_request_list_message(1, 1))
@@ -124,7 +124,7 @@ def test_parameters_travel_as_numbers_in_the_order_of_the_list_without_a_hash(
     assert "MPC_XY_CRUISE" not in values
 
 
-def test_a_set_is_truncated_cut_and_told_and_the_unknown_is_silence(
+def test_param_set_truncates_clamps_and_broadcasts(
     copter: LockstepVehicle,
 ) -> None:
     for value, kept in ((1.6, 1.0), (-1.6, -1.0), (1000.0, 127.0)):
@@ -136,7 +136,7 @@ def test_a_set_is_truncated_cut_and_told_and_the_unknown_is_silence(
     assert read(copter, "COM_OF_LOSS_T") is None
 
 
-def test_a_message_asked_for_follows_its_acknowledgement(copter: LockstepVehicle) -> None:
+def test_requested_message_follows_its_acknowledgement(copter: LockstepVehicle) -> None:
     assert copter.command(512, 148) == "ACCEPTED"
     copter.step(0.02)
     names = [m.get_type() for m in copter.receive()]
@@ -149,7 +149,7 @@ def test_a_message_asked_for_follows_its_acknowledgement(copter: LockstepVehicle
     assert copter.command(2000) == "UNSUPPORTED"
 
 
-def test_home_is_where_it_was_armed_and_its_local_place_is_true(copter: LockstepVehicle) -> None:
+def test_home_is_arming_position_with_true_local_position(copter: LockstepVehicle) -> None:
     copter.vehicle.airframe.position = (4.0, 0.0, 0.0)
     copter.step(0.1)
     copter.command(400, 1)
@@ -161,11 +161,9 @@ def test_home_is_where_it_was_armed_and_its_local_place_is_true(copter: Lockstep
 
 
 @pytest.mark.parametrize("place", [(1.0,), (0.0, 0.0, 0.0, 0.0, 47.3977432, 8.545594, 488.0)])
-def test_a_home_that_was_set_stays_when_it_is_armed_elsewhere(
-    copter: LockstepVehicle, place: tuple[float, ...]
-) -> None:
-    """ArduPilot locks it, whether a place was named or "here"."""
-    assert copter.command(179, *place) == "ACCEPTED"
+def test_commanded_home_is_kept_at_arming(copter: LockstepVehicle, position: tuple[float, ...]) -> None:
+    """ArduPilot locks home, set to a position or to "here"."""
+    assert copter.command(179, *position) == "ACCEPTED"
     copter.vehicle.airframe.position = (4.0, 0.0, 0.0)
     copter.step(0.1)
     assert copter.command(400, 1) == "ACCEPTED"
@@ -173,7 +171,7 @@ def test_a_home_that_was_set_stays_when_it_is_armed_elsewhere(
     assert copter.newest["onboard"]["HOME_POSITION"].latitude == pytest.approx(473977432, abs=40)
 
 
-def test_texts_have_no_tab_and_go_to_everyone_who_speaks(copter: LockstepVehicle) -> None:
+def test_texts_have_no_tab_and_go_to_every_active_link(copter: LockstepVehicle) -> None:
     copter.send(dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
     copter.command(400, 1)
     copter.step(0.02)
@@ -184,22 +182,22 @@ def test_missions_are_refused(copter: LockstepVehicle) -> None:
     copter.send(dialect.MAVLink_mission_count_message(1, 1, 3))
     copter.send(dialect.MAVLink_mission_request_list_message(1, 1))
     copter.step(0.02)
-    told = copter.receive()
-    assert [m.type for m in told if m.get_type() == "MISSION_ACK"] == [3]
-    assert [m.count for m in told if m.get_type() == "MISSION_COUNT"] == [0]
+    reported = copter.receive()
+    assert [m.type for m in reported if m.get_type() == "MISSION_ACK"] == [3]
+    assert [m.count for m in reported if m.get_type() == "MISSION_COUNT"] == [0]
 
 
-def test_a_gimbal_and_a_parameter_of_px4s_are_refused_in_words() -> None:
+def test_gimbal_and_px4_parameter_refused() -> None:
     with pytest.raises(ValueError, match="no gimbal"):
         LockstepVehicle(autopilot="ardupilot", gimbal=True)
     with pytest.raises(KeyError, match="COM_OF_LOSS_T"):
         LockstepVehicle(autopilot="ardupilot", parameters={"COM_OF_LOSS_T": 1.0})
-    with pytest.raises(ValueError, match="expected one of px4, ardupilot"):
+    with pytest.raises(ValueError, match="px4, ardupilot"):
         LockstepVehicle(autopilot="betaflight")
 
 
 def test_a_whole_flight_by_mavutil(tmp_path: Path) -> None:
-    """As the tutorials for ArduPilot fly: modes by name, arm, take off, go, come home."""
+    """A flight as in ArduPilot's tutorials: modes by name, arm, take off, go to a point, return."""
     with running_simulator(autopilot="ardupilot", ready_after=0.0, speed=6.0) as simulator:
         link = mavutil.mavlink_connection(
             simulator.pymavlink_device, source_system=255, dialect="ardupilotmega"

@@ -1,4 +1,4 @@
-"""Arming, disarming, readiness, and what HEARTBEAT and SYS_STATUS tell of them."""
+"""Arming, disarming, readiness, and their report in HEARTBEAT and SYS_STATUS."""
 
 import math
 from typing import Any
@@ -17,7 +17,7 @@ def prearm(harness: SimHarness) -> bool:
     return bool(harness.received("SYS_STATUS")[-1].onboard_control_sensors_health & PREARM_CHECK)
 
 
-def test_it_boots_in_hold_and_becomes_ready_after_a_moment(harness: SimHarness) -> None:
+def test_boots_in_hold_and_becomes_ready(harness: SimHarness) -> None:
     assert not prearm(harness)
     first = harness.heartbeat()
     assert (first.type, first.autopilot, first.mavlink_version) == (2, 12, 3)
@@ -41,7 +41,7 @@ def test_arming_when_ready_is_accepted_and_shown(harness: SimHarness) -> None:
     assert harness.command(400, 1) == [0]  # once more is no error
 
 
-def test_disarming_on_the_ground_is_accepted_and_so_is_disarming_twice(harness: SimHarness) -> None:
+def test_disarming_on_ground_accepted_and_so_disarming_twice(harness: SimHarness) -> None:
     harness.wait_ready()
     harness.command(400, 1)
     assert harness.command(400, 0) == [0]
@@ -49,7 +49,7 @@ def test_disarming_on_the_ground_is_accepted_and_so_is_disarming_twice(harness: 
     assert harness.command(400, 0) == [0]
 
 
-def test_disarming_in_the_air_is_refused_without_the_magic_number(harness: SimHarness) -> None:
+def test_disarming_in_air_is_refused_without_magic_number(harness: SimHarness) -> None:
     harness.take_off()
     assert harness.command(400, 0) == [REJECTED]
     assert harness.armed
@@ -59,12 +59,12 @@ def test_disarming_in_the_air_is_refused_without_the_magic_number(harness: SimHa
     assert harness.height_m == 0.0
 
 
-def test_a_strange_arming_value_is_told_in_words_and_not_answered(harness: SimHarness) -> None:
+def test_invalid_arming_value_sends_text_and_no_answer(harness: SimHarness) -> None:
     harness.heartbeats.append(("gcs", (245, 190), 6))
     harness.wait_ready()
-    for value, told in ((2.0, "2.000"), (-1.4, "-1.400"), (1.5, "1.500")):
+    for value, texts in ((2.0, "2.000"), (-1.4, "-1.400"), (1.5, "1.500")):
         assert harness.command(400, value) == []
-        assert harness.texts()[-1] == f"Unsupported ARM_DISARM param: {told}\t"
+        assert harness.texts()[-1] == f"Unsupported ARM_DISARM param: {texts}\t"
     assert not harness.armed
 
 
@@ -79,7 +79,7 @@ def test_the_arming_value_is_rounded_and_kept_in_a_byte(
     assert not harness.armed
 
 
-def test_without_a_take_off_it_disarms_itself_after_eleven_seconds(harness: SimHarness) -> None:
+def test_disarms_after_11_s_without_takeoff(harness: SimHarness) -> None:
     harness.wait_ready()
     harness.command(400, 1)
     assert 10.8 < harness.until(lambda: not harness.armed, 15.0) < 11.6
@@ -124,7 +124,7 @@ def test_an_offboard_stream_makes_offboard_ready(harness: SimHarness, velocity_s
     harness.offboard(velocity_setpoint(0, 0, 0))
     assert prearm(harness)
     harness.fly(1.1)  # the stream has stopped
-    assert harness.heartbeat().base_mode == 17  # the newest setpoint counts here, however old
+    assert harness.heartbeat().base_mode == 17  # the newest setpoint is used here, however old
     assert not prearm(harness)
     assert harness.heartbeat().system_status == 0
     assert harness.command(400, 1) == [REJECTED]

@@ -1,4 +1,4 @@
-"""SET_ATTITUDE_TARGET: which of it counts, and how attitudes and rates are flown."""
+"""SET_ATTITUDE_TARGET: the fields used, and the control of attitudes and rates."""
 
 import math
 from types import SimpleNamespace
@@ -38,7 +38,7 @@ def rates(p: float, q: float, r: float, thrust: float = HOVER, mask: int = 128) 
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 255))
-def test_the_type_mask_decides_between_attitude_rates_and_nothing(mask: int) -> None:
+def test_type_mask_decides_between_attitude_rates_and_nothing(mask: int) -> None:
     message = dialect.MAVLink_set_attitude_target_message(0, 1, 1, mask, [1, 0, 0, 0], 0.1, 0.2, 0.3, 0.6)
     setpoint = attitude_setpoint(message)
     if not mask & 128:
@@ -54,7 +54,7 @@ def test_the_type_mask_decides_between_attitude_rates_and_nothing(mask: int) -> 
         assert setpoint.thrust == pytest.approx(0.0 if mask & 64 else 0.6)
 
 
-def test_a_thrust_vector_counts_by_its_vertical_part() -> None:
+def test_thrust_vector_uses_its_vertical_part() -> None:
     message = attitude(mask=RATES_IGNORED | 32, thrust=0.9)
     message.thrust_body = [0.1, 0.2, -0.55]
     setpoint = attitude_setpoint(message)
@@ -63,19 +63,17 @@ def test_a_thrust_vector_counts_by_its_vertical_part() -> None:
 
 
 @pytest.mark.parametrize(("mask", "counts"), [(7, True), (128, True), (0, True), (129, False), (135, False)])
-def test_what_controls_something_keeps_the_offboard_signal_alive(
-    harness: SimHarness, mask: int, counts: bool
-) -> None:
+def test_any_controlling_setpoint_keeps_offboard_alive(harness: SimHarness, mask: int, counts: bool) -> None:
     harness.heartbeats.append(("gcs", (245, 190), 6))
     harness.fly(0.1)
     harness.send(attitude(mask=mask))
     harness.fly(0.05)
     assert harness.vehicle.autopilot.has_setpoints is counts
-    assert harness.texts() == []  # what counts for nothing is dropped without a word
+    assert harness.texts() == []  # an unused setpoint is dropped silently
 
 
 @pytest.mark.parametrize(("system", "component", "counts"), [(1, 0, True), (0, 0, True), (2, 1, False)])
-def test_it_counts_if_it_is_addressed_to_the_autopilot(
+def test_setpoint_used_if_addressed_to_autopilot(
     harness: SimHarness, system: int, component: int, counts: bool
 ) -> None:
     harness.fly(0.1)
@@ -97,7 +95,7 @@ def test_level_at_hover_thrust_it_stays_where_it_is(harness: SimHarness) -> None
     assert harness.mode == "OFFBOARD"
 
 
-def test_the_attitude_is_taken_and_the_thrust_is_not_adjusted_to_the_tilt(harness: SimHarness) -> None:
+def test_attitude_is_taken_and_thrust_is_not_adjusted_to_tilt(harness: SimHarness) -> None:
     harness.take_off(20.0)
     tilted = attitude(roll=20.0, pitch=-10.0, yaw=60.0)
     harness.offboard(tilted)
@@ -126,7 +124,7 @@ def test_a_turn_takes_the_short_way_and_keeps_the_vehicle_level(harness: SimHarn
     assert math.degrees(harness.vehicle.airframe.yaw_rad) == pytest.approx(-170.0, abs=3.0)
 
 
-def test_more_thrust_climbs_less_sinks_and_an_ignored_throttle_is_none(harness: SimHarness) -> None:
+def test_more_thrust_climbs_less_sinks_and_ignored_throttle_none(harness: SimHarness) -> None:
     harness.take_off(30.0)
     harness.offboard(attitude())
     harness.fly(1.0, attitude())
@@ -147,7 +145,7 @@ def test_a_tumbling_vehicle_comes_upright(harness: SimHarness) -> None:
     assert abs(harness.vehicle.airframe.pitch_rad) < 0.02
 
 
-def test_a_quaternion_that_is_no_rotation_leaves_the_vehicle_turning_as_it_turned(
+def test_invalid_quaternion_keeps_body_rates(
     harness: SimHarness,
 ) -> None:
     harness.take_off(10.0)
@@ -164,7 +162,7 @@ def test_a_quaternion_that_is_no_rotation_leaves_the_vehicle_turning_as_it_turne
 # ---- flying by rates
 
 
-def test_body_rates_are_followed_and_an_ignored_yaw_rate_stays_what_it_is(harness: SimHarness) -> None:
+def test_body_rates_followed_and_ignored_yaw_rate_kept(harness: SimHarness) -> None:
     harness.take_off(10.0)
     spin = rates(0.0, 0.0, 0.8)
     harness.offboard(spin)
@@ -202,7 +200,7 @@ def test_a_position_may_follow_an_attitude_and_is_flown(
 # ---- taking off, landing, losing it
 
 
-def test_it_takes_off_by_thrust_alone_and_is_disarmed_after_sinking_to_the_ground(
+def test_takeoff_by_thrust_and_disarm_after_landing(
     harness: SimHarness,
 ) -> None:
     harness.wait_ready()
@@ -231,9 +229,7 @@ def test_without_the_stream_the_failsafe_flies_home_by_position(harness: SimHarn
 
 
 @pytest.mark.streams("ATTITUDE_TARGET", "POSITION_TARGET_LOCAL_NED", "POSITION_TARGET_GLOBAL_INT")
-def test_the_attitude_target_tells_the_setpoint_and_there_is_no_position_target(
-    harness: SimHarness, position_setpoint: Any
-) -> None:
+def test_attitude_target_sent_without_position_target(harness: SimHarness, position_setpoint: Any) -> None:
     harness.take_off(10.0)
     wanted = attitude(roll=6.0, yaw=30.0, thrust=0.52)
     harness.offboard(wanted)
@@ -260,7 +256,7 @@ def test_the_attitude_target_tells_the_setpoint_and_there_is_no_position_target(
 
 
 @pytest.mark.streams("ATTITUDE_TARGET", "POSITION_TARGET_LOCAL_NED", "POSITION_TARGET_GLOBAL_INT")
-def test_flown_by_position_the_attitude_target_tells_the_rates_that_correct_the_attitude(
+def test_attitude_target_has_correcting_rates_in_position_mode(
     harness: SimHarness, position_setpoint: Any
 ) -> None:
     harness.take_off(5.0)
@@ -271,11 +267,11 @@ def test_flown_by_position_the_attitude_target_tells_the_rates_that_correct_the_
     harness.fly(0.11, position_setpoint(0, 0, -5, 1.4))
     echo = harness.received("ATTITUDE_TARGET")[0]
     assert echo.q[3] == pytest.approx(math.sin(0.7), abs=0.01)
-    assert echo.body_yaw_rate > 1.0  # a PX4 told 2.5 rad/s at the beginning of such a turn
+    assert echo.body_yaw_rate > 1.0  # a PX4 reported 2.5 rad/s at the beginning of such a turn
 
 
 @pytest.mark.parametrize(("setpoint", "base"), [(attitude(), 145), (rates(0, 0, 0), 129)])
-def test_the_heartbeat_is_stabilized_unless_rates_alone_are_flown(
+def test_heartbeat_is_stabilized_except_with_body_rates(
     harness: SimHarness, setpoint: Any, base: int
 ) -> None:
     harness.take_off(10.0)
@@ -330,7 +326,7 @@ def test_the_quaternion_algebra_agrees_with_the_matrices(attitude_rad: tuple[flo
 
 
 @pytest.mark.parametrize("values", [(0.0,) * 4, (math.nan, 0.0, 0.0, 1.0), (math.inf, 0.0, 0.0, 0.0)])
-def test_what_is_no_rotation_has_no_unit_quaternion(values: tuple[float, float, float, float]) -> None:
+def test_zero_quaternion_has_no_unit_quaternion(values: tuple[float, float, float, float]) -> None:
     assert unit(values) is None
 
 
@@ -342,7 +338,7 @@ def test_what_is_no_rotation_has_no_unit_quaternion(values: tuple[float, float, 
         max_size=5,
     )
 )
-def test_no_attitude_target_can_stop_the_vehicle(
+def test_no_attitude_target_raises(
     make_harness: type[SimHarness], requests: list[tuple[int, list[float]]]
 ) -> None:
     harness = make_harness(["everything"], ready_after_s=0.0)

@@ -1,4 +1,4 @@
-"""How the battery drains, what is told of it, and what its warnings do."""
+"""The battery: discharge, telemetry, warnings and their failsafes."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_a_battery_of_known_capacity_has_a_current_and_sags() -> None:
     assert loaded.volts < rest.volts - 1.0
     assert battery.time_remaining_s == pytest.approx(0.742 * 3600 / 15.5, rel=0.1)
     battery.step(10.0, False, 0.0)
-    assert battery.charge < 0.75  # what is used stays used
+    assert battery.charge < 0.75  # the used charge is not restored
 
 
 @given(
@@ -86,7 +86,7 @@ def test_the_warnings_follow_the_thresholds() -> None:
     assert seen[BatteryWarning.EMERGENCY] == pytest.approx(0.05, abs=0.002)
 
 
-def test_a_battery_that_is_not_checked_warns_nobody() -> None:
+def test_unchecked_battery_has_no_warning() -> None:
     battery = Battery(Parameters({"SIM_BAT_MIN_PCT": 0, "SIM_BAT_DRAIN": 1}))  # CBRK_SUPPLY_CHK is 894281
     for _ in range(50):
         battery.step(0.1, True, 9.8)
@@ -101,7 +101,7 @@ def flying(make_harness: type[SimHarness], **values: float) -> SimHarness:
     return harness
 
 
-def test_a_flight_on_an_emptying_battery_is_warned_returns_and_lands(make_harness: type[SimHarness]) -> None:
+def test_low_battery_warns_returns_and_lands(make_harness: type[SimHarness]) -> None:
     harness = flying(make_harness, RTL_RETURN_ALT=12, SIM_BAT_DRAIN=3000)
     harness.vehicle.autopilot.supervision.battery.charge = 0.12
     harness.until(lambda: any(line.startswith("battery low") for line in harness.events), 8.0)
@@ -153,7 +153,7 @@ def test_com_arm_bat_min_sets_the_charge_that_arming_needs(make_harness: type[Si
     assert harness.command(400, 1) == [0]
 
 
-def test_a_vehicle_without_a_battery_says_so(make_harness: type[SimHarness]) -> None:
+def test_missing_battery_is_reported(make_harness: type[SimHarness]) -> None:
     harness = make_harness(parameters={"SIM_BAT_ENABLE": 0})
     harness.fly(2.2)
     assert harness.received("BATTERY_STATUS") == []

@@ -1,4 +1,4 @@
-"""The figures of `mavlink-sim bench` mean something; how large they are is the machine's affair."""
+"""The figures of `mavlink-sim bench` are plausible; their size depends on the machine."""
 
 from __future__ import annotations
 
@@ -7,22 +7,22 @@ from dataclasses import astuple
 
 import cv2
 
-from mavlink_sim.bench import measure_camera, measure_fleet, measure_lockstep
+from mavlink_sim.cli.bench import measure_camera, measure_fleet, measure_lockstep
 
 
-def test_lockstep_has_a_figure_for_each_way_of_flying() -> None:
+def test_lockstep_bench_has_every_figure() -> None:
     figures = astuple(measure_lockstep(seconds=0.01))  # less than a step: it flies one all the same
     assert len(figures) == 4
     assert all(math.isfinite(figure) and figure > 0.0 for figure in figures)
 
 
-def test_a_fleet_takes_some_share_of_a_core() -> None:
+def test_fleet_bench_reports_cpu_share() -> None:
     share = measure_fleet(vehicles=2, seconds=0.01)
     assert math.isfinite(share)
     assert share > 0.0
 
 
-def test_a_camera_draws_with_and_without_a_lens_and_leaves_opencv_as_it_was() -> None:
+def test_camera_bench_restores_opencv_settings() -> None:
     before = cv2.getNumThreads()
     cv2.setNumThreads(2)
     try:

@@ -1,4 +1,4 @@
-"""Distortion and shutter: every pixel sees what geometry says it sees, and the boxes follow."""
+"""Distortion and shutter: pixels and boxes agree with the geometry."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def bent(distortion: tuple[float, ...]) -> CameraModel:
     pitch=st.floats(-1.5, -0.3),
     yaw=st.floats(-3.0, 3.0),
 )
-def test_a_point_on_the_ground_is_seen_where_the_camera_model_projects_it(
+def test_point_on_ground_is_seen_where_camera_model_projects_it(
     k1: float, k2: float, tangential: float, pitch: float, yaw: float
 ) -> None:
     camera, mount = bent((k1, k2, tangential, -tangential)), CameraMount()
@@ -48,7 +48,7 @@ def test_a_point_on_the_ground_is_seen_where_the_camera_model_projects_it(
     offsets = np.column_stack([middle[0] + north, middle[1] + east, np.full(len(north), 6.0)])
     optical = offsets @ (attitude @ mount.body_from_optical)
     pixels = camera.project(optical)
-    # Far outside the picture the polynomial may bend points back into it.
+    # Far outside the image the polynomial may bend points back into it.
     plane = np.hypot(*(optical[:, :2] / optical[:, 2:]).T)
     inside = (pixels > 1).all(axis=1) & (pixels < (158, 118)).all(axis=1) & (optical[:, 2] > 0) & (plane < 1)
     assert inside.any()
@@ -59,7 +59,7 @@ def test_a_point_on_the_ground_is_seen_where_the_camera_model_projects_it(
     assert np.all(depth <= around.max(axis=0) + 1e-3)
 
 
-def test_the_box_of_a_bent_picture_holds_the_projected_corners() -> None:
+def test_distorted_box_contains_projected_corners() -> None:
     camera, mount = bent(BARREL), CameraMount()
     car = WorldObject(0, "car", (9.0, 4.0, 0.0), 0.7)
     attitude = matrix_from_euler(0.0, -0.15, 0.0)
@@ -77,7 +77,7 @@ def test_the_box_of_a_bent_picture_holds_the_projected_corners() -> None:
     assert seen.pixel_count < (high - low).prod()
 
 
-def test_a_straight_lens_with_a_shutter_that_stands_still_draws_the_plain_picture() -> None:
+def test_identity_lens_gives_the_pinhole_image() -> None:
     world = World((WorldObject(0, "car", (9.0, 1.0, 0.0), 0.7),), GROUND)
     plain = Renderer(world, PLAIN).render((0.0, 0.0, -3.0), LEVEL)
     still = Renderer(world, PLAIN, shutter=Shutter(0.01, 0.02)).render((0.0, 0.0, -3.0), LEVEL)
@@ -102,12 +102,12 @@ def test_under_a_turning_rolling_shutter_uprights_lean(rate_radps: float) -> Non
     near = np.nan_to_num(rendered.depth_m, nan=99.0) < 6.2
     near[70:] = False  # below, the ground is near too
     columns = pole_columns(near)
-    # From the first row to the 70th the camera turns on: to the right, so that things move to the left.
+    # From the first row to the 70th the camera turns to the right, so that objects move to the left.
     expected = -rate_radps * 0.03 * 70 / 120 * PLAIN.fx
     assert columns[-1] - columns[0] == pytest.approx(expected, abs=1.2)
 
 
-def test_under_a_rolling_shutter_moving_sideways_the_ground_shears_by_its_depth() -> None:
+def test_rolling_shutter_sideways_shears_ground_by_depth() -> None:
     camera = CameraModel.from_horizontal_fov(320, 240, math.radians(80.0))
     down = matrix_from_euler(0.0, -math.pi / 2, 0.0)
     for height in (2.0, 4.0):
@@ -125,7 +125,7 @@ def test_under_a_rolling_shutter_moving_sideways_the_ground_shears_by_its_depth(
         assert lower_left[0] - upper_left[0] == pytest.approx(expected, abs=1.5)
 
 
-def test_an_exposure_smears_along_the_motion_alone() -> None:
+def test_exposure_blurs_only_along_motion() -> None:
     world = World((), Ground(("paving",), 0, 256, 0.05))
     looking_down = matrix_from_euler(0.0, -math.pi / 2, 0.0)
     renderer = Renderer(world, PLAIN, CameraMount(), shutter=Shutter(0.02))
@@ -138,12 +138,12 @@ def test_an_exposure_smears_along_the_motion_alone() -> None:
     assert smeared[0] / sharp[0] < 0.6 * smeared[1] / sharp[1]
 
 
-def test_a_distortion_that_cannot_be_drawn_is_refused() -> None:
+def test_unsupported_distortion_refused() -> None:
     with pytest.raises(ValueError, match="weaker coefficients"):
         Lens(bent((-2.0, 0.0, 0.0, 0.0)))
 
 
 @pytest.mark.parametrize(("exposure", "readout"), [(-0.1, 0.0), (0.0, 0.6), (math.nan, 0.0)])
-def test_a_shutter_that_cannot_be_is_refused(exposure: float, readout: float) -> None:
-    with pytest.raises(ValueError, match=r"must be 0 to 0\.5 s"):
+def test_invalid_shutter_refused(exposure: float, readout: float) -> None:
+    with pytest.raises(ValueError, match=r"0 to 0\.5 s"):
         Shutter(exposure, readout)

@@ -1,4 +1,4 @@
-"""`mavlink-sim camera` as a process: frames from another autopilot's pose, and what it refuses."""
+"""`mavlink-sim camera` as a process: frames from another autopilot's pose, and usage errors."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ import pytest
 
 from mavlink_sim.camera.cli import POSE_LOST_S
 from mavlink_sim.camera.vehicle_link import AutopilotLink, LinkError
-from mavlink_sim.cli import main
+from mavlink_sim.cli.main import main
 from mavlink_sim.testing import free_port, running_simulator
 from mavlink_sim.wire.endpoint import UdpEndpoint
 from mavlink_sim.wire.messages import Outgoing, dialect, parser
@@ -28,7 +28,7 @@ from vision.shared_frame import SHARED_MEMORY_DIRECTORY, SharedFrameReader, segm
 pytestmark = pytest.mark.skipif(not SHARED_MEMORY_DIRECTORY.is_dir(), reason="needs Linux's /dev/shm")
 DEADLINE_S = 120.0
 LOWEST_EYE_M = -0.05
-"""The renderer lifts an eye that stands on the ground by so much (NED)."""
+"""The renderer's least height of the camera (NED)."""
 
 
 @pytest.fixture
@@ -61,7 +61,7 @@ def test_a_tcp_connection_that_ends_is_an_error_at_once() -> None:
 
 
 def received(endpoint: UdpEndpoint, link: AutopilotLink, count: int) -> list[Any]:
-    """What comes at the vehicle's end while the link is served, until there are `count`."""
+    """The messages received at the vehicle's end while the link is served, until there are `count`."""
     messages: list[Any] = []
     deadline_s = time.monotonic() + 20.0
     while len(messages) < count:
@@ -142,15 +142,15 @@ def test_two_autopilots_on_one_port_are_refused_by_their_ids(name: str) -> None:
             time.sleep(0.05)
     finally:
         process.kill()
-        _, said = process.communicate()
+        _, events = process.communicate()
         for end in ends:
             end.close()
     assert process.returncode == 2
-    (line,) = said.splitlines()
+    (line,) = events.splitlines()
     assert "4 and 9" in line
 
 
-def test_a_silent_autopilot_is_asked_for_attitude_and_position() -> None:
+def test_missing_pose_messages_are_requested() -> None:
     port = free_port()
     vehicle = UdpEndpoint("127.0.0.1", 0, port)
     link = AutopilotLink(f"udpin://127.0.0.1:{port}")
@@ -194,13 +194,13 @@ def test_listen_only_sends_nothing() -> None:
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 def test_frames_are_drawn_from_another_autopilots_pose(name: str, tmp_path: Path, autopilot: str) -> None:
     """Where each frame's eye is, against the simulator's own truth at the frame's stamp; then a lost pose."""
-    seen, flown = tmp_path / "seen.jsonl", tmp_path / "flown.jsonl"
+    seen, flight = tmp_path / "seen.jsonl", tmp_path / "flown.jsonl"
     with running_simulator(
         truth=tmp_path / "truth.jsonl", autopilot=autopilot, noise="off", gusts=0.0
     ) as sim:
         command = [sys.executable, "-m", "mavlink_sim", "camera", "--camera", name, "--camera-rate", "10"]
         command += ["--vehicle-url", f"udpin://127.0.0.1:{sim.gcs_port}", "--origin", "0,0,0"]
-        command += ["--camera-truth", str(seen), "--truth", str(flown)]
+        command += ["--camera-truth", str(seen), "--truth", str(flight)]
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         try:
             assert process.stdout is not None
@@ -218,13 +218,13 @@ def test_frames_are_drawn_from_another_autopilots_pose(name: str, tmp_path: Path
                     time.sleep(0.02)
             os.kill(sim.pid, signal.SIGSTOP)
             try:
-                _, said = process.communicate(timeout=DEADLINE_S)
+                _, events = process.communicate(timeout=DEADLINE_S)
             finally:
                 os.kill(sim.pid, signal.SIGCONT)
         finally:
             process.kill()
     assert process.returncode == 1
-    assert f"stopped {POSE_LOST_S:g} s ago" in said.splitlines()[-1]
+    assert f"stopped {POSE_LOST_S:g} s ago" in events.splitlines()[-1]
     assert not segment_path(name).exists()
     true = [json.loads(line) for line in (tmp_path / "truth.jsonl").read_text().splitlines()]
     for line in seen.read_text().splitlines():
@@ -236,7 +236,7 @@ def test_frames_are_drawn_from_another_autopilots_pose(name: str, tmp_path: Path
         eye = (north + 0.12 * math.cos(yaw_rad), east + 0.12 * math.sin(yaw_rad), min(down, LOWEST_EYE_M))
         assert math.dist(captured["camera_ned_m"], eye) < 0.05
     assert {"stamp_ns", "position_ned_m", "velocity_ned_mps", "yaw_rad", "armed", "objects"} == set(
-        json.loads(flown.read_text().splitlines()[0])
+        json.loads(flight.read_text().splitlines()[0])
     )
 
 
@@ -247,6 +247,6 @@ def test_help_names_the_further_commands(
     with pytest.raises(SystemExit) as ended:
         main()
     assert ended.value.code == 0
-    said = " ".join(capsys.readouterr().out.split())
+    events = " ".join(capsys.readouterr().out.split())
     for command in ("mavlink-sim camera", "mavlink-sim dataset", "mavlink-sim bench"):
-        assert command in said
+        assert command in events

@@ -1,4 +1,4 @@
-"""The camera in a process of its own: frames for poses, and an end when nobody is there any more."""
+"""The camera in its own process: frames for poses, and its end with its parent."""
 
 from __future__ import annotations
 
@@ -60,17 +60,17 @@ def first_frame(camera: CameraProcess, position: tuple[float, float, float], yaw
     got: list[Frame] = []
     with SharedFrameReader(name) as reader:
 
-        def look() -> bool:
+        def attitude() -> bool:
             frame = reader.latest()
             if frame is not None and frame.captured_ns == stamp_ns:
                 got.append(frame)
             return bool(got)
 
-        until(look, "a frame of the pose sent")
+        until(attitude, "a frame of the pose sent")
     return got[0]
 
 
-def test_a_frame_shows_what_the_pose_sees_and_bears_its_stamp(camera: CameraProcess) -> None:
+def test_frame_shows_its_pose_and_has_its_stamp(camera: CameraProcess) -> None:
     frame = first_frame(camera, (1.0, 0.0, -2.0), 0.0)
     here = Renderer(WORLD, CAMERA, CameraMount()).render((1.0, 0.0, -2.0), np.eye(3))
     assert frame.depth_m is not None
@@ -115,7 +115,7 @@ def _ignores_interrupts(pid: int) -> bool:
 
 
 @pytest.mark.parametrize("painting", [False, True], ids=["while it is imported", "while it paints"])
-def test_a_camera_that_is_still_starting_ends_at_once_and_without_a_word(
+def test_starting_camera_stops_quickly_and_silently(
     name: str, painting: bool, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
 ) -> None:
     vast = World((), Ground(("meadow", "grass", "rows"), 0, 2048, 0.05))  # seconds of painting
@@ -185,6 +185,6 @@ def _runs(pid: int) -> bool:
         return False
 
 
-def test_a_rate_that_cannot_be_is_refused() -> None:
-    with pytest.raises(ValueError, match="rate must be positive"):
+def test_invalid_rate_refused() -> None:
+    with pytest.raises(ValueError, match="rate"):
         CameraProcess(WORLD, rate_hz=0.0)

@@ -1,4 +1,4 @@
-"""MAVProxy as a ground station, driven by what a person would type.
+"""MAVProxy as a ground station, driven by typed commands.
 
 MAVProxy is GPL, and asks for matplotlib, VTK and another OpenCV; it is a tool of this test alone, for which
 `pip install --no-deps MAVProxy pyserial` is enough. Without it the test is skipped.
@@ -32,10 +32,10 @@ TAKEOFF, MISSION, LAND = "4 2", "4 4", "4 6"
 
 
 class Console:
-    """A running MAVProxy: type a line, wait for words."""
+    """A running MAVProxy: type a line, wait for output."""
 
     def __init__(self, device: str, folder: Path) -> None:
-        self.said: list[str] = []
+        self.output: list[str] = []
         self._changed = threading.Condition()
         self.process = subprocess.Popen(
             [
@@ -56,13 +56,13 @@ class Console:
         assert self.process.stdout is not None
         for line in self.process.stdout:
             with self._changed:
-                self.said.append(line.rstrip("\n"))
+                self.output.append(line.rstrip("\n"))
                 self._changed.notify_all()
 
     def type(self, line: str) -> int:
-        """Returns how many lines had been said before."""
+        """Returns the number of lines printed before."""
         assert self.process.stdin is not None
-        before = len(self.said)
+        before = len(self.output)
         self.process.stdin.write(line + "\n")
         self.process.stdin.flush()
         return before
@@ -71,16 +71,16 @@ class Console:
         """The first line, from `since` on, in which the pattern is found."""
 
         def found() -> re.Match[str] | None:
-            return next((hit for line in self.said[since:] if (hit := re.search(pattern, line))), None)
+            return next((hit for line in self.output[since:] if (hit := re.search(pattern, line))), None)
 
         with self._changed:
             self._changed.wait_for(lambda: found() is not None, limit_s)
         hit = found()
-        assert hit is not None, f"no {pattern!r} in {self.said[since:]}"
+        assert hit is not None, f"no {pattern!r} in {self.output[since:]}"
         return hit
 
     def ask(self, line: str, pattern: str, limit_s: float = 10.0) -> re.Match[str]:
-        """Type a line, again and again if it takes a while to be true, until the answer comes."""
+        """Type a line, repeatedly if needed, until the answer is printed."""
         deadline = time.monotonic() + limit_s
         while True:
             since = self.type(line)
@@ -93,7 +93,7 @@ class Console:
     def end(self) -> None:
         assert self.process.stdin is not None
         assert self.process.stdout is not None
-        self.process.kill()  # asked kindly, it waits for one more line of input
+        self.process.kill()  # with SIGTERM it waits for one more line of input
         self.process.wait()
         self._reader.join(10.0)
         self.process.stdin.close()
@@ -142,9 +142,7 @@ def test_it_connects_sets_parameters_and_flies(simulator: RunningSimulator, cons
     console.wait_for("DISARMED")
 
 
-def test_its_takeoff_goes_to_a_height_above_the_sea_as_px4_takes_it(
-    simulator: RunningSimulator, console: Console
-) -> None:
+def test_takeoff_altitude_is_amsl_as_in_px4(simulator: RunningSimulator, console: Console) -> None:
     console.wait_for(r"Received (\d+) parameters")
     console.ask("arm throttle", "COMPONENT_ARM_DISARM: ACCEPTED")
     since = console.type(f"takeoff {HOME_ALTITUDE_M + 4.0}")

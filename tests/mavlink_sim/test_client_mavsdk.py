@@ -38,7 +38,7 @@ async def system(simulator: RunningSimulator) -> AsyncIterator[MavsdkClient]:
         yield client
 
 
-async def test_it_knows_the_vehicle_its_parameters_and_its_state(system: MavsdkClient) -> None:
+async def test_mavsdk_reads_info_parameters_and_state(system: MavsdkClient) -> None:
     information = system.plugin(InfoAsync)
     telemetry = system.plugin(TelemetryAsync)
     parameters = system.plugin(ParamAsync)
@@ -107,14 +107,14 @@ async def test_it_flies_by_action_and_by_offboard(simulator: RunningSimulator, s
     )
 
     await action.goto_location(47.3978, 8.5455942, 494.4, 0.0)
-    await wait_for(telemetry.subscribe_position(), lambda place: place.latitude_deg > 47.39777)
+    await wait_for(telemetry.subscribe_position(), lambda position: position.latitude_deg > 47.39777)
     await action.return_to_launch()
     await asyncio.to_thread(simulator.wait_for_event, "mode RTL")
     await action.land()
     await wait_for(telemetry.subscribe_armed(), lambda armed: not armed)
 
 
-async def test_what_the_vehicle_refuses_is_an_error_of_its_own() -> None:
+async def test_refusal_raises_mavsdk_error() -> None:
     async with (
         vehicle(speed=SPEED, ready_after=600.0) as simulator,
         mavsdk_client(simulator.mavsdk_url, ComponentType.COMPANION_COMPUTER) as system,

@@ -1,4 +1,4 @@
-"""pymavlink's mavutil, mavparm and mavftp as a client: the vehicle must be what they take a PX4 for."""
+"""pymavlink's mavutil, mavparm and mavftp as a client."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_it_arms_takes_off_changes_modes_and_lands(simulator: RunningSimulator, 
     assert simulator.wait_for_event("disarmed (after landing)")
 
 
-def test_every_mode_it_knows_a_name_for_is_taken_and_shown_under_that_name(link: Any) -> None:
+def test_every_named_mode_is_accepted_and_reported(link: Any) -> None:
     refused = {"RATTITUDE", "RTGS"}  # modes that PX4 has no more
     for name in link.mode_mapping():
         link.recv_match(type="COMMAND_ACK")

@@ -59,11 +59,11 @@ def limit(
     return limited_acceleration(acceleration, velocity, yaw, found, parameters(**values), now)
 
 
-def test_switched_off_it_lets_everything_through() -> None:
+def test_disabled_it_limits_nothing() -> None:
     assert limit((3.0, 1.0), ObstacleMap(), CP_DIST=-1.0).acceleration == (3.0, 1.0)
 
 
-def test_without_data_the_vehicle_does_not_move_and_holds_after_five_seconds() -> None:
+def test_without_data_stops_and_holds_after_5_s() -> None:
     found = ObstacleMap()
     first = limit((3.0, 0.0), found, now=100.0)
     assert (first.acceleration, first.hold) == (STILL, False)
@@ -71,18 +71,18 @@ def test_without_data_the_vehicle_does_not_move_and_holds_after_five_seconds() -
     assert limit((3.0, 0.0), found, now=105.1).hold
 
 
-def test_stale_data_count_for_nothing() -> None:
+def test_stale_data_are_ignored() -> None:
     found = obstacle_map()
     assert limit((3.0, 0.0), found, now=100.4).acceleration != STILL
     assert limit((3.0, 0.0), found, now=100.6).acceleration == STILL
 
 
-def test_in_the_open_the_sticks_are_obeyed() -> None:
+def test_sticks_not_limited_without_obstacles() -> None:
     north, east = limit((2.0, 1.0), obstacle_map()).acceleration
     assert (north, east) == pytest.approx((2.0, 1.0))
 
 
-def test_the_nearer_a_wall_the_less_is_left_and_at_the_distance_to_keep_nothing() -> None:
+def test_limit_decreases_to_zero_at_cp_dist() -> None:
     left = []
     for distance_cm in (1500, 1000, 600, 300, 200):
         wall = obstacle_map(dict.fromkeys(range(-6, 7), distance_cm))
@@ -92,12 +92,12 @@ def test_the_nearer_a_wall_the_less_is_left_and_at_the_distance_to_keep_nothing(
     assert left[-1] == pytest.approx(0.0)
 
 
-def test_away_from_a_wall_the_sticks_are_obeyed() -> None:
+def test_sticks_not_limited_away_from_wall() -> None:
     wall = obstacle_map({0: 210})
     assert limit((-3.0, 0.0), wall).acceleration == pytest.approx((-3.0, 0.0))
 
 
-def test_too_near_a_wall_the_stick_towards_it_pushes_away() -> None:
+def test_below_cp_dist_the_stick_pushes_away() -> None:
     assert limit((3.0, 0.0), obstacle_map({0: 100})).acceleration[0] < -1.0
 
 
@@ -122,13 +122,13 @@ def test_a_longer_delay_brakes_earlier() -> None:
     assert slow < swift
 
 
-def test_into_the_unknown_only_a_parameter_allows() -> None:
+def test_unknown_sectors_need_cp_go_no_data() -> None:
     blind = obstacle_map({0: UNKNOWN_CM, 1: UNKNOWN_CM, 71: UNKNOWN_CM})
     assert limit((3.0, 0.0), blind).acceleration == STILL
     assert limit((3.0, 0.0), blind, CP_GO_NO_DATA=1).acceleration[0] > 2.0
 
 
-def test_where_a_sensor_lost_its_sight_no_parameter_allows() -> None:
+def test_sector_with_lost_data_is_never_allowed() -> None:
     found = obstacle_map()
     distances = [FAR_CM] * SECTORS
     distances[0] = UNKNOWN_CM
@@ -156,7 +156,7 @@ def test_wide_sectors_fill_all_the_narrow_ones_they_cover() -> None:
     assert near == {70, 71, 0, 1, 2}  # of a sector that two measurements share PX4 keeps the later
 
 
-def test_a_nearer_sensor_is_not_overruled_by_one_that_sees_nothing() -> None:
+def test_nearer_range_kept_over_out_of_range() -> None:
     found = obstacle_map({0: 300})
     found.add([4000] * SECTORS, 5.0, 0.0, 20, 3000, FRAME_BODY_FRD, 0.0, 100.1)
     assert found.distances_cm[0] == 300
@@ -172,7 +172,7 @@ def test_a_nearer_sensor_is_not_overruled_by_one_that_sees_nothing() -> None:
     st.tuples(st.floats(-12, 12), st.floats(-12, 12)),
     st.floats(0, 60),
 )
-def test_whatever_is_around_the_answer_is_finite(
+def test_result_is_finite_for_any_map(
     distances: list[int],
     yaw: float,
     acceleration: tuple[float, float],
@@ -185,7 +185,7 @@ def test_whatever_is_around_the_answer_is_finite(
     assert all(map(math.isfinite, got.acceleration))
 
 
-def test_the_vehicle_limits_its_pilot_and_holds_when_the_sensor_falls_silent(
+def test_vehicle_limits_sticks_and_holds_without_sensor(
     make_harness: type[SimHarness],
 ) -> None:
     harness = make_harness(ready_after_s=0.0, parameters={"CP_DIST": 3.0, "CP_GUIDE_ANG": 0.0})
@@ -204,7 +204,7 @@ def test_the_vehicle_limits_its_pilot_and_holds_when_the_sensor_falls_silent(
     assert harness.mode == "HOLD"
 
 
-def test_the_message_fills_the_vehicles_map_and_offboard_does_not_care(
+def test_message_fills_map_and_offboard_ignores_it(
     make_harness: type[SimHarness], velocity_setpoint: Any
 ) -> None:
     harness = make_harness(ready_after_s=0.0, parameters={"CP_DIST": 3.0})
@@ -225,7 +225,7 @@ def test_the_message_fills_the_vehicles_map_and_offboard_does_not_care(
 class Wall:
     """A wall north of a hovering vehicle whose pilot flies by remote control, and a sensor that sees it.
 
-    `at_m`: north of where the vehicle was when the wall was put up.
+    `at_m`: north of the vehicle's position when the wall was added.
     """
 
     def __init__(self, make_harness: type[SimHarness], at_m: float, **values: float) -> None:
@@ -246,7 +246,7 @@ class Wall:
         return self.start_m + self.at_m - self.north_m
 
     def fly(self, seconds: float, setpoint: Any = None, *, seen: bool = True, **sticks: float) -> None:
-        """Let time pass with these sticks; the sensor tells at 10 Hz, ahead and 20° to the sides."""
+        """Advance time with these sticks; the sensor sends at 10 Hz, ahead and 20° to the sides."""
         self.vehicle.transmitter.sticks = Sticks(**sticks)
         for _ in range(round(seconds * 10)):
             distances = [FAR_CM] * SECTORS
@@ -269,11 +269,11 @@ def test_full_stick_towards_a_wall_stops_before_it(make_harness: type[SimHarness
     assert wall.harness.mode == "POSCTL"
     assert 0.7 < wall.distance_m < 2.5
     assert abs(wall.vehicle.airframe.velocity[0]) < 0.2
-    wall.fly(2.0, pitch=-1.0)  # and away from it as fast as the pilot likes
+    wall.fly(2.0, pitch=-1.0)  # and away from it without a limit
     assert wall.distance_m > 3.5
 
 
-def test_without_collision_prevention_the_same_stick_leads_through_the_wall(
+def test_without_collision_prevention_wall_is_passed(
     make_harness: type[SimHarness],
 ) -> None:
     wall = Wall(make_harness, 3.0, CP_DIST=-1.0)
@@ -282,7 +282,7 @@ def test_without_collision_prevention_the_same_stick_leads_through_the_wall(
     assert wall.distance_m < 0.0
 
 
-def test_in_offboard_nothing_is_held_back(make_harness: type[SimHarness], velocity_setpoint: Any) -> None:
+def test_offboard_is_not_limited(make_harness: type[SimHarness], velocity_setpoint: Any) -> None:
     wall = Wall(make_harness, 3.0, CP_DIST=1.0, CP_GUIDE_ANG=0)
     north = velocity_setpoint(2, 0, 0)
     wall.harness.offboard(north)
@@ -291,7 +291,7 @@ def test_in_offboard_nothing_is_held_back(make_harness: type[SimHarness], veloci
     assert wall.distance_m < 0.0
 
 
-def test_a_sensor_that_falls_silent_ends_position_mode(make_harness: type[SimHarness]) -> None:
+def test_silent_sensor_ends_position_mode(make_harness: type[SimHarness]) -> None:
     wall = Wall(make_harness, 10.0, CP_DIST=1.0, CP_GUIDE_ANG=0)
     wall.harness.set_mode(3, 0)
     wall.fly(1.0)

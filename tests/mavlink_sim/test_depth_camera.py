@@ -31,7 +31,7 @@ def test_the_error_is_half_a_step_of_disparity_at_most(depth_m: float) -> None:
         assert abs(FOCAL_PX * QUIET.baseline_m / got - disparity) <= QUIET.step_px / 2 + 1e-3
 
 
-def test_a_slope_comes_out_in_steps_that_grow_with_the_square_of_the_range() -> None:
+def test_depth_steps_grow_with_square_of_range() -> None:
     slope = np.tile(np.linspace(2.0, 20.0, 4000, dtype=np.float32), (2, 1))
     levels = np.unique(measured_depth(slope, FOCAL_PX, QUIET, rng()))
     levels = levels[np.isfinite(levels)]
@@ -48,11 +48,11 @@ def test_noise_grows_with_the_square_of_the_range() -> None:
     assert far / near == pytest.approx(16.0, rel=0.1)
 
 
-def test_what_a_near_thing_hides_from_the_right_eye_has_no_depth() -> None:
+def test_occluded_pixels_have_no_depth() -> None:
     depth = flat(10.0)
     depth[:, 30:40] = 2.0
     got = measured_depth(depth, FOCAL_PX, QUIET, rng())
-    # Disparities 10 and 2: the strip of 8 pixels to the left of the near thing.
+    # Disparities 10 and 2: the strip of 8 pixels to the left of the near object.
     assert np.isnan(got[:, 23:30]).all()
     assert np.isfinite(got[:, :21]).all()
     assert np.isfinite(got[:, 30:]).all()
@@ -66,7 +66,7 @@ def test_out_of_range_and_in_the_sky_there_is_no_depth() -> None:
 
 
 @pytest.mark.parametrize("share", [0.01, 0.1, 0.4])
-def test_about_the_share_asked_for_drops_out(share: float) -> None:
+def test_dropout_share_matches_setting(share: float) -> None:
     sensor = DepthSensor(dropout=share, noise_px=0.0)
     lost = [
         np.isnan(measured_depth(np.full((240, 320), 4.0, np.float32), FOCAL_PX, sensor, rng())).mean()
@@ -75,7 +75,7 @@ def test_about_the_share_asked_for_drops_out(share: float) -> None:
     assert np.mean(lost) == pytest.approx(share, rel=0.35)
 
 
-def test_without_a_baseline_depth_is_true_and_what_was_given_is_left_alone() -> None:
+def test_zero_baseline_gives_true_depth_unmodified() -> None:
     depth = flat(3.3)
     got = measured_depth(depth, FOCAL_PX, DepthSensor(baseline_m=0.0, dropout=0.2), rng())
     assert np.all(depth == np.float32(3.3))
@@ -93,12 +93,12 @@ def test_the_same_draws_give_the_same_depth() -> None:
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"baseline_m": -1.0}, "baseline must be 0 to 2 m"),
-        ({"step_px": 5.0}, "step must be 0 to 4 px"),
-        ({"minimum_m": 5.0, "maximum_m": 5.0}, "range must run upwards"),
-        ({"dropout": 1.0}, "dropout must be 0 to below 1"),
+        ({"baseline_m": -1.0}, "baseline"),
+        ({"step_px": 5.0}, "0 to 4 px"),
+        ({"minimum_m": 5.0, "maximum_m": 5.0}, "range"),
+        ({"dropout": 1.0}, "dropout"),
     ],
 )
-def test_a_sensor_that_cannot_be_is_refused(changes: dict[str, float], says: str) -> None:
-    with pytest.raises(ValueError, match=says):
+def test_invalid_sensor_refused(changes: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         DepthSensor(**changes)

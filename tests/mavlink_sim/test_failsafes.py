@@ -1,4 +1,4 @@
-"""PX4's failsafe rules: the state machine by itself, and on the vehicle."""
+"""PX4's failsafe rules: the state machine alone, and on the vehicle."""
 
 from __future__ import annotations
 
@@ -27,9 +27,11 @@ class Machine:
 
     def __init__(self, **values: float) -> None:
         parameters = Parameters({"COM_RC_IN_MODE": 0, "COM_RCL_EXCEPT": 0, **values})
-        self.said: list[Text] = []
+        self.announced: list[Text] = []
         self.impossible: set[Mode] = set()
-        self.machine = FailsafeMachine(parameters, lambda mode: mode not in self.impossible, self.said.append)
+        self.machine = FailsafeMachine(
+            parameters, lambda mode: mode not in self.impossible, self.announced.append
+        )
         self.conditions = Conditions(
             manual_control_lost=False, ground_station_lost=False, offboard_signal_lost=False
         )
@@ -57,10 +59,10 @@ class Machine:
 
     @property
     def texts(self) -> list[str]:
-        return [text.text for text in self.said if text.text]
+        return [text.text for text in self.announced if text.text]
 
 
-def test_losing_the_remote_control_holds_five_seconds_and_then_returns() -> None:
+def test_losing_remote_control_holds_5_s_and_then_returns() -> None:
     machine = Machine(NAV_RCL_ACT=2, COM_FAIL_ACT_T=5)
     machine.conditions.manual_control_lost = True
     assert machine.run(4.9) is Mode.HOLD
@@ -84,7 +86,7 @@ def test_nav_rcl_act_and_nav_dll_act_choose_the_action(act: int, mode: Mode) -> 
         assert machine.run(0.1) is mode
 
 
-def test_the_last_resorts_disarm_or_stop_at_once() -> None:
+def test_disarm_and_terminate_act_at_once() -> None:
     for act, action in ((6, Action.DISARM), (5, Action.TERMINATE)):
         machine = Machine(NAV_RCL_ACT=act)
         machine.conditions.manual_control_lost = True
@@ -95,7 +97,7 @@ def test_the_last_resorts_disarm_or_stop_at_once() -> None:
     assert machine.machine.action is Action.TERMINATE  # it takes a reboot
 
 
-def test_a_link_that_comes_back_does_not_end_the_return_a_change_of_mode_does() -> None:
+def test_return_ends_by_mode_change_not_by_regained_link() -> None:
     machine = Machine(COM_FAIL_ACT_T=0)
     machine.conditions.manual_control_lost = True
     assert machine.run(0.1) is Mode.RTL
@@ -105,7 +107,7 @@ def test_a_link_that_comes_back_does_not_end_the_return_a_change_of_mode_does() 
     assert not machine.machine.in_failsafe
 
 
-def test_a_return_of_the_link_while_still_holding_leaves_the_hold_to_the_pilot() -> None:
+def test_regained_link_during_hold_keeps_hold() -> None:
     machine = Machine(COM_FAIL_ACT_T=5)
     machine.conditions.manual_control_lost = True
     machine.run(2.0)
@@ -113,7 +115,7 @@ def test_a_return_of_the_link_while_still_holding_leaves_the_hold_to_the_pilot()
     assert machine.run(0.2, requested=Mode.ALTCTL) is Mode.ALTCTL
 
 
-def test_sticks_take_over_from_a_return_but_not_during_the_hold_before_it() -> None:
+def test_sticks_take_over_from_return_not_from_hold() -> None:
     machine = Machine(NAV_DLL_ACT=2, COM_FAIL_ACT_T=5)
     machine.intended = Mode.MISSION
     machine.conditions.ground_station_lost = True
@@ -124,7 +126,7 @@ def test_sticks_take_over_from_a_return_but_not_during_the_hold_before_it() -> N
     assert machine.intended is Mode.POSCTL
     assert machine.machine.user_took_over
     assert not machine.machine.in_failsafe
-    assert [text.event[0] for text in machine.said if text.event][-1] == event_identifier(
+    assert [text.event[0] for text in machine.announced if text.event][-1] == event_identifier(
         "failsafe_rc_override"
     )
 
@@ -147,7 +149,7 @@ def test_without_the_delay_only_a_mode_switch_takes_over() -> None:
         pytest.param(Mode.POSCTL, 0, id="position, never excepted"),
     ],
 )
-def test_com_rcl_except_excuses_modes_that_fly_by_themselves(mode: Mode, exception: int) -> None:
+def test_com_rcl_except_excludes_modes(mode: Mode, exception: int) -> None:
     for bits in (0, 7):
         machine = Machine(COM_RCL_EXCEPT=bits, COM_FAIL_ACT_T=0)
         machine.intended = mode
@@ -156,7 +158,7 @@ def test_com_rcl_except_excuses_modes_that_fly_by_themselves(mode: Mode, excepti
         assert machine.machine.in_failsafe is not bool(bits & exception)
 
 
-def test_a_vehicle_armed_without_a_remote_control_never_misses_it() -> None:
+def test_no_rc_loss_if_armed_without_rc() -> None:
     machine = Machine()
     machine.machine.update(STEP_S, machine.conditions, armed=False, intended=Mode.HOLD)
     machine.intended = Mode.HOLD
@@ -167,10 +169,10 @@ def test_a_vehicle_armed_without_a_remote_control_never_misses_it() -> None:
     machine.run(0.1)
     machine.conditions.manual_control_lost = True
     machine.run(0.1)
-    assert machine.machine.in_failsafe  # once it was there, it is missed
+    assert machine.machine.in_failsafe  # a loss needs a first heartbeat
 
 
-def test_the_worst_of_several_failsafes_wins_and_the_next_one_follows_when_it_clears() -> None:
+def test_worst_failsafe_wins_then_the_next_one() -> None:
     machine = Machine(NAV_DLL_ACT=1, COM_LOW_BAT_ACT=2, COM_FAIL_ACT_T=0)
     machine.intended = Mode.MISSION
     machine.conditions.ground_station_lost = True
@@ -210,7 +212,7 @@ def test_a_battery_that_was_critical_at_arming_only_warns() -> None:
     assert machine.run(0.1) is Mode.LAND
 
 
-def test_a_vehicle_that_lands_or_returns_is_not_sent_to_return() -> None:
+def test_landing_or_returning_vehicle_keeps_its_mode() -> None:
     for mode in (Mode.LAND, Mode.RTL):
         machine = Machine(COM_LOW_BAT_ACT=3)
         machine.intended = mode
@@ -219,7 +221,7 @@ def test_a_vehicle_that_lands_or_returns_is_not_sent_to_return() -> None:
         assert machine.machine.action is Action.WARN
 
 
-def test_offboard_loss_acts_at_once_and_ends_when_the_setpoints_return() -> None:
+def test_offboard_loss_acts_at_once_ends_with_setpoints() -> None:
     machine = Machine(COM_OBL_RC_ACT=0)
     machine.intended = Mode.OFFBOARD
     machine.conditions.offboard_signal_lost = True
@@ -231,7 +233,7 @@ def test_offboard_loss_acts_at_once_and_ends_when_the_setpoints_return() -> None
     assert machine.run(0.1) is Mode.OFFBOARD
 
 
-def test_an_action_that_cannot_be_flown_becomes_the_next_one() -> None:
+def test_impossible_action_falls_back_to_next() -> None:
     machine = Machine(COM_FAIL_ACT_T=0)
     machine.conditions.manual_control_lost = True
     machine.impossible = {Mode.RTL}
@@ -241,7 +243,7 @@ def test_an_action_that_cannot_be_flown_becomes_the_next_one() -> None:
     assert machine.machine.action is Action.DESCEND
 
 
-def test_a_breached_fence_can_be_left_by_the_mode_switch_alone() -> None:
+def test_fence_action_ends_only_by_mode_switch() -> None:
     machine = Machine(GF_ACTION=2)
     machine.intended = Mode.MISSION
     machine.conditions.geofence_breached = True
@@ -278,7 +280,7 @@ def flying(make_harness: type[SimHarness], **values: float) -> SimHarness:
     return harness
 
 
-def test_a_remote_control_switched_off_in_flight_ends_in_a_return(make_harness: type[SimHarness]) -> None:
+def test_remote_control_switched_off_in_flight_ends_in_return(make_harness: type[SimHarness]) -> None:
     harness = flying(make_harness)
     harness.vehicle.transmitter.on = False
     holding_s = harness.until(lambda: harness.mode == "HOLD", 2.0)
@@ -292,7 +294,7 @@ def test_a_remote_control_switched_off_in_flight_ends_in_a_return(make_harness: 
     assert "failsafe: manual control lost, RTL" in harness.events
 
 
-def test_a_pilot_whose_remote_control_is_back_takes_over_with_the_sticks(
+def test_regained_rc_takes_over_by_sticks(
     make_harness: type[SimHarness],
 ) -> None:
     harness = flying(make_harness)
@@ -309,9 +311,7 @@ def test_a_pilot_whose_remote_control_is_back_takes_over_with_the_sticks(
     )
 
 
-def test_nobody_misses_a_remote_control_in_offboard(
-    make_harness: type[SimHarness], velocity_setpoint: Any
-) -> None:
+def test_rc_loss_excepted_in_offboard(make_harness: type[SimHarness], velocity_setpoint: Any) -> None:
     harness = flying(make_harness)
     harness.offboard(velocity_setpoint(0, 0, 0))
     harness.vehicle.transmitter.on = False
@@ -341,7 +341,7 @@ def test_losing_the_ground_station_returns_after_the_hold(make_harness: type[Sim
     assert harness.mode == "RTL"
 
 
-def test_a_ground_station_that_never_was_is_not_missed_by_default(harness: SimHarness) -> None:
+def test_missing_ground_station_is_no_loss_by_default(harness: SimHarness) -> None:
     harness.take_off()
     harness.fly(15.0)
     assert harness.mode == "HOLD"
@@ -360,28 +360,28 @@ def test_a_ground_station_that_never_was_is_not_missed_by_default(harness: SimHa
     ],
 )
 def test_sticks_moved_in_an_auto_mode_take_over(
-    make_harness: type[SimHarness], override: int, taken: bool
+    make_harness: type[SimHarness], override: int, taken_over: bool
 ) -> None:
     harness = flying(make_harness, COM_RC_OVERRIDE=override)
     harness.set_mode(4, 3)
     harness.fly(0.5)
     harness.vehicle.transmitter.sticks = Sticks(roll=0.5)
     harness.fly(0.3)
-    assert harness.mode == ("POSCTL" if taken else "HOLD")
-    assert ("Pilot took over using sticks\t" in harness.texts()) is taken
+    assert harness.mode == ("POSCTL" if taken_over else "HOLD")
+    assert ("Pilot took over using sticks\t" in harness.texts()) is taken_over
 
 
 @pytest.mark.parametrize(
     ("override", "taken"), [pytest.param(3, True, id="offboard too"), pytest.param(1, False, id="auto only")]
 )
-def test_sticks_moved_in_offboard_take_over_if_asked_for(
-    make_harness: type[SimHarness], velocity_setpoint: Any, override: int, taken: bool
+def test_sticks_take_over_in_offboard_if_enabled(
+    make_harness: type[SimHarness], velocity_setpoint: Any, override: int, taken_over: bool
 ) -> None:
     harness = flying(make_harness, COM_RC_OVERRIDE=override)
     harness.offboard(velocity_setpoint(0.5, 0, 0))
     harness.vehicle.transmitter.sticks = Sticks(yaw=0.6)
     harness.fly(0.5, velocity_setpoint(0.5, 0, 0))
-    assert harness.mode == ("POSCTL" if taken else "OFFBOARD")
+    assert harness.mode == ("POSCTL" if taken_over else "OFFBOARD")
 
 
 def test_sticks_moved_slowly_do_not_take_over(make_harness: type[SimHarness]) -> None:

@@ -13,11 +13,11 @@ import pytest
 
 from mavlink_sim.faults.console import FaultConsole
 from mavlink_sim.faults.schedule import Outcome
-from mavlink_sim.vehicle import Vehicle
+from mavlink_sim.vehicles.vehicle import Vehicle
 
 
 @pytest.fixture
-def said() -> list[str]:
+def lines() -> list[str]:
     return []
 
 
@@ -28,51 +28,49 @@ def command() -> Callable[[str], Outcome]:
     return vehicle.faults.command
 
 
-def test_lines_are_carried_out_when_they_are_whole(
-    command: Callable[[str], Outcome], said: list[str]
-) -> None:
+def test_lines_executed_when_complete(command: Callable[[str], Outcome], lines: list[str]) -> None:
     reading, writing = os.pipe()
-    console = FaultConsole(reading, command, said.append)
+    console = FaultConsole(reading, command, lines.append)
     console.poll()  # nothing typed: nothing waits
     os.write(writing, b"link_del")
     console.poll()
-    assert said == []
+    assert lines == []
     os.write(writing, b"ay 0.2\n\n# a remark\nwind\nlist\n")
     console.poll()
-    assert said[0] == "fault 1 link_delay 0.2"
-    assert said[1].startswith("not done: wind needs speed")
-    assert said[2].startswith("1 link_delay 0.2: since")
+    assert lines[0] == "fault 1 link_delay 0.2"
+    assert lines[1].startswith("not done: wind")
+    assert lines[2].startswith("1 link_delay 0.2: since")
     os.write(writing, b"end all")
     os.close(writing)
     console.poll()
     console.poll()
-    assert said[3] == "ended 1"
+    assert lines[3] == "ended 1"
     console.poll()  # the end was reached: nothing more happens
-    assert len(said) == 4
+    assert len(lines) == 4
     console.close()
     os.close(reading)
 
 
-def test_a_file_is_read_whole(command: Callable[[str], Outcome], said: list[str], tmp_path: Path) -> None:
+def test_file_is_read_completely(command: Callable[[str], Outcome], lines: list[str], tmp_path: Path) -> None:
     path = tmp_path / "faults"
     path.write_text("link_loss for=3\nstall at=9")
     descriptor = os.open(path, os.O_RDONLY)
-    console = FaultConsole(descriptor, command, said.append)
+    console = FaultConsole(descriptor, command, lines.append)
     for _ in range(3):
         console.poll()
-    assert said == ["fault 1 link_loss for=3", "fault 2 stall at 9 s"]
+    assert lines == ["fault 1 link_loss for=3", "fault 2 stall at 9 s"]
     console.close()
     os.close(descriptor)
 
 
-def test_a_terminal_is_read_and_may_go_away(command: Callable[[str], Outcome], said: list[str]) -> None:
+def test_terminal_is_read_and_may_close(command: Callable[[str], Outcome], lines: list[str]) -> None:
     controller, terminal = pty.openpty()
     tty.setraw(terminal)
-    console = FaultConsole(terminal, command, said.append)
+    console = FaultConsole(terminal, command, lines.append)
     os.write(controller, b"gust 5\n")
     assert select.select([terminal], [], [], 10.0)[0]  # the terminal hands it on in its own time
     console.poll()
-    assert said == ["fault 1 gust 5"]
+    assert lines == ["fault 1 gust 5"]
     os.close(controller)
     console.poll()
     console.poll()
@@ -80,20 +78,18 @@ def test_a_terminal_is_read_and_may_go_away(command: Callable[[str], Outcome], s
     os.close(terminal)
 
 
-def test_bytes_that_are_no_text_and_lines_without_end_do_no_harm(
-    command: Callable[[str], Outcome], said: list[str]
-) -> None:
+def test_binary_and_endless_lines_are_harmless(command: Callable[[str], Outcome], lines: list[str]) -> None:
     reading, writing = os.pipe()
-    console = FaultConsole(reading, command, said.append)
+    console = FaultConsole(reading, command, lines.append)
     os.write(writing, b"\xff\xfe\x00\n")
     console.poll()
-    assert said[0].startswith("not done: ")
+    assert lines[0].startswith("not done: ")
     for _ in range(8):
         os.write(writing, b"x" * 4096)
         console.poll()
     os.write(writing, b"\nlist\n")
     console.poll()
-    assert said[-1] == "no faults"
+    assert lines[-1] == "no faults"
     console.close()
     os.close(reading)
     os.close(writing)

@@ -1,4 +1,4 @@
-"""What each fault does to the vehicle, in lockstep."""
+"""The effect of each fault on the vehicle, in lockstep."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from mavlink_sim.physics.geography import local
+from mavlink_sim.physics.geography import SIH_FRAME
 from mavlink_sim.wire.messages import dialect
 from tests.mavlink_sim.conftest import SimHarness
 
@@ -27,11 +27,11 @@ def begin(harness: SimHarness, line: str) -> int:
     return harness.vehicle.faults.begin(line)
 
 
-# ---- what is said
+# ---- messages
 
 
 @pytest.mark.streams("everything")
-def test_of_a_vehicle_with_heartbeats_only_answers_still_come(harness: SimHarness) -> None:
+def test_heartbeat_only_still_answers(harness: SimHarness) -> None:
     harness.fly(6.0)  # what a start alone sends is over
     begin(harness, "heartbeat_only link=onboard")
     harness.forget()
@@ -84,7 +84,7 @@ def test_the_boot_clock_jumps_in_every_stamp_and_back(harness: SimHarness) -> No
 
 
 @pytest.mark.streams("everything")
-def test_a_second_autopilot_speaks_and_answers(harness: SimHarness) -> None:
+def test_second_autopilot_streams_and_answers(harness: SimHarness) -> None:
     harness.wait_ready()
     begin(harness, "second_autopilot 9")
     harness.forget()
@@ -105,20 +105,20 @@ def test_a_second_autopilot_speaks_and_answers(harness: SimHarness) -> None:
 
 
 @pytest.mark.streams("GLOBAL_POSITION_INT")
-def test_a_second_autopilot_of_the_same_system_gives_every_answer_twice(harness: SimHarness) -> None:
+def test_second_autopilot_of_same_system_doubles_answers(harness: SimHarness) -> None:
     harness.wait_ready()
     begin(harness, "second_autopilot")
     harness.fly(0.5)
     assert harness.command(ARM, 1) == [0, 0]
-    places = [
-        local(message.lat / 1e7, message.lon / 1e7, 0.0)
+    positions = [
+        SIH_FRAME.local(message.lat / 1e7, message.lon / 1e7, 0.0)
         for message in harness.received("GLOBAL_POSITION_INT")
     ]
-    assert {round(east) for _, east, _ in places} == {0, 25}
+    assert {round(east) for _, east, _ in positions} == {0, 25}
 
 
 @pytest.mark.streams("everything")
-def test_a_stalled_vehicle_stands_still_and_reads_all_afterwards(harness: SimHarness) -> None:
+def test_stalled_vehicle_reads_messages_afterwards(harness: SimHarness) -> None:
     harness.wait_ready()
     begin(harness, "stall for=2")
     boot_ms = harness.vehicle.boot_ms
@@ -135,7 +135,7 @@ def test_a_stalled_vehicle_stands_still_and_reads_all_afterwards(harness: SimHar
     assert harness.vehicle.boot_ms == pytest.approx(boot_ms + 400, abs=10)
 
 
-def test_a_slow_vehicle_goes_at_a_part_of_its_pace(harness: SimHarness) -> None:
+def test_slow_vehicle_runs_at_given_pace(harness: SimHarness) -> None:
     begin(harness, "stall 0.25")
     for _ in range(1000):
         harness.vehicle.step(0.004)
@@ -147,7 +147,7 @@ def test_a_slow_vehicle_goes_at_a_part_of_its_pace(harness: SimHarness) -> None:
 
 
 @pytest.mark.streams("GPS_RAW_INT", "LOCAL_POSITION_NED", "ODOMETRY")
-def test_offboard_by_position_ends_blind_when_gps_is_lost_and_resumes(
+def test_offboard_position_descends_without_gps_and_resumes(
     harness: SimHarness, position_setpoint: Callable[..., Any]
 ) -> None:
     harness.heartbeats = [("gcs", (245, 190), 6)]
@@ -174,8 +174,8 @@ def test_offboard_by_position_ends_blind_when_gps_is_lost_and_resumes(
     # PX4 goes on sending positions that stand still
     harness.forget()
     harness.until(lambda: not harness.vehicle.faults.active, 9.0, setpoint)
-    places = {(message.x, message.y) for message in harness.received("LOCAL_POSITION_NED")}
-    assert len(places) == 1
+    positions = {(message.x, message.y) for message in harness.received("LOCAL_POSITION_NED")}
+    assert len(positions) == 1
     harness.until(lambda: harness.mode == "OFFBOARD", 2.0, setpoint)
     assert newest(harness, "ODOMETRY").reset_counter > 0
 
@@ -189,7 +189,7 @@ def test_offboard_by_attitude_needs_no_position() -> None:
     assert not asks_for_position(object())
 
 
-def test_hold_without_gps_descends_and_a_pilot_gets_altitude_mode(harness: SimHarness) -> None:
+def test_hold_without_gps_descends_and_pilot_gets_altitude_mode(harness: SimHarness) -> None:
     harness.take_off(10.0)
     begin(harness, "gps_loss")
     harness.until(lambda: harness.mode == "LAND", 6.0)
@@ -200,7 +200,7 @@ def test_hold_without_gps_descends_and_a_pilot_gets_altitude_mode(harness: SimHa
     assert harness.command(ARM, 1) == [1]
 
 
-def test_position_mode_falls_to_altitude_where_a_pilot_has_sticks(harness: SimHarness) -> None:
+def test_position_mode_falls_to_altitude_where_pilot_has_sticks(harness: SimHarness) -> None:
     harness.take_off(10.0)
     begin(harness, "pilot_takeover POSCTL")
     assert harness.mode == "POSCTL"
@@ -210,19 +210,19 @@ def test_position_mode_falls_to_altitude_where_a_pilot_has_sticks(harness: SimHa
 
 
 @pytest.mark.streams("GLOBAL_POSITION_INT", "GPS_RAW_INT")
-def test_a_drifting_gps_takes_the_vehicle_along(harness: SimHarness) -> None:
+def test_gps_drift_moves_vehicle(harness: SimHarness) -> None:
     harness.take_off(10.0)
     begin(harness, "gps_drift 0.5 towards=0")
     harness.fly(10.0)
     assert harness.vehicle.estimate.position[0] == pytest.approx(0.0, abs=0.7)
     assert harness.vehicle.airframe.position[0] == pytest.approx(-5.0, abs=0.8)
-    fix, told = newest(harness, "GPS_RAW_INT"), newest(harness, "GLOBAL_POSITION_INT")
-    assert fix.lat == pytest.approx(told.lat, abs=60)
+    fix, reported = newest(harness, "GPS_RAW_INT"), newest(harness, "GLOBAL_POSITION_INT")
+    assert fix.lat == pytest.approx(reported.lat, abs=60)
     assert fix.fix_type == 3
 
 
 @pytest.mark.streams("LOCAL_POSITION_NED", "ODOMETRY")
-def test_an_estimator_reset_moves_the_estimate_and_not_the_vehicle(
+def test_estimator_reset_moves_estimate_and_not_vehicle(
     harness: SimHarness, position_setpoint: Callable[..., Any]
 ) -> None:
     harness.take_off(10.0)
@@ -247,7 +247,7 @@ def test_an_estimator_reset_moves_the_estimate_and_not_the_vehicle(
 # ---- power, rotors, air
 
 
-def test_a_battery_has_what_it_is_given_and_is_used_up(harness: SimHarness) -> None:
+def test_battery_fault_sets_and_drains_charge(harness: SimHarness) -> None:
     harness.take_off(5.0)
     begin(harness, "battery 0.5")
     assert newest(harness, "SYS_STATUS").battery_remaining == 50
@@ -257,7 +257,7 @@ def test_a_battery_has_what_it_is_given_and_is_used_up(harness: SimHarness) -> N
     assert newest(harness, "SYS_STATUS").battery_remaining > 60
 
 
-def test_a_battery_that_fails_brings_the_vehicle_down(make_harness: type[SimHarness]) -> None:
+def test_failed_battery_lands_vehicle(make_harness: type[SimHarness]) -> None:
     harness = make_harness(parameters={"COM_FAIL_ACT_T": 0})
     harness.take_off(5.0)
     begin(harness, "battery emergency")
@@ -281,7 +281,7 @@ def test_a_battery_warning_holds_and_has_its_failsafe_by_default(
     harness.heartbeats.append(("gcs", (245, 190), 6))  # texts go to a ground station that speaks
     harness.take_off(30.0)
     begin(harness, f"battery {warning}")
-    harness.fly(12.0)  # an unhurried client's time to see it
+    harness.fly(12.0)  # time for a client to receive it
     assert text in harness.texts()
     assert newest(harness, "SYS_STATUS").battery_remaining == percent
     assert newest(harness, "BATTERY_STATUS").charge_state == charge_state
@@ -290,7 +290,7 @@ def test_a_battery_warning_holds_and_has_its_failsafe_by_default(
     assert harness.mode == mode
 
 
-def test_after_a_battery_fault_the_breaker_counts_again(harness: SimHarness) -> None:
+def test_supply_check_applies_again_after_battery_fault(harness: SimHarness) -> None:
     harness.wait_ready()
     begin(harness, "battery critical")
     harness.fly(0.1)
@@ -304,7 +304,7 @@ def test_after_a_battery_fault_the_breaker_counts_again(harness: SimHarness) -> 
     assert not harness.vehicle.autopilot.supervision.battery.is_checked
 
 
-def test_of_two_failsafes_the_worse_one_is_flown(
+def test_worse_of_two_failsafes_is_active(
     make_harness: type[SimHarness], velocity_setpoint: Callable[..., Any]
 ) -> None:
     harness = make_harness(parameters={"CBRK_SUPPLY_CHK": 0, "COM_FAIL_ACT_T": 0})
@@ -365,14 +365,14 @@ def test_a_pilot_takes_the_vehicle_out_of_offboard(
     assert harness.mode == "POSCTL"
 
 
-def test_a_pilot_who_goes_away_again_leaves_the_mode_behind(harness: SimHarness) -> None:
+def test_pilot_fault_end_keeps_mode(harness: SimHarness) -> None:
     harness.take_off(5.0)
     begin(harness, "pilot_takeover for=1")
     harness.fly(3.0)
     assert harness.mode == "POSCTL"
 
 
-def test_where_a_remote_control_counts_its_pilot_going_away_is_a_failsafe(
+def test_pilot_fault_end_is_rc_loss_if_rc_enabled(
     make_harness: type[SimHarness],
 ) -> None:
     harness = make_harness(parameters={"COM_RC_IN_MODE": 0})
@@ -386,7 +386,7 @@ def test_where_a_remote_control_counts_its_pilot_going_away_is_a_failsafe(
     assert "failsafe: manual control lost, RTL" in harness.events
 
 
-def test_a_mode_is_refused_so_often_and_then_taken(harness: SimHarness) -> None:
+def test_mode_refused_given_count_then_accepted(harness: SimHarness) -> None:
     harness.take_off(5.0)
     begin(harness, "refuse_mode LAND count=2")
     assert harness.command(LAND) == [1]
@@ -399,7 +399,7 @@ def test_a_mode_is_refused_so_often_and_then_taken(harness: SimHarness) -> None:
 
 
 @pytest.mark.streams("everything")
-def test_a_reboot_in_flight_is_silent_then_new_and_disarmed(harness: SimHarness) -> None:
+def test_reboot_in_flight_is_silent_then_disarmed(harness: SimHarness) -> None:
     harness.take_off(30.0)
     assert harness.command(511, 30, 50_000) == [0]  # a setting, and settings are forgotten
     begin(harness, "reboot 2")
@@ -425,7 +425,7 @@ def test_a_reboot_on_the_ground_is_ready_again(harness: SimHarness) -> None:
     assert harness.command(ARM, 1) == [0]
 
 
-def test_what_needs_a_position_is_refused_without_one_and_land_is_not(harness: SimHarness) -> None:
+def test_modes_needing_position_refused_except_land(harness: SimHarness) -> None:
     harness.heartbeats.append(("gcs", (245, 190), 6))
     harness.take_off(8.0)
     begin(harness, "gps_loss")
@@ -451,7 +451,7 @@ def test_what_needs_a_position_is_refused_without_one_and_land_is_not(harness: S
     assert type(harness.vehicle.autopilot.task).__name__ == "Descend"
 
 
-def test_a_landing_goes_on_blindly_when_gps_is_lost(harness: SimHarness) -> None:
+def test_landing_continues_without_gps(harness: SimHarness) -> None:
     harness.take_off(8.0)
     begin(harness, "gps_loss")
     harness.fly(2.0)

@@ -1,4 +1,4 @@
-"""Where faults meet each other, failsafes, missions and reboots."""
+"""Combinations of faults, failsafes, missions and reboots."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 from mavlink_sim import LockstepVehicle
 from mavlink_sim.missions.items import MissionItem
-from mavlink_sim.physics.geography import local
+from mavlink_sim.physics.geography import SIH_FRAME
 from mavlink_sim.wire.messages import dialect
 from tests.mavlink_sim.conftest import SimHarness
 from tests.mavlink_sim.plan_client import land, takeoff, upload, waypoint
@@ -41,7 +41,7 @@ def position_comes_back(harness: SimHarness) -> None:
 
 
 def breach_the_fence(harness: SimHarness, action: int, waits_s: float = 0.0) -> None:
-    """Too high for a moment; what GF_ACTION asks for then lasts longer than the breach."""
+    """A short breach; the action of GF_ACTION lasts longer than the breach."""
     parameters = harness.vehicle.parameters
     parameters.set("COM_FAIL_ACT_T", waits_s)
     parameters.set("GF_ACTION", action)
@@ -55,7 +55,7 @@ def task_of(harness: SimHarness) -> str:
     return type(harness.vehicle.autopilot.task).__name__
 
 
-def test_a_latched_failsafe_goes_on_when_the_position_is_back(harness: SimHarness) -> None:
+def test_latched_failsafe_continues_with_regained_position(harness: SimHarness) -> None:
     harness.take_off(30.0)
     breach_the_fence(harness, RETURN_ACTION)
     assert harness.mode == "RTL"
@@ -68,7 +68,7 @@ def test_a_latched_failsafe_goes_on_when_the_position_is_back(harness: SimHarnes
     assert harness.mode == "RTL"
 
 
-def test_a_failsafe_without_a_position_sinks_and_returns_when_it_is_back(harness: SimHarness) -> None:
+def test_failsafe_descends_blind_then_returns(harness: SimHarness) -> None:
     harness.take_off(40.0)
     lose_position(harness)
     harness.vehicle.parameters.set("COM_FAIL_ACT_T", 0.0)
@@ -80,7 +80,7 @@ def test_a_failsafe_without_a_position_sinks_and_returns_when_it_is_back(harness
 
 
 @pytest.mark.parametrize("mode", ["HOLD", "TAKEOFF", "OFFBOARD", "RTL by the fence"])
-def test_a_vehicle_that_landed_blindly_stays_down_when_the_position_is_back(
+def test_blind_landing_stays_down_with_regained_position(
     harness: SimHarness, position_setpoint: Callable[..., Any], mode: str
 ) -> None:
     up = position_setpoint(0.0, 0.0, -20.0)
@@ -117,7 +117,7 @@ def test_a_terminated_flight_is_disarmed_once_it_is_down(harness: SimHarness) ->
     [(ORBIT, (10, 2, 0, 0, math.nan, math.nan, math.nan)), (CHANGE_ALTITUDE, (520.0,))],
     ids=["orbit", "altitude"],
 )
-def test_without_a_position_no_command_is_taken_that_needs_one(
+def test_commands_needing_position_refused(
     harness: SimHarness, command: int, values: tuple[float, ...]
 ) -> None:
     harness.take_off(30.0)
@@ -141,7 +141,7 @@ def test_two_losses_of_gps_that_overlap_leave_no_error(harness: SimHarness) -> N
     assert estimate.velocity == pytest.approx(harness.vehicle.airframe.velocity, abs=1e-6)
 
 
-def test_home_here_is_where_the_vehicle_believes_to_be(harness: SimHarness) -> None:
+def test_home_here_uses_estimate(harness: SimHarness) -> None:
     harness.wait_ready()
     begin(harness, "ekf_reset 3 0 0")
     assert harness.command(SET_HOME, 1) == [0]
@@ -153,8 +153,8 @@ def test_home_here_is_where_the_vehicle_believes_to_be(harness: SimHarness) -> N
 # ---- commands
 
 
-def test_a_mode_that_is_refused_to_clients_is_not_refused_to_the_mission(harness: SimHarness) -> None:
-    """DO_SET_MODE among the items of a mission is PX4's own affair."""
+def test_refuse_mode_does_not_affect_mission(harness: SimHarness) -> None:
+    """DO_SET_MODE in a mission is not refused by the fault."""
     harness.take_off(5.0)
     begin(harness, "refuse_mode any")
     assert harness.set_mode(4, 5) == [0, 1]
@@ -191,7 +191,7 @@ def test_a_reboot_begins_a_new_boot(harness: SimHarness) -> None:
     assert vehicle.autopilot.home.position[2] == pytest.approx(0.0, abs=0.01)
 
 
-def test_a_vehicle_that_boots_while_it_falls_is_in_the_air(harness: SimHarness) -> None:
+def test_boot_while_falling_is_in_air(harness: SimHarness) -> None:
     harness.take_off(60.0)
     begin(harness, "reboot 0.5")
     harness.forget()
@@ -214,7 +214,7 @@ def test_after_a_reboot_a_ground_station_can_be_lost(harness: SimHarness) -> Non
     assert harness.vehicle.autopilot.supervision.conditions.ground_station_lost
 
 
-def test_a_mission_and_its_place_outlive_a_reboot_but_not_what_was_reached(harness: SimHarness) -> None:
+def test_reboot_keeps_mission_item_not_reached(harness: SimHarness) -> None:
     harness.wait_ready()
     assert upload(harness, [takeoff(4.0), waypoint(4, 0, 4), waypoint(30, 0, 4), land(30, 0)]) == 0
     assert harness.set_mode(4, 4) == [0, 0]
@@ -230,7 +230,7 @@ def test_a_mission_and_its_place_outlive_a_reboot_but_not_what_was_reached(harne
 
 
 @pytest.mark.streams("ATTITUDE")
-def test_a_jump_of_the_clock_outlives_a_reboot_and_ends_cleanly(harness: SimHarness) -> None:
+def test_time_jump_survives_reboot_and_ends(harness: SimHarness) -> None:
     harness.fly(5.0)
     number = begin(harness, "time_jump 100")
     begin(harness, "reboot 1")
@@ -241,7 +241,7 @@ def test_a_jump_of_the_clock_outlives_a_reboot_and_ends_cleanly(harness: SimHarn
     assert harness.received("ATTITUDE")[-1].time_boot_ms == pytest.approx(2_500, abs=30)
 
 
-def test_a_reboot_without_a_fix_has_no_position_until_there_is_one(harness: SimHarness) -> None:
+def test_reboot_without_fix_has_no_position_until_there_is_one(harness: SimHarness) -> None:
     harness.wait_ready()
     number = begin(harness, "gps_loss")
     begin(harness, "reboot 1")
@@ -252,7 +252,7 @@ def test_a_reboot_without_a_fix_has_no_position_until_there_is_one(harness: SimH
     assert harness.vehicle.autopilot.can_arm
 
 
-def test_a_reboot_in_the_moment_of_reacquisition_finds_the_position(harness: SimHarness) -> None:
+def test_reboot_at_reacquisition_has_position(harness: SimHarness) -> None:
     harness.wait_ready()
     begin(harness, "gps_loss")
     harness.fly(6.0)
@@ -264,7 +264,7 @@ def test_a_reboot_in_the_moment_of_reacquisition_finds_the_position(harness: Sim
     assert estimate.position == pytest.approx(harness.vehicle.airframe.position, abs=1e-6)
 
 
-def test_waiting_and_repeating_in_lockstep_go_on_through_a_reboot_and_a_standstill() -> None:
+def test_lockstep_repeats_through_reboot_and_stall() -> None:
     vehicle = LockstepVehicle(seed=1)
     vehicle.step(20.0)
     vehicle.repeat(dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3), 1.0)
@@ -274,11 +274,11 @@ def test_waiting_and_repeating_in_lockstep_go_on_through_a_reboot_and_a_standsti
     assert vehicle.vehicle.links["onboard"].received == 4
 
 
-# ---- the clock and other voices
+# ---- the clock and a second autopilot
 
 
 @pytest.mark.streams("ATTITUDE", "TIMESYNC")
-def test_after_a_standstill_every_clock_tells_the_same_time(harness: SimHarness) -> None:
+def test_all_clocks_agree_after_stall(harness: SimHarness) -> None:
     harness.fly(2.0)
     begin(harness, "stall for=3")
     harness.fly(4.0)
@@ -287,7 +287,7 @@ def test_after_a_standstill_every_clock_tells_the_same_time(harness: SimHarness)
     assert harness.received("ATTITUDE")[-1].time_boot_ms == pytest.approx(3000, abs=20)
 
 
-def test_a_second_autopilot_stands_beside_the_vehicle_and_moves_nothing_of_it(
+def test_second_autopilot_does_not_move_the_vehicle(
     make_harness: type[SimHarness],
 ) -> None:
     harness = make_harness(["GLOBAL_POSITION_INT"], start_ned_m=(100.0, 200.0))
@@ -295,17 +295,17 @@ def test_a_second_autopilot_stands_beside_the_vehicle_and_moves_nothing_of_it(
     begin(harness, "second_autopilot 9")
     harness.forget()
     harness.fly(1.0)
-    places = {
-        message.get_srcSystem() if hasattr(message, "_system") else 1: local(
+    positions = {
+        message.get_srcSystem() if hasattr(message, "_system") else 1: SIH_FRAME.local(
             message.lat / 1e7, message.lon / 1e7, 0.0
         )
         for message in harness.received("GLOBAL_POSITION_INT")
     }
-    assert places[1][:2] == pytest.approx((100.0, 200.0), abs=0.05)
-    assert places[9][:2] == pytest.approx((100.0, 225.0), abs=0.5)
+    assert positions[1][:2] == pytest.approx((100.0, 200.0), abs=0.05)
+    assert positions[9][:2] == pytest.approx((100.0, 225.0), abs=0.5)
 
 
-def test_a_second_autopilot_goes_on_while_the_vehicle_stands_still(harness: SimHarness) -> None:
+def test_second_autopilot_continues_during_stall(harness: SimHarness) -> None:
     harness.wait_ready()
     begin(harness, "second_autopilot 9")
     begin(harness, "stall")
@@ -322,13 +322,13 @@ def test_a_second_autopilot_goes_on_while_the_vehicle_stands_still(harness: SimH
 
 
 @pytest.mark.streams("SERVO_OUTPUT_RAW")
-def test_every_rotor_shows_its_own_command_and_a_dead_one_what_it_is_asked_for(harness: SimHarness) -> None:
+def test_servo_output_has_each_rotor_command(harness: SimHarness) -> None:
     harness.take_off(20.0)
     begin(harness, "motor_failure 2")
     harness.forget()
     harness.fly(0.5)
-    told = harness.received("SERVO_OUTPUT_RAW")[-1]
-    widths = [told.servo1_raw, told.servo2_raw, told.servo3_raw, told.servo4_raw]
+    reported = harness.received("SERVO_OUTPUT_RAW")[-1]
+    widths = [reported.servo1_raw, reported.servo2_raw, reported.servo3_raw, reported.servo4_raw]
     expected = [1000 + round(1000 * command) for command in harness.vehicle.airframe.rotor_commands]
     assert widths == pytest.approx(expected, abs=150)
     assert len(set(widths)) > 1
@@ -336,7 +336,7 @@ def test_every_rotor_shows_its_own_command_and_a_dead_one_what_it_is_asked_for(h
     assert harness.vehicle.airframe.rotor_thrusts[1] < 0.01
 
 
-def test_offboard_right_after_the_first_setpoint_is_no_failsafe(
+def test_offboard_after_first_setpoint_is_no_failsafe(
     make_harness: type[SimHarness], position_setpoint: Callable[..., Any]
 ) -> None:
     for phase in (0, 2, 4):  # of the watch, which looks every other control step

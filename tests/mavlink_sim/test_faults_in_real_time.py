@@ -14,7 +14,7 @@ import zenoh
 
 from mavlink_sim.faults.zenoh_control import ControlError, FaultControl
 from mavlink_sim.testing import free_port, running_simulator
-from mavlink_sim.vehicle import Vehicle
+from mavlink_sim.vehicles.vehicle import Vehicle
 from mavlink_sim.wire.faulty_socket import FaultySocket
 from mavlink_sim.wire.link_faults import Delay, LinkStage, Loss
 from mavlink_sim.wire.messages import dialect, parser
@@ -28,12 +28,12 @@ def bound() -> socket.socket:
 
 
 def drain(endpoint: socket.socket) -> None:
-    """Read until nothing comes for its time-out."""
+    """Read until nothing arrives within its timeout."""
     while True:
         endpoint.recv(2048)
 
 
-def test_a_socket_goes_through_its_stage_and_back_to_itself() -> None:
+def test_socket_uses_stage_only_while_engaged() -> None:
     now_s = 0.0
     stage = LinkStage()
     with bound() as near, bound() as far:
@@ -76,7 +76,7 @@ def test_a_socket_goes_through_its_stage_and_back_to_itself() -> None:
         assert link.recvfrom(100)[0] == b"five"
 
 
-def test_faults_come_from_the_command_line_and_the_console_over_real_sockets() -> None:
+def test_faults_from_command_line_and_console() -> None:
     with bound() as client:
         port = client.getsockname()[1]
         with running_simulator(onboard_port=port, faults=["corrupt 0.5 way=out", "at=1 wind 3"]) as simulator:
@@ -107,17 +107,17 @@ def test_faults_come_from_the_command_line_and_the_console_over_real_sockets() -
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--fault", "link_dely 1"], "did you mean link_delay"),
-        (["--fault", "link_loss link=usb"], "there are: all, onboard, gcs"),
-        (["--control", "nonsense"], "--control nonsense: zenoh cannot listen there"),
+        (["--fault", "link_dely 1"], "link_delay"),
+        (["--fault", "link_loss link=usb"], "all, onboard, gcs"),
+        (["--control", "nonsense"], "--control nonsense"),
     ],
 )
-def test_what_cannot_be_is_said_in_one_line(arguments: list[str], said: str) -> None:
+def test_invalid_options_are_one_line(arguments: list[str], answer: str) -> None:
     ports = ["--onboard-bind", "0", "--gcs-bind", "0"]
     command = [sys.executable, "-m", "mavlink_sim", *ports, *arguments]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, stdin=subprocess.DEVNULL)
     assert done.returncode == 2
-    assert said in done.stderr
+    assert answer in done.stderr
     assert "Traceback" not in done.stderr
 
 
@@ -132,7 +132,7 @@ def client(port: int) -> zenoh.Session:
     return zenoh.open(config)
 
 
-def test_faults_come_over_zenoh_and_are_answered() -> None:
+def test_faults_over_zenoh_are_answered() -> None:
     port = free_port(socket.SOCK_STREAM)
     with (
         running_simulator(control=f"tcp/127.0.0.1:{port}", system_id=3) as simulator,

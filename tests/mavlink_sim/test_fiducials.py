@@ -1,4 +1,4 @@
-"""Marker plates: found by OpenCV's own detector, where geometry puts them."""
+"""Marker plates: found by OpenCV's detector at their geometric position."""
 
 from __future__ import annotations
 
@@ -62,9 +62,7 @@ def test_every_dictionary_is_found_by_opencv(dictionary: str) -> None:
     north=st.floats(-0.5, 0.5),
     identifier=st.integers(0, 49),
 )
-def test_a_lying_marker_is_found_within_a_pixel_of_where_it_lies(
-    yaw: float, height: float, north: float, identifier: int
-) -> None:
+def test_lying_marker_found_within_a_pixel(yaw: float, height: float, north: float, identifier: int) -> None:
     plate = WorldObject(0, "plate", (north, 0.2, 0.0), yaw, printed=Print("4X4_50", identifier, 0.6))
     renderer = Renderer(World((plate,), GROUND), CAMERA, CameraMount())
     image = renderer.render((0.0, 0.0, -height), DOWN).image
@@ -78,7 +76,7 @@ def test_a_lying_marker_is_found_within_a_pixel_of_where_it_lies(
 
 @settings(max_examples=10, deadline=None)
 @given(turn=st.floats(-0.9, 0.9), distance=st.floats(2.0, 6.0), lift=st.floats(0.0, 1.5))
-def test_a_standing_marker_is_found_where_it_stands(turn: float, distance: float, lift: float) -> None:
+def test_standing_marker_found_at_its_position(turn: float, distance: float, lift: float) -> None:
     plate = WorldObject(
         0, "plate", (distance, 0.1, -lift), math.pi + turn, printed=Print("APRILTAG_36h11", 7, 0.7, True)
     )
@@ -96,7 +94,7 @@ def test_a_standing_marker_is_found_where_it_stands(turn: float, distance: float
     assert np.abs(found[7] - wanted).max() < 1.8
 
 
-def test_a_standing_marker_shows_nothing_from_behind() -> None:
+def test_standing_marker_invisible_from_behind() -> None:
     plate = WorldObject(0, "plate", (3.0, 0.0, 0.0), 0.0, printed=Print("4X4_50", 7, 0.8, True))
     rendered = Renderer(World((plate,), GROUND), CAMERA, CameraMount()).render((0.0, 0.0, -0.5), np.eye(3))
     assert [item.world_object.identifier for item in rendered.objects] == [0]
@@ -114,26 +112,26 @@ def test_the_white_margin_is_one_cell_wide() -> None:
 @pytest.mark.parametrize(
     ("dictionary", "identifier", "size", "says"),
     [
-        ("4X4_51", 0, 0.5, "unknown marker dictionary '4X4_51'; known are .*4X4_50"),
-        ("4X4_50", 50, 0.5, "marker 50 is not in dictionary 4X4_50, which has 0 to 49"),
-        ("4X4_50", 0, 0.0, "size must be 0.01 to 50 m"),
+        ("4X4_51", 0, 0.5, "4X4_51.*4X4_50"),
+        ("4X4_50", 50, 0.5, "50.*4X4_50.*0 to 49"),
+        ("4X4_50", 0, 0.0, "0.01 to 50 m"),
     ],
 )
-def test_a_print_that_cannot_be_is_refused(dictionary: str, identifier: int, size: float, says: str) -> None:
-    with pytest.raises(ValueError, match=says):
+def test_invalid_print_refused(dictionary: str, identifier: int, size: float, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         Print(dictionary, identifier, size)
 
 
 def test_only_plates_have_prints_and_only_structures_a_size() -> None:
-    with pytest.raises(ValueError, match="a plate, and nothing else, has a print"):
+    with pytest.raises(ValueError, match="plate"):
         WorldObject(0, "plate", (0.0, 0.0, 0.0))
-    with pytest.raises(ValueError, match="a car has its own size"):
+    with pytest.raises(ValueError, match="car"):
         WorldObject(0, "car", (0.0, 0.0, 0.0), size_m=(1.0, 1.0, 1.0))
-    with pytest.raises(ValueError, match="size must be three lengths"):
+    with pytest.raises(ValueError, match="size"):
         WorldObject(0, "wall", (0.0, 0.0, 0.0), size_m=(1.0, 0.0, 1.0))
 
 
-def test_a_wall_has_the_size_and_place_asked_for() -> None:
+def test_wall_has_given_size_and_position() -> None:
     wall = WorldObject(0, "wall", (5.0, 0.0, 0.0), math.pi, size_m=(3.0, 0.2, 0.5))
     assert wall.footprint_m == pytest.approx((-0.1, 0.1, -1.5, 1.5))
     assert wall.height_m == pytest.approx(0.5)
@@ -141,15 +139,15 @@ def test_a_wall_has_the_size_and_place_asked_for() -> None:
     assert rendered.depth_m[180, 240] == pytest.approx(4.9, abs=0.01)
 
 
-def test_the_shadow_of_something_in_the_air_falls_away_from_the_sun() -> None:
+def test_shadow_of_raised_object_is_away_from_sun() -> None:
     def dark(height: float) -> np.ndarray:
         block = WorldObject(0, "box", (0.0, 0.0, -height), size_m=(0.4, 0.4, 0.1))
-        pictures = [
+        images = [
             Renderer(World(objects, GROUND), CAMERA, CameraMount()).render((0.0, 0.0, -20.0), DOWN)
             for objects in ((block,), ())
         ]
-        ground = cv2.erode((pictures[0].depth_m > 19.9).astype(np.uint8), np.ones((5, 5))) > 0
-        lost = pictures[1].image.astype(int).sum(axis=2) - pictures[0].image.astype(int).sum(axis=2)
+        ground = cv2.erode((images[0].depth_m > 19.9).astype(np.uint8), np.ones((5, 5))) > 0
+        lost = images[1].image.astype(int).sum(axis=2) - images[0].image.astype(int).sum(axis=2)
         rows, columns = np.nonzero((lost > 20) & ground)
         return np.array([rows.mean(), columns.mean()])
 

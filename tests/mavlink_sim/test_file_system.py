@@ -80,7 +80,7 @@ def outcome(call: Callable[[], object]) -> object:
 
 @settings(max_examples=150, deadline=None)
 @given(st.lists(calls, max_size=25))
-def test_every_call_ends_as_on_a_real_disk(script: list[tuple[str, ...]]) -> None:
+def test_calls_match_a_real_file_system(script: list[tuple[str, ...]]) -> None:
     files = FileSystem()
     with tempfile.TemporaryDirectory() as folder:
         for step in script:
@@ -88,7 +88,7 @@ def test_every_call_ends_as_on_a_real_disk(script: list[tuple[str, ...]]) -> Non
             assert here == outcome(partial(on_disk, Path(folder), *step)), step
 
 
-def test_a_provided_file_is_made_anew_whenever_it_is_read() -> None:
+def test_provided_file_is_generated_at_each_read() -> None:
     files = FileSystem()
     contents = iter([b"one", b"two"])
     files.provide("etc/now", lambda: next(contents))
@@ -96,7 +96,7 @@ def test_a_provided_file_is_made_anew_whenever_it_is_read() -> None:
 
 
 @pytest.mark.parametrize("path", ["etc/now", "etc", "/", ""])
-def test_the_vehicles_own_cannot_be_changed(path: str) -> None:
+def test_provided_files_are_read_only(path: str) -> None:
     files = FileSystem()
     files.provide("etc/now", lambda: b"")
     for change in (
@@ -110,7 +110,7 @@ def test_the_vehicles_own_cannot_be_changed(path: str) -> None:
             change()
 
 
-def test_there_is_an_end_of_entries() -> None:
+def test_entries_are_limited() -> None:
     files = FileSystem()
 
     def fill() -> None:

@@ -45,7 +45,7 @@ class Client:
     def repeat(
         self, opcode: int, data: bytes = b"", offset: int = 0, session: int = 0, size: int = -1
     ) -> list[Packet]:
-        """The same again under the same number, as after a lost answer."""
+        """Repeat it with the same number, as after a lost answer."""
         payload = struct.pack(
             "<HBBBBBBI", self.sequence, session, opcode, len(data) if size < 0 else size, 0, 0, 0, offset
         )
@@ -98,14 +98,14 @@ def test_the_root_lists_what_px4_has_there(client: Client) -> None:
     ]
 
 
-def test_the_storage_card_of_a_flight_controller_is_the_same_place(client: Client) -> None:
+def test_storage_card_path_is_the_root(client: Client) -> None:
     client.upload(b"/fs/microsd/note.txt", b"hello")
     assert b"Fnote.txt\t5" in client.list(b"")
     client.ack(Opcode.REMOVE_FILE, b"note.txt")
     assert b"Fnote.txt\t5" not in client.list(b"/fs/microsd")
 
 
-def test_a_long_list_comes_in_parts_by_offset(client: Client) -> None:
+def test_long_list_is_split_by_offset(client: Client) -> None:
     client.ack(Opcode.CREATE_DIRECTORY, b"many")
     names = [f"file-number-{number:03d}" for number in range(30)]
     for name in names:
@@ -120,7 +120,7 @@ def test_a_long_list_comes_in_parts_by_offset(client: Client) -> None:
     assert found == [b"S", b"S"] + [f"F{name}\t0".encode() for name in names]
 
 
-def test_what_is_written_is_read_and_bursts(client: Client) -> None:
+def test_written_file_is_read_and_burst(client: Client) -> None:
     content = os.urandom(5000)
     client.upload(b"log/flight.ulg", content)
     assert client.ack(Opcode.OPEN_FILE_RO, b"log/flight.ulg").data == struct.pack("<I", 5000)
@@ -135,7 +135,7 @@ def test_what_is_written_is_read_and_bursts(client: Client) -> None:
     client.ack(Opcode.TERMINATE_SESSION)
 
 
-def test_a_burst_pauses_after_35_kilobytes_and_goes_on_where_it_is_asked_to(client: Client) -> None:
+def test_burst_pauses_after_35_kb_and_continues_at_offset(client: Client) -> None:
     content = os.urandom(100_000)
     files = client.harness.vehicle.files
     files.write(files.create("big", True), 0, content)
@@ -157,7 +157,7 @@ def test_a_burst_pauses_after_35_kilobytes_and_goes_on_where_it_is_asked_to(clie
     assert rounds == 3
 
 
-def test_a_session_is_one_a_link_and_closes_after_ten_seconds_of_silence(client: Client) -> None:
+def test_one_session_per_link_closes_after_10_s(client: Client) -> None:
     client.ack(Opcode.OPEN_FILE_RO, b"parameters.bson")
     assert client.nak(Opcode.OPEN_FILE_RO, b"parameters.bson") == (Failure.NO_SESSIONS_AVAILABLE,)
     client.harness.fly(9.0)
@@ -169,7 +169,7 @@ def test_a_session_is_one_a_link_and_closes_after_ten_seconds_of_silence(client:
     client.ack(Opcode.OPEN_FILE_RO, b"parameters.bson")
 
 
-def test_a_repeated_request_is_not_carried_out_twice(client: Client) -> None:
+def test_repeated_request_executed_once(client: Client) -> None:
     client.ack(Opcode.CREATE_DIRECTORY, b"once")
     (again,) = client.repeat(Opcode.CREATE_DIRECTORY, b"once")
     assert again.opcode == Opcode.ACK
@@ -272,7 +272,7 @@ def test_any_payload_is_answered(requests: list[tuple[int, bytes, int, int]]) ->
 # ---- what is in the files
 
 
-def test_the_parameter_file_holds_what_differs_from_the_defaults_as_bson() -> None:
+def test_parameter_file_holds_what_differs_from_defaults_as_bson() -> None:
     parameters = Parameters({"COM_OF_LOSS_T": 0.5, "NAV_RCL_ACT": 3})
     content = bson(parameters.customised())
     assert content == (
@@ -283,7 +283,7 @@ def test_the_parameter_file_holds_what_differs_from_the_defaults_as_bson() -> No
     )  # fmt: skip
 
 
-def test_packed_parameters_are_read_by_pymavlinks_own_decoder(harness: SimHarness) -> None:
+def test_packed_parameters_read_by_pymavlink(harness: SimHarness) -> None:
     parameters = harness.vehicle.parameters
     decoded = mavftp.MAVFTP.ftp_param_decode(packed_parameters(parameters))
     assert decoded is not None
@@ -295,7 +295,7 @@ def test_packed_parameters_are_read_by_pymavlinks_own_decoder(harness: SimHarnes
     }
 
 
-def test_packed_parameters_are_offered_on_wish(client: Client) -> None:
+def test_packed_parameters_are_optional(client: Client) -> None:
     vehicle = client.harness.vehicle
     offer_packed_parameters(vehicle.files, vehicle.parameters)
     size = len(packed_parameters(vehicle.parameters))
@@ -324,7 +324,7 @@ def test_the_metadata_is_found_through_component_metadata(harness: SimHarness) -
     assert [entry["name"] for entry in listed] == [parameter.name for parameter in default_parameters()]
 
 
-# ---- clients nobody here wrote
+# ---- other clients
 
 
 @pytest.fixture(scope="module")

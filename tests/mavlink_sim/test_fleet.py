@@ -1,4 +1,4 @@
-"""Many vehicles in one process: ids, ports, places, seeds, one clock."""
+"""Many vehicles in one process: ids, ports, start positions, seeds, one clock."""
 
 import json
 import math
@@ -10,14 +10,13 @@ from typing import Any
 import pytest
 from pymavlink import mavutil
 
-from mavlink_sim import real_time
-from mavlink_sim.cli import main
-from mavlink_sim.fleet import instance_options, places
+from mavlink_sim.cli.main import main
 from mavlink_sim.lockstep import LockstepVehicle
-from mavlink_sim.physics.geography import geographic
-from mavlink_sim.simulation import SimulationOptions
+from mavlink_sim.realtime import loop
+from mavlink_sim.realtime.fleet import instance_options, start_positions
+from mavlink_sim.realtime.options import SimulationOptions
 from mavlink_sim.testing import free_udp_port_range, running_simulator
-from mavlink_sim.vehicle import Vehicle
+from mavlink_sim.vehicles.vehicle import Vehicle
 
 METRE_DEG = math.degrees(1.0 / 6371000.0)
 
@@ -32,15 +31,15 @@ def test_ids_and_ports_count_up_as_in_px4s_sitl() -> None:
     assert [one.seed for one in members] == list(range(10, 30))
 
 
-def test_places_are_a_grid_without_two_in_one() -> None:
-    grid = places(20, 5.0)
+def test_start_positions_are_a_grid() -> None:
+    grid = start_positions(20, 5.0)
     assert grid[0] == (0.0, 0.0)
     assert len(set(grid)) == 20
-    assert max(max(place) for place in grid) == 20.0
+    assert max(max(position) for position in grid) == 20.0
     assert min(math.dist(a, b) for a in grid for b in grid if a != b) == 5.0
 
 
-def test_the_camera_is_on_one_vehicle_and_each_has_its_own_truth_file() -> None:
+def test_camera_on_one_vehicle_and_each_has_its_own_truth_file() -> None:
     options = SimulationOptions(camera="eye", truth=Path("truth.jsonl"))
     members = instance_options(options, 3, 5.0)
     assert [one.camera for one in members] == ["eye", None, None]
@@ -60,7 +59,7 @@ def test_the_camera_is_on_one_vehicle_and_each_has_its_own_truth_file() -> None:
     ],
     ids=["none", "ids", "ports", "camera", "spacing", "noise"],
 )
-def test_a_fleet_that_cannot_be_is_refused_in_one_line(
+def test_invalid_fleet_is_one_line(
     arguments: list[str],
     words: list[str],
     monkeypatch: pytest.MonkeyPatch,
@@ -74,7 +73,7 @@ def test_a_fleet_that_cannot_be_is_refused_in_one_line(
     assert all(word in line for word in words)
 
 
-def test_each_has_its_own_home_and_a_local_frame_that_begins_there() -> None:
+def test_each_vehicle_has_its_home_and_local_frame() -> None:
     first = LockstepVehicle(noise=False)
     second = LockstepVehicle(noise=False, start_ned_m=(10.0, 20.0))
     for vehicle in (first, second):  # in turns, as a fleet's are
@@ -92,21 +91,20 @@ def test_each_has_its_own_home_and_a_local_frame_that_begins_there() -> None:
     assert (origin.latitude, origin.longitude) == (there.lat, there.lon) == (home.latitude, home.longitude)
 
 
-def test_a_place_given_in_degrees_is_flown_to_from_another_start() -> None:
+def test_global_position_reached_from_another_start() -> None:
     vehicle = LockstepVehicle({"onboard": {}}, noise=False, gusts_mps=0.0, start_ned_m=(10.0, 20.0))
     vehicle.take_off(5.0)
     # SIH's home, ten metres south and twenty west of where this one started
-    place = (47.397743225, 8.545594215, 494.4)
-    assert vehicle.command(192, -1.0, 1.0, 0.0, math.nan, *place) == "ACCEPTED"
+    position = (47.397743225, 8.545594215, 494.4)
+    assert vehicle.command(192, -1.0, 1.0, 0.0, math.nan, *position) == "ACCEPTED"
     vehicle.step(25.0)
     north, east, _ = vehicle.truth.position_ned_m
     assert (north, east) == pytest.approx((-10.0, -20.0), abs=0.7)
-    # and who reckons beside it does so from SIH's home
-    assert geographic((0.0, 0.0, -5.0)) == pytest.approx(place)
+    assert vehicle.vehicle.local_frame.local(*position) == pytest.approx((-10.0, -20.0, -5.0))
 
 
-def heard(port: int, wanted: set[int], limit_s: float = 40.0) -> dict[int, dict[str, Any]]:
-    """The newest messages by system and type, once each wanted system told its position."""
+def received(port: int, wanted: set[int], limit_s: float = 40.0) -> dict[int, dict[str, Any]]:
+    """The newest messages by system and type, once each given system has sent its position."""
     link = mavutil.mavlink_connection(f"udpin:127.0.0.1:{port}", source_system=245)
     newest: dict[int, dict[str, Any]] = defaultdict(dict)
     deadline = time.monotonic() + limit_s
@@ -119,19 +117,19 @@ def heard(port: int, wanted: set[int], limit_s: float = 40.0) -> dict[int, dict[
                 return dict(newest)
     finally:
         link.close()
-    raise AssertionError(f"heard {sorted(newest)} of {sorted(wanted)}")
+    raise AssertionError(f"received {sorted(newest)} of {sorted(wanted)}")
 
 
-def test_a_fleet_in_one_process_speaks_on_its_ports(tmp_path: Path) -> None:
+def test_fleet_sends_on_its_ports(tmp_path: Path) -> None:
     ready = tmp_path / "ready.json"
     with running_simulator(vehicles=3, spacing=50.0, ready_file=ready) as simulator:
         assert [one.system_id for one in simulator.vehicles] == [1, 2, 3]
         ports = [one.onboard_port for one in simulator.vehicles]
         assert ports == list(range(ports[0], ports[0] + 3))
         assert {one.gcs_port for one in simulator.vehicles} == {simulator.gcs_port}
-        everybody = heard(simulator.gcs_port, {1, 2, 3})  # all speak to the one ground station
-        assert len({place["GLOBAL_POSITION_INT"].lon for place in everybody.values()}) >= 2
-        assert set(heard(ports[1], {2})) == {2}  # and each to its own companion
+        everybody = received(simulator.gcs_port, {1, 2, 3})  # all send to one ground station
+        assert len({position["GLOBAL_POSITION_INT"].lon for position in everybody.values()}) >= 2
+        assert set(received(ports[1], {2})) == {2}  # and each to its own companion
         report = json.loads(ready.read_text())
         assert [one["system_id"] for one in report["vehicles"]] == [1, 2, 3]
         third = simulator.vehicles[2]
@@ -147,21 +145,22 @@ def test_a_range_of_ports_is_free() -> None:
     assert 1024 < start <= 65531
 
 
-def test_a_machine_that_is_too_slow_is_told_of_and_how_slow(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_slow_machine_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     now_s = 100.0
-    monkeypatch.setattr("mavlink_sim.real_time.time.monotonic", lambda: now_s)
-    told: list[str] = []
-    pace = real_time._Pace(20.0, told.append)
+    monkeypatch.setattr("mavlink_sim.realtime.loop.time.monotonic", lambda: now_s)
+    reports: list[str] = []
+    pace = loop._Pace(20.0, reports.append)
     pace.lose(25.0)
     now_s += 2.0
-    pace.tell()
-    assert told == []  # not at every hiccup
+    pace.report()
+    assert reports == []  # not for every short delay
     now_s += 3.0
-    pace.tell()
-    assert told == ["cannot keep up: 15.00 times real time in the last 5 s, not 20; the machine is too busy"]
+    pace.report()
+    assert len(reports) == 1
+    assert "15.00 times real time" in reports[0]
     now_s += 6.0
-    pace.tell()
-    assert len(told) == 1  # nothing lost since
+    pace.report()
+    assert len(reports) == 1  # nothing lost since
 
 
 def test_a_fleet_flies_in_one_wind_with_the_same_gusts() -> None:
@@ -180,9 +179,9 @@ def test_a_fleet_flies_in_one_wind_with_the_same_gusts() -> None:
     assert gusts[0] == gusts[1] == gusts[2]
     assert any(gusts[0][1])
     other = instance_options(SimulationOptions(seed=8, wind_mps=5.0), 3, 5.0)[0]
-    stranger = Vehicle(seed=other.seed, air_seed=other.world_seed, wind_mps=5.0)
-    stranger.step(20.0)
-    assert (stranger.airframe.wind, stranger.airframe._gust) != gusts[0]
+    other_autopilot = Vehicle(seed=other.seed, air_seed=other.world_seed, wind_mps=5.0)
+    other_autopilot.step(20.0)
+    assert (other_autopilot.airframe.wind, other_autopilot.airframe._gust) != gusts[0]
     assert len({vehicle.estimate.drift for vehicle in vehicles}) == 3
 
 

@@ -1,4 +1,4 @@
-"""The geofence: what is inside, what is refused, and what happens at a breach."""
+"""The geofence: inside and outside, refusals, breaches."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from mavlink_sim.missions.geofence import Area, inside_polygon
-from mavlink_sim.physics.geography import geographic
+from mavlink_sim.physics.geography import SIH_FRAME
 from mavlink_sim.wire.announcements import event_identifier
 from tests.mavlink_sim.conftest import SimHarness
 from tests.mavlink_sim.plan_client import circle, listen, polygon, upload
@@ -42,7 +42,7 @@ def harness(make_harness: type[SimHarness]) -> SimHarness:
     metres,
     metres,
 )
-def test_a_star_shaped_polygon_is_told_as_opencv_tells_it(
+def test_point_in_star_polygon_matches_opencv(
     spokes: list[tuple[int, float]], north: float, east: float
 ) -> None:
     corners = [
@@ -51,7 +51,7 @@ def test_a_star_shaped_polygon_is_told_as_opencv_tells_it(
     ]
     contour = np.array(corners, dtype=np.float32)
     distance = cv2.pointPolygonTest(contour, (north, east), True)
-    assume(abs(distance) > 0.01)  # on the edge either answer will do
+    assume(abs(distance) > 0.01)  # on the edge both results are valid
     assert inside_polygon(corners, (north, east)) == (distance > 0)
 
 
@@ -65,7 +65,7 @@ def test_inclusion_and_exclusion_are_opposites(
     assert inside.allows((north, east)) != outside.allows((north, east))
 
 
-def test_a_polygon_of_nothing_holds_nothing() -> None:
+def test_empty_polygon_contains_no_point() -> None:
     assert not inside_polygon([], (0.0, 0.0))
     assert not inside_polygon([(0.0, 0.0), (1.0, 1.0)], (0.5, 0.5))
 
@@ -73,7 +73,7 @@ def test_a_polygon_of_nothing_holds_nothing() -> None:
 # ---- upload
 
 
-def test_a_fence_without_home_is_left_out_and_said(harness: SimHarness) -> None:
+def test_fence_without_home_is_dropped_and_reported(harness: SimHarness) -> None:
     listen(harness)
     assert upload(harness, polygon(FENCE, inclusion=False), 1) == 0
     harness.fly(0.1)
@@ -82,7 +82,7 @@ def test_a_fence_without_home_is_left_out_and_said(harness: SimHarness) -> None:
     assert harness.vehicle.autopilot.can_arm
 
 
-def test_a_fence_that_the_flying_vehicle_would_break_is_left_out_and_said(harness: SimHarness) -> None:
+def test_fence_breached_at_upload_is_dropped(harness: SimHarness) -> None:
     listen(harness)
     harness.take_off(4.0)
     harness.vehicle.airframe.position = (0.0, 40.0, -4.0)
@@ -97,7 +97,7 @@ def test_a_fence_that_the_flying_vehicle_would_break_is_left_out_and_said(harnes
 # ---- arming
 
 
-def test_outside_the_fence_nobody_arms(make_harness: type[SimHarness]) -> None:
+def test_arming_refused_outside_fence(make_harness: type[SimHarness]) -> None:
     harness = make_harness(ready_after_s=0.0)
     listen(harness)
     upload(harness, [circle(0, 0, 10.0)], 1)
@@ -110,7 +110,7 @@ def test_outside_the_fence_nobody_arms(make_harness: type[SimHarness]) -> None:
     assert harness.heartbeat().system_status == 0
 
 
-def test_without_an_action_the_fence_is_not_looked_at(make_harness: type[SimHarness]) -> None:
+def test_fence_ignored_without_action(make_harness: type[SimHarness]) -> None:
     harness = make_harness(ready_after_s=0.0, parameters={"GF_ACTION": 0})
     upload(harness, [circle(0, 0, 10.0)], 1)
     harness.vehicle.airframe.position = (15.0, 0.0, 0.0)
@@ -138,7 +138,7 @@ def fly_out(harness: SimHarness, velocity_setpoint: Any, **parameters: float) ->
     ("action", "mode"),
     [(1, "OFFBOARD"), (2, "HOLD"), (3, "RTL"), (5, "LAND")],
 )
-def test_a_breach_does_what_gf_action_says(
+def test_breach_executes_gf_action(
     make_harness: type[SimHarness], velocity_setpoint: Any, action: int, mode: str
 ) -> None:
     harness = make_harness(ready_after_s=0.0, parameters={"GF_ACTION": action, "COM_FAIL_ACT_T": 0})
@@ -153,9 +153,7 @@ def test_a_breach_does_what_gf_action_says(
     assert any("geofence breached" in event for event in harness.events)
 
 
-def test_before_it_returns_it_holds_for_a_pilot_to_take_over(
-    make_harness: type[SimHarness], velocity_setpoint: Any
-) -> None:
+def test_breach_holds_before_return(make_harness: type[SimHarness], velocity_setpoint: Any) -> None:
     harness = make_harness(ready_after_s=0.0, parameters={"GF_ACTION": 3})
     fly_out(harness, velocity_setpoint)
     assert harness.mode == "HOLD"
@@ -163,9 +161,7 @@ def test_before_it_returns_it_holds_for_a_pilot_to_take_over(
     assert harness.until(lambda: harness.mode == "RTL", 6.0) == pytest.approx(4.8, abs=0.3)
 
 
-def test_after_a_breach_the_offboard_stream_does_not_take_the_vehicle_back(
-    harness: SimHarness, velocity_setpoint: Any
-) -> None:
+def test_offboard_does_not_resume_after_breach(harness: SimHarness, velocity_setpoint: Any) -> None:
     north = velocity_setpoint(4, 0, 0)
     fly_out(harness, velocity_setpoint)
     harness.fly(3.0, north)
@@ -175,16 +171,16 @@ def test_after_a_breach_the_offboard_stream_does_not_take_the_vehicle_back(
     harness.offboard(home)  # the user may, on purpose, still outside
     harness.until(lambda: harness.vehicle.airframe.position[0] < 6.0, 10.0, home)
     assert harness.mode == "OFFBOARD"
-    harness.until(lambda: harness.mode == "HOLD", 10.0, north)  # and the next breach counts anew
+    harness.until(lambda: harness.mode == "HOLD", 10.0, north)  # and the next breach is a new one
 
 
-def test_a_place_outside_the_fence_is_not_flown_to(harness: SimHarness) -> None:
+def test_goal_outside_fence_refused(harness: SimHarness) -> None:
     listen(harness)
     harness.take_off(4.0)
     upload(harness, [circle(0, 0, 8.0)], 1)
-    latitude, longitude, altitude = geographic((20.0, 0.0, -4.0))
-    place = (round(latitude * 1e7), round(longitude * 1e7), altitude)
-    assert harness.command_int(192, (-1, 1, 0, math.nan), *place) == [0]
+    latitude, longitude, altitude = SIH_FRAME.geographic((20.0, 0.0, -4.0))
+    point = (round(latitude * 1e7), round(longitude * 1e7), altitude)
+    assert harness.command_int(192, (-1, 1, 0, math.nan), *point) == [0]
     harness.fly(2.0)
     assert harness.texts()[-1] == "Reposition is outside geofence\t"
     assert math.hypot(*harness.vehicle.airframe.position[:2]) < 1.0
@@ -206,7 +202,7 @@ def test_termination_stops_the_motors(make_harness: type[SimHarness], velocity_s
         ("GF_MAX_VER_DIST", (0, 0, -2), "Geofence: exceeding maximum altitude above Home"),
     ],
 )
-def test_the_greatest_distances_from_home_are_a_fence_too(
+def test_max_distances_from_home_are_a_fence(
     make_harness: type[SimHarness],
     velocity_setpoint: Any,
     parameter: str,

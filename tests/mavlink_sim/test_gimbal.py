@@ -10,10 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mavlink_sim.physics.geography import geographic
+from mavlink_sim.physics.geography import SIH_FRAME
 from mavlink_sim.physics.gimbal import Aim, Gimbal, Target
 from mavlink_sim.px4.parameters import Parameters
-from mavlink_sim.simulation import Simulation, SimulationOptions
+from mavlink_sim.realtime.options import SimulationOptions
+from mavlink_sim.realtime.simulation import Simulation
 from mavlink_sim.wire.messages import dialect
 from tests.mavlink_sim.conftest import SimHarness
 from vision.attitude import quaternion_from_euler
@@ -44,7 +45,7 @@ def sight(device: Gimbal) -> Any:
 
 @settings(deadline=None, max_examples=30)
 @given(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5), angles, st.floats(-1.3, 0.2), angles)
-def test_locked_angles_are_kept_whatever_the_vehicle_does(
+def test_locked_angles_independent_of_vehicle(
     roll: float, pitch: float, yaw: float, aim_pitch: float, aim_yaw: float
 ) -> None:
     device = gimbal(MNT_MAX_PITCH=90, MNT_MIN_PITCH=-180)
@@ -82,7 +83,7 @@ def test_its_two_poses_agree(roll: float, pitch: float, yaw: float, tilt: float,
     assert np.allclose(whole, matrix_from_quaternion(device.quaternion), atol=1e-9)
 
 
-def test_it_looks_at_a_place_and_keeps_looking_as_the_vehicle_passes() -> None:
+def test_tracks_location_while_vehicle_passes() -> None:
     device = gimbal()
     device.point(Target(Aim.LOCATION, location=(10.0, 0.0, 0.0)))
     for north in (0.0, 5.0, 10.0, 15.0):
@@ -91,7 +92,7 @@ def test_it_looks_at_a_place_and_keeps_looking_as_the_vehicle_passes() -> None:
         assert sight(device) == pytest.approx(towards / np.linalg.norm(towards), abs=1e-3)
 
 
-def test_the_stops_hold() -> None:
+def test_limits_are_respected() -> None:
     device = gimbal(MNT_MAX_PITCH=30, MNT_MIN_PITCH=-60, MNT_RANGE_YAW=180)
     device.point(Target(Aim.ANGLES, 1.5, 3.0))
     settled(device)
@@ -104,7 +105,7 @@ def test_the_stops_hold() -> None:
     assert math.degrees(settled(device, landed=True).tilt_rad) == pytest.approx(-10.0)
 
 
-def test_it_takes_its_time_and_turns_at_a_rate_until_that_is_silent() -> None:
+def test_slews_and_rate_ends_without_repeats() -> None:
     device = gimbal()
     device.point(Target(Aim.ANGLES, -1.5, 0.0))
     for _ in range(50):
@@ -117,7 +118,7 @@ def test_it_takes_its_time_and_turns_at_a_rate_until_that_is_silent() -> None:
     assert (device.pan_rad, device.tilt_rad) == pytest.approx((0.2, -0.1), abs=0.01)
     assert device.angular_velocity((0.0, 0.0, 0.0))[1] == pytest.approx(-0.1, abs=1e-6)
     settled(device)
-    assert device.pan_rad == pytest.approx(0.4, abs=0.01)  # 2 s after the last word it stands
+    assert device.pan_rad == pytest.approx(0.4, abs=0.01)  # 2 s after the last message it stops
 
 
 def test_a_rate_against_a_stop_does_not_wind_up() -> None:
@@ -147,7 +148,7 @@ def degrees(harness: SimHarness) -> tuple[float, float]:
     return math.degrees(device.pitch_rad), math.degrees(device.yaw_rad)
 
 
-def test_a_vehicle_as_delivered_has_no_gimbal(harness: SimHarness) -> None:
+def test_no_gimbal_by_default(harness: SimHarness) -> None:
     harness.wait_ready()
     assert harness.vehicle.gimbal is None
     assert harness.command(512, 280) == [2]
@@ -156,7 +157,7 @@ def test_a_vehicle_as_delivered_has_no_gimbal(harness: SimHarness) -> None:
     assert "MNT_MODE_OUT" not in harness.vehicle.parameters
 
 
-def test_the_gimbal_is_told(make_harness: type[SimHarness]) -> None:
+def test_gimbal_telemetry_is_sent(make_harness: type[SimHarness]) -> None:
     harness = make_harness(gimbal=True)
     harness.wait_ready()
     assert harness.command(512, 280) == [0]
@@ -185,7 +186,7 @@ def test_only_the_one_in_control_moves_it(make_harness: type[SimHarness]) -> Non
     assert harness.command(1001, *GROUND_STATION, -1, -1, source=GROUND_STATION, link="gcs") == [0]
     assert harness.vehicle.gimbal_manager is not None
     assert harness.vehicle.gimbal_manager.primary == GROUND_STATION
-    assert harness.command(1001, -3, -3, -1, -1) == [0]  # not ours to release
+    assert harness.command(1001, -3, -3, -1, -1) == [0]  # not released by another component
     assert harness.vehicle.gimbal_manager.primary == GROUND_STATION
     assert harness.command(1001, -3, -3, -1, -1, source=GROUND_STATION, link="gcs") == [0]
     assert harness.vehicle.gimbal_manager.primary == (0, 0)
@@ -207,11 +208,11 @@ def test_messages_move_it_too(steered: SimHarness) -> None:
     assert degrees(steered)[1] - before == pytest.approx(30.0, abs=2.0)  # MNT_RATE_YAW
 
 
-def test_a_location_is_looked_at_and_forgotten(steered: SimHarness) -> None:
+def test_roi_location_set_and_cleared(steered: SimHarness) -> None:
     x, y, _ = steered.vehicle.airframe.position
-    latitude, longitude, altitude = geographic((x + 20.0, y + 20.0, 0.0))
-    place = (0, 0, 0, 0)
-    assert steered.command_int(195, place, round(latitude * 1e7), round(longitude * 1e7), altitude) == [0]
+    latitude, longitude, altitude = SIH_FRAME.geographic((x + 20.0, y + 20.0, 0.0))
+    position = (0, 0, 0, 0)
+    assert steered.command_int(195, position, round(latitude * 1e7), round(longitude * 1e7), altitude) == [0]
     steered.fly(2.0)
     assert degrees(steered)[1] == pytest.approx(45.0, abs=1.0)
     assert steered.command(197) == [0]
@@ -220,19 +221,19 @@ def test_a_location_is_looked_at_and_forgotten(steered: SimHarness) -> None:
     assert steered.command(195, 0, 0, 0, 0, NAN, NAN, NAN) == [2]
 
 
-def test_the_attitude_told_is_the_gimbals(steered: SimHarness) -> None:
+def test_reported_attitude_is_the_gimbals(steered: SimHarness) -> None:
     assert steered.command(1000, -60, 30, NAN, NAN, 12) == [0]
     steered.fly(2.0)
     steered.forget()
     steered.fly(0.3)
-    told = steered.received("GIMBAL_DEVICE_ATTITUDE_STATUS")[-1]
+    reported = steered.received("GIMBAL_DEVICE_ATTITUDE_STATUS")[-1]
     assert steered.vehicle.gimbal is not None
-    assert list(told.q) == pytest.approx(steered.vehicle.gimbal.quaternion, abs=1e-6)
-    assert told.flags & 64
+    assert list(reported.q) == pytest.approx(steered.vehicle.gimbal.quaternion, abs=1e-6)
+    assert reported.flags & 64
     assert steered.received("MOUNT_ORIENTATION")[-1].pitch == pytest.approx(-60.0, abs=0.1)
 
 
-def test_landing_turns_it_forward_and_its_commands_are_not_repeated(steered: SimHarness) -> None:
+def test_landing_centres_gimbal_once(steered: SimHarness) -> None:
     assert steered.command(1000, -45, 0, NAN, NAN, 12) == [0]
     steered.take_off()
     steered.forget()

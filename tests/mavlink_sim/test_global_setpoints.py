@@ -1,4 +1,4 @@
-"""SET_POSITION_TARGET_GLOBAL_INT, accelerations, and what is flown of mixed setpoints."""
+"""SET_POSITION_TARGET_GLOBAL_INT, accelerations and mixed setpoints."""
 
 import math
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from mavlink_sim.flight.setpoints import (
     trajectory_setpoint,
 )
 from mavlink_sim.physics.airframe import LINEAR_DRAG_PER_S
-from mavlink_sim.physics.geography import HOME_ALTITUDE_M, geographic
+from mavlink_sim.physics.geography import HOME_ALTITUDE_M, SIH_FRAME
 from mavlink_sim.wire.messages import dialect
 from tests.mavlink_sim.conftest import SimHarness
 
@@ -27,14 +27,14 @@ ACCELERATION_ALONE = 0xC3F
 
 
 def globally(
-    place: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0),
     altitude_m: float = 0.0,
     frame: int = 5,
     mask: int = POSITION_ALONE,
     **fields: float,
 ) -> Any:
-    """A setpoint to a local place, given as latitude and longitude; the altitude as it is sent."""
-    latitude, longitude, _ = geographic(place)
+    """A setpoint at a local position, as latitude and longitude; the altitude as sent."""
+    latitude, longitude, _ = SIH_FRAME.geographic(position)
     values = dict.fromkeys(NAMES, 0.0) | fields
     return dialect.MAVLink_set_position_target_global_int_message(
         0, 1, 1, frame, mask, round(latitude * 1e7), round(longitude * 1e7), altitude_m, **values
@@ -54,21 +54,25 @@ def locally(mask: int, frame: int = 1, **fields: float) -> Any:
     [(5, HOME_ALTITUDE_M + 7.0, -7.0), (6, 7.0, -7.0), (11, 7.0, -7.0)],
     ids=["above sea", "above home", "above ground"],
 )
-def test_the_altitude_counts_from_what_the_frame_says(frame: int, altitude_m: float, down_m: float) -> None:
-    setpoint = global_trajectory_setpoint(globally((3.0, -4.0, 0.0), altitude_m, frame), HOME_ALTITUDE_M)
+def test_altitude_reference_follows_frame(frame: int, altitude_m: float, down_m: float) -> None:
+    setpoint = global_trajectory_setpoint(
+        globally((3.0, -4.0, 0.0), altitude_m, frame), SIH_FRAME, HOME_ALTITUDE_M
+    )
     assert setpoint is not None
     assert setpoint.position == pytest.approx((3.0, -4.0, down_m), abs=0.02)
     assert all(math.isnan(value) for value in (*setpoint.velocity, *setpoint.acceleration))
 
 
-def test_a_home_above_the_origin_puts_relative_altitudes_too_low_as_in_px4() -> None:
-    setpoint = global_trajectory_setpoint(globally(altitude_m=10.0, frame=6), HOME_ALTITUDE_M + 2.0)
+def test_relative_altitude_error_with_raised_home_as_in_px4() -> None:
+    setpoint = global_trajectory_setpoint(
+        globally(altitude_m=10.0, frame=6), SIH_FRAME, HOME_ALTITUDE_M + 2.0
+    )
     assert setpoint is not None
     assert setpoint.position[2] == pytest.approx(-8.0)  # 8 m over the origin is 6 m over home
 
 
 @pytest.mark.parametrize("frame", [0, 1, 3, 8, 10])
-def test_a_position_in_another_frame_is_refused_in_words(harness: SimHarness, frame: int) -> None:
+def test_position_in_unsupported_frame_refused(harness: SimHarness, frame: int) -> None:
     harness.heartbeats.append(("gcs", (245, 190), 6))
     harness.wait_ready()
     harness.fly(0.1)
@@ -80,15 +84,15 @@ def test_a_position_in_another_frame_is_refused_in_words(harness: SimHarness, fr
 
 
 @pytest.mark.parametrize("bit", [1, 2, 4])
-def test_one_ignored_axis_disables_the_whole_position_and_then_any_frame_will_do(bit: int) -> None:
+def test_ignored_axis_disables_position_in_any_frame(bit: int) -> None:
     message = globally((3.0, 4.0, 0.0), 500.0, frame=3, mask=0x1C0 | bit, vx=1.0, vy=2.0, vz=3.0)
-    setpoint = global_trajectory_setpoint(message, HOME_ALTITUDE_M)
+    setpoint = global_trajectory_setpoint(message, SIH_FRAME, HOME_ALTITUDE_M)
     assert setpoint is not None
     assert all(math.isnan(value) for value in setpoint.position)
     assert setpoint.velocity == (1.0, 2.0, 3.0)
 
 
-def test_force_is_refused_in_words_and_nothing_at_all_without_any(harness: SimHarness) -> None:
+def test_force_setpoint_refused(harness: SimHarness) -> None:
     harness.heartbeats.append(("gcs", (245, 190), 6))
     harness.wait_ready()
     harness.fly(0.1)
@@ -100,12 +104,12 @@ def test_force_is_refused_in_words_and_nothing_at_all_without_any(harness: SimHa
     assert not harness.vehicle.autopilot.has_setpoints
 
 
-def test_before_the_vehicle_knows_its_place_a_global_position_is_dropped(harness: SimHarness) -> None:
+def test_global_position_dropped_without_own_position(harness: SimHarness) -> None:
     harness.fly(0.1)
     assert not harness.vehicle.autopilot.sensors_ready
     harness.send(globally(altitude_m=500.0))
     assert not harness.vehicle.autopilot.has_setpoints
-    harness.send(globally(mask=0xDC7, vx=1.0))  # a velocity needs no place
+    harness.send(globally(mask=0xDC7, vx=1.0))  # a velocity needs no position
     assert harness.vehicle.autopilot.has_setpoints
 
 
@@ -124,13 +128,13 @@ def test_the_force_bit_matters_only_with_an_acceleration(mask: int, refused: boo
     st.integers(0, 65535),
     st.lists(st.floats(width=32), min_size=9, max_size=9),
 )
-def test_any_global_setpoint_is_dropped_or_finite_where_it_controls(
+def test_any_global_setpoint_dropped_or_finite_where_it_controls(
     frame: int, mask: int, values: list[float]
 ) -> None:
     fields = dict(zip(NAMES, values, strict=False))
     message = globally((1.0, 2.0, 0.0), values[8], frame, mask, **fields)
     try:
-        setpoint = global_trajectory_setpoint(message, HOME_ALTITUDE_M)
+        setpoint = global_trajectory_setpoint(message, SIH_FRAME, HOME_ALTITUDE_M)
     except SetpointRejectedError:
         assert mask & 512 or (not mask & 7 and frame not in (5, 6, 11))
         return
@@ -141,8 +145,8 @@ def test_any_global_setpoint_is_dropped_or_finite_where_it_controls(
     assert not any(math.isinf(value) for value in (*every, setpoint.yaw_rad, setpoint.yaw_rate_radps))
     if mask & 7:
         assert all(math.isnan(value) for value in setpoint.position)
-    flown = flyable(setpoint)
-    groups = (flown.position, flown.velocity, flown.acceleration)
+    flight = flyable(setpoint)
+    groups = (flight.position, flight.velocity, flight.acceleration)
     for axis in range(3):
         assert any(math.isfinite(group[axis]) for group in groups)
 
@@ -171,7 +175,7 @@ def test_a_global_position_is_flown_to_in_each_frame(
     [lambda: locally(ACCELERATION_ALONE, afx=1.0), lambda: globally(mask=ACCELERATION_ALONE, afx=1.0)],
     ids=["local", "global"],
 )
-def test_an_acceleration_alone_gains_the_velocity_that_drag_leaves_of_it(
+def test_acceleration_only_reaches_drag_limited_velocity(
     harness: SimHarness, make: Callable[[], Any]
 ) -> None:
     harness.take_off(10.0)
@@ -201,7 +205,7 @@ def test_a_body_acceleration_is_turned_by_the_whole_attitude() -> None:
 
 
 def test_an_acceleration_beside_a_velocity_is_a_feed_forward(harness: SimHarness) -> None:
-    """With drag at 1/s, 2 m/s need 2 m/s² of thrust: given ahead, little is left to correct."""
+    """With drag at 1/s, 2 m/s need 2 m/s² of thrust: with that feed-forward the error is small."""
     harness.take_off(10.0)
     errors = []
     for ahead in (0.0, 2.0):
@@ -224,7 +228,7 @@ def test_height_by_position_and_the_rest_by_velocity(harness: SimHarness) -> Non
     assert harness.received("POSITION_TARGET_LOCAL_NED")[-1].type_mask == 3
 
 
-def test_place_by_position_and_height_by_acceleration(harness: SimHarness) -> None:
+def test_position_control_with_vertical_acceleration(harness: SimHarness) -> None:
     harness.take_off(10.0)
     mixed = locally(0xCFC, x=2.0, y=0.0, afz=-0.4)
     harness.offboard(mixed)
@@ -240,9 +244,7 @@ def test_place_by_position_and_height_by_acceleration(harness: SimHarness) -> No
     [{"mask": 0xDDF, "vz": -1.0}, {"mask": 0xDFE, "x": 30.0}, {"mask": 0xDD7, "vx": 2.0, "vz": 0.0}],
     ids=["height alone", "north alone", "north and height"],
 )
-def test_what_leaves_an_axis_open_stops_the_vehicle_but_counts_as_a_signal(
-    harness: SimHarness, fields: dict[str, Any]
-) -> None:
+def test_incomplete_setpoint_stops_but_keeps_signal(harness: SimHarness, fields: dict[str, Any]) -> None:
     harness.take_off(6.0)
     before = harness.vehicle.airframe.position
     incomplete = locally(**fields)

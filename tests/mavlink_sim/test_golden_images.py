@@ -1,8 +1,8 @@
-"""The default world and the training scenes look as they always did: models are trained on these pictures.
+"""The default world and the training scenes are unchanged: models are trained on these images.
 
-The record holds mean brightnesses of squares of 32 pixels, so that another processor's rounding in the last
-bit passes, while one object moved or recoloured does not. This file run as a program writes it anew, which
-makes every trained model's measured score a thing of the past.
+The record has mean brightnesses of squares of 32 pixels, so that rounding on another processor passes, while
+one moved or recoloured object does not. This file run as a program writes a new record, which invalidates the
+measured scores of trained models.
 """
 
 from __future__ import annotations

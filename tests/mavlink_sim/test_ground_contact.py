@@ -1,4 +1,4 @@
-"""When a vehicle is meant to leave the ground, has left it, and has landed again."""
+"""Detection of take-off and landing."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def wanted(position: float = math.nan, velocity: float = math.nan, acceleration:
     return asks_to_rise(flight.Offboard(), setpoint, -2.0)
 
 
-def test_only_what_is_wanted_upwards_lifts_off_from_wherever_it_stands() -> None:
+def test_only_upward_setpoints_take_off() -> None:
     assert not wanted()
     assert [wanted(position=down) for down in (-2.2, -2.05, 0.0)] == [True, False, False]
     assert [wanted(velocity=down) for down in (-0.1, 0.0, 1.0)] == [True, False, False]
@@ -38,7 +38,7 @@ def test_only_what_is_wanted_upwards_lifts_off_from_wherever_it_stands() -> None
     assert not asks_to_rise(None, TrajectorySetpoint(NOTHING, NOTHING, NOTHING), -2.0)
 
 
-def test_a_task_that_holds_stays_and_one_that_takes_off_rises_whatever_its_setpoint() -> None:
+def test_hold_stays_and_takeoff_rises() -> None:
     airframe, parameters = Multirotor(), Parameters()
     up = TrajectorySetpoint(NOTHING, (0.0, 0.0, -3.0), NOTHING)
     none = TrajectorySetpoint(NOTHING, NOTHING, NOTHING)
@@ -46,9 +46,9 @@ def test_a_task_that_holds_stays_and_one_that_takes_off_rises_whatever_its_setpo
     assert asks_to_rise(flight.Takeoff(airframe, parameters, -5.0), none, 0.0)
 
 
-def test_the_ramp_creeps_then_climbs_and_begins_anew_with_each_take_off() -> None:
+def test_ramp_restarts_with_each_takeoff() -> None:
     _, ground = contact()
-    assert ground.climb_limit_mps(0.0) == math.inf  # no take-off under way
+    assert ground.climb_limit_mps(0.0) == math.inf  # no take-off in progress
     assert ground.rests(1.0, rises=False)
     assert not ground.rests(2.0, rises=True)
     ramp = [ground.climb_limit_mps(2.0 + step / 10) for step in range(20)]
@@ -64,12 +64,12 @@ def test_the_ramp_creeps_then_climbs_and_begins_anew_with_each_take_off() -> Non
 
 
 @pytest.mark.parametrize("detection_s", [1.0, 1.5])
-def test_it_has_landed_when_it_pressed_on_the_ground_for_so_long_without_a_break(detection_s: float) -> None:
+def test_landed_after_continuous_ground_contact(detection_s: float) -> None:
     airframe, ground = contact(detection_s)
     ground.leave(1.0)
     assert not ground.presses(0.0, 1.0)
     assert not ground.presses(detection_s - 0.1, 1.0)
-    assert not ground.presses(detection_s, math.nan)  # nothing is wanted, and the rotors carry it
+    assert not ground.presses(detection_s, math.nan)  # no setpoint, and the rotors carry it
     assert not ground.presses(detection_s + 0.1, 1.0)
     airframe.thrust_mps2 = 0.4 * GRAVITY_MPS2
     assert ground.presses(2.0 * detection_s + 0.1, math.nan)  # or they do not
@@ -77,7 +77,7 @@ def test_it_has_landed_when_it_pressed_on_the_ground_for_so_long_without_a_break
     assert not ground.presses(2.0 * detection_s + 0.2, 1.0)
 
 
-def test_what_it_has_done_counts_from_arming() -> None:
+def test_has_flown_resets_at_arming() -> None:
     _, ground = contact()
     ground.arm(1.0)
     ground.leave(1.0)

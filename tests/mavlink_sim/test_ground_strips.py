@@ -1,4 +1,4 @@
-"""The ground is drawn strip by strip, out of an atlas of mip levels: how it is cut does not show."""
+"""The ground is drawn in strips from an atlas of mip levels, independent of their size."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ def drawn(width: int, height: int, strip_rows: int, pose: tuple[float, float, fl
     rows=st.sampled_from([1, 7, 64]),
     pose=st.tuples(st.floats(0.2, 40.0), st.floats(-math.pi, math.pi), st.floats(-1.5, 1.5)),
 )
-def test_however_it_is_cut_the_picture_is_the_same(
+def test_image_is_independent_of_strips(
     size: tuple[int, int], rows: int, pose: tuple[float, float, float]
 ) -> None:
-    """But for the last bit of a coordinate, which here and there chooses another mip level."""
+    """Equal except for single pixels, where the last bit of a coordinate selects another mip level."""
     width, height = size
     whole, cut = (drawn(width, height, strip_rows, pose) for strip_rows in (height, rows))
     assert cut.image.shape == (height, width, 3)
@@ -49,13 +49,13 @@ def test_however_it_is_cut_the_picture_is_the_same(
     assert off.mean() < 0.2
 
 
-def test_a_picture_of_the_sky_alone_has_no_depth() -> None:
+def test_sky_only_image_has_no_depth() -> None:
     seen = drawn(64, 48, 16, (5.0, 0.0, 1.4))
     assert np.isnan(seen.depth_m).all()
     assert (seen.image.mean(axis=(0, 1)) > 60).all()
 
 
-def test_each_mip_level_lies_where_its_side_says_with_the_opposite_edge_beside_it() -> None:
+def test_mip_levels_have_positions_and_gutters() -> None:
     tile = np.random.default_rng(0).integers(0, 256, (32, 32, 3), dtype=np.uint8)
     atlas = mip_atlas(tile)
     assert (atlas.size, atlas.levels) == (32, 4)

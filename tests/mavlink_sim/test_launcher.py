@@ -1,4 +1,4 @@
-"""Vehicles of one program are forks of one launcher: what they are, how they end, and what ends them."""
+"""The vehicles of one program as forks of its launcher: their environment and their end."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from mavlink_sim.launching import LaunchedProcess, can_launch, start_simulator
 from mavlink_sim.testing import vehicle
 
 ROOT = Path(__file__).parents[2]
-# Of a vehicle that nobody speaks to.
+# The options of a vehicle without clients.
 SILENT = ["--onboard-bind", "0", "--gcs-bind", "0", "--onboard-port", "9", "--gcs-port", "9", "--no-console"]
 
 pytestmark = pytest.mark.skipif(not can_launch(), reason="a launcher takes Linux with pidfd_open")
@@ -44,7 +44,7 @@ def ends(pid: int, timeout_s: float = 20.0) -> bool:
 
 @pytest.fixture
 def own_launchers(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Launchers of this test alone: they may be killed, or start with other variables."""
+    """Launchers of this test only: they may be killed, or start with other variables."""
     launchers: list[launching._LauncherOfOurs] = []
     monkeypatch.setattr(launching, "_launchers", launchers)
     yield
@@ -52,7 +52,7 @@ def own_launchers(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         launcher.close()
 
 
-def test_vehicles_of_a_program_are_processes_of_their_own_with_one_parent() -> None:
+def test_vehicles_are_processes_with_one_parent() -> None:
     with vehicle(system_id=7) as one, vehicle(system_id=8) as other:
         assert one.pid != other.pid
         assert parent_of(one.pid) == parent_of(other.pid)
@@ -66,7 +66,7 @@ def test_vehicles_of_a_program_are_processes_of_their_own_with_one_parent() -> N
     assert other.process.returncode == -signal.SIGKILL
 
 
-def test_a_vehicle_runs_in_the_folder_and_with_the_variables_of_who_wants_it(
+def test_vehicle_has_folder_and_environment_of_requester(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with vehicle():
@@ -83,7 +83,7 @@ def test_a_vehicle_runs_in_the_folder_and_with_the_variables_of_who_wants_it(
             assert b"WHO_WANTS_IT=a test \xff" in Path(f"/proc/{child}/environ").read_bytes()
 
 
-def test_what_cannot_start_says_so_and_has_its_exit_code() -> None:
+def test_failed_start_reports_and_has_exit_code() -> None:
     with start_simulator([*SILENT, "--wind", "99"]) as process:
         assert process.stdout is not None
         assert process.stdout.read() == "mavlink-sim: --wind 99: expected 0 to 8\n"
@@ -92,7 +92,7 @@ def test_what_cannot_start_says_so_and_has_its_exit_code() -> None:
         assert process.poll() == 2
 
 
-def test_waiting_for_one_that_flies_on_takes_no_longer_than_told() -> None:
+def test_wait_respects_timeout() -> None:
     with start_simulator(SILENT) as process:
         assert process.stdout is not None
         assert process.stdout.readline().startswith("ready: ")
@@ -113,7 +113,7 @@ HOW_IT_ENDS = {
 
 
 @pytest.mark.parametrize("how", HOW_IT_ENDS)
-def test_with_the_program_that_started_them_all_vehicles_end(how: str) -> None:
+def test_vehicles_end_with_their_program(how: str) -> None:
     code = (
         "import os, signal, time; from mavlink_sim.testing import vehicle\n"
         "starting = vehicle(), vehicle(); one, other = (each.__enter__() for each in starting)\n"
@@ -134,7 +134,7 @@ def test_with_the_program_that_started_them_all_vehicles_end(how: str) -> None:
 
 
 @pytest.mark.usefixtures("own_launchers")
-def test_a_vehicle_ends_with_its_launcher_and_the_next_has_another() -> None:
+def test_vehicle_ends_with_launcher_next_has_new_one() -> None:
     with start_simulator(SILENT) as process:
         assert isinstance(process, LaunchedProcess)
         assert process.stdout.readline().startswith("ready: ")
@@ -149,7 +149,7 @@ def test_a_vehicle_ends_with_its_launcher_and_the_next_has_another() -> None:
     assert process.poll() == -signal.SIGTERM
 
 
-def test_several_threads_have_their_vehicles_at_once() -> None:
+def test_threads_start_vehicles_concurrently() -> None:
     with ThreadPoolExecutor(4) as threads:
         started = list(threads.map(lambda _: start_simulator(SILENT), range(8)))
     assert len({process.pid for process in started}) == 8
@@ -161,7 +161,7 @@ def test_several_threads_have_their_vehicles_at_once() -> None:
             assert process.wait(20.0) == 0
 
 
-def test_what_is_too_much_for_the_launcher_is_started_without(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_large_request_starts_without_launcher(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HALF_A_MEGABYTE_1", "x" * 100_000)
     for number in range(2, 6):
         monkeypatch.setenv(f"HALF_A_MEGABYTE_{number}", "x" * 100_000)
@@ -170,7 +170,7 @@ def test_what_is_too_much_for_the_launcher_is_started_without(monkeypatch: pytes
     assert one.process.returncode == 0
 
 
-def test_a_request_that_nobody_understands_hurts_no_other() -> None:
+def test_invalid_request_does_not_affect_others() -> None:
     with vehicle() as one:
         launcher = launching._launcher()
         launcher._requests.send(b"what?")
@@ -179,13 +179,13 @@ def test_a_request_that_nobody_understands_hurts_no_other() -> None:
         assert one.process.poll() is None
 
 
-def test_a_time_that_is_over_is_not_waited_for() -> None:
+def test_expired_timeout_returns_at_once() -> None:
     with vehicle() as one, pytest.raises(subprocess.TimeoutExpired):
         one.process.wait(-1.0)
 
 
 @pytest.mark.usefixtures("own_launchers")
-def test_pythons_own_variables_count_from_the_next_vehicle_on(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_python_variables_apply_to_next_vehicle(monkeypatch: pytest.MonkeyPatch) -> None:
     with vehicle() as one:
         monkeypatch.setenv("PYTHONUNBUFFERED", "1" if os.environ.get("PYTHONUNBUFFERED") == "" else "")
         with vehicle() as other:
@@ -195,7 +195,7 @@ def test_pythons_own_variables_count_from_the_next_vehicle_on(monkeypatch: pytes
 
 
 @pytest.mark.usefixtures("own_launchers")
-def test_a_launcher_that_ends_at_once_says_how(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_launcher_failure_is_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (tmp_path / "mavlink_sim").mkdir()
     (tmp_path / "mavlink_sim" / "__init__.py").write_text("raise SystemExit(7)")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
@@ -204,7 +204,7 @@ def test_a_launcher_that_ends_at_once_says_how(monkeypatch: pytest.MonkeyPatch, 
         start_simulator(SILENT)
 
 
-def test_where_there_are_no_descriptors_of_processes_vehicles_are_started_anew(
+def test_without_pidfd_vehicles_start_directly(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.delattr(os, "pidfd_open")

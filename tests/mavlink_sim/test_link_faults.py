@@ -1,4 +1,4 @@
-"""The link stage invents nothing, loses nothing uncounted, and keeps order where it should."""
+"""The link stage adds nothing, counts every loss, and keeps the order without `Reorder`."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ TRAFFIC = st.lists(st.tuples(st.floats(0.0, 0.2), st.integers(4, 300)), max_size
 def carry(
     impairments: list[Impairment], traffic: list[tuple[float, int]]
 ) -> tuple[Channel, list[bytes], list[tuple[float, bytes]]]:
-    """Send traffic through a channel, looking every time something enters; what went in and came out when."""
+    """Send traffic through a channel, polling at every input; returns inputs and outputs with times."""
     channel = Channel()
     for impairment in impairments:
         channel.impair(impairment)
@@ -84,7 +84,7 @@ def test_every_datagram_is_delivered_lost_or_waiting(
 
 
 @given(KEEPING_BYTES, TRAFFIC)
-def test_nothing_is_invented(impairments: list[Impairment], traffic: list[tuple[float, int]]) -> None:
+def test_no_datagram_is_invented(impairments: list[Impairment], traffic: list[tuple[float, int]]) -> None:
     channel, sent, got = carry(impairments, traffic)
     assert {data for _, data in got} <= set(sent)
     assert len(got) <= len(sent) + channel.counts.duplicated
@@ -128,7 +128,7 @@ def test_corruption_changes_bytes_and_never_the_length(
 
 
 @given(st.lists(st.sampled_from(["loss", "delay", "duplicate", "reorder", "corrupt"])), seeds, TRAFFIC)
-def test_the_same_seed_does_the_same(names: list[str], seed: int, traffic: list[tuple[float, int]]) -> None:
+def test_same_seed_gives_same_result(names: list[str], seed: int, traffic: list[tuple[float, int]]) -> None:
     def made() -> list[Impairment]:
         makers: dict[str, Callable[[], Impairment]] = {
             "loss": lambda: Loss(0.3, seed),
@@ -158,7 +158,7 @@ def test_the_order_of_beginning_does_not_matter() -> None:
     assert carry(one, traffic)[2] == carry(other, traffic)[2]
 
 
-def test_when_a_delay_ends_nothing_overtakes_what_is_on_its_way() -> None:
+def test_end_of_delay_keeps_order() -> None:
     channel, delay = Channel(), Delay(1.0)
     channel.impair(delay)
     channel.push(0.0, b"first")
@@ -179,7 +179,7 @@ def test_reordering_lets_later_ones_come_first() -> None:
     assert channel.counts.held_back == pytest.approx(90, abs=30)
 
 
-def test_a_slow_line_carries_its_rate_and_loses_what_its_buffer_cannot_hold() -> None:
+def test_rate_limit_drops_beyond_buffer() -> None:
     channel = Channel()
     channel.impair(RateLimit(5760.0))
     carried = 0
@@ -192,13 +192,13 @@ def test_a_slow_line_carries_its_rate_and_loses_what_its_buffer_cannot_hold() ->
     assert channel.waiting * 120 <= 4096
 
 
-def test_a_line_that_is_not_full_loses_nothing() -> None:
+def test_rate_limit_below_capacity_loses_nothing() -> None:
     channel, sent, got = carry([RateLimit(10_000.0)], [(0.1, 100)] * 50)
     assert len(got) == len(sent)
     assert channel.counts.lost == 0
 
 
-def test_what_is_on_its_way_can_be_lost_too() -> None:
+def test_datagrams_in_transit_can_be_dropped() -> None:
     channel = Channel()
     channel.impair(Delay(1.0))
     channel.push(0.0, b"x")

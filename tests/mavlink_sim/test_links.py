@@ -1,4 +1,4 @@
-"""Status texts, events and forwarding: what goes out on which link."""
+"""Status texts, events and forwarding per link."""
 
 from typing import Any
 
@@ -22,7 +22,7 @@ def test_a_companion_gets_no_status_texts_but_gets_events(harness: SimHarness) -
     assert harness.received("EVENT", "onboard")
 
 
-def test_a_ground_station_gets_them_on_the_link_it_is_heard_on(harness: SimHarness) -> None:
+def test_texts_go_to_link_of_ground_station(harness: SimHarness) -> None:
     harness.heartbeats.append(("gcs", (245, 190), GCS))
     harness.take_off()
     assert harness.texts("gcs") == [
@@ -34,7 +34,7 @@ def test_a_ground_station_gets_them_on_the_link_it_is_heard_on(harness: SimHarne
     assert harness.texts("onboard") == []
 
 
-def test_a_ground_station_that_falls_silent_gets_no_more(harness: SimHarness) -> None:
+def test_silent_ground_station_gets_no_texts(harness: SimHarness) -> None:
     harness.heartbeats.append(("gcs", (245, 190), GCS))
     harness.wait_ready()
     harness.heartbeats.clear()
@@ -43,7 +43,7 @@ def test_a_ground_station_that_falls_silent_gets_no_more(harness: SimHarness) ->
     assert harness.texts("gcs") == []
 
 
-def test_refusals_are_told_as_critical(harness: SimHarness) -> None:
+def test_refusals_have_severity_critical(harness: SimHarness) -> None:
     harness.heartbeats.append(("gcs", (245, 190), GCS))
     harness.fly(1.0)
     harness.command(400, 1)
@@ -59,7 +59,7 @@ def test_refusals_are_told_as_critical(harness: SimHarness) -> None:
     assert harness.texts()[-1] == "Unsupported main mode\t"
 
 
-def test_a_long_text_comes_in_chunks(harness: SimHarness) -> None:
+def test_long_text_is_chunked(harness: SimHarness) -> None:
     harness.heartbeats.append(("gcs", (245, 190), GCS))
     harness.fly(0.1)
     long = "x" * 120 + "\t"
@@ -72,7 +72,7 @@ def test_a_long_text_comes_in_chunks(harness: SimHarness) -> None:
     assert harness.texts() == [long]
 
 
-def test_the_loss_of_the_companions_heartbeat_is_told_after_seven_seconds(harness: SimHarness) -> None:
+def test_companion_loss_reported_after_7_s(harness: SimHarness) -> None:
     harness.heartbeats += [("gcs", (245, 190), GCS), ("onboard", (1, 191), ONBOARD_CONTROLLER)]
     harness.fly(3.0)
     del harness.heartbeats[1]
@@ -90,11 +90,11 @@ def heartbeat(kind: int = GCS) -> Any:
     return dialect.MAVLink(None).parse_buffer(message.pack(codec))[0]
 
 
-def test_a_ground_stations_heartbeat_is_forwarded_byte_for_byte_to_where_somebody_listens(
+def test_heartbeat_forwarded_byte_for_byte(
     harness: SimHarness,
 ) -> None:
     harness.send(heartbeat(), "gcs", (245, 190))
-    assert harness.inbox["onboard"] == []  # nobody was heard there yet
+    assert harness.inbox["onboard"] == []  # no component received there yet
     harness.send(dialect.MAVLink_heartbeat_message(ONBOARD_CONTROLLER, 8, 0, 0, 4, 3), "onboard")
     harness.forget()
     message = heartbeat()
@@ -105,7 +105,7 @@ def test_a_ground_stations_heartbeat_is_forwarded_byte_for_byte_to_where_somebod
     assert harness.inbox["gcs"] == []
 
 
-def test_a_message_for_the_companion_reaches_it_and_one_for_the_autopilot_does_not(
+def test_forwarding_follows_target_component(
     harness: SimHarness,
 ) -> None:
     harness.send(dialect.MAVLink_heartbeat_message(ONBOARD_CONTROLLER, 8, 0, 0, 4, 3), "onboard")

@@ -1,4 +1,4 @@
-"""The vehicle in one's own process: stepped, spoken to, looked at."""
+"""The vehicle in lockstep: step, messages, truth, copies."""
 
 import hashlib
 import itertools
@@ -40,22 +40,22 @@ def flight(seed: int, links: dict[str, dict[str, float]] | None = None) -> tuple
 
 
 @pytest.fixture(scope="module")
-def flown() -> tuple[str, Any]:
+def fly() -> tuple[str, Any]:
     return flight(5)
 
 
-def test_the_same_seed_is_the_same_flight_to_the_last_byte(flown: tuple[str, Any]) -> None:
-    assert flight(5) == flown
+def test_same_seed_gives_byte_equal_flight(fly: tuple[str, Any]) -> None:
+    assert flight(5) == fly
 
 
-def test_another_seed_is_another_flight(flown: tuple[str, Any]) -> None:
+def test_another_seed_is_another_flight(fly: tuple[str, Any]) -> None:
     other = flight(6, {"onboard": ONBOARD_RATES_HZ})
-    assert flown[0] != other[0]
-    assert flown[1] != other[1]
+    assert fly[0] != other[0]
+    assert fly[1] != other[1]
 
 
-def test_the_number_of_links_does_not_change_the_flight(flown: tuple[str, Any]) -> None:
-    assert flown[1] == flight(5, {"onboard": {}})[1]
+def test_the_number_of_links_does_not_change_the_flight(fly: tuple[str, Any]) -> None:
+    assert fly[1] == flight(5, {"onboard": {}})[1]
 
 
 def test_another_process_flies_the_same_flight() -> None:
@@ -67,8 +67,8 @@ def test_another_process_flies_the_same_flight() -> None:
     vehicle = LockstepVehicle(seed=3)
     vehicle.take_off()
     own = hashlib.sha256(vehicle.receive_bytes()).hexdigest()
-    told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert told.stdout.strip() == own
+    reported = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert reported.stdout.strip() == own
 
 
 def test_three_lines_fly() -> None:
@@ -78,7 +78,7 @@ def test_three_lines_fly() -> None:
     assert vehicle.events == ["armed", "mode TAKEOFF", "takeoff", "mode HOLD"]
 
 
-def test_time_passes_only_when_it_is_stepped_and_by_as_much() -> None:
+def test_time_advances_only_by_step() -> None:
     vehicle = LockstepVehicle()
     assert vehicle.now_s == 0.0
     vehicle.step(0.01)
@@ -101,7 +101,7 @@ def test_messages_come_out_once_and_in_order() -> None:
     assert vehicle.newest["onboard"]["HEARTBEAT"].autopilot == 12
 
 
-def test_bytes_go_in_as_messages_do() -> None:
+def test_bytes_are_received_like_messages() -> None:
     vehicle = LockstepVehicle({"onboard": {}})
     codec = dialect.MAVLink(None, 1, 191)
     packet = dialect.MAVLink_timesync_message(0, 77).pack(codec)
@@ -110,11 +110,11 @@ def test_bytes_go_in_as_messages_do() -> None:
     assert vehicle.newest["onboard"]["TIMESYNC"].ts1 == 77
 
 
-def test_a_quiet_link_sends_answers_alone() -> None:
+def test_quiet_link_sends_only_answers() -> None:
     vehicle = LockstepVehicle({"onboard": {}})
     vehicle.step(6.0)
-    told = {message.get_type() for message in vehicle.receive()}
-    assert told == {"GPS_GLOBAL_ORIGIN"}  # once
+    reported = {message.get_type() for message in vehicle.receive()}
+    assert reported == {"GPS_GLOBAL_ORIGIN"}  # once
     vehicle.step(10.0)
     assert vehicle.receive() == []
     assert vehicle.command(512, 30) == "ACCEPTED"
@@ -130,7 +130,7 @@ def test_a_quiet_link_sends_answers_alone() -> None:
     ],
     ids=["limit", "refused", "no such mode"],
 )
-def test_what_does_not_happen_is_said(
+def test_unreached_condition_raises(
     act: Callable[[LockstepVehicle], object], error: type[Exception], words: list[str]
 ) -> None:
     vehicle = LockstepVehicle({"onboard": {}})
@@ -150,14 +150,14 @@ def test_the_time_of_day_is_stepped_too() -> None:
     assert second.time_unix_usec - first.time_unix_usec == pytest.approx(passed_us, abs=1000)
 
 
-def test_the_package_names_what_it_offers() -> None:
+def test_package_exports_public_names() -> None:
     for name in mavlink_sim.__all__:
         assert getattr(mavlink_sim, name) is not None
-    with pytest.raises(AttributeError, match="nothing_here"):
-        _ = mavlink_sim.nothing_here
+    with pytest.raises(AttributeError, match="no_message"):
+        _ = mavlink_sim.no_message
 
 
-def test_a_vehicle_that_loses_a_motor_crashes_says_so_and_disarms() -> None:
+def test_motor_loss_crashes_reports_and_disarms() -> None:
     vehicle = LockstepVehicle({"onboard": {}}, seed=1)
     vehicle.take_off(10.0)
     vehicle.vehicle.airframe.fail_motor(2)
@@ -209,7 +209,7 @@ def test_a_lost_link_loses_and_bytes_stay_numbered_in_order() -> None:
     assert gaps.count(1) > len(gaps) / 2
 
 
-def test_damaged_messages_are_not_taken_for_messages() -> None:
+def test_corrupted_messages_are_bad_data() -> None:
     vehicle = LockstepVehicle(seed=1)
     vehicle.vehicle.faults.begin("corrupt 1.0 way=out")
     vehicle.step(3.0)
@@ -248,7 +248,7 @@ def client_reads(data: bytes) -> list[Any]:
 # ---- copies
 
 
-def everything_told(vehicle: LockstepVehicle) -> tuple[Any, ...]:
+def all_messages(vehicle: LockstepVehicle) -> tuple[Any, ...]:
     return vehicle.truth, *(vehicle.receive_bytes(link) for link in vehicle.newest)
 
 
@@ -260,7 +260,7 @@ def everything_told(vehicle: LockstepVehicle) -> tuple[Any, ...]:
         ("ardupilot", {}),
     ],
 )
-def test_a_copy_flies_on_as_the_first_does_to_the_last_byte(autopilot: str, options: dict[str, Any]) -> None:
+def test_copy_flies_byte_equal(autopilot: str, options: dict[str, Any]) -> None:
     first = LockstepVehicle(
         {"onboard": ONBOARD_RATES_HZ, "gcs": GCS_RATES_HZ},
         autopilot=autopilot,
@@ -273,7 +273,7 @@ def test_a_copy_flies_on_as_the_first_does_to_the_last_byte(autopilot: str, opti
     first.vehicle.faults.begin("gps_loss for=0.5")
     first.vehicle.faults.begin("wind 4 at=60")
     first.step(0.7)
-    # in the middle of things: a fix that comes back, a command that is not carried out yet, half a message
+    # with pending state: a fix that returns, a command not yet executed, half a message
     half = dialect.MAVLink_command_long_message(1, 1, 512, 0, 242, 0, 0, 0, 0, 0, 0).pack(parser())
     first.send_bytes(half[:9])
     first.send(dialect.MAVLink_command_long_message(1, 1, 21, 0, 0, 0, 0, math.nan, 0, 0, 0))
@@ -281,12 +281,12 @@ def test_a_copy_flies_on_as_the_first_does_to_the_last_byte(autopilot: str, opti
     for vehicle in (first, second):
         vehicle.send_bytes(half[9:])
         vehicle.step(6.0)
-    assert everything_told(first) == everything_told(second)
+    assert all_messages(first) == all_messages(second)
     assert first.events == second.events
     assert any("mode LAND" in event for event in second.events)
 
 
-def test_what_is_done_to_a_copy_does_nothing_to_the_first() -> None:
+def test_copy_is_independent() -> None:
     first, alike = LockstepVehicle(seed=4), LockstepVehicle(seed=4)
     for vehicle in (first, alike):
         vehicle.take_off(3.0)
@@ -297,21 +297,21 @@ def test_what_is_done_to_a_copy_does_nothing_to_the_first() -> None:
     assert second.truth.crashed
     for vehicle in (first, alike):
         vehicle.step(2.0)
-    assert everything_told(first) == everything_told(alike)
+    assert all_messages(first) == all_messages(alike)
     assert first.events == alike.events
 
 
-def test_a_vehicle_with_a_fault_on_it_is_not_copied_and_says_which() -> None:
+def test_copy_with_active_fault_refused() -> None:
     vehicle = LockstepVehicle({"onboard": {}})
     vehicle.vehicle.faults.begin("gust 6")
-    with pytest.raises(ValueError, match="gust is on this vehicle; end it first"):
+    with pytest.raises(ValueError, match="fault gust is active"):
         vehicle.copy()
     vehicle.vehicle.faults.end()
     vehicle.copy().step(1.0)
 
 
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
-def test_setpoints_without_a_message_of_ones_own(autopilot: str) -> None:
+def test_setpoint_methods_send_the_stream(autopilot: str) -> None:
     vehicle = LockstepVehicle({"onboard": {}}, autopilot=autopilot, seed=3, wind_mps=0.0, gusts_mps=0.0)
     vehicle.take_off(5.0)
     vehicle.set_velocity(2.0, 0.0, 0.0)

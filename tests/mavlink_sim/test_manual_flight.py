@@ -1,4 +1,4 @@
-"""The modes flown by sticks: how fast, how far, how level."""
+"""The manual modes: speeds, distances, attitudes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from mavlink_sim.flight.transmitter import CALIBRATION, Sticks
 from mavlink_sim.physics.airframe import GRAVITY_MPS2, MAX_THRUST_MPS2, Multirotor
 from mavlink_sim.px4.modes import Mode
 from mavlink_sim.px4.parameters import Parameters
-from mavlink_sim.vehicle import Vehicle
+from mavlink_sim.vehicles.vehicle import Vehicle
 
 REMOTE_CONTROL = {**CALIBRATION, "COM_RC_IN_MODE": 0}
 
@@ -108,7 +108,7 @@ def test_the_throttle_curve_hovers_in_the_middle() -> None:
         assert throttle_curve(1.0, parameters) == pytest.approx(1.0)
 
 
-def test_position_full_stick_tends_to_the_manual_speed_and_lets_go_to_a_stop() -> None:
+def test_position_full_stick_reaches_manual_speed_then_stops() -> None:
     pilot = Piloted(Mode.POSCTL)
     pilot.fly(8.0, pitch=1.0)
     assert pilot.asked_mps == pytest.approx(9.9, abs=0.2)
@@ -151,7 +151,7 @@ def test_position_sticks_are_against_the_heading() -> None:
     assert math.remainder(math.atan2(vy, vx) - yaw, math.tau) == pytest.approx(0.0, abs=0.1)
 
 
-def test_yaw_by_full_stick_turns_at_mpc_man_y_max_and_holds_the_heading_after() -> None:
+def test_full_yaw_stick_turns_at_mpc_man_y_max_then_holds() -> None:
     pilot = Piloted(Mode.POSCTL, MPC_MAN_Y_MAX=60)
     pilot.fly(1.5, yaw=1.0)
     assert math.degrees(pilot.airframe.rates[2]) == pytest.approx(60.0, abs=3.0)
@@ -168,7 +168,7 @@ def test_position_slow_is_slow() -> None:
     assert -pilot.airframe.velocity[2] == pytest.approx(1.0, abs=0.2)
 
 
-def test_collision_prevention_has_its_place() -> None:
+def test_collision_prevention_limits_the_sticks() -> None:
     pilot = Piloted(Mode.HOLD)
     pilot.autopilot.stick_guard = lambda acceleration, velocity: (0.0, acceleration[1])
     pilot.autopilot.set_mode(Mode.POSCTL)
@@ -178,7 +178,7 @@ def test_collision_prevention_has_its_place() -> None:
     assert pilot.speed_mps > 2.0
 
 
-def test_climbing_and_sinking_by_throttle_keep_to_the_limits_and_the_height_is_held() -> None:
+def test_throttle_climb_within_limits_and_height_hold() -> None:
     for mode in (Mode.POSCTL, Mode.ALTCTL):
         pilot = Piloted(mode)
         pilot.fly(3.0, throttle=1.0)
@@ -228,7 +228,7 @@ def test_altitude_tilts_drifts_on_and_holds_its_height() -> None:
     assert math.degrees(pilot.airframe.roll_rad) == pytest.approx(35.0, abs=2.0)
     pilot.fly(1.0)
     assert abs(math.degrees(pilot.airframe.roll_rad)) < 2.0
-    assert pilot.speed_mps > 1.0  # nothing brakes but the air
+    assert pilot.speed_mps > 1.0  # only drag brakes
     assert pilot.height_m == pytest.approx(height_m, abs=0.7)
 
 

@@ -1,4 +1,4 @@
-"""Vehicles of one world that meet in the air."""
+"""Collisions between vehicles of one world."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mavlink_sim import FleetWorld, LockstepVehicle
-from mavlink_sim.fleet import Fleet, instance_options
 from mavlink_sim.physics.airframe import GRAVITY_MPS2, Multirotor, Vector
 from mavlink_sim.physics.contact import CRASH_MPS, Collision
 from mavlink_sim.physics.midair import REACH_UP_M, Body, Midair, apart
-from mavlink_sim.simulation import SimulationOptions
-from mavlink_sim.vehicle import STEP_S
+from mavlink_sim.realtime.fleet import Fleet, instance_options
+from mavlink_sim.realtime.options import SimulationOptions
+from mavlink_sim.vehicles.vehicle import STEP_S
 from mavlink_sim.wire.messages import dialect
 
 speeds = st.floats(-8.0, 8.0, allow_subnormal=False)
@@ -34,39 +34,37 @@ class World4ms:
         for number, airframe in enumerate(airframes, start=1):
             self.midair.join(Body(airframe, (0.0, 0.0), number, f"vehicle {number}", lambda: self.now_s))
 
-    def look(self) -> None:
-        self.midair.look(STEP_S)
+    def resolve(self) -> None:
+        self.midair.resolve(STEP_S)
 
     def step(self) -> None:
         for airframe in self.airframes:
             airframe.advance(STEP_S)
         self.now_s += STEP_S
-        self.look()
+        self.resolve()
 
     def apart(self) -> float:
         return apart(*self.midair.bodies)
 
 
-def flying(place: Vector, velocity: Vector) -> Multirotor:
+def flying(position: Vector, velocity: Vector) -> Multirotor:
     airframe = Multirotor()
-    put(airframe, place, velocity)
+    put(airframe, position, velocity)
     return airframe
 
 
-def put(airframe: Multirotor, place: Vector, velocity: Vector) -> None:
+def put(airframe: Multirotor, position: Vector, velocity: Vector) -> None:
     airframe.on_ground = False
-    airframe.position, airframe.velocity = place, velocity
+    airframe.position, airframe.velocity = position, velocity
 
 
-@given(place=st.tuples(offsets, offsets, offsets), one=velocities, other=velocities)
-def test_those_that_overlap_are_parted_and_nothing_comes_of_nothing(
-    place: Vector, one: Vector, other: Vector
-) -> None:
+@given(position=st.tuples(offsets, offsets, offsets), one=velocities, other=velocities)
+def test_overlapping_bodies_are_separated(position: Vector, one: Vector, other: Vector) -> None:
     first, second = flying((0.0, 0.0, -5.0), one), flying((9.0, 0.0, -5.0), other)
     world = World4ms(first, second)
-    put(second, (place[0], place[1], place[2] - 5.0), other)
+    put(second, (position[0], position[1], position[2] - 5.0), other)
     touching = world.apart() < 1.0
-    world.look()
+    world.resolve()
     if not touching:
         assert (first.velocity, second.velocity) == (one, other)
         assert first.collisions == second.collisions == 0
@@ -87,21 +85,23 @@ def test_those_that_overlap_are_parted_and_nothing_comes_of_nothing(
 
 @settings(max_examples=40)
 @given(
-    places=st.lists(st.tuples(*[st.floats(-4.0, 4.0)] * 3), min_size=2, max_size=5),
-    ways=st.lists(velocities, min_size=5, max_size=5),
+    positions=st.lists(st.tuples(*[st.floats(-4.0, 4.0)] * 3), min_size=2, max_size=5),
+    directions=st.lists(velocities, min_size=5, max_size=5),
     thrusts=st.lists(st.floats(0.0, 20.0), min_size=5, max_size=5),
     tilts=st.lists(st.floats(-1.5, 1.5), min_size=5, max_size=5),
 )
-def test_nobody_passes_by_unseen_between_two_looks(
-    places: list[Vector], ways: list[Vector], thrusts: list[float], tilts: list[float]
+def test_no_contact_missed_between_calls(
+    positions: list[Vector], directions: list[Vector], thrusts: list[float], tilts: list[float]
 ) -> None:
-    """Those that are far off are not looked at, however they accelerate, and nothing is missed by it."""
+    """Distant bodies are not checked, whatever their acceleration, and no contact is missed."""
 
     def first_meeting(*, always: bool) -> tuple[int, list[int]] | None:
-        bodies = [flying((20.0 * number, 0.0, -50.0), (0.0, 0.0, 0.0)) for number in range(len(places))]
+        bodies = [flying((20.0 * number, 0.0, -50.0), (0.0, 0.0, 0.0)) for number in range(len(positions))]
         world = World4ms(*bodies)
-        for body, (x, y, z), way, thrust, tilt in zip(bodies, places, ways, thrusts, tilts, strict=False):
-            put(body, (x, y, z - 50.0), way)
+        for body, (x, y, z), direction, thrust, tilt in zip(
+            bodies, positions, directions, thrusts, tilts, strict=False
+        ):
+            put(body, (x, y, z - 50.0), direction)
             body.command(thrust, tilt, -tilt, 0.0)
         for step in range(150):
             if always:
@@ -115,24 +115,24 @@ def test_nobody_passes_by_unseen_between_two_looks(
 
 
 @pytest.mark.parametrize("speed_mps", [2.0, 3.0])
-def test_two_that_meet_head_on_bounce_or_break(speed_mps: float) -> None:
+def test_head_on_collision_bounces_or_breaks(speed_mps: float) -> None:
     first = flying((0.0, 0.0, -20.0), (speed_mps, 0.0, 0.0))
     second = flying((0.601, 0.0, -20.0), (-speed_mps, 0.0, 0.0))
-    told: list[Collision] = []
-    first.on_collision = second.on_collision = told.append
+    events: list[Collision] = []
+    first.on_collision = second.on_collision = events.append
     world = World4ms(first, second)
     for _ in range(50):
         world.step()
         assert world.apart() > 0.99
     breaks = 2.0 * speed_mps > CRASH_MPS
-    assert [collision.name for collision in told] == ["vehicle 2", "vehicle 1"]
-    assert all(collision.speed_mps == pytest.approx(2.0 * speed_mps, rel=0.02) for collision in told)
-    assert [collision.crashed for collision in told] == [breaks] * 2
+    assert [collision.name for collision in events] == ["vehicle 2", "vehicle 1"]
+    assert all(collision.speed_mps == pytest.approx(2.0 * speed_mps, rel=0.02) for collision in events)
+    assert [collision.crashed for collision in events] == [breaks] * 2
     assert first.crashed == second.crashed == breaks
     assert first.velocity[0] < 0.0 < second.velocity[0]
 
 
-def test_one_that_sinks_onto_another_stands_on_it_until_that_one_leaves() -> None:
+def test_vehicle_stands_on_another_until_it_leaves() -> None:
     below, above = Multirotor(), flying((0.1, 0.0, -1.0), (0.0, 0.0, 0.4))
     world = World4ms(below, above)
     above.thrust_mps2 = GRAVITY_MPS2 - 0.4  # its drag at 0.4 m/s does the rest
@@ -156,7 +156,7 @@ def test_one_that_sinks_onto_another_stands_on_it_until_that_one_leaves() -> Non
     assert (above.on_ground, above.position[2]) == (True, 0.0)  # it fell
 
 
-def test_one_that_falls_on_another_bounces_off_and_neither_is_pushed_into_the_ground() -> None:
+def test_falling_vehicle_bounces_off_another() -> None:
     below, above = Multirotor(), flying((0.1, 0.0, -1.0), (0.0, 0.0, 2.0))
     world = World4ms(below, above)
     for _ in range(500):
@@ -169,7 +169,7 @@ def test_one_that_falls_on_another_bounces_off_and_neither_is_pushed_into_the_gr
     assert above.last_collision.speed_mps > 2.0
 
 
-def test_two_that_slide_into_each_other_on_the_ground_stop_there() -> None:
+def test_sliding_vehicles_stop_each_other() -> None:
     first, second = Multirotor(), Multirotor()
     second.position = (1.0, 0.0, 0.0)
     world = World4ms(first, second)
@@ -181,28 +181,28 @@ def test_two_that_slide_into_each_other_on_the_ground_stop_there() -> None:
     assert first.position[2] == second.position[2] == 0.0
 
 
-def test_in_one_place_two_cannot_begin() -> None:
+def test_overlapping_start_refused() -> None:
     fleet_world = FleetWorld(3)
     first = LockstepVehicle({"onboard": {}}).vehicle
     fleet_world.join(first)
-    with pytest.raises(ValueError, match="vehicle 1 has joined already"):
+    with pytest.raises(ValueError, match="vehicle 1"):
         fleet_world.join(first)
     near = LockstepVehicle({"onboard": {}}, system_id=2, start_ned_m=(0.0, 0.5)).vehicle
-    with pytest.raises(ValueError, match=r"vehicle 2 is 0.5 m beside vehicle 1: they need 0.6 m"):
+    with pytest.raises(ValueError, match=r"vehicle 2 .*0\.5 m.*vehicle 1.*0\.6 m"):
         fleet_world.join(near)
     fleet_world.join(LockstepVehicle({"onboard": {}}, system_id=3, start_ned_m=(0.0, 0.6)).vehicle)
     fleet_world.join(LockstepVehicle({"onboard": {}}, system_id=4, start_ned_m=(0.0, 1.2)).vehicle)
-    with pytest.raises(ValueError, match="vehicle 5: this fleet_world is of 3"):
+    with pytest.raises(ValueError, match=r"vehicle 5.*3"):
         fleet_world.join(LockstepVehicle({"onboard": {}}, system_id=5, start_ned_m=(9.0, 0.0)).vehicle)
 
 
-def place(north: float, east: float, down: float) -> Any:
+def position(north: float, east: float, down: float) -> Any:
     return dialect.MAVLink_set_position_target_local_ned_message(
         0, 0, 1, 1, 3576, north, east, down, 0, 0, 0, 0, 0, 0, 0, 0
     )
 
 
-def test_two_in_lockstep_do_not_fly_through_each_other() -> None:
+def test_lockstep_vehicles_collide() -> None:
     pair = [
         LockstepVehicle(
             {"onboard": {}}, system_id=number, seed=number, gusts_mps=0.0, start_ned_m=(start, 0.0)
@@ -215,7 +215,7 @@ def test_two_in_lockstep_do_not_fly_through_each_other() -> None:
         vehicle.take_off(3.0)
     # each towards where the other is, in its own frame
     for vehicle, north in zip(pair, (6.0, -6.0), strict=True):
-        vehicle.repeat(place(north, 0.0, -3.0), 20.0)
+        vehicle.repeat(position(north, 0.0, -3.0), 20.0)
         vehicle.step(0.1)
         vehicle.set_mode("OFFBOARD")
     first, second = fleet_world._midair.bodies
@@ -229,7 +229,7 @@ def test_two_in_lockstep_do_not_fly_through_each_other() -> None:
     assert any("vehicle 1 at" in event for event in pair[1].events)
 
 
-def test_one_that_lands_on_another_has_landed() -> None:
+def test_landing_on_another_vehicle_is_landed() -> None:
     pair = [
         LockstepVehicle(
             {"onboard": {}}, system_id=number, start_ned_m=(start, 0.0), noise=False, gusts_mps=0.0
@@ -246,7 +246,7 @@ def test_one_that_lands_on_another_has_landed() -> None:
         -2.95,
         0.0,
         airframe.position[2],
-    )  # above the other, a hand's breadth beside its middle
+    )  # above the other, 0.1 m beside its centre
     upper.send(dialect.MAVLink_command_long_message(2, 1, 21, 0, 0, 0, 0, 0, math.nan, math.nan, math.nan))
     for _ in range(10_000):
         upper.step(STEP_S)
@@ -258,16 +258,16 @@ def test_one_that_lands_on_another_has_landed() -> None:
 
 
 @pytest.mark.parametrize("speed", [1.0, 20.0])
-def test_a_fleet_in_real_time_tells_who_ran_into_whom(speed: float) -> None:
-    said: list[str] = []
+def test_real_time_fleet_reports_collisions(speed: float) -> None:
+    events_text: list[str] = []
     options = SimulationOptions(onboard_bind=0, gcs_bind=0, noise=False, gusts_mps=0.0, speed=speed)
 
-    def hear(text: str) -> None:
-        said.append(text)
+    def on_event(text: str) -> None:
+        events_text.append(text)
         if "vehicle 2 at" in text:
             fleet.stop()
 
-    with Fleet(instance_options(options, 2, 12.0), hear) as fleet:
+    with Fleet(instance_options(options, 2, 12.0), on_event) as fleet:
         first, second = (simulation.vehicle.airframe for simulation in fleet.simulations)
         put(first, (0.0, 0.0, -40.0), (0.0, 15.0, 0.0))
         put(second, (0.0, 0.0, -40.0), (0.0, -15.0, 0.0))
@@ -276,6 +276,6 @@ def test_a_fleet_in_real_time_tells_who_ran_into_whom(speed: float) -> None:
         fleet.run()
         given_up.cancel()
         truth = fleet.simulations[0].truth()
-    assert any(text.startswith("vehicle 1: crashed into vehicle 2 at ") for text in said), said
+    assert any(text.startswith("vehicle 1: crashed into vehicle 2 at ") for text in events_text), events_text
     assert truth["collisions"] == 1
     assert (truth["last_collision"]["object"], truth["crashed"]) == ("vehicle 2", True)

@@ -1,4 +1,4 @@
-"""Missions, fences and rally points by MAVSDK over UDP: a client that nobody here wrote."""
+"""Missions, fences and rally points by MAVSDK over UDP."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from mavsdk.plugins.mission.mission import MissionItem, MissionPlan
 from mavsdk.plugins.mission_raw.mission_raw import MissionItem as RawItem
 from mavsdk.plugins.mission_raw.mission_raw import MissionRawError, MissionRawResult
 
-from mavlink_sim.physics.geography import geographic
+from mavlink_sim.physics.geography import SIH_FRAME
 from mavlink_sim.testing import RunningSimulator, running_simulator
 from tests.mavlink_sim.mavsdk_client import LIMIT_S, MavsdkClient, mavsdk_client, meanwhile, wait_for
 from tests.mavlink_sim.plan_client import item, land, polygon, rally, takeoff, waypoint
@@ -28,7 +28,7 @@ SPEED = 6.0
 
 
 @asynccontextmanager
-async def flown_by_mavsdk(
+async def mavsdk_flight(
     speed: float = 1.0, of_ground_station: bool = False
 ) -> AsyncIterator[tuple[RunningSimulator, MavsdkClient]]:
     """A vehicle in its process and MAVSDK's view of it, ready to arm, on the onboard link or the other."""
@@ -39,21 +39,21 @@ async def flown_by_mavsdk(
             yield simulator, system
 
 
-def place(north: float, east: float) -> tuple[float, float]:
-    latitude, longitude, _ = geographic((north, east, 0.0))
+def position(north: float, east: float) -> tuple[float, float]:
+    latitude, longitude, _ = SIH_FRAME.geographic((north, east, 0.0))
     return latitude, longitude
 
 
 def mission_item(north: float, east: float, **options: Any) -> MissionItem:
-    latitude, longitude = place(north, east)
+    latitude, longitude = position(north, east)
     return MissionItem(latitude, longitude, 4.0, is_fly_through=True, acceptance_radius_m=1.0, **options)
 
 
 async def uploaded(upload: Callable[[list[RawItem]], Awaitable[None]], items: list[RawItem]) -> None:
     """Upload a plan, more than once if need be.
 
-    On a busy machine an answer may come after the vehicle asked again (250 ms); the second answer then meets
-    the next upload, and PX4 takes it for an error.
+    On a busy machine an answer may arrive after the vehicle repeated its request (250 ms); the second answer
+    then arrives during the next upload, and PX4 treats it as an error.
     """
     for attempt in range(4):
         try:
@@ -71,7 +71,7 @@ def raw(items: list[dict[str, Any]]) -> list[RawItem]:
 
 
 async def test_mavsdk_uploads_starts_pauses_and_finishes_a_mission() -> None:
-    async with flown_by_mavsdk(SPEED) as (simulator, system):
+    async with mavsdk_flight(SPEED) as (simulator, system):
         mission = system.plugin(MissionAsync)
         action = system.plugin(ActionAsync)
         telemetry = system.plugin(TelemetryAsync)
@@ -109,8 +109,8 @@ async def test_mavsdk_uploads_starts_pauses_and_finishes_a_mission() -> None:
         assert (await mission.download_mission()).mission_items == []
 
 
-async def test_mavsdk_brings_raw_plans_and_takes_them_back() -> None:
-    async with flown_by_mavsdk() as (_, system):
+async def test_mavsdk_uploads_and_downloads_raw_plans() -> None:
+    async with mavsdk_flight() as (_, system):
         missions = system.plugin(MissionRawAsync)
         flight = raw([takeoff(4.0), waypoint(5, 5, 4.0), item(93, None, 2.0), land(5, 5)])
         fence = raw(polygon([(-40, -40), (40, -40), (40, 40), (-40, 40)]))
@@ -132,11 +132,11 @@ async def test_mavsdk_brings_raw_plans_and_takes_them_back() -> None:
 
 
 async def test_mavsdk_sets_and_clears_a_geofence() -> None:
-    async with flown_by_mavsdk() as (_, system):
+    async with mavsdk_flight() as (_, system):
         fence = system.plugin(GeofenceAsync)
-        corners = [Point(*place(*corner)) for corner in ((-30, -30), (30, -30), (30, 30), (-30, 30))]
+        corners = [Point(*position(*corner)) for corner in ((-30, -30), (30, -30), (30, 30), (-30, 30))]
         inside = Polygon(corners, FenceType.INCLUSION)
-        around = Circle(Point(*place(0, 0)), 15.0, FenceType.INCLUSION)
+        around = Circle(Point(*position(0, 0)), 15.0, FenceType.INCLUSION)
         await fence.upload_geofence(GeofenceData([inside], [around]))
         back = await fence.download_geofence()
         assert len(back.polygons[0].points) == 4
@@ -146,9 +146,9 @@ async def test_mavsdk_sets_and_clears_a_geofence() -> None:
         assert not (await fence.download_geofence()).circles
 
 
-async def test_mavsdk_flies_out_of_its_geofence_and_is_stopped_and_told() -> None:
+async def test_mavsdk_geofence_breach_holds_and_reports() -> None:
     # in real time: texts go to a ground station whose heartbeat comes often enough
-    async with flown_by_mavsdk(1.0, of_ground_station=True) as (simulator, system):
+    async with mavsdk_flight(1.0, of_ground_station=True) as (simulator, system):
         fence, telemetry = system.plugin(GeofenceAsync), system.plugin(TelemetryAsync)
         action, offboard = system.plugin(ActionAsync), system.plugin(OffboardAsync)
         texts: list[str] = []
@@ -158,12 +158,12 @@ async def test_mavsdk_flies_out_of_its_geofence_and_is_stopped_and_told() -> Non
                 async for status in statuses:
                     texts.append(status.text)
 
-        def told(words: str) -> bool:
+        def sent_texts(words: str) -> bool:
             return any(words in text for text in texts)
 
         async with meanwhile(listen()):
             await fence.upload_geofence(
-                GeofenceData([], [Circle(Point(*place(0, 0)), 8.0, FenceType.INCLUSION)])
+                GeofenceData([], [Circle(Point(*position(0, 0)), 8.0, FenceType.INCLUSION)])
             )
             await action.arm()
             await action.takeoff()
@@ -171,12 +171,14 @@ async def test_mavsdk_flies_out_of_its_geofence_and_is_stopped_and_told() -> Non
             await offboard.set_velocity_ned(VelocityNedYaw(3.0, 0.0, 0.0, 0.0))
             await offboard.start()
             await wait_for(telemetry.subscribe_flight_mode(), lambda mode: mode.name == "OFFBOARD")
-            assert not told("Geofence")
+            assert not sent_texts("Geofence")
             await wait_for(telemetry.subscribe_flight_mode(), lambda mode: mode.name == "HOLD")
             outside = await wait_for(telemetry.subscribe_position_velocity_ned())
             assert outside.position.north_m > 7.0
             async with asyncio.timeout(LIMIT_S):
-                while not told("Geofence: approaching or outside geofence") or not told("Failsafe activated"):
+                while not sent_texts("Geofence: approaching or outside geofence") or not sent_texts(
+                    "Failsafe activated"
+                ):
                     await asyncio.sleep(0.05)
             await asyncio.to_thread(simulator.wait_for_event, "failsafe: geofence breached, HOLD")
             stopped = await wait_for(

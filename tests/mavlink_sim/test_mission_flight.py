@@ -43,8 +43,8 @@ def current(harness: SimHarness) -> int:
 def status(harness: SimHarness) -> tuple[int, int, int, int]:
     """The newest MISSION_CURRENT: sequence, total, state, mode."""
     harness.fly(1.1)
-    told = harness.received("MISSION_CURRENT")[-1]
-    return told.seq, told.total, told.mission_state, told.mission_mode
+    texts = harness.received("MISSION_CURRENT")[-1]
+    return texts.seq, texts.total, texts.mission_state, texts.mission_mode
 
 
 def test_a_mission_takes_off_flies_lands_and_disarms(harness: SimHarness) -> None:
@@ -75,7 +75,7 @@ def test_a_mission_takes_off_flies_lands_and_disarms(harness: SimHarness) -> Non
     ]
 
 
-def test_mission_start_arms_and_begins_where_it_is_told(harness: SimHarness) -> None:
+def test_mission_start_arms_and_begins_at_given_item(harness: SimHarness) -> None:
     assert harness.command(300, 0, 0) == [2]
     upload(harness, [takeoff(4.0), waypoint(30, 0, 4), waypoint(0, 6, 4)])
     assert harness.command(300, 3, 0) == [2]
@@ -89,7 +89,7 @@ def test_mission_start_arms_and_begins_where_it_is_told(harness: SimHarness) -> 
     assert status(harness)[2] == 5
 
 
-def test_reached_items_are_told_again_ten_times(harness: SimHarness) -> None:
+def test_reached_items_are_repeated_ten_times(harness: SimHarness) -> None:
     upload(harness, [takeoff(4.0), item(17, (0, 0, 4), 0, 0, 0, NAN)])
     harness.command(300)
     harness.until(lambda: current(harness) == 1, 30.0)
@@ -107,7 +107,7 @@ def test_a_waypoint_is_held_for_its_time_and_heading(harness: SimHarness) -> Non
     assert math.degrees(harness.vehicle.airframe.yaw_rad) == pytest.approx(90.0, abs=12.0)
 
 
-def test_delay_and_speed_and_jump_items_do_what_they_say(harness: SimHarness) -> None:
+def test_delay_speed_and_jump_items_work(harness: SimHarness) -> None:
     upload(
         harness,
         [
@@ -137,7 +137,7 @@ def test_delay_and_speed_and_jump_items_do_what_they_say(harness: SimHarness) ->
     assert status(harness)[2:] == (5, 2)  # complete, though the vehicle is still on its way
 
 
-def test_a_mission_that_ends_in_a_return_holds_for_a_moment(harness: SimHarness) -> None:
+def test_mission_ending_in_return_holds_briefly(harness: SimHarness) -> None:
     upload(harness, [takeoff(3.0), waypoint(4, 0, 3), RETURN])
     harness.command(300)
     harness.until(lambda: harness.mode == "HOLD", 30.0)
@@ -148,7 +148,7 @@ def test_a_mission_that_ends_in_a_return_holds_for_a_moment(harness: SimHarness)
     assert changes == ["mode MISSION", "mode HOLD", "mode RTL", "mode HOLD"]
 
 
-def test_a_pause_keeps_the_place_in_the_mission(harness: SimHarness) -> None:
+def test_pause_keeps_current_item(harness: SimHarness) -> None:
     upload(harness, [takeoff(4.0), waypoint(12, 0, 4), waypoint(12, 8, 4)])
     harness.command(300)
     harness.until(lambda: harness.vehicle.airframe.position[0] > 4.0, 30.0)
@@ -165,7 +165,7 @@ def test_a_pause_keeps_the_place_in_the_mission(harness: SimHarness) -> None:
     assert reached(harness) == [1, 2]
 
 
-def test_a_waypoint_on_the_way_is_passed_without_stopping(harness: SimHarness) -> None:
+def test_intermediate_waypoint_passed_without_stop(harness: SimHarness) -> None:
     upload(harness, [takeoff(4.0), waypoint(15, 0, 4), waypoint(30, 0, 4)])
     harness.command(300)
     harness.until(lambda: current(harness) == 2, 40.0)
@@ -231,7 +231,7 @@ def test_a_finished_mission_begins_again_after_disarming(harness: SimHarness) ->
     assert reached(harness)[-2:] == [0, 1]
 
 
-def test_numbers_that_are_none_do_not_stop_the_vehicle(harness: SimHarness) -> None:
+def test_nan_items_do_not_raise(harness: SimHarness) -> None:
     nothing = [NAN] * 7
     strange = [
         takeoff(3.0),
@@ -301,7 +301,7 @@ def test_an_empty_mission_cannot_be_flown_or_armed_in(harness: SimHarness) -> No
         ),
     ],
 )
-def test_a_mission_that_cannot_be_flown_is_stored_but_refused(
+def test_infeasible_mission_stored_but_refused(
     make_harness: type[SimHarness], parameters: dict[str, float], plan: list[Any], words: str
 ) -> None:
     harness = make_harness(ready_after_s=0.0, parameters=parameters)
@@ -323,7 +323,7 @@ def test_a_far_first_waypoint_is_only_warned_of(make_harness: type[SimHarness]) 
     assert harness.vehicle.autopilot.navigator.mission.valid
 
 
-def test_a_fence_that_comes_later_makes_the_mission_invalid(harness: SimHarness) -> None:
+def test_later_fence_invalidates_mission(harness: SimHarness) -> None:
     upload(harness, [takeoff(5.0), waypoint(30, 0, 5)])
     assert harness.vehicle.autopilot.navigator.mission.valid
     upload(harness, [circle(0, 0, 20.0)], 1)

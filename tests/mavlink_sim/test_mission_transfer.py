@@ -45,7 +45,7 @@ def count(number: int, plan: int = 0, target: tuple[int, int] = (1, 1)) -> Any:
     return dialect.MAVLink_mission_count_message(*target, number, plan)
 
 
-def test_an_uploaded_mission_is_given_back_as_px4_stores_it(harness: SimHarness) -> None:
+def test_uploaded_mission_downloaded_as_px4_stores_it(harness: SimHarness) -> None:
     harness.wait_ready()
     plan = [
         takeoff(5.0),
@@ -68,7 +68,7 @@ def test_an_uploaded_mission_is_given_back_as_px4_stores_it(harness: SimHarness)
     assert [(m.x, m.y, m.z) for m in got] == [(i["x"], i["y"], i["z"]) for i in plan]
     # a waypoint keeps its time, radius and heading (from 0 to 360°), and loses its third parameter
     assert (got[1].param1, got[1].param2, got[1].param3, got[1].param4) == (2.5, 1.5, 0.0, 270.0)
-    assert got[3].param4 == 1.0  # PX4 gives back "leave on a tangent" where a heading was
+    assert got[3].param4 == 1.0  # PX4 returns "leave on a tangent" instead of a heading
     assert (got[4].param1, got[4].param2) == (1.0, 2.0)
 
 
@@ -93,7 +93,7 @@ def test_fence_and_rally_points_go_there_and_back(harness: SimHarness, plan: int
     assert download(harness, 0) == []
 
 
-def test_a_client_that_sends_floats_is_asked_with_floats_from_then_on(harness: SimHarness) -> None:
+def test_float_items_are_requested_as_floats(harness: SimHarness) -> None:
     harness.wait_ready()
     harness.send(count(2))
     assert newest(harness, "MISSION_REQUEST_INT", 0).seq == 0
@@ -110,7 +110,7 @@ def test_a_client_that_sends_floats_is_asked_with_floats_from_then_on(harness: S
     assert (got.frame, got.x) == (3, pytest.approx(47.3977, abs=1e-6))
 
 
-def test_an_unanswered_question_is_repeated_and_in_the_end_given_up(harness: SimHarness) -> None:
+def test_unanswered_request_repeats_then_aborts(harness: SimHarness) -> None:
     listen(harness)
     harness.send(count(2))
     harness.send(message(0, takeoff(5.0)))
@@ -131,7 +131,7 @@ def test_a_lost_acknowledgement_is_sent_again(harness: SimHarness) -> None:
     assert [m.type for m in harness.received("MISSION_ACK")] == [0, 0]
 
 
-def test_an_item_out_of_sequence_is_passed_over(harness: SimHarness) -> None:
+def test_item_out_of_sequence_ignored(harness: SimHarness) -> None:
     harness.send(count(2))
     harness.send(message(1, waypoint(5, 0, 5)))
     assert harness.received("MISSION_ACK") == []
@@ -175,16 +175,16 @@ def test_an_item_without_a_transfer_is_an_error(harness: SimHarness) -> None:
         "polygon of two",
     ],
 )
-def test_an_item_px4_does_not_take_ends_the_upload(
+def test_unsupported_item_ends_upload(
     harness: SimHarness, fields: dict[str, Any], plan: int, result: int
 ) -> None:
     harness.wait_ready()
     assert upload(harness, [fields, fields], plan) == result
-    assert upload(harness, [takeoff(5.0)]) == 0  # the next client is welcome
+    assert upload(harness, [takeoff(5.0)]) == 0  # the next client is accepted
 
 
 @pytest.mark.parametrize(("plan", "most"), [(0, 10000), (1, 64), (2, 32)])
-def test_more_items_than_there_is_room_for_are_refused(harness: SimHarness, plan: int, most: int) -> None:
+def test_too_many_items_refused(harness: SimHarness, plan: int, most: int) -> None:
     harness.send(count(most + 1, plan))
     assert newest(harness, "MISSION_ACK", 0).type == 4
     harness.send(count(most, plan))
@@ -192,7 +192,7 @@ def test_more_items_than_there_is_room_for_are_refused(harness: SimHarness, plan
 
 
 @pytest.mark.parametrize(("items", "result"), [(1, 4), (0, 0)])
-def test_an_unknown_kind_of_plan_has_room_for_nothing(harness: SimHarness, items: int, result: int) -> None:
+def test_unknown_plan_type_has_no_space(harness: SimHarness, items: int, result: int) -> None:
     harness.send(count(items, 7))
     ack = newest(harness, "MISSION_ACK", 0)
     assert (ack.type, ack.mission_type) == (result, 7)
@@ -234,7 +234,7 @@ def test_a_download_asked_out_of_order_ends_with_an_error(harness: SimHarness) -
 
 
 @pytest.mark.parametrize("kind", [0, 1, 2, 255])
-def test_clearing_takes_away_what_it_names(harness: SimHarness, kind: int) -> None:
+def test_clear_removes_named_plan(harness: SimHarness, kind: int) -> None:
     harness.wait_ready()
     upload(harness, [takeoff(5.0)])
     upload(harness, polygon(SQUARE), 1)
@@ -246,7 +246,7 @@ def test_clearing_takes_away_what_it_names(harness: SimHarness, kind: int) -> No
     assert left == [0 if kind in (plan, 255) else full for plan, full in enumerate([1, 4, 1])]
 
 
-def test_messages_for_other_vehicles_or_everybody_are_not_taken(harness: SimHarness) -> None:
+def test_messages_for_others_or_broadcast_ignored(harness: SimHarness) -> None:
     harness.send(count(1, target=(2, 1)))
     harness.send(count(1, target=(0, 0)))
     assert harness.received("MISSION_REQUEST_INT") == harness.received("MISSION_ACK") == []
@@ -254,7 +254,7 @@ def test_messages_for_other_vehicles_or_everybody_are_not_taken(harness: SimHarn
     assert len(harness.received("MISSION_REQUEST_INT")) == 1
 
 
-def test_set_current_is_told_by_mission_current(harness: SimHarness) -> None:
+def test_set_current_confirmed_by_mission_current(harness: SimHarness) -> None:
     listen(harness)
     harness.wait_ready()
     upload(harness, [takeoff(5.0), waypoint(5, 0, 5), RETURN])
@@ -291,7 +291,7 @@ def test_plans_have_identifiers_that_newer_clients_can_read(harness: SimHarness)
     packed = MissionCurrent(1, 2, 3, 1, 11, 12, 13).pack(parser())
     payload = packed[10:-2].ljust(18, b"\0")  # MAVLink 2 leaves out the zeros at the end
     assert struct.unpack("<HHBBIII", payload) == (1, 2, 3, 1, 11, 12, 13)
-    (seen,) = dialect.MAVLink(None).parse_buffer(packed)  # an older client reads the rest
+    (seen,) = dialect.MAVLink(None).parse_buffer(packed)  # an older client decodes the rest
     assert (seen.seq, seen.total, seen.mission_state) == (1, 2, 3)
 
 
@@ -317,7 +317,7 @@ fields = st.fixed_dictionaries(
 
 @settings(max_examples=150, deadline=None)
 @given(fields)
-def test_any_item_is_stored_or_refused_and_what_is_given_back_is_stored_alike(wanted: dict[str, Any]) -> None:
+def test_any_item_refused_or_round_trips(wanted: dict[str, Any]) -> None:
     try:
         stored = item_of(message(0, wanted))
     except ItemRejectedError:

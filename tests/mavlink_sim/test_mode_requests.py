@@ -12,7 +12,7 @@ FOLLOW, PRECISION_LAND, ORBIT = (4, 8), (4, 9), (3, 1)
 
 
 @pytest.mark.parametrize(("main", "sub"), ALL_MODES)
-def test_a_disarmed_vehicle_takes_every_known_mode(harness: SimHarness, main: int, sub: int) -> None:
+def test_disarmed_accepts_every_known_mode(harness: SimHarness, main: int, sub: int) -> None:
     harness.fly(0.1)
     assert harness.set_mode(main, sub) == [0, 0]
     assert harness.heartbeat().custom_mode == main << 16 | sub << 24
@@ -26,7 +26,7 @@ def test_a_disarmed_vehicle_takes_every_known_mode(harness: SimHarness, main: in
         pytest.param(ORBIT, 0x00030000, 81, id="ORBIT, which shows as POSCTL"),
     ],
 )
-def test_a_disarmed_vehicle_takes_follow_precision_landing_and_orbit_too(
+def test_disarmed_accepts_follow_precland_and_orbit(
     harness: SimHarness, request_of: tuple[int, int], shown: int, base_mode: int
 ) -> None:
     harness.wait_ready()
@@ -35,7 +35,7 @@ def test_a_disarmed_vehicle_takes_follow_precision_landing_and_orbit_too(
     assert (beat.custom_mode, beat.base_mode) == (shown, base_mode)
 
 
-def test_the_first_answer_comes_at_once_and_the_real_one_within_ten_milliseconds(harness: SimHarness) -> None:
+def test_first_answer_at_once_second_within_10_ms(harness: SimHarness) -> None:
     harness.fly(0.1)
     harness.forget()
     harness.send(dialect.MAVLink_command_long_message(1, 1, 176, 0, 1, 4, 3, 0, 0, 0, 0))
@@ -44,7 +44,7 @@ def test_the_first_answer_comes_at_once_and_the_real_one_within_ten_milliseconds
     assert len(harness.received("COMMAND_ACK")) == 2
 
 
-def test_commands_sent_one_right_after_the_other_are_carried_out_in_order(harness: SimHarness) -> None:
+def test_consecutive_commands_execute_in_order(harness: SimHarness) -> None:
     harness.take_off(4.0)
     for _ in range(3):
         harness.send(dialect.MAVLink_command_long_message(1, 1, 176, 0, 1, 4, 3, 0, 0, 0, 0))
@@ -54,28 +54,24 @@ def test_commands_sent_one_right_after_the_other_are_carried_out_in_order(harnes
 
 
 @pytest.mark.parametrize(("main", "sub", "base"), [(8, 0, 1), (4, 1, 1), (4, 99, 1), (77, 0, 1), (4, 3, 0)])
-def test_what_is_no_mode_is_accepted_then_rejected(
-    harness: SimHarness, main: int, sub: int, base: int
-) -> None:
+def test_unknown_mode_accepted_then_rejected(harness: SimHarness, main: int, sub: int, base: int) -> None:
     harness.fly(0.1)
     assert harness.set_mode(main, sub, base) == [0, 1]
     assert harness.mode == "HOLD"
 
 
 @pytest.mark.parametrize(("main", "sub"), [(3, 0), (2, 0), (7, 0), (1, 0), (4, 4), (6, 0)])
-def test_in_the_air_a_mode_that_cannot_be_flown_is_accepted_then_rejected(
-    harness: SimHarness, main: int, sub: int
-) -> None:
+def test_unavailable_mode_in_air_accepted_then_rejected(harness: SimHarness, main: int, sub: int) -> None:
     harness.take_off()
     assert harness.set_mode(main, sub) == [0, 1]
     assert harness.heartbeat().custom_mode == 0x03040000
 
 
-def test_the_refusal_is_told_in_words_to_a_ground_station_that_asked(harness: SimHarness) -> None:
+def test_refusal_text_goes_to_requesting_ground_station(harness: SimHarness) -> None:
     harness.heartbeats.append(("gcs", (245, 190), 6))
     harness.take_off()
     harness.forget()
-    harness.set_mode(6)  # asked by the companion: no words
+    harness.set_mode(6)  # requested by the companion: no text
     assert harness.texts() == []
     harness.set_mode(6, source=(245, 190), link="gcs")
     assert harness.texts() == ["Switching to Offboard is currently not available\t"]
@@ -86,7 +82,7 @@ def test_the_refusal_is_told_in_words_to_a_ground_station_that_asked(harness: Si
     assert harness.texts()[1:] == ["Switching to Position is currently not available\t"]
 
 
-def test_the_old_set_mode_message_has_one_answer_which_is_the_real_one(harness: SimHarness) -> None:
+def test_set_mode_message_has_one_real_answer(harness: SimHarness) -> None:
     harness.take_off()
     harness.forget()
     harness.send(dialect.MAVLink_set_mode_message(1, 1, 0x00030000))
@@ -107,10 +103,10 @@ def test_a_mode_change_is_not_announced_by_an_extra_heartbeat(harness: SimHarnes
     assert harness.received("HEARTBEAT") == []
 
 
-def test_current_mode_tells_the_mode_and_the_intention_twice_a_second_and_when_they_change(
+def test_current_mode_sent_at_2_hz_and_on_change(
     harness: SimHarness,
 ) -> None:
-    """However often it is asked for: a real PX4 asked for 20 a second sent 1.75 to 2."""
+    """Whatever the requested rate: a real PX4 asked for 20 Hz sent 1.75 to 2."""
     harness.fly(0.1)
     assert harness.command(511, 436, 50_000) == [0]
     harness.fly(0.7)
@@ -126,13 +122,11 @@ def test_current_mode_tells_the_mode_and_the_intention_twice_a_second_and_when_t
     }
 
 
-def test_another_system_may_take_the_vehicle_from_the_companion(
-    harness: SimHarness, velocity_setpoint: Any
-) -> None:
+def test_another_system_may_change_the_mode(harness: SimHarness, velocity_setpoint: Any) -> None:
     harness.take_off()
     stream = velocity_setpoint(1, 0, 0)
     harness.offboard(stream)
     assert harness.set_mode(4, 3, source=(245, 190), link="gcs") == [0, 0]
-    harness.fly(5.0, stream)  # the companion goes on sending, in vain
+    harness.fly(5.0, stream)  # the companion continues to send
     assert harness.mode == "HOLD"
     assert abs(harness.vehicle.airframe.velocity[0]) < 0.2

@@ -1,4 +1,4 @@
-"""What the range sensors measure of a scene, and what collision prevention makes of it."""
+"""The range sensors in a scene, and collision prevention with them."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ BLOCK = WorldObject(5, "box", (0.0, 3.0, 0.0), size_m=(2.0, 2.0, 1.5))
 LINKS = {"onboard": dict.fromkeys(ONBOARD_RATES_HZ, 0.0), "gcs": GCS_RATES_HZ}
 
 
-def flying(*things: WorldObject, height_m: float = 3.0, **options: Any) -> LockstepVehicle:
-    calm = {"scene": World(things), "gusts_mps": 0.0, "noise": False, "obstacle_sensor": True}
+def flying(*objects: WorldObject, height_m: float = 3.0, **options: Any) -> LockstepVehicle:
+    calm = {"scene": World(objects), "gusts_mps": 0.0, "noise": False, "obstacle_sensor": True}
     vehicle = LockstepVehicle(LINKS, **{**calm, **options})
     vehicle.take_off(height_m)
     return vehicle
 
 
-def piloted(*things: WorldObject, scene: Scene | None = None, **parameters: float) -> LockstepVehicle:
+def piloted(*objects: WorldObject, scene: Scene | None = None, **parameters: float) -> LockstepVehicle:
     """In Position mode, its pilot at the sticks."""
     vehicle = flying(
-        scene=World(things) if scene is None else scene,
+        scene=World(objects) if scene is None else scene,
         parameters={**CALIBRATION, "COM_RC_IN_MODE": 0, "CP_GUIDE_ANG": 0, **parameters},
     )
     vehicle.vehicle.transmitter.on = True
@@ -48,7 +48,7 @@ def sensed(vehicle: LockstepVehicle) -> list[int]:
     return distances
 
 
-def test_the_sensor_tells_the_wall_ahead_and_nothing_behind() -> None:
+def test_sensor_measures_wall_ahead_only() -> None:
     found = sensed(flying(WALL))
     assert found[0] == pytest.approx(100 * FACE_M, abs=3)
     for sector in (-8, -4, 4, 8):  # the nearest point of each sector is at its edge
@@ -57,7 +57,7 @@ def test_the_sensor_tells_the_wall_ahead_and_nothing_behind() -> None:
     assert found[36] == found[18] == NOTHING_CM
 
 
-def test_its_sectors_turn_with_the_vehicle_and_its_height_counts() -> None:
+def test_sectors_follow_heading_and_height() -> None:
     vehicle = flying(WALL)
     vehicle.vehicle.airframe.yaw_rad = math.pi / 2
     vehicle.step(0.2)
@@ -86,12 +86,12 @@ def test_its_noise_comes_from_the_seed() -> None:
     assert 100 * NOISE_M < spread < 100 * 8 * NOISE_M
 
 
-def test_without_it_the_map_stays_empty_and_without_a_scene_it_is_refused() -> None:
+def test_without_sensor_map_empty_without_scene_refused() -> None:
     vehicle = flying(WALL, obstacle_sensor=False)
     assert set(sensed(vehicle)) == {UNKNOWN_CM}
-    with pytest.raises(ValueError, match="nothing to measure without a scene"):
+    with pytest.raises(ValueError, match="scene"):
         LockstepVehicle(obstacle_sensor=True)
-    with pytest.raises(ValueError, match="no collision prevention here"):
+    with pytest.raises(ValueError, match="collision prevention"):
         LockstepVehicle(obstacle_sensor=True, scene=World((WALL,)), autopilot="ardupilot")
 
 
@@ -115,7 +115,7 @@ def test_a_pilot_at_full_stick_stops_before_the_wall() -> None:
     assert math.hypot(*truth.velocity_ned_mps) < 0.2
 
 
-def test_without_collision_prevention_the_same_stick_ends_at_the_wall() -> None:
+def test_without_collision_prevention_same_stick_ends_at_wall() -> None:
     vehicle = piloted(WALL, CP_DIST=-1.0)
     vehicle.vehicle.transmitter.sticks = Sticks(pitch=1.0)
     vehicle.step(6.0)
@@ -123,7 +123,7 @@ def test_without_collision_prevention_the_same_stick_ends_at_the_wall() -> None:
     assert vehicle.truth.position_ned_m[0] < FACE_M
 
 
-def test_a_pilot_is_pushed_back_by_what_comes_along() -> None:
+def test_moving_obstacle_pushes_back() -> None:
     path = Path(((14.0, 0.0, 0.0), (2.5, 0.0, 0.0)), 0.8, "once", fixed_yaw_rad=math.pi)
     scene = Scene(World((WorldObject(2, "wall", (14.0, 0.0, 0.0), math.pi, size_m=(20, 0.3, 6)),)), {2: path})
     vehicle = piloted(scene=scene, CP_DIST=2.0)
@@ -133,13 +133,13 @@ def test_a_pilot_is_pushed_back_by_what_comes_along() -> None:
     assert 2.2 - vehicle.truth.position_ned_m[0] > 1.0
 
 
-def test_the_fused_map_streams_to_a_ground_station_while_collision_prevention_works() -> None:
+def test_fused_map_streams_during_collision_prevention() -> None:
     vehicle = piloted(WALL, CP_DIST=1.5)
     vehicle.receive("gcs"), vehicle.receive("onboard")
     vehicle.step(5.0)
-    told = [one for one in vehicle.receive("gcs") if one.get_type() == "OBSTACLE_DISTANCE"]
-    assert len(told) == 5
-    newest = told[-1]
+    reported = [one for one in vehicle.receive("gcs") if one.get_type() == "OBSTACLE_DISTANCE"]
+    assert len(reported) == 5
+    newest = reported[-1]
     assert newest.distances[0] == pytest.approx(100 * FACE_M, abs=30)
     assert (newest.min_distance, newest.max_distance) == (20, 1200)
     assert (newest.increment, newest.increment_f, newest.angle_offset, newest.frame) == (0, 5.0, 0.0, 12)
@@ -151,15 +151,15 @@ def test_the_fused_map_streams_to_a_ground_station_while_collision_prevention_wo
     assert "OBSTACLE_DISTANCE" not in {one.get_type() for one in vehicle.receive("gcs")}
 
 
-def test_a_companion_may_ask_for_it() -> None:
+def test_companion_may_request_the_map() -> None:
     vehicle = piloted(WALL, CP_DIST=1.5)
     assert vehicle.command(REQUEST_MESSAGE, OBSTACLE_DISTANCE) == "ACCEPTED"
     assert vehicle.newest["onboard"]["OBSTACLE_DISTANCE"].distances[36] == NOTHING_CM
     assert vehicle.command(SET_MESSAGE_INTERVAL, OBSTACLE_DISTANCE, 100_000) == "ACCEPTED"
     vehicle.receive()
     vehicle.step(4.0)
-    told = [one for one in vehicle.receive() if one.get_type() == "OBSTACLE_DISTANCE"]
-    assert len(told) == pytest.approx(39, abs=1)  # 9.85 Hz
+    reported = [one for one in vehicle.receive() if one.get_type() == "OBSTACLE_DISTANCE"]
+    assert len(reported) == pytest.approx(39, abs=1)  # 9.85 Hz
     vehicle.set_mode("HOLD")
     vehicle.step(0.1)
     assert vehicle.command(REQUEST_MESSAGE, OBSTACLE_DISTANCE) == "DENIED"  # PX4 publishes none now
@@ -170,7 +170,7 @@ def range_below(vehicle: LockstepVehicle) -> float:
     return float(vehicle.newest["onboard"]["DISTANCE_SENSOR"].current_distance) / 100.0
 
 
-def test_the_range_below_is_that_to_what_is_below() -> None:
+def test_range_below_is_to_nearest_surface() -> None:
     vehicle = flying(BLOCK, obstacle_sensor=False)
     height = vehicle.truth.height_m
     assert range_below(vehicle) == pytest.approx(height, abs=0.02)
@@ -182,7 +182,7 @@ def test_the_range_below_is_that_to_what_is_below() -> None:
     assert 1.5 < range_below(tree) < 5.0
 
 
-def test_on_a_roof_the_range_below_is_nothing() -> None:
+def test_range_below_is_zero_on_roof() -> None:
     vehicle = LockstepVehicle(LINKS, scene=World((BLOCK,)), gusts_mps=0.0, noise=False)
     airframe = vehicle.vehicle.airframe
     airframe.on_ground, airframe.position = False, (0.0, 3.0, -1.52)
@@ -191,7 +191,7 @@ def test_on_a_roof_the_range_below_is_nothing() -> None:
     assert range_below(vehicle) == 0.0
 
 
-def test_a_leaning_vehicle_looks_past_the_edge() -> None:
+def test_tilted_vehicle_measures_past_the_edge() -> None:
     vehicle = flying(BLOCK, obstacle_sensor=False)
     airframe = vehicle.vehicle.airframe
     airframe.position = (0.0, 2.2, -3.0)

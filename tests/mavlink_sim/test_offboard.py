@@ -1,4 +1,4 @@
-"""OFFBOARD: which setpoints count, how they are flown, and what happens when they stop."""
+"""OFFBOARD: the setpoints used, their control, and their loss."""
 
 import math
 from collections.abc import Callable
@@ -35,14 +35,14 @@ def test_each_axis_of_a_local_setpoint_has_its_own_ignore_bit() -> None:
     assert setpoint.yaw_rate_radps == 8.0
 
 
-def test_in_the_body_frame_the_position_is_ignored_and_the_velocity_turned_by_yaw() -> None:
+def test_body_frame_ignores_position_rotates_velocity() -> None:
     setpoint = trajectory_setpoint(target(8, 0x1C0, x=9, y=9, z=9, vx=1, vy=2, vz=3), math.pi / 2)
     assert all(math.isnan(value) for value in setpoint.position)
     assert setpoint.velocity == pytest.approx((-2.0, 1.0, 3.0))
 
 
 @pytest.mark.parametrize("bit", [8, 16, 32])
-def test_in_the_body_frame_one_ignored_axis_disables_the_whole_velocity(bit: int) -> None:
+def test_body_frame_ignored_axis_disables_velocity(bit: int) -> None:
     with pytest.raises(SetpointRejectedError, match="invalid"):
         trajectory_setpoint(target(8, 0x1C7 | bit, vx=1, vy=2, vz=3), 0.0)
 
@@ -57,9 +57,7 @@ def test_in_the_body_frame_one_ignored_axis_disables_the_whole_velocity(bit: int
         (1, 512, "SET_POSITION_TARGET_LOCAL_NED force not supported"),
     ],
 )
-def test_what_px4_drops_is_dropped_and_told_to_the_ground_station(
-    harness: SimHarness, frame: int, mask: int, text: str
-) -> None:
+def test_invalid_setpoints_dropped_with_text(harness: SimHarness, frame: int, mask: int, text: str) -> None:
     harness.heartbeats.append(("gcs", (245, 190), 6))
     harness.fly(0.1)
     harness.send(target(frame, mask))
@@ -69,7 +67,7 @@ def test_what_px4_drops_is_dropped_and_told_to_the_ground_station(
 
 
 @given(st.integers(0, 15), st.integers(0, 65535), st.lists(st.floats(width=32), min_size=11, max_size=11))
-def test_any_setpoint_is_either_refused_or_finite_where_it_controls(
+def test_any_setpoint_either_refused_or_finite_where_it_controls(
     frame: int, mask: int, values: list[float]
 ) -> None:
     names = ("x", "y", "z", "vx", "vy", "vz", "afx", "afy", "afz", "yaw", "yaw_rate")
@@ -86,7 +84,7 @@ def test_any_setpoint_is_either_refused_or_finite_where_it_controls(
 @pytest.mark.parametrize(("system", "component", "counts"), [
     (1, 1, True), (1, 0, True), (0, 0, True), (2, 1, False), (1, 100, False),
 ])  # fmt: skip
-def test_a_setpoint_counts_if_it_is_addressed_to_the_autopilot(
+def test_setpoint_needs_autopilot_as_target(
     harness: SimHarness, system: int, component: int, counts: bool
 ) -> None:
     harness.fly(0.1)
@@ -97,7 +95,7 @@ def test_a_setpoint_counts_if_it_is_addressed_to_the_autopilot(
 # ---- entering
 
 
-def test_without_a_stream_the_mode_is_refused_in_the_air_and_nothing_changes(harness: SimHarness) -> None:
+def test_offboard_without_stream_refused_in_air(harness: SimHarness) -> None:
     harness.take_off()
     assert harness.set_mode(6) == [0, 1]
     assert harness.mode == "HOLD"
@@ -111,9 +109,7 @@ def test_one_setpoint_just_before_is_enough(harness: SimHarness, velocity_setpoi
     assert harness.mode == "OFFBOARD"
 
 
-def test_setpoints_before_offboard_only_count_as_a_signal(
-    harness: SimHarness, velocity_setpoint: Any
-) -> None:
+def test_setpoints_before_offboard_are_only_a_signal(harness: SimHarness, velocity_setpoint: Any) -> None:
     harness.take_off(5.0)
     harness.fly(0.5, velocity_setpoint(5, 0, 0))
     harness.set_mode(6)
@@ -137,7 +133,7 @@ def test_it_arms_in_offboard_and_climbs_by_the_setpoint(harness: SimHarness, vel
 # ---- flying
 
 
-def test_a_body_velocity_goes_where_the_nose_points(harness: SimHarness, velocity_setpoint: Any) -> None:
+def test_body_velocity_follows_heading(harness: SimHarness, velocity_setpoint: Any) -> None:
     harness.take_off(5.0)
     turn = velocity_setpoint(0, 0, 0, yaw_rate=0.5)
     harness.offboard(turn)
@@ -161,32 +157,32 @@ def test_a_local_position_is_reached_and_its_yaw_taken(harness: SimHarness, posi
     assert harness.vehicle.airframe.yaw_rad == pytest.approx(1.0, abs=0.02)
 
 
-def test_a_position_step_of_ten_metres_is_settled_within_six_seconds(
+def test_position_step_of_ten_metres_settled_within_six_seconds(
     harness: SimHarness, position_setpoint: Any
 ) -> None:
     harness.take_off(5.0)
     harness.offboard(position_setpoint(0, 0, -5))
     harness.fly(3.0, position_setpoint(0, 0, -5))
     step = position_setpoint(10, 0, -5)
-    flown: list[tuple[float, float]] = []
+    active: list[tuple[float, float]] = []
 
     def watch() -> bool:
         airframe = harness.vehicle.airframe
-        flown.append((airframe.position[0], airframe.velocity[0]))
+        active.append((airframe.position[0], airframe.velocity[0]))
         return False
 
     harness.until(watch, 6.0, step, must=False)
-    moving = len(flown)
-    assert 4.5 < max(speed for _, speed in flown) < 5.7
-    assert 0.5 < max(north for north, _ in flown) - 10.0 < 1.2
+    moving = len(active)
+    assert 4.5 < max(speed for _, speed in active) < 5.7
+    assert 0.5 < max(north for north, _ in active) - 10.0 < 1.2
     harness.until(watch, 10.0, step, must=False)
-    assert max(abs(north - 10.0) for north, _ in flown[moving:]) < 0.55  # as a real one wanders, holding
-    assert max(abs(speed) for _, speed in flown[moving:]) < 0.25
+    assert (
+        max(abs(north - 10.0) for north, _ in active[moving:]) < 0.55
+    )  # the measured variation while holding
+    assert max(abs(speed) for _, speed in active[moving:]) < 0.25
 
 
-def test_a_velocity_step_nears_its_goal_slowly_and_stops_so(
-    harness: SimHarness, velocity_setpoint: Any
-) -> None:
+def test_velocity_step_has_measured_shape(harness: SimHarness, velocity_setpoint: Any) -> None:
     """PX4: 2.65 m/s at 6 s, never 95 %; from there 3.3 m in 4.1 s until it is slower than 0.3 m/s."""
     harness.take_off(5.0)
     stop = velocity_setpoint(0, 0, 0)
@@ -229,7 +225,7 @@ def test_the_position_target_is_echoed_with_the_inner_setpoints(
     assert harness.received("POSITION_TARGET_LOCAL_NED")[-1].type_mask == 7
 
 
-def test_landing_by_setpoints_is_noticed_and_disarms(harness: SimHarness, velocity_setpoint: Any) -> None:
+def test_landing_by_setpoints_disarms(harness: SimHarness, velocity_setpoint: Any) -> None:
     harness.take_off()
     down = velocity_setpoint(0, 0, 0.5)
     harness.offboard(down)
@@ -251,7 +247,7 @@ def streaming(harness: SimHarness, velocity_setpoint: Any) -> tuple[Any, Any]:
     return harness, stream
 
 
-def test_the_mode_leaves_offboard_a_little_more_than_a_second_after_the_last_setpoint(
+def test_offboard_left_after_1_s_without_setpoints(
     streaming: tuple[Any, Any],
 ) -> None:
     harness, stream = streaming
@@ -274,7 +270,7 @@ def test_a_stream_above_the_limit_holds_the_mode(streaming: tuple[Any, Any], rat
     assert harness.events == []
 
 
-def test_a_stream_just_below_the_limit_flickers_into_the_failsafe(streaming: tuple[Any, Any]) -> None:
+def test_stream_just_below_limit_flickers_into_failsafe(streaming: tuple[Any, Any]) -> None:
     harness, stream = streaming
     harness.events.clear()
     harness.fly(6.0, stream, 0.9)
@@ -282,7 +278,7 @@ def test_a_stream_just_below_the_limit_flickers_into_the_failsafe(streaming: tup
     assert harness.events.count("mode OFFBOARD") >= 3
 
 
-def test_a_gap_of_eight_tenths_is_nothing(streaming: tuple[Any, Any]) -> None:
+def test_gap_of_0_8_s_is_tolerated(streaming: tuple[Any, Any]) -> None:
     harness, stream = streaming
     harness.events.clear()
     harness.send(stream)
@@ -291,7 +287,7 @@ def test_a_gap_of_eight_tenths_is_nothing(streaming: tuple[Any, Any]) -> None:
     assert harness.events == []
 
 
-def test_offboard_comes_back_by_itself_with_the_setpoints(streaming: tuple[Any, Any]) -> None:
+def test_offboard_resumes_with_setpoints(streaming: tuple[Any, Any]) -> None:
     harness, stream = streaming
     harness.command(511, 436, 50_000)
     harness.fly(3.0)
@@ -311,7 +307,7 @@ def test_a_mode_asked_for_in_the_failsafe_ends_the_intention(streaming: tuple[An
     assert harness.heartbeat().system_status == 4
 
 
-def test_the_failsafe_lands_disarms_and_the_vehicle_shows_offboard_again(
+def test_failsafe_lands_disarms_and_vehicle_shows_offboard_again(
     streaming: tuple[Any, Any],
 ) -> None:
     harness, _ = streaming
@@ -332,7 +328,7 @@ def test_the_failsafe_lands_disarms_and_the_vehicle_shows_offboard_again(
         (5, 2, "HOLD"),
     ],
 )
-def test_what_follows_the_loss_is_a_matter_of_parameters(
+def test_loss_action_follows_parameters(
     make_harness: Callable[..., Any],
     velocity_setpoint: Any,
     loss_action: int,

@@ -1,4 +1,4 @@
-"""DO_ORBIT: the circle, the heading on it, its limits, and what is told of it."""
+"""DO_ORBIT: the circle, the heading on it, its limits, and its telemetry."""
 
 import math
 from typing import Any
@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mavlink_sim.flight.orbit import Orbit
-from mavlink_sim.physics.geography import HOME_ALTITUDE_M, geographic
+from mavlink_sim.physics.geography import HOME_ALTITUDE_M, SIH_FRAME
 from mavlink_sim.wire.messages import dialect
 from tests.mavlink_sim.conftest import SimHarness
 
@@ -25,8 +25,8 @@ def orbit(
     altitude_m: float = NAN,
 ) -> list[int]:
     """Send DO_ORBIT; its answers."""
-    place = (NAN, NAN) if centre is None else geographic(centre)[:2]
-    results: list[int] = harness.command(34, radius_m, speed_mps, yaw_behaviour, NAN, *place, altitude_m)
+    position = (NAN, NAN) if centre is None else SIH_FRAME.geographic(centre)[:2]
+    results: list[int] = harness.command(34, radius_m, speed_mps, yaw_behaviour, NAN, *position, altitude_m)
     return results
 
 
@@ -58,7 +58,7 @@ def circling(harness: SimHarness, seconds: float = 20.0, **options: Any) -> Any:
     ("radius_m", "speed_mps", "clockwise"),
     [(8.0, 3.0, True), (-8.0, 3.0, False), (8.0, -3.0, False), (-8.0, -3.0, True)],
 )
-def test_it_circles_at_the_radius_and_speed_in_the_direction_of_the_signs(
+def test_it_circles_at_radius_and_speed_in_direction_of_signs(
     harness: SimHarness, radius_m: float, speed_mps: float, clockwise: bool
 ) -> None:
     circling(harness, radius_m=radius_m, speed_mps=speed_mps)
@@ -74,7 +74,7 @@ def test_it_circles_at_the_radius_and_speed_in_the_direction_of_the_signs(
     assert harness.height_m == pytest.approx(6.0, abs=0.9)
 
 
-def test_the_mode_is_shown_as_orbit_and_cannot_be_armed_in(harness: SimHarness) -> None:
+def test_orbit_mode_reported_and_prevents_arming(harness: SimHarness) -> None:
     circling(harness, seconds=2.0)
     assert harness.command(512, 436) == [0]
     mode = harness.received("CURRENT_MODE")[-1]
@@ -82,7 +82,7 @@ def test_the_mode_is_shown_as_orbit_and_cannot_be_armed_in(harness: SimHarness) 
     assert (harness.heartbeat().custom_mode, harness.heartbeat().base_mode) == (0x01030000, 145)
 
 
-def test_disarmed_the_mode_is_taken_and_arming_is_refused(harness: SimHarness) -> None:
+def test_disarmed_orbit_accepted_and_arming_refused(harness: SimHarness) -> None:
     harness.wait_ready()
     assert orbit(harness) == [0]
     assert harness.heartbeat().base_mode == 17
@@ -91,7 +91,7 @@ def test_disarmed_the_mode_is_taken_and_arming_is_refused(harness: SimHarness) -
     assert harness.command(400, 1) == [0]
     assert orbit(harness) == [0]
     harness.fly(5.0)
-    assert harness.height_m == 0.0  # an orbit takes nobody off the ground
+    assert harness.height_m == 0.0  # an orbit does not take off
 
 
 def test_set_mode_with_the_orbit_numbers_is_position_mode(harness: SimHarness) -> None:
@@ -111,13 +111,13 @@ def test_each_heading_behaviour(harness: SimHarness, behaviour: int) -> None:
         harness.fly(0.5)
         seen.append(harness.vehicle.airframe.yaw_rad)
         inward = angle_rad(harness) + math.pi
-        # clockwise, the tangent is a quarter turn ahead of the way out
+        # clockwise, the tangent is a quarter turn ahead of the radius
         wanted.append({0: inward, 1: initial, 3: inward - math.pi / 2}.get(behaviour, seen[0]))
     errors = [abs(math.remainder(a - b, math.tau)) for a, b in zip(seen, wanted, strict=True)]
     assert max(errors) < math.radians(15.0)
 
 
-def test_unchanged_keeps_the_heading_of_the_orbit_before_and_at_first_takes_the_parameter(
+def test_unchanged_keeps_heading_of_previous_orbit(
     make_harness: type[SimHarness],
 ) -> None:
     harness = make_harness(parameters={"MC_ORBIT_YAW_MOD": 3})
@@ -134,7 +134,7 @@ def test_the_altitude_is_approached_with_the_circle(harness: SimHarness) -> None
     assert harness.height_m == pytest.approx(10.0, abs=0.9)
 
 
-def test_without_a_centre_it_goes_round_where_it_was(harness: SimHarness) -> None:
+def test_without_centre_orbits_its_position(harness: SimHarness) -> None:
     harness.take_off(6.0)
     x, y, _ = harness.vehicle.airframe.position
     assert orbit(harness, radius_m=5.0, speed_mps=NAN, centre=None) == [0]
@@ -150,9 +150,7 @@ def test_the_speed_is_limited_by_the_centripetal_acceleration(harness: SimHarnes
 
 
 @pytest.mark.parametrize("radius_m", [0.0, 0.5, -0.9, 1001.0])
-def test_a_radius_out_of_the_limits_is_accepted_and_told_and_the_vehicle_hovers(
-    harness: SimHarness, radius_m: float
-) -> None:
+def test_invalid_radius_accepted_reported_and_hovers(harness: SimHarness, radius_m: float) -> None:
     harness.heartbeats.append(("gcs", (245, 190), 6))
     circling(harness, seconds=0.1, radius_m=radius_m)
     assert harness.texts()[-1] == "Orbit radius limit exceeded\t"
@@ -164,7 +162,7 @@ def test_a_radius_out_of_the_limits_is_accepted_and_told_and_the_vehicle_hovers(
     assert harness.received("ORBIT_EXECUTION_STATUS") == []
 
 
-def test_a_new_request_changes_the_orbit_that_is_flown(harness: SimHarness) -> None:
+def test_new_request_changes_orbit(harness: SimHarness) -> None:
     circling(harness, seconds=15.0)
     assert orbit(harness, radius_m=-15.0, speed_mps=NAN, centre=None) == [0]
     harness.fly(15.0)
@@ -173,16 +171,16 @@ def test_a_new_request_changes_the_orbit_that_is_flown(harness: SimHarness) -> N
 
 
 @pytest.mark.streams("POSITION_TARGET_GLOBAL_INT", "POSITION_TARGET_LOCAL_NED")
-def test_the_execution_is_told_while_it_lasts(harness: SimHarness) -> None:
+def test_execution_status_sent_during_orbit(harness: SimHarness) -> None:
     harness.heartbeats.append(("gcs", (245, 190), 6))
     circling(harness, radius_m=-8.0, seconds=15.0)
     harness.forget()
     harness.fly(4.0)
-    told = harness.received("ORBIT_EXECUTION_STATUS")
-    assert 19 <= len(told) <= 21
+    reported = harness.received("ORBIT_EXECUTION_STATUS")
+    assert 19 <= len(reported) <= 21
     assert 7 <= len(harness.received("ORBIT_EXECUTION_STATUS", "gcs")) <= 9
-    latitude, longitude, _ = geographic(CENTRE)
-    last = told[-1]
+    latitude, longitude, _ = SIH_FRAME.geographic(CENTRE)
+    last = reported[-1]
     assert (last.radius, last.frame) == (-8.0, 0)
     assert (last.x, last.y) == pytest.approx((round(latitude * 1e7), round(longitude * 1e7)), abs=1)
     assert last.z == pytest.approx(HOME_ALTITUDE_M + harness.height_m, abs=0.1)
@@ -196,7 +194,7 @@ def test_the_execution_is_told_while_it_lasts(harness: SimHarness) -> None:
     assert harness.command(512, 360) == [2]
 
 
-def test_a_place_that_is_not_on_earth_is_taken_as_px4_takes_it(harness: SimHarness) -> None:
+def test_position_out_of_range_accepted_as_in_px4(harness: SimHarness) -> None:
     harness.take_off(6.0)
     assert harness.command(34, 8, 3, 0, NAN, 91.0, 8.0, NAN) == [0]
     assert harness.mode == "ORBIT"
@@ -211,9 +209,7 @@ numbers = st.one_of(st.floats(width=32), st.sampled_from([0.0, 1.0, 5.0, -20.0, 
 
 @settings(max_examples=12, deadline=None)
 @given(st.lists(st.lists(numbers, min_size=7, max_size=7), min_size=1, max_size=4))
-def test_no_request_makes_the_flight_absurd(
-    make_harness: type[SimHarness], requests: list[list[float]]
-) -> None:
+def test_any_request_stays_finite(make_harness: type[SimHarness], requests: list[list[float]]) -> None:
     harness = make_harness(["everything"], ready_after_s=0.0)
     airframe = harness.vehicle.airframe
     airframe.position, airframe.on_ground = (0.0, 0.0, -5.0), False

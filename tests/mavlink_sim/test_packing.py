@@ -29,7 +29,7 @@ LIMITS = {
 }
 
 
-def test_the_hot_messages_are_there() -> None:
+def test_frequent_messages_have_packers() -> None:
     assert {"attitude", "odometry", "highres_imu", "global_position_int"} <= set(HOT)
     assert len(HOT) >= 13
 
@@ -72,7 +72,7 @@ def test_fields_left_out_have_pymavlinks_values() -> None:
     assert made.pack(parser()) == dialect.MAVLink_distance_sensor_message(*arguments).pack(parser())
 
 
-def test_it_reads_like_the_message_it_stands_for() -> None:
+def test_packed_has_pymavlink_attributes() -> None:
     made = packing.attitude(1200, 0.5, -0.25, 1.0, 0.0, 0.0, 0.0)
     assert isinstance(made, Packed)
     assert (made.time_boot_ms, made.roll, made.pitch) == (1200, 0.5, -0.25)
@@ -81,7 +81,7 @@ def test_it_reads_like_the_message_it_stands_for() -> None:
         _ = made.no_such_field
 
 
-def test_a_copy_can_be_changed_and_the_message_itself_cannot() -> None:
+def test_only_a_copy_can_be_changed() -> None:
     made = packing.attitude(1200, 0.5, -0.25, 1.0, 0.0, 0.0, 0.0)
     changed: Any = copy.copy(made)
     changed.roll = 2.0

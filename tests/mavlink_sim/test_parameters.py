@@ -109,7 +109,7 @@ def test_the_wrong_type_is_answered_by_an_error(harness: SimHarness) -> None:
     assert harness.vehicle.parameters.number("COM_OF_LOSS_T") == 1.0
 
 
-def test_what_is_no_number_is_refused_and_the_old_value_told(harness: SimHarness) -> None:
+def test_non_finite_value_refused_with_old_value(harness: SimHarness) -> None:
     harness.fly(0.1)
     answer = write(harness, "COM_OF_LOSS_T", float("nan"), REAL32)
     assert [message.param_value for message in answer] == [1.0]
@@ -135,7 +135,7 @@ def test_a_client_with_the_right_hash_stops_the_list(harness: SimHarness) -> Non
 
 
 @given(st.integers(-(2**31), 2**31 - 1))
-def test_every_integer_that_a_float_carries_unharmed_is_read_back(value: int) -> None:
+def test_integers_exact_in_float_round_trip(value: int) -> None:
     wire = Parameter("X", INT32, value).wire_value
     pattern = struct.unpack("<I", struct.pack("<i", value))[0]
     if pattern & 0x7F800000 == 0x7F800000 and pattern & 0x7FFFFF and not pattern & 0x400000:
@@ -143,7 +143,7 @@ def test_every_integer_that_a_float_carries_unharmed_is_read_back(value: int) ->
     assert decode_wire_value(INT32, wire) == value
 
 
-def test_an_unknown_name_says_so() -> None:
+def test_unknown_name_raises() -> None:
     with pytest.raises(UnknownParameterError, match="no parameter 'COM_OF_LOST'"):
         Parameters({"COM_OF_LOST": 1.0})
 

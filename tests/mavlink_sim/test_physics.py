@@ -37,7 +37,7 @@ def fly(
     return track
 
 
-def test_a_ten_metre_step_is_flown_as_the_real_vehicle_flew_it() -> None:
+def test_ten_metre_step_matches_real_vehicle() -> None:
     airframe, controller = hovering()
     fly(airframe, controller, TrajectorySetpoint(position=(0.0, 0.0, -5.0), yaw_rad=0.0), 3.0)
     track = fly(airframe, controller, TrajectorySetpoint(position=(10.0, 0.0, -5.0), yaw_rad=0.0), 15.0)
@@ -51,12 +51,12 @@ def test_a_ten_metre_step_is_flown_as_the_real_vehicle_flew_it() -> None:
     assert all(abs(point[2] + 5.0) < 0.6 for point in track)
 
 
-def test_a_velocity_over_the_limit_is_cut_where_it_does_not_lead_to_the_position() -> None:
+def test_velocity_limit_cuts_feed_forward_first() -> None:
     _, controller = hovering()
     setpoint = TrajectorySetpoint(position=(9.0 / 0.95, 0.0, -5.0), velocity=(0.0, 20.0, 0.0))
     controller.update(STEP_S, setpoint, (0.0, 0.0, -5.0), (0.0,) * 3, (0.0,) * 3, 0.0)
     x, y, _ = controller.velocity
-    assert x == pytest.approx(9.0)  # MPC_XY_P asks for 9 m/s, all of it is granted
+    assert x == pytest.approx(9.0)  # MPC_XY_P demands 9 m/s, which is within the limit
     assert math.hypot(x, y) == pytest.approx(12.0)
 
 
@@ -69,7 +69,7 @@ def test_no_velocity_setpoint_is_over_the_limit(values: list[float]) -> None:
     assert math.hypot(*controller.velocity[:2]) <= 12.0 + 1e-6
 
 
-def test_a_held_position_wanders_as_the_real_vehicle_did() -> None:
+def test_held_position_varies_as_measured() -> None:
     spreads, farthest = [], []
     for seed in range(6):
         airframe, controller = hovering(seed=seed, gusts_mps=0.6)
@@ -96,7 +96,7 @@ def test_a_steady_wind_is_held_against_with_a_tilt() -> None:
     assert abs(math.degrees(airframe.pitch_rad)) < 1.0
 
 
-def test_the_same_seed_gives_the_same_flight_and_another_seed_another_one() -> None:
+def test_seed_determines_the_flight() -> None:
     tracks = []
     for seed in (7, 7, 8):
         airframe, controller = hovering(seed=seed, gusts_mps=1.0)
@@ -114,7 +114,7 @@ def test_without_thrust_it_falls_to_the_ground_and_stays_there() -> None:
     assert airframe.on_ground
 
 
-def test_on_the_ground_the_accelerometer_feels_gravity_alone() -> None:
+def test_accelerometer_on_ground_reads_gravity() -> None:
     airframe = Multirotor()
     airframe.step(STEP_S, 0.0, 0.0, 0.0, 0.0)
     assert airframe.specific_force == (0.0, 0.0, -GRAVITY_MPS2)
@@ -136,7 +136,7 @@ vectors = st.tuples(any_number, any_number, any_number)
 
 @settings(max_examples=40, deadline=None)
 @given(vectors, vectors, vectors, any_number, any_number)
-def test_no_setpoint_however_absurd_makes_the_motion_a_nonsense(
+def test_absurd_setpoints_keep_motion_finite(
     position: tuple[float, float, float],
     velocity: tuple[float, float, float],
     acceleration: tuple[float, float, float],
@@ -153,12 +153,12 @@ def test_no_setpoint_however_absurd_makes_the_motion_a_nonsense(
 
 
 def axis(airframe: Multirotor) -> tuple[float, float, float]:
-    """Where the body's down axis points, NED."""
+    """The body's down axis, NED."""
     matrix = airframe.matrix
     return (matrix[2], matrix[5], matrix[8])
 
 
-def test_a_commanded_body_rate_is_reached_as_fast_as_px4s_rate_loop_does() -> None:
+def test_body_rate_reached_as_fast_as_in_px4() -> None:
     airframe, _ = hovering()
     reached = []
     for _ in range(100):
@@ -233,7 +233,7 @@ def test_a_weak_motor_is_flown_with() -> None:
 
 
 @pytest.mark.parametrize(("motor", "share"), [(4, 0.0), (-1, 0.0), (0, 1.5), (0, math.nan)])
-def test_a_motor_that_is_not_there_cannot_fail(motor: int, share: float) -> None:
+def test_unknown_motor_refused(motor: int, share: float) -> None:
     with pytest.raises(ValueError, match="motor"):
         Multirotor().fail_motor(motor, share)
 
@@ -241,9 +241,7 @@ def test_a_motor_that_is_not_there_cannot_fail(motor: int, share: float) -> None
 @pytest.mark.parametrize(
     ("down_mps", "bounces", "crashes"), [(0.5, False, False), (2.5, True, False), (7.0, True, True)]
 )
-def test_the_ground_takes_a_landing_and_breaks_what_falls(
-    down_mps: float, bounces: bool, crashes: bool
-) -> None:
+def test_ground_allows_landing_and_breaks_a_fall(down_mps: float, bounces: bool, crashes: bool) -> None:
     airframe = Multirotor()
     airframe.position, airframe.velocity, airframe.on_ground = (0.0, 0.0, -0.001), (1.0, 0.0, down_mps), False
     met: list[float] = []
@@ -265,15 +263,13 @@ shares = st.floats(-3.0, 3.0)
 
 
 @given(shares, shares, shares, shares)
-def test_the_mixer_never_asks_a_rotor_for_what_it_cannot_give(
-    thrust: float, roll: float, pitch: float, yaw: float
-) -> None:
+def test_mixer_output_within_limits(thrust: float, roll: float, pitch: float, yaw: float) -> None:
     rotors = mixed_thrusts(thrust, (10 * roll, 10 * pitch, 10 * yaw), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     assert all(-1e-9 <= rotor <= 1.0 + 1e-9 for rotor in rotors)
     assert sum(rotors) / 4 <= min(max(thrust, 0.0), 1.0) + 1e-9  # without air mode it adds no thrust
 
 
-def test_small_demands_are_mixed_as_they_are() -> None:
+def test_small_demands_are_not_changed() -> None:
     front_right, rear_left, front_left, rear_right = mixed_thrusts(
         0.5, (0.5, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     )

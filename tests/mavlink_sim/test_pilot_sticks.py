@@ -1,4 +1,4 @@
-"""Joysticks and remote controls: which sticks count, what they say, and what a pilot can do with them."""
+"""Joysticks and remote controls: the source used, channels, and the pilot's requests."""
 
 from __future__ import annotations
 
@@ -62,14 +62,14 @@ def selector(mode: int, **values: float) -> ManualControl:
         ),
     ],
 )
-def test_com_rc_in_mode_decides_which_sticks_count(mode: int, order: list[int], chosen: int | None) -> None:
+def test_com_rc_in_mode_selects_source(mode: int, order: list[int], chosen: int | None) -> None:
     control = selector(mode)
     for number, source in enumerate(order):
         control.offer(Sticks(), source, 1.0 + 0.01 * number)
     assert (control.source if control.valid else None) == chosen
 
 
-def test_another_source_takes_over_once_the_first_is_silent_unless_the_first_is_to_be_kept() -> None:
+def test_source_changes_after_silence_unless_kept() -> None:
     for mode, takes_over in ((2, True), (3, False)):
         control = selector(mode)
         control.offer(Sticks(), Source.REMOTE_CONTROL, 1.0)
@@ -88,7 +88,7 @@ def test_sticks_expire_after_com_rc_loss_t() -> None:
     assert control.sticks == Sticks()
 
 
-def test_sticks_that_creep_are_not_moved_and_sticks_that_are_pushed_are() -> None:
+def test_only_fast_sticks_are_moved() -> None:
     for step, moved in ((0.002, False), (0.02, True)):
         control = selector(1)
         for number in range(50):
@@ -109,7 +109,7 @@ def test_the_arming_gesture_takes_a_second_in_the_corner() -> None:
     assert asked[0][1].by == "stick gesture"
 
 
-def test_switches_ask_once_and_the_first_frame_of_an_armed_vehicle_asks_nothing() -> None:
+def test_switches_request_once_not_on_first_armed_frame() -> None:
     control = selector(0, COM_FLTMODE1=2, COM_FLTMODE2=4)
     control.offer(Sticks(), Source.REMOTE_CONTROL, 1.0)
     control.offer_switches(Switches(mode_slot=1, kill=False), armed=True)
@@ -130,7 +130,7 @@ def test_switches_ask_once_and_the_first_frame_of_an_armed_vehicle_asks_nothing(
 
 
 @given(st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4), st.integers(1, 6), st.booleans())
-def test_what_a_transmitter_sends_is_read_back(positions: list[float], slot: int, kill: bool) -> None:
+def test_transmitter_channels_round_trip(positions: list[float], slot: int, kill: bool) -> None:
     parameters = Parameters(CALIBRATION)
     transmitter = Transmitter(parameters)
     transmitter.sticks, transmitter.mode_slot, transmitter.kill = Sticks(*positions), slot, kill
@@ -179,14 +179,14 @@ def events(harness: SimHarness, name: str) -> list[Any]:
     return [message for message in harness.received("EVENT") if message.id == event_identifier(name)]
 
 
-def test_a_vehicle_as_delivered_ignores_sticks(harness: SimHarness) -> None:
+def test_uncalibrated_vehicle_ignores_sticks(harness: SimHarness) -> None:
     harness.wait_ready()
     push(harness, 0.5, stick_message())
     assert not harness.vehicle.autopilot.pilot_has_sticks
     assert harness.mode == "HOLD"
 
 
-def test_a_joystick_before_any_mode_was_asked_for_makes_position_the_first_mode(
+def test_first_joystick_selects_position_mode(
     make_harness: type[SimHarness],
 ) -> None:
     harness = make_harness(parameters=JOYSTICK)
@@ -215,7 +215,7 @@ def test_sticks_arm_fly_and_disarm(make_harness: type[SimHarness]) -> None:
     assert "Disarmed by stick gesture\t" in harness.texts()
 
 
-def test_arming_is_denied_where_the_throttle_would_surprise(make_harness: type[SimHarness]) -> None:
+def test_arming_denied_with_high_throttle(make_harness: type[SimHarness]) -> None:
     harness = make_harness(parameters=JOYSTICK)
     harness.heartbeats.append(("gcs", GROUND_STATION, 6))
     harness.wait_ready()
@@ -244,14 +244,14 @@ def test_losing_and_regaining_the_joystick_is_an_event(make_harness: type[SimHar
     assert any("manual control regained" in line for line in harness.events)
 
 
-def remote_cockpit(make_harness: type[SimHarness], **values: float) -> SimHarness:
+def remote_control(make_harness: type[SimHarness], **values: float) -> SimHarness:
     harness = make_harness(parameters={**REMOTE_CONTROL, **values})
     harness.heartbeats.append(("gcs", GROUND_STATION, 6))
     harness.vehicle.transmitter.on = True
     return harness
 
 
-def test_a_transmitter_is_told_in_rc_channels_and_sys_status(make_harness: type[SimHarness]) -> None:
+def test_transmitter_reported_in_rc_channels_and_sys_status(make_harness: type[SimHarness]) -> None:
     harness = make_harness(parameters=REMOTE_CONTROL)
     harness.fly(1.0)
     assert harness.received("RC_CHANNELS") == []
@@ -274,7 +274,7 @@ def test_a_transmitter_is_told_in_rc_channels_and_sys_status(make_harness: type[
     assert not harness.received("SYS_STATUS")[-1].onboard_control_sensors_health & 0x10000
 
 
-def test_rc_channels_override_is_a_remote_control_like_any_other(make_harness: type[SimHarness]) -> None:
+def test_rc_channels_override_is_a_remote_control(make_harness: type[SimHarness]) -> None:
     harness = make_harness(parameters=REMOTE_CONTROL)
     harness.wait_ready()
     widths = [1500, 1500, 1000, 1500, 1080, 1000, 1000, 65535]
@@ -287,8 +287,8 @@ def test_rc_channels_override_is_a_remote_control_like_any_other(make_harness: t
     assert harness.received("RC_CHANNELS")[-1].chancount == 7
 
 
-def test_the_mode_switch_changes_the_mode_and_refusals_are_told(make_harness: type[SimHarness]) -> None:
-    harness = remote_cockpit(make_harness, COM_FLTMODE5=3)
+def test_mode_switch_changes_mode_or_reports_refusal(make_harness: type[SimHarness]) -> None:
+    harness = remote_control(make_harness, COM_FLTMODE5=3)
     transmitter = harness.vehicle.transmitter
     harness.take_off()
     transmitter.select(Mode.POSCTL)
@@ -308,10 +308,10 @@ def test_the_mode_switch_changes_the_mode_and_refusals_are_told(make_harness: ty
     assert "Switching to Mission is currently not available\t" in harness.texts()
 
 
-def test_the_kill_switch_stops_the_motors_and_disarms_after_five_seconds(
+def test_kill_switch_stops_motors_and_disarms_after_five_seconds(
     make_harness: type[SimHarness],
 ) -> None:
-    harness = remote_cockpit(make_harness, COM_DISARM_LAND=-1)
+    harness = remote_control(make_harness, COM_DISARM_LAND=-1)
     harness.take_off(6.0)
     harness.vehicle.transmitter.kill = True
     harness.until(lambda: "kill switch engaged" in harness.events, 1.0)
@@ -332,10 +332,10 @@ def test_the_kill_switch_stops_the_motors_and_disarms_after_five_seconds(
     assert harness.vehicle.autopilot.can_arm
 
 
-def test_a_kill_that_is_taken_back_at_once_lets_the_vehicle_catch_itself(
+def test_short_kill_recovers(
     make_harness: type[SimHarness],
 ) -> None:
-    harness = remote_cockpit(make_harness)
+    harness = remote_control(make_harness)
     harness.take_off(15.0)
     harness.vehicle.transmitter.kill = True
     harness.fly(0.4)

@@ -1,4 +1,4 @@
-"""MAVSDK, a client nobody here wrote: flies by joystick, turns the gimbal, reads battery and remote."""
+"""MAVSDK: joystick, gimbal, battery and remote control."""
 
 from __future__ import annotations
 
@@ -53,7 +53,9 @@ async def test_a_joystick_flies_the_vehicle_in_position_mode() -> None:
             await action.arm()
             await manual.start_position_control()
             sticks[2] = 1.0
-            await wait_for(telemetry.subscribe_position(), lambda place: place.relative_altitude_m > 2.0)
+            await wait_for(
+                telemetry.subscribe_position(), lambda position: position.relative_altitude_m > 2.0
+            )
             sticks[:] = [0.8, 0.0, 0.5, 0.0]
             await wait_for(telemetry.subscribe_position_velocity_ned(), lambda p: p.position.north_m > 3.0)
             sticks[:] = [0.0, 0.0, 0.0, 0.0]
@@ -61,7 +63,7 @@ async def test_a_joystick_flies_the_vehicle_in_position_mode() -> None:
         await asyncio.to_thread(simulator.wait_for_event, "disarmed (after landing)")
 
 
-async def test_the_gimbal_and_the_battery_are_read_and_the_gimbal_is_turned() -> None:
+async def test_gimbal_and_battery_are_read_and_gimbal_is_turned() -> None:
     async with connected(speed=4.0, gimbal=True) as (_, system):
         gimbal, telemetry = system.plugin(GimbalAsync), system.plugin(TelemetryAsync)
         listed = await wait_for(gimbal.subscribe_gimbal_list(), lambda update: bool(update.gimbals))

@@ -1,4 +1,4 @@
-"""Landing on a target: seen, lost and never there."""
+"""Landing on a target: in sight, lost and missing."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_a_moving_target_is_followed_down(harness: SimHarness) -> None:
     assert harness.vehicle.airframe.position[0] == pytest.approx(0.6, abs=0.2)
 
 
-def test_a_target_lost_high_up_is_searched_for_and_then_given_up(make_harness: type[SimHarness]) -> None:
+def test_target_lost_high_is_searched_then_abandoned(make_harness: type[SimHarness]) -> None:
     harness = make_harness(
         ready_after_s=0.0,
         parameters={"PLD_BTOUT": 1.0, "PLD_MAX_SRCH": 1, "PLD_SRCH_ALT": 7.0, "PLD_SRCH_TOUT": 4.0},
@@ -91,7 +91,7 @@ def test_a_target_found_while_searching_is_landed_on(make_harness: type[SimHarne
     assert phases(harness)[:3] == ["search", "horizontal approach", "descend"]
 
 
-def test_a_target_lost_low_down_is_landed_on_blindly(make_harness: type[SimHarness]) -> None:
+def test_target_lost_low_lands_without_it(make_harness: type[SimHarness]) -> None:
     harness = make_harness(ready_after_s=0.0, parameters={"PLD_FAPPR_ALT": 1.0})
     harness.take_off(3.0)
     harness.set_mode(4, 9)
@@ -116,7 +116,7 @@ def test_an_opportunistic_landing_without_a_target_lands_at_once(harness: SimHar
     assert phases(harness) == ["fallback"]
 
 
-def test_rtl_lands_on_the_target_if_told_so(make_harness: type[SimHarness]) -> None:
+def test_rtl_lands_on_target_if_enabled(make_harness: type[SimHarness]) -> None:
     harness = make_harness(ready_after_s=0.0, parameters={"RTL_PLD_MD": 1})
     harness.take_off(4.0)
     seen = target(1.0, 1.0)
@@ -126,7 +126,7 @@ def test_rtl_lands_on_the_target_if_told_so(make_harness: type[SimHarness]) -> N
     assert math.dist(harness.vehicle.airframe.position[:2], (1.0, 1.0)) < 0.25
 
 
-def test_a_target_in_another_frame_is_refused_and_one_given_as_angles_passed_over(
+def test_target_frame_refused_and_angles_ignored(
     harness: SimHarness,
 ) -> None:
     listen(harness)

@@ -1,4 +1,4 @@
-"""Measured of a real PX4: what commands answer, what modes do on the ground, what a lost stream leads to."""
+"""Measured on a real PX4: answers to commands, modes on the ground, loss of the setpoint stream."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from mavlink_sim.vehicle import STEP_S
+from mavlink_sim.vehicles.vehicle import STEP_S
 from mavlink_sim.wire.messages import dialect
 from tests.mavlink_sim.conftest import SimHarness
 
@@ -15,7 +15,7 @@ PREARM_CHECK = 0x10000000
 NAN = float("nan")
 
 
-def test_an_answer_takes_at_most_fifteen_milliseconds_and_needs_no_heartbeat_of_ours(
+def test_answer_within_15_ms_without_heartbeat(
     harness: SimHarness,
 ) -> None:
     harness.wait_ready()
@@ -26,7 +26,7 @@ def test_an_answer_takes_at_most_fifteen_milliseconds_and_needs_no_heartbeat_of_
         assert harness.until(lambda: bool(harness.received("COMMAND_ACK")), 0.1) <= 0.015
 
 
-def test_arming_in_offboard_without_a_stream_is_rejected_and_the_mode_stays(harness: SimHarness) -> None:
+def test_arming_in_offboard_without_stream_rejected(harness: SimHarness) -> None:
     harness.wait_ready()
     assert harness.set_mode(6) == [0, 0]
     beat = harness.heartbeat()
@@ -35,9 +35,7 @@ def test_arming_in_offboard_without_a_stream_is_rejected_and_the_mode_stays(harn
     assert harness.heartbeat().custom_mode == 0x00060000
 
 
-def test_on_the_ground_the_loss_of_the_stream_only_drops_the_readiness(
-    harness: SimHarness, velocity_setpoint: Any
-) -> None:
+def test_stream_loss_on_ground_only_drops_readiness(harness: SimHarness, velocity_setpoint: Any) -> None:
     harness.wait_ready()
     harness.offboard(velocity_setpoint(0, 0, 0))
     assert harness.heartbeat().system_status == 3
@@ -55,7 +53,7 @@ def test_take_off_while_flying_is_accepted_and_shown(harness: SimHarness) -> Non
     assert harness.mode == "TAKEOFF"
 
 
-def test_take_off_to_an_altitude_above_the_sea_ends_within_the_acceptance_radius(harness: SimHarness) -> None:
+def test_takeoff_to_amsl_ends_within_acceptance_radius(harness: SimHarness) -> None:
     harness.wait_ready()
     harness.command(400, 1)
     harness.command(22, NAN, 0, 0, NAN, NAN, NAN, 489.4 + 5.0)
@@ -71,9 +69,7 @@ def test_reposition_by_command_long_needs_the_change_of_mode_too(harness: SimHar
 
 
 @pytest.mark.streams("everything")
-def test_a_stream_that_stops_is_left_between_1_05_and_1_15_seconds_later(
-    harness: SimHarness, velocity_setpoint: Any
-) -> None:
+def test_offboard_left_1_05_to_1_15_s_after_stream(harness: SimHarness, velocity_setpoint: Any) -> None:
     harness.take_off(4.0)
     stream = velocity_setpoint(0, 0, 0)
     harness.offboard(stream)
@@ -97,9 +93,7 @@ def test_a_stream_that_stops_is_left_between_1_05_and_1_15_seconds_later(
     assert left <= beats[0] <= left + 1.0  # a heartbeat shows it when its time has come
 
 
-def test_a_heartbeat_shows_the_loss_1_4_to_2_seconds_after_the_last_setpoint_as_its_second_falls(
-    harness: SimHarness, velocity_setpoint: Any
-) -> None:
+def test_heartbeat_shows_loss_after_1_4_to_2_s(harness: SimHarness, velocity_setpoint: Any) -> None:
     """PX4's few losses were seen at 1.4 to 2.0 s. At any phase of the heartbeat, 1.05 to 2.15 s can be."""
     harness.take_off(4.0)
     stream = velocity_setpoint(0, 0, 0)
@@ -118,13 +112,11 @@ def test_a_heartbeat_shows_the_loss_1_4_to_2_seconds_after_the_last_setpoint_as_
     assert sum(1.4 <= delay <= 2.05 for delay in seen) >= 6
 
 
-def test_a_stream_of_0_9_hertz_is_lost_for_some_fifty_milliseconds_at_a_time(
-    harness: SimHarness, velocity_setpoint: Any
-) -> None:
+def test_stream_of_0_9_hz_is_lost_for_50_ms(harness: SimHarness, velocity_setpoint: Any) -> None:
     harness.take_off(4.0)
     stream = velocity_setpoint(0, 0, 0)
     harness.offboard(stream)
-    harness.command(511, 436, 4_000)  # told when it changes
+    harness.command(511, 436, 4_000)  # sent when it changes
     harness.until(lambda: bool(harness.received("CURRENT_MODE")), 1.0, stream)
     lost = []
 
@@ -139,7 +131,7 @@ def test_a_stream_of_0_9_hertz_is_lost_for_some_fifty_milliseconds_at_a_time(
 
 
 @pytest.mark.parametrize(("action", "mode"), [(3, "RTL"), (4, "LAND"), (5, "HOLD")])
-def test_from_whatever_the_failsafe_does_offboard_resumes_with_the_setpoints(
+def test_offboard_resumes_from_every_failsafe_action(
     make_harness: type[SimHarness], velocity_setpoint: Any, action: int, mode: str
 ) -> None:
     harness = make_harness(parameters={"COM_OBL_RC_ACT": action})
@@ -154,7 +146,7 @@ def test_from_whatever_the_failsafe_does_offboard_resumes_with_the_setpoints(
 
 
 @pytest.mark.parametrize(("hold_first", "shown"), [(False, 0x00060000), (True, 0x03040000)])
-def test_after_landing_from_offboard_the_mode_chosen_before_it_is_shown(
+def test_mode_before_offboard_shown_after_landing(
     harness: SimHarness, velocity_setpoint: Any, hold_first: bool, shown: int
 ) -> None:
     harness.take_off()
@@ -166,9 +158,7 @@ def test_after_landing_from_offboard_the_mode_chosen_before_it_is_shown(
     assert harness.heartbeat().custom_mode == shown
 
 
-def test_the_failsafe_of_a_vehicle_far_from_home_climbs_to_thirty_metres_at_once(
-    harness: SimHarness, velocity_setpoint: Any
-) -> None:
+def test_failsafe_far_from_home_climbs_to_30_m(harness: SimHarness, velocity_setpoint: Any) -> None:
     harness.take_off(4.0)
     harness.offboard(velocity_setpoint(0, 0, 0))
     north, east, down = harness.vehicle.airframe.position
@@ -180,7 +170,7 @@ def test_the_failsafe_of_a_vehicle_far_from_home_climbs_to_thirty_metres_at_once
 
 
 @pytest.mark.parametrize("command", [20, 21])
-def test_a_gimbal_is_looked_after_at_a_landing_and_at_a_return(harness: SimHarness, command: int) -> None:
+def test_gimbal_commands_sent_at_landing_and_return(harness: SimHarness, command: int) -> None:
     harness.take_off(4.0)
     harness.forget()
     harness.command(command)
@@ -190,7 +180,7 @@ def test_a_gimbal_is_looked_after_at_a_landing_and_at_a_return(harness: SimHarne
     assert [m.confirmation for m in sent if m.command == 1001] == [0, 0, 1, 2, 3]
 
 
-def test_returning_lands_with_the_state_landing_only_on_its_descent(make_harness: type[SimHarness]) -> None:
+def test_landed_state_landing_only_on_descent_of_return(make_harness: type[SimHarness]) -> None:
     harness = make_harness(parameters={"RTL_RETURN_ALT": 8.0, "RTL_MIN_DIST": 1.0})
     harness.take_off(4.0)
     harness.command_int(192, (-1, 1, 0, NAN), 473978330, 85455942, 493.4)

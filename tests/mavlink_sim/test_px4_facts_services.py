@@ -1,6 +1,6 @@
-"""What was measured of a real PX4, of its services: every statement a test that quotes it.
+"""Measured on a real PX4: requests, TIMESYNC, PING, events, parameters; one test per statement.
 
-Requests, TIMESYNC, PING, events, parameters. "Source" marks what was read in PX4 instead of measured.
+"Source" marks what is from PX4's source instead of measured.
 """
 
 import os
@@ -66,9 +66,7 @@ def test_519_accepted(ready: SimHarness) -> None:
 
 
 @pytest.mark.parametrize("command", [(512, 148), (520, 1)], ids=["512_148", "520"])
-def test_autopilot_version_by_512_148_or_520__message_first_then_ack(
-    ready: SimHarness, command: tuple[int, int]
-) -> None:
+def test_autopilot_version_by_512_148_or_520__before_ack(ready: SimHarness, command: tuple[int, int]) -> None:
     assert ready.command(*command) == [ACCEPTED]
     assert kinds_in_order(ready, "AUTOPILOT_VERSION", "COMMAND_ACK") == ["AUTOPILOT_VERSION", "COMMAND_ACK"]
     version = ready.received("AUTOPILOT_VERSION")[0]
@@ -82,7 +80,7 @@ def test_autopilot_version_by_512_148_or_520__message_first_then_ack(
     assert not any(version.uid2)
 
 
-def test_set_message_interval__accepted_and_honoured_100000_us_gives_9_8_hz(ready: SimHarness) -> None:
+def test_set_message_interval__100000_us_gives_9_8_hz(ready: SimHarness) -> None:
     assert ready.command(511, 30, 100_000) == [ACCEPTED]
     ready.fly(1.0)
     ready.forget()
@@ -123,7 +121,7 @@ def test_get_message_interval__message_interval_and_accepted(ready: SimHarness) 
         ("SYS_STATUS", 1, 200_000),
     ],
 )
-def test_source_to_ask_for_the_interval_that_is_configured_changes_no_rate(
+def test_source_configured_interval_changes_no_rate(
     ready: SimHarness, kind: str, message_id: int, interval_us: int
 ) -> None:
     ready.command(510, message_id)
@@ -148,7 +146,7 @@ def test_request_data_stream__ignored(ready: SimHarness) -> None:
 @pytest.mark.parametrize(
     ("target", "answered"), [((1, 1), 1), ((1, 0), 1), ((0, 0), 1), ((2, 1), 0), ((1, 100), 0)]
 )
-def test_other_system_or_component_2_1_and_1_100_no_answer__1_0_and_0_0_are_answered(
+def test_commands_answered_for_1_0_and_0_0_not_2_1_or_1_100(
     ready: SimHarness, target: tuple[int, int], answered: int
 ) -> None:
     assert len(ready.command(512, 148, target=target)) == answered
@@ -157,21 +155,21 @@ def test_other_system_or_component_2_1_and_1_100_no_answer__1_0_and_0_0_are_answ
 # ---- TIMESYNC and PING
 
 
-def test_timesync_request__answered_at_once_ts1_echoed_tc1_boot_time_in_ns(ready: SimHarness) -> None:
+def test_timesync_request__ts1_echoed_tc1_boot_time_in_ns(ready: SimHarness) -> None:
     ready.send(dialect.MAVLink_timesync_message(0, 123_456_789_012))
     (answer,) = [message for message in ready.received("TIMESYNC") if message.tc1]
     assert answer.ts1 == 123_456_789_012
     assert answer.tc1 == ready.vehicle.boot_us * 1000
 
 
-def test_timesync__px4_sends_its_own_requests_with_tc1_0_at_10_hz(ready: SimHarness) -> None:
+def test_timesync__own_requests_with_tc1_0_at_10_hz(ready: SimHarness) -> None:
     ready.fly(10.0)
     requests = ready.received("TIMESYNC")
     assert all(message.tc1 == 0 for message in requests)
     assert len(requests) / 10.0 == pytest.approx(9.85, abs=0.2)
 
 
-def test_ping_0_0__answered_to_its_sender_with_its_stamp_and_number(ready: SimHarness) -> None:
+def test_ping_0_0__answered_to_sender_with_its_stamp(ready: SimHarness) -> None:
     ready.send(dialect.MAVLink_ping_message(55_000, 9, 0, 0))
     (answer,) = [message for message in ready.received("PING") if message.target_system]
     assert (answer.target_system, answer.target_component) == (1, 191)
@@ -190,7 +188,7 @@ def test_ping_addressed_1_1__not_answered_own_ping_1_hz(ready: SimHarness) -> No
 
 
 def request_event(harness: SimHarness, first: int, last: int, target: tuple[int, int] = (1, 1)) -> None:
-    """REQUEST_EVENT as a client whose dialect has it packs it, read as one whose dialect lacks it."""
+    """REQUEST_EVENT packed by a dialect that has it, decoded by one that lacks it."""
     payload = struct.pack("<HHBB", first, last, *target)
     body = struct.pack("<BBBBBBHB", len(payload), 0, 0, 0, 1, 191, 412, 0) + payload
     crc = dialect.x25crc(body)
@@ -201,7 +199,7 @@ def request_event(harness: SimHarness, first: int, last: int, target: tuple[int,
     harness.fly(0.01)
 
 
-def flown(harness: SimHarness) -> list[Any]:
+def active(harness: SimHarness) -> list[Any]:
     harness.take_off(2.5)
     harness.command(21)
     harness.until(lambda: not harness.armed, 40.0)
@@ -209,15 +207,15 @@ def flown(harness: SimHarness) -> list[Any]:
     return list(harness.received("EVENT"))
 
 
-def test_events__on_occurrence_to_every_link_with_numbers_that_grow(harness: SimHarness) -> None:
-    first = flown(harness)
+def test_events__on_every_link_with_increasing_numbers(harness: SimHarness) -> None:
+    first = active(harness)
     assert len(first) >= 5
     assert [message.sequence for message in first] == list(range(1, len(first) + 1))
     assert [message.id for message in harness.received("EVENT", "gcs")] == [message.id for message in first]
 
 
-def test_source_request_event__the_kept_events_come_again_as_they_were(harness: SimHarness) -> None:
-    first = flown(harness)
+def test_source_request_event__stored_events_are_repeated(harness: SimHarness) -> None:
+    first = active(harness)
     request_event(harness, 2, 4)
     again = harness.received("EVENT")
     assert [(m.id, m.sequence, m.event_time_boot_ms, m.arguments) for m in again] == [
@@ -225,10 +223,10 @@ def test_source_request_event__the_kept_events_come_again_as_they_were(harness: 
     ]
 
 
-def test_source_response_event_error__for_an_event_that_is_not_kept_with_the_next_that_is(
+def test_source_response_event_error__for_a_missing_event(
     harness: SimHarness,
 ) -> None:
-    newest = flown(harness)[-1].sequence
+    newest = active(harness)[-1].sequence
     request_event(harness, 65535, 0)
     errors = harness.received("RESPONSE_EVENT_ERROR")
     assert [(message.sequence, message.sequence_oldest_available) for message in errors] == [
@@ -243,12 +241,12 @@ def test_source_response_event_error__for_an_event_that_is_not_kept_with_the_nex
 
 
 def test_current_event_sequence__0_3_hz_with_the_newest_number(harness: SimHarness) -> None:
-    newest = flown(harness)[-1].sequence
+    newest = active(harness)[-1].sequence
     harness.forget()
     harness.fly(10.0)
-    told = harness.received("CURRENT_EVENT_SEQUENCE")
-    assert len(told) == pytest.approx(3, abs=1)
-    assert {message.sequence for message in told} == {newest}
+    received = harness.received("CURRENT_EVENT_SEQUENCE")
+    assert len(received) == pytest.approx(3, abs=1)
+    assert {message.sequence for message in received} == {newest}
 
 
 # ---- parameters
@@ -260,32 +258,32 @@ def name_of(message: Any) -> str:
 
 
 def recorded_parameters() -> tuple[int, list[Parameter]]:
-    """The recorded _HASH_CHECK and the parameters it was made of."""
+    """The recorded _HASH_CHECK and its parameters."""
     if not PARAMETERS.exists():
         pytest.skip(f"needs the recorded parameters {PARAMETERS}")
     rows = [line.split() for line in PARAMETERS.read_text().splitlines()]
-    told = next(float(value) for name, _, value in rows if name == "_HASH_CHECK")
+    received = next(float(value) for name, _, value in rows if name == "_HASH_CHECK")
     parameters = [
         Parameter(name, int(kind), int(value) if int(kind) == INT32 else float(value))
         for name, kind, value in rows
         if name != "_HASH_CHECK"
     ]
-    return struct.unpack("<I", struct.pack("<f", told))[0], parameters
+    return struct.unpack("<I", struct.pack("<f", received))[0], parameters
 
 
-def test_hash_check__is_reproduced_from_the_887_recorded_parameters() -> None:
-    told, parameters = recorded_parameters()
+def test_hash_check__reproduced_from_recorded_parameters() -> None:
+    received, parameters = recorded_parameters()
     assert len(parameters) == 887
-    assert parameter_hash(parameters) == told == 0x6AF5A894
+    assert parameter_hash(parameters) == received == 0x6AF5A894
 
 
-def test_hash_check__the_vehicle_itself_answers_what_px4_answered(ready: SimHarness) -> None:
+def test_hash_check__vehicle_itself_answers_what_px4_answered(ready: SimHarness) -> None:
     (answer,) = read(ready, b"_HASH_CHECK")
     assert struct.unpack("<I", struct.pack("<f", answer.param_value))[0] == 0x6AF5A894
     assert (answer.param_type, answer.param_index, answer.param_count) == (5, 65535, 887)
 
 
-def test_request_list__887_parameters_604_real32_283_int32_888_messages_in_0_89_s(ready: SimHarness) -> None:
+def test_request_list__888_messages_in_0_89_s(ready: SimHarness) -> None:
     ready.send(dialect.MAVLink_param_request_list_message(1, 1))
     ready.fly(2.0)
     stamped = [
@@ -306,21 +304,21 @@ def test_names_types_and_values_are_those_recorded(ready: SimHarness) -> None:
 
 
 def test_source_hash_check__volatile_parameters_do_not_count(harness: SimHarness) -> None:
-    told, parameters = recorded_parameters()
+    received, parameters = recorded_parameters()
     changed = [
         Parameter(item.name, item.kind, item.value + 1) if is_volatile(item.name) else item
         for item in parameters
     ]
     assert sum(is_volatile(item.name) for item in parameters) == 58
-    assert parameter_hash(changed) == told
+    assert parameter_hash(changed) == received
     everything = 0xFFFFFFFF
     for item in parameters:
         packed = struct.pack("<i" if item.kind == INT32 else "<f", item.value)
         everything = zlib.crc32(item.name.encode() + packed, everything)
-    assert everything ^ 0xFFFFFFFF != told
+    assert everything ^ 0xFFFFFFFF != received
 
 
-def test_request_list__first_after_10_ms_the_hash_then_index_order_about_1000_a_second(
+def test_request_list__hash_first_then_index_order(
     ready: SimHarness,
 ) -> None:
     total = len(ready.vehicle.parameters)
@@ -344,7 +342,7 @@ def test_request_list__first_after_10_ms_the_hash_then_index_order_about_1000_a_
     assert total / (stamped[-1][0] - first_s) == pytest.approx(1000, rel=0.05)
 
 
-def test_source_request_list__asked_again_while_it_runs_begins_anew_without_the_hash(
+def test_source_request_list__repeat_restarts_without_hash(
     ready: SimHarness,
 ) -> None:
     ready.send(dialect.MAVLink_param_request_list_message(1, 1))
@@ -387,7 +385,7 @@ def test_unknown__param_error_345_1_does_not_exist(ready: SimHarness) -> None:
         assert (error.target_system, error.target_component) == (1, 191)
 
 
-def test_a_parameter_of_missions_is_listed_once_a_mission_was_checked(ready: SimHarness) -> None:
+def test_parameter_of_missions_listed_once_mission_was_checked(ready: SimHarness) -> None:
     (unlisted,) = read(ready, b"MIS_DIST_1WP")
     assert (unlisted.param_value, unlisted.param_index, unlisted.param_count) == (10_000.0, 65535, 887)
     assert upload(ready, [waypoint(10.0, 0.0, 5.0)]) == 0
@@ -408,7 +406,7 @@ def test_set__param_value_twice_at_0_and_10_to_20_ms(ready: SimHarness) -> None:
     assert 0.01 <= stamps[1] - stamps[0] <= 0.02
 
 
-def test_source_set__a_change_is_told_on_every_link_and_no_change_is_told_once(ready: SimHarness) -> None:
+def test_source_set__change_sent_on_every_link(ready: SimHarness) -> None:
     write(ready, b"MIS_TAKEOFF_ALT", 4.0, REAL32)
     assert [name_of(message) for message in ready.received("PARAM_VALUE", "gcs")] == ["MIS_TAKEOFF_ALT"]
     assert len(write(ready, b"MIS_TAKEOFF_ALT", 4.0, REAL32)) == 1
@@ -421,12 +419,12 @@ def test_wrong_type__param_error_7_type_mismatch(ready: SimHarness) -> None:
 
 
 @pytest.mark.parametrize("kind", [1, 2, 3, 4, 5, 7, 8, 10, 0, 255])
-def test_source_set__any_type_but_int32_and_real32_is_param_error_6(ready: SimHarness, kind: int) -> None:
+def test_source_set__any_type_but_int32_and_real32_param_error_6(ready: SimHarness, kind: int) -> None:
     (error,) = write(ready, b"COM_OF_LOSS_T", 1.0, kind)
     assert error.error == TYPE_UNSUPPORTED
 
 
-def test_source_set_hash_check__stops_the_list_and_is_param_error_5_read_only(ready: SimHarness) -> None:
+def test_source_set_hash_check__stops_list_and_param_error_5(ready: SimHarness) -> None:
     ready.send(dialect.MAVLink_param_request_list_message(1, 1))
     ready.fly(0.05)
     (error,) = write(ready, b"_HASH_CHECK", 0.0, 5)[-1:]
@@ -449,7 +447,7 @@ def test_a_set_takes_effect_at_once(ready: SimHarness) -> None:
     assert ready.height_m == pytest.approx(6.0, abs=0.7)
 
 
-def test_source_a_few_param_values_arrive_unasked__what_differs_from_the_defaults(
+def test_source_param_values_differing_from_defaults_at_start(
     make_harness: type[SimHarness],
 ) -> None:
     harness = make_harness(parameters={"COM_OF_LOSS_T": 0.5})
@@ -468,9 +466,7 @@ def test_source_a_few_param_values_arrive_unasked__what_differs_from_the_default
     ],
     ids=["PARAM_MAP_RC", "PARAM_EXT_REQUEST_LIST", "PARAM_EXT_REQUEST_READ", "PARAM_EXT_SET"],
 )
-def test_source_rc_maps_and_the_extended_protocol_change_nothing_and_get_no_answer(
-    ready: SimHarness, message: Any
-) -> None:
+def test_source_rc_maps_and_extended_protocol_ignored(ready: SimHarness, message: Any) -> None:
     before = ready.vehicle.parameters.hash()
     ready.send(message)
     ready.fly(0.1)
@@ -479,7 +475,7 @@ def test_source_rc_maps_and_the_extended_protocol_change_nothing_and_get_no_answ
     assert ready.vehicle.parameters.hash() == before
 
 
-def test_other_components_parameters_are_not_ours(ready: SimHarness) -> None:
+def test_other_components_parameters_ignored(ready: SimHarness) -> None:
     ready.send(dialect.MAVLink_param_set_message(1, 100, b"COM_OF_LOSS_T", 2.0, REAL32))
     ready.send(dialect.MAVLink_param_request_read_message(2, 1, b"COM_OF_LOSS_T", -1))
     ready.fly(0.1)

@@ -1,4 +1,4 @@
-"""What was measured of a real PX4's links: what they carry, how much of it, and who hears it."""
+"""Measured on a real PX4's links: messages, data rate, forwarding."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ GCS = 6
 ONBOARD_CONTROLLER = 18
 # Messages of PX4 that pip's pymavlink 2.4.50 does not have in its `common` dialect.
 UNKNOWN_TO_COMMON = {8, 300, 380, 395, 397, 410, 411, 435, 436}
-SIGNATURE_BYTES = 13  # the vehicle that was measured signed what it sent
+SIGNATURE_BYTES = 13  # the measured vehicle signed its messages
 
 
 def names(harness: SimHarness, link: str = "onboard") -> Counter[str]:
     return Counter(item.message.get_type() for _, item in harness.inbox[link])
 
 
-def test_the_streams_are_the_same_whether_or_not_a_companion_is_heard(make_harness: type[SimHarness]) -> None:
-    alone, heard = make_harness(["everything"]), make_harness(["everything"])
-    heard.heartbeats.append(("onboard", (1, 191), ONBOARD_CONTROLLER))
-    for harness in (alone, heard):
+def test_streams_independent_of_companion_heartbeat(make_harness: type[SimHarness]) -> None:
+    alone, received = make_harness(["everything"]), make_harness(["everything"])
+    received.heartbeats.append(("onboard", (1, 191), ONBOARD_CONTROLLER))
+    for harness in (alone, received):
         harness.wait_ready()
         harness.forget()
         harness.fly(10.0)
-    assert names(alone) == names(heard)
+    assert names(alone) == names(received)
 
 
 @pytest.mark.parametrize("flying", [False, True], ids=["disarmed", "in flight"])
@@ -41,7 +41,7 @@ def test_the_onboard_link_carries_29_kilobytes_a_second(make_harness: type[SimHa
     harness = make_harness(["everything"], noise=True, gusts_mps=None)
     if flying:
         harness.take_off()
-    harness.fly(6.0)  # until the last PARAM_VALUE that comes unasked
+    harness.fly(6.0)  # until the last unrequested PARAM_VALUE
     harness.forget()
     harness.fly(20.0)
     codec = parser()
@@ -49,7 +49,7 @@ def test_the_onboard_link_carries_29_kilobytes_a_second(make_harness: type[SimHa
     assert size == pytest.approx(29_000, rel=0.05)
 
 
-def test_what_the_common_dialect_does_not_know_is_what_it_does_not_know_of_px4(harness: SimHarness) -> None:
+def test_unknown_messages_of_common_dialect_match_px4(harness: SimHarness) -> None:
     harness.take_off()
     harness.command(519, 1)
     codec, reader = parser(), common.MAVLink(None)
@@ -61,9 +61,7 @@ def test_what_the_common_dialect_does_not_know_is_what_it_does_not_know_of_px4(h
     assert {8, 300, 380, 410, 411, 436} <= unknown <= UNKNOWN_TO_COMMON
 
 
-def test_a_place_to_fly_to_is_told_in_modes_that_have_one_and_not_in_offboard(
-    harness: SimHarness, velocity_setpoint: Any
-) -> None:
+def test_position_target_global_sent_except_in_offboard(harness: SimHarness, velocity_setpoint: Any) -> None:
     harness.wait_ready()
     assert "POSITION_TARGET_GLOBAL_INT" not in names(harness)  # not on the ground
     harness.take_off(4.0)
@@ -79,9 +77,7 @@ def test_a_place_to_fly_to_is_told_in_modes_that_have_one_and_not_in_offboard(
         assert 9 <= names(harness)["POSITION_TARGET_GLOBAL_INT"] <= 10
 
 
-def test_a_heartbeat_comes_once_a_second_whatever_happens(
-    harness: SimHarness, velocity_setpoint: Any
-) -> None:
+def test_heartbeat_at_1_hz_always(harness: SimHarness, velocity_setpoint: Any) -> None:
     harness.wait_ready()
     harness.forget()
     started = harness.now_s
@@ -121,7 +117,7 @@ def test_the_old_request_for_a_data_stream_is_ignored(harness: SimHarness) -> No
     assert "COMMAND_ACK" not in names(harness)
 
 
-def test_its_own_time_synchronisation_and_pings_are_requests_to_all(harness: SimHarness) -> None:
+def test_timesync_and_ping_are_broadcast_requests(harness: SimHarness) -> None:
     harness.fly(5.0)
     requests = harness.received("TIMESYNC")
     assert len(requests) == pytest.approx(49, abs=1)
@@ -131,7 +127,7 @@ def test_its_own_time_synchronisation_and_pings_are_requests_to_all(harness: Sim
     assert [ping.seq for ping in pings] == list(range(pings[0].seq, pings[0].seq + len(pings)))
 
 
-def test_a_ground_stations_heartbeat_reaches_the_companion_under_the_ground_stations_name(
+def test_ground_station_heartbeat_keeps_its_source(
     harness: SimHarness,
 ) -> None:
     harness.heartbeats += [("gcs", (245, 190), GCS), ("onboard", (1, 191), ONBOARD_CONTROLLER)]

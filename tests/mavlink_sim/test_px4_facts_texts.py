@@ -1,4 +1,4 @@
-"""Every STATUSTEXT that was seen of a real PX4: its words, its severity, its closing tab, its chunks."""
+"""Every STATUSTEXT recorded from a real PX4: text, severity, closing tab, chunks."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ INFO, CRITICAL = 6, 2
 GROUND_STATION = (245, 190)
 
 
-def said(harness: SimHarness, link: str = "gcs") -> list[tuple[int, str]]:
+def sent(harness: SimHarness, link: str = "gcs") -> list[tuple[int, str]]:
     """(severity, whole text) of every STATUSTEXT received."""
     severities = [
         message.severity for message in harness.received("STATUSTEXT", link) if not message.chunk_seq
@@ -22,23 +22,23 @@ def said(harness: SimHarness, link: str = "gcs") -> list[tuple[int, str]]:
 
 
 @pytest.fixture
-def heard(make_harness: type[SimHarness]) -> SimHarness:
+def received(make_harness: type[SimHarness]) -> SimHarness:
     """A vehicle whose ground-station link has a ground station on it."""
     harness = make_harness()
     harness.heartbeats.append(("gcs", GROUND_STATION, 6))
     return harness
 
 
-def test_a_flight_by_command_is_told_in_px4s_words(heard: SimHarness) -> None:
-    heard.wait_ready()
-    heard.command(400, 1)
-    heard.command(22, *[float("nan")] * 7)
-    heard.until(lambda: heard.mode == "HOLD")
-    heard.fly(4.0)
-    heard.command(21)
-    heard.until(lambda: not heard.armed)
-    heard.fly(0.1)
-    assert said(heard) == [
+def test_texts_of_a_flight_by_command(received: SimHarness) -> None:
+    received.wait_ready()
+    received.command(400, 1)
+    received.command(22, *[float("nan")] * 7)
+    received.until(lambda: received.mode == "HOLD")
+    received.fly(4.0)
+    received.command(21)
+    received.until(lambda: not received.armed)
+    received.fly(0.1)
+    assert sent(received) == [
         (INFO, "Armed by external command\t"),
         (INFO, "Using default takeoff altitude: 2.5 m\t"),
         (INFO, "Takeoff detected\t"),
@@ -48,14 +48,14 @@ def test_a_flight_by_command_is_told_in_px4s_words(heard: SimHarness) -> None:
     ]
 
 
-def test_a_return_is_told_in_px4s_words_all_as_information(heard: SimHarness) -> None:
-    heard.take_off(4.0)
-    heard.fly(4.0)
-    heard.forget()
-    heard.command(20)
-    heard.until(lambda: not heard.armed)
-    heard.fly(0.1)
-    assert said(heard) == [
+def test_texts_of_a_return_are_info(received: SimHarness) -> None:
+    received.take_off(4.0)
+    received.fly(4.0)
+    received.forget()
+    received.command(20)
+    received.until(lambda: not received.armed)
+    received.fly(0.1)
+    assert sent(received) == [
         (INFO, "Returning to launch\t"),
         (INFO, "RTL: start return at 493 m (4 m above destination)\t"),
         (INFO, "RTL: land at destination\t"),
@@ -64,33 +64,33 @@ def test_a_return_is_told_in_px4s_words_all_as_information(heard: SimHarness) ->
     ]
 
 
-def test_disarming_is_told_with_its_reason(heard: SimHarness) -> None:
-    heard.wait_ready()
-    heard.command(400, 1)
-    heard.command(400, 0)
-    heard.command(400, 1)
-    heard.until(lambda: not heard.armed, 15.0)
-    heard.fly(0.1)
-    assert [text for text in said(heard) if "Disarmed" in text[1]] == [
+def test_disarming_text_has_reason(received: SimHarness) -> None:
+    received.wait_ready()
+    received.command(400, 1)
+    received.command(400, 0)
+    received.command(400, 1)
+    received.until(lambda: not received.armed, 15.0)
+    received.fly(0.1)
+    assert [text for text in sent(received) if "Disarmed" in text[1]] == [
         (INFO, "Disarmed by external command\t"),
         (INFO, "Disarmed by auto preflight disarming\t"),
     ]
 
 
-def test_what_is_refused_is_told_as_critical_and_only_the_preflight_text_has_no_tab(
-    heard: SimHarness,
+def test_refusal_texts_are_critical_and_end_with_tab(
+    received: SimHarness,
 ) -> None:
-    heard.fly(0.1)
-    heard.command(400, 1)
-    heard.set_mode(77)
-    heard.send(dialect.MAVLink_set_position_target_local_ned_message(0, 1, 1, 9, 1479, *[0] * 11))
-    heard.send(dialect.MAVLink_set_position_target_local_ned_message(0, 1, 1, 1, 4095 - 512, *[0] * 11))
-    heard.send(dialect.MAVLink_set_position_target_local_ned_message(0, 1, 1, 1, 512, *[0] * 11))
-    heard.fly(0.1)
-    heard.take_off()
-    heard.command(400, 0)
-    heard.set_mode(6, source=GROUND_STATION, link="gcs")
-    texts = said(heard)
+    received.fly(0.1)
+    received.command(400, 1)
+    received.set_mode(77)
+    received.send(dialect.MAVLink_set_position_target_local_ned_message(0, 1, 1, 9, 1479, *[0] * 11))
+    received.send(dialect.MAVLink_set_position_target_local_ned_message(0, 1, 1, 1, 4095 - 512, *[0] * 11))
+    received.send(dialect.MAVLink_set_position_target_local_ned_message(0, 1, 1, 1, 512, *[0] * 11))
+    received.fly(0.1)
+    received.take_off()
+    received.command(400, 0)
+    received.set_mode(6, source=GROUND_STATION, link="gcs")
+    texts = sent(received)
     critical = [text for severity, text in texts if severity == CRITICAL]
     assert critical == [
         "Preflight Fail: heading estimate not stable",
@@ -105,21 +105,19 @@ def test_what_is_refused_is_told_as_critical_and_only_the_preflight_text_has_no_
     assert {severity for severity, _ in texts} == {INFO, CRITICAL}
 
 
-def test_the_loss_of_setpoints_and_of_the_companion_are_told(
-    heard: SimHarness, velocity_setpoint: Any
-) -> None:
-    heard.heartbeats.append(("onboard", (1, 191), 18))
-    heard.take_off(4.0)
+def test_texts_of_setpoint_and_companion_loss(received: SimHarness, velocity_setpoint: Any) -> None:
+    received.heartbeats.append(("onboard", (1, 191), 18))
+    received.take_off(4.0)
     stream = velocity_setpoint(0, 0, 0)
-    heard.offboard(stream)
-    del heard.heartbeats[1]
-    heard.forget()
-    last = heard.now_s
-    heard.until(lambda: "Connection to mission computer lost\t" in heard.texts(), 10.0)
-    assert heard.now_s - last == pytest.approx(7.0, abs=1.1)
-    heard.heartbeats.append(("onboard", (1, 191), 18))
-    heard.fly(1.5)
-    assert said(heard) == [
+    received.offboard(stream)
+    del received.heartbeats[1]
+    received.forget()
+    last = received.now_s
+    received.until(lambda: "Connection to mission computer lost\t" in received.texts(), 10.0)
+    assert received.now_s - last == pytest.approx(7.0, abs=1.1)
+    received.heartbeats.append(("onboard", (1, 191), 18))
+    received.fly(1.5)
+    assert sent(received) == [
         (CRITICAL, "Failsafe activated\t"),
         (INFO, "RTL: start return at 493 m (4 m above destination)\t"),
         (INFO, "RTL: land at destination\t"),
@@ -128,31 +126,31 @@ def test_the_loss_of_setpoints_and_of_the_companion_are_told(
     ]
 
 
-def test_a_take_off_to_a_height_above_ground_instead_of_the_sea_goes_nowhere_and_says_why(
-    heard: SimHarness,
+def test_takeoff_below_current_altitude_sends_text(
+    received: SimHarness,
 ) -> None:
-    heard.wait_ready()
-    heard.command(400, 1)
-    assert heard.command(22, 0, 0, 0, float("nan"), float("nan"), float("nan"), 5.0) == [0]
-    heard.until(lambda: not heard.armed, 15.0)
-    heard.fly(0.1)
-    assert (CRITICAL, "Already higher than takeoff altitude\t") in said(heard)
-    assert heard.height_m < 0.1
-    assert said(heard)[-1] == (INFO, "Disarmed by auto preflight disarming\t")
+    received.wait_ready()
+    received.command(400, 1)
+    assert received.command(22, 0, 0, 0, float("nan"), float("nan"), float("nan"), 5.0) == [0]
+    received.until(lambda: not received.armed, 15.0)
+    received.fly(0.1)
+    assert (CRITICAL, "Already higher than takeoff altitude\t") in sent(received)
+    assert received.height_m < 0.1
+    assert sent(received)[-1] == (INFO, "Disarmed by auto preflight disarming\t")
 
 
-def test_a_text_of_more_than_fifty_characters_comes_in_chunks_with_one_number(heard: SimHarness) -> None:
-    heard.fly(0.1)
-    heard.command(400, 1)
-    heard.fly(0.05)
-    short, *chunks = heard.received("STATUSTEXT", "gcs")
+def test_text_over_50_characters_is_chunked(received: SimHarness) -> None:
+    received.fly(0.1)
+    received.command(400, 1)
+    received.fly(0.05)
+    short, *chunks = received.received("STATUSTEXT", "gcs")
     assert (short.id, short.chunk_seq) == (0, 0)
     assert [chunk.chunk_seq for chunk in chunks] == [0, 1]
     assert chunks[0].id == chunks[1].id != 0
     assert len(chunks[0].text) == 50
 
 
-def test_texts_follow_the_ground_stations_heartbeat_to_whatever_link_it_arrives_on(
+def test_texts_follow_ground_station_heartbeat(
     make_harness: type[SimHarness],
 ) -> None:
     harness = make_harness()

@@ -1,4 +1,4 @@
-"""The pytest plugin, by pytest runs of their own: what other people's tests get from it."""
+"""The pytest plugin, in separate pytest runs."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ ARMING = """
 
 @pytest.fixture
 def run(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Runs pytest in a process of its own over a test file, with this plugin and no other."""
+    """Runs pytest in its own process over a test file, with only this plugin."""
     monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
 
@@ -42,9 +42,7 @@ def run(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> Any:
     return start
 
 
-def test_a_vehicle_is_ready_to_be_armed_and_a_passing_test_leaves_nothing_behind(
-    run: Any, pytester: pytest.Pytester
-) -> None:
+def test_passing_test_leaves_no_files(run: Any, pytester: pytest.Pytester) -> None:
     result = run(
         ARMING
         + """
@@ -61,9 +59,7 @@ def test_a_vehicle_is_ready_to_be_armed_and_a_passing_test_leaves_nothing_behind
     assert list(pytester.path.glob("temporary/vehicles/*")) == []
 
 
-def test_a_failing_test_keeps_the_log_and_the_traffic_and_names_them(
-    run: Any, pytester: pytest.Pytester
-) -> None:
+def test_failing_test_keeps_log_and_traffic_and_names_them(run: Any, pytester: pytest.Pytester) -> None:
     result = run(
         ARMING
         + """
@@ -89,9 +85,7 @@ def test_a_failing_test_keeps_the_log_and_the_traffic_and_names_them(
     assert {(245, "COMMAND_LONG"), (1, "COMMAND_ACK"), (1, "HEARTBEAT")} <= kinds  # both directions
 
 
-def test_logs_go_where_they_are_wanted_and_runs_do_not_overwrite_each_other(
-    run: Any, pytester: pytest.Pytester
-) -> None:
+def test_logs_folder_option_and_separate_runs(run: Any, pytester: pytest.Pytester) -> None:
     code = """
     def test_it(make_vehicle):
         make_vehicle(system_id=2)
@@ -102,11 +96,11 @@ def test_logs_go_where_they_are_wanted_and_runs_do_not_overwrite_each_other(
     result.assert_outcomes(failed=1)
     result.stdout.fnmatch_lines(["*- vehicle 1 -*", "*- vehicle 2 -*"])
     folders = sorted(pytester.path.glob("artifacts/*"))
-    said = [(folder / "vehicle.log").read_text() for folder in folders]
-    assert ["ready: system 2" in said[0], "ready: system 3" in said[1]] == [True, True]
+    output = [(folder / "vehicle.log").read_text() for folder in folders]
+    assert ["ready: system 2" in output[0], "ready: system 3" in output[1]] == [True, True]
 
 
-def test_options_come_from_the_marker_and_nearer_ones_count(run: Any) -> None:
+def test_nearest_marker_options_win(run: Any) -> None:
     result = run(
         """
     import pytest
@@ -159,7 +153,7 @@ def test_an_option_that_does_not_exist_is_named(run: Any) -> None:
     )
 
 
-def test_in_parallel_every_test_has_a_vehicle_of_its_own(run: Any) -> None:
+def test_parallel_tests_have_separate_vehicles(run: Any) -> None:
     result = run(
         ARMING
         + """
@@ -176,7 +170,7 @@ def test_in_parallel_every_test_has_a_vehicle_of_its_own(run: Any) -> None:
     result.stdout.fnmatch_lines(["*- vehicle 1 -*", "log:*vehicle.log"])
 
 
-def test_a_vehicle_that_was_killed_says_so_in_its_log(run: Any, pytester: pytest.Pytester) -> None:
+def test_killed_vehicle_log_has_exit_code(run: Any, pytester: pytest.Pytester) -> None:
     result = run(
         """
     def test_it(vehicle):
@@ -187,7 +181,7 @@ def test_a_vehicle_that_was_killed_says_so_in_its_log(run: Any, pytester: pytest
     )
     result.assert_outcomes(failed=1)
     (log,) = pytester.path.glob("temporary/vehicles/*test_it-1/vehicle.log")
-    assert "(its process ended with code -9)" in log.read_text()
+    assert "code -9" in log.read_text()
 
 
 def test_loading_the_plugin_loads_nothing_heavy() -> None:
@@ -203,7 +197,7 @@ def test_loading_the_plugin_loads_nothing_heavy() -> None:
     assert not {"numpy", "pymavlink", "typer", "cv2", "mavlink_sim.testing"} & loaded
 
 
-def test_an_installed_package_brings_the_plugin_by_itself(
+def test_installed_package_provides_plugin(
     pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]

@@ -1,4 +1,4 @@
-"""What the range sensors of one vehicle measure of the others of its fleet_world."""
+"""The range sensors of one vehicle with the others of its fleet world."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from mavlink_sim.physics.contact import HALF_HEIGHT_M, RADIUS_M
 from mavlink_sim.physics.midair import Body
 from mavlink_sim.physics.neighbours import Neighbours
 from mavlink_sim.physics.obstacle_sensor import MAXIMUM_M, NOTHING_CM
-from mavlink_sim.vehicle import STEP_S
+from mavlink_sim.vehicles.vehicle import STEP_S
 from mavlink_sim.world.world import World
 
 REQUEST_MESSAGE, DISTANCE_SENSOR = 512, 132
 
-places = st.tuples(*[st.floats(-4.0, 4.0)] * 3)
+positions = st.tuples(*[st.floats(-4.0, 4.0)] * 3)
 angles = st.floats(-1.0, 1.0)
 
 
-def body(number: int, place: Vector, start: tuple[float, float] = (0.0, 0.0)) -> Body:
+def body(number: int, position: Vector, start: tuple[float, float] = (0.0, 0.0)) -> Body:
     airframe = Multirotor()
     airframe.on_ground = False
-    airframe.position = place
+    airframe.position = position
     return Body(airframe, start, number, f"vehicle {number}", lambda: 0.0)
 
 
@@ -38,13 +38,13 @@ def inside(point: Vector, middle: Vector) -> float:
     return (x * x + y * y) / RADIUS_M**2 + z * z / HALF_HEIGHT_M**2
 
 
-@given(place=places, roll_rad=angles, pitch_rad=angles)
+@given(position=positions, roll_rad=angles, pitch_rad=angles)
 def test_the_range_below_ends_where_the_first_other_begins(
-    place: Vector, roll_rad: float, pitch_rad: float
+    position: Vector, roll_rad: float, pitch_rad: float
 ) -> None:
-    own, other = body(1, (0.0, 0.0, -9.0)), body(2, (place[0], place[1], place[2] - 9.0))
+    own, other = body(1, (0.0, 0.0, -9.0)), body(2, (position[0], position[1], position[2] - 9.0))
     own.airframe.set_attitude(roll_rad, pitch_rad, 0.3)
-    middle = place  # from the middle of one's own
+    middle = position  # from the middle of one's own
     assume(inside((0.0, 0.0, 0.0), middle) > 1.0)
     found = Neighbours([own, other], own).range_below_m()
     if found == 0.0:  # it begins within one's own hull
@@ -57,7 +57,7 @@ def test_the_range_below_ends_where_the_first_other_begins(
         assert inside((x * reach, y * reach, z * reach), middle) == pytest.approx(1.0, abs=1e-6)
 
 
-def test_the_nearest_of_several_below_is_measured_and_nobody_is_his_own_neighbour() -> None:
+def test_range_below_to_nearest_other_vehicle() -> None:
     own, near, far = body(1, (0.0, 0.0, -9.0)), body(2, (0.1, 0.0, -6.0)), body(3, (0.0, 0.0, -2.0))
     bodies = [own]
     neighbours = Neighbours(bodies, own)
@@ -68,7 +68,7 @@ def test_the_nearest_of_several_below_is_measured_and_nobody_is_his_own_neighbou
     assert neighbours.range_below_m() == pytest.approx(3.0 - top - HALF_HEIGHT_M)
 
 
-def test_a_level_cuts_those_at_its_height_wherever_their_frames_begin() -> None:
+def test_outlines_at_height_respect_start_offsets() -> None:
     own = body(1, (1.0, 2.0, -5.0), start=(10.0, 20.0))
     level = body(2, (4.0, 0.0, -5.05), start=(10.0, 25.0))  # 3 m north, 3 m east, 5 cm higher
     above = body(3, (1.0, 5.0, -5.0 - 1.01 * HALF_HEIGHT_M), start=(10.0, 20.0))
@@ -110,12 +110,12 @@ def beside(one: LockstepVehicle, other: LockstepVehicle) -> None:
 
 
 def below_m(vehicle: LockstepVehicle) -> float:
-    """What its DISTANCE_SENSOR tells."""
+    """The value of its DISTANCE_SENSOR."""
     assert vehicle.command(REQUEST_MESSAGE, DISTANCE_SENSOR) == "ACCEPTED"
     return float(vehicle.newest["onboard"]["DISTANCE_SENSOR"].current_distance) / 100.0
 
 
-def test_a_vehicle_ahead_is_in_the_ring_and_one_that_is_higher_is_not() -> None:
+def test_sensor_measures_vehicle_ahead_not_above() -> None:
     _, one, other = pair()
     for vehicle in (one, other):
         vehicle.take_off(3.0)
@@ -130,7 +130,7 @@ def test_a_vehicle_ahead_is_in_the_ring_and_one_that_is_higher_is_not() -> None:
     assert set(around(one)) == {NOTHING_CM}
 
 
-def test_one_that_hovers_over_another_measures_down_to_it() -> None:
+def test_range_below_over_another_vehicle() -> None:
     _, one, other = pair(scene=None, obstacle_sensor=False)
     for vehicle, height_m in ((one, 5.0), (other, 3.0)):
         vehicle.take_off(height_m)
@@ -142,7 +142,7 @@ def test_one_that_hovers_over_another_measures_down_to_it() -> None:
     assert below_m(other) == pytest.approx(3.0, abs=0.02)  # and not what is above it
 
 
-def test_a_copy_is_in_no_flock_and_measures_nobody() -> None:
+def test_copy_is_in_no_fleet_world() -> None:
     _, one, other = pair()
     for vehicle in (one, other):
         vehicle.take_off(3.0)

@@ -9,9 +9,7 @@ from tests.mavlink_sim.conftest import SimHarness
 
 
 @pytest.mark.parametrize("release", ["1.14", "1.15"])
-def test_an_older_release_answers_a_mode_request_once_and_truly(
-    make_harness: type[SimHarness], release: str
-) -> None:
+def test_older_release_answers_mode_request_once(make_harness: type[SimHarness], release: str) -> None:
     harness = make_harness(px4=release)
     harness.take_off()
     assert harness.set_mode(6) == [1]
@@ -26,7 +24,7 @@ def test_a_newer_release_answers_it_twice(make_harness: type[SimHarness], releas
 
 
 @pytest.mark.parametrize(("release", "answers"), [("1.16", 0), ("1.17", 1)])
-def test_what_is_wrong_with_a_parameter_is_told_since_v1_17_alone(
+def test_parameter_errors_since_v1_17_only(
     make_harness: type[SimHarness], release: str, answers: int
 ) -> None:
     harness = make_harness(px4=release)
@@ -42,7 +40,7 @@ def test_what_is_wrong_with_a_parameter_is_told_since_v1_17_alone(
 
 
 @pytest.mark.parametrize("release", RELEASES)
-def test_the_version_that_is_reported_is_the_releases(make_harness: type[SimHarness], release: str) -> None:
+def test_reported_version_is_the_releases(make_harness: type[SimHarness], release: str) -> None:
     harness = make_harness(px4=release)
     harness.fly(0.1)
     harness.command(512, 148)
@@ -50,11 +48,11 @@ def test_the_version_that_is_reported_is_the_releases(make_harness: type[SimHarn
     assert f"{version >> 24}.{version >> 16 & 0xFF}" == release
 
 
-def test_a_release_that_is_not_known_is_refused_by_name() -> None:
+def test_unknown_release_refused() -> None:
     with pytest.raises(ValueError, match=r"'2\.0'.*1\.14, 1\.15, 1\.16, 1\.17"):
         release_named("2.0")
 
 
 def test_an_ardupilot_vehicle_in_lockstep_has_no_release_of_px4() -> None:
-    with pytest.raises(ValueError, match=r"PX4 1\.14 means nothing to an ArduPilot"):
+    with pytest.raises(ValueError, match=r"px4 .1\.14."):
         LockstepVehicle(autopilot="ardupilot", px4="1.14")

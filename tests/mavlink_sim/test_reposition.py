@@ -1,4 +1,4 @@
-"""DO_REPOSITION, DO_CHANGE_ALTITUDE and DO_CHANGE_SPEED: where auto modes fly to, and how fast."""
+"""DO_REPOSITION, DO_CHANGE_ALTITUDE and DO_CHANGE_SPEED: goals and speeds of auto modes."""
 
 import math
 from typing import Any
@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from mavlink_sim.flight.reposition import reposition_goal
 from mavlink_sim.physics.airframe import Multirotor
-from mavlink_sim.physics.geography import HOME_ALTITUDE_M, geographic
+from mavlink_sim.physics.geography import HOME_ALTITUDE_M, SIH_FRAME
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.messages import dialect
 from tests.mavlink_sim.conftest import SimHarness
@@ -24,7 +24,7 @@ SLOW = pytest.approx(1.8, abs=0.4)
 
 def reposition(
     harness: SimHarness,
-    place: tuple[float, float] | None,
+    goal: tuple[float, float] | None,
     height_m: float = NAN,
     *,
     speed_mps: float = -1.0,
@@ -32,10 +32,10 @@ def reposition(
     yaw: float = NAN,
     frame: int = 5,
 ) -> list[int]:
-    """Send DO_REPOSITION as COMMAND_INT to a local place; its answers."""
+    """Send DO_REPOSITION as COMMAND_INT to a local position; its answers."""
     x, y = (NOT_GIVEN, NOT_GIVEN)
-    if place is not None:
-        latitude, longitude, _ = geographic((*place, 0.0))
+    if goal is not None:
+        latitude, longitude, _ = SIH_FRAME.geographic((*goal, 0.0))
         x, y = round(latitude * 1e7), round(longitude * 1e7)
     values = (speed_mps, flags, 0.0, yaw)
     results: list[int] = harness.command_int(192, values, x, y, HOME_ALTITUDE_M + height_m, frame)
@@ -59,7 +59,7 @@ def top_speed_mps(harness: SimHarness, seconds: float) -> float:
 
 
 @pytest.mark.streams("POSITION_TARGET_GLOBAL_INT")
-def test_it_flies_there_nose_first_and_holds(harness: SimHarness) -> None:
+def test_flies_nose_first_and_holds(harness: SimHarness) -> None:
     harness.take_off(5.0)
     assert reposition(harness, (15.0, 15.0), 8.0) == [0]
     harness.fly(3.0)
@@ -82,7 +82,7 @@ def test_a_yaw_is_taken_in_radians(harness: SimHarness) -> None:
 @pytest.mark.parametrize(
     ("mode", "yaw_rad"), [(0, math.pi / 2), (1, -math.pi / 2), (2, math.pi / 2), (3, math.pi / 2), (5, 0.0)]
 )
-def test_without_a_yaw_the_parameter_decides_where_the_nose_points(
+def test_without_yaw_parameter_decides_where_nose_points(
     make_harness: type[SimHarness], mode: int, yaw_rad: float
 ) -> None:
     harness = make_harness(parameters={"MPC_YAW_MODE": mode})
@@ -93,14 +93,14 @@ def test_without_a_yaw_the_parameter_decides_where_the_nose_points(
 
 
 @pytest.mark.parametrize("frame", [0, 3, 5, 6])
-def test_the_frame_is_not_looked_at_the_altitude_is_above_sea_level(harness: SimHarness, frame: int) -> None:
+def test_frame_ignored_and_altitude_is_amsl(harness: SimHarness, frame: int) -> None:
     harness.take_off(5.0)
     assert reposition(harness, (2.0, 0.0), 7.0, frame=frame) == [0]
     harness.fly(8.0)
     assert harness.height_m == pytest.approx(7.0, abs=0.3)
 
 
-def test_an_altitude_alone_keeps_the_place_it_was_flying_to(harness: SimHarness) -> None:
+def test_altitude_only_keeps_horizontal_goal(harness: SimHarness) -> None:
     harness.take_off(5.0)
     reposition(harness, (12.0, 0.0), 5.0)
     harness.fly(1.5)
@@ -109,7 +109,7 @@ def test_an_altitude_alone_keeps_the_place_it_was_flying_to(harness: SimHarness)
     assert math.dist(harness.vehicle.airframe.position, (12.0, 0.0, -9.0)) < 0.4
 
 
-def test_with_nothing_given_it_stops(harness: SimHarness) -> None:
+def test_without_values_it_stops(harness: SimHarness) -> None:
     harness.take_off(5.0)
     reposition(harness, (40.0, 0.0), 5.0)
     harness.fly(4.0)
@@ -122,10 +122,8 @@ def test_with_nothing_given_it_stops(harness: SimHarness) -> None:
 
 
 @pytest.mark.parametrize("flags", [0.0, 2.0, 3.0, NAN])
-def test_without_the_mode_flag_or_with_others_it_is_unsupported_and_flown_in_hold(
-    harness: SimHarness, flags: float
-) -> None:
-    """As a PX4 v1.17 in SIH did: its commander refuses, and its navigator flies."""
+def test_without_mode_flag_unsupported_but_flown_in_hold(harness: SimHarness, flags: float) -> None:
+    """As measured on PX4 v1.17 in SIH: its commander refuses, and its navigator flies."""
     harness.take_off(5.0)
     assert reposition(harness, (9.0, 0.0), 5.0, flags=flags) == [3]
     harness.fly(12.0)
@@ -133,7 +131,7 @@ def test_without_the_mode_flag_or_with_others_it_is_unsupported_and_flown_in_hol
     assert harness.vehicle.airframe.position[0] == pytest.approx(9.0, abs=0.3)
 
 
-def test_without_the_mode_flag_another_mode_flies_on(harness: SimHarness, velocity_setpoint: Any) -> None:
+def test_without_mode_flag_other_modes_continue(harness: SimHarness, velocity_setpoint: Any) -> None:
     harness.take_off(5.0)
     stream = velocity_setpoint(0, 1, 0)
     harness.offboard(stream)
@@ -143,7 +141,7 @@ def test_without_the_mode_flag_another_mode_flies_on(harness: SimHarness, veloci
     assert abs(harness.vehicle.airframe.position[0]) < 0.5
 
 
-def test_a_place_that_is_not_on_earth_is_taken_as_px4_takes_it(harness: SimHarness) -> None:
+def test_position_out_of_range_accepted_as_in_px4(harness: SimHarness) -> None:
     harness.take_off(5.0)
     assert harness.command(192, -1, 1, 0, NAN, 91.0, 8.0, 500.0) == [0]
     harness.fly(5.0)
@@ -151,14 +149,14 @@ def test_a_place_that_is_not_on_earth_is_taken_as_px4_takes_it(harness: SimHarne
     assert harness.command_int(192, (-1.0, 1.0, 0.0, NAN), NOT_GIVEN, 85_000_000, 500.0) == [0]
 
 
-def test_a_nan_put_into_integers_by_accident_is_denied_whatever_the_command(harness: SimHarness) -> None:
+def test_nan_in_command_int_is_denied(harness: SimHarness) -> None:
     harness.take_off(5.0)
     for command in (192, 34, 22):
         assert harness.command_int(command, (-1.0, 1.0, 0.0, NAN), 0x7FF80000, 0x7FF80000, 500.0) == [2]
     assert harness.mode == "HOLD"
 
 
-def test_disarmed_the_mode_is_taken_and_the_goal_forgotten(harness: SimHarness) -> None:
+def test_disarmed_mode_accepted_goal_dropped(harness: SimHarness) -> None:
     harness.wait_ready()
     harness.set_mode(4, 2)
     assert reposition(harness, (20.0, 0.0), 10.0) == [0]
@@ -177,7 +175,7 @@ def test_armed_on_the_ground_it_takes_off_to_the_goal(harness: SimHarness) -> No
     assert math.dist(harness.vehicle.airframe.position, (5.0, 0.0, -6.0)) < 0.4
 
 
-def test_it_ends_offboard_though_the_setpoints_go_on(harness: SimHarness, velocity_setpoint: Any) -> None:
+def test_ends_offboard_despite_setpoints(harness: SimHarness, velocity_setpoint: Any) -> None:
     harness.take_off(5.0)
     stream = velocity_setpoint(1, 0, 0)
     harness.offboard(stream)
@@ -187,7 +185,7 @@ def test_it_ends_offboard_though_the_setpoints_go_on(harness: SimHarness, veloci
     assert math.dist(harness.vehicle.airframe.position, (0.0, 6.0, -5.0)) < 0.3
 
 
-def test_the_altitude_can_be_changed_by_a_command_of_its_own(harness: SimHarness) -> None:
+def test_do_change_altitude_changes_altitude(harness: SimHarness) -> None:
     harness.take_off(5.0)
     assert harness.command(186, HOME_ALTITUDE_M + 9.0, 0) == [0]
     harness.fly(8.0)
@@ -199,7 +197,7 @@ coordinate = st.one_of(st.just(NAN), st.floats(-500.0, 500.0))
 
 @settings(max_examples=60, deadline=None)
 @given(coordinate, coordinate, coordinate, st.one_of(st.just(NAN), st.floats(-3.0, 3.0)), st.booleans())
-def test_the_goal_is_always_a_whole_place(x: float, y: float, z: float, yaw: float, going: bool) -> None:
+def test_goal_is_always_complete(x: float, y: float, z: float, yaw: float, going: bool) -> None:
     airframe = Multirotor()
     airframe.position, airframe.velocity = (1.0, 2.0, -3.0), (2.0, 0.0, 0.0)
     former = (7.0, 8.0, -9.0) if going else None
@@ -217,7 +215,7 @@ def test_the_goal_is_always_a_whole_place(x: float, y: float, z: float, yaw: flo
 # ---- how fast
 
 
-def test_the_cruise_speed_is_the_parameters_unless_the_command_has_one(harness: SimHarness) -> None:
+def test_cruise_speed_from_parameter_or_command(harness: SimHarness) -> None:
     harness.take_off(5.0)
     reposition(harness, (50.0, 0.0), 5.0)
     assert top_speed_mps(harness, 12.0) == FAST
@@ -226,7 +224,7 @@ def test_the_cruise_speed_is_the_parameters_unless_the_command_has_one(harness: 
     assert top_speed_mps(harness, 10.0) == SLOW
 
 
-def test_a_speed_change_acts_at_once_and_on_later_goals_until_the_mode_ends(harness: SimHarness) -> None:
+def test_speed_change_lasts_until_mode_ends(harness: SimHarness) -> None:
     harness.take_off(5.0)
     reposition(harness, (60.0, 0.0), 5.0)
     harness.fly(5.0)
@@ -242,7 +240,7 @@ def test_a_speed_change_acts_at_once_and_on_later_goals_until_the_mode_ends(harn
     assert top_speed_mps(harness, 12.0) == FAST
 
 
-def test_a_speed_of_another_kind_waits_for_the_next_goal_and_zero_takes_it_back(harness: SimHarness) -> None:
+def test_other_speed_type_applies_to_next_goal(harness: SimHarness) -> None:
     harness.take_off(5.0)
     reposition(harness, (80.0, 0.0), 5.0)
     harness.fly(5.0)
@@ -262,10 +260,10 @@ def test_a_speed_change_is_accepted_in_any_state(harness: SimHarness, values: tu
     assert harness.command(178, *values) == [0]
 
 
-# ---- how many answers
+# ---- number of answers
 
 
-def test_the_older_behaviour_of_a_single_true_answer_to_set_mode(make_harness: type[SimHarness]) -> None:
+def test_older_release_single_answer_to_set_mode(make_harness: type[SimHarness]) -> None:
     harness = make_harness(px4="1.15")
     harness.take_off()
     assert harness.set_mode(4, 4) == [1]

@@ -1,4 +1,4 @@
-"""Where RTL leads: home, a rally point, the mission's landing, or back along the mission."""
+"""The destination of RTL: home, a rally point, the mission's landing, or back along the mission."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from mavlink_sim.missions.items import item_of
 from mavlink_sim.missions.plan import Mission
 from mavlink_sim.missions.return_flight import Goal, destination, mission_route
-from mavlink_sim.physics.geography import geographic
+from mavlink_sim.physics.geography import SIH_FRAME
 from mavlink_sim.px4.parameters import Parameters
 from tests.mavlink_sim.conftest import SimHarness
 from tests.mavlink_sim.plan_client import item, land, listen, message, rally, takeoff, upload, waypoint
@@ -29,7 +29,7 @@ def chosen(
     kind: int, north: float, east: float, points: tuple[Any, ...] = (), mission: Mission | None = None
 ) -> Any:
     found, _ = destination(
-        points, mission or Mission(), Parameters({"RTL_TYPE": kind}), HOME, (north, east, -5.0)
+        points, mission or Mission(), Parameters({"RTL_TYPE": kind}), HOME, SIH_FRAME, (north, east, -5.0)
     )
     return found
 
@@ -50,43 +50,43 @@ LANDING = Mission(stored(takeoff(5.0), waypoint(100, 0, 10), land(100, 30)), val
         (3, (1, 1), Goal.HOME, 0.0),
     ],
 )
-def test_the_nearest_place_that_rtl_type_allows_is_chosen(
-    kind: int, place: tuple[float, float], goal: Goal, north: float
+def test_nearest_allowed_destination_selected(
+    kind: int, point: tuple[float, float], goal: Goal, north: float
 ) -> None:
-    found = chosen(kind, *place, POINTS, LANDING)
+    found = chosen(kind, *point, POINTS, LANDING)
     assert found.kind is goal
     assert found.position[0] == pytest.approx(north, abs=0.02)
 
 
-def test_without_any_place_type_five_lands_here_and_type_one_at_home() -> None:
+def test_without_rally_type_5_lands_here_type_1_at_home() -> None:
     assert chosen(5, 20, 0).kind is Goal.HERE
     assert chosen(1, 20, 0).kind is Goal.HOME
 
 
 @given(st.floats(-200, 200), st.floats(-200, 200))
-def test_no_other_allowed_place_is_much_nearer(north: float, east: float) -> None:
+def test_no_allowed_destination_is_much_nearer(north: float, east: float) -> None:
     found = chosen(3, north, east, POINTS[:2], LANDING)
-    nearest = min(math.dist((north, east), place) for place in ((0, 0), (60, 0), (0, 60), (100, 30)))
+    nearest = min(math.dist((north, east), point) for point in ((0, 0), (60, 0), (0, 60), (100, 30)))
     assert math.dist((north, east), found.position[:2]) <= nearest + 4.1
 
 
-def test_a_rally_point_in_an_integer_frame_is_refused_as_px4_does() -> None:
+def test_rally_point_in_integer_frame_is_refused_as_px4_does() -> None:
     points = stored(rally(60, 0, frame=6))
-    found, words = destination(points, Mission(), Parameters(), HOME, (59.0, 0.0, -5.0))
+    found, words = destination(points, Mission(), Parameters(), HOME, SIH_FRAME, (59.0, 0.0, -5.0))
     assert found.kind is Goal.HOME
     assert words == ["RTL: unsupported MAV_FRAME\t"]
 
 
-def test_along_a_mission_it_goes_on_to_the_landing_or_back_home() -> None:
+def test_mission_route_leads_to_landing_or_home() -> None:
     there = Mission(LANDING.items, current=1, valid=True)
-    places, end = mission_route(there, Parameters({"RTL_TYPE": 2}), HOME) or ([], HOME)
-    assert [place[0] for place in places] == [pytest.approx(100.0, abs=0.02)]
+    points, end = mission_route(there, Parameters({"RTL_TYPE": 2}), HOME, SIH_FRAME) or ([], HOME)
+    assert [point[0] for point in points] == [pytest.approx(100.0, abs=0.02)]
     assert end[1] == pytest.approx(30.0, abs=0.02)
     back = Mission(stored(takeoff(5.0), waypoint(30, 0, 5), waypoint(60, 0, 5)), current=2, valid=True)
-    places, end = mission_route(back, Parameters({"RTL_TYPE": 2}), HOME) or ([], (9.0, 9.0, 9.0))
-    assert [place[0] for place in places] == pytest.approx([30.0, 0.0], abs=0.02)
+    points, end = mission_route(back, Parameters({"RTL_TYPE": 2}), HOME, SIH_FRAME) or ([], (9.0, 9.0, 9.0))
+    assert [point[0] for point in points] == pytest.approx([30.0, 0.0], abs=0.02)
     assert end == HOME
-    assert mission_route(back, Parameters(), HOME) is None
+    assert mission_route(back, Parameters(), HOME, SIH_FRAME) is None
 
 
 @pytest.fixture
@@ -114,7 +114,7 @@ def test_rtl_lands_at_the_nearer_rally_point(make: Callable[..., SimHarness]) ->
     assert any("m above destination)" in text for text in harness.texts())
 
 
-def test_a_pilot_who_returns_a_vehicle_that_started_elsewhere_lands_it_at_the_rally_point(
+def test_rally_point_return_with_start_offset(
     make_harness: type[SimHarness],
 ) -> None:
     harness = make_harness(
@@ -127,11 +127,11 @@ def test_a_pilot_who_returns_a_vehicle_that_started_elsewhere_lands_it_at_the_ra
     harness.take_off(4.0)
     harness.vehicle.airframe.position = (12.0, 3.0, -4.0)
     harness.fly(0.01)
-    harness.vehicle.faults.begin("pilot_takeover RTL")  # by who is no part of the vehicle
+    harness.vehicle.faults.begin("pilot_takeover RTL")  # by a component outside the vehicle
     lands_at(harness, 14, 0)
 
 
-def test_rtl_goes_on_along_the_mission_to_its_landing(make: Callable[..., SimHarness]) -> None:
+def test_rtl_follows_mission_to_landing(make: Callable[..., SimHarness]) -> None:
     harness = make(RTL_TYPE=2)
     plan = [takeoff(4.0), waypoint(6, 0, 4, 60.0), waypoint(6, 8, 4), item(189), land(0, 12)]
     upload(harness, plan)
@@ -143,7 +143,7 @@ def test_rtl_goes_on_along_the_mission_to_its_landing(make: Callable[..., SimHar
     lands_at(harness, 0, 12)
 
 
-def test_rtl_flies_to_the_missions_landing_pattern_where_that_is_nearer(
+def test_rtl_flies_to_missions_landing_pattern_where_that_nearer(
     make: Callable[..., SimHarness],
 ) -> None:
     harness = make(RTL_TYPE=3)
@@ -156,14 +156,12 @@ def test_rtl_flies_to_the_missions_landing_pattern_where_that_is_nearer(
 
 
 @pytest.mark.parametrize("before", [True, False])
-def test_rtl_leads_to_where_home_was_set_before_arming_or_after(
-    make: Callable[..., SimHarness], before: bool
-) -> None:
+def test_rtl_leads_to_commanded_home(make: Callable[..., SimHarness], before: bool) -> None:
     harness = make()
     if not before:
         harness.take_off(4.0)
     harness.wait_ready()
-    latitude, longitude, altitude = geographic((0.0, 8.0, 0.0))
+    latitude, longitude, altitude = SIH_FRAME.geographic((0.0, 8.0, 0.0))
     assert harness.command(179, 0, 0, 0, 0, latitude, longitude, altitude) == [0]
     if before:
         harness.take_off(4.0)

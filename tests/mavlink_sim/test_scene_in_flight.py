@@ -1,4 +1,4 @@
-"""`mavlink-sim` with a scene: its things in the truth, its camera at several outputs at once."""
+"""`mavlink-sim` with a scene: its objects in the truth, its camera at several outputs."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ maximum_m = 15
 """
 
 
-def test_a_scene_is_flown_in_and_its_camera_read_in_three_ways(tmp_path: Path) -> None:
+def test_scene_flight_with_three_camera_outputs(tmp_path: Path) -> None:
     scene, truth, seen = tmp_path / "field.toml", tmp_path / "truth.jsonl", tmp_path / "seen.jsonl"
     scene.write_text(SCENE, "utf-8")
     name = f"test-scene-{os.getpid()}-{secrets.token_hex(4)}"
@@ -58,7 +58,7 @@ def test_a_scene_is_flown_in_and_its_camera_read_in_three_ways(tmp_path: Path) -
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as vehicle:
         assert vehicle.stdout is not None
         try:
-            raw = vehicle.stdout.read(160 * 120 * 3)  # standard output has pictures and nothing else
+            raw = vehicle.stdout.read(160 * 120 * 3)  # standard output carries only images
             piped = np.frombuffer(raw, np.uint8).reshape(120, 160, 3)
             with urllib.request.urlopen(
                 f"http://127.0.0.1:{port}/snapshot.jpg", timeout=DEADLINE_S
@@ -70,8 +70,8 @@ def test_a_scene_is_flown_in_and_its_camera_read_in_three_ways(tmp_path: Path) -
             assert frame.depth_m is not None
             assert np.nanmax(frame.depth_m) <= 15.0
             assert served is not None
-            for picture in (piped, served):
-                assert np.abs(picture.astype(int) - frame.image).mean() < 12.0
+            for image in (piped, served):
+                assert np.abs(image.astype(int) - frame.image).mean() < 12.0
             deadline = time.monotonic() + DEADLINE_S
             lines: list[dict[str, Any]] = []
             while len(lines) < 20:
@@ -92,20 +92,20 @@ def test_a_scene_is_flown_in_and_its_camera_read_in_three_ways(tmp_path: Path) -
     stamps = [line["stamp_ns"] for line in lines]
     assert stamps == sorted(stamps)
     assert {"car", "person"} == {item["class_name"] for line in lines for item in line["objects"]}
-    flown = [json.loads(line) for line in truth.read_text("utf-8").splitlines()]
-    assert {item["class_name"] for item in flown[-1]["objects"]} == {"car", "person"}
-    assert flown[0]["objects"][1]["position_ned_m"] != flown[-1]["objects"][1]["position_ned_m"]
+    flight = [json.loads(line) for line in truth.read_text("utf-8").splitlines()]
+    assert {item["class_name"] for item in flight[-1]["objects"]} == {"car", "person"}
+    assert flight[0]["objects"][1]["position_ned_m"] != flight[-1]["objects"][1]["position_ned_m"]
 
 
-def test_a_scene_that_cannot_be_is_explained_in_one_line_and_nothing_starts(tmp_path: Path) -> None:
+def test_invalid_scene_explained_and_not_started(tmp_path: Path) -> None:
     scene = tmp_path / "field.toml"
     scene.write_text("[camera]\nwidth = 'wide'\n", "utf-8")
     command = [sys.executable, "-m", "mavlink_sim", "--onboard-bind", "0", "--gcs-bind", "0"]
-    for arguments, says in (
-        (["--scene", str(scene), "--camera", "unborn"], "camera.width: must be a valid integer, got 'wide'"),
-        (["--camera-output", "gopher://x"], "expected one of shm://NAME"),
+    for arguments, message in (
+        (["--scene", str(scene), "--camera", "unborn"], "camera.width"),
+        (["--camera-output", "gopher://x"], "shm://NAME"),
     ):
         made = subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=DEADLINE_S)
         assert made.returncode == 2
-        assert says in made.stderr
+        assert message in made.stderr
         assert "Traceback" not in made.stderr

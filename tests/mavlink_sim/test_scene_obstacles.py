@@ -1,4 +1,4 @@
-"""The geometry of what is in the way, held against sampling it by brute force."""
+"""The geometry of obstacles, compared with brute-force sampling."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ RADIUS_M, HALF_HEIGHT_M = 0.3, 0.12
 CLASSES = ("wall", "box", "car", "tree", "shed", "pole", "bale", "person", "drone", "boat", "fence")
 SPACING_M = 0.1
 
-things = st.builds(
+objects = st.builds(
     WorldObject,
     st.just(7),
     st.sampled_from(CLASSES),
@@ -53,33 +53,31 @@ def corners_of(mesh: Mesh) -> list[NDArray[np.float64]]:
     return [mesh.starts[first:end] for first, end in zip(mesh.first, ends, strict=True)]
 
 
-def surface(thing: WorldObject) -> NDArray[np.float64]:
+def surface(scene_object: WorldObject) -> NDArray[np.float64]:
     """(N, 3) NED points all over the surface of an object, none farther than SPACING_M from the next."""
-    size = thing.size_m if thing.printed is None else thing.printed.board_size_m
+    size = scene_object.size_m if scene_object.printed is None else scene_object.printed.board_size_m
     sampled = []
-    for corners in corners_of(mesh_of(thing.class_name, thing.appearance, size)):
-        corners = corners * thing.scale
+    for corners in corners_of(mesh_of(scene_object.class_name, scene_object.appearance, size)):
+        corners = corners * scene_object.scale
         for second, third in pairwise(corners[1:]):
-            ways = second - corners[0], third - corners[0]
-            steps = max(2, math.ceil(max(np.linalg.norm(way) for way in ways) / SPACING_M) + 1)
+            motions = second - corners[0], third - corners[0]
+            steps = max(2, math.ceil(max(np.linalg.norm(direction) for direction in motions) / SPACING_M) + 1)
             a, b = np.meshgrid(*[np.linspace(0.0, 1.0, min(steps, 160))] * 2)
             inside = a + b <= 1.0 + 1e-9
-            sampled.append(corners[0] + a[inside][:, None] * ways[0] + b[inside][:, None] * ways[1])
+            sampled.append(corners[0] + a[inside][:, None] * motions[0] + b[inside][:, None] * motions[1])
     own = np.concatenate(sampled)
-    c, s = math.cos(thing.yaw_rad), math.sin(thing.yaw_rad)
+    c, s = math.cos(scene_object.yaw_rad), math.sin(scene_object.yaw_rad)
     turned: NDArray[np.float64] = own @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
-    return turned + thing.position_ned_m
+    return turned + scene_object.position_ned_m
 
 
 @settings(max_examples=30, deadline=None)
-@given(things, points())
-def test_the_nearest_point_is_as_near_as_the_nearest_of_many(
-    thing: WorldObject, point: NDArray[np.float64]
-) -> None:
-    mesh = mesh_of(thing.class_name, thing.appearance)
+@given(objects, points())
+def test_nearest_point_matches_brute_force(scene_object: WorldObject, point: NDArray[np.float64]) -> None:
+    mesh = mesh_of(scene_object.class_name, scene_object.appearance)
     nearest, distance = mesh.nearest(point)
     assert np.linalg.norm(nearest - point) == pytest.approx(distance, abs=1e-9)
-    there = WorldObject(7, thing.class_name, (0.0, 0.0, 0.0), appearance=thing.appearance)
+    there = WorldObject(7, scene_object.class_name, (0.0, 0.0, 0.0), appearance=scene_object.appearance)
     sampled = float(np.linalg.norm(surface(there) - point, axis=1).min())
     assert (
         sampled - SPACING_M <= distance <= sampled + 0.002
@@ -103,13 +101,13 @@ def test_a_box_contains_what_is_within_its_sides(
 
 
 @settings(max_examples=30, deadline=None)
-@given(things, points(), st.floats(-math.pi, math.pi), st.floats(-1.5, 1.5))
+@given(objects, points(), st.floats(-math.pi, math.pi), st.floats(-1.5, 1.5))
 def test_a_ray_ends_where_the_surface_is(
-    thing: WorldObject, origin: NDArray[np.float64], bearing: float, up: float
+    scene_object: WorldObject, origin: NDArray[np.float64], bearing: float, up: float
 ) -> None:
     direction = np.array([math.cos(bearing) * math.cos(up), math.sin(bearing) * math.cos(up), -math.sin(up)])
-    reach = obstacles(thing).range_along(to_vector(origin), to_vector(direction), 0.0)
-    sampled = surface(thing) - origin
+    reach = obstacles(scene_object).range_along(to_vector(origin), to_vector(direction), 0.0)
+    sampled = surface(scene_object) - origin
     along = sampled @ direction
     beside = np.linalg.norm(sampled - along[:, None] * direction, axis=1)
     if math.isfinite(reach):  # there is surface where it ends
@@ -120,17 +118,17 @@ def test_a_ray_ends_where_the_surface_is(
 
 
 @settings(max_examples=30, deadline=None)
-@given(things, points())
-def test_the_gap_is_room_to_move_in_and_the_push_leads_out(
-    thing: WorldObject, centre: NDArray[np.float64]
+@given(objects, points())
+def test_gap_is_free_and_push_resolves_contact(
+    scene_object: WorldObject, centre: NDArray[np.float64]
 ) -> None:
-    found = obstacles(thing)
+    found = obstacles(scene_object)
     gap = found.nearest(to_vector(centre), 0.0)
     radii = np.array([RADIUS_M, RADIUS_M, HALF_HEIGHT_M])
-    sampled = surface(thing)
+    sampled = surface(scene_object)
 
     def depth(middle: NDArray[np.float64]) -> float:
-        """How deep any point of the surface is inside the ellipsoid, 0..1 (its middle); less: outside."""
+        """Depth of the surface in the ellipsoid, 0..1 (its centre); negative: outside."""
         return 1.0 - float(np.linalg.norm((sampled - middle) / radii, axis=1).min())
 
     if gap.clear_m > 0.0:
@@ -142,7 +140,7 @@ def test_the_gap_is_room_to_move_in_and_the_push_leads_out(
     assert gap.obstacle is not None
     assert np.linalg.norm(gap.normal_ned) == pytest.approx(1.0)
     after = found.gap_to(gap.obstacle, to_vector(centre + gap.push_ned_m)).clear_m
-    if thing.class_name in ("box", "bale"):  # of one convex solid
+    if scene_object.class_name in ("box", "bale"):  # of one convex solid
         assert after == pytest.approx(0.0, abs=1e-3)
     elif depth(centre) > 0.1:  # out of one of its solids it may be pushed into the next
         assert after > 2.0 * gap.clear_m - 1e-6
@@ -154,31 +152,31 @@ def test_the_gap_is_room_to_move_in_and_the_push_leads_out(
         lambda rows: np.array(rows).reshape(-1, 2, 2)
     )
 )
-def test_each_sector_has_the_nearest_of_what_lies_in_it(segments: NDArray[np.float64]) -> None:
+def test_each_sector_has_its_nearest_point(segments: NDArray[np.float64]) -> None:
     assume(np.abs(segments).max() > 1e-3)
     shares = np.linspace(0.0, 1.0, 1001)[:, None]
     sampled = np.concatenate([start + shares * (end - start) for start, end in segments])
     distance = np.hypot(sampled[:, 0], sampled[:, 1])
-    assume(distance.min() > 0.1)  # nearer a sample's bearing says nothing
+    assume(distance.min() > 0.1)  # nearer, a sample's bearing is undefined
     spacing = max(float(np.linalg.norm(end - start)) for start, end in segments) / 1000
-    places = np.arctan2(sampled[:, 1], sampled[:, 0]) / (math.tau / SECTORS)
+    positions = np.arctan2(sampled[:, 1], sampled[:, 0]) / (math.tau / SECTORS)
     exact = nearest_in_sectors(segments)
     widened = 1.1 * spacing / distance / (math.tau / SECTORS) + 1e-6
     for sector in range(SECTORS):
-        off = np.abs((places - sector + SECTORS / 2) % SECTORS - SECTORS / 2)
+        off = np.abs((positions - sector + SECTORS / 2) % SECTORS - SECTORS / 2)
         surely, perhaps = distance[off < 0.5 - 1e-9], distance[off <= 0.5 + widened]
         assert exact[sector] <= surely.min(initial=math.inf) + 1e-9
         assert exact[sector] >= perhaps.min(initial=math.inf) - 1.1 * spacing
 
 
 @settings(max_examples=20, deadline=None)
-@given(things, points(6.0), st.floats(-math.pi, math.pi))
-def test_a_scan_sees_what_is_at_its_height_and_nothing_else(
-    thing: WorldObject, origin: NDArray[np.float64], yaw: float
+@given(objects, points(6.0), st.floats(-math.pi, math.pi))
+def test_scan_measures_only_at_its_height(
+    scene_object: WorldObject, origin: NDArray[np.float64], yaw: float
 ) -> None:
-    ranges = obstacles(thing).ranges_around(to_vector(origin), yaw, 12.0, 0.0)
+    ranges = obstacles(scene_object).ranges_around(to_vector(origin), yaw, 12.0, 0.0)
     assert len(ranges) == SECTORS
-    sampled = surface(thing) - origin
+    sampled = surface(scene_object) - origin
     level = np.linalg.norm(sampled[np.abs(sampled[:, 2]) < SPACING_M][:, :2], axis=1)
     if math.isfinite(min(ranges)):
         assert level.size
@@ -188,12 +186,14 @@ def test_a_scan_sees_what_is_at_its_height_and_nothing_else(
         for share in np.linspace(-0.499, 0.499, 9):
             angle = yaw + (sector + share) * math.tau / SECTORS
             rays.append(
-                obstacles(thing).range_along(to_vector(origin), (math.cos(angle), math.sin(angle), 0.0), 0.0)
+                obstacles(scene_object).range_along(
+                    to_vector(origin), (math.cos(angle), math.sin(angle), 0.0), 0.0
+                )
             )
         assert min(rays) >= ranges[sector] - 1e-6
 
 
-def test_what_moves_is_where_its_path_has_led_it() -> None:
+def test_moving_obstacle_follows_its_path() -> None:
     path = Path(((10.0, 0.0, 0.0), (0.0, 0.0, 0.0)), 2.0, "once", fixed_yaw_rad=0.0)
     found = obstacles(WorldObject(3, "box", (10.0, 0.0, 0.0)), paths={3: path})
     assert found.top_speed_mps == 2.0
@@ -206,7 +206,7 @@ def test_what_moves_is_where_its_path_has_led_it() -> None:
     assert gap.obstacle.velocity_at(9.0) == (0.0, 0.0, 0.0)
 
 
-def test_what_lies_flat_on_the_ground_is_not_in_the_way_and_a_raised_plate_is() -> None:
+def test_flat_plate_is_no_obstacle_raised_one_is() -> None:
     marker = Print("4X4_50", 3, 0.5)
     lying = WorldObject(0, "plate", (0.0, 0.0, 0.0), printed=marker)
     raised = WorldObject(1, "plate", (0.0, 0.0, -1.0), printed=marker)
@@ -217,13 +217,13 @@ def test_what_lies_flat_on_the_ground_is_not_in_the_way_and_a_raised_plate_is() 
     assert obstacles(standing).range_along((1.0, 0.0, -0.3), (-1.0, 0.0, 0.0), 0.0) == pytest.approx(0.998)
 
 
-def test_nothing_in_the_way_is_said_as_that() -> None:
+def test_no_obstacle_gives_infinite_gap() -> None:
     nothing = obstacles()
     assert nothing.nearest((0.0, 0.0, -1.0), 0.0).clear_m == math.inf
     assert nothing.range_along((0.0, 0.0, -1.0), (0.0, 0.0, 1.0), 0.0) == math.inf
     assert nothing.ranges_around((0.0, 0.0, -1.0), 0.3, 12.0, 0.0) == [math.inf] * SECTORS
 
 
-def test_what_leans_is_refused_by_name_rather_than_met_upright() -> None:
+def test_leaning_obstacle_refused() -> None:
     with pytest.raises(ValueError, match="box-4 leans"):
         obstacles(WorldObject(4, "box", (3.0, 0.0, 0.0), roll_rad=0.5))

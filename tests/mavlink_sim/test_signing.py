@@ -1,4 +1,4 @@
-"""MAVLink 2 signing: what PX4's rules accept, refuse and count; pymavlink on the other side."""
+"""MAVLink 2 signing by PX4's rules, with pymavlink as the client."""
 
 import hashlib
 import time
@@ -84,7 +84,7 @@ frames = st.one_of(
 
 @settings(max_examples=50)
 @given(frames)
-def test_pymavlink_reads_and_believes_what_is_signed_here(message: Any) -> None:
+def test_pymavlink_accepts_signed_frames(message: Any) -> None:
     signing = vehicle_signing(timestamp=START)
     reader = client(timestamp=START)
     reader.signing.allow_unsigned_callback = None
@@ -103,7 +103,7 @@ def test_a_message_outside_pymavlinks_dialects_is_signed_too() -> None:
     assert crc.crc.to_bytes(2, "little") == signing.signed(frame)[-15:-13]
 
 
-def test_a_rightly_signed_frame_is_accepted_once() -> None:
+def test_valid_signed_frame_accepted_once() -> None:
     signing = vehicle_signing()
     frame = heartbeat(client())
     assert signing.accepts(frame)
@@ -134,7 +134,7 @@ def test_a_replay_on_another_link_of_the_vehicle_is_refused() -> None:
     assert not two.accepts(frame)
 
 
-def test_there_is_room_for_sixteen_streams() -> None:
+def test_sixteen_streams_are_stored() -> None:
     signing = vehicle_signing()
     answers = [signing.accepts(heartbeat(client(link_id=number))) for number in range(17)]
     assert answers == [True] * 16 + [False]
@@ -158,7 +158,7 @@ def test_mav_sign_cfg_decides_about_unsigned_frames(policy: int, is_usb: bool, a
     one = client(None)
     mavlink_1 = bytes(dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3).pack(one, force_mavlink1=True))
     assert signing.accepts(mavlink_1) is accepted
-    assert signing.accepts(heartbeat(client(OTHER_KEY))) is accepted  # PX4 asks the same question of these
+    assert signing.accepts(heartbeat(client(OTHER_KEY))) is accepted  # PX4 has the same check of these
     assert signing.refused == ({} if accepted else {"unsigned": 2, "wrong signature": 1})
 
 
@@ -180,7 +180,7 @@ def test_any_bit_changed_makes_the_signature_wrong() -> None:
             assert not vehicle_signing().accepts(bytes(damaged))
 
 
-def test_setup_signing_is_taken_on_the_usb_link_alone(harness: SimHarness) -> None:
+def test_setup_signing_only_on_usb_link(harness: SimHarness) -> None:
     message = dialect.MAVLink_setup_signing_message(1, 1, KEY, START)
     harness.send(message, "onboard")
     assert not any(link.signing.has_key for link in harness.vehicle.links.values())
@@ -190,7 +190,7 @@ def test_setup_signing_is_taken_on_the_usb_link_alone(harness: SimHarness) -> No
     harness.send(dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
     harness.send(dialect.MAVLink_setup_signing_message(0, 0, KEY, START), "gcs", (245, 190))
     harness.fly(0.1)
-    assert not harness.received("SETUP_SIGNING")  # a key is passed on to nobody
+    assert not harness.received("SETUP_SIGNING")  # a key is not forwarded
     harness.send(dialect.MAVLink_setup_signing_message(1, 1, bytes(32), 0), "gcs", (245, 190))
     assert not harness.vehicle.links["gcs"].signing.has_key
 
@@ -217,7 +217,7 @@ def test_an_endpoint_refuses_and_counts_over_a_real_socket() -> None:
 @pytest.mark.parametrize(
     ("text", "words"), [("00" * 31, "31"), ("nothing", "neither"), ("", "0")], ids=["short", "word", "empty"]
 )
-def test_what_is_no_key_is_refused_without_repeating_it(text: str, words: str) -> None:
+def test_invalid_key_refused_without_repeating_it(text: str, words: str) -> None:
     with pytest.raises(ValueError, match=words):
         key_of(text)
 
@@ -266,7 +266,7 @@ def test_mavutil_with_the_key_flies(ports: tuple[int, int]) -> None:
 
 
 @pytest.mark.parametrize("key", [None, OTHER_KEY], ids=["unsigned", "wrong_key"])
-def test_mavutil_without_the_key_is_not_heard(ports: tuple[int, int], key: bytes | None) -> None:
+def test_mavutil_without_key_is_ignored(ports: tuple[int, int], key: bytes | None) -> None:
     link = mavutil.mavlink_connection(f"udpin:127.0.0.1:{ports[0]}", source_system=1, source_component=191)
     try:
         assert link.wait_heartbeat(timeout=20) is not None
@@ -277,7 +277,7 @@ def test_mavutil_without_the_key_is_not_heard(ports: tuple[int, int], key: bytes
             link.recv_match(type="ATTITUDE", blocking=True, timeout=5)
         link.setup_signing(KEY, sign_outgoing=True, allow_unsigned_callback=refused_unsigned)
         link.mav.ping_send(0, 78, 0, 0)
-        while True:  # the answers come in order: one to the first would have been here before
+        while True:  # answers arrive in order: one to the first would be here already
             answer = link.recv_match(type="PING", blocking=True, timeout=20)
             assert answer is not None
             if answer.target_system == 1:

@@ -1,4 +1,4 @@
-"""Commands that are not about flying: who is answered, and with which MAV_RESULT."""
+"""Commands other than flight commands: the addressees answered, and the MAV_RESULT."""
 
 import pytest
 from hypothesis import given, settings
@@ -58,13 +58,13 @@ def test_home_is_not_set_while_its_parameter_forbids_it(make_harness: type[SimHa
 
 
 @pytest.mark.parametrize("command", [0, 205, 310, 531, 2510])
-def test_what_px4_leaves_to_others_is_not_answered(harness: SimHarness, command: int) -> None:
+def test_commands_of_other_modules_not_answered(harness: SimHarness, command: int) -> None:
     harness.fly(0.1)
     assert harness.command(command) == []
 
 
 @pytest.mark.parametrize(("command", "result"), [(241, 1), (310, 2)])
-def test_an_armed_vehicle_is_not_calibrated_and_no_actuator_tested(
+def test_armed_vehicle_refuses_calibration_and_actuator_test(
     harness: SimHarness, command: int, result: int
 ) -> None:
     harness.wait_ready()
@@ -84,8 +84,8 @@ def test_available_modes_lists_one_or_all(harness: SimHarness) -> None:
     harness.fly(0.1)
     assert harness.command(512, 435, 0) == [0]
     listed = harness.received("AVAILABLE_MODES")
-    assert [told.mode_index for told in listed] == list(range(1, listed[0].number_modes + 1))
-    assert {told.custom_mode for told in listed} >= {0x00010000, 0x03040000, 0x04040000, 0x00060000}
+    assert [reported.mode_index for reported in listed] == list(range(1, listed[0].number_modes + 1))
+    assert {reported.custom_mode for reported in listed} >= {0x00010000, 0x03040000, 0x04040000, 0x00060000}
     harness.forget()
     assert harness.command(512, 435, 1) == [0]
     (manual,) = harness.received("AVAILABLE_MODES")
@@ -94,7 +94,7 @@ def test_available_modes_lists_one_or_all(harness: SimHarness) -> None:
     assert harness.command(512, 435, 200) == [2]
 
 
-def test_flight_information_tells_when_it_armed_and_took_off(harness: SimHarness) -> None:
+def test_flight_information_has_arming_and_takeoff_times(harness: SimHarness) -> None:
     harness.wait_ready()
     assert harness.command(512, 264) == [0]
     before = harness.received("FLIGHT_INFORMATION")[-1]
@@ -153,7 +153,7 @@ def test_a_message_that_it_does_not_have_is_denied(harness: SimHarness, identifi
     assert harness.command(512, identifier) == [2]
 
 
-def test_home_cannot_be_asked_for_before_it_is_known(harness: SimHarness) -> None:
+def test_home_denied_before_known(harness: SimHarness) -> None:
     harness.fly(0.5)
     assert harness.command(512, 242) == [2]
     harness.wait_ready()
@@ -179,7 +179,7 @@ def test_an_interval_is_honoured_switched_off_and_restored(harness: SimHarness) 
 
 
 @pytest.mark.parametrize("identifier", [27, 0, 60000])
-def test_the_interval_of_what_it_does_not_stream_cannot_be_set(harness: SimHarness, identifier: int) -> None:
+def test_interval_of_unknown_stream_fails(harness: SimHarness, identifier: int) -> None:
     harness.fly(0.1)
     assert harness.command(511, identifier, 100_000) == [4]
 
@@ -205,7 +205,7 @@ def test_the_interval_can_be_read_back(harness: SimHarness) -> None:
     assert (answer.message_id, answer.interval_us) == (32, 250_000)
 
 
-def test_a_timesync_request_is_answered_with_its_own_stamp_and_boot_time(harness: SimHarness) -> None:
+def test_timesync_answered_with_its_stamp_and_boot_time(harness: SimHarness) -> None:
     harness.fly(0.5)
     harness.forget()
     harness.send(dialect.MAVLink_timesync_message(0, 123456789))
@@ -221,7 +221,7 @@ def test_a_timesync_answer_is_not_answered(harness: SimHarness) -> None:
     assert harness.received("TIMESYNC") == []
 
 
-def test_a_ping_to_all_is_answered_to_its_sender_and_a_ping_to_it_is_not(harness: SimHarness) -> None:
+def test_ping_to_all_answered_to_its_sender_and_ping_to_it_not(harness: SimHarness) -> None:
     harness.send(dialect.MAVLink_ping_message(77, 5, 0, 0))
     answer = harness.received("PING")[0]
     assert (answer.time_usec, answer.seq, answer.target_system, answer.target_component) == (77, 5, 1, 191)
@@ -252,9 +252,7 @@ COMMANDS = [16, 20, 21, 22, 176, 178, 179, 185, 192, 193, 245, 300, 400, 401, 51
         max_size=6,
     )
 )
-def test_no_command_with_any_values_can_stop_the_vehicle(
-    make_harness: type[SimHarness], requests: list[tuple[int, list[float]]]
-) -> None:
+def test_no_command_raises(make_harness: type[SimHarness], requests: list[tuple[int, list[float]]]) -> None:
     harness = make_harness(["everything"], ready_after_s=0.0)
     harness.command(400, 1)
     for command, values in requests:

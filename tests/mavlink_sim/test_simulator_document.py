@@ -1,4 +1,4 @@
-"""What docs/simulator.md says can be typed is typed here, and what it says of installing is tried."""
+"""Runs the commands and examples of docs/simulator.md, and checks its list of packages."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ OF_THE_VEHICLE = [line for line in COMMANDS if line.startswith("mavlink-sim") an
 @pytest.mark.parametrize("line", OF_THE_VEHICLE)
 def test_every_command_of_the_vehicle_starts_it(line: str, tmp_path: Path) -> None:
     words = shlex.split(line)[1:]
-    if "--camera" in words:  # a name of this test alone
+    if "--camera" in words:  # a name only of this test
         words[words.index("--camera") + 1] = f"document-{tmp_path.parent.name}-{tmp_path.name}"
     ports = [str(port) for port in free_udp_ports(2)]
     elsewhere = ["--onboard-bind", "0", "--gcs-bind", "0", "--onboard-port", ports[0], "--gcs-port", ports[1]]
@@ -98,21 +98,21 @@ def test_the_example_for_pytest_passes(pytester: pytest.Pytester, monkeypatch: p
     result.assert_outcomes(passed=1)
 
 
-def test_the_example_for_continuous_integration_is_a_list_of_steps() -> None:
+def test_example_for_continuous_integration_is_list_of_steps() -> None:
     (block,) = blocks("yaml")
     steps = yaml.safe_load(block)
     assert all("run" in step or "uses" in step for step in steps)
     assert "--vehicle-logs=" in steps[1]["run"]
 
 
-def test_the_vehicle_needs_nothing_but_what_the_document_names() -> None:
+def test_vehicle_needs_only_documented_packages() -> None:
     code = """
 import sys
 for name in ("torch", "cv2", "zenoh", "mavsdk", "pydantic", "aioconsole", "yaml"):
     sys.modules[name] = None  # an import of it fails
 sys.argv = ["mavlink-sim", "--help"]
 import mavlink_sim.testing
-from mavlink_sim.cli import main
+from mavlink_sim.cli.main import main
 main()
 """
     finished = subprocess.run(

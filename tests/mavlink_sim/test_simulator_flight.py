@@ -68,7 +68,7 @@ class Companion:
         return -float(self.newest["LOCAL_POSITION_NED"].z)
 
 
-def test_pymavlink_flies_offboard_loses_the_stream_and_comes_home() -> None:
+def test_pymavlink_flies_offboard_loses_stream_and_comes_home() -> None:
     with running_simulator(speed=SPEED) as simulator:
         companion = Companion(simulator.onboard_port)
         companion.until(lambda: companion.newest["HEARTBEAT"].system_status == 3)
@@ -84,15 +84,15 @@ def test_pymavlink_flies_offboard_loses_the_stream_and_comes_home() -> None:
         companion.until(lambda: companion.mode() == 0x00060000, ahead)
         companion.until(lambda: companion.newest["LOCAL_POSITION_NED"].x > 5.0, ahead)
 
-        # no more setpoints: the failsafe takes over, returns and lands, and nobody commands anything
+        # no more setpoints: the failsafe returns and lands without any command
         companion.until(lambda: companion.newest["CURRENT_MODE"].custom_mode == 0x05040000)
         assert companion.newest["CURRENT_MODE"].intended_custom_mode == 0x00060000
         companion.until(lambda: companion.newest["HEARTBEAT"].system_status == 5)
         companion.until(lambda: not companion.armed(), limit_s=60.0)
 
-        place = companion.newest["LOCAL_POSITION_NED"]
-        assert abs(place.x) < 2.0
-        assert abs(place.y) < 2.0
+        position = companion.newest["LOCAL_POSITION_NED"]
+        assert abs(position.x) < 2.0
+        assert abs(position.y) < 2.0
         assert companion.newest["EXTENDED_SYS_STATE"].landed_state == 1
         companion.link.close()
         simulator.wait_for_event("disarmed (after landing)")
@@ -133,7 +133,9 @@ async def test_mavsdk_flies_the_vehicle() -> None:
             assert await action.get_takeoff_altitude() == pytest.approx(3.0)
             await action.arm()
             await action.takeoff()
-            await wait_for(telemetry.subscribe_position(), lambda place: place.relative_altitude_m > 2.2)
+            await wait_for(
+                telemetry.subscribe_position(), lambda position: position.relative_altitude_m > 2.2
+            )
             await wait_for(telemetry.subscribe_flight_mode(), lambda mode: mode.name == "HOLD")
             with pytest.raises(ActionError):
                 await action.disarm()  # in the air

@@ -1,4 +1,4 @@
-"""`mavlink-sim` as a process: its options, its ports, its words, its end."""
+"""`mavlink-sim` as a process: options, ports, output, exit."""
 
 import json
 import math
@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 from pymavlink import mavutil
 
-from mavlink_sim.cli import main
+from mavlink_sim.cli.main import main
 from mavlink_sim.testing import free_port, free_udp_ports, running_simulator
 from mavlink_sim.wire.endpoint import PEER_SILENCE_S, PortInUseError, UdpEndpoint
 from mavlink_sim.wire.messages import Outgoing, dialect, parser
@@ -68,15 +68,15 @@ def test_a_bad_value_gives_one_clear_line_and_code_two(
     with pytest.raises(SystemExit) as ended:
         main()
     assert ended.value.code == 2
-    said = capsys.readouterr()
-    assert said.out == ""
-    (line,) = said.err.strip().splitlines()
+    output = capsys.readouterr()
+    assert output.out == ""
+    (line,) = output.err.strip().splitlines()
     assert line.startswith("mavlink-sim: ")
     for word in words:
         assert word in line
 
 
-def test_a_ready_file_that_cannot_be_written_gives_one_clear_line_and_code_two() -> None:
+def test_unwritable_ready_file_is_one_line_and_code_2() -> None:
     finished = run("--onboard-bind", "0", "--gcs-bind", "0", "--ready-file", "/nonexistent/folder/ready")
     assert finished.returncode == 2
     assert len(finished.stderr.strip().splitlines()) == 1
@@ -89,18 +89,17 @@ def test_a_taken_port_gives_one_clear_line_and_code_two() -> None:
         port = taken.getsockname()[1]
         finished = run("--onboard-bind", str(port), "--gcs-bind", "0")
     assert finished.returncode == 2
-    assert finished.stderr.strip() == (
-        f"mavlink-sim: UDP port 127.0.0.1:{port} is already in use; stop its user or choose another port"
-    )
+    (line,) = finished.stderr.strip().splitlines()
+    assert f"127.0.0.1:{port}" in line
 
 
-def test_the_version_is_told() -> None:
+def test_version_is_printed() -> None:
     finished = run("--version")
     assert (finished.returncode, finished.stdout) == (0, f"mavlink-sim {version('mavlink-companion')}\n")
 
 
 def wander_m(truth: Path, **options: Any) -> float:
-    """How far a vehicle that holds its position gets from where it began to, horizontally, within 10 s."""
+    """The greatest horizontal distance of a vehicle from its hold position within 10 s."""
     with running_simulator(truth=truth, speed=10.0, ready_after=0.0, **options) as simulator:
         link = mavutil.mavlink_connection(f"udpin:127.0.0.1:{simulator.onboard_port}", source_system=245)
         link.wait_heartbeat(timeout=20)
@@ -111,41 +110,41 @@ def wander_m(truth: Path, **options: Any) -> float:
         while link.recv_match(type="ATTITUDE", blocking=True, timeout=20).time_boot_ms < held_ms + 12_000:
             pass
         link.close()
-    places = [json.loads(line)["position_ned_m"] for line in truth.read_text().splitlines()[-200:]]
-    return max(math.dist(place[:2], places[0][:2]) for place in places)
+    positions = [json.loads(line)["position_ned_m"] for line in truth.read_text().splitlines()[-200:]]
+    return max(math.dist(position[:2], positions[0][:2]) for position in positions)
 
 
-def test_without_wind_gusts_and_noise_the_air_is_still(tmp_path: Path) -> None:
+def test_without_wind_gusts_and_noise_it_is_still(tmp_path: Path) -> None:
     assert wander_m(tmp_path / "still.jsonl", wind=0, gusts=0, noise=False) < 0.001
     assert wander_m(tmp_path / "usual.jsonl", noise="off") > 0.05
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_it_in_good_order(number: signal.Signals) -> None:
+def test_signal_ends_it_cleanly(number: signal.Signals) -> None:
     with running_simulator() as simulator:
         simulator.process.send_signal(number)
         assert simulator.wait_for_event("stopped", 20.0) == "stopped"
         assert simulator.process.wait(20.0) == 0
 
 
-def fail_beside_a_vehicle_that_says(fault: str) -> None:
+def fail_with_running_vehicle(fault: str) -> None:
     with running_simulator() as simulator:
         simulator.fault(fault)
         simulator.wait_for_event(fault.split()[0], 20.0)
-        pytest.fail("as a time-out does")
+        pytest.fail("timeout")
 
 
-def test_what_fails_while_it_runs_carries_what_it_said_last() -> None:
-    with pytest.raises(pytest.fail.Exception, match="as a time-out does") as failure:
-        fail_beside_a_vehicle_that_says("wind speed=3 direction=90")
+def test_failure_note_has_last_events() -> None:
+    with pytest.raises(pytest.fail.Exception, match="timeout") as failure:
+        fail_with_running_vehicle("wind speed=3 direction=90")
     (note,) = failure.value.__notes__
     first, *lines = note.splitlines()
-    assert first == "the vehicle said last:"
+    assert first == "last events of the vehicle:"
     assert any("ready: system 1" in line for line in lines)
     assert any("wind" in line for line in lines)
 
 
-def test_the_ready_file_tells_pid_and_ports(tmp_path: Path) -> None:
+def test_ready_file_has_pid_and_ports(tmp_path: Path) -> None:
     ready = tmp_path / "ready.json"
     with running_simulator(ready_file=ready) as simulator:
         assert json.loads(ready.read_text()) == {
@@ -167,7 +166,7 @@ def test_both_links_send_from_the_start_and_answer() -> None:
             link.close()
 
 
-def test_the_clock_runs_as_fast_as_asked() -> None:
+def test_clock_runs_at_given_speed() -> None:
     with running_simulator(speed=8.0) as simulator:
         link = mavutil.mavlink_connection(f"udpin:127.0.0.1:{simulator.onboard_port}", source_system=245)
         first = link.recv_match(type="ATTITUDE", blocking=True, timeout=20)
@@ -175,7 +174,7 @@ def test_the_clock_runs_as_fast_as_asked() -> None:
         last = first
         while last.time_boot_ms - first.time_boot_ms < 8000:
             last = link.recv_match(type="ATTITUDE", blocking=True, timeout=20)
-        # only one side can be bounded: a busy machine makes it slower, nothing may make it faster
+        # only an upper bound: a busy machine makes it slower, nothing may make it faster
         assert time.monotonic() - started > 0.6
         link.close()
 
@@ -212,14 +211,14 @@ def test_the_truth_is_on_record_line_by_line(tmp_path: Path) -> None:
 
 
 def camera_process(pid: int) -> int:
-    """The process that draws for a simulator."""
+    """The camera process of a simulator."""
     for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
         if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes():
             return int(child)
     raise AssertionError("the simulator has no camera process")
 
 
-def test_the_camera_is_announced_and_its_loss_told_while_the_vehicle_flies_on(tmp_path: Path) -> None:
+def test_camera_start_and_loss_reported_vehicle_continues(tmp_path: Path) -> None:
     name = f"camera-{tmp_path.parent.name}-{tmp_path.name}-{os.getpid()}"
     with running_simulator(camera=name, camera_rate=10.0) as simulator:
         simulator.wait_for_event(f"camera {name} is on", 60.0)
@@ -230,7 +229,7 @@ def test_the_camera_is_announced_and_its_loss_told_while_the_vehicle_flies_on(tm
                 frame = reader.latest()
         assert frame is not None
         assert frame.image.shape == (480, 640, 3)
-        assert frame.image.std() > 5.0  # a picture, not a blank
+        assert frame.image.std() > 5.0  # not a blank image
         assert 0 <= time.monotonic_ns() - frame.captured_ns < 60e9
         os.kill(camera_process(simulator.pid), signal.SIGKILL)
         simulator.wait_for_event(f"camera {name} is lost", 20.0)
@@ -270,11 +269,11 @@ def test_an_endpoint_says_which_port_is_taken() -> None:
         first.close()
 
 
-def test_an_endpoint_answers_its_first_correspondent_until_that_one_falls_silent(
+def test_endpoint_keeps_first_peer_until_silent(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    unheard = free_port()
-    endpoint = UdpEndpoint("127.0.0.1", 0, unheard)
+    silent_peer = free_port()
+    endpoint = UdpEndpoint("127.0.0.1", 0, silent_peer)
     peers = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2)]
     beat = dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3)
     clock = [100.0]
@@ -286,9 +285,9 @@ def test_an_endpoint_answers_its_first_correspondent_until_that_one_falls_silent
         for peer in peers:
             peer.sendto(beat.pack(parser(1, 191)), ("127.0.0.1", endpoint.port))
         deadline = time.perf_counter() + 10.0
-        heard = 0
-        while heard < 2 and time.perf_counter() < deadline:
-            heard += len(endpoint.receive())
+        received = 0
+        while received < 2 and time.perf_counter() < deadline:
+            received += len(endpoint.receive())
         assert endpoint.peer == peers[0].getsockname()
         clock[0] += PEER_SILENCE_S + 0.1
         peers[1].sendto(beat.pack(parser(1, 191)), ("127.0.0.1", endpoint.port))
@@ -318,9 +317,9 @@ def test_garbage_is_skipped_and_the_message_after_it_read() -> None:
     assert set(found) == {"HEARTBEAT"}
 
 
-def test_a_vehicle_without_a_camera_needs_no_library_of_pictures_and_no_zenoh() -> None:
+def test_without_camera_no_opencv_and_no_zenoh() -> None:
     code = (
-        "import sys, mavlink_sim.cli, mavlink_sim.testing; from mavlink_sim import LockstepVehicle\n"
+        "import sys, mavlink_sim.cli.main, mavlink_sim.testing; from mavlink_sim import LockstepVehicle\n"
         "vehicle = LockstepVehicle(gimbal=True); vehicle.take_off()\n"
         "print(*({'numpy', 'cv2', 'zenoh', 'av'} & set(sys.modules)))"
     )

@@ -11,7 +11,7 @@ from mavsdk.asyncio.plugins.offboard import Attitude, AttitudeRate, OffboardAsyn
 from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
 
 from mavlink_sim.physics.airframe import GRAVITY_MPS2, MAX_THRUST_MPS2
-from mavlink_sim.physics.geography import HOME_ALTITUDE_M, geographic, local
+from mavlink_sim.physics.geography import HOME_ALTITUDE_M, SIH_FRAME
 from mavlink_sim.testing import RunningSimulator
 from tests.mavlink_sim.mavsdk_client import mavsdk_client, wait_for
 
@@ -51,7 +51,7 @@ async def test_mavsdk_flies_every_kind_of_setpoint(vehicle: RunningSimulator) ->
         )
 
         # a global position, relative to home
-        latitude, longitude, _ = geographic((-6.0, 4.0, 0.0))
+        latitude, longitude, _ = SIH_FRAME.geographic((-6.0, 4.0, 0.0))
         relative = PositionGlobalYaw.AltitudeType.REL_HOME
         await offboard.set_position_global(PositionGlobalYaw(latitude, longitude, 10.0, 90.0, relative))
         await wait_for(
@@ -60,8 +60,8 @@ async def test_mavsdk_flies_every_kind_of_setpoint(vehicle: RunningSimulator) ->
         )
         await wait_for(telemetry.subscribe_heading(), lambda heading: abs(heading.heading_deg - 90) < 5)
 
-        # round a place at a radius
-        centre = geographic((4.0, 4.0, 0.0))
+        # an orbit
+        centre = SIH_FRAME.geographic((4.0, 4.0, 0.0))
         await action.do_orbit(
             6.0,
             2.0,
@@ -77,14 +77,16 @@ async def test_mavsdk_flies_every_kind_of_setpoint(vehicle: RunningSimulator) ->
         )
 
         # and straight to another
-        goal = geographic((0.0, -8.0, 0.0))
+        goal = SIH_FRAME.geographic((0.0, -8.0, 0.0))
         await action.set_current_speed(3.0)
         await action.goto_location(goal[0], goal[1], HOME_ALTITUDE_M + 7.0, 0.0)
         reached = await wait_for(
             telemetry.subscribe_position(),
-            lambda place: (
+            lambda position: (
                 math.dist(
-                    local(place.latitude_deg, place.longitude_deg, place.absolute_altitude_m),
+                    SIH_FRAME.local(
+                        position.latitude_deg, position.longitude_deg, position.absolute_altitude_m
+                    ),
                     (0.0, -8.0, -7.0),
                 )
                 < 0.7

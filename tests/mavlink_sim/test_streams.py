@@ -1,4 +1,4 @@
-"""Which messages arrive on which link, how often, and in the form a real vehicle sends them."""
+"""The messages of each link, their rates, and their fields as on a real vehicle."""
 
 import math
 import os
@@ -26,7 +26,7 @@ def counts(harness: SimHarness, link: str, seconds: float) -> Counter[str]:
     return Counter(item.message.get_type() for _, item in harness.inbox[link])
 
 
-# As counted of a real PX4, disarmed, over 20 s; none of the vehicle's own tables is asked.
+# As counted on a real PX4, disarmed, over 20 s; independent of the vehicle's tables.
 MEASURED_ONBOARD_HZ = {
     "ATTITUDE": 98.5,
     **dict.fromkeys(("ATTITUDE_QUATERNION", "GLOBAL_POSITION_INT", "HIGHRES_IMU"), 49.0),
@@ -57,12 +57,12 @@ def settled(harness: SimHarness) -> SimHarness:
 
 def test_the_onboard_streams_have_the_measured_rates(settled: SimHarness) -> None:
     seen = counts(settled, "onboard", 20.0)
-    assert set(seen) == set(MEASURED_ONBOARD_HZ)  # nothing else, and no RC_CHANNELS above all
+    assert set(seen) == set(MEASURED_ONBOARD_HZ)  # nothing else, in particular no RC_CHANNELS
     for name, rate in MEASURED_ONBOARD_HZ.items():
         assert seen[name] / 20.0 == pytest.approx(rate, rel=0.01, abs=0.051), name
 
 
-def test_the_ground_stations_streams_have_the_measured_rates_and_the_rest_1_hz_or_less(
+def test_gcs_streams_have_measured_rates(
     settled: SimHarness,
 ) -> None:
     seen = counts(settled, "gcs", 20.0)
@@ -73,7 +73,7 @@ def test_the_ground_stations_streams_have_the_measured_rates_and_the_rest_1_hz_o
     assert max(seen.values()) <= 21
 
 
-def test_a_mode_that_flies_to_a_place_tells_it(harness: SimHarness) -> None:
+def test_modes_with_goal_stream_position_target_global(harness: SimHarness) -> None:
     harness.take_off(5.0)
     harness.forget()
     harness.fly(1.0)
@@ -82,7 +82,7 @@ def test_a_mode_that_flies_to_a_place_tells_it(harness: SimHarness) -> None:
     assert goals[-1].alt == pytest.approx(494.4, abs=0.1)
 
 
-def test_the_origin_is_told_once_and_on_request(harness: SimHarness) -> None:
+def test_origin_sent_once_and_on_request(harness: SimHarness) -> None:
     harness.fly(10.0)
     assert len(harness.received("GPS_GLOBAL_ORIGIN")) == 1
     assert harness.command(512, 49) == [0]
@@ -116,7 +116,7 @@ def test_the_messages_agree_with_each_other_and_with_the_truth(
     assert harness.received("DISTANCE_SENSOR")[-1].current_distance == pytest.approx(-down * 100, abs=5)
 
 
-def test_a_stream_that_was_held_up_skips_instead_of_bursting() -> None:
+def test_delayed_stream_skips_instead_of_bursting() -> None:
     streams = Streams({"ATTITUDE": 100.0})
     assert streams.due(1_000_000) == ["ATTITUDE"]
     assert streams.due(1_000_000) == []
@@ -155,7 +155,7 @@ NAMES_OF_UNKNOWN = {
 }
 
 
-def test_a_flight_yields_the_same_kinds_of_messages_as_the_real_one(
+def test_flight_yields_same_kinds_of_messages_as_real_one(
     harness: SimHarness, recorded: dict[str, list[Any]], velocity_setpoint: Any
 ) -> None:
     harness.take_off()
@@ -166,7 +166,7 @@ def test_a_flight_yields_the_same_kinds_of_messages_as_the_real_one(
     harness.until(lambda: not harness.armed, 40.0)
     ours = {item.message.get_type() for _, item in harness.inbox["onboard"]}
     theirs = {NAMES_OF_UNKNOWN.get(name, name) for name in recorded}
-    assert theirs - ours == {"PARAM_VALUE"}  # a few that PX4 sends unasked when a parameter changes
+    assert theirs - ours == {"PARAM_VALUE"}  # a few that PX4 sends unrequested when a parameter changes
     assert ours - theirs == set()
 
 

@@ -1,4 +1,4 @@
-"""All that a vehicle says, in every kind of flight, can be put on the wire and is finite where it must be."""
+"""Every message of a vehicle, in every kind of flight, can be packed and is finite where required."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def sticks(harness: SimHarness) -> None:
 @pytest.mark.parametrize(
     "flight", [mission, return_to_a_rally_point, precision_landing, geofence, orbit, sticks]
 )
-def test_all_that_is_said_in_a_flight_can_be_put_on_the_wire(
+def test_every_message_of_flights_can_be_packed(
     make_harness: type[SimHarness], flight: Callable[[Any], None]
 ) -> None:
     joystick = {"COM_RC_IN_MODE": 1} if flight is sticks else {}
@@ -75,12 +75,12 @@ def test_all_that_is_said_in_a_flight_can_be_put_on_the_wire(
     harness.take_off(6.0)
     harness.forget()
     flight(harness)
-    assert {told.custom_mode for told in harness.received("HEARTBEAT")} - {HOLD}
+    assert {received.custom_mode for received in harness.received("HEARTBEAT")} - {HOLD}
     codec = parser(1)
     for link in ("onboard", "gcs"):
         for _, item in harness.inbox[link]:
             assert item.pack(codec)
         for kind, names in NUMBERS.items():
-            for told in harness.received(kind, link):
-                assert all(math.isfinite(getattr(told, name)) for name in names), told
+            for received in harness.received(kind, link):
+                assert all(math.isfinite(getattr(received, name)) for name in names), received
     assert len(harness.received("ATTITUDE")) > 300

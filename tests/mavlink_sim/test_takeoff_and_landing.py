@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from mavlink_sim.physics.geography import geographic
+from mavlink_sim.physics.geography import SIH_FRAME
 from tests.mavlink_sim.conftest import SimHarness
 
 NAN = math.nan
@@ -38,9 +38,7 @@ def test_take_off_climbs_to_two_and_a_half_metres_and_holds(harness: SimHarness)
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_in_moving_air_too_hold_begins_after_6_5_to_9_s_at_1_8_to_2_2_m(
-    make_harness: type[SimHarness], seed: int
-) -> None:
+def test_takeoff_with_gusts_ends_as_measured(make_harness: type[SimHarness], seed: int) -> None:
     harness = make_harness(noise=True, gusts_mps=None, seed=seed)
     harness.wait_ready()
     assert harness.command(400, 1) == [0]
@@ -62,7 +60,7 @@ def test_a_higher_take_off_holds_as_soon_as_measured(
     assert least_s <= harness.until(lambda: harness.mode == "HOLD") + 0.04 <= most_s
 
 
-def test_it_is_in_air_as_hold_begins_and_not_before(harness: SimHarness) -> None:
+def test_in_air_only_when_hold_begins(harness: SimHarness) -> None:
     harness.wait_ready()
     harness.command(400, 1)
     harness.command(22, NAN, 0, 0, NAN, NAN, NAN, NAN)
@@ -94,7 +92,7 @@ def test_take_off_is_accepted_before_arming_and_waits_for_it(harness: SimHarness
     assert harness.height_m > 1.5
 
 
-def test_the_mode_take_off_alone_takes_off_once_armed(harness: SimHarness) -> None:
+def test_takeoff_mode_takes_off_once_armed(harness: SimHarness) -> None:
     harness.wait_ready()
     assert harness.set_mode(4, 2) == [0, 0]
     assert harness.command(400, 1) == [0]
@@ -111,7 +109,7 @@ def test_take_off_while_flying_is_accepted_and_does_not_descend(harness: SimHarn
     assert harness.mode == "HOLD"
 
 
-def test_landing_touches_down_softly_and_disarms_two_seconds_later(harness: SimHarness) -> None:
+def test_landing_touches_down_softly_and_disarms_2_s_later(harness: SimHarness) -> None:
     harness.take_off(4.0)
     harness.fly(4.0)
     harness.forget()
@@ -125,7 +123,7 @@ def test_landing_touches_down_softly_and_disarms_two_seconds_later(harness: SimH
     assert landed_states(harness) == [4, 1]
 
 
-def test_after_a_landing_the_mode_chosen_before_it_comes_back(harness: SimHarness) -> None:
+def test_mode_before_landing_restored(harness: SimHarness) -> None:
     harness.take_off()
     harness.command(21)
     harness.until(lambda: not harness.armed, 30.0)
@@ -154,12 +152,12 @@ def test_return_close_to_home_stays_low_lands_and_disarms(harness: SimHarness) -
     harness.until(lambda: not harness.armed, 60.0)
     assert highest < 4.5
     assert landed_states(harness)[-2:] == [4, 1]
-    said = harness.texts()
-    assert said[:2] == ["Returning to launch\t", "RTL: start return at 493 m (4 m above destination)\t"]
-    assert said[-3:] == ["RTL: land at destination\t", "Landing detected\t", "Disarmed by landing\t"]
+    texts = harness.texts()
+    assert texts[:2] == ["Returning to launch\t", "RTL: start return at 493 m (4 m above destination)\t"]
+    assert texts[-3:] == ["RTL: land at destination\t", "Landing detected\t", "Disarmed by landing\t"]
 
 
-def test_return_from_afar_climbs_to_the_return_altitude_and_lands_at_home(
+def test_return_from_afar_climbs_first_and_lands_at_home(
     make_harness: type[SimHarness],
 ) -> None:
     harness = make_harness(parameters={"RTL_RETURN_ALT": 12.0})
@@ -180,7 +178,7 @@ def test_return_from_afar_climbs_to_the_return_altitude_and_lands_at_home(
     harness.until(done, 90.0)
     assert 11.5 < highest < 13.0
     assert math.hypot(*harness.vehicle.airframe.position[:2]) < 1.0
-    # and lands as it stood when it was armed: so did a real PX4
+    # and lands with the heading at arming, as measured on a real PX4
     assert harness.vehicle.airframe.yaw_rad == pytest.approx(0.0, abs=0.05)
 
 
@@ -193,7 +191,7 @@ def test_close_to_home_a_return_turns_to_the_heading_of_home(
 ) -> None:
     harness = make_harness(parameters=parameters)
     harness.take_off(5.0)
-    latitude, longitude, altitude = geographic((0.0, 0.0, 0.0))
+    latitude, longitude, altitude = SIH_FRAME.geographic((0.0, 0.0, 0.0))
     assert harness.command(179, 0, 0, 0, heading_deg, latitude, longitude, altitude) == [0]
     at, above = (round(latitude * 1e7) + 540, round(longitude * 1e7)), altitude + 5.0  # 6 m north
     assert harness.command_int(192, (-1, 1, 0, math.radians(120.0)), *at, above) == [0]
@@ -212,9 +210,9 @@ def test_return_in_moving_air_ends_at_home_too(
     harness.take_off(6.0)
     away = velocity_setpoint(3, 0, 0)
     harness.offboard(away)
-    harness.fly(6.0, away)  # and then nothing: the failsafe returns
+    harness.fly(6.0, away)  # no more setpoints: the failsafe returns
     harness.until(lambda: not harness.armed, 90.0)
-    # the gusts of the last metres decide: with other seeds it is 0.4 to 3 m
+    # depends on the gusts of the last metres: with other seeds it is 0.4 to 3 m
     assert math.hypot(*harness.vehicle.airframe.position[:2]) < 3.5
 
 
@@ -223,7 +221,7 @@ def test_reposition_flies_there_and_turns_to_the_given_heading(harness: SimHarne
     assert harness.command_int(192, (-1, 1, 0, math.pi / 2), 473978330, 85455942, 497.4) == [0]
     harness.fly(25.0)
     north, east, down = harness.vehicle.airframe.position
-    assert north == pytest.approx(10.0, abs=0.6)  # the integrator lets go slowly
+    assert north == pytest.approx(10.0, abs=0.6)  # the integrator decays slowly
     assert east == pytest.approx(0.0, abs=0.3)
     assert down == pytest.approx(-8.0, abs=0.3)
     assert harness.vehicle.airframe.yaw_rad == pytest.approx(math.pi / 2, abs=0.05)
@@ -247,7 +245,7 @@ def test_hold_brakes_and_stays(harness: SimHarness, velocity_setpoint: Any) -> N
     assert 1.0 < harness.vehicle.airframe.position[0] - before < 8.0
 
 
-def test_a_gimbal_is_looked_after_at_every_landing(harness: SimHarness) -> None:
+def test_gimbal_commands_sent_at_every_landing(harness: SimHarness) -> None:
     harness.take_off(4.0)
     harness.forget()
     harness.command(21)

@@ -49,7 +49,7 @@ def test_a_folder_that_cannot_be_made_is_an_error(tmp_path: Path) -> None:
         pass
 
 
-def test_a_full_disk_ends_the_record_aloud_and_not_the_flight(caplog: pytest.LogCaptureFixture) -> None:
+def test_full_disk_ends_record_not_flight(caplog: pytest.LogCaptureFixture) -> None:
     with open("/dev/full", "wb", buffering=0) as full, caplog.at_level(logging.WARNING):
         log = TrafficLog(full)
         log.record(b"packet")

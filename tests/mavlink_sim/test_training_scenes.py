@@ -1,4 +1,4 @@
-"""Labelled pictures: the same again from the same seed, labels that can be seen."""
+"""Labelled images: repeatable from a seed, visible labels."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_a_scene_follows_from_its_generator_alone() -> None:
         assert np.array_equal(one, other)
 
 
-def test_picture_i_is_the_same_whatever_the_count() -> None:
+def test_image_i_is_independent_of_count() -> None:
     short = list(render_dataset(2, 3, 128, 128))
     long = list(render_dataset(3, 3, 128, 128))
     assert np.array_equal(short[1][0], long[1][0])
@@ -60,7 +60,7 @@ def test_scenes_have_the_size_and_types_they_promise(scenes: Scenes) -> None:
         assert ids.dtype == np.int64
 
 
-def test_every_label_is_inside_the_picture_and_large_enough(scenes: Scenes) -> None:
+def test_labels_are_inside_image_and_large_enough(scenes: Scenes) -> None:
     for _, boxes, ids in scenes:
         sides = boxes[:, 2:] - boxes[:, :2]
         assert (boxes >= 0).all()
@@ -70,7 +70,7 @@ def test_every_label_is_inside_the_picture_and_large_enough(scenes: Scenes) -> N
         assert ((ids >= 0) & (ids < len(CLASS_NAMES))).all()
 
 
-def test_most_pictures_show_several_things_and_some_show_none(scenes: Scenes) -> None:
+def test_most_images_show_several_objects(scenes: Scenes) -> None:
     counts = np.array([len(ids) for _, _, ids in scenes])
     assert 3.0 < counts.mean() < 10.0
     assert counts.max() <= 14
@@ -80,7 +80,7 @@ def test_most_pictures_show_several_things_and_some_show_none(scenes: Scenes) ->
 
 
 def test_the_focal_length_is_within_what_was_asked() -> None:
-    """A longer lens makes things larger: with only long lenses the boxes grow."""
+    """A longer lens makes objects larger: with only long lenses the boxes grow."""
 
     def mean_side(focal_px: tuple[float, float]) -> float:
         sides: list[float] = []
@@ -100,7 +100,7 @@ def test_other_frames_follow_from_their_generator_too(draw: Callable[..., Render
     assert not np.array_equal(first.image, draw(np.random.default_rng(6), 160, 128).image)
 
 
-def test_what_is_too_small_to_learn_has_an_id_below_zero() -> None:
+def test_too_small_objects_have_negative_id() -> None:
     small = 0
     for n in range(12):
         _, boxes, ids = training_scene(np.random.default_rng((3, n)), 160, 128)

@@ -1,4 +1,4 @@
-"""The truth on a disk that takes no more."""
+"""The truth file on a full disk."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ FULL = Path("/dev/full")
 needs_full = pytest.mark.skipif(not FULL.exists(), reason="no /dev/full here")
 
 
-def test_each_line_is_there_when_it_was_written(tmp_path: Path) -> None:
+def test_each_line_is_flushed(tmp_path: Path) -> None:
     file = TruthFile(tmp_path / "truth.jsonl")
     assert file.write(json.dumps({"a": 1})) is None
     assert (tmp_path / "truth.jsonl").read_text() == '{"a": 1}\n'
@@ -24,14 +24,14 @@ def test_each_line_is_there_when_it_was_written(tmp_path: Path) -> None:
 
 
 @needs_full
-def test_a_full_disk_is_told_once_and_ends_the_file() -> None:
+def test_full_disk_reported_once_and_ends_file() -> None:
     file = TruthFile(FULL)
-    assert file.write("line") == "the truth is no longer written to /dev/full: No space left on device"
+    assert "/dev/full" in (file.write("line") or "")
     assert file.write("line") is None
 
 
 @needs_full
-def test_the_vehicle_flies_on_when_its_truth_is_no_longer_written() -> None:
+def test_vehicle_continues_after_truth_write_error() -> None:
     with running_simulator(truth=FULL) as simulator:
-        simulator.wait_for_event("the truth is no longer written to /dev/full: No space left on device")
+        simulator.wait_for_event("/dev/full")
         assert simulator.process.poll() is None

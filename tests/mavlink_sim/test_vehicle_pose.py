@@ -92,7 +92,7 @@ def test_simulator_truth_replaces_the_estimate() -> None:
     assert history.monotonic_ns(90 * MS) == 90 * MS
 
 
-def test_a_clock_that_starts_again_starts_the_history_again() -> None:
+def test_clock_restart_resets_history() -> None:
     history = history_of(position(90_000, 1.0), attitude_quaternion(90_000, 0.0))
     history.add(position(500, 3.0), BOOTED_NS + 99_000 * MS)
     history.add(attitude_quaternion(500, 0.0), BOOTED_NS + 99_000 * MS)
@@ -100,12 +100,12 @@ def test_a_clock_that_starts_again_starts_the_history_again() -> None:
     assert history.monotonic_ns(500 * MS) == BOOTED_NS + 99_000 * MS
 
 
-def test_values_that_are_not_finite_are_no_pose() -> None:
+def test_non_finite_values_are_no_pose() -> None:
     history = history_of(position(1000, math.nan), attitude_quaternion(1000, math.nan))
     assert history.span_ns is None
 
 
-def test_clock_goes_by_the_message_delayed_least() -> None:
+def test_clock_uses_least_delayed_message() -> None:
     rng = np.random.default_rng(5)
     clock = BootClock()
     errors = []
@@ -123,7 +123,7 @@ def test_clock_follows_a_simulation_slower_than_real_time() -> None:
     for step in range(2000):
         clock.add(step * 9 * MS, BOOTED_NS + step * 10 * MS)
     lag_ns = BOOTED_NS + 1999 * 10 * MS - clock.monotonic_ns(1999 * 9 * MS)
-    assert 0 <= lag_ns < 0.45e9  # a tenth of two windows, and a little
+    assert 0 <= lag_ns < 0.45e9  # a tenth of two windows, with a margin
 
 
 def test_drawn_pose_is_the_vehicles_in_a_manoeuvre() -> None:
@@ -153,12 +153,12 @@ def test_drawn_pose_is_the_vehicles_in_a_manoeuvre() -> None:
     moved_m = math.dist(truths[0][1], truths[-1][1])
     assert moved_m > 8.0
     errors_m, errors_deg = [], []
-    for now_ns, place, quaternion in truths:
+    for now_ns, position, quaternion in truths:
         if not span[0] <= now_ns <= span[1]:
             continue
-        stamp_ns = history.monotonic_ns(now_ns) - BOOTED_NS  # what the frame's stamp says, less the boot
+        stamp_ns = history.monotonic_ns(now_ns) - BOOTED_NS  # the frame's stamp, less the boot
         pose = history.at(now_ns)
-        errors_m.append(math.dist(pose.position, place) + 3.6 * abs(stamp_ns - now_ns) / 1e9)
+        errors_m.append(math.dist(pose.position, position) + 3.6 * abs(stamp_ns - now_ns) / 1e9)
         cosine = abs(sum(a * b for a, b in zip(pose.attitude, quaternion, strict=True)))
         errors_deg.append(math.degrees(2 * math.acos(min(cosine, 1.0))))
     assert len(errors_m) > 500

@@ -1,4 +1,4 @@
-"""Where things stand, and how far they are."""
+"""Positions and ranges of a world's objects."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ def test_cars_stand_18_to_35_metres_from_the_origin(world: World) -> None:
         assert 18.0 <= math.hypot(*car.position_ned_m[:2]) <= 35.0
 
 
-def test_nothing_stands_within_6_metres_of_the_origin(world: World) -> None:
+def test_no_object_within_6_m_of_origin(world: World) -> None:
     assert min(range_to(item, (0.0, 0.0, 0.0)) for item in world.objects) > 6.0
 
 
-def test_nothing_stands_between_the_origin_and_a_car(world: World) -> None:
+def test_no_object_between_origin_and_car(world: World) -> None:
     for car in world.of_class("car"):
         north, east, _ = car.position_ned_m
         for step in range(1, 18):
@@ -43,7 +43,7 @@ def test_nothing_stands_between_the_origin_and_a_car(world: World) -> None:
             assert min(others) > 0.0
 
 
-def test_no_two_things_stand_in_each_other(world: World) -> None:
+def test_objects_do_not_overlap(world: World) -> None:
     for item in world.objects:
         for other in world.objects:
             if other is not item:
@@ -54,12 +54,12 @@ def test_identifiers_number_the_objects(world: World) -> None:
     assert [item.identifier for item in world.objects] == list(range(len(world.objects)))
 
 
-def test_a_seed_makes_the_same_world_again_and_another_seed_another() -> None:
+def test_seed_makes_same_world_again_and_another_seed_another() -> None:
     assert demo_world(3) == demo_world(3)
     assert demo_world(3) != demo_world(4)
 
 
-def test_a_world_crosses_to_another_process_small() -> None:
+def test_world_pickle_is_small() -> None:
     world = demo_world(1)
     packed = pickle.dumps(world)
     assert pickle.loads(packed) == world
@@ -73,7 +73,7 @@ def test_a_world_crosses_to_another_process_small() -> None:
     north=st.floats(-50.0, 50.0),
     scale=st.floats(0.5, 2.0),
 )
-def test_the_range_is_the_least_distance_to_any_point_of_the_footprint(
+def test_range_is_least_distance_to_any_point_of_footprint(
     yaw: float, bearing: float, distance: float, north: float, scale: float
 ) -> None:
     car = WorldObject(0, "car", (north, -7.0, 0.0), yaw, scale, 3)
@@ -91,15 +91,15 @@ def test_the_range_is_the_least_distance_to_any_point_of_the_footprint(
     assert range_to(car, point) == pytest.approx(sampled, abs=0.1 * scale)
 
 
-def test_the_range_straight_ahead_of_a_car_counts_from_its_bumper() -> None:
+def test_range_ahead_of_car_is_to_its_bumper() -> None:
     car = WorldObject(0, "car", (10.0, 0.0, 0.0), math.pi, 1.0, 0)
     _, front, _, _ = car.footprint_m
     assert range_to(car, (0.0, 0.0, -3.0)) == pytest.approx(10.0 - front)
     assert range_to(car, (10.0, 0.0, 0.0)) == 0.0
 
 
-def test_a_class_that_cannot_be_drawn_is_refused_by_name() -> None:
+def test_unknown_class_refused() -> None:
     with pytest.raises(ValueError, match="unknown class 'zebra'"):
         WorldObject(0, "zebra", (0.0, 0.0, 0.0))
-    with pytest.raises(ValueError, match="scale must be positive"):
+    with pytest.raises(ValueError, match="scale"):
         WorldObject(0, "car", (0.0, 0.0, 0.0), scale=0.0)

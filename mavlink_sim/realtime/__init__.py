@@ -1,0 +1,1 @@
+"""Vehicles in real time, over UDP."""

@@ -1,0 +1,1 @@
+"""The vehicles, one for each firmware, and the world around them."""

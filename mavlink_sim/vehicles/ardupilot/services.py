@@ -1,0 +1,139 @@
+"""Copter's handler of each received message."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+from mavlink_sim.flight.precision_landing import LandingTarget
+from mavlink_sim.flight.setpoints import (
+    ATTITUDE_IGNORE,
+    BODY_YAW_RATE_IGNORE,
+    PITCH_RATE_IGNORE,
+    ROLL_RATE_IGNORE,
+    THROTTLE_IGNORE,
+)
+from mavlink_sim.services import manual_control_service, microservices
+from mavlink_sim.vehicles.ardupilot import commands, landing, parameter_service, streams, targets
+from mavlink_sim.vehicles.ardupilot.context import CopterContext
+from mavlink_sim.vehicles.ardupilot.guided import THRUST_AS_THRUST, Attitude
+from mavlink_sim.wire.announcements import INFO
+from mavlink_sim.wire.links import Link
+from mavlink_sim.wire.messages import dialect
+
+RATES_IGNORE = ROLL_RATE_IGNORE | PITCH_RATE_IGNORE | BODY_YAW_RATE_IGNORE
+MISSION_UNSUPPORTED = 3  # MAV_MISSION_UNSUPPORTED
+UNIT_TOLERANCE = 1e-3
+
+
+def _heartbeat(vehicle: CopterContext, link: Link, message: Any) -> None:
+    if message.get_srcSystem() == int(vehicle.parameters.number("SYSID_MYGCS")):
+        vehicle.copter.watch.ground_station_seen_s = vehicle.now_s
+
+
+def _local_target(vehicle: CopterContext, link: Link, message: Any) -> None:
+    """Outside GUIDED it is silently ignored."""
+    guided = vehicle.copter.guided
+    if guided is not None:
+        frame = vehicle.estimate
+        guided.fly(targets.local_target(message, frame.position, frame.yaw_rad))
+
+
+def _global_target(vehicle: CopterContext, link: Link, message: Any) -> None:
+    guided = vehicle.copter.guided
+    if guided is not None:
+        guided.fly(targets.global_target(message, vehicle.local_frame, vehicle.copter.home.position))
+
+
+def _attitude_target(vehicle: CopterContext, link: Link, message: Any) -> None:
+    """Attitude, all three body rates, or both, and a thrust; any other combination stops the vehicle."""
+    guided = vehicle.copter.guided
+    if guided is None:
+        return
+    mask = int(message.type_mask)
+    ignored = mask & RATES_IGNORE
+    quaternion = None
+    if not mask & ATTITUDE_IGNORE:
+        w, x, y, z = (float(value) for value in message.q)
+        quaternion = (w, x, y, z)
+    rates = (message.body_roll_rate, message.body_pitch_rate, message.body_yaw_rate)
+    sound = (
+        not mask & THROTTLE_IGNORE
+        and ignored in (0, RATES_IGNORE)
+        and math.isfinite(message.thrust)
+        and all(math.isfinite(rate) for rate in rates)
+        and (quaternion is None or abs(math.hypot(*quaternion) - 1.0) < UNIT_TOLERANCE)
+    )
+    if not sound:
+        guided.fly(targets.STOP)
+        return
+    given = None if ignored else rates
+    if int(vehicle.parameters.number("GUID_OPTIONS")) & THRUST_AS_THRUST:
+        guided.fly_attitude(Attitude(quaternion, given, 0.0, min(max(message.thrust, 0.0), 1.0)))
+        return
+    share = (min(max(message.thrust, 0.0), 1.0) - 0.5) * 2.0
+    name = "WPNAV_SPEED_UP" if share > 0.0 else "WPNAV_SPEED_DN"
+    climb = share * vehicle.parameters.number(name) / 100.0
+    guided.fly_attitude(Attitude(quaternion, given, climb))
+
+
+def _landing_target(vehicle: CopterContext, link: Link, message: Any) -> None:
+    """LANDING_TARGET: used if precision landing is enabled with type 1 (MAVLink)."""
+    value = vehicle.parameters.number
+    if not value("PLND_ENABLED") or value("PLND_TYPE") != landing.COMPANION_TYPE:
+        return
+    frame = vehicle.estimate
+    height = -vehicle.airframe.position[2]
+    try:
+        point = landing.target_position(message, frame.position, frame.quaternion, height)
+    except landing.UnsupportedTargetError as error:
+        vehicle.send_text_once(INFO, str(error))
+        return
+    if point is not None:
+        vehicle.copter.navigator.target = LandingTarget(point, vehicle.now_s)
+
+
+def _no_mission(vehicle: CopterContext, link: Link, message: Any) -> None:
+    """Missions are not simulated: the list is empty, an upload is refused."""
+    sender = (message.get_srcSystem(), message.get_srcComponent())
+    kind = int(getattr(message, "mission_type", 0))
+    if message.get_type() == "MISSION_REQUEST_LIST":
+        link.send(dialect.MAVLink_mission_count_message(*sender, 0, kind))
+    else:
+        link.send(dialect.MAVLink_mission_ack_message(*sender, MISSION_UNSUPPORTED, kind))
+
+
+def _setup_signing(vehicle: CopterContext, link: Link, message: Any) -> None:
+    """SETUP_SIGNING: a disarmed ArduPilot accepts the key from any link, for all of its links."""
+    if vehicle.copter.armed:
+        vehicle.send_text(3, "ERROR: Won't setup signing when armed")
+        return
+    for each in vehicle.links.values():
+        each.signing.set_up(bytes(message.secret_key), int(message.initial_timestamp))
+
+
+Handler = Callable[[CopterContext, Link, Any], None]
+
+HANDLERS: dict[str, Handler] = {
+    "HEARTBEAT": _heartbeat,
+    "COMMAND_LONG": commands.handle,
+    "COMMAND_INT": commands.handle,
+    "SET_MODE": commands.set_mode,
+    "SET_POSITION_TARGET_LOCAL_NED": _local_target,
+    "SET_POSITION_TARGET_GLOBAL_INT": _global_target,
+    "SET_ATTITUDE_TARGET": _attitude_target,
+    "MANUAL_CONTROL": manual_control_service.manual_control,
+    "RC_CHANNELS_OVERRIDE": manual_control_service.rc_channels_override,
+    "TIMESYNC": microservices.HANDLERS["TIMESYNC"],
+    "PING": microservices.HANDLERS["PING"],
+    "REQUEST_DATA_STREAM": streams.request_data_stream,
+    "PARAM_REQUEST_LIST": parameter_service.request_list,
+    "PARAM_REQUEST_READ": parameter_service.request_read,
+    "PARAM_SET": parameter_service.set_parameter,
+    "SETUP_SIGNING": _setup_signing,
+    "LANDING_TARGET": _landing_target,
+    "MISSION_REQUEST_LIST": _no_mission,
+    "MISSION_COUNT": _no_mission,
+    "MISSION_CLEAR_ALL": _no_mission,
+}
