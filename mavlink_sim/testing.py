@@ -9,11 +9,13 @@ In asyncio code `async with vehicle(seed=3) as simulator:` does the same without
 from __future__ import annotations
 
 import asyncio
+import ctypes
 import random
 import re
 import signal
 import socket
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -21,8 +23,6 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-from mavlink_sim.launching import LaunchedProcess, start_simulator
 
 READY = re.compile(r"^ready: system (\d+), onboard \S+:(\d+) -> (\d+), ground station \S+:(\d+) -> (\d+)")
 
@@ -32,7 +32,30 @@ FLEET_READY = re.compile(r"^ready: \d+ vehicles")
 # Between the choice of a port and its use another program may request any; Linux assigns those from 32768 on.
 _NOT_GIVEN_AWAY = range(16384, 32768)
 _LINES_NOTED = 30
+_PR_SET_PDEATHSIG = 1  # linux/prctl.h
 _chance = random.SystemRandom()  # parallel tests may all have the same seed
+
+
+def start_simulator(arguments: Sequence[str]) -> subprocess.Popen[str]:
+    """Start `mavlink-sim`; it ends with this program. Its input and output are text pipes.
+
+    Raises:
+        OSError: it cannot be started.
+    """
+    return subprocess.Popen(
+        [sys.executable, "-m", "mavlink_sim", *arguments],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        preexec_fn=_end_with_parent,
+    )
+
+
+def _end_with_parent() -> None:
+    """Run in the new process: it receives SIGTERM when its parent ends (prctl(2))."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 def free_udp_port_range(count: int, host: str = "127.0.0.1") -> int:
@@ -112,7 +135,7 @@ class RunningSimulator:
         transcript: every line it printed, each after the seconds since it was started.
     """
 
-    def __init__(self, process: LaunchedProcess | subprocess.Popen[str], count: int = 1) -> None:
+    def __init__(self, process: subprocess.Popen[str], count: int = 1) -> None:
         self.process = process
         self.vehicles: list[FleetMember] = []
         self._count = count

@@ -58,7 +58,6 @@ GUIDANCE_FLOORS = {
 # The same for `mavlink_sim`: its packages and its own files. Imports inside functions and under
 # TYPE_CHECKING count as well.
 SIMULATOR_LAYERS = {
-    "launching": 0,
     "px4": 0,
     "releases": 0,
     "world": 0,
@@ -81,7 +80,6 @@ SIMULATOR_LAYERS = {
     "__init__": 8,
     "cli": 8,
     "__main__": 9,
-    "launcher": 9,
 }
 MAX_SIMULATOR_LAYERS = 10
 SIMULATOR_MAY_IMPORT = {

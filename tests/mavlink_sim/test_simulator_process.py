@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import select
 import signal
 import socket
 import subprocess
@@ -325,3 +326,19 @@ def test_without_camera_no_opencv_and_no_zenoh() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stdout.strip()) == (0, ""), done.stderr
+
+
+def test_vehicle_ends_with_its_program() -> None:
+    code = (
+        "import os, signal; from mavlink_sim.testing import vehicle\n"
+        "one = vehicle().__enter__(); print(one.pid, flush=True); os.kill(os.getpid(), signal.SIGKILL)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    try:
+        running = os.pidfd_open(int(done.stdout))
+    except ProcessLookupError:
+        return  # it has ended already
+    poll = select.poll()
+    poll.register(running, select.POLLIN)
+    assert poll.poll(20_000)
+    os.close(running)
