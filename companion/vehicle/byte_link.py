@@ -286,7 +286,7 @@ async def _open_serial(url: LinkUrl) -> int:
     descriptor = -1
     try:
         descriptor = os.open(device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
-        # A second reader would take bytes. TIOCEXCL blocks later opens, flock other users of flock.
+        # A second reader would take bytes. TIOCEXCL blocks later opens, `fcntl.flock` other users of it.
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         fcntl.ioctl(descriptor, termios.TIOCEXCL)
         tty.setraw(descriptor)

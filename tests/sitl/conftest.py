@@ -45,10 +45,10 @@ def pytest_terminal_summary(terminalreporter: Any) -> None:
 
 @pytest.fixture(scope="session")
 def link() -> Iterator[AutopilotLink]:
-    """The autopilot, heard."""
+    """The connected autopilot."""
     opened = AutopilotLink(parse_link_url(os.environ[URL]))
     try:
-        opened.until(lambda: opened.autopilot in NAMES, HEARTBEAT_S, f"heard at {os.environ[URL]}")
+        opened.until(lambda: opened.autopilot in NAMES, HEARTBEAT_S, f"heartbeat at {os.environ[URL]}")
         yield opened
     finally:
         opened.close()

@@ -149,7 +149,7 @@ class AutopilotLink:
 
     @property
     def grounded(self) -> bool:
-        """Landed, as far as it tells, and disarmed."""
+        """Landed (if it reports that) and disarmed."""
         return not self.armed and self.landed in _DOWN
 
     @property
@@ -347,7 +347,7 @@ class Flight:
 
 
 def signing_time() -> int:
-    """The time now, as a MAVLink signature tells it."""
+    """The time now in the unit of a MAVLink signature."""
     return round((time.time() - SIGNING_EPOCH_S) * 1e5)
 
 

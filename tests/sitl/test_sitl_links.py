@@ -25,7 +25,7 @@ pytestmark = [pytest.mark.sitl, pytest.mark.timeout(400)]
 # udpin://HOST:PORT to which the autopilot's second link sends, for a second service.
 SECOND = "COMPANION_SITL_SECOND_URL"
 KEY = bytes(range(1, 33))
-HEARD_S, SIGNED_S = 15.0, 10.0
+NAMED_S, SIGNED_S = 15.0, 10.0
 REFUSED = "another service commands this vehicle ("
 
 
@@ -117,15 +117,15 @@ def beside(flight: Flight, services: Services, tmp_path: Path) -> Iterator[Besid
     link.until(lambda: flight.status and flight.status["uptime_s"] > 4.0, 20.0, "running for 4 s")
     with ExitStack() as stack:
         yield Beside(flight, services.flags(flight.driver), port, tmp_path, stack)
-    link.until(lambda: not flight.status["vehicle"]["other_commanders"], HEARD_S, "alone again")
+    link.until(lambda: not flight.status["vehicle"]["other_commanders"], NAMED_S, "alone again")
 
 
 def test_two_services_of_one_name_name_each_other_and_the_later_refuses(beside: Beside) -> None:
     first, link = beside.first, beside.first.link
     second = beside.start("vehicle1")
-    named_s = link.until(lambda: beside.named() == {"mavlink", "zenoh"}, HEARD_S, "named both ways")
-    second.wait_for_line("another service commands this vehicle: 1/191 by mavlink", HEARD_S)
-    second.wait_for_line("by zenoh, not in command", HEARD_S)
+    named_s = link.until(lambda: beside.named() == {"mavlink", "zenoh"}, NAMED_S, "named both ways")
+    second.wait_for_line("another service commands this vehicle: 1/191 by mavlink", NAMED_S)
+    second.wait_for_line("by zenoh, not in command", NAMED_S)
     answers = beside.answers("vehicle1", "takeoff 3")
     assert sorted(REFUSED in answer["reason"] for answer in answers) == [False, True], answers
     second.wait_for_line(REFUSED, 5.0)
@@ -135,15 +135,15 @@ def test_two_services_of_one_name_name_each_other_and_the_later_refuses(beside: 
 def test_a_second_service_of_another_name_refuses(beside: Beside) -> None:
     first, link = beside.first, beside.first.link
     second = beside.start("vehicle2")
-    named_s = link.until(lambda: beside.named() == {"mavlink"}, HEARD_S, "named")
-    second.wait_for_line("another service commands this vehicle: 1/191 by mavlink", HEARD_S)
+    named_s = link.until(lambda: beside.named() == {"mavlink"}, NAMED_S, "named")
+    second.wait_for_line("another service commands this vehicle: 1/191 by mavlink", NAMED_S)
     (answer,) = beside.answers("vehicle2", "takeoff 3")
     assert not answer["success"]
     assert "1/191 by mavlink, not in command" in answer["reason"]
     assert not link.armed
     first.take_off(3.0)
     first.fly("hold")
-    until_s = time.monotonic() + HEARD_S
+    until_s = time.monotonic() + NAMED_S
     while "1/191 by mavlink, in command" not in (answer := beside.answers("vehicle2", "hold")[0])["reason"]:
         assert REFUSED in answer["reason"]
         assert time.monotonic() < until_s, answer
@@ -155,7 +155,7 @@ def test_a_second_service_of_another_name_refuses(beside: Beside) -> None:
 def test_a_second_service_flies_where_that_is_allowed(beside: Beside) -> None:
     link = beside.first.link
     second = beside.start("vehicle2", "--vehicle-allow-other-commander", "true")
-    second.wait_for_line("another service commands this vehicle: 1/191 by mavlink", HEARD_S)
+    second.wait_for_line("another service commands this vehicle: 1/191 by mavlink", NAMED_S)
     until_s = time.monotonic() + READY_S
     while not (answer := beside.answers("vehicle2", "takeoff 3")[0])["success"]:
         assert REFUSED not in answer["reason"]

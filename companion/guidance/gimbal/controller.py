@@ -114,7 +114,7 @@ class GimbalController:
         pitch_rad = None if gimbal is None else gimbal.pitch_rad
         primary = None if gimbal is None else gimbal.primary_control
         return {
-            "heard": gimbal is not None,
+            "answers": gimbal is not None,
             "pitch_deg": None if pitch_rad is None else round(math.degrees(pitch_rad), 1),
             "primary_control": None if primary is None else address_text(primary),
             "ours": self._control.holds(now_ns, gimbal),
