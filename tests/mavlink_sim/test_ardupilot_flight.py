@@ -405,7 +405,7 @@ def calm() -> LockstepVehicle:
     return LockstepVehicle(autopilot="ardupilot", gusts_mps=0.0, noise=False, ready_after_s=0.0)
 
 
-@pytest.mark.parametrize(("armed_for_s", "takes_s"), [(4.0, 5.8), (0.0, 8.15)])
+@pytest.mark.parametrize(("armed_for_s", "duration_s"), [(4.0, 5.8), (0.0, 8.15)])
 def test_takeoff_to_5_m_takes_the_measured_time(
     calm: LockstepVehicle, armed_for_s: float, duration_s: float
 ) -> None:

@@ -160,7 +160,7 @@ def test_home_is_arming_position_with_true_local_position(copter: LockstepVehicl
     assert all(map(math.isnan, home.q))
 
 
-@pytest.mark.parametrize("place", [(1.0,), (0.0, 0.0, 0.0, 0.0, 47.3977432, 8.545594, 488.0)])
+@pytest.mark.parametrize("position", [(1.0,), (0.0, 0.0, 0.0, 0.0, 47.3977432, 8.545594, 488.0)])
 def test_commanded_home_is_kept_at_arming(copter: LockstepVehicle, position: tuple[float, ...]) -> None:
     """ArduPilot locks home, set to a position or to "here"."""
     assert copter.command(179, *position) == "ACCEPTED"

@@ -133,7 +133,7 @@ def test_scene_without_viewpoint_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
+    ("changes", "message"),
     [
         ({"frames": 0}, "1 frame"),
         ({"classes": ("car", "cat")}, "classes"),

@@ -91,7 +91,7 @@ def test_the_same_draws_give_the_same_depth() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
+    ("changes", "message"),
     [
         ({"baseline_m": -1.0}, "baseline"),
         ({"step_px": 5.0}, "0 to 4 px"),

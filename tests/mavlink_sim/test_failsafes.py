@@ -352,7 +352,7 @@ def test_missing_ground_station_is_no_loss_by_default(harness: SimHarness) -> No
 
 
 @pytest.mark.parametrize(
-    ("override", "taken"),
+    ("override", "taken_over"),
     [
         pytest.param(1, True, id="auto"),
         pytest.param(2, False, id="offboard only"),
@@ -372,7 +372,8 @@ def test_sticks_moved_in_an_auto_mode_take_over(
 
 
 @pytest.mark.parametrize(
-    ("override", "taken"), [pytest.param(3, True, id="offboard too"), pytest.param(1, False, id="auto only")]
+    ("override", "taken_over"),
+    [pytest.param(3, True, id="offboard too"), pytest.param(1, False, id="auto only")],
 )
 def test_sticks_take_over_in_offboard_if_enabled(
     make_harness: type[SimHarness], velocity_setpoint: Any, override: int, taken_over: bool

@@ -34,7 +34,7 @@ def test_words_in_any_order(
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("", "names no fault"),
         ("at=3", "names no fault"),

@@ -53,18 +53,18 @@ def test_faults_are_ended_by_number_by_name_and_all_together(harness: SimHarness
 
 def test_values_as_python_arguments(harness: SimHarness) -> None:
     faults = harness.vehicle.faults
-    faults.begin("packet_loss", 0.25, link="gcs", direction="out", duration_s=2.0, seed=5)
+    faults.begin("packet_loss", 0.25, link="gcs", way="out", duration_s=2.0, seed=5)
     assert str(faults.active[0]) == "1 packet_loss 0.25 link=gcs way=out for=2"
     assert faults.active[0].seed == 5
 
 
 @pytest.mark.parametrize(
-    ("line", "said"),
+    ("line", "message"),
     [("link_loss link=usb", "usb"), ("wind 3 at=0.5", "at=0.5")],
 )
-def test_a_fault_that_cannot_begin_is_refused_at_once(harness: SimHarness, line: str, lines: str) -> None:
+def test_a_fault_that_cannot_begin_is_refused_at_once(harness: SimHarness, line: str, message: str) -> None:
     harness.fly(1.0)
-    with pytest.raises(FaultError, match=lines):
+    with pytest.raises(FaultError, match=message):
         harness.vehicle.faults.begin(line)
     assert harness.vehicle.faults.listing() == ["no faults"]
 

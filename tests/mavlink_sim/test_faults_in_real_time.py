@@ -105,7 +105,7 @@ def test_faults_from_command_line_and_console() -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "answer"),
     [
         (["--fault", "link_dely 1"], "link_delay"),
         (["--fault", "link_loss link=usb"], "all, onboard, gcs"),

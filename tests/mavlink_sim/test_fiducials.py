@@ -110,7 +110,7 @@ def test_the_white_margin_is_one_cell_wide() -> None:
 
 
 @pytest.mark.parametrize(
-    ("dictionary", "identifier", "size", "says"),
+    ("dictionary", "identifier", "size", "message"),
     [
         ("4X4_51", 0, 0.5, "4X4_51.*4X4_50"),
         ("4X4_50", 50, 0.5, "50.*4X4_50.*0 to 49"),

@@ -39,7 +39,7 @@ LANDING = Mission(stored(takeoff(5.0), waypoint(100, 0, 10), land(100, 30)), val
 
 
 @pytest.mark.parametrize(
-    ("kind", "place", "goal", "north"),
+    ("kind", "point", "goal", "north"),
     [
         (0, (50, 0), Goal.RALLY, 60.0),
         (0, (10, 0), Goal.HOME, 0.0),

@@ -100,7 +100,7 @@ def test_an_empty_file_is_an_empty_field_with_the_usual_camera() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "message"),
     [
         ("[ground", r"scene: Expected ']' at the end of a table"),
         ("[grund]", r"grund; .*ground\?"),

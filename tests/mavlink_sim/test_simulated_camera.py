@@ -139,7 +139,7 @@ def test_motion_is_difference_of_poses() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
+    ("changes", "message"),
     [
         ({"loss": 1.0}, "frames lost"),
         ({"latency_s": -1.0}, "0 to 5 s"),

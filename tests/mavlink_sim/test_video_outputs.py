@@ -88,7 +88,7 @@ def matches_image(frame: Frame, tolerance: int) -> bool:
 
 
 @pytest.mark.parametrize(
-    ("address", "says"),
+    ("address", "message"),
     [
         ("ftp://x", "shm://NAME"),
         ("pipe:", "expected pipe:PATH"),
