@@ -17,28 +17,6 @@ settings.load_profile("steady")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
-# What a test knows that runs by the clock: a name in its file, or of one of its fixtures.
-CLOCKED = {
-    *("time", "socket", "zenoh", "mavutil", "Fleet", "pytester"),
-    *("running_simulator", "vehicle", "make_vehicle", "running_service", "open_driver"),
-}
-
-
-def runs_by_the_clock(item: pytest.Item) -> bool:
-    """Whether a test flies, listens or waits in real time, so that a busy machine disturbs it."""
-    if not isinstance(item, pytest.Function):
-        return True
-    return not CLOCKED.isdisjoint({*vars(item.module), *item.fixturenames})
-
-
-@pytest.hookimpl(tryfirst=True)  # before `-m` selects
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests that run in real time."""
-    for item in items:
-        if runs_by_the_clock(item):
-            item.add_marker("realtime")
-
-
 @pytest.fixture(scope="session", autouse=True)
 def cache_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Tests leave nothing in the user's cache, and find nothing there."""

@@ -16,6 +16,8 @@ from vision.object_detector import Timing
 from vision.sources import open_source
 from vision.tracking import Tracker, TrackerSettings
 
+pytestmark = pytest.mark.realtime
+
 RATE_HZ = 5.0
 SHOWN = 20
 

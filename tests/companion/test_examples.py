@@ -20,6 +20,8 @@ from mavlink_sim.testing import RunningSimulator
 from tests.companion.command_line import companion
 from tests.companion.service_process import running_service
 
+pytestmark = pytest.mark.realtime
+
 EXAMPLES = Path(__file__).parents[2] / "examples"
 PLUGINS = ("--plugins-modules", "red,square")
 

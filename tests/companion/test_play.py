@@ -19,6 +19,8 @@ from mavlink_sim.testing import free_port
 from tests.companion.command_line import companion
 from tests.companion.service_process import ServiceProcess
 
+pytestmark = pytest.mark.realtime
+
 READY = "Ctrl-C ends it"
 
 

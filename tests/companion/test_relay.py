@@ -15,6 +15,8 @@ from companion.relay import Relay
 from companion.vehicle.driver import LinkError
 from mavlink_sim.testing import free_udp_ports
 
+pytestmark = pytest.mark.realtime
+
 
 @pytest.fixture(autouse=True)
 def short_waits(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,6 +14,8 @@ from mavlink_sim import LockstepVehicle
 from mavlink_sim.testing import running_simulator
 from mavlink_sim.wire.messages import dialect
 
+pytestmark = pytest.mark.realtime
+
 GCS = (255, 190)
 
 

@@ -25,7 +25,10 @@ from mavlink_sim.wire.endpoint import UdpEndpoint
 from mavlink_sim.wire.messages import Outgoing, dialect, parser
 from vision.shared_frame import SHARED_MEMORY_DIRECTORY, SharedFrameReader, segment_path
 
-pytestmark = pytest.mark.skipif(not SHARED_MEMORY_DIRECTORY.is_dir(), reason="needs Linux's /dev/shm")
+pytestmark = [
+    pytest.mark.skipif(not SHARED_MEMORY_DIRECTORY.is_dir(), reason="needs Linux's /dev/shm"),
+    pytest.mark.realtime,
+]
 DEADLINE_S = 120.0
 LOWEST_EYE_M = -0.05
 """The renderer's least height of the camera (NED)."""

@@ -22,7 +22,10 @@ from vision.camera_model import CameraModel, CameraMount
 from vision.frame import Frame
 from vision.shared_frame import SHARED_MEMORY_DIRECTORY, SharedFrameReader, segment_path
 
-pytestmark = pytest.mark.skipif(not SHARED_MEMORY_DIRECTORY.is_dir(), reason="needs Linux's /dev/shm")
+pytestmark = [
+    pytest.mark.skipif(not SHARED_MEMORY_DIRECTORY.is_dir(), reason="needs Linux's /dev/shm"),
+    pytest.mark.realtime,
+]
 DEADLINE_S = 60.0
 CAMERA = CameraModel.from_horizontal_fov(160, 120, math.radians(70.0))
 WORLD = World((WorldObject(0, "car", (12.0, 0.0, 0.0)),), Ground(("concrete",), 0, 256, 0.05))

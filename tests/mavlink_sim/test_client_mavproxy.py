@@ -22,10 +22,13 @@ from mavlink_sim.physics.geography import HOME_ALTITUDE_M
 from mavlink_sim.services.microservices import HANDLERS
 from mavlink_sim.testing import RunningSimulator, vehicle
 
-pytestmark = pytest.mark.skipif(
-    importlib.util.find_spec("MAVProxy") is None or importlib.util.find_spec("serial") is None,
-    reason="MAVProxy is not installed: pip install --no-deps MAVProxy pyserial",
-)
+pytestmark = [
+    pytest.mark.skipif(
+        importlib.util.find_spec("MAVProxy") is None or importlib.util.find_spec("serial") is None,
+        reason="MAVProxy is not installed: pip install --no-deps MAVProxy pyserial",
+    ),
+    pytest.mark.realtime,
+]
 MODULES = "param,arm,mode,wp,cmdlong,link,misc"
 # PX4's main and sub modes: MAVProxy 1.8.75 knows their names, but hands pymavlink all three numbers as one
 TAKEOFF, MISSION, LAND = "4 2", "4 4", "4 6"

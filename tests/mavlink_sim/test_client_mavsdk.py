@@ -23,6 +23,8 @@ from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
 from mavlink_sim.testing import RunningSimulator, vehicle
 from tests.mavlink_sim.mavsdk_client import MavsdkClient, mavsdk_client, wait_for
 
+pytestmark = pytest.mark.realtime
+
 SPEED = 4.0
 
 

@@ -13,6 +13,8 @@ from pymavlink import mavparm, mavutil
 from mavlink_sim.services.microservices import HANDLERS
 from mavlink_sim.testing import RunningSimulator, vehicle
 
+pytestmark = pytest.mark.realtime
+
 SPEED = 4.0
 REAL32, INT32 = 9, 6
 

@@ -19,6 +19,8 @@ from mavlink_sim.wire.faulty_socket import FaultySocket
 from mavlink_sim.wire.link_faults import Delay, LinkStage, Loss
 from mavlink_sim.wire.messages import dialect, parser
 
+pytestmark = pytest.mark.realtime
+
 
 def bound() -> socket.socket:
     made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)

@@ -28,6 +28,8 @@ from mavlink_sim.wire.messages import dialect
 from tests.mavlink_sim.conftest import SimHarness
 from tests.mavlink_sim.mavsdk_client import mavsdk_client
 
+pytestmark = pytest.mark.realtime
+
 
 class Client:
     """A client in lockstep: one request, and the packets that came back within 20 ms."""

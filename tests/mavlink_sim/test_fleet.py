@@ -18,6 +18,8 @@ from mavlink_sim.realtime.options import SimulationOptions
 from mavlink_sim.testing import free_udp_port_range, running_simulator
 from mavlink_sim.vehicles.vehicle import Vehicle
 
+pytestmark = pytest.mark.realtime
+
 METRE_DEG = math.degrees(1.0 / 6371000.0)
 
 

@@ -36,6 +36,8 @@ from vision.camera_model import CameraModel, CameraMount
 from vision.frame import Frame
 from vision.shared_frame import SHARED_MEMORY_DIRECTORY, SharedFrameReader, segment_path
 
+pytestmark = pytest.mark.realtime
+
 needs_shared_memory = pytest.mark.skipif(
     not SHARED_MEMORY_DIRECTORY.is_dir(), reason="needs Linux's /dev/shm"
 )

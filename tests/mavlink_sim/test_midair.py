@@ -19,6 +19,8 @@ from mavlink_sim.realtime.options import SimulationOptions
 from mavlink_sim.vehicles.vehicle import STEP_S
 from mavlink_sim.wire.messages import dialect
 
+pytestmark = pytest.mark.realtime
+
 speeds = st.floats(-8.0, 8.0, allow_subnormal=False)
 velocities = st.tuples(speeds, speeds, speeds)
 offsets = st.floats(-0.7, 0.7, allow_subnormal=False)

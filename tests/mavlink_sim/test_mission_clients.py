@@ -24,6 +24,8 @@ from mavlink_sim.testing import RunningSimulator, running_simulator
 from tests.mavlink_sim.mavsdk_client import LIMIT_S, MavsdkClient, mavsdk_client, meanwhile, wait_for
 from tests.mavlink_sim.plan_client import item, land, polygon, rally, takeoff, waypoint
 
+pytestmark = pytest.mark.realtime
+
 SPEED = 6.0
 
 

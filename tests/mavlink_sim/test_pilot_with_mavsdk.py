@@ -19,6 +19,8 @@ from mavlink_sim.flight.transmitter import CALIBRATION
 from mavlink_sim.testing import RunningSimulator, running_simulator
 from tests.mavlink_sim.mavsdk_client import MavsdkClient, mavsdk_client, meanwhile, wait_for
 
+pytestmark = pytest.mark.realtime
+
 
 @asynccontextmanager
 async def connected(**options: Any) -> AsyncIterator[tuple[RunningSimulator, MavsdkClient]]:

@@ -42,6 +42,7 @@ def run(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> Any:
     return start
 
 
+@pytest.mark.realtime
 def test_passing_test_leaves_no_files(run: Any, pytester: pytest.Pytester) -> None:
     result = run(
         ARMING
@@ -59,6 +60,7 @@ def test_passing_test_leaves_no_files(run: Any, pytester: pytest.Pytester) -> No
     assert list(pytester.path.glob("temporary/vehicles/*")) == []
 
 
+@pytest.mark.realtime
 def test_failing_test_keeps_log_and_traffic_and_names_them(run: Any, pytester: pytest.Pytester) -> None:
     result = run(
         ARMING
@@ -85,6 +87,7 @@ def test_failing_test_keeps_log_and_traffic_and_names_them(run: Any, pytester: p
     assert {(245, "COMMAND_LONG"), (1, "COMMAND_ACK"), (1, "HEARTBEAT")} <= kinds  # both directions
 
 
+@pytest.mark.realtime
 def test_logs_folder_option_and_separate_runs(run: Any, pytester: pytest.Pytester) -> None:
     code = """
     def test_it(make_vehicle):
@@ -100,6 +103,7 @@ def test_logs_folder_option_and_separate_runs(run: Any, pytester: pytest.Pyteste
     assert ["ready: system 2" in output[0], "ready: system 3" in output[1]] == [True, True]
 
 
+@pytest.mark.realtime
 def test_nearest_marker_options_win(run: Any) -> None:
     result = run(
         """
@@ -132,6 +136,7 @@ def test_nearest_marker_options_win(run: Any) -> None:
     result.assert_outcomes(passed=2)
 
 
+@pytest.mark.realtime
 def test_an_option_that_does_not_exist_is_named(run: Any) -> None:
     result = run(
         """
@@ -153,6 +158,7 @@ def test_an_option_that_does_not_exist_is_named(run: Any) -> None:
     )
 
 
+@pytest.mark.realtime
 def test_parallel_tests_have_separate_vehicles(run: Any) -> None:
     result = run(
         ARMING
@@ -170,6 +176,7 @@ def test_parallel_tests_have_separate_vehicles(run: Any) -> None:
     result.stdout.fnmatch_lines(["*- vehicle 1 -*", "log:*vehicle.log"])
 
 
+@pytest.mark.realtime
 def test_killed_vehicle_log_has_exit_code(run: Any, pytester: pytest.Pytester) -> None:
     result = run(
         """
@@ -197,6 +204,7 @@ def test_loading_the_plugin_loads_nothing_heavy() -> None:
     assert not {"numpy", "pymavlink", "typer", "cv2", "mavlink_sim.testing"} & loaded
 
 
+@pytest.mark.realtime
 def test_installed_package_provides_plugin(
     pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
 ) -> None:

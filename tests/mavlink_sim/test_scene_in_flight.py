@@ -21,7 +21,10 @@ import pytest
 from mavlink_sim.testing import free_port
 from vision.shared_frame import SHARED_MEMORY_DIRECTORY, SharedFrameReader, segment_path
 
-pytestmark = pytest.mark.skipif(not SHARED_MEMORY_DIRECTORY.is_dir(), reason="needs Linux's /dev/shm")
+pytestmark = [
+    pytest.mark.skipif(not SHARED_MEMORY_DIRECTORY.is_dir(), reason="needs Linux's /dev/shm"),
+    pytest.mark.realtime,
+]
 DEADLINE_S = 90.0
 SCENE = """
 [ground]

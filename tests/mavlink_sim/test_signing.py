@@ -17,6 +17,8 @@ from mavlink_sim.wire.messages import Outgoing, component_metadata, dialect, par
 from mavlink_sim.wire.signing import ALWAYS, EXCEPT_USB, OPTIONAL, Signing, key_of, timestamp_now
 from tests.mavlink_sim.conftest import SimHarness
 
+pytestmark = pytest.mark.realtime
+
 KEY = bytes(range(32))
 OTHER_KEY = bytes(32 * [7])
 START = 36_000_000_000_000  # a timestamp of 2026

@@ -14,6 +14,8 @@ import yaml
 
 from mavlink_sim.testing import RunningSimulator, free_port, free_udp_ports, running_simulator
 
+pytestmark = pytest.mark.realtime
+
 pytest_plugins = ["pytester"]
 
 ROOT = Path(__file__).parents[2]

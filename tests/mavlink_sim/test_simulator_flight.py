@@ -16,6 +16,8 @@ from pymavlink import mavutil
 from mavlink_sim.testing import running_simulator
 from tests.mavlink_sim.mavsdk_client import mavsdk_client, meanwhile, wait_for
 
+pytestmark = pytest.mark.realtime
+
 SPEED = 4.0  # simulated seconds a second; setpoints are sent by the simulated clock
 
 

@@ -22,6 +22,8 @@ from mavlink_sim.wire.endpoint import PEER_SILENCE_S, PortInUseError, UdpEndpoin
 from mavlink_sim.wire.messages import Outgoing, dialect, parser
 from vision.shared_frame import SharedFrameReader, segment_path
 
+pytestmark = pytest.mark.realtime
+
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(

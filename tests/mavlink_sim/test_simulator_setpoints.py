@@ -15,6 +15,8 @@ from mavlink_sim.physics.geography import HOME_ALTITUDE_M, SIH_FRAME
 from mavlink_sim.testing import RunningSimulator
 from tests.mavlink_sim.mavsdk_client import mavsdk_client, wait_for
 
+pytestmark = pytest.mark.realtime
+
 SPEED = 3.0  # simulated seconds a second; MAVSDK repeats a setpoint 20 times a real second
 HOVER = GRAVITY_MPS2 / MAX_THRUST_MPS2
 

@@ -15,6 +15,8 @@ from mavlink_sim.wire.endpoint import UdpEndpoint
 from mavlink_sim.wire.messages import Outgoing, dialect, parser
 from mavlink_sim.wire.traffic_log import TrafficLog, recording
 
+pytestmark = pytest.mark.realtime
+
 
 def read(path: Path) -> list[Any]:
     log = mavutil.mavlink_connection(str(path))

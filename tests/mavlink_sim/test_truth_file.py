@@ -10,6 +10,8 @@ import pytest
 from mavlink_sim.testing import running_simulator
 from mavlink_sim.world.truth_file import TruthFile
 
+pytestmark = pytest.mark.realtime
+
 FULL = Path("/dev/full")
 needs_full = pytest.mark.skipif(not FULL.exists(), reason="no /dev/full here")
 

@@ -28,6 +28,8 @@ from vision.frame import Frame
 from vision.sources import open_source
 from vision.sources.source import SourceSettings
 
+pytestmark = pytest.mark.realtime
+
 DEADLINE_S = 30.0
 SIZE = (160, 120)
 SETTINGS = SourceSettings(width=SIZE[0], height=SIZE[1], open_timeout_s=20.0, read_timeout_s=20.0)

@@ -19,7 +19,7 @@ from tests.sitl.sitl_harness import (
     set_for_test,
 )
 
-pytestmark = [pytest.mark.sitl, pytest.mark.timeout(500)]
+pytestmark = [pytest.mark.sitl, pytest.mark.timeout(500), pytest.mark.realtime]
 NO_GPS = {PX4: {"SIM_GPS_USED": 0.0}, ARDUPILOT: {"SIM_GPS1_ENABLE": 0.0}}
 NO_POSITION = "the position estimate is not valid"
 NOT_VALID = "estimator reports it as not valid"

@@ -14,7 +14,7 @@ import pytest
 from tests.sitl.sitl_harness import NAMES, Flight, Pose
 from vision.attitude import wrap_angle
 
-pytestmark = [pytest.mark.sitl, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.sitl, pytest.mark.timeout(300), pytest.mark.realtime]
 HEIGHT_M = 5.0
 CORNERS_M = [(0.0, 0.0), (15.0, 0.0), (15.0, 15.0), (0.0, 15.0)]
 

@@ -21,7 +21,7 @@ from tests.companion.service_process import ServiceProcess, running_service
 from tests.sitl.conftest import Services
 from tests.sitl.sitl_harness import PX4, READY_S, AutopilotLink, Flight, bring_down
 
-pytestmark = [pytest.mark.sitl, pytest.mark.timeout(400)]
+pytestmark = [pytest.mark.sitl, pytest.mark.timeout(400), pytest.mark.realtime]
 # udpin://HOST:PORT to which the autopilot's second link sends, for a second service.
 SECOND = "COMPANION_SITL_SECOND_URL"
 KEY = bytes(range(1, 33))

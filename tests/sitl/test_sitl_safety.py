@@ -22,7 +22,7 @@ from tests.sitl.sitl_harness import (
     set_for_test,
 )
 
-pytestmark = [pytest.mark.sitl, pytest.mark.timeout(400)]
+pytestmark = [pytest.mark.sitl, pytest.mark.timeout(400), pytest.mark.realtime]
 # A setpoint that was being sent when the mode changed; and one heartbeat period for a mode to show.
 IN_TRANSIT_S, WATCHED_S = 0.3, 3.0
 

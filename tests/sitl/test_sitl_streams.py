@@ -12,7 +12,7 @@ import pytest
 from mavlink_sim.wire.messages import dialect
 from tests.sitl.sitl_harness import ARDUPILOT, READY_S, Flight
 
-pytestmark = [pytest.mark.sitl, pytest.mark.timeout(400)]
+pytestmark = [pytest.mark.sitl, pytest.mark.timeout(400), pytest.mark.realtime]
 REBOOT_S = 60.0
 # A shell command that restarts a simulated autopilot that refuses to reboot, as PX4's does.
 RESTART = "COMPANION_SITL_RESTART"

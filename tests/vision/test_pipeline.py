@@ -18,6 +18,8 @@ from vision.pipeline import PerceptionResult, Pipeline
 from vision.sources import EndOfStream, Source, SourceSettings, SourceStatistics, open_source
 from vision.tracking import Tracker
 
+pytestmark = pytest.mark.realtime
+
 WIDTH, HEIGHT = 96, 64
 
 

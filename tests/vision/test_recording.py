@@ -16,6 +16,8 @@ from vision.recording import Recording
 from vision.sources import SourceSettings, open_source
 from vision.video_writer import VideoWriterError
 
+pytestmark = pytest.mark.realtime
+
 WIDTH, HEIGHT = 96, 64
 SPOT = Detections(
     np.array([[40, 20, 56, 36]], np.float32), np.ones(1, np.float32), np.zeros(1, np.int64), ("spot",)

@@ -28,7 +28,10 @@ from vision.shared_frame import (
     segment_path,
 )
 
-pytestmark = pytest.mark.skipif(not SHARED_MEMORY_DIRECTORY.is_dir(), reason="needs Linux's /dev/shm")
+pytestmark = [
+    pytest.mark.skipif(not SHARED_MEMORY_DIRECTORY.is_dir(), reason="needs Linux's /dev/shm"),
+    pytest.mark.realtime,
+]
 DEADLINE_S = 60.0
 
 STAMPING_WRITER = """

@@ -15,6 +15,8 @@ from vision.sources.capture import LoopingCapture
 from vision.sources.images import ImagesCapture, natural_key
 from vision.sources.source import SourceStatistics
 
+pytestmark = pytest.mark.realtime
+
 DATA = Path(
     os.environ.get("COMPANION_TEST_DATA", Path(__file__).resolve().parents[2].parent / "shared" / "data")
 )

@@ -13,6 +13,8 @@ import pytest
 from vision.sources import SourceError, SourceSettings, open_source
 from vision.sources.camera import camera_device, fourcc_text
 
+pytestmark = pytest.mark.realtime
+
 
 class FakeCamera:
     """A driver that delivers 640x480 YUYV at 30 Hz for any request, but accepts MJPG."""

@@ -17,7 +17,7 @@ from mavlink_sim.testing import free_port
 from tests.vision.network_streams import QUICK, is_blue, jpeg, wait_for_frame
 from vision.sources import SourceError, SourceSettings, open_source
 
-pytestmark = pytest.mark.usefixtures("no_proxy")
+pytestmark = [pytest.mark.usefixtures("no_proxy"), pytest.mark.realtime]
 
 
 class CameraHandler(BaseHTTPRequestHandler):

@@ -14,6 +14,8 @@ from vision.sources.capture import Capture, CaptureError, RawFrame
 from vision.sources.latest import LatestSource
 from vision.sources.source import EndOfStream, SourceError, SourceSettings
 
+pytestmark = pytest.mark.realtime
+
 QUICK = SourceSettings(open_timeout_s=20.0, read_timeout_s=0.2, retry_min_s=0.01, retry_max_s=0.04)
 
 

@@ -22,6 +22,8 @@ from vision.frame import Frame
 from vision.sources import EndOfStream, Source, SourceError, SourceSettings, open_source
 from vision.sources.raw import RawParser
 
+pytestmark = pytest.mark.realtime
+
 RAW = SourceSettings(width=8, height=6, pixel_format="bgr24", retry_min_s=0.05, retry_max_s=0.1)
 EVERY = SourceSettings(width=8, height=6, pixel_format="bgr24", every_frame=True)
 

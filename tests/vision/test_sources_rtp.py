@@ -15,6 +15,8 @@ from tests.vision.network_streams import QUICK, is_blue, sending, wait_for_frame
 from vision.sources import SourceError, SourceSettings, open_source
 from vision.sources.network import UdpStream
 
+pytestmark = pytest.mark.realtime
+
 
 def test_rtp_jpeg_recovers_from_a_sender_restart(caplog: pytest.LogCaptureFixture) -> None:
     port = free_port()

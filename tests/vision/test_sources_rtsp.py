@@ -13,7 +13,7 @@ from tests.vision.network_streams import QUICK, is_blue, sending, wait_for_frame
 from vision.sources import SourceError, SourceSettings, open_source
 from vision.sources.network import without_password
 
-pytestmark = pytest.mark.usefixtures("no_proxy")
+pytestmark = [pytest.mark.usefixtures("no_proxy"), pytest.mark.realtime]
 
 
 def test_passwords_are_never_shown() -> None:

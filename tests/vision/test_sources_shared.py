@@ -14,6 +14,8 @@ from vision.shared_frame import SharedFrameWriter
 from vision.sources import SourceError, SourceSettings, open_source
 from vision.sources.source import CameraChangedError
 
+pytestmark = pytest.mark.realtime
+
 QUICK = SourceSettings(open_timeout_s=20.0, read_timeout_s=0.3, retry_min_s=0.02, retry_max_s=0.05)
 
 

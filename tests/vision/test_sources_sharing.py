@@ -17,6 +17,8 @@ from vision.shared_frame import SharedFrameReader, SharedFrameWriter
 from vision.sources import Source, SourceError, SourceSettings, open_source
 from vision.sources.sharing import FrameSharing
 
+pytestmark = pytest.mark.realtime
+
 
 @pytest.fixture
 def name() -> Iterator[str]:

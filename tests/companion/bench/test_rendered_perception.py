@@ -25,6 +25,8 @@ from vision.frame import Frame
 from vision.pipeline import PerceptionResult
 from vision.shared_frame import SharedFrameReader, SharedFrameWriter, segment_path
 
+pytestmark = pytest.mark.realtime
+
 SEED = 1
 DEADLINE_S = 60.0
 CAMERA = {

@@ -26,6 +26,8 @@ from companion.bus.session import Bus, BusError
 from companion.settings import ZenohSection
 from mavlink_sim.testing import free_port
 
+pytestmark = pytest.mark.realtime
+
 WAIT_S = 20.0
 
 

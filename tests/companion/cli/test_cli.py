@@ -26,6 +26,8 @@ from companion.guidance.command import COMMANDS
 from mavlink_sim.testing import free_port
 from tests.companion.command_line import companion
 
+pytestmark = pytest.mark.realtime
+
 ONNX = ("--runtime", "onnxruntime")
 
 

@@ -16,6 +16,8 @@ from companion.guidance.command import COMMANDS
 from mavlink_sim.testing import RunningSimulator
 from tests.companion.service_process import running_service
 
+pytestmark = pytest.mark.realtime
+
 EXAMPLE = Path(__file__).parents[3] / "examples" / "circle"
 
 

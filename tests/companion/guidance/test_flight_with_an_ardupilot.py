@@ -13,6 +13,8 @@ from companion.vehicle.state import FlightMode, VehicleState
 from mavlink_sim.testing import running_simulator
 from tests.companion.live_flight import LiveFlight, ground_station
 
+pytestmark = pytest.mark.realtime
+
 LOITER, GUIDED = 5, 4
 
 

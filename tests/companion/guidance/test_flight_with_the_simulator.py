@@ -13,6 +13,8 @@ from companion.vehicle.state import FlightMode, Vector3, VehicleState
 from mavlink_sim.testing import running_simulator
 from tests.companion.live_flight import LiveFlight, ground_station
 
+pytestmark = pytest.mark.realtime
+
 SPEED = 2.0
 
 

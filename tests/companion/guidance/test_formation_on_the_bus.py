@@ -12,6 +12,8 @@ import time
 from collections.abc import AsyncIterator, Callable
 from typing import Any
 
+import pytest
+
 from companion.bus import topics
 from companion.bus.session import Bus
 from companion.guidance.behaviours.formation import FormationBehaviour
@@ -19,6 +21,8 @@ from companion.guidance.formation.neighbours import Neighbourhood
 from companion.settings import ZenohSection
 from mavlink_sim.testing import FleetMember, RunningSimulator, free_port, running_simulator
 from tests.companion.live_flight import LiveFlight
+
+pytestmark = pytest.mark.realtime
 
 VEHICLES = int(os.environ.get("FORMATION_VEHICLES", "3"))
 

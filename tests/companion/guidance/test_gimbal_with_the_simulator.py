@@ -13,6 +13,8 @@ from tests.companion.live_flight import STATION, LiveFlight, ground_station
 from vision.detections import Detections
 from vision.pipeline import PerceptionResult
 
+pytestmark = pytest.mark.realtime
+
 
 class FlightWithGimbal(LiveFlight):
     """A flight with a camera on the gimbal that detects nothing."""

@@ -45,6 +45,7 @@ def test_refused_offboard_ends_command_and_stream() -> None:
     assert len(harness.autopilot.setpoints) == sent
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize(
     ("vehicle", "behaviour", "words"),
     [

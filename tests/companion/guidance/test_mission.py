@@ -22,6 +22,8 @@ from mavlink_sim.testing import running_simulator
 from tests.companion.command_line import companion
 from tests.companion.service_process import running_service
 
+pytestmark = pytest.mark.realtime
+
 NAMES = ("person", "car", "traffic light")
 DOCUMENT = Path(__file__).parents[3] / "docs" / "flight.md"
 

@@ -24,6 +24,8 @@ from companion.operator.line_output import LineOutput
 from companion.settings import ZenohSection
 from mavlink_sim.testing import free_port, running_simulator
 
+pytestmark = pytest.mark.realtime
+
 Pipe = tuple[int, int]
 
 

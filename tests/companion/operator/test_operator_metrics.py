@@ -14,6 +14,8 @@ from companion.operator.metrics import MetricsError, MetricsServer
 from mavlink_sim.testing import free_port, running_simulator
 from tests.companion.service_process import running_service
 
+pytestmark = pytest.mark.realtime
+
 
 def fetch(port: int) -> dict[str, float]:
     """Return all metrics: name with its labels → value."""

@@ -19,6 +19,8 @@ from vision.camera_model import CameraModel
 from vision.geolocation import PixelRays
 from vision.shared_frame import segment_path
 
+pytestmark = pytest.mark.realtime
+
 HEIGHT_M = 3.0
 
 

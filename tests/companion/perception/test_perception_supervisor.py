@@ -23,6 +23,8 @@ from companion.settings.reading import Settings, load_settings
 from vision.pipeline import PerceptionResult
 from vision.sources import SourceSettings, open_source
 
+pytestmark = pytest.mark.realtime
+
 DEADLINE_S = 60.0
 
 

@@ -28,6 +28,8 @@ from vision.pipeline import PerceptionResult
 from vision.rotation import matrix_from_euler
 from vision.tracking import Track, TrackEvent, TrackEventKind, TrackState
 
+pytestmark = pytest.mark.realtime
+
 NEW, UPDATE, LOST, END = (
     TrackEventKind.NEW,
     TrackEventKind.UPDATE,

@@ -39,6 +39,8 @@ from companion.settings.reading import load_settings
 from vision.detections import Detections
 from vision.pipeline import PerceptionResult
 
+pytestmark = pytest.mark.realtime
+
 
 def report(sequence: int) -> Report:
     empty = Detections.empty(("car",))

@@ -10,6 +10,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pytest
 import zenoh
 
 from companion.bus.client import listen
@@ -20,6 +21,8 @@ from mavlink_sim.testing import running_simulator
 from tests.companion.service_process import running_service
 from vision.detections import Detections
 from vision.frame import Frame
+
+pytestmark = pytest.mark.realtime
 
 IMAGE = np.full((120, 160, 3), 90, np.uint8)
 CAR = Detections(

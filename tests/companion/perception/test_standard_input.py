@@ -15,6 +15,8 @@ from hypothesis import strategies as st
 from companion.perception.standard_input import StandardInput
 from companion.settings import SourceSection
 
+pytestmark = pytest.mark.realtime
+
 RAW = SourceSection(uri="-", width=32, height=16, pixel_format="gray8")
 FRAME_BYTES = 32 * 16
 

@@ -19,6 +19,8 @@ from companion.settings.reading import ConfigurationError, load_settings, to_tom
 from mavlink_sim.testing import running_simulator
 from tests.companion.service_process import running_service
 
+pytestmark = pytest.mark.realtime
+
 
 def test_two_models_on_one_camera_are_independent(
     seeing: list[str], small_model: Path, tmp_path: Path

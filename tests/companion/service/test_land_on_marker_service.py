@@ -15,6 +15,8 @@ import pytest
 from mavlink_sim.testing import running_simulator
 from tests.companion.service_process import running_service
 
+pytestmark = pytest.mark.realtime
+
 SCENE = """
 name = "pad"
 [ground]

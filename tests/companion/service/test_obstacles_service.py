@@ -11,8 +11,12 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from mavlink_sim.testing import running_simulator
 from tests.companion.service_process import running_service
+
+pytestmark = pytest.mark.realtime
 
 WALL_NORTH_M, THICKNESS_M, MARGIN_M = 12.0, 0.4, 2.0
 # As for `python -m benchmarks.flights obstacles`: gusts push it a little into the margin.

@@ -20,6 +20,8 @@ from companion.vehicle.state import FlightMode, VehicleState
 from mavlink_sim.testing import running_simulator
 from tests.companion.live_flight import LiveFlight
 
+pytestmark = pytest.mark.realtime
+
 S = 1_000_000_000
 NOW_NS = 1000 * S
 

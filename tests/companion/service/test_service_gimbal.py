@@ -25,6 +25,8 @@ from vision.detections import Detections
 from vision.frame import Frame
 from vision.pipeline import PerceptionResult
 
+pytestmark = pytest.mark.realtime
+
 PITCH_RAD, HEADING_RAD = -0.9, 1.2
 
 

@@ -15,6 +15,8 @@ from companion.settings.reading import load_settings
 from vision.detections import Detections
 from vision.pipeline import PerceptionResult
 
+pytestmark = pytest.mark.realtime
+
 SLOWEST_HZ = "5"
 
 

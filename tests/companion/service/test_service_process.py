@@ -22,6 +22,8 @@ from companion.bus.topics import command_key
 from mavlink_sim.testing import free_port, running_simulator
 from tests.companion.service_process import ServiceProcess, running_service
 
+pytestmark = pytest.mark.realtime
+
 # COM_OF_LOSS_T of the built-in vehicle (PX4's default), and the tolerance.
 LOSS_S, ALLOWED_S = 1.0, 0.5
 

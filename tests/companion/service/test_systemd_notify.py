@@ -5,7 +5,11 @@ from __future__ import annotations
 import socket
 from pathlib import Path
 
+import pytest
+
 from companion.service.systemd_notify import SystemdNotifier
+
+pytestmark = pytest.mark.realtime
 
 
 def test_notifications_are_sent_to_systemd(tmp_path: Path) -> None:

@@ -7,9 +7,13 @@ import queue
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from companion.bus.client import listen
 from mavlink_sim.testing import running_simulator
 from tests.companion.service_process import running_service
+
+pytestmark = pytest.mark.realtime
 
 
 def test_identities_and_their_events_are_published(seeing: list[str], tmp_path: Path) -> None:

@@ -21,6 +21,8 @@ from companion.vehicle.state import FlightMode, LandedState, VehicleState
 from mavlink_sim.testing import RunningSimulator, free_port, running_simulator
 from tests.companion.vehicle.fake_autopilot import SETPOINT, FakeAutopilot, wait_for_state, wait_until
 
+pytestmark = pytest.mark.realtime
+
 
 @asynccontextmanager
 async def copter(speed: float = 4.0) -> AsyncIterator[tuple[Driver, RunningSimulator]]:

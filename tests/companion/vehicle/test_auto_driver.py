@@ -24,6 +24,8 @@ from companion.vehicle.state import VehicleState
 from mavlink_sim.testing import running_simulator
 from tests.companion.vehicle.fake_autopilot import SETPOINT, FakeAutopilot, wait_for_state, wait_until
 
+pytestmark = pytest.mark.realtime
+
 AUTOPILOTS = [(PX4, "mavsdk", "PX4"), (ARDUPILOT, "pymavlink", "ArduPilot")]
 
 

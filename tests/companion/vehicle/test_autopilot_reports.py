@@ -10,6 +10,8 @@ from companion.vehicle.drivers import DriverKind, open_driver
 from mavlink_sim.testing import running_simulator
 from tests.companion.vehicle.fake_autopilot import wait_for_state
 
+pytestmark = pytest.mark.realtime
+
 
 async def test_px4_arming_refusal_has_its_reason(
     kind: DriverKind, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

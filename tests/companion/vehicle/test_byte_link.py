@@ -18,6 +18,8 @@ from companion.vehicle.link_url import parse_link_url
 from mavlink_sim.testing import free_port
 from tests.companion.vehicle.fake_autopilot import wait_until
 
+pytestmark = pytest.mark.realtime
+
 
 class Receiver:
     """Records the received data and its source."""

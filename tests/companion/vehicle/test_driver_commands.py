@@ -21,7 +21,7 @@ from companion.vehicle.mavsdk_driver import MavsdkDriver
 from companion.vehicle.state import FlightMode
 from tests.companion.vehicle.fake_autopilot import FakeAutopilot, wait_for_state, wait_until
 
-pytestmark = pytest.mark.usefixtures("short_measurement")
+pytestmark = [pytest.mark.usefixtures("short_measurement"), pytest.mark.realtime]
 
 
 async def test_arm_returns_when_the_vehicle_reports_it(driver: Driver, autopilot: FakeAutopilot) -> None:

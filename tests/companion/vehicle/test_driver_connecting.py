@@ -16,7 +16,7 @@ from companion.vehicle.state import FlightMode
 from mavlink_sim.testing import free_port
 from tests.companion.vehicle.fake_autopilot import SETPOINT, FakeAutopilot, wait_until
 
-pytestmark = pytest.mark.usefixtures("short_measurement")
+pytestmark = [pytest.mark.usefixtures("short_measurement"), pytest.mark.realtime]
 
 
 async def test_missing_autopilot_is_one_line(kind: DriverKind, port: int) -> None:

@@ -19,6 +19,8 @@ from companion.vehicle.streamer import Streamer
 from mavlink_sim.testing import RunningSimulator, running_simulator
 from tests.companion.vehicle.fake_autopilot import wait_for_state, wait_until
 
+pytestmark = pytest.mark.realtime
+
 # Simulated seconds are short; the loss timeout is long enough in them for a busy test machine.
 FLIGHT = {"COM_OF_LOSS_T": 4.0, "COM_OBL_RC_ACT": 4.0}
 

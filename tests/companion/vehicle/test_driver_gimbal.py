@@ -21,7 +21,7 @@ from tests.companion.live_flight import ground_station
 from tests.companion.vehicle.fake_autopilot import FakeAutopilot, gimbal_of, wait_for_state, wait_until
 from vision.attitude import quaternion_from_euler
 
-pytestmark = pytest.mark.usefixtures("short_measurement")
+pytestmark = [pytest.mark.usefixtures("short_measurement"), pytest.mark.realtime]
 OURS = (1, 191)
 
 

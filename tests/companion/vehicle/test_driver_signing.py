@@ -23,6 +23,8 @@ from companion.vehicle.signing import FrameSigner, SigningKeyError, read_key
 from mavlink_sim.testing import free_port, running_simulator
 from tests.companion.vehicle.fake_autopilot import wait_for_state, wait_until
 
+pytestmark = pytest.mark.realtime
+
 KEY = bytes(range(32))
 
 

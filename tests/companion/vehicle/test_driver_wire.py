@@ -25,7 +25,7 @@ from tests.companion.vehicle.fake_autopilot import (
     wait_until,
 )
 
-pytestmark = pytest.mark.usefixtures("short_measurement")
+pytestmark = [pytest.mark.usefixtures("short_measurement"), pytest.mark.realtime]
 
 
 async def test_velocity_setpoint_has_px4s_type_mask(driver: Driver, autopilot: FakeAutopilot) -> None:

@@ -11,6 +11,8 @@ import pytest
 
 from companion.vehicle.precise_sleep import precise_sleep
 
+pytestmark = pytest.mark.realtime
+
 
 @pytest.mark.parametrize("seconds", [0.02, 0.0005, 1e-9, 0.0, -1.0])
 async def test_sleep_is_never_too_short(seconds: float) -> None:

@@ -17,6 +17,8 @@ from hypothesis import strategies as st
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.streamer import SILENCE_S, Streamer, StreamState
 
+pytestmark = pytest.mark.realtime
+
 MS = 1_000_000
 
 
