@@ -152,6 +152,7 @@ NAMES_OF_UNKNOWN = {
     "UNKNOWN_380": "TIME_ESTIMATE_TO_TARGET",
     "UNKNOWN_410": "EVENT",
     "UNKNOWN_411": "CURRENT_EVENT_SEQUENCE",
+    "UNKNOWN_436": "CURRENT_MODE",  # in the dialects "common" and "ardupilotmega"
 }
 
 
