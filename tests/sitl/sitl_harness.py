@@ -71,6 +71,7 @@ class AutopilotLink:
         autopilot, system_id: MAV_AUTOPILOT of its first heartbeat, and who sent it; None and 0 before.
         modes: (time_s, custom_mode) of every change.
         poses, setpoints_s: everything since the start; when each setpoint of the service came.
+        commands: time and number of each COMMAND_LONG of the service.
         texts: STATUSTEXT of the autopilot. results: the newest MAV_RESULT of each command, whoever gave it.
         home_ned_m: of its newest HOME_POSITION. global_deg: latitude and longitude of its newest position.
         boots: how often its clock has begun again.
@@ -85,6 +86,7 @@ class AutopilotLink:
         self.modes: list[tuple[float, int]] = []
         self.poses: list[Pose] = []
         self.setpoints_s: list[float] = []
+        self.commands: list[tuple[float, int]] = []
         self.texts: list[str] = []
         self.results: dict[int, int] = {}
         self.armed = self.ready = False
@@ -226,22 +228,25 @@ class AutopilotLink:
     # --- the thread ---------------------------------------------------------------------------------------
 
     def _run(self) -> None:
-        receiver, sender = dialect.MAVLink(None), dialect.MAVLink(None)
-        receiver.robust_parsing = sender.robust_parsing = True
+        from_autopilot, from_service = dialect.MAVLink(None), dialect.MAVLink(None)
+        from_autopilot.robust_parsing = from_service.robust_parsing = True
         while not self._closing.is_set():
             for ready in select.select([self._far, self._near], [], [], 0.2)[0]:
                 data, sender = ready.recvfrom(65536)
                 if ready is self._near:
-                    sent = sender.parse_buffer(data) or []
+                    sent = from_service.parse_buffer(data) or []
                     now_s = time.monotonic()
                     self.setpoints_s += [now_s for message in sent if message.get_msgId() == 84]
+                    self.commands += [
+                        (now_s, message.command) for message in sent if message.get_type() == "COMMAND_LONG"
+                    ]
                     if not self.cut:
                         self._to_autopilot(data)
                     continue
                 self._peer = sender or self._peer
                 if not self.cut:
                     self._near.sendto(data, ("127.0.0.1", self.service_port))
-                messages = receiver.parse_buffer(data) or []
+                messages = from_autopilot.parse_buffer(data) or []
                 with self._changed:
                     for message in messages:
                         if message.get_srcComponent() == 1 and self.system_id in (0, message.get_srcSystem()):
@@ -321,7 +326,7 @@ class Flight:
     def fly(self, text: str, timeout_s: float = 120.0) -> dict[str, Any]:
         """A command that has to succeed."""
         reply = self.command(text, timeout_s)
-        assert reply["success"], (reply, [mode for _, mode in self.link.modes[-6:]])
+        assert reply["success"], (reply, self.link.modes[-6:], self.link.commands[-12:])
         return reply
 
     def take_off(self, height_m: float) -> None:

@@ -184,7 +184,7 @@ def test_the_autopilots_geofence_is_named(flight: Flight, parameters: dict[str, 
     home = link.poses[-1].position_ned_m
     reply = flight.command("goto 40 0")
     assert not reply["success"]
-    assert "fence" in reply["reason"].lower()
+    assert "fence" in reply["reason"].lower(), (reply, link.modes[-6:], link.commands[-12:])
     link.after(WATCHED_S)
     if link.autopilot == PX4:
         assert reply["reason"].startswith("autopilot failsafe: hold mode")
