@@ -163,8 +163,10 @@ def test_ground_point_is_recovered_from_the_box_foot(camera: CameraModel, scene:
     assert target.range_source is RangeSource.GROUND_PLANE
     assert target.position_ned_m is not None
     away = math.dist(point[:2], target.position_ned_m[:2])
-    assert away == pytest.approx(CONTACT_INSET_M, abs=0.02 * distance)
-    assert target.ground_range_m == pytest.approx(distance - CONTACT_INSET_M, abs=0.02 * distance)
+    # Half a pixel is 2 cm at 2 m; a distorted lens seen at a slant doubles that.
+    tolerance_m = max(0.06, 0.02 * distance)
+    assert away == pytest.approx(CONTACT_INSET_M, abs=tolerance_m)
+    assert target.ground_range_m == pytest.approx(distance - CONTACT_INSET_M, abs=tolerance_m)
     assert target.distance_m == pytest.approx(math.hypot(target.ground_range_m, height), rel=1e-6)
     assert target.range_sigma_m > 0.3
 
