@@ -28,7 +28,7 @@ from companion.settings import Settings
 
 logger = logging.getLogger(__name__)
 
-# Results queued in the kernel are outdated when read: room for about ten.
+# Results queued in the kernel are outdated when read: space for about ten.
 _SEND_BUFFER_BYTES = 16384
 # Above this backlog (the worker is stopped or busy) no more overlay lines are sent.
 _UNREAD_BYTES = 65536

@@ -65,7 +65,7 @@ class FleetWorld:
         number = vehicle.system_id
         if len(self._vehicles) == self.size:
             raise ValueError(
-                f"vehicle {number}: this fleet world has room for {self.size} vehicles, and all have joined"
+                f"vehicle {number}: this fleet has {self.size} vehicles, and all of them have joined"
             )
         faults = vehicle.faults
         body = Body(

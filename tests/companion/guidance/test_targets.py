@@ -158,8 +158,8 @@ def test_ground_point_is_recovered_from_the_box_foot(camera: CameraModel, scene:
     assume(20 < x < 620 and 40 < y < 470)
     assume(math.atan2(height, distance) > math.radians(4))
     history = history_of(attitude, position, (0.0, 0.0, home_down))
-    # Edges, half a pixel beyond the centres of pixels. The bearing is that of the box's middle, the range that
-    # of its foot: in a rolled image those of a tall box differ in direction, those of a small one do not.
+    # Edges, half a pixel beyond the centres of pixels. The bearing is that of the box's middle, the range
+    # that of its foot: in a rolled image they differ in direction for a tall box, not for a small one.
     tall = (x - 9.5, y - 29.5, x + 10.5, y + 0.5)
     small = (x - 0.5, y - 1.5, x + 1.5, y + 0.5)
     boxes = [detection(small), detection(tall)]
