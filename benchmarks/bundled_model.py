@@ -1,12 +1,12 @@
-"""The bundled detector on held-out drawn frames: how good it is, and what it takes for what.
+"""The bundled detector on held-out rendered frames: its score and its confusions.
 
     python benchmarks/bundled_model.py --image-size 320
 
-draws frames of the default world (of seeds that training never uses), of every example scene and of the
-training scenes' kind with `mavlink-sim dataset`, and judges the model as `companion evaluate` does. Judged
-are objects of which a third is visible and whose box is at least MIN_SIDE_PX and MIN_AREA_PX large as the
-network sees it. Smaller ones may be found or not; to call one by another class is always wrong.
-Precision and recall are those at the confidence that a target needs to be confirmed.
+renders frames of the default world (of seeds that training never uses), of every example scene and of the
+training scenes' kind with `mavlink-sim dataset`, and evaluates the model as `companion evaluate` does.
+Evaluated are objects of which a third is visible and whose box is at least MIN_SIDE_PX and MIN_AREA_PX
+large at the input of the network. Smaller ones may be found or not; to call one by another class is always
+wrong. Precision and recall are those at the confidence that a target needs to be confirmed.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from vision.yolo.recipe import HELD_OUT_SEED
 CONFIRMED = TrackerSection().confirm_score
 """A track is confirmed, and may be flown to, from this median confidence on."""
 DEFAULT_WORLDS = 20
-"""The default world is drawn with the seeds 1 to this; training has others."""
+"""The default world is rendered with the seeds 1 to this; training has others."""
 ALTITUDES_M = ((1.5, 40.0), (2.0, 8.0))
 """Half of a scene's frames are taken anywhere, half as low as flights search."""
 SAME_PLACE_IOU = 0.3
@@ -90,7 +90,7 @@ def _shares(total: int, parts: int) -> list[int]:
 
 
 def read(folder: Path, image_size: int) -> tuple[Dataset, list[list[Seen]]]:
-    """A drawn folder as a data set to judge on, and everything seen in each of its frames."""
+    """A rendered folder as a data set, and everything seen in each of its frames."""
     samples, seen = [], []
     for line in (folder / "truth.jsonl").read_text("utf-8").splitlines():
         entry = json.loads(line)
@@ -169,7 +169,7 @@ def _rounded(value: float) -> float | None:
 def evaluate(
     drawn: Mapping[str, Sequence[Path]], model: str, image_size: int, confidence: float
 ) -> dict[str, Any]:
-    """Judge one model on drawn frames: all of them, and each scene's."""
+    """Evaluate one model on rendered frames: all of them, and each scene's."""
     detector = Detector(
         model, confidence=JUDGED_CONFIDENCE, image_size=image_size, precision="float32", threads=1
     )
@@ -218,13 +218,15 @@ def lines(report: Mapping[str, Any]) -> list[str]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Read the command line, draw, judge, print."""
+    """Read the command line, render, evaluate, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--frames", type=int, default=2000, help="how many to draw, at least 10")
-    parser.add_argument("--model", default=DEFAULT_MODEL, help="model to judge")
+    parser.add_argument("--model", default=DEFAULT_MODEL, help="model to evaluate")
     parser.add_argument("--image-size", type=int, default=640, help="longer side the network sees, pixels")
     parser.add_argument("--confidence", type=float, default=CONFIRMED, help="of precision and recall")
-    parser.add_argument("--folder", type=Path, help="keep the drawn frames here; used again if there are any")
+    parser.add_argument(
+        "--folder", type=Path, help="keep the rendered frames here; existing ones are used again"
+    )
     parser.add_argument("--json", action="store_true", help="one JSON object")
     given = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(message)s")

@@ -1,8 +1,8 @@
-"""Flight campaigns: one flight over many seeds, in lockstep with the built-in vehicle, as a table.
+"""Flight campaigns: one flight over many seeds, in lockstep with the simulated vehicle, as a table.
 
     python -m benchmarks.flights approach-depth --runs 40 --seed 100 --processes 2 [--rendered] [--json]
 
-A flight is a module `companion/bench/flights_NAME.py` with a function `run(seed: int) -> FlightResult`; it is
+A flight is a module `benchmarks/flights_NAME.py` with a function `run(seed: int) -> FlightResult`; it is
 found by that name (`_` is written `-`). The same seed gives the same flight, every time. One whose `run`
 takes `rendered` as well is flown in two ways: with synthetic detections, or with the rendered camera and the
 real perception.

@@ -31,7 +31,7 @@ from vision.camera_model import CameraModel, CameraMount
 from vision.rotation import matrix_from_quaternion
 
 CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(80.0))
-MOUNT = CameraMount(forward_m=0.1, pitch_rad=math.radians(-27.0), levelled=True)
+MOUNT = CameraMount(forward_m=0.1, pitch_rad=math.radians(-27.0), stabilized=True)
 SIZES_M = {"car": (4.2, 1.8, 1.5), "person": (0.5, 0.6, 1.7)}
 SPEED_MPS = 3.0
 DISTANCE_M, HEIGHT_M = 8.0, 4.0

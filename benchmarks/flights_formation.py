@@ -1,4 +1,4 @@
-"""Five built-in vehicles in formation through turns: wind, noise, poses that come late or not at all.
+"""Five simulated vehicles in formation through turns: wind, noise, poses that come late or not at all.
 
 The shape goes by the seed. The leader flies a path with right-angled turns; four vehicles that hover about it
 in any order take their slots and follow. All are of the built-in kind, each with its own origin, clock, gusts
@@ -30,7 +30,7 @@ ASSEMBLED_M = 1.5
 
 
 def hovering(fleet: Fleet, count: int, seed: int, wind_mps: float = WIND_MPS) -> list[str]:
-    """That many built-in vehicles, hovering 7 m apart on a grid in an order of the seed's."""
+    """That many simulated vehicles, hovering 7 m apart on a grid in an order of the seed's."""
     chance = random.Random(seed)
     places = [(-7.0 * (index // 3), 7.0 * (index % 3)) for index in range(count)]
     chance.shuffle(places)

@@ -49,7 +49,7 @@ class Airframe(LockstepDriver, Protocol):
 
 
 class LockstepAirframe(SimulatedDriver):
-    """The built-in vehicle, hovering.
+    """The simulated vehicle, hovering.
 
     Args:
         start: (north, east) metres in the common frame. clock_ns: its clock at the beginning.

@@ -224,7 +224,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.tracking")
     parser.add_argument("--seconds", type=float, default=12.0, help="length of each rendered sequence")
     parser.add_argument("--rate-hz", type=float, default=30.0, help="frame rate")
-    parser.add_argument("--model", help="a checkpoint; default: boxes made from the truth")
+    parser.add_argument("--model", help="a checkpoint; default: boxes from ground truth")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     given = parser.parse_args(arguments)

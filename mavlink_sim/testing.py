@@ -9,7 +9,7 @@ In asyncio code `async with vehicle(seed=3) as simulator:` does the same without
 from __future__ import annotations
 
 import asyncio
-import ctypes
+import os
 import random
 import re
 import signal
@@ -32,30 +32,23 @@ FLEET_READY = re.compile(r"^ready: \d+ vehicles")
 # Between the choice of a port and its use another program may request any; Linux assigns those from 32768 on.
 _NOT_GIVEN_AWAY = range(16384, 32768)
 _LINES_NOTED = 30
-_PR_SET_PDEATHSIG = 1  # linux/prctl.h
 _chance = random.SystemRandom()  # parallel tests may all have the same seed
 
 
 def start_simulator(arguments: Sequence[str]) -> subprocess.Popen[str]:
-    """Start `mavlink-sim`; it ends with this program. Its input and output are text pipes.
+    """Start `mavlink-sim`. On Linux it ends when this program does. Its input and output are text pipes.
 
     Raises:
         OSError: it cannot be started.
     """
+    parent = ["--parent-pid", str(os.getpid())] if hasattr(os, "pidfd_open") else []
     return subprocess.Popen(
-        [sys.executable, "-m", "mavlink_sim", *arguments],
+        [sys.executable, "-m", "mavlink_sim", *arguments, *parent],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
-        preexec_fn=_end_with_parent,
     )
-
-
-def _end_with_parent() -> None:
-    """Run in the new process: it receives SIGTERM when its parent ends (prctl(2))."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 def free_udp_port_range(count: int, host: str = "127.0.0.1") -> int:

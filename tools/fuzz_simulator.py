@@ -469,7 +469,7 @@ def _memory_kb(pid: int) -> int:
 
 def main() -> None:
     """Fuzz in lockstep, then over sockets; print what was found."""
-    arguments = argparse.ArgumentParser(description="Throw mutated MAVLink at the built-in vehicle.")
+    arguments = argparse.ArgumentParser(description="Throw mutated MAVLink at the simulated vehicle.")
     arguments.add_argument("--minutes", type=float, default=10.0, help="over sockets")
     arguments.add_argument("--datagrams", type=int, default=20_000, help="in lockstep")
     arguments.add_argument("--rate", type=float, default=400.0, help="datagrams a second over sockets")

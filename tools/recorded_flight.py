@@ -1,4 +1,4 @@
-"""A recorded flight of a real PX4, flown again by the built-in vehicle, and the two compared.
+"""A recorded flight of a real PX4, flown again by the simulated vehicle, and the two compared.
 
 The companion's half of the recording (everything that did not come from the autopilot) is played to a vehicle
 in lockstep, each message at its stamp; what the vehicle answers is held against what PX4 answered then. Run

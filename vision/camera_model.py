@@ -111,7 +111,7 @@ class CameraMount:
     A negative pitch looks down. With everything zero the camera looks along the body's forward axis.
 
     Attributes:
-        levelled: stabilized by a gimbal: roll and pitch are relative to the horizon, yaw to the vehicle's
+        stabilized: stabilized by a gimbal: roll and pitch are relative to the horizon, yaw to the vehicle's
             heading.
         on_gimbal: pointed by a gimbal: roll, pitch and yaw are relative to the gimbal's frame (FRD, x along
             its axis), whose attitude is given per frame, see `held`.
@@ -124,7 +124,7 @@ class CameraMount:
     roll_rad: float = 0.0
     pitch_rad: float = 0.0
     yaw_rad: float = 0.0
-    levelled: bool = False
+    stabilized: bool = False
     on_gimbal: bool = False
     ned_from_gimbal: NDArray[np.float64] | None = field(default=None, compare=False)
 
@@ -139,7 +139,7 @@ class CameraMount:
 
     @property
     def body_from_optical(self) -> NDArray[np.float64]:
-        """(3, 3) rotation from the optical frame to the body frame (FRD), for a levelled one a level body.
+        """(3, 3) rotation from the optical frame to the body frame (FRD), for a stabilized one a level body.
 
         Read-only: cached and shared between equal mounts.
 
@@ -163,7 +163,7 @@ class CameraMount:
             if self.ned_from_gimbal is None:
                 raise ValueError("a camera on a gimbal needs the gimbal's attitude: use `held`")
             return self.ned_from_gimbal @ self._parent_from_optical
-        if self.levelled:
+        if self.stabilized:
             heading_rad = math.atan2(float(ned_from_body[1, 0]), float(ned_from_body[0, 0]))
             ned_from_body = matrix_from_euler(0.0, 0.0, heading_rad)
         return ned_from_body @ self._parent_from_optical

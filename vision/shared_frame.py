@@ -116,7 +116,7 @@ def _write_calibration(header: Words, calibration: CameraCalibration) -> None:
     header[_COEFFICIENTS] = len(model.distortion)
     floats[_DISTORTION][: len(model.distortion)] = model.distortion
     if mount is not None:
-        flags |= _HAS_MOUNT | (mount.levelled and _STABILIZED) | (mount.on_gimbal and _ON_GIMBAL)
+        flags |= _HAS_MOUNT | (mount.stabilized and _STABILIZED) | (mount.on_gimbal and _ON_GIMBAL)
         floats[_POSITION] = (mount.forward_m, mount.right_m, mount.down_m)
         floats[_ROTATION] = (mount.roll_rad, mount.pitch_rad, mount.yaw_rad)
     header[_CALIBRATION] = flags

@@ -118,7 +118,7 @@ def measure_deadman(runs: int, faults: Sequence[Fault] = FAULTS) -> dict[str, di
 
 
 def deadman_table(figures: dict[str, dict[str, list[float | None]]]) -> Table:
-    """The same for people: the longest of each."""
+    """The figures as a table: the longest of each."""
     runs = max((len(values["braking_s"]) for values in figures.values()), default=0)
     table = Table(title=f"seconds after the fault, the longest of {runs}")
     table.add_column("fault")

@@ -155,7 +155,7 @@ def demos_summary(flights: Sequence[DemoFlight]) -> dict[str, Any]:
 
 
 def demos_table(flights: Sequence[DemoFlight]) -> Table:
-    """The same for people."""
+    """The flights as a table."""
     succeeded = sum(flight.success for flight in flights)
     table = Table(title=f"demonstration: {succeeded} of {len(flights)} succeeded")
     for heading in (

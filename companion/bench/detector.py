@@ -1,4 +1,4 @@
-"""Measuring the detector: every runtime in a process of its own, in turn, so that all meet the same weather.
+"""Measuring the detector: every runtime in a separate process, in turn, under the same load.
 
 `python -m companion.bench.detector` is that process. It takes its order as a line of JSON, says when its
 first detection is done, then for each number it reads detects in so many images and reports how long each
@@ -113,7 +113,7 @@ class Measured:
         except (OSError, ValueError):
             self._process.wait(timeout=10)
             self._errors.seek(0)
-            last = (self._errors.read().strip().splitlines() or ["it said nothing"])[-1]
+            last = (self._errors.read().strip().splitlines() or ["no output"])[-1]
             raise BenchError(f"{self.label}: {last}") from None
         if "error" in answer:
             raise BenchError(f"{self.label}: {answer['error']}")
@@ -180,7 +180,7 @@ def draw_pictures(path: Path, width: int, height: int) -> Path:
 
 
 def machine() -> dict[str, Any]:
-    """What the figures hang on."""
+    """Conditions that affect the figures."""
     from vision.runtimes.autotune import board
 
     return {"board": board(), "processors": len(os.sched_getaffinity(0)), "python": platform.python_version()}

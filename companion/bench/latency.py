@@ -1,4 +1,4 @@
-"""From a frame's capture to the first setpoint that knows of it, in flight with the built-in vehicle."""
+"""From a frame's capture to the first setpoint that knows of it, in flight with the simulated vehicle."""
 
 from __future__ import annotations
 

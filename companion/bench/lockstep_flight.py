@@ -139,7 +139,7 @@ class LockstepFlight:
         rules: ObstacleRules | None = None,
         **options: Any,
     ) -> LockstepFlight:
-        """The built-in vehicle in the air, in HOLD.
+        """The simulated vehicle in the air, in HOLD.
 
         Args:
             height_m: above home, where the flight begins.
@@ -161,9 +161,9 @@ class LockstepFlight:
 
     @property
     def vehicle(self) -> LockstepVehicle:
-        """The built-in vehicle. Raises TypeError where another one is flown."""
+        """The simulated vehicle. Raises TypeError where another one is flown."""
         if not isinstance(self.driver, SimulatedDriver):
-            raise TypeError(f"{type(self.driver).__name__} is not the built-in vehicle")
+            raise TypeError(f"{type(self.driver).__name__} is not the simulated vehicle")
         return self.driver.vehicle
 
     @property
@@ -392,7 +392,7 @@ def camera_settings(
         "camera.mount_roll_deg": math.degrees(mount.roll_rad),
         "camera.mount_pitch_deg": math.degrees(mount.pitch_rad),
         "camera.mount_yaw_deg": math.degrees(mount.yaw_rad),
-        "camera.stabilized": str(mount.levelled).lower(),
+        "camera.stabilized": str(mount.stabilized).lower(),
         "camera.on_gimbal": str(mount.on_gimbal).lower(),
     }
     return plain_settings({key: str(value) for key, value in values.items()} | dict(changes or {}))

@@ -1,4 +1,4 @@
-"""A driver for flights in lockstep: guidance's requests and setpoints to the built-in vehicle, no sockets."""
+"""A driver for flights in lockstep: requests and setpoints to the simulated vehicle, without sockets."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class _Pending:
 
 
 class SimulatedDriver:
-    """The built-in vehicle. A request is answered as `companion.vehicle.flight_commands` answers it.
+    """The simulated vehicle. A request is answered as `companion.vehicle.flight_commands` answers it.
 
     Args:
         vehicle: with the streams of `RATES_HZ` on its first link, if it is PX4-like; an ArduPilot's are asked

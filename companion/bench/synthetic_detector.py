@@ -84,7 +84,7 @@ class _Outline:
 
 
 class SyntheticDetector:
-    """Callable as `lockstep_flight.Sight.detect`. The same seed and calls give the same detections.
+    """Callable as `synthetic_camera`. The same seed and calls give the same detections.
 
     Args:
         with_depth: detections have a range, as with a depth camera.

@@ -159,8 +159,8 @@ class Bus:
     ) -> None:
         """Publish bytes that are too large for one packet, with an attachment as JSON.
 
-        zenoh waits for buffer space for each fragment of such a message, so it is sent in a thread. An image that
-        arrives while the previous one is being sent is dropped.
+        zenoh waits for buffer space for each fragment of such a message, so it is sent in a thread. An
+        image that arrives while the previous one is being sent is dropped.
         """
         path = topic.path(view)
         publisher = self._publishers.get(path)

@@ -211,7 +211,7 @@ def demo(
         # PX4 returns at 30 m (RTL_RETURN_ALT), and no parameter of the autopilot is changed.
         limit_s = duration or (_DEMO_S if vehicle_url is None else _DEMO_AUTOPILOT_S)
         started_s = time.monotonic()
-        lines = LineOutput(sys.stdout.fileno())  # a flight does not wait for whoever reads it
+        lines = LineOutput(sys.stdout.fileno())  # a stalled reader must not delay the flight
         try:
             summary = run_demo(
                 output,

@@ -87,7 +87,7 @@ def evaluate(
             "tiles": tiles,
         }
         sheet = str(misses) if has_sheet else None
-        typer.echo(json.dumps({**settings, **evaluation.plain(), "misses_picture": sheet}))
+        typer.echo(json.dumps({**settings, **evaluation.plain(), "misses_image": sheet}))
         return
     for line in report_lines(evaluation):
         typer.echo(line)

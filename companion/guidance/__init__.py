@@ -1,6 +1,6 @@
 """Guidance: behaviours, limits, and the core that steps one behaviour at a time.
 
-The behaviours are imported here because each adds its command to `registry.COMMANDS`; help texts list them in
+The behaviours are imported here because each adds its command to `command.COMMANDS`; help texts list them in
 this order.
 """
 

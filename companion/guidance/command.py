@@ -11,7 +11,7 @@ that the command becomes, and registers itself:
             return CircleBehaviour(self.radius_m)
 
 Grammar, help, documentation and JSON Schema are generated from the table. A file outside of this package is
-loaded only if the setting `plugins` names it (`companion.plugins`).
+loaded only if the setting `plugins.modules` names it (`companion.plugins`).
 """
 
 from __future__ import annotations
@@ -197,7 +197,7 @@ NO_CONTEXT = BuildContext()
 
 @dataclass(frozen=True)
 class Command(ABC):
-    """An operator's command. A subclass is turned into a dataclass and registered by `registry.behaviour`.
+    """An operator's command. A subclass is turned into a dataclass and registered by `behaviour`.
 
     Attributes:
         word: name in the grammar. help: one line.

@@ -30,7 +30,7 @@ SEARCH_AHEAD_M = 3.0
 CORNER_M = 0.5
 LONGEST_M = 5_000.0
 # Bends are computed from directions 2·BEND_M apart, so a shorter loop has none.
-SHORTEST_ROUND_M = 4.0 * BEND_M
+SHORTEST_LAP_M = 4.0 * BEND_M
 _MOST_PARTS = 2000
 
 
@@ -61,7 +61,7 @@ class Path:
 
     Raises:
         ValueError: fewer than two different points, longer than `LONGEST_M`, or a loop shorter than
-            `SHORTEST_ROUND_M`.
+            `SHORTEST_LAP_M`.
     """
 
     def __init__(self, points: Sequence[Vector3], speed_mps: float, *, closed: bool = False) -> None:
@@ -75,9 +75,9 @@ class Path:
         length_m = sum(math.dist(a, b) for a, b in pairwise(corners))
         if not length_m <= LONGEST_M:
             raise ValueError(f"a path must be at most {LONGEST_M:g} m long, got {length_m:.0f} m")
-        if closed and length_m < SHORTEST_ROUND_M:
+        if closed and length_m < SHORTEST_LAP_M:
             raise ValueError(
-                f"a closed path must be at least {SHORTEST_ROUND_M:g} m long, got {length_m:.1f} m"
+                f"a closed path must be at least {SHORTEST_LAP_M:g} m long, got {length_m:.1f} m"
             )
         self._points = _spaced(corners, max(SPACING_M, length_m / _MOST_PARTS))
         self._at = list(accumulate((math.dist(a, b) for a, b in pairwise(self._points)), initial=0.0))

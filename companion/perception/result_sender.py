@@ -55,7 +55,7 @@ class ResultSender:
         self._last: Message | None = None
         self._busy = False
         self._rest = b""
-        self._thread = threading.Thread(target=self._run, name="outbox", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="perception sender", daemon=True)
         self._thread.start()
 
     def put(self, message: Message) -> None:

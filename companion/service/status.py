@@ -49,7 +49,7 @@ def status_message(
             "armed": state.armed,
             "failsafe": state.failsafe,
             "missing_streams": list(state.missing_streams),
-            "said": [report.text for report in state.reports],
+            "status_texts": [report.text for report in state.reports],
             "other_commanders": others.status(state, now_ns),
         },
         "pilot": {

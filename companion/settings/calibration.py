@@ -79,7 +79,7 @@ def _adopt_mount(
         "mount_right_m": mount.right_m,
         "mount_down_m": mount.down_m,
     }
-    reference = {"stabilized": mount.levelled, "on_gimbal": mount.on_gimbal}
+    reference = {"stabilized": mount.stabilized, "on_gimbal": mount.on_gimbal}
     differing = [key for key, value in reference.items() if getattr(section, key) != value]
     if differing and given & reference.keys():
         conflicts += [f"{key} {getattr(section, key)} (camera: {reference[key]})" for key in differing]

@@ -53,7 +53,7 @@ def camera(
     scene: Annotated[
         str | None,
         typer.Option(
-            help="TOML file with world and camera, or the name of an example; default: the demo world."
+            help="TOML file with world and camera, or the name of a bundled scene; default: the demo world."
         ),
     ] = None,
     camera: Annotated[

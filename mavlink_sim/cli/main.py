@@ -7,8 +7,10 @@ import json
 import logging
 import math
 import os
+import select
 import signal
 import sys
+import threading
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any, NoReturn
@@ -113,7 +115,7 @@ def simulate(
     ] = None,
     scene: Annotated[
         str | None,
-        typer.Option(help="TOML file with world, obstacles and camera, or the name of an example."),
+        typer.Option(help="TOML file with world, obstacles and camera, or the name of a bundled scene."),
     ] = None,
     obstacle_sensor: Annotated[
         bool,
@@ -179,6 +181,9 @@ def simulate(
     ] = None,
     control: Annotated[
         str | None, typer.Option(help="Accept faults over zenoh too, at this endpoint: tcp/127.0.0.1:7447.")
+    ] = None,
+    parent_pid: Annotated[
+        int | None, typer.Option(help="End when the process with this id ends (Linux).")
     ] = None,
     ready_file: Annotated[
         Path | None, typer.Option(help="File for pid and ports as JSON, written once the vehicle runs.")
@@ -274,15 +279,30 @@ def simulate(
     except (OSError, ValueError) as error:
         _fail(str(error))
     with fleet:
-        _run(fleet, ready_file)
+        _run(fleet, ready_file, parent_pid)
 
 
-def _run(fleet: Fleet, ready_file: Path | None) -> None:
+def _stop_after(parent: int) -> None:
+    """Send SIGTERM to this process when another one has ended. Runs in a thread."""
+    try:
+        descriptor = os.pidfd_open(parent)
+    except ProcessLookupError:  # it has ended already
+        pass
+    else:
+        waiting = select.poll()
+        waiting.register(descriptor, select.POLLIN)
+        waiting.poll()
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+def _run(fleet: Fleet, ready_file: Path | None, parent_pid: int | None) -> None:
     def stop(number: int, frame: FrameType | None) -> None:
         fleet.stop()
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, stop)
+    if parent_pid is not None:
+        threading.Thread(target=_stop_after, args=(parent_pid,), daemon=True).start()
     reports = [
         {
             "system_id": one.options.system_id,

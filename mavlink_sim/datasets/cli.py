@@ -29,9 +29,9 @@ class Layout(StrEnum):
 @app.command()
 def dataset(
     out: Annotated[Path, typer.Argument(help="Folder to write to: new or empty.")],
-    frames: Annotated[int, typer.Option(help="How many images.")] = 100,
+    frames: Annotated[int, typer.Option(help="Number of images.")] = 100,
     scene: Annotated[
-        str, typer.Option(help="A scene file, an example's name, or random: the training scenes.")
+        str, typer.Option(help="A scene file, the name of a bundled scene, or random: the training scenes.")
     ] = "random",
     layout: Annotated[Layout, typer.Option("--format", help="Format of the labels.")] = Layout.YOLO,
     seed: Annotated[int, typer.Option(help="The same seed gives the same images.")] = 0,
@@ -42,12 +42,14 @@ def dataset(
         CLASS_NAMES
     ),
     validation: Annotated[float, typer.Option(help="Share of the images for validation.")] = 0.1,
-    min_visible: Annotated[float, typer.Option(help="Least visible share of a labelled object.")] = 0.3,
-    min_side: Annotated[float, typer.Option(help="Least side of a labelled box, pixels.")] = 6.0,
-    lowest: Annotated[float, typer.Option(help="Lowest camera above the ground, m (scenes).")] = 1.5,
-    highest: Annotated[float, typer.Option(help="Highest camera above the ground, m (scenes).")] = 40.0,
-    width: Annotated[int, typer.Option(help="Of random scenes' images.")] = RANDOM_SIZE[0],
-    height: Annotated[int, typer.Option(help="Of random scenes' images.")] = RANDOM_SIZE[1],
+    min_visible: Annotated[
+        float, typer.Option(help="Minimum visible fraction of a labelled object, 0 to 1.")
+    ] = 0.3,
+    min_side: Annotated[float, typer.Option(help="Minimum side of a labelled box, pixels.")] = 6.0,
+    lowest: Annotated[float, typer.Option(help="Minimum camera height, m; with --scene FILE.")] = 1.5,
+    highest: Annotated[float, typer.Option(help="Maximum camera height, m; with --scene FILE.")] = 40.0,
+    width: Annotated[int, typer.Option(help="Image width, pixels; with --scene random.")] = RANDOM_SIZE[0],
+    height: Annotated[int, typer.Option(help="Image height, pixels; with --scene random.")] = RANDOM_SIZE[1],
 ) -> None:
     """Write labelled images of a scene, or of random ones, for training and testing detectors."""
     cv2.setNumThreads(1)
@@ -66,7 +68,7 @@ def dataset(
         )
         chosen = None if scene == "random" else load_scene(scene)
         with Progress(console=Console(stderr=True), transient=True) as progress:
-            task = progress.add_task("pictures", total=frames)
+            task = progress.add_task("images", total=frames)
             labels = make_dataset(out, chosen, options, lambda done: progress.update(task, completed=done))
     except (DatasetError, SceneError, OSError) as error:
         print(f"mavlink-sim: {error}", file=sys.stderr)

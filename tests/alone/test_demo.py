@@ -30,7 +30,7 @@ def demo(output: Path, *flags: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.timeout(240)
 def test_demonstration_flies_an_autopilot_at_a_url(tmp_path: Path) -> None:
-    """Any autopilot: here a built-in vehicle that has no camera of its own, with system id 7."""
+    """Any autopilot: here a simulated vehicle that has no camera of its own, with system id 7."""
     output = tmp_path / "demo"
     parameters = {"RTL_RETURN_ALT": 5.0}
     with running_simulator(seed=3, system_id=7, parameters=parameters) as simulator:

@@ -1,4 +1,4 @@
-"""Five built-in vehicles in formation through turns: the campaign `benchmarks.flights formation`."""
+"""Five simulated vehicles in formation through turns: the campaign `benchmarks.flights formation`."""
 
 from __future__ import annotations
 

@@ -83,7 +83,7 @@ def test_command_writes_json_and_image(tmp_path: Path, small_model: Path) -> Non
     assert figures["per_class"]["person"]["objects"] == 1
     assert figures["per_class"]["car"]["ap50"] is None
     assert figures["missed_at_0.25"] == 1
-    assert figures["misses_picture"] == str(sheet)
+    assert figures["misses_image"] == str(sheet)
     assert cv2.imread(str(sheet)) is not None
     result = CliRunner().invoke(app, [*arguments, "--misses", str(sheet)])
     assert "mAP50-95" in result.stdout

@@ -23,7 +23,7 @@ headings = st.floats(-math.pi, math.pi)
 def test_stabilized_camera_direction_ignores_body_tilt(
     roll: float, pitch: float, yaw: float, down: float, aside: float
 ) -> None:
-    mount = CameraMount(pitch_rad=-down, yaw_rad=aside, levelled=True)
+    mount = CameraMount(pitch_rad=-down, yaw_rad=aside, stabilized=True)
     body = matrix_from_euler(roll, pitch, yaw)
     north, east, below = PixelRays.of(CAMERA, mount, body, MIDDLE).directions[0]
     assert math.asin(below) == pytest.approx(down, abs=1e-6)
@@ -36,15 +36,15 @@ def test_stabilized_camera_direction_ignores_body_tilt(
 @given(yaw=headings, roll=leans, pitch=st.floats(-1.2, 0.0))
 def test_both_mounts_are_equal_on_a_level_body(yaw: float, roll: float, pitch: float) -> None:
     body = matrix_from_euler(0.0, 0.0, yaw)
-    fixed, held = (CameraMount(0.1, 0.0, 0.05, roll, pitch, 0.2, levelled) for levelled in (False, True))
+    fixed, held = (CameraMount(0.1, 0.0, 0.05, roll, pitch, 0.2, stabilized) for stabilized in (False, True))
     assert np.allclose(fixed.ned_from_optical(body), held.ned_from_optical(body))
 
 
-@given(roll=leans, pitch=leans, yaw=headings, levelled=st.booleans())
+@given(roll=leans, pitch=leans, yaw=headings, stabilized=st.booleans())
 def test_ground_point_equals_point_at_its_depth(
-    roll: float, pitch: float, yaw: float, levelled: bool
+    roll: float, pitch: float, yaw: float, stabilized: bool
 ) -> None:
-    mount = CameraMount(0.2, -0.1, 0.05, pitch_rad=-0.9, levelled=levelled)
+    mount = CameraMount(0.2, -0.1, 0.05, pitch_rad=-0.9, stabilized=stabilized)
     body = matrix_from_euler(roll, pitch, yaw)
     pixels = np.array([[100.0, 80.0], [320.0, 240.0], [600.0, 470.0]])
     ground = PixelRays.of(CAMERA, mount, body, pixels).on_ground(10.0, 0.05)

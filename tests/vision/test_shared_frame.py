@@ -315,7 +315,7 @@ def test_the_segment_is_for_its_owner_only(name: str) -> None:
     [
         None,
         CameraMount(0.12, -0.3, 0.05, 0.1, -0.35, 1.2),
-        CameraMount(pitch_rad=-0.4, levelled=True),
+        CameraMount(pitch_rad=-0.4, stabilized=True),
         CameraMount(forward_m=0.2, on_gimbal=True),
     ],
     ids=["none", "fixed", "stabilized", "gimbal"],

@@ -9,7 +9,7 @@ HELD_OUT_SEED = 10_000_000
 """Seed of the evaluation scenes. No training seed comes near it."""
 
 HELD_OUT_SIZE = (640, 480)
-"""Width and height of those scenes, pixels: the size of the built-in vehicle's camera."""
+"""Width and height of those scenes, pixels: the size of the simulated vehicle's camera."""
 
 DEFAULT_RECIPE = TrainingSettings(
     class_names=("person", "bicycle", "car", "truck", "boat", "dog", "chair"),

@@ -49,6 +49,8 @@ def read_safetensors(path: Path) -> SafetensorsContent:
         raise CheckpointError("is a folder; give the path of a .safetensors file") from None
     except OSError as error:
         raise CheckpointError(f"cannot be read ({error.strerror or error})") from None
+    except CheckpointError:
+        raise
     except (SafetensorError, UnicodeDecodeError, ValueError, OverflowError) as error:
         raise CheckpointError(
             f"not a safetensors file, or damaged ({error}); copy or download it again"

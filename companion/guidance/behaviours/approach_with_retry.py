@@ -30,7 +30,7 @@ POINTED_RAD = math.radians(6.0)
 class Approach(Command):
     class_name: Annotated[str, ClassName("class", "what to fly to")]
     distance_m: Annotated[float, Number("distance", "m", 1.0, 100.0, "where to stop, to its surface")] = 5.0
-    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 10.0, "at most")] = 2.0
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 10.0, "maximum speed")] = 2.0
     confidence: Annotated[float, Number("confidence", "", 0.05, 1.0, "minimum confidence")] = 0.3
     lost_timeout_s: Annotated[
         float, Number("lost_timeout", "s", 0.5, 60.0, "wait for a lost object this long")

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated
+from collections.abc import Mapping
+from typing import Annotated, ClassVar
 
 from companion.guidance.behaviour import Behaviour, BehaviourContext
 from companion.guidance.behaviours.path_flight import PathFlight
@@ -17,19 +18,20 @@ _POINTS = 96
 
 @behaviour("figure-eight", "fly a level eight about the current position, first towards the nose")
 class FigureEight(Command):
+    renamed: ClassVar[Mapping[str, str]] = {"nose": "yaw_mode"}
     radius_m: Annotated[float, Number("radius", "m", 3.0, 200.0, "from its centre to either end")] = 10.0
-    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "at most; bends are slower")] = 2.0
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "maximum speed; bends are slower")] = 2.0
     laps: Annotated[float, Number("laps", "", 0.0, 1000.0, "how many; 0: until another command")] = 1.0
-    nose: Annotated[str, EnumArgument("nose", ("along", "still"), "yaw: along the path, or unchanged")] = (
-        "along"
-    )
+    yaw_mode: Annotated[
+        str, EnumArgument("yaw_mode", ("path", "hold"), "yaw: along the path, or unchanged")
+    ] = "path"
 
     @property
     def endless(self) -> bool:
         return self.laps == 0.0
 
     def build(self, context: BuildContext) -> Behaviour:
-        along = self.nose == "along"
+        along = self.yaw_mode == "path"
         return FigureEightBehaviour(self.radius_m, self.speed_mps, self.laps, nose_along=along)
 
 

@@ -55,7 +55,7 @@ class Follow(Command):
             "seen from the object, clockwise; relative to its course 180 is behind",
         ),
     ] = 180.0
-    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "at most")] = 5.0
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "maximum speed")] = 5.0
     confidence: Annotated[float, Number("confidence", "", 0.05, 1.0, "minimum confidence")] = 0.3
     occlusion_s: Annotated[
         float, Number("occlusion", "s", 0.5, 60.0, "follow a hidden object's predicted path this long")

@@ -28,7 +28,7 @@ class FollowPath(Command):
     points: Annotated[
         str, Points("points", 'north,east or north,east,height, metres from home: "0,0 10,0,5 10,10"')
     ]
-    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "at most")] = 3.0
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "maximum speed")] = 3.0
     laps: Annotated[float, Number("laps", "", 0.0, 1000.0, "how many; 0: until another command")] = 1.0
     yaw_mode: Annotated[
         str, EnumArgument("yaw_mode", ("path", "hold"), "yaw: along the path, or unchanged")

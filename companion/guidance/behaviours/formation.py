@@ -80,7 +80,7 @@ class Formation(Command):
     points: Annotated[
         str | None, Points("points", 'path of a virtual leader, from home: "0,0 20,0 20,20,8"')
     ] = None
-    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "of a virtual leader, at most")] = 2.0
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "maximum speed of a virtual leader")] = 2.0
     laps: Annotated[float, Number("laps", "", 0.0, 1000.0, "of its path; 0: until another command")] = 1.0
     lost_timeout_s: Annotated[
         float, Number("lost_timeout", "s", 0.5, 600.0, "how long to hold without the leader's pose")

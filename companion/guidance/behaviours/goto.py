@@ -20,22 +20,31 @@ GLOBAL_MAX_AGE_S = 0.5
 
 @behaviour("goto", "fly straight to a point, given by one pair of arguments")
 class Goto(Command):
-    north_m: Annotated[float | None, Number("north", "m", -5000.0, 5000.0, "of home, with east")] = None
-    east_m: Annotated[float | None, Number("east", "m", -5000.0, 5000.0, "of home, with north")] = None
-    altitude_m: Annotated[
-        float | None, Number("altitude", "m", 1.0, 500.0, "above home; default: unchanged")
+    north_m: Annotated[
+        float | None, Number("north", "m", -5000.0, 5000.0, "distance north of home; needs east")
     ] = None
-    forward_m: Annotated[float | None, Number("forward", "m", -5000.0, 5000.0, "of here, with right")] = None
-    right_m: Annotated[float | None, Number("right", "m", -5000.0, 5000.0, "of here, with forward")] = None
+    east_m: Annotated[
+        float | None, Number("east", "m", -5000.0, 5000.0, "distance east of home; needs north")
+    ] = None
+    altitude_m: Annotated[
+        float | None, Number("altitude", "m", 1.0, 500.0, "height above home; default: unchanged")
+    ] = None
+    forward_m: Annotated[
+        float | None, Number("forward", "m", -5000.0, 5000.0, "distance ahead of here; needs right")
+    ] = None
+    right_m: Annotated[
+        float | None, Number("right", "m", -5000.0, 5000.0, "distance right of here; needs forward")
+    ] = None
     latitude_deg: Annotated[
-        float | None, Number("latitude", "deg", -90.0, 90.0, "WGS 84, with longitude")
+        float | None, Number("latitude", "deg", -90.0, 90.0, "WGS 84; needs longitude")
     ] = None
     longitude_deg: Annotated[
-        float | None, Number("longitude", "deg", -180.0, 180.0, "WGS 84, with latitude")
+        float | None, Number("longitude", "deg", -180.0, 180.0, "WGS 84; needs latitude")
     ] = None
-    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "at most")] = 3.0
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "maximum speed")] = 3.0
     heading_deg: Annotated[
-        float | None, Number("heading", "deg", -360.0, 360.0, "of the nose; default: along the path")
+        float | None,
+        Number("heading", "deg", -360.0, 360.0, "yaw, clockwise from north; default: along the path"),
     ] = None
 
     def __post_init__(self) -> None:

@@ -65,7 +65,7 @@ class Patrol(Command):
     merge_radius_m: Annotated[
         float, Number("merge_radius", "m", 0.5, 100.0, "detections within this distance are one object")
     ] = 5.0
-    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "at most")] = 3.0
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "maximum speed")] = 3.0
     laps: Annotated[float, Number("laps", "", 0.0, 1000.0, "how many; 0: until another command")] = 0.0
     confidence: Annotated[float, Number("confidence", "", 0.05, 1.0, "minimum confidence")] = 0.4
 

@@ -9,7 +9,7 @@ from companion.vehicle.state import FlightMode
 TIMEOUT_S = 5.0
 
 
-@behaviour("stop", "end our command; the autopilot holds the position")
+@behaviour("stop", "end offboard control; the autopilot holds the position")
 class Stop(Command):
     def build(self, context: BuildContext) -> Behaviour:
         return StopBehaviour()

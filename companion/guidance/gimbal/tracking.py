@@ -13,7 +13,7 @@ from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.state import Vector3
 
 GimbalUse = Annotated[
-    str, EnumArgument("gimbal", ("leave", "track"), "leave it alone, or keep its camera on the object")
+    str, EnumArgument("gimbal", ("leave", "track"), "leave: not moved; track: camera kept on the object")
 ]
 
 # Straight below, an elevation does not determine a height.

@@ -22,7 +22,7 @@ from companion.guidance.limits.battery import needs_charge
 from vision.obstacle_sectors import SECTOR_RAD, SECTORS, ObstacleSectors
 
 ObstacleUse = Literal["off", "auto", "required"]
-# A multirotor's velocity delay and deceleration, below those of the built-in vehicle: PX4's integral against
+# A multirotor's velocity delay and deceleration, below those of the simulated vehicle: PX4's integral against
 # drag (MPC_XY_VEL_I_ACC) persists for a second when the vehicle should stop.
 LATENCY_S = 0.6
 DECELERATION_MPS2 = 0.7

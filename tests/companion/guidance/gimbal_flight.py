@@ -1,4 +1,4 @@
-"""Lockstep flight with a camera on the built-in vehicle's gimbal."""
+"""Lockstep flight with a camera on the simulated vehicle's gimbal."""
 
 from __future__ import annotations
 

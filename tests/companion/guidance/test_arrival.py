@@ -1,6 +1,6 @@
-"""Arrival accuracy of behaviours, in lockstep with the built-in vehicle in wind and gusts.
+"""Arrival accuracy of behaviours, in lockstep with the simulated vehicle in wind and gusts.
 
-The built-in vehicle moves like a measured PX4 (velocity step, stop and overshoot); the others respond more
+The simulated vehicle moves like a measured PX4 (velocity step, stop and overshoot); the others respond more
 slowly. Distances are by the vehicle's own estimate, whose error comes on top.
 """
 

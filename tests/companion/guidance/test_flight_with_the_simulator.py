@@ -1,4 +1,4 @@
-"""Guidance with a real driver, a real socket and the built-in vehicle in its own process."""
+"""Guidance with a real driver, a real socket and the simulated vehicle in its own process."""
 
 import asyncio
 import math

@@ -1,4 +1,4 @@
-"""Seek with a sweep and gimbal commands, with driver, socket and the built-in vehicle."""
+"""Seek with a sweep and gimbal commands, with driver, socket and the simulated vehicle."""
 
 from __future__ import annotations
 

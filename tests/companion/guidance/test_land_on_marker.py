@@ -1,4 +1,4 @@
-"""Landing on a marker, in lockstep with the built-in vehicle and step by step."""
+"""Landing on a marker, in lockstep with the simulated vehicle and step by step."""
 
 from __future__ import annotations
 

@@ -275,7 +275,7 @@ def test_invalid_commands_are_one_line_errors(text: str, words: str) -> None:
         "goto altitude=8 forward=5 right=0 heading=90",
         "goto latitude=47.397742 longitude=8.545594",
         'follow-path "0,0 10,0,6" laps=0',
-        "figure-eight radius=8 nose=still",
+        "figure-eight radius=8 yaw_mode=hold",
     ],
 )
 def test_commands_round_trip_and_build_a_behaviour(text: str) -> None:

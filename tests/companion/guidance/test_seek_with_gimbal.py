@@ -1,4 +1,4 @@
-"""`seek` with a camera on a gimbal, flown with the built-in vehicle in lockstep.
+"""`seek` with a camera on a gimbal, flown with the simulated vehicle in lockstep.
 
 A person stands nearly below the vehicle, 68° below the horizon: outside the view of a forward camera (its
 image ends 32° down), and inside that of a gimbal camera that is pitched down.

@@ -24,7 +24,7 @@ from tests.companion.service_process import ServiceProcess, running_service
 
 pytestmark = pytest.mark.realtime
 
-# COM_OF_LOSS_T of the built-in vehicle (PX4's default), and the tolerance.
+# COM_OF_LOSS_T of the simulated vehicle (PX4's default), and the tolerance.
 LOSS_S, ALLOWED_S = 1.0, 0.5
 
 

@@ -1,4 +1,4 @@
-"""One contract, two drivers: each controls the built-in vehicle in its own process, over a real socket."""
+"""One contract, two drivers: each controls the simulated vehicle in its own process, over a real socket."""
 
 from __future__ import annotations
 
