@@ -63,14 +63,16 @@ class StreamRequests:
     def _update_state(self) -> None:
         """Write the missing streams into the state, and log changes."""
         names = tuple(message_name(message_id) for message_id in self.monitor.missing)
-        if names == self._telemetry.state.missing_streams:
+        before = self._telemetry.state.missing_streams
+        if names == before:
             return
         self._telemetry.state = replace(self._telemetry.state, missing_streams=names)
         if not names:
             logger.info("%s: all streams received", self._url)
             return
-        # Usual at the start: most autopilots send few streams without a request.
-        level = logging.WARNING if self._asked_before else logging.INFO
+        # Usual at the start: most autopilots send few streams without a request, and some begin late.
+        lost = self._asked_before and set(names) - set(before)
+        level = logging.WARNING if lost else logging.INFO
         logger.log(level, "%s: streams missing or too slow, requested: %s", self._url, ", ".join(names))
         self._asked_before = True
 

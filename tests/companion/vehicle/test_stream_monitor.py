@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import logging
+
+import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.vehicle.ardupilot_profile import ArduPilotProfile
 from companion.vehicle.stream_monitor import StreamMonitor
+from companion.vehicle.stream_requests import StreamRequests
+from companion.vehicle.telemetry_state import TelemetryState
 from mavlink_sim import LockstepVehicle
 from mavlink_sim.wire.messages import dialect
 
@@ -161,3 +166,20 @@ def test_copter_streams_return_after_being_stopped() -> None:
         client.copter.step(1.0)
         counted = [message.get_type() for message in client.copter.receive()]
         assert counted.count("LOCAL_POSITION_NED") >= 25
+
+
+def test_only_a_newly_missing_stream_is_a_warning(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At the start most are missing, and slow ones come last; a stream that stops later is a warning."""
+
+    async def command(*_: float) -> int:
+        return 0
+
+    requests = StreamRequests("url", TelemetryState("url", lambda: None), command)
+    caplog.set_level(logging.INFO)
+    for missing in ((ATTITUDE, HOME), (HOME,), (), (ATTITUDE,), (ATTITUDE, HOME), (HOME,)):
+        monkeypatch.setattr(StreamMonitor, "missing", missing)
+        requests._update_state()
+    levels = [record.levelno for record in caplog.records if "too slow" in record.message]
+    assert levels == [logging.INFO, logging.INFO, logging.WARNING, logging.WARNING, logging.INFO]
