@@ -189,5 +189,5 @@ def _runs(pid: int) -> bool:
 
 
 def test_invalid_rate_refused() -> None:
-    with pytest.raises(ValueError, match="rate"):
+    with pytest.raises(ValueError, match="rate must be positive"):
         CameraProcess(WORLD, rate_hz=0.0)

@@ -359,6 +359,7 @@ def test_fleet_start_inside_obstacle_is_one_line(
     assert ended.value.code == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert "box-0" in line
+    assert "north 0 m, east 5 m" in line
 
 
 @pytest.mark.parametrize("name", ["village", "marker_landing", "obstacle_course"])

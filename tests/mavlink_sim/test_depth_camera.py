@@ -93,10 +93,10 @@ def test_the_same_draws_give_the_same_depth() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"baseline_m": -1.0}, "baseline"),
+        ({"baseline_m": -1.0}, "baseline must be 0 to 2 m"),
         ({"step_px": 5.0}, "0 to 4 px"),
-        ({"minimum_m": 5.0, "maximum_m": 5.0}, "range"),
-        ({"dropout": 1.0}, "dropout"),
+        ({"minimum_m": 5.0, "maximum_m": 5.0}, "range must run upwards"),
+        ({"dropout": 1.0}, "dropout must be 0 to below 1"),
     ],
 )
 def test_invalid_sensor_refused(changes: dict[str, float], message: str) -> None:

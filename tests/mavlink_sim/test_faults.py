@@ -47,7 +47,7 @@ def test_faults_are_ended_by_number_by_name_and_all_together(harness: SimHarness
     assert faults.end() == 2
     assert faults.end("all") == 0
     assert faults.listing() == ["no faults"]
-    with pytest.raises(FaultError, match="fault 1"):
+    with pytest.raises(FaultError, match="no fault 1 to end"):
         faults.end(1)
 
 
@@ -60,7 +60,10 @@ def test_values_as_python_arguments(harness: SimHarness) -> None:
 
 @pytest.mark.parametrize(
     ("line", "message"),
-    [("link_loss link=usb", "usb"), ("wind 3 at=0.5", "at=0.5")],
+    [
+        ("link_loss link=usb", "no link 'usb'; there are: all, onboard, gcs"),
+        ("wind 3 at=0.5", r"at=0\.5 is in the past"),
+    ],
 )
 def test_a_fault_that_cannot_begin_is_refused_at_once(harness: SimHarness, line: str, message: str) -> None:
     harness.fly(1.0)

@@ -123,11 +123,11 @@ def test_invalid_print_refused(dictionary: str, identifier: int, size: float, me
 
 
 def test_only_plates_have_prints_and_only_structures_a_size() -> None:
-    with pytest.raises(ValueError, match="plate"):
+    with pytest.raises(ValueError, match="a plate must have a print"):
         WorldObject(0, "plate", (0.0, 0.0, 0.0))
-    with pytest.raises(ValueError, match="car"):
+    with pytest.raises(ValueError, match="a car has its own size"):
         WorldObject(0, "car", (0.0, 0.0, 0.0), size_m=(1.0, 1.0, 1.0))
-    with pytest.raises(ValueError, match="size"):
+    with pytest.raises(ValueError, match="size must be three lengths"):
         WorldObject(0, "wall", (0.0, 0.0, 0.0), size_m=(1.0, 0.0, 1.0))
 
 

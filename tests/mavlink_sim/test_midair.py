@@ -187,7 +187,7 @@ def test_overlapping_start_refused() -> None:
     fleet_world = FleetWorld(3)
     first = LockstepVehicle({"onboard": {}}).vehicle
     fleet_world.join(first)
-    with pytest.raises(ValueError, match="vehicle 1"):
+    with pytest.raises(ValueError, match="vehicle 1 has joined already"):
         fleet_world.join(first)
     near = LockstepVehicle({"onboard": {}}, system_id=2, start_ned_m=(0.0, 0.5)).vehicle
     with pytest.raises(ValueError, match=r"vehicle 2 .*0\.5 m.*vehicle 1.*0\.6 m"):

@@ -143,7 +143,7 @@ def test_motion_is_difference_of_poses() -> None:
     [
         ({"loss": 1.0}, "frames lost"),
         ({"latency_s": -1.0}, "0 to 5 s"),
-        ({"rate_hz": 0.0}, "rate"),
+        ({"rate_hz": 0.0}, "rate must be positive"),
     ],
 )
 def test_invalid_camera_refused(changes: dict[str, Any], message: str) -> None:

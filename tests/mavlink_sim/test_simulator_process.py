@@ -93,7 +93,7 @@ def test_a_taken_port_gives_one_clear_line_and_code_two() -> None:
         finished = run("--onboard-bind", str(port), "--gcs-bind", "0")
     assert finished.returncode == 2
     (line,) = finished.stderr.strip().splitlines()
-    assert f"127.0.0.1:{port}" in line
+    assert f"127.0.0.1:{port} is already in use" in line
 
 
 def test_version_is_printed() -> None:

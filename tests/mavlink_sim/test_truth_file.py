@@ -28,12 +28,12 @@ def test_each_line_is_flushed(tmp_path: Path) -> None:
 @needs_full
 def test_full_disk_reported_once_and_ends_file() -> None:
     file = TruthFile(FULL)
-    assert "/dev/full" in (file.write("line") or "")
+    assert "/dev/full: No space left on device" in (file.write("line") or "")
     assert file.write("line") is None
 
 
 @needs_full
 def test_vehicle_continues_after_truth_write_error() -> None:
     with running_simulator(truth=FULL) as simulator:
-        simulator.wait_for_event("/dev/full")
+        simulator.wait_for_event("/dev/full: No space left on device")
         assert simulator.process.poll() is None

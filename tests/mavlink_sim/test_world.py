@@ -101,5 +101,5 @@ def test_range_ahead_of_car_is_to_its_bumper() -> None:
 def test_unknown_class_refused() -> None:
     with pytest.raises(ValueError, match="unknown class 'zebra'"):
         WorldObject(0, "zebra", (0.0, 0.0, 0.0))
-    with pytest.raises(ValueError, match="scale"):
+    with pytest.raises(ValueError, match="scale must be positive"):
         WorldObject(0, "car", (0.0, 0.0, 0.0), scale=0.0)

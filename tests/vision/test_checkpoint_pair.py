@@ -78,7 +78,7 @@ def test_files_of_different_pairs_are_rejected(pair: Path, model: YoloModel) -> 
     [
         pytest.param({"format": "other"}, "format other", id="format"),
         pytest.param({"architecture": None}, "has no `architecture`", id="no architecture"),
-        pytest.param({"weights": 3}, "`weights`", id="weights"),
+        pytest.param({"weights": 3}, "`weights` in model.yaml must be a table", id="weights"),
         pytest.param({"architecture": {"names": {0: "a", 2: "b"}}}, "not numbered from 0", id="names"),
         pytest.param({"architecture": {"names": ["a"]}}, "a network needs 1", id="no rows"),
     ],
@@ -97,11 +97,11 @@ def test_half_a_pair_names_the_other_half(pair: Path) -> None:
     description = pair.with_suffix(".yaml")
     kept = description.read_text()
     description.unlink()
-    with pytest.raises(CheckpointError, match=r"model\.yaml: no"):
+    with pytest.raises(CheckpointError, match=r"model\.yaml: no such file; model\.safetensors needs it"):
         load_checkpoint(pair)
     description.write_text(kept)
     pair.unlink()
-    with pytest.raises(CheckpointError, match=r"model\.safetensors: no"):
+    with pytest.raises(CheckpointError, match=r"model\.safetensors: no such file"):
         load_checkpoint(description)
 
 

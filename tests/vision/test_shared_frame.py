@@ -272,7 +272,7 @@ def test_frame_of_another_size_is_rejected_with_both_sizes(name: str) -> None:
     with SharedFrameWriter(name, 16, 12, True) as writer:
         with pytest.raises(ValueError, match=r"16x12 .*8x6"):
             writer.write(frame(0, 8, 6))
-        with pytest.raises(ValueError, match="with depth"):
+        with pytest.raises(ValueError, match="with depth, the frame has none"):
             writer.write(frame(0, depth=False))
     with pytest.raises(ValueError, match="closed"):
         writer.write(frame(0))

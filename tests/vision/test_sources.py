@@ -216,11 +216,11 @@ def broken_images(path: Path) -> str:
     [
         pytest.param(missing_file, r"bike\.mp4: .*bikes\.mp4", id="missing, with a hint"),
         pytest.param(lambda path: str(path / "no/where.mp4"), "does not exist", id="no folder"),
-        pytest.param(empty_file, "empty", id="empty"),
+        pytest.param(empty_file, "the file is empty", id="empty"),
         pytest.param(text_file, r"text\.mp4: no video", id="not a video"),
         pytest.param(empty_folder, "no images", id="folder without images"),
         pytest.param(broken_images, "none of the 1", id="only broken images"),
-        pytest.param(lambda path: "gopher://x/y", "gopher://", id="unknown scheme"),
+        pytest.param(lambda path: "gopher://x/y", "unknown scheme gopher://", id="unknown scheme"),
         pytest.param(lambda path: "udp://127.0.0.1", "1 to 65535", id="no port"),
         pytest.param(lambda path: "udp://127.0.0.1:1?format=vp9", "mpegts, rtp-h264", id="RTP format"),
         pytest.param(lambda path: "shm://a/b", "plain file name", id="shared memory"),

@@ -145,7 +145,7 @@ def test_pipe_pixel_format_is_rejected_for_a_camera(device: Path) -> None:
 
 
 def test_missing_camera_is_a_one_line_error() -> None:
-    with pytest.raises(SourceError, match=r"/dev/video98765: no"):
+    with pytest.raises(SourceError, match=r"/dev/video98765: no such camera"):
         open_source("98765")
 
 

@@ -202,6 +202,7 @@ def test_broken_pyav_is_logged_and_opencv_is_used(
     assert len(frames_of(path, 10.0)) == 1
     (reported,) = [record.getMessage() for record in caplog.records]
     assert reported.startswith("PyAV")
+    assert "libav: wrong version" in reported
 
 
 def test_an_image_of_another_size_is_rejected(tmp_path: Path) -> None:

@@ -322,7 +322,7 @@ async def test_unknown_vehicle_has_no_service() -> None:
         def other_side() -> None:
             with (
                 open_client(client_settings(settings)) as session,
-                pytest.raises(NoAnswerError, match="'beta'"),
+                pytest.raises(NoAnswerError, match="no service for vehicle 'beta'"),
             ):
                 send_command(session, "beta", "hold")
 

@@ -147,7 +147,7 @@ def test_followers_hold_without_leader_and_resume() -> None:
     fleet.members["a"].muted = True
     fleet.run(8.5)
     for name in "bc":
-        assert ended(fleet, name).reason.endswith("6 s")
+        assert ended(fleet, name).reason.endswith("leader a; waited for 6 s")
         assert not ended(fleet, name).success
     assert separated(fleet)
 
@@ -213,6 +213,8 @@ def test_virtual_structure_flies_its_path_and_ends() -> None:
     members = fleet.members.values()
     assert fleet.run_until(lambda: all(member.outcome is not None for member in members), 90.0)
     assert all(ended(fleet, name).success for name in fleet.members)
+    for name in fleet.members:
+        assert "flown its path" in ended(fleet, name).reason
     assert separated(fleet)
     centre = [sum(member.airframe.place()[axis] for member in members) / 3 for axis in range(3)]
     # Three abreast: their centre is the structure's.

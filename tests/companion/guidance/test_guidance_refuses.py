@@ -112,7 +112,7 @@ def test_goal_beyond_the_limits_is_refused_before_flight(behaviour: Behaviour, w
     harness.run(0.1)
     outcome = harness.command(behaviour).result()
     assert not outcome.success
-    assert outcome.reason.startswith(behaviour.name)
+    assert outcome.reason.startswith(f"{behaviour.name} would leave the limits: ")
     assert where in outcome.reason
     assert not harness.autopilot.setpoints
 

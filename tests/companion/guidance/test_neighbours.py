@@ -150,7 +150,7 @@ def test_missing_neighbour_is_named_in_the_refusal() -> None:
     neighbours.ingest(pose(1), NOW_NS)
     assert words(NOW_NS) is None
     assert "alpha (stale: 2.0 s)" in (words(NOW_NS + 2 * SECOND) or "")
-    assert len(missing_neighbours(None, ())) == 1
+    assert missing_neighbours(None, ()) == ["neighbours (this service does not share poses)"]
     lost = neighbours.neighbourhood(replace(state_at(NOW_NS), global_ns=0), NOW_NS)
     assert "s old" in missing_neighbours(lost, ())[0]
     assert (

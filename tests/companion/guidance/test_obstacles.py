@@ -145,6 +145,8 @@ def test_brake_is_sent_while_depth_is_missing() -> None:
         EventKind.BLIND,
         EventKind.NOTED,
     ]
+    assert "no depth" in harness.events[-2].message
+    assert "depth" in harness.events[-1].message
 
 
 def test_obstacle_outside_the_image_is_remembered() -> None:

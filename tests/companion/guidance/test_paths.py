@@ -259,7 +259,7 @@ def test_north_east_agrees_with_the_ellipsoid(
         ("follow-path 1,nan", "'1,nan'"),
         ("follow-path 1e308,0 1,1", "within 5000 m"),
         ("follow-path 1,1,-50 1,2", "1 to 500 m high"),
-        ("follow-path 1,1 1,2 laps=0.5", "laps must be"),
+        ("follow-path 1,1 1,2 laps=0.5", "laps must be 0, or 1 or more"),
         ("figure-eight radius=1", "3 to 200"),
     ],
 )

@@ -41,7 +41,7 @@ def test_patrol_without_objects_flies_its_lap() -> None:
     outcome, notes, flight = active(PatrolBehaviour(ROUND, ["car"], laps=1.0), [SeenObject("person", 10, 3)])
     assert outcome is not None
     assert outcome.success, outcome.reason
-    assert outcome.reason.endswith("0 stops")
+    assert outcome.reason.endswith("1 lap of 4 points flown, 0 stops")
     assert notes == []
     assert max(nearest(flight, corner) for corner in ROUND) < 1.5
 

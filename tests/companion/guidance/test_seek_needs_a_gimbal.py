@@ -191,10 +191,10 @@ def test_cleared_gimbal_attitude_ends_the_sweep(left: GimbalState | None, ended:
     assert isinstance(behaviour.update(0.05, now), Setpoint)
     behaviour._failure = "no car found" if ended else ""  # the gimbal then returns
     later = replace(now, now_ns=NOW_NS + 50_000_000, state=replace(now.state, gimbal=left))
-    words = "not responding" if left is None else left.why_not_looking(later.now_ns)
-    outcome = behaviour.update(0.05, later)
-    assert isinstance(outcome, Outcome)
-    assert outcome.reason.endswith(words or "?")
+    reason = "gimbal manager not responding"
+    if left is not None:
+        reason = f"seek lost the gimbal: {left.why_not_looking(later.now_ns) or '?'}"
+    assert behaviour.update(0.05, later) == Outcome(False, reason)
 
 
 def test_missing_gimbal_at_the_start_is_named() -> None:

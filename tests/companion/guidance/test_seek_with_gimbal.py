@@ -27,6 +27,7 @@ from tests.companion.guidance.gimbal_flight import (
     gimbal_flight,
     person,
 )
+from tests.companion.guidance.guidance_harness import assert_failed
 
 # Bounds of the combined errors of image, gimbal and estimator.
 DIRECTION_BOUND_RAD, PLACE_BOUND_M = math.radians(1.5), 0.6
@@ -114,16 +115,14 @@ def test_mission_step_holds_until_the_gimbal_points_there() -> None:
 
 def test_without_sweep_it_is_not_found() -> None:
     _, log, _ = fly("seek person laps=1", person(0.0))
-    assert log.outcome is not None
-    assert not log.outcome.success
+    assert_failed(log.outcome, "found in 1 lap")
 
 
 def test_directions_and_positions_while_gimbal_and_yaw_turn() -> None:
     """Searches for another class, so that the sweep does not stop; wind tilts the vehicle."""
     scene_object = person(60.0)
     _, log, seen = fly("seek car sweep=-60 laps=1", scene_object, wind_mps=3.0)
-    assert log.outcome is not None
-    assert not log.outcome.success
+    assert_failed(log.outcome, "found in 1 lap")
     assert pitches(log)[-1] == pytest.approx(pitches(log)[0], abs=5.0), "returned to the initial pitch"
     assert min(pitches(log)) == pytest.approx(-60.0, abs=5.5)
     errors_rad, errors_m = [], []

@@ -144,4 +144,4 @@ def test_stop_times_out_with_the_current_mode() -> None:
     outcome = behaviour.update(0.02, context(6, mode=FlightMode.OFFBOARD))
     assert isinstance(outcome, Outcome)
     assert not outcome.success
-    assert outcome.reason.endswith("offboard mode")
+    assert outcome.reason.endswith("in 5 s: offboard mode")

@@ -167,6 +167,10 @@ def test_ground_point_is_recovered_from_the_box_foot(camera: CameraModel, scene:
     assert at_point.position_ned_m is not None
     away = math.dist(point[:2], at_point.position_ned_m[:2])
     assert away == pytest.approx(CONTACT_INSET_M, abs=0.02 * distance)
+    assert target.position_ned_m is not None
+    away = math.dist(point[:2], target.position_ned_m[:2])
+    # The middle's offset grows with the slant range: at most 2.2 % of it in 355,000 random scenes.
+    assert away == pytest.approx(CONTACT_INSET_M, abs=0.03 * math.hypot(distance, height))
     assert target.range_source is RangeSource.GROUND_PLANE
     assert target.ground_range_m == pytest.approx(distance - CONTACT_INSET_M, abs=0.02 * distance)
     assert target.distance_m == pytest.approx(math.hypot(target.ground_range_m, height), rel=1e-6)

@@ -172,11 +172,11 @@ async def test_end_of_source_finishes_perception(photos: Path) -> None:
 @pytest.mark.parametrize(
     ("overrides", "named"),
     [
-        ({"source.uri": "/nowhere/street.mp4"}, "/nowhere/street.mp4"),
-        ({"detector.enabled": "true", "detector.model": "/nowhere/m.pt"}, "/nowhere/m.pt"),
-        ({"detector.enabled": "true", "detector.kind": "rad"}, "'rad'"),
-        ({"plugins.modules": "no_such_module"}, "no_such_module"),
-        ({"recording.video": "/dev/null/v.webm"}, "/dev/null/v.webm"),
+        ({"source.uri": "/nowhere/street.mp4"}, "/nowhere/street.mp4: no such file"),
+        ({"detector.enabled": "true", "detector.model": "/nowhere/m.pt"}, "/nowhere/m.pt: no such file"),
+        ({"detector.enabled": "true", "detector.kind": "rad"}, "unknown kind 'rad'"),
+        ({"plugins.modules": "no_such_module"}, "no module 'no_such_module'"),
+        ({"recording.video": "/dev/null/v.webm"}, "/dev/null/v.webm: cannot be written"),
     ],
 )
 async def test_start_failure_is_one_line(photos: Path, overrides: dict[str, str], named: str) -> None:

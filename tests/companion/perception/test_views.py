@@ -83,7 +83,7 @@ def test_guidance_camera_selects_the_steering_view(
         running_service(simulator.onboard_port, flags, cwd=tmp_path) as service,
     ):
         # Only the classes of that view's model can be sought.
-        assert "'bicycle'" in service.command("seek bicycle")["reason"]
+        assert "unknown class 'bicycle'" in service.command("seek bicycle")["reason"]
         assert "in the air" in service.command("seek boat")["reason"]
 
 

@@ -57,7 +57,7 @@ async def test_request_is_answered_with_its_result() -> None:
 
 async def test_internal_cancellation_is_answered() -> None:
     hold = Request(7, SetMode(FlightMode.HOLD))
-    assert await refusal_of(FakeDriver(asyncio.CancelledError()), hold) is not None
+    assert await refusal_of(FakeDriver(asyncio.CancelledError()), hold) == "the request was cancelled"
 
 
 async def test_cancelled_request_is_not_answered() -> None:

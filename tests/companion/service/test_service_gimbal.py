@@ -83,11 +83,11 @@ async def test_targets_need_the_gimbals_attitude() -> None:
     set_state(service, state_at(now_ns, None))
     see(service, now_ns)
     assert not service.views[0].targets
-    assert "gimbal" in service.status()["targets"]["localization_error"]
-    assert "gimbal" in service.status()["gimbal"]["problem"]
+    assert "no attitude of the gimbal" in service.status()["targets"]["localization_error"]
+    assert "not responding" in service.status()["gimbal"]["problem"]
     context = step(service, now_ns)
     assert not context.perception_fresh
-    assert "gimbal" in context.gimbal.direction_fault
+    assert "not responding" in context.gimbal.direction_fault
 
     set_state(service, state_at(now_ns + 1, looking_down(now_ns + 1)))
     see(service, now_ns + 1)
@@ -103,7 +103,8 @@ async def test_targets_need_the_gimbals_attitude() -> None:
     set_state(service, replace(state_at(later_ns, looking_down(now_ns + 1))))
     see(service, later_ns)
     assert not service.views[0].targets
-    assert "gimbal" in service.status()["targets"]["localization_error"]
+    error = service.status()["targets"]["localization_error"]
+    assert "newer than the newest attitude of the gimbal" in error
     assert "2.0 s" in step(service, later_ns).gimbal.direction_fault
 
 
@@ -132,7 +133,7 @@ async def test_gimbal_command_without_a_gimbal_is_refused() -> None:
     steering = asyncio.create_task(service._loop.run())
     reply = await service.command("gimbal pitch=-30")
     assert not reply["success"]
-    assert "gimbal" in reply["reason"]
+    assert "not responding" in reply["reason"]
     assert service.guidance.behaviour is None
     steering.cancel()
     await asyncio.gather(steering, return_exceptions=True)
@@ -153,11 +154,12 @@ async def test_gimbal_of_a_camera_is_searched_and_its_loss_reported() -> None:
     later_ns = now_ns + 1_000_000_000
     set_state(service, state_at(later_ns, looking_down(later_ns)))
     service._loop._step(later_ns)
-    assert (service.events[-1].level, "gimbal" in service.events[-1].text) == ("info", True)
+    assert (service.events[-1].level, "direction known" in service.events[-1].text) == ("info", True)
     lost_ns = later_ns + 10_000_000_000
     set_state(service, state_at(lost_ns, looking_down(later_ns)))
     service._loop._step(lost_ns)
-    assert "10.0 s" in service.events[-1].text
+    assert "direction unknown" in service.events[-1].text
+    assert "10.0 s old" in service.events[-1].text
 
 
 def test_stabilized_and_on_gimbal_exclude_each_other() -> None:

@@ -68,7 +68,7 @@ async def test_mode_is_sent_as_main_and_sub_mode(driver: Driver, autopilot: Fake
         (m.param1, m.param2, m.param3) for m in autopilot.received_named("COMMAND_LONG") if m.command == 176
     ]
     assert asked == [(1, 6, 0), (1, 4, 6), (1, 4, 5), (1, 4, 3)]
-    with pytest.raises(ValueError, match="unknown"):
+    with pytest.raises(ValueError, match="mode unknown cannot be requested"):
         await driver.set_mode(FlightMode.UNKNOWN)
 
 

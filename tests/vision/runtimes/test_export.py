@@ -144,7 +144,7 @@ def test_file_with_wrong_outputs_is_not_kept(
     [
         ({"to": "coreml"}, "tensorrt, torchscript"),
         ({"to": "torchscript", "image_size": 100}, "multiple of 32"),
-        ({"to": "torchscript", "output": Path("net.onnx")}, ".torchscript"),
+        ({"to": "torchscript", "output": Path("net.onnx")}, r"\.torchscript"),
     ],
 )
 def test_invalid_export_is_rejected(checkpoint: Path, arguments: dict[str, Any], expected: str) -> None:

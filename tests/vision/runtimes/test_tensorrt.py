@@ -47,5 +47,5 @@ def test_a_precision_that_a_plan_does_not_have_is_rejected(engine: Path) -> None
 
 
 def test_missing_plan_is_a_one_line_error(tmp_path: Path) -> None:
-    with pytest.raises(RuntimeUnusableError, match=r"none\.engine"):
+    with pytest.raises(RuntimeUnusableError, match=r"none\.engine: no such file"):
         read_source(tmp_path / "none.engine")
