@@ -8,7 +8,7 @@ ALLOW_CUDA ?=
 TORCH := --constraint constraints.txt $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) torch
 # Tests at once: of those that compute, and of those that fly in real time and mostly wait.
 WORKERS ?= auto
-REALTIME_WORKERS ?= 4
+REALTIME_WORKERS ?= 6
 BIN := $(VENV)/bin
 READY := $(VENV)/.installed
 
