@@ -24,7 +24,7 @@ from companion.vehicle.commander import ONBOARD_CONTROLLER, commander_mode, read
 from companion.vehicle.connection_advice import no_answer_advice, no_autopilot_text, unsupported_autopilot
 from companion.vehicle.driver import CommandRefusedError, LinkError, NoAnswerError, SystemStatus
 from companion.vehicle.flight_commands import FlightCommands
-from companion.vehicle.framing import Frame, Framer, is_signed, pack_frame
+from companion.vehicle.framing import CURRENT_MODE_ID, Frame, Framer, is_signed, pack_frame
 from companion.vehicle.gimbal import Address, GimbalAim
 from companion.vehicle.gimbal_commands import GimbalCommands
 from companion.vehicle.landing_target import LandingTarget, landing_target_fields
@@ -46,6 +46,7 @@ _AUTOPILOT_INVALID = 8  # MAV_AUTOPILOT: not an autopilot
 _HEARTBEAT = struct.Struct(
     "<IBBBBB"
 )  # custom_mode, type, autopilot, base_mode, system_status, mavlink_version
+_CURRENT_MODE = struct.Struct("<II")  # custom_mode, intended_custom_mode; standard_mode is not read
 _NAMED_VALUE_INT_ID = 252
 _NAMED_VALUE_INT = struct.Struct("<II10s")  # time_boot_ms, value, name
 _FRAME_LOCAL_NED = 1
@@ -269,6 +270,9 @@ class AutopilotDriver(ABC):
                     elif frame.message_id == _SYSTEM_TIME_ID:
                         _, boot_ms = _SYSTEM_TIME.unpack(frame.padded(_SYSTEM_TIME.size))
                         self._telemetry.watch_clock("SYSTEM_TIME", boot_ms, time.monotonic_ns())
+                    elif frame.message_id == CURRENT_MODE_ID:
+                        self._current_mode_from(frame)
+                        continue
                     elif self._reports.on_frame(frame):
                         continue
                 ours.append(frame)
@@ -311,6 +315,13 @@ class AutopilotDriver(ABC):
         fields = {"custom_mode": custom_mode, "base_mode": base_mode, "system_status": system_status}
         self._telemetry.handle("HEARTBEAT", fields)
         self._heartbeat_received.set()
+
+    def _current_mode_from(self, frame: Frame) -> None:
+        """Apply a CURRENT_MODE here, like HEARTBEAT: a library may deliver it after newer heartbeats."""
+        if self._autopilot_kind in self.flown_autopilots:
+            shown, intended = _CURRENT_MODE.unpack(frame.padded(_CURRENT_MODE.size))
+            fields = {"custom_mode": shown, "intended_custom_mode": intended}
+            self._telemetry.handle("CURRENT_MODE", fields)
 
     def _commander_from(self, frame: Frame, mav_type: int, custom_mode: int) -> None:
         """Note another service on this vehicle, if the heartbeat is one's."""

@@ -38,7 +38,8 @@ logger = logging.getLogger(__name__)
 _library_logger = logging.getLogger("mavsdk")
 
 _T = TypeVar("_T")
-_SUBSCRIBED = sorted(TELEMETRY_MESSAGES - {"HEARTBEAT"} | {"COMMAND_ACK"})
+# The base class applies both modes in their order of arrival.
+_SUBSCRIBED = sorted(TELEMETRY_MESSAGES - {"HEARTBEAT", "CURRENT_MODE"} | {"COMMAND_ACK"})
 # After a hang of the loop: neither a setpoint nor a repeated command may arrive late.
 _STALE_NS = round(DEFAULT_LIFETIME_S * 1e9)
 _PARAM_REASONS = {

@@ -14,7 +14,7 @@ from pymavlink.dialects.v20 import common as mavlink
 from companion.vehicle.autopilot_driver import AUTOPILOT_COMPONENT, HEARTBEAT_ID, AutopilotDriver
 from companion.vehicle.autopilot_profile import ARDUPILOT, PX4
 from companion.vehicle.driver import CommandRefusedError
-from companion.vehicle.framing import CURRENT_MODE_ID, EKF_STATUS_REPORT_ID, Frame
+from companion.vehicle.framing import EKF_STATUS_REPORT_ID, Frame
 from companion.vehicle.link_url import LinkUrl
 from companion.vehicle.mav_result import IN_PROGRESS
 from companion.vehicle.telemetry import TELEMETRY_MESSAGES, Fields
@@ -26,7 +26,6 @@ _GIMBAL_ATTITUDE_ID = 285
 # In wire order: the value's bytes unchanged, not converted through a float.
 _PARAM_SET = struct.Struct("<4sBB16sB")
 _EKF_STATUS_REPORT = struct.Struct("<5fH")  # five variances, flags; airspeed_variance is not read
-_CURRENT_MODE = struct.Struct("<II")  # custom_mode, intended_custom_mode; standard_mode is not read
 _DECODED_IDS = {
     message_id
     for message_id, message in mavlink.mavlink_map.items()
@@ -91,12 +90,7 @@ class PymavlinkDriver(AutopilotDriver):
             from_autopilot = frame.component_id == AUTOPILOT_COMPONENT
             if not from_autopilot and frame.message_id != _GIMBAL_ATTITUDE_ID:
                 continue
-            if frame.message_id == CURRENT_MODE_ID:
-                shown, intended = _CURRENT_MODE.unpack(frame.padded(_CURRENT_MODE.size))
-                self._telemetry.handle(
-                    "CURRENT_MODE", {"custom_mode": shown, "intended_custom_mode": intended}
-                )
-            elif frame.message_id == EKF_STATUS_REPORT_ID:
+            if frame.message_id == EKF_STATUS_REPORT_ID:
                 *_, flags = _EKF_STATUS_REPORT.unpack(frame.padded(_EKF_STATUS_REPORT.size))
                 self._telemetry.handle("EKF_STATUS_REPORT", {"flags": flags})
             elif frame.message_id in _DECODED_IDS:

@@ -115,6 +115,7 @@ def flight(link: AutopilotLink, driver: str, services: Services) -> Iterator[Fli
     link.until(lambda: link.ready, READY_S, "ready to be armed")
     yield ready
     bring_down(link)
+    assert not link.strangers, f"other programs send to {os.environ[URL]}: {sorted(link.strangers)}"
 
 
 @pytest.fixture

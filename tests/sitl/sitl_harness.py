@@ -42,6 +42,7 @@ _ARMED = dialect.MAV_MODE_FLAG_SAFETY_ARMED
 _DOWN = (dialect.MAV_LANDED_STATE_ON_GROUND, dialect.MAV_LANDED_STATE_UNDEFINED)
 _ANSWER_S = 3.0
 READY_S, GROUNDED_S = 180.0, 120.0
+SILENT_S = 1.0
 ORBIT_MPS = 2.8
 # Measured: by autopilot and driver, by what was flown.
 FIGURES: dict[str, dict[str, dict[str, float | None]]] = {}
@@ -75,6 +76,7 @@ class AutopilotLink:
         texts: STATUSTEXT of the autopilot. results: the newest MAV_RESULT of each command, whoever gave it.
         home_ned_m: of its newest HOME_POSITION. global_deg: latitude and longitude of its newest position.
         boots: how often its clock has begun again.
+        strangers: other addresses from which datagrams came; those are dropped.
         signed: its newest message bears a signature.
     """
 
@@ -92,6 +94,7 @@ class AutopilotLink:
         self.armed = self.ready = False
         self.landed = dialect.MAV_LANDED_STATE_UNDEFINED
         self.boots = 0
+        self.strangers: set[tuple[str, int]] = set()
         self.signed = False
         self.home_ned_m = (0.0, 0.0, 0.0)
         self.global_deg = (math.nan, math.nan)
@@ -101,6 +104,7 @@ class AutopilotLink:
         self._parameters: dict[str, tuple[float, int]] = {}
         self._changed = threading.Condition()
         self._peer: tuple[str, int] | None = None
+        self._peer_s = -math.inf
         if url.scheme is LinkScheme.UDP_IN:
             self._far = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
             self._far.bind(url.address)
@@ -243,7 +247,8 @@ class AutopilotLink:
                     if not self.cut:
                         self._to_autopilot(data)
                     continue
-                self._peer = sender or self._peer
+                if not self._from_peer(sender):
+                    continue
                 if not self.cut:
                     self._near.sendto(data, ("127.0.0.1", self.service_port))
                 messages = from_autopilot.parse_buffer(data) or []
@@ -252,6 +257,18 @@ class AutopilotLink:
                         if message.get_srcComponent() == 1 and self.system_id in (0, message.get_srcSystem()):
                             self._note(message, time.monotonic())
                     self._changed.notify_all()
+
+    def _from_peer(self, sender: tuple[str, int] | None) -> bool:
+        """Whether the one autopilot sent it. A restarted one may have another address."""
+        now_s = time.monotonic()
+        if sender not in (None, self._peer):
+            if now_s - self._peer_s < SILENT_S:
+                assert sender is not None
+                self.strangers.add(sender)
+                return False
+            self._peer = sender
+        self._peer_s = now_s
+        return True
 
     def _to_autopilot(self, data: bytes) -> None:
         if self._far.type is socket.SOCK_STREAM:

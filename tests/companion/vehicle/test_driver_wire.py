@@ -7,6 +7,7 @@ import logging
 import math
 import struct
 import time
+from itertools import groupby
 
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
@@ -14,6 +15,7 @@ from pymavlink.dialects.v20 import common as mavlink
 from companion.vehicle.driver import Driver, SystemStatus
 from companion.vehicle.drivers import open_driver
 from companion.vehicle.framing import CURRENT_MODE_ID, pack_frame
+from companion.vehicle.px4_modes import custom_mode_of_mode
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
 from tests.companion.vehicle.fake_autopilot import (
@@ -198,6 +200,20 @@ async def test_current_mode_updates_before_the_heartbeat(driver: Driver, autopil
     payload = struct.pack("<IIB", OFFBOARD, OFFBOARD, 0)
     autopilot.send_bytes(pack_frame(CURRENT_MODE_ID, payload, system_id=1, component_id=1, sequence=9))
     await wait_for_state(driver, lambda s: s.mode is FlightMode.OFFBOARD)
+
+
+async def test_modes_are_applied_in_their_order_of_arrival(driver: Driver, autopilot: FakeAutopilot) -> None:
+    """Also by a library whose threads deliver one of the two messages later than the other."""
+    autopilot.sends_heartbeats = False
+    await wait_for_state(driver, lambda s: s.mode is FlightMode.HOLD)
+    modes: list[FlightMode] = []
+    driver.subscribe(lambda state: modes.append(state.mode))
+    payload = struct.pack("<IIB", custom_mode_of_mode(FlightMode.TAKEOFF), 0, 0)
+    autopilot.send_bytes(pack_frame(CURRENT_MODE_ID, payload, system_id=1, component_id=1, sequence=9))
+    autopilot.heartbeat()  # in hold
+    autopilot.send(mavlink.MAVLink_local_position_ned_message(5, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0))
+    await wait_for_state(driver, lambda s: s.position_ned_m is not None)
+    assert [mode for mode, _ in groupby(modes)] == [FlightMode.TAKEOFF, FlightMode.HOLD]
 
 
 async def test_messages_of_other_components_are_ignored(
