@@ -111,7 +111,7 @@ class AutoDriver:
         self._driver.send_landing_target(target)
 
     def send_heartbeat(
-        self, status: SystemStatus, *, uptime_s: float = 0.0, in_command: bool = False
+        self, status: SystemStatus, *, uptime_s: float | None = None, in_command: bool = False
     ) -> None:
         """See Driver."""
         self._driver.send_heartbeat(status, uptime_s=uptime_s, in_command=in_command)

@@ -407,10 +407,11 @@ class AutopilotDriver(ABC):
         )
 
     def send_heartbeat(
-        self, status: SystemStatus, *, uptime_s: float = 0.0, in_command: bool = False
+        self, status: SystemStatus, *, uptime_s: float | None = None, in_command: bool = False
     ) -> None:
         """See Driver."""
-        mode = commander_mode(uptime_s, in_command)
+        own_uptime_s = (time.monotonic_ns() - self._started_ns) / 1e9
+        mode = commander_mode(own_uptime_s if uptime_s is None else uptime_s, in_command)
         payload = _HEARTBEAT.pack(mode, ONBOARD_CONTROLLER, _AUTOPILOT_INVALID, 0, int(status), 3)
         self._own_heartbeats.append((self._sequence, mode))
         self._transmit_payload(HEARTBEAT_ID, payload)

@@ -89,12 +89,12 @@ class Driver(Protocol):
         """Send one LANDING_TARGET now, in the frame that this autopilot accepts."""
 
     def send_heartbeat(
-        self, status: SystemStatus, *, uptime_s: float = 0.0, in_command: bool = False
+        self, status: SystemStatus, *, uptime_s: float | None = None, in_command: bool = False
     ) -> None:
         """Send one HEARTBEAT of MAV_TYPE_ONBOARD_CONTROLLER now.
 
         It carries uptime and whether this service is in command, for another service on the same vehicle
-        (`companion.vehicle.commander`).
+        (`companion.vehicle.commander`). Default of the uptime: since this driver was created.
         """
 
     @property

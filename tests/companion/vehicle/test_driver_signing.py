@@ -8,6 +8,7 @@ import hashlib
 import logging
 import os
 import socket
+import time
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.settings.reading import load_settings, to_toml
+from companion.vehicle.commander import ONBOARD_CONTROLLER, read_commander
 from companion.vehicle.driver import LinkError, NoAnswerError
 from companion.vehicle.drivers import open_driver
 from companion.vehicle.framing import Frame, Framer
@@ -168,9 +170,12 @@ async def test_signed_link_works_and_wrong_key_is_reported(
             await unsigned.close()
 
 
-async def test_a_peer_whose_clock_is_late_is_sent_the_time() -> None:
+async def test_a_peer_whose_clock_is_late_is_sent_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
     port = free_port()
-    driver = open_driver("pymavlink", f"udpin://127.0.0.1:{port}", signing_key=KEY)
+    with monkeypatch.context() as clock:
+        created_ns = time.monotonic_ns() - 100_000_000_000
+        clock.setattr(time, "monotonic_ns", lambda: created_ns)
+        driver = open_driver("pymavlink", f"udpin://127.0.0.1:{port}", signing_key=KEY)
     connecting = asyncio.create_task(driver.connect(20.0))
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as autopilot:
         autopilot.setblocking(False)
@@ -194,6 +199,10 @@ async def test_a_peer_whose_clock_is_late_is_sent_the_time() -> None:
             (frame,) = frames(answers[0])
             assert (frame.system_id, frame.component_id) == driver.own_address
             assert FrameSigner(KEY).accepts(frame)
+            custom_mode = int.from_bytes(frame.padded(4), "little")
+            sender = read_commander(ONBOARD_CONTROLLER, custom_mode, driver.own_address, 0)
+            assert sender is not None
+            assert 100.0 <= sender.uptime_s <= 130.0
             say(int.from_bytes(frame.raw[-12:-6], "little") + 1)
             await wait_until(lambda: driver.state.heartbeat_ns > 0, 5.0)
         finally:
