@@ -26,6 +26,7 @@ from mavlink_sim.physics.contact import (
 )
 from mavlink_sim.realtime.options import SimulationOptions
 from mavlink_sim.realtime.simulation import Simulation
+from mavlink_sim.testing import free_udp_ports
 from mavlink_sim.vehicles.vehicle import STEP_S
 from mavlink_sim.wire.messages import dialect
 from mavlink_sim.world.fiducials import Print
@@ -370,11 +371,16 @@ def test_the_examples_can_be_flown_in(name: str) -> None:
     assert not vehicle.truth.crashed
 
 
+def free_ports() -> dict[str, Any]:
+    onboard_port, gcs_port = free_udp_ports(2)
+    return {"onboard_port": onboard_port, "onboard_bind": 0, "gcs_port": gcs_port, "gcs_bind": 0}
+
+
 def test_simulation_scene_collides_and_truth_has_it(tmp_path: FilePath) -> None:
     scene = tmp_path / "block.toml"
     scene.write_text('[[objects]]\nclass = "box"\nplace_m = [4, 0]\nsize_m = [2, 2, 1.5]\n', "utf-8")
     events: list[str] = []
-    options = SimulationOptions(onboard_bind=0, gcs_bind=0, scene=str(scene), start_ned_m=(1.0, 0.0))
+    options = SimulationOptions(**free_ports(), scene=str(scene), start_ned_m=(1.0, 0.0))
     with Simulation(options, events.append) as simulation:
         truth = simulation.truth()
         assert (truth["crashed"], truth["collisions"], truth["last_collision"]) == (False, 0, None)
@@ -391,7 +397,7 @@ def test_simulation_scene_collides_and_truth_has_it(tmp_path: FilePath) -> None:
 
 
 def test_demo_world_has_no_obstacles(tmp_path: FilePath) -> None:
-    options = SimulationOptions(onboard_bind=0, gcs_bind=0, truth=tmp_path / "truth.jsonl")
+    options = SimulationOptions(**free_ports(), truth=tmp_path / "truth.jsonl")
     with Simulation(options, lambda text: None) as simulation:
         assert simulation.truth()["objects"]
         assert simulation.vehicle.collision_world is None

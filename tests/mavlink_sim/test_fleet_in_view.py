@@ -27,7 +27,7 @@ from mavlink_sim.camera.simulated_camera import Captured, SimulatedCamera, frame
 from mavlink_sim.realtime.fleet import Fleet, instance_options
 from mavlink_sim.realtime.loop import run_together
 from mavlink_sim.realtime.options import SimulationOptions
-from mavlink_sim.testing import running_simulator
+from mavlink_sim.testing import free_port, free_udp_port_range, running_simulator
 from mavlink_sim.vehicles.fleet_world import FleetWorld
 from mavlink_sim.vehicles.vehicle import Vehicle
 from mavlink_sim.world.aircraft import Aircraft, aircraft_objects, identifier_offset
@@ -311,7 +311,14 @@ def test_vehicle_sees_all_others_in_world_frame() -> None:
 def test_all_vehicles_drawn_at_one_time(tmp_path: Path) -> None:
     """Each vehicle's truth and the other's entry of it at the same time agree to the millimetre."""
     options = SimulationOptions(
-        onboard_bind=0, gcs_bind=0, ready_after_s=0.0, noise=False, truth=tmp_path / "truth.jsonl", speed=4.0
+        onboard_port=free_udp_port_range(2),
+        onboard_bind=0,
+        gcs_port=free_port(),
+        gcs_bind=0,
+        ready_after_s=0.0,
+        noise=False,
+        truth=tmp_path / "truth.jsonl",
+        speed=4.0,
     )
     with Fleet(instance_options(options, 2, 6.0), lambda text: None) as fleet:
         for simulation in fleet:

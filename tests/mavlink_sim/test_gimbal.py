@@ -15,6 +15,7 @@ from mavlink_sim.physics.gimbal import Aim, Gimbal, Target
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.realtime.options import SimulationOptions
 from mavlink_sim.realtime.simulation import Simulation
+from mavlink_sim.testing import free_udp_ports
 from mavlink_sim.wire.messages import dialect
 from tests.mavlink_sim.conftest import SimHarness
 from vision.attitude import quaternion_from_euler
@@ -249,8 +250,16 @@ def test_landing_centres_gimbal_once(steered: SimHarness) -> None:
 
 @pytest.mark.parametrize("equipped", [True, False])
 def test_the_camera_of_a_simulation_turns_with_the_gimbal(equipped: bool) -> None:
+    onboard_port, gcs_port = free_udp_ports(2)
     options = SimulationOptions(
-        onboard_bind=0, gcs_bind=0, ready_after_s=0.0, gimbal=equipped, noise=False, console=False
+        onboard_port=onboard_port,
+        onboard_bind=0,
+        gcs_port=gcs_port,
+        gcs_bind=0,
+        ready_after_s=0.0,
+        gimbal=equipped,
+        noise=False,
+        console=False,
     )
     with Simulation(options, lambda line: None) as simulation:
         if not equipped:

@@ -16,6 +16,7 @@ from mavlink_sim.physics.contact import CRASH_MPS, Collision
 from mavlink_sim.physics.midair import REACH_UP_M, Body, Midair, apart
 from mavlink_sim.realtime.fleet import Fleet, instance_options
 from mavlink_sim.realtime.options import SimulationOptions
+from mavlink_sim.testing import free_port, free_udp_port_range
 from mavlink_sim.vehicles.vehicle import STEP_S
 from mavlink_sim.wire.messages import dialect
 
@@ -262,7 +263,15 @@ def test_landing_on_another_vehicle_is_landed() -> None:
 @pytest.mark.parametrize("speed", [1.0, 20.0])
 def test_real_time_fleet_reports_collisions(speed: float) -> None:
     events_text: list[str] = []
-    options = SimulationOptions(onboard_bind=0, gcs_bind=0, noise=False, gusts_mps=0.0, speed=speed)
+    options = SimulationOptions(
+        onboard_port=free_udp_port_range(2),
+        onboard_bind=0,
+        gcs_port=free_port(),
+        gcs_bind=0,
+        noise=False,
+        gusts_mps=0.0,
+        speed=speed,
+    )
 
     def on_event(text: str) -> None:
         events_text.append(text)

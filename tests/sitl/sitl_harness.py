@@ -67,7 +67,7 @@ class AutopilotLink:
     """One autopilot, and the port at which the service finds it.
 
     Attributes:
-        service_port: the service listens there.
+        service_port: the service listens there. address: where the autopilot's messages arrive.
         cut: nothing is passed on while it is true; what the autopilot sends is still recorded.
         autopilot, system_id: MAV_AUTOPILOT of its first heartbeat, and who sent it; None and 0 before.
         modes: (time_s, custom_mode) of every change.
@@ -81,7 +81,7 @@ class AutopilotLink:
     """
 
     def __init__(self, url: LinkUrl) -> None:
-        self.service_port = free_port()
+        self.service_port, self.address = free_port(), url.address
         self.cut = False
         self.autopilot: int | None = None
         self.system_id = 0
@@ -248,6 +248,8 @@ class AutopilotLink:
                         self._to_autopilot(data)
                     continue
                 if not self._from_peer(sender):
+                    with self._changed:
+                        self._changed.notify_all()
                     continue
                 if not self.cut:
                     self._near.sendto(data, ("127.0.0.1", self.service_port))
