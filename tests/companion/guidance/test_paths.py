@@ -21,7 +21,7 @@ from companion.guidance.command import NO_CONTEXT, GrammarError
 from companion.guidance.limits.envelope import Limits
 from companion.guidance.path import ACCELERATION_MPS2, Path, PathFollower
 from companion.vehicle.setpoint import Setpoint
-from companion.vehicle.state import Vector3
+from companion.vehicle.state import Vector3, VehicleState
 from tests.companion.guidance.guidance_harness import Flight
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle
 from vision.attitude import wrap_angle
@@ -94,6 +94,28 @@ def test_goto_by_latitude_and_longitude() -> None:
     assert step.velocity_ned_mps is not None
     assert step.velocity_ned_mps[0] > 0.3
     assert abs(step.velocity_ned_mps[1]) < 1e-6
+
+
+class WrongVelocity(KinematicVehicle):
+    """Its estimate of the velocity is 0.5 m/s too far east, and that is what it controls."""
+
+    ERROR_MPS = 0.5
+
+    @property
+    def state(self) -> VehicleState:
+        north, east, down = self.velocity
+        return replace(super().state, velocity_ned_mps=(north, east + self.ERROR_MPS, down))
+
+    def fly(self, setpoint: Setpoint, dt_s: float) -> None:
+        assert setpoint.velocity_ned_mps is not None
+        north, east, down = setpoint.velocity_ned_mps
+        super().fly(replace(setpoint, velocity_ned_mps=(north, east - self.ERROR_MPS, down)), dt_s)
+
+
+def test_goto_arrives_though_the_estimated_speed_is_wrong() -> None:
+    flight, outcome = active(GotoBehaviour(from_home_m=(15.0, 0.0)), 60.0, WrongVelocity())
+    assert outcome.success, outcome.reason
+    assert math.dist(flight.vehicle.position, (15.0, 0.0, -5.0)) < 0.5
 
 
 def test_goal_beyond_a_limit_ends_without_progress() -> None:
