@@ -21,7 +21,7 @@ from tests.sitl.sitl_harness import (
 
 pytestmark = [pytest.mark.sitl, pytest.mark.timeout(500), pytest.mark.realtime]
 NO_GPS = {PX4: {"SIM_GPS_USED": 0.0}, ARDUPILOT: {"SIM_GPS1_ENABLE": 0.0}}
-NO_POSITION = "the position estimate is not valid"
+NO_POSITION = "position estimate not valid"
 NOT_VALID = "estimator reports it as not valid"
 # PX4's estimator dead-reckons for EKF2_NOAID_TOUT (5 s), Copter's for some 8 s.
 LOSS_S, RETURN_S = 30.0, 60.0
