@@ -42,7 +42,7 @@ class _AttitudeAtCapture:
 
     def __init__(self, camera: Camera) -> None:
         self._camera = camera
-        self.view, self.rate_hz, self.latency_s = camera.view, camera.rate_hz, camera.latency_s
+        self.perceived, self.rate_hz, self.latency_s = camera.perceived, camera.rate_hz, camera.latency_s
         self.ned_from_body: dict[int, NDArray[np.float64]] = {}
 
     def on_state(self, state: VehicleState, history: StateHistory) -> None:

@@ -34,7 +34,6 @@ FLOORS = {
 }
 # The same inside `companion.guidance`: its folders, and its own files.
 GUIDANCE_FLOORS = {
-    "gimbal_status": 0,
     "motion": 0,
     "search_pattern": 0,
     "targets": 0,

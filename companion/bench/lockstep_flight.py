@@ -24,7 +24,7 @@ from companion.guidance.limits.envelope import Limits
 from companion.guidance.limits.obstacles import ObstacleRules
 from companion.guidance.motion import position_and_yaw
 from companion.guidance.targets.from_detections import StateHistory
-from companion.perception.views import View
+from companion.perception.cameras import PerceptionCamera
 from companion.service.factory import guidance_options, streamer_of
 from companion.service.inputs import InputAssembler
 from companion.settings import Settings
@@ -46,11 +46,11 @@ class Camera(Protocol):
     """A camera with its perception, in lockstep.
 
     Attributes:
-        view: what its results are placed by.
+        perceived: what its results are placed by.
         rate_hz: frames a second. latency_s: from capture until what it shows can steer.
     """
 
-    view: View
+    perceived: PerceptionCamera
     rate_hz: float
     latency_s: float
 
@@ -93,7 +93,7 @@ class LockstepFlight:
     Args:
         driver: the vehicle.
         settings: as the service reads them.
-        cameras: the first is the first view's, and so on; none: nothing is seen.
+        cameras: the first is the first camera's of the settings, and so on; none: nothing is seen.
         options: replace what the settings say.
 
     Attributes:
@@ -110,8 +110,10 @@ class LockstepFlight:
     ) -> None:
         self.driver, self.settings, self.cameras = driver, settings, tuple(cameras)
         self.notes: list[tuple[str, str]] = []
-        views = [camera.view for camera in cameras] or [View(settings.of_view(None))]
-        self.inputs = InputAssembler(settings, views, lambda level, text: self.notes.append((level, text)))
+        perceived = [camera.perceived for camera in cameras] or [PerceptionCamera(settings.of_camera(None))]
+        self.inputs = InputAssembler(
+            settings, perceived, lambda level, text: self.notes.append((level, text))
+        )
         self.guidance = Guidance(options or guidance_options(settings, COMPANION))
         self.streamer = streamer_of(settings, driver.send_setpoint, lambda: driver.now_ns)
         self.events: list[GuidanceEvent] = []
@@ -121,7 +123,7 @@ class LockstepFlight:
         self._new: list[CommandInput] = []
         self._results: dict[int, Outcome] = {}
         self._next_frame_ns = [driver.now_ns] * len(self.cameras)
-        self._late: deque[tuple[int, View, Callable[[], PerceptionResult | None]]] = deque()
+        self._late: deque[tuple[int, PerceptionCamera, Callable[[], PerceptionResult | None]]] = deque()
         self._step_due_ns = self._stream_due_ns = driver.now_ns
         self._seen_state: VehicleState | None = None
         self._take_state()
@@ -154,7 +156,7 @@ class LockstepFlight:
         vehicle = LockstepVehicle({"onboard": rates_hz}, seed=seed, wind_mps=wind_mps, **options)
         vehicle.take_off(height_m, limit_s=90.0)
         seen = None if camera is None else camera(vehicle)
-        chosen = settings or (plain_settings() if seen is None else seen.view.settings)
+        chosen = settings or (plain_settings() if seen is None else seen.perceived.settings)
         guided = guidance_options(chosen, COMPANION)
         guided = replace(guided, limits=limits or guided.limits, obstacles=rules or guided.obstacles)
         return cls(SimulatedDriver(vehicle), chosen, [] if seen is None else [seen], guided)
@@ -261,7 +263,7 @@ class LockstepFlight:
             if now_ns >= self._next_frame_ns[index]:
                 self._next_frame_ns[index] += round(1e9 / camera.rate_hz)
                 due_ns = now_ns + round(camera.latency_s * 1e9)
-                self._late.append((due_ns, camera.view, camera.capture(self)))
+                self._late.append((due_ns, camera.perceived, camera.capture(self)))
         seen = self._deliver(now_ns)
         stepped = seen or now_ns >= self._step_due_ns
         if stepped:
@@ -311,13 +313,13 @@ class LockstepFlight:
         """The results that are due; whether the steering camera has seen something."""
         seen = False
         while self._late and self._late[0][0] <= now_ns:
-            _, view, finish = self._late.popleft()
+            _, camera, finish = self._late.popleft()
             result = finish()
             if result is None:
                 continue
-            view.update(result)
-            markers = self.inputs.on_result(view, result, now_ns)
-            seen = seen or view is self.inputs.steering or markers is not None
+            camera.update(result)
+            markers = self.inputs.on_result(camera, result, now_ns)
+            seen = seen or camera is self.inputs.steering or markers is not None
         return seen
 
     def _take_state(self) -> None:

@@ -13,7 +13,7 @@ from companion.bench.lockstep_flight import LockstepFlight
 from companion.bench.rendered_perception import RenderedPerception
 from companion.bench.synthetic_detector import SceneObject
 from companion.guidance.targets.from_detections import HistoryError, StateHistory
-from companion.perception.views import View
+from companion.perception.cameras import PerceptionCamera
 from companion.settings import Settings
 from companion.vehicle.state import Vector3, VehicleState
 from mavlink_sim.camera.depth_camera import DepthSensor
@@ -50,16 +50,16 @@ class RenderedCamera:
         depth: bool = True,
     ) -> None:
         self._perception = RenderedPerception(settings, vehicle, scene)
-        self.view = View(settings, None, self._perception.class_names or None)
+        self.perceived = PerceptionCamera(settings, None, self._perception.class_names or None)
         self.rate_hz, self.latency_s = rate_hz, latency_s
         self._by_flight, self._depth = by_flight, depth
 
     def on_state(self, state: VehicleState, history: StateHistory) -> None:
-        """As `WorkerView.send_state` sends it to the worker."""
+        """As `WorkerCamera.send_state` sends it to the worker."""
         if state.attitude is not None:
             self._perception.add_attitude(state.attitude_ns, state.attitude, state.altitude_m)
         gimbal = state.gimbal
-        if gimbal is not None and gimbal.attitude is not None and self.view.settings.camera.on_gimbal:
+        if gimbal is not None and gimbal.attitude is not None and self.perceived.settings.camera.on_gimbal:
             with contextlib.suppress(HistoryError):
                 self._perception.add_gimbal(gimbal.attitude_ns, history.gimbal_at(gimbal.attitude_ns))
 

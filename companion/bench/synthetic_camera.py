@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 from companion.bench.lockstep_flight import LockstepFlight
 from companion.guidance.targets.from_detections import HistoryError, StateHistory, mount_at
-from companion.perception.views import View
+from companion.perception.cameras import PerceptionCamera
 from companion.settings import Settings
 from companion.vehicle.state import Vector3, VehicleState
 from mavlink_sim.lockstep import Truth
@@ -44,7 +44,7 @@ class SyntheticCamera:
         latency_s: float = 0.08,
         tracker: TrackerSettings | None = TrackerSettings(),  # noqa: B008 - frozen
     ) -> None:
-        self.view = View(settings)
+        self.perceived = PerceptionCamera(settings)
         self.rate_hz, self.latency_s = rate_hz, latency_s
         self._detect, self._find_markers = detect, find_markers
         self._size = size
@@ -96,7 +96,7 @@ class SyntheticCamera:
         ned_from_body = self._attitudes.at(captured_ns)
         if ned_from_body is None:
             return None
-        camera = self.view.settings.camera
+        camera = self.perceived.settings.camera
         try:
             mount = mount_at(camera.mount(), flight.inputs.history, captured_ns)
         except HistoryError:

@@ -141,7 +141,7 @@ async def _run_until_signal(settings: Settings, service: Service) -> None:
 
     def on_ready() -> None:
         _freeze_loaded_objects()
-        cameras = [settings.of_view(name) for name in (None, *settings.cameras)]
+        cameras = [settings.of_camera(name) for name in (None, *settings.cameras)]
         _warn_synthetic_model(
             (camera.source.uri, camera.detector.model)
             for camera in cameras

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from companion.guidance.formation.neighbours import Neighbour, Neighbourhood
-from companion.guidance.gimbal_status import NO_GIMBAL, GimbalStatus
 from companion.guidance.targets.from_markers import NO_MARKERS, MarkerSight
 from companion.guidance.targets.ranging import ALL_MEANS, RangeMeans
 from companion.guidance.targets.target import Target
@@ -31,6 +30,28 @@ class Requirement(StrEnum):
     MARKER = "marker"  # marker detection
     GIMBAL = "gimbal"  # a gimbal manager that responds
     NEIGHBOURS = "neighbours"  # fresh poses of other vehicles
+
+
+@dataclass(frozen=True, slots=True)
+class GimbalStatus:
+    """Control and mounting of the gimbal.
+
+    Attributes:
+        carries_camera: the steering camera is mounted on it.
+        direction_fault: why that camera's direction is unknown; empty: it is known, or it has no gimbal.
+        controlled_by: another owner of primary control, which is not displaced; empty: none.
+        problem: why the gimbal is not moved any more for the active behaviour; empty: it is.
+        camera_pitch_rad: pitch of that camera above the gimbal's axis.
+    """
+
+    carries_camera: bool = False
+    direction_fault: str = ""
+    controlled_by: str = ""
+    problem: str = ""
+    camera_pitch_rad: float = 0.0
+
+
+NO_GIMBAL = GimbalStatus()
 
 
 @dataclass(frozen=True, slots=True)

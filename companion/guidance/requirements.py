@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from companion.guidance.behaviour import Behaviour, BehaviourContext, Requirement
 from companion.guidance.formation.neighbours import missing_neighbours
-from companion.guidance.gimbal_status import missing_gimbal
+from companion.guidance.gimbal.controller import missing_gimbal
 from companion.guidance.limits.battery import NO_MINIMUM, BatteryMinimum
 from companion.guidance.limits.obstacles import NO_RULES, ObstacleRules
 from companion.vehicle.state import LandedState

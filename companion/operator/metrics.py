@@ -72,7 +72,7 @@ class _Collector:
         if status is None:
             return
         yield from _of_service(status)
-        yield from _of_views({"": status["perception"], **status["cameras"]})
+        yield from _of_cameras({"": status["perception"], **status["cameras"]})
 
 
 def _of_service(status: Status) -> Iterator[GaugeMetricFamily | CounterMetricFamily]:
@@ -113,7 +113,7 @@ def _of_service(status: Status) -> Iterator[GaugeMetricFamily | CounterMetricFam
     )
 
 
-def _of_views(views: dict[str, Status]) -> Iterator[GaugeMetricFamily | CounterMetricFamily]:
+def _of_cameras(cameras: dict[str, Status]) -> Iterator[GaugeMetricFamily | CounterMetricFamily]:
     from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
     for key, name, meaning in (
@@ -122,8 +122,8 @@ def _of_views(views: dict[str, Status]) -> Iterator[GaugeMetricFamily | CounterM
         ("restarts", "perception_restarts", "perception processes replaced"),
     ):
         counter = CounterMetricFamily(f"companion_{name}", meaning, labels=["camera"])
-        for view, state in views.items():
-            counter.add_metric([view], float(state[key]))
+        for camera, state in cameras.items():
+            counter.add_metric([camera], float(state[key]))
         yield counter
     frames_skipped = CounterMetricFamily(
         "companion_frames_skipped", "frames without a published result", labels=["camera", "reason"]
@@ -138,14 +138,14 @@ def _of_views(views: dict[str, Status]) -> Iterator[GaugeMetricFamily | CounterM
     )
     rate = GaugeMetricFamily("companion_results_per_second", "over the last two seconds", labels=["camera"])
     running = GaugeMetricFamily("companion_perception_running", "1 while its process runs", labels=["camera"])
-    for view, state in views.items():
+    for camera, state in cameras.items():
         for reason, count in state["frames_skipped"].items():
-            frames_skipped.add_metric([view, reason], float(count))
+            frames_skipped.add_metric([camera, reason], float(count))
         for quantile, key in (("0.5", "timing_p50_ms"), ("0.99", "timing_p99_ms")):
             for stage, value in state[key].items():
-                stages.add_metric([view, stage, quantile], float(value))
+                stages.add_metric([camera, stage, quantile], float(value))
         if state["age_s"] is not None:
-            age.add_metric([view], float(state["age_s"]))
-        rate.add_metric([view], float(state["rate_hz"]))
-        running.add_metric([view], float(state["state"] == "running"))
+            age.add_metric([camera], float(state["age_s"]))
+        rate.add_metric([camera], float(state["rate_hz"]))
+        running.add_metric([camera], float(state["state"] == "running"))
     yield from (frames_skipped, stages, age, rate, running)

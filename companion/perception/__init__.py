@@ -1,1 +1,1 @@
-"""The perception worker process, its supervisor in the service, and the views' results."""
+"""The perception worker process, its supervisor in the service, and the cameras' results."""

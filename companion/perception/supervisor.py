@@ -30,11 +30,9 @@ from companion.perception.messages import (
     Report,
     StartFailed,
 )
-from companion.perception.process import PerceptionProcess, RateLimiter
+from companion.perception.process import PerceptionProcess, RateLimiter, Watchdog
 from companion.perception.standard_input import STANDARD_INPUT, StandardInput
-from companion.perception.status import PerceptionState, PerceptionStatus, StageTimes
-from companion.perception.tracks import LiveTracks
-from companion.perception.watchdog import Watchdog
+from companion.perception.status import LiveTracks, PerceptionState, PerceptionStatus, StageTimes
 from companion.settings import Settings
 from vision.attitude import Quaternion
 from vision.camera_model import CameraCalibration

@@ -17,8 +17,11 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+
+import cv2
+import numpy as np
 
 from companion.perception.assembly import CameraTelemetry, build_pipeline, load_detector
 from companion.perception.messages import (
@@ -28,18 +31,20 @@ from companion.perception.messages import (
     GimbalAttitude,
     Heartbeat,
     Hud,
+    Preview,
     Ready,
     Report,
+    ResultLogHandler,
+    ResultSender,
     StartFailed,
     Stop,
     Watched,
     receive,
 )
-from companion.perception.preview import PreviewEncoder
-from companion.perception.result_sender import ResultLogHandler, ResultSender
 from companion.plugins import PluginError, load_plugins
-from companion.settings import Settings
+from companion.settings import PreviewSection, Settings
 from companion.settings.calibration import adopt_calibration
+from vision.annotate import annotate
 from vision.detections import Detections
 from vision.frame import Frame
 from vision.object_detector import YOLO, ObjectDetector
@@ -49,6 +54,8 @@ from vision.sources import EndOfStream, Source, SourceError, open_source
 from vision.sources.sharing import FrameSharing
 from vision.video_writer import VideoWriterError
 
+logger = logging.getLogger("companion.perception.worker")  # `__main__` in the process itself
+
 # Maximum interval of the loop's messages.
 HEARTBEAT_S = 0.25
 # Time limits of the last messages, and of the shutdown after the service has gone.
@@ -57,6 +64,8 @@ _LOADING_PERIOD_S = 2.0
 GRACE_S = 5.0
 # The service's guidance loop has priority on a shared core.
 NICENESS = 5
+# In the worker the network has priority over preview images.
+_PREVIEW_NICER = 5
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
@@ -104,6 +113,67 @@ class ControlChannel:
         self.stop()
         if not self._finished.wait(GRACE_S):
             os._exit(1)
+
+
+class PreviewEncoder:
+    """Encodes preview images in a thread, at most `rate_hz` a second; only the newest frame waits.
+
+    Attributes:
+        watched: whether previews are wanted; if not, a frame costs nothing.
+
+    Args:
+        deliver: called with each preview, in the encoder's thread.
+    """
+
+    def __init__(self, settings: PreviewSection, deliver: Callable[[Preview], None]) -> None:
+        self.watched = False
+        self._settings = settings
+        self._deliver = deliver
+        self._due_ns = 0
+        self._changed = threading.Condition()
+        self._waiting: tuple[Frame, Detections] | None = None
+        self._closed = False
+        self._thread = threading.Thread(target=self._run, name="preview", daemon=True)
+        self._thread.start()
+
+    def write(self, frame: Frame, detections: Detections) -> None:
+        """Queue a frame with the newest detections. Never waits."""
+        if not self.watched or frame.captured_ns < self._due_ns:
+            return
+        self._due_ns = frame.captured_ns + round(1e9 / self._settings.rate_hz)
+        with self._changed:
+            self._waiting = (frame, detections)
+            self._changed.notify()
+
+    def close(self) -> None:
+        """End the thread."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify()
+        self._thread.join()
+
+    def _run(self) -> None:
+        nice = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), min(nice + _PREVIEW_NICER, 19))
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._waiting or self._closed)
+                if self._closed or self._waiting is None:
+                    return
+                (frame, detections), self._waiting = self._waiting, None
+            try:
+                self._deliver(self._encoded(frame, detections))
+            except Exception:  # a failed preview must not end the thread
+                logger.exception("preview of %dx%d failed", frame.width, frame.height)
+
+    def _encoded(self, frame: Frame, detections: Detections) -> Preview:
+        image = annotate(frame.image, detections) if self._settings.annotate else frame.image
+        if frame.width > self._settings.width:
+            height = max(1, round(frame.height * self._settings.width / frame.width))
+            smaller = cv2.resize(image, (self._settings.width, height), interpolation=cv2.INTER_AREA)
+            image = smaller.astype(np.uint8, copy=False)
+        _, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, self._settings.quality])
+        return Preview(frame.sequence, frame.captured_ns, jpeg.tobytes())
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,7 +35,7 @@ def driver_of(settings: Settings) -> Driver:
 def guidance_options(settings: Settings, own_address: Address) -> GuidanceOptions:
     """Create guidance's options. `own_address`: system and component id of our messages."""
     guidance = settings.guidance
-    cameras = [settings.of_view(name).camera for name in (None, *settings.cameras)]
+    cameras = [settings.of_camera(name).camera for name in (None, *settings.cameras)]
     return GuidanceOptions(
         limits=limits_of(settings),
         own_address=own_address,
@@ -45,7 +45,7 @@ def guidance_options(settings: Settings, own_address: Address) -> GuidanceOption
             guidance.obstacles, guidance.obstacle_margin_m, guidance.max_speed_unobserved_mps
         ),
         perception_max_age_s=guidance.perception_max_age_s,
-        gimbal=gimbal_mounting(cameras, settings.of_view(guidance.camera).camera),
+        gimbal=gimbal_mounting(cameras, settings.of_camera(guidance.camera).camera),
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from companion.guidance.core import Guidance
-from companion.perception.views import WorkerView
+from companion.perception.cameras import WorkerCamera
 from companion.service.other_commanders import OtherCommanders
 from companion.service.status import hud_lines
 from companion.service.systemd_notify import SystemdNotifier
@@ -28,19 +28,19 @@ class Health:
     def __init__(
         self,
         driver: Driver,
-        views: Sequence[WorkerView],
+        cameras: Sequence[WorkerCamera],
         notifier: SystemdNotifier,
         others: OtherCommanders,
         on_event: Callable[[str, str], None],
     ) -> None:
-        self._driver, self._views, self._notifier = driver, views, notifier
+        self._driver, self._cameras, self._notifier = driver, cameras, notifier
         self._others, self._on_event = others, on_event
         self._heartbeat_due_ns = self._hud_due_ns = 0
         self._linked = False
 
     def healthy(self, now_ns: int) -> bool:
         """Whether every camera delivers results and the autopilot is connected."""
-        return all(view.seeing(now_ns) for view in self._views) and self._driver.state.connected(now_ns)
+        return all(camera.seeing(now_ns) for camera in self._cameras) and self._driver.state.connected(now_ns)
 
     async def check(self) -> None:
         """Check the autopilot's parameters once, after the link has opened."""
@@ -80,5 +80,5 @@ class Health:
         if now_ns >= self._hud_due_ns:
             self._hud_due_ns = now_ns + round(HUD_PERIOD_S * 1e9)
             lines = hud_lines(self._driver.state, guidance.status)
-            for view in self._views:
-                view.supervisor.send_hud(lines)
+            for camera in self._cameras:
+                camera.supervisor.send_hud(lines)

@@ -17,8 +17,7 @@ from companion.guidance.interface import Answer, CommandInput, GuidanceInput, St
 from companion.guidance.pose_sharing import PoseSharing
 from companion.guidance.search_pattern import Footprint
 from companion.guidance.targets.from_detections import StateHistory
-from companion.perception.views import View
-from companion.perception.views_markers import MarkerTracker
+from companion.perception.cameras import MarkerTracker, PerceptionCamera
 from companion.plugins import load_plugins
 from companion.settings import Settings
 from companion.vehicle.px4_modes import among_modes
@@ -39,27 +38,27 @@ class InputAssembler:
     """Collects the input between two steps of guidance.
 
     Args:
-        views: the cameras; `guidance.camera` names the steering one.
+        cameras: the cameras; `guidance.camera` names the steering one.
         on_event: called with (level, text) for the operator.
 
     Raises:
         PluginError: a module in `plugins.modules` cannot be loaded.
 
     Attributes:
-        steering: the view whose targets behaviours get.
+        steering: the camera whose targets behaviours get.
         history: the vehicle's states of the last few seconds.
         poses: the other vehicles.
     """
 
     def __init__(
-        self, settings: Settings, views: Sequence[View], on_event: Callable[[str, str], None]
+        self, settings: Settings, cameras: Sequence[PerceptionCamera], on_event: Callable[[str, str], None]
     ) -> None:
         load_plugins(settings.plugins.modules)
         self._settings = settings
-        self.steering = next(view for view in views if view.name == settings.guidance.camera)
+        self.steering = next(camera for camera in cameras if camera.name == settings.guidance.camera)
         self.history = StateHistory()
         self.poses = PoseSharing(settings.vehicle.name, on_event)
-        self._markers = MarkerTracker(views)
+        self._markers = MarkerTracker(cameras)
         self._obstacles: ObstacleSectors | None = None
         self._shown: tuple[FlightMode, bool] | None = None
         self._mode_changes = 0
@@ -89,14 +88,16 @@ class InputAssembler:
         if len(self._logged_ns) > MAX_REMEMBERED:
             self._logged_ns.clear()
 
-    def on_result(self, view: View, result: PerceptionResult, now_ns: int) -> dict[str, Any] | None:
-        """Process a view's result; returns the message of its markers if marker detection is on."""
+    def on_result(
+        self, camera: PerceptionCamera, result: PerceptionResult, now_ns: int
+    ) -> dict[str, Any] | None:
+        """Process a camera's result; returns the message of its markers if marker detection is on."""
         markers = None
         if result.markers is not None:
             name = self._settings.vehicle.name
-            markers = self._markers.localize(view, result, self.history, name, now_ns)
-        if view is self.steering:
-            view.localize(result, self.history)
+            markers = self._markers.localize(camera, result, self.history, name, now_ns)
+        if camera is self.steering:
+            camera.localize(result, self.history)
             if result.obstacles is not None:
                 self._obstacles = result.obstacles
         return markers

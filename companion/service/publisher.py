@@ -19,8 +19,8 @@ from companion.bus.messages import (
 from companion.bus.session import Bus
 from companion.guidance.core import Guidance
 from companion.guidance.limits.obstacles import obstacles_message
+from companion.perception.cameras import WorkerCamera
 from companion.perception.messages import Preview
-from companion.perception.views import WorkerView
 from companion.service.inputs import InputAssembler
 from companion.vehicle.driver import Driver
 from companion.vehicle.streamer import Streamer
@@ -36,38 +36,38 @@ class Publisher:
         self._vehicle, self._bus, self._driver, self._inputs = vehicle, bus, driver, inputs
 
     def publish_result(
-        self, view: WorkerView, result: PerceptionResult, markers: dict[str, Any] | None
+        self, camera: WorkerCamera, result: PerceptionResult, markers: dict[str, Any] | None
     ) -> None:
-        """Publish a view's result. Never raises."""
+        """Publish a camera's result. Never raises."""
         try:
-            self._publish_result(view, result, markers)
+            self._publish_result(camera, result, markers)
         except Exception as error:
             # Guidance has used the result and continues; the failure is logged and in `status`.
             logger.exception("a result could not be published")
-            view.localization_error = f"{type(error).__name__}: {error}"
+            camera.localization_error = f"{type(error).__name__}: {error}"
 
     def _publish_result(
-        self, view: WorkerView, result: PerceptionResult, markers: dict[str, Any] | None
+        self, camera: WorkerCamera, result: PerceptionResult, markers: dict[str, Any] | None
     ) -> None:
         bus, name, now_ns = self._bus, self._vehicle, time.monotonic_ns()
-        message = detections_message(result, name, now_ns, view.name, self._driver.state.clock)
-        bus.publish(topics.DETECTIONS, message, view.name)
-        bus.publish(topics.LABELS, labels_message(result), view.name)
+        message = detections_message(result, name, now_ns, camera.name, self._driver.state.clock)
+        bus.publish(topics.DETECTIONS, message, camera.name)
+        bus.publish(topics.LABELS, labels_message(result), camera.name)
         if result.track_events:
-            bus.publish(topics.TRACKS, tracks_message(result, name, now_ns, view.name), view.name)
+            bus.publish(topics.TRACKS, tracks_message(result, name, now_ns, camera.name), camera.name)
         if markers is not None:
-            bus.publish(topics.MARKERS, {**markers, "published_ns": now_ns}, view.name)
-        if view is self._inputs.steering and result.obstacles is not None:
+            bus.publish(topics.MARKERS, {**markers, "published_ns": now_ns}, camera.name)
+        if camera is self._inputs.steering and result.obstacles is not None:
             bus.publish(topics.OBSTACLES, obstacles_message(result.obstacles, name))
-        view.supervisor.published(result)
+        camera.supervisor.published(result)
 
-    def publish_preview(self, view: WorkerView, preview: Preview) -> None:
+    def publish_preview(self, camera: WorkerCamera, preview: Preview) -> None:
         """Publish a preview image with its stamps."""
-        stamps = {"camera": view.name, "sequence": preview.sequence, "captured_ns": preview.captured_ns}
-        self._bus.publish_image(topics.IMAGE, preview.jpeg, stamps, view.name)
+        stamps = {"camera": camera.name, "sequence": preview.sequence, "captured_ns": preview.captured_ns}
+        self._bus.publish_image(topics.IMAGE, preview.jpeg, stamps, camera.name)
 
     async def publish_vehicle(
-        self, guidance: Guidance, streamer: Streamer, views: Sequence[WorkerView]
+        self, guidance: Guidance, streamer: Streamer, cameras: Sequence[WorkerCamera]
     ) -> None:
         """Publish vehicle, pose and setpoints at the rate of `vehicle`, until cancelled."""
         period_s = 1 / (topics.VEHICLE.rate_hz or 10.0)
@@ -77,8 +77,8 @@ class Publisher:
             pose = self._inputs.poses.message(state, guidance.active, now_ns)
             if pose is not None:
                 self._bus.publish(topics.POSE, pose)
-            for view in views:
-                view.supervisor.watch(self._bus.watched(topics.IMAGE, view.name))
+            for camera in cameras:
+                camera.supervisor.watch(self._bus.watched(topics.IMAGE, camera.name))
             if guidance.in_command:
                 self._bus.publish(
                     topics.SETPOINT,

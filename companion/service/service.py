@@ -16,8 +16,8 @@ from companion.guidance import grammar
 from companion.guidance.core import Guidance
 from companion.operator.console import run_console, terminal_is_free
 from companion.operator.metrics import MetricsServer
+from companion.perception.cameras import WorkerCamera, open_cameras
 from companion.perception.supervisor import PerceptionSupervisor
-from companion.perception.views import WorkerView, open_views
 from companion.service.event import Event, EventLog
 from companion.service.factory import driver_of, gimbal_mounting, guidance_options, streamer_of
 from companion.service.guidance_loop import GuidanceLoop
@@ -39,7 +39,7 @@ class Service:
 
     Attributes:
         ready: everything is up, and commands are accepted.
-        views: the cameras with their models, the first one first.
+        cameras: the cameras with their models, the first one first.
         events: the newest, at most a hundred.
 
     Args:
@@ -64,14 +64,14 @@ class Service:
         self.driver: Driver = driver_of(settings)
         self.streamer = streamer_of(settings, self.driver.send_setpoint)
         self.guidance = Guidance(guidance_options(settings, self.driver.own_address))
-        self.views = open_views(
+        self.cameras = open_cameras(
             settings,
             on_result=self._on_result,
-            on_preview=lambda view, preview: self._publisher.publish_preview(view, preview),
+            on_preview=lambda camera, preview: self._publisher.publish_preview(camera, preview),
             on_event=self._event,
             on_calibration=self._on_calibration,
         )
-        self.inputs = InputAssembler(settings, self.views, self._event)
+        self.inputs = InputAssembler(settings, self.cameras, self._event)
         started_ns = time.monotonic_ns()
         self.others = OtherCommanders(settings.vehicle, self.inputs.poses.source, started_ns, self._event)
         self.bus = Bus(
@@ -97,7 +97,7 @@ class Service:
             others=self.others,
         )
         self._notifier = SystemdNotifier()
-        self._health = Health(self.driver, self.views, self._notifier, self.others, self._event)
+        self._health = Health(self.driver, self.cameras, self._notifier, self.others, self._event)
         self.ready = self._ending = False
         self._status: dict[str, Any] | None = None
         self._stop = asyncio.Event()
@@ -118,8 +118,8 @@ class Service:
                 self._event("info", f"metrics on port {metrics.port}")
             await self._start()
             loops = [self._loop.run(), self.streamer.run(), self._publish_status(), self._health.check()]
-            loops.append(self._publisher.publish_vehicle(self.guidance, self.streamer, self.views))
-            if self._console and all(terminal_is_free(view.settings.source.uri) for view in self.views):
+            loops.append(self._publisher.publish_vehicle(self.guidance, self.streamer, self.cameras))
+            if self._console and all(terminal_is_free(camera.settings.source.uri) for camera in self.cameras):
                 loops.append(run_console(self.command, self.stop, grammar.describe(), self._event))
             tasks = [asyncio.create_task(loop) for loop in loops]
             self._notifier.ready("flying" if self.driver.state.armed else "ready")
@@ -141,7 +141,7 @@ class Service:
             if metrics is not None:
                 await asyncio.to_thread(metrics.close)
             await self.bus.close()  # first: it sends pending answers
-            await asyncio.gather(*(view.supervisor.stop() for view in self.views), self.driver.close())
+            await asyncio.gather(*(camera.supervisor.stop() for camera in self.cameras), self.driver.close())
             self._notifier.close()
 
     def stop(self) -> None:
@@ -167,7 +167,7 @@ class Service:
             driver=self.driver,
             guidance=self.guidance,
             streamer=self.streamer,
-            views=self.views,
+            cameras=self.cameras,
             inputs=self.inputs,
             bus=self.bus,
             others=self.others,
@@ -177,13 +177,13 @@ class Service:
     @property
     def perception(self) -> PerceptionSupervisor:
         """The supervisor of the steering camera."""
-        return next(view for view in self.views if view is self.inputs.steering).supervisor
+        return next(camera for camera in self.cameras if camera is self.inputs.steering).supervisor
 
     async def _start(self) -> None:
         starts = [
             asyncio.create_task(self.bus.start()),
             asyncio.create_task(self.driver.connect(self.settings.vehicle.connect_timeout_s)),
-            *(asyncio.create_task(view.start()) for view in self.views),
+            *(asyncio.create_task(camera.start()) for camera in self.cameras),
         ]
         try:
             done, _ = await asyncio.wait(starts, return_when=asyncio.FIRST_EXCEPTION)
@@ -231,20 +231,20 @@ class Service:
 
     def _on_state(self, state: VehicleState) -> None:
         self.inputs.on_state(state)
-        for view in self.views:
-            view.send_state(state, self.inputs.history)
+        for camera in self.cameras:
+            camera.send_state(state, self.inputs.history)
 
     def _on_calibration(self) -> None:
-        cameras = [view.settings.camera for view in self.views]
-        self.guidance.gimbal.mounting = gimbal_mounting(cameras, self.inputs.steering.settings.camera)
+        sections = [camera.settings.camera for camera in self.cameras]
+        self.guidance.gimbal.mounting = gimbal_mounting(sections, self.inputs.steering.settings.camera)
 
-    def _on_result(self, view: WorkerView, result: PerceptionResult) -> None:
-        """Localize a view's result, let guidance use it, then publish it."""
+    def _on_result(self, camera: WorkerCamera, result: PerceptionResult) -> None:
+        """Localize a camera's result, let guidance use it, then publish it."""
         markers = None
         try:
-            markers = self.inputs.on_result(view, result, time.monotonic_ns())
-            if view is self.inputs.steering or markers is not None:
+            markers = self.inputs.on_result(camera, result, time.monotonic_ns())
+            if camera is self.inputs.steering or markers is not None:
                 self._loop.on_perception()
         finally:
             # The guidance loop runs first: a subscriber can wait for a millisecond, a setpoint cannot.
-            asyncio.get_running_loop().call_soon(self._publisher.publish_result, view, result, markers)
+            asyncio.get_running_loop().call_soon(self._publisher.publish_result, camera, result, markers)

@@ -7,7 +7,7 @@ from typing import Any
 
 from companion.bus.session import Bus
 from companion.guidance.core import Guidance
-from companion.perception.views import WorkerView
+from companion.perception.cameras import WorkerCamera
 from companion.service.inputs import InputAssembler
 from companion.service.other_commanders import OtherCommanders
 from companion.vehicle.driver import Driver
@@ -22,7 +22,7 @@ def status_message(
     driver: Driver,
     guidance: Guidance,
     streamer: Streamer,
-    views: Sequence[WorkerView],
+    cameras: Sequence[WorkerCamera],
     inputs: InputAssembler,
     bus: Bus,
     others: OtherCommanders,
@@ -58,8 +58,8 @@ def status_message(
             "stream": streamer.state.value,
             "setpoints_sent": streamer.sent_count,
         },
-        "perception": views[0].supervisor.status.as_dict(),
-        "cameras": {view.name: view.supervisor.status.as_dict() for view in views if view.name},
+        "perception": cameras[0].supervisor.status.as_dict(),
+        "cameras": {camera.name: camera.supervisor.status.as_dict() for camera in cameras if camera.name},
         "targets": {
             "camera": steering.name,
             "count": len(steering.targets),

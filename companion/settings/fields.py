@@ -12,7 +12,7 @@ from pydantic import StringConstraints
 from pydantic.fields import FieldInfo
 
 from companion.settings.section import Section
-from companion.settings.settings import Settings, ViewSections
+from companion.settings.settings import CameraSections, Settings
 from companion.settings.texts import PATTERN_MEANINGS
 
 _TRUE, _FALSE = ("true", "yes", "on", "1"), ("false", "no", "off", "0")
@@ -39,8 +39,8 @@ def fields_of_sections() -> dict[str, dict[str, FieldInfo]]:
     return {name: section.model_fields for name, section in sections_of_file().items()}
 
 
-SECTIONS_OF_VIEW = tuple(ViewSections.model_fields)
-"""The sections that every view has."""
+SECTIONS_OF_CAMERA = tuple(CameraSections.model_fields)
+"""The sections that every camera has."""
 
 
 def section_of(table: str) -> str | None:
@@ -48,7 +48,7 @@ def section_of(table: str) -> str | None:
     match table.split("."):
         case [section] if section in fields_of_sections():
             return section
-        case ["cameras", _, section] if section in SECTIONS_OF_VIEW:
+        case ["cameras", _, section] if section in SECTIONS_OF_CAMERA:
             return section
     return None
 
@@ -93,7 +93,7 @@ def expectation(field: FieldInfo) -> str:
 
 
 def expectation_of_key() -> str:
-    """Describe the names of views, as text after `must be`."""
+    """Describe the names of cameras, as text after `must be`."""
     return PATTERN_MEANINGS[r"^[A-Za-z0-9][A-Za-z0-9_-]*$"]
 
 

@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 from companion.geometry.fence import Fence, Polygon
 from companion.geometry.points import points_from
 from companion.settings.section import Section
-from companion.settings.texts import VIEW_NAME
+from companion.settings.texts import CAMERA_NAME
 
 
 class GuidanceSection(Section):
@@ -57,7 +57,7 @@ class GuidanceSection(Section):
     """maximum speed in directions that the depth camera does not see, metres a second; unset: no limit"""
     perception_max_age_s: Annotated[float, Field(gt=0, le=10)] = 0.5
     """maximum age of detections used by guidance, seconds since the capture"""
-    camera: Annotated[str | None, VIEW_NAME] = None
+    camera: Annotated[str | None, CAMERA_NAME] = None
     """the steering camera; unset: the one of the sections source, camera and detector"""
 
     @model_validator(mode="after")

@@ -17,7 +17,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 from companion.settings.fields import (
-    SECTIONS_OF_VIEW,
+    SECTIONS_OF_CAMERA,
     expectation,
     expectation_of_key,
     fields_of_sections,
@@ -118,9 +118,10 @@ def load_settings(
 def to_toml(settings: Settings) -> str:
     """Format the settings as a TOML file with a comment on every key; `load_settings` reads it back."""
     paragraphs = [_table(section, getattr(settings, section)) for section in sections_of_file()]
-    for view, sections in settings.cameras.items():
+    for camera, sections in settings.cameras.items():
         paragraphs += [
-            _table(f"cameras.{view}.{section}", getattr(sections, section)) for section in SECTIONS_OF_VIEW
+            _table(f"cameras.{camera}.{section}", getattr(sections, section))
+            for section in SECTIONS_OF_CAMERA
         ]
     return "\n".join(paragraphs)
 
@@ -152,8 +153,8 @@ class _Reading:
         origin = f"in {path}"
         for name, content in _read_toml(path).items():
             if name == "cameras" and isinstance(content, dict):
-                for view, sections in content.items():
-                    self._take_view(view, sections, origin)
+                for name, sections in content.items():
+                    self._take_camera(name, sections, origin)
             else:
                 self._take_table(name, content, origin)
 
@@ -200,23 +201,23 @@ class _Reading:
         section = section_of(table)
         return None if section is None else self._fields[section].get(name)
 
-    def _take_view(self, view: str, sections: Any, origin: str) -> None:
+    def _take_camera(self, name: str, sections: Any, origin: str) -> None:
         if not isinstance(sections, dict):
             self._problems.append(
-                f"cameras.{view}: must hold sections such as [cameras.{view}.source], got {shown(sections)} "
+                f"cameras.{name}: must hold sections such as [cameras.{name}.source], got {shown(sections)} "
                 f"({origin})"
             )
             return
         # An empty table is a camera too: all defaults.
-        self._values.setdefault(f"cameras.{view}", {})
+        self._values.setdefault(f"cameras.{name}", {})
         for section, content in sections.items():
-            self._take_table(f"cameras.{view}.{section}", content, origin)
+            self._take_table(f"cameras.{name}.{section}", content, origin)
 
     def _take_table(self, table: str, content: Any, origin: str) -> None:
         if table == "views":
             self._problems.append(f"[views] ({origin}) was renamed to [cameras] in version 0.2.0")
         elif section_of(table) is None:
-            known = SECTIONS_OF_VIEW if table.startswith("cameras.") else self._fields
+            known = SECTIONS_OF_CAMERA if table.startswith("cameras.") else self._fields
             self._problems.append(
                 f"unknown section [{table}] ({origin}); {_nearest(table.rpartition('.')[2], known)}"
             )

@@ -19,11 +19,11 @@ from companion.settings.perception import (
     TrackerSection,
 )
 from companion.settings.section import Section
-from companion.settings.texts import ViewName
+from companion.settings.texts import CameraName
 from companion.settings.vehicle import VehicleSection
 
 
-class ViewSections(Section):
+class CameraSections(Section):
     """A further camera or model, in its own process, published as cameras/NAME."""
 
     source: SourceSection = SourceSection()
@@ -50,10 +50,10 @@ class Settings(Section):
     metrics: MetricsSection = MetricsSection()
     log: LogSection = LogSection()
     plugins: PluginsSection = PluginsSection()
-    cameras: dict[ViewName, ViewSections] = Field(default_factory=dict)
+    cameras: dict[CameraName, CameraSections] = Field(default_factory=dict)
 
     @model_validator(mode="after")
-    def _views_fit_together(self) -> Self:
+    def _cameras_fit_together(self) -> Self:
         if self.guidance.camera is not None and self.guidance.camera not in self.cameras:
             known = ", ".join(self.cameras) or "none"
             raise ValueError(f"guidance.camera: no camera {self.guidance.camera!r} (cameras: {known})")
@@ -86,11 +86,11 @@ class Settings(Section):
 
     @model_validator(mode="after")
     def _tracks_outlive_the_frame_interval(self) -> Self:
-        cameras: dict[str, Settings | ViewSections] = {"": self}
+        cameras: dict[str, Settings | CameraSections] = {"": self}
         cameras |= {f"cameras.{name}.": sections for name, sections in self.cameras.items()}
-        for prefix, view in cameras.items():
-            rate_hz, max_age_s = view.detector.rate_hz, view.tracker.max_age_s
-            if view.tracker.enabled and rate_hz is not None and 1 / rate_hz >= max_age_s:
+        for prefix, sections in cameras.items():
+            rate_hz, max_age_s = sections.detector.rate_hz, sections.tracker.max_age_s
+            if sections.tracker.enabled and rate_hz is not None and 1 / rate_hz >= max_age_s:
                 raise ValueError(
                     f"{prefix}tracker.max_age_s must be longer than one period of {prefix}detector.rate_hz "
                     f"({1 / rate_hz:.3g} s), got {max_age_s:g}: every track would end before the next frame"
@@ -98,17 +98,17 @@ class Settings(Section):
         return self
 
     def sources(self) -> dict[str, SourceSection]:
-        """Return key of the section → source of that view, the first view first."""
+        """Return key of the section → source of that camera, the first camera first."""
         return {"source": self.source} | {
             f"cameras.{name}.source": sections.source for name, sections in self.cameras.items()
         }
 
-    def of_view(self, name: str | None) -> Settings:
-        """Return the settings of one view's worker, with that view's own sections. None: the first."""
+    def of_camera(self, name: str | None) -> Settings:
+        """Return the settings of one camera's worker, with that camera's own sections. None: the first."""
         if name is None:
             return self.model_copy(update={"cameras": {}})
         sections = self.cameras[name]
-        own = {section: getattr(sections, section) for section in ViewSections.model_fields}
+        own = {section: getattr(sections, section) for section in CameraSections.model_fields}
         return self.model_copy(update={"cameras": {}, **own})
 
 

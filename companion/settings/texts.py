@@ -11,8 +11,8 @@ KEY_WORD = StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length
 KeyWord = Annotated[str, KEY_WORD]
 HOST_AND_PORT = StringConstraints(pattern=r"^[^\s:]+:[0-9]{1,5}$", max_length=300)
 # The same without a dot, since `cameras.NAME.source` is a key.
-VIEW_NAME = StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$", max_length=64)
-ViewName = Annotated[str, VIEW_NAME]
+CAMERA_NAME = StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$", max_length=64)
+CameraName = Annotated[str, CAMERA_NAME]
 VehicleUrl = Annotated[
     str, StringConstraints(pattern=r"^(udpin|udpout|udp|tcp|tcpin|tcpout|serial)://.+$", max_length=400)
 ]

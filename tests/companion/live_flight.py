@@ -13,7 +13,7 @@ from pymavlink import mavutil
 from companion.bench.lockstep_flight import plain_settings
 from companion.guidance.behaviour import Outcome
 from companion.guidance.core import Guidance
-from companion.perception.views import View
+from companion.perception.cameras import PerceptionCamera
 from companion.service.factory import driver_of, guidance_options
 from companion.service.guidance_loop import GuidanceLoop
 from companion.service.health import Health
@@ -44,7 +44,7 @@ class LiveFlight:
         self.streamer = Streamer(self.driver.send_setpoint)
         self.events: list[tuple[str, str]] = []
         self.guidance = Guidance(guidance_options(settings, self.driver.own_address))
-        self.inputs = InputAssembler(settings, [View(settings.of_view(None))], self._event)
+        self.inputs = InputAssembler(settings, [PerceptionCamera(settings.of_camera(None))], self._event)
         started_ns = time.monotonic_ns() - round(ran_s * 1e9)
         self.others = OtherCommanders(settings.vehicle, "here", started_ns, self._event)
         self._health = Health(self.driver, (), SystemdNotifier({}), self.others, self._event)

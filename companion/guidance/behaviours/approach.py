@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome, Requirement
-from companion.guidance.gimbal.tracking import GimbalTracking
+from companion.guidance.gimbal.pitch import GimbalTracking
 from companion.guidance.motion import (
     ARRIVED_M,
     STOPPING_MPS2,

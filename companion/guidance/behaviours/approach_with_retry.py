@@ -11,8 +11,13 @@ from companion.guidance.behaviours.approach import ApproachBehaviour
 from companion.guidance.behaviours.confirmation import DetectionConfirmer
 from companion.guidance.behaviours.seek import SeekBehaviour
 from companion.guidance.command import BuildContext, ClassName, Command, GrammarError, Number, behaviour
-from companion.guidance.gimbal.sweep import LEAST_SWEEP_DEG, USUAL_RATE_DPS, GimbalSweep
-from companion.guidance.gimbal.tracking import GimbalTracking, GimbalUse
+from companion.guidance.gimbal.pitch import (
+    LEAST_SWEEP_DEG,
+    USUAL_RATE_DPS,
+    GimbalSweep,
+    GimbalTracking,
+    GimbalUse,
+)
 from companion.guidance.motion import position_and_yaw, stay_at
 from companion.guidance.search_pattern import field_of_view_rad
 from companion.vehicle.gimbal import GimbalAim

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome, Requirement
 from companion.guidance.command import BuildContext, ClassName, Command, EnumArgument, Number, behaviour
-from companion.guidance.gimbal.tracking import GimbalTracking, GimbalUse
+from companion.guidance.gimbal.pitch import GimbalTracking, GimbalUse
 from companion.guidance.motion import add_velocity_error, correction, in_degrees, position_and_yaw
 from companion.guidance.targets.choosing import TargetSelector
 from companion.guidance.targets.moving_track import MovingTrack

@@ -18,7 +18,7 @@ from companion.guidance.command import (
     Number,
     behaviour,
 )
-from companion.guidance.gimbal.sweep import LEAST_SWEEP_DEG, USUAL_RATE_DPS, GimbalSweep
+from companion.guidance.gimbal.pitch import LEAST_SWEEP_DEG, USUAL_RATE_DPS, GimbalSweep
 from companion.guidance.motion import ground_speed, position_and_yaw, stay_at
 from companion.guidance.path import Path
 from companion.guidance.search_pattern import Footprint, expanding_square, field_of_view_rad, lawnmower

@@ -12,7 +12,7 @@ from companion.guidance.behaviours.confirmation import (
     DetectionConfirmer,
     YawAligner,
 )
-from companion.guidance.gimbal.sweep import GimbalSweep
+from companion.guidance.gimbal.pitch import GimbalSweep
 from companion.guidance.motion import in_degrees, laps_text, position_and_yaw, stay_at
 from companion.guidance.targets.target import DOUBTED, Target
 from companion.vehicle.gimbal import GimbalAim

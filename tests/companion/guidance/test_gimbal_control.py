@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from companion.guidance.gimbal.control import SHOWN_WITHIN_S, GimbalCommand, GimbalControl, GimbalRequest
+from companion.guidance.gimbal.controller import SHOWN_WITHIN_S, GimbalCommand, GimbalControl, GimbalRequest
 from companion.vehicle.gimbal import CONTROL_MAX_AGE_S, NOBODY, GimbalAim, GimbalState
 
 OURS, STATION, AUTOPILOT = (1, 191), (245, 190), (1, 1)

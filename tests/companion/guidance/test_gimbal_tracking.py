@@ -16,11 +16,10 @@ from hypothesis import strategies as st
 
 from companion.bench.lockstep_flight import FlightLog, LockstepFlight, Moment
 from companion.bench.synthetic_detector import SceneObject, ScenePose
-from companion.guidance.behaviour import Behaviour, BehaviourContext
+from companion.guidance.behaviour import Behaviour, BehaviourContext, GimbalStatus
 from companion.guidance.behaviours.gimbal_pointing import PointGimbalBehaviour
 from companion.guidance.command import BuildContext
-from companion.guidance.gimbal.tracking import GimbalTracking
-from companion.guidance.gimbal_status import GimbalStatus
+from companion.guidance.gimbal.pitch import GimbalTracking
 from companion.guidance.grammar import parse
 from companion.guidance.missions.mission_file import plan_from
 from companion.guidance.missions.sequence import SequenceBehaviour

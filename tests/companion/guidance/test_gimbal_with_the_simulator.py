@@ -21,11 +21,11 @@ class FlightWithGimbal(LiveFlight):
 
     def __init__(self, port: int) -> None:
         super().__init__("pymavlink", port, {"camera.on_gimbal": "true", "detector.enabled": "true"})
-        self._view = self.inputs.steering
+        self._camera = self.inputs.steering
 
     def on_step(self, now_ns: int) -> None:
         nothing = Detections.empty(("car",))
-        self._view.update(PerceptionResult(0, now_ns, now_ns, 640, 480, nothing, {}, 0))
+        self._camera.update(PerceptionResult(0, now_ns, now_ns, 640, 480, nothing, {}, 0))
 
     @property
     def gimbal(self) -> GimbalState:

@@ -8,12 +8,11 @@ from typing import Any
 
 import pytest
 
-from companion.guidance.behaviour import Behaviour, BehaviourContext, Outcome
+from companion.guidance.behaviour import Behaviour, BehaviourContext, GimbalStatus, Outcome
 from companion.guidance.behaviours.approach import ApproachBehaviour
 from companion.guidance.behaviours.gimbal_pointing import PointGimbalBehaviour
 from companion.guidance.behaviours.seek import SeekBehaviour
-from companion.guidance.gimbal.sweep import GimbalSweep
-from companion.guidance.gimbal_status import GimbalStatus
+from companion.guidance.gimbal.pitch import GimbalSweep
 from companion.guidance.requirements import check_requirements
 from companion.vehicle.gimbal import CONTROL_MAX_AGE_S, NOBODY, GimbalAim, GimbalState
 from companion.vehicle.setpoint import Setpoint

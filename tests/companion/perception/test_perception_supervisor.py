@@ -263,7 +263,7 @@ async def test_stopped_worker_does_not_block_stop(photos: Path, monkeypatch: pyt
 async def test_incomplete_video_is_reported_at_stop(
     photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("companion.perception.watchdog.SHORTEST_S", 0.3)
+    monkeypatch.setattr("companion.perception.process.SHORTEST_S", 0.3)
     monkeypatch.setattr("companion.perception.supervisor.STOP_S", 1.5)
     monkeypatch.setattr("companion.perception.supervisor.TERMINATE_S", 0.3)
     video = str(tmp_path / "flight.webm")

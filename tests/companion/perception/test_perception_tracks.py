@@ -15,10 +15,9 @@ import cv2
 import numpy as np
 import pytest
 
-from companion.perception.messages import Attitude, Ended, Hud, Report, packed, receive
-from companion.perception.result_sender import ResultSender
+from companion.perception.messages import Attitude, Ended, Hud, Report, ResultSender, packed, receive
+from companion.perception.status import LiveTracks
 from companion.perception.supervisor import PerceptionState, PerceptionSupervisor
-from companion.perception.tracks import LiveTracks
 from companion.perception.worker import ControlChannel
 from companion.settings import Settings
 from companion.settings.reading import load_settings

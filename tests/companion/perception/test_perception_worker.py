@@ -27,13 +27,21 @@ from companion.perception.messages import (
     Message,
     ProtocolError,
     Report,
+    ResultLogHandler,
+    ResultSender,
     packed,
     read_message,
     receive,
 )
-from companion.perception.process import PerceptionProcess, log_printed
-from companion.perception.result_sender import ResultLogHandler, ResultSender
-from companion.perception.watchdog import FIRST_RESULT_S, LONGEST_S, SHORTEST_S, START_S, Watchdog
+from companion.perception.process import (
+    FIRST_RESULT_S,
+    LONGEST_S,
+    SHORTEST_S,
+    START_S,
+    PerceptionProcess,
+    Watchdog,
+    log_printed,
+)
 from companion.perception.worker import ControlChannel
 from companion.settings.reading import load_settings
 from vision.detections import Detections

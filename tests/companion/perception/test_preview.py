@@ -15,7 +15,7 @@ import zenoh
 
 from companion.bus.client import listen
 from companion.perception.messages import Preview
-from companion.perception.preview import PreviewEncoder
+from companion.perception.worker import PreviewEncoder
 from companion.settings import PreviewSection
 from mavlink_sim.testing import running_simulator
 from tests.companion.service_process import running_service

@@ -65,9 +65,9 @@ def set_state(service: Service, state: VehicleState) -> None:
 
 def see(service: Service, captured_ns: int) -> None:
     """Pass a new result of the steering camera."""
-    view, result = service.views[0], seen(captured_ns)
-    view.update(result)
-    service.inputs.on_result(view, result, captured_ns)
+    camera, result = service.cameras[0], seen(captured_ns)
+    camera.update(result)
+    service.inputs.on_result(camera, result, captured_ns)
 
 
 def step(service: Service, now_ns: int) -> BehaviourContext:
@@ -82,7 +82,7 @@ async def test_targets_need_the_gimbals_attitude() -> None:
     service, now_ns = service_of(camera__on_gimbal="true"), time.monotonic_ns()
     set_state(service, state_at(now_ns, None))
     see(service, now_ns)
-    assert not service.views[0].targets
+    assert not service.cameras[0].targets
     assert "no attitude of the gimbal" in service.status()["targets"]["localization_error"]
     assert "not responding" in service.status()["gimbal"]["problem"]
     context = step(service, now_ns)
@@ -91,7 +91,7 @@ async def test_targets_need_the_gimbals_attitude() -> None:
 
     set_state(service, state_at(now_ns + 1, looking_down(now_ns + 1)))
     see(service, now_ns + 1)
-    (target,) = service.views[0].targets
+    (target,) = service.cameras[0].targets
     assert target.elevation_rad == pytest.approx(PITCH_RAD, abs=0.01)
     assert target.bearing_rad == pytest.approx(HEADING_RAD, abs=0.01)
     context = step(service, now_ns + 1)
@@ -102,7 +102,7 @@ async def test_targets_need_the_gimbals_attitude() -> None:
     later_ns = now_ns + 2_000_000_000
     set_state(service, replace(state_at(later_ns, looking_down(now_ns + 1))))
     see(service, later_ns)
-    assert not service.views[0].targets
+    assert not service.cameras[0].targets
     error = service.status()["targets"]["localization_error"]
     assert "newer than the newest attitude of the gimbal" in error
     assert "2.0 s" in step(service, later_ns).gimbal.direction_fault
@@ -112,7 +112,7 @@ async def test_fixed_camera_needs_no_gimbal() -> None:
     service, now_ns = service_of(), time.monotonic_ns()
     set_state(service, state_at(now_ns, None))
     see(service, now_ns)
-    assert len(service.views[0].targets) == 1
+    assert len(service.cameras[0].targets) == 1
     assert service.status()["gimbal"] is None
     assert step(service, now_ns).gimbal.direction_fault == ""
 

@@ -54,7 +54,7 @@ async def test_detection_triggers_a_step_at_once() -> None:
     try:
         await until(lambda: len(steps) == 1)
         for sequence in range(3):
-            service._on_result(service.views[0], result(sequence))
+            service._on_result(service.cameras[0], result(sequence))
             await until(lambda: len(steps) == sequence + 2)  # noqa: B023 - awaited here
         assert steps[1:4] == sent_now
         await until(lambda: len(steps) == 5)
@@ -74,11 +74,11 @@ async def test_setpoint_is_sent_before_publication() -> None:
     try:
         await asyncio.sleep(0)
         for sequence in range(3):
-            service._on_result(service.views[0], result(sequence))
+            service._on_result(service.cameras[0], result(sequence))
             await until(lambda: len(order) >= 3)
             assert order == ["setpoint", "detections", "labels"]
             order.clear()
-        status = service.views[0].supervisor.status
+        status = service.cameras[0].supervisor.status
         assert status.timing_p50_ms.keys() == {"publish"}  # the last stage, measured by the service
     finally:
         steering.cancel()
@@ -89,19 +89,19 @@ async def test_localization_and_publication_fail_independently(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     service = Service(load_settings(os.devnull, {}, {}))
-    view = service.views[0]
+    camera = service.cameras[0]
     published: list[str] = []
     service.bus.publish = lambda topic, *_: published.append(topic.name)  # type: ignore[method-assign]
     with monkeypatch.context() as broken:
-        broken.setattr(type(view), "localize", lambda *_: [][0])
-        view._on_report(result(1))
-        assert view.localization_error.startswith("IndexError")
+        broken.setattr(type(camera), "localize", lambda *_: [][0])
+        camera._on_report(result(1))
+        assert camera.localization_error.startswith("IndexError")
         await until(lambda: published == ["detections", "labels"])
     with monkeypatch.context() as broken:
         broken.setattr("companion.service.publisher.labels_message", lambda *_: dict[str, str]()["nothing"])
-        view._on_report(result(2))
-        assert "attitude" in view.localization_error
-        await until(lambda: view.localization_error == "KeyError: 'nothing'")
+        camera._on_report(result(2))
+        assert "attitude" in camera.localization_error
+        await until(lambda: camera.localization_error == "KeyError: 'nothing'")
     assert [record.exc_info[0] for record in caplog.records if record.exc_info] == [IndexError, KeyError]
 
 
@@ -116,7 +116,7 @@ async def test_other_cameras_do_not_trigger_a_step() -> None:
     steering = asyncio.create_task(service._loop.run())
     try:
         await until(lambda: len(steps) == 1)
-        other = next(view for view in service.views if view is not service.inputs.steering)
+        other = next(camera for camera in service.cameras if camera is not service.inputs.steering)
         service._on_result(other, result(1))
         await until(lambda: len(steps) == 2)
         assert sent_now == []

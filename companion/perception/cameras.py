@@ -1,7 +1,7 @@
-"""Views: each is a camera with its model in a separate process, published under its own name.
+"""Cameras: each with its model in a separate process, published under its own name, and with its markers.
 
-The first view uses the sections `source`, `camera` and `detector`; it has no name. One view is the steering
-one.
+The first camera uses the sections `source`, `camera` and `detector`; it has no name. One camera is the
+steering one.
 """
 
 from __future__ import annotations
@@ -12,34 +12,43 @@ import os
 import statistics
 from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 
-from companion.guidance.targets.from_detections import HistoryError, StateHistory, targets_from_detections
+from companion.guidance.targets.from_detections import (
+    HistoryError,
+    StateHistory,
+    mount_at,
+    targets_from_detections,
+)
+from companion.guidance.targets.from_markers import MarkerSight, MarkerTarget, looks_down, marker_targets
 from companion.guidance.targets.ranging import ALL_MEANS, RangeMeans, sees_ground
 from companion.guidance.targets.target import Target
 from companion.perception.messages import Preview
+from companion.perception.process import START_S
 from companion.perception.supervisor import PerceptionStartError, PerceptionState, PerceptionSupervisor
-from companion.perception.watchdog import START_S
 from companion.settings import DetectorSection, Section, Settings
 from companion.settings.calibration import adopt_calibration
 from companion.settings.perception import NO_SOURCE
 from companion.vehicle.state import VehicleState
 from vision.camera_model import CameraCalibration
+from vision.markers import Marker
 from vision.pipeline import PerceptionResult
 
 logger = logging.getLogger(__name__)
 
-# A view is unhealthy when its newest result is older than this plus its usual interval.
+# A camera is unhealthy when its newest result is older than this plus its usual interval.
 _SEEING_S = 1.0
 
 
-class View:
+class PerceptionCamera:
     """One camera with its model, and its newest result.
 
     Attributes:
         name: None for the first.
-        settings: with this view's own sections; `camera` includes the camera's own calibration.
+        settings: with this camera's own sections; `camera` includes the camera's own calibration.
         newest: the newest result; None before the first.
         targets: the newest result's localized objects, after `localize`.
         localization_error: why they could not be localized; empty if they were.
@@ -114,16 +123,16 @@ class View:
             self._has_depth = True
 
 
-class WorkerView(View):
-    """A view whose results are produced by a perception worker, a separate process run by `supervisor`."""
+class WorkerCamera(PerceptionCamera):
+    """A camera whose results are produced by a perception worker, a separate process run by `supervisor`."""
 
     def __init__(
         self,
         settings: Settings,
         name: str | None,
         *,
-        on_result: Callable[[WorkerView, PerceptionResult], None],
-        on_preview: Callable[[WorkerView, Preview], None],
+        on_result: Callable[[WorkerCamera, PerceptionResult], None],
+        on_preview: Callable[[WorkerCamera, Preview], None],
         on_event: Callable[[str, str], None],
         on_calibration: Callable[[], None],
     ) -> None:
@@ -154,7 +163,7 @@ class WorkerView(View):
         )
 
     async def start(self) -> None:
-        """Start the worker. Raises PerceptionStartError, with the view's name in its message."""
+        """Start the worker. Raises PerceptionStartError, with the camera's name in its message."""
         if self.settings.source.uri == NO_SOURCE:
             return
         try:
@@ -208,22 +217,22 @@ class WorkerView(View):
         self._on_event(level, text if self.name is None else f"camera {self.name}: {text}")
 
 
-def open_views(
+def open_cameras(
     settings: Settings,
     *,
-    on_result: Callable[[WorkerView, PerceptionResult], None],
-    on_preview: Callable[[WorkerView, Preview], None],
+    on_result: Callable[[WorkerCamera, PerceptionResult], None],
+    on_preview: Callable[[WorkerCamera, Preview], None],
     on_event: Callable[[str, str], None],
     on_calibration: Callable[[], None],
-) -> tuple[WorkerView, ...]:
-    """Create all views, the first one first, not started yet.
+) -> tuple[WorkerCamera, ...]:
+    """Create all cameras, the first one first, not started yet.
 
-    `on_calibration` is called after a view's `settings.camera` was changed to its camera's calibration.
+    `on_calibration` is called after a camera's `settings.camera` was changed to its camera's calibration.
     """
-    own_settings = {name: settings.of_view(name) for name in (None, *settings.cameras)}
+    own_settings = {name: settings.of_camera(name) for name in (None, *settings.cameras)}
     threads = threads_each([own.detector for own in own_settings.values()])
     shared = {f"shm://{source.share}" for source in settings.sources().values() if source.share}
-    views = []
+    cameras = []
     for name, own in own_settings.items():
         changes: dict[str, Section] = {}
         if own.detector.threads is None:
@@ -233,8 +242,8 @@ def open_views(
             timeout_s = own.source.open_timeout_s + START_S
             changes["source"] = own.source.model_copy(update={"open_timeout_s": timeout_s})
         own = own.model_copy(update=changes)
-        views.append(
-            WorkerView(
+        cameras.append(
+            WorkerCamera(
                 own,
                 name,
                 on_result=on_result,
@@ -243,7 +252,7 @@ def open_views(
                 on_calibration=on_calibration,
             )
         )
-    return tuple(views)
+    return tuple(cameras)
 
 
 def threads_each(detectors: Sequence[DetectorSection]) -> int:
@@ -255,3 +264,103 @@ def threads_each(detectors: Sequence[DetectorSection]) -> int:
     automatic = [detector for detector in enabled if detector.threads is None]
     configured = sum(detector.threads or 0 for detector in enabled)
     return max(1, (len(os.sched_getaffinity(0)) - 1 - configured) // max(1, len(automatic)))
+
+
+@dataclass(frozen=True, slots=True)
+class _SeenMarkers:
+    captured_ns: int
+    targets: tuple[MarkerTarget, ...]
+    looks_down: bool
+
+
+class MarkerTracker:
+    """The markers of all cameras with marker detection; not only the steering camera may look down."""
+
+    def __init__(self, cameras: Sequence[PerceptionCamera]) -> None:
+        self._detecting = tuple(
+            camera for camera in cameras if camera.settings.markers.dictionary is not None
+        )
+        self._on_pads = {
+            camera.name: {marker.identifier: marker for marker in camera.settings.markers.pad_markers()}
+            for camera in self._detecting
+        }
+        self._seen: dict[str | None, _SeenMarkers] = {}
+
+    def localize(
+        self,
+        camera: PerceptionCamera,
+        result: PerceptionResult,
+        history: StateHistory,
+        vehicle: str,
+        published_ns: int,
+    ) -> dict[str, Any]:
+        """Localize the markers of one frame; returns the message to publish."""
+        markers, section = result.markers or (), camera.settings.camera
+        error_text, down = "", False
+        targets: tuple[MarkerTarget, ...] = ()
+        try:
+            # The mount first: whether the camera looks down does not depend on the vehicle's position.
+            mount = mount_at(section.mount(), history, result.captured_ns)
+            down = looks_down(section.model(result.width, result.height), mount)
+            targets = marker_targets(markers, result.captured_ns, mount, history, self._on_pads[camera.name])
+        except HistoryError as error:
+            # As with detections: without an attitude at the capture they are published, but not targets.
+            error_text = str(error)
+        self._seen[camera.name] = _SeenMarkers(result.captured_ns, targets, down)
+        localized: Sequence[MarkerTarget | None] = targets or [None] * len(markers)
+        return {
+            "vehicle": vehicle,
+            "camera": camera.name,
+            "sequence": result.sequence,
+            "captured_ns": result.captured_ns,
+            "published_ns": published_ns,
+            "width": result.width,
+            "height": result.height,
+            "localization_error": error_text,
+            "markers": [_marker_message(*pair) for pair in zip(markers, localized, strict=True)],
+        }
+
+    def sight(self, now_ns: int, max_age_s: float) -> MarkerSight:
+        """Return the markers of the cameras that look down, for behaviours."""
+        if not self._detecting:
+            return MarkerSight()
+        down = [seen for seen in self._seen.values() if seen.looks_down]
+        if self._seen and not down:
+            return MarkerSight(missing=self._no_camera_below())
+        if not down:
+            return MarkerSight(missing="")
+        newest_ns = max(seen.captured_ns for seen in down)
+        age_s = (now_ns - newest_ns) / 1e9
+        fresh = [seen for seen in down if now_ns - seen.captured_ns <= max_age_s * 1e9]
+        targets = tuple(target for seen in fresh for target in seen.targets)
+        return MarkerSight(targets, newest_ns, age_s, bool(fresh), "")
+
+    def _no_camera_below(self) -> str:
+        cameras = ", ".join(
+            ("camera" if camera.name is None else f"cameras.{camera.name}.camera")
+            + (
+                "'s gimbal does not look down, or its attitude is unknown: use gimbal pitch=-90"
+                if camera.settings.camera.on_gimbal
+                else f".mount_pitch_deg is {camera.settings.camera.mount_pitch_deg:g}"
+            )
+            for camera in self._detecting
+        )
+        return f"a camera that sees straight down ({cameras})"
+
+
+def _marker_message(marker: Marker, target: MarkerTarget | None) -> dict[str, Any]:
+    """Create one marker's message; metres, radians, local NED, pixels. Not localized: image fields only."""
+    message: dict[str, Any] = {
+        "id": marker.identifier,
+        "size_m": marker.size_m,
+        "corners_px": [[round(float(value), 2) for value in corner] for corner in marker.corners_px],
+        "position_camera_m": [round(float(value), 4) for value in marker.position_camera_m],
+        "reprojection_px": round(marker.reprojection_px, 3),
+        "ambiguity": round(marker.ambiguity, 3),
+    }
+    fields = {} if target is None else asdict(target)
+    for name in ("pad", "bearing_rad", "elevation_rad", "distance_m", "ground_range_m", "heading_rad"):
+        message[name] = None if target is None else round(fields[name], 4)
+    for name in ("position_ned_m", "pad_ned_m"):
+        message[name] = None if target is None else [round(value, 3) for value in fields[name]]
+    return message

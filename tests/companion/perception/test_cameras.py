@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from companion.bus.client import listen
-from companion.perception.views import threads_each
+from companion.perception.cameras import threads_each
 from companion.settings import DetectorSection
 from companion.settings.reading import ConfigurationError, load_settings, to_toml
 from mavlink_sim.testing import running_simulator
@@ -34,12 +34,12 @@ def test_two_models_on_one_camera_are_independent(
     )
     received: queue.SimpleQueue[tuple[str, dict[str, Any]]] = queue.SimpleQueue()
 
-    def next_of(view: str | None) -> dict[str, Any]:
+    def next_of(camera: str | None) -> dict[str, Any]:
         while True:
             key, message = received.get(timeout=30)
             own = "" if message["camera"] is None else f"cameras/{message['camera']}/"
             assert key == f"companion/vehicle1/{own}detections"
-            if message["camera"] == view:
+            if message["camera"] == camera:
                 return message
 
     with (
@@ -68,7 +68,7 @@ def test_two_models_on_one_camera_are_independent(
     assert not Path("/dev/shm", shared).exists()
 
 
-def test_guidance_camera_selects_the_steering_view(
+def test_guidance_camera_selects_the_steering_camera(
     exported_model: Path, pictures: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "companion.toml").write_text(
@@ -82,7 +82,7 @@ def test_guidance_camera_selects_the_steering_view(
         running_simulator() as simulator,
         running_service(simulator.onboard_port, flags, cwd=tmp_path) as service,
     ):
-        # Only the classes of that view's model can be sought.
+        # Only the classes of that camera's model can be sought.
         assert "unknown class 'bicycle'" in service.command("seek bicycle")["reason"]
         assert "in the air" in service.command("seek boat")["reason"]
 
@@ -118,7 +118,7 @@ def test_guidance_camera_selects_the_steering_view(
         ("[cameras]\ndown = 1", ["cameras.down", "must hold sections", "got 1"]),
     ],
 )
-def test_invalid_view_is_one_line(text: str, words: list[str], tmp_path: Path) -> None:
+def test_invalid_camera_is_one_line(text: str, words: list[str], tmp_path: Path) -> None:
     path = tmp_path / "companion.toml"
     path.write_text(f'[source]\nuri = "street.mp4"\n{text}\n')
     with pytest.raises(ConfigurationError) as caught:
@@ -128,13 +128,13 @@ def test_invalid_view_is_one_line(text: str, words: list[str], tmp_path: Path) -
         assert word in problem
 
 
-def test_views_round_trip_through_toml(tmp_path: Path) -> None:
+def test_cameras_round_trip_through_toml(tmp_path: Path) -> None:
     path = tmp_path / "companion.toml"
     path.write_text('[cameras.down.source]\nuri = "down.mp4"\n[cameras.up-2.source]\nuri = "up.mp4"\n')
     settings = load_settings(path, {"cameras.down.detector.confidence": "0.4"}, {})
     assert list(settings.cameras) == ["down", "up-2"]
-    assert settings.of_view("down").detector.confidence == 0.4
-    assert settings.of_view(None).detector.confidence == settings.detector.confidence
+    assert settings.of_camera("down").detector.confidence == 0.4
+    assert settings.of_camera(None).detector.confidence == settings.detector.confidence
     path.write_text(to_toml(settings))
     assert load_settings(path, {}, {}) == settings
 
@@ -142,9 +142,9 @@ def test_views_round_trip_through_toml(tmp_path: Path) -> None:
 def test_automatic_threads_leave_a_processor_free() -> None:
     processors = len(os.sched_getaffinity(0))
     asking, off = DetectorSection(), DetectorSection(enabled=False)
-    for views in range(1, 9):
-        each = threads_each([asking] * views)
-        assert each == 1 or (each > 1 and views * each < processors)
+    for cameras in range(1, 9):
+        each = threads_each([asking] * cameras)
+        assert each == 1 or (each > 1 and cameras * each < processors)
     # A disabled detector gets no threads, a configured number is not changed.
     assert threads_each([off, asking, off]) == threads_each([asking])
     assert threads_each([DetectorSection(threads=processors), asking]) == 1
