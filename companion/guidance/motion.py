@@ -17,12 +17,13 @@ STOPPING_DELAY_S = 0.5
 # Below the envelope's acceleration, so that a vehicle with delay still stops in time.
 STOPPING_MPS2 = 0.7
 # `PositionController`: gains of position (1/s), of velocity (as VELOCITY_GAIN), of the integral (1/s²), and
-# the integral's limit. Tuned in lockstep in gusts of 0.6 m/s with MPC_XY_VEL_P_ACC 1.2 to 3: 0.17 m
-# horizontally (p95), where PX4's own position hold has 0.66 m. Higher gains oscillate at the envelope's
-# acceleration limit, and these do at 2 m/s².
-HOLD_GAIN = 1.8
+# the integral's limit. Tuned in lockstep in gusts of 0.6 m/s with MPC_XY_VEL_P_ACC 1.2 to 3; PX4's own
+# position hold moves by 0.66 m there. Higher gains oscillate at the envelope's acceleration limit, and these
+# do at 2 m/s².
+HOLD_GAIN = 2.0
 HOLD_VELOCITY_GAIN = 1.5
 HOLD_DOWN_GAIN = 1.3
+HOLD_DOWN_VELOCITY_GAIN = 1.0
 HOLD_INTEGRAL_GAIN = 0.4
 HOLD_INTEGRAL_MPS = 0.5
 # Farther away than this the error is remaining distance, not a disturbance to integrate.
@@ -124,6 +125,7 @@ class PositionController:
 
     def __init__(self) -> None:
         self._integral_mps = (0.0, 0.0)
+        self._down_integral_mps = 0.0
 
     def velocity(
         self, goal_ned_m: Vector3, state: VehicleState, dt_s: float, top_speed_mps: float = MAX_CORRECTION_MPS
@@ -155,8 +157,18 @@ class PositionController:
         return (
             north_mps + self._integral_mps[0],
             east_mps + self._integral_mps[1],
-            max(-top_speed_mps, min(top_speed_mps, HOLD_DOWN_GAIN * down)),
+            self._down_mps(down, state, dt_s, top_speed_mps),
         )
+
+    def _down_mps(self, down_m: float, state: VehicleState, dt_s: float, top_speed_mps: float) -> float:
+        """The same control law vertically."""
+        wanted = max(-top_speed_mps, min(top_speed_mps, HOLD_DOWN_GAIN * down_m))
+        down_mps = wanted if state.velocity_ned_mps is None else state.velocity_ned_mps[2]
+        integral = self._down_integral_mps + HOLD_INTEGRAL_GAIN * dt_s * down_m
+        near = abs(down_m) < HOLD_INTEGRAL_M
+        self._down_integral_mps = max(-HOLD_INTEGRAL_MPS, min(HOLD_INTEGRAL_MPS, integral)) if near else 0.0
+        asked = wanted + HOLD_DOWN_VELOCITY_GAIN * (wanted - down_mps) + self._down_integral_mps
+        return max(-top_speed_mps, min(top_speed_mps, asked))
 
 
 class Arrival:

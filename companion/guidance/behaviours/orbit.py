@@ -40,7 +40,7 @@ SPEED_MARGIN = 1.25
 # Gains of the radius error (1/s; its integral 1/s²) and of the outward velocity, as in
 # `motion.PositionController`; of the velocity along the circle; of the integrals of speed (1/s²) and heading
 # (1/s).
-RADIUS_GAIN, RADIUS_INTEGRAL_GAIN = 1.3, 0.4
+RADIUS_GAIN, RADIUS_INTEGRAL_GAIN = 1.8, 0.4
 VELOCITY_GAIN = 1.5
 ALONG_GAIN = 0.6
 SPEED_INTEGRAL_GAIN = 0.3
@@ -52,7 +52,7 @@ MAX_LEAD_RAD = 0.6
 ON_CIRCLE_M = 1.5
 # On the circle the velocity command turns continuously. That may use this fraction of the envelope's
 # acceleration, else the vehicle flies slower; the rest is for corrections. An orbit of 8 m at 4 m/s flies 3.7
-# m/s at 3 m/s²; its radius error is 0.22 m (p95) in gusts of 0.6 m/s.
+# m/s at 3 m/s².
 TURNING_FRACTION = 0.8
 # Speed adaptation to that: gain, limit, and filter time constant.
 PACE_GAIN, MAX_PACE_MPS2, PACE_FILTER_S = 1.0, 0.5, 0.5

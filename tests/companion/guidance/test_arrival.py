@@ -105,6 +105,16 @@ def test_goto_arrives_and_hold_keeps_its_goal(name: str, seed: int) -> None:
     assert_arrived(outcome, hold, (home[0] + goal[0], home[1] + goal[1], home[2] - height_m), name)
 
 
+@pytest.mark.parametrize("seed", [16, 19, 20, 22, 34, 41])  # the worst of 50
+def test_hold_stays_within_0_3_m_in_gusts(seed: int) -> None:
+    chance = random.Random(seed)
+    goal = (chance.uniform(-15.0, 15.0), chance.uniform(-15.0, 15.0))
+    goto = GotoBehaviour(from_home_m=goal, altitude_m=chance.uniform(3.0, 8.0), speed_mps=4.0)
+    outcome, hold = then_hold(LockstepFlight.airborne(**air("px4", seed)), goto)
+    assert outcome.goal_ned_m is not None
+    assert max(math.dist(m.context.state.position_ned_m or (), outcome.goal_ned_m) for m in hold) <= 0.3
+
+
 @pytest.mark.parametrize(("name", "seed"), CASES)
 def test_figure_eight_stops_where_it_began(name: str, seed: int) -> None:
     flight = LockstepFlight.airborne(**air(name, seed))
