@@ -40,7 +40,7 @@ SPEED_MARGIN = 1.25
 # Gains of the radius error (1/s; its integral 1/s²) and of the outward velocity, as in
 # `motion.PositionController`; of the velocity along the circle; of the integrals of speed (1/s²) and heading
 # (1/s).
-RADIUS_GAIN, RADIUS_INTEGRAL_GAIN = 1.8, 0.4
+RADIUS_GAIN, RADIUS_INTEGRAL_GAIN = 1.5, 0.4
 VELOCITY_GAIN = 1.5
 ALONG_GAIN = 0.6
 SPEED_INTEGRAL_GAIN = 0.3
