@@ -5,12 +5,9 @@
 >>> vehicle.take_off(5.0)                           # arms, climbs, waits for HOLD: 13 s of flight in 0.1 s
 >>> vehicle.truth.position_ned_m[2] < -4.0
 True
->>> vehicle.set_velocity(2.0, 0.0, 0.0)             # a setpoint stream in OFFBOARD, until another one
->>> vehicle.step(5.0)
->>> vehicle.truth.velocity_ned_mps[0] > 1.5
-True
 
-Everything else is done by MAVLink messages, as with a real vehicle: `send` one, `step`, read what it sent.
+Setpoints are `set_velocity` and `set_position`. Everything else is done by MAVLink messages, as with a real
+vehicle: `send` one, `step`, read what it sent.
 The same seed and the same calls give the same flight and the same bytes.
 """
 
@@ -27,6 +24,7 @@ from mavlink_sim.lockstep_wire import LockstepWire
 from mavlink_sim.vehicles.firmware import PX4, vehicle_class
 from mavlink_sim.vehicles.vehicle import STEP_S
 from mavlink_sim.wire.messages import Outgoing, dialect
+from mavlink_sim.wire.setpoints import position_setpoint, velocity_setpoint
 from mavlink_sim.wire.streams import ONBOARD_RATES_HZ
 
 if TYPE_CHECKING:
@@ -39,11 +37,6 @@ SECOND_ANSWER_S = 0.04  # Commander's answer, after the receiver's
 MAX_WAITING = 50_000
 _ARM_DISARM, _TAKEOFF, _LAND, _SET_MODE = 400, 22, 21, 176
 SETPOINT_RATE_HZ = 20.0
-NAN = math.nan
-# POSITION_TARGET_TYPEMASK: what is to be ignored.
-_ONLY_VELOCITY = 0b0001_1100_0111
-_ONLY_POSITION = 0b0001_1111_1000
-_IGNORE_YAW, _IGNORE_YAW_RATE = 0b0100_0000_0000, 0b1000_0000_0000
 _RESULTS = ("ACCEPTED", "TEMPORARILY_REJECTED", "DENIED", "UNSUPPORTED", "FAILED", "IN_PROGRESS", "CANCELLED")
 
 
@@ -358,25 +351,37 @@ class LockstepVehicle:
 
     # ---- setpoints --------------------------------------------------------------------------------------
 
-    def set_velocity(self, north_mps: float, east_mps: float, down_mps: float, yaw_rad: float = NAN) -> None:
+    def set_velocity(
+        self, north_mps: float, east_mps: float, down_mps: float, yaw_rad: float | None = None
+    ) -> None:
         """Set a velocity over ground, local NED, metres per second.
 
         SET_POSITION_TARGET_LOCAL_NED is sent SETPOINT_RATE_HZ times per second while time advances, in
         OFFBOARD (ArduPilot: GUIDED), until another of these three is called. The first call advances 0.1 s
         before it requests the mode. A vehicle on the ground has to take off first.
 
+        >>> vehicle = LockstepVehicle(seed=1)
+        >>> vehicle.take_off(5.0)
+        >>> vehicle.set_velocity(2.0, 0.0, 0.0, yaw_rad=0.5)
+        >>> vehicle.step(5.0)
+        >>> vehicle.truth.velocity_ned_mps[0] > 1.5
+        True
+
         Args:
-            yaw_rad: heading, clockwise from north; without one it is unchanged.
+            yaw_rad: heading, clockwise from north; None: unchanged.
 
         Raises:
             CommandRefusedError: the mode is not available now; no setpoints are sent.
             ValueError: a number is not finite.
         """
-        self._set_target(_ONLY_VELOCITY, (0.0, 0.0, 0.0, north_mps, east_mps, down_mps), yaw_rad)
+        system_id = self.vehicle.system_id
+        self._stream(velocity_setpoint(north_mps, east_mps, down_mps, yaw_rad, system_id=system_id))
 
-    def set_position(self, north_m: float, east_m: float, down_m: float, yaw_rad: float = NAN) -> None:
+    def set_position(
+        self, north_m: float, east_m: float, down_m: float, yaw_rad: float | None = None
+    ) -> None:
         """Set a position, local NED, metres. Otherwise as `set_velocity`."""
-        self._set_target(_ONLY_POSITION, (north_m, east_m, down_m, 0.0, 0.0, 0.0), yaw_rad)
+        self._stream(position_setpoint(north_m, east_m, down_m, yaw_rad, system_id=self.vehicle.system_id))
 
     def stop_setpoints(self) -> None:
         """Stop the setpoints; the vehicle reacts to their end (PX4: COM_OBL_RC_ACT)."""
@@ -384,24 +389,7 @@ class LockstepVehicle:
             self._setpoints.stop()
         self._setpoints = None
 
-    def _set_target(self, mask: int, values: tuple[float, ...], yaw_rad: float) -> None:
-        if not all(math.isfinite(value) for value in values) or math.isinf(yaw_rad):
-            raise ValueError(f"a setpoint needs finite numbers, got {values} and yaw {yaw_rad}")
-        heading = not math.isnan(yaw_rad)
-        mask |= _IGNORE_YAW_RATE if heading else _IGNORE_YAW  # a rate of 0 keeps the heading
-        message = dialect.MAVLink_set_position_target_local_ned_message(
-            0,
-            self.vehicle.system_id,
-            1,
-            dialect.MAV_FRAME_LOCAL_NED,
-            mask,
-            *values,
-            0.0,
-            0.0,
-            0.0,
-            yaw_rad if heading else 0.0,
-            0.0,
-        )
+    def _stream(self, message: Any) -> None:
         if self._setpoints is not None:
             self._setpoints.message = message
         else:

@@ -32,6 +32,12 @@ FLEET_READY = re.compile(r"^ready: \d+ vehicles")
 # Between the choice of a port and its use another program may request any; Linux assigns those from 32768 on.
 _NOT_GIVEN_AWAY = range(16384, 32768)
 _LINES_NOTED = 30
+# Of real time: still enough for the autopilot's timeout of a simulator at `speed` 20.
+_SETPOINT_PERIOD_S = 0.02
+_ARM_DISARM, _SET_MODE = 400, 176
+_GROUND_STATION = (255, 190)
+# The mode for setpoints, and DO_SET_MODE's parameter 2 for it.
+_SETPOINT_MODES = {"px4": ("OFFBOARD", 6.0), "ardupilot": ("GUIDED", 4.0)}
 _chance = random.SystemRandom()  # parallel tests may all have the same seed
 
 
@@ -128,7 +134,7 @@ class RunningSimulator:
         transcript: every line it printed, each after the seconds since it was started.
     """
 
-    def __init__(self, process: subprocess.Popen[str], count: int = 1) -> None:
+    def __init__(self, process: subprocess.Popen[str], count: int = 1, autopilot: str = "px4") -> None:
         self.process = process
         self.vehicles: list[FleetMember] = []
         self._count = count
@@ -139,6 +145,8 @@ class RunningSimulator:
         self._ready = False
         self._ended = False
         self._changed = threading.Condition()
+        self._autopilot = autopilot
+        self._client: _Client | None = None
         self._reader = threading.Thread(target=self._read, name="simulator-output", daemon=True)
         self._reader.start()
 
@@ -230,6 +238,80 @@ class RunningSimulator:
         self.process.stdin.write(line + "\n")
         self.process.stdin.flush()
 
+    # ---- flying it, on the ground station's link; a client under test has the onboard link ---------------
+
+    def arm(self, timeout_s: float = 5.0) -> None:
+        """Arm the (first) vehicle. Raises TimeoutError if it refuses."""
+        since = len(self.events)
+        self._own_client().command(_ARM_DISARM, 1.0)
+        self.wait_for_event("armed", timeout_s, since)
+
+    def set_velocity(
+        self, north_mps: float, east_mps: float, down_mps: float, yaw_rad: float | None = None
+    ) -> None:
+        """Set a velocity over ground of the (first) vehicle, local NED, metres per second.
+
+        SET_POSITION_TARGET_LOCAL_NED is sent 50 times per second in OFFBOARD (ArduPilot: GUIDED), until
+        another of these three is called. An ArduPilot on the ground has to take off first.
+
+        >>> with running_simulator(ready_after=0.0) as simulator:
+        ...     simulator.set_velocity(0.0, 0.0, -1.0)
+        ...     simulator.arm()
+        ...     simulator.wait_for_event("takeoff")
+        'takeoff'
+
+        Args:
+            yaw_rad: heading, clockwise from north; None: unchanged.
+
+        Raises:
+            TimeoutError: the mode is not available now; no setpoints are sent.
+            ValueError: a number is not finite.
+        """
+        from mavlink_sim.wire.setpoints import velocity_setpoint
+
+        system_id = self.vehicles[0].system_id
+        self._stream(velocity_setpoint(north_mps, east_mps, down_mps, yaw_rad, system_id=system_id))
+
+    def set_position(
+        self, north_m: float, east_m: float, down_m: float, yaw_rad: float | None = None
+    ) -> None:
+        """Set a position, local NED, metres. Otherwise as `set_velocity`."""
+        from mavlink_sim.wire.setpoints import position_setpoint
+
+        system_id = self.vehicles[0].system_id
+        self._stream(position_setpoint(north_m, east_m, down_m, yaw_rad, system_id=system_id))
+
+    def stop_setpoints(self) -> None:
+        """Stop the setpoints; the vehicle reacts to their end (PX4: COM_OBL_RC_ACT)."""
+        if self._client is not None:
+            self._client.setpoint = None
+
+    def _own_client(self) -> _Client:
+        if self._client is None:
+            self._client = _Client(self.gcs_bind, self.vehicles[0].system_id)
+        return self._client
+
+    def _stream(self, message: Any) -> None:
+        client = self._own_client()
+        if client.setpoint is None:
+            client.setpoint = message
+            time.sleep(5 * _SETPOINT_PERIOD_S)  # PX4 accepts OFFBOARD only with a setpoint stream
+        client.setpoint = message
+        name, number = _SETPOINT_MODES[self._autopilot]
+        if self._mode() != name:
+            since = len(self.events)
+            client.command(_SET_MODE, 1.0, number)
+            try:
+                self.wait_for_event(f"mode {name}", 5.0, since)
+            except TimeoutError:
+                client.setpoint = None
+                raise
+
+    def _mode(self) -> str:
+        """The mode of the (first) vehicle by its newest event; empty before the first change."""
+        lines = (line.removeprefix("vehicle 1: ") for line in reversed(self.events))
+        return next((line.removeprefix("mode ") for line in lines if line.startswith("mode ")), "")
+
     def stop(self, timeout_s: float = 10.0) -> int:
         """Stop it (SIGTERM, then SIGKILL). Returns the exit code."""
         if self.process.poll() is None:
@@ -241,7 +323,51 @@ class RunningSimulator:
                 self.process.kill()
         code = self.process.wait()
         self._reader.join(timeout_s)
+        if self._client is not None:
+            self._client.close()
         return code
+
+
+class _Client:
+    """Sends commands, and a setpoint at a rate from a thread of its own, to one port of a vehicle.
+
+    Attributes:
+        setpoint: the message to repeat; None: none.
+    """
+
+    def __init__(self, port: int, system_id: int) -> None:
+        from mavlink_sim.wire.messages import parser
+
+        self.setpoint: Any = None
+        self._system_id = system_id
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.connect(("127.0.0.1", port))
+        self._codec = parser(*_GROUND_STATION)
+        self._lock = threading.Lock()
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._repeat, name="setpoints", daemon=True)
+        self._thread.start()
+
+    def command(self, identifier: int, *parameters: float) -> None:
+        """Send COMMAND_LONG; its effect is an event of the vehicle."""
+        from mavlink_sim.wire.messages import dialect
+
+        values = (*parameters, *[0.0] * (7 - len(parameters)))
+        self._send(dialect.MAVLink_command_long_message(self._system_id, 1, identifier, 0, *values))
+
+    def close(self) -> None:
+        self._closed.set()
+        self._thread.join()
+        self._socket.close()
+
+    def _repeat(self) -> None:
+        while not self._closed.wait(_SETPOINT_PERIOD_S):
+            if (setpoint := self.setpoint) is not None:
+                self._send(setpoint)
+
+    def _send(self, message: Any) -> None:
+        with self._lock, suppress(ConnectionRefusedError):  # the vehicle has just ended
+            self._socket.send(message.pack(self._codec))
 
 
 @contextmanager
@@ -295,7 +421,7 @@ def running_simulator(
     command += ["--console"]
     with start_simulator(command) as process:
         try:
-            simulator = RunningSimulator(process, count)
+            simulator = RunningSimulator(process, count, str(options.get("autopilot") or "px4"))
         except BaseException:
             process.kill()
             raise

@@ -33,7 +33,16 @@ def test_import_of_a_package_loads_nothing_heavy(package: str) -> None:
     assert run.stdout.strip() == "[]"
 
 
-@pytest.mark.parametrize("name", ["mavlink_sim", "mavlink_sim.lockstep", "vision"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "mavlink_sim",
+        "mavlink_sim.lockstep",
+        pytest.param("mavlink_sim.testing", marks=pytest.mark.realtime),
+        "mavlink_sim.wire.setpoints",
+        "vision",
+    ],
+)
 def test_the_example_in_the_docstring_runs(name: str) -> None:
     failed, tried = doctest.testmod(importlib.import_module(name))
     assert tried

@@ -14,7 +14,6 @@ import typer
 
 from mavlink_sim.lockstep import LockstepVehicle
 from mavlink_sim.testing import free_udp_ports
-from mavlink_sim.wire.messages import dialect
 from mavlink_sim.wire.streams import GCS_RATES_HZ, ONBOARD_RATES_HZ
 
 if TYPE_CHECKING:
@@ -65,12 +64,7 @@ def airborne(links: dict[str, dict[str, float]], seed: int = 1) -> LockstepVehic
     """A vehicle that follows setpoints of 20 Hz in OFFBOARD."""
     vehicle = LockstepVehicle(links, seed=seed)
     vehicle.take_off(5.0)
-    setpoint = dialect.MAVLink_set_position_target_local_ned_message(
-        0, 1, 1, 1, 2552, 5, 5, -8, 0, 0, 0, 0, 0, 0, 1, 0
-    )
-    vehicle.repeat(setpoint, 20.0)
-    vehicle.step(0.2)
-    vehicle.set_mode("OFFBOARD")
+    vehicle.set_position(5.0, 5.0, -8.0, yaw_rad=1.0)
     vehicle.receive()
     return vehicle
 

@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 import pytest
 
 from mavlink_sim.vehicles.vehicle import STEP_S, Vehicle
+from mavlink_sim.wire import setpoints
 from mavlink_sim.wire.messages import dialect
 from mavlink_sim.wire.streams import GCS_RATES_HZ, ONBOARD_RATES_HZ
 
@@ -250,10 +251,8 @@ def velocity(forward: float, right: float, down: float, yaw_rate: float = 0.0, f
 
 
 def position(north: float, east: float, down: float, yaw: float = 0.0) -> Any:
-    """A position setpoint in LOCAL_NED (type mask 2552)."""
-    return dialect.MAVLink_set_position_target_local_ned_message(
-        0, 1, 1, 1, 2552, north, east, down, 0, 0, 0, 0, 0, 0, yaw, 0
-    )
+    """A position setpoint in LOCAL_NED, with a heading."""
+    return setpoints.position_setpoint(north, east, down, yaw)
 
 
 @pytest.fixture

@@ -28,7 +28,7 @@ from mavlink_sim.realtime.options import SimulationOptions
 from mavlink_sim.realtime.simulation import Simulation
 from mavlink_sim.testing import free_udp_ports
 from mavlink_sim.vehicles.vehicle import STEP_S
-from mavlink_sim.wire.messages import dialect
+from mavlink_sim.wire.setpoints import position_setpoint, velocity_setpoint
 from mavlink_sim.world.fiducials import Print
 from mavlink_sim.world.obstacles import Obstacles
 from mavlink_sim.world.world import World, WorldObject
@@ -36,19 +36,6 @@ from mavlink_sim.world.world import World, WorldObject
 WALL = WorldObject(2, "wall", (8.0, 0.0, 0.0), math.pi, size_m=(8.0, 0.3, 5.0))
 BLOCK = WorldObject(5, "box", (4.0, 0.0, 0.0), size_m=(2.0, 2.0, 1.5))
 FACE_M = 8.0 - 0.18  # the coping stands out a little
-VELOCITY_ALONE = 3527
-
-
-def velocity(north: float, east: float = 0.0, down: float = 0.0) -> Any:
-    return dialect.MAVLink_set_position_target_local_ned_message(
-        0, 1, 1, 1, VELOCITY_ALONE, 0, 0, 0, north, east, down, 0, 0, 0, 0, 0
-    )
-
-
-def position(north: float, east: float, down: float) -> Any:
-    return dialect.MAVLink_set_position_target_local_ned_message(
-        0, 1, 1, 1, 3576, north, east, down, 0, 0, 0, 0, 0, 0, 0, 0
-    )
 
 
 def flying(*objects: WorldObject, height_m: float = 2.0, **options: Any) -> LockstepVehicle:
@@ -88,7 +75,7 @@ def let_pass(body: Multirotor, clock: list[float], seconds: float) -> None:
 
 def test_a_wall_stops_a_vehicle_and_leaves_it_flying() -> None:
     vehicle = flying(WALL)
-    steer(vehicle, velocity(2.0), 8.0)
+    steer(vehicle, velocity_setpoint(2.0, 0.0, 0.0), 8.0)
     truth = vehicle.truth
     assert truth.position_ned_m[0] == pytest.approx(FACE_M - RADIUS_M, abs=0.05)
     assert not truth.crashed
@@ -98,7 +85,7 @@ def test_a_wall_stops_a_vehicle_and_leaves_it_flying() -> None:
     assert (truth.collision.name, truth.collision.identifier) == ("wall-2", 2)
     assert 1.0 < truth.collision.speed_mps < 2.2
     assert vehicle.events[-1] == f"hit wall-2 at {truth.collision.speed_mps:.1f} m/s"
-    steer(vehicle, velocity(-2.0), 7.0)  # and it can leave
+    steer(vehicle, velocity_setpoint(-2.0, 0.0, 0.0), 7.0)  # and it can leave
     assert vehicle.truth.position_ned_m[0] < 4.0
 
 
@@ -108,7 +95,7 @@ def test_without_scene_flight_is_bit_equal() -> None:
     assert type(plain.vehicle.airframe) is Multirotor
     assert plain.vehicle.collision_world is None
     for vehicle in (plain, among):
-        steer(vehicle, velocity(2.0, 1.0), 5.0)
+        steer(vehicle, velocity_setpoint(2.0, 1.0, 0.0), 5.0)
         vehicle.land()
     assert plain.truth == among.truth
     assert plain.events == among.events
@@ -118,7 +105,7 @@ def test_the_same_seed_gives_the_same_collisions() -> None:
     truths = []
     for _ in range(2):
         vehicle = flying(WALL, seed=9, gusts_mps=0.8, wind_mps=2.0)
-        steer(vehicle, velocity(3.0), 5.0)
+        steer(vehicle, velocity_setpoint(3.0, 0.0, 0.0), 5.0)
         truths.append((vehicle.truth, vehicle.events))
     assert truths[0] == truths[1]
     assert truths[0][0].collisions > 0
@@ -126,7 +113,7 @@ def test_the_same_seed_gives_the_same_collisions() -> None:
 
 def test_too_fast_it_breaks_and_falls() -> None:
     vehicle = flying(WALL, height_m=3.0)
-    steer(vehicle, velocity(9.0), 4.0)
+    steer(vehicle, velocity_setpoint(9.0, 0.0, 0.0), 4.0)
     crash = next(event for event in vehicle.events if event.startswith("crashed into"))
     assert crash.startswith("crashed into wall-2 at ")
     assert float(crash.split()[-2]) > CRASH_MPS
@@ -180,9 +167,9 @@ def test_scraping_a_wall_yaws_vehicle() -> None:
 
 def test_vehicle_recovers_from_wall_contact() -> None:
     vehicle = flying(WALL)
-    steer(vehicle, velocity(2.0, 0.6), 6.0)
+    steer(vehicle, velocity_setpoint(2.0, 0.6, 0.0), 6.0)
     assert vehicle.truth.collisions >= 1
-    steer(vehicle, position(0.0, 0.0, -2.0), 8.0)
+    steer(vehicle, position_setpoint(0.0, 0.0, -2.0), 8.0)
     truth = vehicle.truth
     assert not truth.crashed
     assert math.dist(truth.position_ned_m, (0.0, 0.0, -2.0)) < 0.6
@@ -256,7 +243,7 @@ def test_vehicle_cannot_leave_walled_yard(
 
 def test_it_lands_on_a_roof_stands_and_takes_off_again() -> None:
     vehicle = flying(BLOCK, height_m=4.0)
-    steer(vehicle, position(4.0, 0.0, -4.0), 7.0)
+    steer(vehicle, position_setpoint(4.0, 0.0, -4.0), 7.0)
     vehicle.land()
     truth = vehicle.truth
     landing = vehicle.events.index("touched down on box-5")
@@ -272,7 +259,7 @@ def test_it_lands_on_a_roof_stands_and_takes_off_again() -> None:
     vehicle.take_off(4.0)
     assert vehicle.events[-4:] == ["armed", "mode TAKEOFF", "takeoff", "mode HOLD"]
     assert vehicle.truth.position_ned_m[2] < -3.0
-    steer(vehicle, position(0.0, 4.0, -4.0), 7.0)
+    steer(vehicle, position_setpoint(0.0, 4.0, -4.0), 7.0)
     vehicle.land()
     assert vehicle.truth.position_ned_m[2] == 0.0
     assert vehicle.truth.collisions == 1

@@ -10,21 +10,15 @@ import pytest
 from mavlink_sim import LockstepVehicle
 from mavlink_sim.physics.airframe import GRAVITY_MPS2, Multirotor
 from mavlink_sim.physics.estimator import Estimate
-from mavlink_sim.wire.messages import dialect
 
 REPORTED = {"LOCAL_POSITION_NED": 20.0, "GPS_RAW_INT": 8.0, "ATTITUDE": 50.0, "HIGHRES_IMU": 50.0}
-HERE = dialect.MAVLink_set_position_target_local_ned_message(
-    0, 1, 1, 1, 2552, 0, 0, -5, 0, 0, 0, 0, 0, 0, 0, 0
-)
 
 
 def holding(seconds: float, **options: Any) -> tuple[dict[str, list[Any]], list[Any], LockstepVehicle]:
     """A vehicle holding its position in OFFBOARD: its messages by type, and the truth at the same time."""
     vehicle = LockstepVehicle({"onboard": REPORTED}, **options)
     vehicle.take_off(5.0)
-    vehicle.repeat(HERE, 10.0)
-    vehicle.step(0.3)
-    vehicle.set_mode("OFFBOARD")
+    vehicle.set_position(0.0, 0.0, -5.0, yaw_rad=0.0)
     vehicle.step(12.0)
     vehicle.receive()
     reported: dict[str, list[Any]] = {name: [] for name in REPORTED}

@@ -24,15 +24,10 @@ def flight(seed: int, links: dict[str, dict[str, float]] | None = None) -> tuple
         {"onboard": ONBOARD_RATES_HZ, "gcs": GCS_RATES_HZ} if links is None else links, seed=seed
     )
     vehicle.take_off(4.0)
-    ahead = dialect.MAVLink_set_position_target_local_ned_message(
-        0, 1, 1, 1, 2552, 3, 2, -5, 0, 0, 0, 0, 0, 0, 0.5, 0
-    )
-    stream = vehicle.repeat(ahead, 20.0)
-    vehicle.step(0.2)
-    vehicle.set_mode("OFFBOARD")
+    vehicle.set_position(3.0, 2.0, -5.0, yaw_rad=0.5)
     vehicle.step(5.0)
     vehicle.land()
-    stream.stop()
+    vehicle.stop_setpoints()
     digest = hashlib.sha256()
     for link in vehicle.newest:
         digest.update(vehicle.receive_bytes(link))

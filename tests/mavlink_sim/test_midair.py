@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import threading
-from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -199,12 +198,6 @@ def test_overlapping_start_refused() -> None:
         fleet_world.join(LockstepVehicle({"onboard": {}}, system_id=5, start_ned_m=(9.0, 0.0)).vehicle)
 
 
-def position(north: float, east: float, down: float) -> Any:
-    return dialect.MAVLink_set_position_target_local_ned_message(
-        0, 0, 1, 1, 3576, north, east, down, 0, 0, 0, 0, 0, 0, 0, 0
-    )
-
-
 def test_lockstep_vehicles_collide() -> None:
     pair = [
         LockstepVehicle(
@@ -218,9 +211,7 @@ def test_lockstep_vehicles_collide() -> None:
         vehicle.take_off(3.0)
     # each towards where the other is, in its own frame
     for vehicle, north in zip(pair, (6.0, -6.0), strict=True):
-        vehicle.repeat(position(north, 0.0, -3.0), 20.0)
-        vehicle.step(0.1)
-        vehicle.set_mode("OFFBOARD")
+        vehicle.set_position(north, 0.0, -3.0)
     first, second = fleet_world._midair.bodies
     for _ in range(1500):
         for vehicle in pair:

@@ -137,6 +137,31 @@ def fail_with_running_vehicle(fault: str) -> None:
         pytest.fail("timeout")
 
 
+def test_setpoint_methods_fly_it_until_they_stop(tmp_path: Path) -> None:
+    truth = tmp_path / "truth.jsonl"
+    with running_simulator(ready_after=0.0, wind=0.0, gusts=0.0, truth=truth) as simulator:
+        simulator.set_velocity(0.0, 0.0, -1.5)
+        simulator.arm()
+        simulator.wait_for_event("takeoff")
+        simulator.set_position(3.0, 0.0, -3.0, yaw_rad=1.0)
+        with pytest.raises(ValueError, match="finite numbers"):
+            simulator.set_velocity(math.nan, 0.0, 0.0)
+        time.sleep(6.0)
+        simulator.stop_setpoints()
+        simulator.wait_for_event("failsafe: offboard setpoints lost")
+    positions = [json.loads(line)["position_ned_m"] for line in truth.read_text().splitlines()[1:]]
+    assert min(math.dist(position, (3.0, 0.0, -3.0)) for position in positions) < 0.5
+    assert [event for event in simulator.events if event.startswith("mode")][:1] == ["mode OFFBOARD"]
+
+
+def test_refused_setpoint_mode_is_timeout_error() -> None:
+    with (
+        running_simulator(ready_after=60.0) as simulator,
+        pytest.raises(TimeoutError, match="mode OFFBOARD"),
+    ):
+        simulator.set_position(0.0, 0.0, -3.0)
+
+
 def test_failure_note_has_last_events() -> None:
     with pytest.raises(pytest.fail.Exception, match="timeout") as failure:
         fail_with_running_vehicle("wind speed=3 direction=90")

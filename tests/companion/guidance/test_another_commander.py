@@ -10,10 +10,10 @@ from companion.bench.lockstep_flight import LockstepFlight
 from companion.guidance.core import Phase
 from companion.guidance.interface import EventKind
 from companion.guidance.limits.setpoint_monitor import REASON
-from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode
 from companion.vehicle.streamer import StreamState
 from mavlink_sim.wire.messages import dialect
+from mavlink_sim.wire.setpoints import velocity_setpoint
 
 STATION = (255, 190)
 PAUSE, CONTINUE = 0.0, 1.0
@@ -95,11 +95,7 @@ def test_setpoints_of_another_commander_end_hold(autopilot: str) -> None:
     flight.command("hold")
     flight.run(6.0)
     assert flight.guidance.phase is Phase.OFFBOARD
-    setpoint = Setpoint.velocity((3.0, 0.0, 0.0), 0)
-    message = dialect.MAVLink_set_position_target_local_ned_message(
-        0, 1, 1, dialect.MAV_FRAME_LOCAL_NED, setpoint.type_mask, *[0.0] * 3, 3.0, *[0.0] * 7
-    )
-    flight.vehicle.repeat(message, 150.0, source=STATION)
+    flight.vehicle.repeat(velocity_setpoint(3.0, 0.0, 0.0), 150.0, source=STATION)
     assert flight.run_until(lambda: lost(flight), 6.0)
 
 
