@@ -147,7 +147,6 @@ async def _fly(
             options.camera,
             video=output / VIDEO_NAME,
             video_rate_hz=rate_hz,
-            driver="mavsdk" if vehicle_url is None else "auto",
             system_id=vehicle.system_id,
         )
         with (output / "events.jsonl").open("w") as events:

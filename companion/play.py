@@ -162,7 +162,7 @@ def _opened(options: PlayOptions) -> AbstractAsyncContextManager[SimProcess]:
 def _services(settings: Settings, options: PlayOptions, vehicle: SimProcess, say: Say) -> list[Service]:
     """Create a service for each vehicle; only the first has a camera."""
     name = f"companion-play-{os.getpid()}"
-    first = session_settings(vehicle.port, name, chosen=settings, driver="auto", system_id=vehicle.system_id)
+    first = session_settings(vehicle.port, name, chosen=settings, system_id=vehicle.system_id)
     if options.vehicle_url is None:
         first = _with(
             first, vehicle={"signing_key_file": None}

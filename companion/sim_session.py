@@ -16,7 +16,7 @@ import subprocess
 import sys
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
-from contextlib import ExitStack, asynccontextmanager, suppress
+from contextlib import ExitStack, asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
@@ -184,7 +184,7 @@ async def camera_of_autopilot(url: str, options: SimOptions) -> AsyncIterator[Si
     """
     service_port, camera_port = free_port(), free_port()
     # Loading takes a second, which would delay the relay's messages.
-    await asyncio.to_thread(_load_driver_for_px4)
+    await asyncio.to_thread(importlib.import_module, "companion.vehicle.pymavlink_driver")
     relay = await Relay.open(url, (service_port, camera_port))
     try:
         try:
@@ -201,11 +201,6 @@ async def camera_of_autopilot(url: str, options: SimOptions) -> AsyncIterator[Si
             await process.end()
     finally:
         await relay.close()
-
-
-def _load_driver_for_px4() -> None:
-    with suppress(ImportError, OSError):  # the driver "auto" reports it and uses the other driver
-        importlib.import_module("companion.vehicle.mavsdk_driver")
 
 
 async def _spawn(arguments: Sequence[str], options: SimOptions) -> asyncio.subprocess.Process:
@@ -243,7 +238,7 @@ def session_settings(
     chosen: Settings | None = None,
     video: Path | None = None,
     video_rate_hz: float = 7.5,
-    driver: str = "mavsdk",
+    driver: str = "pymavlink",
     system_id: int = 1,
 ) -> Settings:
     """Return settings for a vehicle on a loopback port and a simulated camera whose frames carry the lens.

@@ -148,14 +148,9 @@ class AutopilotDriver(ABC):
 
     async def connect(self, timeout_s: float) -> None:
         """See Driver. A UDP listener sends nothing first; on other links our heartbeat prompts a reply."""
-        deadline = time.monotonic() + timeout_s
-        await self.listen(timeout_s)
-        await self.start(max(deadline - time.monotonic(), 1.0))
-
-    async def listen(self, timeout_s: float) -> int | None:
-        """First half of `connect`: open the link, wait for a heartbeat, return its MAV_AUTOPILOT."""
         if self._link is not None:
             raise LinkError(f"{self.url}: this driver is already connected")
+        deadline = time.monotonic() + timeout_s
         self._reset()
         try:
             async with asyncio.timeout(timeout_s):
@@ -164,36 +159,15 @@ class AutopilotDriver(ABC):
             raise LinkError(f"{self.url}: could not be opened within {timeout_s:g} s") from error
         try:
             await self._first_heartbeat(timeout_s)
-        except BaseException:
-            await self.close()
-            raise
-        return self._autopilot_kind
-
-    def adopt_link(self, other: AutopilotDriver) -> None:
-        """Continue on the open link of another driver that has received an autopilot heartbeat."""
-        self._reset()
-        link, other._link = other._link, None
-        if link is None or other._newest_heartbeat is None:
-            raise LinkError(f"{self.url}: the listening driver has received no autopilot heartbeat")
-        self._link, link.received = link, self._received
-        self._framer, self._signer, self._others = other._framer, other._signer, other._others
-        self._sequence = other._sequence
-        self.share_subscribers(other)
-        self._heartbeat_from(other._newest_heartbeat, other._source)
-
-    def share_subscribers(self, other: AutopilotDriver) -> None:
-        """Also notify the subscribers of another driver."""
-        self._telemetry.share_subscribers(other._telemetry)
-
-    async def start(self, timeout_s: float) -> None:
-        """Second half of `connect`: exchange messages with the autopilot that was found."""
-        try:
             if self._autopilot_kind not in self.flown_autopilots:
                 raise LinkError(unsupported_autopilot(self.url, self._system_id, self._autopilot_kind))
-            await self._attach(timeout_s)
+            await self._attach(max(deadline - time.monotonic(), 1.0))
         except BaseException:
             await self.close()
             raise
+        self._start_tasks()
+
+    def _start_tasks(self) -> None:
         name = self._telemetry.profile.name
         logger.info(
             "%s: connected to %s, system %s: %s driver", self.url, name, self._system_id, self.library

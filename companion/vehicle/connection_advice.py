@@ -71,6 +71,6 @@ def unsupported_autopilot(url: LinkUrl, system_id: int | None, kind: int | None)
     if kind == ARDUPILOT:
         return (
             f"{url}: the mavsdk driver supports PX4 only, system {system_id} is {name}; "
-            'set vehicle.driver = "pymavlink" or "auto"'
+            'set vehicle.driver = "pymavlink"'
         )
     return f"{url}: only PX4 and ArduPilot are supported, system {system_id} is {name}"

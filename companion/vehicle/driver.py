@@ -44,7 +44,7 @@ class Driver(Protocol):
 
     @property
     def library(self) -> str:
-        """The MAVLink library: "mavsdk", "pymavlink", or "auto" before it is chosen."""
+        """The MAVLink library: "pymavlink" or "mavsdk"."""
 
     async def connect(self, timeout_s: float) -> None:
         """Open the link and wait for the autopilot's first heartbeat.

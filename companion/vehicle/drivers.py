@@ -10,7 +10,7 @@ from companion.vehicle.link_url import parse_link_url
 if TYPE_CHECKING:
     from companion.vehicle.autopilot_driver import AutopilotDriver
 
-DriverKind = Literal["auto", "mavsdk", "pymavlink"]
+DriverKind = Literal["pymavlink", "mavsdk"]
 
 
 def open_driver(
@@ -25,7 +25,7 @@ def open_driver(
     """Create a driver, not connected yet.
 
     Args:
-        kind: the MAVLink library. Both have the same contract; "auto" chooses by the autopilot that answers.
+        kind: the MAVLink library. Both have the same contract; "mavsdk" supports PX4 only.
         url: `udpin://HOST:PORT`, `udpout://HOST:PORT`, `tcp://HOST:PORT` or `serial:///dev/X:BAUD`.
         system_id: the autopilot's MAVLink system id; None: the first autopilot received.
         own_system_id, own_component_id: of our messages; 191 is MAV_COMP_ID_ONBOARD_COMPUTER.
@@ -45,30 +45,19 @@ def open_driver(
     link_url = parse_link_url(url)
 
     # Imported here: each library is slow to load, and one of them is enough.
-    def mavsdk_driver() -> AutopilotDriver:
+    driver_class: type[AutopilotDriver]
+    if kind == "mavsdk":
         from companion.vehicle.mavsdk_driver import MavsdkDriver
 
-        return MavsdkDriver(
-            link_url,
-            system_id=system_id,
-            own_system_id=own_system_id,
-            own_component_id=own_component_id,
-            signing_key=signing_key,
-        )
+        driver_class = MavsdkDriver
+    else:
+        from companion.vehicle.pymavlink_driver import PymavlinkDriver
 
-    if kind == "mavsdk":
-        return mavsdk_driver()
-    from companion.vehicle.pymavlink_driver import PymavlinkDriver
-
-    driver = PymavlinkDriver(
+        driver_class = PymavlinkDriver
+    return driver_class(
         link_url,
         system_id=system_id,
         own_system_id=own_system_id,
         own_component_id=own_component_id,
         signing_key=signing_key,
     )
-    if kind == "pymavlink":
-        return driver
-    from companion.vehicle.auto_driver import AutoDriver
-
-    return AutoDriver(driver, mavsdk_driver)

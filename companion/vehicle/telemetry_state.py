@@ -183,10 +183,6 @@ class TelemetryState:
         self._subscribers[key] = callback
         return lambda: self._subscribers.pop(key, None) and None
 
-    def share_subscribers(self, other: TelemetryState) -> None:
-        """Use the subscriptions of another state, present and future."""
-        self._subscribers = other._subscribers
-
     @contextlib.asynccontextmanager
     async def watching(self, watcher: Callable[[str, Fields], None]) -> AsyncIterator[None]:
         """Call back with every message while the context is active."""

@@ -8,6 +8,7 @@ import time
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
+from companion.vehicle.autopilot_driver import AutopilotDriver
 from companion.vehicle.driver import CommandRefusedError, Driver, LinkError, NoAnswerError, SystemStatus
 from companion.vehicle.drivers import DriverKind, open_driver
 from companion.vehicle.framing import CURRENT_MODE_ID
@@ -81,6 +82,22 @@ async def test_unsupported_autopilot_is_refused(
         await other.stop()
 
 
+async def test_one_heartbeat_suffices_to_connect(
+    kind: DriverKind, port: int, autopilot: FakeAutopilot
+) -> None:
+    autopilot.sends_heartbeats = False
+    driver = open_driver(kind, f"udpin://127.0.0.1:{port}")
+    assert isinstance(driver, AutopilotDriver)
+    connecting = asyncio.create_task(driver.connect(10.0))
+    try:
+        await wait_until(lambda: driver._link is not None, 5.0)
+        autopilot.heartbeat()
+        await connecting
+        assert driver.state.autopilot == "PX4"
+    finally:
+        await driver.close()
+
+
 async def test_busy_port_is_reported(kind: DriverKind, driver: Driver, port: int) -> None:
     with pytest.raises(LinkError, match=rf"{port} is in use: .*QGroundControl"):
         await open_driver(kind, f"udpin://127.0.0.1:{port}").connect(5.0)
@@ -94,6 +111,8 @@ async def test_driver_can_reconnect_after_closing_twice(
     for _ in range(3):
         await driver.connect(10.0)
         assert driver.state.mode is FlightMode.HOLD
+        with pytest.raises(LinkError, match="already"):
+            await driver.connect(1.0)
         await driver.close()
         await driver.close()
     driver.send_setpoint(Setpoint.brake(time.monotonic_ns()))
@@ -192,7 +211,7 @@ async def test_udp_out_sends_the_first_heartbeat(kind: DriverKind, port: int) ->
 
 
 def test_open_driver_refuses_bad_arguments() -> None:
-    with pytest.raises(ValueError, match=r"'dronekit'.*auto, mavsdk, pymav"):
+    with pytest.raises(ValueError, match=r"'dronekit'.*pymavlink, mavsdk"):
         open_driver("dronekit", "udpin://0.0.0.0:14540")  # type: ignore[arg-type]  # refused
     with pytest.raises(ValueError, match="not a link url"):
         open_driver("mavsdk", "14540")
