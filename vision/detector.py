@@ -1,4 +1,4 @@
-"""YOLO detector: letterbox → runtime → class filter → suppression → boxes in the frame's pixels.
+"""Opens a detector by its kind; YOLO: letterbox → runtime → class filter → suppression → boxes in pixels.
 
 Torch is loaded only where it is needed: an ONNX or OpenVINO file saves its import time and memory.
 """
@@ -17,7 +17,15 @@ from numpy.typing import NDArray
 from vision.detections import Detections
 from vision.letterbox import Letterbox, fit
 from vision.model_files import find_model
-from vision.object_detector import ObjectDetector, Timing, resolve_classes
+from vision.object_detector import (
+    DETECTORS,
+    YOLO,
+    DetectorSettings,
+    ObjectDetector,
+    Timing,
+    detector,
+    resolve_classes,
+)
 from vision.runtimes.base import PRECISIONS, Precision
 from vision.runtimes.selection import RuntimeChoice, check_runtime, start_runtime
 from vision.runtimes.source import read_source
@@ -187,6 +195,63 @@ class Detector(ObjectDetector):
             box = fit(width, height, self.image_size, square=self.square, stride=self._stride)
             self._letterbox, self._boxed = box, box.blank()
         return box
+
+
+@detector(YOLO, "a YOLO network, by detector.model")
+def _open_yolo(settings: DetectorSettings) -> ObjectDetector:
+    return Detector(
+        settings.model,
+        classes=settings.classes,
+        confidence=settings.confidence,
+        iou=settings.iou,
+        image_size=settings.image_size,
+        precision=settings.precision,
+        threads=settings.threads,
+        runtime=settings.runtime,
+    )
+
+
+def open_detector(kind: str, settings: DetectorSettings) -> ObjectDetector:
+    """Create a detector.
+
+    Raises:
+        ValueError: no such kind (the message lists the known ones), an unknown class, or an error of the kind
+            itself: `CheckpointError`, `RuntimeMissingError` and `RuntimeUnusableError` are ValueErrors.
+    """
+    if (opener := DETECTORS.get(kind)) is None:
+        raise ValueError(
+            f"detector.kind: unknown kind {kind!r}; known: {DETECTORS.known()}. Kinds of a plug-in "
+            "are known once its module is loaded (plugins.modules, --plugins-modules)"
+        )
+    opened = opener(settings)
+    return opened if kind == YOLO else _FilteredDetector(opened, kind, settings)
+
+
+class _FilteredDetector(ObjectDetector):
+    """Applies `classes` and `confidence` to a plug-in's detector."""
+
+    def __init__(self, inner: ObjectDetector, kind: str, settings: DetectorSettings) -> None:
+        self.class_names = tuple(inner.class_names)
+        self.model_name = inner.model_name or kind
+        self.runtime, self.precision, self.reason = inner.runtime, inner.precision, inner.reason
+        self._inner, self._confidence = inner, settings.confidence
+        wanted = settings.classes
+        self._class_ids = None if wanted is None else resolve_classes(wanted, self.class_names)
+
+    def detect(self, image_bgr: NDArray[np.uint8], /) -> Detections:
+        started = time.perf_counter()
+        found = self._inner.detect(image_bgr)
+        elapsed_ms = (time.perf_counter() - started) * 1e3
+        self.last_timing = self._inner.last_timing or Timing(0.0, elapsed_ms, 0.0)
+        if tuple(found.class_names) != self.class_names:
+            raise TypeError(
+                f"detector {self.model_name}: detections must have its class names {self.class_names}, "
+                f"got {found.class_names}"
+            )
+        kept = found.confidence >= self._confidence
+        if self._class_ids is not None:
+            kept &= np.isin(found.class_id, self._class_ids)
+        return found[kept]
 
 
 def class_names_of(model: str | Path = DEFAULT_MODEL, runtime: RuntimeChoice = "torch") -> tuple[str, ...]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vision.detections import Detections
-from vision.gc_pause import gc_paused
 from vision.registry import Registry
 
 if TYPE_CHECKING:
@@ -21,7 +19,7 @@ if TYPE_CHECKING:
     from vision.runtimes.selection import RuntimeChoice
 
 YOLO = "yolo"
-"""The built-in kind."""
+"""The built-in kind, of `vision.detector`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,66 +132,6 @@ def detector(kind: str, help_text: str) -> Callable[[_Opener], _Opener]:
         return opener
 
     return register
-
-
-def open_detector(kind: str, settings: DetectorSettings) -> ObjectDetector:
-    """Create a detector.
-
-    Raises:
-        ValueError: no such kind (the message lists the known ones), an unknown class, or an error of the kind
-            itself: `CheckpointError`, `RuntimeMissingError` and `RuntimeUnusableError` are ValueErrors.
-    """
-    if (opener := DETECTORS.get(kind)) is None:
-        raise ValueError(
-            f"detector.kind: unknown kind {kind!r}; known: {DETECTORS.known()}. Kinds of a plug-in "
-            "are known once its module is loaded (plugins.modules, --plugins-modules)"
-        )
-    opened = opener(settings)
-    return opened if kind == YOLO else _FilteredDetector(opened, kind, settings)
-
-
-@detector(YOLO, "a YOLO network, by detector.model")
-def _open_yolo(settings: DetectorSettings) -> ObjectDetector:
-    with gc_paused():  # only here: the import takes half a second
-        from vision.detector import Detector
-
-    return Detector(
-        settings.model,
-        classes=settings.classes,
-        confidence=settings.confidence,
-        iou=settings.iou,
-        image_size=settings.image_size,
-        precision=settings.precision,
-        threads=settings.threads,
-        runtime=settings.runtime,
-    )
-
-
-class _FilteredDetector(ObjectDetector):
-    """Applies `classes` and `confidence` to a plug-in's detector."""
-
-    def __init__(self, inner: ObjectDetector, kind: str, settings: DetectorSettings) -> None:
-        self.class_names = tuple(inner.class_names)
-        self.model_name = inner.model_name or kind
-        self.runtime, self.precision, self.reason = inner.runtime, inner.precision, inner.reason
-        self._inner, self._confidence = inner, settings.confidence
-        wanted = settings.classes
-        self._class_ids = None if wanted is None else resolve_classes(wanted, self.class_names)
-
-    def detect(self, image_bgr: NDArray[np.uint8], /) -> Detections:
-        started = time.perf_counter()
-        found = self._inner.detect(image_bgr)
-        elapsed_ms = (time.perf_counter() - started) * 1e3
-        self.last_timing = self._inner.last_timing or Timing(0.0, elapsed_ms, 0.0)
-        if tuple(found.class_names) != self.class_names:
-            raise TypeError(
-                f"detector {self.model_name}: detections must have its class names {self.class_names}, "
-                f"got {found.class_names}"
-            )
-        kept = found.confidence >= self._confidence
-        if self._class_ids is not None:
-            kept &= np.isin(found.class_id, self._class_ids)
-        return found[kept]
 
 
 def resolve_classes(classes: Sequence[str | int], class_names: Sequence[str]) -> tuple[int, ...]:

@@ -305,7 +305,8 @@ def detect(
     with gc_paused():
         from companion.detect import detect_source
         from companion.plugins import PluginError, load_plugins
-        from vision.object_detector import DetectorSettings, open_detector
+        from vision.detector import open_detector
+        from vision.object_detector import DetectorSettings
         from vision.pipeline import FrameDetector
         from vision.sources import SourceError, SourceSettings, open_source
         from vision.tiling import TiledDetector

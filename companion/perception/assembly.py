@@ -13,8 +13,9 @@ from companion.settings import Settings
 from vision.camera_model import CameraMount
 from vision.depth import nearest_points
 from vision.frame import Frame
+from vision.gc_pause import gc_paused
 from vision.markers import Marker, MarkerDetector
-from vision.object_detector import ObjectDetector, open_detector
+from vision.object_detector import ObjectDetector
 from vision.obstacle_sectors import ObstacleSectors, obstacle_sectors
 from vision.pipeline import FrameDetector, FrameRecorder, Pipeline
 from vision.sources import Source
@@ -79,8 +80,11 @@ def load_detector(settings: Settings) -> ObjectDetector:
     """Load the detector of `detector.kind`; the plug-ins must be loaded before.
 
     Raises:
-        ValueError: as `vision.object_detector.open_detector`.
+        ValueError: as `vision.detector.open_detector`.
     """
+    with gc_paused():  # only here: the import takes half a second
+        from vision.detector import open_detector
+
     section = settings.detector
     if section.threads is not None:
         # Else OpenCV's resizing uses every core, independent of the network's threads.

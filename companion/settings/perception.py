@@ -209,7 +209,7 @@ class DetectorSection(Section):
         return self
 
     def loading(self, confidence: float) -> DetectorSettings:
-        """Convert for `vision.object_detector.open_detector`, with this minimum confidence."""
+        """Convert for `vision.detector.open_detector`, with this minimum confidence."""
         return DetectorSettings(
             model=self.model,
             classes=self.classes or None,

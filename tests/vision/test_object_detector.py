@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from vision.detections import Detections
-from vision.detector import Detector
+from vision.detector import Detector, open_detector
 from vision.object_detector import (
     DETECTORS,
     YOLO,
@@ -17,7 +17,6 @@ from vision.object_detector import (
     ObjectDetector,
     Timing,
     detector,
-    open_detector,
 )
 
 FRAME = np.zeros((48, 64, 3), np.uint8)

@@ -24,6 +24,7 @@ import numpy as np
 
 from vision.runtimes.base import Precision, RuntimeName, RuntimeUnusableError, version
 from vision.runtimes.source import ModelSource, read_source
+from vision.runtimes.start import cache_folder, start_named
 from vision.yolo.checkpoint_pair import weights_sha256
 
 logger = logging.getLogger(__name__)
@@ -52,8 +53,6 @@ def fastest_runtime(
     Raises:
         RuntimeUnusableError: none of them runs the model; the message has each one's reason.
     """
-    from vision.runtimes.selection import cache_folder
-
     question = {
         "model": weights_sha256(source.path),
         "class_ids": None if class_ids is None else list(class_ids),
@@ -149,17 +148,7 @@ def measure(
     image_size: int,
 ) -> float:
     """Milliseconds of one inference of a 4:3 input: the minimum, which excludes other load."""
-    from vision.runtimes.selection import start_runtime
-
-    started = start_runtime(
-        source,
-        runtime,
-        class_ids=class_ids,
-        precision=precision,
-        threads=threads,
-        image_size=image_size,
-        sparse_boxes=True,
-    ).runtime
+    started = start_named(source, runtime, class_ids, precision, threads, image_size, sparse_boxes=True)
     stride = max(started.head.strides)
     height = max(stride, image_size * 3 // 4 // stride * stride)
     image = np.random.default_rng(0).integers(0, 256, (height, image_size, 3), np.uint8)

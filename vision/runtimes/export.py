@@ -17,6 +17,7 @@ import torch
 from vision.runtimes.base import RuntimeMissingError, RuntimeName, RuntimeUnusableError, required
 from vision.runtimes.exported import INPUT, KEY, SUFFIXES, ExportedFacts, ExportKind, with_facts
 from vision.runtimes.network import Network
+from vision.runtimes.source import runtime_of_file
 from vision.runtimes.torch_runtime import traced
 from vision.yolo.checkpoint import load_checkpoint
 from vision.yolo.checkpoint_pair import weights_sha256
@@ -183,8 +184,6 @@ def _write_tensorrt(network: Network, facts: ExportedFacts, path: Path) -> None:
 
 def _check(network: Network, facts: ExportedFacts, to: ExportKind, path: Path) -> None:
     """Compare the file's outputs with torch's, for a square and another input: sizes must be dynamic."""
-    from vision.runtimes.selection import runtime_of_file
-
     head = network.head
     runtime = runtime_of_file(_READER[to], path, head, precision="auto" if to == "tensorrt" else "float32")
     stride = max(facts.strides)

@@ -1,4 +1,4 @@
-"""A model file of any kind, and its data before a runtime is selected."""
+"""A model file of any kind: its data before a runtime is selected, and its runtime where it is exported."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vision.runtimes.base import RuntimeName, RuntimeUnusableError, installed
+from vision.runtimes.base import Precision, Runtime, RuntimeName, RuntimeUnusableError, installed
 from vision.runtimes.exported import SUFFIXES, ExportedFacts, ExportKind, kind_of
+from vision.yolo.level_outputs import Head
 from vision.yolo.safe_pickle import CheckpointError
 
 if TYPE_CHECKING:
@@ -118,3 +119,29 @@ def cannot_run(source: ModelSource, runtime: RuntimeName) -> RuntimeUnusableErro
         f"{source.path}: {runtime} cannot run {SUFFIXES[source.kind]} files; "
         f"use the runtime {' or '.join(source.runners())}, or auto, or give the checkpoint"
     )
+
+
+def runtime_of_file(
+    name: RuntimeName,
+    path: Path,
+    head: Head | None = None,
+    *,
+    precision: Precision = "auto",
+    threads: int | None = None,
+) -> Runtime:
+    """Load an exported file. `head` None: from the file's metadata."""
+    if name == "torch":
+        from vision.runtimes.torchscript_runtime import TorchScriptRuntime
+
+        return TorchScriptRuntime(path, head, precision=precision, threads=threads)
+    if name == "onnxruntime":
+        from vision.runtimes.onnx_runtime import OnnxRuntime
+
+        return OnnxRuntime(path, head, precision=precision, threads=threads)
+    if name == "openvino":
+        from vision.runtimes.openvino_runtime import OpenVinoRuntime
+
+        return OpenVinoRuntime(path, head, precision=precision, threads=threads)
+    from vision.runtimes.tensorrt_runtime import TensorRtRuntime
+
+    return TensorRtRuntime(path, head, precision=precision, threads=threads)

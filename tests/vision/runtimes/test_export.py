@@ -24,8 +24,7 @@ from vision.runtimes.base import (
 from vision.runtimes.export import export
 from vision.runtimes.exported import SUFFIXES, ExportedFacts, ExportKind
 from vision.runtimes.network import Network
-from vision.runtimes.selection import runtime_of_file
-from vision.runtimes.source import read_source
+from vision.runtimes.source import read_source, runtime_of_file
 from vision.runtimes.torch_runtime import TorchRuntime
 
 PAIRS: list[tuple[ExportKind, RuntimeName]] = [

@@ -16,8 +16,9 @@ from vision.detector import Detector
 from vision.runtimes import autotune, base
 from vision.runtimes.base import RuntimeMissingError, RuntimeName, RuntimeUnusableError, installed
 from vision.runtimes.export import export
-from vision.runtimes.selection import cache_folder, runtime_of_file, start_runtime
-from vision.runtimes.source import read_source
+from vision.runtimes.selection import start_runtime
+from vision.runtimes.source import read_source, runtime_of_file
+from vision.runtimes.start import cache_folder
 
 
 def only(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
