@@ -27,6 +27,7 @@ from companion.guidance.targets.from_detections import StateHistory
 from companion.perception.cameras import PerceptionCamera
 from companion.service.factory import guidance_options, streamer_of
 from companion.service.inputs import InputAssembler
+from companion.service.requests import apply_output
 from companion.settings import Settings
 from companion.settings.reading import load_settings
 from companion.vehicle.setpoint import Setpoint
@@ -292,16 +293,13 @@ class LockstepFlight:
                 commands=commands,
             ),
         )
-        if output.setpoint is None:
-            self.streamer.stop()
-        else:
-            self.streamer.submit(output.setpoint)
-        for identifier in output.cancelled:
-            self.driver.cancel(identifier)
-        for request in output.requests:
-            self.driver.start(request)
-        if output.landing_target is not None:
-            self.driver.send_landing_target(output.landing_target)
+        apply_output(
+            output,
+            self.streamer,
+            start=self.driver.start,
+            cancel=self.driver.cancel,
+            send_landing_target=self.driver.send_landing_target,
+        )
         self.events += output.events
         self._results |= {result.identifier: result.outcome for result in output.results}
         if self.guidance.behaviour is not None:

@@ -18,6 +18,8 @@ from companion.settings.reading import RENAMED, ConfigurationError, Flag, flags,
 EXIT_BAD_INPUT = 2
 _GIVEN = "companion.settings given as flags"  # in a context's `meta`
 
+# How the help shows the type of a setting; all of them are text to typer.
+_METAVARS = {bool: "<true|false>", int: "<int>", float: "<float>", str: "<str>", tuple: "<list>"}
 # Short names of frequent settings; the full names work too.
 SHORT_NAMES = {
     "source.uri": "--source",
@@ -147,7 +149,15 @@ def _setting_parameters(keys: tuple[str, ...]) -> list[Any]:
             names.insert(0, short)
         panel = flag.key.partition(".")[0]
         parameters.append(
-            _option(name, str | None, *names, help=flag.help, panel=panel, hidden=flag.key in RENAMED)
+            _option(
+                name,
+                str | None,  # parsed with the other origins of settings, which names the flag in errors
+                *names,
+                help=flag.help,
+                metavar=_METAVARS[flag.type],
+                panel=panel,
+                hidden=flag.key in RENAMED,
+            )
         )
     _declare(settings, parameters)
     app = typer.Typer(add_completion=False)
@@ -156,9 +166,17 @@ def _setting_parameters(keys: tuple[str, ...]) -> list[Any]:
 
 
 def _option(
-    name: str, kind: Any, *names: str, help: str, panel: str | None = None, hidden: bool = False
+    name: str,
+    kind: Any,
+    *names: str,
+    help: str,
+    metavar: str | None = None,
+    panel: str | None = None,
+    hidden: bool = False,
 ) -> inspect.Parameter:
-    option = typer.Option(*names, help=help, rich_help_panel=panel, show_default=False, hidden=hidden)
+    option = typer.Option(
+        *names, help=help, metavar=metavar, rich_help_panel=panel, show_default=False, hidden=hidden
+    )
     return inspect.Parameter(
         name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Annotated[kind, option]
     )

@@ -16,7 +16,7 @@ from companion.guidance.interface import EventKind, GuidanceOutput, StreamStatus
 from companion.service.command_handler import CommandHandler
 from companion.service.inputs import InputAssembler
 from companion.service.other_commanders import OtherCommanders
-from companion.service.requests import RequestRunner
+from companion.service.requests import RequestRunner, apply_output
 from companion.vehicle.driver import Driver
 from companion.vehicle.streamer import Streamer
 
@@ -139,16 +139,13 @@ class GuidanceLoop:
             self._on_event("warning", f"{name}: slow update ({text}); expected at most 5 ms")
 
     def _apply(self, output: GuidanceOutput) -> None:
-        if output.setpoint is None:
-            self._streamer.stop()
-        else:
-            self._streamer.submit(output.setpoint)
-        for identifier in output.cancelled:
-            self._requests.cancel(identifier)
-        for request in output.requests:
-            self._requests.start(request)
-        if output.landing_target is not None:
-            self._driver.send_landing_target(output.landing_target)
+        apply_output(
+            output,
+            self._streamer,
+            start=self._requests.start,
+            cancel=self._requests.cancel,
+            send_landing_target=self._driver.send_landing_target,
+        )
         for event in output.events:
             if event.kind not in _ANSWERED:
                 self._on_event(event.level, event.message)

@@ -11,6 +11,7 @@ from companion.guidance.interface import (
     Answer,
     Arm,
     FindGimbal,
+    GuidanceOutput,
     PointGimbal,
     ReleaseGimbal,
     Request,
@@ -19,8 +20,31 @@ from companion.guidance.interface import (
     TakeOff,
 )
 from companion.vehicle.driver import CommandRefusedError, Driver, LinkError
+from companion.vehicle.landing_target import LandingTarget
+from companion.vehicle.streamer import Streamer
 
 logger = logging.getLogger(__name__)
+
+
+def apply_output(
+    output: GuidanceOutput,
+    streamer: Streamer,
+    *,
+    start: Callable[[Request], None],
+    cancel: Callable[[int], None],
+    send_landing_target: Callable[[LandingTarget], None],
+) -> None:
+    """Pass the setpoint, requests and landing target of one step on to the vehicle."""
+    if output.setpoint is None:
+        streamer.stop()
+    else:
+        streamer.submit(output.setpoint)
+    for identifier in output.cancelled:
+        cancel(identifier)
+    for request in output.requests:
+        start(request)
+    if output.landing_target is not None:
+        send_landing_target(output.landing_target)
 
 
 class RequestRunner:

@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 from pymavlink import mavutil
 
-from mavlink_sim.cli.main import main
 from mavlink_sim.lockstep import LockstepVehicle
 from mavlink_sim.realtime import loop
 from mavlink_sim.realtime.fleet import instance_options, start_positions
@@ -47,32 +46,6 @@ def test_camera_on_one_vehicle_and_each_has_its_own_truth_file() -> None:
     assert [one.camera for one in members] == ["eye", None, None]
     assert [one.camera for one in instance_options(options, 3, 5.0, camera_vehicle=2)] == [None, "eye", None]
     assert [str(one.truth) for one in members] == ["truth.jsonl", "truth-2.jsonl", "truth-3.jsonl"]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["--vehicles", "0"], ["0 vehicles", "1 to 250"]),
-        (["--vehicles", "10", "--system-id", "250"], ["255"]),
-        (["--vehicles", "10", "--onboard-port", "65530"], ["--onboard-port", "65535"]),
-        (["--vehicles", "2", "--camera-vehicle", "3"], ["camera", "3"]),
-        (["--spacing", "0"], ["--spacing", "0.6 to 1000"]),
-        (["--noise", "some"], ["--noise", "on or off"]),
-    ],
-    ids=["none", "ids", "ports", "camera", "spacing", "noise"],
-)
-def test_invalid_fleet_is_one_line(
-    arguments: list[str],
-    words: list[str],
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.setattr("sys.argv", ["mavlink-sim", "--onboard-bind", "0", "--gcs-bind", "0", *arguments])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    assert all(word in line for word in words)
 
 
 def test_each_vehicle_has_its_home_and_local_frame() -> None:

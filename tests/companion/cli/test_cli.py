@@ -230,6 +230,18 @@ def test_every_command_has_help(command: str) -> None:
     assert len(done.stdout.splitlines()) > 4
 
 
+def test_help_shows_the_types_of_settings() -> None:
+    shown = CliRunner().invoke(app, ["run", "--help"]).stdout
+    for words in (
+        "--source-loop <true|false>",
+        "--vehicle-system-id <int>",
+        "--detector-confidence <float>",
+        "--vehicle-url <str>",
+        "--detector-classes <list>",
+    ):
+        assert words in shown
+
+
 @pytest.mark.parametrize("command", ["send hold --help", "config --help"])
 def test_small_commands_do_not_load_torch(command: str, tmp_path: Path) -> None:
     code = (

@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
 from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
@@ -13,7 +14,9 @@ from pymavlink.dialects.v20 import common as mavlink
 from companion.vehicle.driver import Driver
 from companion.vehicle.framing import frames_of
 from companion.vehicle.gimbal import GimbalState
+from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import VehicleState
+from companion.vehicle.streamer import Streamer
 
 HOLD, OFFBOARD, MISSION = 0x03040000, 0x00060000, 0x04040000
 SETPOINT = "SET_POSITION_TARGET_LOCAL_NED"
@@ -137,3 +140,22 @@ async def wait_for_state(
 ) -> VehicleState:
     await wait_until(lambda: met(driver.state), timeout_s, lambda: f"another state than {driver.state}")
     return driver.state
+
+
+@asynccontextmanager
+async def streaming(driver: Driver, velocity_ned_mps: tuple[float, float, float]) -> AsyncIterator[Streamer]:
+    """Stream a velocity setpoint, kept fresh until the block ends."""
+    streamer = Streamer(driver.send_setpoint, brake_s=0.1)
+
+    async def want() -> None:
+        while True:
+            streamer.submit(Setpoint.velocity(velocity_ned_mps, time.monotonic_ns(), yaw_rate_radps=0.0))
+            await asyncio.sleep(0.05)
+
+    tasks = [asyncio.create_task(want()), asyncio.create_task(streamer.run())]
+    try:
+        yield streamer
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)

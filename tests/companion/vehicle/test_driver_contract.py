@@ -6,18 +6,16 @@ import asyncio
 import logging
 import math
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 import pytest
 
 from companion.vehicle.driver import CommandRefusedError, Driver
 from companion.vehicle.drivers import DriverKind, open_driver
-from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
-from companion.vehicle.streamer import Streamer
 from mavlink_sim.testing import RunningSimulator, running_simulator
-from tests.companion.vehicle.fake_autopilot import wait_for_state, wait_until
+from tests.companion.vehicle.fake_autopilot import streaming, wait_for_state, wait_until
 
 pytestmark = pytest.mark.realtime
 
@@ -47,27 +45,6 @@ def complete(state: VehicleState) -> bool:
         and state.battery_fraction is not None
         and math.isfinite(state.latitude_deg)
     )
-
-
-@asynccontextmanager
-async def streaming(
-    driver: Driver, velocity: Callable[[], tuple[float, float, float]]
-) -> AsyncIterator[Streamer]:
-    """Stream a velocity setpoint, kept fresh until the block ends."""
-    streamer = Streamer(driver.send_setpoint, brake_s=0.1)
-
-    async def want() -> None:
-        while True:
-            streamer.submit(Setpoint.velocity(velocity(), time.monotonic_ns(), yaw_rate_radps=0.0))
-            await asyncio.sleep(0.05)
-
-    tasks = [asyncio.create_task(want()), asyncio.create_task(streamer.run())]
-    try:
-        yield streamer
-    finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
 
 
 async def test_state_parameters_modes_and_arming_on_the_ground(kind: DriverKind) -> None:
@@ -122,7 +99,7 @@ async def test_px4_failsafe_acts_when_setpoints_end(kind: DriverKind) -> None:
             with pytest.raises(CommandRefusedError, match=r"offboard .*setpoint stream"):
                 await driver.set_mode(FlightMode.OFFBOARD)
 
-            async with streaming(driver, lambda: (1.5, 0.0, 0.0)) as streamer:
+            async with streaming(driver, (1.5, 0.0, 0.0)) as streamer:
                 await wait_until(lambda: streamer.sent_count > 0, 5.0)
                 await driver.set_mode(FlightMode.OFFBOARD)
                 await wait_for_state(driver, lambda s: abs((s.velocity_ned_mps or (0.0,))[0] - 1.5) < 0.3)

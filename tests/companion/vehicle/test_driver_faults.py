@@ -15,11 +15,9 @@ from pymavlink.dialects.v20 import common as mavlink
 from companion.vehicle.autopilot_driver import AutopilotDriver
 from companion.vehicle.driver import CommandRefusedError, Driver
 from companion.vehicle.drivers import DriverKind, open_driver
-from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
-from companion.vehicle.streamer import Streamer
 from mavlink_sim.testing import RunningSimulator, running_simulator
-from tests.companion.vehicle.fake_autopilot import wait_for_state, wait_until
+from tests.companion.vehicle.fake_autopilot import streaming, wait_for_state, wait_until
 
 pytestmark = pytest.mark.realtime
 
@@ -47,25 +45,6 @@ async def ready(driver: Driver) -> None:
         driver,
         lambda s: s.ready_to_arm and s.home_altitude_amsl_m is not None and s.position_ned_m is not None,
     )
-
-
-@asynccontextmanager
-async def hovering(driver: Driver) -> AsyncIterator[Streamer]:
-    """Stream a zero velocity setpoint."""
-    streamer = Streamer(driver.send_setpoint, brake_s=0.1)
-
-    async def want() -> None:
-        while True:
-            streamer.submit(Setpoint.velocity((0.0, 0.0, 0.0), time.monotonic_ns(), yaw_rate_radps=0.0))
-            await asyncio.sleep(0.05)
-
-    tasks = [asyncio.create_task(want()), asyncio.create_task(streamer.run())]
-    try:
-        yield streamer
-    finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
 
 
 @pytest.mark.parametrize(
@@ -269,7 +248,7 @@ async def test_delayed_setpoints_keep_the_vehicle_in_offboard(kind: DriverKind) 
             await wait_for_state(
                 driver, lambda s: s.landed is LandedState.IN_AIR and s.mode is FlightMode.HOLD
             )
-            async with hovering(driver) as streamer:
+            async with streaming(driver, (0.0, 0.0, 0.0)) as streamer:
                 await wait_until(lambda: streamer.sent_count > 0, 5.0)
                 await driver.set_mode(FlightMode.OFFBOARD)
                 simulator.fault("link_delay 0.3 jitter=0.1")
