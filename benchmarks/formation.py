@@ -132,7 +132,6 @@ class PointAirframe:
             attitude_ns=now_ns,
             position_ns=now_ns,
             global_ns=now_ns,
-            landed_ns=now_ns,
             battery_ns=now_ns,
             battery_fraction=0.9,
             armed=True,

@@ -31,7 +31,6 @@ from mavlink_sim.testing import free_port
 
 Say = Callable[[str], None]
 
-MAX_VEHICLES = 8
 _GCS_PORT = 14550  # where ground stations listen
 _TCP = "tcp/"
 

@@ -312,14 +312,12 @@ class SharedFrameReader:
         ValueError: the file is not a segment of this version.
 
     Attributes:
-        torn_reads: copies discarded because the writer overtook them.
         reopened: number of new writers' segments opened.
         calibration: lens and mount of the writing camera; None: unknown to the writer.
     """
 
     def __init__(self, name: str) -> None:
         self.name = name
-        self.torn_reads = 0
         self.reopened = 0
         self._path = segment_path(name)
         self._views: _Slots | None = None
@@ -398,7 +396,6 @@ class SharedFrameReader:
                 if int(words[_LOCK]) == before:
                     self._new_writer = False
                     return Frame(image, captured_ns, sequence, depth_m)
-            self.torn_reads += 1
         return None
 
     def _follow_writer(self) -> None:

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import os
-import tempfile
 import time
 from contextlib import suppress
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from companion.bench.percentiles import percentiles
 from companion.guidance.interface import GuidanceInput, GuidanceOutput
@@ -63,11 +61,10 @@ def measure_latency(seconds: float, *, driver: str) -> dict[str, object]:
     Raises:
         SimSessionError: the vehicle did not get into the air.
     """
-    with tempfile.TemporaryDirectory(prefix="companion-bench-") as folder:
-        return asyncio.run(_measure(Path(folder), seconds, driver))
+    return asyncio.run(_measure(seconds, driver))
 
 
-async def _measure(folder: Path, seconds: float, driver: str) -> dict[str, object]:
+async def _measure(seconds: float, driver: str) -> dict[str, object]:
     figures = _Figures()
     camera = f"companion-bench-{os.getpid()}"
     async with simulator(SimOptions(camera, seed=1)) as vehicle:

@@ -6,7 +6,6 @@ A pose is published only while the global position is known; without one the oth
 from __future__ import annotations
 
 import json
-import logging
 import uuid
 from collections.abc import Callable
 from typing import Any
@@ -16,8 +15,6 @@ from companion.guidance.behaviours.formation import FormationBehaviour
 from companion.guidance.formation.neighbours import Neighbourhood, Neighbours
 from companion.guidance.formation.pose import Pose, PoseError, pose_from_message, pose_message, pose_of
 from companion.vehicle.state import VehicleState
-
-logger = logging.getLogger(__name__)
 
 
 class PoseSharing:

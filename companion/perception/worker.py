@@ -245,7 +245,7 @@ def _work(begin: Begin, control: ControlChannel, sender: ResultSender) -> Ended 
         # Loaded objects stay: scanning them would cost the garbage collector the time of a frame.
         gc.collect()
         gc.freeze()
-        sender.put(_ready(settings, perception))
+        sender.put(_ready(perception))
         if perception.source.calibration is not None:
             adopted = adopt_calibration(settings.camera, perception.source.calibration).camera
             settings = settings.model_copy(update={"camera": adopted})
@@ -310,7 +310,7 @@ def _open(settings: Settings, stack: contextlib.ExitStack, sender: ResultSender)
     return Perception(source, detector, recording, preview)
 
 
-def _ready(settings: Settings, perception: Perception) -> Ready:
+def _ready(perception: Perception) -> Ready:
     detector, calibration = perception.detector, perception.source.calibration
     if detector is None:
         return Ready(perception.source.uri, None, (), None, calibration=calibration)

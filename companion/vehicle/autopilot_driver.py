@@ -437,13 +437,13 @@ class AutopilotDriver(ABC):
 
     # --- commands -----------------------------------------------------------------------------------
 
-    async def _command(self, command: int, *parameters: float, fill: float = 0.0) -> int:
+    async def _command(self, command: int, *parameters: float) -> int:
         """Send a command and return its MAV_RESULT; one at a time per kind, as the protocol requires."""
         if self._link is None:
             raise CommandRefusedError(f"{self.url}: not connected; command {command} was not sent")
         lock = self._command_locks.setdefault(command, asyncio.Lock())
         async with lock:
-            return await self._exchange_command(command, (*parameters, *[fill] * (7 - len(parameters))))
+            return await self._exchange_command(command, (*parameters, *[0.0] * (7 - len(parameters))))
 
     async def arm(self) -> None:
         """See Driver."""

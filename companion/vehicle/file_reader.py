@@ -10,7 +10,7 @@ from collections.abc import Callable
 from companion.vehicle.framing import Frame
 
 FTP_ID = 110  # FILE_TRANSFER_PROTOCOL
-_TERMINATE, _RESET, _OPEN, _READ, _ACK, _NAK = 1, 2, 4, 5, 128, 129
+_TERMINATE, _RESET, _OPEN, _READ, _ACK = 1, 2, 4, 5, 128
 _END_OF_FILE = 6
 _ERRORS = {1: "failed", 2: "failed: errno", 4: "wrong session", 5: "no free session", 10: "no such file"}
 # target network, system, component; sequence, session, opcode, size, request opcode, burst, padding, offset

@@ -35,12 +35,6 @@ def mode_of_custom_mode(custom_mode: int) -> FlightMode:
     return _MODES.get(((custom_mode >> 16) & 0xFF, (custom_mode >> 24) & 0xFF), FlightMode.UNKNOWN)
 
 
-def custom_mode_of_mode(mode: FlightMode) -> int:
-    """Return the custom_mode PX4 reports for a mode. Raises ValueError for UNKNOWN."""
-    main, sub = request_of_mode(mode)
-    return main << 16 | sub << 24
-
-
 def request_of_mode(mode: FlightMode) -> tuple[int, int]:
     """Return (main mode, sub mode), params 2 and 3 of MAV_CMD_DO_SET_MODE. Raises ValueError for UNKNOWN."""
     if mode not in _REQUESTS:

@@ -115,7 +115,6 @@ class VehicleState:
     attitude_ns: int = 0
     position_ns: int = 0
     global_ns: int = 0
-    landed_ns: int = 0
     battery_ns: int = 0
     armed: bool = False
     mode: FlightMode = FlightMode.UNKNOWN

@@ -75,7 +75,7 @@ def _current_mode(state: VehicleState, fields: Fields, _now_ns: int) -> VehicleS
 
 def _extended_sys_state(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:
     landed = _LANDED.get(fields["landed_state"], LandedState.UNKNOWN)
-    return replace(state, landed_ns=now_ns, landed=landed)
+    return replace(state, landed=landed)
 
 
 def _attitude_quaternion(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:

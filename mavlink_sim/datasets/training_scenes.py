@@ -136,7 +136,7 @@ def flight_frame(rng: np.random.Generator, width: int, height: int) -> Rendered:
     """The view ahead from a low vehicle: objects 3 to 70 m away, many distractors, ground, shadows."""
     low = rng.random() < 0.85
     altitude = float(math.exp(rng.uniform(math.log(1.5), math.log(10.0)) + (0.0 if low else math.log(5.0))))
-    camera = _wide_camera(rng, width, height, float(rng.uniform(60.0, 92.0)))
+    camera = _wide_camera(width, height, float(rng.uniform(60.0, 92.0)))
     down = math.radians(float(rng.uniform(4.0, 32.0) if low else rng.uniform(12.0, 65.0)))
     yaw = float(rng.uniform(-math.pi, math.pi))
     attitude = matrix_from_euler(math.radians(float(rng.normal(0.0, 4.0))), -down, yaw)
@@ -173,7 +173,7 @@ def world_frame(rng: np.random.Generator, width: int, height: int) -> Rendered:
     effects = scene.camera.effects if rng.random() < 0.5 else _random_effects(rng)
     model = scene.camera.model
     seen_deg = math.degrees(2 * math.atan(model.width / 2 / model.fx)) * float(rng.uniform(0.85, 1.15))
-    camera = _wide_camera(rng, width, height, seen_deg, model.distortion)
+    camera = _wide_camera(width, height, seen_deg, model.distortion)
     buffers = None if camera.distortion else _buffers(width, height)
     shown = World(objects, world.ground, light, sky)
     renderer = Renderer(shown, camera, CameraMount(), effects, buffers, rng)
@@ -234,7 +234,6 @@ def _gaze(
 
 
 def _wide_camera(
-    rng: np.random.Generator,
     width: int,
     height: int,
     horizontal_fov_deg: float,

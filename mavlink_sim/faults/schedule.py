@@ -14,7 +14,6 @@ grammar is in `grammar`, the effect of each fault in `kinds` and in docs/faults.
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -29,8 +28,6 @@ from mavlink_sim.physics.airframe import Vector
 from mavlink_sim.physics.estimate_errors import as_reported
 from mavlink_sim.wire.link_faults import LinkStage
 from mavlink_sim.wire.links import Link
-
-logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)

@@ -131,7 +131,7 @@ class PositionController:
         self.velocity = velocity_setpoint
         self.acceleration = demanded
         roll, pitch = _tilt(achieved_x, achieved_y, yaw_rad)
-        return Demand(thrust, roll, pitch, self._yaw_rate(setpoint, yaw_rad, dt_s))
+        return Demand(thrust, roll, pitch, self._yaw_rate(setpoint, yaw_rad))
 
     def _velocity_setpoint(self, setpoint: TrajectorySetpoint, position: Vector, max_up_mps: float) -> Vector:
         target_x, target_y, target_z = setpoint.position
@@ -184,7 +184,7 @@ class PositionController:
             limit if z > limit else -limit if z < -limit else z,
         )
 
-    def _yaw_rate(self, setpoint: TrajectorySetpoint, yaw_rad: float, dt_s: float) -> float:
+    def _yaw_rate(self, setpoint: TrajectorySetpoint, yaw_rad: float) -> float:
         rate = setpoint.yaw_rate_radps if setpoint.yaw_rate_radps == setpoint.yaw_rate_radps else 0.0
         self.yaw_rate_radps = rate
         if setpoint.yaw_rad == setpoint.yaw_rad:

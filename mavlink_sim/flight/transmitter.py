@@ -88,11 +88,6 @@ class Transmitter:
         self.mode_slot = 1
         self.arm = self.kill = self.back = self.hold = self.offboard = False
 
-    def calibrate(self) -> None:
-        """Map the channels by `CALIBRATION`, as done once with a ground station."""
-        for name, channel in CALIBRATION.items():
-            self._parameters.set(name, channel)
-
     def select(self, mode: Mode) -> None:
         """Set the mode switch to the position of this mode. Raises ValueError if it has none."""
         for slot in range(1, MODE_SLOTS + 1):

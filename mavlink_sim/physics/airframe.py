@@ -69,7 +69,6 @@ class Multirotor:
         rotor_effectiveness: 0..1 for each rotor; 0 is a failed one. See `fail_motor`.
         on_ground: touching the ground.
         crashed: it hit the ground too hard or upside down: the rotors are broken.
-        touchdown_mps: the downward speed of the last contact with the ground.
         on_touch: called with that speed at every contact.
         collisions: count, with objects and vehicles. last_collision: the newest; None before the first.
         on_collision: called with each.
@@ -101,7 +100,6 @@ class Multirotor:
         "rotor_commands",
         "rotor_effectiveness",
         "rotor_thrusts",
-        "touchdown_mps",
         "velocity",
         "wind",
     )
@@ -117,7 +115,6 @@ class Multirotor:
         self.rotor_effectiveness: Rotors = (1.0, 1.0, 1.0, 1.0)
         self.on_ground = True
         self.crashed = False
-        self.touchdown_mps = 0.0
         self.floor_down_m = 0.0
         self.on_touch: Callable[[float], None] | None = None
         self.collisions = 0
@@ -374,7 +371,6 @@ class Multirotor:
 
     def _touch(self, down_mps: float, tilt_cosine: float) -> float:
         """Contact at this downward speed; returns the downward speed after it (negative: it bounces)."""
-        self.touchdown_mps = down_mps
         self.floor_down_m = 0.0
         if down_mps > CRASH_MPS or tilt_cosine < MAX_STANDING_TILT_COSINE:
             self.crashed = True
@@ -414,13 +410,6 @@ class Multirotor:
             self.last_collision = collision
             if self.on_collision is not None:
                 self.on_collision(collision)
-
-    def repair(self) -> None:
-        """Restore the rotors and the upright attitude at its position, as for a new start."""
-        self.crashed = False
-        self.rotor_effectiveness = (1.0, 1.0, 1.0, 1.0)
-        if self.on_ground:
-            self.set_attitude(0.0, 0.0, self.yaw_rad)
 
 
 def rotation_matrix(quaternion: Quaternion) -> Matrix:

@@ -130,12 +130,10 @@ class CollidingMultirotor(Multirotor):
         was_crashed = self.crashed
         if into > CRASH_MPS or (standing and self.matrix[8] < MAX_STANDING_TILT_COSINE):
             self.crashed = True
-        if standing:
-            self.touchdown_mps = into
-            if not bounces:
-                self.on_ground = True
-                self._support = obstacle
-                self.floor_down_m = self.position[2]
+        if standing and not bounces:
+            self.on_ground = True
+            self._support = obstacle
+            self.floor_down_m = self.position[2]
         crashed = self.crashed and not was_crashed
         self.count(Collision(now_s, obstacle.identifier, obstacle.name, into, standing, crashed))
 

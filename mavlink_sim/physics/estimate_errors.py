@@ -57,11 +57,6 @@ class FallibleEstimate(Estimate):
         self.gps_drift: dict[int, Vector] = {}
         super().__init__(truth, seed, noise)
 
-    @property
-    def spoiled(self) -> bool:
-        """Whether telemetry shows a fault, now or permanently (the reset counter)."""
-        return bool(self.reset_counter or self.fix_lost)
-
     def set_error(
         self, number: int, position_m: Vector | None, velocity_mps: Vector = ZERO, yaw_rad: float = 0.0
     ) -> None:

@@ -5,7 +5,6 @@ One thread, one loop: wait for the sockets until the next physics step is due, p
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from mavlink_sim.faults.injector import fault_injector
 from mavlink_sim.realtime.loop import run_together
 from mavlink_sim.realtime.options import SimulationOptions
-from mavlink_sim.realtime.sim_outputs import SimOutputs, camera_turn_rad, loaded_scene
+from mavlink_sim.realtime.sim_outputs import SimOutputs, loaded_scene
 from mavlink_sim.vehicles.firmware import vehicle_class
 from mavlink_sim.vehicles.fleet_world import FleetWorld
 from mavlink_sim.vehicles.vehicle import STEP_S
@@ -24,9 +23,7 @@ from mavlink_sim.wire.traffic_log import recording
 from mavlink_sim.world.aircraft import identifier_offset
 
 if TYPE_CHECKING:
-    from mavlink_sim.physics.airframe import Vector
-
-logger = logging.getLogger(__name__)
+    pass
 
 # After a stall longer than this the simulation does not catch up but drops the time.
 MAX_BACKLOG_S = 0.25
@@ -194,11 +191,6 @@ class Simulation:
     def show(self, now_ns: int) -> None:
         """Send the pose to the camera and write the truth, each at its rate, with this stamp."""
         self._outputs.show(self._simulated_s, now_ns)
-
-    @property
-    def camera_turn_rad(self) -> Vector | None:
-        """Roll, pitch, yaw from the body to a camera on the gimbal; None for one fixed to the body."""
-        return camera_turn_rad(self.vehicle)
 
     def truth(self) -> dict[str, Any]:
         """The current truth: pose, mode, and the range to every object and vehicle."""

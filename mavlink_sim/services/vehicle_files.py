@@ -2,7 +2,6 @@
 
 As in PX4: parameters that differ from their defaults in BSON; metadata (https://mavlink.io/en/services/
 component_information.html) as xz-compressed JSON under /etc/extras, found through COMPONENT_METADATA.
-PX4 does not have ArduPilot's packed parameters (`@PARAM/param.pck`); `offer_packed_parameters` adds them.
 """
 
 from __future__ import annotations
@@ -29,8 +28,6 @@ PARAMETER_TYPE = 1
 EVENTS_TYPE = 4
 
 _BSON_DOUBLE, _BSON_INT32 = 0x01, 0x10
-_PACK_MAGIC = 0x671B
-_PACK_INT32, _PACK_FLOAT = 3, 4
 
 
 def vehicle_files(parameters: Parameters) -> FileSystem:
@@ -53,11 +50,6 @@ def _compressed_from(metadata: Callable[[], bytes]) -> bytes:
     return _compressed(metadata())
 
 
-def offer_packed_parameters(files: FileSystem, parameters: Parameters) -> None:
-    """Add ArduPilot's `@PARAM/param.pck`, which ground stations for ArduPilot request."""
-    files.provide("@PARAM/param.pck", partial(packed_parameters, parameters))
-
-
 def bson(parameters: Iterable[Parameter]) -> bytes:
     """PX4's parameter file: one BSON document (bsonspec.org) of int32 and double elements."""
     body = bytearray()
@@ -68,27 +60,6 @@ def bson(parameters: Iterable[Parameter]) -> bytes:
         else:
             body += bytes([_BSON_DOUBLE]) + name + struct.pack("<d", parameter.value)
     return struct.pack("<i", len(body) + 5) + body + b"\0"
-
-
-def packed_parameters(parameters: Iterable[Parameter]) -> bytes:
-    """ArduPilot's packed parameters (its AP_Filesystem documentation), with shared prefixes of names.
-
-    A header (magic, number here, total number), then of each parameter its type in 4 bits, flags in 4 (none),
-    the length shared with the previous name in 4 bits, that of the rest less one in 4, the rest, the value.
-    """
-    listed = list(parameters)
-    packed = bytearray(struct.pack("<HHH", _PACK_MAGIC, len(listed), len(listed)))
-    before = ""
-    for parameter in listed:
-        name = parameter.name
-        shared = 0
-        while shared < min(len(name) - 1, len(before), 15) and name[shared] == before[shared]:
-            shared += 1
-        kind, code = (_PACK_INT32, "<i") if parameter.kind == INT32 else (_PACK_FLOAT, "<f")
-        packed += bytes([kind, shared | (len(name) - shared - 1) << 4])
-        packed += name[shared:].encode() + struct.pack(code, parameter.value)
-        before = name
-    return bytes(packed)
 
 
 # ---- metadata

@@ -230,15 +230,6 @@ class Vehicle:
         return None if self.gimbal_manager is None else self.gimbal_manager.gimbal
 
     @property
-    def battery_remaining(self) -> float:
-        """0..1, the autopilot's estimate."""
-        return self.autopilot.supervision.battery.remaining
-
-    @property
-    def battery_volts(self) -> float:
-        return self.autopilot.supervision.battery.volts
-
-    @property
     def transmitter(self) -> Transmitter:
         """The pilot's remote control, initially switched off (COM_RC_IN_MODE selects whether it is used)."""
         return self.autopilot.supervision.transmitter

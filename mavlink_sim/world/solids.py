@@ -321,8 +321,3 @@ def ground_shadows(corners: Points, first: Sequence[int], sun: Points) -> list[N
         np.asarray(cv2.convexHull(fallen[start:end]), np.float32).reshape(-1, 2)
         for start, end in pairwise(first)
     ]
-
-
-def ground_shadow(solid: Points, sun: Points) -> NDArray[np.float32]:
-    """The same of one solid (N, 3)."""
-    return ground_shadows(solid, (0, len(solid)), sun)[0]

@@ -197,10 +197,6 @@ class World:
     light: Light = field(default_factory=Light)
     sky: Sky = field(default_factory=Sky)
 
-    def of_class(self, class_name: str) -> tuple[WorldObject, ...]:
-        """The objects of one class."""
-        return tuple(item for item in self.objects if item.class_name == class_name)
-
 
 def range_to(world_object: WorldObject, position_ned_m: Sequence[float]) -> float:
     """Horizontal metres from a point to the nearest point of the object's footprint, 0 inside it."""

@@ -19,10 +19,10 @@ from mavsdk.asyncio.plugins.ftp import FtpAsync, FtpError
 from mavsdk.plugins.component_metadata import MetadataType
 from pymavlink import mavftp, mavutil
 
-from mavlink_sim.px4.parameters import INT32, Parameters, default_parameters
+from mavlink_sim.px4.parameters import Parameters, default_parameters
 from mavlink_sim.services.file_system import FileSystem, resolve
 from mavlink_sim.services.file_transfer import DATA_BYTES, Failure, Opcode, Packet, Server
-from mavlink_sim.services.vehicle_files import bson, offer_packed_parameters, packed_parameters
+from mavlink_sim.services.vehicle_files import bson
 from mavlink_sim.testing import RunningSimulator, running_simulator
 from mavlink_sim.wire.messages import dialect
 from tests.mavlink_sim.conftest import SimHarness
@@ -283,25 +283,6 @@ def test_parameter_file_holds_what_differs_from_defaults_as_bson() -> None:
         + b"\x10NAV_RCL_ACT\0" + struct.pack("<i", 3)
         + b"\0"
     )  # fmt: skip
-
-
-def test_packed_parameters_read_by_pymavlink(harness: SimHarness) -> None:
-    parameters = harness.vehicle.parameters
-    decoded = mavftp.MAVFTP.ftp_param_decode(packed_parameters(parameters))
-    assert decoded is not None
-    found = {name.decode(): (value, kind) for name, value, kind in decoded.params}
-    assert found == {
-        parameter.name: (parameter.value, mavftp_kind)
-        for parameter in parameters
-        for mavftp_kind in [3 if parameter.kind == INT32 else 4]
-    }
-
-
-def test_packed_parameters_are_optional(client: Client) -> None:
-    vehicle = client.harness.vehicle
-    offer_packed_parameters(vehicle.files, vehicle.parameters)
-    size = len(packed_parameters(vehicle.parameters))
-    assert client.ack(Opcode.OPEN_FILE_RO, b"@PARAM/param.pck").data == struct.pack("<I", size)
 
 
 def test_the_metadata_is_found_through_component_metadata(harness: SimHarness) -> None:

@@ -14,6 +14,7 @@ from mavlink_sim.physics.geography import SIH_FRAME
 from mavlink_sim.physics.gimbal import Aim, Gimbal, Target
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.realtime.options import SimulationOptions
+from mavlink_sim.realtime.sim_outputs import camera_turn_rad
 from mavlink_sim.realtime.simulation import Simulation
 from mavlink_sim.testing import free_udp_ports
 from mavlink_sim.wire.messages import dialect
@@ -263,11 +264,11 @@ def test_the_camera_of_a_simulation_turns_with_the_gimbal(equipped: bool) -> Non
     )
     with Simulation(options, lambda line: None) as simulation:
         if not equipped:
-            assert simulation.camera_turn_rad is None
+            assert camera_turn_rad(simulation.vehicle) is None
             return
         vehicle = simulation.vehicle
         assert vehicle.gimbal is not None
         vehicle.gimbal.point(Target(Aim.ANGLES, math.radians(-20.0), math.radians(30.0)))
         vehicle.step(3.0)
         wanted = (0.0, math.radians(-20.0), math.radians(30.0))
-        assert simulation.camera_turn_rad == pytest.approx(wanted, abs=0.01)
+        assert camera_turn_rad(vehicle) == pytest.approx(wanted, abs=0.01)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from mavlink_sim.world.depth_sort import clip_polygon, depth_sort_tree
 from mavlink_sim.world.materials import palette_of
 from mavlink_sim.world.shapes import BUILDERS, CLASS_NAMES, VARIANTS, shape_of, variant_of
-from mavlink_sim.world.solids import Body, ground_shadow
+from mavlink_sim.world.solids import Body, ground_shadows
 
 SIZES_M = {
     "person": ((0.25, 1.7), (0.4, 2.1), (1.4, 2.2)),
@@ -99,7 +99,7 @@ def test_shadow_ends_where_ray_over_top_meets_ground(elevation: float, azimuth: 
     level = math.cos(elevation)
     sun = np.array([level * math.cos(azimuth), level * math.sin(azimuth), math.sin(elevation)])
     mast = np.array([(0.0, 0.0, 0.0), (0.01, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.0, 2.0)])
-    reach = np.linalg.norm(ground_shadow(mast, sun), axis=1).max()
+    reach = np.linalg.norm(ground_shadows(mast, (0, len(mast)), sun)[0], axis=1).max()
     assert reach == pytest.approx(2.0 / math.tan(max(elevation, 0.05)), rel=0.02, abs=0.02)
 
 

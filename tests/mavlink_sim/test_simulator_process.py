@@ -162,7 +162,7 @@ def test_setpoint_methods_fly_it_until_they_stop(tmp_path: Path) -> None:
 
 def test_refused_setpoint_mode_is_timeout_error() -> None:
     with (
-        running_simulator(ready_after=60.0) as simulator,
+        running_simulator(ready_after=0.0, faults=["refuse_mode"]) as simulator,
         pytest.raises(TimeoutError, match="mode OFFBOARD"),
     ):
         simulator.set_position(0.0, 0.0, -3.0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,8 +14,6 @@ from vision.yolo.safe_pickle import CheckpointError
 if TYPE_CHECKING:
     from vision.yolo.architecture import YoloModel
     from vision.yolo.description import ModelDescription
-
-logger = logging.getLogger(__name__)
 
 # Runtimes of each kind of file. All of them run a checkpoint, by an export.
 _RUNNERS: dict[ExportKind, tuple[RuntimeName, ...]] = {

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import logging
 import os
 import select
 import stat
@@ -20,8 +19,6 @@ from vision.sources.mjpeg import MjpegParser
 from vision.sources.raw import RawParser, StreamError, StreamParser
 from vision.sources.source import RAW_PIXEL_FORMATS, EndOfStream, SourceError, SourceSettings
 from vision.sources.y4m import MAGIC, Y4mParser
-
-logger = logging.getLogger(__name__)
 
 _PIPE_BYTES = 1 << 20  # one frame of 640x480 in one read; the kernel's default is 64 KiB
 

@@ -135,7 +135,6 @@ class LandOnMarkerBehaviour(Behaviour):
         self._pad: PadFilter | None = None
         self._target: LandingTarget | None = None
         self._phase = _Phase.SEARCH
-        self._phase_ns = 0
         self._search: MarkerSearch | None = None
         self._started_down_m = self._goal_down_m = 0.0
         self._failures: list[str] = []
@@ -228,7 +227,7 @@ class LandOnMarkerBehaviour(Behaviour):
     # --- the phases
 
     def _enter(self, phase: _Phase, now_ns: int, timeout_s: float) -> None:
-        self._phase, self._phase_ns = phase, now_ns
+        self._phase = phase
         self._until_ns = now_ns + timeout_s * 1e9
         self._waiting_s = self._blocked_s = 0.0
         self._touching = False

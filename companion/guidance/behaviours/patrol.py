@@ -204,11 +204,11 @@ class PatrolBehaviour(Behaviour):
         if self._wait_until_ns is not None:
             self._remember(aligner.target, now_ns)
             if now_ns >= self._wait_until_ns:
-                return self._go_on(context, position)
+                return self._go_on(context)
         elif aligner.lost(now_ns):
             self._note(f"lost a {_named(aligner.target)} before facing it")
             self._remember(aligner.target, now_ns)
-            return self._go_on(context, position)
+            return self._go_on(context)
         elif aligner.faced(yaw_rad, now_ns):
             self._found += 1
             self._remember(aligner.target, now_ns)
@@ -246,7 +246,7 @@ class PatrolBehaviour(Behaviour):
         velocity = (0.0, 0.0, 0.0) if self._stop is None else stay_at(self._stop, position)
         return Setpoint.velocity(velocity, context.now_ns, yaw_rad=bearing_rad)
 
-    def _go_on(self, context: BehaviourContext, position: Vector3) -> BehaviourOutput:
+    def _go_on(self, context: BehaviourContext) -> BehaviourOutput:
         self._aligner = self._wait_until_ns = None
         self._confirmer.forget()
         self._resume(context)

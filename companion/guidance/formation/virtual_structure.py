@@ -38,7 +38,6 @@ class VirtualStructure:
         self._points, self._speed_mps, self._laps = tuple(points), speed_mps, laps
         self._path: Path | None = None
         self._origin: Vector3 = (0.0, 0.0, 0.0)
-        self._origin_ned: Vector3 = (0.0, 0.0, 0.0)
         self._now_mps = 0.0
         self.along_m = 0.0
 
@@ -60,19 +59,19 @@ class VirtualStructure:
         Raises:
             ValueError: the points do not form a path.
         """
-        self._lay(anchor, anchor.globally(home), home, height_m)
+        self._lay(anchor.globally(home), home, height_m)
         self.along_m = 0.0
 
     def take_over(self, anchor: Anchor, state: Structure) -> None:
         """Continue from the published state of another vehicle's structure. Raises ValueError as `begin`."""
         origin_ned = anchor.local(*state.origin)
         # Points without a height get the structure's current one.
-        self._lay(anchor, state.origin, origin_ned, origin_ned[2] - anchor.local(*state.place)[2])
+        self._lay(state.origin, origin_ned, origin_ned[2] - anchor.local(*state.place)[2])
         self.along_m = state.along_m
         self._now_mps = math.hypot(*state.velocity_ned_mps)
 
-    def _lay(self, anchor: Anchor, origin: Vector3, origin_ned: Vector3, height_m: float) -> None:
-        self._origin, self._origin_ned = origin, origin_ned
+    def _lay(self, origin: Vector3, origin_ned: Vector3, height_m: float) -> None:
+        self._origin = origin
         positions: list[Vector3] = []
         for north, east, *height in self._points:
             height_m = height[0] if height else height_m

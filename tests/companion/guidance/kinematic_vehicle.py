@@ -34,7 +34,6 @@ class KinematicVehicle:
             heartbeat_ns=self.now_ns,
             attitude_ns=self.now_ns,
             position_ns=self.now_ns,
-            landed_ns=self.now_ns,
             armed=self.armed,
             mode=self.mode,
             landed=self.landed,
