@@ -15,6 +15,7 @@ from typing import Annotated, NoReturn
 
 import typer
 
+from mavlink_sim.camera.cli_options import CameraOutputs, CameraRate, CameraTruth, SceneName
 from mavlink_sim.camera.process import OUTPUT_FAILED, CameraProcess
 from mavlink_sim.camera.scene import Scene
 from mavlink_sim.camera.scene_file import scene_or_demo
@@ -50,28 +51,13 @@ def camera(
         str,
         typer.Option(help="The autopilot's link: udpin://HOST:PORT, udpout://HOST:PORT or tcp://HOST:PORT."),
     ],
-    scene: Annotated[
-        str | None,
-        typer.Option(
-            help="TOML file with world and camera, or the name of a bundled scene; default: the demo world."
-        ),
-    ] = None,
+    scene: SceneName = None,
     camera: Annotated[
         str | None, typer.Option(help="Send frames with depth to this shared memory; read it as shm://NAME.")
     ] = None,
-    camera_rate: Annotated[
-        float | None, typer.Option(help="Frames per second, 1 to 120; default: the scene's, else 30.")
-    ] = None,
-    camera_output: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Also send frames to pipe:PATH, pipe:-, http://HOST:PORT or rtp://HOST:PORT; repeatable."
-        ),
-    ] = None,
-    camera_truth: Annotated[
-        Path | None,
-        typer.Option(help="Write the objects in each frame to this file, one JSON object per line."),
-    ] = None,
+    camera_rate: CameraRate = None,
+    camera_output: CameraOutputs = None,
+    camera_truth: CameraTruth = None,
     truth: Annotated[
         Path | None,
         typer.Option(help="Write the pose and the range to every object to this file, JSON lines, 20 Hz."),

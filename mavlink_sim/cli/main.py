@@ -17,6 +17,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
+from mavlink_sim.camera.cli_options import CameraOutputs, CameraRate, CameraTruth, SceneName
 from mavlink_sim.camera.video_outputs import STANDARD_OUTPUT
 from mavlink_sim.physics.midair import REACH_M
 from mavlink_sim.px4.parameters import UnknownParameterError
@@ -110,29 +111,16 @@ def simulate(
     camera: Annotated[
         str | None, typer.Option(help="Render a camera into this shared memory; read it as shm://NAME.")
     ] = None,
-    camera_rate: Annotated[
-        float | None, typer.Option(help="Frames per second of the camera; default: the scene's, else 30.")
-    ] = None,
-    scene: Annotated[
-        str | None,
-        typer.Option(help="TOML file with world, obstacles and camera, or the name of a bundled scene."),
-    ] = None,
+    camera_rate: CameraRate = None,
+    scene: SceneName = None,
     obstacle_sensor: Annotated[
         bool,
         typer.Option(
             "--obstacle-sensor", help="Add a 360-degree range sensor for collision prevention (CP_DIST)."
         ),
     ] = False,
-    camera_output: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Also send frames to pipe:PATH, pipe:-, http://HOST:PORT or rtp://HOST:PORT; repeatable."
-        ),
-    ] = None,
-    camera_truth: Annotated[
-        Path | None,
-        typer.Option(help="Write the objects in each frame to this file, one JSON object per line."),
-    ] = None,
+    camera_output: CameraOutputs = None,
+    camera_truth: CameraTruth = None,
     truth: Annotated[
         Path | None, typer.Option(help="Write the true state to this file, one JSON object per line, 20 Hz.")
     ] = None,

@@ -18,7 +18,7 @@ from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import VehicleState
 from companion.vehicle.streamer import Streamer
 
-HOLD, OFFBOARD, MISSION = 0x03040000, 0x00060000, 0x04040000
+HOLD, OFFBOARD, MISSION, TAKEOFF = 0x03040000, 0x00060000, 0x04040000, 0x02040000
 SETPOINT = "SET_POSITION_TARGET_LOCAL_NED"
 
 

@@ -15,13 +15,13 @@ from pymavlink.dialects.v20 import common as mavlink
 from companion.vehicle.driver import Driver, SystemStatus
 from companion.vehicle.drivers import open_driver
 from companion.vehicle.framing import CURRENT_MODE_ID, pack_frame
-from companion.vehicle.px4_modes import custom_mode_of_mode
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
 from tests.companion.vehicle.fake_autopilot import (
     MISSION,
     OFFBOARD,
     SETPOINT,
+    TAKEOFF,
     FakeAutopilot,
     wait_for_state,
     wait_until,
@@ -208,7 +208,7 @@ async def test_modes_are_applied_in_their_order_of_arrival(driver: Driver, autop
     await wait_for_state(driver, lambda s: s.mode is FlightMode.HOLD)
     modes: list[FlightMode] = []
     driver.subscribe(lambda state: modes.append(state.mode))
-    payload = struct.pack("<IIB", custom_mode_of_mode(FlightMode.TAKEOFF), 0, 0)
+    payload = struct.pack("<IIB", TAKEOFF, 0, 0)
     autopilot.send_bytes(pack_frame(CURRENT_MODE_ID, payload, system_id=1, component_id=1, sequence=9))
     autopilot.heartbeat()  # in hold
     autopilot.send(mavlink.MAVLink_local_position_ned_message(5, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0))
