@@ -51,8 +51,8 @@ def link() -> Iterator[AutopilotLink]:
     try:
         opened.until(lambda: opened.autopilot in NAMES, HEARTBEAT_S, f"heartbeat at {os.environ[URL]}")
         yield opened
-        if opened.strangers:
-            addresses = sorted(opened.strangers)
+        if opened.other_senders:
+            addresses = sorted(opened.other_senders)
             warnings.warn(f"other programs sent to {os.environ[URL]}, dropped: {addresses}", stacklevel=1)
     finally:
         opened.close()

@@ -76,7 +76,7 @@ class AutopilotLink:
         texts: STATUSTEXT of the autopilot. results: the newest MAV_RESULT of each command, whoever gave it.
         home_ned_m: of its newest HOME_POSITION. global_deg: latitude and longitude of its newest position.
         boots: how often its clock has begun again.
-        strangers: other addresses from which datagrams came; those are dropped.
+        other_senders: other addresses from which datagrams came; those are dropped.
         signed: its newest message bears a signature.
     """
 
@@ -94,7 +94,7 @@ class AutopilotLink:
         self.armed = self.ready = False
         self.landed = dialect.MAV_LANDED_STATE_UNDEFINED
         self.boots = 0
-        self.strangers: set[tuple[str, int]] = set()
+        self.other_senders: set[tuple[str, int]] = set()
         self.signed = False
         self.home_ned_m = (0.0, 0.0, 0.0)
         self.global_deg = (math.nan, math.nan)
@@ -266,7 +266,7 @@ class AutopilotLink:
         if sender not in (None, self._peer):
             if now_s - self._peer_s < SILENT_S:
                 assert sender is not None
-                self.strangers.add(sender)
+                self.other_senders.add(sender)
                 return False
             self._peer = sender
         self._peer_s = now_s

@@ -56,8 +56,8 @@ def test_a_second_autopilot_at_the_port_is_dropped_and_named(
     first.heartbeat(HOLD[PX4])
     link.until(lambda: link.modes, 5.0, "a mode")
     second.heartbeat(TAKEOFF)
-    link.until(lambda: link.strangers, 5.0, "a stranger")
-    assert link.strangers == {second.address}
+    link.until(lambda: link.other_senders, 5.0, "another sender")
+    assert link.other_senders == {second.address}
     assert [mode for _, mode in link.modes] == [HOLD[PX4]]
 
 
@@ -70,4 +70,4 @@ def test_a_restarted_autopilot_may_have_another_address(
     link.until(lambda: link.modes, 5.0, "a mode")
     second.heartbeat(TAKEOFF)
     link.until(lambda: len(link.modes) == 2, 5.0, "the second mode")
-    assert not link.strangers
+    assert not link.other_senders
