@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from companion.guidance.formation.neighbours import Neighbour, Neighbourhood
+from companion.guidance.targets.chosen import NO_TRACKS, RecentTracks
 from companion.guidance.targets.from_markers import NO_MARKERS, MarkerSight
 from companion.guidance.targets.ranging import ALL_MEANS, RangeMeans
 from companion.guidance.targets.target import Target
@@ -73,6 +74,7 @@ class BehaviourContext:
         ranging: which means of range estimation are available.
         max_acceleration_mps2: the envelope's limit.
         goal_ned_m: `Outcome.goal_ned_m` of the previous behaviour; None: it had none.
+        tracks: of the steering camera, those that have ended included.
     """
 
     now_ns: int
@@ -89,6 +91,7 @@ class BehaviourContext:
     ranging: RangeMeans = ALL_MEANS
     max_acceleration_mps2: float = 3.0
     goal_ned_m: Vector3 | None = None
+    tracks: RecentTracks = NO_TRACKS
 
     def perception_fault(self, default: str) -> str:
         """Why targets cannot be used, in words; `default` where the gimbal is not the reason."""
@@ -142,6 +145,8 @@ class Behaviour(ABC):
     requirements: frozenset[Requirement] = frozenset()
     # Classes that the detector must know.
     class_names: tuple[str, ...] = ()
+    # The track that must be there, if it is about exactly one.
+    track_id: int | None = None
     # Vehicles whose poses must be fresh, if it requires NEIGHBOURS.
     neighbour_names: tuple[str, ...] = ()
     # Pitches that the gimbal must reach, radians above the horizon, if it requires GIMBAL.

@@ -26,10 +26,13 @@ from typing import Any, ClassVar, TypeVar, dataclass_transform, get_args, get_ty
 from companion.geometry.points import points_from
 from companion.guidance.behaviour import Behaviour
 from companion.guidance.search_pattern import Footprint
+from companion.guidance.targets.chosen import TrackAim
 from companion.vehicle.gimbal import GimbalAim
 
 MOST_POINTS = 500
 FARTHEST_M = 5000.0
+LAST_TRACK_ID = 2**63 - 1  # of an int64
+TRACK_ID_TEXT = "a track_id of the topic detections, a whole number from 1"
 
 
 class GrammarError(ValueError):
@@ -96,7 +99,15 @@ class ClassNames:
     meaning: str
 
 
-Argument = Number | ClassName | EnumArgument | Points | FileName | ClassNames | Word
+@dataclass(frozen=True, slots=True)
+class TrackId:
+    """The `track_id` of an object in the steering camera's detections."""
+
+    key: str
+    meaning: str
+
+
+Argument = Number | ClassName | EnumArgument | Points | FileName | ClassNames | Word | TrackId
 
 
 def names_in(text: str) -> tuple[str, ...]:
@@ -121,6 +132,9 @@ def check(word: str, argument: Argument, value: Any, default: Any) -> None:
             if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
                 shown = f"{value:g}" if isinstance(value, float) else repr(value)
                 raise GrammarError(f"{word}: {key} must be {range_of(argument)}, got {shown}")
+        case TrackId(key):
+            if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= LAST_TRACK_ID:
+                raise GrammarError(f"{word}: {key} must be {TRACK_ID_TEXT}, got {value!r}")
         case EnumArgument(key, words):
             if value not in words:
                 raise GrammarError(f"{word}: {key} must be {' or '.join(words)}, got {value!r}")
@@ -203,18 +217,28 @@ class Command(ABC):
         word: name in the grammar. help: one line.
         takes_attachment: further lines may be sent along.
         renamed: former key of an argument → its current key, for the error message.
+        either: keys of which exactly one must be given; the first may be written without its key.
     """
 
     word: ClassVar[str]
     help: ClassVar[str]
     takes_attachment: ClassVar[bool] = False
     renamed: ClassVar[Mapping[str, str]] = {}
+    either: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
+        given = []
         for field, argument in arguments_of(type(self)):
             value = getattr(self, field.name)
             if value is not None or field.default is not None:
                 check(self.word, argument, value, default_of(field))
+            if argument.key in self.either and value != default_of(field):
+                given.append(argument.key)
+        if self.either and len(given) != 1:
+            wanted = " or ".join(self.either)
+            if given:
+                raise GrammarError(f"{self.word}: give either {wanted}, got both")
+            raise GrammarError(f"{self.word}: {wanted} is missing")
 
     @abstractmethod
     def build(self, context: BuildContext) -> Behaviour:
@@ -226,7 +250,7 @@ class Command(ABC):
         return False
 
     @property
-    def aim(self) -> GimbalAim | None:
+    def aim(self) -> GimbalAim | TrackAim | None:
         """For a command that only points the gimbal, where to; None: the command has a behaviour."""
         return None
 
@@ -238,8 +262,8 @@ class Command(ABC):
                 continue
             written = _quoted(value) if isinstance(value, str) else _plain_number(value)
             # All words without a key may belong to the first argument.
-            required = field.default is MISSING and index == 0
-            words.append(written if required else f"{argument.key}={written}")
+            bare = index == 0 and (field.default is MISSING or isinstance(argument, ClassName))
+            words.append(written if bare else f"{argument.key}={written}")
         return " ".join(words)
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from companion.guidance.behaviour import Outcome, Requirement
 from companion.guidance.gimbal.controller import ENDING, FIND_TIMEOUT_S, GimbalController, is_known
 from companion.guidance.interface import CommandInput, OutputCollector
+from companion.guidance.targets.chosen import RecentTracks
 from companion.vehicle.state import VehicleState
 
 
@@ -82,7 +83,9 @@ class CommandQueue:
             out.result(waiting.command.identifier, Outcome(False, ENDING))
         self._waiting = []
 
-    def take_due(self, now_ns: int, state: VehicleState, out: OutputCollector) -> list[CommandInput]:
+    def take_due(
+        self, now_ns: int, state: VehicleState, tracks: RecentTracks, out: OutputCollector
+    ) -> list[CommandInput]:
         """Remove and return the behaviours to begin now, in order. Gimbal commands go to the gimbal."""
         known = is_known(state.gimbal, now_ns)
         done = [w for w in self._waiting if known or now_ns > w.until_ns or self._gimbal.not_found]
@@ -90,7 +93,7 @@ class CommandQueue:
         due, self._due = [*(w.command for w in done), *self._due], []
         for command in due:
             if command.aim is not None:
-                self._gimbal.point(command.identifier, command.aim, now_ns, state, out)
+                self._gimbal.point(command.identifier, command.aim, now_ns, state, out, tracks)
         return [command for command in due if command.behaviour is not None]
 
 

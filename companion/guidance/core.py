@@ -40,6 +40,7 @@ from companion.guidance.limits.envelope import Envelope, Limits
 from companion.guidance.limits.obstacles import NO_RULES, ObstacleMemory, ObstacleRules
 from companion.guidance.mode_sequence import ModeSequence
 from companion.guidance.requirements import check_requirements
+from companion.guidance.targets.chosen import RecentTracks
 from companion.vehicle.gimbal import Address
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import DEFAULT_LIFETIME_S, Setpoint
@@ -76,6 +77,7 @@ class GuidanceOptions:
         own_address: system and component id of our messages.
         lifetime_s: lifetime of every setpoint; overrides the behaviour's.
         perception_max_age_s: maximum age of targets.
+        track_max_age_s: a track unseen for so long has ended.
     """
 
     limits: Limits = Limits()  # noqa: RUF009 - frozen
@@ -84,6 +86,7 @@ class GuidanceOptions:
     battery: BatteryMinimum = NO_MINIMUM
     obstacles: ObstacleRules = NO_RULES
     perception_max_age_s: float = 0.5
+    track_max_age_s: float = 2.0
     gimbal: GimbalMounting = GimbalMounting()  # noqa: RUF009 - frozen
 
 
@@ -113,6 +116,7 @@ class Guidance:
         self._authority = Authority()
         self._battery = BatteryMonitor(options.battery)
         self._memory = ObstacleMemory()
+        self._tracks = RecentTracks(max_age_s=options.track_max_age_s)
         self._queue = CommandQueue(self.gimbal)
         self._behaviour: Behaviour | None = None
         self._command: CommandInput | None = None
@@ -204,7 +208,7 @@ class Guidance:
         self._queue.watch(inputs.mode_changes, inputs.state, out)
         for command in inputs.commands:
             self._queue.add(command, now_ns, inputs.state, self._gimbal_user, out)
-        for command in self._queue.take_due(now_ns, inputs.state, out):
+        for command in self._queue.take_due(now_ns, inputs.state, context.tracks, out):
             self._begin_command(command, context)
         landing_target = None
         try:
@@ -213,7 +217,7 @@ class Guidance:
                 self._report_reset(self._behaviour, before, context)
                 self._update(context, inputs, paused_s)
             landing_target = self._new_landing_target()
-            self.gimbal.update(now_ns, inputs.state, self._active, out)
+            self.gimbal.update(now_ns, inputs.state, self._active, out, context.tracks)
         except Exception as error:
             self._behaviour_failed(error, context, inputs.stream.sent_count)
         else:
@@ -241,10 +245,12 @@ class Guidance:
         fresh = (
             age_s is not None and age_s <= self.options.perception_max_age_s and not gimbal.direction_fault
         )
+        targets = inputs.targets if fresh else ()
+        self._tracks = self._tracks.updated(targets)
         return BehaviourContext(
             now_ns,
             inputs.state,
-            inputs.targets if fresh else (),
+            targets,
             age_s,
             fresh,
             inputs.obstacles,
@@ -256,6 +262,7 @@ class Guidance:
             goal_ned_m=self._goal_ned_m,
             gimbal=gimbal,
             ranging=inputs.ranging,
+            tracks=self._tracks,
         )
 
     def _output(self, landing_target: LandingTarget | None, *, released: bool = False) -> GuidanceOutput:

@@ -19,6 +19,7 @@ from typing import Any
 
 from companion.guidance.command import (
     COMMANDS,
+    TRACK_ID_TEXT,
     Argument,
     ClassName,
     ClassNames,
@@ -28,6 +29,7 @@ from companion.guidance.command import (
     GrammarError,
     Number,
     Points,
+    TrackId,
     Word,
     arguments_of,
     default_of,
@@ -63,6 +65,8 @@ def parse(text: str, class_names: Sequence[str] | None = None) -> Command:
     for field, argument in arguments_of(kind):
         if field.default is MISSING and field.name not in values:
             raise GrammarError(f"{word}: {argument.key} is missing ({argument.meaning}): {usage(kind)}")
+    if kind.either and not any(f.name in values for f, a in arguments_of(kind) if a.key in kind.either):
+        raise GrammarError(f"{word}: {' or '.join(kind.either)} is missing: {usage(kind)}")
     return kind(**values)
 
 
@@ -71,7 +75,11 @@ def usage(kind: type[Command]) -> str:
     words = [kind.word]
     for field, argument in arguments_of(kind):
         default = default_of(field)
-        if field.default is MISSING:
+        if argument.key in kind.either:
+            if argument.key == kind.either[0]:
+                others = [f"{key}=…" for key in kind.either[1:]]
+                words.append("|".join([argument.key.upper(), *others]))
+        elif field.default is MISSING:
             words.append(argument.key.upper())
         elif isinstance(argument, ClassName):
             words.append(f"[{argument.key.upper()}]")
@@ -121,6 +129,8 @@ def markdown() -> str:
             default = default_of(field)
             if field.default is MISSING:
                 shown = "required"
+            elif argument.key in kind.either:
+                shown = f"{' or '.join(kind.either)} required"
             elif default in (None, ""):
                 shown = "–"
             else:
@@ -136,6 +146,8 @@ def allowed_values(argument: Argument) -> str:
             return f"{low:g} to {high:g}{' ' + unit if unit else ''}"
         case EnumArgument(_, words):
             return " or ".join(words)
+        case TrackId():
+            return "a track_id"
     return ""
 
 
@@ -159,6 +171,8 @@ def json_schema(class_names: Sequence[str] | None = None) -> dict[str, Any]:
             "required": [a.key for field, a in arguments_of(kind) if field.default is MISSING],
             "additionalProperties": False,
         }
+        if kind.either:
+            commands[kind.word]["oneOf"] = [{"required": [key]} for key in kind.either]
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", "$defs": commands}
 
 
@@ -169,6 +183,8 @@ def _argument_schema(argument: Argument, class_names: Sequence[str] | None) -> d
             schema |= {"type": "number", "minimum": low, "maximum": high}
             if unit:
                 schema["unit"] = unit
+        case TrackId():
+            schema |= {"type": "integer", "minimum": 1}
         case EnumArgument(_, words):
             schema["enum"] = list(words)
         case ClassName() if class_names is not None:
@@ -237,7 +253,7 @@ def _assigned(kind: type[Command], tokens: list[_Token]) -> Iterator[tuple[str, 
         yield claim(token.key, token.text)
 
 
-def _value(word: str, argument: Argument, text: str, class_names: Sequence[str] | None) -> float | str:
+def _value(word: str, argument: Argument, text: str, class_names: Sequence[str] | None) -> float | int | str:
     match argument:
         case Number(key, unit):
             number = text.removesuffix(unit) if unit else text
@@ -245,6 +261,11 @@ def _value(word: str, argument: Argument, text: str, class_names: Sequence[str] 
                 return float(number)
             except ValueError:
                 raise GrammarError(f"{word}: {key} must be {range_of(argument)}, got {text!r}") from None
+        case TrackId(key):
+            # At most as many digits as the greatest one has: Python refuses to read thousands.
+            if not re.fullmatch(r"[0-9]{1,19}", text):
+                raise GrammarError(f"{word}: {key} must be {TRACK_ID_TEXT}, got {text!r}")
+            return int(text)
         case EnumArgument():
             return text.lower()
         case Points() | FileName() | Word():

@@ -8,6 +8,7 @@ from typing import Literal
 
 from companion.guidance.behaviour import Behaviour, Outcome
 from companion.guidance.formation.neighbours import Neighbourhood
+from companion.guidance.targets.chosen import TrackAim
 from companion.guidance.targets.from_markers import NO_MARKERS, MarkerSight
 from companion.guidance.targets.ranging import ALL_MEANS, RangeMeans
 from companion.guidance.targets.target import Target
@@ -95,7 +96,7 @@ class CommandInput:
     identifier: int
     text: str
     behaviour: Behaviour | None = None
-    aim: GimbalAim | None = None
+    aim: GimbalAim | TrackAim | None = None
     endless: bool = False
     mode_changes: int | None = None
 

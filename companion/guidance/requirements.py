@@ -58,7 +58,7 @@ def check_requirements(
                 if Requirement.PERCEPTION in behaviour.requirements and not context.gimbal.carries_camera:
                     missing.append("the camera on the gimbal (camera.on_gimbal is not set)")
             case Requirement.DEPTH_OR_SIZE:
-                if (why := context.ranging.missing(behaviour.class_names)) is not None:
+                if (why := context.ranging.missing(_class_names(behaviour, context))) is not None:
                     missing.append(why)
             case Requirement.NEIGHBOURS:
                 missing += missing_neighbours(context.neighbourhood, behaviour.neighbour_names)
@@ -72,7 +72,18 @@ def check_requirements(
         unknown = [name for name in behaviour.class_names if name not in class_names]
         if unknown:
             missing.append(f"a detector that knows {', '.join(unknown)}")
-    return f"{behaviour.name} needs {' and '.join(missing)}" if missing else None
+    if missing:
+        return f"{behaviour.name} needs {' and '.join(missing)}"
+    if behaviour.track_id is not None:
+        why = context.tracks.missing(behaviour.track_id, now_ns)
+        return None if why is None else f"{behaviour.name}: {why}"
+    return None
+
+
+def _class_names(behaviour: Behaviour, context: BehaviourContext) -> tuple[str, ...]:
+    """The classes that it flies to, its track's included."""
+    track = None if behaviour.track_id is None else context.tracks.newest(behaviour.track_id)
+    return behaviour.class_names if track is None else (*behaviour.class_names, track.class_name)
 
 
 def _where(context: BehaviourContext) -> str:

@@ -1,4 +1,4 @@
-"""Approach: fly to an object of a class and stop before it, servoing on its filtered position."""
+"""Approach: fly to an object and stop before it, servoing on its filtered position."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from companion.guidance.motion import (
     stopping_speed,
 )
 from companion.guidance.targets.choosing import TargetSelector
+from companion.guidance.targets.chosen import Wanted
 from companion.guidance.targets.target import DOUBTED, RangeSource, Target
 from companion.guidance.targets.track import ObjectTrack
 from companion.vehicle.gimbal import GimbalAim
@@ -57,10 +58,11 @@ BASE_TIMEOUT_S = 45.0
 class ApproachBehaviour(Behaviour):
     """Keeps the height, yaws to the object and stops `distance_m` before its nearest surface.
 
-    It selects the confirmed object of the class ahead (see `TargetSelector`) and stays with it. After losing
-    it, it brakes and waits for `lost_timeout_s` before it fails.
+    It selects the confirmed object of the class ahead (see `TargetSelector`), or the track, and stays with
+    it. After losing it, it brakes and waits for `lost_timeout_s` before it fails.
 
     Args:
+        class_name, track_id: exactly one of them.
         tracking: keeps the camera's gimbal on the object; None: the gimbal is not used.
 
     Attributes:
@@ -74,8 +76,9 @@ class ApproachBehaviour(Behaviour):
 
     def __init__(
         self,
-        class_name: str,
+        class_name: str = "",
         *,
+        track_id: int | None = None,
         distance_m: float = 5.0,
         speed_mps: float = 2.0,
         confidence: float = 0.3,
@@ -85,9 +88,9 @@ class ApproachBehaviour(Behaviour):
         self._tracking = tracking
         if tracking is not None:
             self.requirements = ApproachBehaviour.requirements | {Requirement.GIMBAL}
-        self.class_names = (class_name,)
+        self._subject = Wanted(class_name, track_id)
+        self.class_names, self.track_id = self._subject.class_names, track_id
         self.lost_at: Vector3 | None = None
-        self._class_name = class_name
         self._distance_m, self._speed_mps = distance_m, speed_mps
         self._confidence = confidence
         self._lost_timeout_s = lost_timeout_s
@@ -136,7 +139,7 @@ class ApproachBehaviour(Behaviour):
         if now_ns > self._until_ns:
             away = f"still {self._range_m:.1f} m away" if track else "range never known"
             took_s = (now_ns - self._started_ns) / 1e9
-            return Outcome(False, f"did not reach the {self._class_name} in {took_s:.0f} s: {away}")
+            return Outcome(False, f"did not reach {self._subject.phrase} in {took_s:.0f} s: {away}")
         if track is None or unseen_s > LOST_AFTER_S or not context.perception_fresh:
             return self._wait(dt_s, context, position, unseen_s)
         if self._wait_point is not None:
@@ -155,7 +158,7 @@ class ApproachBehaviour(Behaviour):
             off_m = math.dist(goal, position) if still else math.inf
             near_m = REACHED_M if self._by_depth else ARRIVED_M
             if self._arrival.update(off_m, speed_of(state), now_ns, near_m):
-                return Outcome(True, f"reached {self._class_name} at {self._range_m:.1f} m", goal)
+                return Outcome(True, f"reached {self._subject.name} at {self._range_m:.1f} m", goal)
             velocity = self._controller.velocity(goal, state, dt_s, top)
             return Setpoint.velocity(velocity, now_ns, yaw_rad=self._bearing_rad)
         speed = stopping_speed(error_m, top, STOPPING_MPS2)
@@ -173,17 +176,13 @@ class ApproachBehaviour(Behaviour):
     @property
     def status(self) -> str:
         if self._track is None:
-            return f"looking for the {self._class_name}"
+            return f"looking for {self._subject.phrase}"
         if self._wait_point is not None:
-            return f"lost the {self._class_name}, waiting"
-        return f"{self._class_name} {self._range_m:.1f} m away"
+            return f"lost {self._subject.phrase}, waiting"
+        return f"{self._subject.name} {self._range_m:.1f} m away"
 
     def _observe(self, context: BehaviourContext, position: Vector3, yaw_rad: float) -> None:
-        fitting = [
-            target
-            for target in context.targets
-            if target.class_name == self._class_name and target.score >= self._confidence
-        ]
+        fitting = self._subject.of(context.targets, self._confidence)
         if self._track is not None:
             if self._track.update(fitting, position):
                 self._seen_ns = self._track.captured_ns
@@ -275,7 +274,8 @@ class ApproachBehaviour(Behaviour):
             else:
                 why = f"last seen {self._range_m:.1f} m away"
                 self.lost_at = self._track.position_ned_m
-            return Outcome(False, f"lost the {self._class_name} for {unseen_s:.1f} s: {why}")
+                why += context.tracks.replacement(self._track.newest, context.now_ns)
+            return Outcome(False, f"lost {self._subject.phrase} for {unseen_s:.1f} s: {why}")
         if self._wait_point is None and ground_speed(context.state) < STANDING_MPS:
             north, east, _ = stopping_point(context.state)
             self._wait_point = (north, east, self._down_m)

@@ -4,13 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome
 from companion.guidance.behaviours.approach import ApproachBehaviour
 from companion.guidance.behaviours.confirmation import DetectionConfirmer
 from companion.guidance.behaviours.seek import SeekBehaviour
-from companion.guidance.command import BuildContext, ClassName, Command, GrammarError, Number, behaviour
+from companion.guidance.command import (
+    BuildContext,
+    ClassName,
+    Command,
+    GrammarError,
+    Number,
+    TrackId,
+    behaviour,
+)
 from companion.guidance.gimbal.pitch import (
     LEAST_SWEEP_DEG,
     USUAL_RATE_DPS,
@@ -31,9 +39,10 @@ LOOK_BACK_LIMIT_S = 12.0
 POINTED_RAD = math.radians(6.0)
 
 
-@behaviour("approach", "fly to an object of the class, keeping the height, and stop before it")
+@behaviour("approach", "fly to an object of the class, or to a track, keeping the height, and stop before it")
 class Approach(Command):
-    class_name: Annotated[str, ClassName("class", "what to fly to")]
+    either: ClassVar[tuple[str, ...]] = ("class", "track")
+    class_name: Annotated[str, ClassName("class", "what to fly to")] = ""
     distance_m: Annotated[float, Number("distance", "m", 1.0, 100.0, "where to stop, to its surface")] = 5.0
     speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 10.0, "maximum speed")] = 2.0
     confidence: Annotated[float, Number("confidence", "", 0.05, 1.0, "minimum confidence")] = 0.3
@@ -42,9 +51,10 @@ class Approach(Command):
     ] = 5.0
     retries: Annotated[
         float,
-        Number("retries", "", 0.0, 20.0, "how often to search for a lost object"),
+        Number("retries", "", 0.0, 20.0, "how often to search for a lost object, unless it is a track"),
     ] = 2.0
     gimbal: GimbalUse = "leave"
+    track_id: Annotated[int | None, TrackId("track", "fly to this track, instead of a class")] = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -53,15 +63,22 @@ class Approach(Command):
 
     def build(self, context: BuildContext) -> Behaviour:
         tracking = GimbalTracking() if self.gimbal == "track" else None
-        return PersistentApproach(
-            lambda: ApproachBehaviour(
+
+        def approach() -> ApproachBehaviour:
+            return ApproachBehaviour(
                 self.class_name,
+                track_id=self.track_id,
                 distance_m=self.distance_m,
                 speed_mps=self.speed_mps,
                 confidence=self.confidence,
                 lost_timeout_s=self.lost_timeout_s,
                 tracking=tracking,
-            ),
+            )
+
+        if self.track_id is not None:
+            return approach()  # a search would find another track
+        return PersistentApproach(
+            approach,
             self.class_name,
             retries=int(self.retries),
             confidence=self.confidence,

@@ -1,15 +1,24 @@
-"""Follow: keep a distance and a bearing to a moving object of a class."""
+"""Follow: keep a distance and a bearing to a moving object."""
 
 from __future__ import annotations
 
 import math
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome, Requirement
-from companion.guidance.command import BuildContext, ClassName, Command, EnumArgument, Number, behaviour
+from companion.guidance.command import (
+    BuildContext,
+    ClassName,
+    Command,
+    EnumArgument,
+    Number,
+    TrackId,
+    behaviour,
+)
 from companion.guidance.gimbal.pitch import GimbalTracking, GimbalUse
 from companion.guidance.motion import add_velocity_error, correction, in_degrees, position_and_yaw
 from companion.guidance.targets.choosing import TargetSelector
+from companion.guidance.targets.chosen import Wanted
 from companion.guidance.targets.moving_track import MovingTrack
 from companion.guidance.targets.target import DOUBTED
 from companion.vehicle.gimbal import GimbalAim
@@ -33,9 +42,10 @@ SURE_OF_SPEED_MPS = 1.0
 UNSEEN_S = 0.6
 
 
-@behaviour("follow", "keep a distance and a bearing to a moving object of the class")
+@behaviour("follow", "keep a distance and a bearing to a moving object of the class, or to a track")
 class Follow(Command):
-    class_name: Annotated[str, ClassName("class", "what to follow")]
+    either: ClassVar[tuple[str, ...]] = ("class", "track")
+    class_name: Annotated[str, ClassName("class", "what to follow")] = ""
     distance_m: Annotated[float, Number("distance", "m", 1.5, 100.0, "to keep, to its surface")] = 8.0
     bearing: Annotated[
         str,
@@ -64,6 +74,7 @@ class Follow(Command):
         float, Number("duration", "s", 0.0, 3600.0, "how long; 0: until another command")
     ] = 0.0
     gimbal: GimbalUse = "leave"
+    track_id: Annotated[int | None, TrackId("track", "follow this track, instead of a class")] = None
 
     @property
     def endless(self) -> bool:
@@ -72,6 +83,7 @@ class Follow(Command):
     def build(self, context: BuildContext) -> Behaviour:
         return FollowBehaviour(
             self.class_name,
+            track_id=self.track_id,
             distance_m=self.distance_m,
             bearing=self.bearing,
             angle_rad=math.radians(self.angle_deg),
@@ -86,10 +98,11 @@ class Follow(Command):
 class FollowBehaviour(Behaviour):
     """Keeps the height, yaws to the object and keeps `distance_m` from its nearest surface.
 
-    It selects the confirmed object of the class ahead (see `TargetSelector`) and stays with it. Unseen, it
-    follows the prediction for `occlusion_s`; then it fails.
+    It selects the confirmed object of the class ahead (see `TargetSelector`), or the track, and stays with
+    it. Unseen, it follows the prediction for `occlusion_s`; then it fails.
 
     Args:
+        class_name, track_id: exactly one of them.
         bearing: where the vehicle stays, seen from the object: "here", its current direction; "compass",
             `angle_rad` clockwise from north; "course", that far clockwise from the object's direction of
             motion (π is behind it).
@@ -111,8 +124,9 @@ class FollowBehaviour(Behaviour):
 
     def __init__(
         self,
-        class_name: str,
+        class_name: str = "",
         *,
+        track_id: int | None = None,
         distance_m: float = 8.0,
         bearing: str = "here",
         angle_rad: float = math.pi,
@@ -125,8 +139,8 @@ class FollowBehaviour(Behaviour):
         self._tracking = tracking
         if tracking is not None:
             self.requirements = FollowBehaviour.requirements | {Requirement.GIMBAL}
-        self.class_names = (class_name,)
-        self._class_name = class_name
+        self._subject = Wanted(class_name, track_id)
+        self.class_names, self.track_id = self._subject.class_names, track_id
         self._distance_m, self._speed_mps = distance_m, speed_mps
         self._bearing, self._angle_rad = bearing, angle_rad
         self._confidence, self._occlusion_s = confidence, occlusion_s
@@ -159,9 +173,9 @@ class FollowBehaviour(Behaviour):
         if self._duration_s and now_ns - self._started_ns >= self._duration_s * 1e9:
             if track is None:
                 return Outcome(
-                    False, f"no localized {self._class_name!r} to follow in {self._duration_s:g} s"
+                    False, f"no localized {self._subject.name!r} to follow in {self._duration_s:g} s"
                 )
-            return Outcome(True, f"followed the {self._class_name} for {self._duration_s:g} s")
+            return Outcome(True, f"followed {self._subject.phrase} for {self._duration_s:g} s")
         if self._unseen_s > self._occlusion_s:
             return Outcome(False, self._lost(context))
         if track is not None:
@@ -226,11 +240,7 @@ class FollowBehaviour(Behaviour):
         if not context.perception_fresh:
             return
         position, _ = position_and_yaw(context.state)
-        fitting = [
-            target
-            for target in context.targets
-            if target.class_name == self._class_name and target.score >= self._confidence
-        ]
+        fitting = self._subject.of(context.targets, self._confidence)
         if self._track is not None:
             if self._track.update(fitting, position):
                 self._seen_ns = self._track.captured_ns
@@ -257,11 +267,13 @@ class FollowBehaviour(Behaviour):
                 f", moving at {math.hypot(north, east):.1f} m/s to {in_degrees(math.atan2(east, north))}°"
             )
             why = f"last expected {self._range_m:.1f} m away{moving}"
+            expected = self._track.position_at(context.now_ns)
+            why += context.tracks.replacement(self._track.newest, context.now_ns, expected)
         elif self._doubted:
             why = DOUBTED
         else:
             why = "never seen with a known range"
-        return f"lost the {self._class_name} for {self._unseen_s:.1f} s: {why}"
+        return f"lost {self._subject.phrase} for {self._unseen_s:.1f} s: {why}"
 
     @property
     def gimbal_aim(self) -> GimbalAim | None:
@@ -270,6 +282,6 @@ class FollowBehaviour(Behaviour):
     @property
     def status(self) -> str:
         if self._track is None:
-            return f"looking for the {self._class_name}"
+            return f"looking for {self._subject.phrase}"
         hidden = f", unseen for {self._unseen_s:.1f} s" if self._unseen_s > UNSEEN_S else ""
-        return f"following the {self._class_name}, {self._range_m:.1f} m away{hidden}"
+        return f"following {self._subject.phrase}, {self._range_m:.1f} m away{hidden}"

@@ -13,6 +13,7 @@ from companion.guidance.command import (
     EnumArgument,
     GrammarError,
     Number,
+    TrackId,
     behaviour,
 )
 from companion.guidance.motion import (
@@ -23,6 +24,7 @@ from companion.guidance.motion import (
     position_and_yaw,
     stopping_speed,
 )
+from companion.guidance.targets.chosen import Wanted
 from companion.guidance.targets.target import Target
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
@@ -62,7 +64,7 @@ SLOWEST_MPS = 0.5
 MAX_CENTRIPETAL_MPS2 = 2.0
 
 
-@behaviour("orbit", "circle, nose to the centre: the point `radius` ahead, or an object of a class")
+@behaviour("orbit", "circle, nose to the centre: the point `radius` ahead, an object of a class, or a track")
 class Orbit(Command):
     class_name: Annotated[str, ClassName("class", "object to circle about, optional")] = ""
     radius_m: Annotated[float, Number("radius", "m", 1.0, 100.0, "of the circle")] = 10.0
@@ -71,6 +73,9 @@ class Orbit(Command):
     direction: Annotated[
         str, EnumArgument("direction", ("clockwise", "counterclockwise"), "seen from above")
     ] = "clockwise"
+    track_id: Annotated[
+        int | None, TrackId("track", "circle about this track's object, instead of a class")
+    ] = None
 
     @property
     def endless(self) -> bool:
@@ -78,6 +83,8 @@ class Orbit(Command):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.class_name and self.track_id is not None:
+            raise GrammarError("orbit: give either class or track, got both")
         fastest = math.sqrt(MAX_CENTRIPETAL_MPS2 * self.radius_m)
         if self.speed_mps > fastest:
             raise GrammarError(
@@ -88,7 +95,12 @@ class Orbit(Command):
     def build(self, context: BuildContext) -> Behaviour:
         clockwise = self.direction == "clockwise"
         return OrbitBehaviour(
-            self.radius_m, self.speed_mps, self.laps, clockwise=clockwise, class_name=self.class_name
+            self.radius_m,
+            self.speed_mps,
+            self.laps,
+            clockwise=clockwise,
+            class_name=self.class_name,
+            track_id=self.track_id,
         )
 
 
@@ -100,7 +112,7 @@ class OrbitBehaviour(Behaviour):
     the radius.
 
     The centre is the point `radius_m` ahead of the vehicle at the start or, with a class name, the position
-    of the object of that class nearest to the nose, determined once.
+    of the object of that class nearest to the nose or, with a track, of its object; determined once.
     """
 
     name = "orbit"
@@ -113,13 +125,14 @@ class OrbitBehaviour(Behaviour):
         *,
         clockwise: bool = True,
         class_name: str = "",
+        track_id: int | None = None,
     ) -> None:
         needs = {Requirement.POSITION, Requirement.IN_AIR}
-        if class_name:
+        self._subject = Wanted(class_name, track_id) if class_name or track_id is not None else None
+        if self._subject is not None:
             needs |= {Requirement.PERCEPTION, Requirement.DEPTH_OR_SIZE}
         self.requirements = frozenset(needs)
-        self.class_names = (class_name,) if class_name else ()
-        self._class_name = class_name
+        self.class_names, self.track_id = ((class_name,) if class_name else ()), track_id
         self._radius_m, self._speed_mps, self._laps = radius_m, speed_mps, laps
         self._turn = 1.0 if clockwise else -1.0
         self._centre: Vector3 | None = None
@@ -137,14 +150,14 @@ class OrbitBehaviour(Behaviour):
         self._out_mps = self._drag_mps2 = self._lead_rad = self._pace_mps = self._turning_mps2 = 0.0
         self._asked_mps = (0.0, 0.0)
         self._centre = None
-        if not self._class_name:
+        if self._subject is None:
             self._centre = (
                 position[0] + self._radius_m * math.cos(yaw_rad),
                 position[1] + self._radius_m * math.sin(yaw_rad),
                 position[2],
             )
-        elif (target := self._nearest_to_nose(context.targets, yaw_rad)) is not None:
-            self._centre = target.position_ned_m
+        else:
+            self._centre = _position_of(self._subject, context, yaw_rad)
         away_m = 0.0 if self._centre is None else math.dist(position[:2], self._centre[:2])
         path_m = self._laps * math.tau * self._radius_m + abs(away_m - self._radius_m)
         turning_mps2 = TURNING_FRACTION * context.max_acceleration_mps2
@@ -153,7 +166,8 @@ class OrbitBehaviour(Behaviour):
 
     def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
         if self._centre is None:
-            return Outcome(False, f"no localized {self._class_name!r} to orbit")
+            assert self._subject is not None
+            return Outcome(False, f"no localized {self._subject.name!r} to orbit")
         position, yaw_rad = position_and_yaw(context.state)
         north, east = position[0] - self._centre[0], position[1] - self._centre[1]
         distance = math.hypot(north, east)
@@ -236,6 +250,10 @@ class OrbitBehaviour(Behaviour):
         angle = 0.0 if self._angle_rad is None else self._angle_rad
         return f"orbiting, {self._flown_rad / math.tau:.1f} laps, {in_degrees(angle)}° from the centre"
 
-    def _nearest_to_nose(self, targets: tuple[Target, ...], yaw_rad: float) -> Target | None:
-        fitting = [t for t in targets if t.class_name == self._class_name and t.position_ned_m is not None]
-        return min(fitting, key=lambda t: abs(wrap_angle(t.bearing_rad - yaw_rad)), default=None)
+
+def _position_of(wanted: Wanted, context: BehaviourContext, yaw_rad: float) -> Vector3 | None:
+    """Of the object nearest to the nose; of a track that is missed in this frame, the newest position."""
+    seen: list[Target] = wanted.of(context.targets if wanted.class_name else context.tracks.targets)
+    located = [target for target in seen if target.position_ned_m is not None]
+    nearest = min(located, key=lambda t: abs(wrap_angle(t.bearing_rad - yaw_rad)), default=None)
+    return None if nearest is None else nearest.position_ned_m

@@ -27,6 +27,7 @@ from companion.guidance.interface import (
     ReleaseGimbal,
     TakeGimbal,
 )
+from companion.guidance.targets.chosen import LOST_AFTER_S, NO_TRACKS, RecentTracks, TrackAim
 from companion.vehicle.gimbal import NOBODY, Address, GimbalAim, GimbalState, address_text
 from companion.vehicle.state import VehicleState
 
@@ -225,13 +226,15 @@ class GimbalMounting:
     camera_pitch_rad: float = 0.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, eq=False)
 class _PointRequest:
-    """An operator's request to point the gimbal."""
+    """An operator's request to point the gimbal; `track`: to keep it on, after it is answered too."""
 
     identifier: int
     aim: GimbalAim
     until_ns: float
+    track: TrackAim | None = None
+    answered: bool = False
 
 
 class GimbalController:
@@ -308,14 +311,31 @@ class GimbalController:
         return self._find is None and self._not_found
 
     def point(
-        self, identifier: int, aim: GimbalAim, now_ns: int, state: VehicleState, out: OutputCollector
+        self,
+        identifier: int,
+        aim: GimbalAim | TrackAim,
+        now_ns: int,
+        state: VehicleState,
+        out: OutputCollector,
+        tracks: RecentTracks = NO_TRACKS,
     ) -> None:
-        """Point it for an operator and release it; it keeps its direction."""
-        if missing := missing_gimbal(state, now_ns, self.snapshot(now_ns, state), (aim.pitch_rad,)):
+        """Point it for an operator and release it; it keeps its direction. At a track: until that is lost."""
+        track = aim if isinstance(aim, TrackAim) else None
+        pitches_rad = (aim.pitch_rad,) if isinstance(aim, GimbalAim) else ()
+        if missing := missing_gimbal(state, now_ns, self.snapshot(now_ns, state), pitches_rad):
             out.result(identifier, Outcome(False, f"gimbal needs {' and '.join(missing)}"))
             return
+        if isinstance(aim, TrackAim):
+            if (why := tracks.missing(aim.track_id, now_ns)) is not None:
+                out.result(identifier, Outcome(False, f"gimbal: {why}"))
+                return
+            direction = aim.direction(tracks, state, self._camera_pitch_rad)
+            if direction is None:
+                out.result(identifier, Outcome(False, "gimbal: the vehicle's heading is unknown"))
+                return
+            aim = direction
         self._end_point(Outcome(False, "gimbal: superseded by a newer gimbal command"), out)
-        self._point = _PointRequest(identifier, aim, now_ns + POINT_TIMEOUT_S * 1e9)
+        self._point = _PointRequest(identifier, aim, now_ns + POINT_TIMEOUT_S * 1e9, track)
 
     # --- the steps ---------------------------------------------------------------------------------------
 
@@ -334,13 +354,20 @@ class GimbalController:
                 self._release_failed = answer.refused is not None
 
     def update(
-        self, now_ns: int, state: VehicleState, active: Behaviour | None, out: OutputCollector
+        self,
+        now_ns: int,
+        state: VehicleState,
+        active: Behaviour | None,
+        out: OutputCollector,
+        tracks: RecentTracks = NO_TRACKS,
     ) -> None:
         """One step, after that of the active behaviour."""
         aim = None if active is None else active.gimbal_aim
         owner: object | None = active
         if self._point is not None and aim is not None and active is not None:
             self._end_point(Outcome(False, f"gimbal: superseded by {active.name}"), out)
+        if self._point is not None and self._point.track is not None:
+            self._aim_at_track(self._point, self._point.track, now_ns, state, tracks, out)
         if self._point is not None:
             aim, owner = self._point.aim, self._point
         request = self._control.update(now_ns, state.gimbal, aim, owner)
@@ -376,9 +403,33 @@ class GimbalController:
             self._ending_since_ns = now_ns
 
     def _end_point(self, outcome: Outcome, out: OutputCollector) -> None:
-        if self._point is not None:
+        if self._point is not None and self._point.answered:
+            out.event(EventKind.GIMBAL, "", outcome.reason, warning=True)
+        elif self._point is not None:
             out.result(self._point.identifier, outcome)
-            self._point = None
+        self._point = None
+
+    @property
+    def _camera_pitch_rad(self) -> float:
+        return self.mounting.camera_pitch_rad if self.mounting.carries_steering else 0.0
+
+    def _aim_at_track(
+        self,
+        request: _PointRequest,
+        track: TrackAim,
+        now_ns: int,
+        state: VehicleState,
+        tracks: RecentTracks,
+        out: OutputCollector,
+    ) -> None:
+        """Aim at the track's object; the request ends when the track is lost."""
+        target = tracks.newest(track.track_id)
+        if target is None or now_ns - target.captured_ns > LOST_AFTER_S * 1e9:
+            instead = "" if target is None else tracks.replacement(target, now_ns)
+            reason = f"gimbal: lost track {track.track_id} for {LOST_AFTER_S:.1f} s{instead}"
+            self._end_point(Outcome(False, reason), out)
+            return
+        request.aim = track.direction(tracks, state, self._camera_pitch_rad) or request.aim
 
     def _problem(self, now_ns: int, state: VehicleState) -> str:
         if self._control.problem:
@@ -402,7 +453,13 @@ class GimbalController:
         gimbal = state.gimbal
         off_rad = None if gimbal is None else gimbal.off_rad(request.aim, state.yaw_rad or 0.0)
         known = gimbal is not None and gimbal.attitude_fresh(now_ns) and off_rad is not None
-        if self._control.pointed == request.aim and known and off_rad is not None and off_rad <= POINTED_RAD:
+        there = known and off_rad is not None and off_rad <= POINTED_RAD
+        if request.track is not None and there:
+            if not request.answered:
+                text = f"gimbal kept on track {request.track.track_id}, now {direction_text(request.aim)}"
+                out.result(request.identifier, Outcome(True, text))
+            request.answered, request.until_ns = True, now_ns + POINT_TIMEOUT_S * 1e9
+        elif self._control.pointed == request.aim and there:
             self._end_point(Outcome(True, f"gimbal points {direction_text(request.aim)}"), out)
         elif now_ns > request.until_ns:
             where = (

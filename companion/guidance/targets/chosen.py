@@ -1,0 +1,203 @@
+"""What a command is about: an object of a class, or exactly one track; and which tracks there are.
+
+A track is never replaced by another object. A command for one that has ended is refused, and a behaviour that
+has lost its track ends; both name the track that is there now.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Collection
+from dataclasses import dataclass
+
+from companion.guidance.targets.target import Target
+from companion.vehicle.gimbal import GimbalAim
+from companion.vehicle.state import VehicleState
+from vision.attitude import wrap_angle
+
+# An ended track is remembered for this long, and at most so many are.
+MEMORY_S, MEMORY_TRACKS = 120.0, 256
+# A track took the place of a lost one if it is within this of it, and for each second since.
+NEAR_M, NEAR_MPS = 2.0, 1.0
+# A gimbal's track unseen for so long is lost; the default of `follow occlusion=`.
+LOST_AFTER_S = 3.0
+# Nearer than this the object is above or below, and its elevation is too sensitive.
+NEAREST_M = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """The objects that a command is about: those of a class, or one track."""
+
+    class_name: str = ""
+    track_id: int | None = None
+
+    def __post_init__(self) -> None:
+        if bool(self.class_name) is (self.track_id is not None):
+            raise ValueError(f"expected a class or a track, got {self.class_name!r} and {self.track_id}")
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """The classes that the detector must know."""
+        return (self.class_name,) if self.class_name else ()
+
+    @property
+    def name(self) -> str:
+        """`car`, or `track 17`."""
+        return self.class_name or f"track {self.track_id}"
+
+    @property
+    def phrase(self) -> str:
+        """`the car`, or `track 17`."""
+        return f"the {self.class_name}" if self.class_name else self.name
+
+    def of(self, targets: Collection[Target], confidence: float = 0.0) -> list[Target]:
+        """These objects' targets with at least a confidence."""
+        return [
+            target
+            for target in targets
+            if (target.track_id == self.track_id if self.track_id else target.class_name == self.class_name)
+            and target.score >= confidence
+        ]
+
+
+@dataclass(frozen=True, slots=True)
+class RecentTracks:
+    """The newest target of each track of the last `MEMORY_S`, newest first.
+
+    Attributes:
+        max_age_s: a track unseen for so long has ended (`tracker.max_age_s`).
+    """
+
+    targets: tuple[Target, ...] = ()
+    max_age_s: float = 2.0
+
+    def newest(self, track_id: int) -> Target | None:
+        """The newest target of a track."""
+        return next((target for target in self.targets if target.track_id == track_id), None)
+
+    def present(self, now_ns: int) -> list[Target]:
+        """Those that have not ended."""
+        return [t for t in self.targets if now_ns - t.captured_ns <= self.max_age_s * 1e9]
+
+    def updated(self, seen: Collection[Target]) -> RecentTracks:
+        """With the targets of a frame; of one that is already included, unchanged."""
+        tracked = {target.track_id: target for target in seen if target.track_id is not None}
+        if not tracked or next(iter(tracked.values())).captured_ns <= self._newest_ns:
+            return self
+        newest_ns = max(target.captured_ns for target in tracked.values())
+        others = [
+            t
+            for t in self.targets
+            if t.track_id not in tracked and newest_ns - t.captured_ns <= MEMORY_S * 1e9
+        ]
+        return RecentTracks((*tracked.values(), *others)[:MEMORY_TRACKS], self.max_age_s)
+
+    @property
+    def _newest_ns(self) -> int:
+        return self.targets[0].captured_ns if self.targets else -1
+
+    def missing(self, track_id: int, now_ns: int) -> str | None:
+        """Why a track cannot be chosen, and what can be instead; None: it is there."""
+        last, present = self.newest(track_id), self.present(now_ns)
+        if last in present:
+            return None
+        gone = f"no track {track_id}"
+        if last is not None:
+            ago_s = (now_ns - last.captured_ns) / 1e9 - self.max_age_s
+            gone = f"track {track_id} ended {ago_s:.0f} s ago"
+            nearest = _nearest(last, [t for t in present if t.trusted and t.class_name == last.class_name])
+            if nearest is not None:
+                there = f"{_apart_text(last, nearest)} from where {track_id} was last seen"
+                return (
+                    f"{gone}; the nearest {nearest.class_name} now is track {nearest.track_id}, {there}: "
+                    f"give track={nearest.track_id}"
+                )
+        counts = Counter(target.class_name for target in present if target.trusted)
+        if not counts:
+            return f"{gone}; no confirmed track is present (tracks need tracker.enabled)"
+        shown = ", ".join(f"{count} {name}" for name, count in sorted(counts.items()))
+        return f"{gone}; present: {shown}; give the track_id of one, from the topic detections"
+
+    def replacement(self, lost: Target, now_ns: int, place: tuple[float, float] | None = None) -> str:
+        """Which track took the place of a lost one, to be added to a reason; empty: none near.
+
+        Args:
+            place: where the object is expected now, north and east; None: where it was last seen.
+        """
+        if lost.track_id is None:
+            return ""
+        where = place or (None if lost.position_ned_m is None else lost.position_ned_m[:2])
+        since = [
+            t
+            for t in self.present(now_ns)
+            if t.trusted and t.class_name == lost.class_name and t.track_id != lost.track_id
+        ]
+        if where is None or not since:
+            return ""
+        near_m = NEAR_M + NEAR_MPS * (now_ns - lost.captured_ns) / 1e9
+        apart_m, nearest = min(((_distance_m(t, where), t) for t in since), key=lambda pair: pair[0])
+        if apart_m > near_m:
+            return ""
+        there = f"{apart_m:.1f} m from where it was {'expected' if place is not None else 'last seen'}"
+        return f"; track {nearest.track_id}, a {nearest.class_name}, is {there}"
+
+
+NO_TRACKS = RecentTracks()
+
+
+@dataclass(frozen=True, slots=True)
+class TrackAim:
+    """Where to point the gimbal: at a track's object."""
+
+    track_id: int
+
+    def direction(
+        self, tracks: RecentTracks, state: VehicleState, camera_pitch_rad: float
+    ) -> GimbalAim | None:
+        """The aim by the newest target, from where the vehicle is now; None: no such track, or no heading.
+
+        Args:
+            camera_pitch_rad: pitch of the camera above the gimbal's axis.
+        """
+        target, yaw_rad = tracks.newest(self.track_id), state.yaw_rad
+        if target is None or yaw_rad is None:
+            return None
+        bearing_rad, elevation_rad = target.bearing_rad, target.elevation_rad
+        if target.position_ned_m is not None and state.position_ned_m is not None:
+            north = target.position_ned_m[0] - state.position_ned_m[0]
+            east = target.position_ned_m[1] - state.position_ned_m[1]
+            rise_m = target.ground_range_m * math.tan(elevation_rad)
+            bearing_rad = math.atan2(east, north)
+            elevation_rad = math.atan2(rise_m, max(math.hypot(north, east), NEAREST_M))
+        pitch_rad = elevation_rad - camera_pitch_rad
+        if state.gimbal is not None:
+            pitch_rad = state.gimbal.nearest_pitch_rad(pitch_rad)
+        return GimbalAim(pitch_rad, wrap_angle(bearing_rad - yaw_rad))
+
+
+def _distance_m(target: Target, place: tuple[float, float]) -> float:
+    return math.inf if target.position_ned_m is None else math.dist(target.position_ned_m[:2], place)
+
+
+def _nearest(last: Target, candidates: list[Target]) -> Target | None:
+    """The one nearest to where another was last seen: by distance, else by direction."""
+
+    def rank(target: Target) -> tuple[float, float]:
+        known = None if last.position_ned_m is None else last.position_ned_m[:2]
+        return (math.inf if known is None else _distance_m(target, known), _off_rad(last, target))
+
+    return min(candidates, key=rank, default=None)
+
+
+def _off_rad(first: Target, second: Target) -> float:
+    return math.hypot(
+        wrap_angle(first.bearing_rad - second.bearing_rad), first.elevation_rad - second.elevation_rad
+    )
+
+
+def _apart_text(first: Target, second: Target) -> str:
+    if first.position_ned_m is not None and second.position_ned_m is not None:
+        return f"{math.dist(first.position_ned_m[:2], second.position_ned_m[:2]):.1f} m"
+    return f"{math.degrees(_off_rad(first, second)):.0f}°"

@@ -1,0 +1,310 @@
+"""Commands about exactly one track: refusals, flights, losses, and the gimbal."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from companion.guidance import Approach, Follow, Gimbal, Orbit
+from companion.guidance.behaviours.approach import ApproachBehaviour
+from companion.guidance.behaviours.follow import FollowBehaviour
+from companion.guidance.behaviours.gimbal_pointing import PointGimbalBehaviour
+from companion.guidance.behaviours.orbit import OrbitBehaviour
+from companion.guidance.command import NO_CONTEXT, Command, GrammarError
+from companion.guidance.core import GuidanceOptions
+from companion.guidance.grammar import json_schema, markdown, parse, usage
+from companion.guidance.interface import EventKind, GuidanceInput
+from companion.guidance.targets.chosen import RecentTracks, TrackAim, Wanted
+from companion.guidance.targets.ranging import RangeMeans
+from tests.companion.guidance.gimbal_flight import gimbal_flight, person
+from tests.companion.guidance.guidance_harness import Flight, GuidanceHarness, engaged, flying
+from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject, look
+
+NAMES = ("car", "person")
+
+
+def car(north: float, east: float, track_id: int, **more: Any) -> SeenObject:
+    return SeenObject("car", north, east, track_id=track_id, track_score=0.8, **more)
+
+
+def watching(vehicle: KinematicVehicle, objects: Sequence[SeenObject], **more: Any) -> GuidanceHarness:
+    """Guidance that sees the objects in every step."""
+
+    def seen(inputs: GuidanceInput) -> GuidanceInput:
+        now_ns = vehicle.now_ns
+        return replace(inputs, targets=look(vehicle, objects, now_ns), seen_ns=now_ns, **more)
+
+    return GuidanceHarness(vehicle, class_names=NAMES, options=GuidanceOptions(), inputs=seen)
+
+
+# --- the grammar
+
+
+@pytest.mark.parametrize(
+    ("text", "command"),
+    [
+        ("follow track=17", Follow(track_id=17)),
+        ("follow track=17 distance=6", Follow(track_id=17, distance_m=6.0)),
+        ("approach track=17", Approach(track_id=17)),
+        ("orbit track=17 radius=8", Orbit(track_id=17, radius_m=8.0)),
+        ("gimbal track=17", Gimbal(track_id=17)),
+    ],
+)
+def test_commands_take_a_track(text: str, command: Command) -> None:
+    assert parse(text, NAMES) == command
+    assert parse(str(command), NAMES) == command
+    assert command.build(NO_CONTEXT).track_id == 17
+
+
+def test_text_of_a_class_command_is_as_it_is_written() -> None:
+    assert str(parse("follow car distance=6")) == "follow car distance=6"
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("follow", ["class or track", "missing", "follow CLASS|track=…"]),
+        ("follow car track=17", ["class or track", "both"]),
+        ("approach car track=17", ["class or track", "both"]),
+        ("orbit car track=17", ["class or track", "both"]),
+        ("gimbal pitch=-30 track=17", ["track", "pitch", "both"]),
+        ("follow track=0", ["track", "track_id", "0"]),
+        ("follow track=1.5", ["track", "track_id", "1.5"]),
+        ("follow track=car", ["track", "track_id", "car"]),
+        ("follow track=99999999999999999999", ["track", "track_id"]),
+    ],
+)
+def test_errors_name_what_to_give(text: str, parts: list[str]) -> None:
+    with pytest.raises(GrammarError) as caught:
+        parse(text, NAMES)
+    assert [part for part in parts if part not in str(caught.value)] == []
+
+
+def test_help_and_schema_show_the_choice() -> None:
+    assert usage(Follow).startswith("follow CLASS|track=… [distance=8]")
+    schema = json_schema()["$defs"]["follow"]
+    assert schema["required"] == []
+    assert schema["oneOf"] == [{"required": ["class"]}, {"required": ["track"]}]
+    assert schema["properties"]["track"]["type"] == "integer"
+    assert (
+        "| `track` | follow this track, instead of a class | a track_id | class or track required |"
+        in markdown()
+    )
+
+
+# --- refusals
+
+
+def refused(harness: GuidanceHarness, behaviour: FollowBehaviour | OrbitBehaviour) -> str:
+    outcome = harness.command(behaviour).result()
+    assert not outcome.success
+    assert not harness.guidance.busy
+    return outcome.reason
+
+
+def test_unknown_track_is_refused_with_what_is_there() -> None:
+    objects = [car(12, 0, 3), car(15, 2, 4), SeenObject("person", 10, -2, track_id=5, track_score=0.8)]
+    harness = watching(flying(), objects)
+    harness.run(0.5)
+    reason = refused(harness, FollowBehaviour(track_id=17))
+    assert "no track 17" in reason
+    assert "2 car, 1 person" in reason
+    assert harness.events[-1].kind is EventKind.REFUSED
+
+
+def test_ended_track_is_refused_with_the_nearest_of_its_class() -> None:
+    first, second = car(12, 0, 17), car(20, 6, 20)
+    walker = SeenObject("person", 12.1, 0.1, track_id=21, track_score=0.8)
+    harness = watching(flying(), objects := [first, second])
+    harness.run(0.5)
+    objects[0] = car(13.2, 0, 23)
+    objects.append(walker)
+    harness.run(6.0)
+    reason = refused(harness, OrbitBehaviour(track_id=17))
+    assert "track 17 ended 4 s ago" in reason
+    assert "the nearest car now is track 23, 1.2 m from where 17 was last seen" in reason
+    assert "give track=23" in reason
+
+
+def test_ended_track_without_another_of_its_class_is_refused_with_what_is_there() -> None:
+    harness = watching(flying(), objects := [car(12, 0, 17)])
+    harness.run(0.5)
+    objects[0] = SeenObject("person", 10, 0, track_id=18, track_score=0.8)
+    harness.run(5.0)
+    reason = refused(harness, FollowBehaviour(track_id=17))
+    assert "track 17 ended 3 s ago" in reason
+    assert "present: 1 person" in reason
+
+
+def test_track_that_is_missed_for_a_moment_is_accepted() -> None:
+    seen = car(12, 0, 17)
+    harness = watching(flying(), [seen])
+    harness.run(0.5)
+    seen.visible = False
+    harness.run(1.5)
+    engaged(harness, FollowBehaviour(track_id=17))
+    assert harness.guidance.busy
+
+
+def test_range_of_the_class_of_a_track_is_required() -> None:
+    means = RangeMeans(depth=False, ground=False, classes=frozenset({"person"}))
+    harness = watching(flying(), [car(12, 0, 17)], ranging=means)
+    harness.run(0.5)
+    assert "a range to a car" in refused(harness, FollowBehaviour(track_id=17))
+
+
+# --- flights
+
+
+def test_follow_keeps_to_the_farther_car() -> None:
+    near, far = car(12, 0, 1), car(20, 3, 2)
+    vehicle = KinematicVehicle()
+
+    def each(seconds: float, _vehicle: KinematicVehicle) -> None:
+        near.north, far.north = 12 + 1.0 * seconds, 20 + 1.0 * seconds
+
+    assert Flight(FollowBehaviour(track_id=2), vehicle, [near, far]).run(20.0, each) is None
+    assert math.dist(vehicle.position[:2], (far.north, far.east)) == pytest.approx(8.0, abs=0.8)
+
+
+def test_approach_flies_to_the_farther_car() -> None:
+    near, far = car(15, 0, 1), car(25, 8, 2)
+    vehicle = KinematicVehicle()
+    outcome = Flight(ApproachBehaviour(track_id=2), vehicle, [near, far]).run(60.0)
+    assert outcome is not None
+    assert outcome.success, outcome.reason
+    assert outcome.reason.startswith("reached track 2 at")
+    assert math.dist(vehicle.position[:2], (far.north, far.east)) == pytest.approx(5.0, abs=0.4)
+
+
+def test_orbit_is_about_the_track() -> None:
+    flight = Flight(OrbitBehaviour(8.0, 3.0, laps=1.0, track_id=2), objects=[car(12, 0, 1), car(16, 5, 2)])
+    flight.latency_s = 0.0  # it begins after the first frame, as its requirement demands
+    outcome = flight.run(60.0)
+    assert outcome is not None
+    assert outcome.success, outcome.reason
+    ends = flight.track[-1]
+    assert math.dist(ends[:2], (16, 5)) == pytest.approx(8.0, abs=0.6)
+
+
+@pytest.mark.parametrize(
+    "behaviour", [FollowBehaviour(track_id=1), ApproachBehaviour(track_id=1, distance_m=2.0)]
+)
+def test_track_with_another_id_in_its_place_is_lost_and_named(
+    behaviour: FollowBehaviour | ApproachBehaviour,
+) -> None:
+    """By class the new id would be taken for the same object."""
+    seen = car(25, 0, 1)
+
+    def each(seconds: float, _vehicle: KinematicVehicle) -> None:
+        seen.track_id = 1 if seconds < 5.0 else 9
+
+    outcome = Flight(behaviour, objects=[seen]).run(30.0, each)
+    assert outcome is not None
+    assert not outcome.success
+    assert outcome.reason.startswith("lost track 1 for")
+    assert "track 9, a car, is 0." in outcome.reason
+
+
+def test_track_that_comes_back_with_its_id_is_followed_on() -> None:
+    seen = car(12, 0, 1)
+    vehicle = KinematicVehicle()
+
+    def each(seconds: float, _vehicle: KinematicVehicle) -> None:
+        seen.north, seen.visible = 12 + 2.0 * seconds, not 8.0 <= seconds < 9.5
+
+    assert Flight(FollowBehaviour(track_id=1), vehicle, [seen]).run(25.0, each) is None
+    assert math.dist(vehicle.position[:2], (seen.north, 0)) == pytest.approx(8.0, abs=0.8)
+
+
+def test_lost_track_far_from_all_others_names_none() -> None:
+    seen, other = car(12, 0, 1), car(30, 20, 2)
+
+    def each(seconds: float, _vehicle: KinematicVehicle) -> None:
+        seen.visible = seconds < 5.0
+
+    outcome = Flight(FollowBehaviour(track_id=1), objects=[seen, other]).run(30.0, each)
+    assert outcome is not None
+    assert "track 2" not in outcome.reason
+
+
+def test_unconfirmed_track_is_not_flown_to() -> None:
+    ghost = car(15, 0, 1, trusted=False)
+    outcome = Flight(ApproachBehaviour(track_id=1), objects=[ghost]).run(20.0)
+    assert outcome is not None
+    assert not outcome.success
+    assert "not confirmed" in outcome.reason
+
+
+def test_wanted_is_a_class_or_a_track() -> None:
+    for wrong in ({}, {"class_name": "car", "track_id": 1}):
+        with pytest.raises(ValueError, match="a class or a track"):
+            Wanted(**wrong)  # type: ignore[arg-type]
+
+
+def test_memory_of_tracks_is_bounded() -> None:
+    vehicle, tracks = KinematicVehicle(), RecentTracks()
+    for number in range(1, 400):
+        vehicle.now_ns += 10_000_000
+        tracks = tracks.updated(look(vehicle, [car(12, 0, number)], vehicle.now_ns))
+    assert len(tracks.targets) == 256
+    assert tracks.targets[0].track_id == 399
+
+
+# --- the gimbal
+
+
+def test_gimbal_is_kept_on_a_track_until_it_is_lost() -> None:
+    walker = person(20.0, 12.0)
+    flight = gimbal_flight(walker)
+    flight.run(2.0)
+    aim = flight.command("gimbal track=1")
+    assert flight.run_until(lambda: flight.outcome(aim), 10.0)
+    outcome = flight.outcome(aim)
+    assert outcome is not None
+    assert outcome.success, outcome.reason
+
+    def off_deg() -> float:
+        target = flight.inputs.steering.targets[0]
+        gimbal, yaw_rad = flight.state.gimbal, flight.state.yaw_rad
+        assert gimbal is not None
+        assert yaw_rad is not None
+        wanted = TrackAim(1).direction(RecentTracks((target,)), flight.state, 0.0)
+        assert wanted is not None
+        off_rad = gimbal.off_rad(wanted, yaw_rad)
+        assert off_rad is not None
+        return math.degrees(off_rad)
+
+    assert off_deg() < 5.0
+    moving = flight.command("goto forward=6 right=0")
+    assert flight.run_until(lambda: flight.outcome(moving), 30.0)
+    assert off_deg() < 5.0, "kept while the vehicle flew"
+    flight.cameras = ()
+    assert flight.run_until(lambda: flight.events[-1].message.startswith("gimbal: lost track 1"), 10.0)
+
+
+def test_gimbal_is_refused_for_a_track_that_is_not_there() -> None:
+    flight = gimbal_flight(person(20.0, 12.0))
+    flight.run(1.0)
+    aim = flight.command("gimbal track=99")
+    flight.run(0.5)
+    outcome = flight.outcome(aim)
+    assert outcome is not None
+    assert not outcome.success
+    assert "no track 99; present: 1 person" in outcome.reason
+
+
+def test_mission_step_points_the_gimbal_at_a_track() -> None:
+    flight = gimbal_flight(person(0.0, 25.0))
+    flight.run(2.0)
+    log = flight.fly(PointGimbalBehaviour(TrackAim(1)), 15.0, warm_up_s=0.0)
+    assert log.outcome is not None
+    assert log.outcome.success, log.outcome.reason
+    gimbal = flight.state.gimbal
+    assert gimbal is not None
+    assert gimbal.pitch_rad is not None
+    assert math.degrees(gimbal.pitch_rad) == pytest.approx(-20.0, abs=4.0)
