@@ -151,7 +151,7 @@ def tracked(
     tracker = Tracker(settings)
     labelled = []
     for seen in sequence:
-        view = _view(attitudes, seen.frame.captured_ns)
+        view = view_of(attitudes, seen.frame.captured_ns)
         started_s = time.perf_counter()
         detections = tracker.update(seen.detections, seen.frame.captured_ns, view).detections
         if timing_ms is not None:
@@ -172,7 +172,7 @@ def believed(
     labelled = []
     for seen in sequence:
         stamp_ns = seen.frame.captured_ns
-        tracker.update(seen.detections, stamp_ns, _view(attitudes, stamp_ns))
+        tracker.update(seen.detections, stamp_ns, view_of(attitudes, stamp_ns))
         tracks = [
             track
             for track in tracker.tracks
@@ -202,7 +202,8 @@ def _in_picture(xyxy: XYXY) -> bool:
     return 0 <= (left + right) / 2 < CAMERA.width and 0 <= (top + bottom) / 2 < CAMERA.height
 
 
-def _view(attitudes: AttitudeHistory | None, stamp_ns: int) -> CameraView | None:
+def view_of(attitudes: AttitudeHistory | None, stamp_ns: int) -> CameraView | None:
+    """The camera's orientation by the reported attitude; None: unknown."""
     ned_from_body = None if attitudes is None else attitudes.at(stamp_ns)
     return None if ned_from_body is None else CameraView(CAMERA, MOUNT.ned_from_optical(ned_from_body))
 

@@ -17,7 +17,7 @@ from vision.frame_selection import TOO_OLD, FrameSelector, Selection
 from vision.markers import Marker
 from vision.obstacle_sectors import ObstacleSectors
 from vision.sources import Source
-from vision.tracking import CameraView, Tracker, TrackEvent
+from vision.tracking import CameraView, ObjectSelection, Tracker, TrackEvent
 
 logger = logging.getLogger(__name__)
 
@@ -92,6 +92,7 @@ class Pipeline:
 
     Attributes:
         frames: frames read so far.
+        object_selection: follows an object that an operator selects; None without a tracker.
     """
 
     def __init__(
@@ -128,6 +129,9 @@ class Pipeline:
         self._selector = FrameSelector(selection)
         self._recorder = recorder
         self._tracker = tracker if detector is not None else None
+        self.object_selection: ObjectSelection | None = None
+        if self._tracker is not None:
+            self.object_selection = ObjectSelection(self._tracker.settings, self._tracker.take_id)
         self._view_at = view_at
         self._find_markers = find_markers
         self._obstacles_in = obstacles_in
@@ -206,7 +210,10 @@ class Pipeline:
         detected_ns = time.perf_counter_ns()
         events: tuple[TrackEvent, ...] = ()
         if self._tracker is not None:
-            tracked = self._tracker.update(detections, frame.captured_ns, self._view_at(frame))
+            view = self._view_at(frame)
+            tracked = self._tracker.update(detections, frame.captured_ns, view)
+            if self.object_selection is not None:
+                tracked = self.object_selection.update(frame, tracked, view)
             detections, events = tracked.detections, tracked.events
         tracked_ns = time.perf_counter_ns()
         timing_ms["track"] = (tracked_ns - detected_ns) / 1e6

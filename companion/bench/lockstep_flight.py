@@ -18,6 +18,8 @@ from typing import Any, Protocol
 
 from companion.bench.simulated_driver import GIMBAL_RATES_HZ, RATES_HZ, LockstepDriver, SimulatedDriver
 from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome, Requirement
+from companion.guidance.behaviours.select import Select
+from companion.guidance.command import GrammarError
 from companion.guidance.core import Guidance, GuidanceOptions, Phase
 from companion.guidance.interface import CommandInput, GuidanceEvent, StreamStatus
 from companion.guidance.limits.envelope import Limits
@@ -195,6 +197,8 @@ class LockstepFlight:
         identifier = next(self._identifiers)
         if isinstance(command, str):
             read = self.inputs.read_command(identifier, command, self.state, self.guidance.check_requirements)
+            if isinstance(read, Select):
+                raise GrammarError("select: here by `RenderedCamera.select`")
         else:
             read = CommandInput(identifier, command.name, command)
         self._new.append(read)

@@ -22,6 +22,7 @@ from mavlink_sim.lockstep import LockstepVehicle
 from mavlink_sim.world.world import Ground, Light, Sky, World, WorldObject
 from vision.camera_model import CameraModel, CameraMount
 from vision.pipeline import PerceptionResult
+from vision.tracking import SelectRequest
 
 # Where what is hidden is taken to.
 AWAY_M = 2000.0
@@ -62,6 +63,10 @@ class RenderedCamera:
         if gimbal is not None and gimbal.attitude is not None and self.perceived.settings.camera.on_gimbal:
             with contextlib.suppress(HistoryError):
                 self._perception.add_gimbal(gimbal.attitude_ns, history.gimbal_at(gimbal.attitude_ns))
+
+    def select(self, request: SelectRequest) -> None:
+        """Select an object with the next frame."""
+        self._perception.select(request)
 
     def capture(self, flight: LockstepFlight) -> Callable[[], PerceptionResult | None]:
         time_s = flight.seconds if self._by_flight else None

@@ -28,6 +28,7 @@ from vision.object_detector import ObjectDetector
 from vision.pipeline import PerceptionResult
 from vision.rotation import matrix_from_quaternion
 from vision.sources import EndOfStream, Source, SourceStatistics
+from vision.tracking import SelectRequest
 
 
 class RenderedPerception:
@@ -97,6 +98,12 @@ class RenderedPerception:
     def add_gimbal(self, stamp_ns: int, wxyz: Quaternion) -> None:
         """Receive the gimbal's attitude (its frame to NED, as `StateHistory.gimbal_at` gives it)."""
         self._telemetry.gimbal.add(stamp_ns, wxyz)
+
+    def select(self, request: SelectRequest) -> None:
+        """Select an object with the next frame."""
+        if self._pipeline.object_selection is None:
+            raise ValueError("select needs tracks: set detector.enabled and tracker.enabled")
+        self._pipeline.object_selection.request(request)
 
     def capture(
         self, now_ns: int, others: tuple[Aircraft, ...] = (), time_s: float | None = None

@@ -21,6 +21,7 @@ from companion.guidance.missions.mission_file import Mission
 from companion.guidance.behaviours.formation import Formation
 from companion.guidance.behaviours.land_on_marker import LandOnMarker
 from companion.guidance.behaviours.gimbal_pointing import Gimbal
+from companion.guidance.behaviours.select import Select
 
 __all__ = [
     "Approach",
@@ -38,6 +39,7 @@ __all__ = [
     "Patrol",
     "Rtl",
     "Seek",
+    "Select",
     "Stop",
     "Takeoff",
 ]

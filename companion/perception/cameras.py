@@ -36,6 +36,7 @@ from companion.vehicle.state import VehicleState
 from vision.camera_model import CameraCalibration
 from vision.markers import Marker
 from vision.pipeline import PerceptionResult
+from vision.tracking import Selected, SelectRequest
 
 logger = logging.getLogger(__name__)
 
@@ -114,6 +115,10 @@ class PerceptionCamera:
             # Without an attitude at the capture a box has no direction: it is published, but not a target.
             self.targets, self.localization_error = (), str(error)
 
+    async def select(self, request: SelectRequest) -> Selected:
+        """Select an object in this camera's images."""
+        return Selected(False, "this camera has no perception process")
+
     def update(self, result: PerceptionResult) -> None:
         """Set the newest result; `localize` sets its targets."""
         if self.newest is not None:
@@ -172,6 +177,9 @@ class WorkerCamera(PerceptionCamera):
             if self.name is None:
                 raise
             raise PerceptionStartError(f"camera {self.name}: {error}") from error
+
+    async def select(self, request: SelectRequest) -> Selected:
+        return await self.supervisor.select(request)
 
     def send_state(self, state: VehicleState, history: StateHistory) -> None:
         """Send the attitudes of vehicle and gimbal to the worker, for its tracker."""

@@ -22,7 +22,7 @@ from companion.settings import Settings
 from vision.attitude import Quaternion
 from vision.camera_model import CameraCalibration
 from vision.pipeline import PerceptionResult
-from vision.tracking import TrackEventKind
+from vision.tracking import Selected, SelectRequest, TrackEventKind
 
 _LENGTH = struct.Struct(">I")
 # Far above any message: a result is a few kilobytes. A longer one is a protocol error.
@@ -159,10 +159,12 @@ Message = (
     | Attitude
     | GimbalAttitude
     | Watched
+    | SelectRequest
     | Stop
     | Ready
     | StartFailed
     | Report
+    | Selected
     | Preview
     | Heartbeat
     | LogLine

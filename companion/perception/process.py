@@ -27,6 +27,7 @@ from companion.perception.messages import (
     read_message,
 )
 from companion.settings import Settings
+from vision.tracking import SelectRequest
 
 logger = logging.getLogger(__name__)
 
@@ -135,6 +136,10 @@ class PerceptionProcess:
     def watch(self, watched: bool) -> None:
         """Send whether previews are wanted."""
         self._put(Watched(watched))
+
+    def select(self, request: SelectRequest) -> None:
+        """Send what to select; a `Selected` answers it."""
+        self._put(request)
 
     def ask_to_stop(self) -> None:
         self._put(Stop())

@@ -153,7 +153,9 @@ class LiveTracks:
             self.next_id = max(self.next_id, int(track_id.max()) + 1)
         return replace(result, track_events=ends + result.track_events) if ends else result
 
-    def worker_ended(self) -> None:
-        """End all tracks; their END events are added to the next worker's first result."""
-        self._orphans += tuple(self._live.values())
+    def worker_ended(self) -> tuple[Track, ...]:
+        """End all tracks, and return them; their END events are added to the next worker's first result."""
+        ended = tuple(self._live.values())
+        self._orphans += ended
         self._live.clear()
+        return ended

@@ -37,6 +37,7 @@ from companion.settings import Settings
 from vision.attitude import Quaternion
 from vision.camera_model import CameraCalibration
 from vision.pipeline import PerceptionResult
+from vision.tracking import TARGET_CLASS, Selected, SelectRequest, TrackEventKind
 
 logger = logging.getLogger(__name__)
 
@@ -45,6 +46,8 @@ __all__ = ["PerceptionStartError", "PerceptionState", "PerceptionStatus", "Perce
 MAX_RESTARTS = 5
 RESTART_WINDOW_S = 60.0
 STOP_S, TERMINATE_S = 5.0, 1.0
+# A selection is answered with the next processed frame.
+SELECT_TIMEOUT_S = 3.0
 _BACK_OFF_S = (0.2, 1.0, 2.0, 4.0, 8.0)
 _TICK_S = 0.25
 _RATE_WINDOW_S = 2.0
@@ -122,6 +125,7 @@ class PerceptionSupervisor:
         self._times = StageTimes()
         self._first_sequence = 0
         self._tracks = LiveTracks()
+        self._selecting: deque[asyncio.Future[Selected]] = deque()
         self._vehicle_limiter, self._gimbal_limiter = RateLimiter(), RateLimiter()
 
     async def start(self) -> None:
@@ -189,6 +193,19 @@ class PerceptionSupervisor:
             self._watched = watched
             if self._process is not None:
                 self._process.watch(watched)
+
+    async def select(self, request: SelectRequest) -> Selected:
+        """Select an object in the worker's images, or end the selection. Never raises."""
+        if self._process is None or self._state is not PerceptionState.RUNNING:
+            return Selected(False, f"perception is not running ({self._state.value})")
+        answer: asyncio.Future[Selected] = asyncio.get_running_loop().create_future()
+        self._selecting.append(answer)
+        self._process.select(request)
+        await asyncio.wait({answer}, timeout=SELECT_TIMEOUT_S)
+        if answer.done():
+            return answer.result()
+        answer.cancel()
+        return Selected(False, f"no image was processed within {SELECT_TIMEOUT_S:g} s")
 
     def send_attitude(self, stamp_ns: int, attitude: Quaternion, height_m: float | None = None) -> None:
         """Send the vehicle's attitude, for tracker and obstacles; at most 50 a second. Never waits.
@@ -345,7 +362,7 @@ class PerceptionSupervisor:
             self._process = self._watchdog = None
             self._before.add(self._now)
             self._now = _Counts()
-            self._tracks.worker_ended()
+            self._selection_ended()
             self._first_sequence = 0 if self._newest is None else self._newest.sequence + 1
 
     async def _spawn(self) -> PerceptionProcess:
@@ -444,6 +461,9 @@ class PerceptionSupervisor:
         )
         self._count(report.frames, result.dropped, result.frames_skipped, report.replaced)
         result = replace(result, dropped=self._before.dropped + self._now.dropped)
+        for event in result.track_events:
+            if event.kind is TrackEventKind.END and event.track.class_name == TARGET_CLASS:
+                self._on_event("info", f"track {event.track.track_id}, the selected object, has ended")
         self._newest = result
         self._results += 1
         self._arrivals_s.append(time.monotonic())
@@ -455,8 +475,25 @@ class PerceptionSupervisor:
         """Set the counts of the current worker."""
         self._now = _Counts(frames, dropped + superseded, {**frames_skipped, "superseded": superseded})
 
+    def _selection_ended(self) -> None:
+        """The worker has ended: its selected object is lost, and its pending selections have failed."""
+        for track in self._tracks.worker_ended():
+            if track.class_name == TARGET_CLASS:
+                text = f"track {track.track_id}, the selected object, is lost with the perception process"
+                self._on_event("warning", f"{text}: select it again")
+        while self._selecting:
+            self._answer_selection(Selected(False, "the perception process has ended; select again"))
+
+    def _answer_selection(self, answer: Selected) -> None:
+        """Answer the oldest request; one that has timed out is only removed."""
+        waiting = self._selecting.popleft() if self._selecting else None
+        if waiting is not None and not waiting.done():
+            waiting.set_result(answer)
+
     def _on_other(self, message: Message) -> None:
-        if isinstance(message, Heartbeat):
+        if isinstance(message, Selected):
+            self._answer_selection(message)
+        elif isinstance(message, Heartbeat):
             superseded = self._now.frames_skipped.get("superseded", 0)
             self._count(message.frames, message.dropped, message.frames_skipped, superseded)
         elif isinstance(message, LogLine):

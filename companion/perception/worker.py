@@ -17,6 +17,7 @@ import sys
 import threading
 import time
 import traceback
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -52,6 +53,7 @@ from vision.pipeline import PerceptionResult, Pipeline
 from vision.recording import Recording
 from vision.sources import EndOfStream, Source, SourceError, open_source
 from vision.sources.sharing import FrameSharing
+from vision.tracking import Selected, SelectRequest
 from vision.video_writer import VideoWriterError
 
 logger = logging.getLogger("companion.perception.worker")  # `__main__` in the process itself
@@ -77,12 +79,14 @@ class ControlChannel:
         hud: overlay of the recorded video's next frames.
         telemetry: of the vehicle.
         watched: whether previews are wanted.
+        selections: what to select, oldest first; the reader removes them.
     """
 
     def __init__(self, connection: socket.socket) -> None:
         self.stopping = False
         self.hud = Hud((), None)
         self.watched = False
+        self.selections: deque[SelectRequest] = deque()
         self.telemetry = CameraTelemetry()
         self._connection = connection
         self._finished = threading.Event()
@@ -107,6 +111,8 @@ class ControlChannel:
                 self.telemetry.gimbal.add(message.stamp_ns, message.wxyz)
             elif isinstance(message, Watched):
                 self.watched = message.watched
+            elif isinstance(message, SelectRequest):
+                self.selections.append(message)
             elif isinstance(message, Stop):
                 self.stop()
         # The service is gone. A thread still blocked in a driver after the grace time never returns.
@@ -327,10 +333,13 @@ def _ready(perception: Perception) -> Ready:
 
 def _run(pipeline: Pipeline, perception: Perception, control: ControlChannel, sender: ResultSender) -> None:
     sent_s = time.monotonic()
+    selection = pipeline.object_selection
 
     def deliver(result: PerceptionResult) -> None:
         nonlocal sent_s
         sender.put_newest(Report(result, pipeline.frames, replaced=0))
+        for answer in () if selection is None else selection.take_answers():
+            sender.put(answer)
         sent_s = time.monotonic()
 
     while not control.stopping:
@@ -338,6 +347,13 @@ def _run(pipeline: Pipeline, perception: Perception, control: ControlChannel, se
             perception.recording.lines = control.hud.lines
             perception.recording.highlight = control.hud.highlight
         perception.preview.watched = control.watched
+        while control.selections:
+            request = control.selections.popleft()
+            if selection is None:
+                why = "select needs tracks: set detector.enabled and tracker.enabled of this camera"
+                sender.put(Selected(False, why))
+            else:
+                selection.request(request)
         pipeline.step(HEARTBEAT_S, deliver)
         if time.monotonic() - sent_s >= HEARTBEAT_S:
             sender.put_newest(Heartbeat(pipeline.frames, pipeline.dropped, pipeline.frames_skipped))

@@ -63,6 +63,7 @@ class GuidanceLoop:
             lambda identifier, text: inputs.read_command(
                 identifier, text, driver.state, guidance.check_requirements
             ),
+            inputs.select,
             self._wake.set,
             on_event,
             check_requirements=lambda command: others.check_requirements(

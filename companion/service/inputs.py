@@ -8,9 +8,11 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 from companion.guidance.behaviour import Behaviour
+from companion.guidance.behaviours.select import FIRST_CAMERA, Select
 from companion.guidance.command import BuildContext, Command, GrammarError
 from companion.guidance.grammar import parse
 from companion.guidance.interface import Answer, CommandInput, GuidanceInput, StreamStatus
@@ -25,6 +27,7 @@ from companion.vehicle.report import Report
 from companion.vehicle.state import FlightMode, VehicleState
 from vision.obstacle_sectors import ObstacleSectors
 from vision.pipeline import PerceptionResult
+from vision.tracking import Selected
 
 logger = logging.getLogger(__name__)
 
@@ -55,6 +58,7 @@ class InputAssembler:
     ) -> None:
         load_plugins(settings.plugins.modules)
         self._settings = settings
+        self._cameras = {camera.name: camera for camera in cameras}
         self.steering = next(camera for camera in cameras if camera.name == settings.guidance.camera)
         self.history = StateHistory()
         self.poses = PoseSharing(settings.vehicle.name, on_event)
@@ -142,8 +146,8 @@ class InputAssembler:
         text: str,
         state: VehicleState,
         check_requirements: Callable[[Behaviour], str | None],
-    ) -> CommandInput:
-        """Parse a command for guidance.
+    ) -> CommandInput | Select:
+        """Parse a command for guidance, or a selection for `select`.
 
         Args:
             text: one line; a mission's lines may follow, if its file is not on this computer.
@@ -159,6 +163,8 @@ class InputAssembler:
         command = parse(text, names)
         if enclosed and not command.takes_attachment:
             raise GrammarError(f"{command}: expected one line; only a mission may have more lines")
+        if isinstance(command, Select):
+            return command
         if (aim := command.aim) is not None:
             return CommandInput(identifier, str(command), aim=aim, mode_changes=self._mode_changes)
         footprint = Footprint(self.steering.settings.camera.field_rad, -self.camera_pitch_rad(state))
@@ -170,6 +176,20 @@ class InputAssembler:
             endless=command.endless,
             mode_changes=self._mode_changes,
         )
+
+    async def select(self, command: Select) -> Selected:
+        """Select an object in a camera's images, for commands with `track=`."""
+        name, camera = command.camera, self.steering
+        if name is not None:
+            known = self._cameras.get(None if name == FIRST_CAMERA else name)
+            if known is None:
+                names = ", ".join(key or FIRST_CAMERA for key in self._cameras)
+                return Selected(False, f"no camera {name!r}; there are: {names}")
+            camera = known
+        answer = await camera.select(command.request)
+        if answer.track_id is None or camera is self.steering:
+            return answer
+        return replace(answer, reason=f"{answer.reason}; not of the steering camera, so no goal of a flight")
 
     @staticmethod
     def _built(command: Command, context: BuildContext) -> Behaviour:

@@ -122,6 +122,11 @@ class Tracker:
             for record, (left, top, right, bottom) in zip(self._records, boxes, strict=True)
         )
 
+    def take_id(self) -> int:
+        """Reserve an id for a track that is made elsewhere."""
+        self._next_id += 1
+        return self._next_id - 1
+
     def update(
         self, detections: Detections, captured_ns: int, view: CameraView | None = None
     ) -> TrackedFrame:

@@ -24,6 +24,7 @@ from vision.camera_model import CameraModel, CameraMount
 from vision.detections import TRACK_CONFIRMED, DetectionRecord
 from vision.geolocation import PixelRays, range_from_known_height
 from vision.rotation import matrix_from_quaternion
+from vision.tracking import TARGET_CLASS
 from vision.tracking.association import overlaps
 
 _Sample = TypeVar("_Sample")
@@ -266,7 +267,10 @@ def _ambiguous(detections: Sequence[DetectionRecord]) -> list[bool]:
     boxes = np.array([detection["xyxy"] for detection in detections])
     scores = np.array([_score(detection) for detection in detections])
     names = np.array([detection["class_name"] for detection in detections])
-    rivals = (names[:, None] != names) & (scores[:, None] < scores + CLEAR_MARGIN)
+    selected = names == TARGET_CLASS  # selected by a person: no class that the detector could confuse
+    rivals = (
+        (names[:, None] != names) & ~selected[:, None] & ~selected & (scores[:, None] < scores + CLEAR_MARGIN)
+    )
     doubtful: list[bool] = (rivals & (overlaps(boxes, boxes) >= SAME_OBJECT_IOU)).any(axis=1).tolist()
     return doubtful
 

@@ -102,7 +102,8 @@ def test_schema_has_every_command_and_its_ranges() -> None:
     json.dumps(schema)
     assert set(schema["$defs"]) == set(COMMANDS)
     approach = schema["$defs"]["approach"]
-    assert approach["required"] == ["class"]
+    assert schema["$defs"]["seek"]["required"] == ["class"]
+    assert approach["oneOf"] == [{"required": ["class"]}, {"required": ["track"]}]
     assert approach["properties"]["class"]["enum"] == ["car", "dog"]
     assert approach["properties"]["distance"] == {
         "type": "number",

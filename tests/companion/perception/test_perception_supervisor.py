@@ -22,6 +22,7 @@ from companion.perception.supervisor import PerceptionStartError, PerceptionStat
 from companion.settings.reading import Settings, load_settings
 from vision.pipeline import PerceptionResult
 from vision.sources import SourceSettings, open_source
+from vision.tracking import Selected, SelectRequest
 
 pytestmark = pytest.mark.realtime
 
@@ -198,6 +199,69 @@ async def test_unknown_class_suggests_the_nearest(photos: Path, exported_model: 
     with pytest.raises(PerceptionStartError, match=r"'persn'.*person"):
         await supervisor.start()
     await supervisor.stop()
+
+
+@pytest.fixture
+def patterned(tmp_path: Path) -> Path:
+    """A still image with a pattern."""
+    folder = tmp_path / "patterned"
+    folder.mkdir()
+    blocks = np.random.default_rng(2).integers(0, 255, (12, 16), np.uint8)
+    image = cv2.resize(blocks, (320, 240), interpolation=cv2.INTER_CUBIC)
+    cv2.imwrite(str(folder / "0.png"), image)
+    return folder
+
+
+async def test_selected_object_is_a_track_until_its_worker_ends(patterned: Path, tiny_model: Path) -> None:
+    # An untrained network has low confidences: nothing is detected.
+    settings = settings_of(patterned, tiny_model, **{"detector.confidence": "0.9"})
+    async with supervised(settings) as (supervisor, recorder):
+        await until(lambda: recorder.results)
+        answer = await supervisor.select(SelectRequest((0.25, 0.25, 0.25, 0.25)))
+        assert answer == Selected(True, "track 1, a target", 1, "target")
+        before = len(recorder.results)
+        await until(lambda: len(recorder.results) > before + 3)
+        (record,) = recorder.results[-1].detections.records()
+        assert (record["track_id"], record["class_name"], record["track_state"]) == (1, "target", "confirmed")
+        assert record["xyxy"] == pytest.approx([80, 60, 160, 120], abs=4.0)
+        assert (await supervisor.select(SelectRequest(None))).reason == "track 1 ended"
+        assert (await supervisor.select(SelectRequest((0.5, 0.25, 0.25, 0.25)))).track_id == 2
+        pid = supervisor.status.pid
+        assert pid is not None
+        os.kill(pid, signal.SIGKILL)
+        await until(lambda: supervisor.status.restarts == 1 and supervisor.state is PerceptionState.RUNNING)
+        assert recorder.has_event("track 2, the selected object, is lost with the perception process")
+        after = len(recorder.results)
+        await until(lambda: len(recorder.results) > after)
+        assert "end" in [event.kind.value for event in recorder.results[after].track_events]
+        assert len(recorder.results[-1].detections) == 0
+        assert (await supervisor.select(SelectRequest((0.5, 0.25, 0.25, 0.25)))).track_id == 3
+    stopped = await supervisor.select(SelectRequest(None))
+    assert not stopped.success
+    assert "not running (stopped)" in stopped.reason
+
+
+async def test_selection_without_a_detector_is_refused(photos: Path) -> None:
+    async with supervised(settings_of(photos)) as (supervisor, _recorder):
+        answer = await supervisor.select(SelectRequest((0.25, 0.25, 0.5, 0.5)))
+        assert not answer.success
+        assert "detector.enabled and tracker.enabled" in answer.reason
+
+
+async def test_selection_fails_when_the_worker_dies_before_it_answers(
+    patterned: Path, tiny_model: Path
+) -> None:
+    async with supervised(settings_of(patterned, tiny_model)) as (supervisor, recorder):
+        await until(lambda: recorder.results)
+        pid = supervisor.status.pid
+        assert pid is not None
+        os.kill(pid, signal.SIGSTOP)
+        asked = asyncio.create_task(supervisor.select(SelectRequest((0.25, 0.25, 0.25, 0.25))))
+        await asyncio.sleep(0)
+        os.kill(pid, signal.SIGKILL)
+        answer = await asked
+        assert not answer.success
+        assert "has ended" in answer.reason
 
 
 async def test_killed_worker_is_replaced_and_sequence_continues(photos: Path) -> None:
