@@ -17,6 +17,7 @@ from companion.perception.cameras import PerceptionCamera
 from companion.settings import Settings
 from companion.vehicle.state import Vector3, VehicleState
 from mavlink_sim.camera.depth_camera import DepthSensor
+from mavlink_sim.camera.renderer import Rendered
 from mavlink_sim.camera.scene import CameraSettings, Scene
 from mavlink_sim.lockstep import LockstepVehicle
 from mavlink_sim.world.world import Ground, Light, Sky, World, WorldObject
@@ -37,6 +38,9 @@ class RenderedCamera:
         latency_s: from capture until a result can steer; more than a small computer takes for it.
         by_flight: what moves does so by the seconds of the flight, not by those since the vehicle's boot.
         depth: frames have depth.
+
+    Attributes:
+        shown: the truth of the newest frame; None before the first.
     """
 
     def __init__(
@@ -54,6 +58,7 @@ class RenderedCamera:
         self.perceived = PerceptionCamera(settings, None, self._perception.class_names or None)
         self.rate_hz, self.latency_s = rate_hz, latency_s
         self._by_flight, self._depth = by_flight, depth
+        self.shown: Rendered | None = None
 
     def on_state(self, state: VehicleState, history: StateHistory) -> None:
         """As `WorkerCamera.send_state` sends it to the worker."""
@@ -71,6 +76,7 @@ class RenderedCamera:
     def capture(self, flight: LockstepFlight) -> Callable[[], PerceptionResult | None]:
         time_s = flight.seconds if self._by_flight else None
         taken = self._perception.capture(flight.now_ns, time_s=time_s)
+        self.shown = self.shown if taken is None else taken.rendered
 
         def finish() -> PerceptionResult | None:
             if taken is None:

@@ -1,0 +1,100 @@
+"""Chosen objects with the rendered camera, the real detector, tracker, filters and ranging, in lockstep."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import pytest
+
+from companion.bench.lockstep_flight import LockstepFlight, camera_settings
+from companion.bench.rendered_camera import RenderedCamera, rendered_scene
+from companion.bench.synthetic_detector import SceneObject, ScenePose
+from mavlink_sim.lockstep import LockstepVehicle
+from vision.camera_model import CameraModel, CameraMount
+from vision.tracking import SelectRequest
+
+CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(80.0))
+MOUNT = CameraMount(forward_m=0.1, pitch_rad=math.radians(-10.0))
+
+
+def standing(
+    class_name: str, north_m: float, east_m: float, size_m: tuple[float, float, float]
+) -> SceneObject:
+    return SceneObject(class_name, size_m, lambda _: ScenePose(north_m, east_m, 1.2))
+
+
+class Flight:
+    """In the air, looking north at some objects."""
+
+    def __init__(self, objects: Sequence[SceneObject], seed: int, *, depth: bool) -> None:
+        changes = {"detector.image_size": "320", "detector.threads": "1"}
+        settings = camera_settings(CAMERA, MOUNT, changes)
+        scene, self.objects = rendered_scene(objects, CAMERA, MOUNT, seed, depth=depth)
+        cameras: list[RenderedCamera] = []
+
+        def camera(vehicle: LockstepVehicle) -> RenderedCamera:
+            cameras.append(RenderedCamera(settings, scene, vehicle, by_flight=True, depth=depth))
+            return cameras[0]
+
+        self.flight = LockstepFlight.airborne(seed=seed, height_m=3.0, wind_mps=1.0, camera=camera)
+        self.camera = cameras[0]
+        self.flight.turn_to(0.0)
+        self.flight.run(2.0)
+
+    def box_of(self, index: int) -> tuple[float, float, float, float]:
+        """An object's true rectangle in the newest frame: left, top, width, height as fractions."""
+        assert self.camera.shown is not None
+        (xyxy,) = [o.xyxy for o in self.camera.shown.objects if o.world_object.identifier == index]
+        left, top, right, bottom = xyxy
+        return (
+            left / CAMERA.width,
+            top / CAMERA.height,
+            (right - left) / CAMERA.width,
+            (bottom - top) / CAMERA.height,
+        )
+
+    def select(self, index: int) -> int:
+        """Select an object by its rectangle; the id of the track that is new since."""
+        before = {target.track_id for target in self.flight.inputs.steering.targets}
+        self.camera.select(SelectRequest(self.box_of(index)))
+        self.flight.run(0.5)
+        (target,) = [t for t in self.flight.inputs.steering.targets if t.class_name == "target"]
+        assert target.track_id not in before
+        assert target.track_id is not None
+        return target.track_id
+
+    def range_m(self, index: int) -> float:
+        return self.objects[index].range_m(self.flight.vehicle.truth.position_ned_m, self.flight.seconds)
+
+
+def test_follow_by_track_keeps_to_the_farther_of_two_cars() -> None:
+    near, far = standing("car", 13.0, -2.5, (4.2, 1.8, 1.5)), standing("car", 20.0, 4.0, (4.2, 1.8, 1.5))
+    seen = Flight([near, far], 11, depth=True)
+    cars = [t for t in seen.flight.inputs.steering.targets if t.class_name == "car" and t.trusted]
+    farther = max(cars, key=lambda target: target.ground_range_m)
+    assert len(cars) == 2
+    log = seen.flight.fly(f"follow track={farther.track_id} distance=7", 30.0)
+    assert log.outcome is not None
+    assert log.outcome.reason == "in progress"
+    seen.flight.run(25.0)
+    assert seen.flight.guidance.busy
+    assert seen.range_m(1) == pytest.approx(7.0, abs=0.8)
+
+
+@pytest.mark.parametrize("depth", [True, False], ids=["depth", "ground"])
+@pytest.mark.parametrize(
+    ("class_name", "size_m"), [("rock", (1.0, 1.0, 0.8)), ("shed", (3.0, 2.4, 2.6))], ids=["rock", "shed"]
+)
+def test_selected_object_of_no_class_is_approached_and_held(
+    class_name: str, size_m: tuple[float, float, float], depth: bool
+) -> None:
+    seen = Flight([standing(class_name, 16.0, 1.5, size_m)], 12, depth=depth)
+    track_id = seen.select(0)
+    log = seen.flight.fly(f"approach track={track_id} distance=6", 90.0)
+    assert log.outcome is not None
+    assert log.outcome.success, log.outcome.reason
+    assert seen.range_m(0) == pytest.approx(6.0, abs=0.5 if depth else 1.5)
+    seen.flight.run(5.0)
+    assert seen.range_m(0) == pytest.approx(6.0, abs=0.6 if depth else 1.6)
+    assert log.violations == {}
