@@ -13,6 +13,7 @@ by its surroundings; 17 scales instead of 33; an image with a low ratio is not l
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import cv2
@@ -182,9 +183,9 @@ def _features(patches: Gray) -> Floats:
     cell = _cell_index(count, side) * DIRECTIONS
     weights = size.ravel()
     length = count * cells * cells * DIRECTIONS
-    histogram = np.bincount(cell + lower % DIRECTIONS, weights * (1.0 - share), length)
-    histogram += np.bincount(cell + (lower + 1) % DIRECTIONS, weights * share, length)
-    histogram = histogram.reshape(count, cells, cells, DIRECTIONS).astype(np.float32)
+    sums = np.bincount(cell + lower % DIRECTIONS, weights * (1.0 - share), length)
+    sums += np.bincount(cell + (lower + 1) % DIRECTIONS, weights * share, length)
+    histogram: Floats = sums.reshape(count, cells, cells, DIRECTIONS).astype(np.float32)
     energy = (histogram**2).sum(3)
     around = np.stack([cv2.blur(one, (3, 3)) for one in energy])
     histogram /= np.sqrt(around + _EPSILON)[..., None] + 0.05
@@ -193,17 +194,14 @@ def _features(patches: Gray) -> Floats:
     return np.concatenate([mean[..., None], histogram], axis=3)
 
 
-_cell_indices: dict[tuple[int, int], NDArray[np.int64]] = {}
-
-
+@lru_cache(maxsize=2)
 def _cell_index(count: int, side: int) -> NDArray[np.int64]:
     """The cell of every pixel, flat."""
-    if (count, side) not in _cell_indices:
-        cells = side // CELL_PX
-        one = np.arange(side) // CELL_PX
-        grid = one[:, None] * cells + one[None]
-        _cell_indices[count, side] = (np.arange(count)[:, None, None] * cells**2 + grid).ravel()
-    return _cell_indices[count, side]
+    cells = side // CELL_PX
+    one = np.arange(side) // CELL_PX
+    grid = one[:, None] * cells + one[None]
+    index: NDArray[np.int64] = (np.arange(count)[:, None, None] * cells**2 + grid).ravel()
+    return index
 
 
 def _ratio(response: NDArray[np.float64], row: int, column: int) -> float:

@@ -144,7 +144,8 @@ class _Target:
     def xyxy(self) -> NDArray[np.float32]:
         """(4,) inside the frame."""
         width, height = self.image.size
-        return np.clip(self.states.xyxy[0], 0.0, [width, height, width, height]).astype(np.float32)
+        edges: NDArray[np.float64] = np.clip(self.states.xyxy[0], 0.0, [width, height, width, height])
+        return edges.astype(np.float32)
 
     def event(self, kind: TrackEventKind, class_id: int) -> TrackEvent:
         track = Track(

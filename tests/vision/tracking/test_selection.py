@@ -154,6 +154,7 @@ def test_rectangle_of_an_earlier_image_is_followed_to_the_newest(camera: Camera)
     assert answer.success, answer.reason
     found = target_of(camera.show())
     assert found is not None
+    assert camera.at is not None
     x, y = camera.at
     assert found[1] == pytest.approx([x - 30, y - 20, x + 30, y + 20], abs=6.0)
 
