@@ -269,6 +269,7 @@ class AutopilotLink:
                 self.other_senders.add(sender)
                 return False
             self._peer = sender
+            self.other_senders.discard(sender)
         self._peer_s = now_s
         return True
 
