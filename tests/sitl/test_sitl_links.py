@@ -123,7 +123,7 @@ def test_two_services_of_one_name_name_each_other_and_the_later_refuses(beside: 
     first, link = beside.first, beside.first.link
     second = beside.start("vehicle1")
     named_s = link.until(lambda: beside.named() == {"mavlink", "zenoh"}, NAMED_S, "named both ways")
-    second.wait_for_line("another service commands this vehicle: 1/191 by mavlink", NAMED_S)
+    second.wait_for_line(f"another service commands this vehicle: {link.system_id}/191 by mavlink", NAMED_S)
     second.wait_for_line("by zenoh, not in command", NAMED_S)
     answers = beside.answers("vehicle1", "takeoff 3")
     assert sorted(REFUSED in answer["reason"] for answer in answers) == [False, True], answers
@@ -135,15 +135,18 @@ def test_a_second_service_of_another_name_refuses(beside: Beside) -> None:
     first, link = beside.first, beside.first.link
     second = beside.start("vehicle2")
     named_s = link.until(lambda: beside.named() == {"mavlink"}, NAMED_S, "named")
-    second.wait_for_line("another service commands this vehicle: 1/191 by mavlink", NAMED_S)
+    second.wait_for_line(f"another service commands this vehicle: {link.system_id}/191 by mavlink", NAMED_S)
     (answer,) = beside.answers("vehicle2", "takeoff 3")
     assert not answer["success"]
-    assert "1/191 by mavlink, not in command" in answer["reason"]
+    assert f"{link.system_id}/191 by mavlink, not in command" in answer["reason"]
     assert not link.armed
     first.take_off(3.0)
     first.fly("hold")
     until_s = time.monotonic() + NAMED_S
-    while "1/191 by mavlink, in command" not in (answer := beside.answers("vehicle2", "hold")[0])["reason"]:
+    while (
+        f"{link.system_id}/191 by mavlink, in command"
+        not in (answer := beside.answers("vehicle2", "hold")[0])["reason"]
+    ):
         assert REFUSED in answer["reason"]
         assert time.monotonic() < until_s, answer
         link.after(0.5)
@@ -154,7 +157,7 @@ def test_a_second_service_of_another_name_refuses(beside: Beside) -> None:
 def test_a_second_service_flies_where_that_is_allowed(beside: Beside) -> None:
     link = beside.first.link
     second = beside.start("vehicle2", "--vehicle-allow-other-commander", "true")
-    second.wait_for_line("another service commands this vehicle: 1/191 by mavlink", NAMED_S)
+    second.wait_for_line(f"another service commands this vehicle: {link.system_id}/191 by mavlink", NAMED_S)
     until_s = time.monotonic() + READY_S
     while not (answer := beside.answers("vehicle2", "takeoff 3")[0])["success"]:
         assert REFUSED not in answer["reason"]
