@@ -16,11 +16,12 @@ from typing import Any, Protocol
 
 from companion.bench.lockstep_flight import TICK_S, LockstepFlight, plain_settings
 from companion.bench.simulated_driver import LockstepDriver, SimulatedDriver
+from companion.bus.vehicle_messages import pose_message
 from companion.guidance.behaviour import Behaviour, Outcome
 from companion.guidance.behaviours.formation import FormationBehaviour
 from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.formation.neighbours import Anchor
-from companion.guidance.formation.pose import pose_from_message, pose_message
+from companion.guidance.formation.pose import pose_from_message
 from companion.guidance.interface import Answer, EventKind, Request, SetMode
 from companion.guidance.limits.envelope import Limits
 from companion.service.factory import guidance_options

@@ -147,11 +147,11 @@ class CameraMount:
         """
         if self.on_gimbal:
             raise ValueError("a camera on a gimbal has no fixed body_from_optical: use ned_from_optical")
-        return self._parent_from_optical
+        return self.parent_from_optical
 
     @property
-    def _parent_from_optical(self) -> NDArray[np.float64]:
-        """(3, 3) rotation from the optical frame to the frame the camera is mounted on."""
+    def parent_from_optical(self) -> NDArray[np.float64]:
+        """(3, 3) rotation from the optical frame to the frame the camera is mounted on; read-only."""
         return _parent_from_optical(self.roll_rad, self.pitch_rad, self.yaw_rad)
 
     def ned_from_optical(self, ned_from_body: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -162,11 +162,11 @@ class CameraMount:
         if self.on_gimbal:
             if self.ned_from_gimbal is None:
                 raise ValueError("a camera on a gimbal needs the gimbal's attitude: use `held`")
-            return self.ned_from_gimbal @ self._parent_from_optical
+            return self.ned_from_gimbal @ self.parent_from_optical
         if self.stabilized:
             heading_rad = math.atan2(float(ned_from_body[1, 0]), float(ned_from_body[0, 0]))
             ned_from_body = matrix_from_euler(0.0, 0.0, heading_rad)
-        return ned_from_body @ self._parent_from_optical
+        return ned_from_body @ self.parent_from_optical
 
 
 @dataclass(frozen=True, slots=True)

@@ -54,6 +54,8 @@ class Detections:
             tracking.
         track_score: (N,) float32, the track's median confidence, NaN without a track.
         track_confirmed: (N,) bool, whether the track is confirmed and its class is not in doubt.
+        track_first_ns: (N,) int64, capture stamp of the track's first detection, 0 without a track; None: not
+            known.
     """
 
     xyxy: NDArray[np.float32]
@@ -64,6 +66,7 @@ class Detections:
     track_id: NDArray[np.int64] | None = None
     track_score: NDArray[np.float32] | None = None
     track_confirmed: NDArray[np.bool_] | None = None
+    track_first_ns: NDArray[np.int64] | None = None
 
     def __post_init__(self) -> None:
         count = len(self.xyxy)
@@ -82,7 +85,7 @@ class Detections:
         missing = [name for name, values in tracks.items() if values is None]
         if missing and len(missing) < len(tracks):
             raise ValueError(f"Detections needs all of {', '.join(tracks)} or none; {missing[0]} is missing")
-        for name, values in tracks.items():
+        for name, values in {**tracks, "track_first_ns": self.track_first_ns}.items():
             if values is not None and values.shape != (count,):
                 raise ValueError(f"Detections.{name} must be ({count},) like xyxy, got {values.shape}")
         if count and not (0 <= int(self.class_id.min()) and int(self.class_id.max()) < len(self.class_names)):
@@ -101,14 +104,24 @@ class Detections:
             [self.xyxy.ravel(), self.confidence, self.nearest_camera_m.ravel()],
             [self.class_id],
         )
-        tracked, bool_bytes = False, bytearray()
+        tracked, bool_bytes, first_known = False, bytearray(), self.track_first_ns is not None
         if self.track_id is not None and self.track_score is not None and self.track_confirmed is not None:
             floats.append(self.track_score)
             integers.append(self.track_id)
             tracked, bool_bytes = True, bytearray(self.track_confirmed)
+        if self.track_first_ns is not None:
+            integers.append(self.track_first_ns)
         float_bytes = bytearray(np.concatenate(floats, dtype=np.float32))
         int_bytes = bytearray(np.concatenate(integers, dtype=np.int64))
-        return _unpickled, (self.class_names, len(self), float_bytes, int_bytes, bool_bytes, tracked)
+        return _unpickled, (
+            self.class_names,
+            len(self),
+            float_bytes,
+            int_bytes,
+            bool_bytes,
+            tracked,
+            first_known,
+        )
 
     def __len__(self) -> int:
         return len(self.xyxy)
@@ -127,6 +140,7 @@ class Detections:
             None if self.track_id is None else self.track_id[index],
             None if self.track_score is None else self.track_score[index],
             None if self.track_confirmed is None else self.track_confirmed[index],
+            None if self.track_first_ns is None else self.track_first_ns[index],
         )
 
     @property
@@ -191,6 +205,7 @@ def _unpickled(
     int_bytes: bytearray,
     bool_bytes: bytearray,
     tracked: bool,
+    first_known: bool,
 ) -> Detections:
     floats, integers = np.frombuffer(float_bytes, np.float32), np.frombuffer(int_bytes, np.int64)
     return Detections(
@@ -199,7 +214,8 @@ def _unpickled(
         integers[:count],
         class_names,
         floats[5 * count : 8 * count].reshape(count, 3),
-        integers[count:] if tracked else None,
+        integers[count : 2 * count] if tracked else None,
         floats[8 * count :] if tracked else None,
         np.frombuffer(bool_bytes, np.bool_) if tracked else None,
+        integers[-count:] if first_known else None,
     )

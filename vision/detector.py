@@ -30,6 +30,7 @@ from vision.runtimes.base import PRECISIONS, Precision
 from vision.runtimes.selection import RuntimeChoice, check_runtime, start_runtime
 from vision.runtimes.source import read_source
 from vision.weights import DEFAULT_WEIGHTS
+from vision.yolo.checkpoint_pair import weights_sha256
 from vision.yolo.postprocess import boxes_from, candidates_of, decode_ltrb
 from vision.yolo.safe_pickle import CheckpointError
 
@@ -54,6 +55,7 @@ class Detector(ObjectDetector):
         precision: of the network, `float32`, `bfloat16` or `float16`.
         precision_reason: why this precision, in words.
         model_name: the value of `model`.
+        model_sha256: of the checkpoint, of a pair's weights, or of the exported file.
         description: what the network was built from; None for an exported file.
         metadata: of the file (licence, origin, score).
         last_timing: of the latest `detect`; None before the first.
@@ -109,7 +111,7 @@ class Detector(ObjectDetector):
         self.class_ids = None if classes is None else resolve_classes(classes, source.class_names)
         self.description: ModelDescription | None = source.description
         self.metadata: dict[str, Any] = source.metadata
-        self.model_name = str(model)
+        self.model_name, self.model_sha256 = str(model), weights_sha256(path)
         self.confidence = confidence
         self.iou = iou
         self.image_size = image_size
@@ -232,7 +234,7 @@ class _FilteredDetector(ObjectDetector):
 
     def __init__(self, inner: ObjectDetector, kind: str, settings: DetectorSettings) -> None:
         self.class_names = tuple(inner.class_names)
-        self.model_name = inner.model_name or kind
+        self.model_name, self.model_sha256 = inner.model_name or kind, inner.model_sha256
         self.runtime, self.precision, self.reason = inner.runtime, inner.precision, inner.reason
         self._inner, self._confidence = inner, settings.confidence
         wanted = settings.classes

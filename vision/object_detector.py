@@ -69,6 +69,7 @@ class ObjectDetector(ABC):
         class_names: id → name, all that it can report; constant after construction.
         last_timing: of the latest `detect`; None if not measured: all its time then counts as inference.
         model_name: for messages; empty: the name of its kind.
+        model_sha256: of its model's file, 64 hexadecimal digits; None without one.
         runtime: of its network; None where there is no choice.
         precision: `float32` for example; None where it does not apply.
         reason: why this runtime and precision, in words.
@@ -77,6 +78,7 @@ class ObjectDetector(ABC):
     class_names: tuple[str, ...]
     last_timing: Timing | None = None
     model_name: str = ""
+    model_sha256: str | None = None
     runtime: str | None = None
     precision: str | None = None
     reason: str = ""

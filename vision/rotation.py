@@ -41,3 +41,19 @@ def matrix_from_quaternion(quaternion: Quaternion) -> NDArray[np.float64]:
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
+
+
+def quaternion_from_matrix(rotation: NDArray[np.float64]) -> Quaternion:
+    """The (w, x, y, z) quaternion of a (3, 3) rotation matrix, w not negative (Shepperd 1978)."""
+    (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
+    # Four times the square of each element: the largest one is the divisor.
+    squares = (1 + a + e + i, 1 + a - e - i, 1 - a + e - i, 1 - a - e + i)
+    rows = (
+        (squares[0], h - f, c - g, d - b),
+        (h - f, squares[1], b + d, c + g),
+        (c - g, b + d, squares[2], f + h),
+        (d - b, c + g, f + h, squares[3]),
+    )
+    row = rows[squares.index(max(squares))]
+    w, x, y, z = unit_quaternion(row)
+    return (w, x, y, z) if w >= 0.0 else (-w, -x, -y, -z)

@@ -320,7 +320,7 @@ class LockstepFlight:
             if result is None:
                 continue
             camera.update(result)
-            markers = self.inputs.on_result(camera, result, now_ns)
+            markers = self.inputs.on_result(camera, result)
             seen = seen or camera is self.inputs.steering or markers is not None
         return seen
 

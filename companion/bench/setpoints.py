@@ -24,13 +24,13 @@ def measure_setpoints(seconds: float, *, rate_hz: float, load: int) -> dict[str,
     The receiver stamps in a thread that blocks in `recv`, so its own wake-up is part of the figure.
     """
     context = multiprocessing.get_context("spawn")
-    busy = [context.Process(target=_busy, daemon=True) for _ in range(load)]
-    for process in busy:
+    loaded = [context.Process(target=busy, daemon=True) for _ in range(load)]
+    for process in loaded:
         process.start()
     try:
         arrivals_ns = asyncio.run(_stream(seconds, rate_hz))
     finally:
-        for process in busy:
+        for process in loaded:
             process.kill()
             process.join()
     spacing_ms = np.diff(arrivals_ns) / 1e6
@@ -75,7 +75,8 @@ async def _stream(seconds: float, rate_hz: float) -> list[int]:
     return arrivals_ns
 
 
-def _busy() -> None:
+def busy() -> None:
+    """Use one core until killed."""
     value = 0
     while True:
         value += 1

@@ -11,6 +11,7 @@ from typing import Any
 
 import zenoh
 from pydantic import ValidationError
+from zenoh import ext
 
 from companion.bus.session import zenoh_config
 from companion.bus.topics import ROOT, TOPICS, alive_key, command_key
@@ -34,14 +35,19 @@ def client_settings(settings: ZenohSection, connect: tuple[str, ...] = ()) -> Ze
     Raises:
         NoAnswerError: there is no valid endpoint.
     """
-    endpoints = connect or settings.connect or settings.listen
+    given = connect or settings.connect
+    endpoints = given or settings.listen
     try:
-        return ZenohSection(
+        section = ZenohSection(
             mode="client",
             connect=tuple(endpoint.replace("0.0.0.0", "127.0.0.1") for endpoint in endpoints),
             listen=(),
             multicast_scouting=settings.multicast_scouting,
+            config_file=settings.config_file,
         )
+        # Endpoints that were not given may be replaced by those of the configuration file.
+        explicit = {"mode"} | ({"connect"} if given else set())
+        return ZenohSection.model_construct(explicit, **dict(section))
     except ValidationError as error:
         where = ", ".join(endpoints) or "no address"
         raise NoAnswerError(
@@ -116,6 +122,7 @@ def _answer(
 ) -> dict[str, Any]:
     """Return the first answer to a query. None in the queue: no more replies. `deadline_s`: of the query."""
     wait_s = timeout_s + _LAST_ANSWER_S
+    ended = gone = False
     while True:
         try:
             item = received.get(timeout=wait_s)
@@ -125,12 +132,19 @@ def _answer(
             answer: dict[str, Any] = json.loads(item.ok.payload.to_string())
             return answer
         if _is(item, zenoh.SampleKind.DELETE):
-            wait_s = _LAST_ANSWER_S  # an answer may have been sent just before
+            wait_s, gone = _LAST_ANSWER_S, True  # an answer may have been sent just before
         elif _is(item, zenoh.SampleKind.PUT):
-            wait_s = timeout_s + _LAST_ANSWER_S  # the network was interrupted
+            wait_s, gone = timeout_s + _LAST_ANSWER_S, False  # the network was interrupted
         elif item is None and time.monotonic() >= deadline_s:
             raise NoAnswerError(
                 f"{text!r}: no answer within {timeout_s:g} s; `companion echo status` shows its state"
+            )
+        elif item is None and not ended and not gone:
+            wait_s, ended = _LAST_ANSWER_S, True  # the token of a killed service may disappear just after
+        elif item is None and not gone:
+            raise NoAnswerError(
+                f"{text!r}: refused: zenoh's access control may not allow this client to send commands "
+                f"to vehicle {vehicle!r}"
             )
         elif item is None:
             raise NoAnswerError(
@@ -154,18 +168,39 @@ def check_topic(key: str) -> None:
 
 
 def listen(
-    session: zenoh.Session, key: str, on_message: Callable[[str, str], None]
-) -> zenoh.Subscriber[None]:
+    session: zenoh.Session,
+    key: str,
+    on_message: Callable[[str, str], None],
+    *,
+    history: bool = False,
+) -> zenoh.Subscriber[None] | ext.AdvancedSubscriber[None]:
     """Call back, on a zenoh thread, with (key, text) of every message on `key` (wildcards allowed).
 
     For binary data such as images, the text has the encoding, the length and the attachment.
+
+    Args:
+        history: begin with the messages that the service has kept (`Topic.cached`), and recover lost ones.
+            The subscription ends when the returned object is dropped.
     """
     full = key if key.startswith(f"{ROOT}/") else f"{ROOT}/*/{key}"
 
     def receive(sample: zenoh.Sample) -> None:
         on_message(str(sample.key_expr), _text_of(sample))
 
-    return session.declare_subscriber(full, receive)
+    return subscribe_kept(session, full, receive) if history else session.declare_subscriber(full, receive)
+
+
+def subscribe_kept(
+    session: zenoh.Session, key: str, receive: Callable[[zenoh.Sample], None]
+) -> ext.AdvancedSubscriber[None]:
+    """Subscribe to a key and begin with the kept messages; those lost on the way are fetched again."""
+    return ext.declare_advanced_subscriber(
+        session,
+        key,
+        receive,
+        history=ext.HistoryConfig(detect_late_publishers=True),
+        recovery=ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
+    )
 
 
 def _text_of(sample: zenoh.Sample) -> str:

@@ -27,7 +27,7 @@ class CommandIntake:
     """
 
     def __init__(self, clock_s: Callable[[], float] = time.monotonic) -> None:
-        self._others, self._stops = _Allowance(clock_s), _Allowance(clock_s)
+        self._others, self._stops = Allowance(clock_s), Allowance(clock_s)
         self._lock = threading.Lock()
         self.refused = 0
 
@@ -56,13 +56,14 @@ class CommandIntake:
         return None, f"command refused: {reason}"
 
 
-class _Allowance:
-    """A token bucket."""
+class Allowance:
+    """A token bucket: `COMMANDS_PER_S`, and `BURST` at once."""
 
-    def __init__(self, clock_s: Callable[[], float]) -> None:
+    def __init__(self, clock_s: Callable[[], float] = time.monotonic) -> None:
         self._clock_s, self._tokens, self._filled_s = clock_s, float(BURST), clock_s()
 
     def take(self) -> bool:
+        """Whether one more is allowed now."""
         now_s = self._clock_s()
         self._tokens = min(float(BURST), self._tokens + COMMANDS_PER_S * (now_s - self._filled_s))
         self._filled_s = now_s

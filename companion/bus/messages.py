@@ -1,20 +1,61 @@
-"""The published messages as plain JSON-able values. Stamps are CLOCK_MONOTONIC nanoseconds of this host.
-
-They are the public contract with subscribers (`docs/messages.md`): fields are added, never changed.
-"""
+"""Builds the bodies of the messages about frames and cameras (`bodies.py`)."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
+from companion.bus.bodies import (
+    CameraInfoBody,
+    DetectionBody,
+    DetectionsBody,
+    FrameBody,
+    ImageBody,
+    MarkerBody,
+    MarkersBody,
+    ObstaclesBody,
+    TrackEventBody,
+    TracksBody,
+    TransformBody,
+    TransformsBody,
+)
 from companion.bus.topics import NO_OBJECTS
+from companion.geometry.geodesy import GeodeticOrigin
+from companion.guidance.targets.from_detections import StateHistory, mount_at
+from companion.guidance.targets.from_markers import LocalizedMarkers, MarkerTarget
+from companion.guidance.targets.target import Target
 from companion.vehicle.clock_sync import ClockOffset
-from companion.vehicle.gimbal import GimbalState
-from companion.vehicle.setpoint import Setpoint
-from companion.vehicle.state import VehicleState
+from vision.camera_model import CameraModel, CameraMount
+from vision.detections import DetectionRecord
+from vision.markers import Marker
+from vision.obstacle_sectors import SECTOR_RAD, ObstacleSectors
 from vision.pipeline import PerceptionResult
+from vision.rotation import quaternion_from_matrix
 from vision.tracking import TrackEvent
+
+
+@dataclass(frozen=True, slots=True)
+class Localization:
+    """Positions of one frame's detections.
+
+    Attributes:
+        targets: one per detection, in their order; empty if `error` gives the reason.
+        error: why the detections have no direction; empty if they have.
+        origin: of local NED; None while latitude and longitude are unknown.
+    """
+
+    targets: tuple[Target, ...] = ()
+    error: str = ""
+    origin: GeodeticOrigin | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ModelIdentity:
+    """A loaded model: its name, and the SHA-256 of its file (None: it has no file)."""
+
+    name: str
+    sha256: str | None
 
 
 def detections_message(
@@ -23,25 +64,75 @@ def detections_message(
     published_ns: int,
     view: str | None = None,
     clock: ClockOffset | None = None,
-) -> dict[str, Any]:
+    *,
+    model: ModelIdentity | None = None,
+    localization: Localization | None = None,
+) -> DetectionsBody:
     """Create the message of one frame's detections, with the stamps captured, inferred and published.
 
-    If the autopilot's clock is known, the capture is also given in that clock, with its error.
+    Args:
+        clock: the autopilot's; the capture is then also given in it, with its error.
+        localization: of the steering camera; None for others.
     """
+    detections = result.detections
+    records = detections.records()
+    unknown: list[Target | None] = [None] * len(records)
+    targets = list(localization.targets) if localization is not None and localization.targets else unknown
+    ages_s: list[float | None] = [None] * len(records)
+    if detections.track_first_ns is not None:
+        first_ns = detections.track_first_ns.tolist()
+        ages_s = [round((result.captured_ns - first) / 1e9, 3) if first else None for first in first_ns]
+    origin = None if localization is None else localization.origin
     return {
         **_of_frame(result, vehicle, published_ns, view),
         "captured_boot_ns": None if clock is None else result.captured_ns + clock.offset_ns,
         "captured_boot_error_ns": None if clock is None else clock.error_ns,
         "inferred_ns": result.inferred_ns,
+        "model": None if model is None else model.name,
+        "model_sha256": None if model is None else model.sha256,
+        "localization_error": None if localization is None else localization.error,
         "timing_ms": {stage: round(value, 2) for stage, value in result.timing_ms.items()},
         "dropped": result.dropped,
-        "detections": result.detections.records(),
+        "detections": [
+            _detection(record, age_s, target, origin)
+            for record, age_s, target in zip(records, ages_s, targets, strict=True)
+        ],
+    }
+
+
+def _detection(
+    record: DetectionRecord, age_s: float | None, target: Target | None, origin: GeodeticOrigin | None
+) -> DetectionBody:
+    position = None if target is None else target.position_ned_m
+    place = None if position is None or origin is None else origin.place(position)
+    return {
+        "class_id": record["class_id"],
+        "class_name": record["class_name"],
+        "confidence": record["confidence"],
+        "xyxy": record["xyxy"],
+        "center": record["center"],
+        "depth_m": record["depth_m"],
+        "nearest_camera_m": record["nearest_camera_m"],
+        "track_id": record.get("track_id"),
+        "track_score": record.get("track_score"),
+        "track_state": record.get("track_state"),
+        "track_age_s": age_s,
+        "bearing_rad": None if target is None else round(target.bearing_rad, 4),
+        "elevation_rad": None if target is None else round(target.elevation_rad, 4),
+        "ground_range_m": None if target is None else _number(target.ground_range_m),
+        "distance_m": None if target is None else _number(target.distance_m),
+        "range_source": None if target is None else target.range_source.value,
+        "range_sigma_m": None if target is None else _number(target.range_sigma_m),
+        "position_ned_m": None if position is None else [round(value, 3) for value in position],
+        "latitude_deg": None if place is None else round(place[0], 8),
+        "longitude_deg": None if place is None else round(place[1], 8),
+        "altitude_amsl_m": None if place is None else round(place[2], 3),
     }
 
 
 def tracks_message(
     result: PerceptionResult, vehicle: str, published_ns: int, view: str | None = None
-) -> dict[str, Any]:
+) -> TracksBody:
     """Create the message of one frame's track events; every track in it is or was confirmed."""
     return {
         **_of_frame(result, vehicle, published_ns, view),
@@ -49,8 +140,7 @@ def tracks_message(
     }
 
 
-def _of_frame(result: PerceptionResult, vehicle: str, published_ns: int, view: str | None) -> dict[str, Any]:
-    """Return the common fields of messages about one frame."""
+def _of_frame(result: PerceptionResult, vehicle: str, published_ns: int, view: str | None) -> FrameBody:
     return {
         "vehicle": vehicle,
         "camera": view,
@@ -62,7 +152,7 @@ def _of_frame(result: PerceptionResult, vehicle: str, published_ns: int, view: s
     }
 
 
-def _track_event(event: TrackEvent) -> dict[str, Any]:
+def _track_event(event: TrackEvent) -> TrackEventBody:
     track = event.track
     return {
         "event": event.kind.value,
@@ -85,68 +175,137 @@ def labels_message(result: PerceptionResult) -> str:
     return ", ".join(result.detections.names) or NO_OBJECTS
 
 
-def vehicle_message(state: VehicleState, now_ns: int) -> dict[str, Any]:
-    """Create the vehicle's message. Metres, metres a second, radians; NED; `attitude_wxyz`: FRD to NED."""
+def image_attachment(sequence: int, captured_ns: int, view: str | None) -> ImageBody:
+    """Create the attachment of one image."""
+    return {"camera": view, "sequence": sequence, "captured_ns": captured_ns}
+
+
+def markers_message(
+    result: PerceptionResult,
+    localized: LocalizedMarkers,
+    vehicle: str,
+    published_ns: int,
+    view: str | None = None,
+) -> MarkersBody:
+    """Create the message of one frame's markers."""
+    markers = result.markers or ()
+    targets = localized.targets or (None,) * len(markers)
     return {
+        **_of_frame(result, vehicle, published_ns, view),
+        "localization_error": localized.error,
+        "markers": [_marker(marker, target) for marker, target in zip(markers, targets, strict=True)],
+    }
+
+
+def _marker(marker: Marker, target: MarkerTarget | None) -> MarkerBody:
+    return {
+        "id": marker.identifier,
+        "size_m": marker.size_m,
+        "corners_px": [[round(float(value), 2) for value in corner] for corner in marker.corners_px],
+        "position_camera_m": [round(float(value), 4) for value in marker.position_camera_m],
+        "reprojection_px": round(marker.reprojection_px, 3),
+        "ambiguity": round(marker.ambiguity, 3),
+        "pad": None if target is None else target.pad,
+        "bearing_rad": None if target is None else round(target.bearing_rad, 4),
+        "elevation_rad": None if target is None else round(target.elevation_rad, 4),
+        "distance_m": None if target is None else round(target.distance_m, 4),
+        "ground_range_m": None if target is None else round(target.ground_range_m, 4),
+        "heading_rad": None if target is None else round(target.heading_rad, 4),
+        "position_ned_m": None if target is None else [round(value, 3) for value in target.position_ned_m],
+        "pad_ned_m": None if target is None else [round(value, 3) for value in target.pad_ned_m],
+    }
+
+
+def obstacles_message(seen: ObstacleSectors, vehicle: str) -> ObstaclesBody:
+    """Create the message of 72 sector distances, clockwise from north; None: no obstacle, or unknown."""
+    return {
+        "vehicle": vehicle,
+        "captured_ns": seen.captured_ns,
+        "frame": "north",
+        "increment_deg": math.degrees(SECTOR_RAD),
+        "distance_m": [round(value, 2) if math.isfinite(value) else None for value in seen.distance_m],
+        "known": [not math.isnan(value) for value in seen.distance_m],
+    }
+
+
+def camera_frame_id(vehicle: str, view: str | None) -> str:
+    """Return the name of a camera's optical frame; others are `<vehicle>/ned`, `/body` and `/gimbal`."""
+    return f"{vehicle}/camera" if view is None else f"{vehicle}/cameras/{view}"
+
+
+def camera_info_message(
+    camera: CameraModel, mount: CameraMount, *, calibrated: bool, vehicle: str, view: str | None, now_ns: int
+) -> CameraInfoBody:
+    """Create the message of one camera's lens and mount."""
+    fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
+    return {
+        "vehicle": vehicle,
+        "camera": view,
         "stamp_ns": now_ns,
-        "connected": state.connected(now_ns),
-        "heartbeat_age_s": _age_s(state.heartbeat_ns, now_ns),
-        "position_age_s": _age_s(state.position_ns, now_ns),
-        "boot_offset_ns": None if state.clock is None else state.clock.offset_ns,
-        "boot_error_ns": None if state.clock is None else state.clock.error_ns,
-        "armed": state.armed,
-        "mode": state.mode.value,
-        "landed": state.landed.value,
-        "failsafe": state.failsafe,
-        "position_ned_m": _rounded(state.position_ned_m),
-        "position_valid": state.position_valid,
-        "reset_count": state.reset_count,
-        "reset_offset_ned_m": _rounded(state.reset_offset_ned_m),
-        "velocity_ned_mps": _rounded(state.velocity_ned_mps),
-        "attitude_wxyz": _rounded(state.attitude, 5),
-        "yaw_rad": None if state.yaw_rad is None else round(state.yaw_rad, 4),
-        "altitude_m": None if state.altitude_m is None else round(state.altitude_m, 3),
-        "latitude_deg": _finite(state.latitude_deg),
-        "longitude_deg": _finite(state.longitude_deg),
-        "altitude_amsl_m": _finite(state.altitude_amsl_m),
-        "battery_fraction": state.battery_fraction,
-        "gimbal": None if state.gimbal is None else _gimbal(state.gimbal, now_ns),
+        "frame_id": camera_frame_id(vehicle, view),
+        "width": camera.width,
+        "height": camera.height,
+        "distortion_model": "plumb_bob",
+        "d": [*camera.distortion, 0.0, 0.0, 0.0, 0.0, 0.0][:5],
+        "k": [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
+        "r": [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+        "p": [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
+        "calibrated": calibrated,
+        "mount": {
+            "parent_frame_id": f"{vehicle}/{'gimbal' if mount.on_gimbal else 'body'}",
+            "translation_m": [mount.forward_m, mount.right_m, mount.down_m],
+            "rotation_wxyz": _quaternion(mount.parent_from_optical),
+            "stabilized": mount.stabilized,
+            "on_gimbal": mount.on_gimbal,
+        },
     }
 
 
-def _gimbal(gimbal: GimbalState, now_ns: int) -> dict[str, Any]:
-    """Return the gimbal's fields: radians; `attitude_wxyz`: FRD to NED, or to NED rotated by the heading."""
+def transforms_message(
+    sequence: int,
+    captured_ns: int,
+    mount: CameraMount,
+    history: StateHistory,
+    vehicle: str,
+    view: str | None = None,
+) -> TransformsBody:
+    """Create the message of the transforms at a frame's capture.
+
+    Raises:
+        HistoryError: the pose of the vehicle or its gimbal at that time is unknown.
+    """
+    pose, mount = history.at(captured_ns), mount_at(mount, history, captured_ns)
+    body, camera = f"{vehicle}/body", camera_frame_id(vehicle, view)
+    on_body = [mount.forward_m, mount.right_m, mount.down_m]
+    chain = [_transform(f"{vehicle}/ned", body, list(pose.position_ned_m), pose.ned_from_body)]
+    if mount.ned_from_gimbal is not None:
+        gimbal = f"{vehicle}/gimbal"
+        chain.append(_transform(body, gimbal, on_body, pose.ned_from_body.T @ mount.ned_from_gimbal))
+        chain.append(_transform(gimbal, camera, [0.0, 0.0, 0.0], mount.parent_from_optical))
+    else:
+        body_from_optical = pose.ned_from_body.T @ mount.ned_from_optical(pose.ned_from_body)
+        chain.append(_transform(body, camera, on_body, body_from_optical))
     return {
-        "attitude_age_s": _age_s(gimbal.attitude_ns, now_ns),
-        "attitude_wxyz": _rounded(gimbal.attitude, 5),
-        "yaw_from": gimbal.yaw_frame.value,
-        "pitch_rad": None if gimbal.pitch_rad is None else round(gimbal.pitch_rad, 4),
-        "primary_control": gimbal.primary_control,
+        "vehicle": vehicle,
+        "camera": view,
+        "sequence": sequence,
+        "captured_ns": captured_ns,
+        "transforms": chain,
     }
 
 
-def setpoint_message(setpoint: Setpoint | None) -> dict[str, Any] | None:
-    """Create the message of a setpoint; None for None."""
-    if setpoint is None:
-        return None
+def _transform(parent: str, child: str, translation_m: list[float], rotation: Any) -> TransformBody:
     return {
-        "position_ned_m": _rounded(setpoint.position_ned_m),
-        "velocity_ned_mps": _rounded(setpoint.velocity_ned_mps),
-        "acceleration_ned_mps2": _rounded(setpoint.acceleration_ned_mps2),
-        "yaw_rad": _finite(setpoint.yaw_rad),
-        "yaw_rate_radps": _finite(setpoint.yaw_rate_radps),
-        "deadline_ns": setpoint.deadline_ns,
+        "parent_frame_id": parent,
+        "child_frame_id": child,
+        "translation_m": [round(value, 4) for value in translation_m],
+        "rotation_wxyz": _quaternion(rotation),
     }
 
 
-def _age_s(stamp_ns: int, now_ns: int) -> float | None:
-    return round((now_ns - stamp_ns) / 1e9, 3) if stamp_ns else None
+def _quaternion(rotation: Any) -> list[float]:
+    return [round(value, 6) for value in quaternion_from_matrix(rotation)]
 
 
-def _rounded(values: tuple[float, ...] | None, digits: int = 3) -> list[float] | None:
-    return None if values is None else [round(value, digits) for value in values]
-
-
-def _finite(value: float | None) -> float | None:
-    """Replace NaN and infinity, which JSON lacks, by None."""
-    return value if value is not None and math.isfinite(value) else None
+def _number(value: float) -> float | None:
+    return round(value, 3) if math.isfinite(value) else None

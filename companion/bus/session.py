@@ -10,62 +10,74 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+import threading
 import time
-from collections.abc import Awaitable, Callable, Coroutine, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence, Set
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
+from types import MappingProxyType
 from typing import Any
 
 import zenoh
+from pydantic_core import to_json
+from zenoh import ext
 
-from companion.bus.command_intake import CommandIntake
-from companion.bus.topics import TOPICS, VIEW_TOPICS, Topic, alive_key, all_vehicles_key, command_key
+from companion.bus.bodies import ImageBody
+from companion.bus.command_intake import COMMANDS_PER_S, Allowance, CommandIntake
+from companion.bus.config import BusError, first_line, zenoh_config
+from companion.bus.topics import (
+    ROOT,
+    TOPICS,
+    VIEW_TOPICS,
+    Topic,
+    alive_key,
+    all_vehicles_key,
+    command_key,
+)
 from companion.settings import ZenohSection
+
+__all__ = ["Bus", "BusError", "encode", "zenoh_config"]
 
 logger = logging.getLogger(__name__)
 
 CommandHandler = Callable[[str], Awaitable[dict[str, Any]]]
+QueryHandler = Callable[[], Awaitable[Any]]
+_Publisher = zenoh.Publisher | ext.AdvancedPublisher
 
 _RETRY_MIN_S, _RETRY_MAX_S = 0.5, 5.0
 _WATCH_PERIOD_S = 0.25
 _ANSWER_S = 0.5
+# Interval in which a subscriber notices the loss of the newest message of a cached topic.
+_MISS_HEARTBEAT_S = 1.0
+# Messages of cached topics that wait for their thread.
+_MOST_UNSENT = 1000
 # Minimum interval of logged command failures.
 _LOG_PERIOD_S = 1.0
 
 
-class BusError(ConnectionError):
-    """The zenoh session cannot be opened (a busy port, a bad endpoint)."""
+def encode(body: Any) -> bytes:
+    """Encode a body as JSON, which lacks NaN and infinity: they become null.
 
-
-def zenoh_config(settings: ZenohSection) -> zenoh.Config:
-    """Convert settings into zenoh's configuration."""
-    config = zenoh.Config()
-    values = {
-        "mode": settings.mode,
-        "connect/endpoints": list(settings.connect),
-        "listen/endpoints": list(settings.listen) if settings.mode == "peer" else [],
-        "scouting/multicast/enabled": settings.multicast_scouting,
-        "timestamping/enabled": True,
-    }
-    if settings.mode == "peer":
-        # A peer starts without its router and keeps retrying.
-        values["connect/exit_on_failure"] = False
-    for key, value in values.items():
-        config.insert_json5(key, json.dumps(value))
-    return config
+    A message with ten detections takes 28 µs, with `json.dumps` 114.
+    """
+    return to_json(body, inf_nan_mode="null")
 
 
 class Bus:
-    """One vehicle's publications and its command queryable.
+    """One vehicle's publications and its queryables.
 
     Args:
         on_event: called with (level, text) when the network is lost or found.
         on_command: returns a command's JSON-able reply; called in the loop, one task each.
+        queries: path of a queryable → function that returns its reply, a body or a JPEG; called as
+            `on_command`. A TimeoutError or KeyError is replied as an error.
         views: names of the views that publish besides the first.
         listeners: topics, each with a callback in the loop for its messages, of any vehicle.
 
     Attributes:
-        published: path of a topic (`Topic.path`) → messages passed to zenoh.
+        published: path of a topic (`Topic.path`) → messages so far. Without a subscriber they are neither
+            encoded nor sent, unless they are kept for a later one (`Topic.cached`).
         publish_failed: messages without a session, or refused by zenoh.
         intake: accepts or refuses commands.
     """
@@ -77,6 +89,7 @@ class Bus:
         *,
         on_event: Callable[[str, str], None],
         on_command: CommandHandler,
+        queries: Mapping[str, QueryHandler] = MappingProxyType({}),
         views: Sequence[str] = (),
         listeners: Sequence[tuple[Topic, Callable[[bytes], None]]] = (),
     ) -> None:
@@ -85,16 +98,27 @@ class Bus:
         self._on_event = on_event
         self._on_command = on_command
         self._session: zenoh.Session | None = None
-        self._publishers: dict[str, zenoh.Publisher] = {}
+        self._queries = dict(queries)
+        self._publishers: dict[str, _Publisher] = {}
+        self._watched: dict[str, bool] = {}
+        self._matching: list[zenoh.MatchingListener[None]] = []
         self._tasks: set[asyncio.Task[None]] = set()
         self._sending: set[str] = set()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._connected = False
         self._watching: asyncio.Task[None] | None = None
-        self._token: zenoh.LivelinessToken | None = None
-        self._queryable: zenoh.Queryable[None] | None = None
+        self._tokens: dict[str, zenoh.LivelinessToken] = {}
+        self._queryables: list[zenoh.Queryable[None]] = []
+        self._query_allowance = Allowance()
+        # While zenoh sends kept messages to a frozen reader, a put of that topic waits for seconds, as does a
+        # reply to one. So neither is sent by the loop, and the reader of an image delays no command's result.
+        self._kept_puts = ThreadPoolExecutor(1, "zenoh kept messages")
+        self._room_for_kept = threading.Semaphore(_MOST_UNSENT)
+        self._command_replies = ThreadPoolExecutor(1, "zenoh command replies")
+        self._query_replies = ThreadPoolExecutor(1, "zenoh query replies")
         self._listeners = tuple(listeners)
         self._subscribers: list[zenoh.Subscriber[None]] = []
+        self._token: zenoh.LivelinessToken | None = None
         self._streams: list[tuple[Topic, str | None]] = [(topic, None) for topic in TOPICS]
         self._streams += [(topic, view) for view in views for topic in VIEW_TOPICS]
         self.published: dict[str, int] = {topic.path(view): 0 for topic, view in self._streams}
@@ -119,13 +143,14 @@ class Bus:
             BusError: a peer cannot listen on its endpoints.
         """
         self._loop = asyncio.get_running_loop()
-        if self._settings.mode == "peer":
+        config = zenoh_config(self._settings)
+        if json.loads(config.get_json("mode")) != "client":
             try:
-                self._adopt(await asyncio.to_thread(zenoh.open, zenoh_config(self._settings)))
+                self._adopt(await asyncio.to_thread(zenoh.open, config))
             except zenoh.ZError as error:
                 endpoints = ", ".join(self._settings.listen)
                 raise BusError(
-                    f"zenoh cannot listen on {endpoints}: {_first_line(error)}. "
+                    f"zenoh cannot listen on {endpoints}: {first_line(error)}. "
                     "If a router or another service uses it, set zenoh.connect to it and zenoh.listen to none"
                 ) from error
         self._watching = self._spawn(self._watch())
@@ -140,22 +165,38 @@ class Bus:
             await asyncio.wait(answers, timeout=_ANSWER_S)
         for task in list(self._tasks):
             task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+        if self._tasks:
+            await asyncio.wait(self._tasks, timeout=_ANSWER_S)
         session, self._session = self._session, None
         self._publishers.clear()
+        with suppress(TimeoutError):
+            async with asyncio.timeout(_ANSWER_S):
+                await asyncio.to_thread(self._kept_puts.shutdown)  # the last events are sent
+        self._tokens.clear()
         if session is not None:
             with suppress(TimeoutError):
                 async with asyncio.timeout(3.0):
                     await asyncio.to_thread(session.close)
+        for executor in (self._kept_puts, self._command_replies, self._query_replies):
+            executor.shutdown(wait=False, cancel_futures=True)
 
     def watched(self, topic: Topic, view: str | None = None) -> bool:
-        """Whether the topic has a subscriber now."""
-        publisher = self._publishers.get(topic.path(view))
-        # zenoh's stubs call this a bool.
-        return publisher is not None and bool(publisher.matching_status.matching)  # type: ignore[attr-defined]
+        """Whether the topic has a subscriber now. Not known for a cached topic."""
+        return self._watched.get(topic.path(view), False)
+
+    def set_alive(self, parts: Set[str]) -> None:
+        """Show these parts as alive and no others: a liveliness token `…/alive/PART` each."""
+        session = self._session
+        if session is None:
+            return
+        for part in self._tokens.keys() - parts:
+            self._tokens.pop(part).undeclare()  # type: ignore[no-untyped-call]
+        for part in parts - self._tokens.keys():
+            key = f"{alive_key(self._vehicle)}/{part}"
+            self._tokens[part] = session.liveliness().declare_token(key)
 
     def publish_image(
-        self, topic: Topic, image: bytes, attachment: dict[str, Any], view: str | None = None
+        self, topic: Topic, image: bytes, attachment: ImageBody, view: str | None = None
     ) -> None:
         """Publish bytes that are too large for one packet, with an attachment as JSON.
 
@@ -167,21 +208,26 @@ class Bus:
         if publisher is None or path in self._sending:
             self.publish_failed += 1
             return
+        if not self._watched[path]:
+            return  # it was made for a query
         self._sending.add(path)
         self._spawn(self._send(path, publisher, image, json.dumps(attachment)))
 
-    async def _send(self, path: str, publisher: zenoh.Publisher, image: bytes, attachment: str) -> None:
+    async def _send(self, path: str, publisher: _Publisher, image: bytes, attachment: str) -> None:
         try:
             await asyncio.to_thread(publisher.put, image, attachment=attachment)
             self.published[path] += 1
         except zenoh.ZError as error:
             self.publish_failed += 1
-            logger.warning("zenoh refused a message on %s: %s", path, _first_line(error))
+            logger.warning("zenoh refused a message on %s: %s", path, first_line(error))
         finally:
             self._sending.discard(path)
 
     def publish(self, topic: Topic, value: Any, view: str | None = None) -> None:
-        """Publish a JSON-able value, or a text unchanged. Never raises for the network.
+        """Publish a body, or a text unchanged. Never raises for the network.
+
+        Args:
+            value: the body, or a function that returns it; None: nothing is published.
 
         For a blocked reader zenoh drops the message, after a millisecond at most.
         """
@@ -190,34 +236,92 @@ class Bus:
         if publisher is None:
             self.publish_failed += 1
             return
-        payload = value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
+        if not topic.cached and not self._watched[path]:
+            self.published[path] += 1
+            return
+        body = value() if callable(value) else value
+        if body is None:
+            return
+        payload = body if isinstance(body, str) else encode(body)
+        if not topic.cached:
+            self._put(path, publisher, payload)
+        elif self._room_for_kept.acquire(blocking=False):
+            self._kept_puts.submit(self._put_kept, path, publisher, payload)
+        else:
+            self.publish_failed += 1
+
+    def _put_kept(self, path: str, publisher: _Publisher, payload: str | bytes) -> None:
+        try:
+            self._put(path, publisher, payload)
+        finally:
+            self._room_for_kept.release()
+
+    def _put(self, path: str, publisher: _Publisher, payload: str | bytes) -> None:
         try:
             publisher.put(payload)
         except zenoh.ZError as error:
             self.publish_failed += 1
-            logger.warning("zenoh refused a message on %s: %s", path, _first_line(error))
+            logger.warning("zenoh refused a message on %s: %s", path, first_line(error))
             return
         self.published[path] += 1
 
     def _adopt(self, session: zenoh.Session) -> None:
         self._session = session
-        self._publishers = {
-            topic.path(view): session.declare_publisher(
-                topic.key(self._vehicle, view),
-                encoding=topic.encoding,
-                congestion_control=zenoh.CongestionControl.DROP,
-                priority=topic.priority,
-                express=topic.express,
-            )
-            for topic, view in self._streams
-        }
+        for topic, view in self._streams:
+            self._declare(session, topic, view)
         # zenoh removes the token when this process ends, in any way.
         self._token = session.liveliness().declare_token(alive_key(self._vehicle))
-        self._queryable = session.declare_queryable(command_key(self._vehicle), self._from_zenoh_thread)
+        self._queryables = [session.declare_queryable(command_key(self._vehicle), self._from_zenoh_thread)]
+        self._queryables += [
+            session.declare_queryable(f"{ROOT}/{self._vehicle}/{path}", partial(self._on_query, path))
+            for path in self._queries
+        ]
         self._subscribers = [
             session.declare_subscriber(all_vehicles_key(topic), partial(self._on_sample, listener))
             for topic, listener in self._listeners
         ]
+
+    def _declare(self, session: zenoh.Session, topic: Topic, view: str | None) -> None:
+        path, key = topic.path(view), topic.key(self._vehicle, view)
+        drop = zenoh.CongestionControl.DROP
+        # Our own subscribers, for other vehicles' poses, do not count and get nothing.
+        remote = zenoh.Locality.REMOTE
+        if topic.cached:
+            self._publishers[path] = ext.declare_advanced_publisher(
+                session,
+                key,
+                encoding=topic.encoding,
+                congestion_control=drop,
+                priority=topic.priority,
+                express=topic.express,
+                allowed_destination=remote,
+                cache=ext.CacheConfig(
+                    topic.cached, replies_config=ext.RepliesConfig(congestion_control=drop)
+                ),
+                # The sporadic heartbeat is sent with BLOCK.
+                sample_miss_detection=ext.MissDetectionConfig(
+                    heartbeat=_MISS_HEARTBEAT_S, sporadic_heartbeat=None
+                ),
+                publisher_detection=True,
+            )
+            return
+        publisher = session.declare_publisher(
+            key,
+            encoding=topic.encoding,
+            congestion_control=drop,
+            priority=topic.priority,
+            express=topic.express,
+            allowed_destination=remote,
+        )
+
+        def on_matching(status: zenoh.MatchingStatus) -> None:
+            self._watched[path] = bool(status.matching)
+
+        self._publishers[path] = publisher
+        self._watched[path] = False
+        self._matching.append(publisher.declare_matching_listener(on_matching))
+        if publisher.matching_status.matching:  # type: ignore[attr-defined]
+            self._watched[path] = True
 
     def _on_sample(self, listener: Callable[[bytes], None], sample: zenoh.Sample) -> None:
         if self._loop is not None and not self._loop.is_closed():
@@ -229,8 +333,7 @@ class Bus:
         if text is not None and loop is not None and not loop.is_closed():
             loop.call_soon_threadsafe(lambda: self._spawn(self._answer(query, text)))
             return
-        with query:
-            _reply(query, {"command": "", "success": False, "reason": why or "the service has ended"})
+        _reply(query, {"command": "", "success": False, "reason": why or "the service has ended"})
 
     async def _answer(self, query: zenoh.Query, text: str) -> None:
         reply: dict[str, Any] = {"command": text[:200], "success": False, "reason": "the service has ended"}
@@ -241,8 +344,27 @@ class Bus:
             reply["reason"] = f"{type(error).__name__}: {error}"
         finally:
             # The sender always gets a reply, since it must not send the command again.
-            with query:
-                _reply(query, reply)
+            await self._in(self._command_replies, _reply, query, reply)
+
+    def _on_query(self, path: str, query: zenoh.Query) -> None:
+        loop = self._loop
+        if not self._query_allowance.take():
+            _reply_error(query, f"more than {COMMANDS_PER_S:g} queries a second; send it again later")
+        elif loop is not None and not loop.is_closed():
+            loop.call_soon_threadsafe(lambda: self._spawn(self._answer_query(path, query)))
+
+    async def _answer_query(self, path: str, query: zenoh.Query) -> None:
+        try:
+            body = await self._queries[path]()
+        except (TimeoutError, KeyError) as error:
+            await self._in(self._query_replies, _reply_error, query, f"{path}: {error}")
+            return
+        key = f"{ROOT}/{self._vehicle}/{path}"
+        await self._in(self._query_replies, _reply_body, query, key, body)
+
+    async def _in(self, executor: ThreadPoolExecutor, send: Callable[..., None], *arguments: Any) -> None:
+        with suppress(zenoh.ZError):  # the sender has gone
+            await asyncio.get_running_loop().run_in_executor(executor, send, *arguments)
 
     def _log_failure(self, text: str) -> None:
         now_s = time.monotonic()
@@ -303,9 +425,17 @@ def _payload(query: zenoh.Query) -> tuple[int, Callable[[], bytes]]:
 
 
 def _reply(query: zenoh.Query, reply: dict[str, Any]) -> None:
-    query.reply(query.key_expr, json.dumps(reply), encoding=zenoh.Encoding.APPLICATION_JSON)
+    with query:
+        query.reply(query.key_expr, json.dumps(reply), encoding=zenoh.Encoding.APPLICATION_JSON)
 
 
-def _first_line(error: BaseException) -> str:
-    """Return the text of an error without the source location that zenoh appends."""
-    return str(error).splitlines()[0].split(" at /")[0].strip() if str(error) else type(error).__name__
+def _reply_body(query: zenoh.Query, key: str, body: Any) -> None:
+    jpeg = isinstance(body, bytes)
+    encoding = zenoh.Encoding.IMAGE_JPEG if jpeg else zenoh.Encoding.APPLICATION_JSON
+    with query:
+        query.reply(key, body if jpeg else encode(body), encoding=encoding)
+
+
+def _reply_error(query: zenoh.Query, reason: str) -> None:
+    with query:
+        query.reply_err(json.dumps({"reason": reason}), encoding=zenoh.Encoding.APPLICATION_JSON)

@@ -1,4 +1,4 @@
-"""The table of published topics: key, encoding, rate, maximum age, quality of service.
+"""The table of published topics and queryables: key, body, rate, maximum age, quality of service.
 
 A topic's key is `companion/<vehicle>/<name>`. A reader that uses a topic for control must refuse messages
 older than `max_age_s`.
@@ -6,12 +6,19 @@ older than `max_age_s`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, field
+from typing import Any, Final
 
 import zenoh
 
+from companion.bus import bodies
+
 ROOT = "companion"
+
+_JSON = zenoh.Encoding.APPLICATION_JSON
+_REAL_TIME = zenoh.Priority.REAL_TIME
+# Not DATA, the priority of queries: a reply to a frozen reader is sent with BLOCK and holds that queue.
+_TELEMETRY = zenoh.Priority.DATA_HIGH
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,20 +26,29 @@ class Topic:
     """One stream.
 
     Attributes:
+        body: type of the payload; of `image` that of its attachment.
+        published: when, in words.
         rate_hz: nominal; None if it follows the camera or is irregular.
         max_age_s: max age of a valid message; None if it does not age (events).
+        of_camera: published by every camera.
+        cached: number of newest messages kept for late subscribers; 0: none are, and nothing is encoded
+            without a subscriber.
         encoding: of the payload.
         priority, express: zenoh's quality of service. Congestion control is DROP for every topic: with BLOCK
             one frozen reader stops the guidance loop for seconds.
     """
 
     name: str
-    rate_hz: float | None
-    max_age_s: float | None
-    encoding: zenoh.Encoding
-    priority: zenoh.Priority
-    express: bool
+    body: Any
     description: str
+    published: str
+    rate_hz: float | None = None
+    max_age_s: float | None = None
+    of_camera: bool = False
+    cached: int = 0
+    encoding: zenoh.Encoding = field(default_factory=lambda: _JSON)
+    priority: zenoh.Priority = field(default_factory=lambda: _TELEMETRY)
+    express: bool = False
 
     def key(self, vehicle: str, view: str | None = None) -> str:
         """Return the zenoh key of one vehicle's stream; views other than the first use the view's name."""
@@ -43,69 +59,134 @@ class Topic:
         return self.name if view is None else f"cameras/{view}/{self.name}"
 
 
-_JSON = zenoh.Encoding.APPLICATION_JSON
-_REAL_TIME = zenoh.Priority.REAL_TIME
-_DATA = zenoh.Priority.DATA
-
 DETECTIONS: Final = Topic(
-    "detections", None, 0.5, _JSON, _REAL_TIME, True, "the detections of one frame, one message per frame"
+    "detections",
+    bodies.DetectionsBody,
+    "the detections of one frame, with tracks and positions",
+    "per processed frame",
+    max_age_s=0.5,
+    of_camera=True,
+    priority=_REAL_TIME,
+    express=True,
 )
 LABELS: Final = Topic(
     "labels",
-    None,
-    0.5,
-    zenoh.Encoding.TEXT_PLAIN,
-    _DATA,
-    False,
-    "the class names of one frame, comma separated",
+    str,
+    "class names, comma separated, or `no objects detected`",
+    "per processed frame",
+    max_age_s=0.5,
+    of_camera=True,
+    encoding=zenoh.Encoding.TEXT_PLAIN,
 )
 TRACKS: Final = Topic(
     "tracks",
-    None,
-    None,
-    _JSON,
-    _DATA,
-    False,
-    "the track events of one frame: new, update, lost, end",
+    bodies.TracksBody,
+    "track events: new, update, lost, end",
+    "per frame with track events",
+    of_camera=True,
+    cached=100,
 )
 MARKERS: Final = Topic(
-    "markers", None, 0.5, _JSON, _REAL_TIME, True, "the markers in one frame, with their positions"
+    "markers",
+    bodies.MarkersBody,
+    "the markers in a frame and their positions",
+    "per processed frame, if marker detection is on",
+    max_age_s=0.5,
+    of_camera=True,
+    priority=_REAL_TIME,
+    express=True,
 )
-VEHICLE: Final = Topic("vehicle", 10.0, 0.5, _JSON, _DATA, True, "state of the vehicle")
-SETPOINT: Final = Topic("setpoint", 10.0, 0.5, _JSON, _DATA, True, "the requested setpoint and the one sent")
-POSE: Final = Topic("pose", 10.0, 1.0, _JSON, _REAL_TIME, True, "global pose, for other vehicles")
-OBSTACLES: Final = Topic(
-    "obstacles", None, 0.5, _JSON, _REAL_TIME, True, "distance of the nearest obstacle in 72 directions"
+TRANSFORMS: Final = Topic(
+    "transforms",
+    bodies.TransformsBody,
+    "NED, body, gimbal and camera at the capture",
+    "per processed frame with a known attitude",
+    max_age_s=0.5,
+    of_camera=True,
+    priority=_REAL_TIME,
+    express=True,
 )
-STATUS: Final = Topic("status", 1.0, 3.0, _JSON, _DATA, False, "state of every part of the service")
-EVENTS: Final = Topic(
-    "events",
-    None,
-    None,
-    _JSON,
-    _DATA,
-    False,
-    "events: modes, behaviours, losses and recoveries",
+CAMERA_INFO: Final = Topic(
+    "camera_info",
+    bodies.CameraInfoBody,
+    "lens and mount of the camera",
+    "1 Hz after the first frame",
+    rate_hz=1.0,
+    of_camera=True,
+    cached=1,
 )
-
 IMAGE: Final = Topic(
     "image",
-    5.0,
-    1.0,
-    zenoh.Encoding.IMAGE_JPEG,
-    zenoh.Priority.BACKGROUND,
-    False,
-    "a frame with its detections drawn, JPEG; only while there is a subscriber",
+    bodies.ImageBody,
+    "a frame with its detections drawn; the attachment has its number",
+    "at most `preview.rate_hz`, only with subscribers",
+    rate_hz=5.0,
+    max_age_s=1.0,
+    of_camera=True,
+    encoding=zenoh.Encoding.IMAGE_JPEG,
+    priority=zenoh.Priority.BACKGROUND,
 )
-
-# Topics published by every view.
-VIEW_TOPICS: Final = (DETECTIONS, LABELS, TRACKS, MARKERS, IMAGE)
+VEHICLE: Final = Topic(
+    "vehicle",
+    bodies.VehicleBody,
+    "state of the vehicle",
+    "10 Hz",
+    rate_hz=10.0,
+    max_age_s=0.5,
+    express=True,
+)
+SETPOINT: Final = Topic(
+    "setpoint",
+    bodies.SetpointsBody,
+    "the requested setpoint and the one sent",
+    "10 Hz while in command",
+    rate_hz=10.0,
+    max_age_s=0.5,
+    express=True,
+)
+POSE: Final = Topic(
+    "pose",
+    bodies.PoseBody,
+    "global pose, for other vehicles",
+    "10 Hz while known",
+    rate_hz=10.0,
+    max_age_s=1.0,
+    priority=_REAL_TIME,
+    express=True,
+)
+OBSTACLES: Final = Topic(
+    "obstacles",
+    bodies.ObstaclesBody,
+    "distance of the nearest obstacle in 72 horizontal directions, from north",
+    "per depth image of the steering camera",
+    max_age_s=0.5,
+    priority=_REAL_TIME,
+    express=True,
+)
+STATUS: Final = Topic(
+    "status",
+    bodies.StatusBody,
+    "state of every part of the service",
+    "1 Hz",
+    rate_hz=1.0,
+    max_age_s=3.0,
+    cached=1,
+)
+EVENTS: Final = Topic(
+    "events",
+    bodies.EventBody,
+    "modes, behaviours, losses and recoveries",
+    "on occurrence",
+    cached=100,
+)
 
 TOPICS: Final = (
     DETECTIONS,
     LABELS,
     TRACKS,
     MARKERS,
+    TRANSFORMS,
+    CAMERA_INFO,
     IMAGE,
     VEHICLE,
     SETPOINT,
@@ -114,6 +195,9 @@ TOPICS: Final = (
     STATUS,
     EVENTS,
 )
+
+# Topics published by every view.
+VIEW_TOPICS: Final = tuple(topic for topic in TOPICS if topic.of_camera)
 
 # The last part of the key of the queryable that executes a command and returns its result.
 COMMAND: Final = "command"

@@ -1,4 +1,4 @@
-"""The command line of `companion bench detector|latency|setpoints|deadman`."""
+"""The command line of `companion bench detector|latency|setpoints|bus|deadman`."""
 
 from __future__ import annotations
 
@@ -96,6 +96,34 @@ def bench_setpoints(
     from companion.bench.setpoints import measure_setpoints
 
     _print_figures(measure_setpoints(seconds, rate_hz=rate_hz, load=load), as_json)
+
+
+@bench.command("bus")
+def bench_bus(
+    seconds: Annotated[float, typer.Option(min=1, help="Duration of the measurement.")] = 10.0,
+    rate_hz: Annotated[float, typer.Option(min=1, max=1000, help="Messages a second.")] = 30.0,
+    load: Annotated[
+        int | None, typer.Option(min=0, help="Number of CPU-bound processes. Default: one for each core.")
+    ] = None,
+    recovered: Annotated[
+        int | None,
+        typer.Option(min=1, help="Instead publish this many messages of a recovered topic; count the lost."),
+    ] = None,
+    as_json: _JSON = False,
+) -> None:
+    """Measure the time from publication to a subscriber in another process. All cores are busy."""
+    import os
+
+    from companion.bench.bus import measure_bus, measure_recovery
+    from companion.bus.session import BusError
+
+    with plain_errors(BusError, RuntimeError):
+        if recovered is not None:
+            figures = measure_recovery(recovered)
+        else:
+            busy = len(os.sched_getaffinity(0)) if load is None else load
+            figures = measure_bus(seconds, rate_hz=rate_hz, load=busy)
+    _print_figures(figures, as_json)
 
 
 @bench.command("deadman")

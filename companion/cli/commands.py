@@ -26,6 +26,7 @@ from companion.cli.flags import EXIT_BAD_INPUT, plain_errors, settings_command
 from companion.cli.mission import mission
 from companion.cli.models import models
 from companion.cli.play import play
+from companion.cli.topics import topics
 from companion.settings import Settings
 from companion.settings.perception import DEFAULT_MODEL, NO_SOURCE
 from vision.gc_pause import gc_paused
@@ -45,6 +46,7 @@ ORDER = (
     "send",
     "echo",
     "commands",
+    "topics",
     "mission",
     "config",
     "evaluate",
@@ -61,6 +63,7 @@ app = typer.Typer(
 
 app.add_typer(models, name="models")
 app.command()(evaluate)
+app.command()(topics)
 settings_command(app, *CLIENT_SETTINGS, "plugins", "detector")(mission)
 settings_command(app)(play)
 app.add_typer(bench, name="bench")
@@ -451,8 +454,9 @@ def send(
 ) -> None:
     """Send a command to a running service. Waits for its outcome."""
     from companion.bus.client import NoAnswerError, client_settings, open_client, send_command
+    from companion.bus.session import BusError
 
-    with plain_errors(NoAnswerError):
+    with plain_errors(NoAnswerError, BusError):
         client = client_settings(settings.zenoh, (connect,) if connect else ())
         with open_client(client) as session:
             reply = send_command(session, settings.vehicle.name, command, timeout_s=timeout)
@@ -467,19 +471,23 @@ def echo(
     key: Annotated[str, typer.Argument(help="Topic (labels), or zenoh key with wildcards.")] = "**",
     connect: Annotated[str | None, typer.Option(help="Zenoh endpoint of the service or its router.")] = None,
     limit: Annotated[int | None, typer.Option(min=1, help="Maximum number of messages.")] = None,
+    history: Annotated[
+        bool, typer.Option("--history", help="Begin with kept messages: events, tracks, status, camera_info.")
+    ] = False,
 ) -> None:
     """Print the messages of a running service. One line each: key and message."""
     import queue
 
     from companion.bus.client import NoAnswerError, check_topic, client_settings, listen, open_client
+    from companion.bus.session import BusError
 
     messages: queue.SimpleQueue[tuple[str, str]] = queue.SimpleQueue()
     with plain_errors(ValueError):
         check_topic(key)
-    with plain_errors(NoAnswerError):
+    with plain_errors(NoAnswerError, BusError):
         client = client_settings(settings.zenoh, (connect,) if connect else ())
         with open_client(client) as session:
-            subscriber = listen(session, key, lambda name, text: messages.put((name, text)))
+            subscriber = listen(session, key, lambda name, text: messages.put((name, text)), history=history)
             try:
                 printed = 0
                 while limit is None or printed < limit:

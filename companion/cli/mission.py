@@ -27,6 +27,7 @@ def mission(
 ) -> None:
     """Check and fly a mission file. Sends it to a running service and waits for its outcome."""
     from companion.bus.client import NoAnswerError, client_settings, open_client, send_command
+    from companion.bus.session import BusError
     from companion.guidance.missions.mission_file import (
         Mission,
         MissionError,
@@ -37,7 +38,7 @@ def mission(
     )
     from companion.plugins import PluginError, load_plugins
 
-    with plain_errors(MissionError, NoAnswerError, PluginError, ValueError):
+    with plain_errors(MissionError, NoAnswerError, BusError, PluginError, ValueError):
         load_plugins(settings.plugins.modules)
         text = read_mission(find_mission(file))
         plan = plan_from(text, file, _class_names(settings) if check else None)

@@ -8,12 +8,11 @@ from __future__ import annotations
 import json
 import uuid
 from collections.abc import Callable
-from typing import Any
 
 from companion.guidance.behaviour import Behaviour
 from companion.guidance.behaviours.formation import FormationBehaviour
 from companion.guidance.formation.neighbours import Neighbourhood, Neighbours
-from companion.guidance.formation.pose import Pose, PoseError, pose_from_message, pose_message, pose_of
+from companion.guidance.formation.pose import Pose, PoseError, pose_from_message, pose_of
 from companion.vehicle.state import VehicleState
 
 
@@ -67,15 +66,11 @@ class PoseSharing:
             role = "leader"
         return pose_of(state, now_ns, vehicle=self.vehicle, source=self.source, role=role, formation=note)
 
-    def message(self, state: VehicleState, active: Behaviour | None, now_ns: int) -> dict[str, Any] | None:
-        """The same as published."""
-        pose = self.pose(state, active, now_ns)
-        return None if pose is None else pose_message(pose)
+    def ages_s(self, now_ns: int) -> dict[str, float]:
+        """Age of each other vehicle's pose, seconds."""
+        return self._neighbours.ages_s(now_ns)
 
-    def status(self, now_ns: int) -> dict[str, Any]:
-        """For `status`: age of each other vehicle's pose, seconds, and counts of dropped messages."""
-        return {
-            "ages_s": self._neighbours.ages_s(now_ns),
-            "unread": self.unread,
-            "out_of_order": self._neighbours.refused,
-        }
+    @property
+    def out_of_order(self) -> int:
+        """Count of messages older than the newest one."""
+        return self._neighbours.refused

@@ -7,7 +7,7 @@ the guidance loop.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
-Status = dict[str, Any]
+Status = Mapping[str, Any]
 
 
 class MetricsError(RuntimeError):

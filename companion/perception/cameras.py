@@ -12,8 +12,7 @@ import os
 import statistics
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -23,7 +22,13 @@ from companion.guidance.targets.from_detections import (
     mount_at,
     targets_from_detections,
 )
-from companion.guidance.targets.from_markers import MarkerSight, MarkerTarget, looks_down, marker_targets
+from companion.guidance.targets.from_markers import (
+    LocalizedMarkers,
+    MarkerSight,
+    MarkerTarget,
+    looks_down,
+    marker_targets,
+)
 from companion.guidance.targets.ranging import ALL_MEANS, RangeMeans, sees_ground
 from companion.guidance.targets.target import Target
 from companion.perception.messages import Preview
@@ -34,7 +39,6 @@ from companion.settings.calibration import adopt_calibration
 from companion.settings.perception import NO_SOURCE
 from companion.vehicle.state import VehicleState
 from vision.camera_model import CameraCalibration
-from vision.markers import Marker
 from vision.pipeline import PerceptionResult
 from vision.tracking import Selected, SelectRequest
 
@@ -295,14 +299,9 @@ class MarkerTracker:
         self._seen: dict[str | None, _SeenMarkers] = {}
 
     def localize(
-        self,
-        camera: PerceptionCamera,
-        result: PerceptionResult,
-        history: StateHistory,
-        vehicle: str,
-        published_ns: int,
-    ) -> dict[str, Any]:
-        """Localize the markers of one frame; returns the message to publish."""
+        self, camera: PerceptionCamera, result: PerceptionResult, history: StateHistory
+    ) -> LocalizedMarkers:
+        """Localize the markers of one frame."""
         markers, section = result.markers or (), camera.settings.camera
         error_text, down = "", False
         targets: tuple[MarkerTarget, ...] = ()
@@ -315,18 +314,7 @@ class MarkerTracker:
             # As with detections: without an attitude at the capture they are published, but not targets.
             error_text = str(error)
         self._seen[camera.name] = _SeenMarkers(result.captured_ns, targets, down)
-        localized: Sequence[MarkerTarget | None] = targets or [None] * len(markers)
-        return {
-            "vehicle": vehicle,
-            "camera": camera.name,
-            "sequence": result.sequence,
-            "captured_ns": result.captured_ns,
-            "published_ns": published_ns,
-            "width": result.width,
-            "height": result.height,
-            "localization_error": error_text,
-            "markers": [_marker_message(*pair) for pair in zip(markers, localized, strict=True)],
-        }
+        return LocalizedMarkers(targets, error_text)
 
     def sight(self, now_ns: int, max_age_s: float) -> MarkerSight:
         """Return the markers of the cameras that look down, for behaviours."""
@@ -354,21 +342,3 @@ class MarkerTracker:
             for camera in self._detecting
         )
         return f"a camera that sees straight down ({cameras})"
-
-
-def _marker_message(marker: Marker, target: MarkerTarget | None) -> dict[str, Any]:
-    """Create one marker's message; metres, radians, local NED, pixels. Not localized: image fields only."""
-    message: dict[str, Any] = {
-        "id": marker.identifier,
-        "size_m": marker.size_m,
-        "corners_px": [[round(float(value), 2) for value in corner] for corner in marker.corners_px],
-        "position_camera_m": [round(float(value), 4) for value in marker.position_camera_m],
-        "reprojection_px": round(marker.reprojection_px, 3),
-        "ambiguity": round(marker.ambiguity, 3),
-    }
-    fields = {} if target is None else asdict(target)
-    for name in ("pad", "bearing_rad", "elevation_rad", "distance_m", "ground_range_m", "heading_rad"):
-        message[name] = None if target is None else round(fields[name], 4)
-    for name in ("position_ned_m", "pad_ned_m"):
-        message[name] = None if target is None else [round(value, 3) for value in fields[name]]
-    return message

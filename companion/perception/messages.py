@@ -86,6 +86,7 @@ class Ready:
 
     `model` is None without a detector; `precision` and `runtime` of the network are None without a network.
     `reason`: why these were selected, as text. `calibration`: from the camera, if it provides one.
+    `model_sha256`: of the model's file; None without one.
     """
 
     source: str
@@ -95,6 +96,7 @@ class Ready:
     runtime: str | None = None
     reason: str = ""
     calibration: CameraCalibration | None = None
+    model_sha256: str | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,6 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from typing import Any
 
 from vision.pipeline import PerceptionResult
 from vision.tracking import Track, TrackEvent, TrackEventKind
@@ -69,34 +68,6 @@ class PerceptionStatus:
     runtime: str | None = None
     runtime_reason: str = ""
     problem: str = ""
-
-    def as_dict(self) -> dict[str, Any]:
-        """Convert to JSON-able values; of the newest result only its sequence number."""
-        return {
-            "state": self.state.value,
-            "pid": self.pid,
-            "restarts": self.restarts,
-            "frames": self.frames,
-            "results": self.results,
-            "rate_hz": round(self.rate_hz, 2),
-            "sequence": None if self.newest is None else self.newest.sequence,
-            "age_s": None if self.age_s is None else round(self.age_s, 3),
-            "timing_ms": _rounded(self.timing_ms),
-            "timing_p50_ms": _rounded(self.timing_p50_ms),
-            "timing_p99_ms": _rounded(self.timing_p99_ms),
-            "dropped": self.dropped,
-            "frames_skipped": dict(self.frames_skipped),
-            "stuck_after_s": self.stuck_after_s,
-            "class_names": list(self.class_names),
-            "tracks": self.tracks,
-            "runtime": self.runtime,
-            "runtime_reason": self.runtime_reason,
-            "problem": self.problem,
-        }
-
-
-def _rounded(timing_ms: Mapping[str, float]) -> dict[str, float]:
-    return {stage: round(value, 3) for stage, value in timing_ms.items()}
 
 
 WINDOW = 200

@@ -234,6 +234,11 @@ class PerceptionSupervisor:
         return self._state
 
     @property
+    def ready(self) -> Ready | None:
+        """What the newest worker has loaded; None before the start."""
+        return self._ready
+
+    @property
     def class_names(self) -> tuple[str, ...]:
         """Classes of the model, id → name; empty before the start and without a detector."""
         return () if self._ready is None else self._ready.class_names

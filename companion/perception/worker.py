@@ -328,6 +328,7 @@ def _ready(perception: Perception) -> Ready:
         detector.runtime,
         detector.reason,
         calibration,
+        detector.model_sha256,
     )
 
 

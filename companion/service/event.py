@@ -6,8 +6,9 @@ import logging
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
+
+from companion.bus.bodies import EventBody
 
 logger = logging.getLogger(__package__)
 
@@ -32,7 +33,7 @@ class EventLog:
     """
 
     def __init__(
-        self, publish: Callable[[dict[str, Any]], None], on_event: Callable[[Event], None] | None
+        self, publish: Callable[[EventBody], None], on_event: Callable[[Event], None] | None
     ) -> None:
         self._publish, self._on_event = publish, on_event
         self.newest: deque[Event] = deque(maxlen=100)
@@ -42,7 +43,7 @@ class EventLog:
         event = Event(time.monotonic_ns(), level, text)
         self.newest.append(event)
         logger.log(getattr(logging, level.upper()), "%s", text)
-        self._publish(asdict(event))
+        self._publish({"stamp_ns": event.stamp_ns, "level": event.level, "text": event.text})
         if self._on_event is not None:
             try:
                 self._on_event(event)

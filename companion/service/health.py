@@ -7,9 +7,9 @@ from collections.abc import Callable, Sequence
 from companion.guidance.core import Guidance
 from companion.perception.cameras import WorkerCamera
 from companion.service.other_commanders import OtherCommanders
-from companion.service.status import hud_lines
 from companion.service.systemd_notify import SystemdNotifier
 from companion.vehicle.driver import CommandRefusedError, Driver, SystemStatus
+from companion.vehicle.state import VehicleState
 
 HEARTBEAT_PERIOD_S = 1.0
 HUD_PERIOD_S = 0.2
@@ -82,3 +82,15 @@ class Health:
             lines = hud_lines(self._driver.state, guidance.status)
             for camera in self._cameras:
                 camera.supervisor.send_hud(lines)
+
+
+def hud_lines(state: VehicleState, status: str) -> tuple[str, ...]:
+    """Return the overlay lines of the recorded video. `status`: guidance's, as text."""
+    altitude = "-" if state.altitude_m is None else f"{state.altitude_m:.1f} m"
+    speed = state.velocity_ned_mps
+    horizontal = "-" if speed is None else f"{(speed[0] ** 2 + speed[1] ** 2) ** 0.5:.1f} m/s"
+    return (
+        f"{state.mode.value}  {'armed' if state.armed else 'disarmed'}",
+        status,
+        f"height {altitude}  speed {horizontal}",
+    )

@@ -9,7 +9,6 @@ import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
 
 from companion.guidance.behaviour import Behaviour
 from companion.guidance.behaviours.select import FIRST_CAMERA, Select
@@ -19,6 +18,7 @@ from companion.guidance.interface import Answer, CommandInput, GuidanceInput, St
 from companion.guidance.pose_sharing import PoseSharing
 from companion.guidance.search_pattern import Footprint
 from companion.guidance.targets.from_detections import StateHistory
+from companion.guidance.targets.from_markers import LocalizedMarkers
 from companion.perception.cameras import MarkerTracker, PerceptionCamera
 from companion.plugins import load_plugins
 from companion.settings import Settings
@@ -92,14 +92,11 @@ class InputAssembler:
         if len(self._logged_ns) > MAX_REMEMBERED:
             self._logged_ns.clear()
 
-    def on_result(
-        self, camera: PerceptionCamera, result: PerceptionResult, now_ns: int
-    ) -> dict[str, Any] | None:
-        """Process a camera's result; returns the message of its markers if marker detection is on."""
+    def on_result(self, camera: PerceptionCamera, result: PerceptionResult) -> LocalizedMarkers | None:
+        """Process a camera's result; returns its markers if marker detection is on."""
         markers = None
         if result.markers is not None:
-            name = self._settings.vehicle.name
-            markers = self._markers.localize(camera, result, self.history, name, now_ns)
+            markers = self._markers.localize(camera, result, self.history)
         if camera is self.steering:
             camera.localize(result, self.history)
             if result.obstacles is not None:

@@ -10,8 +10,8 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
+from companion.bus.bodies import OtherCommanderBody
 from companion.guidance.interface import CommandInput
 from companion.guidance.limits.battery import needs_charge
 from companion.settings.vehicle import VehicleSection
@@ -130,7 +130,7 @@ class OtherCommanders:
                 )
         return None
 
-    def status(self, state: VehicleState, now_ns: int) -> list[dict[str, Any]]:
+    def status(self, state: VehicleState, now_ns: int) -> list[OtherCommanderBody]:
         """Return the present services as fields of `status`."""
         return [
             {

@@ -1,4 +1,4 @@
-"""Publishes the service's data: camera results, vehicle, pose, setpoints."""
+"""Publishes the service's data: camera results, cameras, vehicle, pose, setpoints."""
 
 from __future__ import annotations
 
@@ -6,22 +6,38 @@ import asyncio
 import logging
 import time
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import replace
+from urllib.parse import quote
 
 from companion.bus import topics
+from companion.bus.bodies import TransformsBody
 from companion.bus.messages import (
+    Localization,
+    ModelIdentity,
+    camera_info_message,
     detections_message,
+    image_attachment,
     labels_message,
-    setpoint_message,
+    markers_message,
+    obstacles_message,
     tracks_message,
-    vehicle_message,
+    transforms_message,
 )
 from companion.bus.session import Bus
+from companion.bus.vehicle_messages import (
+    geodetic_origin,
+    pose_message,
+    setpoints_message,
+    vehicle_message,
+)
 from companion.guidance.core import Guidance
-from companion.guidance.limits.obstacles import obstacles_message
+from companion.guidance.targets.from_detections import HistoryError
+from companion.guidance.targets.from_markers import LocalizedMarkers
 from companion.perception.cameras import WorkerCamera
 from companion.perception.messages import Preview
+from companion.perception.supervisor import PerceptionState
 from companion.service.inputs import InputAssembler
+from companion.service.queries import Queries
 from companion.vehicle.driver import Driver
 from companion.vehicle.streamer import Streamer
 from vision.pipeline import PerceptionResult
@@ -32,39 +48,98 @@ logger = logging.getLogger(__package__)
 class Publisher:
     """Publishes every topic except `status` and `events`, which the service publishes itself."""
 
-    def __init__(self, vehicle: str, bus: Bus, driver: Driver, inputs: InputAssembler) -> None:
-        self._vehicle, self._bus, self._driver, self._inputs = vehicle, bus, driver, inputs
+    def __init__(
+        self, vehicle: str, bus: Bus, driver: Driver, inputs: InputAssembler, queries: Queries
+    ) -> None:
+        self._vehicle, self._bus, self._driver = vehicle, bus, driver
+        self._inputs, self._queries = inputs, queries
 
     def publish_result(
-        self, camera: WorkerCamera, result: PerceptionResult, markers: dict[str, Any] | None
+        self,
+        camera: WorkerCamera,
+        result: PerceptionResult,
+        markers: LocalizedMarkers | None,
+        localization: Localization,
     ) -> None:
-        """Publish a camera's result. Never raises."""
+        """Publish a camera's result. Never raises.
+
+        Args:
+            localization: of the result's detections, if `camera` is the steering one.
+        """
         try:
-            self._publish_result(camera, result, markers)
+            self._publish_result(camera, result, markers, localization)
         except Exception as error:
             # Guidance has used the result and continues; the failure is logged and in `status`.
             logger.exception("a result could not be published")
             camera.localization_error = f"{type(error).__name__}: {error}"
 
     def _publish_result(
-        self, camera: WorkerCamera, result: PerceptionResult, markers: dict[str, Any] | None
+        self,
+        camera: WorkerCamera,
+        result: PerceptionResult,
+        markers: LocalizedMarkers | None,
+        localization: Localization,
     ) -> None:
-        bus, name, now_ns = self._bus, self._vehicle, time.monotonic_ns()
-        message = detections_message(result, name, now_ns, camera.name, self._driver.state.clock)
-        bus.publish(topics.DETECTIONS, message, camera.name)
-        bus.publish(topics.LABELS, labels_message(result), camera.name)
+        bus, vehicle, name, now_ns = self._bus, self._vehicle, camera.name, time.monotonic_ns()
+        state, steering = self._driver.state, camera is self._inputs.steering
+
+        def located() -> Localization:
+            return replace(localization, origin=geodetic_origin(state, now_ns))
+
+        bus.publish(
+            topics.DETECTIONS,
+            lambda: detections_message(
+                result,
+                vehicle,
+                now_ns,
+                name,
+                state.clock,
+                model=_model(camera),
+                localization=located() if steering else None,
+            ),
+            name,
+        )
+        bus.publish(topics.LABELS, lambda: labels_message(result), name)
         if result.track_events:
-            bus.publish(topics.TRACKS, tracks_message(result, name, now_ns, camera.name), camera.name)
+            bus.publish(topics.TRACKS, lambda: tracks_message(result, vehicle, now_ns, name), name)
         if markers is not None:
-            bus.publish(topics.MARKERS, {**markers, "published_ns": now_ns}, camera.name)
-        if camera is self._inputs.steering and result.obstacles is not None:
-            bus.publish(topics.OBSTACLES, obstacles_message(result.obstacles, name))
+            bus.publish(topics.MARKERS, lambda: markers_message(result, markers, vehicle, now_ns, name), name)
+        if (obstacles := result.obstacles) is not None and steering:
+            bus.publish(topics.OBSTACLES, lambda: obstacles_message(obstacles, vehicle))
+        bus.publish(topics.TRANSFORMS, lambda: self._transforms(camera, result), name)
         camera.supervisor.published(result)
 
+    def _transforms(self, camera: WorkerCamera, result: PerceptionResult) -> TransformsBody | None:
+        mount, history = camera.settings.camera.mount(), self._inputs.history
+        try:
+            return transforms_message(
+                result.sequence, result.captured_ns, mount, history, self._vehicle, camera.name
+            )
+        except HistoryError:
+            return None  # `localization_error` has the reason
+
+    def publish_cameras(self, cameras: Sequence[WorkerCamera]) -> None:
+        """Publish lens and mount of every camera that has given a frame."""
+        now_ns = time.monotonic_ns()
+        for camera in cameras:
+            if (newest := camera.newest) is None:
+                continue
+            section = camera.settings.camera
+            message = camera_info_message(
+                section.model(newest.width, newest.height),
+                section.mount(),
+                calibrated=section.fx_px is not None,
+                vehicle=self._vehicle,
+                view=camera.name,
+                now_ns=now_ns,
+            )
+            self._bus.publish(topics.CAMERA_INFO, message, camera.name)
+
     def publish_preview(self, camera: WorkerCamera, preview: Preview) -> None:
-        """Publish a preview image with its stamps."""
-        stamps = {"camera": camera.name, "sequence": preview.sequence, "captured_ns": preview.captured_ns}
-        self._bus.publish_image(topics.IMAGE, preview.jpeg, stamps, camera.name)
+        """Publish a preview image with its stamps, and answer the queries for one."""
+        self._queries.on_image(camera, preview.jpeg)
+        attachment = image_attachment(preview.sequence, preview.captured_ns, camera.name)
+        self._bus.publish_image(topics.IMAGE, preview.jpeg, attachment, camera.name)
 
     async def publish_vehicle(
         self, guidance: Guidance, streamer: Streamer, cameras: Sequence[WorkerCamera]
@@ -72,23 +147,36 @@ class Publisher:
         """Publish vehicle, pose and setpoints at the rate of `vehicle`, until cancelled."""
         period_s = 1 / (topics.VEHICLE.rate_hz or 10.0)
         while True:
-            now_ns, state = time.monotonic_ns(), self._driver.state
-            self._bus.publish(topics.VEHICLE, vehicle_message(state, now_ns))
-            pose = self._inputs.poses.message(state, guidance.active, now_ns)
-            if pose is not None:
-                self._bus.publish(topics.POSE, pose)
+            self._publish_vehicle(guidance, streamer, time.monotonic_ns())
             for camera in cameras:
-                camera.supervisor.watch(self._bus.watched(topics.IMAGE, camera.name))
-            if guidance.in_command:
-                self._bus.publish(
-                    topics.SETPOINT,
-                    {
-                        "stamp_ns": now_ns,
-                        "asked": setpoint_message(guidance.asked),
-                        "sent": setpoint_message(streamer.last_sent),
-                        "sent_ns": streamer.last_sent_ns,
-                        "stream": streamer.state.value,
-                        "limited_by": list(guidance.limited_by),
-                    },
-                )
+                watched = self._bus.watched(topics.IMAGE, camera.name)
+                camera.supervisor.watch(watched or self._queries.image_wanted(camera))
+            self._bus.set_alive(_alive(cameras))
             await asyncio.sleep(period_s)
+
+    def _publish_vehicle(self, guidance: Guidance, streamer: Streamer, now_ns: int) -> None:
+        bus, state = self._bus, self._driver.state
+        bus.publish(topics.VEHICLE, lambda: vehicle_message(state, now_ns))
+        pose = self._inputs.poses.pose(state, guidance.active, now_ns)
+        if pose is not None:
+            bus.publish(topics.POSE, lambda: pose_message(pose))
+        if guidance.in_command:
+            bus.publish(topics.SETPOINT, lambda: setpoints_message(guidance, streamer, now_ns))
+
+
+def _alive(cameras: Sequence[WorkerCamera]) -> set[str]:
+    """Return the liveliness tokens of the cameras and models that run."""
+    alive = set()
+    for camera in cameras:
+        if camera.supervisor.state is PerceptionState.RUNNING:
+            part = "camera" if camera.name is None else f"cameras/{camera.name}"
+            alive.add(part)
+            if (model := _model(camera)) is not None:
+                # A path has characters that a key must not have.
+                alive.add(f"{part}/model/{quote(model.name, safe='')}")
+    return alive
+
+
+def _model(camera: WorkerCamera) -> ModelIdentity | None:
+    ready = camera.supervisor.ready
+    return None if ready is None or ready.model is None else ModelIdentity(ready.model, ready.model_sha256)

@@ -11,7 +11,10 @@ from collections.abc import Callable
 from typing import Any
 
 from companion.bus import topics
+from companion.bus.bodies import StatusBody
+from companion.bus.messages import Localization
 from companion.bus.session import Bus
+from companion.bus.status_message import status_message
 from companion.guidance import grammar
 from companion.guidance.core import Guidance
 from companion.operator.console import run_console, terminal_is_free
@@ -25,7 +28,7 @@ from companion.service.health import Health
 from companion.service.inputs import InputAssembler
 from companion.service.other_commanders import OtherCommanders
 from companion.service.publisher import Publisher
-from companion.service.status import status_message
+from companion.service.queries import Queries
 from companion.service.systemd_notify import SystemdNotifier
 from companion.settings import Settings
 from companion.vehicle.driver import CommandRefusedError, Driver
@@ -74,18 +77,20 @@ class Service:
         self.inputs = InputAssembler(settings, self.cameras, self._event)
         started_ns = time.monotonic_ns()
         self.others = OtherCommanders(settings.vehicle, self.inputs.poses.source, started_ns, self._event)
+        self._queries = Queries(settings, self.status)
         self.bus = Bus(
             settings.zenoh,
             settings.vehicle.name,
             on_event=self._event,
             on_command=self.command,
+            queries=self._queries.handlers(self.cameras),
             views=tuple(settings.cameras),
             listeners=[
                 (topics.POSE, lambda data: self.inputs.poses.on_message(data, time.monotonic_ns())),
                 (topics.STATUS, lambda data: self.others.on_status(data, time.monotonic_ns())),
             ],
         )
-        self._publisher = Publisher(settings.vehicle.name, self.bus, self.driver, self.inputs)
+        self._publisher = Publisher(settings.vehicle.name, self.bus, self.driver, self.inputs, self._queries)
         self._loop = GuidanceLoop(
             self.guidance,
             self.inputs,
@@ -99,7 +104,7 @@ class Service:
         self._notifier = SystemdNotifier()
         self._health = Health(self.driver, self.cameras, self._notifier, self.others, self._event)
         self.ready = self._ending = False
-        self._status: dict[str, Any] | None = None
+        self._status: StatusBody | None = None
         self._stop = asyncio.Event()
 
     async def run(self, ready: Callable[[], None] | None = None) -> None:
@@ -158,19 +163,21 @@ class Service:
             return {"command": text, "success": False, "reason": reason}
         return await self._loop.execute(text)
 
-    def status(self) -> dict[str, Any]:
+    def status(self) -> StatusBody:
         """The state of every part, as published on `status`."""
         now_ns = time.monotonic_ns()
         return status_message(
             now_ns,
+            uptime_s=self.others.uptime_s(now_ns),
             healthy=self._health.healthy(now_ns),
             driver=self.driver,
             guidance=self.guidance,
             streamer=self.streamer,
             cameras=self.cameras,
-            inputs=self.inputs,
+            steering=self.inputs.steering,
+            poses=self.inputs.poses,
             bus=self.bus,
-            others=self.others,
+            others=self.others.status(self.driver.state, now_ns),
             dropped_lines=self._dropped_lines(),
         )
 
@@ -226,6 +233,7 @@ class Service:
         while True:
             self._status = status = self.status()
             self.bus.publish(topics.STATUS, status)
+            self._publisher.publish_cameras(self.cameras)
             self._notifier.status(f"{status['vehicle']['mode']}, {status['pilot']['behaviour']}")
             await asyncio.sleep(1 / (topics.STATUS.rate_hz or 1.0))
 
@@ -240,11 +248,14 @@ class Service:
 
     def _on_result(self, camera: WorkerCamera, result: PerceptionResult) -> None:
         """Localize a camera's result, let guidance use it, then publish it."""
-        markers = None
+        markers, localization = None, Localization(error="failed")
         try:
-            markers = self.inputs.on_result(camera, result, time.monotonic_ns())
+            markers = self.inputs.on_result(camera, result)
+            localization = Localization(camera.targets, camera.localization_error)
             if camera is self.inputs.steering or markers is not None:
                 self._loop.on_perception()
         finally:
             # The guidance loop runs first: a subscriber can wait for a millisecond, a setpoint cannot.
-            asyncio.get_running_loop().call_soon(self._publisher.publish_result, camera, result, markers)
+            asyncio.get_running_loop().call_soon(
+                self._publisher.publish_result, camera, result, markers, localization
+            )

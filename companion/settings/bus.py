@@ -21,6 +21,8 @@ class ZenohSection(Section):
     """endpoints to listen on (peer only); tcp/0.0.0.0:7447 is open to the whole network"""
     multicast_scouting: bool = False
     """find other peers on the local network by multicast"""
+    config_file: str | None = None
+    """zenoh's configuration file (JSON5): TLS, access control; its keys replace defaults of those above"""
 
     @model_validator(mode="after")
     def _reachable(self) -> Self:

@@ -27,12 +27,12 @@ class Section(BaseModel):
         texts: dict[str, str] = {}
         for base in reversed(cls.__mro__):
             if issubclass(base, Section):
-                texts |= _texts_below_keys(base.__module__).get(base.__name__, {})
+                texts |= texts_below_keys(base.__module__).get(base.__name__, {})
         return texts
 
 
 @functools.cache
-def _texts_below_keys(module: str) -> dict[str, dict[str, str]]:
+def texts_below_keys(module: str) -> dict[str, dict[str, str]]:
     """Return class → key → the string below it in the source."""
     try:
         source = inspect.getsource(sys.modules[module])

@@ -29,6 +29,7 @@ def tracked() -> Detections:
         track_id=np.array([4, NO_TRACK, 9]),
         track_score=np.array([0.8, np.nan, 0.3], np.float32),
         track_confirmed=np.array([True, False, False]),
+        track_first_ns=np.array([1, 2, 0]),
     )
 
 

@@ -333,6 +333,13 @@ class Tracker:
             [record is not None and record.confirmed and not record.class_in_doubt for record in of_each],
             np.bool_,
         )
-        labelled = replace(detections, track_id=track_id, track_score=score, track_confirmed=confirmed)
+        first_ns = np.array([0 if record is None else record.first_ns for record in of_each], np.int64)
+        labelled = replace(
+            detections,
+            track_id=track_id,
+            track_score=score,
+            track_confirmed=confirmed,
+            track_first_ns=first_ns,
+        )
         kept = (track_id != NO_TRACK) | (detections.confidence >= self.settings.keep_confidence)
         return labelled if kept.all() else labelled[kept]

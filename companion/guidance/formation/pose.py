@@ -159,58 +159,6 @@ def turn_rate(state: VehicleState) -> float:
     return (math.sin(roll) * pitch_rate + math.cos(roll) * yaw_rate) / max(0.2, math.cos(pitch))
 
 
-def pose_message(pose: Pose) -> dict[str, Any]:
-    """A pose as published (JSON-compatible)."""
-    return {
-        "vehicle": pose.vehicle,
-        "source": pose.source,
-        "published_ns": pose.published_ns,
-        "age_s": round(pose.age_s, 4),
-        "latitude_deg": round(pose.latitude_deg, 8),
-        "longitude_deg": round(pose.longitude_deg, 8),
-        "altitude_amsl_m": round(pose.altitude_m, 3),
-        "velocity_ned_mps": [round(value, 3) for value in pose.velocity_ned_mps],
-        "heading_rad": round(pose.heading_rad, 4),
-        "turn_rate_radps": round(pose.turn_rate_radps, 4),
-        "role": pose.role,
-        "airborne": pose.airborne,
-        "formation": None if pose.formation is None else _note_message(pose.formation),
-    }
-
-
-def _note_message(note: FormationNote) -> dict[str, Any]:
-    structure = note.structure
-    return {
-        "leader": note.leader,
-        "plan": {
-            "version": note.plan.version,
-            "author": note.plan.author,
-            "shape": note.plan.shape,
-            "spacing_m": note.plan.spacing_m,
-        },
-        "wish": note.wish,
-        "error_m": round(note.error_m, 2),
-        "slots": dict(note.slots),
-        "count": note.count,
-        "heading_rad": round(note.heading_rad, 4),
-        "turn_rate_radps": round(note.turn_rate_radps, 4),
-        "structure": None
-        if structure is None
-        else {
-            "place": [
-                round(structure.place[0], 8),
-                round(structure.place[1], 8),
-                round(structure.place[2], 3),
-            ],
-            "velocity_ned_mps": [round(value, 3) for value in structure.velocity_ned_mps],
-            "heading_rad": round(structure.heading_rad, 4),
-            "origin": list(structure.origin),
-            "along_m": round(structure.along_m, 2),
-            "over": structure.over,
-        },
-    }
-
-
 def pose_from_message(message: Any) -> Pose:
     """Parse and validate a published pose. Raises PoseError."""
     fields = _Fields(message, "pose")

@@ -15,7 +15,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any
 
 from companion.guidance.behaviour import Behaviour, GimbalStatus, Outcome
 from companion.guidance.interface import (
@@ -283,20 +282,9 @@ class GimbalController:
             self.mounting.camera_pitch_rad,
         )
 
-    def status(self, now_ns: int, state: VehicleState) -> dict[str, Any] | None:
-        """For `status`; None where there is no gimbal and none is expected."""
-        gimbal = state.gimbal
-        if gimbal is None and not self.mounting.carries_camera:
-            return None
-        pitch_rad = None if gimbal is None else gimbal.pitch_rad
-        primary = None if gimbal is None else gimbal.primary_control
-        return {
-            "answers": gimbal is not None,
-            "pitch_deg": None if pitch_rad is None else round(math.degrees(pitch_rad), 1),
-            "primary_control": None if primary is None else address_text(primary),
-            "ours": self._control.holds(now_ns, gimbal),
-            "problem": self._problem(now_ns, state),
-        }
+    def in_control(self, now_ns: int, state: VehicleState) -> bool:
+        """Whether this service has primary control."""
+        return self._control.holds(now_ns, state.gimbal)
 
     # --- commands ----------------------------------------------------------------------------------------
 
@@ -431,7 +419,7 @@ class GimbalController:
             return
         request.aim = track.direction(tracks, state, self._camera_pitch_rad) or request.aim
 
-    def _problem(self, now_ns: int, state: VehicleState) -> str:
+    def problem(self, now_ns: int, state: VehicleState) -> str:
         if self._control.problem:
             return self._control.problem
         if state.gimbal is None:
@@ -477,7 +465,7 @@ class GimbalController:
             text = (
                 "camera direction known: gimbal attitude received"
                 if looking
-                else f"camera direction unknown: {self._problem(now_ns, state)}"
+                else f"camera direction unknown: {self.problem(now_ns, state)}"
             )
             out.event(EventKind.GIMBAL, "", text, warning=not looking)
         self._looking = looking

@@ -13,7 +13,6 @@ danger. `guidance.max_speed_unobserved_mps` sets a limit for vehicles that fly w
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -158,22 +157,6 @@ def fresh(context: BehaviourContext) -> bool:
     """Whether sectors no older than `MAX_AGE_S` are available."""
     seen = context.obstacles
     return seen is not None and context.now_ns - seen.captured_ns <= MAX_AGE_S * 1e9
-
-
-def obstacles_message(seen: ObstacleSectors, vehicle: str) -> dict[str, object]:
-    """The published message: 72 sector distances, clockwise from north; null: no obstacle, or unknown."""
-    return {
-        "vehicle": vehicle,
-        "captured_ns": seen.captured_ns,
-        "frame": "north",
-        "increment_deg": math.degrees(SECTOR_RAD),
-        "distance_m": _finite(seen.distance_m),
-        "known": [not math.isnan(value) for value in seen.distance_m],
-    }
-
-
-def _finite(values: Sequence[float]) -> list[float | None]:
-    return [round(value, 2) if math.isfinite(value) else None for value in values]
 
 
 def _age(seen: ObstacleSectors | None, now_ns: int) -> str:

@@ -56,6 +56,19 @@ class MarkerTarget:
 
 
 @dataclass(frozen=True, slots=True)
+class LocalizedMarkers:
+    """The markers of one frame.
+
+    Attributes:
+        targets: one per marker, in their order; empty if `error` gives the reason.
+        error: why they have no position; empty if they have.
+    """
+
+    targets: tuple[MarkerTarget, ...]
+    error: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class MarkerSight:
     """The current marker detections.
 

@@ -12,11 +12,10 @@ import numpy as np
 from companion.bus.messages import (
     detections_message,
     labels_message,
-    setpoint_message,
     tracks_message,
-    vehicle_message,
 )
 from companion.bus.topics import NO_OBJECTS
+from companion.bus.vehicle_messages import setpoint_message, vehicle_message
 from companion.vehicle.clock_sync import ClockOffset
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, VehicleState
@@ -57,6 +56,9 @@ def test_detection_message() -> None:
         "published_ns": 3_000,
         "captured_boot_ns": None,
         "captured_boot_error_ns": None,
+        "model": None,
+        "model_sha256": None,
+        "localization_error": None,
         "width": 640,
         "height": 480,
         "timing_ms": {"inference": 20.12},
@@ -73,6 +75,17 @@ def test_detection_message() -> None:
                 "track_id": None,
                 "track_score": None,
                 "track_state": None,
+                "track_age_s": None,
+                "bearing_rad": None,
+                "elevation_rad": None,
+                "ground_range_m": None,
+                "distance_m": None,
+                "range_source": None,
+                "range_sigma_m": None,
+                "position_ned_m": None,
+                "latitude_deg": None,
+                "longitude_deg": None,
+                "altitude_amsl_m": None,
             }
         ],
     }

@@ -16,6 +16,7 @@ import pytest
 
 from companion.bus import topics
 from companion.bus.session import Bus
+from companion.bus.vehicle_messages import pose_message
 from companion.guidance.behaviours.formation import FormationBehaviour
 from companion.guidance.formation.neighbours import Neighbourhood
 from companion.settings import ZenohSection
@@ -55,9 +56,9 @@ class Companion:
 
     async def publish(self) -> None:
         while True:
-            message = self.poses.message(self.driver.state, self.guidance.behaviour, time.monotonic_ns())
-            if message is not None:
-                self.bus.publish(topics.POSE, message)
+            pose = self.poses.pose(self.driver.state, self.guidance.behaviour, time.monotonic_ns())
+            if pose is not None:
+                self.bus.publish(topics.POSE, pose_message(pose))
             await asyncio.sleep(0.1)
 
 
@@ -129,9 +130,9 @@ async def test_vehicles_share_poses_and_fly_in_formation() -> None:
             await until(lambda: max(map(error_m, followers)) < 1.0)
 
             def role() -> object:
-                message = leader.poses.message(leader.driver.state, None, time.monotonic_ns())
-                assert message is not None
-                return message["role"]
+                pose = leader.poses.pose(leader.driver.state, None, time.monotonic_ns())
+                assert pose is not None
+                return pose_message(pose)["role"]
 
             await until(lambda: role() == "leader")
             least_m: list[float] = []
@@ -150,4 +151,4 @@ async def test_vehicles_share_poses_and_fly_in_formation() -> None:
             # When a service ends, its poses stop and its followers hold.
             await leader.bus.close()
             await until(lambda: all("no pose" in m.guidance.status for m in followers))
-            assert all(json.dumps(m.poses.status(time.monotonic_ns())) for m in fleet)
+            assert all(json.dumps(m.poses.ages_s(time.monotonic_ns())) for m in fleet)

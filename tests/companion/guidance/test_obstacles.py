@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.flights_obstacles import ALLOWED_M, MARGIN_M, run
+from companion.bus.messages import obstacles_message
 from companion.guidance.behaviour import BehaviourContext
 from companion.guidance.behaviours.goto import GotoBehaviour
 from companion.guidance.behaviours.land import LandBehaviour
@@ -16,7 +17,6 @@ from companion.guidance.limits.obstacles import (
     MAX_AGE_S,
     ObstacleMemory,
     ObstacleRules,
-    obstacles_message,
     speed_towards,
 )
 from companion.guidance.requirements import check_requirements

@@ -6,11 +6,13 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from companion.bus.vehicle_messages import pose_message
 from companion.guidance.formation.pose import (
     FormationNote,
     Plan,
@@ -18,7 +20,6 @@ from companion.guidance.formation.pose import (
     PoseError,
     Structure,
     pose_from_message,
-    pose_message,
     pose_of,
 )
 from companion.vehicle.state import LandedState, VehicleState
@@ -121,7 +122,7 @@ def test_invalid_field_is_rejected_by_name(path: Sequence[str | int], value: obj
 
 @pytest.mark.parametrize("key", list(pose_message(POSE)))
 def test_missing_field_is_rejected(key: str) -> None:
-    message = pose_message(POSE)
+    message: dict[str, Any] = {**pose_message(POSE)}
     del message[key]
     with pytest.raises(PoseError, match=f"{key} is missing"):
         pose_from_message(message)
@@ -136,7 +137,7 @@ json_value = st.recursive(
 
 @given(st.sampled_from(sorted(pose_message(POSE))), json_value)
 def test_any_field_value_is_a_pose_or_rejected(key: str, value: object) -> None:
-    message = pose_message(POSE)
+    message: dict[str, Any] = {**pose_message(POSE)}
     message[key] = value
     try:
         pose = pose_from_message(message)

@@ -67,7 +67,7 @@ def see(service: Service, captured_ns: int) -> None:
     """Pass a new result of the steering camera."""
     camera, result = service.cameras[0], seen(captured_ns)
     camera.update(result)
-    service.inputs.on_result(camera, result, captured_ns)
+    service.inputs.on_result(camera, result)
 
 
 def step(service: Service, now_ns: int) -> BehaviourContext:
@@ -84,7 +84,9 @@ async def test_targets_need_the_gimbals_attitude() -> None:
     see(service, now_ns)
     assert not service.cameras[0].targets
     assert "no attitude of the gimbal" in service.status()["targets"]["localization_error"]
-    assert "not responding" in service.status()["gimbal"]["problem"]
+    gimbal = service.status()["gimbal"]
+    assert gimbal is not None
+    assert "not responding" in (gimbal["problem"] or "")
     context = step(service, now_ns)
     assert not context.perception_fresh
     assert "not responding" in context.gimbal.direction_fault

@@ -6,9 +6,11 @@ import asyncio
 import os
 import time
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 
+from companion.bus.topics import Topic
 from companion.guidance.interface import GuidanceInput, GuidanceOutput
 from companion.service import Service
 from companion.settings.reading import load_settings
@@ -76,7 +78,7 @@ async def test_setpoint_is_sent_before_publication() -> None:
         for sequence in range(3):
             service._on_result(service.cameras[0], result(sequence))
             await until(lambda: len(order) >= 3)
-            assert order == ["setpoint", "detections", "labels"]
+            assert order == ["setpoint", "detections", "labels", "transforms"]
             order.clear()
         status = service.cameras[0].supervisor.status
         assert status.timing_p50_ms.keys() == {"publish"}  # the last stage, measured by the service
@@ -91,7 +93,12 @@ async def test_localization_and_publication_fail_independently(
     service = Service(load_settings(os.devnull, {}, {}))
     camera = service.cameras[0]
     published: list[str] = []
-    service.bus.publish = lambda topic, *_: published.append(topic.name)  # type: ignore[method-assign]
+
+    def publish(topic: Topic, value: Any, view: str | None = None) -> None:
+        if (value() if callable(value) else value) is not None:
+            published.append(topic.name)
+
+    service.bus.publish = publish  # type: ignore[method-assign]
     with monkeypatch.context() as broken:
         broken.setattr(type(camera), "localize", lambda *_: [][0])
         camera._on_report(result(1))

@@ -1,0 +1,255 @@
+"""The bus under load, measured on this machine: time from publication to a subscriber in another process."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import multiprocessing
+import os
+import socket
+import time
+from multiprocessing.connection import Connection
+from typing import Any
+
+import numpy as np
+import zenoh
+
+from companion.bench.setpoints import busy
+from companion.bus import topics
+from companion.bus.bodies import DetectionBody, DetectionsBody
+from companion.bus.client import client_settings, open_client, subscribe_kept
+from companion.bus.session import Bus
+from companion.settings import ZenohSection
+from mavlink_sim.testing import free_port
+
+VEHICLE = "bench"
+# Ten detections with every field: about 5 kB of JSON.
+DETECTIONS = 10
+# Messages of a recovered topic are sent in bursts of at most half of what is kept.
+BURST, BURST_PERIOD_S = topics.EVENTS.cached // 2, 0.01
+# After the last message: a lost one is noticed by the next heartbeat.
+SETTLE_S = 4.0
+_START_S = 30.0
+
+
+def measure_bus(seconds: float, *, rate_hz: float, load: int) -> dict[str, Any]:
+    """Milliseconds from before a message of ten detections is built until another process has received it.
+
+    Args:
+        load: number of busy processes beside the two.
+
+    Raises:
+        RuntimeError: the subscriber's process does not start.
+    """
+    context = multiprocessing.get_context("spawn")
+    loaded = [context.Process(target=busy, daemon=True) for _ in range(load)]
+    for process in loaded:
+        process.start()
+    try:
+        built_us, received = asyncio.run(_publish_detections(seconds, rate_hz))
+    finally:
+        for process in loaded:
+            process.kill()
+            process.join()
+    delay_ms = np.array([delay_ns for _, delay_ns in received["delays"]]) / 1e6
+    return {
+        "rate_hz": rate_hz,
+        "busy_processes": load,
+        "cores": len(os.sched_getaffinity(0)),
+        "published": len(built_us),
+        "received": len(delay_ms),
+        "bytes": received["bytes"],
+        "publish_p50_ms": round(float(np.percentile(built_us, 50)) / 1e3, 3),
+        "publish_p99_ms": round(float(np.percentile(built_us, 99)) / 1e3, 3),
+        "delay_p50_ms": round(float(np.percentile(delay_ms, 50)), 3),
+        "delay_p99_ms": round(float(np.percentile(delay_ms, 99)), 3),
+        "delay_max_ms": round(float(delay_ms.max()), 3),
+    }
+
+
+async def _publish_detections(seconds: float, rate_hz: float) -> tuple[list[float], dict[str, Any]]:
+    async with _Reader(_read_detections) as reader:
+        reader.bus.publish(topics.DETECTIONS, lambda: _detections(0))
+        await _until_watched(reader.bus)
+        for number in range(20):  # a warm-up, of connections and of the interpreter
+            reader.bus.publish(topics.DETECTIONS, lambda number=number: _detections(-1 - number))
+            await asyncio.sleep(0.02)
+        taken_us = []
+        due_s = time.monotonic()
+        for number in range(round(seconds * rate_hz)):
+            due_s += 1 / rate_hz
+            await asyncio.sleep(max(0.0, due_s - time.monotonic()))
+            started = time.perf_counter()
+            reader.bus.publish(topics.DETECTIONS, lambda number=number: _detections(number + 1))
+            taken_us.append((time.perf_counter() - started) * 1e6)
+        await asyncio.sleep(0.5)
+        return taken_us, await reader.result()
+
+
+async def _until_watched(bus: Bus) -> None:
+    async with asyncio.timeout(_START_S):
+        while not bus.watched(topics.DETECTIONS):  # noqa: ASYNC110 - there is no event for it
+            await asyncio.sleep(0.01)
+
+
+def measure_recovery(messages: int) -> dict[str, Any]:
+    """Publish on a topic with kept messages; count what an advanced subscriber in another process misses.
+
+    Raises:
+        RuntimeError: the subscriber's process does not start.
+    """
+    return asyncio.run(_publish_events(messages))
+
+
+async def _publish_events(messages: int) -> dict[str, Any]:
+    started_s = time.monotonic()
+    async with _Reader(_read_events) as reader:
+        early_kb = 0
+        due_s = time.monotonic()
+        for first in range(0, messages, BURST):
+            for number in range(first, min(first + BURST, messages)):
+                reader.bus.publish(topics.EVENTS, {"stamp_ns": number, "level": "info", "text": "event"})
+            if not early_kb and first >= messages // 10:
+                early_kb = _resident_kb()
+                reader.connection.send("memory")
+            due_s += BURST_PERIOD_S
+            await asyncio.sleep(max(0.0, due_s - time.monotonic()))
+        grown_kb = _resident_kb() - early_kb
+        await asyncio.sleep(SETTLE_S)
+        result = await reader.result()
+    return {
+        "messages": messages,
+        "received": result["received"],
+        "lost": messages - result["received"],
+        "seconds": round(time.monotonic() - started_s, 1),
+        "publisher_growth_kb": grown_kb,
+        "subscriber_growth_kb": result["growth_kb"],
+    }
+
+
+class _Reader:
+    """A bus in this process and a subscriber in another one, as an asynchronous context manager."""
+
+    def __init__(self, target: Any) -> None:
+        self._settings = ZenohSection(listen=(f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}",))
+        self._target = target
+
+    async def __aenter__(self) -> _Reader:
+        self.bus = Bus(self._settings, VEHICLE, on_event=lambda *_: None, on_command=_no_command)
+        await self.bus.start()
+        context = multiprocessing.get_context("spawn")
+        self.connection, theirs = context.Pipe()
+        arguments = (self._settings.listen[0], theirs)
+        self._process = context.Process(target=self._target, args=arguments, daemon=True)
+        self._process.start()
+        theirs.close()
+        if not await asyncio.to_thread(self.connection.poll, _START_S):
+            raise RuntimeError(f"the subscriber's process did not start within {_START_S:g} s")
+        self.connection.recv()
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self._process.kill()
+        self._process.join()
+        await self.bus.close()
+
+    async def result(self) -> dict[str, Any]:
+        """End the subscriber and return what it counted."""
+        self.connection.send("end")
+        result: dict[str, Any] = await asyncio.to_thread(self.connection.recv)
+        return result
+
+
+def _read_detections(endpoint: str, connection: Connection) -> None:
+    delays: list[tuple[int, int]] = []
+    size = 0
+
+    def receive(sample: zenoh.Sample) -> None:
+        nonlocal size
+        now_ns = time.monotonic_ns()
+        body = json.loads(sample.payload.to_bytes())
+        if body["sequence"] > 0:
+            size = len(sample.payload)
+            delays.append((body["sequence"], now_ns - body["published_ns"]))
+
+    with open_client(client_settings(ZenohSection(listen=(endpoint,)))) as session:
+        subscriber = session.declare_subscriber(topics.DETECTIONS.key(VEHICLE), receive)
+        connection.send("ready")
+        connection.recv()
+        connection.send({"delays": delays, "bytes": size})
+        subscriber.undeclare()  # type: ignore[no-untyped-call]
+
+
+def _read_events(endpoint: str, connection: Connection) -> None:
+    received = 0
+    newest = -1
+
+    def receive(sample: zenoh.Sample) -> None:
+        nonlocal received, newest
+        number = json.loads(sample.payload.to_bytes())["stamp_ns"]
+        received += number > newest  # a repeated one does not count
+        newest = max(newest, number)
+
+    with open_client(client_settings(ZenohSection(listen=(endpoint,)))) as session:
+        subscriber = subscribe_kept(session, topics.EVENTS.key(VEHICLE), receive)
+        connection.send("ready")
+        early_kb = _resident_kb()
+        while connection.recv() != "end":
+            early_kb = _resident_kb()
+        connection.send({"received": received, "growth_kb": _resident_kb() - early_kb})
+        subscriber.undeclare()  # type: ignore[no-untyped-call]
+
+
+def _resident_kb() -> int:
+    """Resident memory of this process (proc_pid_statm(5))."""
+    with open("/proc/self/statm") as file:
+        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") // 1024
+
+
+async def _no_command(text: str) -> dict[str, Any]:
+    return {"command": text, "success": False, "reason": "a benchmark executes no commands"}
+
+
+def _detections(sequence: int) -> DetectionsBody:
+    car: DetectionBody = {
+        "class_id": 2,
+        "class_name": "car",
+        "confidence": 0.93,
+        "xyxy": [301.2, 198.0, 388.7, 251.4],
+        "center": [344.95, 224.7],
+        "depth_m": 11.32,
+        "nearest_camera_m": [0.61, 0.18, 11.32],
+        "track_id": 7,
+        "track_score": 0.88,
+        "track_state": "confirmed",
+        "track_age_s": 3.2,
+        "bearing_rad": 0.0512,
+        "elevation_rad": -0.0213,
+        "ground_range_m": 11.337,
+        "distance_m": 11.34,
+        "range_source": "depth",
+        "range_sigma_m": 0.272,
+        "position_ned_m": [11.323, 0.581, -2.41],
+        "latitude_deg": 47.39781404,
+        "longitude_deg": 8.54560773,
+        "altitude_amsl_m": 490.41,
+    }
+    now_ns = time.monotonic_ns()
+    return {
+        "vehicle": VEHICLE,
+        "camera": None,
+        "sequence": sequence,
+        "captured_ns": now_ns,
+        "published_ns": now_ns,
+        "width": 640,
+        "height": 480,
+        "captured_boot_ns": None,
+        "captured_boot_error_ns": None,
+        "inferred_ns": now_ns,
+        "model": "default",
+        "model_sha256": None,
+        "localization_error": "",
+        "timing_ms": {"preprocess": 1.1, "inference": 21.0, "postprocess": 0.8},
+        "dropped": 0,
+        "detections": [car] * DETECTIONS,
+    }

@@ -1,0 +1,57 @@
+"""zenoh's configuration from the settings and, if they name one, a configuration file."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import zenoh
+
+from companion.settings import ZenohSection
+
+
+class BusError(ConnectionError):
+    """The zenoh session cannot be opened (a busy port, a bad endpoint, a bad configuration file)."""
+
+
+def zenoh_config(settings: ZenohSection) -> zenoh.Config:
+    """Convert settings into zenoh's configuration.
+
+    A key of `config_file` replaces the default of a setting. A setting that was given must not differ from
+    it.
+
+    Raises:
+        BusError: the file cannot be read, or differs from a given setting.
+    """
+    defaults, config = zenoh.Config(), zenoh.Config()
+    if settings.config_file is not None:
+        try:
+            config = zenoh.Config.from_file(settings.config_file)
+        except zenoh.ZError as error:
+            raise BusError(f"zenoh.config_file {settings.config_file}: {first_line(error)}") from error
+    ours: dict[str, tuple[str, Any]] = {
+        "mode": ("mode", settings.mode),
+        "connect": ("connect/endpoints", list(settings.connect)),
+        "listen": ("listen/endpoints", list(settings.listen) if settings.mode == "peer" else []),
+        "multicast_scouting": ("scouting/multicast/enabled", settings.multicast_scouting),
+    }
+    for name, (key, value) in ours.items():
+        in_file = json.loads(config.get_json(key))
+        if in_file == json.loads(defaults.get_json(key)) or (key.startswith("listen") and not value):
+            config.insert_json5(key, json.dumps(value))
+        elif in_file != value and name in settings.model_fields_set:
+            raise BusError(
+                f"zenoh.{name} is {json.dumps(value)}, but {settings.config_file} has {key} "
+                f"{json.dumps(in_file)}: remove one of the two"
+            )
+    # Needed for the messages kept for late subscribers.
+    config.insert_json5("timestamping/enabled", "true")
+    if json.loads(config.get_json("mode")) == "peer":
+        # A peer starts without its router and keeps retrying.
+        config.insert_json5("connect/exit_on_failure", "false")
+    return config
+
+
+def first_line(error: BaseException) -> str:
+    """Return the text of an error without the source location that zenoh appends."""
+    return str(error).splitlines()[0].split(" at /")[0].strip() if str(error) else type(error).__name__

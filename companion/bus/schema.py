@@ -1,0 +1,101 @@
+"""JSON Schema of every message, and the table of topics as text, JSON and Markdown."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import zenoh
+from pydantic import TypeAdapter
+from pydantic.json_schema import GenerateJsonSchema
+from typing_extensions import get_original_bases
+
+from companion.bus import bodies
+from companion.bus.topics import TOPICS, Topic
+from companion.settings.section import texts_below_keys
+
+DIALECT = GenerateJsonSchema.schema_dialect
+
+
+class _WithoutTitles(GenerateJsonSchema):
+    """A title in every field would repeat its name."""
+
+    def field_title_should_be_set(self, schema: Any) -> bool:
+        return False
+
+
+def schema_of(body: Any) -> dict[str, Any]:
+    """Return the JSON Schema (draft 2020-12) of a body's type. Unknown fields are allowed: they are added."""
+    schema = TypeAdapter(body).json_schema(schema_generator=_WithoutTitles)
+    for name, part in {**schema.get("$defs", {}), schema.get("title", ""): schema}.items():
+        for key, text in _texts_of(name).items():
+            part["properties"][key]["description"] = text
+    return {"$schema": DIALECT, **schema}
+
+
+def _texts_of(name: str) -> dict[str, str]:
+    """Return field → the string below it, of a body and its bases."""
+    texts = texts_below_keys(bodies.__name__)
+    bases = [base.__name__ for base in get_original_bases(getattr(bodies, name))] if name in texts else []
+    return {key: text for owner in (*bases, name) for key, text in texts.get(owner, {}).items()}
+
+
+def topic_table() -> list[dict[str, Any]]:
+    """Return the topics as plain values: name, encoding, rate, maximum age and contents."""
+    return [
+        {
+            "name": topic.name,
+            "payload": payload_of(topic),
+            "encoding": str(topic.encoding),
+            "published": topic.published,
+            "rate_hz": topic.rate_hz,
+            "max_age_s": topic.max_age_s,
+            "of_camera": topic.of_camera,
+            "cached": topic.cached,
+            "description": topic.description,
+        }
+        for topic in TOPICS
+    ]
+
+
+def payload_of(topic: Topic) -> str:
+    """Return the kind of payload, in one word."""
+    if topic.encoding == zenoh.Encoding.IMAGE_JPEG:
+        return "JPEG"
+    return "text" if topic.encoding == zenoh.Encoding.TEXT_PLAIN else "JSON"
+
+
+COLUMNS = ("name", "payload", "published", "max age", "kept")
+
+
+def topic_rows() -> list[tuple[str, ...]]:
+    """Return the rows of the table for people, with `COLUMNS`."""
+    return [
+        (
+            topic.name,
+            f"{payload_of(topic)}: {topic.description}",
+            topic.published,
+            "–" if topic.max_age_s is None else f"{topic.max_age_s:g} s",
+            str(topic.cached or "–"),
+        )
+        for topic in TOPICS
+    ]
+
+
+def topics_markdown() -> str:
+    """Return the table in docs/messages.md."""
+    lines = ["| " + " | ".join(COLUMNS) + " |", "|---" * len(COLUMNS) + "|"]
+    lines += ["| " + " | ".join((f"`{name}`", *rest)) + " |" for name, *rest in topic_rows()]
+    return "\n".join(lines) + "\n"
+
+
+def write_schemas(folder: Path) -> list[Path]:
+    """Write NAME.schema.json for every topic. Raises OSError."""
+    folder.mkdir(parents=True, exist_ok=True)
+    written = []
+    for topic in TOPICS:
+        path = folder / f"{topic.name}.schema.json"
+        path.write_text(json.dumps(schema_of(topic.body), indent=2, ensure_ascii=False) + "\n")
+        written.append(path)
+    return written

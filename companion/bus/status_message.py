@@ -1,0 +1,133 @@
+"""Builds the body of `status`: the state of every part of a service."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+from companion.bus.bodies import OtherCommanderBody, StatusBody, StatusCameraBody, StatusGimbalBody
+from companion.bus.session import Bus
+from companion.guidance.core import Guidance
+from companion.guidance.gimbal.controller import GimbalController
+from companion.guidance.pose_sharing import PoseSharing
+from companion.perception.cameras import PerceptionCamera, WorkerCamera
+from companion.perception.supervisor import PerceptionSupervisor
+from companion.vehicle.driver import Driver
+from companion.vehicle.gimbal import address_text
+from companion.vehicle.state import VehicleState
+from companion.vehicle.streamer import Streamer
+
+
+def status_message(
+    now_ns: int,
+    *,
+    uptime_s: float,
+    healthy: bool,
+    driver: Driver,
+    guidance: Guidance,
+    streamer: Streamer,
+    cameras: Sequence[WorkerCamera],
+    steering: PerceptionCamera,
+    poses: PoseSharing,
+    bus: Bus,
+    others: list[OtherCommanderBody],
+    dropped_lines: int,
+) -> StatusBody:
+    """Create the message published on `status` (`docs/messages.md`).
+
+    Args:
+        now_ns: CLOCK_MONOTONIC. steering: the camera that guidance uses. others: services that command the
+            same vehicle. dropped_lines: of the log.
+    """
+    state = driver.state
+    return {
+        "stamp_ns": now_ns,
+        "service": poses.source,
+        "uptime_s": round(uptime_s, 1),
+        "healthy": healthy,
+        "vehicle": {
+            "name": poses.vehicle,
+            "connected": state.connected(now_ns),
+            "autopilot": state.autopilot,
+            "driver": driver.library,
+            "mode": state.mode.value,
+            "armed": state.armed,
+            "failsafe": state.failsafe,
+            "missing_streams": list(state.missing_streams),
+            "status_texts": [report.text for report in state.reports],
+            "other_commanders": others,
+        },
+        "pilot": {
+            "in_command": guidance.in_command,
+            "behaviour": guidance.status,
+            "stream": streamer.state.value,
+            "setpoints_sent": streamer.sent_count,
+        },
+        "perception": _camera(cameras[0].supervisor),
+        "cameras": {camera.name: _camera(camera.supervisor) for camera in cameras if camera.name},
+        "targets": {
+            "camera": steering.name,
+            "count": len(steering.targets),
+            "localization_error": steering.localization_error,
+        },
+        "gimbal": _gimbal(guidance.gimbal, now_ns, state),
+        "neighbours": {
+            "ages_s": poses.ages_s(now_ns),
+            "unread": poses.unread,
+            "out_of_order": poses.out_of_order,
+        },
+        "bus": {
+            "connected": bus.connected,
+            "published": dict(bus.published),
+            "publish_failed": bus.publish_failed,
+            "refused_commands": bus.intake.refused,
+        },
+        "log": {"dropped_lines": dropped_lines},
+    }
+
+
+def _camera(supervisor: PerceptionSupervisor) -> StatusCameraBody:
+    status, ready = supervisor.status, supervisor.ready
+    return {
+        "state": status.state.value,
+        "pid": status.pid,
+        "restarts": status.restarts,
+        "frames": status.frames,
+        "results": status.results,
+        "rate_hz": round(status.rate_hz, 2),
+        "sequence": None if status.newest is None else status.newest.sequence,
+        "age_s": None if status.age_s is None else round(status.age_s, 3),
+        "timing_ms": _rounded(status.timing_ms),
+        "timing_p50_ms": _rounded(status.timing_p50_ms),
+        "timing_p99_ms": _rounded(status.timing_p99_ms),
+        "dropped": status.dropped,
+        "frames_skipped": dict(status.frames_skipped),
+        "stuck_after_s": status.stuck_after_s,
+        "class_names": list(status.class_names),
+        "tracks": status.tracks,
+        "model": None if ready is None else ready.model,
+        "model_sha256": None if ready is None else ready.model_sha256,
+        "runtime": status.runtime,
+        "runtime_reason": status.runtime_reason,
+        "problem": status.problem,
+    }
+
+
+def _gimbal(controller: GimbalController, now_ns: int, state: VehicleState) -> StatusGimbalBody | None:
+    """Return the gimbal's fields; None where there is no gimbal and none is expected."""
+    gimbal = state.gimbal
+    if gimbal is None and not controller.mounting.carries_camera:
+        return None
+    pitch_rad = None if gimbal is None else gimbal.pitch_rad
+    primary = None if gimbal is None else gimbal.primary_control
+    return {
+        "answers": gimbal is not None,
+        "pitch_deg": None if pitch_rad is None else round(math.degrees(pitch_rad), 1),
+        "primary_control": None if primary is None else address_text(primary),
+        "ours": controller.in_control(now_ns, state),
+        "problem": controller.problem(now_ns, state),
+    }
+
+
+def _rounded(timing_ms: Mapping[str, float]) -> dict[str, float]:
+    return {stage: round(value, 3) for stage, value in timing_ms.items()}

@@ -1,0 +1,43 @@
+"""`companion bench bus`: what it counts and that nothing is lost on a recovered topic."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from companion.bench.bus import _detections, measure_recovery
+from tests.companion.bus.message_check import check_message
+from tests.companion.command_line import companion
+
+pytestmark = pytest.mark.realtime
+
+
+def test_delay_to_another_process_is_measured(tmp_path: Path) -> None:
+    printed = companion("bench", "bus", "--seconds", "2", "--load", "0", "--json", cwd=tmp_path)
+    assert printed.returncode == 0, printed.stderr
+    figures = json.loads(printed.stdout)
+    assert figures["published"] == 60
+    assert 0 < figures["received"] <= 60
+    assert figures["bytes"] > 4000
+    assert 0.0 < figures["delay_p50_ms"] <= figures["delay_p99_ms"] <= figures["delay_max_ms"]
+
+
+def test_benchmark_publishes_a_valid_message() -> None:
+    check_message("detections", _detections(1))
+
+
+def test_no_message_of_a_recovered_topic_is_lost() -> None:
+    figures = measure_recovery(5_000)
+    assert (figures["received"], figures["lost"]) == (5_000, 0)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_million_messages_of_a_recovered_topic_leave_no_memory() -> None:
+    figures = measure_recovery(1_000_000)
+    assert figures["lost"] == 0
+    # A message is 45 bytes: kept ones would be 45 MB.
+    assert figures["publisher_growth_kb"] < 5_000
+    assert figures["subscriber_growth_kb"] < 5_000

@@ -1,0 +1,91 @@
+"""The schemas and tables made of the topics."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from jsonschema import Draft202012Validator, ValidationError
+
+from companion.bus.bodies import CommandReplyBody, EventBody
+from companion.bus.schema import schema_of, topic_table, topics_markdown, write_schemas
+from companion.bus.topics import TOPICS
+from companion.guidance.formation.pose import ROLES
+from companion.guidance.targets.target import RangeSource
+from tests.companion.bus.message_check import check_message, closed, validator
+from tests.companion.command_line import companion
+from vision.detections import TRACK_CONFIRMED, TRACK_NONE, TRACK_TENTATIVE
+from vision.tracking import TrackEventKind
+
+ROOT = Path(__file__).parents[3]
+
+
+@pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.name)
+def test_schema_is_valid_and_describes_every_field(topic: Any) -> None:
+    schema = schema_of(topic.body)
+    Draft202012Validator.check_schema(schema)
+    for part in (schema, *schema.get("$defs", {}).values()):
+        for field in part.get("properties", {}).values():
+            assert field["description"]
+            assert "title" not in field
+
+
+def test_words_are_those_of_the_code() -> None:
+    detection = validator("detections").schema["$defs"]["DetectionBody"]["properties"]
+    event = validator("tracks").schema["$defs"]["TrackEventBody"]["properties"]
+    assert detection["track_state"]["anyOf"][0]["enum"] == [TRACK_CONFIRMED, TRACK_TENTATIVE, TRACK_NONE]
+    assert detection["range_source"]["anyOf"][0]["enum"] == [source.value for source in RangeSource]
+    assert event["event"]["enum"] == [kind.value for kind in TrackEventKind]
+    assert validator("pose").schema["properties"]["role"]["enum"] == list(ROLES)
+
+
+def test_check_refuses_unknown_missing_and_wrong_fields() -> None:
+    event: EventBody = {"stamp_ns": 1, "level": "info", "text": "ready"}
+    check_message("events", event)
+    for wrong in ({**event, "more": 1}, {"stamp_ns": 1, "level": "info"}, {**event, "level": "loud"}):
+        with pytest.raises(ValidationError):
+            check_message("events", wrong)
+
+
+def test_mission_reply_has_steps() -> None:
+    reply = Draft202012Validator(closed(schema_of(CommandReplyBody)))
+    step = {"title": "find", "command": "seek", "success": True, "reason": "", "started_ns": 1, "ended_ns": 2}
+    reply.validate({"command": "mission", "success": True, "reason": "", "steps": [step]})
+    reply.validate({"command": "hold", "success": True, "reason": ""})
+    assert not reply.is_valid({"command": "hold", "success": True})
+
+
+def test_table_in_the_document_is_that_of_the_code() -> None:
+    assert topics_markdown() in (ROOT / "docs" / "messages.md").read_text()
+
+
+def test_example_bodies_in_the_document_are_valid() -> None:
+    text = (ROOT / "docs" / "messages.md").read_text()
+    checked = set()
+    for section in text.split("\n## ")[1:]:
+        name = section.partition("\n")[0].split(",")[0].strip()
+        _, found, block = section.partition("```json\n")
+        if not found or name not in {topic.name for topic in TOPICS} - {"vehicle", "status"}:
+            continue
+        check_message(name, json.loads(block.partition("```")[0]))
+        checked.add(name)
+    assert checked == {"detections", "tracks", "pose", "markers", "camera_info", "transforms"}
+
+
+def test_schema_files(tmp_path: Path) -> None:
+    written = write_schemas(tmp_path / "schemas")
+    assert [path.name for path in written] == [f"{topic.name}.schema.json" for topic in TOPICS]
+    schema = json.loads((tmp_path / "schemas" / "events.schema.json").read_text())
+    assert schema["required"] == ["stamp_ns", "level", "text"]
+
+
+def test_topics_on_the_command_line(tmp_path: Path) -> None:
+    printed = companion("topics", "--json", cwd=tmp_path)
+    assert [json.loads(line) for line in printed.stdout.splitlines()] == topic_table()
+    assert companion("topics", "--markdown", cwd=tmp_path).stdout == topics_markdown()
+    listed = companion("topics", "--schema", tmp_path / "schemas", cwd=tmp_path)
+    assert len(listed.stdout.splitlines()) == len(TOPICS)
+    plain = companion("topics", cwd=tmp_path).stdout
+    assert all(topic.name in plain for topic in TOPICS)

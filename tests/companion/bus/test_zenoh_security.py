@@ -1,0 +1,111 @@
+"""TLS and access control with the files and commands of docs/how-to/zenoh-security.md."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import queue
+import re
+import shutil
+import socket
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from companion.bus import topics
+from companion.bus.client import NoAnswerError, client_settings, listen, open_client, send_command
+from companion.bus.session import Bus
+from companion.settings import ZenohSection
+from mavlink_sim.testing import free_port
+
+pytestmark = [
+    pytest.mark.realtime,
+    pytest.mark.skipif(shutil.which("openssl") is None, reason="needs the program openssl"),
+]
+PAGE = (Path(__file__).parents[3] / "docs" / "how-to" / "zenoh-security.md").read_text()
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The files of the page, in the current folder."""
+    monkeypatch.chdir(tmp_path)
+    certificates = re.findall(r"^```sh\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)[0]
+    subprocess.run(["bash", "-ec", certificates], check=True, capture_output=True, timeout=60)
+    service, operator = re.findall(r"^```json5\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
+    Path("vehicle1.json5").write_text(service)
+    Path("operator.json5").write_text(operator)
+    Path("reader.json5").write_text(operator.replace("operator", "reader"))
+    Path("nobody.json5").write_text('{transport: {link: {tls: {root_ca_certificate: "ca.pem"}}}}')
+    return tmp_path
+
+
+def client(name: str, endpoint: str) -> ZenohSection:
+    return client_settings(ZenohSection(config_file=f"{name}.json5"), (endpoint,))
+
+
+def answered(session: Any, path: str) -> list[bool]:
+    return [reply.ok is not None for reply in session.get(f"companion/alpha/{path}", timeout=5.0)]
+
+
+@pytest.mark.usefixtures("folder")
+async def test_reader_sees_detections_but_may_not_command() -> None:
+    endpoint = f"tls/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    executed: list[str] = []
+
+    async def execute(text: str) -> dict[str, Any]:
+        executed.append(text)
+        return {"command": text, "success": True, "reason": ""}
+
+    async def reply() -> dict[str, int]:
+        return {"value": 1}
+
+    bus = Bus(
+        ZenohSection(listen=(endpoint,), config_file="vehicle1.json5"),
+        "alpha",
+        on_event=lambda *_: None,
+        on_command=execute,
+        queries={"status": reply, "config": reply},
+    )
+    await bus.start()
+    bus.publish(topics.EVENTS, {"stamp_ns": 1, "level": "info", "text": "ready"})
+
+    def use(name: str) -> tuple[str, dict[str, list[bool]], dict[str, Any] | str]:
+        """One detection, the answers to queries, and the reply to a command or why there is none."""
+        received: queue.SimpleQueue[str] = queue.SimpleQueue()
+        with open_client(client(name, endpoint), timeout_s=5.0) as session:
+            listen(session, "detections", lambda _, text: received.put(text))
+            detection = received.get(timeout=20.0)
+            kept: queue.SimpleQueue[str] = queue.SimpleQueue()
+            events = listen(session, "events", lambda _, text: kept.put(text), history=True)
+            assert json.loads(kept.get(timeout=20.0))["text"] == "ready"
+            del events
+            answers = {path: answered(session, path) for path in ("status", "config")}
+            try:
+                return detection, answers, send_command(session, "alpha", f"hold {name}", timeout_s=5.0)
+            except NoAnswerError as error:
+                return detection, answers, str(error)
+
+    try:
+        results = {}
+        for name in ("operator", "reader"):
+            using = asyncio.create_task(asyncio.to_thread(use, name))
+            while not using.done():
+                bus.publish(topics.DETECTIONS, {"detections": []})
+                await asyncio.sleep(0.02)
+            results[name] = await using
+        with pytest.raises(NoAnswerError), open_client(client("nobody", endpoint), timeout_s=0.5):
+            pass
+    finally:
+        await bus.close()
+    detection, answers, answer = results["operator"]
+    assert detection == '{"detections":[]}'
+    assert answers == {"status": [True], "config": [True]}
+    assert answer == {"command": "hold operator", "success": True, "reason": ""}
+    detection, answers, answer = results["reader"]
+    assert detection == '{"detections":[]}'
+    assert answers == {"status": [True], "config": []}
+    assert isinstance(answer, str)
+    assert "access control" in answer
+    assert executed == ["hold operator"]
