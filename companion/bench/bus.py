@@ -20,6 +20,7 @@ from companion.bus.bodies import DetectionBody, DetectionsBody
 from companion.bus.client import client_settings, open_client, subscribe_kept
 from companion.bus.session import Bus
 from companion.settings import ZenohSection
+from companion.vehicle.scheduler_slice import set_scheduler_slice
 from mavlink_sim.testing import free_port
 
 VEHICLE = "bench"
@@ -68,6 +69,7 @@ def measure_bus(seconds: float, *, rate_hz: float, load: int) -> dict[str, Any]:
 
 
 async def _publish_detections(seconds: float, rate_hz: float) -> tuple[list[float], dict[str, Any]]:
+    set_scheduler_slice()  # as the service
     async with _Reader(_read_detections) as reader:
         reader.bus.publish(topics.DETECTIONS, lambda: _detections(0))
         await _until_watched(reader.bus)

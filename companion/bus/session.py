@@ -36,6 +36,7 @@ from companion.bus.topics import (
     command_key,
 )
 from companion.settings import ZenohSection
+from companion.vehicle.scheduler_slice import set_scheduler_slice
 
 __all__ = ["Bus", "BusError", "encode", "zenoh_config"]
 
@@ -146,7 +147,7 @@ class Bus:
         config = zenoh_config(self._settings)
         if json.loads(config.get_json("mode")) != "client":
             try:
-                self._adopt(await asyncio.to_thread(zenoh.open, config))
+                self._adopt(await asyncio.to_thread(_open, config))
             except zenoh.ZError as error:
                 endpoints = ", ".join(self._settings.listen)
                 raise BusError(
@@ -380,7 +381,7 @@ class Bus:
         endpoints = ", ".join(self._settings.connect)
         while self._session is None:
             try:
-                self._adopt(await asyncio.to_thread(zenoh.open, zenoh_config(self._settings)))
+                self._adopt(await asyncio.to_thread(_open, zenoh_config(self._settings)))
             except zenoh.ZError:
                 if not reported:
                     self._on_event("warning", f"zenoh: no peer at {endpoints}, retrying")
@@ -413,6 +414,12 @@ class Bus:
         self._tasks.discard(task)
         if not task.cancelled() and (error := task.exception()) is not None:
             logger.error("zenoh task failed", exc_info=error)
+
+
+def _open(config: zenoh.Config) -> zenoh.Session:
+    """Open a session. Its threads inherit the short slice, so that they run at once on a busy computer."""
+    set_scheduler_slice()
+    return zenoh.open(config)
 
 
 def _payload(query: zenoh.Query) -> tuple[int, Callable[[], bytes]]:
