@@ -510,7 +510,7 @@ class StatusVehicleBody(TypedDict):
     autopilot: str | None
     """PX4 or ArduPilot; null until known"""
     driver: str
-    """MAVLink library; auto until one is selected"""
+    """MAVLink library: mavsdk or pymavlink"""
     mode: str
     """flight mode"""
     armed: bool
