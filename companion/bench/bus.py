@@ -7,6 +7,7 @@ import json
 import multiprocessing
 import os
 import socket
+import threading
 import time
 from multiprocessing.connection import Connection
 from typing import Any
@@ -26,10 +27,10 @@ from mavlink_sim.testing import free_port
 VEHICLE = "bench"
 # Ten detections with every field: about 5 kB of JSON.
 DETECTIONS = 10
-# Messages of a recovered topic are sent in bursts of at most half of what is kept.
-BURST, BURST_PERIOD_S = topics.EVENTS.cached // 2, 0.01
-# After the last message: a lost one is noticed by the next heartbeat.
-SETTLE_S = 4.0
+# A burst is half of what is kept, so that every message of it can be recovered.
+BURST = topics.EVENTS.cached // 2
+# A lost message at the end of a burst is noticed by the next heartbeat, one second later.
+RECOVERY_S = 10.0
 _START_S = 30.0
 
 
@@ -97,6 +98,8 @@ async def _until_watched(bus: Bus) -> None:
 def measure_recovery(messages: int) -> dict[str, Any]:
     """Publish on a topic with kept messages; count what an advanced subscriber in another process misses.
 
+    Bursts of `BURST` messages, each as soon as the one before has been received or recovered.
+
     Raises:
         RuntimeError: the subscriber's process does not start.
     """
@@ -107,17 +110,16 @@ async def _publish_events(messages: int) -> dict[str, Any]:
     started_s = time.monotonic()
     async with _Reader(_read_events) as reader:
         early_kb = 0
-        due_s = time.monotonic()
         for first in range(0, messages, BURST):
-            for number in range(first, min(first + BURST, messages)):
+            end = min(first + BURST, messages)
+            for number in range(first, end):
                 reader.bus.publish(topics.EVENTS, {"stamp_ns": number, "level": "info", "text": "event"})
-            if not early_kb and first >= messages // 10:
+            if not await reader.received(end):
+                break
+            if not early_kb and end >= messages // 10:
                 early_kb = _resident_kb()
                 reader.connection.send("memory")
-            due_s += BURST_PERIOD_S
-            await asyncio.sleep(max(0.0, due_s - time.monotonic()))
         grown_kb = _resident_kb() - early_kb
-        await asyncio.sleep(SETTLE_S)
         result = await reader.result()
     return {
         "messages": messages,
@@ -155,6 +157,13 @@ class _Reader:
         self._process.join()
         await self.bus.close()
 
+    async def received(self, count: int) -> bool:
+        """Wait until the subscriber has received this many; False after `RECOVERY_S`."""
+        self.connection.send(count)
+        if not await asyncio.to_thread(self.connection.poll, RECOVERY_S):
+            return False
+        return bool(self.connection.recv() == count)
+
     async def result(self) -> dict[str, Any]:
         """End the subscriber and return what it counted."""
         self.connection.send("end")
@@ -185,19 +194,27 @@ def _read_detections(endpoint: str, connection: Connection) -> None:
 def _read_events(endpoint: str, connection: Connection) -> None:
     received = 0
     newest = -1
+    changed = threading.Condition()
 
     def receive(sample: zenoh.Sample) -> None:
         nonlocal received, newest
         number = json.loads(sample.payload.to_bytes())["stamp_ns"]
-        received += number > newest  # a repeated one does not count
-        newest = max(newest, number)
+        with changed:
+            received += number > newest  # a repeated one does not count
+            newest = max(newest, number)
+            changed.notify()
 
     with open_client(client_settings(ZenohSection(listen=(endpoint,)))) as session:
         subscriber = subscribe_kept(session, topics.EVENTS.key(VEHICLE), receive)
         connection.send("ready")
         early_kb = _resident_kb()
-        while connection.recv() != "end":
-            early_kb = _resident_kb()
+        while (request := connection.recv()) != "end":
+            if request == "memory":
+                early_kb = _resident_kb()
+                continue
+            with changed:
+                changed.wait_for(lambda expected=request: newest >= expected - 1, RECOVERY_S)
+            connection.send(request)
         connection.send({"received": received, "growth_kb": _resident_kb() - early_kb})
         subscriber.undeclare()  # type: ignore[no-untyped-call]
 
