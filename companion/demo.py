@@ -18,6 +18,7 @@ from typing import Any
 
 from companion.bus.client import client_settings, listen, open_client
 from companion.bus.topics import DETECTIONS
+from companion.dashboard.process import dashboard_process
 from companion.service import Event, Service
 from companion.sim_session import (
     FIND,
@@ -175,7 +176,7 @@ async def _until_finished(
     The end of the simulator or camera in flight is a failure; the mission continues, to return the vehicle.
     """
     deadline_s = time.monotonic() + limit_s
-    flying = asyncio.create_task(with_service(service, lambda: _watched_mission(service, flight)))
+    flying = asyncio.create_task(with_service(service, lambda: _watched_mission(service, flight, say)))
     lost = asyncio.create_task(vehicle.until_lost())
     try:
         await asyncio.wait({flying, lost}, timeout=limit_s, return_when=asyncio.FIRST_COMPLETED)
@@ -195,7 +196,7 @@ async def _until_finished(
         raise ended
 
 
-async def _watched_mission(service: Service, flight: _Flight) -> None:
+async def _watched_mission(service: Service, flight: _Flight, say: Say) -> None:
     """Fly the mission while an independent zenoh subscriber counts the detection messages."""
 
     def count(_key: str, text: str) -> None:
@@ -205,7 +206,8 @@ async def _watched_mission(service: Service, flight: _Flight) -> None:
     with open_client(client_settings(service.settings.zenoh)) as session:
         subscriber = listen(session, DETECTIONS.name, count)
         try:
-            await _mission(service, flight)
+            async with dashboard_process(service.settings, say):
+                await _mission(service, flight)
         finally:
             subscriber.undeclare()  # type: ignore[no-untyped-call]
 

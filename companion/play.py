@@ -11,6 +11,7 @@ from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass
 from typing import Any
 
+from companion.dashboard.process import dashboard_process
 from companion.guidance import grammar
 from companion.operator.console import run_console, terminal_is_free
 from companion.service import Event, Service
@@ -122,11 +123,12 @@ async def _until_stopped(
             await vehicle.until_ready()
             ready = True
             _print_next_commands(services, scene, say)
-            if terminal_is_free(settings.source.uri):
-                await run_console(
-                    _commands_of(services), stop.set, grammar.describe(), lambda level, text: say(text)
-                )
-            await stop.wait()
+            async with dashboard_process(services[0].settings, say):
+                if terminal_is_free(settings.source.uri):
+                    await run_console(
+                        _commands_of(services), stop.set, grammar.describe(), lambda level, text: say(text)
+                    )
+                await stop.wait()
 
         running = asyncio.create_task(with_services(services, work))
         lost = asyncio.create_task(vehicle.until_lost())

@@ -12,12 +12,14 @@ ROOT = Path(__file__).parent.parent
 
 # Each room of `companion` and its floor; a room may import from lower floors alone.
 FLOORS = {
+    "child_process": 0,
     "geometry": 0,
     "plugins": 0,
     "settings": 1,
     "vehicle": 2,
     "relay": 3,
     "guidance": 3,
+    "dashboard": 4,
     "operator": 4,
     "perception": 4,
     "bus": 5,

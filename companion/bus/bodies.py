@@ -16,6 +16,7 @@ from typing_extensions import TypedDict
 Two = Annotated[list[float], Field(min_length=2, max_length=2)]
 Three = Annotated[list[float], Field(min_length=3, max_length=3)]
 Four = Annotated[list[float], Field(min_length=4, max_length=4)]
+Corners = list[Two]
 Matrix3 = Annotated[list[float], Field(min_length=9, max_length=9)]
 Matrix34 = Annotated[list[float], Field(min_length=12, max_length=12)]
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -210,6 +211,8 @@ class ImageBody(TypedDict):
     """number of the frame, as in detections"""
     captured_ns: int
     """capture of the frame"""
+    annotated: bool
+    """the detections are drawn in it"""
 
 
 class MountBody(TypedDict):
@@ -338,6 +341,8 @@ class VehicleBody(TypedDict):
     """rotates body (FRD) into NED"""
     yaw_rad: float | None
     """heading, clockwise from north"""
+    home_ned_m: Three | None
+    """home, as position_ned_m; null until known"""
     altitude_m: float | None
     """above home"""
     latitude_deg: float | None
@@ -525,6 +530,51 @@ class StatusVehicleBody(TypedDict):
     """other services seen within 3.5 s"""
 
 
+class StatusStepBody(TypedDict):
+    """A step of a mission that has ended."""
+
+    title: str
+    """its title in the mission"""
+    command: str
+    """its command"""
+    success: bool
+    """it reached its goal"""
+    reason: str
+    """how it ended"""
+    started_ns: int
+    """its start"""
+    ended_ns: int
+    """its end"""
+
+
+class StatusMissionBody(TypedDict):
+    """The mission being flown."""
+
+    name: str
+    """its name"""
+    steps: list[str]
+    """titles"""
+    current: int
+    """index of the active step"""
+    failure: str
+    """why its failure handling is flown; empty: it is not"""
+    ended: list[StatusStepBody]
+    """the last 20 steps"""
+
+
+class StatusLimitsBody(TypedDict):
+    """Where the vehicle may fly, from home."""
+
+    max_distance_m: float
+    """horizontally"""
+    max_altitude_m: float
+    """above home"""
+    fence_include: Corners
+    """corners north, east; empty: no fence"""
+    fence_exclude: list[Corners]
+    """areas not to enter"""
+
+
 class StatusPilotBody(TypedDict):
     """Guidance."""
 
@@ -536,6 +586,8 @@ class StatusPilotBody(TypedDict):
     """state of the streamer"""
     setpoints_sent: int
     """so far"""
+    mission: StatusMissionBody | None
+    """null: no mission is flown"""
 
 
 class StatusCameraBody(TypedDict):
@@ -657,6 +709,8 @@ class StatusBody(TypedDict):
     """the link to the vehicle"""
     pilot: StatusPilotBody
     """guidance"""
+    limits: StatusLimitsBody
+    """where the vehicle may fly"""
     perception: StatusCameraBody
     """the first camera"""
     cameras: dict[str, StatusCameraBody]

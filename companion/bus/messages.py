@@ -175,9 +175,9 @@ def labels_message(result: PerceptionResult) -> str:
     return ", ".join(result.detections.names) or NO_OBJECTS
 
 
-def image_attachment(sequence: int, captured_ns: int, view: str | None) -> ImageBody:
+def image_attachment(sequence: int, captured_ns: int, view: str | None, *, annotated: bool) -> ImageBody:
     """Create the attachment of one image."""
-    return {"camera": view, "sequence": sequence, "captured_ns": captured_ns}
+    return {"camera": view, "sequence": sequence, "captured_ns": captured_ns, "annotated": annotated}
 
 
 def markers_message(

@@ -5,10 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from companion.bus.bodies import OtherCommanderBody, StatusBody, StatusCameraBody, StatusGimbalBody
+from companion.bus.bodies import (
+    OtherCommanderBody,
+    StatusBody,
+    StatusCameraBody,
+    StatusGimbalBody,
+    StatusMissionBody,
+)
 from companion.bus.session import Bus
+from companion.geometry.fence import Polygon
+from companion.guidance.behaviour import Behaviour
 from companion.guidance.core import Guidance
 from companion.guidance.gimbal.controller import GimbalController
+from companion.guidance.missions.sequence import SequenceBehaviour
 from companion.guidance.pose_sharing import PoseSharing
 from companion.perception.cameras import PerceptionCamera, WorkerCamera
 from companion.perception.supervisor import PerceptionSupervisor
@@ -16,6 +25,8 @@ from companion.vehicle.driver import Driver
 from companion.vehicle.gimbal import address_text
 from companion.vehicle.state import VehicleState
 from companion.vehicle.streamer import Streamer
+
+RECENT_STEPS = 20
 
 
 def status_message(
@@ -39,7 +50,7 @@ def status_message(
         now_ns: CLOCK_MONOTONIC. steering: the camera that guidance uses. others: services that command the
             same vehicle. dropped_lines: of the log.
     """
-    state = driver.state
+    state, limits = driver.state, guidance.options.limits
     return {
         "stamp_ns": now_ns,
         "service": poses.source,
@@ -62,6 +73,13 @@ def status_message(
             "behaviour": guidance.status,
             "stream": streamer.state.value,
             "setpoints_sent": streamer.sent_count,
+            "mission": _mission(guidance.behaviour),
+        },
+        "limits": {
+            "max_distance_m": limits.max_distance_m,
+            "max_altitude_m": limits.max_altitude_m,
+            "fence_include": _corners(limits.fence.include),
+            "fence_exclude": [_corners(polygon) for polygon in limits.fence.exclude],
         },
         "perception": _camera(cameras[0].supervisor),
         "cameras": {camera.name: _camera(camera.supervisor) for camera in cameras if camera.name},
@@ -84,6 +102,32 @@ def status_message(
         },
         "log": {"dropped_lines": dropped_lines},
     }
+
+
+def _mission(behaviour: Behaviour | None) -> StatusMissionBody | None:
+    if not isinstance(behaviour, SequenceBehaviour):
+        return None
+    return {
+        "name": behaviour.plan.name,
+        "steps": [step.title for step in behaviour.plan.steps],
+        "current": behaviour.current,
+        "failure": behaviour.failure,
+        "ended": [
+            {
+                "title": record.title,
+                "command": record.command,
+                "success": record.success,
+                "reason": record.reason,
+                "started_ns": record.started_ns,
+                "ended_ns": record.ended_ns,
+            }
+            for record in behaviour.records[-RECENT_STEPS:]
+        ],
+    }
+
+
+def _corners(polygon: Polygon) -> list[list[float]]:
+    return [list(corner) for corner in polygon]
 
 
 def _camera(supervisor: PerceptionSupervisor) -> StatusCameraBody:

@@ -118,9 +118,9 @@ CAMERA_INFO: Final = Topic(
 IMAGE: Final = Topic(
     "image",
     bodies.ImageBody,
-    "a frame with its detections drawn; the attachment has its number",
+    "a frame, with `preview.annotate` with its detections drawn; the attachment has its number",
     "at most `preview.rate_hz`, only with subscribers",
-    rate_hz=5.0,
+    rate_hz=15.0,
     max_age_s=1.0,
     of_camera=True,
     encoding=zenoh.Encoding.IMAGE_JPEG,

@@ -42,6 +42,7 @@ def vehicle_message(state: VehicleState, now_ns: int) -> VehicleBody:
         "velocity_ned_mps": _rounded(state.velocity_ned_mps),
         "attitude_wxyz": _rounded(state.attitude, 5),
         "yaw_rad": None if state.yaw_rad is None else round(state.yaw_rad, 4),
+        "home_ned_m": _rounded(state.home_position_ned_m),
         "altitude_m": None if state.altitude_m is None else round(state.altitude_m, 3),
         "latitude_deg": _finite(state.latitude_deg),
         "longitude_deg": _finite(state.longitude_deg),

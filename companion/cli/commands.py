@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from companion.cli.bench import bench
+from companion.cli.dashboard import dashboard
 from companion.cli.evaluate import evaluate
 from companion.cli.flags import EXIT_BAD_INPUT, plain_errors, settings_command
 from companion.cli.mission import mission
@@ -45,6 +46,7 @@ ORDER = (
     "detect",
     "send",
     "echo",
+    "dashboard",
     "commands",
     "topics",
     "mission",
@@ -66,6 +68,7 @@ app.command()(evaluate)
 app.command()(topics)
 settings_command(app, *CLIENT_SETTINGS, "plugins", "detector")(mission)
 settings_command(app)(play)
+settings_command(app, *CLIENT_SETTINGS, "dashboard")(dashboard)
 app.add_typer(bench, name="bench")
 
 EXIT_FAILED = 1
@@ -141,8 +144,10 @@ def _warn_synthetic_model(detectors: Iterable[tuple[str, str]]) -> None:
 
 async def _run_until_signal(settings: Settings, service: Service) -> None:
     loop = asyncio.get_running_loop()
+    ready = asyncio.Event()
 
     def on_ready() -> None:
+        ready.set()
         _freeze_loaded_objects()
         cameras = [settings.of_camera(name) for name in (None, *settings.cameras)]
         _warn_synthetic_model(
@@ -155,10 +160,27 @@ async def _run_until_signal(settings: Settings, service: Service) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         # Before the service is ready there is nothing to shut down.
         loop.add_signal_handler(number, lambda: service.stop() if service.ready else running.cancel())
+    page = asyncio.create_task(_run_dashboard(settings, ready))
     try:
         await running
     except asyncio.CancelledError:
         raise typer.Exit(EXIT_FAILED) from None
+    finally:
+        page.cancel()
+        await asyncio.gather(page, return_exceptions=True)
+
+
+async def _run_dashboard(settings: Settings, ready: asyncio.Event) -> None:
+    """Run the page once the service is ready, until cancelled."""
+    from companion.dashboard.process import dashboard_process
+
+    def say(line: str) -> None:
+        logger = logging.getLogger("companion")
+        logger.log(logging.INFO if "http://" in line else logging.WARNING, "%s", line)
+
+    await ready.wait()
+    async with dashboard_process(settings, say):
+        await asyncio.Event().wait()
 
 
 @app.command()

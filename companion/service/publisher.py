@@ -138,7 +138,9 @@ class Publisher:
     def publish_preview(self, camera: WorkerCamera, preview: Preview) -> None:
         """Publish a preview image with its stamps, and answer the queries for one."""
         self._queries.on_image(camera, preview.jpeg)
-        attachment = image_attachment(preview.sequence, preview.captured_ns, camera.name)
+        attachment = image_attachment(
+            preview.sequence, preview.captured_ns, camera.name, annotated=camera.settings.preview.annotate
+        )
         self._bus.publish_image(topics.IMAGE, preview.jpeg, attachment, camera.name)
 
     async def publish_vehicle(

@@ -1,11 +1,20 @@
-"""The settings of metrics, log and plug-ins."""
+"""The settings of dashboard, metrics, log and plug-ins."""
 
 from __future__ import annotations
 
 from typing import Annotated, Literal
 
 from companion.settings.section import Section
-from companion.settings.texts import HOST_AND_PORT
+from companion.settings.texts import HOST_AND_PORT, HOST_AND_PORT_OR_EMPTY
+
+
+class DashboardSection(Section):
+    """The web page of the vehicle."""
+
+    listen: Annotated[str, HOST_AND_PORT_OR_EMPTY] = "127.0.0.1:8088"
+    """HOST:PORT of the page; empty: none"""
+    token_file: str | None = None
+    """file with the token, readable by its owner only; required if other computers can reach `listen`"""
 
 
 class MetricsSection(Section):

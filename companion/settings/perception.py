@@ -321,11 +321,11 @@ class RecordingSection(Section):
 class PreviewSection(Section):
     """Preview images on the network: JPEG, only while there is a subscriber."""
 
-    rate_hz: Annotated[float, Field(gt=0, le=60)] = 5.0
+    rate_hz: Annotated[float, Field(gt=0, le=60)] = 15.0
     """maximum rate, Hz"""
     quality: Annotated[int, Field(ge=1, le=100)] = 80
     """JPEG quality"""
     width: Annotated[int, Field(ge=16, le=4096)] = 1280
     """maximum width, pixels; larger frames are scaled down"""
-    annotate: bool = True
-    """draw the detections"""
+    annotate: bool = False
+    """draw the detections; the dashboard draws them itself"""

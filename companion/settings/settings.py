@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from companion.settings.bus import ZenohSection
 from companion.settings.guidance import GuidanceSection
-from companion.settings.operator import LogSection, MetricsSection, PluginsSection
+from companion.settings.operator import DashboardSection, LogSection, MetricsSection, PluginsSection
 from companion.settings.perception import (
     CameraSection,
     DetectorSection,
@@ -47,6 +47,7 @@ class Settings(Section):
     zenoh: ZenohSection = ZenohSection()
     recording: RecordingSection = RecordingSection()
     preview: PreviewSection = PreviewSection()
+    dashboard: DashboardSection = DashboardSection()
     metrics: MetricsSection = MetricsSection()
     log: LogSection = LogSection()
     plugins: PluginsSection = PluginsSection()

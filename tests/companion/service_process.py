@@ -31,6 +31,7 @@ class ServiceProcess:
     def __init__(self, process: subprocess.Popen[bytes], endpoint: str) -> None:
         self.process = process
         self.endpoint = endpoint
+        self.url = ""  # of the dashboard, where a test sets it
         self.lines: list[str] = []
         self._queue: queue.Queue[str | None] = queue.Queue()
         self.output = process.stderr or process.stdout
@@ -124,7 +125,8 @@ def running_service(
     An exception in between gets the service's last lines as a note.
     """
     command = [sys.executable, "-m", "companion.cli", "run"]
-    command += ["--vehicle-url", f"udpin://127.0.0.1:{onboard_port}", "--detector-threads", "1", *flags]
+    command += ["--vehicle-url", f"udpin://127.0.0.1:{onboard_port}", "--detector-threads", "1"]
+    command += ["--dashboard-listen", "", *flags]
     if endpoint is None:
         endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
         command += ["--zenoh-listen", endpoint]

@@ -29,7 +29,10 @@ def playing(folder: Path, *flags: str) -> Iterator[ServiceProcess]:
     """A running `companion play` that is ready for commands."""
     endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     process = subprocess.Popen(
-        [sys.executable, "-m", "companion.cli", "play", "--zenoh-listen", endpoint, *flags],
+        [
+            *(sys.executable, "-m", "companion.cli", "play", "--zenoh-listen", endpoint),
+            *("--dashboard-listen", "", *flags),
+        ],
         cwd=folder,
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,

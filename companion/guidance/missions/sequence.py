@@ -132,6 +132,21 @@ class SequenceBehaviour(Behaviour):
         doing = "" if self._active is None else f": {self._active.status}"
         return f"mission {self._plan.name}, {self.where}{doing}"
 
+    @property
+    def plan(self) -> Plan:
+        """The plan being flown."""
+        return self._plan
+
+    @property
+    def current(self) -> int:
+        """Index of the active step."""
+        return self._at
+
+    @property
+    def failure(self) -> str:
+        """Why the failure handling is flown; empty: it is not."""
+        return self._failure
+
     def with_step(self, outcome: Outcome) -> Outcome:
         """Add the current step to an outcome that came from outside (a pilot, another command)."""
         if outcome.success or self._ended or self._active is None:

@@ -1,0 +1,91 @@
+"""Programs beside the service, each a module in its own process: clients of the bus like any other.
+
+Nothing in such a program can delay the service. It ends when its standard input is closed, which the parent
+holds: at the end of the context, and when the parent is killed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import sys
+import threading
+from asyncio.subprocess import PIPE, STDOUT, Process
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager, suppress
+
+# Exit code of a program that has printed in one line why it cannot work: it is not started again.
+EXIT_REFUSED = 2
+MAX_RESTARTS = 5
+_RESTART_S = 1.0
+_END_S = 5.0
+
+Say = Callable[[str], None]
+
+
+@asynccontextmanager
+async def child_process(name: str, module: str, argument: str, say: Say) -> AsyncIterator[None]:
+    """Run `python -m MODULE ARGUMENT` meanwhile; started again after a crash.
+
+    Args:
+        name: for people. say: called in the loop with each line that it prints, and with its end.
+    """
+    running = asyncio.create_task(_supervise(name, (module, argument), say), name=name)
+    try:
+        yield
+    finally:
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+
+
+async def _supervise(name: str, words: tuple[str, str], say: Say) -> None:
+    for restarts in range(MAX_RESTARTS + 1):
+        process = await asyncio.create_subprocess_exec(
+            sys.executable,
+            "-P",  # import from the search path below, not from the working directory
+            "-m",
+            *words,
+            stdin=PIPE,
+            stdout=PIPE,
+            stderr=STDOUT,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            # Ctrl-C in the terminal is for the parent, which then closes the pipe.
+            process_group=0,
+        )
+        try:
+            assert process.stdout is not None
+            while line := await process.stdout.readline():
+                say(f"{name}: {line.decode(errors='replace').rstrip()}")
+            code = await process.wait()
+        finally:
+            await _end(process)
+        if code == EXIT_REFUSED:
+            return
+        if restarts < MAX_RESTARTS:
+            say(f"{name}: its process ended with code {code}; it is started again")
+            await asyncio.sleep(_RESTART_S)
+    say(f"{name}: ended {MAX_RESTARTS + 1} times; not started again")
+
+
+async def _end(process: Process) -> None:
+    """Close the pipe, which ends the process; kill it if it does not end."""
+    assert process.stdin is not None
+    process.stdin.close()
+    try:
+        async with asyncio.timeout(_END_S):
+            await process.wait()
+    except TimeoutError:
+        with suppress(ProcessLookupError):
+            process.kill()
+        await process.wait()
+
+
+def on_parent_end(call: Callable[[], None]) -> None:
+    """In the program: call a function, in a thread, when the parent has closed the pipe or was killed."""
+
+    def wait() -> None:
+        while os.read(sys.stdin.fileno(), 64):
+            pass
+        call()
+
+    threading.Thread(target=wait, name="parent", daemon=True).start()

@@ -1,0 +1,33 @@
+"""The dashboard as a child process: `python -m companion.dashboard`, options as JSON in the argument.
+
+It prints the page's address, or one line why there is none. It ends with its parent.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import sys
+
+from companion.child_process import EXIT_REFUSED, on_parent_end
+from companion.dashboard.access import DashboardError
+from companion.dashboard.server import DashboardOptions, serve
+from companion.settings import ZenohSection
+
+
+def main(argument: str) -> int:
+    """Serve; returns the exit code."""
+    values = json.loads(argument)
+    zenoh = ZenohSection.model_validate_json(json.dumps(values.pop("zenoh")))
+    on_parent_end(lambda: os._exit(0))  # zenoh's threads and open streams need no shutdown
+    try:
+        asyncio.run(serve(DashboardOptions(zenoh=zenoh, **values), lambda url: print(url, flush=True)))
+    except DashboardError as error:
+        print(error, flush=True)
+        return EXIT_REFUSED
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1]))

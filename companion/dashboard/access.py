@@ -1,0 +1,160 @@
+"""Who may use the page: the token, and the checks against requests that other web pages cause.
+
+A browser sends requests to any address on behalf of any page. Therefore every request needs a `Host` of ours
+(DNS rebinding) and, where the browser says which page it comes from (`Origin`, `Sec-Fetch-Site`), our own; a
+POST also needs a header that other pages cannot set.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import ipaddress
+import os
+import socket
+import stat
+from collections.abc import Mapping
+from dataclasses import dataclass
+from http.cookies import CookieError, SimpleCookie
+from pathlib import Path
+from typing import NamedTuple
+
+HEADER = "x-companion-dashboard"
+"""A POST needs it, with any value: a page of another origin cannot send it without a CORS permission."""
+COOKIE = "companion_dashboard"
+SHORTEST_TOKEN = 16
+_LONGEST_FILE_BYTES = 1024
+
+
+class DashboardError(RuntimeError):
+    """The page cannot be served. The message is one line."""
+
+
+class Refusal(NamedTuple):
+    """An HTTP status and one line of text."""
+
+    status: int
+    text: str
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this computer can reach a server on this host."""
+    if host == "localhost":
+        return True
+    address = _address(host)
+    return address is not None and address.is_loopback
+
+
+def read_token(path: str | Path) -> str:
+    """Read the token: one line of at least 16 printable characters, in a file readable by its owner only.
+
+    Raises:
+        DashboardError: the file or its content is not acceptable. The message never contains the token.
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            status = os.fstat(file.fileno())
+            content = file.read(_LONGEST_FILE_BYTES + 1) if stat.S_ISREG(status.st_mode) else b""
+    except OSError as error:
+        raise DashboardError(f"dashboard.token_file {path}: cannot be read: {error.strerror}") from error
+    if status.st_mode & 0o077:
+        mode = stat.S_IMODE(status.st_mode)
+        raise DashboardError(
+            f"dashboard.token_file {path}: others can read it (mode {mode:o}): chmod 600 {path}"
+        )
+    token = content.decode("ascii", "replace").strip()
+    if len(content) > _LONGEST_FILE_BYTES or not token.isprintable() or " " in token or "\ufffd" in token:
+        raise DashboardError(f"dashboard.token_file {path}: expected one line of ASCII without spaces")
+    if len(token) < SHORTEST_TOKEN:
+        raise DashboardError(
+            f"dashboard.token_file {path}: expected at least {SHORTEST_TOKEN} characters, got {len(token)}; "
+            f"for example: openssl rand -hex 16 > {path}"
+        )
+    return token
+
+
+@dataclass(frozen=True)
+class Access:
+    """The rules of one server.
+
+    Attributes:
+        host: the address that it listens on. token: None: none is needed.
+
+    Raises:
+        DashboardError: other computers can reach `host`, and there is no token.
+    """
+
+    host: str
+    token: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.token is None and not is_loopback(self.host):
+            raise DashboardError(
+                f"dashboard.listen {self.host} is open to other computers: dashboard.token_file must be set"
+            )
+
+    @property
+    def cookie(self) -> str:
+        """The cookie's value. It is derived from the token, so it outlives a restart and not a new token."""
+        return hmac.new((self.token or "").encode(), COOKIE.encode(), hashlib.sha256).hexdigest()
+
+    def token_is(self, text: str) -> bool:
+        """Whether a text is the token."""
+        return self.token is not None and _equal(text, self.token)
+
+    def check(self, method: str, path: str, headers: Mapping[str, str]) -> Refusal | None:
+        """Check everything but the token; None: the request is accepted.
+
+        Args:
+            headers: names in lower case.
+        """
+        host = headers.get("host", "")
+        if not self._host_is_ours(host):
+            return Refusal(403, f"Host {host!r} is not an address of this server")
+        origin = headers.get("origin")
+        if origin is not None and origin not in (f"http://{host}", f"https://{host}"):
+            return Refusal(403, f"Origin {origin!r} is another page")
+        # Following a link to the page is harmless: it cannot be framed, and the link's page cannot read it.
+        followed_link = method == "GET" and path == "/" and headers.get("sec-fetch-mode") == "navigate"
+        if not followed_link and headers.get("sec-fetch-site", "none") not in ("same-origin", "none"):
+            return Refusal(403, "requested by another page")
+        if method not in ("GET", "HEAD") and HEADER not in headers:
+            return Refusal(403, f"the header {HEADER} is missing")
+        return None
+
+    def admits(self, headers: Mapping[str, str]) -> bool:
+        """Whether a request has the token (`Authorization: Bearer …`) or the cookie, or needs none."""
+        if self.token is None:
+            return True
+        scheme, _, given = headers.get("authorization", "").partition(" ")
+        if scheme.lower() == "bearer" and self.token_is(given.strip()):
+            return True
+        try:
+            cookie = SimpleCookie(headers.get("cookie", "")).get(COOKIE)
+        except CookieError:
+            return False
+        return cookie is not None and _equal(cookie.value, self.cookie)
+
+    def _host_is_ours(self, header: str) -> bool:
+        """Whether a `Host` is an address, or a name that no one else can point at this computer."""
+        name = header.rpartition(":")[0] if header.rpartition(":")[2].isdecimal() else header
+        name = name.lower()
+        if name == self.host or name == "localhost":
+            return bool(name)
+        if is_loopback(self.host):
+            return is_loopback(name.strip("[]"))
+        own = socket.gethostname().lower()
+        return _address(name.strip("[]")) is not None or name in (own, f"{own}.local")
+
+
+def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
+    try:
+        return ipaddress.ip_address(host)
+    except ValueError:
+        return None
+
+
+def _equal(one: str, other: str) -> bool:
+    """Compare in constant time."""
+    return hmac.compare_digest(one.encode("utf-8", "surrogatepass"), other.encode())

@@ -1,0 +1,299 @@
+"""The web server: the page, one stream of state, pictures on request, commands by POST.
+
+Nothing is queued for a browser. The stream sends what is newest when the browser is ready for more, and a
+picture is sent when the browser asks for the next one. A connection whose data are not accepted for
+`TCP_USER_TIMEOUT` is closed by the kernel.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import re
+import socket
+import time
+from collections.abc import AsyncIterator, Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from importlib import resources
+from typing import Any
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.datastructures import Headers
+from starlette.requests import Request
+from starlette.responses import JSONResponse, PlainTextResponse, Response, StreamingResponse
+from starlette.routing import Route
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from companion.dashboard.access import COOKIE, Access, DashboardError, Refusal, read_token
+from companion.dashboard.bridge import Bridge, News
+from companion.settings import ZenohSection
+
+STREAM_PERIOD_S = 0.1
+PICTURE_WAIT_S = 0.5
+REPLY_WAIT_S = 1.0
+"""How long a POST waits for the command's outcome; a later one is only in the stream."""
+LONGEST_COMMAND, LARGEST_BODY_BYTES = 8000, 64 * 1024
+MAX_CONNECTIONS = 100
+MAX_STREAMS_PER_BROWSER = 3
+"""A browser opens 6 connections to one host; streams of many windows would leave none for a stop command."""
+_UNACCEPTED_MS = 15_000
+_SEND_BUFFER_BYTES = 256 * 1024
+_FILES = {"page.html": "text/html", "page.css": "text/css", "page.js": "text/javascript"}
+_SECURITY = {
+    "cache-control": "no-store",
+    "content-security-policy": "default-src 'self'; img-src data:; base-uri 'none'; frame-ancestors 'none'",
+    "cross-origin-resource-policy": "same-origin",
+    "referrer-policy": "no-referrer",
+    "x-content-type-options": "nosniff",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class DashboardOptions:
+    """Options of a server.
+
+    Attributes:
+        listen: HOST:PORT. token_file: required beyond loopback.
+        zenoh: settings of a client (`companion.bus.client.client_settings`).
+        vehicle: name of the vehicle.
+    """
+
+    listen: str
+    token_file: str | None
+    zenoh: ZenohSection
+    vehicle: str
+
+
+async def serve(options: DashboardOptions, on_ready: Callable[[str], None]) -> None:
+    """Serve until SIGINT or SIGTERM, or until cancelled.
+
+    Args:
+        on_ready: called with the page's address.
+
+    Raises:
+        DashboardError: the address is in use or not available, or the token is missing.
+    """
+    host, port = split_listen(options.listen)
+    token = None if options.token_file is None else read_token(options.token_file)
+    access = Access(host, token)
+    with listening_socket(host, port) as listener:
+        bridge = Bridge(options.zenoh, options.vehicle)
+        application = create_app(bridge, access)
+        server = uvicorn.Server(
+            uvicorn.Config(
+                application,
+                http="h11",
+                ws="none",
+                lifespan="off",
+                access_log=False,
+                log_level="critical",
+                server_header=False,
+                limit_concurrency=MAX_CONNECTIONS,
+                timeout_graceful_shutdown=1,
+            )
+        )
+        bridging = asyncio.create_task(bridge.run())
+        bridging.add_done_callback(lambda _: setattr(server, "should_exit", True))
+        try:
+            on_ready(f"http://{host}:{port}/")
+            await server.serve(sockets=[listener])
+            if bridging.done():
+                bridging.result()  # raises why it ended
+        finally:
+            bridging.cancel()
+            await asyncio.gather(bridging, return_exceptions=True)
+
+
+def split_listen(listen: str) -> tuple[str, int]:
+    """Split HOST:PORT. Raises DashboardError for a port above 65535."""
+    host, _, port = listen.rpartition(":")
+    if not host or not port.isdecimal() or int(port) > 65535:
+        raise DashboardError(f"dashboard.listen {listen}: expected HOST:PORT such as 127.0.0.1:8088")
+    return host, int(port)
+
+
+def listening_socket(host: str, port: int) -> socket.socket:
+    """Open the server's socket. Raises DashboardError."""
+    try:
+        listener = socket.create_server((host, port))
+    except OSError as error:
+        raise DashboardError(
+            f"no page on {host}:{port}: {error.strerror or error}; --dashboard-listen sets another address"
+        ) from error
+    # Accepted connections inherit these.
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES)
+    with suppress(AttributeError):  # not on Linux
+        listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _UNACCEPTED_MS)
+    return listener
+
+
+def create_app(bridge: Bridge, access: Access) -> ASGIApp:
+    """Create the ASGI application."""
+    folder = resources.files("companion.dashboard")
+    files = {name: (folder / name).read_bytes() for name in _FILES}
+    streams = StreamTable()
+
+    async def page(request: Request) -> Response:
+        response = Response(files["page.html"], media_type="text/html")
+        if access.token is not None and "token" in request.query_params:
+            # The page removes the token from the address; from here on the cookie is used.
+            response.set_cookie(COOKIE, access.cookie, httponly=True, samesite="strict", max_age=30 * 86400)
+        return response
+
+    async def file(request: Request) -> Response:
+        name = request.url.path.lstrip("/")
+        return Response(files[name], media_type=_FILES[name])
+
+    async def events(request: Request) -> Response:
+        browser = (
+            f"{request.client.host if request.client else ''} {request.query_params.get('browser', '')[:64]}"
+        )
+        return StreamingResponse(
+            _stream(bridge, streams, browser),
+            media_type="text/event-stream",
+        )
+
+    async def picture(request: Request) -> Response:
+        try:
+            after = int(request.query_params.get("after", "-1"))
+        except ValueError:
+            return PlainTextResponse("after: expected a number", 400)
+        camera = request.query_params.get("camera", "")
+        if not re.fullmatch("[A-Za-z0-9_-]{0,64}", camera):
+            return PlainTextResponse("camera: expected the name of a camera, or none for the first", 400)
+        found = await bridge.picture(camera, after, PICTURE_WAIT_S)
+        if found is None:
+            return Response(status_code=204)
+        return Response(found.jpeg, media_type="image/jpeg", headers={"x-frame": json.dumps(found.about)})
+
+    async def command(request: Request) -> Response:
+        body = bytearray()
+        async for chunk in request.stream():
+            body += chunk
+            if len(body) > LARGEST_BODY_BYTES:
+                return PlainTextResponse(f"at most {LARGEST_BODY_BYTES} bytes are accepted", 413)
+        try:
+            sent = json.loads(body)
+            text, identifier = sent["text"], str(sent.get("id", ""))[:64]
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+            return PlainTextResponse('expected JSON such as {"text": "takeoff 5", "id": "1"}', 400)
+        if not isinstance(text, str) or not 0 < len(text) <= LONGEST_COMMAND:
+            return PlainTextResponse(f"text: expected 1 to {LONGEST_COMMAND} characters", 400)
+        outcome = bridge.command(text, identifier)
+        if outcome is None:
+            return PlainTextResponse("too many commands are waiting for their outcome", 429)
+        try:
+            async with asyncio.timeout(REPLY_WAIT_S):
+                return JSONResponse(await asyncio.shield(outcome))
+        except TimeoutError:
+            return JSONResponse({"id": identifier, "command": text[:200]}, 202)
+
+    async def clock(_request: Request) -> Response:
+        return JSONResponse({"now_ns": time.monotonic_ns()})
+
+    routes = [
+        Route("/", page),
+        *(Route(f"/{name}", file) for name in _FILES if name != "page.html"),
+        Route("/events", events),
+        Route("/picture", picture),
+        Route("/clock", clock),
+        Route("/command", command, methods=["POST"]),
+    ]
+    return _Guard(Starlette(routes=routes), access)
+
+
+class StreamTable:
+    """The open streams of each browser, the oldest first; a new one ends the oldest of too many."""
+
+    def __init__(self) -> None:
+        self._open: dict[str, list[asyncio.Event]] = {}
+
+    def add(self, browser: str) -> asyncio.Event:
+        """Return an event that is set when the stream has to end."""
+        streams = self._open.setdefault(browser, [])
+        streams.append(ended := asyncio.Event())
+        for old in streams[:-MAX_STREAMS_PER_BROWSER]:
+            old.set()
+        return ended
+
+    def remove(self, browser: str, ended: asyncio.Event) -> None:
+        """Forget a stream."""
+        self._open[browser].remove(ended)
+        if not self._open[browser]:
+            del self._open[browser]
+
+
+async def _stream(bridge: Bridge, streams: StreamTable, browser: str) -> AsyncIterator[str]:
+    """Yield server-sent events with what is new since the one before, at most ten a second."""
+    ended = streams.add(browser)
+    seen = 0
+    try:
+        with bridge.watching():
+            yield "retry: 1000\n\n"
+            while not ended.is_set():
+                news = bridge.news(seen)
+                seen = news.number
+                yield f"data: {_text_of(bridge, news)}\n\n"
+                with suppress(TimeoutError):
+                    await asyncio.wait_for(ended.wait(), STREAM_PERIOD_S)
+            yield "event: replaced\ndata: {}\n\n"
+    finally:
+        streams.remove(browser, ended)
+
+
+def _text_of(bridge: Bridge, news: News) -> str:
+    """Format what is new as JSON."""
+    head = {
+        "now_ns": time.monotonic_ns(),
+        "vehicle_name": bridge.vehicle,
+        "problem": bridge.problem,
+        "alive": bridge.alive,
+        "ages_s": news.ages_s,
+        "events": news.events,
+        "replies": news.replies,
+    }
+    topics = ", ".join(f"{json.dumps(path)}: {text}" for path, text in news.topics.items())
+    return f'{json.dumps(head)[:-1]}, "topics": {{{topics}}}}}'
+
+
+class _Guard:
+    """Applies the access rules to every request, and adds the security headers to every response."""
+
+    def __init__(self, application: ASGIApp, access: Access) -> None:
+        self._application, self._access = application, access
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            return
+        refusal = self._refusal(Request(scope))
+
+        async def send_secured(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                extra = [(name.encode(), value.encode()) for name, value in _SECURITY.items()]
+                message = {**message, "headers": [*message.get("headers", []), *extra]}
+            await send(message)
+
+        if refusal is None:
+            await self._application(scope, receive, send_secured)
+        else:
+            await PlainTextResponse(f"{refusal.text}\n", refusal.status)(scope, receive, send_secured)
+
+    def _refusal(self, request: Request) -> Refusal | None:
+        headers = _joined(request.headers)
+        path = request.url.path
+        if (refusal := self._access.check(request.method, path, headers)) is not None:
+            return refusal
+        given = request.query_params.get("token") if path == "/" else None
+        if given is not None and self._access.token is not None:
+            return None if self._access.token_is(given) else Refusal(401, "wrong token")
+        if self._access.admits(headers):
+            return None
+        return Refusal(401, "a token is needed: open /?token=… once, or send it as Authorization: Bearer …")
+
+
+def _joined(headers: Headers) -> dict[str, str]:
+    """Return name → value; a header that was sent twice has both values, and then matches no rule."""
+    names: dict[str, Any] = {name: ", ".join(headers.getlist(name)) for name in headers}
+    return names

@@ -1,0 +1,242 @@
+"""From zenoh to the page's state, with real sessions; a second session plays the service."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+import time
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager, contextmanager
+from typing import Any
+
+import pytest
+import zenoh
+
+from companion.bus.session import zenoh_config
+from companion.bus.topics import DETECTIONS, EVENTS, IMAGE, STATUS, VEHICLE, alive_key, command_key
+from companion.dashboard.bridge import LARGEST_JSON_BYTES, MAX_COMMANDS, Bridge
+from companion.settings import ZenohSection
+from mavlink_sim.testing import free_port
+
+pytestmark = pytest.mark.realtime
+
+NAME = "vehicle1"
+FOUND = {
+    "class_id": 1,
+    "class_name": "car",
+    "confidence": 0.9,
+    "xyxy": [64.0, 48.0, 320.0, 240.0],
+    "track_id": 7,
+    "track_state": "confirmed",
+}
+BOX = [0.1, 0.1, 0.5, 0.5, "car", 0.9, 7, "confirmed"]
+
+
+def frame(sequence: int, **more: Any) -> dict[str, Any]:
+    return {"sequence": sequence, "width": 640, "height": 480, "detections": [FOUND], **more}
+
+
+class Publisher:
+    """The service's end."""
+
+    def __init__(self, endpoint: str) -> None:
+        self.session = zenoh.open(zenoh_config(ZenohSection(listen=(endpoint,))))
+        self.token = self.session.liveliness().declare_token(alive_key(NAME))
+        self._image = self.session.declare_publisher(IMAGE.key(NAME))
+
+    def publish(self, key: str, value: Any) -> None:
+        self.session.put(key, value if isinstance(value, str | bytes) else json.dumps(value))
+
+    def image(self, sequence: int, jpeg: bytes = b"jpeg", **more: Any) -> None:
+        self._image.put(jpeg, attachment=json.dumps({"sequence": sequence, "captured_ns": 5, **more}))
+
+    @property
+    def image_is_watched(self) -> bool:
+        return bool(self._image.matching_status.matching)  # type: ignore[attr-defined]
+
+
+@contextmanager
+def publishing(endpoint: str | None = None) -> Iterator[tuple[Publisher, str]]:
+    endpoint = endpoint or f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    publisher = Publisher(endpoint)
+    try:
+        yield publisher, endpoint
+    finally:
+        publisher.session.close()  # type: ignore[no-untyped-call]
+
+
+@asynccontextmanager
+async def bridging(endpoint: str) -> AsyncIterator[Bridge]:
+    bridge = Bridge(ZenohSection(mode="client", connect=(endpoint,), listen=()), NAME)
+    running = asyncio.create_task(bridge.run())
+    try:
+        yield bridge
+    finally:
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+
+
+async def until(condition: Callable[[], Any], timeout_s: float = 15.0) -> Any:
+    deadline_s = time.monotonic() + timeout_s
+    while not (value := condition()):
+        assert time.monotonic() < deadline_s
+        await asyncio.sleep(0.02)
+    return value
+
+
+async def test_state_is_the_newest_message_of_each_topic() -> None:
+    with publishing() as (service, endpoint):
+        async with bridging(endpoint) as bridge:
+            with bridge.watching():
+                await until(lambda: bridge.alive)
+                for height in (1.0, 2.0):
+                    service.publish(VEHICLE.key(NAME), {"altitude_m": height})
+                service.publish(DETECTIONS.key(NAME, "down"), frame(3))
+                service.publish(EVENTS.key(NAME), {"level": "info", "text": "ready"})
+                await until(lambda: len(bridge.news(0).topics) == 2 and bridge.news(0).events)
+                await until(lambda: json.loads(bridge.news(0).topics["vehicle"])["altitude_m"] == 2.0)
+                news = bridge.news(0)
+                assert json.loads(news.topics["cameras/down/detections"])["sequence"] == 3
+                assert news.events == [{"level": "info", "text": "ready"}]
+                assert 0.0 <= news.ages_s["vehicle"] < 5.0
+                later = bridge.news(news.number)
+                assert (later.topics, later.events, later.number) == ({}, [], news.number)
+                assert set(later.ages_s) == set(news.topics)
+
+
+async def test_useless_messages_are_ignored() -> None:
+    with publishing() as (service, endpoint):
+        async with bridging(endpoint) as bridge:
+            with bridge.watching():
+                await until(lambda: bridge.alive)
+                for bad in (
+                    "{",
+                    "[1]",
+                    '{"altitude_m": NaN}',
+                    b"\xff\xfe",
+                    "[" * 100_000,
+                    "9" * LARGEST_JSON_BYTES + "9",
+                ):
+                    service.publish(VEHICLE.key(NAME), bad)
+                    service.publish(DETECTIONS.key(NAME), bad)
+                service.publish(DETECTIONS.key(NAME), {"detections": []})  # no sequence
+                service.publish(STATUS.key(NAME), {"healthy": True})
+                await until(lambda: "status" in bridge.news(0).topics)
+                assert set(bridge.news(0).topics) == {"status"}
+
+
+async def test_picture_has_the_boxes_of_its_frame() -> None:
+    with publishing() as (service, endpoint):
+        async with bridging(endpoint) as bridge:
+            with bridge.watching():
+                await until(lambda: bridge.alive)
+                asked = asyncio.create_task(bridge.picture("", -1, 20.0))
+                await until(lambda: service.image_is_watched)
+                service.publish(DETECTIONS.key(NAME), frame(4, detections=[]))
+                service.publish(DETECTIONS.key(NAME), frame(5))
+                service.publish(DETECTIONS.key(NAME), frame(6, detections=[]))
+                await until(lambda: '"sequence": 6' in bridge.news(0).topics.get("detections", ""))
+                service.image(5, b"five", annotated=False)
+                picture = await asked
+                assert picture is not None
+                assert picture.jpeg == b"five"
+                assert picture.about == {
+                    "sequence": 5,
+                    "captured_ns": 5,
+                    "annotated": False,
+                    "boxes": [BOX],
+                    "boxes_sequence": 5,
+                }
+                # The same picture is not sent twice. A frame that was not processed has the boxes before it.
+                assert await bridge.picture("", 5, 0.2) is None
+                service.image(7)
+                picture = await bridge.picture("", 5, 10.0)
+                assert picture is not None
+                assert (picture.about["sequence"], picture.about["boxes_sequence"]) == (7, 6)
+
+
+async def test_nothing_is_subscribed_without_a_browser() -> None:
+    with publishing() as (service, endpoint):
+        vehicle = service.session.declare_publisher(VEHICLE.key(NAME))
+
+        def watched() -> bool:
+            return bool(vehicle.matching_status.matching)  # type: ignore[attr-defined]
+
+        async with bridging(endpoint) as bridge:
+            with bridge.watching():
+                await until(watched)
+                assert not service.image_is_watched
+                assert await bridge.picture("", -1, 0.3) is None
+                await until(lambda: service.image_is_watched)
+                with bridge.watching():
+                    pass
+                assert watched()
+            await until(lambda: not watched())
+            await until(lambda: not service.image_is_watched)
+
+
+async def test_command_and_its_outcome() -> None:
+    with publishing() as (service, endpoint):
+
+        def answer(query: zenoh.Query) -> None:
+            assert query.payload is not None
+            text = query.payload.to_string()
+            with query:
+                reply = {"success": text == "land", "reason": f"got {text}", "track": 17}
+                query.reply(query.key_expr, json.dumps(reply))
+
+        service.session.declare_queryable(command_key(NAME), answer)
+        async with bridging(endpoint) as bridge:
+            await until(lambda: not bridge.problem)
+            for text, success in (("land", True), ("follow track=17", False)):
+                outcome = bridge.command(text, "id1")
+                assert outcome is not None
+                reply = {"success": success, "reason": f"got {text}", "track": 17}
+                wanted = {"id": "id1", "command": text, **reply}
+                assert await asyncio.wait_for(outcome, 20) == wanted
+                assert bridge.news(0).replies[-1] == wanted
+
+
+async def test_stop_has_its_own_allowance_of_waiting_commands() -> None:
+    with publishing() as (service, endpoint):
+        queries: list[zenoh.Query] = []
+        service.session.declare_queryable(command_key(NAME), queries.append)
+        async with bridging(endpoint) as bridge:
+            await until(lambda: not bridge.problem)
+            waiting = [bridge.command("hold", str(number)) for number in range(MAX_COMMANDS)]
+            assert None not in waiting
+            assert bridge.command("hold", "more") is None
+            stop = bridge.command(" STOP", "stop")
+            assert stop is not None
+            await until(lambda: len(queries) == MAX_COMMANDS + 1, 30.0)
+            service.token.undeclare()  # type: ignore[no-untyped-call]
+            replies = await asyncio.gather(stop, *(one for one in waiting if one is not None))
+            assert not any(reply["success"] for reply in replies)
+            queries.clear()
+
+
+async def test_no_service_and_a_service_that_goes_and_returns() -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    async with bridging(endpoint) as bridge:
+        with bridge.watching():
+            await until(lambda: "companion run" in bridge.problem)
+            outcome = bridge.command("land", "1")
+            assert outcome is not None
+            assert not (await outcome)["success"]
+            with publishing(endpoint) as (service, _):
+                await until(lambda: bridge.alive and not bridge.problem)
+                service.publish(VEHICLE.key(NAME), {"mode": "hold"})
+                await until(lambda: bridge.news(0).topics)
+            await until(lambda: bridge.alive is False)
+            await until(lambda: "lost" in bridge.problem)
+            assert "vehicle" in bridge.news(0).ages_s
+            with publishing(endpoint) as (service, _):
+                await until(lambda: bridge.alive and not bridge.problem, 30.0)
+                before = bridge.news(0).number
+
+                def new() -> bool:
+                    service.publish(VEHICLE.key(NAME), {"mode": "land"})
+                    return bool(bridge.news(before).topics)
+
+                await until(new, 30.0)

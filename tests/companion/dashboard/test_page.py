@@ -1,0 +1,161 @@
+"""The page in a real browser, at a running `companion play`."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+
+import pytest
+
+from companion.bus.topics import VEHICLE
+from mavlink_sim.testing import free_port
+from tests.companion.dashboard.chromium import PROGRAM, Browser, Tab, chromium, wait_for
+from tests.companion.dashboard.serving import dashboard_command
+from tests.companion.dashboard.test_bridge import publishing
+from tests.companion.service_process import ServiceProcess
+from tests.companion.test_play import playing
+
+pytestmark = [
+    pytest.mark.realtime,
+    pytest.mark.timeout(240),
+    pytest.mark.skipif(PROGRAM is None, reason="no chromium on the PATH"),
+]
+
+BOXES = "[...cameras.values()].flatMap((camera) => camera.about ? camera.about.boxes : [])"
+REPLY = "document.querySelector('#reply').textContent"
+LINK = "(document.querySelector('#link')?.textContent ?? '')"
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with chromium(tmp_path_factory.mktemp("profile")) as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServiceProcess]:
+    listen = f"127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    with playing(tmp_path_factory.mktemp("play"), "--dashboard-listen", listen) as running:
+        running.wait_for_line(f"dashboard: http://{listen}/", 60.0)
+        running.url = f"http://{listen}/"
+        yield running
+
+
+@pytest.fixture
+def tab(browser: Browser, service: ServiceProcess) -> Iterator[Tab]:
+    opened = browser.open(service.url)
+    opened.resize(1280, 900)
+    opened.until("document.readyState === 'complete' && typeof state === 'object'")
+    yield opened
+    opened.close()
+
+
+def rectangle(tab: Tab, selector: str) -> tuple[float, float, float, float]:
+    """Left, top, width and height of an element in the window, pixels."""
+    box = tab.value(f"document.querySelector('{selector}').getBoundingClientRect().toJSON()")
+    return box["left"], box["top"], box["width"], box["height"]
+
+
+def centre_of_a_track(tab: Tab) -> tuple[int, float, float]:
+    """The id of the largest box with a track, and its centre in the window."""
+    tab.until(f"{BOXES}.some((box) => box[6] != null)", 60.0)
+    boxes = [box for box in tab.value(BOXES) if box[6] is not None]
+    largest = max(boxes, key=lambda box: (box[2] - box[0]) * (box[3] - box[1]))
+    x, y, width, height = rectangle(tab, "figure canvas")
+    left, top, right, bottom = largest[:4]
+    return largest[6], x + (left + right) / 2 * width, y + (top + bottom) / 2 * height
+
+
+def test_box_is_clicked_and_its_command_arrives(service: ServiceProcess, tab: Tab) -> None:
+    number, x, y = centre_of_a_track(tab)
+    tab.click(x, y)
+    assert tab.until("!document.querySelector('#menu').hidden")
+    title, *items = tab.value("[...document.querySelector('#menu').children].map((item) => item.textContent)")
+    assert title.startswith(f"track {number}, ")
+    assert items[:3] == ["Follow", "Approach", "Orbit"]
+    tab.value("[...document.querySelectorAll('#menu button')][1].click()")
+    # The vehicle is on the ground: the service answers, whatever it answers.
+    answered = f"approach track={number}: "
+    tab.until(f"/^{answered}(done|failed): (?!no )/.test({REPLY})")
+    assert tab.value("document.querySelector('#menu').hidden")
+
+
+def test_rectangle_selects_what_is_in_it(tab: Tab) -> None:
+    tab.until("[...cameras.values()].some((camera) => camera.bitmap !== null)")
+    left, top, width, height = rectangle(tab, "figure canvas")
+    tab.drag(left + 0.4 * width, top + 0.3 * height, left + 0.5 * width, top + 0.5 * height)
+    tab.until(f"{REPLY}.startsWith('select ')")
+    words = tab.value(REPLY).partition(": ")[0].split()[1:]
+    sent = {key: float(value) for key, _, value in (word.partition("=") for word in words)}
+    assert sent == pytest.approx({"x": 0.4, "y": 0.3, "width": 0.1, "height": 0.2}, abs=0.01)
+
+
+def test_takeoff_button_and_space_bar(service: ServiceProcess, tab: Tab) -> None:
+    tab.until("state.topics.vehicle && state.topics.status")
+    assert "car" in tab.value("[...document.querySelector('#class').options].map((option) => option.value)")
+    tab.value("document.querySelector('#altitude').value = 3")
+    tab.value("document.querySelector('[data-command^=takeoff]').click()")
+    tab.until(f"{REPLY}.startsWith('takeoff 3: done')", 60.0)
+    tab.until("document.querySelector('#armed').textContent === 'yes'")
+    assert tab.value("Number.parseFloat(document.querySelector('#height').textContent)") > 2.0
+    tab.until("document.querySelector('#log').textContent.includes('command: takeoff altitude=3')")
+    # Space stops although a button has the focus, and does not press that button.
+    tab.value("document.querySelector('[data-command=land]').focus()")
+    tab.press(" ", " ")
+    tab.until(f"{REPLY}.startsWith('stop: ')")
+    # In the field of commands it is a character.
+    tab.value("document.querySelector('#text').focus()")
+    for key in "hold 1":
+        tab.press(key, key)
+    assert tab.value("document.querySelector('#text').value") == "hold 1"
+    tab.press("Enter", "\r")
+    tab.until(f"{REPLY}.startsWith('hold 1: ')")
+
+
+def test_page_shows_a_stop_button_and_names_on_a_phone(tab: Tab) -> None:
+    tab.resize(390, 844, phone=True)
+    left, top, width, height = rectangle(tab, "#stop")
+    assert left >= 0
+    assert top > 700
+    assert left + width <= 390
+    assert top + height <= 844
+    assert tab.value("document.documentElement.scrollWidth") <= 390
+    named = "control.ariaLabel || control.textContent.trim() || (control.labels && control.labels.length)"
+    controls = "[...document.querySelectorAll('button, input, select, canvas')]"
+    assert tab.value(f"{controls}.filter((control) => !({named})).map((control) => control.outerHTML)") == []
+
+
+def test_stop_works_with_the_page_in_many_windows(browser: Browser, service: ServiceProcess) -> None:
+    tabs = [browser.open(service.url) for _ in range(8)]
+    try:
+        for opened in tabs:
+            opened.until("typeof state === 'object' && (state.at > 0 || state.replaced)")
+        newest = tabs[-1]
+        newest.until("state.topics.status")
+        newest.value("document.querySelector('#stop').click()")
+        newest.until(f"/^stop: (done|failed)/.test({REPLY})", 5.0)
+    finally:
+        for opened in tabs:
+            opened.close()
+
+
+def test_page_says_when_no_service_answers_and_how_old_its_state_is(browser: Browser) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    with dashboard_command(endpoint) as url:
+        tab = browser.open(url)
+        tab.until(f"{LINK}.includes('is `companion run` running?')")
+        with publishing(endpoint) as (service, _):
+
+            def shown() -> bool:
+                service.publish(VEHICLE.key("vehicle1"), {"mode": "hold", "connected": True})
+                return bool(tab.value("document.querySelector('#mode').textContent === 'hold'"))
+
+            wait_for(shown)
+        tab.until(f"/Shown is its state of [0-9]+ s ago/.test({LINK})")
+        tab.close()
+
+
+def test_page_says_when_the_dashboard_is_gone(service: ServiceProcess, tab: Tab) -> None:
+    tab.until("state.topics.status")
+    service.process.kill()  # the last test with this service
+    tab.until(f"/does not answer; everything here is [0-9]+ s old/.test({LINK})")

@@ -1,0 +1,228 @@
+"""The page's server, by real HTTP on loopback."""
+
+from __future__ import annotations
+
+import gc
+import json
+import socket
+import tracemalloc
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from companion.bus.topics import DETECTIONS, VEHICLE, command_key
+from companion.dashboard.access import COOKIE, DashboardError
+from companion.dashboard.server import LARGEST_BODY_BYTES, MAX_STREAMS_PER_BROWSER
+from tests.companion.dashboard.serving import POST, EventStream, request, serving
+from tests.companion.dashboard.test_bridge import NAME, frame, publishing, until
+
+pytestmark = pytest.mark.realtime
+
+TOKEN = "0123456789abcdef0123456789abcdef"
+
+
+async def test_page_and_its_files_have_security_headers() -> None:
+    async with serving() as port:
+        for path, kind in (("/", "text/html"), ("/page.css", "text/css"), ("/page.js", "text/javascript")):
+            status, headers, body = await request(port, "GET", path)
+            assert status == 200
+            assert headers["content-type"].startswith(kind)
+            assert "frame-ancestors 'none'" in headers["content-security-policy"]
+            assert headers["cross-origin-resource-policy"] == "same-origin"
+            assert b"http://" not in body
+            assert b"https://" not in body  # nothing from elsewhere
+        assert (await request(port, "GET", "/bridge.py"))[0] == 404
+
+
+async def test_requests_of_other_pages_are_refused() -> None:
+    async with serving() as port:
+        for path in ("/", "/events", "/picture", "/clock", "/page.js"):
+            for headers in ({"host": "evil.example"}, {"origin": "http://evil.example"}):
+                assert (await request(port, "GET", path, headers))[0] == 403
+        body = {"text": "land"}
+        assert (await request(port, "POST", "/command", {"content-type": "text/plain"}, body))[0] == 403
+        assert (await request(port, "POST", "/command", {**POST, "origin": "null"}, body))[0] == 403
+
+
+async def test_token_opens_the_page_and_sets_a_cookie(tmp_path: Path) -> None:
+    path = tmp_path / "token"
+    path.write_text(TOKEN)
+    path.chmod(0o600)
+    async with serving(listen="0.0.0.0", token_file=path) as port:
+        assert (await request(port, "GET", "/"))[0] == 401
+        assert (await request(port, "GET", "/?token=wrong"))[0] == 401
+        assert (await request(port, "GET", f"/clock?token={TOKEN}"))[0] == 401
+        assert (await request(port, "GET", "/clock", {"authorization": f"Bearer {TOKEN}"}))[0] == 200
+        status, headers, body = await request(port, "GET", f"/?token={TOKEN}")
+        assert status == 200
+        cookie = headers["set-cookie"]
+        assert "HttpOnly" in cookie
+        assert "SameSite=strict" in cookie
+        assert TOKEN not in cookie
+        assert TOKEN.encode() not in body
+        value = cookie.partition(";")[0]
+        assert value.startswith(f"{COOKIE}=")
+        assert (await request(port, "GET", "/", {"cookie": value}))[0] == 200
+        assert (await request(port, "POST", "/command", {"cookie": value}, {"text": "land"}))[0] == 403
+
+
+async def test_address_in_use_or_open_without_token_is_refused() -> None:
+    async with serving() as port:
+        with pytest.raises(DashboardError) as refused:
+            async with serving(port=port):
+                raise AssertionError
+        assert str(port) in str(refused.value)
+    with pytest.raises(DashboardError, match="token_file"):
+        async with serving(listen="0.0.0.0"):
+            raise AssertionError
+
+
+async def test_stream_sends_what_is_new() -> None:
+    with publishing() as (service, endpoint):
+        async with serving(endpoint) as port:
+            stream = await EventStream.open(port)
+            assert stream.response.headers["content-type"].startswith("text/event-stream")
+            heights: list[float] = []
+            service_seen = False
+            for number in range(200):
+                service.publish(VEHICLE.key(NAME), {"altitude_m": float(number)})
+                news = await stream.next()
+                assert news is not None
+                assert news["vehicle_name"] == NAME
+                service_seen = service_seen or news["alive"] is True
+                if "vehicle" in news["topics"]:
+                    heights.append(news["topics"]["vehicle"]["altitude_m"])
+                if len(heights) > 5 and service_seen:
+                    break
+            assert service_seen
+            assert heights == sorted(set(heights))
+            quiet: Any = {"topics": {"vehicle": {}}}
+            while "vehicle" in quiet["topics"]:
+                quiet = await stream.next()
+            assert quiet["ages_s"]["vehicle"] >= 0.0
+            stream.close()
+
+
+async def test_stream_says_that_no_service_answers() -> None:
+    async with serving() as port:
+        stream = await EventStream.open(port)
+        news = await stream.next()
+        while news is not None and "companion run" not in news["problem"]:
+            news = await stream.next()
+        assert news is not None
+        assert news["topics"] == {}
+        stream.close()
+        status, _, body = await request(port, "POST", "/command", POST, {"text": "land", "id": "1"})
+        assert status == 200
+        assert json.loads(body)["success"] is False
+
+
+async def test_too_many_windows_end_the_oldest_stream() -> None:
+    async with serving() as port:
+        streams = [await EventStream.open(port, "?browser=one") for _ in range(MAX_STREAMS_PER_BROWSER + 1)]
+        other = await EventStream.open(port, "?browser=two")
+        seen = [await streams[0].next()]
+        while seen[-1] is not None:
+            seen.append(await streams[0].next())
+        assert seen[-2] == {}  # the event `replaced`
+        for stream in (*streams[1:], other):
+            news = await stream.next()
+            assert news is not None
+            assert "ages_s" in news
+        for stream in (*streams, other):
+            stream.close()
+
+
+async def test_command_and_its_late_outcome() -> None:
+    with publishing() as (service, endpoint):
+        queries: list[Any] = []
+        service.session.declare_queryable(command_key(NAME), queries.append)
+        async with serving(endpoint) as port:
+            stream = await EventStream.open(port)
+            await stream.next()
+            status, _, body = await request(
+                port, "POST", "/command", POST, {"text": "approach track=17", "id": "page-1"}
+            )
+            assert status == 202
+            assert json.loads(body) == {"id": "page-1", "command": "approach track=17"}
+            query = (await until(lambda: queries))[0]
+            assert query.payload.to_string() == "approach track=17"
+            with query:
+                query.reply(query.key_expr, json.dumps({"success": True, "reason": "reached"}))
+            queries.clear()
+            replies: list[Any] = []
+            while not replies:
+                news = await stream.next()
+                assert news is not None
+                replies = news["replies"]
+            wanted = {"id": "page-1", "command": "approach track=17", "success": True, "reason": "reached"}
+            assert replies == [wanted]
+            stream.close()
+
+
+@pytest.mark.parametrize(
+    ("body", "status"),
+    [
+        (b"", 400),
+        (b"[]", 400),
+        (b"[" * 50_000, 400),
+        (b'{"text": 1}', 400),
+        (b'{"text": ""}', 400),
+        (json.dumps({"text": "x" * 8001}).encode(), 400),
+        (b" " * (LARGEST_BODY_BYTES + 1), 413),
+    ],
+)
+async def test_bad_commands_are_refused(body: bytes, status: int) -> None:
+    async with serving() as port:
+        assert (await request(port, "POST", "/command", POST, body))[0] == status
+        for query in ("after=x", "camera=*", "camera=a/b", "camera=%24%2A"):
+            assert (await request(port, "GET", f"/picture?{query}"))[0] == 400
+
+
+async def test_picture_has_its_frame_in_a_header() -> None:
+    with publishing() as (service, endpoint):
+        async with serving(endpoint) as port:
+            stream = await EventStream.open(port)
+            await stream.next()
+            assert (await request(port, "GET", "/picture?camera="))[0] == 204
+            boxes: list[Any] = []
+            for sequence in range(3, 200):
+                service.publish(DETECTIONS.key(NAME), frame(sequence))
+                service.image(sequence, b"\xff\xd8jpeg")
+                status, headers, body = await request(port, "GET", "/picture?camera=&after=-1")
+                boxes = json.loads(headers["x-frame"])["boxes"] if status == 200 else []
+                if boxes:
+                    break
+            assert headers["content-type"] == "image/jpeg"
+            assert body == b"\xff\xd8jpeg"
+            assert json.loads(headers["x-frame"])["captured_ns"] == 5
+            assert boxes[0][4:] == ["car", 0.9, 7, "confirmed"]
+            stream.close()
+
+
+async def test_browser_that_reads_nothing_costs_no_memory() -> None:
+    with publishing() as (service, endpoint):
+        async with serving(endpoint) as port:
+            dead = socket.create_connection(("127.0.0.1", port))
+            dead.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            dead.sendall(f"GET /events HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n\r\n".encode())
+            alive = await EventStream.open(port)
+            large = {"text": "x" * 100_000}
+
+            async def megabytes(count: int) -> None:
+                for _ in range(count * 10):
+                    service.publish(VEHICLE.key(NAME), large)
+                    await alive.next()
+
+            await megabytes(2)
+            gc.collect()
+            tracemalloc.start()
+            before, _ = tracemalloc.get_traced_memory()
+            await megabytes(3)
+            gc.collect()
+            after, _ = tracemalloc.get_traced_memory()
+            tracemalloc.stop()
+            assert after - before < 1_000_000  # 3 MB were sent to the other browser
+            alive.close()
+            dead.close()
