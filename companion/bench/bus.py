@@ -193,8 +193,11 @@ def _read_detections(endpoint: str, connection: Connection) -> None:
 
 def _read_events(endpoint: str, connection: Connection) -> None:
     received = 0
-    newest = -1
+    newest, expected = -1, 0
     changed = threading.Condition()
+
+    def reached() -> bool:
+        return newest >= expected - 1
 
     def receive(sample: zenoh.Sample) -> None:
         nonlocal received, newest
@@ -212,8 +215,9 @@ def _read_events(endpoint: str, connection: Connection) -> None:
             if request == "memory":
                 early_kb = _resident_kb()
                 continue
+            expected = request
             with changed:
-                changed.wait_for(lambda expected=request: newest >= expected - 1, RECOVERY_S)
+                changed.wait_for(reached, RECOVERY_S)
             connection.send(request)
         connection.send({"received": received, "growth_kb": _resident_kb() - early_kb})
         subscriber.undeclare()  # type: ignore[no-untyped-call]
