@@ -454,6 +454,11 @@ class Guidance:
 
     def _conclude(self, outcome: Outcome, context: BehaviourContext, sent_count: int) -> None:
         """The behaviour ended by itself: hold if setpoints are flown, else hand over to the autopilot."""
+        behaviour = self._behaviour
+        if behaviour is not None and self.busy and self._command is None and not self._after_battery:
+            # An endless command was answered when it began: nobody waits for how it ends.
+            text = f"{behaviour.name} ended: {outcome.reason}"
+            self._out.event(EventKind.NOTED, behaviour.name, text, warning=not outcome.success)
         self._end(outcome)
         self._goal_ned_m = outcome.goal_ned_m
         if self.phase is Phase.REQUESTING:

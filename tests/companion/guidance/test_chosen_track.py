@@ -210,6 +210,22 @@ def test_track_with_another_id_in_its_place_is_lost_and_named(
     assert "track 9, a car, is 0." in outcome.reason
 
 
+def test_loss_of_a_track_that_is_followed_is_an_event() -> None:
+    """The command was answered when it began."""
+    seen = car(12, 0, 17)
+    harness = watching(flying(), [seen])
+    harness.run(0.5)
+    command = harness.command(FollowBehaviour(track_id=17), endless=True)
+    assert harness.outcome(command).success
+    harness.run(2.0)
+    seen.track_id = 23
+    harness.until(lambda: harness.events[-1].kind is EventKind.ENDED, 10.0)
+    note = harness.events[-2]
+    assert (note.kind, note.level) == (EventKind.NOTED, "warning")
+    assert note.message.startswith("follow ended: lost track 17 for 3.0 s")
+    assert "track 23, a car, is 0." in note.message
+
+
 def test_track_that_comes_back_with_its_id_is_followed_on() -> None:
     seen = car(12, 0, 1)
     vehicle = KinematicVehicle()
