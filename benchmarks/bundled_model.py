@@ -34,8 +34,9 @@ from mavlink_sim.datasets.dataset import DatasetOptions, make_dataset
 from mavlink_sim.datasets.training_scenes import MIN_AREA_PX, MIN_SIDE_PX, MIN_VISIBLE_FRACTION
 from mavlink_sim.world.shapes import CLASS_NAMES
 from vision.detector import DEFAULT_MODEL, Detector
-from vision.evaluation.samples import Dataset, Sample, read_image
-from vision.yolo.metrics import WRONG, ImageResult, box_iou, judge, operating_points, score_detections
+from vision.evaluation.datasets import Dataset, Sample, read_image
+from vision.tracking.association import overlaps
+from vision.yolo.metrics import WRONG, ImageResult, judge, operating_points, score_detections
 from vision.yolo.recipe import HELD_OUT_SEED
 
 CONFIRMED = TrackerSection().confirm_score
@@ -118,7 +119,7 @@ def mistakes(
     for result, things in zip(results, seen, strict=True):
         boxes: NDArray[np.float32] = np.array([thing.xyxy for thing in things], np.float32).reshape(-1, 4)
         wrong = np.flatnonzero(judge(result, confidence) == WRONG)
-        overlap = box_iou(result.boxes[wrong], boxes)
+        overlap = overlaps(result.boxes[wrong], boxes)
         for row, index in enumerate(wrong.tolist()):
             said = names[int(result.class_ids[index])]
             best = int(overlap[row].argmax()) if len(boxes) else -1

@@ -39,7 +39,7 @@ from companion.sim_session import (
 from companion.vehicle.state import LandedState
 from mavlink_sim.world.mesh import surface_range_to
 from mavlink_sim.world.world import demo_world
-from vision.video_encoders import has_pyav
+from vision.video_writer import has_pyav
 
 VIDEO_NAME = "flight.webm"
 # Two cores render, process and record this rate. A slow encoder records every third frame: the camera's rate

@@ -19,8 +19,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from vision.detections import Detections
+from vision.evaluation.datasets import Dataset, DatasetError, read_image
 from vision.evaluation.misses import WorstMisses
-from vision.evaluation.samples import Dataset, DatasetError, read_image
 from vision.pipeline import FrameDetector
 from vision.yolo.metrics import ImageResult, Score, score_detections
 

@@ -19,9 +19,8 @@ from mavlink_sim.datasets.training_scenes import random_scene, training_scene
 from mavlink_sim.world.shapes import CLASS_NAMES
 from vision.yolo.checkpoint import load_checkpoint, save_checkpoint
 from vision.yolo.checkpoint_pair import WEIGHTS_SUFFIX
-from vision.yolo.evaluation import evaluate
 from vision.yolo.metrics import Score
-from vision.yolo.recipe import DEFAULT_RECIPE, HELD_OUT_SEED, HELD_OUT_SIZE, REFINEMENT
+from vision.yolo.recipe import DEFAULT_RECIPE, HELD_OUT_SEED, HELD_OUT_SIZE, REFINEMENT, evaluate
 from vision.yolo.training import Progress as TrainingProgress
 from vision.yolo.training import TrainedModel, TrainingSettings, train
 

@@ -34,10 +34,7 @@ class _Sizes:
     def of(cls, width: int, height: int) -> _Sizes:
         scale = max((width * height / (640 * 480)) ** 0.5, 0.3)
         return cls(
-            max(1, round(2 * scale)),
-            max(0.3, 0.47 * scale),
-            max(1, round(scale)),
-            max(2, round(4 * scale)),
+            max(1, round(2 * scale)), max(0.3, 0.47 * scale), max(1, round(scale)), max(2, round(4 * scale))
         )
 
 

@@ -176,10 +176,7 @@ def _averaged(
 
 
 def _ground(
-    depth_m: NDArray[np.float32],
-    edges: _Edges,
-    camera: CameraModel,
-    down: NDArray[np.float64],
+    depth_m: NDArray[np.float32], edges: _Edges, camera: CameraModel, down: NDArray[np.float64]
 ) -> float | None:
     """Height of the lens above the ground at the object, metres; None where it cannot be measured."""
     left, top, right, bottom = edges

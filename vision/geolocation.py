@@ -35,11 +35,7 @@ class PixelRays:
 
     @classmethod
     def of(
-        cls,
-        camera: CameraModel,
-        mount: CameraMount,
-        ned_from_body: NDArray[np.float64],
-        pixels: NDArray[Any],
+        cls, camera: CameraModel, mount: CameraMount, ned_from_body: NDArray[np.float64], pixels: NDArray[Any]
     ) -> PixelRays:
         """Rays of (N, 2) pixels; `ned_from_body` is the (3, 3) attitude."""
         rays = camera.rays(pixels)

@@ -15,6 +15,7 @@ from vision.detections import Detections
 from vision.frame import Frame
 from vision.frame_selection import TOO_OLD, FrameSelector, Selection
 from vision.markers import Marker
+from vision.object_detector import Timing
 from vision.obstacle_sectors import ObstacleSectors
 from vision.sources import Source
 from vision.tracking import CameraView, ObjectSelection, Tracker, TrackEvent
@@ -58,17 +59,6 @@ class PerceptionResult:
     frames_skipped: Mapping[str, int] = field(default_factory=dict)
     markers: tuple[Marker, ...] | None = None
     obstacles: ObstacleSectors | None = None
-
-
-class Timing(Protocol):
-    """Durations of the stages of one detection, milliseconds."""
-
-    @property
-    def preprocess_ms(self) -> float: ...
-    @property
-    def inference_ms(self) -> float: ...
-    @property
-    def postprocess_ms(self) -> float: ...
 
 
 class FrameDetector(Protocol):

@@ -87,6 +87,13 @@ def load_plain_yaml(text: str) -> Any:
         raise PlainYamlError(" ".join(str(error).split())) from None
 
 
+def numbered(table: dict[Any, Any]) -> list[Any] | None:
+    """`{0: person, 1: car}` → a list, also of texts for numbers; None if the keys are not 0, 1, …"""
+    if sorted(map(str, table)) != sorted(map(str, range(len(table)))):
+        return None
+    return [table[index] if index in table else table[str(index)] for index in range(len(table))]
+
+
 def _check_events(text: str) -> None:
     """Reject tags, anchors and oversized input before anything is built."""
     depth = 0

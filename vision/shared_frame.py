@@ -40,6 +40,7 @@ import mmap
 import os
 import secrets
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -248,16 +249,31 @@ def _move_into_place(draft: Path, path: Path) -> None:
     while True:
         try:
             os.link(draft, path)
-        except FileExistsError:
-            if not _replace_dead(draft, path):
-                continue
-        else:
             draft.unlink()
-        return
+            return
+        except FileExistsError:
+            pass
+        try:
+            if _if_dead(path, lambda: os.replace(draft, path)):
+                return
+        except BlockingIOError as error:
+            raise FileExistsError(
+                f"shared memory {path.name!r} is being written by another process; stop it or choose another "
+                "name"
+            ) from error
 
 
-def _replace_dead(draft: Path, path: Path) -> bool:
-    """Move the draft over `path` if its writer is dead; False if the file disappeared meanwhile."""
+def remove_leavings(name: str) -> bool:
+    """Remove the segment of a killed writer; True if there was one. A living writer's segment stays."""
+    path = segment_path(name)
+    try:
+        return _if_dead(path, path.unlink)
+    except BlockingIOError:
+        return False
+
+
+def _if_dead(path: Path, act: Callable[[], object]) -> bool:
+    """Run `act` on the segment of a dead writer; False if there is none. Raises BlockingIOError: it lives."""
     try:
         old = os.open(path, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW)
     except FileNotFoundError:
@@ -266,33 +282,10 @@ def _replace_dead(draft: Path, path: Path) -> bool:
         fcntl.flock(old, fcntl.LOCK_EX | fcntl.LOCK_NB)
         if not _same_file(path, old):
             return False
-        os.replace(draft, path)
-    except BlockingIOError as error:
-        raise FileExistsError(
-            f"shared memory {path.name!r} is being written by another process; stop it or choose another name"
-        ) from error
+        act()
+        return True
     finally:
         os.close(old)
-    return True
-
-
-def remove_leavings(name: str) -> bool:
-    """Remove the segment of a killed writer; True if there was one. A living writer's segment stays."""
-    path = segment_path(name)
-    try:
-        stale = os.open(path, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW)
-    except FileNotFoundError:
-        return False
-    try:
-        fcntl.flock(stale, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        dead = _same_file(path, stale)
-        if dead:
-            path.unlink()
-        return dead
-    except BlockingIOError:
-        return False
-    finally:
-        os.close(stale)
 
 
 def _same_file(path: Path, descriptor: int) -> bool:

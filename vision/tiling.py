@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vision.detections import Detections
-from vision.pipeline import FrameDetector, Timing
+from vision.object_detector import Timing
+from vision.pipeline import FrameDetector
 
 # A box nearer than this to an inner edge of its tile counts as cut, pixels.
 _CUT_PX = 4.0
@@ -35,15 +36,6 @@ class Tile:
     top: int
     right: int
     bottom: int
-
-
-@dataclass(frozen=True, slots=True)
-class TiledTiming:
-    """Milliseconds of all passes together; merging counts as postprocessing."""
-
-    preprocess_ms: float
-    inference_ms: float
-    postprocess_ms: float
 
 
 def tiles_of(width: int, height: int, tile_size: int, overlap: float) -> list[Tile]:
@@ -76,12 +68,7 @@ class TiledDetector:
     """
 
     def __init__(
-        self,
-        detector: FrameDetector,
-        *,
-        tile_size: int = 640,
-        overlap: float = 0.2,
-        whole_frame: bool = True,
+        self, detector: FrameDetector, *, tile_size: int = 640, overlap: float = 0.2, whole_frame: bool = True
     ) -> None:
         """
         Args:
@@ -130,7 +117,7 @@ class TiledDetector:
             passes.append(self._detect_part(image_bgr, spent))
             cuts.append(np.zeros(len(passes[-1]), np.bool_))
         merged = merge_passes(passes, cuts)
-        self.last_timing = TiledTiming(*map(float, spent))
+        self.last_timing = Timing(*map(float, spent))
         self.last_passes = len(passes)
         return merged
 

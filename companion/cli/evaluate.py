@@ -52,8 +52,7 @@ def evaluate(
         write_sheet,
     )
     from vision.detector import Detector
-    from vision.evaluation.dataset import open_dataset
-    from vision.evaluation.samples import DatasetError
+    from vision.evaluation.datasets import DatasetError, open_dataset
     from vision.pipeline import FrameDetector
     from vision.tiling import TiledDetector
     from vision.yolo.safe_pickle import CheckpointError

@@ -108,7 +108,7 @@ def export(
     from vision.runtimes.base import RuntimeUnusableError
     from vision.runtimes.export import export
     from vision.yolo.checkpoint import CheckpointError, load_checkpoint
-    from vision.yolo.model_family import model_family_of
+    from vision.yolo.published import model_family_of
 
     path = _path(file)
     with plain_errors(CheckpointError, RuntimeUnusableError, ValueError, OSError):

@@ -13,7 +13,7 @@ from vision.runtimes.selection import RuntimeChoice
 from vision.weights import DEFAULT_WEIGHTS
 from vision.yolo.checkpoint import load_checkpoint
 from vision.yolo.checkpoint_pair import is_pair, pair_paths, weights_sha256
-from vision.yolo.model_family import describe
+from vision.yolo.published import describe
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,15 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mavlink_sim.datasets.training_scenes import random_scene
-from vision.evaluation.samples import image_files, read_image
+from vision.evaluation.datasets import image_files, read_image
 from vision.letterbox import fit
 from vision.runtimes.base import Precision, Runtime, RuntimeUnusableError
 from vision.runtimes.exported import KEY
 from vision.runtimes.selection import start_runtime
 from vision.runtimes.source import ModelSource, read_source
+from vision.tracking.association import overlaps
 from vision.yolo.checkpoint_pair import weights_sha256
 from vision.yolo.level_outputs import LevelOutput
-from vision.yolo.metrics import box_iou
 from vision.yolo.postprocess import Boxes, Candidates, boxes_of, decode_ltrb
 
 CONFIDENCE = 0.25
@@ -189,7 +189,7 @@ class _Largest:
 
     def _compare_boxes(self, first: Boxes, second: Boxes) -> None:
         self.boxes += len(first)
-        overlap = box_iou(first.xyxy, second.xyxy) * (first.class_id[:, None] == second.class_id[None])
+        overlap = overlaps(first.xyxy, second.xyxy) * (first.class_id[:, None] == second.class_id[None])
         free = np.ones(len(second), np.bool_)
         for index in range(len(first)):
             best = int(np.where(free, overlap[index], -1).argmax()) if len(second) else -1

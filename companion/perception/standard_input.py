@@ -19,9 +19,8 @@ import threading
 from typing import NamedTuple
 
 from companion.settings import SourceSection
-from vision.sources.raw import StreamError
 from vision.sources.source import RAW_PIXEL_FORMATS
-from vision.sources.y4m import MAGIC, parse_y4m_header
+from vision.sources.stream_formats import MAGIC, StreamError, parse_y4m_header
 
 logger = logging.getLogger(__name__)
 

@@ -52,7 +52,7 @@ from vision.object_detector import YOLO, ObjectDetector
 from vision.pipeline import PerceptionResult, Pipeline
 from vision.recording import Recording
 from vision.sources import EndOfStream, Source, SourceError, open_source
-from vision.sources.sharing import FrameSharing
+from vision.sources.shared import FrameSharing
 from vision.tracking import Selected, SelectRequest
 from vision.video_writer import VideoWriterError
 

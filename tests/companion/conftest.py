@@ -11,7 +11,7 @@ import pytest
 from vision.runtimes.export import export
 from vision.yolo.architecture import build
 from vision.yolo.checkpoint import save_checkpoint
-from vision.yolo.description import yolov8_description
+from vision.yolo.published import yolov8_description
 
 
 @pytest.fixture(scope="session")

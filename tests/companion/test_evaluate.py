@@ -14,8 +14,7 @@ from typer.testing import CliRunner
 from companion.cli import app
 from companion.evaluate import evaluate_dataset, map_classes
 from vision.detections import Detections
-from vision.evaluation.dataset import open_dataset
-from vision.evaluation.samples import Dataset, DatasetError, Sample
+from vision.evaluation.datasets import Dataset, DatasetError, Sample, open_dataset
 
 DATA = Path(os.environ.get("COMPANION_TEST_DATA", Path(__file__).parents[3] / "shared" / "data"))
 

@@ -5,19 +5,18 @@ from __future__ import annotations
 from urllib.request import getproxies
 
 import pytest
-from torch import nn
 
-from tests.vision.foreign_checkpoints import FOREIGN, foreign_classes
+from tests.vision.foreign_checkpoints import FOREIGN, Classes, foreign_classes
 
 
 @pytest.fixture
-def foreign(monkeypatch: pytest.MonkeyPatch) -> dict[str, type[nn.Module]]:
+def foreign(monkeypatch: pytest.MonkeyPatch) -> Classes:
     """Classes with the foreign library's names, importable only during a test."""
     return foreign_classes(monkeypatch, FOREIGN)
 
 
 @pytest.fixture
-def early_foreign(monkeypatch: pytest.MonkeyPatch) -> dict[str, type[nn.Module]]:
+def early_foreign(monkeypatch: pytest.MonkeyPatch) -> Classes:
     """As in the first releases: all layers in one module."""
     modules = {
         name: "ultralytics.nn.modules" if module.startswith("ultralytics.nn.modules") else module

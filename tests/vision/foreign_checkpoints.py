@@ -15,7 +15,11 @@ import pytest
 import torch
 from torch import nn
 
-from vision.yolo.architecture import ModelDescription, YoloModel, build, yolov8_description
+from vision.yolo.architecture import ModelDescription, YoloModel, build
+from vision.yolo.published import yolov8_description
+
+Classes = dict[str, type[nn.Module]]
+"""The foreign library's names, each with a class of that name."""
 
 NAMES = ("car", "dog")
 SMALL = (0.1, 0.01, 64)
@@ -43,7 +47,7 @@ def trained_model(description: ModelDescription | None = None, seed: int = 0) ->
     return model.eval()
 
 
-def foreign_classes(monkeypatch: pytest.MonkeyPatch, modules: dict[str, str]) -> dict[str, type[nn.Module]]:
+def foreign_classes(monkeypatch: pytest.MonkeyPatch, modules: dict[str, str]) -> Classes:
     classes = {}
     for name, module_name in modules.items():
         parts = module_name.split(".")
@@ -57,7 +61,7 @@ def foreign_classes(monkeypatch: pytest.MonkeyPatch, modules: dict[str, str]) ->
     return classes
 
 
-def as_foreign(model: YoloModel, classes: dict[str, type[nn.Module]], **attributes: Any) -> Any:
+def as_foreign(model: YoloModel, classes: Classes, **attributes: Any) -> Any:
     """Our network's modules with the foreign library's class names and attributes."""
 
     def relabelled(module: nn.Module) -> nn.Module:

@@ -1,4 +1,4 @@
-"""Shared by tests of network streams: distinguishable images, as JPEG and in RTP."""
+"""Shared by tests of sources: waiting for frames and log lines; distinguishable images, JPEG and RTP."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pytest
 
 from vision.frame import Frame
 from vision.sources import Source, SourceSettings
@@ -24,13 +25,29 @@ def jpeg(blue: int) -> bytes:
     return cv2.imencode(".jpg", image)[1].tobytes()
 
 
-def wait_for_frame(source: Source, wanted: Callable[[Frame], bool], within_s: float = 30.0) -> Frame:
+def wait_for_frame(
+    source: Source, wanted: Callable[[Frame], bool] = lambda frame: True, within_s: float = 30.0
+) -> Frame:
     deadline_s = time.monotonic() + within_s
     while time.monotonic() < deadline_s:
         frame = source.read(0.5)
         if frame is not None and wanted(frame):
             return frame
     raise AssertionError(f"no such frame within {within_s} s")
+
+
+def read_until_logged(source: Source, caplog: pytest.LogCaptureFixture, word: str) -> list[Frame]:
+    """Read until the log contains the word; the frames meanwhile."""
+    frames = []
+    deadline_s = time.monotonic() + 20
+    while word not in caplog.text and time.monotonic() < deadline_s:
+        if (frame := source.read(0.05)) is not None:
+            frames.append(frame)
+    return frames
+
+
+def is_grey(value: int) -> Callable[[Frame], bool]:
+    return lambda frame: int(frame.image[0, 0, 0]) == value
 
 
 def is_blue(value: int) -> Callable[[Frame], bool]:

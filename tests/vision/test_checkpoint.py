@@ -17,13 +17,14 @@ from torch import Tensor, nn
 from tests.vision.foreign_checkpoints import (
     NAMES,
     SMALL,
+    Classes,
     as_foreign,
     assert_same_maps,
     save_foreign,
     trained_model,
 )
 from vision.yolo import torch_archive
-from vision.yolo.architecture import ModelDescription, yolov8_description
+from vision.yolo.architecture import ModelDescription
 from vision.yolo.checkpoint import (
     FORMAT,
     CheckpointError,
@@ -32,7 +33,7 @@ from vision.yolo.checkpoint import (
     save_checkpoint,
 )
 from vision.yolo.layers import Conv
-from vision.yolo.published import SCALES, published_description
+from vision.yolo.published import SCALES, published_description, yolov8_description
 from vision.yolo.safe_pickle import AllowedGlobal, unpickle
 
 
@@ -127,9 +128,7 @@ def test_weights_that_do_not_fit_are_named(tmp_path: Path, key: str, tensor: Ten
 # Ultralytics' format
 
 
-def test_a_foreign_checkpoint_gives_the_network_that_was_trained(
-    tmp_path: Path, foreign: dict[str, type[nn.Module]]
-) -> None:
+def test_a_foreign_checkpoint_gives_the_network_that_was_trained(tmp_path: Path, foreign: Classes) -> None:
     model = trained_model()
     path = save_foreign(tmp_path / "f.pt", as_foreign(model, foreign))
     loaded = load_checkpoint(path)
@@ -139,7 +138,7 @@ def test_a_foreign_checkpoint_gives_the_network_that_was_trained(
     assert_same_maps(model, loaded.model)
 
 
-def test_foreign_checkpoint_needs_no_library(tmp_path: Path, foreign: dict[str, type[nn.Module]]) -> None:
+def test_foreign_checkpoint_needs_no_library(tmp_path: Path, foreign: Classes) -> None:
     path = save_foreign(tmp_path / "f.pt", as_foreign(trained_model(), foreign))
     before = {name: module for name, module in sys.modules.items() if name.startswith("ultralytics")}
     for name in before:
@@ -151,7 +150,7 @@ def test_foreign_checkpoint_needs_no_library(tmp_path: Path, foreign: dict[str, 
         sys.modules.update(before)
 
 
-def test_the_averaged_weights_are_preferred(tmp_path: Path, foreign: dict[str, type[nn.Module]]) -> None:
+def test_the_averaged_weights_are_preferred(tmp_path: Path, foreign: Classes) -> None:
     model, averaged = trained_model(seed=1), trained_model(seed=2)
     path = save_foreign(
         tmp_path / "f.pt", as_foreign(model, foreign), ema=as_foreign(averaged, foreign), updates=5
@@ -159,9 +158,7 @@ def test_the_averaged_weights_are_preferred(tmp_path: Path, foreign: dict[str, t
     assert_same_maps(averaged, load_checkpoint(path).model)
 
 
-def test_training_leftovers_in_the_file_are_ignored(
-    tmp_path: Path, foreign: dict[str, type[nn.Module]]
-) -> None:
+def test_training_leftovers_in_the_file_are_ignored(tmp_path: Path, foreign: Classes) -> None:
     path = save_foreign(
         tmp_path / "f.pt",
         as_foreign(trained_model(), foreign),
@@ -174,9 +171,7 @@ def test_training_leftovers_in_the_file_are_ignored(
     assert load_checkpoint(path).class_names == NAMES
 
 
-def test_the_epsilon_of_each_normalisation_is_kept(
-    tmp_path: Path, foreign: dict[str, type[nn.Module]]
-) -> None:
+def test_the_epsilon_of_each_normalisation_is_kept(tmp_path: Path, foreign: Classes) -> None:
     model = trained_model()
     norm = model.model[0].get_submodule("bn")
     assert isinstance(norm, nn.BatchNorm2d)
@@ -187,9 +182,7 @@ def test_the_epsilon_of_each_normalisation_is_kept(
     assert_same_maps(model, loaded)
 
 
-def test_the_activation_is_the_one_that_was_trained(
-    tmp_path: Path, foreign: dict[str, type[nn.Module]]
-) -> None:
+def test_the_activation_is_the_one_that_was_trained(tmp_path: Path, foreign: Classes) -> None:
     model = trained_model()
     for module in model.modules():
         if isinstance(module, Conv):
@@ -199,7 +192,7 @@ def test_the_activation_is_the_one_that_was_trained(
     assert_same_maps(model, load_checkpoint(path).model)
 
 
-def test_names_may_be_a_list(tmp_path: Path, foreign: dict[str, type[nn.Module]]) -> None:
+def test_names_may_be_a_list(tmp_path: Path, foreign: Classes) -> None:
     path = save_foreign(tmp_path / "f.pt", as_foreign(trained_model(), foreign, names=list(NAMES)))
     assert load_checkpoint(path).class_names == NAMES
 
@@ -215,39 +208,33 @@ def test_names_may_be_a_list(tmp_path: Path, foreign: dict[str, type[nn.Module]]
     ],
 )
 def test_a_foreign_model_with_a_part_missing_is_rejected(
-    tmp_path: Path, foreign: dict[str, type[nn.Module]], attributes: dict[str, Any], expected: str
+    tmp_path: Path, foreign: Classes, attributes: dict[str, Any], expected: str
 ) -> None:
     path = save_foreign(tmp_path / "f.pt", as_foreign(trained_model(), foreign, **attributes))
     with pytest.raises(CheckpointError, match=expected):
         load_checkpoint(path)
 
 
-def test_a_layer_that_is_not_known_is_named_with_its_row(
-    tmp_path: Path, foreign: dict[str, type[nn.Module]]
-) -> None:
+def test_a_layer_that_is_not_known_is_named_with_its_row(tmp_path: Path, foreign: Classes) -> None:
     whole = as_foreign(trained_model(), foreign)
     whole.yaml["backbone"][4] = [-1, 3, "GhostConv", [256, True]]
     with pytest.raises(CheckpointError, match=r"row 4: .*'GhostConv'"):
         load_checkpoint(save_foreign(tmp_path / "f.pt", whole))
 
 
-def test_a_model_of_another_task_is_rejected(tmp_path: Path, foreign: dict[str, type[nn.Module]]) -> None:
+def test_a_model_of_another_task_is_rejected(tmp_path: Path, foreign: Classes) -> None:
     path = save_foreign(tmp_path / "f.pt", foreign["SegmentationModel"]())
     with pytest.raises(CheckpointError, match="SegmentationModel"):
         load_checkpoint(path)
 
 
-def test_a_class_that_is_not_on_the_list_is_rejected_by_name(
-    tmp_path: Path, foreign: dict[str, type[nn.Module]]
-) -> None:
+def test_a_class_that_is_not_on_the_list_is_rejected_by_name(tmp_path: Path, foreign: Classes) -> None:
     path = save_foreign(tmp_path / "f.pt", foreign["C3Ghost"]())
     with pytest.raises(UnsafeCheckpointError, match=r"ultralytics\.nn\.modules\.block\.C3Ghost"):
         load_checkpoint(path)
 
 
-def test_modules_that_contain_each_other_are_rejected(
-    tmp_path: Path, foreign: dict[str, type[nn.Module]]
-) -> None:
+def test_modules_that_contain_each_other_are_rejected(tmp_path: Path, foreign: Classes) -> None:
     whole = as_foreign(trained_model(), foreign)
     whole._modules["itself"] = whole
     with pytest.raises(CheckpointError, match="contain each other"):
@@ -284,7 +271,7 @@ def terse(whole: Any) -> None:
     ],
 )
 def test_every_family_is_built_from_its_pickled_layers(
-    tmp_path: Path, foreign: dict[str, type[nn.Module]], model_family: str, scale: str
+    tmp_path: Path, foreign: Classes, model_family: str, scale: str
 ) -> None:
     model = trained_model(shrunk(model_family, scale))
     whole = as_foreign(model, foreign)
@@ -301,7 +288,7 @@ def test_every_family_is_built_from_its_pickled_layers(
 
 @pytest.mark.parametrize("model_family", ["YOLOv5u", "YOLOv8"])
 def test_a_checkpoint_of_the_first_releases_is_read(
-    tmp_path: Path, early_foreign: dict[str, type[nn.Module]], model_family: str
+    tmp_path: Path, early_foreign: Classes, model_family: str
 ) -> None:
     model = trained_model(shrunk(model_family, "n"))
     whole = as_foreign(model, early_foreign)
@@ -314,16 +301,14 @@ def test_a_checkpoint_of_the_first_releases_is_read(
     assert_same_maps(model, loaded.model)
 
 
-def test_dual_head_is_end_to_end_in_any_state(tmp_path: Path, foreign: dict[str, type[nn.Module]]) -> None:
+def test_dual_head_is_end_to_end_in_any_state(tmp_path: Path, foreign: Classes) -> None:
     whole = as_foreign(trained_model(shrunk("YOLO26", "n")), foreign)
     whole.model[-1]._end2end = False
     assert load_checkpoint(save_foreign(tmp_path / "f.pt", whole)).model.end_to_end
 
 
 @pytest.mark.parametrize("model_family", ["YOLOv8", "YOLOv10", "YOLO26"])
-def test_a_checkpoint_saved_folded_is_read(
-    tmp_path: Path, foreign: dict[str, type[nn.Module]], model_family: str
-) -> None:
+def test_a_checkpoint_saved_folded_is_read(tmp_path: Path, foreign: Classes, model_family: str) -> None:
     model = trained_model(shrunk(model_family, "s"))
     model.fuse()
     whole = as_foreign(model, foreign)
@@ -342,7 +327,7 @@ def test_a_checkpoint_saved_folded_is_read(
 
 @pytest.mark.parametrize("unscaled", [True, False])
 def test_channels_equal_to_classes_are_scaled_as_trained(
-    tmp_path: Path, foreign: dict[str, type[nn.Module]], unscaled: bool
+    tmp_path: Path, foreign: Classes, unscaled: bool
 ) -> None:
     names = tuple(f"class {index}" for index in range(64))
     description = dataclasses.replace(
@@ -356,7 +341,7 @@ def test_channels_equal_to_classes_are_scaled_as_trained(
 
 @pytest.mark.parametrize("change", [{"class_width": 24}, {"light_classes": True}])
 def test_the_head_is_the_one_that_was_trained(
-    tmp_path: Path, foreign: dict[str, type[nn.Module]], change: dict[str, Any]
+    tmp_path: Path, foreign: Classes, change: dict[str, Any]
 ) -> None:
     """Until 8.1 class branches of many classes were wider; 8.3.0 gave YOLOv8 the light ones of YOLO11."""
     model = trained_model(dataclasses.replace(yolov8_description(SMALL, NAMES), **change))
@@ -364,9 +349,7 @@ def test_the_head_is_the_one_that_was_trained(
     assert_same_maps(model, loaded.model)
 
 
-def test_another_stride_than_the_layers_give_is_rejected(
-    tmp_path: Path, foreign: dict[str, type[nn.Module]]
-) -> None:
+def test_another_stride_than_the_layers_give_is_rejected(tmp_path: Path, foreign: Classes) -> None:
     whole = as_foreign(trained_model(), foreign)
     whole.model[-1].stride = torch.tensor([4.0, 8.0, 16.0])
     with pytest.raises(CheckpointError, match=r"strides \[4.0, 8.0, 16.0\], not \(8, 16, 32\)"):

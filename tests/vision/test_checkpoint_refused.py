@@ -15,12 +15,12 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from torch import nn
 
 from tests.vision.foreign_checkpoints import (
     FOREIGN,
     NAMES,
     Calls,
+    Classes,
     Global,
     archive,
     as_foreign,
@@ -30,7 +30,6 @@ from tests.vision.foreign_checkpoints import (
     save_foreign,
     trained_model,
 )
-from vision.yolo.architecture import yolov8_description
 from vision.yolo.checkpoint import (
     FORMAT,
     CheckpointError,
@@ -38,6 +37,7 @@ from vision.yolo.checkpoint import (
     load_checkpoint,
     save_checkpoint,
 )
+from vision.yolo.published import yolov8_description
 from vision.yolo.safe_pickle import unpickle
 
 
@@ -74,7 +74,7 @@ def test_pickle_with_a_call_is_rejected_and_not_run(tmp_path: Path, name: str) -
     assert not marker.exists()
 
 
-def test_hidden_call_in_a_checkpoint_is_not_run(tmp_path: Path, foreign: dict[str, type[nn.Module]]) -> None:
+def test_hidden_call_in_a_checkpoint_is_not_run(tmp_path: Path, foreign: Classes) -> None:
     import os
 
     marker = tmp_path / "it-ran"

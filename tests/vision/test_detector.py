@@ -16,8 +16,10 @@ import torch
 from vision import detector as detector_module
 from vision.detector import Detector
 from vision.object_detector import resolve_classes
-from vision.yolo.architecture import YoloModel, build, yolov8_description
+from vision.tracking.association import overlaps
+from vision.yolo.architecture import YoloModel, build
 from vision.yolo.checkpoint import CheckpointError, save_checkpoint
+from vision.yolo.published import yolov8_description
 
 NAMES = ("person", "bicycle", "car", "dog")
 TEST_DATA = Path(
@@ -203,21 +205,10 @@ def test_missing_bundled_model_is_reported(tmp_path: Path, monkeypatch: pytest.M
         Detector()
 
 
-def intersection_over_union(a: np.ndarray[Any, Any], b: np.ndarray[Any, Any]) -> float:
-    width = min(a[2], b[2]) - max(a[0], b[0])
-    height = min(a[3], b[3]) - max(a[1], b[1])
-    common = max(width, 0.0) * max(height, 0.0)
-    return float(common / ((a[2] - a[0]) * (a[3] - a[1]) + (b[2] - b[0]) * (b[3] - b[1]) - common))
-
-
 @pytest.mark.skipif(not REFERENCE.is_file(), reason=f"{REFERENCE} is not here; set COMPANION_TEST_DATA")
 @pytest.mark.parametrize(
     ("variant", "arguments"),
-    [
-        ("rect", {}),
-        ("rect_person_car", {"classes": [0, 2]}),
-        ("square", {"square": True}),
-    ],
+    [("rect", {}), ("rect_person_car", {"classes": [0, 2]}), ("square", {"square": True})],
 )
 def test_real_photographs_match_the_reference(variant: str, arguments: dict[str, Any]) -> None:
     detector = Detector(COCO_MODEL, precision="float32", **arguments)
@@ -229,10 +220,9 @@ def test_real_photographs_match_the_reference(variant: str, arguments: dict[str,
         found = detector.detect(np.asarray(image, np.uint8))
         unmatched = set(range(len(found)))
         for expected in entry[variant]:
+            iou = overlaps(np.array([expected["xyxy"]]), found.xyxy)[0]
             overlap, best = max(
-                (intersection_over_union(np.array(expected["xyxy"]), found.xyxy[index]), index)
-                for index in unmatched
-                if found.class_id[index] == expected["class_id"]
+                (iou[index], index) for index in unmatched if found.class_id[index] == expected["class_id"]
             )
             assert overlap >= 0.99, (entry["name"], expected)
             assert found.confidence[best] == pytest.approx(expected["confidence"], abs=0.005)

@@ -9,16 +9,15 @@ import pytest
 import torch
 from torch import nn
 
+from vision.yolo.heads import DFL, Detect
 from vision.yolo.layers import (
     C2PSA,
-    DFL,
     SPPF,
     AreaAttention,
     Bottleneck,
     C2f,
     Concat,
     Conv,
-    Detect,
     LargeKernelDWConv,
     SCDown,
 )

@@ -31,10 +31,7 @@ def test_letterbox_position_follows_the_convention(
 
 
 @given(
-    width=st.integers(1, 3000),
-    height=st.integers(1, 3000),
-    cells=st.integers(1, 40),
-    square=st.booleans(),
+    width=st.integers(1, 3000), height=st.integers(1, 3000), cells=st.integers(1, 40), square=st.booleans()
 )
 def test_frame_is_inside_an_input_of_whole_cells(width: int, height: int, cells: int, square: bool) -> None:
     box = fit(width, height, 32 * cells, square=square)

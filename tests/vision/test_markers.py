@@ -16,14 +16,7 @@ from mavlink_sim.camera.renderer import Renderer
 from mavlink_sim.world.fiducials import Print
 from mavlink_sim.world.world import Ground, World, WorldObject
 from vision.camera_model import CameraModel, CameraMount
-from vision.markers import (
-    DICTIONARIES,
-    MarkerDetector,
-    MarkerKind,
-    marker_from_corners,
-    marker_poses,
-    square,
-)
+from vision.markers import DICTIONARIES, MarkerDetector, MarkerKind, marker_from_corners, marker_poses, square
 from vision.rotation import matrix_from_euler
 
 PLAIN = CameraModel.from_horizontal_fov(640, 480, math.radians(70.0))

@@ -16,7 +16,6 @@ from vision.yolo.metrics import (
     WRONG,
     ImageResult,
     average_precision,
-    box_iou,
     judge,
     operating_points,
     score_detections,
@@ -47,26 +46,30 @@ def test_finding_everything_exactly_scores_one() -> None:
     assert score.images == 1
 
 
-def test_a_missed_object_costs_the_recall_points_beyond() -> None:
-    score = score_detections([result([(SQUARE, 0.9, 0)], [(SQUARE, 0), (FAR, 0)])], NAMES)
-    assert score.map50 == pytest.approx(51 / 101)
-
-
-def test_a_more_confident_false_alarm_halves_the_precision() -> None:
-    score = score_detections([result([(FAR, 0.9, 0), (SQUARE, 0.8, 0)], [(SQUARE, 0)])], NAMES)
-    assert score.map50 == pytest.approx(0.5)
-
-
-def test_a_less_confident_false_alarm_costs_nothing() -> None:
-    score = score_detections([result([(FAR, 0.1, 0), (SQUARE, 0.8, 0)], [(SQUARE, 0)])], NAMES)
-    assert score.map50 == pytest.approx(1)
-
-
-def test_the_second_box_on_one_object_is_a_false_alarm() -> None:
-    score = score_detections(
-        [result([(SQUARE, 0.9, 0), (SQUARE, 0.8, 0), (FAR, 0.7, 0)], [(SQUARE, 0), (FAR, 0)])], NAMES
-    )
-    assert score.map50 == pytest.approx((51 + 50 * 2 / 3) / 101)
+@pytest.mark.parametrize(
+    ("found", "true", "map50"),
+    [
+        pytest.param([(SQUARE, 0.9, 0)], [(SQUARE, 0), (FAR, 0)], 51 / 101, id="a missed object"),
+        pytest.param([(FAR, 0.9, 0), (SQUARE, 0.8, 0)], [(SQUARE, 0)], 0.5, id="a confident false alarm"),
+        pytest.param([(FAR, 0.1, 0), (SQUARE, 0.8, 0)], [(SQUARE, 0)], 1, id="a less confident false alarm"),
+        pytest.param(
+            [(SQUARE, 0.9, 0), (SQUARE, 0.8, 0), (FAR, 0.7, 0)],
+            [(SQUARE, 0), (FAR, 0)],
+            (51 + 50 * 2 / 3) / 101,
+            id="a second box on one object is a false alarm",
+        ),
+        pytest.param(
+            [*[(FAR, 0.9, 0)] * 100, (SQUARE, 0.1, 0)],
+            [(SQUARE, 0)],
+            0,
+            id="the hundred most confident count",
+        ),
+    ],
+)
+def test_precision_of_one_image(
+    found: list[tuple[Box, float, int]], true: list[tuple[Box, int]], map50: float
+) -> None:
+    assert score_detections([result(found, true)], NAMES).map50 == pytest.approx(map50)
 
 
 def test_a_box_of_iou_0_72_counts_at_the_five_lower_thresholds() -> None:
@@ -87,11 +90,6 @@ def test_an_object_is_not_found_by_a_box_in_another_image() -> None:
     assert score.map50 == 0
 
 
-def test_only_the_hundred_most_confident_boxes_of_an_image_count() -> None:
-    noise = [(FAR, 0.9, 0)] * 100
-    assert score_detections([result([*noise, (SQUARE, 0.1, 0)], [(SQUARE, 0)])], NAMES).map50 == 0
-
-
 def test_no_images_give_no_score() -> None:
     assert math.isnan(score_detections([], NAMES).map50)
 
@@ -104,11 +102,6 @@ def test_unknown_class_id_is_rejected() -> None:
 def test_precision_without_true_objects_is_not_defined() -> None:
     with pytest.raises(ValueError, match="got 0"):
         average_precision(np.zeros(0, np.float32), np.zeros(0, bool), 0)
-
-
-def test_iou_of_half_overlapping_boxes_is_a_third() -> None:
-    iou = box_iou(np.array([[0, 0, 2, 2]], np.float32), np.array([[1, 0, 3, 2]], np.float32))
-    assert iou.tolist() == [[pytest.approx(1 / 3)]]
 
 
 def plain_average_precision(confidences: list[float], right: list[bool], objects: int) -> float:

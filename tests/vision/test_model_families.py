@@ -13,10 +13,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.vision.dense_decoding import decoded
 from vision.yolo.architecture import ArchitectureError, ModelDescription, YoloModel, build, build_shapes
-from vision.yolo.model_family import describe
 from vision.yolo.postprocess import select_boxes
-from vision.yolo.published import SCALES, published_description
+from vision.yolo.published import SCALES, describe, published_description
 
 COCO_SIZED = [f"class {index}" for index in range(80)]
 FEW = ("car", "dog", "boat")
@@ -143,6 +143,12 @@ def test_outputs_match_the_reference(model_family: str, scale: str) -> None:
             "n",
             ("model.23.cv3.0.0.0.conv.weight", "model.23.cv3.0.1.1.bn.bias", "model.23.cv3.0.2.bias"),
         ),
+        ("YOLOv8", "n", ("model.0.bn.running_var", "model.2.m.0.cv1.conv.weight", "model.9.cv2.bn.bias")),
+        (
+            "YOLOv8",
+            "n",
+            ("model.22.cv2.0.0.conv.weight", "model.22.cv3.2.2.bias", "model.22.dfl.conv.weight"),
+        ),
         ("YOLO12", "n", ("model.6.m.0.0.attn.qkv.conv.weight", "model.6.m.0.1.mlp.1.bn.bias")),
         ("YOLO12", "l", ("model.6.gamma", "model.8.gamma", "model.6.m.3.1.attn.pe.conv.weight")),
         ("YOLO26", "n", ("model.22.m.0.0.cv1.conv.weight", "model.22.m.0.1.attn.proj.conv.weight")),
@@ -171,10 +177,7 @@ def test_published_description_survives_the_round_trip(model_family: str) -> Non
 
 @pytest.mark.parametrize(
     ("model_family", "scale", "expected"),
-    [
-        ("YOLO13", "n", "'YOLO13'.*YOLOv5u, YOLOv8"),
-        ("YOLO11", "b", "YOLO11 .*'b'.*n, s, m, l, x"),
-    ],
+    [("YOLO13", "n", "'YOLO13'.*YOLOv5u, YOLOv8"), ("YOLO11", "b", "YOLO11 .*'b'.*n, s, m, l, x")],
 )
 def test_an_unpublished_network_is_rejected_with_the_known_ones(
     model_family: str, scale: str, expected: str
@@ -247,7 +250,7 @@ def reference_boxes(
     model: YoloModel, maps: list[Tensor], confidence: float, most: int
 ) -> list[tuple[int, int]]:
     """(cell, class) of the boxes, by sorting every pair of the best cells."""
-    scores = model.decode(maps)[0, :, 4:]
+    scores = decoded(model, maps)[0, :, 4:]
     cells = scores.max(dim=1).values.argsort(descending=True, stable=True)[:most]
     pairs = [(scores[cell, kind].item(), int(cell), kind) for cell in cells for kind in range(len(FEW))]
     best = sorted(pairs, reverse=True)[:most]
@@ -259,15 +262,15 @@ def test_the_best_pairs_of_cell_and_class_are_selected(most: int) -> None:
     model = lively()
     with torch.inference_mode():
         maps = model(make_image())
-        decoded = model.decode(maps)[0]
-    confidence = decoded[:, 4:].max(dim=1).values.median().item()
+        dense = decoded(model, maps)[0]
+    confidence = dense[:, 4:].max(dim=1).values.median().item()
     boxes = select_boxes(model, maps, confidence=confidence, most=most)
     expected = reference_boxes(model, maps, confidence, most)
     assert len(boxes) == len(expected) > 0
     for index, (cell, kind) in enumerate(expected):
         assert boxes.class_id[index] == kind
-        assert boxes.confidence[index] == pytest.approx(decoded[cell, 4 + kind].item(), abs=1e-6)
-        assert boxes.xyxy[index] == pytest.approx(decoded[cell, :4].numpy(), abs=1e-3)
+        assert boxes.confidence[index] == pytest.approx(dense[cell, 4 + kind].item(), abs=1e-6)
+        assert boxes.xyxy[index] == pytest.approx(dense[cell, :4].numpy(), abs=1e-3)
 
 
 def test_overlapping_boxes_of_an_end_to_end_head_are_all_kept() -> None:

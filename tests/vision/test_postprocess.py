@@ -12,10 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
+from tests.vision.dense_decoding import decoded
 from vision.yolo import postprocess
-from vision.yolo.architecture import YoloModel, build, yolov8_description
+from vision.yolo.architecture import YoloModel, build
 from vision.yolo.level_outputs import ClassRows, Head, LevelOutput
 from vision.yolo.postprocess import boxes_of, candidates_of, select_boxes, suppress
+from vision.yolo.published import yolov8_description
 
 NAMES = ("car", "dog", "boat")
 
@@ -62,7 +64,7 @@ def test_the_same_boxes_come_from_the_dense_decoding(model: YoloModel) -> None:
     generator = torch.Generator().manual_seed(3)
     maps = [torch.randn(level.shape, generator=generator) for level in empty_maps()]
     boxes = select_boxes(model, maps, confidence=0.0, iou=1.0, most=10_000)
-    dense = model.decode(maps)[0]
+    dense = decoded(model, maps)[0]
     best, best_class = dense[:, 4:].max(dim=1)
     order = best.argsort(descending=True, stable=True)
     np.testing.assert_allclose(boxes.xyxy, dense[order, :4], atol=1e-3)

@@ -117,10 +117,7 @@ def wait_for(read: Callable[[], Frame | None]) -> Frame:
 )  # fmt: skip
 def test_newest_frame_is_read_unchanged(width: int, height: int, depth: bool, slots: int, count: int) -> None:
     name = f"test-frames-{os.getpid()}-{secrets.token_hex(4)}"
-    with (
-        SharedFrameWriter(name, width, height, depth, slots) as writer,
-        SharedFrameReader(name) as reader,
-    ):
+    with SharedFrameWriter(name, width, height, depth, slots) as writer, SharedFrameReader(name) as reader:
         assert reader.latest() is None
         for sequence in range(count):
             sent = frame(sequence, width, height, depth)

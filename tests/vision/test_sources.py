@@ -12,7 +12,7 @@ import pytest
 
 from vision.sources import EndOfStream, SourceError, SourceSettings, open_source
 from vision.sources.capture import LoopingCapture
-from vision.sources.images import ImagesCapture, natural_key
+from vision.sources.files import ImagesCapture, natural_key
 from vision.sources.source import SourceStatistics
 
 pytestmark = pytest.mark.realtime

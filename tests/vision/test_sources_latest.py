@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from vision.frame import Frame
+from tests.vision.network_streams import is_grey, wait_for_frame
 from vision.sources.capture import Capture, CaptureError, RawFrame
 from vision.sources.latest import LatestSource
 from vision.sources.source import EndOfStream, SourceError, SourceSettings
@@ -57,15 +57,6 @@ def opener(*feeds: Capture | Exception) -> Callable[[], Capture]:
     return open_capture
 
 
-def frame_of(source: LatestSource, value: int) -> Frame:
-    deadline_s = time.monotonic() + 20
-    while time.monotonic() < deadline_s:
-        frame = source.read(0.2)
-        if frame is not None and int(frame.image[0, 0, 0]) == value:
-            return frame
-    raise AssertionError(f"frame {value} never came")
-
-
 def test_lost_capture_is_reopened_and_logged_once(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("WARNING")
     gate = threading.Event()
@@ -74,9 +65,9 @@ def test_lost_capture_is_reopened_and_logged_once(caplog: pytest.LogCaptureFixtu
     with LatestSource(
         "camera", opener(first, CaptureError("no"), CaptureError("no"), second), QUICK
     ) as source:
-        frame_of(source, 1)
+        wait_for_frame(source, is_grey(1))
         gate.set()
-        frame = frame_of(source, 2)
+        frame = wait_for_frame(source, is_grey(2))
         assert frame.sequence == 1
         assert source.statistics.reopened == 1
     lines = [record.getMessage() for record in caplog.records]
@@ -88,8 +79,8 @@ def test_lost_capture_is_reopened_and_logged_once(caplog: pytest.LogCaptureFixtu
 
 def test_silence_is_a_loss(caplog: pytest.LogCaptureFixture) -> None:
     with LatestSource("camera", opener(ScriptedFeed([1]), ScriptedFeed([2])), QUICK) as source:
-        frame_of(source, 1)
-        frame_of(source, 2)
+        wait_for_frame(source, is_grey(1))
+        wait_for_frame(source, is_grey(2))
     assert "lost: no data" in caplog.text
 
 
@@ -131,16 +122,16 @@ def test_unexpected_error_is_raised_in_the_reader() -> None:
     gate = threading.Event()
     source = LatestSource("camera", opener(ScriptedFeed([1, ZeroDivisionError("a bug")], gate)), QUICK)
     with source:
-        frame_of(source, 1)
+        wait_for_frame(source, is_grey(1))
         gate.set()
         with pytest.raises(ZeroDivisionError, match="a bug"):
-            frame_of(source, 2)
+            wait_for_frame(source, is_grey(2))
 
 
 def test_without_reopening_the_end_comes_after_the_last_frame() -> None:
     capture = ScriptedFeed([1, 2, EndOfStream()])
     with LatestSource("pipe", opener(capture), QUICK, reopen=False) as source:
-        assert frame_of(source, 2).sequence == 1
+        assert wait_for_frame(source, is_grey(2)).sequence == 1
         with pytest.raises(EndOfStream):
             source.read(20.0)
         with pytest.raises(EndOfStream):
@@ -151,7 +142,7 @@ def test_without_reopening_a_loss_is_an_error() -> None:
     gate = threading.Event()
     capture = ScriptedFeed([1, CaptureError("a broken frame")], gate)
     with LatestSource("pipe", opener(capture), QUICK, reopen=False) as source:
-        frame_of(source, 1)
+        wait_for_frame(source, is_grey(1))
         gate.set()
         with pytest.raises(SourceError, match="pipe: a broken frame"):
             source.read(20.0)
@@ -187,5 +178,5 @@ def test_overwritten_frames_count_as_dropped() -> None:
             return None if raw is None else RawFrame(raw.image, skipped=4)
 
     with LatestSource("shared", opener(Skipping([1])), QUICK) as source:
-        assert frame_of(source, 1).sequence == 4
+        assert wait_for_frame(source, is_grey(1)).sequence == 4
         assert source.statistics.dropped == 4

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import os
 import subprocess
@@ -15,12 +14,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from vision.frame import Frame
-from vision.sources import EndOfStream, Source, SourceError, SourceSettings, open_source
-from vision.sources.raw import RawParser
+from tests.vision.network_streams import is_grey, read_until_logged, wait_for_frame
+from vision.sources import EndOfStream, SourceError, SourceSettings, open_source
 
 pytestmark = pytest.mark.realtime
 
@@ -49,40 +45,6 @@ def write_in_thread(path: Path, write: Callable[[int], object]) -> threading.Thr
     thread = threading.Thread(target=run, daemon=True)
     thread.start()
     return thread
-
-
-def next_frame(source: Source, within_s: float = 20.0) -> Frame:
-    deadline_s = time.monotonic() + within_s
-    while time.monotonic() < deadline_s:
-        if (frame := source.read(0.5)) is not None:
-            return frame
-    raise AssertionError(f"no frame within {within_s} s")
-
-
-@settings(max_examples=60, deadline=None)
-@given(
-    st.sampled_from(["bgr24", "rgb24", "gray8"]),
-    st.integers(1, 9),
-    st.integers(1, 9),
-    st.integers(0, 4),
-    st.integers(0, 1 << 20),
-    st.lists(st.integers(0, 1 << 20), max_size=8),
-)
-def test_raw_frames_are_complete_for_any_stream_split(
-    pixel_format: str, width: int, height: int, count: int, extra: int, cuts: list[int]
-) -> None:
-    channels = 1 if pixel_format == "gray8" else 3
-    size = width * height * channels
-    pixels = np.random.default_rng(size).integers(0, 256, (count, height, width, channels), dtype=np.uint8)
-    stream = pixels.tobytes() + b"\1" * (extra % size)
-    parser = RawParser(width, height, pixel_format)
-    edges = [0, *sorted(cut % (len(stream) + 1) for cut in cuts), len(stream)]
-    found = [p for a, b in itertools.pairwise(edges) for p in parser.push(stream[a:b])]
-    wanted = pixels[..., ::-1] if pixel_format == "rgb24" else np.broadcast_to(pixels, (*pixels.shape[:3], 3))
-    assert len(found) == count
-    for image, expected in zip(found, wanted, strict=True):
-        np.testing.assert_array_equal(image, expected)
-    assert bool(parser.leftover()) == (extra % size > 0)
 
 
 def test_fifo_every_frame_in_order_until_the_writer_closes(tmp_path: Path) -> None:
@@ -115,10 +77,7 @@ def test_fifo_newest_frame_wins_and_drops_are_counted(tmp_path: Path) -> None:
     with open_source(str(path), RAW) as source:
         assert source.live
         assert written.wait(20)
-        frame = next_frame(source)
-        while int(frame.image[0, 0, 0]) != 49:
-            frame = next_frame(source)
-        assert frame.sequence == 49
+        assert wait_for_frame(source, is_grey(49)).sequence == 49
         assert source.statistics.delivered + source.statistics.dropped == 50
         assert source.read(0.01) is None
         closing.set()
@@ -131,12 +90,10 @@ def test_fifo_recovers_with_a_new_writer(tmp_path: Path, caplog: pytest.LogCaptu
     first = write_in_thread(path, lambda out: os.write(out, raw_frame(1) + raw_frame(2)[:50]) and None)
     with open_source(str(path), RAW) as source:
         first.join()
-        assert int(next_frame(source).image[0, 0, 0]) == 1
-        deadline_s = time.monotonic() + 20
-        while "lost" not in caplog.text and time.monotonic() < deadline_s:
-            assert source.read(0.05) is None
+        assert int(wait_for_frame(source).image[0, 0, 0]) == 1
+        assert read_until_logged(source, caplog, "lost") == []
         second = write_in_thread(path, lambda out: os.write(out, raw_frame(3)) and None)
-        frame = next_frame(source)
+        frame = wait_for_frame(source)
         second.join()
         assert int(frame.image[0, 0, 0]) == 3
         assert source.statistics.reopened == 1
@@ -163,12 +120,10 @@ def test_a_slow_writer_of_a_fifo_is_not_cut_off(tmp_path: Path, caplog: pytest.L
     writer = write_in_thread(path, write)
     quick = SourceSettings(width=8, height=6, pixel_format="bgr24", read_timeout_s=0.2)
     with open_source(str(path), quick) as source:
-        next_frame(source)
-        deadline_s = time.monotonic() + 20
-        while "waiting" not in caplog.text and time.monotonic() < deadline_s:
-            assert source.read(0.05) is None
+        wait_for_frame(source)
+        assert read_until_logged(source, caplog, "waiting") == []
         go_on.set()
-        assert int(next_frame(source).image[0, 0, 0]) == 2
+        assert int(wait_for_frame(source).image[0, 0, 0]) == 2
         assert source.statistics.reopened == 0
     writer.join()
 
@@ -187,7 +142,7 @@ def test_read_returns_none_while_the_writer_is_late(tmp_path: Path) -> None:
         assert source.read() is not None
         assert source.read(0.05) is None
         go_on.set()
-        assert next_frame(source).sequence == 1
+        assert wait_for_frame(source).sequence == 1
         with pytest.raises(EndOfStream):
             source.read(10.0)
     writer.join()

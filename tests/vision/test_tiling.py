@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from vision.detections import Detections
+from vision.object_detector import Timing
 from vision.pipeline import FrameDetector
-from vision.tiling import Tile, TiledDetector, TiledTiming, merge_passes, tiles_of
+from vision.tiling import Tile, TiledDetector, merge_passes, tiles_of
 
 NAMES = ("car", "dog")
 Edge = Callable[[Tile], int]
@@ -27,14 +28,14 @@ class Patches:
     class_names: tuple[str, ...] = NAMES
     smallest: float = 0.0
     asked: list[tuple[int, int]] = field(default_factory=list)
-    last_timing: TiledTiming | None = None
+    last_timing: Timing | None = None
 
     def detect(self, image_bgr: NDArray[np.uint8], /) -> Detections:
         import cv2
 
         height, width = image_bgr.shape[:2]
         self.asked.append((width, height))
-        self.last_timing = TiledTiming(1.0, 10.0, 2.0)
+        self.last_timing = Timing(1.0, 10.0, 2.0)
         _, _, boxes, _ = cv2.connectedComponentsWithStats((image_bgr[:, :, 0] > 128).astype(np.uint8))
         found = [(x, y, x + w, y + h) for x, y, w, h, _ in boxes[1:] if w >= self.smallest * width]
         xyxy = np.array(found, np.float32).reshape(-1, 4)

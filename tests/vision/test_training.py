@@ -16,10 +16,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from vision.yolo.augmentation import NO_AUGMENTATION, Augmentation, LabelledImage, augment
-from vision.yolo.evaluation import evaluate
-from vision.yolo.scene_batches import SceneKey, SceneSource, collate, draw_scene, scene_batches
-from vision.yolo.training import Progress, Stage, TrainedModel, TrainingSettings, load_average, train
+from vision.yolo.recipe import evaluate
+from vision.yolo.scene_batches import (
+    NO_AUGMENTATION,
+    Augmentation,
+    LabelledImage,
+    SceneKey,
+    SceneSource,
+    augment,
+    collate,
+    draw_scene,
+    scene_batches,
+)
+from vision.yolo.training import Progress, Stage, TrainedModel, TrainingSettings, train
 
 COLOURS = ((40, 40, 220), (60, 200, 60))
 
@@ -94,9 +103,7 @@ def test_another_seed_gives_other_weights() -> None:
     )
 
 
-def test_resumed_training_gives_uninterrupted_weights(
-    tmp_path: Path,
-) -> None:
+def test_resumed_training_gives_uninterrupted_weights(tmp_path: Path) -> None:
     whole = train(SMALL, rectangles, silent)
     kept = tmp_path / "state.pt"
     cut = train(replace(SMALL, time_limit_s=0.0), rectangles, silent, checkpoint=kept)
@@ -104,7 +111,6 @@ def test_resumed_training_gives_uninterrupted_weights(
     resumed = train(SMALL, rectangles, silent, checkpoint=kept, resume=True)
     assert resumed.steps_done == 4
     assert torch.equal(weights(whole), weights(resumed))
-    assert torch.equal(weights(load_average(kept, SMALL)), weights(resumed))
 
 
 def test_resuming_another_network_is_rejected(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from vision import video_encoders
+from vision import video_writer
 from vision.video_writer import VideoWriter, VideoWriterError
 
 SECOND = 1_000_000_000
@@ -53,9 +53,9 @@ def encoder(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
         pytest.importorskip("av", reason="PyAV is an optional extra")
     else:
         monkeypatch.setitem(sys.modules, "av", None)
-    video_encoders._pyav.cache_clear()
+    video_writer._pyav.cache_clear()
     yield str(request.param)
-    video_encoders._pyav.cache_clear()
+    video_writer._pyav.cache_clear()
 
 
 def test_video_at_its_rate_has_every_image_once(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
@@ -155,10 +155,7 @@ def test_full_disk_is_reported(tmp_path: Path, encoder: str) -> None:
     writer = VideoWriter(path, 64, 48, 10.0)
     for index in range(20):
         writer.write(make_image(index * 12), index * SECOND // 10)
-    reported = {
-        "PyAV": "cannot be written: No space left on device",
-        "OpenCV": "0 of 20 frames",
-    }
+    reported = {"PyAV": "cannot be written: No space left on device", "OpenCV": "0 of 20 frames"}
     with pytest.raises(VideoWriterError, match=re.escape(reported[encoder])):
         writer.close()
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vision.detections import Detections
-from vision.yolo.metrics import box_iou
+from vision.tracking.association import overlaps
 
 _TILE = 168
 _CAPTION = 34
@@ -78,7 +78,7 @@ class WorstMisses:
         `found.class_names`.
         """
         detected = found[found.confidence >= self._confidence]
-        matches = (box_iou(detected.xyxy, true_boxes) >= self._iou) & (
+        matches = (overlaps(detected.xyxy, true_boxes) >= self._iou) & (
             detected.class_id[:, None] == true_class_ids[None, :]
         )
         height, width = image.shape[:2]

@@ -85,16 +85,14 @@ def required(runtime: RuntimeName, *, also: str | None = None) -> Any:
     """Import the runtime's module. Raises `RuntimeMissingError`, which names the extra to install."""
     for package in filter(None, (runtime, also)):
         try:
-            if importlib.util.find_spec(package) is None:
-                raise RuntimeMissingError(
-                    f"the runtime {runtime} is not installed ({package} is missing): "
-                    f"pip install 'mavlink-companion[{runtime}]'"
-                )
+            found = importlib.util.find_spec(package) is not None
         except ModuleNotFoundError:  # of a dotted name, when its first part is missing
+            found = False
+        if not found:
             raise RuntimeMissingError(
                 f"the runtime {runtime} is not installed ({package} is missing): "
                 f"pip install 'mavlink-companion[{runtime}]'"
-            ) from None
+            )
     try:
         return importlib.import_module(runtime)
     except ImportError as error:

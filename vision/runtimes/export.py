@@ -173,7 +173,7 @@ def _write_torchscript(network: Network, facts: ExportedFacts, path: Path) -> No
 
 
 def _write_tensorrt(network: Network, facts: ExportedFacts, path: Path) -> None:
-    from vision.runtimes.tensorrt_build import build_plan
+    from vision.runtimes.tensorrt_runtime import build_plan
 
     onnx_path = path.with_suffix(".onnx")
     _write_onnx(network, facts, onnx_path)

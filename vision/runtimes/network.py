@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from vision.runtimes.base import RuntimeUnusableError
 from vision.yolo.architecture import YoloModel
-from vision.yolo.layers import Detect
+from vision.yolo.heads import Detect
 from vision.yolo.level_outputs import BoxBranch, ClassRows, Head
 from vision.yolo.postprocess import head_of
 

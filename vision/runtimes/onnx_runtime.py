@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -62,7 +63,7 @@ class OnnxRuntime:
 
     @property
     def threads(self) -> int:
-        return self._threads or processors()
+        return self._threads or len(os.sched_getaffinity(0))
 
     def prepare(self, height: int, width: int) -> None:
         self.infer(np.zeros((height, width, 3), np.uint8))
@@ -85,13 +86,6 @@ def onnx_facts(path: Path, session: Any = None) -> ExportedFacts:
     if text is None:
         raise not_ours(path)
     return ExportedFacts.from_json(text, path)
-
-
-def processors() -> int:
-    """Number of processors available to this process."""
-    import os
-
-    return len(os.sched_getaffinity(0))
 
 
 def _session(onnxruntime: Any, path: Path, options: Any, providers: list[str]) -> Any:

@@ -93,7 +93,7 @@ def read_source(path: Path) -> ModelSource:
 
 def _facts(path: Path, kind: ExportKind) -> ExportedFacts:
     if kind == "torchscript":
-        from vision.runtimes.torchscript_runtime import torchscript_facts
+        from vision.runtimes.torch_runtime import torchscript_facts
 
         return torchscript_facts(path)
     if kind == "tensorrt":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vision.camera_model import CameraCalibration
+from vision.frame import Frame
 from vision.sources.source import EndOfStream
 
 
@@ -36,6 +38,12 @@ class RawFrame:
     media_s: float | None = None
     skipped: int = 0
     decode_ms: float = 0.0
+
+    def numbered(self, sequence: int) -> Frame:
+        """The frame to deliver, ready now; one of a file is captured now."""
+        now_ns = time.monotonic_ns()
+        captured_ns = now_ns if self.captured_ns is None else self.captured_ns
+        return Frame(self.image, captured_ns, sequence, self.depth_m, now_ns, self.decode_ms, self.media_s)
 
 
 class Capture(ABC):

@@ -253,19 +253,9 @@ class LatestSource(Source):
         self._stop.wait(max(self._pace_origin_s + raw.media_s - time.monotonic(), 0.0))
 
     def _publish(self, raw: RawFrame, capture: Capture) -> None:
-        ready_ns = time.monotonic_ns()
-        captured_ns = ready_ns if raw.captured_ns is None else raw.captured_ns
         unreadable = self._unreadable_before + capture.unreadable
         self._sequence += raw.skipped + unreadable - self._statistics.unreadable
-        frame = Frame(
-            raw.image,
-            captured_ns,
-            self._sequence,
-            raw.depth_m,
-            ready_ns,
-            raw.decode_ms,
-            raw.media_s,
-        )
+        frame = raw.numbered(self._sequence)
         self._sequence += 1
         if self._settings.on_frame is not None:
             self._settings.on_frame(frame)

@@ -10,17 +10,15 @@ from pathlib import Path
 
 from vision.sources.camera import CameraCapture, camera_device, check_camera
 from vision.sources.capture import Capture, LoopingCapture
-from vision.sources.http_stream import open_http
-from vision.sources.images import ImagesCapture, images_in, is_image
+from vision.sources.files import ImagesCapture, VideoFileCapture, images_in, is_image
 from vision.sources.latest import LatestSource
-from vision.sources.network import UdpStream, open_rtsp, without_password
+from vision.sources.network import UdpStream, open_http, open_rtsp, without_password
 from vision.sources.opencv import quiet_opencv
 from vision.sources.pipe import Fifo, PipeCapture, check_pipe_settings
 from vision.sources.registry import SOURCES, source
 from vision.sources.sequential import SequentialSource
 from vision.sources.shared import SharedFrameCapture, check_name
 from vision.sources.source import RAW_PIXEL_FORMATS, Source, SourceError, SourceSettings
-from vision.sources.video_file import VideoFileCapture
 
 _IMAGE_RATE_HZ = 10.0  # of images used as a camera without rate_hz
 
@@ -175,11 +173,7 @@ def _open_fifo(path: Path, settings: SourceSettings) -> Source:
         if settings.every_frame:
             return SequentialSource(str(path), fifo.open_capture, settings, on_close=fifo.close)
         return LatestSource(
-            str(path),
-            fifo.open_capture,
-            settings,
-            advice="start its writer",
-            on_close=fifo.close,
+            str(path), fifo.open_capture, settings, advice="start its writer", on_close=fifo.close
         )
     except BaseException:
         fifo.close()

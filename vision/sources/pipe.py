@@ -15,10 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vision.sources.capture import Capture, CaptureError, RawFrame
-from vision.sources.mjpeg import MjpegParser
-from vision.sources.raw import RawParser, StreamError, StreamParser
 from vision.sources.source import RAW_PIXEL_FORMATS, EndOfStream, SourceError, SourceSettings
-from vision.sources.y4m import MAGIC, Y4mParser
+from vision.sources.stream_formats import MAGIC, MjpegParser, RawParser, StreamError, StreamParser, Y4mParser
 
 _PIPE_BYTES = 1 << 20  # one frame of 640x480 in one read; the kernel's default is 64 KiB
 

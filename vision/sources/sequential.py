@@ -80,17 +80,7 @@ class SequentialSource(Source):
         self._sequence += raw.skipped + self._capture.unreadable - self._unreadable_seen
         self._unreadable_seen = self._capture.unreadable
         self._dropped += raw.skipped
-        ready_ns = time.monotonic_ns()
-        captured_ns = ready_ns if raw.captured_ns is None else raw.captured_ns
-        frame = Frame(
-            raw.image,
-            captured_ns,
-            self._sequence,
-            raw.depth_m,
-            ready_ns,
-            raw.decode_ms,
-            raw.media_s,
-        )
+        frame = raw.numbered(self._sequence)
         self._sequence += 1
         self._delivered += 1
         if self._on_frame is not None:

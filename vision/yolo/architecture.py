@@ -1,30 +1,19 @@
 """The network, built row by row from its description.
 
-`build` creates it with random weights; the description comes from a checkpoint or from `yolov8_description`.
+`build` creates it with random weights. A description comes from a checkpoint or from `vision.yolo.published`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor, nn
 
-from vision.yolo.description import ArchitectureError, LayerSpec, ModelDescription, yolov8_description
+from vision.yolo.description import ArchitectureError, LayerSpec, ModelDescription
+from vision.yolo.heads import Detect
 from vision.yolo.layer_config import HEADS, LAYERS, build_layer
-from vision.yolo.layers import Concat, Conv, Detect, LargeKernelDWConv
+from vision.yolo.layers import ACTIVATIONS, Concat, Conv, LargeKernelDWConv
 
-__all__ = [
-    "ArchitectureError",
-    "LayerSpec",
-    "ModelDescription",
-    "YoloModel",
-    "anchor_points",
-    "build",
-    "build_shapes",
-    "decode_boxes",
-    "yolov8_description",
-]
+__all__ = ["ArchitectureError", "LayerSpec", "ModelDescription", "YoloModel", "build", "build_shapes"]
 
 _IMAGE = -1
 # The deepest published network repeats 48 blocks; far more is not a valid description.
@@ -43,6 +32,9 @@ class YoloModel(nn.Module):
         self.description = description
         layers, self._sources, self.strides = _build_layers(description)
         self.model = nn.ModuleList(layers)
+        for module in self.modules():
+            if isinstance(module, Conv) and isinstance(module.act, nn.SiLU):
+                module.act = ACTIVATIONS[description.activation](inplace=True)
         self._last_use = {source: index for index, sources in enumerate(self._sources) for source in sources}
         self.detect.initialise_biases(self.strides)
 
@@ -83,14 +75,6 @@ class YoloModel(nn.Module):
         levels: list[Tensor] = list(outputs[len(self.model) - 1])
         return levels
 
-    def decode(self, outputs: Sequence[Tensor]) -> Tensor:
-        """Raw outputs → (B, N, 4 + classes): xyxy in pixels of the network's input, then scores in 0..1."""
-        flat = torch.cat([level.flatten(2) for level in outputs], dim=2).transpose(1, 2)
-        sides, logits = torch.split(flat, [4 * self.reg_max, len(self.class_names)], dim=2)
-        centres, strides = anchor_points(outputs, self.strides)
-        boxes = decode_boxes(self.detect.dfl(sides), centres, strides)
-        return torch.cat((boxes, logits.sigmoid()), dim=2)
-
     def fuse(self) -> YoloModel:
         """Fold every batch normalisation into its convolution, in place, and switch to inference.
 
@@ -112,29 +96,6 @@ def build_shapes(description: ModelDescription) -> YoloModel:
     """Build the network on the meta device, which needs no memory for weights. Raises as `build` does."""
     with torch.device("meta"):
         return YoloModel(description)
-
-
-def anchor_points(outputs: Sequence[Tensor], strides: Sequence[int]) -> tuple[Tensor, Tensor]:
-    """The centre of every cell, level by level and row by row.
-
-    Returns (N, 2) x, y in cells of the point's level, and (N, 1) the level's stride in pixels.
-    """
-    centres, steps = [], []
-    for level, stride in zip(outputs, strides, strict=True):
-        height, width = level.shape[-2:]
-        y, x = torch.meshgrid(
-            torch.arange(height, dtype=torch.float32, device=level.device) + 0.5,
-            torch.arange(width, dtype=torch.float32, device=level.device) + 0.5,
-            indexing="ij",
-        )
-        centres.append(torch.stack((x, y), dim=-1).view(-1, 2))
-        steps.append(torch.full((height * width, 1), float(stride), device=level.device))
-    return torch.cat(centres), torch.cat(steps)
-
-
-def decode_boxes(distances: Tensor, centres: Tensor, strides: Tensor) -> Tensor:
-    """Distances from a cell's centre (…, N, 4: left, top, right, bottom, in cells) → xyxy in pixels."""
-    return torch.cat((centres - distances[..., :2], centres + distances[..., 2:]), dim=-1) * strides
 
 
 def _build_layers(

@@ -13,8 +13,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import yaml
+from safetensors import SafetensorError, safe_open
+from torch import Tensor
 
-from vision.plain_yaml import PlainDumper, PlainYamlError, load_plain_yaml
+from vision.plain_yaml import PlainDumper, PlainYamlError, load_plain_yaml, numbered
 from vision.yolo.safe_pickle import CheckpointError, one_line
 
 if TYPE_CHECKING:
@@ -45,14 +47,12 @@ def read_pair(path: Path) -> dict[str, Any]:
     Raises:
         CheckpointError: a file is missing or damaged, or the two do not match. One line.
     """
-    from vision.yolo.safetensors_file import read_safetensors
-
     weights_path, description_path = pair_paths(path)
     table = _read_description(description_path, weights_path)
     declared = table.pop("weights", {})
     try:
         _check_belongs(weights_path, declared, description_path)
-        content = read_safetensors(weights_path)
+        tensors, metadata = read_safetensors(weights_path)
     except CheckpointError as error:
         raise CheckpointError(one_line(f"{weights_path}: {error}")) from None
     architecture = table.pop("architecture", None)
@@ -62,11 +62,13 @@ def read_pair(path: Path) -> dict[str, Any]:
         )
     names = architecture.get("names", table.pop("names", None))
     if isinstance(names, dict):
-        names = _numbered(names, description_path)
+        names = numbered(names)
+        if names is None:
+            raise CheckpointError(f"{description_path}: its class names are not numbered from 0")
     return {
         "description": {**architecture, "names": names},
-        "state_dict": content.tensors,
-        "metadata": {**content.metadata, **table},
+        "state_dict": tensors,
+        "metadata": {**metadata, **table},
     }
 
 
@@ -79,8 +81,6 @@ def write_pair(
         description: of the network, `ModelDescription.to_plain()`.
         metadata: plain values; the keys `format`, `weights` and `architecture` are reserved.
     """
-    from vision.yolo.safetensors_file import write_safetensors
-
     reserved = metadata.keys() & {"format", "weights", "architecture"}
     if reserved:
         raise ValueError(f"the metadata must not have the key {sorted(reserved)[0]!r}")
@@ -167,13 +167,6 @@ def _check_belongs(weights_path: Path, declared: Any, description_path: Path) ->
         )
 
 
-def _numbered(names: dict[Any, Any], path: Path) -> list[Any]:
-    """`{0: person, 1: car}` → a list."""
-    if sorted(map(str, names)) != sorted(map(str, range(len(names)))):
-        raise CheckpointError(f"{path}: its class names are not numbered from 0")
-    return [names[index] if index in names else names[str(index)] for index in range(len(names))]
-
-
 class _Row(list[Any]):
     """A list to be written on one line."""
 
@@ -183,8 +176,7 @@ class _Dumper(PlainDumper):
 
 
 _Dumper.add_representer(
-    _Row,
-    lambda dumper, row: dumper.represent_sequence("tag:yaml.org,2002:seq", row, flow_style=True),
+    _Row, lambda dumper, row: dumper.represent_sequence("tag:yaml.org,2002:seq", row, flow_style=True)
 )
 
 
@@ -196,3 +188,58 @@ def _one_line_rows(description: Mapping[str, Any]) -> dict[str, Any]:
         else (_Row(value) if isinstance(value, list) else value)
         for key, value in description.items()
     }
+
+
+# The library accepts headers of 100 MB, which take gigabytes to parse; a network's has a few hundred kB.
+_MAX_HEADER_BYTES = 4 << 20
+
+
+def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Every tensor of `path`, on the CPU, by name, and the header's texts; needs as much memory as the file.
+
+    Raises:
+        CheckpointError: the file is missing, truncated, or invalid.
+    """
+    try:
+        with path.open("rb") as file:
+            size, length = os.fstat(file.fileno()).st_size, int.from_bytes(file.read(8), "little")
+        if size >= 8 and length > _MAX_HEADER_BYTES:
+            raise CheckpointError(
+                f"its header has {length} bytes, expected at most {_MAX_HEADER_BYTES}; "
+                "it is damaged, or not a safetensors file"
+            )
+        with safe_open(path, framework="pt", device="cpu") as content:
+            # Cloned: the library's tensors are views of the mapped file, which may be replaced.
+            tensors = {name: content.get_tensor(name).clone() for name in content.keys()}  # noqa: SIM118
+            return tensors, content.metadata() or {}
+    except FileNotFoundError:
+        raise CheckpointError("no such file; the weights of a pair are NAME.safetensors") from None
+    except IsADirectoryError:
+        raise CheckpointError("is a folder; give the path of a .safetensors file") from None
+    except OSError as error:
+        raise CheckpointError(f"cannot be read ({error.strerror or error})") from None
+    except CheckpointError:
+        raise
+    except (SafetensorError, UnicodeDecodeError, ValueError, OverflowError) as error:
+        raise CheckpointError(
+            f"not a safetensors file, or damaged ({error}); copy or download it again"
+        ) from None
+
+
+def write_safetensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
+    """Write `tensors` and `metadata` to `path`, and sync to disk.
+
+    Raises:
+        TypeError: a tensor of a type that the format does not support.
+    """
+    from safetensors.torch import save  # imports torch
+
+    contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    for name, tensor in contiguous.items():
+        if tensor.dtype.is_complex or tensor.is_quantized:
+            raise TypeError(f"{name} is {tensor.dtype}; safetensors files hold real numbers")
+    data = save(contiguous, dict(metadata) or None)
+    with path.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())

@@ -1,28 +1,97 @@
 """The description of a network: rows of (from, repeats, layer, arguments) and three multipliers.
 
-A checkpoint contains its description; `yolov8_description` and `published_description` return the published
-ones.
+A checkpoint contains its description; `vision.yolo.published` has the published ones.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
-from vision.yolo.convolution import ACTIVATIONS
-from vision.yolo.layer_spec import ArchitectureError, LayerSpec, apply_pooling_form, apply_scale
+from vision.yolo.layers import ACTIVATIONS
 
-__all__ = ["YOLOV8_SCALES", "ArchitectureError", "LayerSpec", "ModelDescription", "yolov8_description"]
+_LARGEST_REPEATS = 64
 
-# scale → depth multiple, width multiple, largest channel count before the width multiple (published table).
-YOLOV8_SCALES: dict[str, tuple[float, float, int]] = {
-    "n": (0.33, 0.25, 1024),
-    "s": (0.33, 0.50, 1024),
-    "m": (0.67, 0.75, 768),
-    "l": (1.0, 1.00, 512),
-    "x": (1.0, 1.25, 512),
-}
+
+class ArchitectureError(ValueError):
+    """A description that cannot be built; the message names the row."""
+
+
+@dataclass(frozen=True, slots=True)
+class LayerSpec:
+    """One layer: the rows it reads (-1 is the row before), how often it repeats, its name, its arguments."""
+
+    source: tuple[int, ...]
+    repeats: int
+    layer: str
+    arguments: tuple[Any, ...] = ()
+
+    @classmethod
+    def from_plain(cls, row: object, index: int) -> LayerSpec:
+        """From `[from, repeats, layer, arguments]`; raises `ArchitectureError` naming row `index`."""
+        if not isinstance(row, list | tuple) or len(row) != 4:
+            raise ArchitectureError(
+                f"row {index} must be [from, repeats, layer, arguments], got {row!r:.200}"
+            )
+        source, repeats, layer, arguments = row
+        sources = tuple(source) if isinstance(source, list | tuple) else (source,)
+        if not sources or not all(type(value) is int for value in sources):
+            raise ArchitectureError(f"row {index}: 'from' must be row numbers, got {source!r:.200}")
+        if type(repeats) is not int or not 1 <= repeats <= _LARGEST_REPEATS:
+            raise ArchitectureError(
+                f"row {index}: repeats must be 1..{_LARGEST_REPEATS}, got {repeats!r:.200}"
+            )
+        if not isinstance(layer, str) or not isinstance(arguments, list | tuple):
+            raise ArchitectureError(f"row {index}: expected a layer's name and arguments, got {row!r:.99}")
+        return cls(sources, repeats, layer, tuple(arguments))
+
+    def to_plain(self) -> list[Any]:
+        source = self.source[0] if len(self.source) == 1 else list(self.source)
+        return [source, self.repeats, self.layer, list(self.arguments)]
+
+    def with_argument(self, position: int, value: Any, defaults: Sequence[Any]) -> LayerSpec:
+        """The row with one argument set; omitted arguments before it are filled from `defaults`.
+
+        A row that already has the value, explicitly or by `defaults`, stays unchanged.
+        """
+        arguments = [*self.arguments, *defaults[len(self.arguments) :]]
+        if arguments[position] == value:
+            return self
+        arguments[position] = value
+        return replace(self, arguments=tuple(arguments[: max(len(self.arguments), position + 1)]))
+
+
+# Defaults of omitted arguments; the first, the channels, has none.
+C3K2_DEFAULTS = (None, False, 0.5, False, 1, True)
+A2C2F_DEFAULTS = (None, True, 1, False, 2.0, 0.5, 1, True)
+PUBLISHED_MLP_RATIOS = (2.0, 1.2)
+SPPF_DEFAULTS = (None, 5, 3, False, True)
+
+
+def apply_scale(row: LayerSpec, scale: str) -> LayerSpec:
+    """Make explicit what a table shared by all scales (YOLO11, 12 and 26) implies for the larger ones.
+
+    From m on, every C3k2 consists of C3k blocks; from l on, area attention has a residual and a narrower
+    feed-forward network.
+    """
+    if row.layer == "C3k2" and scale in ("m", "l", "x"):
+        return row.with_argument(1, True, C3K2_DEFAULTS)
+    attends = row.layer == "A2C2f" and row.arguments[1:2] != (False,)
+    if attends and scale in ("l", "x") and len(row.arguments) <= 3:
+        return row.with_argument(3, True, A2C2F_DEFAULTS).with_argument(
+            4, PUBLISHED_MLP_RATIOS[1], A2C2F_DEFAULTS
+        )
+    return row
+
+
+def apply_pooling_form(row: LayerSpec) -> LayerSpec:
+    """An SPPF row with more than a kernel is YOLO26's form: no activation after its first convolution."""
+    if row.layer == "SPPF" and 2 < len(row.arguments) < len(SPPF_DEFAULTS):
+        return row.with_argument(4, False, SPPF_DEFAULTS)
+    return row
+
+
 _LARGEST_ROWS = 128
 _LARGEST_CLASS_WIDTH = 1 << 14
 # Families with these layers have depthwise class branches in the head.
@@ -130,10 +199,10 @@ class ModelDescription:
         names = plain.get("names") if class_names is None else class_names
         if isinstance(names, str) or not isinstance(names, Sequence):
             raise ArchitectureError(f"a model needs a list of class names, got {names!r:.200}")
-        depth, width, max_channels = _multiples(plain)
+        letter, depth, width, max_channels = _scale(plain)
         plain_rows = [*_list(plain, "backbone"), *_list(plain, "head")]
         rows = tuple(
-            apply_scale(apply_pooling_form(LayerSpec.from_plain(row, index)), _scale(plain))
+            apply_scale(apply_pooling_form(LayerSpec.from_plain(row, index)), letter)
             for index, row in enumerate(plain_rows)
         )
         layers = {row.layer for row in rows}
@@ -145,69 +214,18 @@ class ModelDescription:
             depth_multiple=depth,
             width_multiple=width,
             max_channels=max_channels,
-            channels=_first(plain, ("channels", "ch"), 3),
-            reg_max=_first(plain, ("reg_max",), 16),
-            activation=_activation_name(_first(plain, ("activation",), "SiLU")),
+            channels=_first(plain, 3, "channels", "ch"),
+            reg_max=_first(plain, 16, "reg_max"),
+            activation=_activation_name(_first(plain, "SiLU", "activation")),
             unscaled_channels=tuple(_list(plain, "unscaled_channels")),
-            light_classes=_first(plain, ("light_classes",), not _LIGHT_CLASS_LAYERS.isdisjoint(layers)),
+            light_classes=_first(plain, not _LIGHT_CLASS_LAYERS.isdisjoint(layers), "light_classes"),
             class_width=plain.get("class_width"),
-            end_to_end=_first(plain, ("end2end",), "v10Detect" in layers),
+            end_to_end=_first(plain, "v10Detect" in layers, "end2end"),
         )
 
 
-def yolov8_description(scale: str | tuple[float, float, int], class_names: Sequence[str]) -> ModelDescription:
-    """The published YOLOv8 network.
-
-    Args:
-        scale: `n`, `s`, `m`, `l`, `x`, or (depth multiple, width multiple, largest channel count).
-        class_names: id → name.
-    """
-    if isinstance(scale, str):
-        if scale not in YOLOV8_SCALES:
-            raise ArchitectureError(f"unknown scale {scale!r}; known: {', '.join(YOLOV8_SCALES)}")
-        scale = YOLOV8_SCALES[scale]
-    depth, width, max_channels = scale
-    previous = (-1,)
-
-    def down(channels: int) -> LayerSpec:
-        return LayerSpec(previous, 1, "Conv", (channels, 3, 2))
-
-    upsample = LayerSpec(previous, 1, "nn.Upsample", (None, 2, "nearest"))
-    backbone = (
-        down(64),
-        down(128),
-        LayerSpec(previous, 3, "C2f", (128, True)),
-        down(256),
-        LayerSpec(previous, 6, "C2f", (256, True)),
-        down(512),
-        LayerSpec(previous, 6, "C2f", (512, True)),
-        down(1024),
-        LayerSpec(previous, 3, "C2f", (1024, True)),
-        LayerSpec(previous, 1, "SPPF", (1024, 5)),
-    )
-    head = (
-        upsample,
-        LayerSpec((-1, 6), 1, "Concat", (1,)),
-        LayerSpec(previous, 3, "C2f", (512,)),
-        upsample,
-        LayerSpec((-1, 4), 1, "Concat", (1,)),
-        LayerSpec(previous, 3, "C2f", (256,)),
-        down(256),
-        LayerSpec((-1, 12), 1, "Concat", (1,)),
-        LayerSpec(previous, 3, "C2f", (512,)),
-        down(512),
-        LayerSpec((-1, 9), 1, "Concat", (1,)),
-        LayerSpec(previous, 3, "C2f", (1024,)),
-        LayerSpec((15, 18, 21), 1, "Detect", ("nc",)),
-    )
-    return ModelDescription(tuple(class_names), backbone, head, depth, width, max_channels)
-
-
-def _first(plain: Mapping[Any, Any], keys: Sequence[str], default: Any) -> Any:
-    for key in keys:
-        if plain.get(key) is not None:
-            return plain[key]
-    return default
+def _first(plain: Mapping[Any, Any], default: Any, *keys: str) -> Any:
+    return next((plain[key] for key in keys if plain.get(key) is not None), default)
 
 
 def _list(plain: Mapping[Any, Any], key: str) -> Sequence[Any]:
@@ -224,30 +242,18 @@ def _activation_name(value: Any) -> Any:
     return value.removesuffix("()").removeprefix("torch.").removeprefix("nn.")
 
 
-def _multiples(plain: Mapping[Any, Any]) -> tuple[float, float, int | None]:
-    """(depth multiple, width multiple, largest channel count) of a model table."""
-    scales = plain.get("scales")
+def _scale(plain: Mapping[Any, Any]) -> tuple[str, Any, Any, Any]:
+    """(letter or an empty text, depth multiple, width multiple, largest channel count)."""
+    scales, letter = plain.get("scales"), plain.get("scale")
     if not scales:
-        return (
-            _first(plain, ("depth_multiple",), 1.0),
-            _first(plain, ("width_multiple",), 1.0),
-            plain.get("max_channels"),
-        )
+        multiples = (_first(plain, 1.0, key) for key in ("depth_multiple", "width_multiple"))
+        return (letter if isinstance(letter, str) else "", *multiples, plain.get("max_channels"))
     if not isinstance(scales, Mapping):
         raise ArchitectureError(f"`scales` must be a table, got {scales!r:.200}")
-    scale = plain.get("scale") or next(iter(scales))
-    if not isinstance(scale, str) or scale not in scales:
-        raise ArchitectureError(f"scale {scale!r:.100} is not in the table {', '.join(map(str, scales))}")
-    row = scales[scale]
+    letter = letter or next(iter(scales))
+    if not isinstance(letter, str) or letter not in scales:
+        raise ArchitectureError(f"scale {letter!r:.100} is not in the table {', '.join(map(str, scales))}")
+    row = scales[letter]
     if not isinstance(row, list | tuple) or len(row) != 3:
-        raise ArchitectureError(f"scale {scale!r} must be [depth, width, max_channels], got {row!r:.200}")
-    depth, width, max_channels = row
-    return depth, width, max_channels
-
-
-def _scale(plain: Mapping[Any, Any]) -> str:
-    """The letter of the scale; empty if the table has none. `_multiples` rejects invalid ones."""
-    scales = plain.get("scales")
-    first = next(iter(scales)) if isinstance(scales, Mapping) and scales else ""
-    scale = plain.get("scale") or first
-    return scale if isinstance(scale, str) else ""
+        raise ArchitectureError(f"scale {letter!r} must be [depth, width, max_channels], got {row!r:.200}")
+    return (letter, *row)

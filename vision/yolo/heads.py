@@ -16,7 +16,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from vision.yolo.convolution import Conv, DWConv
+from vision.yolo.layers import Conv, DWConv
 
 
 class DFL(nn.Module):
@@ -61,7 +61,6 @@ class Detect(nn.Module):
         light: bool = False,
         end_to_end: bool = False,
         class_width: int | None = None,
-        activation: str = "SiLU",
     ) -> None:
         super().__init__()
         self.nc = classes
@@ -71,10 +70,8 @@ class Detect(nn.Module):
         box_width = max(16, inputs[0] // 4, 4 * reg_max)
         class_width = max(inputs[0], min(classes, 100)) if class_width is None else class_width
         class_branch = _light_branch if light else _branch
-        self.cv2 = nn.ModuleList(_branch(channels, box_width, 4 * reg_max, activation) for channels in inputs)
-        self.cv3 = nn.ModuleList(
-            class_branch(channels, class_width, classes, activation) for channels in inputs
-        )
+        self.cv2 = nn.ModuleList(_branch(channels, box_width, 4 * reg_max) for channels in inputs)
+        self.cv3 = nn.ModuleList(class_branch(channels, class_width, classes) for channels in inputs)
         self.dfl = DFL(reg_max) if reg_max > 1 else nn.Identity()
         if end_to_end:
             self.one2one_cv2 = copy.deepcopy(self.cv2)
@@ -119,19 +116,13 @@ class Detect(nn.Module):
                 _last_bias(kind).data.fill_(math.log(5 / self.nc / (image_size / stride) ** 2))
 
 
-def _branch(channels: int, width: int, outputs: int, activation: str) -> nn.Sequential:
-    return nn.Sequential(
-        Conv(channels, width, 3, activation=activation),
-        Conv(width, width, 3, activation=activation),
-        nn.Conv2d(width, outputs, 1),
-    )
+def _branch(channels: int, width: int, outputs: int) -> nn.Sequential:
+    return nn.Sequential(Conv(channels, width, 3), Conv(width, width, 3), nn.Conv2d(width, outputs, 1))
 
 
-def _light_branch(channels: int, width: int, outputs: int, activation: str) -> nn.Sequential:
+def _light_branch(channels: int, width: int, outputs: int) -> nn.Sequential:
     def separable(inputs: int) -> nn.Sequential:
-        return nn.Sequential(
-            DWConv(inputs, inputs, 3, activation=activation), Conv(inputs, width, activation=activation)
-        )
+        return nn.Sequential(DWConv(inputs, inputs, 3), Conv(inputs, width))
 
     return nn.Sequential(separable(channels), separable(width), nn.Conv2d(width, outputs, 1))
 

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from torch import nn
 
-from vision.yolo.attention import CHANNELS_PER_AREA_HEAD, CHANNELS_PER_HEAD
 from vision.yolo.description import ArchitectureError, LayerSpec, ModelDescription
-from vision.yolo.layer_arguments import LARGEST_KERNEL, LayerArguments
+from vision.yolo.heads import Detect
 from vision.yolo.layers import (
     C2,
     C2PSA,
     C3,
+    CHANNELS_PER_AREA_HEAD,
+    CHANNELS_PER_HEAD,
     PSA,
     SPPF,
     A2C2f,
@@ -22,11 +24,82 @@ from vision.yolo.layers import (
     C3k2,
     Concat,
     Conv,
-    Detect,
     DWConv,
     SCDown,
     same_padding,
 )
+
+LARGEST_KERNEL = 31
+_LARGEST_CHANNELS = 1 << 14
+_MOST_REPEATS = 64
+
+
+@dataclass(frozen=True, slots=True)
+class LayerArguments:
+    """A row being built. Every method raises `ArchitectureError` for an invalid argument.
+
+    Attributes:
+        inputs: channels of the rows it reads.
+    """
+
+    row: LayerSpec
+    inputs: tuple[int, ...]
+    description: ModelDescription
+
+    def single(self) -> int:
+        """The channels of the one row it reads."""
+        if len(self.inputs) != 1:
+            raise ArchitectureError(f"reads one row, got {self.row.source}")
+        return self.inputs[0]
+
+    def number(self, position: int, name: str, largest: int, default: int | None = None) -> int:
+        value = self._argument(position, default)
+        if type(value) is not int or not 1 <= value <= largest:
+            raise ArchitectureError(f"{name} must be a whole number in 1..{largest}, got {value!r:.100}")
+        return value
+
+    def odd(self, position: int, name: str, default: int) -> int:
+        value = self.number(position, name, LARGEST_KERNEL, default)
+        if value % 2 == 0:
+            raise ArchitectureError(f"the {name} must be odd, got {value}")
+        return value
+
+    def flag(self, position: int, name: str, default: bool) -> bool:
+        value = self._argument(position, default)
+        if not isinstance(value, bool):
+            raise ArchitectureError(f"the {name} must be true or false, got {value!r:.100}")
+        return value
+
+    def ratio(self, position: int, name: str, default: float, largest: float = 1.0) -> float:
+        value = self._argument(position, default)
+        if not isinstance(value, int | float) or isinstance(value, bool) or not 0 < value <= largest:
+            raise ArchitectureError(f"the {name} must be a number in 0..{largest:g}, got {value!r:.100}")
+        return float(value)
+
+    def ungrouped(self, position: int) -> None:
+        if self._argument(position, 1) != 1:
+            raise ArchitectureError(f"does not support groups, got {self._argument(position, 1)!r:.100}")
+
+    def _argument(self, position: int, default: object) -> object:
+        return self.row.arguments[position] if position < len(self.row.arguments) else default
+
+    def channels(self) -> int:
+        """The first argument, scaled."""
+        count = self.number(0, "channels", _LARGEST_CHANNELS)
+        description = self.description
+        if count in description.unscaled_channels:
+            return count
+        limited = count if description.max_channels is None else min(count, description.max_channels)
+        return max(8, math.ceil(limited * description.width_multiple / 8) * 8)
+
+    def repeats(self) -> int:
+        if self.row.repeats == 1:
+            return 1
+        repeats = max(1, round(self.row.repeats * self.description.depth_multiple))
+        if repeats > _MOST_REPEATS:
+            raise ArchitectureError(f"would repeat {repeats} times, the limit is {_MOST_REPEATS}")
+        return repeats
+
 
 HEADS = ("Detect", "v10Detect")
 
@@ -41,17 +114,38 @@ class BuiltLayer:
     enlargement: int = 1
 
 
+_Builder = Callable[["LayerArguments"], BuiltLayer]
+_BUILDERS: dict[str, tuple[_Builder, int | None, bool]] = {}
+
+
 def build_layer(row: LayerSpec, inputs: Sequence[int], description: ModelDescription) -> BuiltLayer:
     """Build the module of `row`, one of `LAYERS`, for inputs with `inputs` channels.
 
     Raises `ArchitectureError`.
     """
-    return _BUILDERS[row.layer](LayerArguments(row, tuple(inputs), description))
+    builder, most_arguments, repeats = _BUILDERS[row.layer]
+    if most_arguments is not None and len(row.arguments) > most_arguments:
+        raise ArchitectureError(f"takes at most {most_arguments} arguments, got {list(row.arguments)!r:.200}")
+    if row.repeats != 1 and not repeats:
+        raise ArchitectureError(f"cannot repeat, got repeats {row.repeats}")
+    return builder(LayerArguments(row, tuple(inputs), description))
 
 
+def _builds(
+    *names: str, most_arguments: int | None = None, repeats: bool = False
+) -> Callable[[_Builder], _Builder]:
+    """Decorator: register the builder of these layers, by default for any number of arguments."""
+
+    def register(builder: _Builder) -> _Builder:
+        for name in names:
+            _BUILDERS[name] = builder, most_arguments, repeats
+        return builder
+
+    return register
+
+
+@_builds("Conv", most_arguments=4)
 def _conv(row: LayerArguments) -> BuiltLayer:
-    row.takes(4)
-    row.once()
     channels = row.channels()
     kernel = row.number(1, "kernel", LARGEST_KERNEL, 1)
     stride = row.number(2, "stride", 2, 1)
@@ -61,33 +155,31 @@ def _conv(row: LayerArguments) -> BuiltLayer:
     # Keeps every size a whole number of cells: exactly size / stride.
     if (2 * (same_padding(kernel) if padding is None else padding) - kernel) // stride != -1:
         raise ArchitectureError(f"a kernel of {kernel} with padding {padding} does not divide by its stride")
-    module = Conv(row.single(), channels, kernel, stride, padding=padding, activation=row.activation)
+    module = Conv(row.single(), channels, kernel, stride, padding=padding)
     return BuiltLayer(module, channels, reduction=stride)
 
 
+@_builds("DWConv", most_arguments=3)
 def _depthwise(row: LayerArguments) -> BuiltLayer:
-    row.takes(3)
-    row.once()
     channels = row.channels()
     kernel, stride = row.odd(1, "kernel", 1), row.number(2, "stride", 2, 1)
-    module = DWConv(row.single(), channels, kernel, stride, activation=row.activation)
+    module = DWConv(row.single(), channels, kernel, stride)
     return BuiltLayer(module, channels, reduction=stride)
 
 
+@_builds("SCDown", most_arguments=3)
 def _scdown(row: LayerArguments) -> BuiltLayer:
-    row.takes(3)
-    row.once()
     channels = row.channels()
     kernel, stride = row.odd(1, "kernel", 3), row.number(2, "stride", 2, 2)
-    module = SCDown(row.single(), channels, kernel, stride, activation=row.activation)
+    module = SCDown(row.single(), channels, kernel, stride)
     return BuiltLayer(module, channels, reduction=stride)
 
 
-def _partial(block: type[C2 | C2f | C3], shortcut: bool) -> Callable[[LayerArguments], BuiltLayer]:
+def _partial(name: str, block: type[C2 | C2f | C3], shortcut: bool) -> None:
     """The older cross-stage partial blocks, which differ in their default of `shortcut`."""
 
+    @_builds(name, most_arguments=4, repeats=True)
     def builder(row: LayerArguments) -> BuiltLayer:
-        row.takes(4)
         row.ungrouped(2)
         channels = row.channels()
         module = block(
@@ -96,15 +188,17 @@ def _partial(block: type[C2 | C2f | C3], shortcut: bool) -> Callable[[LayerArgum
             row.repeats(),
             row.flag(1, "shortcut", shortcut),
             expansion=row.ratio(3, "expansion", 0.5),
-            activation=row.activation,
         )
         return BuiltLayer(module, channels)
 
-    return builder
+
+_partial("C2", C2, shortcut=True)
+_partial("C2f", C2f, shortcut=False)
+_partial("C3", C3, shortcut=True)
 
 
+@_builds("C3k2", most_arguments=6, repeats=True)
 def _c3k2(row: LayerArguments) -> BuiltLayer:
-    row.takes(6)
     row.ungrouped(4)
     channels, expansion = row.channels(), row.ratio(2, "expansion", 0.5)
     attention = row.flag(3, "attention", False)
@@ -118,13 +212,12 @@ def _c3k2(row: LayerArguments) -> BuiltLayer:
         expansion,
         attention,
         row.flag(5, "shortcut", True),
-        activation=row.activation,
     )
     return BuiltLayer(module, channels)
 
 
+@_builds("A2C2f", most_arguments=8, repeats=True)
 def _a2c2f(row: LayerArguments) -> BuiltLayer:
-    row.takes(8)
     row.ungrouped(6)
     channels, expansion = row.channels(), row.ratio(5, "expansion", 0.5)
     area_attention = row.flag(1, "area attention", True)
@@ -147,30 +240,28 @@ def _a2c2f(row: LayerArguments) -> BuiltLayer:
         row.ratio(4, "width of the feed-forward network", 2.0, 8.0),
         expansion,
         row.flag(7, "shortcut", True),
-        activation=row.activation,
     )
     return BuiltLayer(module, channels)
 
 
+@_builds("C2fCIB", most_arguments=3, repeats=True)
 def _c2fcib(row: LayerArguments) -> BuiltLayer:
-    row.takes(3)
     channels = row.channels()
     shortcut, large = row.flag(1, "shortcut", False), row.flag(2, "large kernel", False)
-    module = C2fCIB(row.single(), channels, row.repeats(), shortcut, large, activation=row.activation)
+    module = C2fCIB(row.single(), channels, row.repeats(), shortcut, large)
     return BuiltLayer(module, channels)
 
 
+@_builds("PSA", most_arguments=1)
 def _psa(row: LayerArguments) -> BuiltLayer:
-    row.takes(1)
-    row.once()
     channels = _attended(row)
-    return BuiltLayer(PSA(channels, activation=row.activation), channels)
+    return BuiltLayer(PSA(channels), channels)
 
 
+@_builds("C2PSA", most_arguments=1, repeats=True)
 def _c2psa(row: LayerArguments) -> BuiltLayer:
-    row.takes(1)
     channels = _attended(row)
-    return BuiltLayer(C2PSA(channels, row.repeats(), activation=row.activation), channels)
+    return BuiltLayer(C2PSA(channels, row.repeats()), channels)
 
 
 def _attended(row: LayerArguments) -> int:
@@ -187,9 +278,8 @@ def _divides_into_heads(channels: int) -> None:
         raise ArchitectureError(f"cannot divide {channels} channels into heads of {CHANNELS_PER_HEAD}")
 
 
+@_builds("SPPF", most_arguments=5)
 def _sppf(row: LayerArguments) -> BuiltLayer:
-    row.takes(5)
-    row.once()
     channels = row.channels()
     module = SPPF(
         row.single(),
@@ -198,13 +288,12 @@ def _sppf(row: LayerArguments) -> BuiltLayer:
         row.number(2, "pools", 16, 3),
         row.flag(3, "shortcut", False),
         row.flag(4, "first activation", True),
-        activation=row.activation,
     )
     return BuiltLayer(module, channels)
 
 
+@_builds("Upsample", "nn.Upsample")
 def _upsample(row: LayerArguments) -> BuiltLayer:
-    row.once()
     size, factor, mode = (*row.row.arguments, None, None, None)[:3]
     if size not in (None, "None") or type(factor) is not int or factor != 2 or mode != "nearest":
         raise ArchitectureError(
@@ -213,15 +302,15 @@ def _upsample(row: LayerArguments) -> BuiltLayer:
     return BuiltLayer(nn.Upsample(scale_factor=2, mode="nearest"), row.single(), enlargement=2)
 
 
+@_builds("Concat")
 def _concat(row: LayerArguments) -> BuiltLayer:
-    row.once()
     if tuple(row.row.arguments) not in ((), (1,)):
         raise ArchitectureError(f"concatenates channels (axis 1), got {list(row.row.arguments)!r:.200}")
     return BuiltLayer(Concat(1), sum(row.inputs))
 
 
+@_builds(*HEADS)
 def _detect(row: LayerArguments) -> BuiltLayer:
-    row.once()
     description = row.description
     classes = len(description.class_names)
     if tuple(row.row.arguments) not in (("nc",), (classes,)):
@@ -235,29 +324,9 @@ def _detect(row: LayerArguments) -> BuiltLayer:
         light=description.light_classes,
         end_to_end=description.end_to_end,
         class_width=description.class_width,
-        activation=description.activation,
     )
     return BuiltLayer(module, 0)
 
 
-_BUILDERS: dict[str, Callable[[LayerArguments], BuiltLayer]] = {
-    "A2C2f": _a2c2f,
-    "C2PSA": _c2psa,
-    "C2": _partial(C2, shortcut=True),
-    "C2f": _partial(C2f, shortcut=False),
-    "C2fCIB": _c2fcib,
-    "C3": _partial(C3, shortcut=True),
-    "C3k2": _c3k2,
-    "Concat": _concat,
-    "Conv": _conv,
-    "DWConv": _depthwise,
-    "Detect": _detect,
-    "PSA": _psa,
-    "SCDown": _scdown,
-    "SPPF": _sppf,
-    "Upsample": _upsample,
-    "nn.Upsample": _upsample,
-    "v10Detect": _detect,
-}
 LAYERS = tuple(sorted(_BUILDERS))
 """The supported layer names."""

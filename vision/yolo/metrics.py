@@ -12,6 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from vision.tracking.association import overlaps
+
 IOU_THRESHOLDS: NDArray[np.float64] = np.linspace(0.5, 0.95, 10)
 # k / 100 rounds like a recall of found / objects; multiples of a step would differ in the last bit.
 RECALL_POINTS = np.arange(101) / 100
@@ -79,16 +81,6 @@ class OperatingPoint:
     @property
     def recall(self) -> float:
         return self.right / self.objects if self.objects else float("nan")
-
-
-def box_iou(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.float64]:
-    """(N, 4) and (M, 4) boxes xyxy → (N, M) intersection over union."""
-    a, b = first.astype(np.float64)[:, None], second.astype(np.float64)[None]
-    inner = np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2])
-    intersection = np.clip(inner, 0, None).prod(-1)
-    union = (a[..., 2:] - a[..., :2]).prod(-1) + (b[..., 2:] - b[..., :2]).prod(-1) - intersection
-    ratio: NDArray[np.float64] = intersection / np.maximum(union, 1e-12)
-    return ratio
 
 
 def score_detections(results: Sequence[ImageResult], class_names: Sequence[str]) -> Score:
@@ -204,7 +196,7 @@ def _verdicts(
     verdict = np.full((len(IOU_THRESHOLDS), len(boxes)), WRONG, np.int8)
     if not len(true_boxes):
         return verdict
-    overlap = box_iou(boxes, true_boxes[~ignored])
+    overlap = overlaps(boxes, true_boxes[~ignored])
     inside = _share_inside(boxes, true_boxes[ignored]).max(axis=1, initial=0.0)
     for row, threshold in enumerate(IOU_THRESHOLDS):
         free = np.ones(overlap.shape[1], np.bool_)

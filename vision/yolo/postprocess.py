@@ -128,10 +128,7 @@ def candidates_of(
 
 
 def decode_ltrb(
-    head: Head,
-    levels: Sequence[LevelOutput],
-    candidates: Sequence[Candidates],
-    product: Product = np.matmul,
+    head: Head, levels: Sequence[LevelOutput], candidates: Sequence[Candidates], product: Product = np.matmul
 ) -> list[NDArray[np.float32]]:
     """Each level's (4 · reg_max, N) raw box sides at its N candidates, computed from the neck if necessary.
 

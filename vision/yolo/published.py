@@ -1,4 +1,4 @@
-"""The published networks: YOLOv5u, YOLOv8, YOLOv10, YOLO11, YOLO12, YOLO26, every scale.
+"""The published networks of YOLOv5u, YOLOv8, YOLOv10, YOLO11, YOLO12 and YOLO26, and the facts of a network.
 
 All have one structure: a backbone that halves the image five times, a path up that concatenates finer
 features, a path down, and a head at strides 8, 16 and 32 (feature pyramid, Lin et al., 2017; path
@@ -11,8 +11,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from vision.yolo.description import YOLOV8_SCALES, ModelDescription, yolov8_description
-from vision.yolo.layer_spec import ArchitectureError
+import torch
+from torch.utils.flop_counter import FlopCounterMode
+
+from vision.yolo.architecture import YoloModel, build_shapes
+from vision.yolo.description import ArchitectureError, ModelDescription
 
 Scale = tuple[float, float, int]
 """Depth multiple, width multiple, largest channel count before the width multiple."""
@@ -35,7 +38,13 @@ SCALES: Mapping[str, Mapping[str, Scale]] = {
         "l": (1.00, 1.00, 1024),
         "x": (1.33, 1.25, 1024),
     },
-    "YOLOv8": YOLOV8_SCALES,
+    "YOLOv8": {
+        "n": (0.33, 0.25, 1024),
+        "s": (0.33, 0.50, 1024),
+        "m": (0.67, 0.75, 768),
+        "l": (1.00, 1.00, 512),
+        "x": (1.00, 1.25, 512),
+    },
     "YOLOv10": {
         "n": (0.33, 0.25, 1024),
         "s": (0.33, 0.50, 1024),
@@ -51,29 +60,37 @@ SCALES: Mapping[str, Mapping[str, Scale]] = {
 """Model family → scale letter → its multipliers, as published."""
 
 
-def published_description(model_family: str, scale: str, class_names: Sequence[str]) -> ModelDescription:
-    """The published network of a model family and a scale, both keys of `SCALES`.
+def published_description(
+    model_family: str, scale: str | Scale, class_names: Sequence[str]
+) -> ModelDescription:
+    """The published network of a model family, a key of `SCALES`.
 
-    Raises `ArchitectureError` for an unknown one.
+    Args:
+        scale: a letter of the family, or other multipliers for the blocks of all its letters.
+        class_names: id → name.
+
+    Raises `ArchitectureError` for an unknown family or scale.
     """
     if model_family not in SCALES:
         raise ArchitectureError(f"unknown model family {model_family!r:.100}; known: {', '.join(SCALES)}")
     scales = SCALES[model_family]
-    if scale not in scales:
+    if isinstance(scale, str) and scale not in scales:
         raise ArchitectureError(f"{model_family} has no scale {scale!r:.100}; known: {', '.join(scales)}")
-    if model_family == "YOLOv8":
-        return yolov8_description(scale, class_names)
-    backbone, head = _rows(_blocks(model_family, scale))
-    depth, width, most = scales[scale]
+    letter, multipliers = (scale, scales[scale]) if isinstance(scale, str) else ("own", scale)
+    backbone, head = _rows(_blocks(model_family, letter))
     table = {
         "backbone": backbone,
         "head": head,
-        "scales": {scale: [depth, width, most]},
-        "scale": scale,
+        "scales": {letter: multipliers},
         "reg_max": 1 if model_family == "YOLO26" else 16,
         "end2end": model_family in ("YOLOv10", "YOLO26"),
     }
     return ModelDescription.from_plain(table, class_names)
+
+
+def yolov8_description(scale: str | Scale, class_names: Sequence[str]) -> ModelDescription:
+    """The published YOLOv8 network; see `published_description`."""
+    return published_description("YOLOv8", scale, class_names)
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,6 +131,15 @@ def _blocks(model_family: str, scale: str) -> _Blocks:
             up=(c3, c3),
             down=(c3, c3),
             narrow_first=True,
+        )
+    if model_family == "YOLOv8":
+        c2f: Block = (3, "C2f", ())
+        return _Blocks(
+            stages=((3, "C2f", (True,)), (6, "C2f", (True,)), (6, "C2f", (True,)), (3, "C2f", (True,))),
+            stage_channels=(128, 256, 512, 1024),
+            deepest=(sppf,),
+            up=(c2f, c2f),
+            down=(c2f, c2f),
         )
     if model_family == "YOLOv10":
         return _yolov10(scale, sppf)
@@ -202,3 +228,93 @@ def _rows(blocks: _Blocks) -> tuple[list[Any], list[Any]]:
         levels.append(block(2 * channels, kind))
     add(blocks.head, ("nc",), source=list(levels))
     return rows[:in_backbone], rows[in_backbone:]
+
+
+_USUAL_STRIDES = (8, 16, 32)
+
+
+@dataclass(frozen=True, slots=True)
+class ModelFacts:
+    """Result of `describe`.
+
+    Attributes:
+        model_family: as `YOLOv8`, `YOLO11`; with `-P2` or `-P6` if the head also reads a finer or a coarser
+            level; `unknown` for a custom network.
+        scale: the letter, if the multipliers are the published ones of that family; else None.
+        parameters: of the network as given. Folding batch normalisation reduces them, and so does dropping
+            the training-only branches of an end-to-end head.
+        gflops: 10⁹ floating-point operations per image (a multiplication and an addition are two) of
+            convolutions and attention, after `fuse`.
+        end_to_end: whether it needs no NMS.
+    """
+
+    model_family: str
+    scale: str | None
+    parameters: int
+    gflops: float
+    end_to_end: bool
+
+
+def describe(model: YoloModel, image_size: int = 640) -> ModelFacts:
+    """Determine the facts of a network.
+
+    Args:
+        image_size: side of the square image for `gflops`, pixels, a multiple of the largest stride.
+
+    Raises:
+        ValueError: `image_size` is not a multiple.
+    """
+    largest = max(model.strides)
+    if image_size < largest or image_size % largest:
+        raise ValueError(f"image_size must be a multiple of {largest}, got {image_size}")
+    model_family = model_family_of(model)
+    return ModelFacts(
+        model_family=model_family,
+        scale=_scale(model.description, model_family),
+        parameters=sum(parameter.numel() for parameter in model.parameters()),
+        gflops=_gflops(model.description, image_size),
+        end_to_end=model.end_to_end,
+    )
+
+
+def model_family_of(model: YoloModel) -> str:
+    """Determine only `ModelFacts.model_family`, which is fast."""
+    description, strides = model.description, model.strides
+    layers = {row.layer for row in description.rows}
+    if layers & {"v10Detect", "SCDown", "C2fCIB"}:
+        model_family = "YOLOv10"
+    elif "A2C2f" in layers:
+        model_family = "YOLO12"
+    elif "C3k2" in layers:
+        model_family = "YOLO26" if description.reg_max == 1 else "YOLO11"
+    elif "C2f" in layers:
+        model_family = "YOLOv8"
+    elif "C3" in layers:
+        model_family = "YOLOv5u"
+    else:
+        return "unknown"
+    if strides == _USUAL_STRIDES:
+        return model_family
+    finest, coarsest = strides[0].bit_length() - 1, strides[-1].bit_length() - 1
+    return f"{model_family}-P{finest if finest < 3 else coarsest}"
+
+
+def _scale(description: ModelDescription, model_family: str) -> str | None:
+    for letter, (depth, width, most) in SCALES.get(model_family.partition("-")[0], {}).items():
+        # The first releases had a table per scale, with channels limited in the rows.
+        if (description.depth_multiple, description.width_multiple) == (depth, width) and (
+            description.max_channels in (None, most)
+        ):
+            return letter
+    return None
+
+
+def _gflops(description: ModelDescription, image_size: int) -> float:
+    # On the meta device: nothing is computed, and the caller's network is unchanged.
+    model = build_shapes(description).fuse()
+    with torch.device("meta"):
+        image = torch.empty(1, description.channels, image_size, image_size)
+    counter = FlopCounterMode(display=False)
+    with torch.inference_mode(), counter:
+        model(image)
+    return counter.get_total_flops() / 1e9

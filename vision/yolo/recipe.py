@@ -1,8 +1,16 @@
-"""The two training runs of the bundled weights, and their evaluation scenes."""
+"""The two training runs of the bundled weights, and their evaluation on scenes that training has not seen."""
 
 from __future__ import annotations
 
-from vision.yolo.augmentation import Augmentation
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from vision.yolo.architecture import YoloModel
+from vision.yolo.metrics import ImageResult, Score, score_detections
+from vision.yolo.postprocess import select_boxes
+from vision.yolo.scene_batches import Augmentation, SceneKey, SceneSource, collate, draw_scene, network_input
 from vision.yolo.training import Stage, TrainingSettings
 
 HELD_OUT_SEED = 10_000_000
@@ -37,11 +45,8 @@ DEFAULT_RECIPE = TrainingSettings(
 )
 """The first run: large objects from anywhere (`random_scene`), from random weights."""
 
-REFINEMENT = TrainingSettings(
-    class_names=DEFAULT_RECIPE.class_names,
-    depth_multiple=DEFAULT_RECIPE.depth_multiple,
-    width_multiple=DEFAULT_RECIPE.width_multiple,
-    max_channels=DEFAULT_RECIPE.max_channels,
+REFINEMENT = replace(
+    DEFAULT_RECIPE,
     # A scene of the camera's size is expensive to draw and gives many images: whole at half its pixels,
     # and parts of it at up to 1.3 times its pixels.
     stages=(
@@ -54,9 +59,53 @@ REFINEMENT = TrainingSettings(
         zoom_probability=0.6, zoom_min=0.9, zoom_max=1.3, min_side_px=5.0, min_area_px=60.0
     ),
     seed=2,
-    threads=1,
     bfloat16=True,
-    workers=1,
 )
 """The second run, from the first one's weights: views of a flight, near and far, and many distractors
 (`training_scene`)."""
+
+
+@torch.inference_mode()
+def evaluate(
+    model: YoloModel,
+    scenes: SceneSource,
+    seed: int,
+    count: int,
+    width: int,
+    height: int,
+    *,
+    confidence: float = 0.001,
+    iou: float = 0.7,
+) -> Score:
+    """Mean average precision over `count` scenes of `width` × `height` pixels (multiples of 32).
+
+    Args:
+        model: is put into evaluation mode.
+        scenes: draws the scenes.
+        seed: of the held-out set; far from every training seed.
+        confidence: detections below it are ignored; low, so that the whole recall range is covered.
+        iou: NMS IoU threshold.
+
+    Raises:
+        ValueError: the size is not a multiple of 32, or the source returns an invalid scene.
+    """
+    if width % 32 or height % 32:
+        raise ValueError(f"evaluation scenes must be multiples of 32 pixels, got {width}x{height}")
+    model.eval()
+    results = []
+    for index in range(count):
+        scene = draw_scene(scenes, SceneKey(seed, index, width, height), len(model.class_names))
+        images, _ = collate([scene])
+        true_ids = np.asarray(scene[2], np.int64)
+        found = select_boxes(model, model(network_input(images)), confidence=confidence, iou=iou)
+        results.append(
+            ImageResult(
+                found.xyxy,
+                found.confidence,
+                found.class_id,
+                np.asarray(scene[1], np.float32),
+                np.where(true_ids < 0, ~true_ids, true_ids),
+                true_ids < 0,
+            )
+        )
+    return score_detections(results, model.class_names)

@@ -15,7 +15,6 @@ from typing import Any, BinaryIO
 import torch
 from torch import Tensor
 
-from vision.yolo.allowlist import STUB_NAMES
 from vision.yolo.safe_pickle import (
     AllowedGlobal,
     CheckpointError,
@@ -24,6 +23,42 @@ from vision.yolo.safe_pickle import (
     one_line,
     unpickle,
 )
+
+# Names that a detection checkpoint may contain: layers and plain values. Each is read as a stub. A name here
+# makes the file readable, so that the builder can report an unknown layer; it allows no code to run.
+_TORCH_MODULES = """activation.GELU activation.Hardswish activation.LeakyReLU activation.ReLU activation.ReLU6
+    activation.SiLU activation.Sigmoid batchnorm.BatchNorm2d container.ModuleList container.Sequential
+    conv.Conv2d conv.ConvTranspose2d dropout.Dropout linear.Identity linear.Linear loss.BCEWithLogitsLoss
+    module.Module pooling.AdaptiveAvgPool2d pooling.MaxPool2d upsampling.Upsample"""
+_BLOCKS = """A2C2f AAttn ABlock Attention Bottleneck C2 C2PSA C2f C2fCIB C3 C3k C3k2 CIB DFL PSA PSABlock
+    Proto RepVGGDW SCDown SPPF"""
+_CONVOLUTIONS = "Concat Conv DWConv"
+_HEADS = "Classify Detect OBB Pose Segment v10Detect"
+_LAYERS = f"{_BLOCKS} {_CONVOLUTIONS} {_HEADS}"
+_MODELS = "ClassificationModel DetectionModel OBBModel PoseModel SegmentationModel YOLOv10DetectionModel"
+# A model saved during training contains its loss; it is ignored.
+_LOSSES = """utils.loss.BboxLoss utils.loss.DFLoss utils.loss.E2EDetectLoss utils.loss.E2ELoss
+    utils.loss.v8DetectionLoss utils.tal.TaskAlignedAssigner yolo.utils.loss.BboxLoss
+    yolo.utils.loss.v8DetectionLoss yolo.utils.tal.TaskAlignedAssigner yolo.v8.detect.train.Loss"""
+# Until 8.0.6 the training settings were omegaconf objects, stored with the model.
+_OLD_SETTINGS = """__builtin__.dict omegaconf.base.ContainerMetadata omegaconf.base.Metadata typing.Any
+    omegaconf.dictconfig.DictConfig omegaconf.listconfig.ListConfig omegaconf.nodes.AnyNode"""
+_PLAIN_VALUES = """ultralytics.utils.IterableSimpleNamespace ultralytics.yolo.utils.IterableSimpleNamespace
+    numpy.core.multiarray.scalar numpy._core.multiarray.scalar numpy.dtype pathlib.PosixPath
+    pathlib.PurePosixPath pathlib.WindowsPath _codecs.encode torch.device"""
+_STUB_NAMES: tuple[str, ...] = (
+    *(f"torch.nn.modules.{name}" for name in _TORCH_MODULES.split()),
+    *(f"ultralytics.nn.modules.block.{name}" for name in _BLOCKS.split()),
+    *(f"ultralytics.nn.modules.conv.{name}" for name in _CONVOLUTIONS.split()),
+    *(f"ultralytics.nn.modules.head.{name}" for name in _HEADS.split()),
+    # Until 8.0.90 all layers were in one file.
+    *(f"ultralytics.nn.modules.{name}" for name in _LAYERS.split()),
+    *(f"ultralytics.nn.tasks.{name}" for name in _MODELS.split()),
+    *(f"ultralytics.{name}" for name in _LOSSES.split()),
+    *_OLD_SETTINGS.split(),
+    *_PLAIN_VALUES.split(),
+)
+
 
 _STORAGES: dict[str, torch.dtype] = {
     "torch.DoubleStorage": torch.float64,
@@ -180,7 +215,7 @@ class _Archive:
             "dill._dill._load_type": _type_by_name,
         }
         return (
-            {name: AllowedGlobal(name) for name in (*STUB_NAMES, *_STORAGES)}
+            {name: AllowedGlobal(name) for name in (*_STUB_NAMES, *_STORAGES)}
             | {name: AllowedGlobal(name, make) for name, make in calls.items()}
         )  # fmt: skip
 

@@ -18,10 +18,9 @@ import torch
 from torch import Tensor, nn
 
 from vision.yolo.architecture import YoloModel, build
-from vision.yolo.augmentation import Augmentation
-from vision.yolo.description import yolov8_description
 from vision.yolo.losses import DetectionLoss, detection_loss
-from vision.yolo.scene_batches import SceneKey, SceneSource, network_input, scene_batches
+from vision.yolo.published import yolov8_description
+from vision.yolo.scene_batches import Augmentation, SceneKey, SceneSource, network_input, scene_batches
 
 logger = logging.getLogger(__name__)
 
@@ -258,7 +257,8 @@ def train(
         nn.utils.clip_grad_norm_(model.parameters(), settings.gradient_limit)
         optimiser.step()
         step += 1
-        update_average(average, model, average_decay_at(step, settings.average_decay))
+        # Small at first, so that the initial weights fade quickly.
+        update_average(average, model, min(settings.average_decay, step / (step + 10)))
 
         now = time.monotonic()
         images_done += len(images)
@@ -278,31 +278,11 @@ def train(
     return TrainedModel(average.eval(), settings, step, time.monotonic() - started)
 
 
-def average_decay_at(step: int, decay: float) -> float:
-    """The averaging decay after `step` steps: small at first, so that the initial weights fade quickly."""
-    return min(decay, step / (step + 10))
-
-
 @torch.no_grad()
 def update_average(average: nn.Module, model: nn.Module, decay: float) -> None:
     """Move the averaged weights and normalisation statistics towards the model's: a ← d·a + (1 - d)·m."""
     for kept, new in zip(_floats(average), _floats(model), strict=True):
         kept.lerp_(new, 1 - decay)
-
-
-def load_average(checkpoint: Path, settings: TrainingSettings) -> TrainedModel:
-    """The averaged model of a training checkpoint, for example while training is in progress.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: the checkpoint is of another network.
-    """
-    state = _read(checkpoint)
-    scale = (settings.depth_multiple, settings.width_multiple, settings.max_channels)
-    model = build(yolov8_description(scale, settings.class_names))
-    _require_same_network(state, settings, checkpoint)
-    model.load_state_dict(state["average"])
-    return TrainedModel(model.eval(), settings, int(state["step"]), float("nan"))
 
 
 def _floats(module: nn.Module) -> list[Tensor]:
@@ -447,22 +427,6 @@ def _save(
     logger.info("training state of step %d written to %s", step, path)
 
 
-def _read(path: Path) -> dict[str, Any]:
-    if not path.is_file():
-        raise FileNotFoundError(f"no training checkpoint at {path}")
-    state = torch.load(path, map_location="cpu", weights_only=True)
-    if not isinstance(state, dict) or state.get("kind") != _CHECKPOINT_KIND:
-        raise ValueError(f"{path} is not a training checkpoint of this program ({_CHECKPOINT_KIND!r})")
-    return state
-
-
-def _require_same_network(state: dict[str, Any], settings: TrainingSettings, path: Path) -> None:
-    if state["network"] != _network(settings):
-        raise ValueError(
-            f"{path} is of the network {state['network']}, the settings require {_network(settings)}"
-        )
-
-
 def _restore(
     path: Path,
     settings: TrainingSettings,
@@ -470,8 +434,15 @@ def _restore(
     average: nn.Module,
     optimiser: torch.optim.Optimizer,
 ) -> int:
-    state = _read(path)
-    _require_same_network(state, settings, path)
+    if not path.is_file():
+        raise FileNotFoundError(f"no training checkpoint at {path}")
+    state = torch.load(path, map_location="cpu", weights_only=True)
+    if not isinstance(state, dict) or state.get("kind") != _CHECKPOINT_KIND:
+        raise ValueError(f"{path} is not a training checkpoint of this program ({_CHECKPOINT_KIND!r})")
+    if state["network"] != _network(settings):
+        raise ValueError(
+            f"{path} is of the network {state['network']}, the settings require {_network(settings)}"
+        )
     model.load_state_dict(state["model"])
     average.load_state_dict(state["average"])
     optimiser.load_state_dict(state["optimiser"])

@@ -11,8 +11,9 @@ from typer.testing import CliRunner
 
 from companion.bench.detector import BenchError, read_result, table
 from companion.cli import app
-from vision.yolo.architecture import build, yolov8_description
+from vision.yolo.architecture import build
 from vision.yolo.checkpoint import save_checkpoint
+from vision.yolo.published import yolov8_description
 
 
 @pytest.fixture

@@ -35,7 +35,7 @@ def tiny_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     from vision.yolo.architecture import build
     from vision.yolo.checkpoint import save_checkpoint
-    from vision.yolo.description import yolov8_description
+    from vision.yolo.published import yolov8_description
 
     torch.manual_seed(1)
     path = tmp_path_factory.mktemp("model") / "tiny.pt"

@@ -10,8 +10,9 @@ import pytest
 import torch
 from torch import nn
 
-from vision.yolo.architecture import YoloModel, build, yolov8_description
+from vision.yolo.architecture import YoloModel, build
 from vision.yolo.checkpoint import save_checkpoint
+from vision.yolo.published import yolov8_description
 
 NAMES = ("person", "bicycle", "car", "dog", "boat", "chair")
 

@@ -1,8 +1,9 @@
-"""Exported networks: same outputs as torch, loadable alone, rejected if invalid."""
+"""Exported networks: same outputs as torch, loadable alone with their metadata, rejected if invalid."""
 
 from __future__ import annotations
 
 import hashlib
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -10,21 +11,27 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from tests.vision.runtimes.conftest import NAMES, lively_model, make_image
 from vision.detector import Detector
 from vision.runtimes import export as export_module
-from vision.runtimes.base import (
-    RUNTIMES,
-    RuntimeMissingError,
-    RuntimeName,
-    RuntimeUnusableError,
-    installed,
-)
+from vision.runtimes.base import RUNTIMES, RuntimeMissingError, RuntimeName, RuntimeUnusableError, installed
 from vision.runtimes.export import export
-from vision.runtimes.exported import SUFFIXES, ExportedFacts, ExportKind
+from vision.runtimes.exported import (
+    FORMAT,
+    MAGIC,
+    SUFFIXES,
+    ExportedFacts,
+    ExportKind,
+    kind_of,
+    split_facts,
+    with_facts,
+)
 from vision.runtimes.network import Network
 from vision.runtimes.source import read_source, runtime_of_file
+from vision.runtimes.tensorrt_runtime import TensorRtRuntime, build_plan
 from vision.runtimes.torch_runtime import TorchRuntime
 
 PAIRS: list[tuple[ExportKind, RuntimeName]] = [
@@ -195,3 +202,123 @@ def test_onnx_export_does_not_need_onnxruntime(
     monkeypatch.setitem(sys.modules, "onnx", None)
     with pytest.raises(RuntimeMissingError, match=r"mavlink-companion\[onnxruntime\]"):
         export_module._write_onnx(network, facts, path)
+
+
+PATH = Path("net.engine")
+FACTS = ExportedFacts(
+    ("person", "car"), (8, 16, 32), 16, False, 640, "ab" * 32, None, "YOLOv8", {"licence": "é"}
+)
+
+names = st.text(min_size=1, max_size=20)
+
+
+@given(
+    class_names=st.lists(names, min_size=1, max_size=5).map(tuple),
+    strides=st.lists(st.integers(1, 128), min_size=1, max_size=4).map(tuple),
+    reg_max=st.integers(1, 32),
+    end_to_end=st.booleans(),
+    fixed_size=st.none() | st.tuples(st.integers(32, 640), st.integers(32, 640)),
+    metadata=st.dictionaries(names, st.integers() | names, max_size=3),
+)
+def test_facts_survive_the_round_trip(**values: object) -> None:
+    facts = ExportedFacts(image_size=320, source_sha256="00", model_family="YOLO11", **values)  # type: ignore[arg-type]
+    assert ExportedFacts.from_json(facts.to_json(), PATH) == facts
+
+
+@given(text=st.text() | st.recursive(st.none() | st.integers() | st.text(), st.lists).map(json.dumps))
+def test_anything_else_is_rejected_by_name(text: str) -> None:
+    with pytest.raises(RuntimeUnusableError, match=r"net\.engine"):
+        ExportedFacts.from_json(text, PATH)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"format": "other"},
+        {"class_names": []},
+        {"class_names": [1]},
+        {"strides": [0]},
+        {"strides": ["8"]},
+        {"reg_max": 1.5},
+        {"fixed_size": [1]},
+        {"metadata": []},
+        {"end_to_end": 1},
+        {"more": 1},
+    ],
+    ids=str,
+)
+def test_invalid_facts_are_rejected(change: dict[str, object]) -> None:
+    text = json.dumps(json.loads(FACTS.to_json()) | change)
+    with pytest.raises(RuntimeUnusableError, match="companion models export"):
+        ExportedFacts.from_json(text, PATH)
+
+
+def test_facts_give_the_output_layout() -> None:
+    head = FACTS.head()
+    assert (head.strides, head.reg_max, head.end_to_end, head.class_ids) == ((8, 16, 32), 16, False, (0, 1))
+    assert head.kinds == ("sides", "classes")
+
+
+def test_a_plan_keeps_its_facts_before_it() -> None:
+    facts, plan = split_facts(with_facts(FACTS, b"the plan"), PATH)
+    assert facts == FACTS
+    assert bytes(plan) == b"the plan"
+
+
+@given(cut=st.integers(0, len(with_facts(FACTS, b"")) - 1))
+def test_a_plan_that_is_cut_short_is_rejected(cut: int) -> None:
+    with pytest.raises(RuntimeUnusableError):
+        split_facts(with_facts(FACTS, b"")[:cut], PATH)
+
+
+@given(content=st.binary() | st.binary().map(lambda tail: MAGIC + tail))
+def test_foreign_plan_is_rejected(content: bytes) -> None:
+    with pytest.raises(RuntimeUnusableError, match=r"net\.engine"):
+        split_facts(content, PATH)
+
+
+def test_kind_follows_from_the_suffix() -> None:
+    assert kind_of(Path("a/b.onnx")) == "onnx"
+    assert kind_of(Path("b.xml")) == "openvino"
+    assert kind_of(Path("b.engine")) == "tensorrt"
+    assert kind_of(Path("b.torchscript")) == "torchscript"
+    assert kind_of(Path("b.pt")) is None
+    assert FORMAT.endswith(".v1")
+
+
+absent = pytest.mark.skipif(installed("tensorrt"), reason="TensorRT is installed here")
+
+
+@pytest.fixture
+def engine(tmp_path: Path) -> Path:
+    path = tmp_path / "net.engine"
+    path.write_bytes(with_facts(FACTS, b"a plan"))
+    return path
+
+
+@absent
+def test_running_without_tensorrt_names_the_extra(engine: Path) -> None:
+    with pytest.raises(RuntimeMissingError, match=r"mavlink-companion\[tensorrt\]"):
+        TensorRtRuntime(engine)
+
+
+@absent
+def test_building_without_tensorrt_names_the_extra(tmp_path: Path) -> None:
+    with pytest.raises(RuntimeMissingError, match=r"mavlink-companion\[tensorrt\]"):
+        build_plan(tmp_path / "net.onnx", largest_side=640, stride=32)
+
+
+def test_plan_metadata_is_readable_without_tensorrt(engine: Path) -> None:
+    source = read_source(engine)
+    assert source.class_names == ("person", "car")
+    assert source.runners() == ("tensorrt",)
+
+
+def test_a_precision_that_a_plan_does_not_have_is_rejected(engine: Path) -> None:
+    with pytest.raises(RuntimeUnusableError, match=r"float16.* bfloat16"):
+        TensorRtRuntime(engine, precision="bfloat16")
+
+
+def test_missing_plan_is_a_one_line_error(tmp_path: Path) -> None:
+    with pytest.raises(RuntimeUnusableError, match=r"none\.engine: no such file"):
+        read_source(tmp_path / "none.engine")

@@ -43,9 +43,7 @@ def test_one_graph_runs_every_size() -> None:
 
 
 @pytest.mark.usefixtures("no_bfloat16")
-def test_static_network_keeps_a_few_graphs_by_size(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_static_network_keeps_a_few_graphs_by_size(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(TorchRuntime, "_any_size", lambda self: None)
     monkeypatch.setattr(torch_runtime_module, "_MOST_GRAPHS", 2)
     runtime = TorchRuntime(lively_model())

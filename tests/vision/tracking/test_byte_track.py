@@ -12,14 +12,7 @@ from hypothesis import strategies as st
 from vision.camera_model import CameraModel
 from vision.detections import NO_TRACK, Detections
 from vision.rotation import BODY_FROM_OPTICAL, matrix_from_euler
-from vision.tracking import (
-    CameraView,
-    TrackedFrame,
-    Tracker,
-    TrackerSettings,
-    TrackEventKind,
-    TrackState,
-)
+from vision.tracking import CameraView, TrackedFrame, Tracker, TrackerSettings, TrackEventKind, TrackState
 
 NAMES = ("person", "car")
 CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(70))
@@ -336,9 +329,7 @@ frame_sequences = st.lists(
 
 @settings(max_examples=60)
 @given(frame_sequences)
-def test_invariants_hold_for_any_input(
-    frames: list[tuple[float, list[Seen], float | None]],
-) -> None:
+def test_invariants_hold_for_any_input(frames: list[tuple[float, list[Seen], float | None]]) -> None:
     sequence = TrackingSequence(min_hits=2)
     live: set[int] = set()
     ended: set[int] = set()

@@ -1,22 +1,90 @@
-"""YUV4MPEG2, the uncompressed video stream of mjpegtools (`yuv4mpeg(5)`), as written by ffmpeg and GStreamer.
-
-A line `YUV4MPEG2 W640 H480 F30:1 C420jpeg …`, then for every frame a line `FRAME …` and its planes: luma,
-then the two chroma planes. Colours are BT.601; the range is the broadcast one (16..235) unless
-`XCOLORRANGE=FULL`.
-"""
+"""Images in a byte stream: raw pixels, YUV4MPEG2 and Motion JPEG, decoded from pieces of any size."""
 
 from __future__ import annotations
 
 import logging
+import re
 from dataclasses import dataclass
+from typing import Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vision.sources.raw import StreamError
+from vision.sources.files import decode_image
+from vision.sources.source import RAW_PIXEL_FORMATS
 
 logger = logging.getLogger(__name__)
+
+
+class StreamError(Exception):
+    """The bytes do not follow the format."""
+
+
+class StreamParser(Protocol):
+    """Decodes bytes, received in pieces of any size, into images."""
+
+    @property
+    def unreadable(self) -> int:
+        """Images that could not be decoded."""
+        ...
+
+    @property
+    def rate_hz(self) -> float | None:
+        """The frame rate in the stream's header, if it has one."""
+        ...
+
+    def push(self, data: bytes) -> list[NDArray[np.uint8]]:
+        """Add bytes; returns the images they complete, (height, width, 3) BGR.
+
+        Raises:
+            StreamError: the bytes break the format; the stream cannot continue.
+        """
+        ...
+
+    def leftover(self) -> str:
+        """At the end of the stream: what is incomplete, in words; empty if nothing."""
+        ...
+
+
+class RawParser:
+    """Consecutive frames of `width` × `height` pixels in `bgr24`, `rgb24` or `gray8`."""
+
+    unreadable = 0
+    rate_hz: float | None = None
+
+    def __init__(self, width: int, height: int, pixel_format: str) -> None:
+        self._width = width
+        self._height = height
+        self._format = pixel_format
+        self._channels = RAW_PIXEL_FORMATS[pixel_format]
+        self._frame_bytes = width * height * self._channels
+        self._buffer = bytearray()
+
+    def push(self, data: bytes) -> list[NDArray[np.uint8]]:
+        self._buffer += data
+        size = self._frame_bytes
+        count = len(self._buffer) // size
+        images = [self._decode(self._buffer[i * size : (i + 1) * size]) for i in range(count)]
+        if count:
+            del self._buffer[: count * size]
+        return images
+
+    def _decode(self, data: bytearray) -> NDArray[np.uint8]:
+        pixels = np.frombuffer(data, np.uint8).reshape(self._height, self._width, self._channels)
+        if self._format == "bgr24":
+            return pixels  # the slice is a copy, so it is writable
+        code = cv2.COLOR_RGB2BGR if self._format == "rgb24" else cv2.COLOR_GRAY2BGR
+        return np.asarray(cv2.cvtColor(pixels, code), dtype=np.uint8)
+
+    def leftover(self) -> str:
+        if not self._buffer:
+            return ""
+        return (
+            f"the last frame is incomplete: {len(self._buffer)} of {self._frame_bytes} bytes "
+            f"({self._width}x{self._height} {self._format}); check width and height"
+        )
+
 
 MAGIC = b"YUV4MPEG2"
 _LINE_LIMIT = 4096  # bytes; the specification has no limit, a line this long is not a header
@@ -198,3 +266,133 @@ class Y4mParser:
         if self._buffer:
             return f"{len(self._buffer)} bytes of an incomplete line"
         return ""
+
+
+_START = b"\xff\xd8\xff"  # SOI and the first byte of the next marker
+_MARKER = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]", re.DOTALL)
+_SOI, _EOI, _SOS, _TEM = 0xD8, 0xD9, 0xDA, 0x01
+_LARGEST_IMAGE = 64 << 20  # bytes; more without an end is not a JPEG
+
+
+class MjpegSplitter:
+    """Splits a stream, received in pieces of any size, into complete JPEG images.
+
+    Attributes:
+        damaged: images that started and were not completed.
+    """
+
+    def __init__(self) -> None:
+        self.damaged = 0
+        self._buffer = bytearray()
+        self._inside = False  # an image starts at the buffer's first byte
+        self._position = 0
+        self._in_scan = False
+
+    def push(self, data: bytes) -> list[bytes]:
+        """Add bytes; returns the images they complete."""
+        self._buffer += data
+        images: list[bytes] = []
+        while self._find_start():
+            length = self._walk()
+            if length is None:
+                if len(self._buffer) <= _LARGEST_IMAGE:
+                    break
+                self._discard(len(self._buffer))
+            elif length > 0:
+                images.append(bytes(self._buffer[:length]))
+                del self._buffer[:length]
+                self._inside = False
+        return images
+
+    @property
+    def pending(self) -> int:
+        """Bytes of the incomplete image."""
+        return len(self._buffer) if self._inside else 0
+
+    def _find_start(self) -> bool:
+        if self._inside:
+            return True
+        start = self._buffer.find(_START)
+        if start < 0:
+            del self._buffer[: max(len(self._buffer) - (len(_START) - 1), 0)]
+            return False
+        del self._buffer[:start]
+        self._inside, self._in_scan, self._position = True, False, 2
+        return True
+
+    def _discard(self, at: int) -> None:
+        """Discard the current image and search for the next from byte `at`."""
+        self.damaged += 1
+        del self._buffer[:at]
+        self._inside = False
+
+    def _walk(self) -> int | None:
+        """Walk the segments: the image's length, None if bytes are missing, 0 if it was discarded."""
+        buffer = self._buffer
+        while True:
+            if self._in_scan:
+                found = _MARKER.search(buffer, self._position)
+                if found is None:
+                    self._position = max(self._position, len(buffer) - 1)
+                    return None
+                self._position = found.start()
+                self._in_scan = False
+            at = self._position
+            if at + 2 > len(buffer):
+                return None
+            if buffer[at] != 0xFF:
+                self._discard(at)
+                return 0
+            code = buffer[at + 1]
+            if code == 0xFF:  # fill byte
+                self._position = at + 1
+            elif code == _EOI:
+                return at + 2
+            elif code == _SOI or code == 0x00:
+                self._discard(at)
+                return 0
+            elif code == _TEM or 0xD0 <= code <= 0xD7:  # markers without a length
+                self._position = at + 2
+            else:
+                if at + 4 > len(buffer):
+                    return None
+                length = int.from_bytes(buffer[at + 2 : at + 4], "big")
+                if length < 2:
+                    self._discard(at + 2)
+                    return 0
+                if at + 2 + length > len(buffer):
+                    return None
+                self._position = at + 2 + length
+                self._in_scan = code == _SOS
+
+
+class MjpegParser:
+    """Decodes Motion JPEG. An image that cannot be decoded is counted and skipped."""
+
+    rate_hz: float | None = None
+
+    def __init__(self) -> None:
+        self._splitter = MjpegSplitter()
+        self._undecodable = 0
+        self._next_warning = 1
+
+    @property
+    def unreadable(self) -> int:
+        return self._undecodable + self._splitter.damaged
+
+    def push(self, data: bytes) -> list[NDArray[np.uint8]]:
+        decoded = []
+        for jpeg in self._splitter.push(data):
+            image = decode_image(jpeg)
+            if image is None:
+                self._undecodable += 1
+            else:
+                decoded.append(image)
+        if self.unreadable >= self._next_warning:
+            logger.warning("MJPEG: %d damaged images skipped so far", self.unreadable)
+            self._next_warning = self.unreadable * 10  # a bad cable must not fill the log
+        return decoded
+
+    def leftover(self) -> str:
+        pending = self._splitter.pending
+        return f"the last image is incomplete ({pending} bytes)" if pending else ""

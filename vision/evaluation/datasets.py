@@ -1,0 +1,407 @@
+"""Labelled data sets in YOLO and COCO format: images and their ground truth.
+
+YOLO: images, with label files of `class cx cy w h` lines beside them or under `labels/`. Coordinates are
+fractions of the image. A line with more numbers is a polygon (segmentation label); its bounding box is used.
+An image without a label file, or with an empty one, is a negative.
+
+COCO: one JSON file of images, categories and annotations (cocodataset.org, Data format).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vision.plain_yaml import PlainYamlError, load_plain_yaml, numbered
+
+
+def open_dataset(path: Path, *, split: str | None = None, images: Path | None = None) -> Dataset:
+    """Detect the format of the data set at `path` and read its labels.
+
+    Args:
+        path: a folder with `images/` and `labels/`, or with both side by side; one with a `data.yaml`, or
+            that file; a COCO annotation file (JSON), or a folder with one.
+        split: `train`, `val` or `test` of a `data.yaml`; None: `val`, or the first other one.
+        images: folder of a COCO file's images; None: searched near the file.
+
+    Raises:
+        DatasetError: no data set found, or an invalid label.
+    """
+    if not path.exists():
+        raise DatasetError(
+            f"{path}: no such file or folder; give a data set's folder, data.yaml or COCO JSON"
+        )
+    annotations = path if path.suffix.lower() == ".json" else find_annotations(path)
+    if annotations is not None:
+        return read_coco(annotations, images)
+    return read_yolo(path, split)
+
+
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff")
+
+
+class DatasetError(ValueError):
+    """A data set that cannot be used; the message names the file, the line or entry, and the problem."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sample:
+    """One image and its ground truth.
+
+    Attributes:
+        image: the file.
+        boxes: (N, 4) float32 xyxy: pixels, or fractions of the image if `in_fractions`.
+        class_ids: (N,) int64.
+        in_fractions: as in YOLO labels.
+        ignored: (N,) bool: regions that need not be detected (COCO's `iscrowd`).
+    """
+
+    image: Path
+    boxes: NDArray[np.float32]
+    class_ids: NDArray[np.int64]
+    in_fractions: bool = False
+    ignored: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
+
+    def __post_init__(self) -> None:
+        if self.ignored.shape != self.class_ids.shape:
+            object.__setattr__(self, "ignored", np.zeros(len(self.class_ids), np.bool_))
+
+    def boxes_in(self, width: int, height: int) -> NDArray[np.float32]:
+        """(N, 4) float32 xyxy in the pixels of an image of this size."""
+        if not self.in_fractions:
+            return self.boxes
+        return self.boxes * np.array([width, height, width, height], np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class Dataset:
+    """Samples in the order of their files.
+
+    Attributes:
+        root: path that was opened.
+        kind: "YOLO" or "COCO".
+        class_names: id → name; None if the data set has no names.
+        samples: one per image; one without labels is a negative.
+    """
+
+    root: Path
+    kind: str
+    class_names: tuple[str, ...] | None
+    samples: tuple[Sample, ...]
+
+
+def image_files(folder: Path) -> list[Path]:
+    """Every image below `folder`, by name."""
+    return sorted(_images_below(folder))
+
+
+def _images_below(folder: Path) -> Iterator[Path]:
+    for where, folders, names in os.walk(folder):
+        folders.sort()
+        yield from (Path(where, name) for name in names if Path(name).suffix.lower() in IMAGE_SUFFIXES)
+
+
+def read_image(path: Path) -> NDArray[np.uint8]:
+    """(height, width, 3) uint8 BGR, rotated by its EXIF orientation; raises `DatasetError`."""
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if image is None:
+        raise DatasetError(f"{path}: cannot be read as an image; it may be truncated")
+    return image.astype(np.uint8, copy=False)
+
+
+def find_annotations(folder: Path) -> Path | None:
+    """Find the annotation file of a folder: the only JSON with `images` and `annotations`; None if there is
+    none.
+    """
+    if not folder.is_dir():
+        return None
+    found = sorted({*folder.glob("annotations/*.json"), *folder.glob("*.json")})
+    fitting = [path for path in found if path.name.startswith(("instances", "_annotations", "annotations"))]
+    candidates = fitting or [path for path in found if _looks_like_coco(path)]
+    if len(candidates) > 1:
+        names = ", ".join(str(path.relative_to(folder)) for path in candidates)
+        raise DatasetError(f"{folder}: has several annotation files, give one: {names}")
+    return candidates[0] if candidates else None
+
+
+def _looks_like_coco(path: Path) -> bool:
+    """Check the keys at the beginning and end of the file: annotation files can be large."""
+    with path.open("rb") as file:
+        seen = file.read(1 << 16)
+        file.seek(max(0, path.stat().st_size - (1 << 16)))
+        seen += file.read()
+    return b'"images"' in seen and (b'"annotations"' in seen or b'"categories"' in seen)
+
+
+def read_coco(path: Path, images: Path | None = None) -> Dataset:
+    """Read the data set of one annotation file; raises `DatasetError` naming the entry."""
+    try:
+        content = json.loads(path.read_bytes())
+    except OSError as error:
+        raise DatasetError(f"{path}: cannot be read ({error.strerror or error})") from None
+    except (ValueError, RecursionError) as error:
+        raise DatasetError(f"{path}: is not JSON ({error})") from None
+    if not isinstance(content, dict):
+        raise DatasetError(f"{path}: expected an object with images, annotations and categories")
+    names, ids = _categories(_entries(content, "categories", path), path)
+    annotations = defaultdict(list)
+    for index, entry in enumerate(_entries(content, "annotations", path)):
+        image_id, class_id, box, crowd = _annotation(entry, ids, f"{path}, annotation {index}")
+        annotations[image_id].append((class_id, box, crowd))
+    samples = []
+    finder = _ImageFinder(path, images)
+    for index, entry in enumerate(_entries(content, "images", path)):
+        where = f"{path}, image {index}"
+        image_id, file_name = entry.get("id"), entry.get("file_name")
+        if type(image_id) not in (int, str) or not isinstance(file_name, str):
+            raise DatasetError(f"{where}: expected `id` and `file_name`")
+        seen = annotations.pop(image_id, [])
+        samples.append(
+            Sample(
+                finder.find(file_name, where),
+                np.array([box for _, box, _ in seen], np.float32).reshape(-1, 4),
+                np.array([class_id for class_id, _, _ in seen], np.int64),
+                ignored=np.array([crowd for _, _, crowd in seen], np.bool_),
+            )
+        )
+    if annotations:
+        raise DatasetError(
+            f"{path}: has annotations of the image {next(iter(annotations))!r}, which is not listed"
+        )
+    if not samples:
+        raise DatasetError(f"{path}: lists no images")
+    return Dataset(path, "COCO", names, tuple(samples))
+
+
+def _entries(content: dict[str, Any], key: str, path: Path) -> list[dict[str, Any]]:
+    value = content.get(key)
+    if not isinstance(value, list) or not all(isinstance(entry, dict) for entry in value):
+        raise DatasetError(f"{path}: `{key}` must be a list of objects")
+    return value
+
+
+def _categories(entries: list[dict[str, Any]], path: Path) -> tuple[tuple[str, ...], dict[Any, int]]:
+    """Names in the order of the file, and the file's ids → their index in it."""
+    ids: dict[Any, int] = {}
+    names = []
+    for index, entry in enumerate(entries):
+        if type(entry.get("id")) is not int or not isinstance(entry.get("name"), str) or entry["id"] in ids:
+            raise DatasetError(f"{path}, category {index}: expected a unique `id` and a `name`")
+        ids[entry["id"]] = index
+        names.append(entry["name"])
+    if not names:
+        raise DatasetError(f"{path}: has no categories")
+    return tuple(names), ids
+
+
+def _annotation(entry: dict[str, Any], ids: dict[Any, int], where: str) -> tuple[Any, int, list[float], bool]:
+    category, box = entry.get("category_id"), entry.get("bbox")
+    if type(category) is not int or category not in ids:
+        raise DatasetError(f"{where}: its category_id {category!r:.100} is not in categories")
+    if type(entry.get("image_id")) not in (int, str):
+        raise DatasetError(f"{where}: has no image_id")
+    if (
+        not isinstance(box, list)
+        or len(box) != 4
+        or not all(type(value) in (int, float) and math.isfinite(value) for value in box)
+        or min(box[2:]) < 0
+    ):
+        raise DatasetError(
+            f"{where}: its bbox must be [left, top, width, height] in pixels, got {box!r:.100}"
+        )
+    left, top, width, height = box
+    return (
+        entry["image_id"],
+        ids[category],
+        [left, top, left + width, top + height],
+        bool(entry.get("iscrowd")),
+    )
+
+
+class _ImageFinder:
+    """Finds the images of an annotation file: beside it, in `images/`, or in a folder named after the
+    split.
+    """
+
+    def __init__(self, annotations: Path, images: Path | None) -> None:
+        if images is not None and not images.is_dir():
+            raise DatasetError(f"{images}: is not a folder of images")
+        root = annotations.parent
+        split = annotations.stem.removeprefix("instances_")
+        above = root.parent if root.name == "annotations" else root
+        self._folders = (
+            [images] if images else [root, above / split, above / "images" / split, above / "images", above]
+        )
+
+    def find(self, file_name: str, where: str) -> Path:
+        for folder in self._folders:
+            if (folder / file_name).is_file():
+                return folder / file_name
+        searched = ", ".join(str(folder) for folder in self._folders)
+        raise DatasetError(f"{where}: {file_name} is in none of {searched}; give the folder with --images")
+
+
+_TABLE_NAMES = ("data.yaml", "data.yml", "dataset.yaml")
+_SPLITS = ("val", "test", "train")
+# Labels are written with six digits, so a box at the edge may exceed it by this much.
+_ROUNDING = 1e-4
+_LARGEST_LABELS_BYTES = 16 << 20
+
+
+def read_yolo(path: Path, split: str | None = None) -> Dataset:
+    """Read the data set at `path`: a `data.yaml`, a folder with one, or a folder of images. Raises
+    `DatasetError`.
+    """
+    table_path = (
+        path if path.is_file() else next((path / n for n in _TABLE_NAMES if (path / n).is_file()), None)
+    )
+    if table_path is None:
+        names, images = None, image_files(path / "images" if (path / "images").is_dir() else path)
+    else:
+        table = _read_table(table_path)
+        names, images = _names(table, table_path), _images_of(table, table_path, split)
+    if not images:
+        raise DatasetError(
+            f"{path}: has no images; expected images/ and labels/, or images with label files beside them"
+        )
+    samples = tuple(_sample(image, path, names) for image in images)
+    if not any(_labels_path(image, path).is_file() for image in images):
+        raise DatasetError(
+            f"{path}: none of its {len(images)} images has labels; for {images[0]} "
+            f"{_labels_path(images[0], path)} was expected"
+        )
+    return Dataset(path, "YOLO", names, samples)
+
+
+def _read_table(path: Path) -> dict[Any, Any]:
+    try:
+        table = load_plain_yaml(path.read_text(encoding="utf-8"))
+    except (PlainYamlError, UnicodeDecodeError) as error:
+        raise DatasetError(f"{path}: {error}") from None
+    if not isinstance(table, dict):
+        raise DatasetError(f"{path}: expected a table with `names` and `val`")
+    return table
+
+
+def _names(table: dict[Any, Any], path: Path) -> tuple[str, ...] | None:
+    names = table.get("names")
+    if isinstance(names, dict):
+        names = numbered(names)
+        if names is None:
+            raise DatasetError(f"{path}: the class names are not numbered from 0")
+    if names is None:
+        return None
+    if not isinstance(names, list) or not names:
+        raise DatasetError(f"{path}: `names` must be a list or a numbered table of class names")
+    return tuple(str(name) for name in names)
+
+
+def _images_of(table: dict[Any, Any], path: Path, split: str | None) -> list[Path]:
+    available = [name for name in _SPLITS if table.get(name)]
+    chosen = split or (available[0] if available else None)
+    if chosen is None and split is None:
+        root = path.parent
+        return image_files(root / "images" if (root / "images").is_dir() else root)
+    if chosen not in available:
+        raise DatasetError(f"{path}: has no split {chosen!r}; it has {', '.join(available) or 'none'}")
+    base = path.parent / str(table["path"]) if table.get("path") else path.parent
+    if not base.is_dir():
+        base = path.parent  # `path` is often the author's local path.
+    entries = table[chosen] if isinstance(table[chosen], list) else [table[chosen]]
+    found: list[Path] = []
+    for entry in entries:
+        where = base / str(entry)
+        if where.is_dir():
+            found += image_files(where)
+        elif where.is_file() and where.suffix == ".txt":
+            lines = where.read_text(encoding="utf-8").splitlines()
+            found += [
+                _listed(line.strip(), base, where, number)
+                for number, line in enumerate(lines, 1)
+                if line.strip()
+            ]
+        else:
+            raise DatasetError(f"{path}: `{chosen}` names {where}, which does not exist")
+    return found
+
+
+def _listed(line: str, base: Path, source: Path, number: int) -> Path:
+    image = base / line
+    if not image.is_file():
+        raise DatasetError(f"{source}, line {number}: {image} does not exist")
+    return image
+
+
+def _labels_path(image: Path, root: Path) -> Path:
+    """`…/images/x/1.jpg` → `…/labels/x/1.txt`, for the last `images`; else the file beside the image."""
+    parts = list(image.parts)
+    below = len((root if root.is_dir() else root.parent).parts)
+    for index in range(len(parts) - 2, -1, -1):
+        if parts[index] == "images":
+            moved = Path(*parts[:index], "labels", *parts[index + 1 :]).with_suffix(".txt")
+            if index >= below or moved.is_file():
+                return moved
+    return image.with_suffix(".txt")
+
+
+def _sample(image: Path, root: Path, names: tuple[str, ...] | None) -> Sample:
+    path = _labels_path(image, root)
+    if not path.is_file():
+        return Sample(image, np.zeros((0, 4), np.float32), np.zeros(0, np.int64), in_fractions=True)
+    if path.stat().st_size > _LARGEST_LABELS_BYTES:
+        raise DatasetError(f"{path}: has {path.stat().st_size} bytes, too many for a label file")
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except UnicodeDecodeError:
+        raise DatasetError(f"{path}: is not UTF-8 text") from None
+    boxes: list[NDArray[np.float64]] = []
+    class_ids: list[int] = []
+    for number, line in enumerate(lines, 1):
+        if words := line.split():
+            class_id, box = _label(words, f"{path}, line {number}", names)
+            class_ids.append(class_id)
+            boxes.append(box)
+    xyxy = np.array(boxes, np.float32).reshape(-1, 4)
+    return Sample(image, xyxy, np.array(class_ids, np.int64), in_fractions=True)
+
+
+def _label(words: list[str], where: str, names: tuple[str, ...] | None) -> tuple[int, NDArray[np.float64]]:
+    """One line → class id and (4,) xyxy in fractions."""
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        raise DatasetError(f"{where}: expected numbers, got {' '.join(words)!r:.100}") from None
+    class_id = numbers[0]
+    if not class_id.is_integer() or class_id < 0 or (names is not None and class_id >= len(names)):
+        known = "0 or more" if names is None else f"0..{len(names) - 1}"
+        raise DatasetError(f"{where}: the class must be a whole number, {known}, got {words[0]:.100}")
+    values = np.array(numbers[1:])
+    if len(values) != 4 and (len(values) < 6 or len(values) % 2):
+        raise DatasetError(f"{where}: expected `class cx cy w h` or a polygon, got {len(words)} numbers")
+    if not all(math.isfinite(value) for value in values):
+        raise DatasetError(f"{where}: has a number that is not finite")
+    if len(values) == 4:
+        x, y, width, height = values
+        if width <= 0 or height <= 0:
+            raise DatasetError(f"{where}: width and height must be above 0, got {width:g} and {height:g}")
+        box = np.array([x - width / 2, y - height / 2, x + width / 2, y + height / 2])
+        inside = values
+    else:
+        x, y = values[::2], values[1::2]
+        box = np.array([x.min(), y.min(), x.max(), y.max()])
+        inside = values
+    if inside.min() < -_ROUNDING or inside.max() > 1 + _ROUNDING:
+        raise DatasetError(
+            f"{where}: coordinates are fractions of the image, 0..1, got {inside.min():g} to {inside.max():g}"
+        )
+    return int(class_id), box.clip(0, 1)
