@@ -10,7 +10,7 @@ import time
 
 import numpy as np
 
-from companion.vehicle.scheduler_slice import set_scheduler_slice
+from companion.vehicle.precise_sleep import set_scheduler_slice
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.streamer import Streamer
 

@@ -17,6 +17,9 @@ Differences from PX4, and how they are handled:
 * EKF_STATUS_REPORT has the flags of PX4's ESTIMATOR_STATUS. No message counts estimator resets: they are
   detected by the jump of the position.
 * Hardly any stream is sent without a request; parameters are sent as numbers, whatever their type.
+
+The flight modes (HEARTBEAT.custom_mode, parameter 2 of MAV_CMD_DO_SET_MODE) have PX4's names, mapped by
+behaviour: GUIDED is OFFBOARD, LOITER is POSITION, BRAKE is HOLD.
 """
 
 from __future__ import annotations
@@ -24,13 +27,44 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from companion.vehicle.ardupilot_modes import GUIDED, custom_mode_of_mode, mode_of_custom_mode
 from companion.vehicle.autopilot_profile import HOME_POSITION_ID, AutopilotProfile
 from companion.vehicle.driver import CommandRefusedError
 from companion.vehicle.framing import EKF_STATUS_REPORT_ID
 from companion.vehicle.setpoint import IGNORE_ACCELERATION, IGNORE_YAW, IGNORE_YAW_RATE
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
 from companion.vehicle.telemetry import Fields
+
+GUIDED, BRAKE = 4, 17
+
+_MODES: dict[int, FlightMode] = {
+    0: FlightMode.STABILIZED,
+    1: FlightMode.ACRO,
+    2: FlightMode.ALTITUDE,
+    3: FlightMode.MISSION,
+    GUIDED: FlightMode.OFFBOARD,
+    5: FlightMode.POSITION,  # LOITER: flown by sticks
+    6: FlightMode.RETURN,
+    9: FlightMode.LAND,
+    16: FlightMode.POSITION,  # POSHOLD
+    BRAKE: FlightMode.HOLD,
+    21: FlightMode.RETURN,  # SMART_RTL
+    23: FlightMode.FOLLOW,
+    27: FlightMode.RETURN,  # AUTO_RTL
+}
+_REQUESTS = {mode: number for number, mode in reversed(_MODES.items())}
+
+
+def mode_of_custom_mode(custom_mode: int) -> FlightMode:
+    """Return the mode of a custom_mode; UNKNOWN for modes without an equivalent here."""
+    return _MODES.get(custom_mode, FlightMode.UNKNOWN)
+
+
+def custom_mode_of_mode(mode: FlightMode) -> int:
+    """Return the custom_mode to request. Raises ValueError for a mode that Copter does not have."""
+    if mode not in _REQUESTS:
+        raise ValueError(f"ArduPilot has no mode {mode!s}; available: {', '.join(_REQUESTS)}")
+    return _REQUESTS[mode]
+
 
 GPS_GLOBAL_ORIGIN_ID = 49
 _IN_AIR = 2  # MAV_LANDED_STATE_IN_AIR

@@ -1,7 +1,14 @@
-"""Converts STATUSTEXT and EVENT of one autopilot into reports; event texts are read from the autopilot."""
+"""Reports of an autopilot, from its STATUSTEXT and EVENT messages.
+
+STATUSTEXT is reassembled (https://mavlink.io/en/messages/common.html#STATUSTEXT). The texts of PX4's events
+come from MAVLink's events metadata (https://mavlink.io/en/services/events.html), a file that is read from the
+autopilot by MAVLink FTP (https://mavlink.io/en/services/ftp.html).
+"""
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import json
 import logging
 import lzma
@@ -10,12 +17,11 @@ import re
 import struct
 import time
 from collections import deque
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
+from typing import Any, NamedTuple
 
 from companion.vehicle.driver import CommandRefusedError
-from companion.vehicle.event_catalogue import Event, EventCatalogue
-from companion.vehicle.file_reader import FTP_ID, FileReader, FileReadError
 from companion.vehicle.framing import (
     COMPONENT_METADATA_ID,
     CURRENT_EVENT_SEQUENCE_ID,
@@ -23,10 +29,234 @@ from companion.vehicle.framing import (
     REQUEST_EVENT_ID,
     Frame,
 )
-from companion.vehicle.status_texts import STATUSTEXT_ID, StatusTexts
+from companion.vehicle.report import ALL_MODES, WARNING, Report
 from companion.vehicle.telemetry_state import TelemetryState
 
 logger = logging.getLogger(__name__)
+
+STATUSTEXT_ID = 253
+_STATUSTEXT = struct.Struct("<B50sHB")  # severity, text, id, chunk_seq
+_CHUNK = 50
+_LONGEST_TEXT = 500
+
+
+class StatusTexts:
+    """Reassembles texts from STATUSTEXT: long ones are sent in chunks of 50 bytes with one id."""
+
+    def __init__(self) -> None:
+        self._id = 0
+        self._chunks: list[bytes] = []
+
+    def add(self, frame: Frame, now_ns: int) -> Report | None:
+        """Return the text that a frame completes. A text with a lost chunk is dropped at the next text."""
+        severity, chunk, identifier, sequence = _STATUSTEXT.unpack(frame.padded(_STATUSTEXT.size))
+        ends = b"\0" in chunk
+        if identifier == 0:
+            return _text_report(severity, chunk, now_ns)
+        if sequence == 0 or identifier != self._id:
+            self._id, self._chunks = identifier, []
+        if sequence != len(self._chunks):
+            return None
+        self._chunks.append(chunk)
+        if not ends and len(self._chunks) * _CHUNK < _LONGEST_TEXT:
+            return None
+        whole, self._chunks, self._id = b"".join(self._chunks), [], 0
+        return _text_report(severity, whole, now_ns)
+
+
+def _text_report(severity: int, text: bytes, now_ns: int) -> Report | None:
+    words = text.split(b"\0")[0].decode("utf-8", "replace").strip()
+    if words.endswith("fence breached"):
+        severity = min(severity, WARNING)  # ArduPilot 4.7 sends the reason of its mode change as NOTICE
+    return Report(now_ns, severity, words) if words else None
+
+
+_LAYOUTS = {
+    "uint8_t": "<B",
+    "int8_t": "<b",
+    "uint16_t": "<H",
+    "int16_t": "<h",
+    "uint32_t": "<I",
+    "int32_t": "<i",
+    "uint64_t": "<Q",
+    "int64_t": "<q",
+    "float": "<f",
+}
+# {argument, from 1}{decimals}{unit}; literal braces are escaped.
+_ARGUMENT = re.compile(r"(?<!\\)\{(\d+)(?::\.(\d+))?([^}]*)\}")
+_TAG = re.compile(r"(?<!\\)<[^>]*>")
+_UNITS = {"m": " m", "m_v": " m", "m^2": " m²", "m/s": " m/s", "C": " °C"}
+_MODES_TYPE = "navigation_mode_group_t"
+_MAX_LEVEL = 7  # MAV_SEVERITY_DEBUG; above it are messages between machines
+
+
+class Event(NamedTuple):
+    """The fields of EVENT (410). `log_levels`: external level in the lower 4 bits; `arguments`: 40 bytes."""
+
+    identifier: int
+    sequence: int
+    log_levels: int
+    arguments: bytes
+
+
+class EventCatalogue:
+    """The events of one autopilot's metadata.
+
+    Args:
+        metadata: the events JSON; None: not available, so events are reported by number.
+
+    Raises:
+        ValueError: `metadata` is not events JSON.
+    """
+
+    def __init__(self, metadata: bytes | None) -> None:
+        self._events: dict[int, tuple[str, Mapping[str, Any]]] = {}
+        self._enums: dict[str, Mapping[str, Any]] = {}
+        if metadata is None:
+            return
+        try:
+            components = json.loads(metadata)["components"]
+            for number, component in components.items():
+                self._enums |= {
+                    f"{component['namespace']}::{name}": enum
+                    for name, enum in component.get("enums", {}).items()
+                }
+                for group, content in component.get("event_groups", {}).items():
+                    for identifier, event in content.get("events", {}).items():
+                        self._events[int(number) << 24 | int(identifier)] = (group, event)
+        except (KeyError, TypeError, AttributeError, UnicodeDecodeError) as error:
+            raise ValueError(f"not events metadata: {type(error).__name__}: {error}") from error
+
+    def report(self, event: Event, now_ns: int) -> Report | None:
+        """Convert an event to a report. None for summaries and for levels beyond debug."""
+        level = event.log_levels & 0x0F
+        group, known = self._events.get(event.identifier, ("", {}))
+        if level > _MAX_LEVEL or known.get("type") == "summary":
+            return None
+        if "message" not in known:
+            return Report(now_ns, level, f"event {event.identifier:#010x} (not in the metadata)")
+        arguments = known.get("arguments", ())
+        values = self._values(arguments, event.arguments)
+        of_modes = bool(arguments) and arguments[0]["type"].endswith(_MODES_TYPE)
+        modes = int.from_bytes(event.arguments[:4], "little") if of_modes else ALL_MODES
+
+        def formatted(match: re.Match[str]) -> str:
+            number = int(match[1]) - 1
+            return _value(values[number], match[2], match[3]) if number < len(values) else "?"
+
+        text = _ARGUMENT.sub(formatted, _TAG.sub("", str(known["message"])))
+        return Report(
+            now_ns, level, re.sub(r"\\(.)", r"\1", text).strip(), group, str(known.get("name", "")), modes
+        )
+
+    def _values(self, arguments: Any, packed: bytes) -> list[str | float]:
+        """Decode the arguments in order, up to the first that the metadata does not describe."""
+        values: list[str | float] = []
+        offset = 0
+        for argument in arguments:
+            enum = self._enums.get(argument["type"]) or self._enums.get(f"px4::{argument['type']}")
+            layout = _LAYOUTS.get(argument["type"] if enum is None else enum["type"])
+            if layout is None or offset + struct.calcsize(layout) > len(packed):
+                break
+            (number,) = struct.unpack_from(layout, packed, offset)
+            offset += struct.calcsize(layout)
+            values.append(number if enum is None else _named(enum, number))
+        return values
+
+
+def _named(enum: Mapping[str, Any], number: int) -> str:
+    entries = {int(value): entry["description"] or entry["name"] for value, entry in enum["entries"].items()}
+    if not enum.get("is_bitfield"):
+        return str(entries.get(number, number))
+    return ", ".join(words for bit, words in sorted(entries.items()) if number & bit) or "none"
+
+
+def _value(value: str | float, decimals: str | None, unit: str) -> str:
+    words = f"{value:.{decimals}f}" if decimals is not None and not isinstance(value, str) else f"{value}"
+    return words + _UNITS.get(unit, unit)
+
+
+FTP_ID = 110  # FILE_TRANSFER_PROTOCOL
+_TERMINATE, _RESET, _OPEN, _READ, _ACK = 1, 2, 4, 5, 128
+_END_OF_FILE = 6
+_ERRORS = {1: "failed", 2: "failed: errno", 4: "wrong session", 5: "no free session", 10: "no such file"}
+# target network, system, component; sequence, session, opcode, size, request opcode, burst, padding, offset
+_HEADER = struct.Struct("<3BHBBBBBBI")
+_DATA = 239
+_ATTEMPTS, _ATTEMPT_S = 6, 0.5
+LARGEST_FILE = 4 * 1024 * 1024
+
+
+class FileReadError(OSError):
+    """The file cannot be read. The message says which and why."""
+
+
+class FileReader:
+    """Reads one file at a time.
+
+    Args:
+        send: sends one payload of FILE_TRANSFER_PROTOCOL.
+        target: returns system and component id of the autopilot.
+    """
+
+    def __init__(self, send: Callable[[int, bytes], None], target: Callable[[], tuple[int, int]]) -> None:
+        self._send, self._target = send, target
+        self._sequence = 0
+        self._answer: asyncio.Future[bytes] | None = None
+
+    def on_frame(self, frame: Frame) -> None:
+        """Process a reply of the autopilot."""
+        payload = frame.padded(_HEADER.size + _DATA)
+        sequence = _HEADER.unpack_from(payload)[3]
+        if self._answer is not None and not self._answer.done() and sequence == self._sequence + 1 & 0xFFFF:
+            self._answer.set_result(payload)
+
+    async def read(self, path: str) -> bytes:
+        """Return the content of a file. Raises FileReadError."""
+        await self._request(path, _RESET)  # closes sessions that were left open
+        session, opened = await self._request(path, _OPEN, path.encode())
+        size = int.from_bytes(opened[:4], "little")
+        if size > LARGEST_FILE:
+            raise FileReadError(f"{path}: {size} bytes exceed the limit of {LARGEST_FILE}")
+        content = b""
+        try:
+            while len(content) < size:
+                _, part = await self._request(path, _READ, session=session, offset=len(content), size=_DATA)
+                if not part:
+                    raise FileReadError(f"{path}: truncated after {len(content)} of {size} bytes")
+                content += part
+        finally:
+            with contextlib.suppress(FileReadError):
+                await self._request(path, _TERMINATE, session=session)
+        return content
+
+    async def _request(
+        self, path: str, opcode: int, data: bytes = b"", *, session: int = 0, offset: int = 0, size: int = 0
+    ) -> tuple[int, bytes]:
+        """Send one request, repeated until answered; returns the session and the reply's data."""
+        self._sequence = self._sequence + 2 & 0xFFFF
+        system, component = self._target()
+        header = _HEADER.pack(
+            0, system, component, self._sequence, session, opcode, size or len(data), 0, 0, 0, offset
+        )
+        for _ in range(_ATTEMPTS):
+            self._answer = asyncio.get_running_loop().create_future()
+            self._send(FTP_ID, (header + data).ljust(_HEADER.size + _DATA, b"\0"))
+            await asyncio.wait([self._answer], timeout=_ATTEMPT_S)
+            if self._answer.done():
+                break
+        else:
+            raise FileReadError(f"{path}: no MAVLink FTP answer from the autopilot")
+        payload = self._answer.result()
+        _, _, _, _, answered, code, length, _, _, _, _ = _HEADER.unpack_from(payload)
+        part = payload[_HEADER.size : _HEADER.size + min(length, _DATA)]
+        if code == _ACK:
+            return answered, part
+        error = part[0] if part else 0
+        if opcode in (_RESET, _TERMINATE) or (opcode == _READ and error == _END_OF_FILE):
+            return answered, b""
+        raise FileReadError(f"{path}: {_ERRORS.get(error, f'MAVLink FTP error {error}')}")
+
 
 _REQUEST_MESSAGE = 512
 _EVENT = struct.Struct(

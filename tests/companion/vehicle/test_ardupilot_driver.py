@@ -11,8 +11,7 @@ from contextlib import asynccontextmanager
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.vehicle.ardupilot_modes import custom_mode_of_mode, mode_of_custom_mode
-from companion.vehicle.ardupilot_profile import ArduPilotProfile
+from companion.vehicle.ardupilot_profile import ArduPilotProfile, custom_mode_of_mode, mode_of_custom_mode
 from companion.vehicle.autopilot_driver import AutopilotDriver
 from companion.vehicle.driver import CommandRefusedError, Driver, SystemStatus
 from companion.vehicle.drivers import open_driver

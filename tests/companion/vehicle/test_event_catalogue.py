@@ -5,8 +5,8 @@ import struct
 
 import pytest
 
-from companion.vehicle.event_catalogue import Event, EventCatalogue
 from companion.vehicle.report import ALL_MODES, Report
+from companion.vehicle.report_reader import Event, EventCatalogue
 
 ERROR, INFO, PROTOCOL = 0x63, 0x66, 0x68
 

@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.vehicle.file_reader import FileReader, FileReadError
 from companion.vehicle.framing import (
     CURRENT_EVENT_SEQUENCE_ID,
     EVENT_ID,
@@ -17,8 +16,7 @@ from companion.vehicle.framing import (
     pack_frame,
 )
 from companion.vehicle.report import Report
-from companion.vehicle.report_reader import ReportReader
-from companion.vehicle.status_texts import StatusTexts
+from companion.vehicle.report_reader import FileReader, FileReadError, ReportReader, StatusTexts
 from companion.vehicle.telemetry_state import TelemetryState
 
 
@@ -102,13 +100,13 @@ class Autopilot:
 async def test_file_is_read_despite_lost_replies(
     size: int, loses: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("companion.vehicle.file_reader._ATTEMPT_S", 0.02)
+    monkeypatch.setattr("companion.vehicle.report_reader._ATTEMPT_S", 0.02)
     content = bytes(number % 251 for number in range(size))
     assert await Autopilot(content, loses).reader.read("etc/a.json") == content
 
 
 async def test_missing_file_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("companion.vehicle.file_reader._ATTEMPT_S", 0.01)
+    monkeypatch.setattr("companion.vehicle.report_reader._ATTEMPT_S", 0.01)
     with pytest.raises(FileReadError, match=r"etc/b\.json: no such file"):
         await Autopilot().reader.read("etc/b.json")
     with pytest.raises(FileReadError, match="no MAVLink FTP answer"):

@@ -10,8 +10,7 @@ from typing import NamedTuple
 
 import pytest
 
-from companion.vehicle import scheduler_slice
-from companion.vehicle.scheduler_slice import SHORTEST_NS, set_scheduler_slice
+from companion.vehicle.precise_sleep import SHORTEST_NS, set_scheduler_slice
 
 
 class Scheduling(NamedTuple):
@@ -54,7 +53,7 @@ def test_scheduler_slice_is_set_and_niceness_kept() -> None:
 
 
 def test_refused_slice_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scheduler_slice, "_SCHED_OTHER", 99)  # no such policy
+    monkeypatch.setattr("companion.vehicle.precise_sleep._SCHED_OTHER", 99)  # no such policy
     supported, before, after = in_a_thread()
     assert supported is False
     assert after == before

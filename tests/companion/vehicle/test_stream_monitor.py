@@ -8,8 +8,7 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.vehicle.ardupilot_profile import ArduPilotProfile
-from companion.vehicle.stream_monitor import StreamMonitor
-from companion.vehicle.stream_requests import StreamRequests
+from companion.vehicle.stream_requests import StreamMonitor, StreamRequests
 from companion.vehicle.telemetry_state import TelemetryState
 from mavlink_sim import LockstepVehicle
 from mavlink_sim.wire.messages import dialect
