@@ -257,12 +257,16 @@ def reference_boxes(
     return [(cell, kind) for score, cell, kind in best if score > confidence]
 
 
-@pytest.mark.parametrize("most", [5, 20, 300])
-def test_the_best_pairs_of_cell_and_class_are_selected(most: int) -> None:
+def lively_outputs() -> tuple[YoloModel, list[Tensor]]:
     model = lively()
     with torch.inference_mode():
-        maps = model(make_image())
-        dense = decoded(model, maps)[0]
+        return model, model(make_image())
+
+
+@pytest.mark.parametrize("most", [5, 20, 300])
+def test_the_best_pairs_of_cell_and_class_are_selected(most: int) -> None:
+    model, maps = lively_outputs()
+    dense = decoded(model, maps)[0]
     confidence = dense[:, 4:].max(dim=1).values.median().item()
     boxes = select_boxes(model, maps, confidence=confidence, most=most)
     expected = reference_boxes(model, maps, confidence, most)
@@ -274,17 +278,13 @@ def test_the_best_pairs_of_cell_and_class_are_selected(most: int) -> None:
 
 
 def test_overlapping_boxes_of_an_end_to_end_head_are_all_kept() -> None:
-    model = lively()
-    with torch.inference_mode():
-        maps = model(make_image())
+    model, maps = lively_outputs()
     many = select_boxes(model, maps, confidence=0.0, iou=0.0, most=1000)
     assert len(many) == sum(level.shape[2] * level.shape[3] for level in maps) * len(FEW)
 
 
 def test_a_class_filter_gives_what_filtering_afterwards_gives() -> None:
-    model = lively()
-    with torch.inference_mode():
-        maps = model(make_image())
+    model, maps = lively_outputs()
     every = select_boxes(model, maps, confidence=0.3, most=1000)
     only = select_boxes(model, maps, confidence=0.3, most=1000, class_ids=(0, 2))
     kept = every.class_id != 1
@@ -294,9 +294,7 @@ def test_a_class_filter_gives_what_filtering_afterwards_gives() -> None:
 
 
 def test_no_box_above_the_confidence_is_an_empty_list() -> None:
-    model = lively()
-    with torch.inference_mode():
-        boxes = select_boxes(model, model(make_image()), confidence=1.0)
+    boxes = select_boxes(*lively_outputs(), confidence=1.0)
     assert (len(boxes), boxes.xyxy.shape) == (0, (0, 4))
     assert (boxes.confidence.dtype, boxes.class_id.dtype) == (np.dtype(np.float32), np.dtype(np.int64))
 

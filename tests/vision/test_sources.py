@@ -187,51 +187,28 @@ def test_a_raw_file_is_read_with_the_format_and_size_given(tmp_path: Path) -> No
     assert frames[0].image[0, 0].tolist() == [3, 2, 1]
 
 
-def missing_file(path: Path) -> str:
-    (path / "bikes.mp4").write_bytes(b"")
-    return str(path / "bike.mp4")
-
-
-def empty_file(path: Path) -> str:
-    (path / "empty.mp4").write_bytes(b"")
-    return str(path / "empty.mp4")
-
-
-def text_file(path: Path) -> str:
-    (path / "text.mp4").write_text("no video " * 100)
-    return str(path / "text.mp4")
-
-
-def empty_folder(path: Path) -> str:
-    return str(path)
-
-
-def broken_images(path: Path) -> str:
-    (path / "a.png").write_text("not an image")
-    return str(path)
-
-
 @pytest.mark.parametrize(
-    ("make", "words"),
+    ("files", "address", "words"),
     [
-        pytest.param(missing_file, r"bike\.mp4: .*bikes\.mp4", id="missing, with a hint"),
-        pytest.param(lambda path: str(path / "no/where.mp4"), "does not exist", id="no folder"),
-        pytest.param(empty_file, "the file is empty", id="empty"),
-        pytest.param(text_file, r"text\.mp4: no video", id="not a video"),
-        pytest.param(empty_folder, "no images", id="folder without images"),
-        pytest.param(broken_images, "none of the 1", id="only broken images"),
-        pytest.param(lambda path: "gopher://x/y", "unknown scheme gopher://", id="unknown scheme"),
-        pytest.param(lambda path: "udp://127.0.0.1", "1 to 65535", id="no port"),
-        pytest.param(lambda path: "udp://127.0.0.1:1?format=vp9", "mpegts, rtp-h264", id="RTP format"),
-        pytest.param(lambda path: "shm://a/b", "plain file name", id="shared memory"),
+        pytest.param({"bikes.mp4": ""}, "{}/bike.mp4", r"bike\.mp4: .*bikes\.mp4", id="missing, with a hint"),
+        pytest.param({}, "{}/no/where.mp4", "does not exist", id="no folder"),
+        pytest.param({"empty.mp4": ""}, "{}/empty.mp4", "the file is empty", id="empty"),
+        pytest.param({"a.mp4": "no video " * 100}, "{}/a.mp4", r"a\.mp4: no video", id="not a video"),
+        pytest.param({}, "{}", "no images", id="folder without images"),
+        pytest.param({"a.png": "not an image"}, "{}", "none of the 1", id="only broken images"),
+        pytest.param({}, "gopher://x/y", "unknown scheme gopher://", id="unknown scheme"),
+        pytest.param({}, "udp://127.0.0.1", "1 to 65535", id="no port"),
+        pytest.param({}, "udp://127.0.0.1:1?format=vp9", "mpegts, rtp-h264", id="RTP format"),
+        pytest.param({}, "shm://a/b", "plain file name", id="shared memory"),
     ],
 )
 def test_open_failure_is_a_one_line_error(
-    tmp_path: Path, make: object, words: str, capfd: pytest.CaptureFixture[str]
+    tmp_path: Path, files: dict[str, str], address: str, words: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    uri = make(tmp_path)  # type: ignore[operator]
+    for name, content in files.items():
+        (tmp_path / name).write_text(content)
     with pytest.raises(SourceError, match=words) as caught:
-        open_source(uri)
+        open_source(address.format(tmp_path))
     assert "\n" not in str(caught.value)
     assert capfd.readouterr().err == ""  # no output of OpenCV or FFmpeg
 

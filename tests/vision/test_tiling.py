@@ -114,27 +114,25 @@ def test_pieces_are_merged_without_the_whole_frame() -> None:
     assert same_boxes(found, [box])
 
 
-def test_objects_within_each_other_in_one_pass_stay_two() -> None:
-    one_pass = Detections(
-        np.array([[0, 0, 100, 100], [10, 10, 40, 90]], np.float32),
-        np.array([0.9, 0.8], np.float32),
-        np.array([0, 0]),
+def one_pass(*found: tuple[tuple[int, int, int, int], float], class_id: int = 0) -> Detections:
+    return Detections(
+        np.array([box for box, _ in found], np.float32).reshape(-1, 4),
+        np.array([confidence for _, confidence in found], np.float32),
+        np.full(len(found), class_id),
         NAMES,
     )
-    nothing = Detections.empty(NAMES)
-    assert len(merge_passes([one_pass, nothing], [np.zeros(2, np.bool_), np.zeros(0, np.bool_)])) == 2
+
+
+def test_objects_within_each_other_in_one_pass_stay_two() -> None:
+    within = one_pass(((0, 0, 100, 100), 0.9), ((10, 10, 40, 90), 0.8))
+    assert len(merge_passes([within, one_pass()], [np.zeros(2, np.bool_), np.zeros(0, np.bool_)])) == 2
 
 
 def test_whole_box_beats_a_more_confident_piece() -> None:
-    half = Detections(
-        np.array([[0, 0, 50, 100]], np.float32), np.array([0.99], np.float32), np.array([0]), NAMES
-    )
-    whole = Detections(
-        np.array([[0, 0, 100, 100]], np.float32), np.array([0.5], np.float32), np.array([0]), NAMES
-    )
+    half, whole = one_pass(((0, 0, 50, 100), 0.99)), one_pass(((0, 0, 100, 100), 0.5))
     merged = merge_passes([half, whole], [np.array([True]), np.array([False])])
     assert merged.xyxy.tolist() == [[0, 0, 100, 100]]
-    other = Detections(whole.xyxy, whole.confidence, np.array([1]), NAMES)
+    other = one_pass(((0, 0, 100, 100), 0.5), class_id=1)
     assert len(merge_passes([half, other], [np.array([True]), np.array([False])])) == 2
 
 

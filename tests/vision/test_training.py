@@ -178,15 +178,18 @@ def test_each_stage_has_its_own_decay() -> None:
     assert rates[100] == pytest.approx(0.1)
 
 
-def test_stage_rate_must_be_valid() -> None:
-    with pytest.raises(ValueError, match="rate of a stage"):
-        Stage(64, 64, 1, 100, rate=0.0)
-
-
-@pytest.mark.parametrize("decay_steps", [-1, 101])
-def test_stage_decay_is_at_most_its_length(decay_steps: int) -> None:
-    with pytest.raises(ValueError, match="decay_steps"):
-        Stage(64, 64, 1, 100, decay_steps=decay_steps)
+@pytest.mark.parametrize(
+    ("width", "change", "message"),
+    [
+        (64, {"rate": 0.0}, "rate of a stage"),
+        (64, {"decay_steps": -1}, "decay_steps"),
+        (64, {"decay_steps": 101}, "decay_steps"),
+        (100, {}, "multiples of 32 pixels, got 100x64"),
+    ],
+)
+def test_impossible_stage_is_rejected(width: int, change: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Stage(width, 64, 1, 100, **change)
 
 
 @pytest.mark.parametrize(
@@ -200,11 +203,6 @@ def test_stage_decay_is_at_most_its_length(decay_steps: int) -> None:
 def test_impossible_settings_are_rejected(change: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         replace(SMALL, **change)
-
-
-def test_image_size_must_be_a_multiple_of_32() -> None:
-    with pytest.raises(ValueError, match="multiples of 32 pixels, got 100x64"):
-        Stage(100, 64, 1, 1)
 
 
 def wrong_size(rng: np.random.Generator, width: int, height: int) -> LabelledImage:
