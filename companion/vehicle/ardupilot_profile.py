@@ -52,6 +52,10 @@ _MODES: dict[int, FlightMode] = {
     27: FlightMode.RETURN,  # AUTO_RTL
 }
 _REQUESTS = {mode: number for number, mode in reversed(_MODES.items())}
+GPS_GLOBAL_ORIGIN_ID = 49
+_IN_AIR = 2  # MAV_LANDED_STATE_IN_AIR
+_EARTH_RADIUS_M = 6_371_000.0
+_METRES_PER_UNIT = math.radians(1e-7) * _EARTH_RADIUS_M  # of latitude
 
 
 def mode_of_custom_mode(custom_mode: int) -> FlightMode:
@@ -64,12 +68,6 @@ def custom_mode_of_mode(mode: FlightMode) -> int:
     if mode not in _REQUESTS:
         raise ValueError(f"ArduPilot has no mode {mode!s}; available: {', '.join(_REQUESTS)}")
     return _REQUESTS[mode]
-
-
-GPS_GLOBAL_ORIGIN_ID = 49
-_IN_AIR = 2  # MAV_LANDED_STATE_IN_AIR
-_EARTH_RADIUS_M = 6_371_000.0
-_METRES_PER_UNIT = math.radians(1e-7) * _EARTH_RADIUS_M  # of latitude
 
 
 class ArduPilotProfile(AutopilotProfile):

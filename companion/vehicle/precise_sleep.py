@@ -29,6 +29,12 @@ Sleep = Callable[[float], Awaitable[None]]
 
 
 _CLOCK_MONOTONIC = 1
+SHORTEST_NS = 100_000
+# System call numbers: the C library has no wrapper.
+_SCHED_SETATTR = {"x86_64": 314, "aarch64": 274, "armv7l": 380, "riscv64": 274}
+_SCHED_OTHER = 0
+# struct sched_attr, first version: size, policy, flags, nice, priority, runtime, deadline, period.
+_SCHED_ATTR = struct.Struct("=IIQiIQQQ")
 
 
 class _Timespec(ctypes.Structure):
@@ -95,14 +101,6 @@ class _Timer:
 def _error(call: str) -> OSError:
     number = ctypes.get_errno()
     return OSError(number, f"{call}: {os.strerror(number)}")
-
-
-SHORTEST_NS = 100_000
-# System call numbers: the C library has no wrapper.
-_SCHED_SETATTR = {"x86_64": 314, "aarch64": 274, "armv7l": 380, "riscv64": 274}
-_SCHED_OTHER = 0
-# struct sched_attr, first version: size, policy, flags, nice, priority, runtime, deadline, period.
-_SCHED_ATTR = struct.Struct("=IIQiIQQQ")
 
 
 def set_scheduler_slice(slice_ns: int = SHORTEST_NS) -> bool:

@@ -38,6 +38,41 @@ STATUSTEXT_ID = 253
 _STATUSTEXT = struct.Struct("<B50sHB")  # severity, text, id, chunk_seq
 _CHUNK = 50
 _LONGEST_TEXT = 500
+_LAYOUTS = {
+    "uint8_t": "<B",
+    "int8_t": "<b",
+    "uint16_t": "<H",
+    "int16_t": "<h",
+    "uint32_t": "<I",
+    "int32_t": "<i",
+    "uint64_t": "<Q",
+    "int64_t": "<q",
+    "float": "<f",
+}
+# {argument, from 1}{decimals}{unit}; literal braces are escaped.
+_ARGUMENT = re.compile(r"(?<!\\)\{(\d+)(?::\.(\d+))?([^}]*)\}")
+_TAG = re.compile(r"(?<!\\)<[^>]*>")
+_UNITS = {"m": " m", "m_v": " m", "m^2": " m²", "m/s": " m/s", "C": " °C"}
+_MODES_TYPE = "navigation_mode_group_t"
+_MAX_LEVEL = 7  # MAV_SEVERITY_DEBUG; above it are messages between machines
+FTP_ID = 110  # FILE_TRANSFER_PROTOCOL
+_TERMINATE, _RESET, _OPEN, _READ, _ACK = 1, 2, 4, 5, 128
+_END_OF_FILE = 6
+_ERRORS = {1: "failed", 2: "failed: errno", 4: "wrong session", 5: "no free session", 10: "no such file"}
+# target network, system, component; sequence, session, opcode, size, request opcode, burst, padding, offset
+_HEADER = struct.Struct("<3BHBBBBBBI")
+_DATA = 239
+_ATTEMPTS, _ATTEMPT_S = 6, 0.5
+LARGEST_FILE = 4 * 1024 * 1024
+_REQUEST_MESSAGE = 512
+# id, boot ms, sequence, destination component and system, levels, arguments
+_EVENT = struct.Struct("<IIHBBB40s")
+_METADATA = struct.Struct("<II100s")  # boot ms, CRC-32 of the file, its URI
+_EVENTS_TYPE = 4  # COMP_METADATA_TYPE_EVENTS
+_MFTP = re.compile(r"mftp://(?:\[;comp=\d+\])?/?(.+)")
+_METADATA_S = 3.0
+_WAITING_EVENTS = 40
+_LONGEST_GAP = 20  # PX4 buffers this many events
 
 
 class StatusTexts:
@@ -69,25 +104,6 @@ def _text_report(severity: int, text: bytes, now_ns: int) -> Report | None:
     if words.endswith("fence breached"):
         severity = min(severity, WARNING)  # ArduPilot 4.7 sends the reason of its mode change as NOTICE
     return Report(now_ns, severity, words) if words else None
-
-
-_LAYOUTS = {
-    "uint8_t": "<B",
-    "int8_t": "<b",
-    "uint16_t": "<H",
-    "int16_t": "<h",
-    "uint32_t": "<I",
-    "int32_t": "<i",
-    "uint64_t": "<Q",
-    "int64_t": "<q",
-    "float": "<f",
-}
-# {argument, from 1}{decimals}{unit}; literal braces are escaped.
-_ARGUMENT = re.compile(r"(?<!\\)\{(\d+)(?::\.(\d+))?([^}]*)\}")
-_TAG = re.compile(r"(?<!\\)<[^>]*>")
-_UNITS = {"m": " m", "m_v": " m", "m^2": " m²", "m/s": " m/s", "C": " °C"}
-_MODES_TYPE = "navigation_mode_group_t"
-_MAX_LEVEL = 7  # MAV_SEVERITY_DEBUG; above it are messages between machines
 
 
 class Event(NamedTuple):
@@ -176,17 +192,6 @@ def _value(value: str | float, decimals: str | None, unit: str) -> str:
     return words + _UNITS.get(unit, unit)
 
 
-FTP_ID = 110  # FILE_TRANSFER_PROTOCOL
-_TERMINATE, _RESET, _OPEN, _READ, _ACK = 1, 2, 4, 5, 128
-_END_OF_FILE = 6
-_ERRORS = {1: "failed", 2: "failed: errno", 4: "wrong session", 5: "no free session", 10: "no such file"}
-# target network, system, component; sequence, session, opcode, size, request opcode, burst, padding, offset
-_HEADER = struct.Struct("<3BHBBBBBBI")
-_DATA = 239
-_ATTEMPTS, _ATTEMPT_S = 6, 0.5
-LARGEST_FILE = 4 * 1024 * 1024
-
-
 class FileReadError(OSError):
     """The file cannot be read. The message says which and why."""
 
@@ -256,18 +261,6 @@ class FileReader:
         if opcode in (_RESET, _TERMINATE) or (opcode == _READ and error == _END_OF_FILE):
             return answered, b""
         raise FileReadError(f"{path}: {_ERRORS.get(error, f'MAVLink FTP error {error}')}")
-
-
-_REQUEST_MESSAGE = 512
-_EVENT = struct.Struct(
-    "<IIHBBB40s"
-)  # id, boot ms, sequence, destination component and system, levels, arguments
-_METADATA = struct.Struct("<II100s")  # boot ms, CRC-32 of the file, its URI
-_EVENTS_TYPE = 4  # COMP_METADATA_TYPE_EVENTS
-_MFTP = re.compile(r"mftp://(?:\[;comp=\d+\])?/?(.+)")
-_METADATA_S = 3.0
-_WAITING_EVENTS = 40
-_LONGEST_GAP = 20  # PX4 buffers this many events
 
 
 class ReportReader:

@@ -25,6 +25,12 @@ WINDOW_S = 2.0
 _MIN_RATIO = 0.5  # of the expected rate
 _MESSAGES_PER_WINDOW = 2.0  # expected; a slower stream has a longer window
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 2.0, 8.0
+_SET_MESSAGE_INTERVAL = 511
+_REQUEST_MESSAGE = 512
+_MEASURE_S = 1.5
+_CHECK_S = 0.2
+# Messages that pymavlink's "common" does not have.
+_NAMES = {CURRENT_MODE_ID: "CURRENT_MODE", EKF_STATUS_REPORT_ID: "EKF_STATUS_REPORT"}
 
 
 @dataclass(slots=True)
@@ -108,14 +114,6 @@ class StreamMonitor:
     def missing(self) -> tuple[int, ...]:
         """The message ids below half of their rate in their last window."""
         return tuple(message_id for message_id, stream in self._streams.items() if stream.is_missing)
-
-
-_SET_MESSAGE_INTERVAL = 511
-_REQUEST_MESSAGE = 512
-_MEASURE_S = 1.5
-_CHECK_S = 0.2
-# Messages that pymavlink's "common" does not have.
-_NAMES = {CURRENT_MODE_ID: "CURRENT_MODE", EKF_STATUS_REPORT_ID: "EKF_STATUS_REPORT"}
 
 
 class StreamRequests:

@@ -24,6 +24,13 @@ from numpy.typing import NDArray
 
 from vision.plain_yaml import PlainYamlError, load_plain_yaml, numbered
 
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff")
+_TABLE_NAMES = ("data.yaml", "data.yml", "dataset.yaml")
+_SPLITS = ("val", "test", "train")
+# Labels are written with six digits, so a box at the edge may exceed it by this much.
+_ROUNDING = 1e-4
+_LARGEST_LABELS_BYTES = 16 << 20
+
 
 def open_dataset(path: Path, *, split: str | None = None, images: Path | None = None) -> Dataset:
     """Detect the format of the data set at `path` and read its labels.
@@ -45,9 +52,6 @@ def open_dataset(path: Path, *, split: str | None = None, images: Path | None = 
     if annotations is not None:
         return read_coco(annotations, images)
     return read_yolo(path, split)
-
-
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff")
 
 
 class DatasetError(ValueError):
@@ -249,13 +253,6 @@ class _ImageFinder:
                 return folder / file_name
         searched = ", ".join(str(folder) for folder in self._folders)
         raise DatasetError(f"{where}: {file_name} is in none of {searched}; give the folder with --images")
-
-
-_TABLE_NAMES = ("data.yaml", "data.yml", "dataset.yaml")
-_SPLITS = ("val", "test", "train")
-# Labels are written with six digits, so a box at the edge may exceed it by this much.
-_ROUNDING = 1e-4
-_LARGEST_LABELS_BYTES = 16 << 20
 
 
 def read_yolo(path: Path, split: str | None = None) -> Dataset:

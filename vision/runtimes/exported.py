@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import struct
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -86,16 +86,13 @@ class ExportedFacts:
                 f"{path}: its metadata cannot be used ({error!s:.200}); "
                 "export it again with `companion models export`"
             ) from None
-        return cls(
-            names,
-            strides,
-            facts.reg_max,
-            facts.end_to_end,
-            facts.image_size,
-            str(facts.source_sha256),
-            None if fixed is None else (fixed[0], fixed[1]),
-            str(facts.model_family),
-            facts.metadata,
+        return replace(
+            facts,
+            class_names=names,
+            strides=strides,
+            fixed_size=None if fixed is None else (fixed[0], fixed[1]),
+            source_sha256=str(facts.source_sha256),
+            model_family=str(facts.model_family),
         )
 
 

@@ -17,6 +17,7 @@ logger = logging.getLogger(__name__)
 
 # Memory for trying layer implementations. Tuned for boards that share memory with the processor.
 _WORKSPACE_BYTES = 1 << 30
+_CUDA = "cuda.bindings.runtime"
 
 
 def build_plan(onnx_path: Path, *, largest_side: int, stride: int, half: bool = True) -> bytes:
@@ -53,9 +54,6 @@ def build_plan(onnx_path: Path, *, largest_side: int, stride: int, half: bool = 
             f"{onnx_path}: TensorRT cannot build a plan; see its log on standard error"
         )
     return bytes(plan)
-
-
-_CUDA = "cuda.bindings.runtime"
 
 
 class TensorRtRuntime:

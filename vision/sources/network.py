@@ -32,6 +32,13 @@ _LOW_LATENCY = {"fflags": "nobuffer", "flags": "low_delay"}
 _RTP_FORMATS = {"rtp-h264": "H264/90000", "rtp-h265": "H265/90000", "rtp-jpeg": "JPEG/90000"}
 _JPEG_PAYLOAD, _FIRST_DYNAMIC_PAYLOAD = 26, 96
 _LONGEST_STEP_S = 1.0  # a larger step of the stream's time is a discontinuity, not a pause
+_JPEG_TYPES = ("multipart/x-mixed-replace", "image/jpeg", "image/jpg", "video/x-motion-jpeg", "video/x-jpeg")
+_REFUSALS = {
+    401: "requires a user and password",
+    403: "denies access",
+    404: "has no such resource",
+    410: "no longer has this resource",
+}
 
 
 def without_password(uri: str) -> str:
@@ -227,15 +234,6 @@ def _udp_address(uri: str, parts: SplitResult) -> tuple[str, int]:
         return str(socket.getaddrinfo(host, port, socket.AF_INET, socket.SOCK_DGRAM)[0][4][0]), port
     except OSError as error:
         raise SourceError(f"{uri}: {host!r} is not an address and cannot be resolved") from error
-
-
-_JPEG_TYPES = ("multipart/x-mixed-replace", "image/jpeg", "image/jpg", "video/x-motion-jpeg", "video/x-jpeg")
-_REFUSALS = {
-    401: "requires a user and password",
-    403: "denies access",
-    404: "has no such resource",
-    410: "no longer has this resource",
-}
 
 
 def open_http(uri: str, settings: SourceSettings) -> Capture:

@@ -16,6 +16,28 @@ from vision.sources.source import RAW_PIXEL_FORMATS
 
 logger = logging.getLogger(__name__)
 
+MAGIC = b"YUV4MPEG2"
+_LINE_LIMIT = 4096  # bytes; the specification has no limit, a line this long is not a header
+# Horizontal and vertical chroma subsampling, and whether an alpha plane follows. None: no chroma.
+_COLOUR_SPACES: dict[str, tuple[tuple[int, int] | None, bool]] = {
+    "420": ((2, 2), False),
+    "420jpeg": ((2, 2), False),
+    "420mpeg2": ((2, 2), False),
+    "420paldv": ((2, 2), False),
+    "411": ((4, 1), False),
+    "422": ((2, 1), False),
+    "440": ((1, 2), False),
+    "444": ((1, 1), False),
+    "444alpha": ((1, 1), True),
+    "mono": (None, False),
+}
+_LUMA_TO_FULL = np.clip(np.rint((np.arange(256) - 16) * 255.0 / 219.0), 0, 255).astype(np.uint8)
+_CHROMA_TO_FULL = np.clip(np.rint((np.arange(256) - 128) * 255.0 / 224.0 + 128), 0, 255).astype(np.uint8)
+_START = b"\xff\xd8\xff"  # SOI and the first byte of the next marker
+_MARKER = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]", re.DOTALL)
+_SOI, _EOI, _SOS, _TEM = 0xD8, 0xD9, 0xDA, 0x01
+_LARGEST_IMAGE = 64 << 20  # bytes; more without an end is not a JPEG
+
 
 class StreamError(Exception):
     """The bytes do not follow the format."""
@@ -84,27 +106,6 @@ class RawParser:
             f"the last frame is incomplete: {len(self._buffer)} of {self._frame_bytes} bytes "
             f"({self._width}x{self._height} {self._format}); check width and height"
         )
-
-
-MAGIC = b"YUV4MPEG2"
-_LINE_LIMIT = 4096  # bytes; the specification has no limit, a line this long is not a header
-
-# Horizontal and vertical chroma subsampling, and whether an alpha plane follows. None: no chroma.
-_COLOUR_SPACES: dict[str, tuple[tuple[int, int] | None, bool]] = {
-    "420": ((2, 2), False),
-    "420jpeg": ((2, 2), False),
-    "420mpeg2": ((2, 2), False),
-    "420paldv": ((2, 2), False),
-    "411": ((4, 1), False),
-    "422": ((2, 1), False),
-    "440": ((1, 2), False),
-    "444": ((1, 1), False),
-    "444alpha": ((1, 1), True),
-    "mono": (None, False),
-}
-
-_LUMA_TO_FULL = np.clip(np.rint((np.arange(256) - 16) * 255.0 / 219.0), 0, 255).astype(np.uint8)
-_CHROMA_TO_FULL = np.clip(np.rint((np.arange(256) - 128) * 255.0 / 224.0 + 128), 0, 255).astype(np.uint8)
 
 
 @dataclass(frozen=True, slots=True)
@@ -266,12 +267,6 @@ class Y4mParser:
         if self._buffer:
             return f"{len(self._buffer)} bytes of an incomplete line"
         return ""
-
-
-_START = b"\xff\xd8\xff"  # SOI and the first byte of the next marker
-_MARKER = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]", re.DOTALL)
-_SOI, _EOI, _SOS, _TEM = 0xD8, 0xD9, 0xDA, 0x01
-_LARGEST_IMAGE = 64 << 20  # bytes; more without an end is not a JPEG
 
 
 class MjpegSplitter:

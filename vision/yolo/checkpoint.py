@@ -57,6 +57,11 @@ _LONGEST_TEXT = 100_000
 # Of all layers together: the largest published networks have about eighty.
 _MOST_REPEATS = 256
 
+Modules = Mapping[str, Stub]
+"""Dotted name → module, `model.<row>` for the rows."""
+# The last convolution of each layer, by its name: its channels are the layer's output.
+_LAST_CONVOLUTIONS = ("cv3.conv", "cv2.conv", "conv")
+
 
 @dataclass(frozen=True, slots=True)
 class LoadedModel:
@@ -311,13 +316,6 @@ def _plain(value: Any) -> Any:
         raise CheckpointError(f"has a {type(value).__name__} where a plain value belongs")
 
     return copy(value, 0)
-
-
-Modules = Mapping[str, Stub]
-"""Dotted name → module, `model.<row>` for the rows."""
-
-# The last convolution of each layer, by its name: its channels are the layer's output.
-_LAST_CONVOLUTIONS = ("cv3.conv", "cv2.conv", "conv")
 
 
 def as_trained(description: ModelDescription, modules: Modules) -> ModelDescription:

@@ -26,6 +26,8 @@ PAIR_FORMAT = "mavlink-companion.yolo.v2"
 WEIGHTS_SUFFIX = ".safetensors"
 DESCRIPTION_SUFFIXES = (".yaml", ".yml")
 _LARGEST_DESCRIPTION_BYTES = 2 << 20
+# The library accepts headers of 100 MB, which take gigabytes to parse; a network's has a few hundred kB.
+_MAX_HEADER_BYTES = 4 << 20
 
 
 def is_pair(path: Path) -> bool:
@@ -188,10 +190,6 @@ def _one_line_rows(description: Mapping[str, Any]) -> dict[str, Any]:
         else (_Row(value) if isinstance(value, list) else value)
         for key, value in description.items()
     }
-
-
-# The library accepts headers of 100 MB, which take gigabytes to parse; a network's has a few hundred kB.
-_MAX_HEADER_BYTES = 4 << 20
 
 
 def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:

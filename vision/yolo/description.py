@@ -12,6 +12,15 @@ from typing import Any
 from vision.yolo.layers import ACTIVATIONS
 
 _LARGEST_REPEATS = 64
+# Defaults of omitted arguments; the first, the channels, has none.
+C3K2_DEFAULTS = (None, False, 0.5, False, 1, True)
+A2C2F_DEFAULTS = (None, True, 1, False, 2.0, 0.5, 1, True)
+PUBLISHED_MLP_RATIOS = (2.0, 1.2)
+SPPF_DEFAULTS = (None, 5, 3, False, True)
+_LARGEST_ROWS = 128
+_LARGEST_CLASS_WIDTH = 1 << 14
+# Families with these layers have depthwise class branches in the head.
+_LIGHT_CLASS_LAYERS = frozenset({"C3k2", "A2C2f", "C2fCIB", "v10Detect"})
 
 
 class ArchitectureError(ValueError):
@@ -62,13 +71,6 @@ class LayerSpec:
         return replace(self, arguments=tuple(arguments[: max(len(self.arguments), position + 1)]))
 
 
-# Defaults of omitted arguments; the first, the channels, has none.
-C3K2_DEFAULTS = (None, False, 0.5, False, 1, True)
-A2C2F_DEFAULTS = (None, True, 1, False, 2.0, 0.5, 1, True)
-PUBLISHED_MLP_RATIOS = (2.0, 1.2)
-SPPF_DEFAULTS = (None, 5, 3, False, True)
-
-
 def apply_scale(row: LayerSpec, scale: str) -> LayerSpec:
     """Make explicit what a table shared by all scales (YOLO11, 12 and 26) implies for the larger ones.
 
@@ -90,12 +92,6 @@ def apply_pooling_form(row: LayerSpec) -> LayerSpec:
     if row.layer == "SPPF" and 2 < len(row.arguments) < len(SPPF_DEFAULTS):
         return row.with_argument(4, False, SPPF_DEFAULTS)
     return row
-
-
-_LARGEST_ROWS = 128
-_LARGEST_CLASS_WIDTH = 1 << 14
-# Families with these layers have depthwise class branches in the head.
-_LIGHT_CLASS_LAYERS = frozenset({"C3k2", "A2C2f", "C2fCIB", "v10Detect"})
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,6 +32,8 @@ from vision.yolo.layers import (
 LARGEST_KERNEL = 31
 _LARGEST_CHANNELS = 1 << 14
 _MOST_REPEATS = 64
+HEADS = ("Detect", "v10Detect")
+_BUILDERS: dict[str, tuple[_Builder, int | None, bool]] = {}
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,9 +103,6 @@ class LayerArguments:
         return repeats
 
 
-HEADS = ("Detect", "v10Detect")
-
-
 @dataclass(frozen=True, slots=True)
 class BuiltLayer:
     """A row's module, its output channels, and the factors by which it reduces and enlarges the size."""
@@ -115,7 +114,6 @@ class BuiltLayer:
 
 
 _Builder = Callable[["LayerArguments"], BuiltLayer]
-_BUILDERS: dict[str, tuple[_Builder, int | None, bool]] = {}
 
 
 def build_layer(row: LayerSpec, inputs: Sequence[int], description: ModelDescription) -> BuiltLayer:

@@ -21,6 +21,8 @@ BATCH_NORM_EPSILON = 1e-3
 BATCH_NORM_MOMENTUM = 0.03
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {"SiLU": nn.SiLU, "ReLU": nn.ReLU}
+CHANNELS_PER_HEAD = 64
+CHANNELS_PER_AREA_HEAD = 32
 
 
 def same_padding(kernel: int) -> int:
@@ -84,10 +86,6 @@ class DWConv(Conv):
     ) -> None:
         groups = math.gcd(inputs, outputs)
         super().__init__(inputs, outputs, kernel, stride, groups=groups, activate=activate)
-
-
-CHANNELS_PER_HEAD = 64
-CHANNELS_PER_AREA_HEAD = 32
 
 
 def attend(query: Tensor, key: Tensor, value: Tensor) -> Tensor:

@@ -20,6 +20,11 @@ from torch import Tensor
 ALPHA = 0.5
 BETA = 6.0
 TOP_K = 10
+BINS = 16
+"""Distance bins per side of a box; bin k is k strides."""
+BOX_GAIN = 7.5
+CLASS_GAIN = 0.5
+DISTRIBUTION_GAIN = 1.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,14 +128,6 @@ def assign_task_aligned(
     cell_classes = true_classes.gather(1, owner)
     targets = torch.zeros_like(scores).scatter_(-1, cell_classes[..., None], strength[..., None])
     return Assignment(foreground, cell_boxes, targets)
-
-
-BINS = 16
-"""Distance bins per side of a box; bin k is k strides."""
-
-BOX_GAIN = 7.5
-CLASS_GAIN = 0.5
-DISTRIBUTION_GAIN = 1.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)

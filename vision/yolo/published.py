@@ -59,6 +59,8 @@ SCALES: Mapping[str, Mapping[str, Scale]] = {
 }
 """Model family → scale letter → its multipliers, as published."""
 
+_USUAL_STRIDES = (8, 16, 32)
+
 
 def published_description(
     model_family: str, scale: str | Scale, class_names: Sequence[str]
@@ -228,9 +230,6 @@ def _rows(blocks: _Blocks) -> tuple[list[Any], list[Any]]:
         levels.append(block(2 * channels, kind))
     add(blocks.head, ("nc",), source=list(levels))
     return rows[:in_backbone], rows[in_backbone:]
-
-
-_USUAL_STRIDES = (8, 16, 32)
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,6 +24,15 @@ LabelledImage = tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.int64]]
 
 An id ~class (negative) marks an object that is neither to be detected nor background."""
 
+SceneSource = Callable[[np.random.Generator, int, int], LabelledImage]
+"""`(rng, width, height) → (image (height, width, 3) uint8 BGR, boxes (N, 4) pixels xyxy, class ids (N,))`.
+
+A class id ~class marks an object that is not to be learned (`LabelledImage`). All randomness must come from
+`rng`. With workers it must be picklable: a module-level function, or a `functools.partial` of one.
+"""
+KEPT_BYTES = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 4
+"""Cache of repeated scenes per drawing process, a quarter of the memory; others are drawn again."""
+
 
 @dataclass(frozen=True, slots=True)
 class Augmentation:
@@ -145,17 +154,6 @@ def _recoloured(
     table = np.stack([hue_table, saturation_table, brightness_table], -1)[None]
     coloured = cv2.LUT(cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_BGR2HSV), table)
     return cv2.cvtColor(coloured, cv2.COLOR_HSV2BGR).astype(np.uint8, copy=False)
-
-
-SceneSource = Callable[[np.random.Generator, int, int], LabelledImage]
-"""`(rng, width, height) → (image (height, width, 3) uint8 BGR, boxes (N, 4) pixels xyxy, class ids (N,))`.
-
-A class id ~class marks an object that is not to be learned (`LabelledImage`). All randomness must come from
-`rng`. With workers it must be picklable: a module-level function, or a `functools.partial` of one.
-"""
-
-KEPT_BYTES = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 4
-"""Cache of repeated scenes per drawing process, a quarter of the memory; others are drawn again."""
 
 
 @dataclass(frozen=True, slots=True)
