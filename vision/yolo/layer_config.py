@@ -33,7 +33,6 @@ LARGEST_KERNEL = 31
 _LARGEST_CHANNELS = 1 << 14
 _MOST_REPEATS = 64
 HEADS = ("Detect", "v10Detect")
-_BUILDERS: dict[str, tuple[_Builder, int | None, bool]] = {}
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,6 +113,7 @@ class BuiltLayer:
 
 
 _Builder = Callable[["LayerArguments"], BuiltLayer]
+_BUILDERS: dict[str, tuple[_Builder, int | None, bool]] = {}
 
 
 def build_layer(row: LayerSpec, inputs: Sequence[int], description: ModelDescription) -> BuiltLayer:
