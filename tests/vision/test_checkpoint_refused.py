@@ -242,13 +242,6 @@ def test_an_archive_without_a_model_is_rejected(tmp_path: Path) -> None:
             load_checkpoint(tmp_path / "x.pt")
 
 
-def test_a_compressed_archive_is_rejected(tmp_path: Path) -> None:
-    with zipfile.ZipFile(tmp_path / "bomb.pt", "w", zipfile.ZIP_DEFLATED) as file:
-        file.writestr("model/data.pkl", bytes(50_000_000))
-    with pytest.raises(CheckpointError, match="is compressed"):
-        load_checkpoint(tmp_path / "bomb.pt")
-
-
 def test_two_members_that_share_their_bytes_are_rejected(tmp_path: Path) -> None:
     """Overlapping members make a small file large."""
     path = tmp_path / "overlap.pt"

@@ -128,7 +128,7 @@ def runtime_of_file(
 ) -> Runtime:
     """Load an exported file. `head` None: from the file's metadata."""
     if name == "torch":
-        from vision.runtimes.torchscript_runtime import TorchScriptRuntime
+        from vision.runtimes.torch_runtime import TorchScriptRuntime
 
         return TorchScriptRuntime(path, head, precision=precision, threads=threads)
     if name == "onnxruntime":

@@ -278,11 +278,9 @@ def test_foreign_plan_is_rejected(content: bytes) -> None:
 
 
 def test_kind_follows_from_the_suffix() -> None:
-    assert kind_of(Path("a/b.onnx")) == "onnx"
-    assert kind_of(Path("b.xml")) == "openvino"
-    assert kind_of(Path("b.engine")) == "tensorrt"
-    assert kind_of(Path("b.torchscript")) == "torchscript"
-    assert kind_of(Path("b.pt")) is None
+    names = ("a/b.onnx", "b.xml", "b.engine", "b.torchscript", "b.pt")
+    kinds = [kind_of(Path(name)) for name in names]
+    assert kinds == ["onnx", "openvino", "tensorrt", "torchscript", None]
     assert FORMAT.endswith(".v1")
 
 
