@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 from safetensors import SafetensorError, safe_open
-from torch import Tensor
 
 from vision.plain_yaml import PlainDumper, PlainYamlError, load_plain_yaml, numbered
 from vision.yolo.safe_pickle import CheckpointError, one_line
