@@ -21,7 +21,7 @@ from companion.bus.bodies import DetectionBody, DetectionsBody
 from companion.bus.client import client_settings, open_client, subscribe_kept
 from companion.bus.session import Bus
 from companion.settings import ZenohSection
-from companion.vehicle.scheduler_slice import set_scheduler_slice
+from companion.vehicle.precise_sleep import set_scheduler_slice
 from mavlink_sim.testing import free_port
 
 VEHICLE = "bench"

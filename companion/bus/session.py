@@ -36,7 +36,7 @@ from companion.bus.topics import (
     command_key,
 )
 from companion.settings import ZenohSection
-from companion.vehicle.scheduler_slice import set_scheduler_slice
+from companion.vehicle.precise_sleep import set_scheduler_slice
 
 __all__ = ["Bus", "BusError", "encode", "zenoh_config"]
 
