@@ -74,7 +74,6 @@ SIMULATOR_LAYERS = {
     "faults": 5,
     "services": 5,
     "lockstep_link": 6,
-    "lockstep_wire": 6,
     "vehicles": 6,
     "lockstep": 7,
     "realtime": 7,

@@ -16,7 +16,7 @@ from companion.guidance.command import COMMANDS
 from mavlink_sim.camera.cli import app as camera_app
 from mavlink_sim.cli.bench import app as bench_app
 from mavlink_sim.cli.main import app as simulator_app
-from mavlink_sim.datasets.cli import app as dataset_app
+from mavlink_sim.datasets.dataset import app as dataset_app
 
 ROOT = Path(__file__).parent.parent
 DOCUMENTS = [

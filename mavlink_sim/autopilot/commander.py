@@ -11,16 +11,17 @@ import struct
 from collections import deque
 from collections.abc import Callable
 
-from mavlink_sim.autopilot import arming_checks, position_failsafe
+from mavlink_sim.autopilot import position_failsafe
 from mavlink_sim.autopilot.ground_contact import TAKEOFF_DETECTION_HEIGHT_M, GroundContact, asks_to_rise
 from mavlink_sim.autopilot.home import Home
-from mavlink_sim.autopilot.supervision import REASONS, Supervision
-from mavlink_sim.flight import manual_flight, reposition
+from mavlink_sim.autopilot.supervision import REASONS, Supervision, failing_checks
+from mavlink_sim.flight import manual_flight
 from mavlink_sim.flight import tasks as flight
 from mavlink_sim.flight.attitude_control import AttitudeController, RatesSetpoint
 from mavlink_sim.flight.orbit import Orbit, OrbitRequest
 from mavlink_sim.flight.position_control import Demand, PositionController, TrajectorySetpoint
 from mavlink_sim.flight.precision_landing import Precision
+from mavlink_sim.flight.tasks import Reposition, reposition_goal
 from mavlink_sim.missions.navigator import Navigator
 from mavlink_sim.physics.airframe import Multirotor, Vector
 from mavlink_sim.physics.geography import LocalFrame
@@ -217,7 +218,7 @@ class Autopilot:
 
     def report_checks(self) -> None:
         """Report the failing checks by their events, for RUN_PREARM_CHECKS and a refusal to arm."""
-        self.texts.extend(arming_checks.failing_checks(self))
+        self.texts.extend(failing_checks(self))
 
     def disarm(self, force: bool = False, by: str = "external command") -> int:
         """MAV_RESULT of a disarming request; `force` stops the motors in the air too."""
@@ -314,11 +315,11 @@ class Autopilot:
         if not (self.armed and self.mode is Mode.HOLD):  # not armed, or a failsafe is active
             return
         airframe, parameters = self._airframe, self._parameters
-        goal = reposition.reposition_goal(goal, yaw_rad, airframe, parameters, former)
+        goal = reposition_goal(goal, yaw_rad, airframe, parameters, former)
         if not self.navigator.allows_goal(goal):
             self._send_text(CRITICAL, "Reposition is outside geofence\t")
             return
-        self.task = reposition.Reposition(airframe, parameters, goal, yaw_rad, self.home.position)
+        self.task = Reposition(airframe, parameters, goal, yaw_rad, self.home.position)
         self.task.cruise_at(speed_mps if speed_mps > 0.0 else self.cruise_mps)
 
     def _goal(self) -> Vector | None:

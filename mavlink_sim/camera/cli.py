@@ -19,8 +19,7 @@ from mavlink_sim.camera.cli_options import CameraOutputs, CameraRate, CameraTrut
 from mavlink_sim.camera.process import OUTPUT_FAILED, CameraProcess
 from mavlink_sim.camera.scene import Scene
 from mavlink_sim.camera.scene_file import scene_or_demo
-from mavlink_sim.camera.vehicle_link import AutopilotLink
-from mavlink_sim.camera.vehicle_pose import Pose, PoseHistory, Vector
+from mavlink_sim.camera.vehicle_pose import AutopilotLink, Pose, PoseHistory, Vector
 from mavlink_sim.camera.video_outputs import STANDARD_OUTPUT
 from mavlink_sim.world.truth_file import TruthFile, object_truth
 from vision.attitude import euler_from_quaternion
@@ -89,11 +88,7 @@ def camera(
         world_origin = None if origin is None else _parse_origin(origin)
         with ExitStack() as resources:
             process = CameraProcess(
-                chosen,
-                rate_hz=rate_hz,
-                shared_name=camera,
-                outputs=camera_output or (),
-                truth=camera_truth,
+                chosen, rate_hz=rate_hz, shared_name=camera, outputs=camera_output or (), truth=camera_truth
             )
             lines = None
             if truth is not None:

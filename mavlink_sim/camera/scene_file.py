@@ -69,10 +69,7 @@ Degrees = Annotated[Number, Field(ge=-360, le=360)]
 Positive = Annotated[Number, Field(gt=0, le=100_000)]
 Colour = Annotated[list[Annotated[Number, Field(ge=0, le=255)]], Field(min_length=3, max_length=3)]
 Gain = Annotated[list[Annotated[Number, Field(gt=0, le=4)]], Field(min_length=3, max_length=3)]
-Size = Annotated[
-    list[Annotated[Number, Field(ge=0.001, le=500)]],
-    Field(min_length=3, max_length=3),
-]
+Size = Annotated[list[Annotated[Number, Field(ge=0.001, le=500)]], Field(min_length=3, max_length=3)]
 Seed = Annotated[int, Field(ge=0, le=2**31 - 1)]
 
 

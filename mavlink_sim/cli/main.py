@@ -18,7 +18,6 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from mavlink_sim.camera.cli_options import CameraOutputs, CameraRate, CameraTruth, SceneName
-from mavlink_sim.camera.video_outputs import STANDARD_OUTPUT
 from mavlink_sim.physics.midair import REACH_M
 from mavlink_sim.px4.parameters import UnknownParameterError
 from mavlink_sim.realtime.fleet import Fleet, instance_options
@@ -160,12 +159,10 @@ def simulate(
         ),
     ] = None,
     fault: Annotated[
-        list[str] | None,
-        typer.Option(help="Inject a fault, e.g. 'link_delay 0.2 at=20 for=5'; repeatable."),
+        list[str] | None, typer.Option(help="Inject a fault, e.g. 'link_delay 0.2 at=20 for=5'; repeatable.")
     ] = None,
     console: Annotated[
-        bool | None,
-        typer.Option(help="Read faults from standard input; by default if that is a terminal."),
+        bool | None, typer.Option(help="Read faults from standard input; by default if that is a terminal.")
     ] = None,
     control: Annotated[
         str | None, typer.Option(help="Accept faults over zenoh too, at this endpoint: tcp/127.0.0.1:7447.")
@@ -178,8 +175,7 @@ def simulate(
     ] = None,
     verbose: Annotated[bool, typer.Option("--verbose", help="Also log the links.")] = False,
     version: Annotated[
-        bool,
-        typer.Option("--version", callback=_print_version, is_eager=True, help="Show the version."),
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Show the version.")
     ] = False,
 ) -> None:
     """Fly a PX4-like multirotor on UDP until interrupted (Ctrl-C)."""
@@ -199,7 +195,7 @@ def simulate(
         _check("gusts", gusts, 0.0, MAX_GUSTS_MPS)
     if camera_rate is not None:
         _check("camera-rate", camera_rate, 1.0, 120.0)
-    if STANDARD_OUTPUT in (camera_output or []):
+    if "pipe:-" in (camera_output or []):
         sys.stdout = sys.stderr  # standard output carries only the images
     _check("ready-after", ready_after, 0.0, 600.0)
     _check("speed", speed, 0.05, 20.0)
@@ -336,7 +332,7 @@ def main() -> None:
     """The entry point; a usage error is one line on standard error, with exit code 2."""
     try:
         if sys.argv[1:2] == ["dataset"]:
-            from mavlink_sim.datasets.cli import app as dataset_app
+            from mavlink_sim.datasets.dataset import app as dataset_app
 
             code = dataset_app(sys.argv[2:], prog_name="mavlink-sim dataset", standalone_mode=False)
         elif sys.argv[1:2] == ["camera"]:

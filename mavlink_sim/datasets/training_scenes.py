@@ -8,7 +8,7 @@ them. All random numbers are from one generator, so that a seed gives the same i
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 
@@ -77,10 +77,7 @@ _SIZES_M = {
 
 
 def random_scene(
-    rng: np.random.Generator,
-    width: int = 384,
-    height: int = 384,
-    focal_px: tuple[float, float] | None = None,
+    rng: np.random.Generator, width: int = 384, height: int = 384, focal_px: tuple[float, float] | None = None
 ) -> tuple[Image, Boxes, ClassIds]:
     """One labelled image.
 
@@ -266,14 +263,6 @@ def random_frame(
     effects = _random_effects(rng)
     renderer = Renderer(World(objects, ground, light, sky), camera, CameraMount(), effects, buffers, rng)
     return renderer.render(position, attitude)
-
-
-def render_dataset(
-    count: int, seed: int, width: int = 384, height: int = 384
-) -> Iterator[tuple[Image, Boxes, ClassIds]]:
-    """`count` labelled images; image i of a seed is the same whatever the count."""
-    for index in range(count):
-        yield random_scene(np.random.default_rng((seed, index)), width, height)
 
 
 def _counts(xyxy: tuple[float, float, float, float], visible_fraction: float) -> bool:

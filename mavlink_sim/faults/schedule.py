@@ -20,8 +20,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from mavlink_sim.faults.context import ActiveFault, FaultTarget, Gate, Refusal
-from mavlink_sim.faults.effects_link import chosen_links
-from mavlink_sim.faults.effects_messages import shifted
+from mavlink_sim.faults.effects import chosen_links, shifted
 from mavlink_sim.faults.grammar import Fault, FaultError, parse_fault
 from mavlink_sim.faults.kinds import EFFECTS, KINDS
 from mavlink_sim.physics.airframe import Vector

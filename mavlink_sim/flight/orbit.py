@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 from mavlink_sim.flight.position_control import NAN, NOTHING, TrajectorySetpoint
-from mavlink_sim.flight.tasks import Task, Trajectory
+from mavlink_sim.flight.tasks import Trajectory, TrajectoryTask
 from mavlink_sim.physics.airframe import Multirotor, Vector
 from mavlink_sim.px4.parameters import Parameters
 
@@ -52,13 +52,11 @@ class OrbitRequest:
     centre: Vector
 
 
-class Orbit(Task):
+class Orbit(TrajectoryTask):
     """Orbit a centre. `refused` after a request outside the limits: then the vehicle hovers."""
 
     def __init__(self, airframe: Multirotor, parameters: Parameters) -> None:
-        self._airframe = airframe
-        self._parameters = parameters
-        self._trajectory = Trajectory(airframe, parameters)
+        super().__init__(airframe, parameters)
         self._heading = _Heading(airframe.yaw_rad)
         self.refused = False
         self.centre = airframe.position
@@ -105,8 +103,7 @@ class Orbit(Task):
 
     def _possible_speed(self, speed_mps: float) -> float:
         limit = min(
-            abs(self._parameters.number("MPC_XY_VEL_MAX")),
-            math.sqrt(MAX_CENTRIPETAL_MPS2 * self.radius_m),
+            abs(self._parameters.number("MPC_XY_VEL_MAX")), math.sqrt(MAX_CENTRIPETAL_MPS2 * self.radius_m)
         )
         return min(max(speed_mps, -limit), limit)
 

@@ -71,13 +71,11 @@ class PrecisionLanding(flight.TrajectoryTask):
         point: Vector | None = None,
         on_phase: Callable[[str], None] | None = None,
     ) -> None:
-        self._airframe = airframe
-        self._parameters = parameters
+        super().__init__(airframe, parameters)
         self._precision = precision
         self._newest = newest
         self._now_s = now_s
         self._on_phase = on_phase
-        self._trajectory = flight.Trajectory(airframe, parameters)
         self.goal: Vector = self._trajectory.stopping_point() if point is None else point
         self._land: flight.Land | None = None
         self._seen: LandingTarget | None = None
@@ -107,7 +105,7 @@ class PrecisionLanding(flight.TrajectoryTask):
             self._approach_target()
         elif self._precision is Precision.OPPORTUNISTIC:
             self._fall_back()
-        elif self._horizontal_distance(self.goal) < self._parameters.number("NAV_ACC_RAD"):
+        elif math.dist(self.goal[:2], self._airframe.position[:2]) < self._parameters.number("NAV_ACC_RAD"):
             if not self._parameters.number("PLD_SRCH_TOUT") > 0.0:
                 self._fall_back()
             elif self._waited(SETTLE_S):
@@ -219,9 +217,6 @@ class PrecisionLanding(flight.TrajectoryTask):
     def _within_acceptance(self, target: LandingTarget) -> bool:
         radius = self._parameters.number("PLD_HACC_RAD")
         return all(abs(target.position[axis] - self._airframe.position[axis]) < radius for axis in (0, 1))
-
-    def _horizontal_distance(self, point: Vector) -> float:
-        return math.dist(point[:2], self._airframe.position[:2])
 
     def _waited(self, seconds: float) -> bool:
         """Whether the first call in this phase was longer ago than that."""

@@ -79,10 +79,7 @@ def trajectory_setpoint(
 
 
 def global_trajectory_setpoint(
-    message: Any,
-    frame: LocalFrame,
-    home_altitude_m: float | None,
-    ground_altitude_m: float = HOME_ALTITUDE_M,
+    message: Any, frame: LocalFrame, home_altitude_m: float | None, ground_altitude_m: float = HOME_ALTITUDE_M
 ) -> TrajectorySetpoint | None:
     """The setpoint of a SET_POSITION_TARGET_GLOBAL_INT message; None where PX4 drops it silently.
 

@@ -76,10 +76,7 @@ def areas_of(items: Sequence[MissionItem], frame: LocalFrame) -> list[Area]:
     index = 0
     while index < len(items):
         item = items[index]
-        circle = item.command in (
-            mission_items.FENCE_CIRCLE_INCLUSION,
-            mission_items.FENCE_CIRCLE_EXCLUSION,
-        )
+        circle = item.command in (mission_items.FENCE_CIRCLE_INCLUSION, mission_items.FENCE_CIRCLE_EXCLUSION)
         count = 1
         if item.command in mission_items.FENCE_POLYGONS:
             count = max(int(item.parameters[0]), 1)

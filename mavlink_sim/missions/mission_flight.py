@@ -73,7 +73,7 @@ class Stage(enum.Enum):
     ACT = "act"  # an item without a position
 
 
-class MissionFlight(flight.Task):
+class MissionFlight(flight.TrajectoryTask):
     """Fly the mission on board from its current item on.
 
     Attributes:
@@ -83,9 +83,7 @@ class MissionFlight(flight.Task):
     def __init__(self, navigator: MissionNavigator, airframe: Multirotor, parameters: Parameters) -> None:
         self._navigator = navigator
         self._mission = navigator.mission
-        self._airframe = airframe
-        self._parameters = parameters
-        self._trajectory = flight.Trajectory(airframe, parameters)
+        super().__init__(airframe, parameters)
         self._descent: flight.TrajectoryTask | None = None
         self._since_check_s = 0.0
         self._arrived_s: float | None = None

@@ -161,10 +161,8 @@ class RouteReturn(flight.TrajectoryTask):
         make_landing: Callable[[Vector, float], flight.TrajectoryTask],
         climb_to_z: float | None = None,
     ) -> None:
-        self._airframe = airframe
-        self._parameters = parameters
+        super().__init__(airframe, parameters)
         self._make_landing = make_landing
-        self._trajectory = flight.Trajectory(airframe, parameters)
         self._landing = landing
         self._descent: flight.TrajectoryTask | None = None
         x, y, z = self._trajectory.stopping_point()

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from enum import Enum
 
 from mavlink_sim.physics.airframe import Vector
+from mavlink_sim.physics.quaternions import product
 from mavlink_sim.px4.parameters import Parameters
-
-Quaternion = tuple[float, float, float, float]
+from vision.attitude import Quaternion
 
 SLEW_RADPS = math.radians(120.0)  # slew rate to a new target, of a small brushless gimbal
 JOINT_RADPS = math.radians(300.0)  # greatest rate of stabilisation
@@ -87,7 +87,7 @@ class Gimbal:
     @property
     def body_quaternion(self) -> Quaternion:
         """`body_from_gimbal`, (w, x, y, z): the current mount of a camera on it."""
-        return _product(_about_z(self.pan_rad), _about_y(self.tilt_rad))
+        return product(_about_z(self.pan_rad), _about_y(self.tilt_rad))
 
     def angular_velocity(self, body_rates: Vector) -> Vector:
         """About the gimbal's own axes, rad/s, given the vehicle's body rates (FRD)."""
@@ -144,7 +144,7 @@ class Gimbal:
 
     def _aim_angles(self, attitude: Quaternion) -> None:
         """The pose that follows from the joints."""
-        self.quaternion = _product(attitude, self.body_quaternion)
+        self.quaternion = product(attitude, self.body_quaternion)
         x, y, z = _x_axis(self.quaternion)
         self.pitch_rad = math.asin(min(max(-z, -1.0), 1.0))
         if math.hypot(x, y) > 1e-6:
@@ -264,14 +264,3 @@ def _about_z(angle: float) -> Quaternion:
 
 def _about_y(angle: float) -> Quaternion:
     return (math.cos(angle / 2.0), 0.0, math.sin(angle / 2.0), 0.0)
-
-
-def _product(p: Quaternion, q: Quaternion) -> Quaternion:
-    a, b, c, d = p
-    e, f, g, h = q
-    return (
-        a * e - b * f - c * g - d * h,
-        a * f + b * e + c * h - d * g,
-        a * g - b * h + c * e + d * f,
-        a * h + b * g - c * f + d * e,
-    )

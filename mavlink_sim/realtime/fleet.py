@@ -12,9 +12,8 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
-from mavlink_sim.realtime.loop import run_together
 from mavlink_sim.realtime.options import SimulationOptions
-from mavlink_sim.realtime.simulation import Simulation
+from mavlink_sim.realtime.simulation import Simulation, run_together
 from mavlink_sim.vehicles.fleet_world import FleetWorld
 
 MAX_VEHICLES = 250  # system ids are 1 to 255, and a ground station needs some

@@ -10,34 +10,20 @@ from mavlink_sim.vehicles.firmware import PX4
 
 @dataclass(frozen=True)
 class SimulationOptions:
-    """The options of a simulation; those of the command line have the same names and defaults.
+    """The options of a simulation, with the names and defaults of the command line, whose help explains them.
 
     Attributes:
-        onboard_port, gcs_port: UDP ports the vehicle initially sends to.
         onboard_bind, gcs_bind: UDP ports it binds; 0 selects free ones.
         wind_mps: steady wind; `seed` sets its direction, the gusts and the world.
         gusts_mps: standard deviation of the gusts per axis; None for the default, 0 for none.
         world_seed: sets them instead, the same for all vehicles of a fleet; None: `seed`.
         camera: name of the shared-memory segment the camera's frames go to; None for no shared memory.
         camera_outputs: further addresses the frames go to (`video_outputs`).
-        camera_truth: file for the objects in each frame, one JSON object per line.
         scene: a scene file, or the name of an example (`scene_file.load_scene`), whose objects are obstacles;
             None for the demo world, which is only visible.
-        obstacle_sensor: with a 360° range sensor for collision prevention; needs a scene.
-        truth: file for the truth, one JSON object per line; None for none.
-        record: folder for the traffic of each link, `<link>-<system id>.tlog`; None for none.
-        ready_after_s: how long after boot the estimator allows arming.
-        autopilot: the firmware to emulate, `firmware.AUTOPILOTS`.
-        px4: the release of PX4 to emulate; None: the newest.
-        speed: simulated seconds per real second.
-        noise: whether sensors and estimates have a real vehicle's errors.
         start_ned_m: north and east of SIH's home, the start and origin of its local frame.
-        parameters: PX4 parameters that differ from the defaults.
-        gimbal: with a two-axis gimbal (gimbal protocol version 2) that carries the camera.
         signing_key: 32 bytes for MAVLink 2 signing on every link; MAV_SIGN_CFG sets what is refused.
-        faults: in the grammar of `faults.grammar`; they begin at the start or at their time.
         console: read faults from standard input; None: if that is a terminal.
-        control: a zenoh endpoint that accepts faults (`tcp/127.0.0.1:7447`); None for none.
     """
 
     host: str = "127.0.0.1"

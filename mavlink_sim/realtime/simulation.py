@@ -5,32 +5,30 @@ One thread, one loop: wait for the sockets until the next physics step is due, p
 
 from __future__ import annotations
 
+import selectors
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mavlink_sim.faults.injector import fault_injector
-from mavlink_sim.realtime.loop import run_together
 from mavlink_sim.realtime.options import SimulationOptions
 from mavlink_sim.realtime.sim_outputs import SimOutputs, loaded_scene
 from mavlink_sim.vehicles.firmware import vehicle_class
 from mavlink_sim.vehicles.fleet_world import FleetWorld
 from mavlink_sim.vehicles.vehicle import STEP_S
-from mavlink_sim.wire.endpoint import UdpEndpoint
+from mavlink_sim.wire.endpoint import UdpEndpoint, recording
 from mavlink_sim.wire.streams import GCS_RATES_HZ
-from mavlink_sim.wire.traffic_log import recording
 from mavlink_sim.world.aircraft import identifier_offset
 
-if TYPE_CHECKING:
-    pass
+PACE_PERIOD_S = 5.0
 
 # After a stall longer than this the simulation does not catch up but drops the time.
 MAX_BACKLOG_S = 0.25
 
 
 class Simulation:
-    """One vehicle running in real time. Use as a context manager; `run` returns after `stop`.
+    """One vehicle running in real time. Use as a context manager; `run_together` runs it.
 
     Args:
         fleet_world: the vehicles of its fleet; None: it is alone.
@@ -68,10 +66,8 @@ class Simulation:
         )
         self.vehicle.clock_ns = self._boot_clock_ns
         self.vehicle.utc_ns = time.time_ns
-        self._stopped = False
         self._started_ns = time.monotonic_ns()
         self._simulated_s = 0.0
-        self._on_event = on_event
         self._resources = ExitStack()
         try:
             self.endpoints = {
@@ -114,10 +110,6 @@ class Simulation:
     def close(self) -> None:
         self._resources.close()
 
-    def stop(self) -> None:
-        """Make `run` return soon; may be called from a signal handler."""
-        self._stopped = True
-
     @property
     def speed(self) -> float:
         """Simulated seconds per second."""
@@ -131,10 +123,6 @@ class Simulation:
     def _boot_clock_ns(self) -> int:
         """The same since the vehicle's boot, without the time of stalls."""
         return self._clock_ns() - (self.vehicle.faults.elapsed_us - self.vehicle.boot_us) * 1000
-
-    def run(self) -> None:
-        """Run until `stop`."""
-        run_together([self], lambda: self._stopped, self._on_event)
 
     def start_clock(self, now_ns: int) -> None:
         """Start the clock at a monotonic time."""
@@ -195,3 +183,73 @@ class Simulation:
     def truth(self) -> dict[str, Any]:
         """The current truth: pose, mode, and the range to every object and vehicle."""
         return self._outputs.truth(self._simulated_s, time.monotonic_ns())
+
+
+class _Pace:
+    """Reports, every few seconds, that the machine is too slow for the requested speed."""
+
+    def __init__(self, speed: float, on_event: Callable[[str], None]) -> None:
+        self._speed = speed
+        self._on_event = on_event
+        self._lost_s = 0.0
+        self._since_s = time.monotonic()
+
+    def lose(self, simulated_s: float) -> None:
+        self._lost_s += simulated_s
+
+    def report(self) -> None:
+        passed_s = time.monotonic() - self._since_s
+        if passed_s < PACE_PERIOD_S:
+            return
+        if self._lost_s > 0.01 * self._speed * passed_s:
+            reached = self._speed - self._lost_s / passed_s
+            self._on_event(
+                f"cannot keep up: {reached:.2f} times real time in the last {passed_s:.0f} s, "
+                f"not {self._speed:g}; the machine is too busy"
+            )
+        self._lost_s = 0.0
+        self._since_s += passed_s
+
+
+def run_together(
+    simulations: Sequence[Simulation],
+    stopped: Callable[[], bool],
+    on_event: Callable[[str], None],
+    stepped_all: Callable[[], None] = lambda: None,
+) -> None:
+    """The loop: wait for the sockets until the next step is due, process messages, step, send.
+
+    `stepped_all` is called after each step of all of them.
+    """
+    first = simulations[0]
+    speed = first.speed
+    pace = _Pace(speed, on_event)
+    started_ns = time.monotonic_ns()
+    for simulation in simulations:
+        simulation.start_clock(started_ns)
+    with selectors.DefaultSelector() as selector:
+        for simulation in simulations:
+            for name, endpoint in simulation.endpoints.items():
+                selector.register(endpoint, selectors.EVENT_READ, (simulation, name))
+        while not stopped():
+            lost_s = first.backlog()
+            if lost_s > 0.0:
+                pace.lose(lost_s)
+                for simulation in simulations:
+                    simulation.let_go(lost_s)
+            pace.report()
+            for key, _ in selector.select(first.until_next_step()):
+                simulation, name = key.data
+                simulation.receive(name)
+            # one time for all, so that cameras show all of them at one simulated time
+            now_ns = time.monotonic_ns()
+            steps = first.steps_due(now_ns)
+            for _ in range(steps):
+                for simulation in simulations:
+                    simulation.step()
+                stepped_all()
+            for simulation in simulations:
+                simulation.settle(stepped=steps > 0)
+            if steps:
+                for simulation in simulations:
+                    simulation.show(now_ns)

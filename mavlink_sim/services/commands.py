@@ -11,13 +11,11 @@ from mavlink_sim.physics.airframe import Vector
 from mavlink_sim.px4.modes import CUSTOM_MODE_ENABLED, Mode, mode_of
 from mavlink_sim.services import gimbal_protocol, parameter_protocol
 from mavlink_sim.services.context import ServiceContext
-from mavlink_sim.services.mission_start import mission_start
 from mavlink_sim.services.system_streams import available_modes
 from mavlink_sim.services.telemetry import MESSAGE_IDS
 from mavlink_sim.wire.announcements import CRITICAL, Text
-from mavlink_sim.wire.commands import Command
 from mavlink_sim.wire.links import Link
-from mavlink_sim.wire.messages import dialect, protocol_version
+from mavlink_sim.wire.messages import Command, dialect, protocol_version
 
 DENIED = 2  # MAV_RESULT
 UNSUPPORTED = 3
@@ -37,6 +35,7 @@ DO_SET_MODE = 176
 DO_CHANGE_SPEED = 178
 DO_CHANGE_ALTITUDE = 186
 DO_REPOSITION = 192
+PREFLIGHT_STORAGE = 245
 ARM_DISARM = 400
 GET_MESSAGE_INTERVAL = 510
 SET_MESSAGE_INTERVAL = 511
@@ -92,14 +91,6 @@ def _takeoff(vehicle: ServiceContext, link: Link, command: Command) -> int:
     return vehicle.autopilot.takeoff(altitude - home_altitude)
 
 
-def _land(vehicle: ServiceContext, link: Link, command: Command) -> int:
-    return vehicle.autopilot.land()
-
-
-def _return_to_launch(vehicle: ServiceContext, link: Link, command: Command) -> int:
-    return vehicle.autopilot.return_home()
-
-
 def _reposition(vehicle: ServiceContext, link: Link, command: Command) -> int:
     speed, flags, _, yaw = command.parameters[:4]
     goal = _point_of(vehicle, *command.parameters[4:7])
@@ -152,7 +143,20 @@ def _run_prearm_checks(vehicle: ServiceContext, link: Link, command: Command) ->
 
 
 def _mission_start(vehicle: ServiceContext, link: Link, command: Command) -> int:
-    return mission_start(vehicle.autopilot, command.parameters[0])
+    """Mode MISSION and arming. Parameter 1: the item to begin with, -1 for the current one."""
+    autopilot, first = vehicle.autopilot, command.parameters[0]
+    mission = autopilot.navigator.mission
+    if not mission.valid:
+        autopilot.texts.append(Text(CRITICAL, "Mission start denied! No valid mission\t"))
+        return DENIED
+    if not (math.isfinite(first) and -1.0 <= first < len(mission.items)):
+        return DENIED
+    if first >= 0.0:
+        autopilot.navigator.set_current(int(first))
+    if autopilot.set_mode(Mode.MISSION) == ACCEPTED and autopilot.arm() == ACCEPTED:
+        return ACCEPTED
+    autopilot.report_unavailable(Mode.MISSION)
+    return TEMPORARILY_REJECTED
 
 
 def _set_home(vehicle: ServiceContext, link: Link, command: Command) -> int:
@@ -179,10 +183,6 @@ def _flight_termination(vehicle: ServiceContext, link: Link, command: Command) -
     return ACCEPTED if command.parameters[0] > 0.5 else DENIED
 
 
-def _preflight_storage(vehicle: ServiceContext, link: Link, command: Command) -> int:
-    return parameter_protocol.reset(vehicle, command.parameters[0])
-
-
 def _request_message(vehicle: ServiceContext, link: Link, command: Command) -> int:
     if _identifier(command.parameters[0]) == MESSAGE_INTERVAL:
         return _send_interval(vehicle, link, command.parameters[1])
@@ -197,10 +197,6 @@ def _request_message(vehicle: ServiceContext, link: Link, command: Command) -> i
     return ACCEPTED
 
 
-def _get_home_position(vehicle: ServiceContext, link: Link, command: Command) -> int:
-    return ACCEPTED if vehicle.send_built(link, "HOME_POSITION") else DENIED
-
-
 def _actuator_test(vehicle: ServiceContext, link: Link, command: Command) -> int | None:
     """No actuator moves. An unknown function is not answered, as in PX4."""
     if vehicle.autopilot.armed or vehicle.parameters.number("COM_MOT_TEST_EN") != 1:
@@ -213,10 +209,6 @@ def _calibrate(vehicle: ServiceContext, link: Link, command: Command) -> int:
     """All zero ends a calibration; there is none here."""
     if vehicle.autopilot.armed:
         return TEMPORARILY_REJECTED
-    return UNSUPPORTED if any(command.parameters) else ACCEPTED
-
-
-def _reboot(vehicle: ServiceContext, link: Link, command: Command) -> int:
     return UNSUPPORTED if any(command.parameters) else ACCEPTED
 
 
@@ -247,10 +239,6 @@ def _set_message_interval(vehicle: ServiceContext, link: Link, command: Command)
     return ACCEPTED
 
 
-def _get_message_interval(vehicle: ServiceContext, link: Link, command: Command) -> int:
-    return _send_interval(vehicle, link, command.parameters[0])
-
-
 def _send_interval(vehicle: ServiceContext, link: Link, message_id: float) -> int:
     identifier = _identifier(message_id)
     name = MESSAGE_IDS.get(identifier)
@@ -269,8 +257,8 @@ def _nearest(value: float) -> int:
 
 
 _HANDLERS: dict[int, Callable[[ServiceContext, Link, Command], int | None]] = {
-    NAV_RETURN_TO_LAUNCH: _return_to_launch,
-    NAV_LAND: _land,
+    NAV_RETURN_TO_LAUNCH: lambda vehicle, link, command: vehicle.autopilot.return_home(),
+    NAV_LAND: lambda vehicle, link, command: vehicle.autopilot.land(),
     NAV_TAKEOFF: _takeoff,
     DO_ORBIT: _orbit,
     DO_SET_MODE: _do_set_mode,
@@ -285,14 +273,19 @@ _HANDLERS: dict[int, Callable[[ServiceContext, Link, Command], int | None]] = {
     gimbal_protocol.DO_SET_ROI: gimbal_protocol.set_roi,
     205: _silence,  # DO_MOUNT_CONTROL
     241: _calibrate,  # PREFLIGHT_CALIBRATION
-    245: _preflight_storage,  # PREFLIGHT_STORAGE
-    246: _reboot,  # PREFLIGHT_REBOOT_SHUTDOWN
+    PREFLIGHT_STORAGE: lambda vehicle, link, command: parameter_protocol.reset(
+        vehicle, command.parameters[0]
+    ),
+    # PREFLIGHT_REBOOT_SHUTDOWN
+    246: lambda vehicle, link, command: UNSUPPORTED if any(command.parameters) else ACCEPTED,
     300: _mission_start,
     310: _actuator_test,  # ACTUATOR_TEST
     ARM_DISARM: _arm,
     401: _run_prearm_checks,
-    GET_HOME_POSITION: _get_home_position,
-    GET_MESSAGE_INTERVAL: _get_message_interval,
+    GET_HOME_POSITION: lambda vehicle, link, command: (
+        ACCEPTED if vehicle.send_built(link, "HOME_POSITION") else DENIED
+    ),
+    GET_MESSAGE_INTERVAL: lambda vehicle, link, command: _send_interval(vehicle, link, command.parameters[0]),
     SET_MESSAGE_INTERVAL: _set_message_interval,
     REQUEST_MESSAGE: _request_message,
     519: _request_protocol_version,  # REQUEST_PROTOCOL_VERSION

@@ -18,9 +18,8 @@ from mavlink_sim.physics.geography import LocalFrame
 from mavlink_sim.physics.gimbal import Aim, Gimbal, Target
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.announcements import GimbalCommand
-from mavlink_sim.wire.commands import Command
 from mavlink_sim.wire.links import Link
-from mavlink_sim.wire.messages import dialect
+from mavlink_sim.wire.messages import Command, dialect
 from vision.attitude import euler_from_quaternion
 
 ACCEPTED, DENIED, UNSUPPORTED = 0, 2, 3  # MAV_RESULT

@@ -26,9 +26,8 @@ from mavlink_sim.services import (
 )
 from mavlink_sim.services.context import Handler, ServiceContext
 from mavlink_sim.wire.announcements import CRITICAL, Text
-from mavlink_sim.wire.commands import Command, command_of, is_misencoded
 from mavlink_sim.wire.links import Link
-from mavlink_sim.wire.messages import dialect
+from mavlink_sim.wire.messages import Command, command_of, dialect, is_misencoded
 
 logger = logging.getLogger(__name__)
 
@@ -47,11 +46,11 @@ def _heartbeat(vehicle: ServiceContext, link: Link, message: Any) -> None:
 
 def _command(vehicle: ServiceContext, link: Link, message: Any) -> None:
     if is_misencoded(message):
-        _acknowledge(link, message, message.command, commands.DENIED)
+        acknowledge(link, message, message.command, commands.DENIED)
         return
     command = command_of(message)
     if command.identifier in commands.ANSWERED_TWICE and vehicle.release.acknowledges_modes_twice:
-        _acknowledge(link, message, command.identifier, ACCEPTED)
+        acknowledge(link, message, command.identifier, ACCEPTED)
     if command.identifier in commands.ANSWERED_BY_RECEIVER:
         _execute(vehicle, link, message, command)
     else:
@@ -63,10 +62,11 @@ def _execute(vehicle: ServiceContext, link: Link, message: Any, command: Command
     if result is None:
         result = commands.execute(vehicle, link, command)
     if result is not None:
-        _acknowledge(link, message, command.identifier, result)
+        acknowledge(link, message, command.identifier, result)
 
 
-def _acknowledge(link: Link, message: Any, command: int, result: int) -> None:
+def acknowledge(link: Link, message: Any, command: int, result: int) -> None:
+    """Send COMMAND_ACK to the sender of a message."""
     link.send(
         dialect.MAVLink_command_ack_message(
             command, result, 0, 0, message.get_srcSystem(), message.get_srcComponent()

@@ -61,7 +61,7 @@ def continue_list(link: Link, parameters: Parameters, dt_s: float) -> None:
 def request_read(vehicle: ServiceContext, link: Link, message: Any) -> None:
     """PARAM_REQUEST_READ, by index or (index -1) by name."""
     index = int(message.param_index)
-    name = _text_of(message.param_id)
+    name = text_of(message.param_id)
     if index < 0 and name == HASH_CHECK:
         _send_hash(link, vehicle.parameters)
         return
@@ -74,7 +74,7 @@ def request_read(vehicle: ServiceContext, link: Link, message: Any) -> None:
 
 def set_parameter(vehicle: ServiceContext, link: Link, message: Any) -> None:
     """PARAM_SET: reply with the value; if it changed, send it again on every link 15 ms later."""
-    name = _text_of(message.param_id)
+    name = text_of(message.param_id)
     if name == HASH_CHECK:
         link.parameters_left.clear()  # the client has a matching cache and needs no list
         _send_error(link, message, name, -1, READ_ONLY)
@@ -153,6 +153,7 @@ def _send_error(link: Link, message: Any, name: str, index: int, error: int) -> 
     )
 
 
-def _text_of(field: str | bytes) -> str:
+def text_of(field: str | bytes) -> str:
+    """The text of a message's field, which ends at a zero."""
     text = field.decode(errors="replace") if isinstance(field, bytes) else field
     return text.split("\0", 1)[0]

@@ -44,15 +44,7 @@ def sys_status(vehicle: ServiceContext) -> Any:
     receiver = manual_control_service.receiver_bits(vehicle)
     battery = autopilot.supervision.battery
     return dialect.MAVLink_sys_status_message(
-        present | receiver,
-        enabled,
-        health | receiver,
-        120,
-        *battery.system_status,
-        *([0] * 6),
-        0,
-        0,
-        1,
+        present | receiver, enabled, health | receiver, 120, *battery.system_status, *([0] * 6), 0, 0, 1
     )
 
 
@@ -192,10 +184,7 @@ def current_event_sequence(vehicle: ServiceContext) -> Any:
 def gps_global_origin(vehicle: ServiceContext) -> Any:
     latitude, longitude, altitude = vehicle.local_frame.geographic((0.0, 0.0, 0.0))
     return dialect.MAVLink_gps_global_origin_message(
-        round(latitude * 1e7),
-        round(longitude * 1e7),
-        round(altitude * 1000),
-        vehicle.boot_us,
+        round(latitude * 1e7), round(longitude * 1e7), round(altitude * 1000), vehicle.boot_us
     )
 
 

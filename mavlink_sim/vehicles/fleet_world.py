@@ -8,8 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from mavlink_sim.physics.airframe import Vector
-from mavlink_sim.physics.midair import Body, Midair
-from mavlink_sim.physics.neighbours import Neighbours
+from mavlink_sim.physics.midair import Body, Midair, Neighbours
 from mavlink_sim.vehicles.vehicle import STEP_S, Vehicle
 from mavlink_sim.world.aircraft import Aircraft, aircraft_objects
 
@@ -28,11 +27,7 @@ def as_aircraft(vehicle: Vehicle) -> Aircraft:
     """A vehicle's current pose in the world."""
     airframe = vehicle.airframe
     return Aircraft(
-        vehicle.system_id,
-        position_in_world(vehicle),
-        airframe.roll_rad,
-        airframe.pitch_rad,
-        airframe.yaw_rad,
+        vehicle.system_id, position_in_world(vehicle), airframe.roll_rad, airframe.pitch_rad, airframe.yaw_rad
     )
 
 
@@ -69,11 +64,7 @@ class FleetWorld:
             )
         faults = vehicle.faults
         body = Body(
-            vehicle.airframe,
-            vehicle.start_ned_m,
-            offset + number,
-            f"vehicle {number}",
-            lambda: faults.now_s,
+            vehicle.airframe, vehicle.start_ned_m, offset + number, f"vehicle {number}", lambda: faults.now_s
         )
         self._midair.join(body)
         vehicle.neighbours = Neighbours(self._midair.bodies, body)

@@ -98,11 +98,7 @@ def printed_side(printed: Print) -> NDArray[np.float64]:
 
 
 def reflectance(
-    printed: Print,
-    eye: NDArray[np.float64],
-    plate_from_pixel: NDArray[np.float64],
-    x: Plane,
-    y: Plane,
+    printed: Print, eye: NDArray[np.float64], plate_from_pixel: NDArray[np.float64], x: Plane, y: Plane
 ) -> Plane:
     """(N,) mean reflectance of the print over each pixel.
 

@@ -6,11 +6,7 @@ import math
 
 import numpy as np
 
-from mavlink_sim.world.solids import Body, Points, rectangle
-
-
-def _between(rng: np.random.Generator, low: float, high: float) -> float:
-    return float(rng.uniform(low, high))
+from mavlink_sim.world.solids import Body, Points, between, rectangle
 
 
 def _swing(pivot: Points, length: float, forward_rad: float, outward: float = 0.0) -> Points:
@@ -23,8 +19,8 @@ def _swing(pivot: Points, length: float, forward_rad: float, outward: float = 0.
 def person(rng: np.random.Generator) -> Body:
     """A person standing, walking, waving or with spread arms, about 1.75 m tall, facing +x."""
     pose = ("stand", "walk", "walk", "wave", "spread", "run")[int(rng.integers(6))]
-    tall = _between(rng, 1.58, 1.9)
-    build = _between(rng, 0.88, 1.15)
+    tall = between(rng, 1.58, 1.9)
+    build = between(rng, 0.88, 1.15)
     body = Body()
     stride = {"stand": 0.04, "walk": 0.42, "wave": 0.06, "spread": 0.1, "run": 0.75}[pose]
     hip_z = tall * 0.5 * (0.97 if pose == "run" else 1.0)
@@ -85,10 +81,10 @@ def person(rng: np.random.Generator) -> Body:
 
 def dog(rng: np.random.Generator) -> Body:
     """A dog standing or trotting, 0.7 to 1.1 m long, facing +x."""
-    size = _between(rng, 0.85, 1.2)
-    stocky = _between(rng, 0.85, 1.2)
+    size = between(rng, 0.85, 1.2)
+    stocky = between(rng, 0.85, 1.2)
     back, length = 0.52 * size, 0.62 * size
-    stride = _between(rng, 0.0, 0.5)
+    stride = between(rng, 0.0, 0.5)
     body = Body()
     rear, front = -length / 2, length / 2
     chest, waist = 0.125 * size * stocky, 0.10 * size * stocky
@@ -119,7 +115,7 @@ def dog(rng: np.random.Generator) -> Body:
         root = head + np.array((-0.02 * size, side * 0.06 * size, 0.06 * size))
         tip = root + ((-0.01, side * 0.015, 0.1 * size) if pricked else (0.0, side * 0.05, -0.11 * size))
         body.tube(root, tip, 0.035 * size, "ears", 4, 0.012)
-    raised = _between(rng, -0.15, 0.3) * size
+    raised = between(rng, -0.15, 0.3) * size
     tail = np.array([rear - 0.02, 0.0, back + 0.06 * size])
     middle = tail + np.array((-0.14 * size, 0, raised * 0.4))
     body.tube(tail, middle, 0.032 * size, "coat", 5, 0.026 * size)
@@ -134,8 +130,8 @@ def dog(rng: np.random.Generator) -> Body:
 def chair(rng: np.random.Generator) -> Body:
     """A kitchen, garden, office or arm chair; its back is towards -x."""
     style = ("plain", "garden", "office", "arm")[int(rng.integers(4))]
-    width, depth = _between(rng, 0.42, 0.5), _between(rng, 0.42, 0.5)
-    seat, top = _between(rng, 0.42, 0.48), _between(rng, 0.84, 1.0)
+    width, depth = between(rng, 0.42, 0.5), between(rng, 0.42, 0.5)
+    seat, top = between(rng, 0.42, 0.48), between(rng, 0.84, 1.0)
     body = Body()
     if style == "arm":
         width, depth, top = width + 0.28, depth + 0.24, top - 0.08
@@ -148,7 +144,7 @@ def chair(rng: np.random.Generator) -> Body:
                 body.box((x, side * (width / 2 - 0.08), 0.05), (0.06, 0.06, 0.1), "frame")
         return body
     body.box((0, 0, seat), (depth, width, 0.05 if style != "office" else 0.09), "fabric")
-    lean = _between(rng, 0.04, 0.12)
+    lean = between(rng, 0.04, 0.12)
     low = np.array(
         [
             (-depth / 2, -width / 2),

@@ -307,6 +307,11 @@ def inset(side: Points, left: float, right: float, low: float, high: float) -> P
     return np.array([at(left, low), at(right, low), at(right, high), at(left, high)])
 
 
+def between(rng: np.random.Generator, low: float, high: float) -> float:
+    """A uniformly distributed number."""
+    return float(rng.uniform(low, high))
+
+
 def ground_shadows(corners: Points, first: Sequence[int], sun: Points) -> list[NDArray[np.float32]]:
     """(K, 2) convex outlines on the ground (x, y) of solids' shadows.
 

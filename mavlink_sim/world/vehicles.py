@@ -6,11 +6,7 @@ import math
 
 import numpy as np
 
-from mavlink_sim.world.solids import Body, Points, Triple, disc, inset
-
-
-def _between(rng: np.random.Generator, low: float, high: float) -> float:
-    return float(rng.uniform(low, high))
+from mavlink_sim.world.solids import Body, Points, Triple, between, disc, inset
 
 
 def wheel(body: Body, x: float, y: float, radius: float, clear: float, sides: int = 12) -> None:
@@ -31,15 +27,15 @@ def car(rng: np.random.Generator) -> Body:
     """A saloon, hatchback, estate or off-roader, about 4.3 × 1.8 × 1.5 m, facing +x."""
     style = ("saloon", "hatchback", "estate", "tall")[int(rng.integers(4))]
     tall = style == "tall"
-    length = _between(rng, 4.15, 4.75) if style != "hatchback" else _between(rng, 3.7, 4.2)
-    width = _between(rng, 1.72, 1.88)
-    height = _between(rng, 1.62, 1.82) if tall else _between(rng, 1.4, 1.52)
+    length = between(rng, 4.15, 4.75) if style != "hatchback" else between(rng, 3.7, 4.2)
+    width = between(rng, 1.72, 1.88)
+    height = between(rng, 1.62, 1.82) if tall else between(rng, 1.4, 1.52)
     belt = height * (0.60 if not tall else 0.58)
     clear = 0.27 if tall else 0.19
     front, rear = length / 2, -length / 2
     body = Body()
 
-    hood_start = front - length * _between(rng, 0.24, 0.29)
+    hood_start = front - length * between(rng, 0.24, 0.29)
     shoulders = np.array(
         [
             (rear + 0.12, clear),
@@ -59,7 +55,7 @@ def car(rng: np.random.Generator) -> Body:
 
     base_front = hood_start + 0.18
     base_rear = rear + {"saloon": length * 0.19, "hatchback": 0.12, "estate": 0.1, "tall": 0.1}[style]
-    roof_front = base_front - (height - belt) * _between(rng, 1.05, 1.35)
+    roof_front = base_front - (height - belt) * between(rng, 1.05, 1.35)
     rake = {"saloon": 1.0, "hatchback": 0.62, "estate": 0.38, "tall": 0.25}[style]
     roof_rear = base_rear + (height - belt) * rake
     cabin_w, roof_w = width - 0.14, width - 0.46
@@ -120,11 +116,11 @@ def car(rng: np.random.Generator) -> Body:
 def truck(rng: np.random.Generator) -> Body:
     """A lorry with a box, a tarpaulin, a tank or a flat bed, about 7 × 2.4 × 3 m, facing +x."""
     style = ("box", "box", "tarpaulin", "tank", "flat")[int(rng.integers(5))]
-    length, width = _between(rng, 6.4, 7.8), _between(rng, 2.25, 2.5)
-    height = _between(rng, 2.9, 3.4)
+    length, width = between(rng, 6.4, 7.8), between(rng, 2.25, 2.5)
+    height = between(rng, 2.9, 3.4)
     front, rear = length / 2, -length / 2
-    cab = _between(rng, 1.7, 2.1)
-    deck, cab_top = 0.95, _between(rng, 2.45, 2.8)
+    cab = between(rng, 1.7, 2.1)
+    deck, cab_top = 0.95, between(rng, 2.45, 2.8)
     body = Body()
     body.box(((rear + front - cab) / 2, 0, 0.75), (length - cab + 0.2, 0.9, 0.3), "under")
 
@@ -175,9 +171,9 @@ def truck(rng: np.random.Generator) -> Body:
         for side in (-1.0, 1.0):
             body.box((middle, side * (width / 2 - 0.03), deck + 0.3), (run, 0.06, 0.42), "cargo")
         for index in range(int(rng.integers(0, 4))):
-            size = _between(rng, 0.7, 1.2)
+            size = between(rng, 0.7, 1.2)
             body.box(
-                (start + 0.8 + index * 1.35, _between(rng, -0.4, 0.4), deck + 0.12 + size / 2),
+                (start + 0.8 + index * 1.35, between(rng, -0.4, 0.4), deck + 0.12 + size / 2),
                 (size, size, size),
                 "load",
             )
@@ -217,13 +213,13 @@ def truck(rng: np.random.Generator) -> Body:
 def bicycle(rng: np.random.Generator) -> Body:
     """An upright bicycle, about 1.75 m long, facing +x."""
     body = Body()
-    radius = _between(rng, 0.32, 0.35)
-    base = _between(rng, 1.0, 1.1)
+    radius = between(rng, 0.32, 0.35)
+    base = between(rng, 1.0, 1.1)
     rear, front = -base / 2, base / 2
     for x in (rear, front):
         _spoked_wheel(body, x, radius)
     bottom = (rear + 0.42, 0.0, radius - 0.05)
-    seat_top = (rear + 0.26, 0.0, _between(rng, 0.78, 0.86))
+    seat_top = (rear + 0.26, 0.0, between(rng, 0.78, 0.86))
     head_low, head_high = (front - 0.2, 0.0, 0.62), (front - 0.27, 0.0, 0.86)
     tube = 0.024
     low_entry = rng.random() < 0.35
@@ -246,7 +242,7 @@ def bicycle(rng: np.random.Generator) -> Body:
         offset=(seat_top[0] - 0.05, 0.0),
     )
     bar = (head_high[0] - 0.03, 0.0, 1.0)
-    reach = _between(rng, 0.26, 0.31)
+    reach = between(rng, 0.26, 0.31)
     for side in (-1.0, 1.0):
         grip = (bar[0] - 0.1, side * reach, 1.02)
         body.tube(bar, (bar[0] + 0.05, side * reach * 0.7, 1.02), 0.015, "trim", 4)
@@ -299,10 +295,10 @@ def _spoked_wheel(body: Body, x: float, radius: float, sides: int = 14) -> None:
 def boat(rng: np.random.Generator) -> Body:
     """A motor boat, sailing boat or rowing boat, about 5 × 2 m, its bow towards +x."""
     style = ("motor", "sail", "open")[int(rng.integers(3))]
-    length, width = _between(rng, 4.4, 6.2), _between(rng, 1.8, 2.3)
+    length, width = between(rng, 4.4, 6.2), between(rng, 1.8, 2.3)
     if style == "open":
         length, width = length * 0.8, width * 0.8
-    high = _between(rng, 0.72, 0.95) if style != "open" else _between(rng, 0.5, 0.62)
+    high = between(rng, 0.72, 0.95) if style != "open" else between(rng, 0.5, 0.62)
     outline = np.array(
         [
             (-0.5, -0.40),
@@ -337,7 +333,7 @@ def boat(rng: np.random.Generator) -> Body:
     if style == "motor":
         cabin = np.array([(-0.16, -0.32), (0.2, -0.28), (0.2, 0.28), (-0.16, 0.32)]) * (length, width)
         roof = np.array([(-0.15, -0.28), (0.07, -0.25), (0.07, 0.25), (-0.15, 0.28)]) * (length, width)
-        top = high + _between(rng, 0.7, 0.95)
+        top = high + between(rng, 0.7, 0.95)
         sides = body.loft(cabin, roof, high, top, "cabin", top_slot="cabin_top")
         looks: list[Triple] = [(0, -1, 0.1), (1, 0, 0.9), (0, 1, 0.1), (-1, 0, 0)]
         for wall, look in zip(sides, looks, strict=True):
@@ -350,7 +346,7 @@ def boat(rng: np.random.Generator) -> Body:
         sides = body.loft(cabin, cabin * 0.88, high, high + 0.42, "cabin", top_slot="cabin_top")
         for wall, across in ((sides[0], -1.0), (sides[2], 1.0)):
             body.add_decal(inset(wall, 0.15, 0.85, 0.3, 0.75), "glass", (0.1, across, 0.1))
-        mast, tall = 0.12 * length, high + _between(rng, 4.2, 5.4)
+        mast, tall = 0.12 * length, high + between(rng, 4.2, 5.4)
         body.tube((mast, 0, high), (mast, 0, tall), 0.055, "trim", 5)
         boom_end = (-0.38 * length, 0.0, high + 0.75)
         body.tube((mast, 0, high + 0.75), boom_end, 0.045, "trim", 4)

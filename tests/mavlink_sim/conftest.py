@@ -129,7 +129,7 @@ class SimHarness:
     def received(self, kind: str, link: str = "onboard") -> list[Any]:
         if kind in self._switched_off:
             raise LookupError(
-                f'{kind} is not received: mark the test with streams("{kind}"), or make_harness(["{kind}"])'
+                f'{kind} is not received: mark the test with streams("{kind}"), or SimHarness(["{kind}"])'
             )
         return [item.message for _, item in self._inbox[link] if item.message.get_type() == kind]
 
@@ -137,7 +137,7 @@ class SimHarness:
     def inbox(self) -> dict[str, list[tuple[float, Any]]]:
         """Every message received on each link since the last `forget`, as (time, message)."""
         if self._switched_off:
-            raise LookupError('mark the test with streams("everything"), or make_harness so')
+            raise LookupError('mark the test with streams("everything"), or SimHarness(EVERYTHING) so')
         return self._inbox
 
     def forget(self) -> None:
@@ -243,14 +243,16 @@ class SimHarness:
         assert self.mode == "OFFBOARD"
 
 
-def velocity(forward: float, right: float, down: float, yaw_rate: float = 0.0, frame: int = 8) -> Any:
+def velocity_setpoint(
+    forward: float, right: float, down: float, yaw_rate: float = 0.0, frame: int = 8
+) -> Any:
     """A velocity setpoint as in the flight recorded from a real vehicle (type mask 1479)."""
     return dialect.MAVLink_set_position_target_local_ned_message(
         0, 1, 1, frame, 1479, 0, 0, 0, forward, right, down, 0, 0, 0, 0, yaw_rate
     )
 
 
-def position(north: float, east: float, down: float, yaw: float = 0.0) -> Any:
+def position_setpoint(north: float, east: float, down: float, yaw: float = 0.0) -> Any:
     """A position setpoint in LOCAL_NED, with a heading."""
     return setpoints.position_setpoint(north, east, down, yaw)
 
@@ -260,19 +262,3 @@ def harness(request: pytest.FixtureRequest) -> SimHarness:
     """A vehicle in still air, on the ground, just booted."""
     marker = request.node.get_closest_marker("streams")
     return SimHarness(streams=() if marker is None else marker.args)
-
-
-@pytest.fixture(scope="session")
-def make_harness() -> type[SimHarness]:
-    """Makes vehicles with other options."""
-    return SimHarness
-
-
-@pytest.fixture
-def velocity_setpoint() -> Callable[..., Any]:
-    return velocity
-
-
-@pytest.fixture
-def position_setpoint() -> Callable[..., Any]:
-    return position

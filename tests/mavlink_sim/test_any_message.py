@@ -62,16 +62,16 @@ def fly_through(harness: SimHarness, datagrams: list[bytes]) -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(st.lists(packets(HANDLED), min_size=1, max_size=12))
-def test_messages_it_handles(make_harness: type[SimHarness], datagrams: list[bytes]) -> None:
-    harness = make_harness(["everything"], ready_after_s=0.0)
+def test_messages_it_handles(datagrams: list[bytes]) -> None:
+    harness = SimHarness(["everything"], ready_after_s=0.0)
     harness.command(400, 1)
     fly_through(harness, datagrams)
 
 
 @settings(max_examples=10, deadline=None)
 @given(st.lists(packets(OTHERS), min_size=1, max_size=12))
-def test_messages_it_does_not_handle(make_harness: type[SimHarness], datagrams: list[bytes]) -> None:
-    harness = make_harness(["everything"], ready_after_s=0.0)
+def test_messages_it_does_not_handle(datagrams: list[bytes]) -> None:
+    harness = SimHarness(["everything"], ready_after_s=0.0)
     harness.send(dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3), "gcs", (245, 190))
     fly_through(harness, datagrams)
 
@@ -104,8 +104,8 @@ PARAMETERS = [
 
 @settings(max_examples=10, deadline=None)
 @given(st.dictionaries(st.sampled_from(PARAMETERS), finite, min_size=1, max_size=5))
-def test_parameters_out_of_every_range(make_harness: type[SimHarness], values: dict[str, float]) -> None:
-    harness = make_harness(["everything"], ready_after_s=0.0)
+def test_parameters_out_of_every_range(values: dict[str, float]) -> None:
+    harness = SimHarness(["everything"], ready_after_s=0.0)
     for name, value in values.items():
         harness.vehicle.parameters.set(name, value)
     harness.fly(0.1)

@@ -97,9 +97,7 @@ def test_takeoff_needs_guided_and_arming_height_above_home(copter: LockstepVehic
     assert copter.truth.mode == "GUIDED"
 
 
-def test_setpoints_do_not_take_off_and_disarm_delay_disarms(
-    copter: LockstepVehicle,
-) -> None:
+def test_setpoints_do_not_take_off_and_disarm_delay_disarms(copter: LockstepVehicle) -> None:
     copter.set_mode("GUIDED")
     copter.arm()
     armed_s = copter.now_s
@@ -128,9 +126,7 @@ def test_position_relative_to_origin_vehicle_or_heading(
     assert away(flying, position) < 1.0
 
 
-def test_stale_velocity_stops_after_guid_timeout_mode_stays(
-    flying: LockstepVehicle,
-) -> None:
+def test_stale_velocity_stops_after_guid_timeout_mode_stays(flying: LockstepVehicle) -> None:
     guided(flying, VELOCITY & ~2048, 2.0, 0.0, 0.0)
     flying.step(2.8)
     assert flying.truth.velocity_ned_mps[0] == pytest.approx(2.0, abs=0.7)
@@ -148,9 +144,7 @@ def test_position_target_never_expires(flying: LockstepVehicle) -> None:
     assert away(flying, (30.0, 0.0, -6.0)) < 1.0
 
 
-def test_heading_follows_flight_and_holds_with_rate_0(
-    flying: LockstepVehicle,
-) -> None:
+def test_heading_follows_flight_and_holds_with_rate_0(flying: LockstepVehicle) -> None:
     sent = flying.repeat(target(VELOCITY & ~2048, (0.0, 3.0, 0.0)), 10.0)
     flying.step(5.0)
     assert abs(flying.truth.yaw_rad) < 0.2
@@ -198,9 +192,7 @@ def test_global_relative_position_is_reached(flying: LockstepVehicle) -> None:
     assert away(flying, (10.0, 0.0, -9.0)) < 1.0
 
 
-def test_attitude_with_climb_rate_levels_after_timeout(
-    flying: LockstepVehicle,
-) -> None:
+def test_attitude_with_climb_rate_levels_after_timeout(flying: LockstepVehicle) -> None:
     tilt = math.radians(-8.0)
     attitude = dialect.MAVLink_set_attitude_target_message(
         0, 1, 1, 0b111, [math.cos(tilt / 2), 0.0, math.sin(tilt / 2), 0.0], 0.0, 0.0, 0.0, 0.75
@@ -266,9 +258,7 @@ def test_rtl_climbs_returns_waits_and_lands_at_home() -> None:
     assert vehicle.truth.mode == "RTL"
 
 
-def test_disarm_delay_restarts_with_arming(
-    flying: LockstepVehicle,
-) -> None:
+def test_disarm_delay_restarts_with_arming(flying: LockstepVehicle) -> None:
     flying.set_mode("LAND")
     flying.run_until(lambda truth: not truth.armed, 60.0)
     flying.step(15.0)
@@ -451,8 +441,7 @@ def test_velocity_circle_is_no_wider_than_measured(calm: LockstepVehicle) -> Non
         away_m = math.hypot(x, y)
         back_mps = 0.8 * (radius_m - away_m)
         sent.message = target(
-            VELOCITY,
-            ((-y * speed_mps + x * back_mps) / away_m, (x * speed_mps + y * back_mps) / away_m, 0.0),
+            VELOCITY, ((-y * speed_mps + x * back_mps) / away_m, (x * speed_mps + y * back_mps) / away_m, 0.0)
         )
         calm.step(0.05)
         if step > 120:

@@ -44,9 +44,7 @@ def read(vehicle: LockstepVehicle, name: str) -> Any:
     return found[-1] if found else None
 
 
-def test_heartbeat_is_ardupilot_and_sent_at_mode_change(
-    copter: LockstepVehicle,
-) -> None:
+def test_heartbeat_is_ardupilot_and_sent_at_mode_change(copter: LockstepVehicle) -> None:
     copter.step(1.0)
     beat = copter.newest["onboard"]["HEARTBEAT"]
     assert (beat.autopilot, beat.type, beat.custom_mode, beat.base_mode, beat.system_status) == (
@@ -77,9 +75,7 @@ def test_set_mode_acknowledged_with_its_own_id(copter: LockstepVehicle) -> None:
     assert copter.truth.mode == "LOITER"
 
 
-def test_streams_only_on_request_by_group_or_message(
-    copter: LockstepVehicle,
-) -> None:
+def test_streams_only_on_request_by_group_or_message(copter: LockstepVehicle) -> None:
     assert set(kinds(copter, 12.0)) == {"HEARTBEAT", "TIMESYNC"}
     copter.send(dialect.MAVLink_request_data_stream_message(1, 1, 6, 5, 1))
     counted = kinds(copter, 4.0)
@@ -112,9 +108,7 @@ def test_reboot_drops_requested_rates_keeps_parameters(copter: LockstepVehicle) 
     assert counted["VFR_HUD"] == 16
 
 
-def test_parameters_are_numbers_in_list_order_without_hash(
-    copter: LockstepVehicle,
-) -> None:
+def test_parameters_are_numbers_in_list_order_without_hash(copter: LockstepVehicle) -> None:
     copter.send(dialect.MAVLink_param_request_list_message(1, 1))
     copter.step(1.0)
     listed = [m for m in copter.receive() if m.get_type() == "PARAM_VALUE"]
@@ -126,9 +120,7 @@ def test_parameters_are_numbers_in_list_order_without_hash(
     assert "MPC_XY_CRUISE" not in values
 
 
-def test_param_set_truncates_clamps_and_broadcasts(
-    copter: LockstepVehicle,
-) -> None:
+def test_param_set_truncates_clamps_and_broadcasts(copter: LockstepVehicle) -> None:
     for value, kept in ((1.6, 1.0), (-1.6, -1.0), (1000.0, 127.0)):
         copter.send(dialect.MAVLink_param_set_message(1, 1, b"DISARM_DELAY", value, 9))
         copter.step(0.02)

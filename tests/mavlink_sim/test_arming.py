@@ -1,11 +1,10 @@
 """Arming, disarming, readiness, and their report in HEARTBEAT and SYS_STATUS."""
 
 import math
-from typing import Any
 
 import pytest
 
-from tests.mavlink_sim.conftest import SimHarness
+from tests.mavlink_sim.conftest import SimHarness, velocity_setpoint
 
 PREARM_CHECK = 0x10000000
 REJECTED = 1
@@ -85,8 +84,8 @@ def test_disarms_after_11_s_without_takeoff(harness: SimHarness) -> None:
     assert 10.8 < harness.until(lambda: not harness.armed, 15.0) < 11.6
 
 
-def test_the_time_to_the_preflight_disarm_is_a_parameter(make_harness: type[SimHarness]) -> None:
-    harness = make_harness(parameters={"COM_DISARM_PRFLT": 2.0})
+def test_the_time_to_the_preflight_disarm_is_a_parameter() -> None:
+    harness = SimHarness(parameters={"COM_DISARM_PRFLT": 2.0})
     harness.wait_ready()
     harness.command(400, 1)
     assert 2.9 < harness.until(lambda: not harness.armed, 15.0) < 3.5
@@ -119,12 +118,15 @@ def test_a_remote_control_makes_position_mode_ready(harness: SimHarness) -> None
     assert harness.command(400, 1) == [0]
 
 
-def test_an_offboard_stream_makes_offboard_ready(harness: SimHarness, velocity_setpoint: Any) -> None:
+def test_an_offboard_stream_makes_offboard_ready(harness: SimHarness) -> None:
     harness.wait_ready()
     harness.offboard(velocity_setpoint(0, 0, 0))
     assert prearm(harness)
+    harness.events.clear()
     harness.fly(1.1)  # the stream has stopped
-    assert harness.heartbeat().base_mode == 17  # the newest setpoint is used here, however old
+    beat = harness.heartbeat()
+    assert (beat.custom_mode, beat.base_mode) == (0x00060000, 17)  # the newest setpoint, however old
+    assert harness.events == []
     assert not prearm(harness)
     assert harness.heartbeat().system_status == 0
     assert harness.command(400, 1) == [REJECTED]

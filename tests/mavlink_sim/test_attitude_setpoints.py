@@ -14,7 +14,7 @@ from mavlink_sim.physics.airframe import GRAVITY_MPS2, LINEAR_DRAG_PER_S, MAX_TH
 from mavlink_sim.physics.quaternions import inverse, product, third_axis, unit
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.messages import dialect
-from tests.mavlink_sim.conftest import SimHarness
+from tests.mavlink_sim.conftest import SimHarness, position_setpoint
 from vision.attitude import euler_from_quaternion, quaternion_from_euler
 from vision.rotation import matrix_from_quaternion
 
@@ -145,9 +145,7 @@ def test_a_tumbling_vehicle_comes_upright(harness: SimHarness) -> None:
     assert abs(harness.vehicle.airframe.pitch_rad) < 0.02
 
 
-def test_invalid_quaternion_keeps_body_rates(
-    harness: SimHarness,
-) -> None:
+def test_invalid_quaternion_keeps_body_rates(harness: SimHarness) -> None:
     harness.take_off(10.0)
     harness.offboard(rates(0.0, 0.0, 0.5))
     harness.fly(3.0, rates(0.0, 0.0, 0.5))
@@ -186,9 +184,7 @@ def test_a_whole_flip_is_possible_by_rates(harness: SimHarness) -> None:
 
 
 @pytest.mark.parametrize("first", [attitude(roll=5.0), rates(0.1, 0.0, 0.0)], ids=["attitude", "rates"])
-def test_a_position_may_follow_an_attitude_and_is_flown(
-    harness: SimHarness, position_setpoint: Any, first: Any
-) -> None:
+def test_a_position_may_follow_an_attitude_and_is_flown(harness: SimHarness, first: Any) -> None:
     harness.take_off(8.0)
     harness.offboard(first)
     harness.fly(1.0, first)
@@ -200,9 +196,7 @@ def test_a_position_may_follow_an_attitude_and_is_flown(
 # ---- taking off, landing, losing it
 
 
-def test_takeoff_by_thrust_and_disarm_after_landing(
-    harness: SimHarness,
-) -> None:
+def test_takeoff_by_thrust_and_disarm_after_landing(harness: SimHarness) -> None:
     harness.wait_ready()
     climb = attitude(thrust=HOVER + 0.03)
     harness.offboard(climb)
@@ -229,7 +223,7 @@ def test_without_the_stream_the_failsafe_flies_home_by_position(harness: SimHarn
 
 
 @pytest.mark.streams("ATTITUDE_TARGET", "POSITION_TARGET_LOCAL_NED", "POSITION_TARGET_GLOBAL_INT")
-def test_attitude_target_sent_without_position_target(harness: SimHarness, position_setpoint: Any) -> None:
+def test_attitude_target_sent_without_position_target(harness: SimHarness) -> None:
     harness.take_off(10.0)
     wanted = attitude(roll=6.0, yaw=30.0, thrust=0.52)
     harness.offboard(wanted)
@@ -256,9 +250,7 @@ def test_attitude_target_sent_without_position_target(harness: SimHarness, posit
 
 
 @pytest.mark.streams("ATTITUDE_TARGET", "POSITION_TARGET_LOCAL_NED", "POSITION_TARGET_GLOBAL_INT")
-def test_attitude_target_has_correcting_rates_in_position_mode(
-    harness: SimHarness, position_setpoint: Any
-) -> None:
+def test_attitude_target_has_correcting_rates_in_position_mode(harness: SimHarness) -> None:
     harness.take_off(5.0)
     facing_north = position_setpoint(0, 0, -5, 0.0)
     harness.offboard(facing_north)
@@ -338,10 +330,8 @@ def test_zero_quaternion_has_no_unit_quaternion(values: tuple[float, float, floa
         max_size=5,
     )
 )
-def test_no_attitude_target_raises(
-    make_harness: type[SimHarness], requests: list[tuple[int, list[float]]]
-) -> None:
-    harness = make_harness(["everything"], ready_after_s=0.0)
+def test_no_attitude_target_raises(requests: list[tuple[int, list[float]]]) -> None:
+    harness = SimHarness(["everything"], ready_after_s=0.0)
     harness.offboard(attitude())
     harness.command(400, 1)
     for mask, values in requests:

@@ -94,15 +94,15 @@ def test_unchecked_battery_has_no_warning() -> None:
     assert battery.checked_warning is BatteryWarning.NONE
 
 
-def flying(make_harness: type[SimHarness], **values: float) -> SimHarness:
-    harness = make_harness(parameters={**CHECKED, "COM_FAIL_ACT_T": 1, **values})
+def flying(**values: float) -> SimHarness:
+    harness = SimHarness(parameters={**CHECKED, "COM_FAIL_ACT_T": 1, **values})
     harness.heartbeats.append(("gcs", GROUND_STATION, 6))
     harness.take_off(11.0)
     return harness
 
 
-def test_low_battery_warns_returns_and_lands(make_harness: type[SimHarness]) -> None:
-    harness = flying(make_harness, RTL_RETURN_ALT=12, SIM_BAT_DRAIN=3000)
+def test_low_battery_warns_returns_and_lands() -> None:
+    harness = flying(RTL_RETURN_ALT=12, SIM_BAT_DRAIN=3000)
     harness.vehicle.autopilot.supervision.battery.charge = 0.12
     harness.until(lambda: any(line.startswith("battery low") for line in harness.events), 8.0)
     harness.fly(0.1)
@@ -118,16 +118,16 @@ def test_low_battery_warns_returns_and_lands(make_harness: type[SimHarness]) -> 
     assert harness.received("BATTERY_STATUS")[-1].charge_state == 4
 
 
-def test_by_default_a_battery_does_not_end_a_flight(make_harness: type[SimHarness]) -> None:
-    harness = make_harness(parameters={"SIM_BAT_MIN_PCT": 0, "SIM_BAT_DRAIN": 10})
+def test_by_default_a_battery_does_not_end_a_flight() -> None:
+    harness = SimHarness(parameters={"SIM_BAT_MIN_PCT": 0, "SIM_BAT_DRAIN": 10})
     harness.take_off()
     harness.fly(4.0)
     assert harness.mode == "HOLD"
     assert harness.received("BATTERY_STATUS")[-1].charge_state == 4
 
 
-def test_arming_is_refused_on_an_empty_battery(make_harness: type[SimHarness]) -> None:
-    harness = make_harness(parameters=CHECKED)
+def test_arming_is_refused_on_an_empty_battery() -> None:
+    harness = SimHarness(parameters=CHECKED)
     harness.heartbeats.append(("gcs", GROUND_STATION, 6))
     harness.wait_ready()
     harness.vehicle.autopilot.supervision.battery.forced_charge = 0.0
@@ -140,8 +140,8 @@ def test_arming_is_refused_on_an_empty_battery(make_harness: type[SimHarness]) -
     assert harness.command(400, 1) == [0]
 
 
-def test_com_arm_bat_min_sets_the_charge_that_arming_needs(make_harness: type[SimHarness]) -> None:
-    harness = make_harness(parameters={**CHECKED, "COM_ARM_BAT_MIN": 0.9, "BAT1_V_CHARGED": 4.2})
+def test_com_arm_bat_min_sets_the_charge_that_arming_needs() -> None:
+    harness = SimHarness(parameters={**CHECKED, "COM_ARM_BAT_MIN": 0.9, "BAT1_V_CHARGED": 4.2})
     harness.wait_ready()
     battery = harness.vehicle.autopilot.supervision.battery
     battery.forced_charge = 0.0
@@ -153,8 +153,8 @@ def test_com_arm_bat_min_sets_the_charge_that_arming_needs(make_harness: type[Si
     assert harness.command(400, 1) == [0]
 
 
-def test_missing_battery_is_reported(make_harness: type[SimHarness]) -> None:
-    harness = make_harness(parameters={"SIM_BAT_ENABLE": 0})
+def test_missing_battery_is_reported() -> None:
+    harness = SimHarness(parameters={"SIM_BAT_ENABLE": 0})
     harness.fly(2.2)
     assert harness.received("BATTERY_STATUS") == []
     status = harness.received("SYS_STATUS")[-1]

@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 
 from mavlink_sim.camera.cli import POSE_LOST_S
-from mavlink_sim.camera.vehicle_link import AutopilotLink, LinkError
+from mavlink_sim.camera.vehicle_pose import AutopilotLink, LinkError
 from mavlink_sim.cli.main import main
 from mavlink_sim.testing import free_port, running_simulator
 from mavlink_sim.wire.endpoint import UdpEndpoint

@@ -19,7 +19,6 @@ from pathlib import Path
 import pytest
 
 from mavlink_sim.physics.geography import HOME_ALTITUDE_M
-from mavlink_sim.services.microservices import HANDLERS
 from mavlink_sim.testing import RunningSimulator, vehicle
 
 pytestmark = [
@@ -177,7 +176,6 @@ MISSION_FILE = """QGC WPL 110
 """
 
 
-@pytest.mark.skipif("MISSION_COUNT" not in HANDLERS, reason="this vehicle takes no missions")
 def test_it_loads_a_mission_and_flies_it(
     simulator: RunningSimulator, console: Console, tmp_path: Path
 ) -> None:
@@ -194,7 +192,6 @@ def test_it_loads_a_mission_and_flies_it(
     simulator.wait_for_event("disarmed (after landing)", 60.0)
 
 
-@pytest.mark.skipif("FILE_TRANSFER_PROTOCOL" not in HANDLERS, reason="this vehicle has no MAVLink FTP")
 def test_it_lists_files(console: Console) -> None:
     console.wait_for(r"Received (\d+) parameters")
     since = console.type("module load ftp")

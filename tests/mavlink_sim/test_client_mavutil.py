@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 from pymavlink import mavparm, mavutil
 
-from mavlink_sim.services.microservices import HANDLERS
 from mavlink_sim.testing import RunningSimulator, vehicle
 
 pytestmark = pytest.mark.realtime
@@ -93,7 +92,6 @@ def test_all_parameters_are_fetched_written_and_saved(
     assert "MIS_TAKEOFF_ALT" in (tmp_path / "saved.parm").read_text()
 
 
-@pytest.mark.skipif("FILE_TRANSFER_PROTOCOL" not in HANDLERS, reason="this vehicle has no MAVLink FTP")
 def test_mavftp_lists_the_root_folder(link: Any) -> None:
     from pymavlink import mavftp
 

@@ -20,7 +20,7 @@ from mavlink_sim.flight.collision_prevention import (
 from mavlink_sim.flight.transmitter import CALIBRATION, Sticks
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.messages import dialect
-from tests.mavlink_sim.conftest import SimHarness
+from tests.mavlink_sim.conftest import SimHarness, velocity_setpoint
 from tests.mavlink_sim.plan_client import listen
 
 FAR_CM = 2100  # nothing within the 20 m of the sensor
@@ -185,13 +185,11 @@ def test_result_is_finite_for_any_map(
     assert all(map(math.isfinite, got.acceleration))
 
 
-def test_vehicle_limits_sticks_and_holds_without_sensor(
-    make_harness: type[SimHarness],
-) -> None:
-    harness = make_harness(ready_after_s=0.0, parameters={"CP_DIST": 3.0, "CP_GUIDE_ANG": 0.0})
+def test_vehicle_limits_sticks_and_holds_without_sensor() -> None:
+    harness = SimHarness(ready_after_s=0.0, parameters={"CP_DIST": 3.0, "CP_GUIDE_ANG": 0.0})
     harness.take_off()
     harness.vehicle.autopilot.pilot_takes_over()
-    allowed = harness.vehicle.autopilot.navigator.allowed_acceleration
+    allowed = harness.vehicle.autopilot.navigator.guard_sticks
     assert allowed((3.0, 0.0), STILL) == STILL
     free = dialect.MAVLink_obstacle_distance_message(0, 0, [FAR_CM] * SECTORS, 5, 20, 2000, 0.0, 0.0, 12)
     harness.send(free)
@@ -204,10 +202,8 @@ def test_vehicle_limits_sticks_and_holds_without_sensor(
     assert harness.mode == "HOLD"
 
 
-def test_message_fills_map_and_offboard_ignores_it(
-    make_harness: type[SimHarness], velocity_setpoint: Any
-) -> None:
-    harness = make_harness(ready_after_s=0.0, parameters={"CP_DIST": 3.0})
+def test_message_fills_map_and_offboard_ignores_it() -> None:
+    harness = SimHarness(ready_after_s=0.0, parameters={"CP_DIST": 3.0})
     listen(harness)
     near = [150] * SECTORS
     harness.send(dialect.MAVLink_obstacle_distance_message(0, 0, near, 5, 20, 2000, 0.0, 0.0, 12))
@@ -228,8 +224,8 @@ class Wall:
     `at_m`: north of the vehicle's position when the wall was added.
     """
 
-    def __init__(self, make_harness: type[SimHarness], at_m: float, **values: float) -> None:
-        self.harness = make_harness(parameters={**CALIBRATION, "COM_RC_IN_MODE": 0, **values})
+    def __init__(self, at_m: float, **values: float) -> None:
+        self.harness = SimHarness(parameters={**CALIBRATION, "COM_RC_IN_MODE": 0, **values})
         self.vehicle = self.harness.vehicle
         self.vehicle.transmitter.on = True
         self.harness.take_off(5.0)
@@ -262,8 +258,8 @@ class Wall:
             self.harness.fly(0.1, setpoint)
 
 
-def test_full_stick_towards_a_wall_stops_before_it(make_harness: type[SimHarness]) -> None:
-    wall = Wall(make_harness, 3.0, CP_DIST=1.0, CP_GUIDE_ANG=0)
+def test_full_stick_towards_a_wall_stops_before_it() -> None:
+    wall = Wall(3.0, CP_DIST=1.0, CP_GUIDE_ANG=0)
     assert wall.harness.set_mode(3, 0) == [0, 0]
     wall.fly(8.0, pitch=1.0)
     assert wall.harness.mode == "POSCTL"
@@ -273,17 +269,15 @@ def test_full_stick_towards_a_wall_stops_before_it(make_harness: type[SimHarness
     assert wall.distance_m > 3.5
 
 
-def test_without_collision_prevention_wall_is_passed(
-    make_harness: type[SimHarness],
-) -> None:
-    wall = Wall(make_harness, 3.0, CP_DIST=-1.0)
+def test_without_collision_prevention_wall_is_passed() -> None:
+    wall = Wall(3.0, CP_DIST=-1.0)
     wall.harness.set_mode(3, 0)
     wall.fly(4.0, pitch=1.0)
     assert wall.distance_m < 0.0
 
 
-def test_offboard_is_not_limited(make_harness: type[SimHarness], velocity_setpoint: Any) -> None:
-    wall = Wall(make_harness, 3.0, CP_DIST=1.0, CP_GUIDE_ANG=0)
+def test_offboard_is_not_limited() -> None:
+    wall = Wall(3.0, CP_DIST=1.0, CP_GUIDE_ANG=0)
     north = velocity_setpoint(2, 0, 0)
     wall.harness.offboard(north)
     wall.fly(4.0, north)
@@ -291,8 +285,8 @@ def test_offboard_is_not_limited(make_harness: type[SimHarness], velocity_setpoi
     assert wall.distance_m < 0.0
 
 
-def test_silent_sensor_ends_position_mode(make_harness: type[SimHarness]) -> None:
-    wall = Wall(make_harness, 10.0, CP_DIST=1.0, CP_GUIDE_ANG=0)
+def test_silent_sensor_ends_position_mode() -> None:
+    wall = Wall(10.0, CP_DIST=1.0, CP_GUIDE_ANG=0)
     wall.harness.set_mode(3, 0)
     wall.fly(1.0)
     wall.fly(4.5, seen=False)

@@ -14,7 +14,6 @@ from mavlink_sim.camera.scene import Path, Scene
 from mavlink_sim.cli.main import main
 from mavlink_sim.lockstep import LockstepVehicle
 from mavlink_sim.physics.airframe import Multirotor, rotation_matrix
-from mavlink_sim.physics.collisions import CollidingMultirotor
 from mavlink_sim.physics.contact import (
     CRASH_MPS,
     HALF_HEIGHT_M,
@@ -27,6 +26,7 @@ from mavlink_sim.physics.contact import (
 from mavlink_sim.realtime.options import SimulationOptions
 from mavlink_sim.realtime.simulation import Simulation
 from mavlink_sim.testing import free_udp_ports
+from mavlink_sim.vehicles.collision_world import CollidingMultirotor
 from mavlink_sim.vehicles.vehicle import STEP_S
 from mavlink_sim.wire.setpoints import position_setpoint, velocity_setpoint
 from mavlink_sim.world.fiducials import Print
@@ -216,11 +216,7 @@ def test_vehicle_cannot_leave_walled_yard(
 ) -> None:
     sides = [
         WorldObject(
-            index,
-            "box",
-            (2.0 * math.cos(angle), 2.0 * math.sin(angle), 0.0),
-            angle,
-            size_m=(0.2, 6.0, 40.0),
+            index, "box", (2.0 * math.cos(angle), 2.0 * math.sin(angle), 0.0), angle, size_m=(0.2, 6.0, 40.0)
         )
         for index, angle in enumerate(yaw + side * math.pi / 2 for side in range(4))
     ]

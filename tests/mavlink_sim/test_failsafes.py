@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 
-from mavlink_sim.autopilot.failsafe_actions import Action
-from mavlink_sim.autopilot.failsafe_conditions import Conditions
-from mavlink_sim.autopilot.failsafes import FailsafeMachine
+from mavlink_sim.autopilot.failsafes import Action, Conditions, FailsafeMachine
 from mavlink_sim.flight.transmitter import CALIBRATION, Sticks
 from mavlink_sim.physics.battery import BatteryWarning
 from mavlink_sim.px4.modes import Mode
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.announcements import Text, event_identifier
 from mavlink_sim.wire.messages import dialect
-from tests.mavlink_sim.conftest import SimHarness
+from tests.mavlink_sim.conftest import SimHarness, velocity_setpoint
 
 GROUND_STATION = (245, 190)
 REMOTE_CONTROL = {**CALIBRATION, "COM_RC_IN_MODE": 0, "COM_FLTMODE1": 2, "COM_FLTMODE4": 4}
@@ -269,8 +265,8 @@ def test_a_flickering_condition_uses_up_the_delay() -> None:
 # ---- on the vehicle
 
 
-def flying(make_harness: type[SimHarness], **values: float) -> SimHarness:
-    harness = make_harness(parameters={**REMOTE_CONTROL, **values})
+def flying(**values: float) -> SimHarness:
+    harness = SimHarness(parameters={**REMOTE_CONTROL, **values})
     harness.heartbeats.append(("gcs", GROUND_STATION, 6))
     harness.vehicle.transmitter.on = True
     harness.take_off(12.0)
@@ -280,8 +276,8 @@ def flying(make_harness: type[SimHarness], **values: float) -> SimHarness:
     return harness
 
 
-def test_remote_control_switched_off_in_flight_ends_in_return(make_harness: type[SimHarness]) -> None:
-    harness = flying(make_harness)
+def test_remote_control_switched_off_in_flight_ends_in_return() -> None:
+    harness = flying()
     harness.vehicle.transmitter.on = False
     holding_s = harness.until(lambda: harness.mode == "HOLD", 2.0)
     assert holding_s == pytest.approx(0.5, abs=0.1)
@@ -294,10 +290,8 @@ def test_remote_control_switched_off_in_flight_ends_in_return(make_harness: type
     assert "failsafe: manual control lost, RTL" in harness.events
 
 
-def test_regained_rc_takes_over_by_sticks(
-    make_harness: type[SimHarness],
-) -> None:
-    harness = flying(make_harness)
+def test_regained_rc_takes_over_by_sticks() -> None:
+    harness = flying()
     transmitter = harness.vehicle.transmitter
     transmitter.on = False
     harness.until(lambda: harness.mode == "RTL", 7.0)
@@ -311,16 +305,16 @@ def test_regained_rc_takes_over_by_sticks(
     )
 
 
-def test_rc_loss_excepted_in_offboard(make_harness: type[SimHarness], velocity_setpoint: Any) -> None:
-    harness = flying(make_harness)
+def test_rc_loss_excepted_in_offboard() -> None:
+    harness = flying()
     harness.offboard(velocity_setpoint(0, 0, 0))
     harness.vehicle.transmitter.on = False
     harness.fly(3.0, velocity_setpoint(0, 0, 0))
     assert harness.mode == "OFFBOARD"
 
 
-def test_losing_the_ground_station_returns_after_the_hold(make_harness: type[SimHarness]) -> None:
-    harness = make_harness(parameters={"NAV_DLL_ACT": 2, "COM_DL_LOSS_T": 3})
+def test_losing_the_ground_station_returns_after_the_hold() -> None:
+    harness = SimHarness(parameters={"NAV_DLL_ACT": 2, "COM_DL_LOSS_T": 3})
     harness.until(lambda: harness.vehicle.autopilot.sensors_ready, 5.0)
     harness.fly(0.2)
     assert not harness.vehicle.autopilot.can_arm
@@ -359,10 +353,8 @@ def test_missing_ground_station_is_no_loss_by_default(harness: SimHarness) -> No
         pytest.param(0, False, id="off"),
     ],
 )
-def test_sticks_moved_in_an_auto_mode_take_over(
-    make_harness: type[SimHarness], override: int, taken_over: bool
-) -> None:
-    harness = flying(make_harness, COM_RC_OVERRIDE=override)
+def test_sticks_moved_in_an_auto_mode_take_over(override: int, taken_over: bool) -> None:
+    harness = flying(COM_RC_OVERRIDE=override)
     harness.set_mode(4, 3)
     harness.fly(0.5)
     harness.vehicle.transmitter.sticks = Sticks(roll=0.5)
@@ -375,18 +367,16 @@ def test_sticks_moved_in_an_auto_mode_take_over(
     ("override", "taken_over"),
     [pytest.param(3, True, id="offboard too"), pytest.param(1, False, id="auto only")],
 )
-def test_sticks_take_over_in_offboard_if_enabled(
-    make_harness: type[SimHarness], velocity_setpoint: Any, override: int, taken_over: bool
-) -> None:
-    harness = flying(make_harness, COM_RC_OVERRIDE=override)
+def test_sticks_take_over_in_offboard_if_enabled(override: int, taken_over: bool) -> None:
+    harness = flying(COM_RC_OVERRIDE=override)
     harness.offboard(velocity_setpoint(0.5, 0, 0))
     harness.vehicle.transmitter.sticks = Sticks(yaw=0.6)
     harness.fly(0.5, velocity_setpoint(0.5, 0, 0))
     assert harness.mode == ("POSCTL" if taken_over else "OFFBOARD")
 
 
-def test_sticks_moved_slowly_do_not_take_over(make_harness: type[SimHarness]) -> None:
-    harness = flying(make_harness)
+def test_sticks_moved_slowly_do_not_take_over() -> None:
+    harness = flying()
     harness.set_mode(4, 3)
     harness.fly(0.5)
     for number in range(100):  # 20 % a second; COM_RC_STICK_OV is 30

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import pytest
 
 from mavlink_sim.physics.geography import SIH_FRAME
 from mavlink_sim.wire.messages import dialect
-from tests.mavlink_sim.conftest import SimHarness
+from tests.mavlink_sim.conftest import SimHarness, position_setpoint, velocity_setpoint
 
 DO_SET_MODE, LAND, ARM, REQUEST_MESSAGE = 176, 21, 400, 512
 GPS_ID, ESTIMATOR_ID = 24, 230
@@ -147,9 +146,7 @@ def test_slow_vehicle_runs_at_given_pace(harness: SimHarness) -> None:
 
 
 @pytest.mark.streams("GPS_RAW_INT", "LOCAL_POSITION_NED", "ODOMETRY")
-def test_offboard_position_descends_without_gps_and_resumes(
-    harness: SimHarness, position_setpoint: Callable[..., Any]
-) -> None:
+def test_offboard_position_descends_without_gps_and_resumes(harness: SimHarness) -> None:
     harness.heartbeats = [("gcs", (245, 190), 6)]
     harness.take_off(20.0)
     setpoint = position_setpoint(0, 0, -20)
@@ -222,9 +219,7 @@ def test_gps_drift_moves_vehicle(harness: SimHarness) -> None:
 
 
 @pytest.mark.streams("LOCAL_POSITION_NED", "ODOMETRY")
-def test_estimator_reset_moves_estimate_and_not_vehicle(
-    harness: SimHarness, position_setpoint: Callable[..., Any]
-) -> None:
+def test_estimator_reset_moves_estimate_and_not_vehicle(harness: SimHarness) -> None:
     harness.take_off(10.0)
     setpoint = position_setpoint(0, 0, -10)
     harness.offboard(setpoint)
@@ -257,8 +252,8 @@ def test_battery_fault_sets_and_drains_charge(harness: SimHarness) -> None:
     assert newest(harness, "SYS_STATUS").battery_remaining > 60
 
 
-def test_failed_battery_lands_vehicle(make_harness: type[SimHarness]) -> None:
-    harness = make_harness(parameters={"COM_FAIL_ACT_T": 0})
+def test_failed_battery_lands_vehicle() -> None:
+    harness = SimHarness(parameters={"COM_FAIL_ACT_T": 0})
     harness.take_off(5.0)
     begin(harness, "battery emergency")
     harness.fly(0.1)
@@ -304,10 +299,8 @@ def test_supply_check_applies_again_after_battery_fault(harness: SimHarness) -> 
     assert not harness.vehicle.autopilot.supervision.battery.is_checked
 
 
-def test_worse_of_two_failsafes_is_active(
-    make_harness: type[SimHarness], velocity_setpoint: Callable[..., Any]
-) -> None:
-    harness = make_harness(parameters={"CBRK_SUPPLY_CHK": 0, "COM_FAIL_ACT_T": 0})
+def test_worse_of_two_failsafes_is_active() -> None:
+    harness = SimHarness(parameters={"CBRK_SUPPLY_CHK": 0, "COM_FAIL_ACT_T": 0})
     harness.take_off(8.0)
     harness.offboard(velocity_setpoint(0, 0, 0))
     harness.until(lambda: harness.mode == "RTL", 2.0)  # the stream is lost
@@ -354,9 +347,7 @@ def test_a_gust_rises_and_falls_once(harness: SimHarness) -> None:
 # ---- command
 
 
-def test_a_pilot_takes_the_vehicle_out_of_offboard(
-    harness: SimHarness, velocity_setpoint: Callable[..., Any]
-) -> None:
+def test_a_pilot_takes_the_vehicle_out_of_offboard(harness: SimHarness) -> None:
     harness.take_off(5.0)
     setpoint = velocity_setpoint(1, 0, 0)
     harness.offboard(setpoint)
@@ -372,10 +363,8 @@ def test_pilot_fault_end_keeps_mode(harness: SimHarness) -> None:
     assert harness.mode == "POSCTL"
 
 
-def test_pilot_fault_end_is_rc_loss_if_rc_enabled(
-    make_harness: type[SimHarness],
-) -> None:
-    harness = make_harness(parameters={"COM_RC_IN_MODE": 0})
+def test_pilot_fault_end_is_rc_loss_if_rc_enabled() -> None:
+    harness = SimHarness(parameters={"COM_RC_IN_MODE": 0})
     harness.take_off(5.0)
     begin(harness, "pilot_takeover for=2")
     harness.fly(1.9)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any
 
 import pytest
 
@@ -12,10 +10,10 @@ from mavlink_sim import LockstepVehicle
 from mavlink_sim.missions.items import MissionItem
 from mavlink_sim.physics.geography import SIH_FRAME
 from mavlink_sim.wire.messages import dialect
-from tests.mavlink_sim.conftest import SimHarness
+from tests.mavlink_sim.conftest import SimHarness, position_setpoint
 from tests.mavlink_sim.plan_client import land, takeoff, upload, waypoint
 
-ORBIT, CHANGE_ALTITUDE, SET_HOME = 34, 186, 179
+SET_HOME = 179
 RETURN_ACTION, TERMINATE_ACTION = 3, 4  # GF_ACTION
 
 
@@ -80,9 +78,7 @@ def test_failsafe_descends_blind_then_returns(harness: SimHarness) -> None:
 
 
 @pytest.mark.parametrize("mode", ["HOLD", "TAKEOFF", "OFFBOARD", "RTL by the fence"])
-def test_blind_landing_stays_down_with_regained_position(
-    harness: SimHarness, position_setpoint: Callable[..., Any], mode: str
-) -> None:
+def test_blind_landing_stays_down_with_regained_position(harness: SimHarness, mode: str) -> None:
     up = position_setpoint(0.0, 0.0, -20.0)
     harness.take_off(4.0)
     harness.vehicle.parameters.set("COM_DISARM_LAND", 30.0)
@@ -110,20 +106,6 @@ def test_a_terminated_flight_is_disarmed_once_it_is_down(harness: SimHarness) ->
     assert harness.armed
     harness.until(lambda: not harness.armed, 15.0)
     assert harness.vehicle.autopilot.landed
-
-
-@pytest.mark.parametrize(
-    ("command", "values"),
-    [(ORBIT, (10, 2, 0, 0, math.nan, math.nan, math.nan)), (CHANGE_ALTITUDE, (520.0,))],
-    ids=["orbit", "altitude"],
-)
-def test_commands_needing_position_refused(
-    harness: SimHarness, command: int, values: tuple[float, ...]
-) -> None:
-    harness.take_off(30.0)
-    lose_position(harness)
-    assert harness.command(command, *values) == [1]
-    assert harness.mode == "LAND"
 
 
 # ---- faults of the estimate
@@ -287,10 +269,8 @@ def test_all_clocks_agree_after_stall(harness: SimHarness) -> None:
     assert harness.received("ATTITUDE")[-1].time_boot_ms == pytest.approx(3000, abs=20)
 
 
-def test_second_autopilot_does_not_move_the_vehicle(
-    make_harness: type[SimHarness],
-) -> None:
-    harness = make_harness(["GLOBAL_POSITION_INT"], start_ned_m=(100.0, 200.0))
+def test_second_autopilot_does_not_move_the_vehicle() -> None:
+    harness = SimHarness(["GLOBAL_POSITION_INT"], start_ned_m=(100.0, 200.0))
     harness.wait_ready()
     begin(harness, "second_autopilot 9")
     harness.forget()
@@ -336,11 +316,9 @@ def test_servo_output_has_each_rotor_command(harness: SimHarness) -> None:
     assert harness.vehicle.airframe.rotor_thrusts[1] < 0.01
 
 
-def test_offboard_after_first_setpoint_is_no_failsafe(
-    make_harness: type[SimHarness], position_setpoint: Callable[..., Any]
-) -> None:
+def test_offboard_after_first_setpoint_is_no_failsafe() -> None:
     for phase in (0, 2, 4):  # of the watch, which looks every other control step
-        harness = make_harness()
+        harness = SimHarness()
         harness.take_off(5.0)
         harness.fly(0.004 * phase + 1e-6)
         harness.send(position_setpoint(0.0, 0.0, -5.0))

@@ -1,14 +1,25 @@
-"""Begin, end and report of faults; the same seed gives the same faults."""
+"""Faults: their grammar, begin, end and report; typed on a console; repeated by the seed."""
 
 from __future__ import annotations
 
+import os
+import pty
+import select
+import tty
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from mavlink_sim.faults.grammar import FaultError
+from mavlink_sim.faults.grammar import FaultError, parse_fault
+from mavlink_sim.faults.injector import FaultConsole
+from mavlink_sim.faults.kinds import EFFECTS, KINDS
+from mavlink_sim.faults.schedule import Outcome
 from mavlink_sim.lockstep_link import LockstepLink
-from mavlink_sim.vehicles.vehicle import STEP_S
+from mavlink_sim.vehicles.vehicle import STEP_S, Vehicle
 from mavlink_sim.wire.messages import dialect, parser
 from tests.mavlink_sim.conftest import SimHarness
 
@@ -100,9 +111,9 @@ def test_grammar_commands_return_text(harness: SimHarness) -> None:
     assert not command("help nothing").ok
 
 
-def test_the_same_seed_has_the_same_faults_to_the_byte(make_harness: type[SimHarness]) -> None:
+def test_the_same_seed_has_the_same_faults_to_the_byte() -> None:
     def flight(seed: int) -> list[tuple[float, bytes]]:
-        harness = make_harness(["everything"], seed=seed)
+        harness = SimHarness(["everything"], seed=seed)
         link = LockstepLink(harness.vehicle, "onboard")
         for line in (
             "packet_loss 0.2",
@@ -159,3 +170,154 @@ def test_fault_on_one_direction_of_one_link(harness: SimHarness) -> None:
     assert received_onboard
     assert not [m for m in received_onboard if m.get_type() == "TIMESYNC" and m.ts1 == 77]
     assert [m for m in received_gcs if m.get_type() == "TIMESYNC" and m.ts1 == 78]
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "values", "at_s", "duration_s"),
+    [
+        ("link_delay 0.2", "link_delay", {"seconds": 0.2, "link": "all"}, None, None),
+        ("at=20 motor_failure 2", "motor_failure", {"motor": 2}, 20.0, None),
+        ("for=5 packet_loss 0.3 link=gcs way=out", "packet_loss", {"share": 0.3, "way": "out"}, None, 5.0),
+        ("packet_loss share=0.3", "packet_loss", {"share": 0.3}, None, None),
+        ("battery Low", "battery", {"remaining": "low"}, None, None),
+        ("battery 0.4", "battery", {"remaining": 0.4}, None, None),
+        ("ekf_reset 1 2 yaw=30", "ekf_reset", {"north": 1.0, "east": 2.0, "yaw": 30.0}, None, None),
+        ("refuse_mode offboard count=2", "refuse_mode", {"mode": "OFFBOARD", "count": "2"}, None, None),
+        ("stall for=2 at=1", "stall", {"pace": 0.0}, 1.0, 2.0),
+    ],
+)
+def test_words_in_any_order(
+    text: str, name: str, values: dict[str, object], at_s: float | None, duration_s: float | None
+) -> None:
+    fault = parse_fault(text, KINDS)
+    assert fault.kind.name == name
+    assert values.items() <= dict(fault.values).items()
+    assert (fault.at_s, fault.duration_s) == (at_s, duration_s)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "names no fault"),
+        ("at=3", "names no fault"),
+        ("link_dely 1", "link_delay"),
+        ("link_delay", "link_delay SECONDS"),
+        ("link_delay x", "0 to 60 s"),
+        ("link_delay nan", "expected a number"),
+        ("link_delay 1 2 gcs in 5", "unexpected"),
+        ("link_delay 1 colour=red", "unexpected 'colour='"),
+        ("link_delay 1 way=up", "both, out, in"),
+        ("link_delay 1 at=-1", "expected a number, 0"),
+        ("link_delay 1 for=0", "above 0 s"),
+        ("link_delay 1 for=1 for=2", "for is given twice"),
+        ("motor_failure 5", "1 to 4"),
+        ("battery full", "low, critical, emergency"),
+        ("lost_ack 0", "a whole number, 1 to"),
+        ("gps_loss seed=x", "a whole number"),
+    ],
+)
+def test_invalid_faults_refused_in_one_line(text: str, message: str) -> None:
+    with pytest.raises(FaultError) as refusal:
+        parse_fault(text, KINDS)
+    assert message in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+@given(
+    st.text(max_size=80)
+    | st.lists(st.sampled_from([*KINDS, "at=1", "for=2", "0.5", "x", "link=all"])).map(" ".join)
+)
+def test_any_text_is_a_fault_or_a_refusal(text: str) -> None:
+    try:
+        fault = parse_fault(text, KINDS)
+    except FaultError:
+        return
+    again = parse_fault(str(fault), KINDS)
+    assert again.values == fault.values
+    assert again.duration_s == fault.duration_s
+
+
+def test_every_kind_has_an_effect_and_a_summary() -> None:
+    assert set(KINDS) == set(EFFECTS)
+    for kind in KINDS.values():
+        assert kind.summary
+        assert kind.usage.startswith(kind.name)
+
+
+@pytest.fixture
+def lines() -> list[str]:
+    return []
+
+
+@pytest.fixture
+def command() -> Callable[[str], Outcome]:
+    vehicle = Vehicle()
+    vehicle.add_link("onboard")
+    return vehicle.faults.command
+
+
+def test_lines_executed_when_complete(command: Callable[[str], Outcome], lines: list[str]) -> None:
+    reading, writing = os.pipe()
+    console = FaultConsole(reading, command, lines.append)
+    console.poll()  # nothing typed: nothing waits
+    os.write(writing, b"link_del")
+    console.poll()
+    assert lines == []
+    os.write(writing, b"ay 0.2\n\n# a remark\nwind\nlist\n")
+    console.poll()
+    assert lines[0] == "fault 1 link_delay 0.2"
+    assert lines[1].startswith("not done: wind")
+    assert lines[2].startswith("1 link_delay 0.2: since")
+    os.write(writing, b"end all")
+    os.close(writing)
+    console.poll()
+    console.poll()
+    assert lines[3] == "ended 1"
+    console.poll()  # the end was reached: nothing more happens
+    assert len(lines) == 4
+    console.close()
+    os.close(reading)
+
+
+def test_file_is_read_completely(command: Callable[[str], Outcome], lines: list[str], tmp_path: Path) -> None:
+    path = tmp_path / "faults"
+    path.write_text("link_loss for=3\nstall at=9")
+    descriptor = os.open(path, os.O_RDONLY)
+    console = FaultConsole(descriptor, command, lines.append)
+    for _ in range(3):
+        console.poll()
+    assert lines == ["fault 1 link_loss for=3", "fault 2 stall at 9 s"]
+    console.close()
+    os.close(descriptor)
+
+
+def test_terminal_is_read_and_may_close(command: Callable[[str], Outcome], lines: list[str]) -> None:
+    controller, terminal = pty.openpty()
+    tty.setraw(terminal)
+    console = FaultConsole(terminal, command, lines.append)
+    os.write(controller, b"gust 5\n")
+    assert select.select([terminal], [], [], 10.0)[0]  # the terminal hands it on in its own time
+    console.poll()
+    assert lines == ["fault 1 gust 5"]
+    os.close(controller)
+    console.poll()
+    console.poll()
+    console.close()
+    os.close(terminal)
+
+
+def test_binary_and_endless_lines_are_harmless(command: Callable[[str], Outcome], lines: list[str]) -> None:
+    reading, writing = os.pipe()
+    console = FaultConsole(reading, command, lines.append)
+    os.write(writing, b"\xff\xfe\x00\n")
+    console.poll()
+    assert lines[0].startswith("not done: ")
+    for _ in range(8):
+        os.write(writing, b"x" * 4096)
+        console.poll()
+    os.write(writing, b"\nlist\n")
+    console.poll()
+    assert lines[-1] == "no faults"
+    console.close()
+    os.close(reading)
+    os.close(writing)

@@ -20,8 +20,15 @@ from mavsdk.plugins.component_metadata import MetadataType
 from pymavlink import mavftp, mavutil
 
 from mavlink_sim.px4.parameters import Parameters, default_parameters
-from mavlink_sim.services.file_system import FileSystem, resolve
-from mavlink_sim.services.file_transfer import DATA_BYTES, Failure, Opcode, Packet, Server
+from mavlink_sim.services.file_transfer import (
+    DATA_BYTES,
+    Failure,
+    FileSystem,
+    Opcode,
+    Packet,
+    Server,
+    resolve,
+)
 from mavlink_sim.services.vehicle_files import bson
 from mavlink_sim.testing import RunningSimulator, running_simulator
 from mavlink_sim.wire.messages import dialect

@@ -11,7 +11,7 @@ import pytest
 from pymavlink import mavutil
 
 from mavlink_sim.lockstep import LockstepVehicle
-from mavlink_sim.realtime import loop
+from mavlink_sim.realtime import simulation
 from mavlink_sim.realtime.fleet import instance_options, start_positions
 from mavlink_sim.realtime.options import SimulationOptions
 from mavlink_sim.testing import free_udp_port_range, running_simulator
@@ -122,9 +122,9 @@ def test_a_range_of_ports_is_free() -> None:
 
 def test_too_slow_machine_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     now_s = 100.0
-    monkeypatch.setattr("mavlink_sim.realtime.loop.time.monotonic", lambda: now_s)
+    monkeypatch.setattr("mavlink_sim.realtime.simulation.time.monotonic", lambda: now_s)
     reports: list[str] = []
-    pace = loop._Pace(20.0, reports.append)
+    pace = simulation._Pace(20.0, reports.append)
     pace.lose(25.0)
     now_s += 2.0
     pace.report()

@@ -18,15 +18,14 @@ import numpy as np
 import pytest
 from pymavlink import mavutil
 
-from mavlink_sim.camera.process import CameraProcess
+from mavlink_sim.camera.process import SLOTS, CameraProcess, SharedPoses
 from mavlink_sim.camera.renderer import Renderer
 from mavlink_sim.camera.scene import CameraSettings, Scene
 from mavlink_sim.camera.scene import Path as Way
-from mavlink_sim.camera.shared_poses import SLOTS, SharedPoses
 from mavlink_sim.camera.simulated_camera import Captured, SimulatedCamera, frame_truth
 from mavlink_sim.realtime.fleet import Fleet, instance_options
-from mavlink_sim.realtime.loop import run_together
 from mavlink_sim.realtime.options import SimulationOptions
+from mavlink_sim.realtime.simulation import run_together
 from mavlink_sim.testing import free_port, free_udp_port_range, running_simulator
 from mavlink_sim.vehicles.fleet_world import FleetWorld
 from mavlink_sim.vehicles.vehicle import Vehicle

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import cv2
 import numpy as np
@@ -14,7 +13,7 @@ from hypothesis import strategies as st
 from mavlink_sim.missions.geofence import Area, inside_polygon
 from mavlink_sim.physics.geography import SIH_FRAME
 from mavlink_sim.wire.announcements import event_identifier
-from tests.mavlink_sim.conftest import SimHarness
+from tests.mavlink_sim.conftest import SimHarness, velocity_setpoint
 from tests.mavlink_sim.plan_client import circle, listen, polygon, upload
 
 FENCE = [(-20.0, -20.0), (-20.0, 20.0), (20.0, 20.0), (20.0, -20.0)]
@@ -23,9 +22,9 @@ centimetres = st.integers(-10_000, 10_000)
 
 
 @pytest.fixture
-def harness(make_harness: type[SimHarness]) -> SimHarness:
+def harness() -> SimHarness:
     """A vehicle that is ready at once."""
-    return make_harness(ready_after_s=0.0)
+    return SimHarness(ready_after_s=0.0)
 
 
 # ---- geometry
@@ -97,8 +96,8 @@ def test_fence_breached_at_upload_is_dropped(harness: SimHarness) -> None:
 # ---- arming
 
 
-def test_arming_refused_outside_fence(make_harness: type[SimHarness]) -> None:
-    harness = make_harness(ready_after_s=0.0)
+def test_arming_refused_outside_fence() -> None:
+    harness = SimHarness(ready_after_s=0.0)
     listen(harness)
     upload(harness, [circle(0, 0, 10.0)], 1)
     harness.fly(0.3)
@@ -110,8 +109,8 @@ def test_arming_refused_outside_fence(make_harness: type[SimHarness]) -> None:
     assert harness.heartbeat().system_status == 0
 
 
-def test_fence_ignored_without_action(make_harness: type[SimHarness]) -> None:
-    harness = make_harness(ready_after_s=0.0, parameters={"GF_ACTION": 0})
+def test_fence_ignored_without_action() -> None:
+    harness = SimHarness(ready_after_s=0.0, parameters={"GF_ACTION": 0})
     upload(harness, [circle(0, 0, 10.0)], 1)
     harness.vehicle.airframe.position = (15.0, 0.0, 0.0)
     harness.fly(0.3)
@@ -121,7 +120,7 @@ def test_fence_ignored_without_action(make_harness: type[SimHarness]) -> None:
 # ---- breaches
 
 
-def fly_out(harness: SimHarness, velocity_setpoint: Any, **parameters: float) -> None:
+def fly_out(harness: SimHarness, **parameters: float) -> None:
     """Into the air, and north in OFFBOARD until the fence at 8 m is broken."""
     listen(harness)
     harness.take_off(4.0)
@@ -134,15 +133,10 @@ def fly_out(harness: SimHarness, velocity_setpoint: Any, **parameters: float) ->
     harness.fly(0.3, north)
 
 
-@pytest.mark.parametrize(
-    ("action", "mode"),
-    [(1, "OFFBOARD"), (2, "HOLD"), (3, "RTL"), (5, "LAND")],
-)
-def test_breach_executes_gf_action(
-    make_harness: type[SimHarness], velocity_setpoint: Any, action: int, mode: str
-) -> None:
-    harness = make_harness(ready_after_s=0.0, parameters={"GF_ACTION": action, "COM_FAIL_ACT_T": 0})
-    fly_out(harness, velocity_setpoint)
+@pytest.mark.parametrize(("action", "mode"), [(1, "OFFBOARD"), (2, "HOLD"), (3, "RTL"), (5, "LAND")])
+def test_breach_executes_gf_action(action: int, mode: str) -> None:
+    harness = SimHarness(ready_after_s=0.0, parameters={"GF_ACTION": action, "COM_FAIL_ACT_T": 0})
+    fly_out(harness)
     assert harness.mode == mode
     assert "Geofence: approaching or outside geofence" in harness.texts()
     assert ("Failsafe activated\t" in harness.texts()) is (action != 1)
@@ -153,17 +147,17 @@ def test_breach_executes_gf_action(
     assert any("geofence breached" in event for event in harness.events)
 
 
-def test_breach_holds_before_return(make_harness: type[SimHarness], velocity_setpoint: Any) -> None:
-    harness = make_harness(ready_after_s=0.0, parameters={"GF_ACTION": 3})
-    fly_out(harness, velocity_setpoint)
+def test_breach_holds_before_return() -> None:
+    harness = SimHarness(ready_after_s=0.0, parameters={"GF_ACTION": 3})
+    fly_out(harness)
     assert harness.mode == "HOLD"
     assert "Failsafe activated: entering Hold for 5 seconds\t" in harness.texts()
     assert harness.until(lambda: harness.mode == "RTL", 6.0) == pytest.approx(4.8, abs=0.3)
 
 
-def test_offboard_does_not_resume_after_breach(harness: SimHarness, velocity_setpoint: Any) -> None:
+def test_offboard_does_not_resume_after_breach(harness: SimHarness) -> None:
     north = velocity_setpoint(4, 0, 0)
-    fly_out(harness, velocity_setpoint)
+    fly_out(harness)
     harness.fly(3.0, north)
     assert harness.mode == "HOLD"
     assert harness.vehicle.airframe.position[0] < 16.0
@@ -186,9 +180,9 @@ def test_goal_outside_fence_refused(harness: SimHarness) -> None:
     assert math.hypot(*harness.vehicle.airframe.position[:2]) < 1.0
 
 
-def test_termination_stops_the_motors(make_harness: type[SimHarness], velocity_setpoint: Any) -> None:
-    harness = make_harness(ready_after_s=0.0, parameters={"GF_ACTION": 4})
-    fly_out(harness, velocity_setpoint)
+def test_termination_stops_the_motors() -> None:
+    harness = SimHarness(ready_after_s=0.0, parameters={"GF_ACTION": 4})
+    fly_out(harness)
     assert harness.heartbeat().system_status == 8
     harness.until(lambda: harness.vehicle.airframe.on_ground, 5.0)
     assert harness.vehicle.airframe.thrust_mps2 < 0.1
@@ -203,13 +197,9 @@ def test_termination_stops_the_motors(make_harness: type[SimHarness], velocity_s
     ],
 )
 def test_max_distances_from_home_are_a_fence(
-    make_harness: type[SimHarness],
-    velocity_setpoint: Any,
-    parameter: str,
-    setpoint: tuple[float, ...],
-    words: str,
+    parameter: str, setpoint: tuple[float, float, float], words: str
 ) -> None:
-    harness = make_harness(ready_after_s=0.0, parameters={parameter: 8.0})
+    harness = SimHarness(ready_after_s=0.0, parameters={parameter: 8.0})
     listen(harness)
     harness.take_off(4.0)
     away = velocity_setpoint(*setpoint)

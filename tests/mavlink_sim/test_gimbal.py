@@ -137,8 +137,8 @@ def test_a_rate_against_a_stop_does_not_wind_up() -> None:
 
 
 @pytest.fixture
-def steered(make_harness: type[SimHarness]) -> SimHarness:
-    harness = make_harness(gimbal=True)
+def steered() -> SimHarness:
+    harness = SimHarness(gimbal=True)
     harness.wait_ready()
     assert harness.command(1001, *COMPANION, -1, -1) == [0]
     return harness
@@ -159,8 +159,8 @@ def test_no_gimbal_by_default(harness: SimHarness) -> None:
     assert "MNT_MODE_OUT" not in harness.vehicle.parameters
 
 
-def test_gimbal_telemetry_is_sent(make_harness: type[SimHarness]) -> None:
-    harness = make_harness(gimbal=True)
+def test_gimbal_telemetry_is_sent() -> None:
+    harness = SimHarness(gimbal=True)
     harness.wait_ready()
     assert harness.command(512, 280) == [0]
     information = harness.received("GIMBAL_MANAGER_INFORMATION")[-1]
@@ -176,8 +176,8 @@ def test_gimbal_telemetry_is_sent(make_harness: type[SimHarness]) -> None:
     assert (status.primary_control_sysid, status.primary_control_compid) == (0, 0)
 
 
-def test_only_the_one_in_control_moves_it(make_harness: type[SimHarness]) -> None:
-    harness = make_harness(gimbal=True)
+def test_only_the_one_in_control_moves_it() -> None:
+    harness = SimHarness(gimbal=True)
     harness.wait_ready()
     assert harness.command(1000, -45, 0, NAN, NAN, 12) == [2]
     assert harness.command(1001, *COMPANION, -1, -1) == [0]

@@ -21,35 +21,19 @@ from mavlink_sim.wire.link_faults import (
 
 share = st.floats(0.0, 1.0)
 seeds = st.integers(0, 2**32)
-KEEPING_ORDER = st.lists(
-    st.one_of(
-        st.builds(Loss, share, seeds),
-        st.builds(Delay, st.floats(0.0, 1.0), st.floats(0.0, 1.0), seeds),
-        st.builds(RateLimit, st.floats(100.0, 1e6)),
-    ),
-    max_size=4,
+in_order = (
+    st.builds(Loss, share, seeds),
+    st.builds(Delay, st.floats(0.0, 1.0), st.floats(0.0, 1.0), seeds),
+    st.builds(RateLimit, st.floats(100.0, 1e6)),
 )
-KEEPING_BYTES = st.lists(
-    st.one_of(
-        st.builds(Loss, share, seeds),
-        st.builds(Delay, st.floats(0.0, 1.0), st.floats(0.0, 1.0), seeds),
-        st.builds(RateLimit, st.floats(100.0, 1e6)),
-        st.builds(Duplication, share, seeds),
-        st.builds(Reorder, share, st.floats(0.01, 1.0), seeds),
-    ),
-    max_size=5,
+unchanged = (
+    *in_order,
+    st.builds(Duplication, share, seeds),
+    st.builds(Reorder, share, st.floats(0.01, 1.0), seeds),
 )
-ANY = st.lists(
-    st.one_of(
-        st.builds(Loss, share, seeds),
-        st.builds(Delay, st.floats(0.0, 1.0), st.floats(0.0, 1.0), seeds),
-        st.builds(RateLimit, st.floats(100.0, 1e6)),
-        st.builds(Duplication, share, seeds),
-        st.builds(Reorder, share, st.floats(0.01, 1.0), seeds),
-        st.builds(Corruption, share, seeds),
-    ),
-    max_size=6,
-)
+KEEPING_ORDER = st.lists(st.one_of(*in_order), max_size=4)
+KEEPING_BYTES = st.lists(st.one_of(*unchanged), max_size=5)
+ANY = st.lists(st.one_of(*unchanged, st.builds(Corruption, share, seeds)), max_size=6)
 # gaps between datagrams (seconds), their sizes
 TRAFFIC = st.lists(st.tuples(st.floats(0.0, 0.2), st.integers(4, 300)), max_size=60)
 

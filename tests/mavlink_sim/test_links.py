@@ -90,9 +90,7 @@ def heartbeat(kind: int = GCS) -> Any:
     return dialect.MAVLink(None).parse_buffer(message.pack(codec))[0]
 
 
-def test_heartbeat_forwarded_byte_for_byte(
-    harness: SimHarness,
-) -> None:
+def test_heartbeat_forwarded_byte_for_byte(harness: SimHarness) -> None:
     harness.send(heartbeat(), "gcs", (245, 190))
     assert harness.inbox["onboard"] == []  # no component received there yet
     harness.send(dialect.MAVLink_heartbeat_message(ONBOARD_CONTROLLER, 8, 0, 0, 4, 3), "onboard")
@@ -105,9 +103,7 @@ def test_heartbeat_forwarded_byte_for_byte(
     assert harness.inbox["gcs"] == []
 
 
-def test_forwarding_follows_target_component(
-    harness: SimHarness,
-) -> None:
+def test_forwarding_follows_target_component(harness: SimHarness) -> None:
     harness.send(dialect.MAVLink_heartbeat_message(ONBOARD_CONTROLLER, 8, 0, 0, 4, 3), "onboard")
     harness.forget()
     source = (245, 190)

@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 
-import mavlink_sim
 from mavlink_sim import CommandRefusedError, LockstepVehicle, NotReachedError
 from mavlink_sim.faults.grammar import FaultError
 from mavlink_sim.wire.messages import dialect, parser
@@ -143,13 +142,6 @@ def test_the_time_of_day_is_stepped_too() -> None:
     second = vehicle.newest["onboard"]["SYSTEM_TIME"]
     passed_us = (second.time_boot_ms - first.time_boot_ms) * 1000
     assert second.time_unix_usec - first.time_unix_usec == pytest.approx(passed_us, abs=1000)
-
-
-def test_package_exports_public_names() -> None:
-    for name in mavlink_sim.__all__:
-        assert getattr(mavlink_sim, name) is not None
-    with pytest.raises(AttributeError, match="no_message"):
-        _ = mavlink_sim.no_message
 
 
 def test_motor_loss_crashes_reports_and_disarms() -> None:

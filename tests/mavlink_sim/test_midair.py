@@ -236,11 +236,7 @@ def test_landing_on_another_vehicle_is_landed() -> None:
     upper = pair[1]
     upper.take_off(3.0)
     airframe = upper.vehicle.airframe
-    airframe.position = (
-        -2.95,
-        0.0,
-        airframe.position[2],
-    )  # above the other, 0.1 m beside its centre
+    airframe.position = (-2.95, 0.0, airframe.position[2])  # above the other, 0.1 m beside its centre
     upper.send(dialect.MAVLink_command_long_message(2, 1, 21, 0, 0, 0, 0, 0, math.nan, math.nan, math.nan))
     for _ in range(10_000):
         upper.step(STEP_S)

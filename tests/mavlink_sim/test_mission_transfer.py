@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mavlink_sim.missions.items import ItemRejectedError, PlanType, item_of, message_of
-from mavlink_sim.services.mission_messages import MissionCurrent
+from mavlink_sim.services.mission_transfer import MissionCurrent
 from mavlink_sim.wire.messages import dialect, parser
 from tests.mavlink_sim.conftest import SimHarness
 from tests.mavlink_sim.plan_client import (
@@ -36,9 +36,9 @@ SQUARE = [(-50.0, -50.0), (-50.0, 50.0), (50.0, 50.0), (50.0, -50.0)]
 
 
 @pytest.fixture
-def harness(make_harness: type[SimHarness]) -> SimHarness:
+def harness() -> SimHarness:
     """A vehicle that is ready at once."""
-    return make_harness(ready_after_s=0.0)
+    return SimHarness(ready_after_s=0.0)
 
 
 def count(number: int, plan: int = 0, target: tuple[int, int] = (1, 1)) -> Any:

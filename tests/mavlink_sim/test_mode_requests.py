@@ -1,11 +1,12 @@
-"""DO_SET_MODE and SET_MODE: two answers, the second one true."""
-
-from typing import Any
+"""Flight modes: their encodings, DO_SET_MODE and SET_MODE, and PX4's releases where they differ."""
 
 import pytest
 
+from mavlink_sim import LockstepVehicle
+from mavlink_sim.px4.modes import Mode, base_mode, mode_of
+from mavlink_sim.releases import RELEASES, release_named
 from mavlink_sim.wire.messages import dialect
-from tests.mavlink_sim.conftest import SimHarness
+from tests.mavlink_sim.conftest import SimHarness, velocity_setpoint
 
 ALL_MODES = [(1, 0), (2, 0), (3, 0), (3, 2), (4, 2), (4, 3), (4, 4), (4, 5), (4, 6), (5, 0), (6, 0), (7, 0)]
 FOLLOW, PRECISION_LAND, ORBIT = (4, 8), (4, 9), (3, 1)
@@ -94,18 +95,7 @@ def test_set_mode_message_has_one_real_answer(harness: SimHarness) -> None:
     assert harness.mode == "RTL"
 
 
-def test_a_mode_change_is_not_announced_by_an_extra_heartbeat(harness: SimHarness) -> None:
-    harness.wait_ready()
-    harness.heartbeat()
-    harness.forget()
-    harness.set_mode(4, 2)
-    harness.fly(0.9)
-    assert harness.received("HEARTBEAT") == []
-
-
-def test_current_mode_sent_at_2_hz_and_on_change(
-    harness: SimHarness,
-) -> None:
+def test_current_mode_sent_at_2_hz_and_on_change(harness: SimHarness) -> None:
     """Whatever the requested rate: a real PX4 asked for 20 Hz sent 1.75 to 2."""
     harness.fly(0.1)
     assert harness.command(511, 436, 50_000) == [0]
@@ -122,7 +112,7 @@ def test_current_mode_sent_at_2_hz_and_on_change(
     }
 
 
-def test_another_system_may_change_the_mode(harness: SimHarness, velocity_setpoint: Any) -> None:
+def test_another_system_may_change_the_mode(harness: SimHarness) -> None:
     harness.take_off()
     stream = velocity_setpoint(1, 0, 0)
     harness.offboard(stream)
@@ -130,3 +120,103 @@ def test_another_system_may_change_the_mode(harness: SimHarness, velocity_setpoi
     harness.fly(5.0, stream)  # the companion continues to send
     assert harness.mode == "HOLD"
     assert abs(harness.vehicle.airframe.velocity[0]) < 0.2
+
+
+@pytest.mark.parametrize(
+    ("mode", "custom"),
+    [
+        (Mode.MANUAL, 0x00010000),
+        (Mode.ALTCTL, 0x00020000),
+        (Mode.POSCTL, 0x00030000),
+        (Mode.POSITION_SLOW, 0x02030000),
+        (Mode.TAKEOFF, 0x02040000),
+        (Mode.HOLD, 0x03040000),
+        (Mode.MISSION, 0x04040000),
+        (Mode.RTL, 0x05040000),
+        (Mode.LAND, 0x06040000),
+        (Mode.FOLLOW, 0x08040000),
+        (Mode.PRECLAND, 0x09040000),
+        (Mode.ACRO, 0x00050000),
+        (Mode.OFFBOARD, 0x00060000),
+        (Mode.STABILIZED, 0x00070000),
+    ],
+)
+def test_a_mode_has_px4s_custom_mode_and_is_found_by_it(mode: Mode, custom: int) -> None:
+    assert mode.custom_mode == custom
+    assert mode_of(custom >> 16 & 0xFF, custom >> 24) is mode
+
+
+@pytest.mark.parametrize(("main", "sub"), [(8, 0), (4, 1), (4, 99), (0, 0), (10, 0), (99, 0)])
+def test_modes_that_px4_refuses_are_no_modes(main: int, sub: int) -> None:
+    assert mode_of(main, sub) is None
+
+
+def test_an_orbit_request_shows_as_position_mode() -> None:
+    assert mode_of(3, 1) is Mode.POSCTL
+
+
+@pytest.mark.parametrize(
+    ("mode", "armed", "has_setpoints", "expected"),
+    [
+        (Mode.HOLD, False, False, 29),
+        (Mode.HOLD, True, False, 157),
+        (Mode.RTL, True, False, 157),
+        (Mode.OFFBOARD, False, True, 17),
+        (Mode.OFFBOARD, True, True, 145),
+        (Mode.OFFBOARD, False, False, 1),
+        (Mode.POSCTL, False, False, 81),
+        (Mode.MANUAL, False, True, 81),
+        (Mode.ACRO, False, False, 65),
+        (Mode.FOLLOW, False, False, 17),
+    ],
+)
+def test_the_base_mode_is_as_measured(mode: Mode, armed: bool, has_setpoints: bool, expected: int) -> None:
+    assert base_mode(mode, armed, has_setpoints) == expected
+
+
+@pytest.mark.parametrize("release", ["1.14", "1.15"])
+def test_older_release_answers_mode_request_once(release: str) -> None:
+    harness = SimHarness(px4=release)
+    harness.take_off()
+    assert harness.set_mode(6) == [1]
+    assert harness.set_mode(4, 5) == [0]
+
+
+@pytest.mark.parametrize("release", ["1.16", "1.17"])
+def test_a_newer_release_answers_it_twice(release: str) -> None:
+    harness = SimHarness(px4=release)
+    harness.take_off()
+    assert harness.set_mode(6) == [0, 1]
+
+
+@pytest.mark.parametrize(("release", "answers"), [("1.16", 0), ("1.17", 1)])
+def test_parameter_errors_since_v1_17_only(release: str, answers: int) -> None:
+    harness = SimHarness(px4=release)
+    for request in (
+        dialect.MAVLink_param_request_read_message(1, 1, b"NO_SUCH", -1),
+        dialect.MAVLink_param_set_message(1, 1, b"COM_OF_LOSS_T", 1.0, 6),
+    ):
+        harness.forget()
+        harness.send(request)
+        harness.fly(0.05)
+        assert harness.received("PARAM_VALUE") == []
+        assert len(harness.received("PARAM_ERROR")) == answers
+
+
+@pytest.mark.parametrize("release", RELEASES)
+def test_reported_version_is_the_releases(release: str) -> None:
+    harness = SimHarness(px4=release)
+    harness.fly(0.1)
+    harness.command(512, 148)
+    version = harness.received("AUTOPILOT_VERSION")[0].flight_sw_version
+    assert f"{version >> 24}.{version >> 16 & 0xFF}" == release
+
+
+def test_unknown_release_refused() -> None:
+    with pytest.raises(ValueError, match=r"'2\.0'.*1\.14, 1\.15, 1\.16, 1\.17"):
+        release_named("2.0")
+
+
+def test_an_ardupilot_vehicle_in_lockstep_has_no_release_of_px4() -> None:
+    with pytest.raises(ValueError, match=r"px4 .1\.14."):
+        LockstepVehicle(autopilot="ardupilot", px4="1.14")

@@ -1,7 +1,6 @@
 """OFFBOARD: the setpoints used, their control, and their loss."""
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -10,7 +9,7 @@ from hypothesis import strategies as st
 
 from mavlink_sim.flight.setpoints import SetpointRejectedError, trajectory_setpoint
 from mavlink_sim.wire.messages import dialect
-from tests.mavlink_sim.conftest import SimHarness
+from tests.mavlink_sim.conftest import SimHarness, position_setpoint, velocity_setpoint
 
 
 def target(frame: int = 1, mask: int = 0, **fields: float) -> Any:
@@ -101,7 +100,7 @@ def test_offboard_without_stream_refused_in_air(harness: SimHarness) -> None:
     assert harness.mode == "HOLD"
 
 
-def test_one_setpoint_just_before_is_enough(harness: SimHarness, velocity_setpoint: Any) -> None:
+def test_one_setpoint_just_before_is_enough(harness: SimHarness) -> None:
     harness.take_off()
     harness.send(velocity_setpoint(0, 0, 0))
     assert harness.set_mode(6) == [0, 0]
@@ -109,7 +108,7 @@ def test_one_setpoint_just_before_is_enough(harness: SimHarness, velocity_setpoi
     assert harness.mode == "OFFBOARD"
 
 
-def test_setpoints_before_offboard_are_only_a_signal(harness: SimHarness, velocity_setpoint: Any) -> None:
+def test_setpoints_before_offboard_are_only_a_signal(harness: SimHarness) -> None:
     harness.take_off(5.0)
     harness.fly(0.5, velocity_setpoint(5, 0, 0))
     harness.set_mode(6)
@@ -118,7 +117,7 @@ def test_setpoints_before_offboard_are_only_a_signal(harness: SimHarness, veloci
     assert math.hypot(*harness.vehicle.airframe.velocity) < 0.3
 
 
-def test_it_arms_in_offboard_and_climbs_by_the_setpoint(harness: SimHarness, velocity_setpoint: Any) -> None:
+def test_it_arms_in_offboard_and_climbs_by_the_setpoint(harness: SimHarness) -> None:
     harness.wait_ready()
     climb = velocity_setpoint(0, 0, -1)
     harness.offboard(climb)
@@ -133,7 +132,7 @@ def test_it_arms_in_offboard_and_climbs_by_the_setpoint(harness: SimHarness, vel
 # ---- flying
 
 
-def test_body_velocity_follows_heading(harness: SimHarness, velocity_setpoint: Any) -> None:
+def test_body_velocity_follows_heading(harness: SimHarness) -> None:
     harness.take_off(5.0)
     turn = velocity_setpoint(0, 0, 0, yaw_rate=0.5)
     harness.offboard(turn)
@@ -148,7 +147,7 @@ def test_body_velocity_follows_heading(harness: SimHarness, velocity_setpoint: A
     assert math.atan2(vy, vx) == pytest.approx(heading, abs=0.1)
 
 
-def test_a_local_position_is_reached_and_its_yaw_taken(harness: SimHarness, position_setpoint: Any) -> None:
+def test_a_local_position_is_reached_and_its_yaw_taken(harness: SimHarness) -> None:
     harness.take_off(5.0)
     there = position_setpoint(3, -2, -4, 1.0)
     harness.offboard(there)
@@ -157,9 +156,7 @@ def test_a_local_position_is_reached_and_its_yaw_taken(harness: SimHarness, posi
     assert harness.vehicle.airframe.yaw_rad == pytest.approx(1.0, abs=0.02)
 
 
-def test_position_step_of_ten_metres_settled_within_six_seconds(
-    harness: SimHarness, position_setpoint: Any
-) -> None:
+def test_position_step_of_ten_metres_settled_within_six_seconds(harness: SimHarness) -> None:
     harness.take_off(5.0)
     harness.offboard(position_setpoint(0, 0, -5))
     harness.fly(3.0, position_setpoint(0, 0, -5))
@@ -182,7 +179,7 @@ def test_position_step_of_ten_metres_settled_within_six_seconds(
     assert max(abs(speed) for _, speed in active[moving:]) < 0.25
 
 
-def test_velocity_step_has_measured_shape(harness: SimHarness, velocity_setpoint: Any) -> None:
+def test_velocity_step_has_measured_shape(harness: SimHarness) -> None:
     """PX4: 2.65 m/s at 6 s, never 95 %; from there 3.3 m in 4.1 s until it is slower than 0.3 m/s."""
     harness.take_off(5.0)
     stop = velocity_setpoint(0, 0, 0)
@@ -205,9 +202,7 @@ def test_velocity_step_has_measured_shape(harness: SimHarness, velocity_setpoint
 
 
 @pytest.mark.streams("POSITION_TARGET_LOCAL_NED")
-def test_the_position_target_is_echoed_with_the_inner_setpoints(
-    harness: SimHarness, position_setpoint: Any, velocity_setpoint: Any
-) -> None:
+def test_the_position_target_is_echoed_with_the_inner_setpoints(harness: SimHarness) -> None:
     harness.fly(0.3)
     resting = harness.received("POSITION_TARGET_LOCAL_NED")[-1]
     assert (resting.type_mask, resting.afz) == (63, 100.0)
@@ -225,7 +220,7 @@ def test_the_position_target_is_echoed_with_the_inner_setpoints(
     assert harness.received("POSITION_TARGET_LOCAL_NED")[-1].type_mask == 7
 
 
-def test_landing_by_setpoints_disarms(harness: SimHarness, velocity_setpoint: Any) -> None:
+def test_landing_by_setpoints_disarms(harness: SimHarness) -> None:
     harness.take_off()
     down = velocity_setpoint(0, 0, 0.5)
     harness.offboard(down)
@@ -237,7 +232,7 @@ def test_landing_by_setpoints_disarms(harness: SimHarness, velocity_setpoint: An
 
 
 @pytest.fixture
-def streaming(harness: SimHarness, velocity_setpoint: Any) -> tuple[Any, Any]:
+def streaming(harness: SimHarness) -> tuple[Any, Any]:
     """A vehicle that flies in OFFBOARD by a stream, four metres up."""
     harness.heartbeats.append(("gcs", (245, 190), 6))
     harness.take_off(4.0)
@@ -247,9 +242,7 @@ def streaming(harness: SimHarness, velocity_setpoint: Any) -> tuple[Any, Any]:
     return harness, stream
 
 
-def test_offboard_left_after_1_s_without_setpoints(
-    streaming: tuple[Any, Any],
-) -> None:
+def test_offboard_left_after_1_s_without_setpoints(streaming: tuple[Any, Any]) -> None:
     harness, stream = streaming
     harness.send(stream)
     harness.forget()
@@ -307,9 +300,7 @@ def test_a_mode_asked_for_in_the_failsafe_ends_the_intention(streaming: tuple[An
     assert harness.heartbeat().system_status == 4
 
 
-def test_failsafe_lands_disarms_and_vehicle_shows_offboard_again(
-    streaming: tuple[Any, Any],
-) -> None:
+def test_failsafe_lands_disarms_and_vehicle_shows_offboard_again(streaming: tuple[Any, Any]) -> None:
     harness, _ = streaming
     harness.until(lambda: not harness.armed, 40.0)
     beat = harness.heartbeat()
@@ -328,14 +319,8 @@ def test_failsafe_lands_disarms_and_vehicle_shows_offboard_again(
         (5, 2, "HOLD"),
     ],
 )
-def test_loss_action_follows_parameters(
-    make_harness: Callable[..., Any],
-    velocity_setpoint: Any,
-    loss_action: int,
-    no_sticks_action: int,
-    mode: str,
-) -> None:
-    harness = make_harness(parameters={"COM_OBL_RC_ACT": loss_action, "NAV_RCL_ACT": no_sticks_action})
+def test_loss_action_follows_parameters(loss_action: int, no_sticks_action: int, mode: str) -> None:
+    harness = SimHarness(parameters={"COM_OBL_RC_ACT": loss_action, "NAV_RCL_ACT": no_sticks_action})
     harness.take_off(4.0)
     harness.offboard(velocity_setpoint(0, 0, 0))
     harness.fly(1.3)
@@ -349,10 +334,8 @@ def test_with_a_remote_control_the_loss_leads_to_position_mode(streaming: tuple[
     assert harness.mode == "POSCTL"
 
 
-def test_the_time_until_the_loss_is_a_parameter(
-    make_harness: type[SimHarness], velocity_setpoint: Any
-) -> None:
-    harness = make_harness(parameters={"COM_OF_LOSS_T": 0.4})
+def test_the_time_until_the_loss_is_a_parameter() -> None:
+    harness = SimHarness(parameters={"COM_OF_LOSS_T": 0.4})
     harness.take_off(4.0)
     stream = velocity_setpoint(0, 0, 0)
     harness.offboard(stream)

@@ -117,10 +117,8 @@ def test_each_heading_behaviour(harness: SimHarness, behaviour: int) -> None:
     assert max(errors) < math.radians(15.0)
 
 
-def test_unchanged_keeps_heading_of_previous_orbit(
-    make_harness: type[SimHarness],
-) -> None:
-    harness = make_harness(parameters={"MC_ORBIT_YAW_MOD": 3})
+def test_unchanged_keeps_heading_of_previous_orbit() -> None:
+    harness = SimHarness(parameters={"MC_ORBIT_YAW_MOD": 3})
     circling(harness, seconds=1.0, yaw_behaviour=5)
     task = task_of(harness)
     assert task.yaw_behaviour == 3
@@ -209,8 +207,8 @@ numbers = st.one_of(st.floats(width=32), st.sampled_from([0.0, 1.0, 5.0, -20.0, 
 
 @settings(max_examples=12, deadline=None)
 @given(st.lists(st.lists(numbers, min_size=7, max_size=7), min_size=1, max_size=4))
-def test_any_request_stays_finite(make_harness: type[SimHarness], requests: list[list[float]]) -> None:
-    harness = make_harness(["everything"], ready_after_s=0.0)
+def test_any_request_stays_finite(requests: list[list[float]]) -> None:
+    harness = SimHarness(["everything"], ready_after_s=0.0)
     airframe = harness.vehicle.airframe
     airframe.position, airframe.on_ground = (0.0, 0.0, -5.0), False
     harness.command(400, 1)

@@ -186,10 +186,8 @@ def test_uncalibrated_vehicle_ignores_sticks(harness: SimHarness) -> None:
     assert harness.mode == "HOLD"
 
 
-def test_first_joystick_selects_position_mode(
-    make_harness: type[SimHarness],
-) -> None:
-    harness = make_harness(parameters=JOYSTICK)
+def test_first_joystick_selects_position_mode() -> None:
+    harness = SimHarness(parameters=JOYSTICK)
     harness.wait_ready()
     push(harness, 0.2, stick_message(target=7))
     assert harness.mode == "HOLD"  # it was for another vehicle
@@ -198,8 +196,8 @@ def test_first_joystick_selects_position_mode(
     assert harness.vehicle.autopilot.can_arm
 
 
-def test_sticks_arm_fly_and_disarm(make_harness: type[SimHarness]) -> None:
-    harness = make_harness(parameters=JOYSTICK)
+def test_sticks_arm_fly_and_disarm() -> None:
+    harness = SimHarness(parameters=JOYSTICK)
     harness.heartbeats.append(("gcs", GROUND_STATION, 6))
     harness.wait_ready()
     push(harness, 0.2, stick_message())
@@ -215,8 +213,8 @@ def test_sticks_arm_fly_and_disarm(make_harness: type[SimHarness]) -> None:
     assert "Disarmed by stick gesture\t" in harness.texts()
 
 
-def test_arming_denied_with_high_throttle(make_harness: type[SimHarness]) -> None:
-    harness = make_harness(parameters=JOYSTICK)
+def test_arming_denied_with_high_throttle() -> None:
+    harness = SimHarness(parameters=JOYSTICK)
     harness.heartbeats.append(("gcs", GROUND_STATION, 6))
     harness.wait_ready()
     push(harness, 1.2, stick_message(throttle=900))
@@ -232,8 +230,8 @@ def test_arming_denied_with_high_throttle(make_harness: type[SimHarness]) -> Non
     assert "Arming denied: switch to manual mode first\t" in harness.texts()
 
 
-def test_losing_and_regaining_the_joystick_is_an_event(make_harness: type[SimHarness]) -> None:
-    harness = make_harness(parameters=JOYSTICK)
+def test_losing_and_regaining_the_joystick_is_an_event() -> None:
+    harness = SimHarness(parameters=JOYSTICK)
     harness.wait_ready()
     push(harness, 0.2, stick_message())
     lost_s = harness.until(lambda: bool(events(harness, "commander_rc_lost")), 2.0)
@@ -244,15 +242,15 @@ def test_losing_and_regaining_the_joystick_is_an_event(make_harness: type[SimHar
     assert any("manual control regained" in line for line in harness.events)
 
 
-def remote_control(make_harness: type[SimHarness], **values: float) -> SimHarness:
-    harness = make_harness(parameters={**REMOTE_CONTROL, **values})
+def remote_control(**values: float) -> SimHarness:
+    harness = SimHarness(parameters={**REMOTE_CONTROL, **values})
     harness.heartbeats.append(("gcs", GROUND_STATION, 6))
     harness.vehicle.transmitter.on = True
     return harness
 
 
-def test_transmitter_reported_in_rc_channels_and_sys_status(make_harness: type[SimHarness]) -> None:
-    harness = make_harness(parameters=REMOTE_CONTROL)
+def test_transmitter_reported_in_rc_channels_and_sys_status() -> None:
+    harness = SimHarness(parameters=REMOTE_CONTROL)
     harness.fly(1.0)
     assert harness.received("RC_CHANNELS") == []
     harness.vehicle.transmitter.on = True
@@ -274,8 +272,8 @@ def test_transmitter_reported_in_rc_channels_and_sys_status(make_harness: type[S
     assert not harness.received("SYS_STATUS")[-1].onboard_control_sensors_health & 0x10000
 
 
-def test_rc_channels_override_is_a_remote_control(make_harness: type[SimHarness]) -> None:
-    harness = make_harness(parameters=REMOTE_CONTROL)
+def test_rc_channels_override_is_a_remote_control() -> None:
+    harness = SimHarness(parameters=REMOTE_CONTROL)
     harness.wait_ready()
     widths = [1500, 1500, 1000, 1500, 1080, 1000, 1000, 65535]
     message = dialect.MAVLink_rc_channels_override_message(1, 1, *widths, *[0] * 10)
@@ -287,8 +285,8 @@ def test_rc_channels_override_is_a_remote_control(make_harness: type[SimHarness]
     assert harness.received("RC_CHANNELS")[-1].chancount == 7
 
 
-def test_mode_switch_changes_mode_or_reports_refusal(make_harness: type[SimHarness]) -> None:
-    harness = remote_control(make_harness, COM_FLTMODE5=3)
+def test_mode_switch_changes_mode_or_reports_refusal() -> None:
+    harness = remote_control(COM_FLTMODE5=3)
     transmitter = harness.vehicle.transmitter
     harness.take_off()
     transmitter.select(Mode.POSCTL)
@@ -308,10 +306,8 @@ def test_mode_switch_changes_mode_or_reports_refusal(make_harness: type[SimHarne
     assert "Switching to Mission is currently not available\t" in harness.texts()
 
 
-def test_kill_switch_stops_motors_and_disarms_after_five_seconds(
-    make_harness: type[SimHarness],
-) -> None:
-    harness = remote_control(make_harness, COM_DISARM_LAND=-1)
+def test_kill_switch_stops_motors_and_disarms_after_five_seconds() -> None:
+    harness = remote_control(COM_DISARM_LAND=-1)
     harness.take_off(6.0)
     harness.vehicle.transmitter.kill = True
     harness.until(lambda: "kill switch engaged" in harness.events, 1.0)
@@ -332,10 +328,8 @@ def test_kill_switch_stops_motors_and_disarms_after_five_seconds(
     assert harness.vehicle.autopilot.can_arm
 
 
-def test_short_kill_recovers(
-    make_harness: type[SimHarness],
-) -> None:
-    harness = remote_control(make_harness)
+def test_short_kill_recovers() -> None:
+    harness = remote_control()
     harness.take_off(15.0)
     harness.vehicle.transmitter.kill = True
     harness.fly(0.4)

@@ -15,9 +15,9 @@ TARGET = (2.0, -1.5)
 
 
 @pytest.fixture
-def harness(make_harness: type[SimHarness]) -> SimHarness:
+def harness() -> SimHarness:
     """A vehicle that is ready at once."""
-    return make_harness(ready_after_s=0.0)
+    return SimHarness(ready_after_s=0.0)
 
 
 def target(north: float, east: float, down: float = 0.0, frame: int = 1, valid: int = 1) -> Any:
@@ -59,8 +59,8 @@ def test_a_moving_target_is_followed_down(harness: SimHarness) -> None:
     assert harness.vehicle.airframe.position[0] == pytest.approx(0.6, abs=0.2)
 
 
-def test_target_lost_high_is_searched_then_abandoned(make_harness: type[SimHarness]) -> None:
-    harness = make_harness(
+def test_target_lost_high_is_searched_then_abandoned() -> None:
+    harness = SimHarness(
         ready_after_s=0.0,
         parameters={"PLD_BTOUT": 1.0, "PLD_MAX_SRCH": 1, "PLD_SRCH_ALT": 7.0, "PLD_SRCH_TOUT": 4.0},
     )
@@ -81,8 +81,8 @@ def test_target_lost_high_is_searched_then_abandoned(make_harness: type[SimHarne
     assert phases(harness) == ["horizontal approach", "descend", "start", "search", "fallback"]
 
 
-def test_a_target_found_while_searching_is_landed_on(make_harness: type[SimHarness]) -> None:
-    harness = make_harness(ready_after_s=0.0, parameters={"PLD_SRCH_ALT": 6.0})
+def test_a_target_found_while_searching_is_landed_on() -> None:
+    harness = SimHarness(ready_after_s=0.0, parameters={"PLD_SRCH_ALT": 6.0})
     harness.take_off(4.0)
     harness.set_mode(4, 9)
     harness.until(lambda: "search" in phases(harness), 10.0)
@@ -91,8 +91,8 @@ def test_a_target_found_while_searching_is_landed_on(make_harness: type[SimHarne
     assert phases(harness)[:3] == ["search", "horizontal approach", "descend"]
 
 
-def test_target_lost_low_lands_without_it(make_harness: type[SimHarness]) -> None:
-    harness = make_harness(ready_after_s=0.0, parameters={"PLD_FAPPR_ALT": 1.0})
+def test_target_lost_low_lands_without_it() -> None:
+    harness = SimHarness(ready_after_s=0.0, parameters={"PLD_FAPPR_ALT": 1.0})
     harness.take_off(3.0)
     harness.set_mode(4, 9)
     harness.until(lambda: harness.height_m < 0.8, 40.0, target(0.5, 0.5))
@@ -116,8 +116,8 @@ def test_an_opportunistic_landing_without_a_target_lands_at_once(harness: SimHar
     assert phases(harness) == ["fallback"]
 
 
-def test_rtl_lands_on_target_if_enabled(make_harness: type[SimHarness]) -> None:
-    harness = make_harness(ready_after_s=0.0, parameters={"RTL_PLD_MD": 1})
+def test_rtl_lands_on_target_if_enabled() -> None:
+    harness = SimHarness(ready_after_s=0.0, parameters={"RTL_PLD_MD": 1})
     harness.take_off(4.0)
     seen = target(1.0, 1.0)
     harness.fly(0.2, seen)
@@ -126,9 +126,7 @@ def test_rtl_lands_on_target_if_enabled(make_harness: type[SimHarness]) -> None:
     assert math.dist(harness.vehicle.airframe.position[:2], (1.0, 1.0)) < 0.25
 
 
-def test_target_frame_refused_and_angles_ignored(
-    harness: SimHarness,
-) -> None:
+def test_target_frame_refused_and_angles_ignored(harness: SimHarness) -> None:
     listen(harness)
     harness.send(target(1, 1, frame=12))
     harness.send(target(1, 1, valid=0))

@@ -43,12 +43,12 @@ def kinds_in_order(harness: SimHarness, *kinds: str) -> list[str]:
 @pytest.mark.parametrize(
     ("message_id", "kind"),
     [
-        pytest.param(148, "AUTOPILOT_VERSION", id="AUTOPILOT_VERSION"),
-        pytest.param(242, "HOME_POSITION", id="HOME_POSITION"),
-        pytest.param(49, "GPS_GLOBAL_ORIGIN", id="GPS_GLOBAL_ORIGIN"),
-        pytest.param(436, "CURRENT_MODE", id="CURRENT_MODE"),
-        pytest.param(397, "COMPONENT_METADATA", id="COMPONENT_METADATA"),
-        pytest.param(411, "CURRENT_EVENT_SEQUENCE", id="CURRENT_EVENT_SEQUENCE"),
+        (148, "AUTOPILOT_VERSION"),
+        (242, "HOME_POSITION"),
+        (49, "GPS_GLOBAL_ORIGIN"),
+        (436, "CURRENT_MODE"),
+        (397, "COMPONENT_METADATA"),
+        (411, "CURRENT_EVENT_SEQUENCE"),
     ],
 )
 def test_request_message__message_then_accepted(ready: SimHarness, message_id: int, kind: str) -> None:
@@ -56,13 +56,9 @@ def test_request_message__message_then_accepted(ready: SimHarness, message_id: i
     assert kinds_in_order(ready, kind, "COMMAND_ACK")[:2] == [kind, "COMMAND_ACK"]
 
 
-@pytest.mark.parametrize("message_id", [259, 60000, -1], ids=["CAMERA_INFORMATION", "60000", "-1"])
+@pytest.mark.parametrize("message_id", [259, 280, 27, 60000, -1])
 def test_request_message__unknown_id_or_nothing_to_send_denied(ready: SimHarness, message_id: int) -> None:
     assert ready.command(512, message_id) == [DENIED]
-
-
-def test_519_accepted(ready: SimHarness) -> None:
-    assert ready.command(519, 1) == [ACCEPTED]
 
 
 @pytest.mark.parametrize("command", [(512, 148), (520, 1)], ids=["512_148", "520"])
@@ -135,14 +131,6 @@ def test_source_configured_interval_changes_no_rate(
     assert rates[0] == pytest.approx(rates[1], rel=0.01, abs=0.1)
 
 
-def test_request_data_stream__ignored(ready: SimHarness) -> None:
-    ready.send(dialect.MAVLink_request_data_stream_message(1, 1, 0, 1, 1))
-    ready.forget()
-    ready.fly(4.0)
-    assert len(ready.received("ATTITUDE")) / 4.0 == pytest.approx(98.5, abs=2.0)
-    assert not ready.received("COMMAND_ACK")
-
-
 @pytest.mark.parametrize(
     ("target", "answered"), [((1, 1), 1), ((1, 0), 1), ((0, 0), 1), ((2, 1), 0), ((1, 100), 0)]
 )
@@ -160,13 +148,6 @@ def test_timesync_request__ts1_echoed_tc1_boot_time_in_ns(ready: SimHarness) -> 
     (answer,) = [message for message in ready.received("TIMESYNC") if message.tc1]
     assert answer.ts1 == 123_456_789_012
     assert answer.tc1 == ready.vehicle.boot_us * 1000
-
-
-def test_timesync__own_requests_with_tc1_0_at_10_hz(ready: SimHarness) -> None:
-    ready.fly(10.0)
-    requests = ready.received("TIMESYNC")
-    assert all(message.tc1 == 0 for message in requests)
-    assert len(requests) / 10.0 == pytest.approx(9.85, abs=0.2)
 
 
 def test_ping_0_0__answered_to_sender_with_its_stamp(ready: SimHarness) -> None:
@@ -223,9 +204,7 @@ def test_source_request_event__stored_events_are_repeated(harness: SimHarness) -
     ]
 
 
-def test_source_response_event_error__for_a_missing_event(
-    harness: SimHarness,
-) -> None:
+def test_source_response_event_error__for_a_missing_event(harness: SimHarness) -> None:
     newest = active(harness)[-1].sequence
     request_event(harness, 65535, 0)
     errors = harness.received("RESPONSE_EVENT_ERROR")
@@ -283,21 +262,6 @@ def test_hash_check__vehicle_itself_answers_what_px4_answered(ready: SimHarness)
     assert (answer.param_type, answer.param_index, answer.param_count) == (5, 65535, 887)
 
 
-def test_request_list__888_messages_in_0_89_s(ready: SimHarness) -> None:
-    ready.send(dialect.MAVLink_param_request_list_message(1, 1))
-    ready.fly(2.0)
-    stamped = [
-        (time, item.message)
-        for time, item in ready.inbox["onboard"]
-        if item.message.get_type() == "PARAM_VALUE"
-    ]
-    assert len(stamped) == 888
-    assert stamped[-1][0] - stamped[0][0] == pytest.approx(0.89, abs=0.02)
-    assert {message.param_count for _, message in stamped} == {887}
-    kinds = [message.param_type for _, message in stamped[1:]]
-    assert (kinds.count(REAL32), kinds.count(INT32)) == (604, 283)
-
-
 def test_names_types_and_values_are_those_recorded(ready: SimHarness) -> None:
     _, parameters = recorded_parameters()
     assert list(ready.vehicle.parameters) == parameters
@@ -318,9 +282,7 @@ def test_source_hash_check__volatile_parameters_do_not_count(harness: SimHarness
     assert everything ^ 0xFFFFFFFF != received
 
 
-def test_request_list__hash_first_then_index_order(
-    ready: SimHarness,
-) -> None:
+def test_request_list__hash_first_then_index_order(ready: SimHarness) -> None:
     total = len(ready.vehicle.parameters)
     started = ready.now_s
     ready.send(dialect.MAVLink_param_request_list_message(1, 1))
@@ -339,12 +301,16 @@ def test_request_list__hash_first_then_index_order(
         total,
     )
     assert [message.param_index for _, message in stamped[1:]] == list(range(total))
-    assert total / (stamped[-1][0] - first_s) == pytest.approx(1000, rel=0.05)
+    names = [name_of(message) for _, message in stamped[1:]]
+    assert names == sorted(names)
+    assert {message.param_count for _, message in stamped} == {total}
+    assert total == 887
+    assert stamped[-1][0] - first_s == pytest.approx(0.89, abs=0.02)
+    kinds = [message.param_type for _, message in stamped[1:]]
+    assert (kinds.count(REAL32), kinds.count(INT32)) == (604, 283)
 
 
-def test_source_request_list__repeat_restarts_without_hash(
-    ready: SimHarness,
-) -> None:
+def test_source_request_list__repeat_restarts_without_hash(ready: SimHarness) -> None:
     ready.send(dialect.MAVLink_param_request_list_message(1, 1))
     ready.fly(0.1)
     ready.forget()
@@ -375,6 +341,7 @@ def test_read_by_name_or_index__one_param_value(ready: SimHarness) -> None:
     (by_name,) = read(ready, b"COM_OF_LOSS_T")
     (by_index,) = read(ready, b"", by_name.param_index)
     assert by_name.param_value == by_index.param_value == 1.0
+    assert by_name.param_type == REAL32
     assert name_of(by_index) == "COM_OF_LOSS_T"
 
 
@@ -416,6 +383,7 @@ def test_source_set__change_sent_on_every_link(ready: SimHarness) -> None:
 def test_wrong_type__param_error_7_type_mismatch(ready: SimHarness) -> None:
     (error,) = write(ready, b"COM_OF_LOSS_T", 1.0, INT32)
     assert error.error == TYPE_MISMATCH
+    assert ready.vehicle.parameters.number("COM_OF_LOSS_T") == 1.0
 
 
 @pytest.mark.parametrize("kind", [1, 2, 3, 4, 5, 7, 8, 10, 0, 255])
@@ -436,6 +404,7 @@ def test_source_set_hash_check__stops_list_and_param_error_5(ready: SimHarness) 
 
 def test_out_of_range_is_accepted_com_of_loss_t_1000(ready: SimHarness) -> None:
     assert [message.param_value for message in write(ready, b"COM_OF_LOSS_T", 1000.0, REAL32)] == [1000.0] * 2
+    assert ready.vehicle.parameters.number("COM_OF_LOSS_T") == 1000.0
 
 
 def test_a_set_takes_effect_at_once(ready: SimHarness) -> None:
@@ -447,10 +416,8 @@ def test_a_set_takes_effect_at_once(ready: SimHarness) -> None:
     assert ready.height_m == pytest.approx(6.0, abs=0.7)
 
 
-def test_source_param_values_differing_from_defaults_at_start(
-    make_harness: type[SimHarness],
-) -> None:
-    harness = make_harness(parameters={"COM_OF_LOSS_T": 0.5})
+def test_source_param_values_differing_from_defaults_at_start() -> None:
+    harness = SimHarness(parameters={"COM_OF_LOSS_T": 0.5})
     harness.fly(2.0)
     for link in ("onboard", "gcs"):
         assert [name_of(message) for message in harness.received("PARAM_VALUE", link)] == ["COM_OF_LOSS_T"]

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import common
 
 from mavlink_sim.wire.messages import dialect, parser
-from tests.mavlink_sim.conftest import SimHarness
+from tests.mavlink_sim.conftest import SimHarness, velocity_setpoint
 
 pytestmark = pytest.mark.streams("everything")
 
@@ -25,8 +24,8 @@ def names(harness: SimHarness, link: str = "onboard") -> Counter[str]:
     return Counter(item.message.get_type() for _, item in harness.inbox[link])
 
 
-def test_streams_independent_of_companion_heartbeat(make_harness: type[SimHarness]) -> None:
-    alone, received = make_harness(["everything"]), make_harness(["everything"])
+def test_streams_independent_of_companion_heartbeat() -> None:
+    alone, received = SimHarness(["everything"]), SimHarness(["everything"])
     received.heartbeats.append(("onboard", (1, 191), ONBOARD_CONTROLLER))
     for harness in (alone, received):
         harness.wait_ready()
@@ -36,9 +35,9 @@ def test_streams_independent_of_companion_heartbeat(make_harness: type[SimHarnes
 
 
 @pytest.mark.parametrize("flying", [False, True], ids=["disarmed", "in flight"])
-def test_the_onboard_link_carries_29_kilobytes_a_second(make_harness: type[SimHarness], flying: bool) -> None:
+def test_the_onboard_link_carries_29_kilobytes_a_second(flying: bool) -> None:
     """Of whole frames with their signatures, as in the recorded flight: 28.7 kB/s before arming."""
-    harness = make_harness(["everything"], noise=True, gusts_mps=None)
+    harness = SimHarness(["everything"], noise=True, gusts_mps=None)
     if flying:
         harness.take_off()
     harness.fly(6.0)  # until the last unrequested PARAM_VALUE
@@ -61,7 +60,7 @@ def test_unknown_messages_of_common_dialect_match_px4(harness: SimHarness) -> No
     assert {8, 300, 380, 410, 411, 436} <= unknown <= UNKNOWN_TO_COMMON
 
 
-def test_position_target_global_sent_except_in_offboard(harness: SimHarness, velocity_setpoint: Any) -> None:
+def test_position_target_global_sent_except_in_offboard(harness: SimHarness) -> None:
     harness.wait_ready()
     assert "POSITION_TARGET_GLOBAL_INT" not in names(harness)  # not on the ground
     harness.take_off(4.0)
@@ -77,7 +76,7 @@ def test_position_target_global_sent_except_in_offboard(harness: SimHarness, vel
         assert 9 <= names(harness)["POSITION_TARGET_GLOBAL_INT"] <= 10
 
 
-def test_heartbeat_at_1_hz_always(harness: SimHarness, velocity_setpoint: Any) -> None:
+def test_heartbeat_at_1_hz_always(harness: SimHarness) -> None:
     harness.wait_ready()
     harness.forget()
     started = harness.now_s
@@ -127,9 +126,7 @@ def test_timesync_and_ping_are_broadcast_requests(harness: SimHarness) -> None:
     assert [ping.seq for ping in pings] == list(range(pings[0].seq, pings[0].seq + len(pings)))
 
 
-def test_ground_station_heartbeat_keeps_its_source(
-    harness: SimHarness,
-) -> None:
+def test_ground_station_heartbeat_keeps_its_source(harness: SimHarness) -> None:
     harness.heartbeats += [("gcs", (245, 190), GCS), ("onboard", (1, 191), ONBOARD_CONTROLLER)]
     harness.fly(5.0)
     sources = Counter((item.system, item.component) for _, item in harness.inbox["onboard"] if item.forwarded)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 
 from mavlink_sim.wire.messages import dialect
-from tests.mavlink_sim.conftest import SimHarness
+from tests.mavlink_sim.conftest import SimHarness, velocity_setpoint
 
 INFO, CRITICAL = 6, 2
 GROUND_STATION = (245, 190)
@@ -22,9 +20,9 @@ def sent(harness: SimHarness, link: str = "gcs") -> list[tuple[int, str]]:
 
 
 @pytest.fixture
-def received(make_harness: type[SimHarness]) -> SimHarness:
+def received() -> SimHarness:
     """A vehicle whose ground-station link has a ground station on it."""
-    harness = make_harness()
+    harness = SimHarness()
     harness.heartbeats.append(("gcs", GROUND_STATION, 6))
     return harness
 
@@ -77,9 +75,7 @@ def test_disarming_text_has_reason(received: SimHarness) -> None:
     ]
 
 
-def test_refusal_texts_are_critical_and_end_with_tab(
-    received: SimHarness,
-) -> None:
+def test_refusal_texts_are_critical_and_end_with_tab(received: SimHarness) -> None:
     received.fly(0.1)
     received.command(400, 1)
     received.set_mode(77)
@@ -105,7 +101,7 @@ def test_refusal_texts_are_critical_and_end_with_tab(
     assert {severity for severity, _ in texts} == {INFO, CRITICAL}
 
 
-def test_texts_of_setpoint_and_companion_loss(received: SimHarness, velocity_setpoint: Any) -> None:
+def test_texts_of_setpoint_and_companion_loss(received: SimHarness) -> None:
     received.heartbeats.append(("onboard", (1, 191), 18))
     received.take_off(4.0)
     stream = velocity_setpoint(0, 0, 0)
@@ -126,9 +122,7 @@ def test_texts_of_setpoint_and_companion_loss(received: SimHarness, velocity_set
     ]
 
 
-def test_takeoff_below_current_altitude_sends_text(
-    received: SimHarness,
-) -> None:
+def test_takeoff_below_current_altitude_sends_text(received: SimHarness) -> None:
     received.wait_ready()
     received.command(400, 1)
     assert received.command(22, 0, 0, 0, float("nan"), float("nan"), float("nan"), 5.0) == [0]
@@ -150,21 +144,11 @@ def test_text_over_50_characters_is_chunked(received: SimHarness) -> None:
     assert len(chunks[0].text) == 50
 
 
-def test_texts_follow_ground_station_heartbeat(
-    make_harness: type[SimHarness],
-) -> None:
-    harness = make_harness()
+def test_texts_follow_ground_station_heartbeat() -> None:
+    harness = SimHarness()
     harness.heartbeats.append(("onboard", GROUND_STATION, 6))
     harness.wait_ready()
     harness.command(400, 1)
     harness.fly(0.1)
     assert harness.texts("onboard") == ["Armed by external command\t"]
     assert harness.texts("gcs") == []
-
-
-def test_events_go_to_every_link_with_one_numbering(harness: SimHarness) -> None:
-    harness.take_off()
-    numbers = {link: [m.sequence for m in harness.received("EVENT", link)] for link in ("onboard", "gcs")}
-    assert numbers["onboard"] == numbers["gcs"] != []
-    newest = harness.received("CURRENT_EVENT_SEQUENCE")[-1]
-    assert newest.sequence <= numbers["onboard"][-1]

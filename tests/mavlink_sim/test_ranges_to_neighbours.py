@@ -13,8 +13,7 @@ from mavlink_sim import FleetWorld, LockstepVehicle
 from mavlink_sim.flight.transmitter import CALIBRATION, Sticks
 from mavlink_sim.physics.airframe import Multirotor, Vector
 from mavlink_sim.physics.contact import HALF_HEIGHT_M, RADIUS_M
-from mavlink_sim.physics.midair import Body
-from mavlink_sim.physics.neighbours import Neighbours
+from mavlink_sim.physics.midair import Body, Neighbours
 from mavlink_sim.physics.obstacle_sensor import MAXIMUM_M, NOTHING_CM
 from mavlink_sim.vehicles.vehicle import STEP_S
 from mavlink_sim.world.world import World

@@ -1,19 +1,26 @@
-"""Rendering: depth against geometry, boxes against projection, occlusion."""
+"""Rendering: depth against geometry, boxes against projection, occlusion, the ground, recorded images."""
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
+from mavlink_sim.camera import ground_view
 from mavlink_sim.camera.ground_view import Buffers
-from mavlink_sim.camera.image_effects import ImageEffects
+from mavlink_sim.camera.image_effects import MILD_EFFECTS, ImageEffects
 from mavlink_sim.camera.renderer import DEFAULT_CAMERA, DEFAULT_MOUNT, Rendered, Renderer, VisibleObject
+from mavlink_sim.datasets.training_scenes import random_scene
 from mavlink_sim.world.shapes import CLASS_NAMES
+from mavlink_sim.world.textures import GUTTER, mip_atlas
 from mavlink_sim.world.world import Ground, Light, Sky, World, WorldObject, demo_world
 from vision.camera_model import CameraModel, CameraMount
 from vision.geolocation import PixelRays
@@ -290,3 +297,121 @@ def test_effects_change_image_as_named() -> None:
     )
     grey = image(ImageEffects(grey=1.0))
     assert np.ptp(grey, axis=2).max() <= 1.0
+
+
+WORLD = demo_world(1)
+
+
+def drawn(width: int, height: int, strip_rows: int, pose: tuple[float, float, float]) -> Rendered:
+    """At a height above the ground, rolled and pitched."""
+    height_m, roll_rad, pitch_rad = pose
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ground_view, "STRIP_ROWS", strip_rows)
+        renderer = Renderer(WORLD, CameraModel.from_horizontal_fov(width, height, math.radians(70.0)))
+        return renderer.render((3.0, -2.0, -height_m), matrix_from_euler(roll_rad, pitch_rad, 0.7))
+
+
+@settings(max_examples=40)
+@given(
+    size=st.sampled_from([(1, 1), (1, 65), (7, 129), (64, 2), (90, 66), (160, 128)]),
+    rows=st.sampled_from([1, 7, 64]),
+    pose=st.tuples(st.floats(0.2, 40.0), st.floats(-math.pi, math.pi), st.floats(-1.5, 1.5)),
+)
+def test_image_is_independent_of_strips(
+    size: tuple[int, int], rows: int, pose: tuple[float, float, float]
+) -> None:
+    """Equal except for single pixels, where the last bit of a coordinate selects another mip level."""
+    width, height = size
+    whole, cut = (drawn(width, height, strip_rows, pose) for strip_rows in (height, rows))
+    assert cut.image.shape == (height, width, 3)
+    np.testing.assert_array_equal(np.isnan(whole.depth_m), np.isnan(cut.depth_m))
+    np.testing.assert_allclose(whole.depth_m, cut.depth_m, rtol=2e-3)
+    off = np.abs(whole.image.astype(int) - cut.image)
+    assert np.count_nonzero(off > 1) <= max(3, 0.01 * off.size)
+    assert off.mean() < 0.2
+
+
+def test_sky_only_image_has_no_depth() -> None:
+    seen = drawn(64, 48, 16, (5.0, 0.0, 1.4))
+    assert np.isnan(seen.depth_m).all()
+    assert (seen.image.mean(axis=(0, 1)) > 60).all()
+
+
+def test_mip_levels_have_positions_and_gutters() -> None:
+    tile = np.random.default_rng(0).integers(0, 256, (32, 32, 3), dtype=np.uint8)
+    atlas = mip_atlas(tile)
+    assert (atlas.size, atlas.levels) == (32, 4)
+    level = tile
+    for number in range(atlas.levels):
+        side = 32 >> number
+        rows, columns = slice(GUTTER, GUTTER + side), slice(2 * side, 3 * side)
+        np.testing.assert_array_equal(atlas.pixels[rows, columns, :3], level)
+        for gutter, opposite in ((2 * side - 1, 3 * side - 1), (3 * side, 2 * side)):
+            np.testing.assert_array_equal(atlas.pixels[rows, gutter], atlas.pixels[rows, opposite])
+        np.testing.assert_array_equal(
+            atlas.pixels[GUTTER - 1, columns], atlas.pixels[GUTTER + side - 1, columns]
+        )
+        half = (side // 2, side // 2)
+        level = np.asarray(cv2.resize(level, half, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+# The default world and the training scenes are unchanged: models are trained on these images. The record has
+# mean brightnesses of squares of 32 pixels, so that rounding on another processor passes, while one moved or
+# recoloured object does not. This file run as a program writes a new record, which invalidates the scores.
+RECORD = Path(__file__).with_name("golden_images.json")
+POSES = (((0.0, 0.0, -5.0), (0.0, 0.0, 1.0)), ((-8.0, 4.0, -12.0), (0.1, -0.3, 1.5)))
+RANDOM_SEEDS = range(8)
+TOLERANCE = 0.05
+"""Grey levels: one pixel of a square (1024 in all channels) changed by 150 shows."""
+
+
+def _squares(image: NDArray[np.uint8]) -> list[float]:
+    height, width = image.shape[0] // 32, image.shape[1] // 32
+    cut = image[: height * 32, : width * 32].reshape(height, 32, width, 32, 3)
+    means: list[float] = np.round(cut.mean(axis=(1, 3, 4)), 3).ravel().tolist()
+    return means
+
+
+def _demo(number: int) -> dict[str, list[float]]:
+    position, angles = POSES[number]
+    renderer = Renderer(demo_world(1), effects=MILD_EFFECTS)
+    frame = renderer.render(position, matrix_from_euler(*angles))
+    depth = np.nan_to_num(1.0 / frame.depth_m)
+    return {
+        "image": _squares(frame.image),
+        "inverse_depth": np.round(depth[::32, ::32], 5).ravel().tolist(),
+        "boxes": [edge for item in frame.objects for edge in item.xyxy],
+    }
+
+
+def _random(seed: int) -> dict[str, list[float]]:
+    image, boxes, ids = random_scene(np.random.default_rng((7, seed)), 256, 256)
+    return {"image": _squares(image), "boxes": boxes.ravel().tolist(), "ids": ids.tolist()}
+
+
+def _record() -> dict[str, dict[str, list[float]]]:
+    demo = {f"demo {number}": _demo(number) for number in range(len(POSES))}
+    return {**demo, **{f"random {seed}": _random(seed) for seed in RANDOM_SEEDS}}
+
+
+def _compare(now: dict[str, list[float]], then: dict[str, list[float]]) -> None:
+    assert len(now["image"]) == len(then["image"])
+    assert np.abs(np.subtract(now["image"], then["image"])).max() < TOLERANCE
+    assert now.get("ids") == then.get("ids")
+    assert len(now["boxes"]) == len(then["boxes"])
+    assert np.allclose(now["boxes"], then["boxes"], atol=1.01)
+    assert np.allclose(now.get("inverse_depth", ()), then.get("inverse_depth", ()), atol=1e-4)
+
+
+@pytest.mark.parametrize("number", range(len(POSES)))
+def test_the_default_world_is_drawn_as_recorded(number: int) -> None:
+    _compare(_demo(number), json.loads(RECORD.read_text("utf-8"))[f"demo {number}"])
+
+
+@pytest.mark.parametrize("seed", RANDOM_SEEDS)
+def test_a_training_scene_is_drawn_as_recorded(seed: int) -> None:
+    _compare(_random(seed), json.loads(RECORD.read_text("utf-8"))[f"random {seed}"])
+
+
+if __name__ == "__main__":
+    RECORD.write_text(json.dumps(_record()) + "\n", encoding="utf-8")

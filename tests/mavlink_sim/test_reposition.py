@@ -1,18 +1,17 @@
 """DO_REPOSITION, DO_CHANGE_ALTITUDE and DO_CHANGE_SPEED: goals and speeds of auto modes."""
 
 import math
-from typing import Any
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mavlink_sim.flight.reposition import reposition_goal
+from mavlink_sim.flight.tasks import reposition_goal
 from mavlink_sim.physics.airframe import Multirotor
 from mavlink_sim.physics.geography import HOME_ALTITUDE_M, SIH_FRAME
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.messages import dialect
-from tests.mavlink_sim.conftest import SimHarness
+from tests.mavlink_sim.conftest import SimHarness, velocity_setpoint
 
 NAN = math.nan
 CHANGE_MODE = 1.0
@@ -82,10 +81,8 @@ def test_a_yaw_is_taken_in_radians(harness: SimHarness) -> None:
 @pytest.mark.parametrize(
     ("mode", "yaw_rad"), [(0, math.pi / 2), (1, -math.pi / 2), (2, math.pi / 2), (3, math.pi / 2), (5, 0.0)]
 )
-def test_without_yaw_parameter_decides_where_nose_points(
-    make_harness: type[SimHarness], mode: int, yaw_rad: float
-) -> None:
-    harness = make_harness(parameters={"MPC_YAW_MODE": mode})
+def test_without_yaw_parameter_decides_where_nose_points(mode: int, yaw_rad: float) -> None:
+    harness = SimHarness(parameters={"MPC_YAW_MODE": mode})
     harness.take_off(5.0)
     assert reposition(harness, (0.0, 30.0), 5.0) == [0]
     harness.fly(6.0)
@@ -131,7 +128,7 @@ def test_without_mode_flag_unsupported_but_flown_in_hold(harness: SimHarness, fl
     assert harness.vehicle.airframe.position[0] == pytest.approx(9.0, abs=0.3)
 
 
-def test_without_mode_flag_other_modes_continue(harness: SimHarness, velocity_setpoint: Any) -> None:
+def test_without_mode_flag_other_modes_continue(harness: SimHarness) -> None:
     harness.take_off(5.0)
     stream = velocity_setpoint(0, 1, 0)
     harness.offboard(stream)
@@ -175,7 +172,7 @@ def test_armed_on_the_ground_it_takes_off_to_the_goal(harness: SimHarness) -> No
     assert math.dist(harness.vehicle.airframe.position, (5.0, 0.0, -6.0)) < 0.4
 
 
-def test_ends_offboard_despite_setpoints(harness: SimHarness, velocity_setpoint: Any) -> None:
+def test_ends_offboard_despite_setpoints(harness: SimHarness) -> None:
     harness.take_off(5.0)
     stream = velocity_setpoint(1, 0, 0)
     harness.offboard(stream)
@@ -263,8 +260,8 @@ def test_a_speed_change_is_accepted_in_any_state(harness: SimHarness, values: tu
 # ---- number of answers
 
 
-def test_older_release_single_answer_to_set_mode(make_harness: type[SimHarness]) -> None:
-    harness = make_harness(px4="1.15")
+def test_older_release_single_answer_to_set_mode() -> None:
+    harness = SimHarness(px4="1.15")
     harness.take_off()
     assert harness.set_mode(4, 4) == [1]
     assert harness.set_mode(6) == [1]

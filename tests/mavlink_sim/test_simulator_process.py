@@ -1,6 +1,9 @@
-"""`mavlink-sim` as a process: options, ports, output, exit."""
+"""`mavlink-sim` as a process: options, ports, output, exit, truth file, record of the traffic."""
+
+from __future__ import annotations
 
 import json
+import logging
 import math
 import os
 import select
@@ -18,8 +21,9 @@ from pymavlink import mavutil
 
 from mavlink_sim.cli.main import main
 from mavlink_sim.testing import free_port, free_udp_ports, running_simulator
-from mavlink_sim.wire.endpoint import PEER_SILENCE_S, PortInUseError, UdpEndpoint
+from mavlink_sim.wire.endpoint import PEER_SILENCE_S, PortInUseError, TrafficLog, UdpEndpoint, recording
 from mavlink_sim.wire.messages import Outgoing, dialect, parser
+from mavlink_sim.world.truth_file import TruthFile
 from vision.shared_frame import SharedFrameReader, segment_path
 
 pytestmark = pytest.mark.realtime
@@ -64,6 +68,9 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
         (["--spacing", "7"], ["--spacing 7", "one vehicle", "--vehicles N"]),
         (["--host", "not.a.host.invalid"], ["not.a.host.invalid"]),
         (["--truth", "/nonexistent/folder/truth.jsonl"], ["truth.jsonl"]),
+        (["--fault", "link_dely 1"], ["link_delay"]),
+        (["--fault", "link_loss link=usb"], ["all, onboard, gcs"]),
+        (["--control", "nonsense"], ["--control nonsense"]),
     ],
     ids=lambda value: "_".join(value) if isinstance(value, list) else str(value),
 )
@@ -303,9 +310,7 @@ def test_an_endpoint_says_which_port_is_taken() -> None:
         first.close()
 
 
-def test_endpoint_keeps_first_peer_until_silent(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_endpoint_keeps_first_peer_until_silent(monkeypatch: pytest.MonkeyPatch) -> None:
     silent_peer = free_port()
     endpoint = UdpEndpoint("127.0.0.1", 0, silent_peer)
     peers = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2)]
@@ -375,3 +380,72 @@ def test_vehicle_ends_with_its_program() -> None:
     poll.register(running, select.POLLIN)
     assert poll.poll(20_000)
     os.close(running)
+
+
+FULL = Path("/dev/full")
+needs_full = pytest.mark.skipif(not FULL.exists(), reason="no /dev/full here")
+
+
+def test_each_line_is_flushed(tmp_path: Path) -> None:
+    file = TruthFile(tmp_path / "truth.jsonl")
+    assert file.write(json.dumps({"a": 1})) is None
+    assert (tmp_path / "truth.jsonl").read_text() == '{"a": 1}\n'
+    file.close()
+    file.close()
+    assert file.write("more") is None
+
+
+@needs_full
+def test_full_disk_reported_once_and_ends_file() -> None:
+    file = TruthFile(FULL)
+    assert "/dev/full: No space left on device" in (file.write("line") or "")
+    assert file.write("line") is None
+
+
+@needs_full
+def test_vehicle_continues_after_truth_write_error() -> None:
+    with running_simulator(truth=FULL) as simulator:
+        simulator.wait_for_event("/dev/full: No space left on device")
+        assert simulator.process.poll() is None
+
+
+def read(path: Path) -> list[Any]:
+    log = mavutil.mavlink_connection(str(path))
+    found = []
+    while (message := log.recv_match()) is not None:
+        found.append(message)
+    log.close()
+    return found
+
+
+def test_both_directions_are_recorded_with_the_time_of_day(tmp_path: Path) -> None:
+    endpoint = UdpEndpoint("127.0.0.1", 0, 9)
+    before = time.time()
+    with recording({"onboard": endpoint}, tmp_path / "new" / "folder"):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
+            beat = dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3)
+            peer.sendto(beat.pack(parser(1, 191)), ("127.0.0.1", endpoint.port))
+            deadline = time.monotonic() + 10.0
+            while not endpoint.receive():
+                assert time.monotonic() < deadline
+        endpoint.send([Outgoing(dialect.MAVLink_heartbeat_message(2, 12, 0, 0, 3, 3), 1, 1)])
+    endpoint.send([Outgoing(dialect.MAVLink_heartbeat_message(2, 12, 0, 0, 3, 3), 1, 1)])  # not any more
+    endpoint.close()
+    messages = read(tmp_path / "new" / "folder" / "onboard.tlog")
+    assert [(m.get_type(), m.get_srcComponent()) for m in messages] == [("HEARTBEAT", 191), ("HEARTBEAT", 1)]
+    assert before - 1.0 <= messages[0]._timestamp <= messages[1]._timestamp <= time.time() + 1.0
+
+
+def test_a_folder_that_cannot_be_made_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(OSError, match="file"), recording({}, tmp_path / "file" / "folder"):
+        pass
+
+
+def test_full_disk_ends_record_not_flight(caplog: pytest.LogCaptureFixture) -> None:
+    with open("/dev/full", "wb", buffering=0) as full, caplog.at_level(logging.WARNING):
+        log = TrafficLog(full)
+        log.record(b"packet")
+        log.record(b"packet")
+    assert len(caplog.records) == 1
+    assert "/dev/full" in caplog.text

@@ -11,13 +11,12 @@ from pymavlink import mavutil
 
 from mavlink_sim.wire.messages import dialect
 from mavlink_sim.wire.streams import Streams
-from tests.mavlink_sim.conftest import SimHarness
+from tests.mavlink_sim.conftest import SimHarness, position_setpoint, velocity_setpoint
 
 pytestmark = pytest.mark.streams("everything")
 
 DATA = Path(os.environ.get("COMPANION_TEST_DATA", Path(__file__).parents[2] / "../shared/data"))
 RECORDING = DATA / "px4" / "px4_sih_offboard_flight.tlog"
-PARAMETERS = DATA / "px4" / "parameters.txt"
 
 
 def counts(harness: SimHarness, link: str, seconds: float) -> Counter[str]:
@@ -62,9 +61,7 @@ def test_the_onboard_streams_have_the_measured_rates(settled: SimHarness) -> Non
         assert seen[name] / 20.0 == pytest.approx(rate, rel=0.01, abs=0.051), name
 
 
-def test_gcs_streams_have_measured_rates(
-    settled: SimHarness,
-) -> None:
+def test_gcs_streams_have_measured_rates(settled: SimHarness) -> None:
     seen = counts(settled, "gcs", 20.0)
     assert set(seen) <= set(MEASURED_ONBOARD_HZ)
     for name, rate in MEASURED_GCS_HZ.items():
@@ -89,9 +86,7 @@ def test_origin_sent_once_and_on_request(harness: SimHarness) -> None:
     assert len(harness.received("GPS_GLOBAL_ORIGIN")) == 2
 
 
-def test_the_messages_agree_with_each_other_and_with_the_truth(
-    harness: SimHarness, position_setpoint: Any
-) -> None:
+def test_the_messages_agree_with_each_other_and_with_the_truth(harness: SimHarness) -> None:
     harness.take_off(5.0)
     there = position_setpoint(4, -3, -6, 0.7)
     harness.offboard(there)
@@ -157,7 +152,7 @@ NAMES_OF_UNKNOWN = {
 
 
 def test_flight_yields_same_kinds_of_messages_as_real_one(
-    harness: SimHarness, recorded: dict[str, list[Any]], velocity_setpoint: Any
+    harness: SimHarness, recorded: dict[str, list[Any]]
 ) -> None:
     harness.take_off()
     stream = velocity_setpoint(1, 0, -0.5)
@@ -202,15 +197,3 @@ def test_events_are_those_of_the_real_flight(harness: SimHarness, recorded: dict
     events = harness.received("EVENT")
     assert {message.id.to_bytes(4, "little") for message in events} <= theirs
     assert [message.sequence for message in events] == list(range(1, len(events) + 1))
-
-
-def test_the_parameters_are_those_a_real_vehicle_reports(harness: SimHarness) -> None:
-    if not PARAMETERS.exists():
-        pytest.skip(f"needs the recorded parameters {PARAMETERS}")
-    recorded = {}
-    for line in PARAMETERS.read_text().splitlines():
-        name, kind, value = line.split()
-        recorded[name] = (int(kind), float(value))
-    harness.fly(0.1)
-    for parameter in harness.vehicle.parameters:
-        assert (parameter.kind, float(parameter.value)) == recorded[parameter.name], parameter.name

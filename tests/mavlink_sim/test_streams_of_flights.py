@@ -67,11 +67,9 @@ def sticks(harness: SimHarness) -> None:
 @pytest.mark.parametrize(
     "flight", [mission, return_to_a_rally_point, precision_landing, geofence, orbit, sticks]
 )
-def test_every_message_of_flights_can_be_packed(
-    make_harness: type[SimHarness], flight: Callable[[Any], None]
-) -> None:
+def test_every_message_of_flights_can_be_packed(flight: Callable[[Any], None]) -> None:
     joystick = {"COM_RC_IN_MODE": 1} if flight is sticks else {}
-    harness = make_harness(["everything"], parameters=joystick)
+    harness = SimHarness(["everything"], parameters=joystick)
     harness.take_off(6.0)
     harness.forget()
     flight(harness)

@@ -1,12 +1,19 @@
-"""TAKEOFF, LAND, RTL, HOLD and DO_REPOSITION, with the landed states they pass through."""
+"""TAKEOFF, LAND, RTL and HOLD, their landed states, and the detection of take-off and landing."""
 
+from __future__ import annotations
+
+import itertools
 import math
-from typing import Any
 
 import pytest
 
+from mavlink_sim.autopilot.ground_contact import RAMP_CREEP_MPS, GroundContact, asks_to_rise
+from mavlink_sim.flight import tasks as flight
+from mavlink_sim.flight.position_control import TrajectorySetpoint
+from mavlink_sim.physics.airframe import GRAVITY_MPS2, Multirotor
 from mavlink_sim.physics.geography import SIH_FRAME
-from tests.mavlink_sim.conftest import SimHarness
+from mavlink_sim.px4.parameters import Parameters
+from tests.mavlink_sim.conftest import SimHarness, velocity_setpoint
 
 NAN = math.nan
 
@@ -38,8 +45,8 @@ def test_take_off_climbs_to_two_and_a_half_metres_and_holds(harness: SimHarness)
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_takeoff_with_gusts_ends_as_measured(make_harness: type[SimHarness], seed: int) -> None:
-    harness = make_harness(noise=True, gusts_mps=None, seed=seed)
+def test_takeoff_with_gusts_ends_as_measured(seed: int) -> None:
+    harness = SimHarness(noise=True, gusts_mps=None, seed=seed)
     harness.wait_ready()
     assert harness.command(400, 1) == [0]
     armed_s = harness.now_s
@@ -142,7 +149,6 @@ def test_leaving_land_in_the_air_is_in_air_again(harness: SimHarness) -> None:
 
 
 def test_return_close_to_home_stays_low_lands_and_disarms(harness: SimHarness) -> None:
-    harness.heartbeats.append(("gcs", (245, 190), 6))
     harness.take_off(4.0)
     harness.fly(4.0)
     harness.forget()
@@ -152,15 +158,10 @@ def test_return_close_to_home_stays_low_lands_and_disarms(harness: SimHarness) -
     harness.until(lambda: not harness.armed, 60.0)
     assert highest < 4.5
     assert landed_states(harness)[-2:] == [4, 1]
-    texts = harness.texts()
-    assert texts[:2] == ["Returning to launch\t", "RTL: start return at 493 m (4 m above destination)\t"]
-    assert texts[-3:] == ["RTL: land at destination\t", "Landing detected\t", "Disarmed by landing\t"]
 
 
-def test_return_from_afar_climbs_first_and_lands_at_home(
-    make_harness: type[SimHarness],
-) -> None:
-    harness = make_harness(parameters={"RTL_RETURN_ALT": 12.0})
+def test_return_from_afar_climbs_first_and_lands_at_home() -> None:
+    harness = SimHarness(parameters={"RTL_RETURN_ALT": 12.0})
     harness.take_off(4.0)
     assert harness.command_int(192, (-1, 1, 0, NAN), 473980000, 85455942, 494.4) == [0]
     harness.fly(14.0)
@@ -187,9 +188,9 @@ def test_return_from_afar_climbs_first_and_lands_at_home(
     [({}, 70.0, 70.0), ({"WV_EN": 1}, 70.0, 120.0), ({}, math.nan, 120.0)],
 )
 def test_close_to_home_a_return_turns_to_the_heading_of_home(
-    make_harness: type[SimHarness], parameters: dict[str, float], heading_deg: float, landed_deg: float
+    parameters: dict[str, float], heading_deg: float, landed_deg: float
 ) -> None:
-    harness = make_harness(parameters=parameters)
+    harness = SimHarness(parameters=parameters)
     harness.take_off(5.0)
     latitude, longitude, altitude = SIH_FRAME.geographic((0.0, 0.0, 0.0))
     assert harness.command(179, 0, 0, 0, heading_deg, latitude, longitude, altitude) == [0]
@@ -203,10 +204,8 @@ def test_close_to_home_a_return_turns_to_the_heading_of_home(
 
 
 @pytest.mark.parametrize(("seed", "wind_mps"), [(0, 0.0), (1, 0.0), (2, 5.0)])
-def test_return_in_moving_air_ends_at_home_too(
-    make_harness: type[SimHarness], velocity_setpoint: Any, seed: int, wind_mps: float
-) -> None:
-    harness = make_harness(gusts_mps=None, seed=seed, wind_mps=wind_mps)
+def test_return_in_moving_air_ends_at_home_too(seed: int, wind_mps: float) -> None:
+    harness = SimHarness(gusts_mps=None, seed=seed, wind_mps=wind_mps)
     harness.take_off(6.0)
     away = velocity_setpoint(3, 0, 0)
     harness.offboard(away)
@@ -216,24 +215,7 @@ def test_return_in_moving_air_ends_at_home_too(
     assert math.hypot(*harness.vehicle.airframe.position[:2]) < 3.5
 
 
-def test_reposition_flies_there_and_turns_to_the_given_heading(harness: SimHarness) -> None:
-    harness.take_off(5.0)
-    assert harness.command_int(192, (-1, 1, 0, math.pi / 2), 473978330, 85455942, 497.4) == [0]
-    harness.fly(25.0)
-    north, east, down = harness.vehicle.airframe.position
-    assert north == pytest.approx(10.0, abs=0.6)  # the integrator decays slowly
-    assert east == pytest.approx(0.0, abs=0.3)
-    assert down == pytest.approx(-8.0, abs=0.3)
-    assert harness.vehicle.airframe.yaw_rad == pytest.approx(math.pi / 2, abs=0.05)
-    assert harness.mode == "HOLD"
-
-
-def test_reposition_without_the_change_of_mode_is_unsupported(harness: SimHarness) -> None:
-    harness.take_off()
-    assert harness.command_int(192, (-1, 0, 0, NAN), 473978330, 85455942, 497.4) == [3]
-
-
-def test_hold_brakes_and_stays(harness: SimHarness, velocity_setpoint: Any) -> None:
+def test_hold_brakes_and_stays(harness: SimHarness) -> None:
     harness.take_off(5.0)
     fast = velocity_setpoint(4, 0, 0)
     harness.offboard(fast)
@@ -245,20 +227,77 @@ def test_hold_brakes_and_stays(harness: SimHarness, velocity_setpoint: Any) -> N
     assert 1.0 < harness.vehicle.airframe.position[0] - before < 8.0
 
 
-def test_gimbal_commands_sent_at_every_landing(harness: SimHarness) -> None:
-    harness.take_off(4.0)
-    harness.forget()
-    harness.command(21)
-    harness.fly(3.0)
-    sent = [
-        (m.target_system, m.target_component, m.command, m.confirmation)
-        for m in harness.received("COMMAND_LONG")
-    ]
-    assert sent == [
-        (1, 0, 1001, 0),
-        (1, 0, 1000, 0),
-        (1, 0, 1001, 0),
-        (1, 0, 1001, 1),
-        (1, 0, 1001, 2),
-        (1, 0, 1001, 3),
-    ]
+NOTHING = (math.nan, math.nan, math.nan)
+
+
+def contact(detection_s: float = 1.5) -> tuple[Multirotor, GroundContact]:
+    airframe = Multirotor()
+    airframe.thrust_mps2 = GRAVITY_MPS2
+    return airframe, GroundContact(airframe, Parameters({"MPC_TKO_RAMP_T": 2.0}), detection_s)
+
+
+def wanted(position: float = math.nan, velocity: float = math.nan, acceleration: float = math.nan) -> bool:
+    setpoint = TrajectorySetpoint(
+        (math.nan, math.nan, position), (math.nan, math.nan, velocity), (math.nan, math.nan, acceleration)
+    )
+    return asks_to_rise(flight.Offboard(), setpoint, -2.0)
+
+
+def test_only_upward_setpoints_take_off() -> None:
+    assert not wanted()
+    assert [wanted(position=down) for down in (-2.2, -2.05, 0.0)] == [True, False, False]
+    assert [wanted(velocity=down) for down in (-0.1, 0.0, 1.0)] == [True, False, False]
+    assert [wanted(acceleration=down) for down in (-0.4, -0.2, 1.0)] == [True, False, False]
+    assert wanted(position=0.0, velocity=-1.0)
+    assert not asks_to_rise(None, TrajectorySetpoint(NOTHING, NOTHING, NOTHING), -2.0)
+
+
+def test_hold_stays_and_takeoff_rises() -> None:
+    airframe, parameters = Multirotor(), Parameters()
+    up = TrajectorySetpoint(NOTHING, (0.0, 0.0, -3.0), NOTHING)
+    none = TrajectorySetpoint(NOTHING, NOTHING, NOTHING)
+    assert not asks_to_rise(flight.Hold(airframe, parameters), up, 0.0)
+    assert asks_to_rise(flight.Takeoff(airframe, parameters, -5.0), none, 0.0)
+
+
+def test_ramp_restarts_with_each_takeoff() -> None:
+    _, ground = contact()
+    assert ground.climb_limit_mps(0.0) == math.inf  # no take-off in progress
+    assert ground.rests(1.0, rises=False)
+    assert not ground.rests(2.0, rises=True)
+    ramp = [ground.climb_limit_mps(2.0 + step / 10) for step in range(20)]
+    assert ramp[0] == ramp[15] == RAMP_CREEP_MPS
+    assert all(before <= after for before, after in itertools.pairwise(ramp))
+    assert ground.climb_limit_mps(4.5) == Parameters().number("MPC_TKO_SPEED")  # not off the ground yet
+    ground.leave(1.0)
+    assert ground.climb_limit_mps(4.6) == math.inf
+    ground.touch_down(9.0)
+    assert ground.rests(9.1, rises=False)
+    assert not ground.rests(10.0, rises=True)
+    assert ground.climb_limit_mps(10.1) == RAMP_CREEP_MPS
+
+
+@pytest.mark.parametrize("detection_s", [1.0, 1.5])
+def test_landed_after_continuous_ground_contact(detection_s: float) -> None:
+    airframe, ground = contact(detection_s)
+    ground.leave(1.0)
+    assert not ground.presses(0.0, 1.0)
+    assert not ground.presses(detection_s - 0.1, 1.0)
+    assert not ground.presses(detection_s, math.nan)  # no setpoint, and the rotors carry it
+    assert not ground.presses(detection_s + 0.1, 1.0)
+    airframe.thrust_mps2 = 0.4 * GRAVITY_MPS2
+    assert ground.presses(2.0 * detection_s + 0.1, math.nan)  # or they do not
+    airframe.on_ground = False
+    assert not ground.presses(2.0 * detection_s + 0.2, 1.0)
+
+
+def test_has_flown_resets_at_arming() -> None:
+    _, ground = contact()
+    ground.arm(1.0)
+    ground.leave(1.0)
+    assert (ground.landed, ground.has_flown) == (False, True)
+    ground.touch_down(8.0)
+    assert (ground.landed, ground.has_flown) == (True, True)
+    ground.arm(10.0)
+    assert not ground.has_flown
+    assert (ground.armed_for_s(11.0), ground.landed_for_s(11.0)) == (1.0, 3.0)

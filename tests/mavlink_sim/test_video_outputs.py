@@ -19,10 +19,15 @@ import cv2
 import numpy as np
 import pytest
 
-from mavlink_sim.camera.mjpeg_output import MAX_CLIENTS, MjpegOutput
-from mavlink_sim.camera.newest_frame import NewestFrame
-from mavlink_sim.camera.pipe_output import PipeOutput
-from mavlink_sim.camera.video_outputs import FrameOutput, check_output, open_output
+from mavlink_sim.camera.video_outputs import (
+    MAX_CLIENTS,
+    FrameOutput,
+    MjpegOutput,
+    NewestFrame,
+    PipeOutput,
+    check_output,
+    open_output,
+)
 from mavlink_sim.testing import free_port
 from vision.frame import Frame
 from vision.sources import open_source
@@ -116,9 +121,7 @@ def test_fifo_carries_complete_images(tmp_path: Path, feeding: Callable[[FrameOu
     assert not path.exists()
 
 
-def test_hanging_reader_delays_no_other(
-    tmp_path: Path,
-) -> None:
+def test_hanging_reader_delays_no_other(tmp_path: Path) -> None:
     path = tmp_path / "camera"
     os.mkfifo(path)
     reader = os.open(path, os.O_RDONLY | os.O_NONBLOCK)

@@ -4,9 +4,9 @@ vehicle.
 `CopterVehicle` (`copter.py`) is the vehicle. Everything specific to Copter 4.5 is in this package, from
 ArduPilot's public documentation and the behaviour of its released versions:
 
-* modes, arming and texts: `autopilot.py`, `modes.py`, `failsafes.py`
-* GUIDED and its setpoints: `guided.py`, `targets.py`
-* LAND with precision landing, RTL: `landing.py`, `return_to_launch.py`
+* modes, arming and texts: `autopilot.py`, `modes.py`
+* GUIDED and its setpoints: `guided.py`
+* LAND with precision landing, RTL: `landing.py`
 * commands, streams, telemetry, parameters: `commands.py`, `streams.py`, `telemetry.py`, `parameters.py`
 
 Not simulated: missions and AUTO (refused as without a mission), rally points, FTP, logs, terrain, the polygon

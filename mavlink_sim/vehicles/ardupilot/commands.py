@@ -31,14 +31,14 @@ from mavlink_sim.services.commands import (
     SET_MESSAGE_INTERVAL,
     UNSUPPORTED,
 )
+from mavlink_sim.services.microservices import acknowledge
 from mavlink_sim.vehicles.ardupilot import streams
 from mavlink_sim.vehicles.ardupilot.autopilot import FAILED
 from mavlink_sim.vehicles.ardupilot.context import CopterContext
+from mavlink_sim.vehicles.ardupilot.guided import GLOBAL_RELATIVE_ALT, GLOBAL_TERRAIN_ALT, GuidedTarget
 from mavlink_sim.vehicles.ardupilot.modes import CopterMode, mode_of
-from mavlink_sim.vehicles.ardupilot.targets import GLOBAL_RELATIVE_ALT, GLOBAL_TERRAIN_ALT, GuidedTarget
-from mavlink_sim.wire.commands import Command, command_of
 from mavlink_sim.wire.links import Link
-from mavlink_sim.wire.messages import dialect
+from mavlink_sim.wire.messages import Command, command_of, dialect
 
 FORCE_ARM = 2989.0
 NAV_LOITER_UNLIM = 17
@@ -48,12 +48,7 @@ DO_PAUSE_CONTINUE = 193
 CHANGE_MODE = 1  # MAV_DO_REPOSITION_FLAGS_CHANGE_MODE
 CLIMB_SPEED, DESCENT_SPEED = 2, 3  # SPEED_TYPE; airspeed and ground speed are one here
 ANSWER_DELAY_S = 0.004
-_ABOVE_HOME = (
-    GLOBAL_RELATIVE_ALT,
-    GLOBAL_RELATIVE_ALT_INT,
-    GLOBAL_TERRAIN_ALT,
-    GLOBAL_TERRAIN_ALT_INT,
-)
+_ABOVE_HOME = (GLOBAL_RELATIVE_ALT, GLOBAL_RELATIVE_ALT_INT, GLOBAL_TERRAIN_ALT, GLOBAL_TERRAIN_ALT_INT)
 
 
 def handle(vehicle: CopterContext, link: Link, message: Any) -> None:
@@ -69,14 +64,6 @@ def _answer(vehicle: CopterContext, link: Link, message: Any, command: Command, 
         handler = _HANDLERS.get(command.identifier)
         result = UNSUPPORTED if handler is None else handler(vehicle, link, command, frame)
     acknowledge(link, message, command.identifier, result)
-
-
-def acknowledge(link: Link, message: Any, command: int, result: int) -> None:
-    link.send(
-        dialect.MAVLink_command_ack_message(
-            command, result, 0, 0, message.get_srcSystem(), message.get_srcComponent()
-        )
-    )
 
 
 def set_mode(vehicle: CopterContext, link: Link, message: Any) -> None:

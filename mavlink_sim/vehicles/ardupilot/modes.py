@@ -55,45 +55,18 @@ _STANDARD_MODES = {
     CopterMode.LAND: 7,
 }
 
+
+def _modes(names: str) -> frozenset[CopterMode]:
+    return frozenset(CopterMode[name] for name in names.split())
+
+
 # The simulated modes; a request for another one is answered as by a build without it.
-FLOWN = frozenset(
-    {
-        CopterMode.STABILIZE,
-        CopterMode.ACRO,
-        CopterMode.ALT_HOLD,
-        CopterMode.AUTO,
-        CopterMode.GUIDED,
-        CopterMode.LOITER,
-        CopterMode.RTL,
-        CopterMode.LAND,
-        CopterMode.POSHOLD,
-        CopterMode.BRAKE,
-    }
-)
+FLOWN = _modes("STABILIZE ACRO ALT_HOLD AUTO GUIDED LOITER RTL LAND POSHOLD BRAKE")
 # Possible without a horizontal position; LAND then descends without holding its position.
-WITHOUT_POSITION = frozenset({CopterMode.STABILIZE, CopterMode.ACRO, CopterMode.ALT_HOLD, CopterMode.LAND})
-ARMABLE = frozenset(
-    {
-        CopterMode.STABILIZE,
-        CopterMode.ACRO,
-        CopterMode.ALT_HOLD,
-        CopterMode.GUIDED,
-        CopterMode.LOITER,
-        CopterMode.POSHOLD,
-    }
-)
+WITHOUT_POSITION = _modes("STABILIZE ACRO ALT_HOLD LAND")
+ARMABLE = _modes("STABILIZE ACRO ALT_HOLD GUIDED LOITER POSHOLD")
 # Modes with position control, shown in HEARTBEAT.base_mode as MAV_MODE_FLAG_GUIDED_ENABLED.
-POSITION_CONTROLLED = frozenset(
-    {
-        CopterMode.AUTO,
-        CopterMode.GUIDED,
-        CopterMode.LOITER,
-        CopterMode.RTL,
-        CopterMode.LAND,
-        CopterMode.POSHOLD,
-        CopterMode.BRAKE,
-    }
-)
+POSITION_CONTROLLED = _modes("AUTO GUIDED LOITER RTL LAND POSHOLD BRAKE")
 
 
 def mode_of(custom_mode: int) -> CopterMode | None:

@@ -31,6 +31,7 @@ class CopterParameter(Parameter):
         return float(self.value)
 
 
+_GROUPS = "RAW_SENS EXT_STAT RC_CHAN RAW_CTRL POSITION EXTRA1 EXTRA2 EXTRA3 PARAMS"
 # Copter 4.5's names, types and defaults. SR0 is the ground station's link, SR1 the companion's.
 _DEFAULTS: tuple[tuple[str, int, float], ...] = (
     ("SYSID_THISMAV", INT16, 1),
@@ -88,26 +89,13 @@ _DEFAULTS: tuple[tuple[str, int, float], ...] = (
     ("PLND_ALT_MIN", REAL32, 0.75),
     ("SIM_WIND_SPD", REAL32, 0.0),
     ("SIM_WIND_DIR", REAL32, 180.0),
-    *(
-        (f"SR{link}_{group}", INT16, 0)
-        for link in (0, 1)
-        for group in (
-            "RAW_SENS",
-            "EXT_STAT",
-            "RC_CHAN",
-            "RAW_CTRL",
-            "POSITION",
-            "EXTRA1",
-            "EXTRA2",
-            "EXTRA3",
-            "PARAMS",
-        )
-    ),
+    *((f"SR{link}_{group}", INT16, 0) for link in (0, 1) for group in _GROUPS.split()),
 )
 
 
-def _hundredth(name: str) -> Callable[[Parameters], float]:
-    return lambda own: own.number(name) / 100.0
+def _hundredth(*names: str) -> Callable[[Parameters], float]:
+    """A hundredth of the largest of these parameters."""
+    return lambda own: max(own.number(name) for name in names) / 100.0
 
 
 def _wind(component: Callable[[float], float]) -> Callable[[Parameters], float]:
@@ -115,21 +103,18 @@ def _wind(component: Callable[[float], float]) -> Callable[[Parameters], float]:
     return lambda own: -own.number("SIM_WIND_SPD") * component(math.radians(own.number("SIM_WIND_DIR")))
 
 
-_FAST_DOWN = "LAND_SPEED_HIGH"
 # What the shared control loops read, from Copter's parameters (cm, cm/s, centidegrees there).
 _LOOPS: dict[str, Callable[[Parameters], float]] = {
     "MPC_XY_CRUISE": _hundredth("WPNAV_SPEED"),
-    "MPC_XY_VEL_MAX": lambda own: max(own.number("WPNAV_SPEED"), own.number("LOIT_SPEED")) / 100.0,
+    "MPC_XY_VEL_MAX": _hundredth("WPNAV_SPEED", "LOIT_SPEED"),
     "MPC_VEL_MANUAL": _hundredth("LOIT_SPEED"),
     "MPC_ACC_HOR": _hundredth("WPNAV_ACCEL"),
     "MPC_Z_V_AUTO_UP": _hundredth("WPNAV_SPEED_UP"),
     "MPC_Z_V_AUTO_DN": _hundredth("WPNAV_SPEED_DN"),
-    "MPC_Z_VEL_MAX_UP": lambda own: max(own.number("WPNAV_SPEED_UP"), own.number("PILOT_SPEED_UP")) / 100.0,
-    "MPC_Z_VEL_MAX_DN": lambda own: (
-        max(own.number("WPNAV_SPEED_DN"), own.number("PILOT_SPEED_DN"), own.number(_FAST_DOWN)) / 100.0
-    ),
-    "MPC_ACC_DOWN_MAX": lambda own: max(own.number("WPNAV_ACCEL_Z"), own.number("PILOT_ACCEL_Z")) / 100.0,
-    "MPC_ACC_UP_MAX": lambda own: max(own.number("WPNAV_ACCEL_Z"), own.number("PILOT_ACCEL_Z")) / 100.0,
+    "MPC_Z_VEL_MAX_UP": _hundredth("WPNAV_SPEED_UP", "PILOT_SPEED_UP"),
+    "MPC_Z_VEL_MAX_DN": _hundredth("WPNAV_SPEED_DN", "PILOT_SPEED_DN", "LAND_SPEED_HIGH"),
+    "MPC_ACC_DOWN_MAX": _hundredth("WPNAV_ACCEL_Z", "PILOT_ACCEL_Z"),
+    "MPC_ACC_UP_MAX": _hundredth("WPNAV_ACCEL_Z", "PILOT_ACCEL_Z"),
     "MPC_LAND_SPEED": _hundredth("LAND_SPEED"),
     "MPC_XY_ERR_MAX": lambda own: 4.0,  # ArduPilot is faster, and its target has a longer lead
     "MPC_TKO_SPEED": _hundredth("WPNAV_SPEED_UP"),

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 import math
+from collections import deque
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from mavlink_sim.flight.precision_landing import LandingTarget
@@ -14,13 +17,71 @@ from mavlink_sim.flight.setpoints import (
     ROLL_RATE_IGNORE,
     THROTTLE_IGNORE,
 )
+from mavlink_sim.px4.parameters import Parameter
 from mavlink_sim.services import manual_control_service, microservices
-from mavlink_sim.vehicles.ardupilot import commands, landing, parameter_service, streams, targets
+from mavlink_sim.services.parameter_protocol import text_of
+from mavlink_sim.vehicles.ardupilot import commands, landing, streams
 from mavlink_sim.vehicles.ardupilot.context import CopterContext
-from mavlink_sim.vehicles.ardupilot.guided import THRUST_AS_THRUST, Attitude
+from mavlink_sim.vehicles.ardupilot.guided import (
+    STOP,
+    THRUST_AS_THRUST,
+    Attitude,
+    global_target,
+    local_target,
+)
 from mavlink_sim.wire.announcements import INFO
 from mavlink_sim.wire.links import Link
 from mavlink_sim.wire.messages import dialect
+
+logger = logging.getLogger(__name__)
+
+NO_INDEX = 65535
+FIRST_ANSWER_S = 0.01
+
+
+def request_list(vehicle: CopterContext, link: Link, message: Any) -> None:
+    """PARAM_REQUEST_LIST: all of them in the order of their indices."""
+
+    def begin() -> None:
+        link.parameters_left = deque(vehicle.parameters)
+        link.parameter_credit = 0.0
+
+    vehicle.after(FIRST_ANSWER_S, begin)
+
+
+def request_read(vehicle: CopterContext, link: Link, message: Any) -> None:
+    """PARAM_REQUEST_READ, by index or (index -1) by name."""
+    index = int(message.param_index)
+    parameters = vehicle.parameters
+    parameter = parameters.at(index) if index >= 0 else parameters.get(text_of(message.param_id))
+    if parameter is not None:
+        vehicle.after(0.0, partial(_send_value, vehicle, link, parameter, index if index >= 0 else NO_INDEX))
+
+
+def set_parameter(vehicle: CopterContext, link: Link, message: Any) -> None:
+    """PARAM_SET: truncate and clamp the value to its type, then send it on every link."""
+    name = text_of(message.param_id)
+    if name not in vehicle.parameters:
+        return
+    try:
+        parameter = vehicle.parameters.set(name, float(message.param_value))
+    except ValueError as error:
+        logger.info("PARAM_SET is ignored: %s", error)
+        return
+    vehicle.unsaved_rates.pop(name, None)
+    for each in vehicle.links.values():
+        if name.startswith(streams.prefix(vehicle, each)):
+            streams.follow_parameters(vehicle, each)
+        _send_value(vehicle, each, parameter, NO_INDEX)
+
+
+def _send_value(vehicle: CopterContext, link: Link, parameter: Parameter, index: int) -> None:
+    link.send(
+        dialect.MAVLink_param_value_message(
+            parameter.name.encode(), parameter.wire_value, parameter.kind, len(vehicle.parameters), index
+        )
+    )
+
 
 RATES_IGNORE = ROLL_RATE_IGNORE | PITCH_RATE_IGNORE | BODY_YAW_RATE_IGNORE
 MISSION_UNSUPPORTED = 3  # MAV_MISSION_UNSUPPORTED
@@ -37,13 +98,13 @@ def _local_target(vehicle: CopterContext, link: Link, message: Any) -> None:
     guided = vehicle.copter.guided
     if guided is not None:
         frame = vehicle.estimate
-        guided.fly(targets.local_target(message, frame.position, frame.yaw_rad))
+        guided.fly(local_target(message, frame.position, frame.yaw_rad))
 
 
 def _global_target(vehicle: CopterContext, link: Link, message: Any) -> None:
     guided = vehicle.copter.guided
     if guided is not None:
-        guided.fly(targets.global_target(message, vehicle.local_frame, vehicle.copter.home.position))
+        guided.fly(global_target(message, vehicle.local_frame, vehicle.copter.home.position))
 
 
 def _attitude_target(vehicle: CopterContext, link: Link, message: Any) -> None:
@@ -66,7 +127,7 @@ def _attitude_target(vehicle: CopterContext, link: Link, message: Any) -> None:
         and (quaternion is None or abs(math.hypot(*quaternion) - 1.0) < UNIT_TOLERANCE)
     )
     if not sound:
-        guided.fly(targets.STOP)
+        guided.fly(STOP)
         return
     given = None if ignored else rates
     if int(vehicle.parameters.number("GUID_OPTIONS")) & THRUST_AS_THRUST:
@@ -128,9 +189,9 @@ HANDLERS: dict[str, Handler] = {
     "TIMESYNC": microservices.HANDLERS["TIMESYNC"],
     "PING": microservices.HANDLERS["PING"],
     "REQUEST_DATA_STREAM": streams.request_data_stream,
-    "PARAM_REQUEST_LIST": parameter_service.request_list,
-    "PARAM_REQUEST_READ": parameter_service.request_read,
-    "PARAM_SET": parameter_service.set_parameter,
+    "PARAM_REQUEST_LIST": request_list,
+    "PARAM_REQUEST_READ": request_read,
+    "PARAM_SET": set_parameter,
     "SETUP_SIGNING": _setup_signing,
     "LANDING_TARGET": _landing_target,
     "MISSION_REQUEST_LIST": _no_mission,

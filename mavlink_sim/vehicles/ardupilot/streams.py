@@ -24,10 +24,7 @@ GROUPS: dict[str, tuple[int, tuple[str, ...]]] = {
     "POSITION": (6, ("GLOBAL_POSITION_INT", "LOCAL_POSITION_NED")),
     "EXTRA1": (10, ("ATTITUDE",)),
     "EXTRA2": (11, ("VFR_HUD",)),
-    "EXTRA3": (
-        12,
-        ("SYSTEM_TIME", "DISTANCE_SENSOR", "BATTERY_STATUS", "EKF_STATUS_REPORT", "VIBRATION"),
-    ),
+    "EXTRA3": (12, ("SYSTEM_TIME", "DISTANCE_SENSOR", "BATTERY_STATUS", "EKF_STATUS_REPORT", "VIBRATION")),
 }
 # In no group: by SET_MESSAGE_INTERVAL or REQUEST_MESSAGE only.
 SINGLE = (

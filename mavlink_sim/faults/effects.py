@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import random
+import struct
+from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 from mavlink_sim.autopilot.commander import TEMPORARILY_REJECTED
 from mavlink_sim.faults.context import ActiveFault, FaultTarget
@@ -14,6 +18,246 @@ from mavlink_sim.physics.airframe import Vector
 from mavlink_sim.physics.estimate_errors import ZERO
 from mavlink_sim.px4.modes import Mode, mode_of
 from mavlink_sim.wire.announcements import Text
+from mavlink_sim.wire.link_faults import (
+    Channel,
+    Corruption,
+    Delay,
+    Duplication,
+    Impairment,
+    Loss,
+    RateLimit,
+    Reorder,
+)
+from mavlink_sim.wire.links import Link
+from mavlink_sim.wire.messages import Outgoing, parser
+from mavlink_sim.wire.streams import ONBOARD_RATES_HZ
+
+
+def chosen_links(vehicle: FaultTarget, link: str) -> list[str]:
+    """The names of the selected links. Raises FaultError for one that the vehicle does not have."""
+    if not vehicle.links:
+        raise FaultError("link fault: this vehicle has no links")
+    if link == "all":
+        return list(vehicle.links)
+    if link not in vehicle.links:
+        raise FaultError(f"there is no link {link!r}; there are: all, {', '.join(vehicle.links)}")
+    return [link]
+
+
+def _channels(vehicle: FaultTarget, one: ActiveFault) -> list[tuple[str, Channel]]:
+    """The selected directions, each with the seed of its random numbers."""
+    values = one.fault.values
+    found = []
+    for name in chosen_links(vehicle, values["link"]):
+        stage = vehicle.faults.stage(name)
+        for direction, channel in (("out", stage.outbound), ("in", stage.inbound)):
+            if values["way"] in ("both", direction):
+                found.append((f"{one.seed}:{name}:{direction}", channel))
+    return found
+
+
+def _impair(vehicle: FaultTarget, one: ActiveFault, make: Callable[[str], Impairment]) -> None:
+    for seed, channel in _channels(vehicle, one):
+        impairment = make(seed)
+        channel.impair(impairment)
+        one.undo.append(partial(channel.clear, impairment))
+
+
+def link_loss(vehicle: FaultTarget, one: ActiveFault) -> None:
+    """Drop everything, also what is in transit."""
+    for _, channel in _channels(vehicle, one):
+        channel.drop_waiting()
+    _impair(vehicle, one, lambda seed: Loss(1.0, seed))
+
+
+def link_delay(vehicle: FaultTarget, one: ActiveFault) -> None:
+    """Delay everything."""
+    values = one.fault.values
+    _impair(vehicle, one, lambda seed: Delay(values["seconds"], values["jitter"], seed))
+
+
+def link_jitter(vehicle: FaultTarget, one: ActiveFault) -> None:
+    """Delay each datagram by a random time."""
+    _impair(vehicle, one, lambda seed: Delay(0.0, one.fault.values["seconds"], seed))
+
+
+def packet_loss(vehicle: FaultTarget, one: ActiveFault) -> None:
+    """Lose datagrams."""
+    _impair(vehicle, one, lambda seed: Loss(one.fault.values["share"], seed))
+
+
+def duplicate(vehicle: FaultTarget, one: ActiveFault) -> None:
+    """Duplicate datagrams."""
+    _impair(vehicle, one, lambda seed: Duplication(one.fault.values["share"], seed))
+
+
+def reorder(vehicle: FaultTarget, one: ActiveFault) -> None:
+    """Reorder datagrams."""
+    values = one.fault.values
+    _impair(vehicle, one, lambda seed: Reorder(values["share"], values["hold"], seed))
+
+
+def corrupt(vehicle: FaultTarget, one: ActiveFault) -> None:
+    """Change bytes."""
+    _impair(vehicle, one, lambda seed: Corruption(one.fault.values["share"], seed))
+
+
+def rate_limit(vehicle: FaultTarget, one: ActiveFault) -> None:
+    """Limit the data rate."""
+    _impair(vehicle, one, lambda seed: RateLimit(one.fault.values["bytes_per_s"]))
+
+
+_U32, _U64 = 2**32, 2**64
+_I64_MAX = 2**63 - 1
+_EVENT_ID, _LINK_NODE_STATUS_ID = 410, 8
+# time_usec of these is the boot time; elsewhere it is UTC or zero
+_BOOT_TIME_USEC = {
+    "ALTITUDE",
+    "ESTIMATOR_STATUS",
+    "GPS_GLOBAL_ORIGIN",
+    "HIGHRES_IMU",
+    "HOME_POSITION",
+    "ODOMETRY",
+    "VIBRATION",
+}
+# Where the second autopilot starts, east of the vehicle's start.
+SECOND_START_EAST_M = 25.0
+
+
+def heartbeat_only(vehicle: FaultTarget, one: ActiveFault) -> None:
+    """Stop the streams; answers to clients are still sent."""
+    names = chosen_links(vehicle, one.fault.values["link"])
+
+    def gate(link: Link, message: Any) -> Any:
+        kind = message.get_type()
+        if link.name not in names or kind == "HEARTBEAT" or kind not in link.streams:
+            return message
+        answer = (kind == "TIMESYNC" and message.tc1 != 0) or (kind == "PING" and message.target_system != 0)
+        return message if answer else None
+
+    _gated(vehicle, one, gate)
+
+
+def lost_ack(vehicle: FaultTarget, one: ActiveFault) -> None:
+    """Drop COMMAND_ACK: every one, or the Nth from now on."""
+    values = one.fault.values
+    names = chosen_links(vehicle, values["link"])
+    left = None if values["which"] == "all" else int(values["which"])
+
+    def gate(link: Link, message: Any) -> Any:
+        nonlocal left
+        if message.get_type() != "COMMAND_ACK" or link.name not in names:
+            return message
+        if values["command"] not in (0, message.command):
+            return message
+        if left is None:
+            return None
+        left -= 1
+        if left > 0:
+            return message
+        vehicle.after(0.0, partial(vehicle.faults.finish, one.number))
+        return None if left == 0 else message
+
+    _gated(vehicle, one, gate)
+
+
+def _gated(vehicle: FaultTarget, one: ActiveFault, gate: Any) -> None:
+    vehicle.faults.gates[one.number] = gate
+    one.undo.append(partial(vehicle.faults.gates.pop, one.number))
+
+
+def time_jump(vehicle: FaultTarget, one: ActiveFault) -> None:
+    """Shift the boot clock, in every stamp and in TIMESYNC, until the fault ends."""
+    jump_us = round(one.fault.values["seconds"] * 1e6)
+    vehicle.faults.boot_offset_us += jump_us
+
+    def undo() -> None:
+        vehicle.faults.boot_offset_us -= jump_us
+
+    one.undo.append(undo)
+
+
+def shifted(message: Any, boot_offset_us: int) -> Any:
+    """The message with its boot times shifted, TIMESYNC's too."""
+    kind = message.get_type()
+    moved = copy.copy(message)
+    if kind == "TIMESYNC":
+        field = "ts1" if message.tc1 == 0 else "tc1"
+        stamp = getattr(message, field) + boot_offset_us * 1000
+        setattr(moved, field, max(min(stamp, _I64_MAX), -_I64_MAX))
+    elif kind in _BOOT_TIME_USEC or (kind == "PING" and message.target_system == 0):
+        moved.time_usec = (message.time_usec + boot_offset_us) % _U64
+    elif hasattr(message, "time_boot_ms"):
+        moved.time_boot_ms = (message.time_boot_ms + boot_offset_us // 1000) % _U32
+    elif kind == "SERVO_OUTPUT_RAW":
+        moved.time_usec = (message.time_usec + boot_offset_us) % _U32
+    elif message.get_msgId() == _EVENT_ID:
+        stamp = (message.event_time_boot_ms + boot_offset_us // 1000) % _U32
+        moved.event_time_boot_ms = stamp
+        moved._packed = message._packed[:4] + struct.pack("<I", stamp) + message._packed[8:]
+    elif message.get_msgId() == _LINK_NODE_STATUS_ID:
+        stamp = (message.timestamp + boot_offset_us // 1000) % _U64
+        moved.timestamp = stamp
+        moved._packed = struct.pack("<Q", stamp) + message._packed[8:]
+    else:
+        return message
+    return moved
+
+
+class _Spoken:
+    """A message of the second autopilot with its packet, with that autopilot's sequence number."""
+
+    def __init__(self, message: Any, packet: bytes, system: int) -> None:
+        self._message = message
+        self._packet = packet
+        self._system = system
+
+    def get_msgbuf(self) -> bytes:
+        return self._packet
+
+    def get_srcSystem(self) -> int:  # noqa: N802 - pymavlink's name
+        return self._system
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return getattr(self._message, name)
+
+
+def second_autopilot(vehicle: FaultTarget, one: ActiveFault) -> None:
+    """Attach the autopilot of another vehicle, disarmed on the ground, to every link of this one."""
+    system = one.fault.values["system"] or vehicle.system_id
+    other = vehicle.second_autopilot(system, one.seed, SECOND_START_EAST_M)
+    codecs = {}
+    for name, link in vehicle.links.items():
+        other.add_link(name, {stream: link.streams.rate_hz(stream) for stream in ONBOARD_RATES_HZ})
+        codecs[name] = parser(system)
+
+    def speak(dt_s: float) -> None:
+        other.step(dt_s)
+        for name, codec in codecs.items():
+            for item in other.outgoing(name):
+                if not item.forwarded:  # what it would forward has been on these links already
+                    spoken = _Spoken(item.message, item.pack(codec), system)
+                    vehicle.links[name].outbox.append(Outgoing(spoken, system, item.component, True))
+
+    vehicle.faults.second[one.number] = other
+    one.each_step, one.apart = speak, True
+    one.undo.append(partial(vehicle.faults.second.pop, one.number))
+
+
+def stall(vehicle: FaultTarget, one: ActiveFault) -> None:
+    """Stop or slow down the vehicle's time; messages to it wait, and are all read afterwards."""
+    vehicle.faults.pace = one.fault.values["pace"]
+
+    def undo() -> None:
+        others = [each for each in vehicle.faults.active if each.fault.kind.name == "stall"]
+        vehicle.faults.pace = others[-1].fault.values["pace"] if others else 1.0
+        if vehicle.faults.pace > 0.0:
+            vehicle.faults.take_in_held()
+
+    one.undo.append(undo)
+
 
 DEAD_RECKONING_S = 5.0  # EKF2_NOAID_TOUT
 REACQUISITION_S = 1.0  # from the first fix to a position that is fused again
