@@ -32,6 +32,7 @@ BURST = topics.EVENTS.cached // 2
 # A lost message at the end of a burst is noticed by the next heartbeat, one second later.
 RECOVERY_S = 10.0
 _START_S = 30.0
+_WARM_UP = -1
 
 
 def measure_bus(seconds: float, *, rate_hz: float, load: int) -> dict[str, Any]:
@@ -109,6 +110,10 @@ def measure_recovery(messages: int) -> dict[str, Any]:
 async def _publish_events(messages: int) -> dict[str, Any]:
     started_s = time.monotonic()
     async with _Reader(_read_events) as reader:
+        while not reader.connection.poll():  # the subscription may still be on its way
+            reader.bus.publish(topics.EVENTS, {"stamp_ns": _WARM_UP, "level": "info", "text": "event"})
+            await asyncio.sleep(0.05)
+        reader.connection.recv()
         early_kb = 0
         for first in range(0, messages, BURST):
             end = min(first + BURST, messages)
@@ -192,24 +197,29 @@ def _read_detections(endpoint: str, connection: Connection) -> None:
 
 
 def _read_events(endpoint: str, connection: Connection) -> None:
-    received = 0
-    newest, expected = -1, 0
+    newest, expected = _WARM_UP, 0
+    missing: set[int] = set()
     changed = threading.Condition()
+    started = threading.Event()
 
-    def reached() -> bool:
-        return newest >= expected - 1
+    def complete() -> bool:
+        return newest >= expected - 1 and not missing
 
     def receive(sample: zenoh.Sample) -> None:
-        nonlocal received, newest
+        nonlocal newest
         number = json.loads(sample.payload.to_bytes())["stamp_ns"]
+        started.set()
         with changed:
-            received += number > newest  # a repeated one does not count
+            missing.discard(number)
+            missing.update(range(newest + 1, number))
             newest = max(newest, number)
             changed.notify()
 
     with open_client(client_settings(ZenohSection(listen=(endpoint,)))) as session:
         subscriber = subscribe_kept(session, topics.EVENTS.key(VEHICLE), receive)
         connection.send("ready")
+        started.wait(_START_S)
+        connection.send("started")
         early_kb = _resident_kb()
         while (request := connection.recv()) != "end":
             if request == "memory":
@@ -217,9 +227,9 @@ def _read_events(endpoint: str, connection: Connection) -> None:
                 continue
             expected = request
             with changed:
-                changed.wait_for(reached, RECOVERY_S)
+                changed.wait_for(complete, RECOVERY_S)
             connection.send(request)
-        connection.send({"received": received, "growth_kb": _resident_kb() - early_kb})
+        connection.send({"received": newest + 1 - len(missing), "growth_kb": _resident_kb() - early_kb})
         subscriber.undeclare()  # type: ignore[no-untyped-call]
 
 
