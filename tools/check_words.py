@@ -43,7 +43,7 @@ PHRASES = {
     "what flies": "the active behaviour, the vehicle",
 }
 # Names of others: of a library, and of a file format's key.
-ALLOWED = ("fcntl.flock", ".tell()")
+ALLOWED = ("fcntl.flock", ".tell()", "def tell(self)")
 
 _WORDS = re.compile(r"(?<![A-Za-z])(" + "|".join(INSTEAD) + r")(?![a-z])", re.IGNORECASE)
 _CAPITALS = re.compile(r"(?<=[a-z0-9])(?=[A-Z])")

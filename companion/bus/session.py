@@ -27,6 +27,7 @@ from companion.bus.bodies import ImageBody
 from companion.bus.command_intake import COMMANDS_PER_S, Allowance, CommandIntake
 from companion.bus.config import BusError, first_line, zenoh_config
 from companion.bus.topics import (
+    RECORDER_TOPICS,
     ROOT,
     TOPICS,
     VIEW_TOPICS,
@@ -120,7 +121,9 @@ class Bus:
         self._listeners = tuple(listeners)
         self._subscribers: list[zenoh.Subscriber[None]] = []
         self._token: zenoh.LivelinessToken | None = None
-        self._streams: list[tuple[Topic, str | None]] = [(topic, None) for topic in TOPICS]
+        self._streams: list[tuple[Topic, str | None]] = [
+            (topic, None) for topic in (*TOPICS, *RECORDER_TOPICS)
+        ]
         self._streams += [(topic, view) for view in views for topic in VIEW_TOPICS]
         self.published: dict[str, int] = {topic.path(view): 0 for topic, view in self._streams}
         self.publish_failed = 0
@@ -225,7 +228,7 @@ class Bus:
             self._sending.discard(path)
 
     def publish(self, topic: Topic, value: Any, view: str | None = None) -> None:
-        """Publish a body, or a text unchanged. Never raises for the network.
+        """Publish a body, or a text or bytes unchanged. Never raises for the network.
 
         Args:
             value: the body, or a function that returns it; None: nothing is published.
@@ -243,7 +246,7 @@ class Bus:
         body = value() if callable(value) else value
         if body is None:
             return
-        payload = body if isinstance(body, str) else encode(body)
+        payload = body if isinstance(body, str | bytes) else encode(body)
         if not topic.cached:
             self._put(path, publisher, payload)
         elif self._room_for_kept.acquire(blocking=False):

@@ -19,6 +19,8 @@ _JSON = zenoh.Encoding.APPLICATION_JSON
 _REAL_TIME = zenoh.Priority.REAL_TIME
 # Not DATA, the priority of queries: a reply to a frozen reader is sent with BLOCK and holds that queue.
 _TELEMETRY = zenoh.Priority.DATA_HIGH
+# A queue of its own: a recorder that is late delays nothing else.
+_RECORD = zenoh.Priority.DATA_LOW
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,6 +182,38 @@ EVENTS: Final = Topic(
     cached=100,
 )
 
+# Published only while a recorder listens. A key part with @ matches no wildcard: no other reader gets them.
+RUN: Final = Topic(
+    "@record/run",
+    dict[str, Any],
+    "version and settings of the service, for a replay",
+    "1 Hz",
+    rate_hz=1.0,
+    priority=_RECORD,
+)
+GUIDANCE_INPUT: Final = Topic(
+    "@record/guidance_input",
+    dict[str, Any],
+    "the input of each step of guidance",
+    "per step",
+    priority=_RECORD,
+)
+GUIDANCE_OUTPUT: Final = Topic(
+    "@record/guidance_output",
+    dict[str, Any],
+    "the output of each step of guidance",
+    "per step",
+    priority=_RECORD,
+)
+MAVLINK: Final = Topic(
+    "@record/mavlink",
+    bytes,
+    "the bytes on the autopilot's link, both ways (`recording.tap`)",
+    "20 Hz",
+    encoding=zenoh.Encoding.APPLICATION_OCTET_STREAM,
+    priority=_RECORD,
+)
+
 TOPICS: Final = (
     DETECTIONS,
     LABELS,
@@ -198,6 +232,8 @@ TOPICS: Final = (
 
 # Topics published by every view.
 VIEW_TOPICS: Final = tuple(topic for topic in TOPICS if topic.of_camera)
+
+RECORDER_TOPICS: Final = (RUN, GUIDANCE_INPUT, GUIDANCE_OUTPUT, MAVLINK)
 
 # The last part of the key of the queryable that executes a command and returns its result.
 COMMAND: Final = "command"

@@ -27,6 +27,7 @@ from companion.cli.flags import EXIT_BAD_INPUT, plain_errors, settings_command
 from companion.cli.mission import mission
 from companion.cli.models import models
 from companion.cli.play import play
+from companion.cli.recordings import RECORD_SETTINGS, log, record, replay
 from companion.cli.topics import topics
 from companion.settings import Settings
 from companion.settings.perception import DEFAULT_MODEL, NO_SOURCE
@@ -50,6 +51,8 @@ ORDER = (
     "commands",
     "topics",
     "mission",
+    "record",
+    "replay",
     "config",
     "evaluate",
     "train",
@@ -70,6 +73,9 @@ settings_command(app, *CLIENT_SETTINGS, "plugins", "detector")(mission)
 settings_command(app)(play)
 settings_command(app, *CLIENT_SETTINGS, "dashboard")(dashboard)
 app.add_typer(bench, name="bench")
+settings_command(app, *CLIENT_SETTINGS, *RECORD_SETTINGS)(record)
+settings_command(app, "plugins")(replay)
+app.add_typer(log, name="log")
 
 EXIT_FAILED = 1
 _DEMO_S, _DEMO_AUTOPILOT_S = 150.0, 300.0

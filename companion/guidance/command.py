@@ -244,6 +244,10 @@ class Command(ABC):
     def build(self, context: BuildContext) -> Behaviour:
         """Build the behaviour. Raises GrammarError where the command cannot be flown."""
 
+    def read_attachment(self) -> str:
+        """Read the lines that were not sent along, on this computer. Raises GrammarError."""
+        return ""
+
     @property
     def endless(self) -> bool:
         """Whether it runs until another command comes."""

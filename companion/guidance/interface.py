@@ -8,6 +8,7 @@ from typing import Literal
 
 from companion.guidance.behaviour import Behaviour, Outcome
 from companion.guidance.formation.neighbours import Neighbourhood
+from companion.guidance.search_pattern import Footprint
 from companion.guidance.targets.chosen import TrackAim
 from companion.guidance.targets.from_markers import NO_MARKERS, MarkerSight
 from companion.guidance.targets.ranging import ALL_MEANS, RangeMeans
@@ -81,6 +82,15 @@ class Answer:
 
 
 @dataclass(frozen=True, slots=True)
+class CommandSource:
+    """What a command's behaviour was built from besides its text (`BuildContext`), for a replay."""
+
+    attachment: str
+    footprint: Footprint | None
+    class_names: tuple[str, ...] | None
+
+
+@dataclass(frozen=True, slots=True)
 class CommandInput:
     """An operator's command. It is answered once, by a `CommandResult` with the same identifier.
 
@@ -91,6 +101,7 @@ class CommandInput:
         endless: the command does not end by itself, so it is answered when the vehicle flies it.
         mode_changes: `GuidanceInput.mode_changes` when the command was given; None: not known. A later
             change of mode or arming supersedes the command.
+        source: None where the behaviour was not built from a text.
     """
 
     identifier: int
@@ -99,6 +110,7 @@ class CommandInput:
     aim: GimbalAim | TrackAim | None = None
     endless: bool = False
     mode_changes: int | None = None
+    source: CommandSource | None = None
 
     def __post_init__(self) -> None:
         if (self.behaviour is None) == (self.aim is None):
@@ -183,7 +195,8 @@ class GuidanceInput:
     class_names: tuple[str, ...] | None = None
     mode_changes: int = 0
     answers: tuple[Answer, ...] = ()
-    commands: tuple[CommandInput, ...] = ()
+    # A behaviour has no encoding: commands are recorded by what they were built from (`CommandSource`).
+    commands: tuple[CommandInput, ...] = field(default=(), metadata={"recorded": False})
     ending: bool = False
 
 

@@ -2,25 +2,33 @@
 
 from __future__ import annotations
 
+import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import AsyncExitStack, asynccontextmanager
+from typing import Any
 
+from companion.bus.client import NoAnswerError, client_settings
+from companion.child_process import child_process
 from companion.guidance.core import GuidanceOptions
 from companion.guidance.gimbal.controller import GimbalMounting
 from companion.guidance.limits.battery import BatteryMinimum
 from companion.guidance.limits.envelope import Limits
 from companion.guidance.limits.obstacles import ObstacleRules
 from companion.settings import CameraSection, Settings
-from companion.vehicle.driver import Driver
+from companion.vehicle.driver import Driver, OnBytes
 from companion.vehicle.drivers import open_driver
 from companion.vehicle.gimbal import Address
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.signing import read_key
 from companion.vehicle.streamer import Streamer
 
+# Beginnings of the lines that its clients print when all is well.
+_ROUTINE = ("recorder: recording to ", "recorder: recorded ", "foxglove: open ")
 
-def driver_of(settings: Settings) -> Driver:
-    """Create the driver, not connected yet."""
+
+def driver_of(settings: Settings, on_bytes: OnBytes | None = None) -> Driver:
+    """Create the driver, not connected yet. `on_bytes`: called with everything on the link."""
     return open_driver(
         settings.vehicle.driver,
         settings.vehicle.url,
@@ -29,6 +37,7 @@ def driver_of(settings: Settings) -> Driver:
         signing_key=None
         if settings.vehicle.signing_key_file is None
         else read_key(settings.vehicle.signing_key_file),
+        on_bytes=on_bytes,
     )
 
 
@@ -82,3 +91,29 @@ def limits_of(settings: Settings) -> Limits:
         fence=guidance.fence(),
         min_separation_m=guidance.min_separation_m,
     )
+
+
+@asynccontextmanager
+async def clients_of(settings: Settings, on_event: Callable[[str, str], None]) -> AsyncIterator[None]:
+    """Run meanwhile the clients that are set: the recorder, and Foxglove live."""
+    programs: dict[str, dict[str, Any]] = {}
+    if settings.recording.directory:
+        keys = {"directory", "images", "max_file_mb", "max_file_minutes", "max_total_mb"}
+        programs["recorder"] = settings.recording.model_dump(include=keys)
+    if settings.foxglove.listen is not None:
+        programs["foxglove"] = settings.foxglove.model_dump()
+
+    def say(line: str) -> None:
+        on_event("info" if line.startswith(_ROUTINE) else "warning", line)
+
+    async with AsyncExitStack() as stack:
+        for name, options in programs.items():
+            try:
+                zenoh = client_settings(settings.zenoh)
+            except NoAnswerError as error:
+                on_event("warning", f"{name}: {error}")
+                continue
+            client = {"zenoh": zenoh.model_dump(mode="json"), "given": sorted(zenoh.model_fields_set)}
+            argument = json.dumps({**client, "vehicle": settings.vehicle.name, **options})
+            await stack.enter_async_context(child_process(name, "companion.recording", argument, say))
+        yield

@@ -12,7 +12,7 @@ from typing import Any
 
 from companion.guidance.core import Guidance
 from companion.guidance.gimbal.controller import ENDING
-from companion.guidance.interface import EventKind, GuidanceOutput, StreamStatus
+from companion.guidance.interface import EventKind, GuidanceInput, GuidanceOutput, StreamStatus
 from companion.service.command_handler import CommandHandler
 from companion.service.inputs import InputAssembler
 from companion.service.other_commanders import OtherCommanders
@@ -38,6 +38,7 @@ class GuidanceLoop:
         rate_hz: of guidance.
         on_event: called with (level, text). on_step: called after every step with its time.
         others: other services that command the vehicle.
+        record: called with time, input and output of every step.
     """
 
     def __init__(
@@ -51,11 +52,12 @@ class GuidanceLoop:
         on_event: Callable[[str, str], None],
         on_step: Callable[[int], None],
         others: OtherCommanders,
+        record: Callable[[int, GuidanceInput, GuidanceOutput], None] = lambda now_ns, inputs, output: None,
     ) -> None:
         self.guidance, self._inputs = guidance, inputs
         self._driver, self._streamer = driver, streamer
         self._period_s = 1 / rate_hz
-        self._on_event, self._on_step = on_event, on_step
+        self._on_event, self._on_step, self._record = on_event, on_step, record
         self._wake = asyncio.Event()
         self._seen = False
         self._requests = RequestRunner(driver, self._wake.set)
@@ -123,6 +125,7 @@ class GuidanceLoop:
         output = self.guidance.step(now_ns, inputs)
         self._warn_slow(name, time.thread_time_ns() - used_ns, time.monotonic_ns() - begun_ns, now_ns)
         self._apply(output)
+        self._record(now_ns, inputs, output)
         return output
 
     def _warn_slow(self, before: str, used_ns: int, passed_ns: int, now_ns: int) -> None:

@@ -14,7 +14,7 @@ from companion.guidance.behaviour import Behaviour
 from companion.guidance.behaviours.select import FIRST_CAMERA, Select
 from companion.guidance.command import BuildContext, Command, GrammarError
 from companion.guidance.grammar import parse
-from companion.guidance.interface import Answer, CommandInput, GuidanceInput, StreamStatus
+from companion.guidance.interface import Answer, CommandInput, CommandSource, GuidanceInput, StreamStatus
 from companion.guidance.pose_sharing import PoseSharing
 from companion.guidance.search_pattern import Footprint
 from companion.guidance.targets.from_detections import StateHistory
@@ -165,13 +165,15 @@ class InputAssembler:
         if (aim := command.aim) is not None:
             return CommandInput(identifier, str(command), aim=aim, mode_changes=self._mode_changes)
         footprint = Footprint(self.steering.settings.camera.field_rad, -self.camera_pitch_rad(state))
-        context = BuildContext(footprint, names, enclosed, check_requirements)
+        source = CommandSource(enclosed if enclosed.strip() else command.read_attachment(), footprint, names)
+        context = BuildContext(footprint, names, source.attachment, check_requirements)
         return CommandInput(
             identifier,
             str(command),
             self._built(command, context),
             endless=command.endless,
             mode_changes=self._mode_changes,
+            source=source,
         )
 
     async def select(self, command: Select) -> Selected:
@@ -190,6 +192,7 @@ class InputAssembler:
 
     @staticmethod
     def _built(command: Command, context: BuildContext) -> Behaviour:
+        """Build the behaviour. Raises GrammarError, for an error of a plug-in too."""
         try:
             return command.build(context)
         except GrammarError:

@@ -21,8 +21,15 @@ from companion.operator.console import run_console, terminal_is_free
 from companion.operator.metrics import MetricsServer
 from companion.perception.cameras import WorkerCamera, open_cameras
 from companion.perception.supervisor import PerceptionSupervisor
+from companion.recording.tap import FlightTap, run_record
 from companion.service.event import Event, EventLog
-from companion.service.factory import driver_of, gimbal_mounting, guidance_options, streamer_of
+from companion.service.factory import (
+    clients_of,
+    driver_of,
+    gimbal_mounting,
+    guidance_options,
+    streamer_of,
+)
 from companion.service.guidance_loop import GuidanceLoop
 from companion.service.health import Health
 from companion.service.inputs import InputAssembler
@@ -64,7 +71,7 @@ class Service:
         self._console, self._dropped_lines = console, dropped_lines
         log = EventLog(lambda event: self.bus.publish(topics.EVENTS, event), on_event)
         self.events, self._event = log.newest, log.add
-        self.driver: Driver = driver_of(settings)
+        self.driver: Driver = driver_of(settings, lambda sent, data: self._tap.on_bytes(sent, data))
         self.streamer = streamer_of(settings, self.driver.send_setpoint)
         self.guidance = Guidance(guidance_options(settings, self.driver.own_address))
         self.cameras = open_cameras(
@@ -90,6 +97,11 @@ class Service:
                 (topics.STATUS, lambda data: self.others.on_status(data, time.monotonic_ns())),
             ],
         )
+        self._tap = FlightTap(
+            self.bus,
+            run_record(settings, self.guidance.options, self.driver.own_address, self.inputs.poses.source),
+            expected=bool(settings.recording.directory),
+        )
         self._publisher = Publisher(settings.vehicle.name, self.bus, self.driver, self.inputs, self._queries)
         self._loop = GuidanceLoop(
             self.guidance,
@@ -100,6 +112,9 @@ class Service:
             on_event=self._event,
             on_step=lambda now_ns: self._health.after_step(now_ns, self.guidance),
             others=self.others,
+            record=lambda now_ns, inputs, output: self._tap.on_step(
+                now_ns, self.guidance.gimbal.mounting, inputs, output
+            ),
         )
         self._notifier = SystemdNotifier()
         self._health = Health(self.driver, self.cameras, self._notifier, self.others, self._event)
@@ -114,6 +129,11 @@ class Service:
             LinkError: no autopilot. PerceptionStartError: no model, classes or frames. BusError: no network.
             MetricsError: its library is missing or its address is not available.
         """
+        async with clients_of(self.settings, self._event):
+            self._tap.start()
+            await self._run(ready)
+
+    async def _run(self, ready: Callable[[], None] | None) -> None:
         unsubscribe = self.driver.subscribe(self._on_state)
         tasks: list[asyncio.Task[None]] = []
         metrics: MetricsServer | None = None
@@ -145,6 +165,7 @@ class Service:
             await asyncio.gather(*tasks, return_exceptions=True)
             if metrics is not None:
                 await asyncio.to_thread(metrics.close)
+            await asyncio.to_thread(self._tap.close)
             await self.bus.close()  # first: it sends pending answers
             await asyncio.gather(*(camera.supervisor.stop() for camera in self.cameras), self.driver.close())
             self._notifier.close()

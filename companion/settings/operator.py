@@ -1,9 +1,12 @@
-"""The settings of dashboard, metrics, log and plug-ins."""
+"""The settings of dashboard, recordings, Foxglove, metrics, log and plug-ins."""
 
 from __future__ import annotations
 
 from typing import Annotated, Literal
 
+from pydantic import Field
+
+from companion.settings.perception import VideoSection
 from companion.settings.section import Section
 from companion.settings.texts import HOST_AND_PORT, HOST_AND_PORT_OR_EMPTY
 
@@ -15,6 +18,28 @@ class DashboardSection(Section):
     """HOST:PORT of the page; empty: none"""
     token_file: str | None = None
     """file with the token, readable by its owner only; required if other computers can reach `listen`"""
+
+
+class RecordingSection(VideoSection):
+    """Recordings on disk: the annotated video, and everything as MCAP."""
+
+    directory: str = ""
+    """folder of the MCAP recordings, one per run (extra `recording`); empty: none"""
+    images: bool = True
+    """record the preview images too"""
+    max_file_mb: Annotated[int, Field(ge=1, le=1_000_000)] = 1000
+    """size at which the next file begins, megabytes"""
+    max_file_minutes: Annotated[int, Field(ge=1, le=10_000)] = 60
+    """duration after which the next file begins, minutes"""
+    max_total_mb: Annotated[int, Field(ge=1, le=100_000_000)] = 10_000
+    """size of all recordings in the folder, megabytes; the oldest are removed"""
+
+
+class FoxgloveSection(Section):
+    """Live data for Foxglove."""
+
+    listen: Annotated[str | None, HOST_AND_PORT] = None
+    """HOST:PORT of Foxglove's WebSocket, such as 127.0.0.1:8765 (extra `foxglove`); unset: disabled"""
 
 
 class MetricsSection(Section):

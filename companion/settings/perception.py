@@ -303,8 +303,8 @@ def _other_marker(text: str) -> tuple[int, float, PadMarker | None]:
     return int(identifier), float(size), PadMarker(int(identifier), int(pad), *map(float, offset))
 
 
-class RecordingSection(Section):
-    """Recordings on disk."""
+class VideoSection(Section):
+    """The annotated video of one camera."""
 
     video: str | None = None
     """file of the annotated video, .webm; unset: none"""

@@ -117,6 +117,15 @@ def load_settings(
     return reading.settings()
 
 
+def changed(settings: Settings, changes: Mapping[str, str]) -> Settings:
+    """Return the settings with changes, dotted key → text. Raises ConfigurationError."""
+    reading = _Reading()
+    reading.take_values(settings)
+    for key, text in changes.items():
+        reading.take_text(key, text, "given as a flag")
+    return reading.settings()
+
+
 def to_toml(settings: Settings) -> str:
     """Format the settings as a TOML file with a comment on every key; `load_settings` reads it back."""
     paragraphs = [_table(section, getattr(settings, section)) for section in sections_of_file()]
@@ -159,6 +168,12 @@ class _Reading:
                     self._take_camera(name, sections, origin)
             else:
                 self._take_table(name, content, origin)
+
+    def take_values(self, settings: Settings) -> None:
+        for name, content in settings.model_dump(exclude={"cameras"}).items():
+            self._take_table(name, content, "in effect")
+        for view, sections in settings.model_dump(include={"cameras"})["cameras"].items():
+            self._take_camera(view, sections, "in effect")
 
     def take_environment(self, environment: Mapping[str, str]) -> None:
         for variable in sorted(environment):

@@ -8,15 +8,22 @@ from pydantic import Field, model_validator
 
 from companion.settings.bus import ZenohSection
 from companion.settings.guidance import GuidanceSection
-from companion.settings.operator import DashboardSection, LogSection, MetricsSection, PluginsSection
+from companion.settings.operator import (
+    DashboardSection,
+    FoxgloveSection,
+    LogSection,
+    MetricsSection,
+    PluginsSection,
+    RecordingSection,
+)
 from companion.settings.perception import (
     CameraSection,
     DetectorSection,
     MarkersSection,
     PreviewSection,
-    RecordingSection,
     SourceSection,
     TrackerSection,
+    VideoSection,
 )
 from companion.settings.section import Section
 from companion.settings.texts import CameraName
@@ -31,7 +38,7 @@ class CameraSections(Section):
     detector: DetectorSection = DetectorSection()
     tracker: TrackerSection = TrackerSection()
     markers: MarkersSection = MarkersSection()
-    recording: RecordingSection = RecordingSection()
+    recording: VideoSection = VideoSection()
 
 
 class Settings(Section):
@@ -48,6 +55,7 @@ class Settings(Section):
     recording: RecordingSection = RecordingSection()
     preview: PreviewSection = PreviewSection()
     dashboard: DashboardSection = DashboardSection()
+    foxglove: FoxgloveSection = FoxgloveSection()
     metrics: MetricsSection = MetricsSection()
     log: LogSection = LogSection()
     plugins: PluginsSection = PluginsSection()
@@ -75,6 +83,15 @@ class Settings(Section):
             if source.share in sharers:
                 raise ValueError(f"{key}.share and {sharers[source.share]}.share are both {source.share!r}")
             sharers[source.share] = key
+        return self
+
+    @model_validator(mode="after")
+    def _recordings_fit(self) -> Self:
+        if self.recording.max_total_mb < self.recording.max_file_mb:
+            raise ValueError(
+                "recording.max_total_mb must be at least recording.max_file_mb, got "
+                f"{self.recording.max_total_mb} and {self.recording.max_file_mb}"
+            )
         return self
 
     @model_validator(mode="after")

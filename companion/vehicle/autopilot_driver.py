@@ -22,7 +22,7 @@ from companion.vehicle.byte_link import ByteLink, Source, open_link
 from companion.vehicle.commander import NAME as COMMANDER_NAME
 from companion.vehicle.commander import ONBOARD_CONTROLLER, commander_mode, read_commander
 from companion.vehicle.connection_advice import no_answer_advice, no_autopilot_text, unsupported_autopilot
-from companion.vehicle.driver import CommandRefusedError, LinkError, NoAnswerError, SystemStatus
+from companion.vehicle.driver import CommandRefusedError, LinkError, NoAnswerError, OnBytes, SystemStatus
 from companion.vehicle.flight_commands import FlightCommands
 from companion.vehicle.framing import CURRENT_MODE_ID, Frame, Framer, is_signed, pack_frame
 from companion.vehicle.gimbal import Address, GimbalAim
@@ -72,8 +72,10 @@ class AutopilotDriver(ABC):
         own_system_id: int,
         own_component_id: int,
         signing_key: bytes | None = None,
+        on_bytes: OnBytes | None = None,
     ) -> None:
         self.url = url
+        self._on_bytes = on_bytes
         self._signer = None if signing_key is None else FrameSigner(signing_key)
         self._wanted_system_id = system_id
         self._own_system_id = own_system_id
@@ -220,6 +222,8 @@ class AutopilotDriver(ABC):
         link = self._link
         if link is None:
             return
+        if self._on_bytes is not None:
+            self._on_bytes(False, data)
         ours: list[Frame] = []
         for frame in self._framer.feed(data, datagram=link.datagrams):
             if self._signer is not None and not self._signer.accepts(frame):
@@ -358,6 +362,8 @@ class AutopilotDriver(ABC):
             self._warn_stale_setpoint()
             return
         self._link.send(ready)
+        if self._on_bytes is not None:
+            self._on_bytes(True, ready)
 
     def _boot_ms(self) -> int:
         return (time.monotonic_ns() - self._started_ns) // 1_000_000 & 0xFFFF_FFFF

@@ -15,6 +15,9 @@ from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, VehicleState
 
+# Called with every piece of bytes on the link: whether we sent it, and the bytes. Must return at once.
+OnBytes = Callable[[bool, bytes], None]
+
 
 class LinkError(ConnectionError):
     """The link cannot be opened, or no autopilot answers on it. The message is one line."""

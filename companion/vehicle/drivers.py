@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Literal, get_args
 
-from companion.vehicle.driver import Driver
+from companion.vehicle.driver import Driver, OnBytes
 from companion.vehicle.link_url import parse_link_url
 
 if TYPE_CHECKING:
@@ -21,6 +21,7 @@ def open_driver(
     own_system_id: int = 1,
     own_component_id: int = 191,
     signing_key: bytes | None = None,
+    on_bytes: OnBytes | None = None,
 ) -> Driver:
     """Create a driver, not connected yet.
 
@@ -30,6 +31,7 @@ def open_driver(
         system_id: the autopilot's MAVLink system id; None: the first autopilot received.
         own_system_id, own_component_id: of our messages; 191 is MAV_COMP_ID_ONBOARD_COMPUTER.
         signing_key: 32 bytes of MAVLink 2 signing; None: nothing is signed and everything is accepted.
+        on_bytes: called in the loop with everything received and sent.
 
     Raises:
         LinkUrlError: the url has none of these forms (a ValueError and a LinkError).
@@ -60,4 +62,5 @@ def open_driver(
         own_system_id=own_system_id,
         own_component_id=own_component_id,
         signing_key=signing_key,
+        on_bytes=on_bytes,
     )

@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from companion.vehicle.autopilot_driver import AUTOPILOT_COMPONENT, HEARTBEAT_ID, AutopilotDriver
 from companion.vehicle.autopilot_profile import ARDUPILOT, PX4
-from companion.vehicle.driver import CommandRefusedError
+from companion.vehicle.driver import CommandRefusedError, OnBytes
 from companion.vehicle.framing import EKF_STATUS_REPORT_ID, Frame
 from companion.vehicle.link_url import LinkUrl
 from companion.vehicle.mav_result import IN_PROGRESS
@@ -67,6 +67,7 @@ class PymavlinkDriver(AutopilotDriver):
         own_system_id: int,
         own_component_id: int,
         signing_key: bytes | None = None,
+        on_bytes: OnBytes | None = None,
     ) -> None:
         super().__init__(
             url,
@@ -74,6 +75,7 @@ class PymavlinkDriver(AutopilotDriver):
             own_system_id=own_system_id,
             own_component_id=own_component_id,
             signing_key=signing_key,
+            on_bytes=on_bytes,
         )
         self._codec = mavlink.MAVLink(None, own_system_id, own_component_id)
 

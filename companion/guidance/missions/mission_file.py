@@ -78,9 +78,12 @@ class Mission(Command):
         if len(text.encode()) > LARGEST_BYTES:
             raise MissionError(f"{self.file}: a mission has at most {LARGEST_BYTES} bytes")
         if not text.strip():
-            text = read_mission(find_mission(self.file))
+            text = self.read_attachment()
         plan = plan_from(text, self.file, context.class_names, context.footprint)
         return SequenceBehaviour(plan, context.check_requirements)
+
+    def read_attachment(self) -> str:
+        return read_mission(find_mission(self.file))
 
 
 class StepTable(BaseModel):

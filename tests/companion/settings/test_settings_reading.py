@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+import os
 import tomllib
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from companion.settings.reading import (
     RENAMED,
     ConfigurationError,
     Settings,
+    changed,
     default_path,
     flags,
     load_settings,
@@ -371,3 +373,13 @@ def test_renamed_views_section_names_cameras(tmp_path: Path) -> None:
     path.write_text('[views.down.source]\nuri = "down.mp4"\n')
     with pytest.raises(ConfigurationError, match=r"\[views\].*was renamed to \[cameras\]"):
         load_settings(path, {}, {})
+
+
+def test_changed_settings_keep_the_rest() -> None:
+    keys = {"guidance.max_climb_mps": "1", "cameras.down.source.uri": "down.mp4"}
+    before = load_settings(os.devnull, keys, {})
+    after = changed(before, {"guidance.brake_s": "1"})
+    assert (after.guidance.brake_s, after.guidance.max_climb_mps) == (1.0, 1.0)
+    assert after.cameras == before.cameras != {}
+    with pytest.raises(ConfigurationError, match=r"guidance\.brake_s"):
+        changed(before, {"guidance.brake_s": "fast"})

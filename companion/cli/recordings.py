@@ -1,0 +1,171 @@
+"""`companion record`, `replay` and `log`: recordings of flights."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from companion.cli.flags import EXIT_BAD_INPUT, plain_errors
+from companion.settings import Settings
+
+EXIT_DIFFERENT = 1
+RECORD_SETTINGS = tuple(
+    f"recording.{key}" for key in ("images", "max_file_mb", "max_file_minutes", "max_total_mb")
+)
+
+log = typer.Typer(
+    help="List and show recordings.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+
+
+@contextmanager
+def _with_library() -> Iterator[None]:
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        typer.echo(f"companion: {error}: pip install 'mavlink-companion[recording]'", err=True)
+        raise typer.Exit(EXIT_BAD_INPUT) from error
+
+
+def record(
+    settings: Settings,
+    directory: Annotated[Path, typer.Argument(metavar="DIR", help="Folder for the recordings.")],
+    connect: Annotated[str | None, typer.Option(help="Zenoh endpoint of the service or its router.")] = None,
+) -> None:
+    """Record a running service. Writes MCAP files until Ctrl-C or SIGTERM."""
+    from companion.bus.client import NoAnswerError, client_settings
+    from companion.bus.config import BusError
+
+    with _with_library():
+        from companion.recording import RecordingError
+        from companion.recording.recorder import RecorderOptions
+        from companion.recording.recorder import record as record_until
+
+    ending = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: ending.set())
+    recording = settings.recording
+    with plain_errors(RecordingError, NoAnswerError, BusError):
+        options = RecorderOptions(
+            zenoh=client_settings(settings.zenoh, (connect,) if connect else ()),
+            vehicle=settings.vehicle.name,
+            directory=str(directory),
+            images=recording.images,
+            max_file_mb=recording.max_file_mb,
+            max_file_minutes=recording.max_file_minutes,
+            max_total_mb=recording.max_total_mb,
+        )
+        record_until(options, ending, lambda text: typer.echo(text, err=True))
+
+
+def replay(
+    settings: Settings,
+    files: Annotated[list[Path], typer.Argument(metavar="FILE…", help="Files of one run, in order.")],
+    changes: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Change a setting, such as guidance.brake_s=1."),
+    ] = None,
+    model: Annotated[
+        str | None, typer.Option(help="Also detect in the recorded images, with this model.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Run guidance again over a recording.
+
+    Compares each output with the recorded one. The exit code is 1 if any differs. With --model also compares
+    detections; they do not go to guidance.
+    """
+    from companion.plugins import PluginError, load_plugins
+    from companion.settings.reading import ConfigurationError
+
+    with _with_library():
+        from companion.recording import RecordingError
+        from companion.replay import replay as replay_files
+        from companion.replay import report
+    with plain_errors(RecordingError, ConfigurationError, PluginError):
+        load_plugins(settings.plugins.modules)
+        found = replay_files(files, dict(map(_key_and_value, changes or ())))
+    detections, lines = None, report(found)
+    if model is not None:
+        from companion import replay_detections
+
+        with plain_errors(RecordingError, ValueError):  # CheckpointError is a ValueError
+            detections = replay_detections.replay_detections(files, model)
+        lines = itertools.chain(lines, replay_detections.report(detections))
+    if as_json:
+        more = {} if detections is None else {"detections": detections.as_dict()}
+        typer.echo(json.dumps(found.as_dict() | more))
+    else:
+        for line in lines:
+            typer.echo(line)
+    if found.first is not None or (detections is not None and detections.differing_images):
+        raise typer.Exit(EXIT_DIFFERENT)
+
+
+def _key_and_value(text: str) -> tuple[str, str]:
+    key, equals, value = text.partition("=")
+    if not equals:
+        raise typer.BadParameter(f"expected KEY=VALUE, got {text!r}", param_hint="--set")
+    return key.strip(), value.strip()
+
+
+@log.command("list")
+def list_recordings(
+    directory: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of recordings.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object per file.")] = False,
+) -> None:
+    """List the recordings of a folder. One line each: vehicle, start, duration, size, flights."""
+    with _with_library():
+        from companion.flight_log import listed, summaries
+        from companion.recording import RecordingError
+    with plain_errors(RecordingError):
+        for found in summaries(directory):
+            if isinstance(found, RecordingError):
+                typer.echo(f"companion: {found}", err=True)
+            else:
+                typer.echo(json.dumps(found.as_dict()) if as_json else listed(found))
+
+
+@log.command("show")
+def show_recording(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A recording.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Show a recording: events, modes, arming, refusals, losses and damage."""
+    with _with_library():
+        from companion.flight_log import shown, summarize
+        from companion.recording import RecordingError
+    with plain_errors(RecordingError):
+        found = summarize(file)
+    if as_json:
+        typer.echo(json.dumps(found.as_dict()))
+    else:
+        for line in shown(found):
+            typer.echo(line)
+
+
+@log.command("recover")
+def recover_recording(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A damaged recording.")],
+    output: Annotated[Path, typer.Argument(metavar="OUTPUT", help="The new file.")],
+) -> None:
+    """Copy what can be read of a recording to a new, complete file."""
+    with _with_library():
+        from companion.recording import RecordingError
+        from companion.recording.files import recover
+    with plain_errors(RecordingError):
+        problems, messages = recover(file, output)
+    for line in problems:
+        typer.echo(f"companion: {line}", err=True)
+    typer.echo(f"{output}: {messages} messages")

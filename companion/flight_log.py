@@ -1,0 +1,171 @@
+"""`companion log`: what happened in a recording, in words."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from companion.bus.topics import EVENTS, VEHICLE
+from companion.recording import RecordingError
+from companion.recording.convert import OUTPUT_CHANNEL, RECORDER_CHANNEL, RUN_CHANNEL
+from companion.recording.files import RecordingReader
+
+
+@dataclass(frozen=True, slots=True)
+class Flight:
+    """One time from arming to disarming. Unix time; `ended_ns` is None if the recording ends armed."""
+
+    armed_ns: int
+    ended_ns: int | None
+
+
+@dataclass
+class RecordingSummary:
+    """One recording.
+
+    Attributes:
+        began_ns, ended_ns: Unix time of its first and last message; 0 without one.
+        lines: (Unix time, kind, text) of events, modes and refusals, in order.
+        losses: the recorder's last note about losses.
+        problems: damage of the file.
+    """
+
+    path: Path
+    size: int
+    vehicle: str = ""
+    version: str = ""
+    began_ns: int = 0
+    ended_ns: int = 0
+    flights: list[Flight] = field(default_factory=list)
+    lines: list[tuple[int, str, str]] = field(default_factory=list)
+    losses: dict[str, Any] = field(default_factory=dict)
+    problems: list[str] = field(default_factory=list)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it as JSON-able data."""
+        return {
+            "path": str(self.path),
+            "bytes": self.size,
+            "vehicle": self.vehicle,
+            "version": self.version,
+            "began": _shown(self.began_ns),
+            "duration_s": self.duration_s,
+            "flights": [
+                {"armed": _shown(flight.armed_ns), "duration_s": _seconds(flight, self.ended_ns)}
+                for flight in self.flights
+            ],
+            "lines": [
+                {"time": _shown(stamp_ns), "kind": kind, "text": text} for stamp_ns, kind, text in self.lines
+            ],
+            "losses": self.losses,
+            "problems": self.problems,
+        }
+
+    @property
+    def duration_s(self) -> float:
+        """From the first to the last message."""
+        return round((self.ended_ns - self.began_ns) / 1e9, 1)
+
+
+def summarize(path: Path) -> RecordingSummary:
+    """Read a recording. Raises RecordingError."""
+    reader = RecordingReader(path)
+    found = RecordingSummary(path, path.stat().st_size)
+    mode: str | None = None
+    armed: bool | None = None
+    for channel, log_time_ns, data in reader.messages():
+        found.began_ns = min(found.began_ns or log_time_ns, log_time_ns)
+        found.ended_ns = max(found.ended_ns, log_time_ns)
+        if channel.topic not in (RUN_CHANNEL, EVENTS.name, VEHICLE.name, OUTPUT_CHANNEL, RECORDER_CHANNEL):
+            continue
+        try:
+            message = json.loads(data)
+            match channel.topic:
+                case topic if topic == RUN_CHANNEL:
+                    found.vehicle, found.version = message["vehicle"], message["version"]
+                case topic if topic == RECORDER_CHANNEL:
+                    found.losses = message
+                case topic if topic == EVENTS.name:
+                    found.lines.append((log_time_ns, message["level"], message["text"]))
+                case topic if topic == OUTPUT_CHANNEL:
+                    found.lines += [
+                        (log_time_ns, "refused", f"{event['behaviour']}: {event['message']}")
+                        for event in message["events"]
+                        if event["kind"] == "refused"
+                    ]
+                case _:
+                    if message["mode"] != mode:
+                        mode = message["mode"]
+                        found.lines.append((log_time_ns, "mode", str(mode)))
+                    if message["armed"] != armed:
+                        armed = message["armed"]
+                        _on_armed(found, bool(armed), log_time_ns)
+        except (ValueError, KeyError, TypeError) as error:
+            found.problems.append(f"{path}: a message on {channel.topic} cannot be read: {error}")
+    found.lines.sort(key=lambda line: line[0])
+    found.problems += reader.problems
+    return found
+
+
+def _on_armed(found: RecordingSummary, armed: bool, stamp_ns: int) -> None:
+    if armed:
+        found.flights.append(Flight(stamp_ns, None))
+        found.lines.append((stamp_ns, "armed", ""))
+    elif found.flights:
+        found.flights[-1] = Flight(found.flights[-1].armed_ns, stamp_ns)
+        found.lines.append((stamp_ns, "disarmed", ""))
+
+
+def summaries(directory: Path) -> Iterator[RecordingSummary | RecordingError]:
+    """Summarize every .mcap file of a folder, by name; the error where one cannot be read.
+
+    Raises:
+        RecordingError: the folder cannot be read.
+    """
+    try:
+        paths = sorted(path for path in directory.iterdir() if path.suffix == ".mcap")
+    except OSError as error:
+        raise RecordingError(f"{directory}: cannot be read: {error.strerror}") from error
+    for path in paths:
+        try:
+            yield summarize(path)
+        except RecordingError as error:
+            yield error
+
+
+def listed(found: RecordingSummary) -> str:
+    """Return a recording in one line."""
+    durations = ", ".join(f"{_seconds(flight, found.ended_ns):.0f} s" for flight in found.flights)
+    flights = f"armed {durations}" if found.flights else "not armed"
+    words = [
+        found.path.name,
+        found.vehicle or "-",
+        _shown(found.began_ns),
+        f"{found.duration_s:.0f} s",
+        f"{found.size / 1e6:.1f} MB",
+        flights,
+        *(["damaged"] if found.problems else []),
+    ]
+    return "  ".join(words)
+
+
+def shown(found: RecordingSummary) -> Iterator[str]:
+    """Return a recording as lines for people."""
+    yield listed(found)
+    for stamp_ns, kind, text in found.lines:
+        yield f"{(stamp_ns - found.began_ns) / 1e9:9.2f} s  {kind:8}  {text}".rstrip()
+    lost = {name: count for name, count in found.losses.items() if count and name != "first_step"}
+    yield from (f"{name.replace('_', ' ')}: {count}" for name, count in lost.items())
+    yield from found.problems
+
+
+def _seconds(flight: Flight, end_ns: int) -> float:
+    return round(((flight.ended_ns or end_ns) - flight.armed_ns) / 1e9, 1)
+
+
+def _shown(stamp_ns: int) -> str:
+    return datetime.fromtimestamp(stamp_ns / 1e9, UTC).strftime("%Y-%m-%dT%H:%M:%SZ") if stamp_ns else "-"

@@ -1,0 +1,5 @@
+"""Recordings of flights in MCAP: writing, reading, and the values of guidance in them."""
+
+
+class RecordingError(ValueError):
+    """A recording cannot be written, read or served. The message is one line."""

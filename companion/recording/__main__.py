@@ -1,0 +1,53 @@
+"""The clients that the service starts: `python -m companion.recording OPTIONS`, as JSON.
+
+With `listen` it serves Foxglove live (`live.py`), else it records (`recorder.py`).
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+from threading import Event
+
+from companion.bus.client import NoAnswerError
+from companion.bus.config import BusError
+from companion.child_process import EXIT_REFUSED, on_parent_end
+from companion.recording import RecordingError
+from companion.settings import ZenohSection
+
+
+def main(argument: str) -> int:
+    """Work until the parent ends; returns the exit code."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent
+    ending = Event()
+    on_parent_end(ending.set)
+    values = json.loads(argument)
+    section = ZenohSection.model_validate_json(json.dumps(values.pop("zenoh")))
+    # Those not given may be replaced by zenoh's own configuration file.
+    zenoh = ZenohSection.model_construct(set(values.pop("given")), **dict(section))
+    extra = "foxglove" if "listen" in values else "recording"
+    try:
+        if extra == "foxglove":
+            from companion.recording.live import LiveOptions, serve
+
+            serve(LiveOptions(zenoh=zenoh, **values), ending, _say)
+        else:
+            from companion.recording.recorder import RecorderOptions, record
+
+            record(RecorderOptions(zenoh=zenoh, **values), ending, _say)
+    except ModuleNotFoundError as error:
+        _say(f"{error}: pip install 'mavlink-companion[{extra}]'")
+        return EXIT_REFUSED
+    except (RecordingError, NoAnswerError, BusError) as error:
+        _say(str(error))
+        return EXIT_REFUSED
+    return 0
+
+
+def _say(text: str) -> None:
+    print(text, flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1]))

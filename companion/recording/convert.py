@@ -1,0 +1,276 @@
+"""Messages of the bus as messages of a recording: as they are, and as Foxglove's types.
+
+Our topics keep their names (`detections`, `cameras/down/detections`); Foxglove's begin with a slash. Log
+times are Unix time: the stamp of the message plus the offset of the service's clock at its start.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import time
+from collections.abc import Iterator
+from typing import Any
+
+from companion.bus.topics import (
+    DETECTIONS,
+    EVENTS,
+    GUIDANCE_INPUT,
+    GUIDANCE_OUTPUT,
+    IMAGE,
+    LABELS,
+    MAVLINK,
+    RUN,
+    VEHICLE,
+)
+from companion.recording.files import Channel, Recorded
+from companion.recording.foxglove_schemas import SCHEMAS
+from companion.recording.tap import unpack_link_bytes
+
+# Names of topics and channels.
+RUN_CHANNEL, INPUT_CHANNEL, OUTPUT_CHANNEL = "run", "guidance_input", "guidance_output"
+RECEIVED_CHANNEL, SENT_CHANNEL, RECORDER_CHANNEL = "mavlink_received", "mavlink_sent", "recorder"
+ANY_OBJECT = b'{"type":"object"}'
+_OF_RECORDER = {
+    RUN.name: RUN_CHANNEL,
+    GUIDANCE_INPUT.name: INPUT_CHANNEL,
+    GUIDANCE_OUTPUT.name: OUTPUT_CHANNEL,
+}
+_STAMPS = ("published_ns", "stamp_ns", "now_ns")
+_LEVELS = {"info": 2, "warning": 3, "error": 4}  # foxglove.LogLevel
+_LINE_LOOP = 2  # foxglove.PointsAnnotationType
+_COLORS = {"confirmed": (0.2, 1.0, 0.3), "tentative": (1.0, 0.8, 0.1)}
+_OTHER_COLOR = (0.4, 0.7, 1.0)
+
+
+class Converter:
+    """Converts the messages of one vehicle's service.
+
+    Args:
+        vehicle: its name; begins the names of frames.
+
+    Attributes:
+        lost_steps, lost_pieces: steps of guidance, and pieces of the link's bytes, dropped on the way.
+        first_step: the first step of guidance received; None before.
+    """
+
+    def __init__(self, vehicle: str) -> None:
+        self._vehicle = vehicle
+        # Of this host, until the service's own is received; both are equal on one host.
+        self._offset_ns = time.time_ns() - time.monotonic_ns()
+        self._preview_width = 0
+        self._service: str | None = None
+        self.lost_steps = self.lost_pieces = 0
+        self.first_step: int | None = None
+        self._next_step = self._next_piece = -1
+
+    def convert(self, path: str, payload: bytes, attachment: bytes | None = None) -> Iterator[Recorded]:
+        """Return the messages that a message of the bus becomes.
+
+        Args:
+            path: the key after the vehicle's name.
+            attachment: of an image.
+
+        Raises:
+            ValueError, KeyError, TypeError: the message is not what its topic says.
+        """
+        camera, _, name = path.rpartition("/")
+        if path == MAVLINK.name:
+            yield from self._link_bytes(payload)
+            return
+        if name == IMAGE.name:
+            yield self._image(camera, payload, json.loads(attachment or b"{}"))
+            return
+        if name == LABELS.name:
+            text = json.dumps({"labels": payload.decode()}).encode()
+            yield Recorded(Channel(path, "companion.labels", ANY_OBJECT), time.time_ns(), text)
+            return
+        message = json.loads(payload)
+        if path == RUN.name:
+            self._on_run(message)
+        elif path == GUIDANCE_INPUT.name:
+            self._on_step(message["step"])
+        topic = _OF_RECORDER.get(path, path)
+        stamp_ns = next((message[key] for key in _STAMPS if key in message), None)
+        log_time_ns = time.time_ns() if stamp_ns is None else stamp_ns + self._offset_ns
+        yield Recorded(
+            Channel(topic, f"companion.{_OF_RECORDER.get(path, name)}", ANY_OBJECT), log_time_ns, payload
+        )
+        make = {
+            DETECTIONS.name: self._annotations,
+            VEHICLE.name: self._vehicle_state,
+            EVENTS.name: self._log,
+            "transforms": self._transforms,
+            "camera_info": self._calibration,
+        }.get(name)
+        if make is not None and topic == path:
+            for converted_topic, kind, body in make(camera, message):
+                yield _recorded(converted_topic, kind, log_time_ns, body)
+
+    def _on_run(self, run: dict[str, Any]) -> None:
+        if run["service"] != self._service:
+            self._service = run["service"]
+            self._next_step = self._next_piece = -1
+        self._offset_ns = int(run["unix_offset_ns"])
+        self._preview_width = int(run["settings"]["preview"]["width"])
+
+    def _on_step(self, step: int) -> None:
+        if self.first_step is None:
+            self.first_step = step
+        if self._next_step >= 0:
+            self.lost_steps += max(0, step - self._next_step)
+        self._next_step = step + 1
+
+    def _link_bytes(self, payload: bytes) -> Iterator[Recorded]:
+        for number, piece in unpack_link_bytes(payload):
+            if self._next_piece >= 0:
+                self.lost_pieces += max(0, number - self._next_piece)
+            self._next_piece = number + 1
+            channel = Channel(SENT_CHANNEL if piece.sent else RECEIVED_CHANNEL, encoding="mavlink")
+            yield Recorded(channel, piece.stamp_ns + self._offset_ns, piece.data)
+
+    def _image(self, camera: str, jpeg: bytes, stamps: dict[str, Any]) -> Recorded:
+        captured_ns = stamps["captured_ns"]
+        body = {
+            "timestamp": self._time(captured_ns),
+            "frame_id": self._camera_frame(camera),
+            "data": base64.b64encode(jpeg).decode(),
+            "format": "jpeg",
+        }
+        text = json.dumps(body, separators=(",", ":")).encode()
+        return Recorded(image_channel(camera), captured_ns + self._offset_ns, text)
+
+    def _annotations(self, camera: str, message: dict[str, Any]) -> Iterator[tuple[str, str, Any]]:
+        # The image is scaled down where it is wider than `preview.width`.
+        width = message["width"]
+        scale = min(1.0, self._preview_width / width) if self._preview_width else 1.0
+        stamp = self._time(message["captured_ns"])
+        points, texts = [], []
+        for found in message["detections"]:
+            left, top, right, bottom = (value * scale for value in found["xyxy"])
+            red, green, blue = _COLORS.get(found["track_state"], _OTHER_COLOR)
+            color = {"r": red, "g": green, "b": blue, "a": 1.0}
+            track = "" if found["track_id"] is None else f" {found['track_id']}"
+            points.append(
+                {
+                    "timestamp": stamp,
+                    "type": _LINE_LOOP,
+                    "points": [
+                        {"x": x, "y": y}
+                        for x, y in ((left, top), (right, top), (right, bottom), (left, bottom))
+                    ],
+                    "outline_color": color,
+                    "outline_colors": [],
+                    "fill_color": {**color, "a": 0.0},
+                    "thickness": 2,
+                    "metadata": [],
+                }
+            )
+            texts.append(
+                {
+                    "timestamp": stamp,
+                    "position": {"x": left, "y": top},
+                    "text": f"{found['class_name']}{track} {found['confidence']:.2f}",
+                    "font_size": 12,
+                    "text_color": {"r": 0.0, "g": 0.0, "b": 0.0, "a": 1.0},
+                    "background_color": color,
+                    "metadata": [],
+                }
+            )
+        body = {"timestamp": stamp, "circles": [], "points": points, "texts": texts, "metadata": []}
+        yield _joined("", camera, "annotations"), "ImageAnnotations", body
+
+    def _vehicle_state(self, _camera: str, message: dict[str, Any]) -> Iterator[tuple[str, str, Any]]:
+        stamp = self._time(message["stamp_ns"])
+        position, attitude = message["position_ned_m"], message["attitude_wxyz"]
+        if position is not None and attitude is not None:
+            # A root with z up, so that a viewer shows down as down: x is east, y north.
+            half = math.sqrt(0.5)
+            yield _transforms_body(
+                _transform(
+                    stamp, "local_enu", f"{self._vehicle}/ned", (0.0, 0.0, 0.0), (0.0, half, half, 0.0)
+                ),
+                _transform(stamp, f"{self._vehicle}/ned", f"{self._vehicle}/body", position, attitude),
+            )
+        fix = [message[key] for key in ("latitude_deg", "longitude_deg", "altitude_amsl_m")]
+        if None not in fix:
+            body = {
+                "timestamp": stamp,
+                "frame_id": f"{self._vehicle}/body",
+                **dict(zip(("latitude", "longitude", "altitude"), fix, strict=True)),
+                "position_covariance": [0.0] * 9,
+                "position_covariance_type": 0,  # UNKNOWN
+            }
+            yield "/location", "LocationFix", body
+
+    def _transforms(self, _camera: str, message: dict[str, Any]) -> Iterator[tuple[str, str, Any]]:
+        stamp = self._time(message["captured_ns"])
+        yield _transforms_body(
+            *(
+                _transform(
+                    stamp,
+                    each["parent_frame_id"],
+                    each["child_frame_id"],
+                    each["translation_m"],
+                    each["rotation_wxyz"],
+                )
+                for each in message["transforms"]
+            )
+        )
+
+    def _calibration(self, camera: str, message: dict[str, Any]) -> Iterator[tuple[str, str, Any]]:
+        body = {
+            "timestamp": self._time(message["stamp_ns"]),
+            **{key: message[key] for key in ("frame_id", "width", "height", "distortion_model")},
+            **{key.upper(): message[key] for key in ("d", "k", "r", "p")},
+        }
+        yield _joined("", camera, "camera_info"), "CameraCalibration", body
+
+    def _log(self, _camera: str, message: dict[str, Any]) -> Iterator[tuple[str, str, Any]]:
+        body = {
+            "timestamp": self._time(message["stamp_ns"]),
+            "level": _LEVELS.get(message["level"], 0),
+            "message": message["text"],
+            "name": self._vehicle,
+            "file": "",
+            "line": 0,
+        }
+        yield "/log", "Log", body
+
+    def _time(self, stamp_ns: int) -> dict[str, int]:
+        seconds, rest = divmod(stamp_ns + self._offset_ns, 1_000_000_000)
+        return {"sec": seconds, "nsec": rest}
+
+    def _camera_frame(self, camera: str) -> str:
+        return f"{self._vehicle}/{camera or 'camera'}"
+
+
+def image_channel(camera: str) -> Channel:
+    """Return the channel of a camera's images. `camera`: empty, or `cameras/NAME`."""
+    name = "foxglove.CompressedImage"
+    return Channel(_joined("", camera, IMAGE.name), name, SCHEMAS[name])
+
+
+def _joined(*parts: str) -> str:
+    return "/".join(part for index, part in enumerate(parts) if part or index == 0)
+
+
+def _recorded(topic: str, kind: str, log_time_ns: int, body: Any) -> Recorded:
+    name = f"foxglove.{kind}"
+    text = json.dumps(body, separators=(",", ":")).encode()
+    return Recorded(Channel(topic, name, SCHEMAS[name]), log_time_ns, text)
+
+
+def _transforms_body(*transforms: dict[str, Any]) -> tuple[str, str, Any]:
+    return "/tf", "FrameTransforms", {"transforms": list(transforms)}
+
+
+def _transform(stamp: Any, parent: str, child: str, translation: Any, wxyz: Any) -> dict[str, Any]:
+    return {
+        "timestamp": stamp,
+        "parent_frame_id": parent,
+        "child_frame_id": child,
+        "translation": dict(zip("xyz", translation, strict=True)),
+        "rotation": dict(zip("wxyz", wxyz, strict=True)),
+    }

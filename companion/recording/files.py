@@ -1,0 +1,285 @@
+"""MCAP files (https://mcap.dev/spec): a crash costs a second at most, and a damaged file is read."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Channel as ChannelRecord
+from mcap.records import Chunk, Message, Schema
+from mcap.stream_reader import breakup_chunk
+from mcap.writer import CompressionType, Writer
+
+from companion.recording import RecordingError
+
+MAGIC = b"\x89MCAP0\r\n"
+PROFILE = "companion"
+CHUNK_BYTES = 1 << 20
+# A chunk is written at least this often: what a crash or a cut loses.
+FLUSH_S = 1.0
+_HEADER_BYTES = 9  # opcode and length of a record
+_LARGEST_RECORD_BYTES = 1 << 30
+# Of our own files: only these are removed for space.
+_NAME = re.compile(r"[\w.-]+_\d{8}T\d{6}Z_\d{3}\.mcap")
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """A channel of a file. `schema` is a JSON Schema, or empty for `encoding` other than json."""
+
+    topic: str
+    schema_name: str = ""
+    schema: bytes = b""
+    encoding: str = "json"
+
+
+class Recorded(NamedTuple):
+    """One message of a file. `log_time_ns`: Unix time."""
+
+    channel: Channel
+    log_time_ns: int
+    data: bytes
+
+
+class RecordingWriter:
+    """Writes messages to a sequence of files in one folder.
+
+    A file ends at its largest size or duration; then the next part begins. While all recordings in the folder
+    are larger than `max_total_bytes`, the oldest file is removed.
+
+    Args:
+        name: the first word of the files' names.
+
+    Attributes:
+        path: the current file.
+        begins: messages that every further part begins with, by topic; set by the owner.
+
+    Raises:
+        RecordingError: the folder or a file cannot be written, here and from `write` and `flush`. The file is
+            then cut after its last whole chunk.
+    """
+
+    def __init__(
+        self, directory: Path, name: str, *, max_bytes: int, max_duration_s: float, max_total_bytes: int
+    ) -> None:
+        self._directory = directory
+        self._prefix = f"{name}_{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}"
+        self._max_bytes, self._max_duration_s = max_bytes, max_duration_s
+        self._max_total_bytes = max_total_bytes
+        self._part = 0
+        self.begins: dict[str, Recorded] = {}
+        try:
+            directory.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise RecordingError(f"{directory}: the folder cannot be made: {error.strerror}") from error
+        self._open()
+
+    def write(self, channel: Channel, log_time_ns: int, data: bytes) -> None:
+        """Add a message; written with its chunk."""
+        with self._cut_on_failure():
+            self._messages.add(channel, log_time_ns, data)
+
+    def flush(self) -> None:
+        """Write what is pending, begin the next part if it is due, and remove old files. Call each second."""
+        with self._cut_on_failure():
+            self._messages.writer.flush()  # type: ignore[no-untyped-call]
+            self._file.sync()
+        if self._file.size >= self._max_bytes or time.monotonic() - self._began_s >= self._max_duration_s:
+            self.begin_next()
+        self._remove_old()
+
+    def begin_next(self) -> None:
+        """End the file and begin the next one."""
+        self.close()
+        self._part += 1
+        self._open()
+        for message in self.begins.values():
+            self.write(*message)
+
+    def close(self) -> None:
+        """Write the rest and the summary."""
+        with self._cut_on_failure():
+            self._messages.writer.finish()  # type: ignore[no-untyped-call]
+            self._file.sync()
+        self._file.close()
+
+    def _open(self) -> None:
+        self.path = self._directory / f"{self._prefix}_{self._part:03d}.mcap"
+        self._began_s = time.monotonic()
+        try:
+            self._file = _File(self.path)
+        except OSError as error:
+            raise RecordingError(f"{self.path}: cannot be created: {error.strerror}") from error
+        with self._cut_on_failure():
+            self._messages = _Messages(self._file)
+
+    @contextlib.contextmanager
+    def _cut_on_failure(self) -> Iterator[None]:
+        whole = self._file.size
+        try:
+            yield
+        except OSError as error:
+            # Half a chunk is of no use, and on a full disk its space is.
+            with contextlib.suppress(OSError):
+                self._file.cut(whole)
+            self._file.close()
+            raise RecordingError(f"{self.path}: cannot be written: {error.strerror}") from error
+
+    def _remove_old(self) -> None:
+        files = {path: path.stat() for path in self._directory.iterdir() if _NAME.fullmatch(path.name)}
+        total = sum(status.st_size for status in files.values())
+        for path in sorted(files, key=lambda path: (files[path].st_mtime_ns, path.name)):
+            if total <= self._max_total_bytes or path == self.path:
+                return
+            total -= files[path].st_size
+            with contextlib.suppress(OSError):  # another recorder may have removed it
+                path.unlink()
+
+
+class _Messages:
+    """A started MCAP writer that registers the channels it meets."""
+
+    def __init__(self, file: Any) -> None:
+        self.writer = Writer(file, CHUNK_BYTES, CompressionType.ZSTD)
+        self.writer.start(PROFILE)
+        self._schemas: dict[str, int] = {"": 0}
+        self._channels: dict[str, int] = {}
+
+    def add(self, channel: Channel, log_time_ns: int, data: bytes) -> None:
+        identifier, name = self._channels.get(channel.topic), channel.schema_name
+        if identifier is None:
+            if name not in self._schemas:
+                self._schemas[name] = self.writer.register_schema(name, "jsonschema", channel.schema)
+            identifier = self.writer.register_channel(channel.topic, channel.encoding, self._schemas[name])
+            self._channels[channel.topic] = identifier
+        self.writer.add_message(identifier, log_time_ns, data, log_time_ns)
+
+
+class _File:
+    """An unbuffered file: nothing is left to be written when a write has failed."""
+
+    def __init__(self, path: Path) -> None:
+        self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        self.size = 0
+
+    def write(self, data: bytes) -> int:
+        rest = memoryview(data)
+        while rest:
+            written = os.write(self._descriptor, rest)
+            self.size += written
+            rest = rest[written:]
+        return len(data)
+
+    def tell(self) -> int:
+        return self.size
+
+    def flush(self) -> None:
+        """Nothing is buffered."""
+
+    def sync(self) -> None:
+        os.fdatasync(self._descriptor)
+
+    def cut(self, size: int) -> None:
+        os.ftruncate(self._descriptor, size)
+        self.size = size
+
+    def close(self) -> None:
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+        self._descriptor = -1
+
+
+class RecordingReader:
+    """Reads the messages of one file, in the order of writing. Only whole chunks are read.
+
+    Attributes:
+        problems: what could not be read, a line each; complete after `messages` has ended.
+
+    Raises:
+        RecordingError: the file cannot be read, or is not MCAP.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.problems: list[str] = []
+        try:
+            with path.open("rb") as file:
+                begin = file.read(len(MAGIC))
+                self._size = os.fstat(file.fileno()).st_size
+        except OSError as error:
+            raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
+        if not begin:
+            raise RecordingError(f"{path}: the file is empty")
+        if begin != MAGIC:
+            raise RecordingError(f"{path}: not an MCAP file")
+
+    def messages(self, *topics: str) -> Iterator[Recorded]:
+        """Return the messages of these topics; none: of all."""
+        self.problems = []
+        schemas: dict[int, Schema] = {}
+        channels: dict[int, Channel] = {}
+        for record in self._records():
+            if isinstance(record, Schema):
+                schemas[record.id] = record
+            elif isinstance(record, ChannelRecord):
+                schema = schemas.get(record.schema_id)
+                name, text = ("", b"") if schema is None else (schema.name, schema.data)
+                channels[record.id] = Channel(record.topic, name, text, record.message_encoding)
+            elif record.channel_id in channels:
+                channel = channels[record.channel_id]
+                if not topics or channel.topic in topics:
+                    yield Recorded(channel, record.log_time, record.data)
+
+    def _records(self) -> Iterator[Schema | ChannelRecord | Message]:
+        at = len(MAGIC)
+        with self.path.open("rb") as file:
+            file.seek(at)
+            while True:
+                header = file.read(_HEADER_BYTES)
+                length = int.from_bytes(header[1:], "little")
+                if len(header) < _HEADER_BYTES or at + _HEADER_BYTES + length > self._size:
+                    self.problems.append(f"{self.path}: ends inside a record, at byte {at} of {self._size}")
+                    return
+                opcode = header[0]
+                if opcode == Opcode.DATA_END:
+                    return
+                if opcode == Opcode.CHUNK and length <= _LARGEST_RECORD_BYTES:
+                    try:
+                        chunk = Chunk.read(ReadDataStream(BytesIO(file.read(length))))
+                        records = breakup_chunk(chunk, validate_crc=True)
+                    except Exception as error:  # of mcap, struct and the decompressor: no common base
+                        self.problems.append(f"{self.path}: damaged chunk at byte {at}: {error}")
+                    else:
+                        for record in records:
+                            if isinstance(record, Schema | ChannelRecord | Message):
+                                yield record
+                at += _HEADER_BYTES + length
+                file.seek(at)
+
+
+def recover(path: Path, output: Path) -> tuple[list[str], int]:
+    """Copy what can be read to a new, complete file. Returns the problems and the number of messages.
+
+    Raises:
+        RecordingError: the file cannot be read, or the new one cannot be written or exists.
+    """
+    reader = RecordingReader(path)
+    try:
+        with output.open("xb") as file:
+            messages = _Messages(file)
+            count = 0
+            for count, message in enumerate(reader.messages(), 1):  # noqa: B007 - counted
+                messages.add(*message)
+            messages.writer.finish()  # type: ignore[no-untyped-call]
+    except OSError as error:
+        raise RecordingError(f"{output}: cannot be written: {error.strerror}") from error
+    return reader.problems, count

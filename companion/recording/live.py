@@ -1,0 +1,115 @@
+"""Foxglove live: a client of the bus that serves what a recording has as Foxglove's WebSocket protocol."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from threading import Event, Lock
+
+import foxglove
+import zenoh
+from foxglove.websocket import ChannelView, Client, ServerListener
+
+from companion.bus.client import open_client
+from companion.bus.topics import IMAGE, ROOT, RUN, TOPICS
+from companion.recording import RecordingError
+from companion.recording.convert import Converter, image_channel
+from companion.recording.files import Channel
+from companion.recording.recorder import subscribe_all
+from companion.settings import ZenohSection
+
+
+@dataclass(frozen=True, slots=True)
+class LiveOptions:
+    """What to serve, and where. `listen`: HOST:PORT. `zenoh`: settings of a client."""
+
+    zenoh: ZenohSection
+    vehicle: str
+    listen: str
+
+
+class Live(ServerListener):
+    """Sends messages to viewers. Images are subscribed to only while a viewer shows them."""
+
+    def __init__(self, options: LiveOptions, session: zenoh.Session) -> None:
+        self._vehicle, self._session = options.vehicle, session
+        self._converter = Converter(options.vehicle)
+        self._channels: dict[str, foxglove.Channel] = {}
+        self._viewers: Counter[str] = Counter()
+        self._images: dict[str, zenoh.Subscriber[None]] = {}
+        self._lock = Lock()  # zenoh's threads, and the server's
+        host, _, port = options.listen.rpartition(":")
+        self._channel(image_channel(""))
+        try:
+            self._server = foxglove.start_server(
+                name=f"companion {options.vehicle}", host=host, port=int(port), server_listener=self
+            )
+        except Exception as error:  # of the SDK, without a common base
+            raise RecordingError(f"foxglove.listen: {options.listen} cannot be served: {error}") from error
+        topics = [topic for topic in (*TOPICS, RUN) if topic is not IMAGE]
+        self._subscribers = subscribe_all(session, options.vehicle, topics, self._on_sample)
+
+    @property
+    def port(self) -> int:
+        """The port that is served."""
+        return self._server.port
+
+    def close(self) -> None:
+        """Stop serving."""
+        for subscriber in (*self._subscribers, *self._images.values()):
+            subscriber.undeclare()
+        self._server.stop()
+
+    def on_subscribe(self, client: Client, channel: ChannelView) -> None:
+        """Called by the server: a viewer shows a topic."""
+        with self._lock:
+            self._viewers[channel.topic] += 1
+            if self._viewers[channel.topic] == 1 and channel.topic.endswith(f"/{IMAGE.name}"):
+                key = f"{ROOT}/{self._vehicle}{channel.topic}"
+                self._images[channel.topic] = self._session.declare_subscriber(key, self._on_sample)
+
+    def on_unsubscribe(self, client: Client, channel: ChannelView) -> None:
+        """Called by the server: a viewer shows a topic no more."""
+        with self._lock:
+            self._viewers[channel.topic] -= 1
+            images = None if self._viewers[channel.topic] else self._images.pop(channel.topic, None)
+        if images is not None:
+            images.undeclare()  # type: ignore[no-untyped-call]
+
+    def _on_sample(self, sample: zenoh.Sample) -> None:
+        attachment = sample.attachment
+        path = str(sample.key_expr).removeprefix(f"{ROOT}/{self._vehicle}/")
+        try:
+            with self._lock:
+                messages = list(
+                    self._converter.convert(
+                        path, sample.payload.to_bytes(), None if attachment is None else attachment.to_bytes()
+                    )
+                )
+                if path == RUN.name:
+                    for camera in json.loads(messages[0].data)["settings"]["cameras"]:
+                        self._channel(image_channel(f"cameras/{camera}"))
+                channels = [self._channel(message.channel) for message in messages]
+        except (ValueError, KeyError, TypeError):
+            return  # of another version, or another program's
+        for channel, message in zip(channels, messages, strict=True):
+            channel.log(message.data, log_time=message.log_time_ns)
+
+    def _channel(self, channel: Channel) -> foxglove.Channel:
+        found = self._channels.get(channel.topic)
+        if found is None:
+            schema = foxglove.Schema(name=channel.schema_name, encoding="jsonschema", data=channel.schema)
+            found = foxglove.Channel(channel.topic, schema=schema, message_encoding=channel.encoding)
+            self._channels[channel.topic] = found
+        return found
+
+
+def serve(options: LiveOptions, ending: Event, say: Callable[[str], None]) -> None:
+    """Serve until `ending` is set. Raises RecordingError; NoAnswerError: no service at the endpoint."""
+    with open_client(options.zenoh, timeout_s=10.0) as session:
+        live = Live(options, session)
+        say(f"open ws://{options.listen.rpartition(':')[0]}:{live.port} in Foxglove")
+        ending.wait()
+        live.close()

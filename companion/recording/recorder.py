@@ -1,0 +1,176 @@
+"""The recorder: a client of the bus that writes everything of one vehicle to MCAP files."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+import zenoh
+
+from companion.bus.client import open_client, subscribe_kept
+from companion.bus.topics import IMAGE, MAVLINK, RECORDER_TOPICS, ROOT, TOPICS, Topic
+from companion.recording.convert import ANY_OBJECT, RECORDER_CHANNEL, RUN_CHANNEL, Converter
+from companion.recording.files import FLUSH_S, Channel, Recorded, RecordingWriter
+from companion.settings import ZenohSection
+
+# The service and its perception have priority.
+_NICER = 10
+_NOTE = Channel(RECORDER_CHANNEL, f"companion.{RECORDER_CHANNEL}", ANY_OBJECT)
+MAX_WAITING = 10_000
+_POLL_S = 0.05
+# The last messages of a service that ends may still arrive.
+_LAST_S = 0.3
+
+
+@dataclass(frozen=True, slots=True)
+class RecorderOptions:
+    """What to record, and where.
+
+    Attributes:
+        zenoh: settings of a client. vehicle: its name in the keys.
+        images: record the preview images too.
+    """
+
+    zenoh: ZenohSection
+    vehicle: str
+    directory: str
+    images: bool
+    max_file_mb: int
+    max_file_minutes: int
+    max_total_mb: int
+
+
+class Recorder:
+    """Converts and writes messages. Messages may be added from any thread."""
+
+    def __init__(self, options: RecorderOptions) -> None:
+        self._writer = RecordingWriter(
+            Path(options.directory),
+            options.vehicle,
+            max_bytes=options.max_file_mb * 1_000_000,
+            max_duration_s=options.max_file_minutes * 60.0,
+            max_total_bytes=options.max_total_mb * 1_000_000,
+        )
+        self._converter = Converter(options.vehicle)
+        self._waiting: deque[tuple[str, bytes, bytes | None]] = deque(maxlen=MAX_WAITING)
+        self._added = self._taken = self._unread = 0
+        self._noted: dict[str, Any] = {}
+        self._flush_due_s = 0.0
+
+    @property
+    def path(self) -> Path:
+        """The current file."""
+        return self._writer.path
+
+    def add(self, path: str, payload: bytes, attachment: bytes | None) -> None:
+        """Queue a message; if the writer is late, the oldest is dropped."""
+        self._added += 1
+        self._waiting.append((path, payload, attachment))
+
+    def write(self) -> None:
+        """Write what is queued. Raises RecordingError."""
+        for _ in range(len(self._waiting)):
+            path, payload, attachment = self._waiting.popleft()
+            self._taken += 1
+            try:
+                messages = list(self._converter.convert(path, payload, attachment))
+            except (ValueError, KeyError, TypeError):
+                self._unread += 1  # of another version, or another program's
+                continue
+            for message in messages:
+                self._write(message)
+        if time.monotonic() >= self._flush_due_s:
+            self._flush_due_s = time.monotonic() + FLUSH_S
+            self._note_losses()
+            self._writer.flush()
+
+    def _write(self, message: Recorded) -> None:
+        begins = self._writer.begins
+        if message.channel.topic != RUN_CHANNEL:
+            self._writer.write(*message)
+        elif RUN_CHANNEL not in begins or begins[RUN_CHANNEL].data != message.data:
+            # Else it is repeated, as each second, for recorders that begin later.
+            restarted = RUN_CHANNEL in begins
+            begins[RUN_CHANNEL] = message
+            if restarted:
+                self._writer.begin_next()
+            else:
+                self._writer.write(*message)
+
+    def close(self) -> None:
+        """Write the rest and end the file. Raises RecordingError."""
+        self._flush_due_s = 0.0
+        self.write()
+        self._writer.close()
+
+    def _note_losses(self) -> None:
+        """Write what was lost, as it changes: a recording with a gap says so."""
+        note = {
+            "first_step": self._converter.first_step,
+            "lost_steps": self._converter.lost_steps,
+            "lost_link_pieces": self._converter.lost_pieces,
+            "dropped_messages": self._added - self._taken - len(self._waiting),
+            "unread_messages": self._unread,
+        }
+        if note != self._noted:
+            self._noted = note
+            self._writer.write(_NOTE, time.time_ns(), json.dumps(note).encode())
+
+
+def topics_of(options: RecorderOptions) -> list[Topic]:
+    """Return the topics to subscribe to; the one that says that a recorder listens is the last."""
+    topics = [topic for topic in TOPICS if options.images or topic is not IMAGE]
+    return [*topics, *(topic for topic in RECORDER_TOPICS if topic is not MAVLINK), MAVLINK]
+
+
+def subscribe_all(
+    session: zenoh.Session, vehicle: str, topics: Sequence[Topic], receive: Callable[[zenoh.Sample], None]
+) -> list[Any]:
+    """Subscribe to topics of all cameras; those with kept messages begin with them."""
+    subscribers: list[Any] = []
+    for topic in topics:
+        for view in (None, "*") if topic.of_camera else (None,):
+            key = topic.key(vehicle, view)
+            subscribe = subscribe_kept if topic.cached else zenoh.Session.declare_subscriber
+            subscribers.append(subscribe(session, key, receive))
+    return subscribers
+
+
+def record(options: RecorderOptions, ending: Event, say: Callable[[str], None]) -> None:
+    """Record until `ending` is set.
+
+    Args:
+        say: called with the first file's path, and at the end with the last one's.
+
+    Raises:
+        RecordingError: the recording cannot be written (any more). NoAnswerError: no service at the endpoint.
+    """
+    os.nice(_NICER)
+    prefix = f"{ROOT}/{options.vehicle}/"
+    with open_client(options.zenoh, timeout_s=10.0) as session:
+        recorder = Recorder(options)
+
+        def receive(sample: zenoh.Sample) -> None:
+            attachment = sample.attachment
+            recorder.add(
+                str(sample.key_expr).removeprefix(prefix),
+                sample.payload.to_bytes(),
+                None if attachment is None else attachment.to_bytes(),
+            )
+
+        subscribers = subscribe_all(session, options.vehicle, topics_of(options), receive)
+        say(f"recording to {recorder.path}")
+        while not ending.wait(_POLL_S):
+            recorder.write()
+        time.sleep(_LAST_S)
+        for subscriber in subscribers:
+            subscriber.undeclare()
+    recorder.close()
+    say(f"recorded {recorder.path}")

@@ -1,0 +1,263 @@
+"""`companion replay`: step guidance again over recorded inputs, compare its outputs with the recorded ones.
+
+`Guidance.step` is a function of its inputs: without a change every output is equal, bit for bit, on the same
+processor, Python and library versions. A replay is open-loop: with a changed setting the vehicle of the
+recording does not react, so the first differences say what the setting does, not how the flight would go on.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+from companion.guidance.command import GrammarError
+from companion.guidance.core import Guidance, GuidanceOptions
+from companion.recording import RecordingError
+from companion.recording.convert import INPUT_CHANNEL, OUTPUT_CHANNEL, RUN_CHANNEL
+from companion.recording.encoding import DecodeError, decode, dumps
+from companion.recording.files import RecordingReader
+from companion.recording.guidance_record import LAYOUT, inputs_of, output_record, read_step
+from companion.service.factory import guidance_options
+from companion.settings import Settings
+from companion.settings.reading import ConfigurationError, changed
+
+MAX_LISTED = 10
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """One differing value of an output. `seconds` since the first replayed step."""
+
+    step: int
+    seconds: float
+    field: str
+    recorded: Any
+    replayed: Any
+
+
+@dataclass(frozen=True, slots=True)
+class ChangedSetting:
+    """A setting of the replay that differs from the recording's."""
+
+    key: str
+    recorded: Any
+    replayed: Any
+
+
+@dataclass
+class Replay:
+    """The result.
+
+    Attributes:
+        digest: SHA-256 of all replayed outputs.
+        inexact: why the replay may differ from the flight although nothing was changed, a line each.
+        first: the first difference; None: all outputs are equal.
+        differing_fields: field of an output → steps in which it differs.
+        events_recorded, events_replayed: texts of events that only one side has, the first ten.
+    """
+
+    vehicle: str
+    version: str
+    changed: list[ChangedSetting]
+    steps: int = 0
+    seconds: float = 0.0
+    commands: int = 0
+    digest: str = ""
+    inexact: list[str] = field(default_factory=list)
+    first: Difference | None = None
+    differing_steps: int = 0
+    differing_fields: dict[str, int] = field(default_factory=dict)
+    events_recorded: list[str] = field(default_factory=list)
+    events_replayed: list[str] = field(default_factory=list)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it as JSON-able data."""
+        return {"identical": self.first is None, **asdict(self)}
+
+
+def replay(paths: Sequence[Path], changes: Mapping[str, str]) -> Replay:
+    """Replay one run of a service.
+
+    Args:
+        paths: its files, in order.
+        changes: key of `[guidance]` → text, for the replay.
+
+    Raises:
+        RecordingError: not a recording of this version, or without steps of guidance.
+        ConfigurationError: an invalid change, or one that guidance does not depend on.
+    """
+    run = _run_of(paths)
+    if run["layout"] != LAYOUT:
+        raise RecordingError(
+            f"{paths[0]}: recorded by version {run['version']}, whose guidance has other inputs or outputs; "
+            f"replay it with that version"
+        )
+    try:
+        options = decode(GuidanceOptions, run["options"])
+        recorded_settings = Settings.model_validate_json(json.dumps(run["settings"]))
+    except ValueError as error:  # also of pydantic
+        raise RecordingError(f"{paths[0]}: its settings cannot be read: {_first_line(error)}") from error
+    options, changed_settings = _changed_options(options, recorded_settings, run["own_address"], changes)
+    found = Replay(run["vehicle"], run["version"], changed_settings)
+    _step_all(paths, Guidance(options), found)
+    if not found.steps:
+        raise RecordingError(f"{paths[0]}: has no steps of guidance")
+    return found
+
+
+def _run_of(paths: Sequence[Path]) -> dict[str, Any]:
+    """Return the description of the run that all files are of."""
+    runs: dict[str, dict[str, Any]] = {}
+    for path in paths:
+        for message in RecordingReader(path).messages(RUN_CHANNEL):
+            run = _json(path, message.data)
+            runs[run["service"]] = run
+            break
+        else:
+            raise RecordingError(f"{path}: not a recording of the service: it has no message on 'run'")
+    if len(runs) > 1:
+        raise RecordingError(f"{len(runs)} runs of the service: replay the files of one")
+    return next(iter(runs.values()))
+
+
+def _changed_options(
+    options: GuidanceOptions, recorded: Settings, own_address: Sequence[int], changes: Mapping[str, str]
+) -> tuple[GuidanceOptions, list[ChangedSetting]]:
+    system, component = own_address
+    before = guidance_options(recorded, (system, component))
+    listed = []
+    for key, text in changes.items():
+        if not key.startswith("guidance."):
+            raise ConfigurationError(f"{key}: only settings of [guidance] can be changed in a replay")
+        settings = changed(recorded, {key: text})
+        name = key.partition(".")[2]
+        old, new = getattr(recorded.guidance, name), getattr(settings.guidance, name)
+        after = guidance_options(settings, (system, component))
+        if old != new and after == before:
+            raise ConfigurationError(f"{key}: Guidance.step does not depend on it; its inputs are recorded")
+        listed.append(ChangedSetting(key, old, new))
+    after = guidance_options(changed(recorded, changes), (system, component))
+    different = {
+        each.name: getattr(after, each.name)
+        for each in fields(GuidanceOptions)
+        if getattr(after, each.name) != getattr(before, each.name)
+    }
+    return replace(options, **different), listed
+
+
+def _step_all(paths: Sequence[Path], guidance: Guidance, found: Replay) -> None:
+    digest = hashlib.sha256()
+    pending: dict[int, bytes] = {}
+    next_step = first_ns = 0
+    events: tuple[Counter[str], Counter[str]] = (Counter(), Counter())
+    differing: Counter[str] = Counter()
+    for path, topic, data in _messages(paths, found.inexact):
+        record = _json(path, data)
+        if topic == INPUT_CHANNEL:
+            recorded = _decoded(path, record)
+            if recorded.step != next_step:
+                found.inexact.append(_gap(next_step, recorded.step, started=found.steps > 0))
+            next_step = recorded.step + 1
+            first_ns = first_ns or recorded.now_ns
+            guidance.gimbal.mounting = recorded.mounting
+            try:
+                inputs = inputs_of(recorded, guidance.check_requirements)
+            except GrammarError as error:
+                raise RecordingError(f"{path}: step {recorded.step}: {_first_line(error)}") from error
+            output = guidance.step(recorded.now_ns, inputs)
+            text = dumps(output_record(recorded.step, recorded.now_ns, output))
+            digest.update(text)
+            pending = {recorded.step: text}
+            found.steps += 1
+            found.commands += len(inputs.commands)
+            found.seconds = round((recorded.now_ns - first_ns) / 1e9, 3)
+        elif (replayed := pending.pop(record["step"], None)) is not None and replayed != data:
+            found.differing_steps += 1
+            again = json.loads(replayed)
+            differences = list(_differences(record, again))
+            differing.update({name.partition(".")[0].partition("[")[0] for name, _, _ in differences})
+            if found.first is None and differences:
+                name, old, new = differences[0]
+                seconds = round((record["now_ns"] - first_ns) / 1e9, 3)
+                found.first = Difference(record["step"], seconds, name, old, new)
+            for counter, side in zip(events, (record, again), strict=True):
+                counter.update(event["message"] for event in side["events"])
+    found.digest = digest.hexdigest()
+    found.differing_fields = dict(differing.most_common())
+    found.events_recorded = list((events[0] - events[1]).elements())[:MAX_LISTED]
+    found.events_replayed = list((events[1] - events[0]).elements())[:MAX_LISTED]
+
+
+def _messages(paths: Sequence[Path], problems: list[str]) -> Iterator[tuple[Path, str, bytes]]:
+    for path in paths:
+        reader = RecordingReader(path)
+        for message in reader.messages(INPUT_CHANNEL, OUTPUT_CHANNEL):
+            yield path, message.channel.topic, message.data
+        problems += reader.problems
+
+
+def _gap(expected: int, step: int, *, started: bool) -> str:
+    if not started:
+        return f"it begins with step {step}: what happened before is not known"
+    if step > expected:
+        return f"steps {expected} to {step - 1} are missing"
+    return f"step {step} follows step {expected - 1}: the files are not in order"
+
+
+def _decoded(path: Path, record: Any) -> Any:
+    try:
+        return read_step(record)
+    except DecodeError as error:
+        raise RecordingError(f"{path}: {_first_line(error)}") from error
+
+
+def _json(path: Path, data: bytes) -> Any:
+    try:
+        return json.loads(data)
+    except ValueError as error:
+        raise RecordingError(f"{path}: not JSON: {error}") from error
+
+
+def _differences(recorded: Any, replayed: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Field, recorded and replayed value of each difference; the type counts too."""
+    if type(recorded) is type(replayed) is dict:
+        for key in recorded | replayed:
+            inner = f"{name}.{key}" if name else key
+            yield from _differences(recorded.get(key), replayed.get(key), inner)
+    elif type(recorded) is type(replayed) is list and len(recorded) == len(replayed):
+        for index, (old, new) in enumerate(zip(recorded, replayed, strict=True)):
+            yield from _differences(old, new, f"{name}[{index}]")
+    elif type(recorded) is not type(replayed) or recorded != replayed:
+        yield name, recorded, replayed
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).partition("\n")[0]
+
+
+def report(found: Replay) -> Iterator[str]:
+    """Return the result as lines for people."""
+    yield (
+        f"{found.steps} steps, {found.seconds:g} s, {found.commands} commands of {found.vehicle}, "
+        f"recorded by version {found.version}"
+    )
+    yield from (f"not exact: {reason}" for reason in found.inexact)
+    for setting in found.changed:
+        yield f"changed: {setting.key}: recorded {setting.recorded}, replayed {setting.replayed}"
+    if found.first is None:
+        yield f"all outputs are identical (SHA-256 {found.digest})"
+        return
+    first = found.first
+    yield (
+        f"first difference: step {first.step}, {first.seconds:g} s: {first.field}: "
+        f"recorded {first.recorded}, replayed {first.replayed}"
+    )
+    listed = ", ".join(f"{name} in {count}" for name, count in found.differing_fields.items())
+    yield f"{found.differing_steps} of {found.steps} steps differ: {listed}"
+    yield from (f"event only in the recording: {text}" for text in found.events_recorded)
+    yield from (f"event only in the replay: {text}" for text in found.events_replayed)

@@ -1,0 +1,175 @@
+"""Messages of the bus become messages of a recording, with Foxglove's types and one time."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import jsonschema
+import pytest
+
+from companion.bench.lockstep_flight import plain_settings
+from companion.bus.messages import detections_message
+from companion.bus.vehicle_messages import vehicle_message
+from companion.guidance.core import GuidanceOptions
+from companion.recording.convert import Converter
+from companion.recording.encoding import dumps
+from companion.recording.files import Recorded
+from companion.recording.foxglove_schemas import SCHEMAS
+from companion.recording.tap import LinkBytes, pack_link_bytes, run_record, unpack_link_bytes
+from companion.vehicle.state import VehicleState
+from vision.detections import Detections
+from vision.pipeline import PerceptionResult
+
+CAPTURED_NS, PUBLISHED_NS = 91_000_000_123, 91_050_000_000
+STATE = VehicleState(
+    position_ned_m=(1.0, 2.0, -3.0),
+    attitude=(1.0, 0.0, 0.0, 0.0),
+    latitude_deg=47.0,
+    longitude_deg=8.0,
+    altitude_amsl_m=500.0,
+)
+CAMERA_INFO = {
+    "stamp_ns": PUBLISHED_NS,
+    "frame_id": "vehicle1/camera",
+    "width": 1920,
+    "height": 1080,
+    "distortion_model": "plumb_bob",
+    "d": [0.0] * 5,
+    "k": [1.0] * 9,
+    "r": [1.0] * 9,
+    "p": [1.0] * 12,
+}
+TRANSFORMS = {
+    "captured_ns": CAPTURED_NS,
+    "transforms": [
+        {
+            "parent_frame_id": "vehicle1/body",
+            "child_frame_id": "vehicle1/camera",
+            "translation_m": [0.1, 0.0, 0.0],
+            "rotation_wxyz": [0.5, 0.5, 0.5, 0.5],
+        }
+    ],
+}
+
+
+@pytest.fixture
+def converter() -> Converter:
+    """Of a service whose preview is half as wide as the frames."""
+    converter = Converter("vehicle1")
+    settings = plain_settings({"preview.width": "960"})
+    run = run_record(settings, GuidanceOptions(), (1, 191), "service1")
+    assert [message.channel.topic for message in converter.convert("@record/run", dumps(run))] == ["run"]
+    return converter
+
+
+def detections() -> bytes:
+    found = Detections.empty(("car",))
+    result = PerceptionResult(7, CAPTURED_NS, CAPTURED_NS, 1920, 1080, found, {"total": 1.0}, dropped=0)
+    message = detections_message(result, "vehicle1", PUBLISHED_NS)
+    detection = {
+        "class_name": "car",
+        "confidence": 0.9,
+        "xyxy": [100.0, 200.0, 300.0, 400.0],
+        "track_id": 4,
+        "track_state": "confirmed",
+    }
+    return dumps({**message, "detections": [detection]})
+
+
+def foxglove(messages: Iterator[Recorded]) -> dict[str, Any]:
+    """Topic → body of Foxglove's messages, each valid by its schema."""
+    found = {}
+    for message in messages:
+        if message.channel.schema_name.startswith("foxglove."):
+            body = json.loads(message.data)
+            jsonschema.validate(body, json.loads(message.channel.schema))
+            found[message.channel.topic] = body
+    return found
+
+
+def test_every_schema_is_valid() -> None:
+    for name, text in SCHEMAS.items():
+        jsonschema.Draft202012Validator.check_schema(json.loads(text))
+        assert json.loads(text)["title"] == name
+
+
+def test_image_and_annotations_have_the_capture_as_time(converter: Converter) -> None:
+    stamps = dumps({"camera": None, "sequence": 7, "captured_ns": CAPTURED_NS})
+    image = foxglove(converter.convert("image", b"\xff\xd8", stamps))["/image"]
+    annotations = foxglove(converter.convert("detections", detections()))["/annotations"]
+    assert image["timestamp"] == annotations["timestamp"]
+    assert image["timestamp"]["nsec"] == annotations["points"][0]["timestamp"]["nsec"]
+    assert base64.b64decode(image["data"]) == b"\xff\xd8"
+
+
+def test_annotations_are_scaled_to_the_preview(converter: Converter) -> None:
+    annotations = foxglove(converter.convert("cameras/down/detections", detections()))
+    (box,) = annotations["/cameras/down/annotations"]["points"]
+    assert [(point["x"], point["y"]) for point in box["points"]] == [
+        (50.0, 100.0),
+        (150.0, 100.0),
+        (150.0, 200.0),
+        (50.0, 200.0),
+    ]
+    (label,) = annotations["/cameras/down/annotations"]["texts"]
+    assert label["text"] == "car 4 0.90"
+
+
+def test_vehicle_becomes_transforms_and_a_location(converter: Converter) -> None:
+    found = foxglove(converter.convert("vehicle", dumps(vehicle_message(STATE, PUBLISHED_NS))))
+    root, body = found["/tf"]["transforms"]
+    assert (root["parent_frame_id"], root["child_frame_id"]) == ("local_enu", "vehicle1/ned")
+    assert body["translation"] == {"x": 1.0, "y": 2.0, "z": -3.0}
+    assert found["/location"]["altitude"] == 500.0
+    unknown = foxglove(converter.convert("vehicle", dumps(vehicle_message(VehicleState(), PUBLISHED_NS))))
+    assert unknown == {}
+
+
+@pytest.mark.parametrize(
+    ("path", "message", "topic"),
+    [
+        ("camera_info", CAMERA_INFO, "/camera_info"),
+        ("transforms", TRANSFORMS, "/tf"),
+        ("events", {"stamp_ns": 1, "level": "warning", "text": "late"}, "/log"),
+    ],
+)
+def test_message_is_kept_and_converted(
+    converter: Converter, path: str, message: dict[str, Any], topic: str
+) -> None:
+    kept, *others = converter.convert(path, dumps(message))
+    assert (kept.channel.topic, json.loads(kept.data)) == (path, message)
+    assert list(foxglove(iter(others))) == [topic]
+
+
+def test_log_time_is_the_stamp_in_unix_time(converter: Converter) -> None:
+    (first, *_), (second, *_) = (
+        list(converter.convert("pose", dumps({"published_ns": stamp_ns}))) for stamp_ns in (1_000, 3_500)
+    )
+    assert second.log_time_ns - first.log_time_ns == 2_500
+
+
+def test_link_bytes_are_split_and_losses_counted(converter: Converter) -> None:
+    pieces = [LinkBytes(10, False, b"abc"), LinkBytes(20, True, b""), LinkBytes(30, False, bytes(300))]
+    packed = pack_link_bytes(5, pieces)
+    assert list(unpack_link_bytes(packed)) == list(enumerate(pieces, 5))
+    found = list(converter.convert("@record/mavlink", packed))
+    assert [message.channel.topic for message in found] == [
+        "mavlink_received",
+        "mavlink_sent",
+        "mavlink_received",
+    ]
+    assert [message.data for message in found] == [piece.data for piece in pieces]
+    assert converter.lost_pieces == 0
+    list(converter.convert("@record/mavlink", pack_link_bytes(10, pieces[:1])))
+    assert converter.lost_pieces == 2
+    with pytest.raises(ValueError, match="piece"):
+        list(unpack_link_bytes(packed[:-1]))
+
+
+def test_lost_steps_are_counted(converter: Converter) -> None:
+    for step in (3, 4, 8):
+        list(converter.convert("@record/guidance_input", dumps({"step": step, "now_ns": step})))
+    assert (converter.first_step, converter.lost_steps) == (3, 3)

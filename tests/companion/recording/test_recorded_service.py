@@ -1,0 +1,183 @@
+"""The service with its recorder: what is in the file, and what happens when either is killed."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from pymavlink import mavutil
+
+from companion.recording.files import RecordingReader
+from companion.replay import replay
+from mavlink_sim.testing import running_simulator
+from tests.companion.service_process import ServiceProcess, running_service
+
+pytestmark = pytest.mark.realtime
+
+
+def wait_for(condition: Callable[[], object], timeout_s: float = 60.0) -> None:
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def files(folder: Path) -> list[Path]:
+    return sorted(folder.glob("*.mcap"))
+
+
+def recorder_of(service: ServiceProcess) -> int:
+    """The process id of the service's recorder."""
+    listed = subprocess.run(
+        ["ps", "--ppid", str(service.pid), "-o", "pid=,args="], capture_output=True, text=True, check=True
+    )
+    (line,) = (line for line in listed.stdout.splitlines() if "companion.recording" in line)
+    return int(line.split()[0])
+
+
+def messages_of(path: Path) -> Counter[str]:
+    return Counter(message.channel.topic for message in RecordingReader(path).messages())
+
+
+def test_flight_is_recorded_and_replays(filming: list[str], tmp_path: Path) -> None:
+    folder = tmp_path / "recordings"
+    with (
+        running_simulator() as simulator,
+        running_service(
+            simulator.onboard_port, [*filming, "--recording-directory", str(folder)], cwd=tmp_path
+        ) as service,
+    ):
+        service.take_off(2.5)
+        assert service.command("hold")["success"]
+        assert not service.command("goto forward=900 right=0")["success"]
+        wait_for(lambda: files(folder))
+        assert service.stop() == 0
+    (path,) = files(folder)
+    reader = RecordingReader(path)
+    found = Counter(message.channel.topic for message in reader.messages())
+    assert reader.problems == []
+    assert found["guidance_input"] == found["guidance_output"] > 50
+    for topic in (
+        "run",
+        "events",
+        "vehicle",
+        "setpoint",
+        "detections",
+        "/image",
+        "/annotations",
+        "/tf",
+        "/log",
+    ):
+        assert found[topic], topic
+    (note,) = [json.loads(message.data) for message in reader.messages("recorder")][-1:]
+    assert (note["first_step"], note["lost_steps"], note["dropped_messages"]) == (0, 0, 0)
+
+    result = replay([path], {})
+    assert (result.first, result.inexact) == (None, [])
+    assert result.steps == found["guidance_input"]
+    sent = mavutil.mavlink.MAVLink(None)
+    names = Counter(
+        message.get_type()
+        for recorded in reader.messages("mavlink_sent")
+        for message in sent.parse_buffer(recorded.data) or ()
+    )
+    last = list(reader.messages("guidance_input"))[-1]
+    assert (
+        0 < names["SET_POSITION_TARGET_LOCAL_NED"] <= json.loads(last.data)["inputs"]["stream"]["sent_count"]
+    )
+    assert names["HEARTBEAT"]
+
+
+def test_killed_recorder_leaves_a_file_and_is_started_again(filming: list[str], tmp_path: Path) -> None:
+    folder = tmp_path / "recordings"
+    with (
+        running_simulator() as simulator,
+        running_service(
+            simulator.onboard_port, [*filming, "--recording-directory", str(folder)], cwd=tmp_path
+        ) as service,
+    ):
+        wait_for(lambda: files(folder) and messages_of(files(folder)[0])["guidance_input"] > 20)
+        os.kill(recorder_of(service), signal.SIGKILL)
+        service.wait_for_line("started again")
+        (first,) = files(folder)
+        assert messages_of(first)["guidance_input"] > 20
+        assert RecordingReader(first).path == first
+        wait_for(lambda: len(files(folder)) == 2 and messages_of(files(folder)[1])["guidance_input"] > 20)
+        assert service.command("stop")["success"]
+    second = replay([files(folder)[1]], {})
+    assert second.inexact  # it does not begin with the service
+
+
+def test_recorder_ends_with_a_killed_service(filming: list[str], tmp_path: Path) -> None:
+    folder = tmp_path / "recordings"
+    with (
+        running_simulator() as simulator,
+        running_service(
+            simulator.onboard_port, [*filming, "--recording-directory", str(folder)], cwd=tmp_path
+        ) as service,
+    ):
+        wait_for(lambda: files(folder) and messages_of(files(folder)[0])["guidance_input"] > 20)
+        recorder = recorder_of(service)
+        service.signal(signal.SIGKILL)
+
+        def ended() -> bool:
+            with contextlib.suppress(ProcessLookupError, FileNotFoundError):
+                return "Z" in Path(f"/proc/{recorder}/stat").read_text().rpartition(")")[2].split()[0]
+            return True
+
+        wait_for(ended)
+    (path,) = files(folder)
+    reader = RecordingReader(path)
+    assert len(list(reader.messages())) > 100
+    assert reader.problems == []
+
+
+def test_recorder_joins_a_running_service(filming: list[str], tmp_path: Path) -> None:
+    folder = tmp_path / "recordings"
+    with (
+        running_simulator() as simulator,
+        running_service(simulator.onboard_port, filming, cwd=tmp_path) as service,
+    ):
+        command = [
+            sys.executable,
+            "-m",
+            "companion.cli",
+            "record",
+            str(folder),
+            "--connect",
+            service.endpoint,
+        ]
+        recorder = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE)
+        wait_for(lambda: files(folder) and messages_of(files(folder)[0])["guidance_input"] > 20)
+        recorder.terminate()
+        _, printed = recorder.communicate(timeout=60)
+        assert recorder.returncode == 0
+        assert len(printed.splitlines()) == 2
+    (path,) = files(folder)
+    assert RecordingReader(path).problems == []
+    assert replay([path], {}).inexact
+
+
+def test_folder_that_cannot_be_made_is_reported_and_the_service_runs(
+    filming: list[str], tmp_path: Path
+) -> None:
+    (tmp_path / "file").touch()
+    with (
+        running_simulator() as simulator,
+        running_service(
+            simulator.onboard_port,
+            [*filming, "--recording-directory", str(tmp_path / "file" / "folder")],
+            cwd=tmp_path,
+        ) as service,
+    ):
+        assert "recorder: " in service.wait_for_line("cannot be made")
+        assert service.command("stop")["success"]

@@ -1,0 +1,110 @@
+"""`companion log`: flights, modes, events and refusals of recordings."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+
+from companion.bench.lockstep_flight import plain_settings
+from companion.bus.vehicle_messages import vehicle_message
+from companion.guidance.core import GuidanceOptions
+from companion.recording.convert import Converter
+from companion.recording.encoding import dumps
+from companion.recording.files import RecordingReader
+from companion.recording.tap import run_record
+from companion.vehicle.state import FlightMode, VehicleState
+from tests.companion.command_line import companion
+from tests.companion.recording.lockstep_recording import new_writer
+
+SECOND_NS = 10**9
+REFUSED = {
+    "stamp_ns": 1,
+    "kind": "refused",
+    "behaviour": "goto",
+    "message": "refused: too far",
+    "outcome": None,
+    "level": "info",
+}
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Ten seconds with a flight of four, in two modes, with an event and a refusal."""
+    writer, converter = new_writer(tmp_path_factory.mktemp("log")), Converter("vehicle1")
+
+    def write(path: str, message: object) -> None:
+        for converted in converter.convert(path, dumps(message)):
+            writer.write(*converted)
+
+    write("@record/run", run_record(plain_settings(), GuidanceOptions(), (1, 191), "service1"))
+    state = VehicleState(mode=FlightMode.HOLD)
+    for second in range(11):
+        armed = 3 <= second < 7
+        mode = FlightMode.TAKEOFF if armed else FlightMode.HOLD
+        write("vehicle", vehicle_message(replace(state, armed=armed, mode=mode), second * SECOND_NS))
+        if second == 5:
+            write("events", {"stamp_ns": second * SECOND_NS + 1, "level": "warning", "text": "low battery"})
+            output = {"step": 1, "now_ns": second * SECOND_NS + 2, "events": [REFUSED]}
+            write("@record/guidance_output", output)
+    writer.close()
+    return writer.path
+
+
+def test_show_lists_what_happened_in_order(path: Path, tmp_path: Path) -> None:
+    done = companion("log", "show", path, "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert [(line["kind"], line["text"]) for line in found["lines"]] == [
+        ("mode", "hold"),
+        ("mode", "takeoff"),
+        ("armed", ""),
+        ("warning", "low battery"),
+        ("refused", "goto: refused: too far"),
+        ("mode", "hold"),
+        ("disarmed", ""),
+    ]
+    assert [flight["duration_s"] for flight in found["flights"]] == [4.0]
+    assert (found["vehicle"], found["problems"]) == ("vehicle1", [])
+    text = companion("log", "show", path, cwd=tmp_path).stdout
+    assert len(text.splitlines()) == 1 + len(found["lines"])
+
+
+def test_list_has_a_line_for_each_file_and_one_for_a_bad_one(path: Path, tmp_path: Path) -> None:
+    (tmp_path / "a.mcap").write_bytes(path.read_bytes())
+    (tmp_path / "b.mcap").write_bytes(path.read_bytes()[:1000])
+    (tmp_path / "c.mcap").touch()
+    done = companion("log", "list", tmp_path, "--json", cwd=tmp_path)
+    assert done.returncode == 0
+    found = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [Path(each["path"]).name for each in found] == ["a.mcap", "b.mcap"]
+    assert [bool(each["problems"]) for each in found] == [False, True]
+    assert len(done.stderr.splitlines()) == 1
+    assert "c.mcap" in done.stderr
+
+
+def test_recover_writes_a_complete_file(path: Path, tmp_path: Path) -> None:
+    (tmp_path / "cut.mcap").write_bytes(path.read_bytes()[:-400])  # in the summary: no message is lost
+    done = companion("log", "recover", "cut.mcap", "whole.mcap", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    with (tmp_path / "whole.mcap").open("rb") as whole:
+        found = list(make_reader(whole).iter_messages())
+    assert len(found) == len(list(RecordingReader(path).messages()))
+
+
+@pytest.mark.parametrize("command", [("list", "none"), ("show", "none"), ("recover", "none", "x.mcap")])
+def test_missing_path_is_one_line(command: tuple[str, ...], tmp_path: Path) -> None:
+    done = companion("log", *command, cwd=tmp_path)
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert done.stderr.startswith("companion: none: ")
+
+
+def test_record_without_a_service_is_one_line_and_leaves_no_file(tmp_path: Path) -> None:
+    done = companion("record", "out", "--connect", "tcp/127.0.0.1:9", cwd=tmp_path)
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
