@@ -78,10 +78,9 @@ def run_record(
     Of the settings it has no address, file of a key or source.
     """
     sections = {"camera", "detector", "tracker"}
-    kept = {"vehicle": {"name"}, "guidance": True, "preview": True, **dict.fromkeys(sections, True)}
-    values = settings.model_dump(
-        mode="json", include={**kept, "cameras": dict.fromkeys(settings.cameras, sections)}
-    )
+    kept: dict[str, Any] = {"vehicle": {"name"}, "guidance": True, "preview": True}
+    kept |= {**dict.fromkeys(sections, True), "cameras": dict.fromkeys(settings.cameras, sections)}
+    values = settings.model_dump(mode="json", include=kept)
     # A device may be given once only, and by default it is.
     for camera in (values, *values["cameras"].values()):
         camera["source"] = {"uri": NO_SOURCE}
