@@ -55,6 +55,22 @@ def client_settings(settings: ZenohSection, connect: tuple[str, ...] = ()) -> Ze
         ) from error
 
 
+def settings_for_child(zenoh: ZenohSection) -> dict[str, Any]:
+    """Return the settings of a client in a child process as JSON-able data.
+
+    Raises:
+        NoAnswerError: as `client_settings`.
+    """
+    client = client_settings(zenoh)
+    return {"values": client.model_dump(mode="json"), "given": sorted(client.model_fields_set)}
+
+
+def settings_in_child(data: dict[str, Any]) -> ZenohSection:
+    """Return the settings that `settings_for_child` gave; those not given may be in `zenoh.config_file`."""
+    section = ZenohSection.model_validate_json(json.dumps(data["values"]))
+    return ZenohSection.model_construct(set(data["given"]), **dict(section))
+
+
 @contextmanager
 def open_client(settings: ZenohSection, *, timeout_s: float = 2.0) -> Iterator[zenoh.Session]:
     """Open a session that is connected to at least one node.

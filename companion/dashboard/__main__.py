@@ -10,20 +10,21 @@ import json
 import os
 import sys
 
+from companion.bus.client import settings_in_child
+from companion.bus.config import BusError
 from companion.child_process import EXIT_REFUSED, on_parent_end
 from companion.dashboard.access import DashboardError
 from companion.dashboard.server import DashboardOptions, serve
-from companion.settings import ZenohSection
 
 
 def main(argument: str) -> int:
     """Serve; returns the exit code."""
     values = json.loads(argument)
-    zenoh = ZenohSection.model_validate_json(json.dumps(values.pop("zenoh")))
+    zenoh = settings_in_child(values.pop("zenoh"))
     on_parent_end(lambda: os._exit(0))  # zenoh's threads and open streams need no shutdown
     try:
         asyncio.run(serve(DashboardOptions(zenoh=zenoh, **values), lambda url: print(url, flush=True)))
-    except DashboardError as error:
+    except (DashboardError, BusError) as error:
         print(error, flush=True)
         return EXIT_REFUSED
     return 0

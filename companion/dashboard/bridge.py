@@ -20,7 +20,7 @@ from typing import Any
 
 import zenoh
 
-from companion.bus.client import NoAnswerError, send_command
+from companion.bus.client import NoAnswerError, send_command, subscribe_kept
 from companion.bus.session import zenoh_config
 from companion.bus.topics import DETECTIONS, EVENTS, IMAGE, ROOT, SETPOINT, STATUS, VEHICLE, alive_key
 from companion.settings import ZenohSection
@@ -250,10 +250,11 @@ class Bridge:
         session = self._session
         if session is None or not self._watchers or self._subscribers:
             return
-        keys = [topic.key(self.vehicle) for topic in (DETECTIONS, VEHICLE, SETPOINT, STATUS)]
+        keys = [topic.key(self.vehicle) for topic in (DETECTIONS, VEHICLE, SETPOINT)]
         for key in (*keys, DETECTIONS.key(self.vehicle, "*")):
             self._subscribers.append(session.declare_subscriber(key, self._on_state))
-        self._subscribers.append(session.declare_subscriber(EVENTS.key(self.vehicle), self._on_event))
+        for topic, receive in ((STATUS, self._on_state), (EVENTS, self._on_event)):
+            self._subscribers.append(subscribe_kept(session, topic.key(self.vehicle), receive))
         self._subscribed_s = time.monotonic()
         alive = session.liveliness().declare_subscriber(alive_key(self.vehicle), self._on_alive, history=True)
         self._subscribers.append(alive)
@@ -286,10 +287,13 @@ class Bridge:
 
     def _on_event(self, sample: zenoh.Sample) -> None:
         value = _json(sample)
-        if value is not None:
-            with self._lock:
-                self._number += 1
-                self._events.append((self._number, value))
+        if value is None:
+            return
+        with self._lock:
+            if any(event == value for _, event in self._events):
+                return  # kept by the service, and received before
+            self._number += 1
+            self._events.append((self._number, value))
 
     def _on_image(self, camera: _Camera, sample: zenoh.Sample) -> None:
         now_s = time.monotonic()

@@ -6,7 +6,7 @@ import json
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 
-from companion.bus.client import NoAnswerError, client_settings
+from companion.bus.client import NoAnswerError, settings_for_child
 from companion.child_process import child_process
 from companion.settings import Settings
 
@@ -22,7 +22,7 @@ async def dashboard_process(settings: Settings, say: Callable[[str], None]) -> A
         yield
         return
     try:
-        zenoh = client_settings(settings.zenoh)
+        zenoh = settings_for_child(settings.zenoh)
     except NoAnswerError as error:
         say(f"dashboard: {error}")
         yield
@@ -30,7 +30,7 @@ async def dashboard_process(settings: Settings, say: Callable[[str], None]) -> A
     options = {
         "listen": settings.dashboard.listen,
         "token_file": settings.dashboard.token_file,
-        "zenoh": zenoh.model_dump(mode="json"),
+        "zenoh": zenoh,
         "vehicle": settings.vehicle.name,
     }
     async with child_process("dashboard", "companion.dashboard", json.dumps(options), say):

@@ -10,11 +10,10 @@ import signal
 import sys
 from threading import Event
 
-from companion.bus.client import NoAnswerError
+from companion.bus.client import NoAnswerError, settings_in_child
 from companion.bus.config import BusError
 from companion.child_process import EXIT_REFUSED, on_parent_end
 from companion.recording import RecordingError
-from companion.settings import ZenohSection
 
 
 def main(argument: str) -> int:
@@ -23,9 +22,7 @@ def main(argument: str) -> int:
     ending = Event()
     on_parent_end(ending.set)
     values = json.loads(argument)
-    section = ZenohSection.model_validate_json(json.dumps(values.pop("zenoh")))
-    # Those not given may be replaced by zenoh's own configuration file.
-    zenoh = ZenohSection.model_construct(set(values.pop("given")), **dict(section))
+    zenoh = settings_in_child(values.pop("zenoh"))
     extra = "foxglove" if "listen" in values else "recording"
     try:
         if extra == "foxglove":

@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager
 from typing import Any
 
-from companion.bus.client import NoAnswerError, client_settings
+from companion.bus.client import NoAnswerError, settings_for_child
 from companion.child_process import child_process
 from companion.guidance.core import GuidanceOptions
 from companion.guidance.gimbal.controller import GimbalMounting
@@ -109,11 +109,10 @@ async def clients_of(settings: Settings, on_event: Callable[[str, str], None]) -
     async with AsyncExitStack() as stack:
         for name, options in programs.items():
             try:
-                zenoh = client_settings(settings.zenoh)
+                zenoh = settings_for_child(settings.zenoh)
             except NoAnswerError as error:
                 on_event("warning", f"{name}: {error}")
                 continue
-            client = {"zenoh": zenoh.model_dump(mode="json"), "given": sorted(zenoh.model_fields_set)}
-            argument = json.dumps({**client, "vehicle": settings.vehicle.name, **options})
+            argument = json.dumps({"zenoh": zenoh, "vehicle": settings.vehicle.name, **options})
             await stack.enter_async_context(child_process(name, "companion.recording", argument, say))
         yield

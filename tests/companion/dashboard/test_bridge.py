@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import zenoh
 
-from companion.bus.session import zenoh_config
+from companion.bus.session import Bus, zenoh_config
 from companion.bus.topics import DETECTIONS, EVENTS, IMAGE, STATUS, VEHICLE, alive_key, command_key
 from companion.dashboard.bridge import LARGEST_JSON_BYTES, MAX_COMMANDS, Bridge
 from companion.settings import ZenohSection
@@ -103,6 +103,32 @@ async def test_state_is_the_newest_message_of_each_topic() -> None:
                 later = bridge.news(news.number)
                 assert (later.topics, later.events, later.number) == ({}, [], news.number)
                 assert set(later.ages_s) == set(news.topics)
+
+
+async def test_kept_events_arrive_once_when_a_page_opens_later() -> None:
+    section = ZenohSection(listen=(f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}",))
+    bus = Bus(section, NAME, on_event=lambda *_: None, on_command=_no_command)
+    await bus.start()
+    try:
+        events = [{"stamp_ns": number, "level": "info", "text": f"event {number}"} for number in range(5)]
+        for event in events:
+            bus.publish(EVENTS, event)
+        bus.publish(STATUS, {"healthy": True})
+        async with bridging(section.listen[0]) as bridge:
+            for _ in range(2):
+                with bridge.watching():
+                    await until(lambda: bridge.alive and "status" in bridge.news(0).topics)
+                    await until(lambda: len(bridge.news(0).events) >= len(events))
+            with bridge.watching():
+                bus.publish(EVENTS, {"stamp_ns": 5, "level": "info", "text": "last"})
+                await until(lambda: bridge.news(0).events[-1]["text"] == "last")
+            assert bridge.news(0).events[:-1] == events
+    finally:
+        await bus.close()
+
+
+async def _no_command(text: str) -> dict[str, Any]:
+    return {"success": False, "reason": text}
 
 
 async def test_useless_messages_are_ignored() -> None:

@@ -140,7 +140,8 @@ async def test_command_and_its_late_outcome() -> None:
         service.session.declare_queryable(command_key(NAME), queries.append)
         async with serving(endpoint) as port:
             stream = await EventStream.open(port)
-            await stream.next()
+            while not (news := await stream.next()) or not news["alive"]:
+                assert news is not None  # until the page's session is connected
             status, _, body = await request(
                 port, "POST", "/command", POST, {"text": "approach track=17", "id": "page-1"}
             )
