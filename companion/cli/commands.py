@@ -53,6 +53,7 @@ ORDER = (
     "mission",
     "record",
     "replay",
+    "log",
     "config",
     "evaluate",
     "train",
