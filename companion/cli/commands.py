@@ -53,7 +53,6 @@ ORDER = (
     "mission",
     "record",
     "replay",
-    "log",
     "config",
     "evaluate",
     "train",
