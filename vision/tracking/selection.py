@@ -299,6 +299,7 @@ def _with_target(detections: Detections, target: _Target) -> Detections:
     assert detections.track_id is not None
     assert detections.track_score is not None
     assert detections.track_confirmed is not None
+    assert detections.track_first_ns is not None
     return replace(
         detections,
         xyxy=np.concatenate([detections.xyxy, target.xyxy[None]]),
@@ -309,6 +310,7 @@ def _with_target(detections: Detections, target: _Target) -> Detections:
         track_id=np.append(detections.track_id, target.track_id),
         track_score=np.append(detections.track_score, np.float32(target.scores.median)),
         track_confirmed=np.append(detections.track_confirmed, True),
+        track_first_ns=np.append(detections.track_first_ns, np.int64(target.first_ns)),
     )
 
 
