@@ -70,10 +70,9 @@ def test_every_message_of_a_flight_is_valid(tmp_path: Path) -> None:
         session.declare_subscriber("companion/vehicle1/**", samples.put)
         replies: list[dict[str, Any]] = []
         service.take_off(3.0)
-        for text in ("goto north=1 east=0 speed=1", "dance", "land"):
+        for text in ("hold duration=1", "dance", "land"):
             replies.append(service.command_when_it_can(text, 90.0))
-    # Whether it arrives is another test's matter: a busy computer may end the command.
-    assert [reply["success"] for reply in replies[1:]] == [False, True], replies
+    assert [reply["success"] for reply in replies] == [True, False, True], replies
 
     bodies: dict[str, list[Any]] = defaultdict(list)
     while not samples.empty():
