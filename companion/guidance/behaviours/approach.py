@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome, Requirement
 from companion.guidance.gimbal.pitch import GimbalTracking
@@ -107,6 +108,8 @@ class ApproachBehaviour(Behaviour):
         self._object_ned_m: Vector3 = (0.0, 0.0, 0.0)
         self._arrival, self._controller = Arrival(), PositionController()
         self._range_m = math.nan
+        self._last_id: int | None = None
+        self._notes: list[str] = []
 
     def on_activate(self, context: BehaviourContext) -> None:
         position, _ = position_and_yaw(context.state)
@@ -169,6 +172,10 @@ class ApproachBehaviour(Behaviour):
         velocity = (north_mps, east_mps, correction(self._down_m - position[2]))
         return Setpoint.velocity(velocity, now_ns, yaw_rad=self._bearing_rad)
 
+    def take_notes(self) -> Sequence[str]:
+        notes, self._notes = self._notes, []
+        return notes
+
     @property
     def gimbal_aim(self) -> GimbalAim | None:
         return None if self._tracking is None else self._tracking.aim
@@ -182,13 +189,15 @@ class ApproachBehaviour(Behaviour):
         return f"{self._subject.name} {self._range_m:.1f} m away"
 
     def _observe(self, context: BehaviourContext, position: Vector3, yaw_rad: float) -> None:
-        fitting = self._subject.of(context.targets, self._confidence)
-        if self._track is not None:
-            if self._track.update(fitting, position):
-                self._seen_ns = self._track.captured_ns
+        if (track := self._track) is not None:
+            if track.update(self._subject.same(context.targets, track.newest, self._confidence), position):
+                self._seen_ns = track.captured_ns
             elif context.now_ns - self._seen_ns > LOST_AFTER_S * 1e9:
-                self._find_again(self._track, fitting, position)
+                self._find_again(track, self._subject.of(context.targets, self._confidence), position)
+            self._notes += self._subject.new_id(self._last_id, self._track.track_id)
+            self._last_id = self._track.track_id
             return
+        fitting = self._subject.of(context.targets, self._confidence)
         if fitting:
             self._doubted = not any(target.trusted for target in fitting)
         chosen = self._selector.update(fitting, yaw_rad, context.now_ns)
@@ -217,7 +226,7 @@ class ApproachBehaviour(Behaviour):
                 return
 
     def _begin(self, target: Target, position: Vector3, now_ns: int) -> None:
-        self._track = ObjectTrack(target, position)
+        self._track, self._last_id = ObjectTrack(target, position), target.track_id
         self._seen_ns = target.captured_ns
         path_m = abs(target.ground_range_m - self._distance_m)
         self._until_ns = now_ns + (BASE_TIMEOUT_S + 3.0 * path_m / self._speed_mps) * 1e9

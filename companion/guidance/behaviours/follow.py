@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Annotated, ClassVar
 
 from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome, Requirement
@@ -157,6 +158,7 @@ class FollowBehaviour(Behaviour):
         self._course_rad: float | None = None
         self._range_m = math.nan
         self._unseen_s = 0.0
+        self._notes: list[str] = []
 
     def on_activate(self, context: BehaviourContext) -> None:
         position, _ = position_and_yaw(context.state)
@@ -240,11 +242,13 @@ class FollowBehaviour(Behaviour):
         if not context.perception_fresh:
             return
         position, _ = position_and_yaw(context.state)
-        fitting = self._subject.of(context.targets, self._confidence)
-        if self._track is not None:
-            if self._track.update(fitting, position):
-                self._seen_ns = self._track.captured_ns
+        if (track := self._track) is not None:
+            before = track.track_id
+            if track.update(self._subject.same(context.targets, track.newest, self._confidence), position):
+                self._seen_ns = track.captured_ns
+                self._notes += self._subject.new_id(before, track.track_id)
             return
+        fitting = self._subject.of(context.targets, self._confidence)
         if fitting:
             self._doubted = not any(target.trusted for target in fitting)
         chosen = self._selector.update(fitting, yaw_rad, context.now_ns)
@@ -274,6 +278,10 @@ class FollowBehaviour(Behaviour):
         else:
             why = "never seen with a known range"
         return f"lost {self._subject.phrase} for {self._unseen_s:.1f} s: {why}"
+
+    def take_notes(self) -> Sequence[str]:
+        notes, self._notes = self._notes, []
+        return notes
 
     @property
     def gimbal_aim(self) -> GimbalAim | None:

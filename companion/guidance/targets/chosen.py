@@ -1,7 +1,9 @@
 """What a command is about: an object of a class, or exactly one track; and which tracks there are.
 
-A track is never replaced by another object. A command for one that has ended is refused, and a behaviour that
-has lost its track ends; both name the track that is there now.
+A command for a track that has ended is refused, and a behaviour that has lost its track ends; both name the
+track that is there now. While it is flown to, its object may get a new id from the image tracker, for example
+after it has left the image for a moment. It is followed on where it is expected (see `MovingTrack`), and the
+new id is reported. An object that was seen beside it never takes its place.
 """
 
 from __future__ import annotations
@@ -60,6 +62,16 @@ class Wanted:
             if (target.track_id == self.track_id if self.track_id else target.class_name == self.class_name)
             and target.score >= confidence
         ]
+
+    def same(self, targets: Collection[Target], last: Target, confidence: float = 0.0) -> list[Target]:
+        """Those that may be the object that was seen last: of its class, with any id."""
+        return Wanted(last.class_name).of(targets, confidence)
+
+    def new_id(self, before: int | None, after: int | None) -> list[str]:
+        """The note that the object of a track has another id now; empty: there is nothing to say."""
+        if self.track_id is None or before == after:
+            return []
+        return [f"{self.name}: the object is track {after} now"]
 
 
 @dataclass(frozen=True, slots=True)

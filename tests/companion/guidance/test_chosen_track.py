@@ -194,16 +194,36 @@ def test_orbit_is_about_the_track() -> None:
 @pytest.mark.parametrize(
     "behaviour", [FollowBehaviour(track_id=1), ApproachBehaviour(track_id=1, distance_m=2.0)]
 )
-def test_track_with_another_id_in_its_place_is_lost_and_named(
+def test_object_that_gets_another_id_in_its_place_is_flown_to_on(
     behaviour: FollowBehaviour | ApproachBehaviour,
 ) -> None:
-    """By class the new id would be taken for the same object."""
+    """As after it left the image for a moment, because the vehicle leaned forward."""
     seen = car(25, 0, 1)
 
     def each(seconds: float, _vehicle: KinematicVehicle) -> None:
-        seen.track_id = 1 if seconds < 5.0 else 9
+        seen.visible, seen.track_id = not 4.0 <= seconds < 5.0, 1 if seconds < 4.5 else 9
 
-    outcome = Flight(behaviour, objects=[seen]).run(30.0, each)
+    flight = Flight(behaviour, objects=[seen])
+    outcome = flight.run(30.0, each)
+    assert outcome is None or outcome.success, outcome
+    wanted_m = 8.0 if isinstance(behaviour, FollowBehaviour) else 2.0
+    assert math.dist(flight.track[-1][:2], (25, 0)) == pytest.approx(wanted_m, abs=0.6)
+    assert behaviour.take_notes() == ["track 1: the object is track 9 now"]
+
+
+@pytest.mark.parametrize(
+    "behaviour", [FollowBehaviour(track_id=1), ApproachBehaviour(track_id=1, distance_m=2.0)]
+)
+def test_object_seen_beside_the_track_never_takes_its_place(
+    behaviour: FollowBehaviour | ApproachBehaviour,
+) -> None:
+    seen, beside = car(25, 0, 1), car(25, 4.0, 9)
+
+    def each(seconds: float, _vehicle: KinematicVehicle) -> None:
+        seen.visible = seconds < 4.0
+        beside.east = 4.0 if seconds < 4.0 else 0.0
+
+    outcome = Flight(behaviour, objects=[seen, beside]).run(30.0, each)
     assert outcome is not None
     assert not outcome.success
     assert outcome.reason.startswith("lost track 1 for")
@@ -218,12 +238,12 @@ def test_loss_of_a_track_that_is_followed_is_an_event() -> None:
     command = harness.command(FollowBehaviour(track_id=17), endless=True)
     assert harness.outcome(command).success
     harness.run(2.0)
-    seen.track_id = 23
+    seen.track_id, seen.east = 23, 4.8
     harness.until(lambda: harness.events[-1].kind is EventKind.ENDED, 10.0)
     note = harness.events[-2]
     assert (note.kind, note.level) == (EventKind.NOTED, "warning")
     assert note.message.startswith("follow ended: lost track 17 for 3.0 s")
-    assert "track 23, a car, is 0." in note.message
+    assert "track 23, a car, is " in note.message
 
 
 def test_track_that_comes_back_with_its_id_is_followed_on() -> None:
