@@ -193,9 +193,10 @@ class ApproachBehaviour(Behaviour):
             if track.update(self._subject.same(context.targets, track.newest, self._confidence), position):
                 self._seen_ns = track.captured_ns
             elif context.now_ns - self._seen_ns > LOST_AFTER_S * 1e9:
-                self._find_again(track, self._subject.of(context.targets, self._confidence), position)
-            self._notes += self._subject.new_id(self._last_id, self._track.track_id)
-            self._last_id = self._track.track_id
+                fitting = self._subject.of(context.targets, self._confidence)
+                self._track = track = self._found_again(track, fitting, position)
+            self._notes += self._subject.new_id(self._last_id, track.track_id)
+            self._last_id = track.track_id
             return
         fitting = self._subject.of(context.targets, self._confidence)
         if fitting:
@@ -211,7 +212,7 @@ class ApproachBehaviour(Behaviour):
             return
         self._begin(chosen, position, context.now_ns)
 
-    def _find_again(self, lost: ObjectTrack, fitting: list[Target], position: Vector3) -> None:
+    def _found_again(self, lost: ObjectTrack, fitting: list[Target], position: Vector3) -> ObjectTrack:
         """Restart the track at a detection near the lost object: a wrong range can divert a track."""
         north, east = lost.position_ned_m[0] - position[0], lost.position_ned_m[1] - position[1]
         bearing, range_m = math.atan2(east, north), math.hypot(north, east)
@@ -222,8 +223,9 @@ class ApproachBehaviour(Behaviour):
                 continue
             off = abs(wrap_angle(target.bearing_rad - bearing))
             if off < SAME_BEARING_RAD and 0.5 * range_m < target.ground_range_m < 2.0 * range_m:
-                self._track, self._seen_ns = lost.restart(target, position), target.captured_ns
-                return
+                self._seen_ns = target.captured_ns
+                return lost.restart(target, position)
+        return lost
 
     def _begin(self, target: Target, position: Vector3, now_ns: int) -> None:
         self._track, self._last_id = ObjectTrack(target, position), target.track_id
