@@ -21,6 +21,7 @@ from companion.sim_session import (
     SimOptions,
     SimProcess,
     SimSessionError,
+    camera_name,
     camera_of_autopilot,
     session_settings,
     simulator,
@@ -34,6 +35,10 @@ Say = Callable[[str], None]
 
 _GCS_PORT = 14550  # where ground stations listen
 _TCP = "tcp/"
+_CAMERA_RATE_HZ = 20.0
+"""Frames a second of all cameras together, for two cores that also detect objects in them."""
+_MAX_CAMERAS = 4
+"""At this number each has 5 frames a second; fewer would make tracks uncertain."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +48,7 @@ class PlayOptions:
     Attributes:
         scene: scene file or name of a bundled scene; None: the demo world.
         seed: random seed of the world and the simulated vehicles.
-        vehicles: number of simulated vehicles, one service each; the first has the camera.
+        vehicles: number of simulated vehicles, one service each; see `cameras`.
         vehicle_url: `udpin://HOST:PORT` to which an autopilot sends; None: the simulated vehicle.
         autopilot: autopilot firmware to emulate: px4 or ardupilot.
     """
@@ -53,6 +58,11 @@ class PlayOptions:
     vehicles: int = 1
     vehicle_url: str | None = None
     autopilot: str = "px4"
+
+    @property
+    def cameras(self) -> int:
+        """How many vehicles have a camera: all of up to `_MAX_CAMERAS`, else the first one."""
+        return self.vehicles if self.vehicles <= _MAX_CAMERAS else 1
 
 
 class SimulationLostError(SimSessionError):
@@ -114,7 +124,7 @@ async def _play(settings: Settings, options: PlayOptions, scene: Scene, say: Say
 async def _until_stopped(
     settings: Settings, options: PlayOptions, scene: Scene, say: Say, stop: asyncio.Event
 ) -> None:
-    async with _opened(options) as vehicle:
+    async with _opened(options, scene) as vehicle:
         services = _services(settings, options, vehicle, say)
         ready = False
 
@@ -122,7 +132,7 @@ async def _until_stopped(
             nonlocal ready
             await vehicle.until_ready()
             ready = True
-            _print_next_commands(services, scene, say)
+            _print_next_commands(services, options.cameras, scene, say)
             async with dashboard_process(services[0].settings, say):
                 if terminal_is_free(settings.source.uri):
                     await run_console(
@@ -145,13 +155,17 @@ async def _until_stopped(
             raise service_end
 
 
-def _opened(options: PlayOptions) -> AbstractAsyncContextManager[SimProcess]:
+def _opened(options: PlayOptions, scene: Scene) -> AbstractAsyncContextManager[SimProcess]:
+    rate_hz = None if options.scene else _CAMERA_RATE_HZ
+    if options.cameras > 1:
+        rate_hz = min(scene.camera.rate_hz, _CAMERA_RATE_HZ / options.cameras)
     camera = SimOptions(
         camera=f"companion-play-{os.getpid()}",
         seed=options.seed,
         scene=options.scene,
-        camera_rate_hz=None if options.scene else 20.0,
+        camera_rate_hz=rate_hz,
         vehicles=options.vehicles,
+        cameras=options.cameras,
         autopilot=options.autopilot,
         gcs_port=_GCS_PORT,
     )
@@ -161,7 +175,7 @@ def _opened(options: PlayOptions) -> AbstractAsyncContextManager[SimProcess]:
 
 
 def _services(settings: Settings, options: PlayOptions, vehicle: SimProcess, say: Say) -> list[Service]:
-    """Create a service for each vehicle; only the first has a camera."""
+    """Create a service for each vehicle; that of one without a camera has no perception."""
     name = f"companion-play-{os.getpid()}"
     first = session_settings(vehicle.port, name, chosen=settings, system_id=vehicle.system_id)
     if options.vehicle_url is None:
@@ -174,6 +188,7 @@ def _services(settings: Settings, options: PlayOptions, vehicle: SimProcess, say
         if zenoh.mode == "peer":
             listen = (f"{_TCP}127.0.0.1:{free_port(socket.SOCK_STREAM)}",)
             zenoh = zenoh.model_copy(update={"listen": listen, "connect": zenoh.listen or zenoh.connect})
+        with_camera = number <= options.cameras
         several.append(
             _with(
                 first,
@@ -182,8 +197,8 @@ def _services(settings: Settings, options: PlayOptions, vehicle: SimProcess, say
                     "system_id": number,
                     "url": f"udpin://127.0.0.1:{vehicle.port + number - 1}",
                 },
-                source={"uri": NO_SOURCE},
-                detector={"enabled": False},
+                source={"uri": f"shm://{camera_name(name, number)}" if with_camera else NO_SOURCE},
+                detector={"enabled": first.detector.enabled and with_camera},
                 recording={"video": None},
                 metrics={"listen": None},
             ).model_copy(update={"zenoh": zenoh})
@@ -217,19 +232,20 @@ def _commands_of(services: list[Service]) -> Callable[[str], Any]:
     return command
 
 
-def _print_next_commands(services: list[Service], scene: Scene, say: Say) -> None:
+def _print_next_commands(services: list[Service], cameras: int, scene: Scene, say: Say) -> None:
     zenoh = services[0].settings.zenoh
     connect = "" if zenoh == type(zenoh)() else f" --connect {(zenoh.listen or zenoh.connect)[0]}"
     known = services[0].perception.status.class_names
     classes = sorted({item.class_name for item in scene.world.objects} & set(known))
     say(f"the scene {scene.name!r} has: {', '.join(classes) or 'no class of the model'}")
+    if cameras < len(services):
+        say(f"only {services[0].settings.vehicle.name} has a camera: more than {_MAX_CAMERAS} vehicles")
     say("ready for commands; in another terminal:")
-    for number, service in enumerate(services):
+    for number, service in enumerate(services, 1):
         name = service.settings.vehicle.name
         to = connect if name == "vehicle1" else f"{connect} --vehicle-name {name}"
-        camera = classes and number == 0
         say(f'  companion send{to} "takeoff 5"{"" if len(services) == 1 else f"   # {name}"}')
-        if camera:
+        if classes and number <= cameras:
             target = "car" if "car" in classes else classes[0]
             say(f'  companion send{to} "seek {target}"')
     say(f"  companion echo{connect} detections")

@@ -60,13 +60,13 @@ class SimOptions:
     """Options of the simulation.
 
     Attributes:
-        camera: name of the shared memory for the camera's frames.
+        camera: name of the shared memory for the camera's frames; see `camera_name`.
         seed: random seed of the world and the simulated vehicle.
         scene: scene file or name of a bundled scene; None: the demo world.
         camera_rate_hz: frames per second; None: the scene's own.
         truth_path: file for the true pose, 20 lines per second; None: no file.
         log_path: file for the process's output; None: no file.
-        vehicles: number of simulated vehicles; the first has the camera.
+        vehicles: number of simulated vehicles. cameras: how many of them have a camera, the first ones.
         autopilot: autopilot firmware to emulate.
         gcs_port: UDP port for a ground station; None: a free one.
     """
@@ -78,6 +78,7 @@ class SimOptions:
     truth_path: Path | None = None
     log_path: Path | None = None
     vehicles: int = 1
+    cameras: int = 1
     autopilot: str = "px4"
     gcs_port: int | None = None
 
@@ -163,7 +164,7 @@ async def simulator(options: SimOptions) -> AsyncIterator[SimProcess]:
     arguments = ["--onboard-port", str(port), "--onboard-bind", "0"]
     arguments += ["--gcs-port", str(gcs_port), "--gcs-bind", "0", "--autopilot", options.autopilot]
     if options.vehicles > 1:
-        arguments += ["--vehicles", str(options.vehicles)]
+        arguments += ["--vehicles", str(options.vehicles), "--cameras", str(options.cameras)]
     if options.autopilot == "px4":
         for name, value in SIMULATOR_PARAMETERS.items():
             arguments += ["--param", f"{name}={value:g}"]
@@ -229,6 +230,11 @@ def _end_with_us() -> None:
     """Run in the new process: it receives SIGTERM when this process ends (prctl(2))."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
+def camera_name(camera: str, number: int) -> str:
+    """Return the name of a fleet's shared memory with the frames of a vehicle, counted from 1."""
+    return camera if number == 1 else f"{camera}-{number}"
 
 
 def session_settings(

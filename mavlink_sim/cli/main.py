@@ -148,6 +148,10 @@ def simulate(
     camera_vehicle: Annotated[
         int | None, typer.Option(help="Vehicle of the fleet that has the camera; default: the first.")
     ] = None,
+    cameras: Annotated[
+        int | None,
+        typer.Option(help="Number of vehicles with a camera, from that one on; the second's is NAME-2."),
+    ] = None,
     param: Annotated[
         list[str] | None, typer.Option(help="Set a parameter of the autopilot, NAME=VALUE; repeatable.")
     ] = None,
@@ -243,7 +247,7 @@ def simulate(
         control=control,
     )
     if not options.shows_world:
-        _refuse_without_camera({"camera-rate": camera_rate, "camera-vehicle": camera_vehicle})
+        _refuse_without_camera({"camera-rate": camera_rate, "camera-vehicle": camera_vehicle, "cameras": cameras})
     if obstacle_sensor and scene is None:
         _fail("--obstacle-sensor: there is nothing to measure; add --scene FILE, or leave it out")
     if spacing is not None and vehicles == 1:
@@ -254,6 +258,7 @@ def simulate(
             vehicles,
             DEFAULT_SPACING_M if spacing is None else spacing,
             1 if camera_vehicle is None else camera_vehicle,
+            1 if cameras is None else cameras,
         )
         fleet = Fleet(members, on_event=_print_line)
     except PortInUseError as error:

@@ -26,22 +26,30 @@ def start_positions(count: int, spacing_m: float) -> list[tuple[float, float]]:
 
 
 def instance_options(
-    options: SimulationOptions, count: int, spacing_m: float, camera_vehicle: int = 1
+    options: SimulationOptions, count: int, spacing_m: float, camera_vehicle: int = 1, cameras: int = 1
 ) -> list[SimulationOptions]:
     """The options of each vehicle of a fleet; `options` are the first one's.
 
     They share one world, wind and gusts, those of the first one's seed; noise and faults have separate seeds.
-    A bind port of 0 stays 0 (a free one each). Only `camera_vehicle` (counted from 1) has the camera; the
-    truth files of all but the first have the system id in their name. Every vehicle has the faults; the first
-    one has the console, each has its own zenoh key.
+    A bind port of 0 stays 0 (a free one each). `cameras` vehicles from `camera_vehicle` (counted from 1) on
+    have a camera. The first of them has the camera's name and the outputs; the names of the others end in
+    their system id, as do the truth files of all vehicles but the first. Every vehicle has the faults; the
+    first one has the console, each has its own zenoh key.
 
     Raises:
-        ValueError: too many vehicles (ids, ports), or no such vehicle for the camera.
+        ValueError: too many vehicles (ids, ports), or no such vehicles for the cameras.
     """
     if not 1 <= count <= MAX_VEHICLES:
         raise ValueError(f"{count} vehicles: expected 1 to {MAX_VEHICLES}")
     if not 1 <= camera_vehicle <= count:
         raise ValueError(f"camera on vehicle {camera_vehicle}: the fleet has vehicles 1 to {count}")
+    with_camera = range(camera_vehicle - 1, camera_vehicle - 1 + cameras)
+    if cameras < 1 or with_camera[-1] >= count:
+        raise ValueError(
+            f"{cameras} cameras from vehicle {camera_vehicle} on: the fleet has vehicles 1 to {count}"
+        )
+    if cameras > 1 and options.camera is None:
+        raise ValueError(f"{cameras} cameras: expected the name of their shared memory, --camera NAME")
     if options.system_id + count - 1 > 255:
         raise ValueError(f"{count} vehicles from system id {options.system_id} on: ids end at 255")
     for name in ("onboard_port", "onboard_bind", "gcs_bind"):
@@ -51,6 +59,8 @@ def instance_options(
     fleet = []
     for index, start in enumerate(start_positions(count, spacing_m)):
         system_id = options.system_id + index
+        first_camera = index == with_camera[0]
+        camera = options.camera if first_camera else f"{options.camera}-{system_id}"
         fleet.append(
             replace(
                 options,
@@ -61,9 +71,9 @@ def instance_options(
                 onboard_port=options.onboard_port + index,
                 onboard_bind=options.onboard_bind + index if options.onboard_bind else 0,
                 gcs_bind=options.gcs_bind + index if options.gcs_bind else 0,
-                camera=options.camera if index + 1 == camera_vehicle else None,
-                camera_outputs=options.camera_outputs if index + 1 == camera_vehicle else (),
-                camera_truth=options.camera_truth if index + 1 == camera_vehicle else None,
+                camera=camera if index in with_camera else None,
+                camera_outputs=options.camera_outputs if first_camera else (),
+                camera_truth=options.camera_truth if first_camera else None,
                 console=options.console if index == 0 else False,
                 truth=options.truth if index == 0 else _numbered(options.truth, system_id),
             )
