@@ -1,4 +1,4 @@
-"""The zenoh side: keeps the newest message of each topic and the newest picture of each camera.
+"""One vehicle's messages: keeps the newest of each topic and the newest picture of each camera.
 
 zenoh calls back on its own threads. Each message replaces the one before, so nothing grows, however slow the
 readers are. Only what a browser shows is subscribed: the state while a stream is open, a camera's pictures
@@ -13,17 +13,14 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
 import zenoh
 
-from companion.bus.client import NoAnswerError, send_command, subscribe_kept
-from companion.bus.session import zenoh_config
-from companion.bus.topics import DETECTIONS, EVENTS, IMAGE, ROOT, SETPOINT, STATUS, VEHICLE, alive_key
-from companion.settings import ZenohSection
+from companion.bus.client import subscribe_kept
+from companion.bus.topics import DETECTIONS, EVENTS, IMAGE, ROOT, SETPOINT, STATUS, VEHICLE
+from companion.dashboard.merge import Sighting
 
 logger = logging.getLogger(__name__)
 
@@ -31,13 +28,12 @@ LARGEST_JSON_BYTES, LARGEST_PICTURE_BYTES = 1 << 18, 1 << 23
 MAX_RATE_HZ = 15.0
 """Of pictures; those in between are dropped."""
 MAX_CAMERAS, MAX_BOXES = 16, 200
-MAX_COMMANDS = 32
-"""Commands that wait for their outcome; `stop` has a separate allowance of the same size."""
+MAX_TRACKS = 30
+"""Of a vehicle, on the map."""
+TRACK_SHOWN_S = 10.0
 _LEASE_S = 2.0
-_RETRY_S = 1.0
 _DISCOVERY_S = 2.0
-_KEPT_EVENTS, _KEPT_REPLIES, _KEPT_FRAMES = 200, 50, 32
-_COMMAND_TIMEOUT_S = 3600.0
+_KEPT_EVENTS, _KEPT_FRAMES = 200, 32
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,14 +52,13 @@ class News:
     Attributes:
         number: the newest. topics: path → JSON text of the newest message, if it is new.
         ages_s: path → seconds since the newest message arrived, of all topics.
-        events, replies: in the order of arrival.
+        events: in the order of arrival.
     """
 
     number: int
     topics: dict[str, str]
     ages_s: dict[str, float]
     events: list[dict[str, Any]]
-    replies: list[dict[str, Any]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,49 +86,33 @@ class _Camera:
     arrived: asyncio.Event = field(default_factory=asyncio.Event)
 
 
+@dataclass(slots=True)
+class Link:
+    """The connection to zenoh. `session` is None while there is none, and `problem` then says why."""
+
+    session: zenoh.Session | None = None
+    loop: asyncio.AbstractEventLoop | None = None
+    problem: str = "connecting"
+
+
 class Bridge:
-    """One vehicle's state for the page, and its commands.
+    """One vehicle's state for the page."""
 
-    Args:
-        settings: of a zenoh client.
-
-    Attributes:
-        problem: why there is no connection to zenoh; empty if there is one.
-    """
-
-    def __init__(self, settings: ZenohSection, vehicle: str) -> None:
+    def __init__(self, link: Link, vehicle: str) -> None:
         self.vehicle = vehicle
-        self.problem = "connecting"
-        self._settings = settings
+        self._link = link
         self._topics: dict[str, _Message] = {}
         # With their numbers in the order of arrival.
         self._events: deque[tuple[int, dict[str, Any]]] = deque(maxlen=_KEPT_EVENTS)
-        self._replies: deque[tuple[int, dict[str, Any]]] = deque(maxlen=_KEPT_REPLIES)
-        self._session: zenoh.Session | None = None
-        self._loop: asyncio.AbstractEventLoop | None = None
         self._lock = threading.Lock()
         self._number = 0
         self._cameras: dict[str, _Camera] = {}
+        # Track id → sighting, and when it came; the newest last.
+        self._sightings: dict[int, tuple[Sighting, float]] = {}
+        self._state: dict[str, Any] = {}
         self._alive: bool | None = None
-        self._watchers, self._subscribed_s = 0, 0.0
+        self._subscribed_s = 0.0
         self._subscribers: list[Any] = []
-        self._waiting = {True: 0, False: 0}
-
-    async def run(self) -> None:
-        """Connect, and end what nobody watches any more; until cancelled."""
-        self._loop = asyncio.get_running_loop()
-        try:
-            while True:
-                if self._session is None:
-                    await self._connect()
-                else:
-                    self._watch_link(self._session)
-                    self._end_leases()
-                await asyncio.sleep(_RETRY_S)
-        finally:
-            session, self._session = self._session, None
-            if session is not None:
-                await asyncio.to_thread(session.close)
 
     @property
     def alive(self) -> bool | None:
@@ -142,29 +121,55 @@ class Bridge:
             return False
         return self._alive
 
-    @contextmanager
-    def watching(self) -> Iterator[None]:
-        """Subscribe to the state meanwhile."""
-        self._watchers += 1
-        self._subscribe()
-        try:
-            yield
-        finally:
-            self._watchers -= 1
-            if not self._watchers:
-                _undeclare(self._subscribers)
-                self._alive = None
+    def set_alive(self, alive: bool | None) -> None:
+        """Note that the service's liveliness token has come or gone; None: unknown."""
+        self._alive = alive
+
+    def subscribe(self) -> None:
+        """Subscribe to the state, if that is not done and there is a session."""
+        session = self._link.session
+        if session is None or self._subscribers:
+            return
+        keys = [topic.key(self.vehicle) for topic in (DETECTIONS, VEHICLE, SETPOINT)]
+        for key in (*keys, DETECTIONS.key(self.vehicle, "*")):
+            self._subscribers.append(session.declare_subscriber(key, self._on_state))
+        for topic, receive in ((STATUS, self._on_state), (EVENTS, self._on_event)):
+            self._subscribers.append(subscribe_kept(session, topic.key(self.vehicle), receive))
+        self._subscribed_s = time.monotonic()
+
+    def unsubscribe(self) -> None:
+        """End what `subscribe` began."""
+        undeclare(self._subscribers)
+        self._alive = None
+
+    @property
+    def state(self) -> dict[str, Any]:
+        """The newest message of the topic `vehicle`; empty without one."""
+        return self._state
+
+    def state_age_s(self) -> float | None:
+        """Seconds since the newest message of the topic `vehicle`."""
+        with self._lock:
+            kept = self._topics.get(VEHICLE.name)
+        return None if kept is None else time.monotonic() - kept.received_s
+
+    def sightings(self) -> list[Sighting]:
+        """Return the confirmed tracks of the last `TRACK_SHOWN_S` seconds whose position is known."""
+        oldest_s = time.monotonic() - TRACK_SHOWN_S
+        with self._lock:
+            return [sighting for sighting, seen_s in self._sightings.values() if seen_s > oldest_s]
 
     async def picture(self, camera: str, after: int, timeout_s: float) -> Picture | None:
         """Wait for a picture of another frame than `after`; None if none comes. `camera`: "" is the first."""
         kept = self._camera(camera)
-        if kept is None or self._session is None:
+        session = self._link.session
+        if kept is None or session is None:
             await asyncio.sleep(timeout_s)
             return None
         kept.lease_s = time.monotonic() + _LEASE_S + timeout_s
         if kept.subscriber is None:
             kept.picture = None
-            kept.subscriber = self._session.declare_subscriber(
+            kept.subscriber = session.declare_subscriber(
                 IMAGE.key(self.vehicle, camera or None), lambda sample: self._on_image(kept, sample)
             )
         try:
@@ -186,89 +191,16 @@ class Bridge:
                 topics={path: kept.text for path, kept in self._topics.items() if kept.number > after},
                 ages_s={path: round(now_s - kept.received_s, 2) for path, kept in self._topics.items()},
                 events=[event for number, event in self._events if number > after],
-                replies=[reply for number, reply in self._replies if number > after],
             )
 
-    def command(self, text: str, identifier: str) -> asyncio.Future[dict[str, Any]] | None:
-        """Send a command; the outcome is also added to `replies`. None: too many are waiting."""
-        assert self._loop is not None
-        stop = text.strip().lower() == "stop"
-        if self._waiting[stop] >= MAX_COMMANDS:
-            return None
-        self._waiting[stop] += 1
-        outcome: asyncio.Future[dict[str, Any]] = self._loop.create_future()
-        # A thread each: a pool would let endless commands delay a stop.
-        threading.Thread(
-            target=self._send, args=(self._loop, text, identifier, stop, outcome), daemon=True
-        ).start()
-        return outcome
-
-    def _send(
-        self,
-        loop: asyncio.AbstractEventLoop,
-        text: str,
-        identifier: str,
-        stop: bool,
-        outcome: asyncio.Future[dict[str, Any]],
-    ) -> None:
-        session = self._session
-        try:
-            if session is None:
-                raise NoAnswerError(self.problem)
-            reply = send_command(session, self.vehicle, text, timeout_s=_COMMAND_TIMEOUT_S)
-        except (NoAnswerError, ValueError, zenoh.ZError) as error:
-            reply = {"success": False, "reason": str(error).partition("\n")[0]}
-
-        def finish() -> None:
-            self._waiting[stop] -= 1
-            answer = {**reply, "id": identifier, "command": text[:200]}
-            with self._lock:
-                self._number += 1
-                self._replies.append((self._number, answer))
-            outcome.set_result(answer)
-
-        if not loop.is_closed():
-            loop.call_soon_threadsafe(finish)
-
-    async def _connect(self) -> None:
-        try:
-            self._session = await asyncio.to_thread(zenoh.open, zenoh_config(self._settings))
-        except zenoh.ZError:
-            self.problem = (
-                f"no zenoh node at {', '.join(self._settings.connect)}: is `companion run` running?"
-            )
-            return
-        self.problem = ""
-        self._subscribe()
-
-    def _watch_link(self, session: zenoh.Session) -> None:
-        """Note a lost connection; zenoh itself connects again."""
-        linked = bool(list(session.info.routers_zid()) or list(session.info.peers_zid()))
-        self.problem = "" if linked else f"connection to {', '.join(self._settings.connect)} lost, retrying"
-
-    def _subscribe(self) -> None:
-        session = self._session
-        if session is None or not self._watchers or self._subscribers:
-            return
-        keys = [topic.key(self.vehicle) for topic in (DETECTIONS, VEHICLE, SETPOINT)]
-        for key in (*keys, DETECTIONS.key(self.vehicle, "*")):
-            self._subscribers.append(session.declare_subscriber(key, self._on_state))
-        for topic, receive in ((STATUS, self._on_state), (EVENTS, self._on_event)):
-            self._subscribers.append(subscribe_kept(session, topic.key(self.vehicle), receive))
-        self._subscribed_s = time.monotonic()
-        alive = session.liveliness().declare_subscriber(alive_key(self.vehicle), self._on_alive, history=True)
-        self._subscribers.append(alive)
-
-    def _end_leases(self) -> None:
+    def end_leases(self) -> None:
+        """End the subscriptions of pictures that nobody has asked for."""
         for camera in self._cameras.values():
             if camera.subscriber is not None and time.monotonic() > camera.lease_s:
-                _undeclare([camera.subscriber])
+                undeclare([camera.subscriber])
                 camera.subscriber = camera.picture = None
 
     # --- on zenoh's threads
-
-    def _on_alive(self, sample: zenoh.Sample) -> None:
-        self._alive = sample.kind == zenoh.SampleKind.PUT
 
     def _on_state(self, sample: zenoh.Sample) -> None:
         value = _json(sample)
@@ -280,10 +212,22 @@ class Bridge:
             if camera is None or not isinstance(value.get("sequence"), int):
                 return
             camera.frames.append(value)
+            self._note_sightings(value)
+        elif path == VEHICLE.name:
+            self._state = value
         text = json.dumps(value)
         with self._lock:
             self._number += 1
             self._topics[path] = _Message(text, self._number, time.monotonic())
+
+    def _note_sightings(self, message: dict[str, Any]) -> None:
+        now_s = time.monotonic()
+        for found in _sightings(self.vehicle, message):
+            with self._lock:
+                self._sightings.pop(found.track_id, None)
+                self._sightings[found.track_id] = found, now_s
+                if len(self._sightings) > MAX_TRACKS:
+                    del self._sightings[next(iter(self._sightings))]
 
     def _on_event(self, sample: zenoh.Sample) -> None:
         value = _json(sample)
@@ -309,8 +253,9 @@ class Bridge:
             logger.debug("an image without usable attachment", exc_info=True)
             return
         camera.picture, camera.received_s = Picture(sample.payload.to_bytes(), about), now_s
-        if self._loop is not None and not self._loop.is_closed():
-            self._loop.call_soon_threadsafe(camera.arrived.set)
+        loop = self._link.loop
+        if loop is not None and not loop.is_closed():
+            loop.call_soon_threadsafe(camera.arrived.set)
 
     def _camera(self, name: str) -> _Camera | None:
         """Return what is kept of a camera; None for one more than `MAX_CAMERAS`."""
@@ -337,6 +282,27 @@ def _boxes(frames: list[dict[str, Any]], sequence: int) -> dict[str, Any]:
     return {"boxes": boxes, "boxes_sequence": frame["sequence"]}
 
 
+def _sightings(vehicle: str, message: dict[str, Any]) -> list[Sighting]:
+    """Return the confirmed tracks with a position in a message of detections; none if it is malformed."""
+    try:
+        found = [
+            Sighting(
+                vehicle,
+                int(one["track_id"]),
+                str(one["class_name"]),
+                float(one["latitude_deg"]),
+                float(one["longitude_deg"]),
+                None if one.get("range_sigma_m") is None else float(one["range_sigma_m"]),
+            )
+            for one in message["detections"][:MAX_BOXES]
+            if one.get("track_state") == "confirmed" and one.get("latitude_deg") is not None
+        ]
+        return [one for one in found if abs(one.latitude_deg) < 90.0 and abs(one.longitude_deg) <= 180.0]
+    except (ValueError, KeyError, TypeError, AttributeError):
+        logger.debug("a message with unusable detections", exc_info=True)
+        return []
+
+
 def _json(sample: zenoh.Sample) -> dict[str, Any] | None:
     """Return a message's object; None if it is none, too large, or not strict JSON."""
     if len(sample.payload) > LARGEST_JSON_BYTES:
@@ -352,7 +318,8 @@ def _json(sample: zenoh.Sample) -> dict[str, Any] | None:
     return value if isinstance(value, dict) else None
 
 
-def _undeclare(subscribers: list[Any]) -> None:
+def undeclare(subscribers: list[Any]) -> None:
+    """End subscriptions and forget them."""
     for subscriber in subscribers:
         subscriber.undeclare()
     subscribers.clear()

@@ -1,17 +1,20 @@
 "use strict";
-// The page of one vehicle. State arrives in one stream of server-sent events (`/events`); each picture is requested when
+// The page of one vehicle of those on the bus, and the map of all. State arrives in one stream of server-sent events (`/events`); each picture is requested when
 // the one before is drawn, so a slow connection gets fewer pictures, never older ones; commands are POSTs.
 
 const $ = (id) => document.getElementById(id);
 const HISTORY_S = 60, TRAIL_M = 0.3, TRAIL_POINTS = 800, LOG_LINES = 200, STALE_S = 3, STATUS_STALE_S = 4;
 const HEADERS = { "Content-Type": "application/json", "X-Companion-Dashboard": "1" };
 const DRAG_PX = 8, PICTURE_PERIOD_MS = 60;
+const ALL = "*"; // as the vehicle of a stop
 const number = (value, digits) => value.toFixed(digits).replace(/^-(?=0(\.0*)?$)/, ""); // no -0.0
 const three = (values, digits) => (values || [null, null, null]).map((v) => v == null ? "–" : number(v, digits));
 const degrees = (radians) => radians * 180 / Math.PI;
 const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
-if (new URLSearchParams(location.search).has("token")) history.replaceState(null, "", "/"); // the cookie is set now
+const address = new URLSearchParams(location.search);
+const addressOf = (vehicle) => vehicle ? `/?vehicle=${encodeURIComponent(vehicle)}` : "/";
+if (address.has("token")) history.replaceState(null, "", addressOf(address.get("vehicle"))); // the cookie is set now
 
 function browserId() {
   try {
@@ -22,10 +25,14 @@ function browserId() {
 }
 
 const state = {
-  topics: {}, ages: {}, at: 0, problem: "connecting to the dashboard", alive: null, replaced: false, refused: "",
-  trail: [], tracks: new Map(), latency: [], drops: [], lost: null, chosen: null, mission: null,
-  offsetNs: null, videoMs: null, sent: new Map(), number: 0,
+  at: 0, problem: "connecting to the dashboard", alive: null, replaced: false, refused: "",
+  offsetNs: null, sent: new Map(), number: 0,
+  vehicle: address.get("vehicle") || "", vehicles: [], objects: [], ...ofOneVehicle(),
 };
+
+function ofOneVehicle() {
+  return { topics: {}, ages: {}, trail: [], tracks: new Map(), latency: [], drops: [], lost: null, chosen: null, mission: null, videoMs: null };
+}
 const cameras = new Map();
 
 // --- the stream
@@ -34,7 +41,7 @@ let stream = null;
 
 function connect() {
   if (stream || document.hidden || state.replaced) return;
-  stream = new EventSource(`/events?browser=${encodeURIComponent(browserId())}`);
+  stream = new EventSource(`/events?browser=${encodeURIComponent(browserId())}&vehicle=${encodeURIComponent(state.vehicle)}`);
   stream.onmessage = (event) => onNews(JSON.parse(event.data));
   stream.addEventListener("replaced", () => {
     disconnect();
@@ -48,6 +55,21 @@ function disconnect() {
   stream = null;
 }
 
+function select(vehicle) {
+  if (vehicle === state.vehicle) return;
+  closeMenu();
+  disconnect();
+  Object.assign(state, ofOneVehicle(), { vehicle, at: 0, alive: null, objects: [] });
+  for (const view of cameras.values()) view.end();
+  cameras.clear();
+  $("log").replaceChildren();
+  $("class").replaceChildren();
+  $("vehicle").textContent = document.title = vehicle;
+  history.replaceState(null, "", addressOf(vehicle));
+  renderFleet();
+  connect();
+}
+
 async function explain() {
   // An EventSource does not report the status of a refusal.
   try {
@@ -59,7 +81,8 @@ async function explain() {
 function onNews(news) {
   state.at = performance.now();
   state.problem = news.problem; state.alive = news.alive; state.ages = news.ages_s; state.refused = "";
-  $("vehicle").textContent = document.title = news.vehicle_name;
+  state.vehicle = $("vehicle").textContent = document.title = news.vehicle_name;
+  state.vehicles = news.vehicles; state.objects = news.objects;
   Object.assign(state.topics, news.topics);
   for (const [path, value] of Object.entries(news.topics)) {
     if (path.endsWith("detections")) onDetections(path, value);
@@ -131,18 +154,22 @@ function record(series, values) {
 
 // --- commands
 
-async function send(text, then) {
+const isFleet = () => state.vehicles.length > 1;
+const named = (vehicle, text) => isFleet() && vehicle !== ALL ? `${vehicle}: ${text}` : text;
+
+async function send(text, then, vehicle = state.vehicle) {
+  const title = vehicle === ALL ? `${text} all` : named(vehicle, text);
   const id = `${browserId()}-${++state.number}-${Date.now()}`;
   state.sent.set(id, then);
-  reply(`${text}: sent`, "waiting");
+  reply(`${title}: sent`, "waiting");
   try {
-    const response = await fetch("/command", { method: "POST", headers: HEADERS, body: JSON.stringify({ text, id }), priority: "high" });
+    const response = await fetch("/command", { method: "POST", headers: HEADERS, body: JSON.stringify({ text, id, vehicle }), priority: "high" });
     if (response.status === 200) onReply(await response.json());
-    else if (response.status === 202) { if (state.sent.has(id)) reply(`${text}: in progress`, "waiting"); }
-    else { state.sent.delete(id); reply(`${text}: not sent: ${(await response.text()).trim()}`, "bad"); }
+    else if (response.status === 202) { if (state.sent.has(id)) reply(`${title}: in progress`, "waiting"); }
+    else { state.sent.delete(id); reply(`${title}: not sent: ${(await response.text()).trim()}`, "bad"); }
   } catch (error) {
     state.sent.delete(id);
-    reply(`${text}: not sent: the dashboard does not answer (${error.message})`, "bad");
+    reply(`${title}: not sent: the dashboard does not answer (${error.message})`, "bad");
   }
 }
 
@@ -150,8 +177,8 @@ function onReply(answer) {
   if (!state.sent.has(answer.id)) return; // of another window, or here a second time
   const then = state.sent.get(answer.id);
   state.sent.delete(answer.id);
-  reply(`${answer.command}: ${answer.success ? "done" : "failed"}: ${answer.reason}`, answer.success ? "good" : "bad");
-  if (then && answer.success) then(answer);
+  reply(`${named(answer.vehicle, answer.command)}: ${answer.success ? "done" : "failed"}: ${answer.reason}`, answer.success ? "good" : "bad");
+  if (then && answer.success && answer.vehicle === state.vehicle) then(answer);
 }
 
 function reply(text, kind) {
@@ -173,7 +200,9 @@ $("sending").addEventListener("submit", (event) => {
   const text = $("text").value.trim();
   if (text) { send(text); $("text").select(); }
 });
-$("stop").addEventListener("click", () => send("stop"));
+const sendStop = (all) => send("stop", null, all && isFleet() ? ALL : state.vehicle);
+$("stop").addEventListener("click", (event) => sendStop(event.shiftKey));
+$("stop-all").addEventListener("click", () => sendStop(true));
 
 // Space stops, wherever the focus is, except where a text is typed. Buttons are pressed by Enter.
 const typing = (target) => target instanceof HTMLInputElement && target.type !== "number";
@@ -181,7 +210,7 @@ document.addEventListener("keydown", (event) => {
   if (event.key === "Escape") closeMenu();
   if (event.key !== " " || typing(event.target)) return;
   event.preventDefault();
-  if (!event.repeat) send("stop");
+  if (!event.repeat) sendStop(event.shiftKey);
 }, true);
 document.addEventListener("keyup", (event) => { if (event.key === " " && !typing(event.target)) event.preventDefault(); }, true);
 
@@ -237,7 +266,7 @@ function camera(name) {
 
 class Camera {
   constructor(name) {
-    this.name = name; this.about = null; this.bitmap = null; this.drag = null; this.times = []; this.at = 0;
+    this.name = name; this.vehicle = state.vehicle; this.ended = false; this.about = null; this.bitmap = null; this.drag = null; this.times = []; this.at = 0;
     this.figure = document.createElement("figure");
     this.canvas = document.createElement("canvas");
     this.canvas.setAttribute("role", "img");
@@ -255,14 +284,15 @@ class Camera {
   }
 
   async run() {
-    for (let after = -1; ;) {
+    for (let after = -1; !this.ended;) {
       const begun = performance.now();
       if (document.hidden || state.replaced || !stream) { await pause(300); continue; }
       try {
-        const response = await fetch(`/picture?camera=${encodeURIComponent(this.name)}&after=${after}`, { priority: "low" });
+        const response = await fetch(`/picture?camera=${encodeURIComponent(this.name)}&after=${after}&vehicle=${encodeURIComponent(this.vehicle)}`, { priority: "low" });
         if (response.status === 200) {
           const about = JSON.parse(response.headers.get("X-Frame"));
           const bitmap = await createImageBitmap(await response.blob());
+          if (this.ended) break;
           if (this.bitmap) this.bitmap.close();
           this.bitmap = bitmap; this.about = about; after = about.sequence;
           this.at = performance.now();
@@ -274,6 +304,11 @@ class Camera {
       } catch { await pause(1000); }
       await pause(Math.max(0, PICTURE_PERIOD_MS - (performance.now() - begun)));
     }
+  }
+
+  end() {
+    this.ended = true;
+    this.figure.remove();
   }
 
   measure() {
@@ -416,6 +451,7 @@ function linkText() {
 }
 
 function render() {
+  renderFleet();
   const [text, bad] = linkText();
   setText($("link"), text);
   $("link").className = bad ? "bad" : "";
@@ -435,6 +471,25 @@ function render() {
   drawAttitude(vehicle);
   drawChart($("latency"), $("latency-now"), state.latency, { result: "capture to result", video: "capture to screen" }, "ms");
   drawChart($("drops"), $("drops-now"), state.drops, { dropped: "dropped", skipped: "skipped by setting" }, "/s");
+}
+
+function renderFleet() {
+  const fleet = $("fleet"), vehicles = state.vehicles;
+  fleet.hidden = $("stop-all").hidden = !isFleet();
+  document.body.classList.toggle("of-fleet", isFleet());
+  if (vehicles.map((one) => one.name).join() !== [...fleet.children].map((item) => item.value).join()) {
+    fleet.replaceChildren(...vehicles.map(({ name }) => {
+      const item = document.createElement("button");
+      item.type = "button"; item.value = name;
+      item.onclick = () => select(name);
+      return item;
+    }));
+  }
+  vehicles.forEach((one, index) => {
+    const item = fleet.children[index], shown = one.alive === false ? "gone" : one.mode || "–";
+    setText(item, `${one.name} · ${shown}${one.alive && one.altitude_m != null ? ` · ${number(one.altitude_m, 1)} m` : ""}`);
+    item.setAttribute("aria-pressed", one.name === state.vehicle);
+  });
 }
 
 function renderMission(pilot) {
@@ -522,8 +577,8 @@ function drawMap(vehicle, limits) {
   const [g, width, height] = sized($("map")), home = vehicle.home_ned_m || [0, 0, 0], own = vehicle.position_ned_m;
   const about = (corners) => (corners || []).map(([n, e]) => [n + home[0], e + home[1]]);
   const include = about(limits.fence_include), exclude = (limits.fence_exclude || []).map(about);
-  const tracks = [...state.tracks.entries()].filter(([, track]) => track.at);
-  const points = [home, ...state.trail, ...tracks.map(([, track]) => track.at), ...include, ...exclude.flat()];
+  const tracks = mapTracks(), others = state.vehicles.filter((one) => one.name !== state.vehicle && one.at_ned_m);
+  const points = [home, ...state.trail, ...tracks.map((track) => track.at), ...others.map((one) => one.at_ned_m), ...include, ...exclude.flat()];
   if (own) points.push(own);
   const norths = points.map((p) => p[0]), easts = points.map((p) => p[1]);
   const span = Math.max(20, 1.2 * (Math.max(...norths) - Math.min(...norths)), 1.2 * (Math.max(...easts) - Math.min(...easts)) * height / width);
@@ -542,14 +597,28 @@ function drawMap(vehicle, limits) {
   for (const area of exclude) { path(area, true); g.strokeStyle = bad; g.fillStyle = `${bad}33`; g.fill(); g.stroke(); }
   if (state.trail.length > 1) { path(state.trail); g.strokeStyle = accent; g.globalAlpha = .55; g.stroke(); g.globalAlpha = 1; }
   const labels = [];
-  for (const [id, track] of tracks.reverse()) { // the newest first: a label is drawn where no other is
-    if (track.trail.length > 1) { path(track.trail); g.strokeStyle = second; g.globalAlpha = .5; g.stroke(); g.globalAlpha = 1; }
-    const [x, y] = xy(track.at);
-    g.fillStyle = second; g.beginPath(); g.arc(x, y, id === state.chosen ? 7 : 5, 0, 7); g.fill();
-    const text = `${track.name} #${id}`, size = g.measureText(text).width, left = Math.min(x + 8, width - size - 2);
-    if (labels.some((one) => Math.abs(one.y - y) < 13 && left < one.right && one.left < left + size)) continue;
+  const note = (text, x, y) => {
+    const size = g.measureText(text).width, left = Math.max(2, Math.min(x + 8, width - size - 2));
+    if (labels.some((one) => Math.abs(one.y - y) < 13 && left < one.right && one.left < left + size)) return;
     labels.push({ y, left, right: left + size });
     g.fillStyle = ink; g.fillText(text, left, y + 4);
+  };
+  const arrow = ([x, y], yaw, colour) => {
+    g.save(); g.translate(x, y); g.rotate(yaw || 0);
+    g.fillStyle = colour; g.strokeStyle = css("--panel"); g.beginPath(); g.moveTo(0, -12); g.lineTo(8, 9); g.lineTo(0, 5); g.lineTo(-8, 9); g.closePath(); g.fill(); g.stroke();
+    g.restore();
+  };
+  for (const one of others) {
+    g.globalAlpha = one.state_age_s > STALE_S ? .4 : 1;
+    arrow(xy(one.at_ned_m), one.yaw_rad, soft);
+    note(one.name, ...xy(one.at_ned_m));
+    g.globalAlpha = 1;
+  }
+  for (const track of tracks.reverse()) { // the newest first: a label is drawn where no other is
+    if (track.trail.length > 1) { path(track.trail); g.strokeStyle = second; g.globalAlpha = .5; g.stroke(); g.globalAlpha = 1; }
+    const [x, y] = xy(track.at);
+    g.fillStyle = second; g.beginPath(); g.arc(x, y, track.chosen ? 7 : 5, 0, 7); g.fill();
+    note(track.text, x, y);
   }
   const [hx, hy] = xy(home);
   g.strokeStyle = ink; g.fillStyle = ink;
@@ -561,9 +630,8 @@ function drawMap(vehicle, limits) {
       const [n, e] = setpoint.velocity_ned_mps;
       g.strokeStyle = second; g.beginPath(); g.moveTo(x, y); g.lineTo(x + 12 * e, y - 12 * n); g.stroke();
     }
-    g.save(); g.translate(x, y); g.rotate(vehicle.yaw_rad || 0);
-    g.fillStyle = accent; g.strokeStyle = css("--panel"); g.beginPath(); g.moveTo(0, -12); g.lineTo(8, 9); g.lineTo(0, 5); g.lineTo(-8, 9); g.closePath(); g.fill(); g.stroke();
-    g.restore();
+    arrow([x, y], vehicle.yaw_rad, accent);
+    if (isFleet()) note(state.vehicle, x, y);
   }
   g.fillStyle = soft; g.strokeStyle = soft;
   g.fillText(`${grid} m`, 10, height - 14);
@@ -571,7 +639,23 @@ function drawMap(vehicle, limits) {
   g.textAlign = "center"; g.fillText("N", width - 14, 24); g.textAlign = "left";
   g.beginPath(); g.moveTo(width - 14, 6); g.lineTo(width - 18, 13); g.lineTo(width - 10, 13); g.fill();
   const where = own ? `vehicle ${(own[0] - home[0]).toFixed(0)} m north and ${(own[1] - home[1]).toFixed(0)} m east of home` : "position unknown";
-  $("map").setAttribute("aria-label", `Map, north up: ${where}, ${tracks.length} tracks`);
+  const listed = isFleet() ? `, ${[...others, ...tracks].slice(0, 20).map((one) => one.text || one.name).join("; ")}` : "";
+  $("map").setAttribute("aria-label", `Map, north up: ${where}, ${tracks.length} tracks${listed}`);
+}
+
+function mapTracks() {
+  // The shown vehicle's tracks with their trails, and what only others see; an object that several see is drawn once.
+  const drawn = [], merged = new Map();
+  for (const { class_name: name, at_ned_m: at, tracks } of state.objects) {
+    const own = tracks.find(([vehicle, id]) => vehicle === state.vehicle && state.tracks.has(id));
+    const text = `${name} ${tracks.map(([vehicle, id]) => `${vehicle} #${id}`).join(", ")}`;
+    if (own) merged.set(own[1], text);
+    else if (at) drawn.push({ at, trail: [], text });
+  }
+  for (const [id, { at, trail, name }] of state.tracks) {
+    if (at) drawn.push({ at, trail, text: merged.get(id) || `${name} ${isFleet() ? `${state.vehicle} ` : ""}#${id}`, chosen: id === state.chosen });
+  }
+  return drawn;
 }
 
 function drawAttitude(vehicle) {

@@ -28,12 +28,15 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from companion.dashboard.access import COOKIE, Access, DashboardError, Refusal, read_token
 from companion.dashboard.bridge import Bridge, News
+from companion.dashboard.fleet import MAX_VEHICLES, Fleet
 from companion.settings import ZenohSection
 
 STREAM_PERIOD_S = 0.1
 PICTURE_WAIT_S = 0.5
 REPLY_WAIT_S = 1.0
 """How long a POST waits for the command's outcome; a later one is only in the stream."""
+ALL = "*"
+"""As the vehicle of a `stop`: all."""
 LONGEST_COMMAND, LARGEST_BODY_BYTES = 8000, 64 * 1024
 MAX_CONNECTIONS = 100
 MAX_STREAMS_PER_BROWSER = 3
@@ -57,7 +60,7 @@ class DashboardOptions:
     Attributes:
         listen: HOST:PORT. token_file: required beyond loopback.
         zenoh: settings of a client (`companion.bus.client.client_settings`).
-        vehicle: name of the vehicle.
+        vehicle: name of the vehicle that is shown first.
     """
 
     listen: str
@@ -79,8 +82,8 @@ async def serve(options: DashboardOptions, on_ready: Callable[[str], None]) -> N
     token = None if options.token_file is None else read_token(options.token_file)
     access = Access(host, token)
     with listening_socket(host, port) as listener:
-        bridge = Bridge(options.zenoh, options.vehicle)
-        application = create_app(bridge, access)
+        fleet = Fleet(options.zenoh, options.vehicle)
+        application = create_app(fleet, access)
         server = uvicorn.Server(
             uvicorn.Config(
                 application,
@@ -94,7 +97,7 @@ async def serve(options: DashboardOptions, on_ready: Callable[[str], None]) -> N
                 timeout_graceful_shutdown=1,
             )
         )
-        bridging = asyncio.create_task(bridge.run())
+        bridging = asyncio.create_task(fleet.run())
         bridging.add_done_callback(lambda _: setattr(server, "should_exit", True))
         try:
             on_ready(f"http://{host}:{port}/")
@@ -129,7 +132,7 @@ def listening_socket(host: str, port: int) -> socket.socket:
     return listener
 
 
-def create_app(bridge: Bridge, access: Access) -> ASGIApp:
+def create_app(fleet: Fleet, access: Access) -> ASGIApp:
     """Create the ASGI application."""
     folder = resources.files("companion.dashboard")
     files = {name: (folder / name).read_bytes() for name in _FILES}
@@ -146,12 +149,22 @@ def create_app(bridge: Bridge, access: Access) -> ASGIApp:
         name = request.url.path.lstrip("/")
         return Response(files[name], media_type=_FILES[name])
 
+    def bridge_of(vehicle: Any) -> Bridge | Response:
+        """Return the bridge of the vehicle in a request, or a refusal."""
+        if not isinstance(vehicle, str) or not re.fullmatch("([A-Za-z0-9][A-Za-z0-9_.-]{0,63})?", vehicle):
+            return PlainTextResponse("vehicle: expected the name of a vehicle, or none for the first", 400)
+        bridge = fleet.bridge(vehicle)
+        return PlainTextResponse(f"at most {MAX_VEHICLES} vehicles", 429) if bridge is None else bridge
+
     async def events(request: Request) -> Response:
+        bridge = bridge_of(request.query_params.get("vehicle", ""))
+        if isinstance(bridge, Response):
+            return bridge
         browser = (
             f"{request.client.host if request.client else ''} {request.query_params.get('browser', '')[:64]}"
         )
         return StreamingResponse(
-            _stream(bridge, streams, browser),
+            _stream(fleet, bridge, streams, browser),
             media_type="text/event-stream",
         )
 
@@ -163,6 +176,9 @@ def create_app(bridge: Bridge, access: Access) -> ASGIApp:
         camera = request.query_params.get("camera", "")
         if not re.fullmatch("[A-Za-z0-9_-]{0,64}", camera):
             return PlainTextResponse("camera: expected the name of a camera, or none for the first", 400)
+        bridge = bridge_of(request.query_params.get("vehicle", ""))
+        if isinstance(bridge, Response):
+            return bridge
         found = await bridge.picture(camera, after, PICTURE_WAIT_S)
         if found is None:
             return Response(status_code=204)
@@ -177,18 +193,26 @@ def create_app(bridge: Bridge, access: Access) -> ASGIApp:
         try:
             sent = json.loads(body)
             text, identifier = sent["text"], str(sent.get("id", ""))[:64]
+            vehicle = sent.get("vehicle", "")
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
             return PlainTextResponse('expected JSON such as {"text": "takeoff 5", "id": "1"}', 400)
         if not isinstance(text, str) or not 0 < len(text) <= LONGEST_COMMAND:
             return PlainTextResponse(f"text: expected 1 to {LONGEST_COMMAND} characters", 400)
-        outcome = bridge.command(text, identifier)
+        if vehicle == ALL:
+            if text.strip().lower() != "stop":
+                return PlainTextResponse("only stop can be sent to all vehicles", 400)
+            return JSONResponse(await fleet.stop_all(identifier))
+        bridge = bridge_of(vehicle)
+        if isinstance(bridge, Response):
+            return bridge
+        outcome = fleet.command(bridge.vehicle, text, identifier)
         if outcome is None:
             return PlainTextResponse("too many commands are waiting for their outcome", 429)
         try:
             async with asyncio.timeout(REPLY_WAIT_S):
                 return JSONResponse(await asyncio.shield(outcome))
         except TimeoutError:
-            return JSONResponse({"id": identifier, "command": text[:200]}, 202)
+            return JSONResponse({"id": identifier, "command": text[:200], "vehicle": bridge.vehicle}, 202)
 
     async def clock(_request: Request) -> Response:
         return JSONResponse({"now_ns": time.monotonic_ns()})
@@ -225,17 +249,18 @@ class StreamTable:
             del self._open[browser]
 
 
-async def _stream(bridge: Bridge, streams: StreamTable, browser: str) -> AsyncIterator[str]:
+async def _stream(fleet: Fleet, bridge: Bridge, streams: StreamTable, browser: str) -> AsyncIterator[str]:
     """Yield server-sent events with what is new since the one before, at most ten a second."""
     ended = streams.add(browser)
-    seen = 0
+    seen = answered = 0
     try:
-        with bridge.watching():
+        with fleet.watching(bridge):
             yield "retry: 1000\n\n"
             while not ended.is_set():
                 news = bridge.news(seen)
                 seen = news.number
-                yield f"data: {_text_of(bridge, news)}\n\n"
+                answered, replies = fleet.replies(answered)
+                yield f"data: {_text_of(fleet, bridge, news, replies)}\n\n"
                 with suppress(TimeoutError):
                     await asyncio.wait_for(ended.wait(), STREAM_PERIOD_S)
             yield "event: replaced\ndata: {}\n\n"
@@ -243,16 +268,18 @@ async def _stream(bridge: Bridge, streams: StreamTable, browser: str) -> AsyncIt
         streams.remove(browser, ended)
 
 
-def _text_of(bridge: Bridge, news: News) -> str:
+def _text_of(fleet: Fleet, bridge: Bridge, news: News, replies: list[dict[str, Any]]) -> str:
     """Format what is new as JSON."""
     head = {
         "now_ns": time.monotonic_ns(),
         "vehicle_name": bridge.vehicle,
-        "problem": bridge.problem,
+        "problem": fleet.problem,
         "alive": bridge.alive,
         "ages_s": news.ages_s,
         "events": news.events,
-        "replies": news.replies,
+        "replies": replies,
+        "vehicles": (vehicles := fleet.vehicles(bridge)),
+        "objects": fleet.objects(bridge) if len(vehicles) > 1 else [],
     }
     topics = ", ".join(f"{json.dumps(path)}: {text}" for path, text in news.topics.items())
     return f'{json.dumps(head)[:-1]}, "topics": {{{topics}}}}}'

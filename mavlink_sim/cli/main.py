@@ -247,7 +247,9 @@ def simulate(
         control=control,
     )
     if not options.shows_world:
-        _refuse_without_camera({"camera-rate": camera_rate, "camera-vehicle": camera_vehicle, "cameras": cameras})
+        _refuse_without_camera(
+            {"camera-rate": camera_rate, "camera-vehicle": camera_vehicle, "cameras": cameras}
+        )
     if obstacle_sensor and scene is None:
         _fail("--obstacle-sensor: there is nothing to measure; add --scene FILE, or leave it out")
     if spacing is not None and vehicles == 1:

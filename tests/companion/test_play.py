@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import socket
@@ -13,8 +14,11 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+import zenoh
 
 from companion.bus.client import send_command
+from companion.bus.topics import DETECTIONS
+from companion.play import PlayOptions
 from mavlink_sim.testing import free_port
 from tests.companion.command_line import companion
 from tests.companion.service_process import ServiceProcess
@@ -97,10 +101,20 @@ def test_play_in_the_air_holds_and_ends_on_ctrl_c(tmp_path: Path) -> None:
             for text in ("takeoff 3", "hold"):
                 reply = send_command(session, "vehicle2", text, timeout_s=60.0)
                 assert reply["success"], reply
+            # It sees by its own camera.
+            seen = session.declare_subscriber(DETECTIONS.key("vehicle2"), zenoh.handlers.FifoChannel(10))
+            message = json.loads(seen.recv().payload.to_string())
+            assert (message["vehicle"], message["width"], message["height"]) == ("vehicle2", 640, 480)
+            assert message["localization_error"] == ""
         started = descendants(running.pid)
         running.signal(signal.SIGINT)
         assert running.process.wait(20) == 0
         assert not until_gone(started)
+
+
+def test_up_to_four_vehicles_have_a_camera_each() -> None:
+    cameras = [PlayOptions(vehicles=count).cameras for count in (1, 2, 4, 5, 8)]
+    assert cameras == [1, 2, 4, 1, 1]
 
 
 def test_play_exits_with_1_when_simulator_dies(tmp_path: Path) -> None:

@@ -45,6 +45,8 @@ def test_camera_on_one_vehicle_and_each_has_its_own_truth_file() -> None:
     members = instance_options(options, 3, 5.0)
     assert [one.camera for one in members] == ["eye", None, None]
     assert [one.camera for one in instance_options(options, 3, 5.0, camera_vehicle=2)] == [None, "eye", None]
+    several = instance_options(options, 4, 5.0, camera_vehicle=2, cameras=2)
+    assert [one.camera for one in several] == [None, "eye", "eye-3", None]
     assert [str(one.truth) for one in members] == ["truth.jsonl", "truth-2.jsonl", "truth-3.jsonl"]
 
 

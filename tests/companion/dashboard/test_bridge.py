@@ -15,7 +15,8 @@ import zenoh
 
 from companion.bus.session import Bus, zenoh_config
 from companion.bus.topics import DETECTIONS, EVENTS, IMAGE, STATUS, VEHICLE, alive_key, command_key
-from companion.dashboard.bridge import LARGEST_JSON_BYTES, MAX_COMMANDS, Bridge
+from companion.dashboard.bridge import LARGEST_JSON_BYTES
+from companion.dashboard.fleet import MAX_COMMANDS, Fleet
 from companion.settings import ZenohSection
 from mavlink_sim.testing import free_port
 
@@ -40,10 +41,11 @@ def frame(sequence: int, **more: Any) -> dict[str, Any]:
 class Publisher:
     """The service's end."""
 
-    def __init__(self, endpoint: str) -> None:
-        self.session = zenoh.open(zenoh_config(ZenohSection(listen=(endpoint,))))
-        self.token = self.session.liveliness().declare_token(alive_key(NAME))
-        self._image = self.session.declare_publisher(IMAGE.key(NAME))
+    def __init__(self, endpoint: str, name: str = NAME, connect: str | None = None) -> None:
+        section = ZenohSection(listen=(endpoint,), connect=() if connect is None else (connect,))
+        self.session = zenoh.open(zenoh_config(section))
+        self.token = self.session.liveliness().declare_token(alive_key(name))
+        self._image = self.session.declare_publisher(IMAGE.key(name))
 
     def publish(self, key: str, value: Any) -> None:
         self.session.put(key, value if isinstance(value, str | bytes) else json.dumps(value))
@@ -57,9 +59,11 @@ class Publisher:
 
 
 @contextmanager
-def publishing(endpoint: str | None = None) -> Iterator[tuple[Publisher, str]]:
+def publishing(
+    endpoint: str | None = None, name: str = NAME, connect: str | None = None
+) -> Iterator[tuple[Publisher, str]]:
     endpoint = endpoint or f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
-    publisher = Publisher(endpoint)
+    publisher = Publisher(endpoint, name, connect)
     try:
         yield publisher, endpoint
     finally:
@@ -67,11 +71,11 @@ def publishing(endpoint: str | None = None) -> Iterator[tuple[Publisher, str]]:
 
 
 @asynccontextmanager
-async def bridging(endpoint: str) -> AsyncIterator[Bridge]:
-    bridge = Bridge(ZenohSection(mode="client", connect=(endpoint,), listen=()), NAME)
-    running = asyncio.create_task(bridge.run())
+async def bridging(endpoint: str) -> AsyncIterator[Fleet]:
+    fleet = Fleet(ZenohSection(mode="client", connect=(endpoint,), listen=()), NAME)
+    running = asyncio.create_task(fleet.run())
     try:
-        yield bridge
+        yield fleet
     finally:
         running.cancel()
         await asyncio.gather(running, return_exceptions=True)
@@ -87,8 +91,9 @@ async def until(condition: Callable[[], Any], timeout_s: float = 15.0) -> Any:
 
 async def test_state_is_the_newest_message_of_each_topic() -> None:
     with publishing() as (service, endpoint):
-        async with bridging(endpoint) as bridge:
-            with bridge.watching():
+        async with bridging(endpoint) as fleet:
+            bridge = fleet.first
+            with fleet.watching(bridge):
                 await until(lambda: bridge.alive)
                 for height in (1.0, 2.0):
                     service.publish(VEHICLE.key(NAME), {"altitude_m": height})
@@ -114,12 +119,13 @@ async def test_kept_events_arrive_once_when_a_page_opens_later() -> None:
         for event in events:
             bus.publish(EVENTS, event)
         bus.publish(STATUS, {"healthy": True})
-        async with bridging(section.listen[0]) as bridge:
+        async with bridging(section.listen[0]) as fleet:
+            bridge = fleet.first
             for _ in range(2):
-                with bridge.watching():
+                with fleet.watching(bridge):
                     await until(lambda: bridge.alive and "status" in bridge.news(0).topics)
                     await until(lambda: len(bridge.news(0).events) >= len(events))
-            with bridge.watching():
+            with fleet.watching(bridge):
                 bus.publish(EVENTS, {"stamp_ns": 5, "level": "info", "text": "last"})
                 await until(lambda: bridge.news(0).events[-1]["text"] == "last")
             assert bridge.news(0).events[:-1] == events
@@ -133,8 +139,9 @@ async def _no_command(text: str) -> dict[str, Any]:
 
 async def test_useless_messages_are_ignored() -> None:
     with publishing() as (service, endpoint):
-        async with bridging(endpoint) as bridge:
-            with bridge.watching():
+        async with bridging(endpoint) as fleet:
+            bridge = fleet.first
+            with fleet.watching(bridge):
                 await until(lambda: bridge.alive)
                 for bad in (
                     "{",
@@ -154,8 +161,9 @@ async def test_useless_messages_are_ignored() -> None:
 
 async def test_picture_has_the_boxes_of_its_frame() -> None:
     with publishing() as (service, endpoint):
-        async with bridging(endpoint) as bridge:
-            with bridge.watching():
+        async with bridging(endpoint) as fleet:
+            bridge = fleet.first
+            with fleet.watching(bridge):
                 await until(lambda: bridge.alive)
                 asked = asyncio.create_task(bridge.picture("", -1, 20.0))
                 await until(lambda: service.image_is_watched)
@@ -189,13 +197,14 @@ async def test_nothing_is_subscribed_without_a_browser() -> None:
         def watched() -> bool:
             return bool(vehicle.matching_status.matching)  # type: ignore[attr-defined]
 
-        async with bridging(endpoint) as bridge:
-            with bridge.watching():
+        async with bridging(endpoint) as fleet:
+            bridge = fleet.first
+            with fleet.watching(bridge):
                 await until(watched)
                 assert not service.image_is_watched
                 assert await bridge.picture("", -1, 0.3) is None
                 await until(lambda: service.image_is_watched)
-                with bridge.watching():
+                with fleet.watching(bridge):
                     pass
                 assert watched()
             await until(lambda: not watched())
@@ -213,27 +222,27 @@ async def test_command_and_its_outcome() -> None:
                 query.reply(query.key_expr, json.dumps(reply))
 
         service.session.declare_queryable(command_key(NAME), answer)
-        async with bridging(endpoint) as bridge:
-            await until(lambda: not bridge.problem)
+        async with bridging(endpoint) as fleet:
+            await until(lambda: not fleet.problem)
             for text, success in (("land", True), ("follow track=17", False)):
-                outcome = bridge.command(text, "id1")
+                outcome = fleet.command(NAME, text, "id1")
                 assert outcome is not None
                 reply = {"success": success, "reason": f"got {text}", "track": 17}
-                wanted = {"id": "id1", "command": text, **reply}
+                wanted = {"id": "id1", "command": text, "vehicle": NAME, **reply}
                 assert await asyncio.wait_for(outcome, 20) == wanted
-                assert bridge.news(0).replies[-1] == wanted
+                assert fleet.replies(0)[1][-1] == wanted
 
 
 async def test_stop_has_its_own_allowance_of_waiting_commands() -> None:
     with publishing() as (service, endpoint):
         queries: list[zenoh.Query] = []
         service.session.declare_queryable(command_key(NAME), queries.append)
-        async with bridging(endpoint) as bridge:
-            await until(lambda: not bridge.problem)
-            waiting = [bridge.command("hold", str(number)) for number in range(MAX_COMMANDS)]
+        async with bridging(endpoint) as fleet:
+            await until(lambda: not fleet.problem)
+            waiting = [fleet.command(NAME, "hold", str(number)) for number in range(MAX_COMMANDS)]
             assert None not in waiting
-            assert bridge.command("hold", "more") is None
-            stop = bridge.command(" STOP", "stop")
+            assert fleet.command(NAME, "hold", "more") is None
+            stop = fleet.command(NAME, " STOP", "stop")
             assert stop is not None
             await until(lambda: len(queries) == MAX_COMMANDS + 1, 30.0)
             service.token.undeclare()  # type: ignore[no-untyped-call]
@@ -244,21 +253,22 @@ async def test_stop_has_its_own_allowance_of_waiting_commands() -> None:
 
 async def test_no_service_and_a_service_that_goes_and_returns() -> None:
     endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
-    async with bridging(endpoint) as bridge:
-        with bridge.watching():
-            await until(lambda: "companion run" in bridge.problem)
-            outcome = bridge.command("land", "1")
+    async with bridging(endpoint) as fleet:
+        bridge = fleet.first
+        with fleet.watching(bridge):
+            await until(lambda: "companion run" in fleet.problem)
+            outcome = fleet.command(NAME, "land", "1")
             assert outcome is not None
             assert not (await outcome)["success"]
             with publishing(endpoint) as (service, _):
-                await until(lambda: bridge.alive and not bridge.problem)
+                await until(lambda: bridge.alive and not fleet.problem)
                 service.publish(VEHICLE.key(NAME), {"mode": "hold"})
                 await until(lambda: bridge.news(0).topics)
             await until(lambda: bridge.alive is False)
-            await until(lambda: "lost" in bridge.problem)
+            await until(lambda: "lost" in fleet.problem)
             assert "vehicle" in bridge.news(0).ages_s
             with publishing(endpoint) as (service, _):
-                await until(lambda: bridge.alive and not bridge.problem, 30.0)
+                await until(lambda: bridge.alive and not fleet.problem, 30.0)
                 before = bridge.news(0).number
 
                 def new() -> bool:

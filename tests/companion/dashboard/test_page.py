@@ -12,6 +12,7 @@ from mavlink_sim.testing import free_port
 from tests.companion.dashboard.chromium import PROGRAM, Browser, Tab, chromium, wait_for
 from tests.companion.dashboard.serving import dashboard_command
 from tests.companion.dashboard.test_bridge import publishing
+from tests.companion.dashboard.test_fleet import answering, publish_scene, two_vehicles
 from tests.companion.service_process import ServiceProcess
 from tests.companion.test_play import playing
 
@@ -152,6 +153,45 @@ def test_page_says_when_no_service_answers_and_how_old_its_state_is(browser: Bro
 
             wait_for(shown)
         tab.until(f"/Shown is its state of [0-9]+ s ago/.test({LINK})")
+        tab.close()
+
+
+def test_page_of_a_fleet_switches_the_vehicle_and_stops_all(browser: Browser) -> None:
+    with two_vehicles() as (services, endpoint), dashboard_command(endpoint) as url:
+        received = answering(services)
+        tab = browser.open(url)
+
+        def until(expression: str) -> None:
+            def shown() -> bool:
+                publish_scene(services)
+                return bool(tab.value(expression))
+
+            wait_for(shown)
+
+        text = "document.querySelector('{}').{}".format
+        listed = "[...document.querySelectorAll('#fleet button')].map((item) => item.value).join()"
+        until(f"typeof state === 'object' && {listed} === 'vehicle1,vehicle2'")
+        # One car, seen by both, and the person that only the other one sees.
+        until(f"{text('#map', 'ariaLabel')}.includes('car vehicle1 #7, vehicle2 #3')")
+        until(f"{text('#map', 'ariaLabel')}.includes('person vehicle2 #4')")
+        tab.value("document.querySelectorAll('#fleet button')[1].click()")
+        until(f"{text('#vehicle', 'textContent')} === 'vehicle2' && location.search === '?vehicle=vehicle2'")
+        until(f"{text('#map', 'ariaLabel')}.includes('car vehicle1 #7, vehicle2 #3')")
+        until(f"{text('#map', 'ariaLabel')}.includes('vehicle 2 m north and 1 m east of home')")
+        tab.value("document.querySelector('[data-command=land]').click()")
+        tab.until(f"{REPLY} === 'vehicle2: land: done: holding'")
+        assert received == [("vehicle2", "land")]
+        tab.press(" ", " ")
+        tab.until(f"{REPLY} === 'vehicle2: stop: done: holding'")
+        assert received[1:] == [("vehicle2", "stop")]
+        tab.value("document.querySelector('#stop-all').click()")
+        tab.until(f"{REPLY} === 'stop all: done: vehicle1: holding; vehicle2: holding'")
+        assert sorted(received[2:]) == [("vehicle1", "stop"), ("vehicle2", "stop")]
+        tab.resize(390, 844, phone=True)
+        stop, stop_all = rectangle(tab, "#stop"), rectangle(tab, "#stop-all")
+        assert stop[0] + stop[2] <= stop_all[0]
+        assert stop_all[0] + stop_all[2] <= 390
+        assert tab.value("document.documentElement.scrollWidth") <= 390
         tab.close()
 
 

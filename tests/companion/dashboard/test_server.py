@@ -146,7 +146,11 @@ async def test_command_and_its_late_outcome() -> None:
                 port, "POST", "/command", POST, {"text": "approach track=17", "id": "page-1"}
             )
             assert status == 202
-            assert json.loads(body) == {"id": "page-1", "command": "approach track=17"}
+            assert json.loads(body) == {
+                "id": "page-1",
+                "command": "approach track=17",
+                "vehicle": NAME,
+            }
             query = (await until(lambda: queries))[0]
             assert query.payload.to_string() == "approach track=17"
             with query:
@@ -157,8 +161,9 @@ async def test_command_and_its_late_outcome() -> None:
                 news = await stream.next()
                 assert news is not None
                 replies = news["replies"]
-            wanted = {"id": "page-1", "command": "approach track=17", "success": True, "reason": "reached"}
-            assert replies == [wanted]
+            (reply,) = replies
+            assert (reply["id"], reply["command"], reply["vehicle"]) == ("page-1", "approach track=17", NAME)
+            assert (reply["success"], reply["reason"]) == (True, "reached")
             stream.close()
 
 
@@ -170,6 +175,9 @@ async def test_command_and_its_late_outcome() -> None:
         (b"[" * 50_000, 400),
         (b'{"text": 1}', 400),
         (b'{"text": ""}', 400),
+        (b'{"text": "land", "vehicle": "*"}', 400),
+        (b'{"text": "land", "vehicle": "a/*"}', 400),
+        (b'{"text": "land", "vehicle": 1}', 400),
         (json.dumps({"text": "x" * 8001}).encode(), 400),
         (b" " * (LARGEST_BODY_BYTES + 1), 413),
     ],
@@ -177,8 +185,9 @@ async def test_command_and_its_late_outcome() -> None:
 async def test_bad_commands_are_refused(body: bytes, status: int) -> None:
     async with serving() as port:
         assert (await request(port, "POST", "/command", POST, body))[0] == status
-        for query in ("after=x", "camera=*", "camera=a/b", "camera=%24%2A"):
+        for query in ("after=x", "camera=*", "camera=a/b", "camera=%24%2A", "vehicle=*", "vehicle=a/b"):
             assert (await request(port, "GET", f"/picture?{query}"))[0] == 400
+        assert (await request(port, "GET", "/events?vehicle=a/b"))[0] == 400
 
 
 async def test_picture_has_its_frame_in_a_header() -> None:

@@ -1,0 +1,191 @@
+"""Two vehicles on the bus: who is there, the map of both, commands to one and to all."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import AsyncIterator, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+import zenoh
+
+from companion.bus.topics import DETECTIONS, SETPOINT, VEHICLE, command_key
+from companion.dashboard.fleet import MAX_VEHICLES
+from companion.geometry.geodesy import latitude_longitude
+from tests.companion.dashboard.serving import POST, EventStream, request, serving
+from tests.companion.dashboard.test_bridge import FOUND, NAME, Publisher, bridging, frame, publishing, until
+
+pytestmark = pytest.mark.realtime
+
+OTHER = "vehicle2"
+HOME = (47.3977, 8.5456)
+STARTS_M = {NAME: (0.0, 0.0), OTHER: (0.0, 5.0)}
+"""Origins of local NED, north and east of `HOME`."""
+
+
+@contextmanager
+def two_vehicles() -> Iterator[tuple[dict[str, Publisher], str]]:
+    with (
+        publishing() as (first, endpoint),
+        publishing(name=OTHER, connect=endpoint) as (second, _),
+    ):
+        yield {NAME: first, OTHER: second}, endpoint
+
+
+def state_at(vehicle: str, north_m: float, east_m: float) -> dict[str, Any]:
+    """The state of a vehicle at metres from its own origin."""
+    start_north_m, start_east_m = STARTS_M[vehicle]
+    latitude, longitude = latitude_longitude(HOME, start_north_m + north_m, start_east_m + east_m)
+    return {
+        "mode": "hold",
+        "altitude_m": 3.0,
+        "position_ned_m": [north_m, east_m, -3.0],
+        "latitude_deg": latitude,
+        "longitude_deg": longitude,
+    }
+
+
+def detections(track: int, north_m: float, east_m: float, **more: Any) -> dict[str, Any]:
+    """A message with one track at metres from `HOME`."""
+    latitude, longitude = latitude_longitude(HOME, north_m, east_m)
+    place = {"latitude_deg": latitude, "longitude_deg": longitude, "range_sigma_m": 0.3}
+    return frame(1, detections=[{**FOUND, "track_id": track, **place, **more}])
+
+
+def publish_scene(services: dict[str, Publisher]) -> None:
+    """Both see a car 10 m north of `HOME`; the second one also a person."""
+    services[NAME].publish(VEHICLE.key(NAME), state_at(NAME, 1.0, 0.0))
+    services[NAME].publish(DETECTIONS.key(NAME), detections(7, 10.0, 0.0))
+    services[OTHER].publish(VEHICLE.key(OTHER), state_at(OTHER, 2.0, 1.0))
+    services[OTHER].publish(DETECTIONS.key(OTHER), detections(3, 10.5, 0.2))
+    services[OTHER].publish(DETECTIONS.key(OTHER), detections(4, 0.0, 8.0, class_name="person"))
+    weak = detections(5, 0.0, 20.0, track_state="tentative")
+    services[OTHER].publish(DETECTIONS.key(OTHER), weak)
+
+
+async def test_page_of_either_vehicle_has_both_and_each_object_once() -> None:
+    with two_vehicles() as (services, endpoint):
+        async with bridging(endpoint) as fleet:
+            other = fleet.bridge(OTHER)
+            assert other is not None
+            with fleet.watching(fleet.first):
+                await until(lambda: fleet.first.alive and other.alive)
+
+                def shown() -> bool:
+                    publish_scene(services)
+                    return len(fleet.vehicles(other)) == 2 and len(fleet.objects(other)) == 2
+
+                await until(shown)
+                # In local NED of the vehicle that is shown.
+                for bridge, east_m in ((fleet.first, 0.0), (other, -5.0)):
+                    first, second = fleet.vehicles(bridge)
+                    assert (first["name"], first["mode"], first["alive"]) == (NAME, "hold", True)
+                    assert first["at_ned_m"] == pytest.approx([1.0, east_m], abs=0.02)
+                    assert second["at_ned_m"] == pytest.approx([2.0, east_m + 6.0], abs=0.02)
+                    car, person = sorted(fleet.objects(bridge), key=lambda one: str(one["class_name"]))
+                    assert car["tracks"] == [[NAME, 7], [OTHER, 3]]
+                    assert car["at_ned_m"] == pytest.approx([10.25, east_m + 0.1], abs=0.02)
+                    assert person["tracks"] == [[OTHER, 4]]
+                    assert person["at_ned_m"] == pytest.approx([0.0, east_m + 8.0], abs=0.02)
+
+
+async def test_vehicle_that_comes_later_is_listed_until_it_goes() -> None:
+    with publishing() as (_, endpoint):
+        async with bridging(endpoint) as fleet:
+            with fleet.watching(fleet.first):
+                await until(lambda: fleet.first.alive)
+
+                def names() -> list[str]:
+                    return [one["name"] for one in fleet.vehicles(fleet.first)]
+
+                assert names() == [NAME]
+                with publishing(name=OTHER, connect=endpoint) as (service, _):
+                    await until(lambda: names() == [NAME, OTHER])
+                    setpoint = service.session.declare_publisher(SETPOINT.key(OTHER))
+                    await until(lambda: setpoint.matching_status.matching)  # type: ignore[attr-defined]
+                await until(lambda: names() == [NAME])
+
+
+async def test_no_vehicle_is_subscribed_without_a_page() -> None:
+    with two_vehicles() as (services, endpoint):
+        state = services[OTHER].session.declare_publisher(VEHICLE.key(OTHER))
+
+        def watched() -> bool:
+            return bool(state.matching_status.matching)  # type: ignore[attr-defined]
+
+        async with bridging(endpoint) as fleet:
+            await until(lambda: not fleet.problem)
+            with fleet.watching(fleet.first):
+                await until(watched)
+            await until(lambda: not watched())
+
+
+async def test_number_of_kept_vehicles_is_limited() -> None:
+    with publishing() as (_, endpoint):
+        async with bridging(endpoint) as fleet:
+            with fleet.watching(fleet.first):
+                kept = [fleet.bridge(f"other{number}") for number in range(MAX_VEHICLES - 1)]
+                for bridge in kept:
+                    assert bridge is not None
+                    bridge.set_alive(True)
+                assert fleet.bridge("more") is None
+                assert fleet.bridge("other3") is kept[3]
+                kept[3].set_alive(False)  # type: ignore[union-attr]
+                assert fleet.bridge("more") is not None
+                assert fleet.bridge("other4") is kept[4]
+
+
+def answering(services: dict[str, Publisher]) -> list[tuple[str, str]]:
+    """Answer the commands of all; returns the list of (vehicle, text) that is filled."""
+    received: list[tuple[str, str]] = []
+
+    def declare(name: str) -> None:
+        def answer(query: zenoh.Query) -> None:
+            assert query.payload is not None
+            received.append((name, query.payload.to_string()))
+            with query:
+                query.reply(query.key_expr, json.dumps({"success": True, "reason": "holding"}))
+
+        services[name].session.declare_queryable(command_key(name), answer)
+
+    for name in services:
+        declare(name)
+    return received
+
+
+async def test_command_reaches_the_named_vehicle_and_stop_all_reaches_all() -> None:
+    with two_vehicles() as (services, endpoint):
+        received = answering(services)
+        async with serving(endpoint) as port:
+            async for news in stream_of(port, f"?vehicle={OTHER}"):
+                if len([one for one in news["vehicles"] if one["alive"]]) == 2:
+                    break
+            assert news["vehicle_name"] == OTHER
+            status, _, body = await request(
+                port, "POST", "/command", POST, {"text": "land", "vehicle": OTHER}
+            )
+            assert (status, json.loads(body)["vehicle"]) == (200, OTHER)
+            assert received == [(OTHER, "land")]
+            # Without an open page too.
+            sent = {"text": "stop", "vehicle": "*", "id": "1"}
+            status, _, body = await request(port, "POST", "/command", POST, sent)
+            outcome = json.loads(body)
+            assert (status, outcome["success"], outcome["id"]) == (200, True, "1")
+            assert outcome["reason"] == f"{NAME}: holding; {OTHER}: holding"
+            assert sorted(received[1:]) == [(NAME, "stop"), (OTHER, "stop")]
+
+
+async def test_stop_all_without_a_vehicle_fails() -> None:
+    async with serving() as port:
+        status, _, body = await request(port, "POST", "/command", POST, {"text": "stop", "vehicle": "*"})
+        assert (status, json.loads(body)["success"]) == (200, False)
+
+
+async def stream_of(port: int, query: str) -> AsyncIterator[dict[str, Any]]:
+    stream = await EventStream.open(port, query)
+    try:
+        while (news := await stream.next()) is not None:
+            yield news
+    finally:
+        stream.close()
