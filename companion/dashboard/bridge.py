@@ -30,7 +30,7 @@ MAX_RATE_HZ = 15.0
 MAX_CAMERAS, MAX_BOXES = 16, 200
 MAX_TRACKS = 30
 """Of a vehicle, on the map."""
-TRACK_SHOWN_S = 10.0
+TRACK_SHOWN_S, MAX_SIGMA_M = 10.0, 1000.0
 _LEASE_S = 2.0
 _DISCOVERY_S = 2.0
 _KEPT_EVENTS, _KEPT_FRAMES = 200, 32
@@ -141,6 +141,13 @@ class Bridge:
         """End what `subscribe` began."""
         undeclare(self._subscribers)
         self._alive = None
+
+    def close(self) -> None:
+        """End all subscriptions, those of pictures too."""
+        self.unsubscribe()
+        for camera in self._cameras.values():
+            camera.lease_s = 0.0
+        self.end_leases()
 
     @property
     def state(self) -> dict[str, Any]:
@@ -297,10 +304,15 @@ def _sightings(vehicle: str, message: dict[str, Any]) -> list[Sighting]:
             for one in message["detections"][:MAX_BOXES]
             if one.get("track_state") == "confirmed" and one.get("latitude_deg") is not None
         ]
-        return [one for one in found if abs(one.latitude_deg) < 90.0 and abs(one.longitude_deg) <= 180.0]
-    except (ValueError, KeyError, TypeError, AttributeError):
+        return [one for one in found if _is_plausible(one)]
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError):
         logger.debug("a message with unusable detections", exc_info=True)
         return []
+
+
+def _is_plausible(one: Sighting) -> bool:
+    place = abs(one.latitude_deg) < 90.0 and abs(one.longitude_deg) <= 180.0
+    return place and (one.sigma_m is None or 0.0 <= one.sigma_m < MAX_SIGMA_M)
 
 
 def _json(sample: zenoh.Sample) -> dict[str, Any] | None:

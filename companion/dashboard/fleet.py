@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import threading
-import time
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -26,8 +25,7 @@ from companion.settings import ZenohSection
 MAX_VEHICLES = 16
 MAX_COMMANDS = 32
 """Commands that wait for their outcome; `stop` has a separate allowance of the same size."""
-_RETRY_S = 1.0
-_MERGE_PERIOD_S = 0.5
+_PERIOD_S = 0.5
 _LIST_TIMEOUT_S, _STOP_WAIT_S = 1.0, 5.0
 _KEPT_REPLIES = 50
 _COMMAND_TIMEOUT_S = 3600.0
@@ -53,7 +51,6 @@ class Fleet:
         self._number = 0
         self._waiting = {True: 0, False: 0}
         self._objects: list[SeenObject] = []
-        self._merged_s = 0.0
 
     @property
     def problem(self) -> str:
@@ -61,7 +58,7 @@ class Fleet:
         return self._link.problem
 
     async def run(self) -> None:
-        """Connect, and end what nobody watches any more; until cancelled."""
+        """Connect, merge what the vehicles see, end what nobody watches any more; until cancelled."""
         self._link.loop = asyncio.get_running_loop()
         try:
             while True:
@@ -71,7 +68,10 @@ class Fleet:
                     self._watch_link(self._link.session)
                     for bridge in self._bridges.values():
                         bridge.end_leases()
-                await asyncio.sleep(_RETRY_S)
+                # In a thread: for many tracks it takes longer than a stop command may wait.
+                seen = [one for bridge in self._bridges.values() for one in bridge.sightings()]
+                self._objects = await asyncio.to_thread(merged, seen)
+                await asyncio.sleep(_PERIOD_S)
         finally:
             session, self._link.session = self._link.session, None
             if session is not None:
@@ -85,7 +85,7 @@ class Fleet:
             for name, bridge in list(self._bridges.items()):
                 unused = bridge is not self.first and not bridge.alive and name not in self._watched
                 if unused and len(self._bridges) >= MAX_VEHICLES:
-                    bridge.unsubscribe()
+                    bridge.close()
                     del self._bridges[name]
             if len(self._bridges) >= MAX_VEHICLES:
                 return None
@@ -135,14 +135,6 @@ class Fleet:
 
     def objects(self, shown: Bridge) -> list[dict[str, Any]]:
         """Return what the vehicles see, once each; `at_ned_m` as in `vehicles`."""
-        if time.monotonic() > self._merged_s + _MERGE_PERIOD_S:
-            self._objects = merged(
-                sighting
-                for bridge in list(self._bridges.values())
-                if bridge.alive
-                for sighting in bridge.sightings()
-            )
-            self._merged_s = time.monotonic()
         return [
             {
                 "class_name": seen.class_name,

@@ -69,7 +69,8 @@ def _place(origin_deg: tuple[float, float], one: Sighting) -> tuple[float, float
 
 
 def _groups(placed: list[_Placed]) -> list[list[_Placed]]:
-    group_of = {index: [one] for index, one in enumerate(placed)}
+    # Vehicle → its sighting.
+    group_of = {index: {one[2].vehicle: one} for index, one in enumerate(placed)}
     pairs = sorted(
         (math.dist(one[:2], other[:2]), first, second)
         for first, one in enumerate(placed)
@@ -78,12 +79,14 @@ def _groups(placed: list[_Placed]) -> list[list[_Placed]]:
     )
     for _, first, second in pairs:
         group, joining = group_of[first], group_of[second]
-        if group is not joining and all(_one_object(one, other) for one in group for other in joining):
-            group += joining
-            for index, one in group_of.items():
-                if one is joining:
+        if group.keys().isdisjoint(joining) and all(
+            _one_object(one, other) for one in group.values() for other in joining.values()
+        ):
+            group |= joining
+            for index, joined in group_of.items():
+                if joined is joining:
                     group_of[index] = group
-    return list({id(group): group for group in group_of.values()}.values())
+    return [list(group.values()) for group in {id(group): group for group in group_of.values()}.values()]
 
 
 def _one_object(one: _Placed, other: _Placed) -> bool:

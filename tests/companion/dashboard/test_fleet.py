@@ -62,6 +62,9 @@ def publish_scene(services: dict[str, Publisher]) -> None:
     services[OTHER].publish(DETECTIONS.key(OTHER), detections(4, 0.0, 8.0, class_name="person"))
     weak = detections(5, 0.0, 20.0, track_state="tentative")
     services[OTHER].publish(DETECTIONS.key(OTHER), weak)
+    for name in ("latitude_deg", "range_sigma_m", "track_id"):
+        useless = json.dumps(detections(6, 0.0, 30.0, **{name: "number"}))
+        services[OTHER].publish(DETECTIONS.key(OTHER), useless.replace('"number"', "1e999"))
 
 
 async def test_page_of_either_vehicle_has_both_and_each_object_once() -> None:
@@ -74,7 +77,8 @@ async def test_page_of_either_vehicle_has_both_and_each_object_once() -> None:
 
                 def shown() -> bool:
                     publish_scene(services)
-                    return len(fleet.vehicles(other)) == 2 and len(fleet.objects(other)) == 2
+                    tracks = [track for one in fleet.objects(other) for track in one["tracks"]]
+                    return len(fleet.vehicles(other)) == 2 and len(tracks) == 3
 
                 await until(shown)
                 # In local NED of the vehicle that is shown.
