@@ -269,11 +269,10 @@ def _vehicle_of(sample: zenoh.Sample) -> str:
 
 def _local(shown: dict[str, Any], latitude_deg: Any, longitude_deg: Any) -> list[float] | None:
     """Return metres north and east in local NED of a vehicle whose state is given; None if unknown."""
-    here, own = (shown.get("latitude_deg"), shown.get("longitude_deg")), shown.get("position_ned_m")
     try:
-        north_m, east_m = north_east(
-            (float(here[0]), float(here[1])), (float(latitude_deg), float(longitude_deg))
-        )
+        here = float(shown["latitude_deg"]), float(shown["longitude_deg"])
+        north_m, east_m = north_east(here, (float(latitude_deg), float(longitude_deg)))
+        own = shown["position_ned_m"]
         return [round(own[0] + north_m, 2), round(own[1] + east_m, 2)]
-    except (TypeError, ValueError, IndexError):
+    except (KeyError, TypeError, ValueError, IndexError):
         return None

@@ -96,9 +96,7 @@ def _one_object(one: _Placed, other: _Placed) -> bool:
 
 def _object(class_name: str, origin_deg: tuple[float, float], group: list[_Placed]) -> SeenObject:
     weights = [1.0 / one[2].variance_m2 for one in group]
-    north_m, east_m = (
-        sum(weight * one[axis] for weight, one in zip(weights, group, strict=True)) / sum(weights)
-        for axis in (0, 1)
-    )
+    north_m = sum(weight * one[0] for weight, one in zip(weights, group, strict=True)) / sum(weights)
+    east_m = sum(weight * one[1] for weight, one in zip(weights, group, strict=True)) / sum(weights)
     sightings = sorted((one[2] for one in group), key=lambda one: (one.vehicle, one.track_id))
     return SeenObject(class_name, *latitude_longitude(origin_deg, north_m, east_m), tuple(sightings))
