@@ -281,6 +281,7 @@ class Camera {
     this.canvas.addEventListener("pointermove", (event) => this.move(event));
     this.canvas.addEventListener("pointerup", (event) => this.release(event));
     this.canvas.addEventListener("pointercancel", () => { this.drag = null; this.draw(); });
+    this.writeCaption();
   }
 
   async run() {
