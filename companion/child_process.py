@@ -39,6 +39,13 @@ async def child_process(name: str, module: str, argument: str, say: Say) -> Asyn
 
 
 async def _supervise(name: str, words: tuple[str, str], say: Say) -> None:
+    try:
+        await _run_again(name, words, say)
+    except (OSError, ValueError) as error:  # no process, or a line above 64 KiB
+        say(f"{name}: not started again: {error}")
+
+
+async def _run_again(name: str, words: tuple[str, str], say: Say) -> None:
     for restarts in range(MAX_RESTARTS + 1):
         process = await asyncio.create_subprocess_exec(
             sys.executable,

@@ -27,6 +27,8 @@ from companion.settings import Settings
 from companion.settings.reading import ConfigurationError, changed
 
 MAX_LISTED = 10
+WINDOW = 1000
+"""Steps that an input and its output may be apart in a file."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +79,7 @@ class Replay:
 
     def as_dict(self) -> dict[str, Any]:
         """Return it as JSON-able data."""
-        return {"identical": self.first is None, **asdict(self)}
+        return {"identical": not self.differing_steps, **asdict(self)}
 
 
 def replay(paths: Sequence[Path], changes: Mapping[str, str]) -> Replay:
@@ -152,7 +154,10 @@ def _changed_options(
 
 def _step_all(paths: Sequence[Path], guidance: Guidance, found: Replay) -> None:
     digest = hashlib.sha256()
-    pending: dict[int, bytes] = {}
+    # By step: replayed outputs and recorded ones that wait for each other; either may come first.
+    replayed: dict[int, bytes] = {}
+    outputs: dict[int, bytes] = {}
+    unrecorded: list[int] = []
     next_step = first_ns = 0
     events: tuple[Counter[str], Counter[str]] = (Counter(), Counter())
     differing: Counter[str] = Counter()
@@ -172,21 +177,35 @@ def _step_all(paths: Sequence[Path], guidance: Guidance, found: Replay) -> None:
             output = guidance.step(recorded.now_ns, inputs)
             text = dumps(output_record(recorded.step, recorded.now_ns, output))
             digest.update(text)
-            pending = {recorded.step: text}
+            step = recorded.step
+            replayed[step] = text
             found.steps += 1
             found.commands += len(inputs.commands)
             found.seconds = round((recorded.now_ns - first_ns) / 1e9, 3)
-        elif (replayed := pending.pop(record["step"], None)) is not None and replayed != data:
+        else:
+            step = record["step"]
+            outputs[step] = data
+        for waiting in (replayed, outputs):
+            if len(waiting) > WINDOW:
+                oldest = min(waiting)
+                del waiting[oldest]
+                if waiting is replayed:
+                    unrecorded.append(oldest)
+        if step in replayed and step in outputs and (new := replayed.pop(step)) != (old := outputs.pop(step)):
             found.differing_steps += 1
-            again = json.loads(replayed)
-            differences = list(_differences(record, again))
+            was, again = json.loads(old), json.loads(new)
+            differences = list(_differences(was, again))
             differing.update({name.partition(".")[0].partition("[")[0] for name, _, _ in differences})
             if found.first is None and differences:
-                name, old, new = differences[0]
-                seconds = round((record["now_ns"] - first_ns) / 1e9, 3)
-                found.first = Difference(record["step"], seconds, name, old, new)
-            for counter, side in zip(events, (record, again), strict=True):
+                seconds = round((was["now_ns"] - first_ns) / 1e9, 3)
+                found.first = Difference(step, seconds, *differences[0])
+            for counter, side in zip(events, (was, again), strict=True):
                 counter.update(event["message"] for event in side["events"])
+    unrecorded += [step for step in sorted(replayed) if step != next_step - 1]  # the last may be cut
+    if unrecorded:
+        found.inexact.append(
+            f"the outputs of {len(unrecorded)} steps are not recorded, first of {unrecorded[0]}"
+        )
     found.digest = digest.hexdigest()
     found.differing_fields = dict(differing.most_common())
     found.events_recorded = list((events[0] - events[1]).elements())[:MAX_LISTED]
@@ -232,7 +251,7 @@ def _differences(recorded: Any, replayed: Any, name: str = "") -> Iterator[tuple
     elif type(recorded) is type(replayed) is list and len(recorded) == len(replayed):
         for index, (old, new) in enumerate(zip(recorded, replayed, strict=True)):
             yield from _differences(old, new, f"{name}[{index}]")
-    elif type(recorded) is not type(replayed) or recorded != replayed:
+    elif dumps(recorded) != dumps(replayed):  # bit for bit: 0.0 and -0.0 differ
         yield name, recorded, replayed
 
 
@@ -249,7 +268,7 @@ def report(found: Replay) -> Iterator[str]:
     yield from (f"not exact: {reason}" for reason in found.inexact)
     for setting in found.changed:
         yield f"changed: {setting.key}: recorded {setting.recorded}, replayed {setting.replayed}"
-    if found.first is None:
+    if not found.differing_steps or found.first is None:
         yield f"all outputs are identical (SHA-256 {found.digest})"
         return
     first = found.first

@@ -53,6 +53,8 @@ _ANSWER_S = 0.5
 # Interval in which a subscriber notices the loss of the newest message of a cached topic.
 _MISS_HEARTBEAT_S = 1.0
 # Messages of cached topics that wait for their thread.
+# Larger messages are sent in fragments of zenoh's batch of 64 KiB.
+LARGE_BYTES = 48_000
 _MOST_UNSENT = 1000
 # Minimum interval of logged command failures.
 _LOG_PERIOD_S = 1.0
@@ -233,7 +235,8 @@ class Bus:
         Args:
             value: the body, or a function that returns it; None: nothing is published.
 
-        For a blocked reader zenoh drops the message, after a millisecond at most.
+        For a blocked reader zenoh drops the message, after a millisecond at most. A large one waits longer,
+        for each of its fragments, so a thread sends it.
         """
         path = topic.path(view)
         publisher = self._publishers.get(path)
@@ -247,7 +250,7 @@ class Bus:
         if body is None:
             return
         payload = body if isinstance(body, str | bytes) else encode(body)
-        if not topic.cached:
+        if not topic.cached and len(payload) <= LARGE_BYTES:
             self._put(path, publisher, payload)
         elif self._room_for_kept.acquire(blocking=False):
             self._kept_puts.submit(self._put_kept, path, publisher, payload)

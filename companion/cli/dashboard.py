@@ -20,6 +20,7 @@ def dashboard(
 ) -> None:
     """Serve the web page of a running service. Ends on Ctrl-C."""
     from companion.bus.client import NoAnswerError, client_settings
+    from companion.bus.config import BusError
     from companion.dashboard.access import DashboardError
     from companion.dashboard.server import DashboardOptions, serve
 
@@ -27,7 +28,7 @@ def dashboard(
     if not address:
         typer.echo("companion: dashboard.listen is empty: set --listen to HOST:PORT", err=True)
         raise typer.Exit(EXIT_BAD_INPUT)
-    with plain_errors(NoAnswerError, DashboardError):
+    with plain_errors(NoAnswerError, DashboardError, BusError):
         zenoh = client_settings(settings.zenoh, (connect,) if connect else ())
         options = DashboardOptions(address, settings.dashboard.token_file, zenoh, settings.vehicle.name)
         try:

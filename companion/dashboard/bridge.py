@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+import math
 import threading
 import time
 from collections import deque
@@ -323,8 +324,13 @@ def _json(sample: zenoh.Sample) -> dict[str, Any] | None:
     def refuse(constant: str) -> None:
         raise ValueError(constant)  # NaN and Infinity, which browsers do not read
 
+    def finite(number: str) -> float:
+        if not math.isfinite(value := float(number)):
+            raise ValueError(number)  # 1e999
+        return value
+
     try:
-        value = json.loads(sample.payload.to_bytes(), parse_constant=refuse)
+        value = json.loads(sample.payload.to_bytes(), parse_constant=refuse, parse_float=finite)
     except (ValueError, RecursionError):
         return None
     return value if isinstance(value, dict) else None

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -24,11 +24,11 @@ from companion.settings import ZenohSection
 
 MAX_VEHICLES = 16
 MAX_COMMANDS = 32
-"""Commands that wait for their outcome; `stop` has a separate allowance of the same size."""
+"""Commands of one vehicle that wait for their outcome; `stop` has a separate allowance of the same size."""
 _PERIOD_S = 0.5
 _LIST_TIMEOUT_S, _STOP_WAIT_S = 1.0, 5.0
 _KEPT_REPLIES = 50
-_COMMAND_TIMEOUT_S = 3600.0
+_COMMAND_TIMEOUT_S, _STOP_TIMEOUT_S = 3600.0, 10.0
 
 
 class Fleet:
@@ -49,7 +49,7 @@ class Fleet:
         # With their numbers in the order of arrival.
         self._replies: deque[tuple[int, dict[str, Any]]] = deque(maxlen=_KEPT_REPLIES)
         self._number = 0
-        self._waiting = {True: 0, False: 0}
+        self._waiting: Counter[tuple[str, bool]] = Counter()  # by vehicle, and whether it is `stop`
         self._objects: list[SeenObject] = []
 
     @property
@@ -153,14 +153,14 @@ class Fleet:
         loop = self._link.loop
         assert loop is not None
         stop = text.strip().lower() == "stop"
-        if self._waiting[stop] >= MAX_COMMANDS:
+        if self._waiting[vehicle, stop] >= MAX_COMMANDS:
             return None
-        self._waiting[stop] += 1
+        self._waiting[vehicle, stop] += 1
         outcome: asyncio.Future[dict[str, Any]] = loop.create_future()
         about = {"id": identifier, "command": text[:200], "vehicle": vehicle}
 
         def finish(reply: dict[str, Any]) -> None:
-            self._waiting[stop] -= 1
+            self._waiting[vehicle, stop] -= 1
             answer = {**reply, **about}
             self._number += 1
             self._replies.append((self._number, answer))
@@ -171,7 +171,9 @@ class Fleet:
                 session = self._link.session
                 if session is None:
                     raise NoAnswerError(self.problem)
-                reply = send_command(session, vehicle, text, timeout_s=_COMMAND_TIMEOUT_S)
+                reply = send_command(
+                    session, vehicle, text, timeout_s=_STOP_TIMEOUT_S if stop else _COMMAND_TIMEOUT_S
+                )
             except (NoAnswerError, ValueError, zenoh.ZError) as error:
                 reply = {"success": False, "reason": str(error).partition("\n")[0]}
             if not loop.is_closed():

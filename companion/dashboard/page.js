@@ -42,6 +42,7 @@ let stream = null;
 function connect() {
   if (stream || document.hidden || state.replaced) return;
   stream = new EventSource(`/events?browser=${encodeURIComponent(browserId())}&vehicle=${encodeURIComponent(state.vehicle)}`);
+  stream.onopen = () => $("log").replaceChildren(); // a new stream begins with all kept events
   stream.onmessage = (event) => onNews(JSON.parse(event.data));
   stream.addEventListener("replaced", () => {
     disconnect();
@@ -168,8 +169,8 @@ async function send(text, then, vehicle = state.vehicle) {
     else if (response.status === 202) { if (state.sent.has(id)) reply(`${title}: in progress`, "waiting"); }
     else { state.sent.delete(id); reply(`${title}: not sent: ${(await response.text()).trim()}`, "bad"); }
   } catch (error) {
-    state.sent.delete(id);
-    reply(`${title}: not sent: the dashboard does not answer (${error.message})`, "bad");
+    // Its outcome may still come by the stream.
+    reply(`${title}: no answer of the dashboard, it may have been sent (${error.message})`, "bad");
   }
 }
 
@@ -198,7 +199,7 @@ $("commands").addEventListener("click", (event) => {
 $("sending").addEventListener("submit", (event) => {
   event.preventDefault();
   const text = $("text").value.trim();
-  if (text) { send(text); $("text").select(); }
+  if (text) { send(text); $("text").value = ""; $("text").blur(); } // the space bar stops again
 });
 const sendStop = (all) => send("stop", null, all && isFleet() ? ALL : state.vehicle);
 $("stop").addEventListener("click", (event) => sendStop(event.shiftKey));

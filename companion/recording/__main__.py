@@ -10,10 +10,13 @@ import signal
 import sys
 from threading import Event
 
-from companion.bus.client import NoAnswerError, settings_in_child
+from companion.bus.client import NoAnswerError, open_client, settings_in_child
 from companion.bus.config import BusError
 from companion.child_process import EXIT_REFUSED, on_parent_end
 from companion.recording import RecordingError
+from companion.settings import ZenohSection
+
+_RETRY_S = 2.0
 
 
 def main(argument: str) -> int:
@@ -25,6 +28,8 @@ def main(argument: str) -> int:
     zenoh = settings_in_child(values.pop("zenoh"))
     extra = "foxglove" if "listen" in values else "recording"
     try:
+        if not _wait_for_node(zenoh, ending):
+            return 0
         if extra == "foxglove":
             from companion.recording.live import LiveOptions, serve
 
@@ -40,6 +45,21 @@ def main(argument: str) -> int:
         _say(str(error))
         return EXIT_REFUSED
     return 0
+
+
+def _wait_for_node(zenoh: ZenohSection, ending: Event) -> bool:
+    """Wait for a node, such as a router that starts later; False: ended before."""
+    said = False
+    while not ending.is_set():
+        try:
+            with open_client(zenoh):
+                return True
+        except NoAnswerError as error:
+            if not said:
+                _say(f"{error}; retrying")
+            said = True
+        ending.wait(_RETRY_S)
+    return False
 
 
 def _say(text: str) -> None:

@@ -94,6 +94,8 @@ class Converter:
         topic = _OF_RECORDER.get(path, path)
         stamp_ns = next((message[key] for key in _STAMPS if key in message), None)
         log_time_ns = time.time_ns() if stamp_ns is None else stamp_ns + self._offset_ns
+        if type(log_time_ns) is not int or not 0 <= log_time_ns < 2**64:
+            raise ValueError(f"{path}: stamp {stamp_ns!r}, expected nanoseconds as a whole number")
         yield Recorded(
             Channel(topic, f"companion.{_OF_RECORDER.get(path, name)}", ANY_OBJECT), log_time_ns, payload
         )

@@ -29,7 +29,7 @@ FLUSH_S = 1.0
 _HEADER_BYTES = 9  # opcode and length of a record
 _LARGEST_RECORD_BYTES = 1 << 30
 # Of our own files: only these are removed for space.
-_NAME = re.compile(r"[\w.-]+_\d{8}T\d{6}Z_\d{3}\.mcap")
+_NAME = re.compile(r"[\w.-]+_\d{8}T\d{6}Z_\d{3,}\.mcap")
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,8 +138,10 @@ class RecordingWriter:
         files = {path: path.stat() for path in self._directory.iterdir() if _NAME.fullmatch(path.name)}
         total = sum(status.st_size for status in files.values())
         for path in sorted(files, key=lambda path: (files[path].st_mtime_ns, path.name)):
-            if total <= self._max_total_bytes or path == self.path:
+            if total <= self._max_total_bytes:
                 return
+            if path == self.path:  # the oldest by a clock that was set back
+                continue
             total -= files[path].st_size
             with contextlib.suppress(OSError):  # another recorder may have removed it
                 path.unlink()

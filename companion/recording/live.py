@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 import json
 from collections import Counter
 from collections.abc import Callable
@@ -108,6 +109,12 @@ class Live(ServerListener):
 
 def serve(options: LiveOptions, ending: Event, say: Callable[[str], None]) -> None:
     """Serve until `ending` is set. Raises RecordingError; NoAnswerError: no service at the endpoint."""
+    host = options.listen.rpartition(":")[0].strip("[]")
+    if host != "localhost" and not ipaddress.ip_address(host).is_loopback:
+        raise RecordingError(
+            f"foxglove.listen: expected a loopback address, since there is no authentication, got {host}; "
+            "from another computer use ssh -L"
+        )
     with open_client(options.zenoh, timeout_s=10.0) as session:
         live = Live(options, session)
         say(f"open ws://{options.listen.rpartition(':')[0]}:{live.port} in Foxglove")

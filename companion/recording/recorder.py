@@ -81,7 +81,7 @@ class Recorder:
             self._taken += 1
             try:
                 messages = list(self._converter.convert(path, payload, attachment))
-            except (ValueError, KeyError, TypeError):
+            except (ValueError, KeyError, TypeError, RecursionError):
                 self._unread += 1  # of another version, or another program's
                 continue
             for message in messages:

@@ -144,6 +144,29 @@ def test_missing_steps_are_reported(flown: Path, tmp_path: Path) -> None:
     assert "50 to 51" in found.inexact[1]
 
 
+def test_missing_outputs_are_reported(flown: Path, tmp_path: Path) -> None:
+    def change(message: Recorded) -> Recorded | None:
+        lost = message.channel.topic == OUTPUT_CHANNEL and 10 <= json.loads(message.data)["step"] < 13
+        return None if lost else message
+
+    found = replay([rewritten(flown, tmp_path, change)], {})
+    assert found.inexact == ["the outputs of 3 steps are not recorded, first of 10"]
+    assert found.differing_steps == 0
+
+
+def test_outputs_before_their_inputs_are_compared(flown: Path, tmp_path: Path) -> None:
+    """Messages with one stamp are read in any order."""
+
+    def change(message: Recorded) -> Recorded:
+        if message.channel.topic != OUTPUT_CHANNEL:
+            return message
+        output = json.loads(message.data) | {"rate_wanted": "none"}
+        return message._replace(data=json.dumps(output).encode(), log_time_ns=message.log_time_ns - 1)
+
+    found = replay([rewritten(flown, tmp_path, change)], {})
+    assert (found.differing_steps, found.inexact) == (found.steps, [])
+
+
 def test_parts_are_replayed_together(flown: Path, tmp_path: Path) -> None:
     def half(second: bool) -> Path:
         def change(message: Recorded) -> Recorded | None:

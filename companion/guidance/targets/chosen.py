@@ -59,7 +59,11 @@ class Wanted:
         return [
             target
             for target in targets
-            if (target.track_id == self.track_id if self.track_id else target.class_name == self.class_name)
+            if (
+                target.track_id == self.track_id
+                if self.track_id is not None
+                else target.class_name == self.class_name
+            )
             and target.score >= confidence
         ]
 

@@ -12,7 +12,7 @@ from mavlink_sim.testing import free_port
 from tests.companion.dashboard.chromium import PROGRAM, Browser, Tab, chromium, wait_for
 from tests.companion.dashboard.serving import dashboard_command
 from tests.companion.dashboard.test_bridge import publishing
-from tests.companion.dashboard.test_fleet import answering, publish_scene, two_vehicles
+from tests.companion.dashboard.test_dashboard_fleet import answering, publish_scene, two_vehicles
 from tests.companion.service_process import ServiceProcess
 from tests.companion.test_play import playing
 
