@@ -24,7 +24,7 @@ demo: $(READY)
 # Hundreds of processes are started: bytecode is kept, whatever the environment says.
 test test-slow: export PYTHONDONTWRITEBYTECODE =
 test: $(READY)
-	$(BIN)/python -m pytest tests/alone --reruns 1
+	$(BIN)/python -m pytest tests/alone
 	$(BIN)/python -m pytest --ignore tests/alone -n $(WORKERS) --dist worksteal -m "not realtime and not slow"
 	$(BIN)/python -m pytest --ignore tests/alone -n $(REALTIME_WORKERS) --dist worksteal -m "realtime and not slow" --reruns 1
 
