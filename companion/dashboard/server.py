@@ -25,6 +25,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from companion.dashboard.access import COOKIE, Access, DashboardError, Refusal, read_token
 from companion.dashboard.bridge import Bridge, News
@@ -33,6 +34,8 @@ from companion.settings import ZenohSection
 
 STREAM_PERIOD_S = 0.1
 PICTURE_WAIT_S = 0.5
+FIRST_REQUEST_S = 5.0
+"""A connection without a complete request head after this is closed: silent ones would use up the limit."""
 REPLY_WAIT_S = 1.0
 """How long a POST waits for the command's outcome; a later one is only in the stream."""
 ALL = "*"
@@ -69,6 +72,18 @@ class DashboardOptions:
     vehicle: str
 
 
+class _Connection(H11Protocol):
+    """A connection that must ask for something."""
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        self.loop.call_later(FIRST_REQUEST_S, self._close_if_silent)
+
+    def _close_if_silent(self) -> None:
+        if self.cycle is None:
+            self.transport.close()
+
+
 async def serve(options: DashboardOptions, on_ready: Callable[[str], None]) -> None:
     """Serve until SIGINT or SIGTERM, or until cancelled.
 
@@ -87,7 +102,7 @@ async def serve(options: DashboardOptions, on_ready: Callable[[str], None]) -> N
         server = uvicorn.Server(
             uvicorn.Config(
                 application,
-                http="h11",
+                http=_Connection,
                 ws="none",
                 lifespan="off",
                 access_log=False,

@@ -115,9 +115,9 @@ def _zoomed(
         if len(boxes) and (window < whole).any() and rng.random() < 0.7:
             # Most of a large scene is empty: prefer a window with an object.
             centre = boxes[int(rng.integers(len(boxes)))].reshape(2, 2).mean(axis=0) * zoom
-            room = window - zoom * whole
+            margin = window - zoom * whole
             shift = np.clip(
-                rng.uniform(0.1, 0.9, 2) * window - centre, np.minimum(room, 0), np.maximum(room, 0)
+                rng.uniform(0.1, 0.9, 2) * window - centre, np.minimum(margin, 0), np.maximum(margin, 0)
             )
     # warpAffine counts from pixel centres, boxes from pixel edges: half a pixel each.
     centre_shift = shift + 0.5 * zoom - 0.5
@@ -228,7 +228,7 @@ class _Scenes(Dataset[LabelledImage]):
         self.scenes, self.class_count, self.augmentation = scenes, class_count, augmentation
         self.repeated = repeated
         self.drawn: dict[SceneKey, LabelledImage] = {}
-        self.room = KEPT_BYTES
+        self.margin = KEPT_BYTES
 
     def __getitem__(self, key: SceneKey) -> LabelledImage:
         scene_key = replace(key, view=0)
@@ -236,9 +236,9 @@ class _Scenes(Dataset[LabelledImage]):
         if scene is None:
             scene = draw_scene(self.scenes, scene_key, self.class_count)
             # No eviction: scenes repeat in order, so the oldest is the one needed next.
-            if scene_key in self.repeated and scene[0].nbytes <= self.room:
+            if scene_key in self.repeated and scene[0].nbytes <= self.margin:
                 self.drawn[scene_key] = scene
-                self.room -= scene[0].nbytes
+                self.margin -= scene[0].nbytes
         rng = np.random.default_rng([key.seed, key.scene, key.view])
         return augment(rng, scene, self.augmentation, key.size)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import gc
 import json
 import socket
@@ -13,7 +14,7 @@ import pytest
 
 from companion.bus.topics import DETECTIONS, VEHICLE, command_key
 from companion.dashboard.access import COOKIE, DashboardError
-from companion.dashboard.server import LARGEST_BODY_BYTES, MAX_STREAMS_PER_BROWSER
+from companion.dashboard.server import LARGEST_BODY_BYTES, MAX_CONNECTIONS, MAX_STREAMS_PER_BROWSER
 from tests.companion.dashboard.serving import POST, EventStream, request, serving
 from tests.companion.dashboard.test_bridge import NAME, frame, publishing, until
 
@@ -236,3 +237,16 @@ async def test_browser_that_reads_nothing_costs_no_memory() -> None:
             assert after - before < 1_000_000  # 3 MB were sent to the other browser
             alive.close()
             dead.close()
+
+
+async def test_silent_connections_do_not_use_up_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("companion.dashboard.server.FIRST_REQUEST_S", 1.0)
+    async with serving() as port:
+        silent = [socket.create_connection(("127.0.0.1", port)) for _ in range(MAX_CONNECTIONS)]
+        silent[0].sendall(b"GET / HT")  # half a request is none
+        assert (await request(port, "GET", "/clock"))[0] == 503
+        for connection in silent:
+            connection.settimeout(10.0)
+            assert await asyncio.to_thread(connection.recv, 1) == b""
+            connection.close()
+        assert (await request(port, "GET", "/clock"))[0] == 200
