@@ -51,7 +51,10 @@ def guidance_options(settings: Settings, own_address: Address) -> GuidanceOption
         lifetime_s=guidance.setpoint_lifetime_s,
         battery=BatteryMinimum(guidance.min_battery_percent / 100.0, guidance.low_battery),
         obstacles=ObstacleRules(
-            guidance.obstacles, guidance.obstacle_margin_m, guidance.max_speed_unobserved_mps
+            guidance.obstacles,
+            guidance.obstacle_margin_m,
+            guidance.max_speed_unobserved_mps,
+            guidance.perception_max_age_s,
         ),
         perception_max_age_s=guidance.perception_max_age_s,
         track_max_age_s=settings.of_camera(guidance.camera).tracker.max_age_s,

@@ -56,7 +56,7 @@ class GuidanceSection(Section):
     max_speed_unobserved_mps: Annotated[float | None, Field(gt=0, le=30)] = None
     """maximum speed in directions that the depth camera does not see, metres a second; unset: no limit"""
     perception_max_age_s: Annotated[float, Field(gt=0, le=10)] = 0.5
-    """maximum age of detections used by guidance, seconds since the capture"""
+    """maximum age of detections and depth used by guidance, seconds since the capture"""
     camera: Annotated[str | None, CAMERA_NAME] = None
     """the steering camera; unset: the one of the sections source, camera and detector"""
 

@@ -30,7 +30,6 @@ DECELERATION_MPS2 = 0.7
 BRAKING_GAIN, MOST_BRAKING_MPS, MOST_RETREAT_MPS = 1.5, 2.0, 0.8
 # Maximum speed per metre left.
 GAIN_PER_S = 0.4
-MAX_AGE_S = 0.5
 # A few seconds: a person moves out of the way in less.
 REMEMBERED_S = 8.0
 REMEMBERED_WITHIN_M = 8.0
@@ -48,6 +47,7 @@ class ObstacleRules:
             nothing flies without it.
         margin_m: minimum distance from the vehicle's centre to an obstacle.
         max_speed_unobserved_mps: into unseen sectors; None: not limited.
+        max_age_s: of the depth image, since the capture.
 
     Raises:
         ValueError: a number is not positive.
@@ -56,30 +56,36 @@ class ObstacleRules:
     use: ObstacleUse = "off"
     margin_m: float = 2.0
     max_speed_unobserved_mps: float | None = None
+    max_age_s: float = 0.5
 
     def __post_init__(self) -> None:
-        for name in ("margin_m", "max_speed_unobserved_mps"):
+        for name in ("margin_m", "max_speed_unobserved_mps", "max_age_s"):
             value = getattr(self, name)
             if value is not None and not (math.isfinite(value) and value > 0.0):
                 raise ValueError(f"{name} must be a finite number above 0, got {value}")
 
+    def fresh(self, context: BehaviourContext) -> bool:
+        """Whether sectors no older than `max_age_s` are available."""
+        seen = context.obstacles
+        return seen is not None and context.now_ns - seen.captured_ns <= self.max_age_s * 1e9
+
     def missing(self, behaviour: Behaviour, context: BehaviourContext) -> str | None:
         """What is missing for a behaviour that flies, in words; None: nothing."""
-        if self.use != "required" or not needs_charge(behaviour) or fresh(context):
+        if self.use != "required" or not needs_charge(behaviour) or self.fresh(context):
             return None
         return f"depth ({_age(context.obstacles, context.now_ns)}; guidance.obstacles is required)"
 
     def blind(self, context: BehaviourContext) -> str | None:
         """Why the vehicle must brake without depth; None: it need not."""
         relied_on = self.use == "required" or (self.use == "auto" and context.obstacles is not None)
-        if not relied_on or fresh(context):
+        if not relied_on or self.fresh(context):
             return None
         return f"no depth: {_age(context.obstacles, context.now_ns)}"
 
     def constraints(self, context: BehaviourContext) -> tuple[Constraint, ...]:
         """(north, east) unit direction and the speed allowed in it, for every limiting sector."""
         seen = context.obstacles
-        if self.use == "off" or seen is None or not fresh(context):
+        if self.use == "off" or seen is None or not self.fresh(context):
             return ()
         late_s = LATENCY_S + (context.now_ns - seen.captured_ns) / 1e9
         constraints = []
@@ -151,12 +157,6 @@ def speed_towards(left_m: float, late_s: float, deceleration_mps2: float = DECEL
     late = deceleration_mps2 * late_s
     left_m = max(0.0, left_m)
     return min(math.sqrt(late**2 + 2.0 * deceleration_mps2 * left_m) - late, GAIN_PER_S * left_m)
-
-
-def fresh(context: BehaviourContext) -> bool:
-    """Whether sectors no older than `MAX_AGE_S` are available."""
-    seen = context.obstacles
-    return seen is not None and context.now_ns - seen.captured_ns <= MAX_AGE_S * 1e9
 
 
 def _age(seen: ObstacleSectors | None, now_ns: int) -> str:

@@ -14,12 +14,13 @@ from companion.guidance.core import GuidanceOptions
 from companion.guidance.interface import EventKind
 from companion.guidance.limits.envelope import Envelope
 from companion.guidance.limits.obstacles import (
-    MAX_AGE_S,
     ObstacleMemory,
     ObstacleRules,
     speed_towards,
 )
 from companion.guidance.requirements import check_requirements
+from companion.service.factory import guidance_options
+from companion.settings.reading import load_settings
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, Vector3
 from tests.companion.guidance.guidance_harness import GuidanceHarness
@@ -108,11 +109,17 @@ def test_stale_depth_brakes_with_its_age() -> None:
     vehicle = KinematicVehicle()
     seen = sectors(vehicle.now_ns)
     rules = ObstacleRules("auto")
-    assert rules.blind(context(seen, age_s=MAX_AGE_S - 0.1)) is None
+    assert rules.blind(context(seen, age_s=0.4)) is None
     assert "0.7 s old" in (rules.blind(context(seen, age_s=0.7)) or "")
     assert rules.blind(context(None)) is None
     assert "none received" in (ObstacleRules("required").blind(context(None)) or "")
     assert ObstacleRules("off").blind(context(seen, age_s=9.0)) is None
+    assert ObstacleRules("auto", max_age_s=1.0).blind(context(seen, age_s=0.9)) is None
+
+
+def test_depth_age_follows_perception_max_age_s() -> None:
+    settings = load_settings("/dev/null", {"guidance.perception_max_age_s": "1.5"}, environment={})
+    assert guidance_options(settings, (1, 191)).obstacles.max_age_s == 1.5
 
 
 def test_missing_required_depth_is_refused() -> None:
