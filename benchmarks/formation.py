@@ -34,6 +34,7 @@ from mavlink_sim.lockstep import COMPANION
 from mavlink_sim.vehicles.vehicle import BACKGROUND_GUSTS_MPS, GUST_SHARE_OF_WIND
 from mavlink_sim.wire.streams import ONBOARD_RATES_HZ
 from vision.attitude import quaternion_from_euler, wrap_angle
+from vision.obstacle_sectors import ObstacleSectors
 
 POSES_HZ = 10.0
 # Of what PX4 sends a companion by itself, what its state is made of.
@@ -109,6 +110,9 @@ class PointAirframe:
 
     def send_landing_target(self, target: LandingTarget) -> None:
         raise NotImplementedError("a point lands on nothing")
+
+    def send_obstacle_distance(self, sectors: ObstacleSectors) -> None:
+        raise NotImplementedError("a point sees no obstacles")
 
     def start(self, request: Request) -> None:
         """It does at once what it is asked."""

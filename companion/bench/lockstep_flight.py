@@ -303,6 +303,7 @@ class LockstepFlight:
             start=self.driver.start,
             cancel=self.driver.cancel,
             send_landing_target=self.driver.send_landing_target,
+            send_obstacle_distance=self.driver.send_obstacle_distance,
         )
         self.events += output.events
         self._results |= {result.identifier: result.outcome for result in output.results}

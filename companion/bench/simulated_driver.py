@@ -24,12 +24,14 @@ from companion.vehicle.driver import CommandRefusedError
 from companion.vehicle.gimbal_commands import CONFIGURE, FOLLOWING_NOSE, PITCHYAW, RELEASE, UNCHANGED
 from companion.vehicle.landing_target import LandingTarget, landing_target_fields
 from companion.vehicle.mav_result import ACCEPTED, IN_PROGRESS, result_name
+from companion.vehicle.obstacle_distance import obstacle_distance_fields
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import VehicleState
 from companion.vehicle.telemetry import TELEMETRY_MESSAGES, apply_message
 from mavlink_sim.lockstep import COMPANION, LockstepVehicle
 from mavlink_sim.vehicles.ardupilot.copter import CopterVehicle
 from mavlink_sim.wire.messages import dialect
+from vision.obstacle_sectors import ObstacleSectors
 
 START_NS = 1_000_000_000_000
 # As the drivers wait.
@@ -60,6 +62,9 @@ class LockstepDriver(Protocol):
 
     def send_landing_target(self, target: LandingTarget) -> None:
         """One landing target, now."""
+
+    def send_obstacle_distance(self, sectors: ObstacleSectors) -> None:
+        """One OBSTACLE_DISTANCE, now."""
 
     def start(self, request: Request) -> None:
         """Begin to carry out a request of guidance."""
@@ -129,6 +134,11 @@ class SimulatedDriver:
     def send_landing_target(self, target: LandingTarget) -> None:
         fields = landing_target_fields(target, self._kind, self._state.reset_offset_ned_m)
         self.vehicle.send(dialect.MAVLink_landing_target_message(**fields))
+
+    def send_obstacle_distance(self, sectors: ObstacleSectors) -> None:
+        if self._state.yaw_rad is not None:
+            fields = obstacle_distance_fields(sectors, self._state.yaw_rad)
+            self.vehicle.send(dialect.MAVLink_obstacle_distance_message(**fields))
 
     def start(self, request: Request) -> None:
         mav, state = dialect, self._state

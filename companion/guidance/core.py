@@ -46,6 +46,7 @@ from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import DEFAULT_LIFETIME_S, Setpoint
 from companion.vehicle.state import FlightMode, Vector3
 from companion.vehicle.streamer import StreamState
+from vision.obstacle_sectors import ObstacleSectors
 
 logger = logging.getLogger(__name__)
 
@@ -56,6 +57,7 @@ ENGAGE_TIMEOUT_S = 3.0
 REASON_WAIT_S = 0.3
 # In OFFBOARD without a position estimate: brake for this long, then hand over to the autopilot.
 POSITION_LOSS_S = 2.0
+OBSTACLE_DISTANCE_PERIOD_NS = 100_000_000
 
 
 class Phase(StrEnum):
@@ -85,6 +87,7 @@ class GuidanceOptions:
     lifetime_s: float = DEFAULT_LIFETIME_S
     battery: BatteryMinimum = NO_MINIMUM
     obstacles: ObstacleRules = NO_RULES
+    send_obstacle_distance: bool = False
     perception_max_age_s: float = 0.5
     track_max_age_s: float = 2.0
     gimbal: GimbalMounting = GimbalMounting()  # noqa: RUF009 - frozen
@@ -136,7 +139,7 @@ class Guidance:
         self._blind = False
         self._goal_ned_m: Vector3 | None = None
         self._mode_changes = 0
-        self._landing_target_ns = 0
+        self._landing_target_ns = self._obstacle_distance_ns = 0
         # Read once in each step, where an exception is handled.
         self._active: Behaviour | None = None
         self._landing = False
@@ -272,6 +275,7 @@ class Guidance:
             tuple(out.requests),
             tuple(out.cancelled),
             landing_target,
+            self._due_obstacles(),
             tuple(out.events),
             tuple(out.results),
             released,
@@ -321,6 +325,19 @@ class Guidance:
             return None
         self._landing_target_ns = target.captured_ns
         return target
+
+    def _due_obstacles(self) -> ObstacleSectors | None:
+        """The sectors for the autopilot, also while a pilot flies; None: not due, or stale."""
+        context = self._context
+        if not self.options.send_obstacle_distance or context is None:
+            return None
+        if context.now_ns < self._obstacle_distance_ns or not self.options.obstacles.fresh(context):
+            return None
+        # On a grid, so that the steps' own period does not lower the rate.
+        due_ns = self._obstacle_distance_ns + OBSTACLE_DISTANCE_PERIOD_NS
+        late = context.now_ns >= due_ns
+        self._obstacle_distance_ns = context.now_ns + OBSTACLE_DISTANCE_PERIOD_NS if late else due_ns
+        return context.obstacles
 
     # --- one step of the behaviour -----------------------------------------------------------------------
 

@@ -208,6 +208,7 @@ class GuidanceOutput:
         setpoint: to stream from now on, a brake included; None: stop streaming.
         requests: new ones. cancelled: identifiers of abandoned requests.
         landing_target: for the autopilot, once per frame that shows one.
+        obstacle_distance: for the autopilot's collision prevention, 10 times a second; never stale.
         released: after `ending`: no request is pending and no control is held.
     """
 
@@ -215,6 +216,7 @@ class GuidanceOutput:
     requests: tuple[Request, ...] = ()
     cancelled: tuple[int, ...] = ()
     landing_target: LandingTarget | None = None
+    obstacle_distance: ObstacleSectors | None = None
     events: tuple[GuidanceEvent, ...] = ()
     results: tuple[CommandResult, ...] = ()
     released: bool = False

@@ -149,6 +149,7 @@ class GuidanceLoop:
             start=self._requests.start,
             cancel=self._requests.cancel,
             send_landing_target=self._driver.send_landing_target,
+            send_obstacle_distance=self._driver.send_obstacle_distance,
         )
         for event in output.events:
             if event.kind not in _ANSWERED:

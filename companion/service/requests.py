@@ -22,6 +22,7 @@ from companion.guidance.interface import (
 from companion.vehicle.driver import CommandRefusedError, Driver, LinkError
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.streamer import Streamer
+from vision.obstacle_sectors import ObstacleSectors
 
 logger = logging.getLogger(__name__)
 
@@ -33,8 +34,9 @@ def apply_output(
     start: Callable[[Request], None],
     cancel: Callable[[int], None],
     send_landing_target: Callable[[LandingTarget], None],
+    send_obstacle_distance: Callable[[ObstacleSectors], None],
 ) -> None:
-    """Pass the setpoint, requests and landing target of one step on to the vehicle."""
+    """Pass the setpoint, requests, landing target and obstacles of one step on to the vehicle."""
     if output.setpoint is None:
         streamer.stop()
     else:
@@ -45,6 +47,8 @@ def apply_output(
         start(request)
     if output.landing_target is not None:
         send_landing_target(output.landing_target)
+    if output.obstacle_distance is not None:
+        send_obstacle_distance(output.obstacle_distance)
 
 
 class RequestRunner:

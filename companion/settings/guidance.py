@@ -55,6 +55,8 @@ class GuidanceSection(Section):
     """minimum distance of obstacles from the vehicle's centre, metres"""
     max_speed_unobserved_mps: Annotated[float | None, Field(gt=0, le=30)] = None
     """maximum speed in directions that the depth camera does not see, metres a second; unset: no limit"""
+    send_obstacle_distance: bool = False
+    """send OBSTACLE_DISTANCE to the autopilot, for its collision prevention in the pilot's Position mode"""
     perception_max_age_s: Annotated[float, Field(gt=0, le=10)] = 0.5
     """maximum age of detections and depth used by guidance, seconds since the capture"""
     camera: Annotated[str | None, CAMERA_NAME] = None
@@ -72,6 +74,8 @@ class GuidanceSection(Section):
                 f"setpoint_lifetime_s must be longer than one period of rate_hz ({1 / self.rate_hz:.3g} s), "
                 f"got {self.setpoint_lifetime_s:g}: each setpoint would expire before the next"
             )
+        if self.send_obstacle_distance and self.obstacles == "off":
+            raise ValueError("send_obstacle_distance needs obstacles auto or required, got off")
         self.fence()
         return self
 

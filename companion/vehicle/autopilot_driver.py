@@ -29,6 +29,7 @@ from companion.vehicle.gimbal import Address, GimbalAim
 from companion.vehicle.gimbal_commands import GimbalCommands
 from companion.vehicle.landing_target import LandingTarget, landing_target_fields
 from companion.vehicle.link_url import LinkScheme, LinkUrl
+from companion.vehicle.obstacle_distance import obstacle_distance_fields
 from companion.vehicle.report_reader import ReportReader
 from companion.vehicle.setpoint import LEAVES_WITHIN_S, Setpoint
 from companion.vehicle.signing import FrameSigner
@@ -36,6 +37,7 @@ from companion.vehicle.state import HEARTBEAT_MAX_AGE_S, FlightMode, VehicleStat
 from companion.vehicle.stream_requests import StreamRequests
 from companion.vehicle.telemetry import Fields
 from companion.vehicle.telemetry_state import TelemetryState
+from vision.obstacle_sectors import ObstacleSectors
 
 logger = logging.getLogger(__name__)
 
@@ -440,6 +442,12 @@ class AutopilotDriver(ABC):
             offset = self._telemetry.state.reset_offset_ned_m
             fields = landing_target_fields(target, self._autopilot_kind or 0, offset)
             self._send_message("LANDING_TARGET", fields)
+
+    def send_obstacle_distance(self, sectors: ObstacleSectors) -> None:
+        """See Driver."""
+        yaw_rad = self._telemetry.state.yaw_rad
+        if self._link is not None and self._system_id is not None and yaw_rad is not None:
+            self._send_message("OBSTACLE_DISTANCE", obstacle_distance_fields(sectors, yaw_rad))
 
     # --- commands -----------------------------------------------------------------------------------
 

@@ -10,8 +10,8 @@ from companion.bus.messages import obstacles_message
 from companion.guidance.behaviour import BehaviourContext
 from companion.guidance.behaviours.goto import GotoBehaviour
 from companion.guidance.behaviours.land import LandBehaviour
-from companion.guidance.core import GuidanceOptions
-from companion.guidance.interface import EventKind
+from companion.guidance.core import Guidance, GuidanceOptions
+from companion.guidance.interface import EventKind, GuidanceInput
 from companion.guidance.limits.envelope import Envelope
 from companion.guidance.limits.obstacles import (
     ObstacleMemory,
@@ -20,7 +20,7 @@ from companion.guidance.limits.obstacles import (
 )
 from companion.guidance.requirements import check_requirements
 from companion.service.factory import guidance_options
-from companion.settings.reading import load_settings
+from companion.settings.reading import ConfigurationError, load_settings
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, Vector3
 from tests.companion.guidance.guidance_harness import GuidanceHarness
@@ -120,6 +120,25 @@ def test_stale_depth_brakes_with_its_age() -> None:
 def test_depth_age_follows_perception_max_age_s() -> None:
     settings = load_settings("/dev/null", {"guidance.perception_max_age_s": "1.5"}, environment={})
     assert guidance_options(settings, (1, 191)).obstacles.max_age_s == 1.5
+
+
+@pytest.mark.parametrize("send", [True, False])
+def test_obstacle_distance_is_sent_at_10_hz_while_fresh(send: bool) -> None:
+    vehicle = KinematicVehicle(mode=FlightMode.POSITION)  # a pilot flies
+    guidance = Guidance(GuidanceOptions(obstacles=ObstacleRules("auto"), send_obstacle_distance=send))
+    begun_ns, sent = vehicle.now_ns, []
+    for _ in range(200):  # 10 s of 20 steps a second; the depth camera stops after 5 s
+        inputs = GuidanceInput(vehicle.state, obstacles=sectors(min(vehicle.now_ns, begun_ns + 5 * 10**9)))
+        if guidance.step(vehicle.now_ns, inputs).obstacle_distance is not None:
+            sent.append((vehicle.now_ns - begun_ns) / 1e9)
+        vehicle.now_ns += 50_000_000
+    assert sent == pytest.approx([number / 10 for number in range(56)] if send else [])
+
+
+def test_sending_needs_obstacle_sectors() -> None:
+    flags = {"guidance.send_obstacle_distance": "true", "guidance.obstacles": "off"}
+    with pytest.raises(ConfigurationError, match="send_obstacle_distance"):
+        load_settings("/dev/null", flags, environment={})
 
 
 def test_missing_required_depth_is_refused() -> None:
