@@ -11,8 +11,12 @@ import json
 import math
 import time
 from collections.abc import Iterator
+from functools import cache
 from typing import Any
 
+from typing_extensions import TypedDict
+
+from companion.bus.schema import schema_of
 from companion.bus.topics import (
     DETECTIONS,
     EVENTS,
@@ -22,6 +26,7 @@ from companion.bus.topics import (
     LABELS,
     MAVLINK,
     RUN,
+    TOPICS,
     VEHICLE,
 )
 from companion.recording.files import Channel, Recorded
@@ -32,6 +37,7 @@ from companion.recording.tap import unpack_link_bytes
 RUN_CHANNEL, INPUT_CHANNEL, OUTPUT_CHANNEL = "run", "guidance_input", "guidance_output"
 RECEIVED_CHANNEL, SENT_CHANNEL, RECORDER_CHANNEL = "mavlink_received", "mavlink_sent", "recorder"
 ANY_OBJECT = b'{"type":"object"}'
+_BODIES = {topic.name: topic.body for topic in TOPICS}
 _OF_RECORDER = {
     RUN.name: RUN_CHANNEL,
     GUIDANCE_INPUT.name: INPUT_CHANNEL,
@@ -42,6 +48,24 @@ _LEVELS = {"info": 2, "warning": 3, "error": 4}  # foxglove.LogLevel
 _LINE_LOOP = 2  # foxglove.PointsAnnotationType
 _COLORS = {"confirmed": (0.2, 1.0, 0.3), "tentative": (1.0, 0.8, 0.1)}
 _OTHER_COLOR = (0.4, 0.7, 1.0)
+
+
+class LabelsBody(TypedDict):
+    """`labels`, which is plain text on the bus."""
+
+    labels: str
+
+
+@cache
+def stored_schema(body: Any) -> bytes:
+    """Return the JSON Schema of a body's type as it is stored in a file.
+
+    The fields are inside `allOf`: Lichtblick, and Foxglove before it, refuse a topic with a nullable field in
+    `properties`, and read one without `properties` as it comes.
+    """
+    schema = schema_of(body)
+    outer = {key: schema.pop(key) for key in ("$schema", "$defs") if key in schema}
+    return json.dumps({**outer, "type": "object", "allOf": [schema]}).encode()
 
 
 class Converter:
@@ -84,7 +108,7 @@ class Converter:
             return
         if name == LABELS.name:
             text = json.dumps({"labels": payload.decode()}).encode()
-            yield Recorded(Channel(path, "companion.labels", ANY_OBJECT), time.time_ns(), text)
+            yield Recorded(Channel(path, "companion.labels", stored_schema(LabelsBody)), time.time_ns(), text)
             return
         message = json.loads(payload)
         if path == RUN.name:
@@ -96,9 +120,9 @@ class Converter:
         log_time_ns = time.time_ns() if stamp_ns is None else stamp_ns + self._offset_ns
         if type(log_time_ns) is not int or not 0 <= log_time_ns < 2**64:
             raise ValueError(f"{path}: stamp {stamp_ns!r}, expected nanoseconds as a whole number")
-        yield Recorded(
-            Channel(topic, f"companion.{_OF_RECORDER.get(path, name)}", ANY_OBJECT), log_time_ns, payload
-        )
+        kind = _OF_RECORDER.get(path, name)
+        schema = stored_schema(_BODIES[kind]) if kind in _BODIES else ANY_OBJECT
+        yield Recorded(Channel(topic, f"companion.{kind}", schema), log_time_ns, payload)
         make = {
             DETECTIONS.name: self._annotations,
             VEHICLE.name: self._vehicle_state,

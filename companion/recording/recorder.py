@@ -13,20 +13,33 @@ from threading import Event
 from typing import Any
 
 import zenoh
+from typing_extensions import TypedDict
 
 from companion.bus.client import open_client, subscribe_kept
 from companion.bus.topics import IMAGE, MAVLINK, RECORDER_TOPICS, ROOT, TOPICS, Topic
-from companion.recording.convert import ANY_OBJECT, RECORDER_CHANNEL, RUN_CHANNEL, Converter
+from companion.recording.convert import RECORDER_CHANNEL, RUN_CHANNEL, Converter, stored_schema
 from companion.recording.files import FLUSH_S, Channel, Recorded, RecordingWriter
 from companion.settings import ZenohSection
 
 # The service and its perception have priority.
 _NICER = 10
-_NOTE = Channel(RECORDER_CHANNEL, f"companion.{RECORDER_CHANNEL}", ANY_OBJECT)
 MAX_WAITING = 10_000
 _POLL_S = 0.05
 # The last messages of a service that ends may still arrive.
 _LAST_S = 0.3
+
+
+class LossesBody(TypedDict):
+    """What was lost on the way to the file, since the recorder began."""
+
+    first_step: int | None
+    lost_steps: int
+    lost_link_pieces: int
+    dropped_messages: int
+    unread_messages: int
+
+
+_LOSSES = Channel(RECORDER_CHANNEL, f"companion.{RECORDER_CHANNEL}", stored_schema(LossesBody))
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +74,7 @@ class Recorder:
         self._converter = Converter(options.vehicle)
         self._waiting: deque[tuple[str, bytes, bytes | None]] = deque(maxlen=MAX_WAITING)
         self._added = self._taken = self._unread = 0
-        self._noted: dict[str, Any] = {}
+        self._noted: LossesBody | None = None
         self._flush_due_s = 0.0
 
     @property
@@ -112,7 +125,7 @@ class Recorder:
 
     def _note_losses(self) -> None:
         """Write what was lost, as it changes: a recording with a gap says so."""
-        note = {
+        note: LossesBody = {
             "first_step": self._converter.first_step,
             "lost_steps": self._converter.lost_steps,
             "lost_link_pieces": self._converter.lost_pieces,
@@ -121,7 +134,7 @@ class Recorder:
         }
         if note != self._noted:
             self._noted = note
-            self._writer.write(_NOTE, time.time_ns(), json.dumps(note).encode())
+            self._writer.write(_LOSSES, time.time_ns(), json.dumps(note).encode())
 
 
 def topics_of(options: RecorderOptions) -> list[Topic]:

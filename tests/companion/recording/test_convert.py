@@ -169,6 +169,28 @@ def test_link_bytes_are_split_and_losses_counted(converter: Converter) -> None:
         list(unpack_link_bytes(packed[:-1]))
 
 
+def schema_errors(recorded: Recorded, body: dict[str, Any]) -> list[str]:
+    validator = jsonschema.Draft202012Validator(json.loads(recorded.channel.schema))
+    return [error.validator for error in validator.iter_errors(body)]
+
+
+def test_stored_schema_accepts_the_message_and_refuses_others(converter: Converter) -> None:
+    empty = PerceptionResult(
+        7, CAPTURED_NS, CAPTURED_NS, 1920, 1080, Detections.empty(("car",)), {"total": 1.0}, dropped=0
+    )
+    for path, body in {
+        "vehicle": vehicle_message(STATE, PUBLISHED_NS),
+        "cameras/down/detections": detections_message(empty, "vehicle1", PUBLISHED_NS),
+        "events": {"stamp_ns": 1, "level": "warning", "text": "late"},
+    }.items():
+        recorded, *_ = converter.convert(path, dumps(body))
+        assert schema_errors(recorded, body) == []
+        wrong = {**body, next(key for key in body if key.endswith("_ns")): "now"}
+        assert "type" in schema_errors(recorded, wrong)
+    (labels,) = converter.convert("labels", b"2 cars")
+    assert schema_errors(labels, json.loads(labels.data)) == []
+
+
 def test_lost_steps_are_counted(converter: Converter) -> None:
     for step in (3, 4, 8):
         list(converter.convert("@record/guidance_input", dumps({"step": step, "now_ns": step})))

@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
+import jsonschema
 import pytest
 from pymavlink import mavutil
 
@@ -48,6 +49,19 @@ def messages_of(path: Path) -> Counter[str]:
     return Counter(message.channel.topic for message in RecordingReader(path).messages())
 
 
+def schema_errors(path: Path) -> list[str]:
+    """What is wrong with the JSON messages of a file by the schemas in it."""
+    validators: dict[bytes, jsonschema.Draft202012Validator] = {}
+    found = []
+    for channel, _, data in RecordingReader(path).messages():
+        if channel.encoding == "json":
+            if channel.schema not in validators:
+                validators[channel.schema] = jsonschema.Draft202012Validator(json.loads(channel.schema))
+            error = next(validators[channel.schema].iter_errors(json.loads(data)), None)
+            found += [] if error is None else [f"{channel.topic}: {error.message}"]
+    return found
+
+
 def test_flight_is_recorded_and_replays(filming: list[str], tmp_path: Path) -> None:
     folder = tmp_path / "recordings"
     with (
@@ -78,6 +92,7 @@ def test_flight_is_recorded_and_replays(filming: list[str], tmp_path: Path) -> N
         "/log",
     ):
         assert found[topic], topic
+    assert schema_errors(path) == []
     (note,) = [json.loads(message.data) for message in reader.messages("recorder")][-1:]
     assert (note["first_step"], note["lost_steps"], note["dropped_messages"]) == (0, 0, 0)
 
