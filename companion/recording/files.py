@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import re
 import time
@@ -29,7 +30,7 @@ FLUSH_S = 1.0
 _HEADER_BYTES = 9  # opcode and length of a record
 _LARGEST_RECORD_BYTES = 1 << 30
 # Of our own files: only these are removed for space.
-_NAME = re.compile(r"[\w.-]+_\d{8}T\d{6}Z_\d{3,}\.mcap")
+_NAME = re.compile(r"[\w.-]+_\d{8}T\d{6}Z(-\d+)?_\d{3,}\.mcap")
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,12 +114,18 @@ class RecordingWriter:
         self._file.close()
 
     def _open(self) -> None:
-        self.path = self._directory / f"{self._prefix}_{self._part:03d}.mcap"
         self._began_s = time.monotonic()
-        try:
-            self._file = _File(self.path)
-        except OSError as error:
-            raise RecordingError(f"{self.path}: cannot be created: {error.strerror}") from error
+        for number in itertools.count(1):  # another recorder may have begun in the same second
+            begin = self._prefix if number == 1 else f"{self._prefix}-{number}"
+            self.path = self._directory / f"{begin}_{self._part:05d}.mcap"
+            try:
+                self._file = _File(self.path)
+            except FileExistsError:
+                continue
+            except OSError as error:
+                raise RecordingError(f"{self.path}: cannot be created: {error.strerror}") from error
+            self._prefix = begin
+            break
         with self._cut_on_failure():
             self._messages = _Messages(self._file)
 

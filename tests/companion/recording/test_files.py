@@ -7,6 +7,7 @@ import random
 import re
 import resource
 import signal
+import time
 from pathlib import Path
 
 import pytest
@@ -126,7 +127,7 @@ def test_parts_begin_with_the_run_and_the_oldest_are_removed(tmp_path: Path) -> 
     writer.close()
     parts = sorted(path for path in tmp_path.glob("vehicle1_*.mcap"))
     assert all(other.exists() for other in others)
-    assert [path.name[-8:-5] for path in parts] == ["009", "010"][-len(parts) :]
+    assert [path.name[-10:-5] for path in parts] == ["00009", "00010"][-len(parts) :]
     assert sum(path.stat().st_size for path in parts) <= 120_000
     for path in parts:
         messages = list(RecordingReader(path).messages())
@@ -140,6 +141,40 @@ def test_part_ends_at_its_largest_duration(tmp_path: Path) -> None:
         writer.flush()
     writer.close()
     assert len(list(tmp_path.iterdir())) == 4
+
+
+def test_recorders_of_one_second_write_different_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(time, "strftime", lambda *_: "20261125T141512Z")
+    writers = [new_writer(tmp_path) for _ in range(3)]
+    for part in range(2):
+        for number, writer in enumerate(writers):
+            writer.write(RAW, 10 * part + number, b"x")
+            if part == 0:
+                writer.begin_next()
+    for writer in writers:
+        writer.close()
+    found = {path.name: times(path) for path in tmp_path.iterdir()}
+    assert found == {
+        f"vehicle1_20261125T141512Z{mark}_0000{part}.mcap": [10 * part + number]
+        for number, mark in enumerate(("", "-2", "-3"))
+        for part in range(2)
+    }
+    # All are known as recordings: of three limits' worth, the current file is left.
+    writer = new_writer(tmp_path, max_total_bytes=1)
+    writer.flush()
+    assert list(tmp_path.iterdir()) == [writer.path]
+
+
+def test_names_of_more_than_999_parts_are_in_order(tmp_path: Path) -> None:
+    writer = new_writer(tmp_path)
+    paths = []
+    for writer._part in (8, 98, 998, 9998):
+        writer.begin_next()
+        paths.append(writer.path)
+    writer.close()
+    assert sorted(paths) == paths
 
 
 def test_full_disk_leaves_a_file_of_whole_chunks(tmp_path: Path) -> None:
