@@ -169,3 +169,22 @@ def recover_recording(
     for line in problems:
         typer.echo(f"companion: {line}", err=True)
     typer.echo(f"{output}: {messages} messages")
+
+
+@log.command("tlog")
+def write_tlog(
+    file: Annotated[Path, typer.Argument(metavar="RECORDING", help="A recording.")],
+    output: Annotated[
+        Path | None, typer.Argument(metavar="OUTPUT", help="The new file; by default RECORDING with .tlog.")
+    ] = None,
+) -> None:
+    """Write the recorded MAVLink, both ways, as a .tlog for ground stations."""
+    with _with_library():
+        from companion.recording import RecordingError
+        from companion.recording.tlog import write_tlog as write
+    output = output or file.with_suffix(".tlog")
+    with plain_errors(RecordingError):
+        problems, frames = write(file, output)
+    for line in problems:
+        typer.echo(f"companion: {line}", err=True)
+    typer.echo(f"{output}: {frames} MAVLink messages")

@@ -7,16 +7,16 @@ import itertools
 import os
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel as ChannelRecord
-from mcap.records import Chunk, Message, Schema
+from mcap.records import Chunk, Message, Metadata, Schema
 from mcap.stream_reader import breakup_chunk
 from mcap.writer import CompressionType, Writer
 
@@ -211,7 +211,8 @@ class RecordingReader:
     """Reads the messages of one file, in the order of writing. Only whole chunks are read.
 
     Attributes:
-        problems: what could not be read, a line each; complete after `messages` has ended.
+        problems: what could not be read, a line each; complete after `messages` has ended, as the next.
+        metadata: name of a metadata record → its entries.
 
     Raises:
         RecordingError: the file cannot be read, or is not MCAP.
@@ -220,6 +221,7 @@ class RecordingReader:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.problems: list[str] = []
+        self.metadata: dict[str, dict[str, str]] = {}
         try:
             with path.open("rb") as file:
                 begin = file.read(len(MAGIC))
@@ -271,6 +273,13 @@ class RecordingReader:
                         for record in records:
                             if isinstance(record, Schema | ChannelRecord | Message):
                                 yield record
+                elif opcode == Opcode.METADATA and length <= _LARGEST_RECORD_BYTES:
+                    try:
+                        metadata = Metadata.read(ReadDataStream(BytesIO(file.read(length))))
+                    except Exception as error:  # as above
+                        self.problems.append(f"{self.path}: damaged metadata at byte {at}: {error}")
+                    else:
+                        self.metadata[metadata.name] = metadata.metadata
                 at += _HEADER_BYTES + length
                 file.seek(at)
 
@@ -282,13 +291,46 @@ def recover(path: Path, output: Path) -> tuple[list[str], int]:
         RecordingError: the file cannot be read, or the new one cannot be written or exists.
     """
     reader = RecordingReader(path)
-    try:
-        with output.open("xb") as file:
-            messages = _Messages(file)
-            count = 0
-            for count, message in enumerate(reader.messages(), 1):  # noqa: B007 - counted
-                messages.add(*message)
-            messages.writer.finish()  # type: ignore[no-untyped-call]
-    except OSError as error:
-        raise RecordingError(f"{output}: cannot be written: {error.strerror}") from error
+    count = write_messages(output, reader.messages(), reader.metadata)
     return reader.problems, count
+
+
+def write_messages(
+    output: Path, messages: Iterable[Recorded], metadata: Mapping[str, Mapping[str, str]]
+) -> int:
+    """Write a new, complete file. Returns the number of messages.
+
+    Args:
+        metadata: name of a record → its entries; read after the messages.
+
+    Raises:
+        RecordingError: the file cannot be written or exists.
+    """
+    count = 0
+    with new_file(output) as file:
+        writer = _Messages(file)
+        for count, message in enumerate(messages, 1):  # noqa: B007 - counted
+            writer.add(*message)
+        for name, entries in metadata.items():
+            writer.writer.add_metadata(name, dict(entries))
+        writer.writer.finish()  # type: ignore[no-untyped-call]
+    return count
+
+
+@contextlib.contextmanager
+def new_file(path: Path) -> Iterator[BinaryIO]:
+    """Open a new file; it is removed if the block raises.
+
+    Raises:
+        RecordingError: the file exists or cannot be written.
+    """
+    try:
+        with path.open("xb") as file:
+            try:
+                yield file
+                file.flush()
+            except BaseException:
+                path.unlink()
+                raise
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be written: {error.strerror}") from error
