@@ -11,8 +11,16 @@ from typing import Any
 
 from companion.bus.topics import EVENTS, VEHICLE
 from companion.recording import RecordingError
-from companion.recording.convert import OUTPUT_CHANNEL, RECORDER_CHANNEL, RUN_CHANNEL
+from companion.recording.convert import (
+    LOG_CHANNEL,
+    OUTPUT_CHANNEL,
+    RECORDER_CHANNEL,
+    RUN_CHANNEL,
+    ULOG_NAME,
+)
 from companion.recording.files import RecordingReader
+
+_READ = (RUN_CHANNEL, EVENTS.name, VEHICLE.name, OUTPUT_CHANNEL, RECORDER_CHANNEL, LOG_CHANNEL)
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +39,7 @@ class RecordingSummary:
         began_ns, ended_ns: Unix time of its first and last message; 0 without one.
         lines: (Unix time, kind, text) of events, modes and refusals, in order.
         losses: the recorder's last note about losses.
+        metadata: of the file, such as the clock of a ULog in it.
         problems: damage of the file.
     """
 
@@ -43,6 +52,7 @@ class RecordingSummary:
     flights: list[Flight] = field(default_factory=list)
     lines: list[tuple[int, str, str]] = field(default_factory=list)
     losses: dict[str, Any] = field(default_factory=dict)
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
 
     def as_dict(self) -> dict[str, Any]:
@@ -62,6 +72,7 @@ class RecordingSummary:
                 {"time": _shown(stamp_ns), "kind": kind, "text": text} for stamp_ns, kind, text in self.lines
             ],
             "losses": self.losses,
+            "metadata": self.metadata,
             "problems": self.problems,
         }
 
@@ -80,7 +91,7 @@ def summarize(path: Path) -> RecordingSummary:
     for channel, log_time_ns, data in reader.messages():
         found.began_ns = min(found.began_ns or log_time_ns, log_time_ns)
         found.ended_ns = max(found.ended_ns, log_time_ns)
-        if channel.topic not in (RUN_CHANNEL, EVENTS.name, VEHICLE.name, OUTPUT_CHANNEL, RECORDER_CHANNEL):
+        if channel.topic not in _READ:
             continue
         try:
             message = json.loads(data)
@@ -91,6 +102,9 @@ def summarize(path: Path) -> RecordingSummary:
                     found.losses = message
                 case topic if topic == EVENTS.name:
                     found.lines.append((log_time_ns, message["level"], message["text"]))
+                case topic if topic == LOG_CHANNEL:
+                    if message["name"] == ULOG_NAME:  # the others are events
+                        found.lines.append((log_time_ns, ULOG_NAME, message["message"]))
                 case topic if topic == OUTPUT_CHANNEL:
                     found.lines += [
                         (log_time_ns, "refused", f"{event['behaviour']}: {event['message']}")
@@ -107,6 +121,7 @@ def summarize(path: Path) -> RecordingSummary:
         except (ValueError, KeyError, TypeError) as error:
             found.problems.append(f"{path}: a message on {channel.topic} cannot be read: {error}")
     found.lines.sort(key=lambda line: line[0])
+    found.metadata = reader.metadata
     found.problems += reader.problems
     return found
 
@@ -160,6 +175,8 @@ def shown(found: RecordingSummary) -> Iterator[str]:
         yield f"{(stamp_ns - found.began_ns) / 1e9:9.2f} s  {kind:8}  {text}".rstrip()
     lost = {name: count for name, count in found.losses.items() if count and name != "first_step"}
     yield from (f"{name.replace('_', ' ')}: {count}" for name, count in lost.items())
+    for name, entries in found.metadata.items():
+        yield f"{name}: " + ", ".join(f"{key} {value}" for key, value in entries.items())
     yield from found.problems
 
 

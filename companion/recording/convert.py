@@ -36,6 +36,9 @@ from companion.recording.tap import unpack_link_bytes
 # Names of topics and channels.
 RUN_CHANNEL, INPUT_CHANNEL, OUTPUT_CHANNEL = "run", "guidance_input", "guidance_output"
 RECEIVED_CHANNEL, SENT_CHANNEL, RECORDER_CHANNEL = "mavlink_received", "mavlink_sent", "recorder"
+LOG_CHANNEL = "/log"
+ULOG_NAME = "ulog"
+"""Begins the names of a ULog's topics and metadata; the name in its messages on `/log`."""
 ANY_OBJECT = b'{"type":"object"}'
 _BODIES = {topic.name: topic.body for topic in TOPICS}
 _OF_RECORDER = {
@@ -132,7 +135,7 @@ class Converter:
         }.get(name)
         if make is not None and topic == path:
             for converted_topic, kind, body in make(camera, message):
-                yield _recorded(converted_topic, kind, log_time_ns, body)
+                yield foxglove_message(converted_topic, kind, log_time_ns, body)
 
     def _on_run(self, run: dict[str, Any]) -> None:
         if run["service"] != self._service:
@@ -254,22 +257,31 @@ class Converter:
         yield _joined("", camera, "camera_info"), "CameraCalibration", body
 
     def _log(self, _camera: str, message: dict[str, Any]) -> Iterator[tuple[str, str, Any]]:
-        body = {
-            "timestamp": self._time(message["stamp_ns"]),
-            "level": _LEVELS.get(message["level"], 0),
-            "message": message["text"],
-            "name": self._vehicle,
-            "file": "",
-            "line": 0,
-        }
-        yield "/log", "Log", body
+        unix_ns, level = message["stamp_ns"] + self._offset_ns, _LEVELS.get(message["level"], 0)
+        yield LOG_CHANNEL, "Log", log_body(unix_ns, level, message["text"], self._vehicle)
 
     def _time(self, stamp_ns: int) -> dict[str, int]:
-        seconds, rest = divmod(stamp_ns + self._offset_ns, 1_000_000_000)
-        return {"sec": seconds, "nsec": rest}
+        return _unix_time(stamp_ns + self._offset_ns)
 
     def _camera_frame(self, camera: str) -> str:
         return f"{self._vehicle}/{camera or 'camera'}"
+
+
+def log_body(unix_ns: int, level: int, text: str, name: str) -> dict[str, Any]:
+    """Return a foxglove.Log. `level`: of foxglove.LogLevel. `name`: of the source."""
+    return {
+        "timestamp": _unix_time(unix_ns),
+        "level": level,
+        "message": text,
+        "name": name,
+        "file": "",
+        "line": 0,
+    }
+
+
+def _unix_time(unix_ns: int) -> dict[str, int]:
+    seconds, rest = divmod(unix_ns, 1_000_000_000)
+    return {"sec": seconds, "nsec": rest}
 
 
 def image_channel(camera: str) -> Channel:
@@ -282,7 +294,8 @@ def _joined(*parts: str) -> str:
     return "/".join(part for index, part in enumerate(parts) if part or index == 0)
 
 
-def _recorded(topic: str, kind: str, log_time_ns: int, body: Any) -> Recorded:
+def foxglove_message(topic: str, kind: str, log_time_ns: int, body: Any) -> Recorded:
+    """Return a message of one of Foxglove's types. `kind`: its name without `foxglove.`."""
     name = f"foxglove.{kind}"
     text = json.dumps(body, separators=(",", ":")).encode()
     return Recorded(Channel(topic, name, SCHEMAS[name]), log_time_ns, text)
