@@ -17,7 +17,7 @@ from contextlib import asynccontextmanager, suppress
 # Exit code of a program that has printed in one line why it cannot work: it is not started again.
 EXIT_REFUSED = 2
 MAX_RESTARTS = 5
-_RESTART_S = 1.0
+_RESTART_S = 1.0  # longer by this each time; the first time at once
 _END_S = 5.0
 
 Say = Callable[[str], None]
@@ -70,7 +70,7 @@ async def _run_again(name: str, words: tuple[str, str], say: Say) -> None:
             return
         if restarts < MAX_RESTARTS:
             say(f"{name}: its process ended with code {code}; it is started again")
-            await asyncio.sleep(_RESTART_S)
+            await asyncio.sleep(_RESTART_S * restarts)
     say(f"{name}: ended {MAX_RESTARTS + 1} times; not started again")
 
 

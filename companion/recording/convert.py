@@ -31,7 +31,7 @@ from companion.bus.topics import (
 )
 from companion.recording.files import Channel, Recorded
 from companion.recording.foxglove_schemas import SCHEMAS
-from companion.recording.tap import unpack_link_bytes
+from companion.recording.link_bytes import unpack_link_bytes
 
 # Names of topics and channels.
 RUN_CHANNEL, INPUT_CHANNEL, OUTPUT_CHANNEL = "run", "guidance_input", "guidance_output"

@@ -7,13 +7,12 @@ publishes them, while a recorder listens: steps of guidance, and the bytes on th
 from __future__ import annotations
 
 import logging
-import struct
 import threading
 import time
 from collections import deque
 from collections.abc import Iterator
 from importlib.metadata import version
-from typing import Any, NamedTuple
+from typing import Any
 
 from companion.bus.session import Bus
 from companion.bus.topics import GUIDANCE_INPUT, GUIDANCE_OUTPUT, MAVLINK, RUN
@@ -22,52 +21,19 @@ from companion.guidance.gimbal.controller import GimbalMounting
 from companion.guidance.interface import GuidanceInput, GuidanceOutput
 from companion.recording.encoding import dumps, encode
 from companion.recording.guidance_record import LAYOUT, input_record, output_record
+from companion.recording.link_bytes import LinkBytes, pack_link_bytes
 from companion.settings import Settings
 from companion.settings.perception import NO_SOURCE
 from companion.vehicle.gimbal import Address
 
 logger = logging.getLogger(__name__)
 
-# Some ten seconds of either: a recorder that was just started needs three to listen.
+# Some ten seconds of either: a recorder that was just started needs one to three to listen.
 MAX_STEPS, MAX_PIECES = 1000, 10_000
 PERIOD_S = 0.05
 _RUN_PERIOD_S = 1.0
-# How long the first steps are kept for the recorder that the service starts itself.
+# How long steps and bytes are kept for the recorder that the service starts itself, and starts again.
 _RECORDER_STARTS_S = 15.0
-_FIRST = struct.Struct("<Q")
-_PIECE = struct.Struct("<QBI")
-
-
-class LinkBytes(NamedTuple):
-    """A piece of the bytes on the autopilot's link: when (CLOCK_MONOTONIC), whether we sent it."""
-
-    stamp_ns: int
-    sent: bool
-    data: bytes
-
-
-def pack_link_bytes(first: int, pieces: list[LinkBytes]) -> bytes:
-    """Join pieces into one message. `first`: the number of the first one, counted since the start."""
-    parts = [_FIRST.pack(first)]
-    for stamp_ns, sent, data in pieces:
-        parts += (_PIECE.pack(stamp_ns, sent, len(data)), data)
-    return b"".join(parts)
-
-
-def unpack_link_bytes(message: bytes) -> Iterator[tuple[int, LinkBytes]]:
-    """Return the number of each piece, and the piece. Raises ValueError for anything else."""
-    try:
-        (number,) = _FIRST.unpack_from(message)
-        at = _FIRST.size
-        while at < len(message):
-            stamp_ns, sent, length = _PIECE.unpack_from(message, at)
-            at += _PIECE.size + length
-            if at > len(message):
-                raise ValueError("link bytes end inside a piece")
-            yield number, LinkBytes(stamp_ns, bool(sent), message[at - length : at])
-            number += 1
-    except struct.error as error:
-        raise ValueError(f"not link bytes: {error}") from error
 
 
 def run_record(
@@ -101,7 +67,7 @@ class FlightTap:
 
     Args:
         run: of `run_record`.
-        expected: the service starts a recorder itself, so the first steps wait for it.
+        expected: the service starts a recorder itself, so steps and bytes wait for it.
     """
 
     def __init__(self, bus: Bus, run: dict[str, Any], *, expected: bool) -> None:
@@ -111,7 +77,8 @@ class FlightTap:
         )
         self._pieces: deque[tuple[int, LinkBytes]] = deque(maxlen=MAX_PIECES)
         self._step = self._piece = 0
-        self._wait_until_s = time.monotonic() + _RECORDER_STARTS_S if expected else 0.0
+        self._wait_s = _RECORDER_STARTS_S if expected else 0.0
+        self._wait_until_s = time.monotonic() + self._wait_s
         self._run_due_s = 0.0
         self._failed = False
         self._closing = threading.Event()
@@ -156,7 +123,7 @@ class FlightTap:
                 self._steps.clear()
                 self._pieces.clear()
             return
-        self._wait_until_s = 0.0
+        self._wait_until_s = time.monotonic() + self._wait_s
         for _ in range(len(self._steps)):
             self._publish_step(*self._steps.popleft())
             time.sleep(0)  # the loop's thread goes first

@@ -77,9 +77,7 @@ def merge_ulog(path: Path, ulog_path: Path, output: Path) -> Merged:
         problems.append(f"{ulog_path}: damaged; what could be read was added")
     if ulog.dropouts:
         lost_ms = sum(dropout.duration for dropout in ulog.dropouts)
-        problems.append(
-            f"{ulog_path}: {len(ulog.dropouts)} gaps, {lost_ms} ms together: its card was too slow"
-        )
+        problems.append(f"{ulog_path}: {len(ulog.dropouts)} gaps, {lost_ms} ms together")
     return Merged(count, len(topics), found, problems)
 
 

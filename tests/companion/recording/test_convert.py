@@ -18,7 +18,8 @@ from companion.recording.convert import Converter
 from companion.recording.encoding import dumps
 from companion.recording.files import Recorded
 from companion.recording.foxglove_schemas import SCHEMAS
-from companion.recording.tap import LinkBytes, pack_link_bytes, run_record, unpack_link_bytes
+from companion.recording.link_bytes import LinkBytes, pack_link_bytes, unpack_link_bytes
+from companion.recording.tap import run_record
 from companion.vehicle.state import VehicleState
 from vision.detections import Detections
 from vision.pipeline import PerceptionResult

@@ -5,13 +5,16 @@ from __future__ import annotations
 import json
 from typing import Any
 
+import pytest
+
 from companion.bench.lockstep_flight import plain_settings
 from companion.bus.topics import GUIDANCE_INPUT, GUIDANCE_OUTPUT, MAVLINK, RUN, Topic
 from companion.guidance.behaviour import Outcome
 from companion.guidance.core import GuidanceOptions
 from companion.guidance.gimbal.controller import GimbalMounting
 from companion.guidance.interface import CommandResult, GuidanceInput, GuidanceOutput
-from companion.recording.tap import MAX_PIECES, MAX_STEPS, FlightTap, run_record, unpack_link_bytes
+from companion.recording.link_bytes import unpack_link_bytes
+from companion.recording.tap import MAX_PIECES, MAX_STEPS, FlightTap, run_record
 from companion.settings import Settings
 from companion.settings.reading import changed
 from companion.vehicle.state import VehicleState
@@ -88,6 +91,20 @@ def test_first_steps_wait_only_for_an_expected_recorder() -> None:
         step(tap)
         tap._publish()
         assert json.loads(bus.of(GUIDANCE_INPUT)[0])["step"] == first
+
+
+@pytest.mark.parametrize("expected", [False, True])
+def test_steps_wait_for_an_expected_recorder_that_ended(expected: bool) -> None:
+    bus = BusOfTest(listening=True)
+    tap = tap_on(bus, expected=expected)
+    for bus.listening in (True, False, False, True):
+        step(tap)
+        tap.on_bytes(True, b"a")
+        tap._publish()
+    steps = [json.loads(value)["step"] for value in bus.of(GUIDANCE_INPUT)]
+    assert steps == ([0, 1, 2, 3] if expected else [0, 3])
+    pieces = [number for packed in bus.of(MAVLINK) for number, _ in unpack_link_bytes(packed)]
+    assert pieces == steps
 
 
 def test_step_that_cannot_be_encoded_is_left_out(caplog: Any) -> None:

@@ -14,7 +14,8 @@ from companion.bench.lockstep_flight import plain_settings
 from companion.guidance.core import GuidanceOptions
 from companion.recording.convert import Converter
 from companion.recording.encoding import dumps
-from companion.recording.tap import LinkBytes, pack_link_bytes, run_record
+from companion.recording.link_bytes import LinkBytes, pack_link_bytes
+from companion.recording.tap import run_record
 from tests.companion.recording.lockstep_recording import new_writer
 
 ATTITUDE = "uint64_t timestamp;float[4] q;uint8_t[4] _padding0;"
