@@ -102,9 +102,12 @@ def test_every_type_of_value_is_json_by_its_schema(tmp_path: Path) -> None:
         )
     # Written when the log began, long after its own stamp.
     ulog.add(numbers[0], struct.pack("<Qd3ff?f?f?8sb", 1, *[0.0] * 5, False, 0.0, False, 0.0, False, b"", 0))
+    ulog.gap(20)
     (tmp_path / "c.ulg").write_bytes(ulog.data)
     merged = merge_ulog(path, tmp_path / "c.ulg", tmp_path / "out.mcap")
-    assert (merged.topics, merged.problems) == (3, [])
+    assert merged.topics == 3
+    (gap,) = merged.problems
+    assert "20 ms" in gap
     expected = {
         "timestamp": stamp_us,
         "lat": 47.123456789012,

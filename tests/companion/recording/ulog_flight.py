@@ -114,6 +114,9 @@ class UlogBytes:
     def log(self, level: int, stamp_us: int, text: str) -> None:
         self._message("L", struct.pack("<BQ", ord(str(level)), stamp_us) + text.encode())
 
+    def gap(self, duration_ms: int) -> None:
+        self._message("O", struct.pack("<H", duration_ms))
+
 
 def ulog_of(flight: Flight, begin_s: float, end_s: float, **formats: str) -> UlogBytes:
     """The log of a part of a flight: the attitude at about 20 Hz, and one text in the middle.
