@@ -128,6 +128,13 @@ def test_killed_recorder_leaves_a_file_and_is_started_again(filming: list[str], 
         assert RecordingReader(first).path == first
         wait_for(lambda: len(files(folder)) == 2 and messages_of(files(folder)[1])["guidance_input"] > 20)
         assert service.command("stop")["success"]
+    before, after = (
+        [json.loads(message.data) for message in RecordingReader(path).messages("guidance_input")]
+        for path in files(folder)
+    )
+    # Only the last chunk, of a second, is missing: the steps wait for the new recorder.
+    assert after[0]["now_ns"] - before[-1]["now_ns"] < 2e9
+    assert [each["step"] for each in after] == list(range(after[0]["step"], after[-1]["step"] + 1))
     second = replay([files(folder)[1]], {})
     assert second.inexact  # it does not begin with the service
 

@@ -11,10 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import jsonschema
+import numpy as np
 import pytest
 from mcap.reader import make_reader
 
 from companion.recording import RecordingError
+from companion.recording.boot_clock import Boot, BootClock
 from companion.recording.files import RecordingReader
 from companion.recording.ulog import merge_ulog
 from tests.companion.command_line import companion
@@ -72,6 +74,16 @@ def test_error_grows_outside_of_the_answers(tmp_path: Path) -> None:
     ]
     # 290 s before the first answer, by a clock that is fast by 60 ppm.
     assert 10e6 < max(errors) <= merged.alignment.error_ns < 40e6
+
+
+def test_uneven_clock_widens_the_error() -> None:
+    second, steps_ns = 10**9, [0, 0, 4_000_000, 0, 0]
+    nodes = [(at * second, -step, 200_000) for at, step in enumerate(steps_ns)]
+    clock = BootClock(Boot(nodes))
+    assert clock.error_ns(0, 4 * second) == 200_000 + 4_000_000 - 2 * 200_000
+    assert clock.error_ns(0, second // 2) == 200_000
+    middle = clock.to_unix(np.array([2 * second - 4_000_000]))
+    assert abs(int(middle[0]) - 2 * second) <= 1
 
 
 def test_every_type_of_value_is_json_by_its_schema(tmp_path: Path) -> None:
