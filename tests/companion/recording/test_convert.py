@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import jsonschema
@@ -170,7 +170,7 @@ def test_link_bytes_are_split_and_losses_counted(converter: Converter) -> None:
         list(unpack_link_bytes(packed[:-1]))
 
 
-def schema_errors(recorded: Recorded, body: dict[str, Any]) -> list[str]:
+def schema_errors(recorded: Recorded, body: Mapping[str, Any]) -> list[str]:
     validator = jsonschema.Draft202012Validator(json.loads(recorded.channel.schema))
     return [error.validator for error in validator.iter_errors(body)]
 

@@ -16,7 +16,7 @@ import pytest
 from mcap.reader import make_reader
 
 from companion.recording import RecordingError
-from companion.recording.boot_clock import Boot, BootClock
+from companion.recording.boot_clock import Boot, BootClock, align
 from companion.recording.files import RecordingReader
 from companion.recording.ulog import merge_ulog
 from tests.companion.command_line import companion
@@ -76,14 +76,34 @@ def test_error_grows_outside_of_the_answers(tmp_path: Path) -> None:
     assert 10e6 < max(errors) <= merged.alignment.error_ns < 40e6
 
 
-def test_uneven_clock_widens_the_error() -> None:
+def test_answers_that_contradict_the_lines_widen_the_error() -> None:
     second, steps_ns = 10**9, [0, 0, 4_000_000, 0, 0]
-    nodes = [(at * second, -step, 200_000) for at, step in enumerate(steps_ns)]
-    clock = BootClock(Boot(nodes))
-    assert clock.error_ns(0, 4 * second) == 200_000 + 4_000_000 - 2 * 200_000
+    answers = [(at * second, 10**18 + step, 200_000 + at) for at, step in enumerate(steps_ns)]
+    clock = BootClock(answers, 10 * second)  # the first is used
+    assert clock.error_ns(0, 4 * second) == 200_000 + 4_000_000 - 200_002
     assert clock.error_ns(0, second // 2) == 200_000
-    middle = clock.to_unix(np.array([2 * second - 4_000_000]))
-    assert abs(int(middle[0]) - 2 * second) <= 1
+    assert clock.to_unix(np.array([2 * second])).tolist() == [10**18 + 2 * second]
+    every = BootClock(answers, 1)
+    assert every.error_ns(0, 4 * second) == 200_004
+    assert every.to_unix(np.array([2 * second, second // 2])).tolist() == [
+        10**18 + 2 * second + 4_000_000,
+        10**18 + second // 2,
+    ]
+
+
+@pytest.mark.parametrize(
+    ("early_ns", "error_ns"), [(0, 200_000), (150_000, 200_000), (30_000_000, 30_200_000)]
+)
+def test_sample_that_arrives_before_its_stamp_widens_the_error(early_ns: int, error_ns: int) -> None:
+    boot = Boot([(at * 500_000_000, 10**18, 200_000) for at in range(10)])
+    samples = [struct.pack("<I4f", 500 * at + 250, *[at] * 4) for at in range(9)]
+    boot.samples[31] = [
+        (10**18 + (500 * at + 250) * 1_000_000 - (early_ns if at == 5 else -1_000_000), sample)
+        for at, sample in enumerate(samples)
+    ]
+    found = align([boot], 0, 4_000_000_000, {31: set(samples), 32: set()})
+    assert (found.error_ns, found.equal) == (error_ns, 9)
+    assert (found.least_delay_ns, found.median_delay_ns) == (-early_ns, 1_000_000)
 
 
 def test_every_type_of_value_is_json_by_its_schema(tmp_path: Path) -> None:
