@@ -41,7 +41,7 @@ def test_wheel_holds_the_packages_and_their_data(tmp_path: Path) -> None:
     wanted = {path.relative_to(ROOT).as_posix() for path in sources}
     wanted |= {path.relative_to(ROOT).as_posix() for path in ROOT.glob("mavlink_sim/scenes/*.toml")}
     wanted |= {path.relative_to(ROOT).as_posix() for path in ROOT.glob("vision/weights/*.safetensors")}
-    wanted |= {f"companion/dashboard/page.{kind}" for kind in ("html", "css", "js")}
+    wanted |= {path.relative_to(ROOT).as_posix() for path in ROOT.glob("companion/dashboard/page/*")}
     wanted |= {f"{package}/py.typed" for package in packages}
     assert wanted <= set(names), sorted(wanted - set(names))
     for unit in ("companion.service", "companion.toml"):

@@ -16,6 +16,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib import resources
+from pathlib import Path
 from typing import Any
 
 import uvicorn
@@ -46,7 +47,7 @@ MAX_STREAMS_PER_BROWSER = 3
 """A browser opens 6 connections to one host; streams of many windows would leave none for a stop command."""
 _UNACCEPTED_MS = 15_000
 _SEND_BUFFER_BYTES = 256 * 1024
-_FILES = {"page.html": "text/html", "page.css": "text/css", "page.js": "text/javascript"}
+_TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript"}
 _SECURITY = {
     "cache-control": "no-store",
     "content-security-policy": "default-src 'self'; img-src data:; base-uri 'none'; frame-ancestors 'none'",
@@ -149,8 +150,8 @@ def listening_socket(host: str, port: int) -> socket.socket:
 
 def create_app(fleet: Fleet, access: Access) -> ASGIApp:
     """Create the ASGI application."""
-    folder = resources.files("companion.dashboard")
-    files = {name: (folder / name).read_bytes() for name in _FILES}
+    folder = resources.files("companion.dashboard") / "page"
+    files = {file.name: file.read_bytes() for file in folder.iterdir()}
     streams = StreamTable()
 
     async def page(request: Request) -> Response:
@@ -162,7 +163,7 @@ def create_app(fleet: Fleet, access: Access) -> ASGIApp:
 
     async def file(request: Request) -> Response:
         name = request.url.path.lstrip("/")
-        return Response(files[name], media_type=_FILES[name])
+        return Response(files[name], media_type=_TYPES[Path(name).suffix])
 
     def bridge_of(vehicle: Any) -> Bridge | Response:
         """Return the bridge of the vehicle in a request, or a refusal."""
@@ -234,7 +235,7 @@ def create_app(fleet: Fleet, access: Access) -> ASGIApp:
 
     routes = [
         Route("/", page),
-        *(Route(f"/{name}", file) for name in _FILES if name != "page.html"),
+        *(Route(f"/{name}", file) for name in files if name != "page.html"),
         Route("/events", events),
         Route("/picture", picture),
         Route("/clock", clock),

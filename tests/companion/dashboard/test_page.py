@@ -27,6 +27,20 @@ REPLY = "document.querySelector('#reply').textContent"
 LINK = "(document.querySelector('#link')?.textContent ?? '')"
 
 
+OPENED = """
+location.protocol === 'http:' && document.readyState === 'complete'
+  && Promise.all(['state', 'cameras'].map((name) => import(`/${name}.js`)))
+    .then((modules) => Object.assign(globalThis, ...modules) && true)
+"""
+
+
+def open_page(browser: Browser, url: str) -> Tab:
+    """Open the page in a window; what its modules export becomes global, for the expressions below."""
+    tab = browser.open(url)
+    tab.until(OPENED)
+    return tab
+
+
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     with chromium(tmp_path_factory.mktemp("profile")) as running:
@@ -44,9 +58,8 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServiceProcess
 
 @pytest.fixture
 def tab(browser: Browser, service: ServiceProcess) -> Iterator[Tab]:
-    opened = browser.open(service.url)
+    opened = open_page(browser, service.url)
     opened.resize(1280, 900)
-    opened.until("document.readyState === 'complete' && typeof state === 'object'")
     yield opened
     opened.close()
 
@@ -127,10 +140,10 @@ def test_page_shows_a_stop_button_and_names_on_a_phone(tab: Tab) -> None:
 
 
 def test_stop_works_with_the_page_in_many_windows(browser: Browser, service: ServiceProcess) -> None:
-    tabs = [browser.open(service.url) for _ in range(8)]
+    tabs = [open_page(browser, service.url) for _ in range(8)]
     try:
         for opened in tabs:
-            opened.until("typeof state === 'object' && (state.at > 0 || state.replaced)")
+            opened.until("state.at > 0 || state.replaced")
         newest = tabs[-1]
         newest.until("state.topics.status")
         newest.value("document.querySelector('#stop').click()")
@@ -143,7 +156,7 @@ def test_stop_works_with_the_page_in_many_windows(browser: Browser, service: Ser
 def test_page_says_when_no_service_answers_and_how_old_its_state_is(browser: Browser) -> None:
     endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     with dashboard_command(endpoint) as url:
-        tab = browser.open(url)
+        tab = open_page(browser, url)
         tab.until(f"{LINK}.includes('is `companion run` running?')")
         with publishing(endpoint) as (service, _):
 
@@ -159,7 +172,7 @@ def test_page_says_when_no_service_answers_and_how_old_its_state_is(browser: Bro
 def test_page_of_a_fleet_switches_the_vehicle_and_stops_all(browser: Browser) -> None:
     with two_vehicles() as (services, endpoint), dashboard_command(endpoint) as url:
         received = answering(services)
-        tab = browser.open(url)
+        tab = open_page(browser, url)
 
         def until(expression: str) -> None:
             def shown() -> bool:
@@ -170,7 +183,7 @@ def test_page_of_a_fleet_switches_the_vehicle_and_stops_all(browser: Browser) ->
 
         text = "document.querySelector('{}').{}".format
         listed = "[...document.querySelectorAll('#fleet button')].map((item) => item.value).join()"
-        until(f"typeof state === 'object' && {listed} === 'vehicle1,vehicle2'")
+        until(f"{listed} === 'vehicle1,vehicle2'")
         # One car, seen by both, and the person that only the other one sees.
         until(f"{text('#map', 'ariaLabel')}.includes('car vehicle1 #7, vehicle2 #3')")
         until(f"{text('#map', 'ariaLabel')}.includes('person vehicle2 #4')")

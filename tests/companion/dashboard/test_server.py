@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from companion import dashboard
 from companion.bus.topics import DETECTIONS, VEHICLE, command_key
 from companion.dashboard.access import COOKIE, DashboardError
 from companion.dashboard.server import LARGEST_BODY_BYTES, MAX_CONNECTIONS, MAX_STREAMS_PER_BROWSER
@@ -21,19 +22,23 @@ from tests.companion.dashboard.test_bridge import NAME, frame, publishing, until
 pytestmark = pytest.mark.realtime
 
 TOKEN = "0123456789abcdef0123456789abcdef"
+KINDS = {".html": "text/html", ".css": "text/css", ".js": "text/javascript"}
+PAGE = {path.name: KINDS[path.suffix] for path in Path(dashboard.__file__).with_name("page").iterdir()}
 
 
 async def test_page_and_its_files_have_security_headers() -> None:
     async with serving() as port:
-        for path, kind in (("/", "text/html"), ("/page.css", "text/css"), ("/page.js", "text/javascript")):
+        for path in ("/", *(f"/{name}" for name in PAGE if name != "page.html")):
             status, headers, body = await request(port, "GET", path)
             assert status == 200
+            kind = PAGE[path.strip("/") or "page.html"]
             assert headers["content-type"].startswith(kind)
             assert "frame-ancestors 'none'" in headers["content-security-policy"]
             assert headers["cross-origin-resource-policy"] == "same-origin"
             assert b"http://" not in body
             assert b"https://" not in body  # nothing from elsewhere
-        assert (await request(port, "GET", "/bridge.py"))[0] == 404
+        for path in ("/bridge.py", "/page.html"):
+            assert (await request(port, "GET", path))[0] == 404
 
 
 async def test_requests_of_other_pages_are_refused() -> None:

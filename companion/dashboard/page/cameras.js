@@ -1,0 +1,240 @@
+// A canvas for each camera. Each picture is requested when the one before is drawn, so a slow connection gets
+// fewer pictures, never older ones.
+
+import { openMenu, send } from "./commands.js";
+import { $, button, cameras, pause, setText, state } from "./state.js";
+
+const PICTURE_PERIOD_MS = 60;
+const DRAG_PX = 8;
+const CHOSEN = "#ffd23f";
+const CONFIRMED = "#39e07f";
+const TENTATIVE = "#c9d1dc";
+
+// Returns the view of a camera, and begins it; an empty name is the first camera.
+export function camera(name) {
+  if (!cameras.has(name)) {
+    const view = new Camera(name);
+    cameras.set(name, view);
+    $("cameras").append(view.figure);
+    view.run();
+  }
+  return cameras.get(name);
+}
+
+export function endCameras() {
+  for (const view of cameras.values()) view.end();
+  cameras.clear();
+}
+
+export class Camera {
+  constructor(name) {
+    this.name = name;
+    this.label = name || "first camera";
+    this.vehicle = state.vehicle;
+    this.ended = false;
+    this.bitmap = null;
+    this.about = null; // the frame and the boxes of `bitmap`
+    this.at = 0; // of the newest picture, in milliseconds of performance.now()
+    this.times = []; // of the pictures of the last two seconds
+    this.latencyMs = null;
+    this.status = {};
+    this.drag = null;
+
+    this.canvas = document.createElement("canvas");
+    this.canvas.setAttribute("role", "img");
+    this.canvas.addEventListener("pointerdown", (event) => this.press(event));
+    this.canvas.addEventListener("pointermove", (event) => this.move(event));
+    this.canvas.addEventListener("pointerup", (event) => this.release(event));
+    this.canvas.addEventListener("pointercancel", () => {
+      this.drag = null;
+      this.draw();
+    });
+    const area = button("Select area", () => {
+      area.setAttribute("aria-pressed", this.figure.classList.toggle("selecting"));
+    });
+    area.setAttribute("aria-pressed", "false");
+    this.caption = document.createElement("span");
+    const caption = document.createElement("figcaption");
+    caption.append(this.caption, area);
+    this.figure = document.createElement("figure");
+    this.figure.append(this.canvas, caption);
+    this.writeCaption();
+  }
+
+  async run() {
+    while (!this.ended) {
+      const begun = performance.now();
+      if (document.hidden || state.replaced || !state.stream) {
+        await pause(300);
+        continue;
+      }
+      try {
+        const response = await this.request();
+        if (response.status === 200) await this.show(response);
+        else if (response.status !== 204) await pause(1000);
+      } catch {
+        await pause(1000);
+      }
+      await pause(Math.max(0, PICTURE_PERIOD_MS - (performance.now() - begun)));
+    }
+  }
+
+  request() {
+    const after = this.about ? this.about.sequence : -1;
+    const query = new URLSearchParams({ camera: this.name, after, vehicle: this.vehicle });
+    return fetch(`/picture?${query}`, { priority: "low" });
+  }
+
+  async show(response) {
+    const about = JSON.parse(response.headers.get("X-Frame"));
+    const bitmap = await createImageBitmap(await response.blob());
+    if (this.ended) return;
+    if (this.bitmap) this.bitmap.close();
+    this.bitmap = bitmap;
+    this.about = about;
+    this.at = performance.now();
+    this.times.push(this.at);
+    while (this.times[0] < this.at - 2000) this.times.shift();
+    this.draw();
+    this.measure();
+  }
+
+  end() {
+    this.ended = true;
+    this.figure.remove();
+  }
+
+  measure() {
+    // From the capture to the drawn picture, on the service's clock; unknown where that is another computer's.
+    if (state.offsetNs == null || !this.about.captured_ns) return;
+    const ms = (performance.now() * 1e6 + state.offsetNs - this.about.captured_ns) / 1e6;
+    this.latencyMs = ms > -5 && ms < 60000 ? Math.max(0, ms) : null;
+    if (this.name === "") state.videoMs = this.latencyMs;
+  }
+
+  draw() {
+    const { canvas, bitmap, about } = this;
+    if (!bitmap) return;
+    const scale = devicePixelRatio || 1;
+    const width = Math.round(canvas.clientWidth * scale);
+    const height = Math.round(width * bitmap.height / bitmap.width);
+    if (canvas.width !== width || canvas.height !== height) {
+      canvas.width = width;
+      canvas.height = height;
+      canvas.style.aspectRatio = `${bitmap.width} / ${bitmap.height}`;
+    }
+    const g = canvas.getContext("2d");
+    g.drawImage(bitmap, 0, 0, width, height);
+    g.font = `600 ${13 * scale}px system-ui, sans-serif`;
+    g.textBaseline = "top";
+    g.setLineDash(about.boxes_sequence === about.sequence ? [] : [6 * scale, 4 * scale]);
+    for (const box of about.boxes) {
+      const isChosen = box[6] != null && box[6] === state.chosen;
+      if (!about.annotated || isChosen) this.drawBox(g, box, isChosen, scale); // else it is in the picture
+    }
+    g.setLineDash([]);
+    if (this.drag && this.drag.moved) {
+      const [l, t, r, b] = this.drag.box;
+      const rectangle = [l * width, t * height, (r - l) * width, (b - t) * height];
+      g.strokeStyle = "#fff";
+      g.lineWidth = 2 * scale;
+      g.fillStyle = "#fff3";
+      g.fillRect(...rectangle);
+      g.strokeRect(...rectangle);
+    }
+  }
+
+  drawBox(g, [l, t, r, b, name, confidence, id, kind], isChosen, scale) {
+    const { width, height, clientWidth } = this.canvas;
+    const isTentative = kind === "tentative" || kind === "none";
+    const colour = isChosen ? CHOSEN : isTentative ? TENTATIVE : CONFIRMED;
+    const x = l * width;
+    const y = t * height;
+    const h = (b - t) * height;
+    for (const [style, thickness] of [["#000a", 2], [colour, 0]]) {
+      g.strokeStyle = style;
+      g.lineWidth = ((isChosen ? 4 : 2) + thickness) * scale;
+      g.strokeRect(x, y, (r - l) * width, h);
+    }
+    const words = [name];
+    if (id != null) words.push(`#${id}`);
+    if (clientWidth >= 420) words.push(Number(confidence).toFixed(2));
+    const text = words.join(" ");
+    const line = 18 * scale;
+    const size = g.measureText(text).width + 8 * scale;
+    const left = Math.max(0, Math.min(x, width - size));
+    const top = y >= line ? y - line : Math.min(y + h, height - line);
+    g.fillStyle = colour;
+    g.fillRect(left, top, size, line);
+    g.fillStyle = "#0b0e12";
+    g.fillText(text, left + 4 * scale, top + 2 * scale);
+  }
+
+  writeCaption() {
+    const ageS = this.at ? (performance.now() - this.at) / 1000 : null;
+    const words = [this.label];
+    if (ageS == null) words.push("no picture yet");
+    else if (ageS > 1.5) words.push(`picture ${ageS.toFixed(0)} s old`);
+    else {
+      words.push(`${(this.times.length / 2).toFixed(0)} pictures/s`);
+      if (this.latencyMs != null) words.push(`${this.latencyMs.toFixed(0)} ms from capture to screen`);
+    }
+    if (this.status.rate_hz != null) words.push(`${this.status.rate_hz.toFixed(1)} results/s`);
+    if (this.status.problem) words.push(this.status.problem);
+    setText(this.caption, words.join(" · "));
+    const boxes = this.about ? this.about.boxes.length : 0;
+    this.canvas.setAttribute("aria-label", `Video of ${this.label}, ${boxes} boxes`);
+  }
+
+  // --- the pointer: a click opens the menu of a box, a drag selects a rectangle
+
+  pointOf(event) {
+    const box = this.canvas.getBoundingClientRect();
+    const clamp = (value) => Math.min(1, Math.max(0, value));
+    return [clamp((event.clientX - box.left) / box.width), clamp((event.clientY - box.top) / box.height)];
+  }
+
+  press(event) {
+    if (event.button !== 0 || !this.bitmap) return;
+    const [x, y] = this.pointOf(event);
+    const selects = event.pointerType === "mouse" || this.figure.classList.contains("selecting");
+    this.drag = { x, y, px: event.clientX, py: event.clientY, moved: false, box: [x, y, x, y], selects };
+    if (selects) this.canvas.setPointerCapture(event.pointerId);
+  }
+
+  move(event) {
+    const drag = this.drag;
+    if (!drag) return;
+    const [x, y] = this.pointOf(event);
+    if (Math.hypot(event.clientX - drag.px, event.clientY - drag.py) > DRAG_PX) drag.moved = drag.selects;
+    drag.box = [Math.min(x, drag.x), Math.min(y, drag.y), Math.max(x, drag.x), Math.max(y, drag.y)];
+    if (drag.moved) this.draw();
+  }
+
+  release(event) {
+    const drag = this.drag;
+    this.drag = null;
+    if (!drag) return;
+    const { clientX, clientY } = event;
+    if (drag.moved) {
+      this.draw();
+      this.select(drag.box, ({ track, class: name }) => {
+        if (track != null) openMenu({ id: track, name }, clientX, clientY);
+      });
+      return;
+    }
+    const isInside = ([l, t, r, b]) => drag.x >= l && drag.x <= r && drag.y >= t && drag.y <= b;
+    const size = ([l, t, r, b]) => (r - l) * (b - t);
+    const inside = this.about.boxes.filter((box) => box[6] != null && isInside(box));
+    const [smallest] = inside.sort((one, other) => size(one) - size(other));
+    if (smallest) openMenu({ id: smallest[6], name: smallest[4] }, clientX, clientY);
+  }
+
+  select([l, t, r, b], then) {
+    const words = this.name ? [`camera=${this.name}`] : [];
+    for (const [name, share] of Object.entries({ x: l, y: t, width: r - l, height: b - t })) {
+      words.push(`${name}=${share.toFixed(4)}`);
+    }
+    send(`select ${words.join(" ")}`, then);
+  }
+}

@@ -1,0 +1,127 @@
+// Commands: the buttons, the text field, the keys, STOP, and the menu of a track. Each is a POST.
+
+import { $, ALL, browserId, button, isFleet, state } from "./state.js";
+
+const HEADERS = { "Content-Type": "application/json", "X-Companion-Dashboard": "1" };
+
+const waiting = new Map(); // id of a command → what to call after its success
+let count = 0;
+
+const named = (vehicle, text) => isFleet() && vehicle !== ALL ? `${vehicle}: ${text}` : text;
+const quoted = (name) => /^[\w-]+$/.test(name) ? name : `"${name}"`;
+
+export async function send(text, then, vehicle = state.vehicle) {
+  const title = vehicle === ALL ? `${text} all` : named(vehicle, text);
+  const id = `${browserId()}-${++count}-${Date.now()}`;
+  waiting.set(id, then);
+  reply(`${title}: sent`, "waiting");
+  const body = JSON.stringify({ text, id, vehicle });
+  try {
+    const response = await fetch("/command", { method: "POST", headers: HEADERS, body, priority: "high" });
+    if (response.status === 200) {
+      onReply(await response.json());
+    } else if (response.status === 202) {
+      if (waiting.has(id)) reply(`${title}: in progress`, "waiting");
+    } else {
+      waiting.delete(id);
+      reply(`${title}: not sent: ${(await response.text()).trim()}`, "bad");
+    }
+  } catch (error) {
+    // Its outcome may still come by the stream.
+    reply(`${title}: no answer of the dashboard, it may have been sent (${error.message})`, "bad");
+  }
+}
+
+export function onReply(answer) {
+  if (!waiting.has(answer.id)) return; // of another window, or here a second time
+  const then = waiting.get(answer.id);
+  waiting.delete(answer.id);
+  const outcome = answer.success ? "done" : "failed";
+  reply(`${named(answer.vehicle, answer.command)}: ${outcome}: ${answer.reason}`, answer.success ? "good" : "bad");
+  if (then && answer.success && answer.vehicle === state.vehicle) then(answer);
+}
+
+function reply(text, kind) {
+  $("reply").textContent = text;
+  $("reply").className = kind;
+}
+
+const sendStop = (all) => send("stop", null, all && isFleet() ? ALL : state.vehicle);
+$("stop").addEventListener("click", (event) => sendStop(event.shiftKey));
+$("stop-all").addEventListener("click", () => sendStop(true));
+
+$("commands").addEventListener("click", (event) => {
+  const template = event.target.dataset && event.target.dataset.command;
+  if (!template) return;
+  const name = $("class").value;
+  if (template.includes("{class}") && !name) {
+    reply("No class is known: the detector is off or not ready.", "bad");
+    return;
+  }
+  send(template.replace("{altitude}", $("altitude").value || "5").replace("{class}", quoted(name)));
+});
+
+$("sending").addEventListener("submit", (event) => {
+  event.preventDefault();
+  const text = $("text").value.trim();
+  if (!text) return;
+  send(text);
+  $("text").value = "";
+  $("text").blur(); // the space bar stops again
+});
+
+// Space stops, wherever the focus is, except where a text is typed. Buttons are pressed by Enter.
+const isTyping = (target) => target instanceof HTMLInputElement && target.type !== "number";
+document.addEventListener("keydown", (event) => {
+  if (event.key === "Escape") closeMenu();
+  if (event.key !== " " || isTyping(event.target)) return;
+  event.preventDefault();
+  if (!event.repeat) sendStop(event.shiftKey);
+}, true);
+document.addEventListener("keyup", (event) => {
+  if (event.key === " " && !isTyping(event.target)) event.preventDefault();
+}, true);
+
+// --- the menu of a track
+
+const TRACK_COMMANDS = { follow: "Follow", approach: "Approach", orbit: "Orbit", gimbal: "Point gimbal" };
+let openedBy = null;
+
+// Opens the menu of a track at a point of the window; `opener` gets the focus back.
+export function openMenu(track, x, y, opener = null) {
+  const menu = $("menu");
+  state.chosen = track.id;
+  openedBy = opener;
+  const title = document.createElement("p");
+  title.textContent = `track ${track.id}, ${track.name}`;
+  menu.replaceChildren(title, ...Object.entries(TRACK_COMMANDS).map(([word, text]) => {
+    const item = button(text, () => {
+      closeMenu();
+      send(`${word} track=${track.id}`);
+    });
+    item.setAttribute("role", "menuitem");
+    return item;
+  }));
+  menu.hidden = false;
+  const box = menu.getBoundingClientRect();
+  menu.style.left = `${Math.max(4, Math.min(x, innerWidth - box.width - 4))}px`;
+  menu.style.top = `${Math.max(4, Math.min(y, innerHeight - box.height - 4))}px`;
+  menu.querySelector("button").focus();
+}
+
+export function closeMenu() {
+  if ($("menu").hidden) return;
+  $("menu").hidden = true;
+  if (openedBy && openedBy.isConnected) openedBy.focus();
+}
+
+$("menu").addEventListener("keydown", (event) => {
+  const step = { ArrowDown: 1, ArrowUp: -1 }[event.key];
+  if (!step) return;
+  event.preventDefault();
+  const items = [...$("menu").querySelectorAll("button")];
+  items[(items.indexOf(document.activeElement) + step + items.length) % items.length].focus();
+});
+document.addEventListener("pointerdown", (event) => {
+  if (!$("menu").contains(event.target)) closeMenu();
+});

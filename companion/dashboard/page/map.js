@@ -1,0 +1,182 @@
+// The map, north up, in the shown vehicle's local NED.
+
+import { drawLine, sized, trace } from "./canvas.js";
+import { $, age, css, isFleet, STALE_S, state } from "./state.js";
+
+const GRIDS_M = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000];
+const MIN_SPAN_M = 20;
+const MIN_GRID_PX = 45;
+const MAX_NAMED = 20; // for a screen reader
+
+export function drawMap(vehicle, limits) {
+  const home = vehicle.home_ned_m || [0, 0, 0];
+  const own = vehicle.position_ned_m;
+  const around = (corners) => (corners || []).map(([n, e]) => [n + home[0], e + home[1]]);
+  const include = around(limits.fence_include);
+  const exclude = (limits.fence_exclude || []).map(around);
+  const others = state.vehicles.filter((one) => one.name !== state.vehicle && one.at_ned_m);
+  const tracks = mapTracks();
+  const view = fit([
+    home, ...state.trail, ...tracks.map((track) => track.at), ...others.map((one) => one.at_ned_m),
+    ...include, ...exclude.flat(), ...(own ? [own] : []),
+  ]);
+
+  drawGrid(view);
+  drawFence(view, include, exclude);
+  drawTrail(view, state.trail, css("--accent"));
+  for (const one of others) {
+    view.g.globalAlpha = one.state_age_s > STALE_S ? .4 : 1;
+    drawArrow(view, one.at_ned_m, one.yaw_rad, css("--soft"));
+    drawLabel(view, one.name, one.at_ned_m);
+    view.g.globalAlpha = 1;
+  }
+  for (const track of [...tracks].reverse()) { // the newest first: a label is drawn where no other is
+    drawTrail(view, track.trail, css("--second"));
+    drawDot(view, track.at, track.chosen ? 7 : 5);
+    drawLabel(view, track.text, track.at);
+  }
+  drawHome(view, home);
+  if (own) {
+    drawSetpoint(view, own);
+    drawArrow(view, own, vehicle.yaw_rad, css("--accent"));
+    if (isFleet()) drawLabel(view, state.vehicle, own);
+  }
+  drawScale(view);
+
+  const north = own && (own[0] - home[0]).toFixed(0);
+  const east = own && (own[1] - home[1]).toFixed(0);
+  const where = own ? `vehicle ${north} m north and ${east} m east of home` : "position unknown";
+  const names = [...others.map((one) => one.name), ...tracks.map((track) => track.text)];
+  const listed = isFleet() ? `, ${names.slice(0, MAX_NAMED).join("; ")}` : "";
+  $("map").setAttribute("aria-label", `Map, north up: ${where}, ${tracks.length} tracks${listed}`);
+}
+
+// The shown vehicle's tracks with their trails, and what only others see. An object that several see is drawn once.
+function mapTracks() {
+  const drawn = [];
+  const merged = new Map();
+  for (const { class_name: name, at_ned_m: at, tracks } of state.objects) {
+    const own = tracks.find(([vehicle, id]) => vehicle === state.vehicle && state.tracks.has(id));
+    const text = `${name} ${tracks.map(([vehicle, id]) => `${vehicle} #${id}`).join(", ")}`;
+    if (own) merged.set(own[1], text);
+    else if (at) drawn.push({ at, trail: [], text });
+  }
+  for (const [id, { at, trail, name }] of state.tracks) {
+    const text = merged.get(id) || `${name} ${isFleet() ? `${state.vehicle} ` : ""}#${id}`;
+    drawn.push({ at, trail, text, chosen: id === state.chosen });
+  }
+  return drawn;
+}
+
+// Returns what the functions below draw with: all points are inside, with a margin.
+function fit(points) {
+  const [g, width, height] = sized($("map"));
+  const norths = points.map((point) => point[0]);
+  const easts = points.map((point) => point[1]);
+  const [south, north] = [Math.min(...norths), Math.max(...norths)];
+  const [west, east] = [Math.min(...easts), Math.max(...easts)];
+  const span = Math.max(MIN_SPAN_M, 1.2 * (north - south), 1.2 * (east - west) * height / width);
+  const scale = height / span;
+  const middle = [(north + south) / 2, (east + west) / 2];
+  const xy = ([n, e]) => [width / 2 + (e - middle[1]) * scale, height / 2 - (n - middle[0]) * scale];
+  const grid = GRIDS_M.find((m) => m * scale >= MIN_GRID_PX) || 2000;
+  return { g, width, height, scale, middle, xy, grid, labels: [] };
+}
+
+function drawGrid({ g, width, height, scale, middle, xy, grid }) {
+  g.strokeStyle = css("--line");
+  g.lineWidth = 1;
+  const marks = (centre, span) => {
+    const first = Math.ceil((centre - span / 2) / grid);
+    const last = Math.floor((centre + span / 2) / grid);
+    return Array.from({ length: last - first + 1 }, (_, index) => (first + index) * grid);
+  };
+  for (const n of marks(middle[0], height / scale)) {
+    const y = xy([n, 0])[1];
+    drawLine(g, [0, y], [width, y]);
+  }
+  for (const e of marks(middle[1], width / scale)) {
+    const x = xy([0, e])[0];
+    drawLine(g, [x, 0], [x, height]);
+  }
+}
+
+function drawFence({ g, xy }, include, exclude) {
+  g.lineWidth = 2;
+  for (const corners of [include, ...exclude]) {
+    const colour = corners === include ? css("--good") : css("--bad");
+    trace(g, corners.map(xy));
+    g.closePath();
+    g.strokeStyle = colour;
+    g.fillStyle = `${colour}33`;
+    if (corners !== include) g.fill();
+    g.stroke();
+  }
+}
+
+function drawTrail({ g, xy }, trail, colour) {
+  if (trail.length < 2) return;
+  g.strokeStyle = colour;
+  g.globalAlpha = .5;
+  drawLine(g, ...trail.map(xy));
+  g.globalAlpha = 1;
+}
+
+function drawLabel({ g, width, xy, labels }, text, at) {
+  const [x, y] = xy(at);
+  const size = g.measureText(text).width;
+  const left = Math.max(2, Math.min(x + 8, width - size - 2));
+  if (labels.some((one) => Math.abs(one.y - y) < 13 && left < one.right && one.left < left + size)) return;
+  labels.push({ y, left, right: left + size });
+  g.fillStyle = css("--ink");
+  g.fillText(text, left, y + 4);
+}
+
+function drawArrow({ g, xy }, at, yaw, colour) {
+  g.save();
+  g.translate(...xy(at));
+  g.rotate(yaw || 0);
+  g.fillStyle = colour;
+  g.strokeStyle = css("--panel");
+  trace(g, [[0, -12], [8, 9], [0, 5], [-8, 9]]);
+  g.closePath();
+  g.fill();
+  g.stroke();
+  g.restore();
+}
+
+function drawDot({ g, xy }, at, radius) {
+  g.fillStyle = css("--second");
+  g.beginPath();
+  g.arc(...xy(at), radius, 0, 7);
+  g.fill();
+}
+
+function drawHome({ g, xy }, home) {
+  g.save();
+  g.translate(...xy(home));
+  g.strokeStyle = css("--ink");
+  drawLine(g, [-7, 0], [0, -7], [7, 0]);
+  drawLine(g, [-5, -1], [-5, 6], [5, 6], [5, -1]);
+  g.restore();
+}
+
+function drawSetpoint({ g, xy }, own) {
+  const sent = age("setpoint") < 1 && state.topics.setpoint && state.topics.setpoint.sent;
+  if (!sent || !sent.velocity_ned_mps) return;
+  const [north, east] = sent.velocity_ned_mps;
+  const [x, y] = xy(own);
+  g.strokeStyle = css("--second");
+  drawLine(g, [x, y], [x + 12 * east, y - 12 * north]);
+}
+
+function drawScale({ g, width, height, scale, grid }) {
+  g.fillStyle = g.strokeStyle = css("--soft");
+  g.fillText(`${grid} m`, 10, height - 14);
+  drawLine(g, [10, height - 8], [10 + grid * scale, height - 8]);
+  g.textAlign = "center";
+  g.fillText("N", width - 14, 24);
+  g.textAlign = "left";
+  trace(g, [[width - 14, 6], [width - 18, 13], [width - 10, 13]]);
+  g.fill();
+}

@@ -1,0 +1,152 @@
+// The stream of server-sent events (`/events`): what is new of the shown vehicle, and the map of all vehicles.
+
+import { camera, endCameras } from "./cameras.js";
+import { closeMenu, onReply } from "./commands.js";
+import { $, browserId, ofOneVehicle, record, showAddress, state } from "./state.js";
+
+const TRAIL_M = 0.3; // between two points of a trail
+const TRAIL_POINTS = 800;
+const TRACK_TRAIL_POINTS = 100;
+const TRACK_SHOWN_MS = 10000;
+const LOG_LINES = 200;
+
+export function connect() {
+  if (state.stream || document.hidden || state.replaced) return;
+  const query = new URLSearchParams({ browser: browserId(), vehicle: state.vehicle });
+  const stream = state.stream = new EventSource(`/events?${query}`);
+  stream.onopen = () => $("log").replaceChildren(); // a new stream begins with all kept events
+  stream.onmessage = (event) => onNews(JSON.parse(event.data));
+  stream.addEventListener("replaced", () => {
+    disconnect();
+    state.replaced = true; // the browser has too many windows of this page for one server
+  });
+  stream.onerror = () => {
+    if (stream !== state.stream || stream.readyState !== EventSource.CLOSED) return;
+    disconnect();
+    explain();
+    setTimeout(connect, 2000);
+  };
+}
+
+export function disconnect() {
+  if (state.stream) state.stream.close();
+  state.stream = null;
+}
+
+async function explain() {
+  // An EventSource does not report the status of a refusal.
+  try {
+    const response = await fetch("/clock");
+    state.refused = response.ok ? "" : (await response.text()).trim();
+  } catch {
+    state.refused = "";
+  }
+}
+
+// Shows another vehicle.
+export function select(vehicle) {
+  if (vehicle === state.vehicle) return;
+  closeMenu();
+  disconnect();
+  Object.assign(state, ofOneVehicle(), { vehicle, at: 0, alive: null, objects: [] });
+  endCameras();
+  $("log").replaceChildren();
+  $("class").replaceChildren();
+  $("vehicle").textContent = document.title = vehicle;
+  showAddress(vehicle);
+  connect();
+}
+
+function onNews(news) {
+  state.at = performance.now();
+  state.refused = "";
+  state.problem = news.problem;
+  state.alive = news.alive;
+  state.ages = news.ages_s;
+  state.vehicle = $("vehicle").textContent = document.title = news.vehicle_name;
+  state.vehicles = news.vehicles;
+  state.objects = news.objects;
+  Object.assign(state.topics, news.topics);
+  for (const [path, message] of Object.entries(news.topics)) {
+    if (path.endsWith("detections")) onDetections(path, message);
+  }
+  if (news.topics.vehicle) extend(state.trail, news.topics.vehicle.position_ned_m, TRAIL_POINTS);
+  if (news.topics.status) onStatus(news.topics.status);
+  for (const event of news.events) log(event.level, event.text, (news.now_ns - event.stamp_ns) / 1e9);
+  news.replies.forEach(onReply);
+}
+
+function extend(trail, at, limit) {
+  const last = trail.at(-1);
+  if (at && (!last || Math.hypot(at[0] - last[0], at[1] - last[1]) > TRAIL_M)) trail.push(at);
+  if (trail.length > limit) trail.shift();
+}
+
+function onDetections(path, message) {
+  const name = cameraOf(path);
+  camera(name);
+  const now = performance.now();
+  for (const found of message.detections || []) {
+    const at = found.position_ned_m || placed(found);
+    if (found.track_id == null || found.track_state === "tentative" || !at) continue;
+    const { trail } = state.tracks.get(found.track_id) || { trail: [] };
+    extend(trail, at, TRACK_TRAIL_POINTS);
+    state.tracks.set(found.track_id, { at, trail, name: found.class_name, seen: now });
+  }
+  for (const [id, track] of state.tracks) {
+    if (now - track.seen > TRACK_SHOWN_MS) state.tracks.delete(id);
+  }
+  if (name === "" && message.published_ns) {
+    record(state.latency, { result: (message.published_ns - message.captured_ns) / 1e6, video: state.videoMs });
+  }
+}
+
+// The name of the camera of a path such as `cameras/down/detections`.
+export function cameraOf(path) {
+  return path === "detections" ? "" : path.split("/")[1];
+}
+
+// The position from the direction and the range over ground, where the message has them but no position.
+function placed({ ground_range_m: range, bearing_rad: bearing }) {
+  const own = state.topics.vehicle && state.topics.vehicle.position_ned_m;
+  if (!own || range == null || bearing == null) return null;
+  return [own[0] + range * Math.cos(bearing), own[1] + range * Math.sin(bearing)];
+}
+
+function onStatus(status) {
+  const views = { "": status.perception, ...status.cameras };
+  let skipped = 0;
+  let dropped = 0;
+  for (const [name, view] of Object.entries(views)) {
+    if (!view || view.state === "stopped") continue;
+    camera(name).status = view;
+    dropped += view.dropped || 0;
+    const { every = 0, rate = 0 } = view.frames_skipped || {};
+    skipped += every + rate;
+  }
+  const before = state.lost;
+  const now = performance.now();
+  state.lost = { at: now, dropped, skipped, service: status.service };
+  if (before && before.service === status.service && now > before.at) {
+    const s = (now - before.at) / 1000;
+    const rate = (count, earlier) => Math.max(0, count - earlier) / s;
+    record(state.drops, { dropped: rate(dropped, before.dropped), skipped: rate(skipped, before.skipped) });
+  }
+  const names = (status.perception && status.perception.class_names) || [];
+  const list = $("class");
+  if (names.join() !== [...list.options].map((option) => option.value).join()) {
+    list.replaceChildren(...names.map((name) => new Option(name)));
+    if (names.includes("car")) list.value = "car";
+  }
+  if (status.pilot && status.pilot.mission) state.mission = status.pilot.mission;
+}
+
+function log(level, text, agoS) {
+  const time = document.createElement("time");
+  time.textContent = new Date(Date.now() - Math.max(0, agoS < 1e5 ? agoS : 0) * 1000).toLocaleTimeString();
+  const item = document.createElement("li");
+  item.className = level;
+  item.append(time, " ", level === "info" ? text : `${level}: ${text}`);
+  $("log").prepend(item);
+  while ($("log").children.length > LOG_LINES) $("log").lastChild.remove();
+}
