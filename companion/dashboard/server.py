@@ -43,8 +43,9 @@ ALL = "*"
 """As the vehicle of a `stop`: all."""
 LONGEST_COMMAND, LARGEST_BODY_BYTES = 8000, 64 * 1024
 MAX_CONNECTIONS = 100
-MAX_STREAMS_PER_BROWSER = 3
-"""A browser opens 6 connections to one host; streams of many windows would leave none for a stop command."""
+MAX_STREAMS_PER_BROWSER = 2
+"""A browser opens 6 connections to one host. One window uses a stream and 2 for pictures, each of two windows
+a stream and 1, so that a stop command has one at once."""
 _UNACCEPTED_MS = 15_000
 _SEND_BUFFER_BYTES = 256 * 1024
 _TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript"}
@@ -195,7 +196,8 @@ def create_app(fleet: Fleet, access: Access) -> ASGIApp:
         bridge = bridge_of(request.query_params.get("vehicle", ""))
         if isinstance(bridge, Response):
             return bridge
-        found = await bridge.picture(camera, after, PICTURE_WAIT_S)
+        wait_s = 0.0 if request.query_params.get("wait") == "0" else PICTURE_WAIT_S
+        found = await bridge.picture(camera, after, wait_s)
         if found is None:
             return Response(status_code=204)
         return Response(found.jpeg, media_type="image/jpeg", headers={"x-frame": json.dumps(found.about)})
@@ -258,6 +260,10 @@ class StreamTable:
             old.set()
         return ended
 
+    def count(self, browser: str) -> int:
+        """Return the number of a browser's streams that go on."""
+        return sum(not ended.is_set() for ended in self._open[browser])
+
     def remove(self, browser: str, ended: asyncio.Event) -> None:
         """Forget a stream."""
         self._open[browser].remove(ended)
@@ -276,7 +282,7 @@ async def _stream(fleet: Fleet, bridge: Bridge, streams: StreamTable, browser: s
                 news = bridge.news(seen)
                 seen = news.number
                 answered, replies = fleet.replies(answered)
-                yield f"data: {_text_of(fleet, bridge, news, replies)}\n\n"
+                yield f"data: {_text_of(fleet, bridge, news, replies, streams.count(browser))}\n\n"
                 with suppress(TimeoutError):
                     await asyncio.wait_for(ended.wait(), STREAM_PERIOD_S)
             yield "event: replaced\ndata: {}\n\n"
@@ -284,7 +290,7 @@ async def _stream(fleet: Fleet, bridge: Bridge, streams: StreamTable, browser: s
         streams.remove(browser, ended)
 
 
-def _text_of(fleet: Fleet, bridge: Bridge, news: News, replies: list[dict[str, Any]]) -> str:
+def _text_of(fleet: Fleet, bridge: Bridge, news: News, replies: list[dict[str, Any]], windows: int) -> str:
     """Format what is new as JSON."""
     head = {
         "now_ns": time.monotonic_ns(),
@@ -294,6 +300,7 @@ def _text_of(fleet: Fleet, bridge: Bridge, news: News, replies: list[dict[str, A
         "ages_s": news.ages_s,
         "events": news.events,
         "replies": replies,
+        "windows": windows,
         "vehicles": (vehicles := fleet.vehicles(bridge)),
         "objects": fleet.objects(bridge) if len(vehicles) > 1 else [],
     }

@@ -1,10 +1,13 @@
 // A canvas for each camera. Each picture is requested when the one before is drawn, so a slow connection gets
-// fewer pictures, never older ones.
+// fewer pictures, never older ones. The cameras take turns: a browser has six connections to one host, and one
+// has to be free for a stop command.
 
 import { openMenu, send } from "./commands.js";
 import { $, button, cameras, pause, setText, state } from "./state.js";
 
 const PICTURE_PERIOD_MS = 60;
+const IDLE_PERIOD_MS = 500;
+const FAULT_PERIOD_MS = 1000;
 const DRAG_PX = 8;
 const CHOSEN = "#ffd23f";
 const CONFIRMED = "#39e07f";
@@ -20,6 +23,31 @@ export function camera(name) {
   }
   return cameras.get(name);
 }
+
+// Cameras that wait for their turn, the longest first: what to call when it has come.
+const queue = [];
+let inFlight = 0;
+
+function takeTurn() {
+  return new Promise((begin) => {
+    queue.push(begin);
+    nextTurn();
+  });
+}
+
+function endTurn() {
+  inFlight--;
+  nextTurn();
+}
+
+function nextTurn() {
+  while (queue.length && inFlight < state.maxPictures) {
+    inFlight++;
+    queue.shift()();
+  }
+}
+
+const isCrowded = () => cameras.size > state.maxPictures;
 
 export function endCameras() {
   for (const view of cameras.values()) view.end();
@@ -37,6 +65,7 @@ export class Camera {
     this.at = 0; // of the newest picture, in milliseconds of performance.now()
     this.times = []; // of the pictures of the last two seconds
     this.latencyMs = null;
+    this.isIdle = false; // the newest request got no picture
     this.status = {};
     this.drag = null;
 
@@ -68,26 +97,34 @@ export class Camera {
         await pause(300);
         continue;
       }
+      let period = PICTURE_PERIOD_MS;
       try {
-        const response = await this.request();
-        if (response.status === 200) await this.show(response);
-        else if (response.status !== 204) await pause(1000);
+        const { status, frame, jpeg } = await this.request();
+        this.isIdle = status === 204;
+        if (status === 200) this.show(JSON.parse(frame), await createImageBitmap(jpeg));
+        else if (!this.isIdle) period = FAULT_PERIOD_MS;
+        else if (isCrowded()) period = IDLE_PERIOD_MS;
       } catch {
-        await pause(1000);
+        period = FAULT_PERIOD_MS;
       }
-      await pause(Math.max(0, PICTURE_PERIOD_MS - (performance.now() - begun)));
+      await pause(Math.max(0, period - (performance.now() - begun)));
     }
   }
 
-  request() {
-    const after = this.about ? this.about.sequence : -1;
-    const query = new URLSearchParams({ camera: this.name, after, vehicle: this.vehicle });
-    return fetch(`/picture?${query}`, { priority: "low" });
+  async request() {
+    await takeTurn();
+    try {
+      const after = this.about ? this.about.sequence : -1;
+      const query = new URLSearchParams({ camera: this.name, after, vehicle: this.vehicle });
+      if (this.isIdle && isCrowded()) query.set("wait", 0); // a camera without pictures must not delay the others
+      const response = await fetch(`/picture?${query}`, { priority: "low" });
+      return { status: response.status, frame: response.headers.get("X-Frame"), jpeg: await response.blob() };
+    } finally {
+      endTurn();
+    }
   }
 
-  async show(response) {
-    const about = JSON.parse(response.headers.get("X-Frame"));
-    const bitmap = await createImageBitmap(await response.blob());
+  show(about, bitmap) {
     if (this.ended) return;
     if (this.bitmap) this.bitmap.close();
     this.bitmap = bitmap;

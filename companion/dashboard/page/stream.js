@@ -9,6 +9,7 @@ const TRAIL_POINTS = 800;
 const TRACK_TRAIL_POINTS = 100;
 const TRACK_SHOWN_MS = 10000;
 const LOG_LINES = 200;
+const MAX_PICTURES = 2; // in flight; with the stream and those of a second window, a browser has connections left
 
 export function connect() {
   if (state.stream || document.hidden || state.replaced) return;
@@ -60,6 +61,7 @@ export function select(vehicle) {
 function onNews(news) {
   state.at = performance.now();
   state.refused = "";
+  state.maxPictures = news.windows > 1 ? 1 : MAX_PICTURES;
   state.problem = news.problem;
   state.alive = news.alive;
   state.ages = news.ages_s;

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import itertools
+import json
 import socket
+import time
+from collections import Counter
 from collections.abc import Iterator
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
 
+import cv2
+import numpy as np
 import pytest
 
-from companion.bus.topics import VEHICLE
+from companion.bus.topics import DETECTIONS, IMAGE, VEHICLE
 from mavlink_sim.testing import free_port
 from tests.companion.dashboard.chromium import PROGRAM, Browser, Tab, chromium, wait_for
 from tests.companion.dashboard.serving import dashboard_command
-from tests.companion.dashboard.test_bridge import publishing
+from tests.companion.dashboard.test_bridge import NAME, frame, publishing
 from tests.companion.dashboard.test_dashboard_fleet import answering, publish_scene, two_vehicles
 from tests.companion.service_process import ServiceProcess
 from tests.companion.test_play import playing
@@ -151,6 +159,83 @@ def test_stop_works_with_the_page_in_many_windows(browser: Browser, service: Ser
     finally:
         for opened in tabs:
             opened.close()
+
+
+REQUESTS = "performance.getEntriesByType('resource').map((entry) => entry.toJSON())"
+
+
+def pictures(tab: Tab) -> list[dict[str, Any]]:
+    """The requests of pictures that have ended, with `camera`, `startTime` and `responseEnd` in ms."""
+    found = [(urlsplit(entry["name"]), entry) for entry in tab.value(REQUESTS)]
+    return [
+        {**entry, "camera": parse_qs(url.query, keep_blank_values=True)["camera"][0]}
+        for url, entry in found
+        if url.path == "/picture"
+    ]
+
+
+def most_at_once(requests: list[dict[str, Any]]) -> int:
+    return max(
+        sum(one["startTime"] <= other["startTime"] < one["responseEnd"] for one in requests)
+        for other in requests
+    )
+
+
+def test_cameras_take_turns_and_stop_has_a_free_connection(browser: Browser) -> None:
+    names = ["", "down", "left", "right"]
+    jpeg = cv2.imencode(".jpg", np.zeros((48, 64, 3), np.uint8))[1].tobytes()
+    with publishing() as (service, endpoint), dashboard_command(endpoint) as url:
+        answering({NAME: service})
+        tab = open_page(browser, url)
+        sequence = itertools.count()
+
+        def publish(seconds: float, *cameras: str) -> None:
+            for end_s in np.arange(time.monotonic() + 0.05, time.monotonic() + seconds, 0.05):
+                about = {"sequence": next(sequence), "captured_ns": time.monotonic_ns()}
+                for name in cameras:
+                    service.publish(DETECTIONS.key(NAME, name or None), frame(about["sequence"]))
+                    key = IMAGE.key(NAME, name or None)
+                    service.session.put(key, jpeg, attachment=json.dumps(about))
+                time.sleep(max(0.0, end_s - time.monotonic()))
+
+        def begin() -> None:
+            tab.value("performance.clearResourceTimings(); performance.setResourceTimingBufferSize(9999)")
+
+        def answered() -> Counter[str]:
+            return Counter(one["camera"] for one in pictures(tab) if one["responseStatus"] == 200)
+
+        def shown() -> bool:
+            publish(0.2, *names)
+            return bool(tab.value("[...cameras.values()].filter((view) => view.bitmap).length === 4"))
+
+        wait_for(shown)
+        begin()
+        publish(4.0, *names)
+        assert most_at_once(pictures(tab)) == 2
+        counts = answered()
+        assert set(counts) == set(names)
+        assert min(counts.values()) > max(0.7 * max(counts.values()), 4.0 * 3.0)  # of 15 a second at most
+        # Cameras without pictures delay the others little.
+        publish(1.0, "right")
+        begin()
+        publish(4.0, "right")
+        assert most_at_once(pictures(tab)) == 2
+        assert answered()["right"] > 4.0 * 5.0
+        # A second window takes its part of the connections.
+        other = open_page(browser, url)
+        other.until("state.maxPictures === 1 && cameras.size === 1")
+        tab.until("state.maxPictures === 1")
+        publish(1.0, *names)
+        other.until("cameras.size === 4")
+        begin()
+        publish(1.0, "right")
+        other.value("document.querySelector('#stop').click()")
+        other.until(f"{REPLY} === 'stop: done: holding'")
+        assert most_at_once(pictures(tab)) == 1
+        (stop,) = [one for one in other.value(REQUESTS) if one["name"].endswith("/command")]
+        assert stop["requestStart"] - stop["startTime"] < 200.0  # a picture may be waited for for 500
+        other.close()
+        tab.close()
 
 
 def test_page_says_when_no_service_answers_and_how_old_its_state_is(browser: Browser) -> None:
