@@ -18,11 +18,12 @@ export function drawMap(vehicle, limits) {
   const tracks = mapTracks();
   const view = fit([
     home, ...state.trail, ...tracks.map((track) => track.at), ...others.map((one) => one.at_ned_m),
-    ...include, ...exclude.flat(), ...(own ? [own] : []),
+    ...[...state.trails.values()].flat(), ...include, ...exclude.flat(), ...(own ? [own] : []),
   ]);
 
   drawGrid(view);
   drawFence(view, include, exclude);
+  for (const trail of state.trails.values()) drawTrail(view, trail, css("--soft"));
   drawTrail(view, state.trail, css("--accent"));
   for (const one of others) {
     view.g.globalAlpha = one.state_age_s > STALE_S ? .4 : 1;

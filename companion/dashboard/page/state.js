@@ -27,6 +27,7 @@ export function ofOneVehicle() {
     topics: {},
     ages: {},
     trail: [],
+    trails: new Map(), // of the other vehicles, by name; in local NED of the shown one
     tracks: new Map(), // by id
     latency: [],
     drops: [],

@@ -6,6 +6,7 @@ import { $, browserId, ofOneVehicle, record, showAddress, state } from "./state.
 
 const TRAIL_M = 0.3; // between two points of a trail
 const TRAIL_POINTS = 800;
+const OTHER_TRAIL_POINTS = 300;
 const TRACK_TRAIL_POINTS = 100;
 const TRACK_SHOWN_MS = 10000;
 const LOG_LINES = 200;
@@ -69,6 +70,7 @@ function onNews(news) {
   state.vehicles = news.vehicles;
   state.objects = news.objects;
   Object.assign(state.topics, news.topics);
+  extendTrails(news.vehicles);
   for (const [path, message] of Object.entries(news.topics)) {
     if (path.endsWith("detections")) onDetections(path, message);
   }
@@ -76,6 +78,16 @@ function onNews(news) {
   if (news.topics.status) onStatus(news.topics.status);
   for (const event of news.events) log(event.level, event.text, (news.now_ns - event.stamp_ns) / 1e9);
   news.replies.forEach(onReply);
+}
+
+export function extendTrails(vehicles) {
+  const trails = new Map();
+  for (const { name, at_ned_m: at } of vehicles) {
+    if (name === state.vehicle) continue;
+    trails.set(name, state.trails.get(name) || []);
+    extend(trails.get(name), at, OTHER_TRAIL_POINTS);
+  }
+  state.trails = trails; // those of vehicles that are gone are dropped
 }
 
 function extend(trail, at, limit) {

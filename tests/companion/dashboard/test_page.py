@@ -20,7 +20,13 @@ from mavlink_sim.testing import free_port
 from tests.companion.dashboard.chromium import PROGRAM, Browser, Tab, chromium, wait_for
 from tests.companion.dashboard.serving import dashboard_command
 from tests.companion.dashboard.test_bridge import NAME, frame, publishing
-from tests.companion.dashboard.test_dashboard_fleet import answering, publish_scene, two_vehicles
+from tests.companion.dashboard.test_dashboard_fleet import (
+    OTHER,
+    answering,
+    publish_scene,
+    state_at,
+    two_vehicles,
+)
 from tests.companion.service_process import ServiceProcess
 from tests.companion.test_play import playing
 
@@ -37,7 +43,7 @@ LINK = "(document.querySelector('#link')?.textContent ?? '')"
 
 OPENED = """
 location.protocol === 'http:' && document.readyState === 'complete'
-  && Promise.all(['state', 'cameras'].map((name) => import(`/${name}.js`)))
+  && Promise.all(['state', 'stream', 'cameras'].map((name) => import(`/${name}.js`)))
     .then((modules) => Object.assign(globalThis, ...modules) && true)
 """
 
@@ -272,6 +278,16 @@ def test_page_of_a_fleet_switches_the_vehicle_and_stops_all(browser: Browser) ->
         # One car, seen by both, and the person that only the other one sees.
         until(f"{text('#map', 'ariaLabel')}.includes('car vehicle1 #7, vehicle2 #3')")
         until(f"{text('#map', 'ariaLabel')}.includes('person vehicle2 #4')")
+        # The other one's trail, of points that are 0.3 m apart.
+        assert tab.value("[...state.trails].map(([name, trail]) => [name, trail.length])") == [[OTHER, 1]]
+        latest = "state.trails.get('vehicle2').at(-1)[1]"
+        for east_m in (1.2, 2.0):
+            services[OTHER].publish(VEHICLE.key(OTHER), state_at(OTHER, 2.0, east_m))
+            tab.until(f"Math.abs(state.vehicles[1].at_ned_m[1] - {5.0 + east_m}) < 0.1")
+        tab.until(f"Math.abs({latest} - 7) < 0.1")
+        assert tab.value("state.trails.get('vehicle2').length") == 2
+        trail = "extendTrails([...Array(2000).keys()].map((n) => ({name: 'other', at_ned_m: [n, 0]})))"
+        assert tab.value(f"{trail}, state.trails.get('other').length") == 300
         tab.value("document.querySelectorAll('#fleet button')[1].click()")
         until(f"{text('#vehicle', 'textContent')} === 'vehicle2' && location.search === '?vehicle=vehicle2'")
         until(f"{text('#map', 'ariaLabel')}.includes('car vehicle1 #7, vehicle2 #3')")
