@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 from typing import Annotated
 
 import typer
@@ -22,7 +23,7 @@ def dashboard(
     from companion.bus.client import NoAnswerError, client_settings
     from companion.bus.config import BusError
     from companion.dashboard.access import DashboardError
-    from companion.dashboard.server import DashboardOptions, serve
+    from companion.dashboard.server import NICENESS, DashboardOptions, serve
 
     address = settings.dashboard.listen if listen is None else listen
     if not address:
@@ -31,6 +32,7 @@ def dashboard(
     with plain_errors(NoAnswerError, DashboardError, BusError):
         zenoh = client_settings(settings.zenoh, (connect,) if connect else ())
         options = DashboardOptions(address, settings.dashboard.token_file, zenoh, settings.vehicle.name)
+        os.nice(NICENESS)
         try:
             asyncio.run(serve(options, lambda url: print(f"dashboard: {url}", flush=True)))
         except KeyboardInterrupt:

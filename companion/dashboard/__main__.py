@@ -14,11 +14,12 @@ from companion.bus.client import settings_in_child
 from companion.bus.config import BusError
 from companion.child_process import EXIT_REFUSED, on_parent_end
 from companion.dashboard.access import DashboardError
-from companion.dashboard.server import DashboardOptions, serve
+from companion.dashboard.server import NICENESS, DashboardOptions, serve
 
 
 def main(argument: str) -> int:
     """Serve; returns the exit code."""
+    os.nice(NICENESS)
     values = json.loads(argument)
     zenoh = settings_in_child(values.pop("zenoh"))
     on_parent_end(lambda: os._exit(0))  # zenoh's threads and open streams need no shutdown

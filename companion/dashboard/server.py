@@ -33,6 +33,8 @@ from companion.dashboard.bridge import Bridge, News
 from companion.dashboard.fleet import MAX_VEHICLES, Fleet
 from companion.settings import ZenohSection
 
+NICENESS = 5
+"""Of the server's process: the loop that steers has priority."""
 STREAM_PERIOD_S = 0.1
 PICTURE_WAIT_S = 0.5
 FIRST_REQUEST_S = 5.0

@@ -13,10 +13,12 @@ from pathlib import Path
 
 import pytest
 
+from companion.dashboard.server import NICENESS
 from mavlink_sim.testing import free_port
 from tests.companion.command_line import companion
 from tests.companion.dashboard.serving import dashboard_command
 from tests.companion.service_process import ServiceProcess
+from tests.companion.test_play import descendants
 
 pytestmark = pytest.mark.realtime
 
@@ -83,7 +85,7 @@ asyncio.run(main())
 """
 
 
-def test_child_ends_when_its_parent_is_killed() -> None:
+def test_child_has_lower_priority_and_ends_when_its_parent_is_killed() -> None:
     port = free_port(socket.SOCK_STREAM)
     process = subprocess.Popen(
         [sys.executable, "-c", PARENT, f"127.0.0.1:{port}"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT
@@ -91,6 +93,9 @@ def test_child_ends_when_its_parent_is_killed() -> None:
     running = ServiceProcess(process, "")
     try:
         running.wait_for_line(f"dashboard: http://127.0.0.1:{port}/", 60.0)
+        (child,) = descendants(process.pid)
+        own = os.getpriority(os.PRIO_PROCESS, 0)
+        assert os.getpriority(os.PRIO_PROCESS, child) == min(own + NICENESS, 19)
         os.kill(process.pid, signal.SIGKILL)
         assert until_refused(port)
     finally:
