@@ -61,7 +61,8 @@ def settings_for_child(zenoh: ZenohSection) -> dict[str, Any]:
     Raises:
         NoAnswerError: as `client_settings`.
     """
-    client = client_settings(zenoh)
+    file = zenoh.child_config_file or zenoh.config_file
+    client = client_settings(zenoh.model_copy(update={"config_file": file}))
     return {"values": client.model_dump(mode="json"), "given": sorted(client.model_fields_set)}
 
 

@@ -23,6 +23,8 @@ class ZenohSection(Section):
     """find other peers on the local network by multicast"""
     config_file: str | None = None
     """zenoh's configuration file (JSON5): TLS, access control; its keys replace defaults of those above"""
+    child_config_file: str | None = None
+    """the same for dashboard, recorder and Foxglove that the service starts; unset: config_file"""
 
     @model_validator(mode="after")
     def _reachable(self) -> Self:

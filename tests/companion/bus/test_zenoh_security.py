@@ -17,8 +17,11 @@ import pytest
 from companion.bus import topics
 from companion.bus.client import NoAnswerError, client_settings, listen, open_client, send_command
 from companion.bus.session import Bus
-from companion.settings import ZenohSection
+from companion.dashboard.process import dashboard_process
+from companion.service.factory import clients_of
+from companion.settings import Settings, ZenohSection
 from mavlink_sim.testing import free_port
+from tests.companion.dashboard.serving import POST, EventStream, request
 
 pytestmark = [
     pytest.mark.realtime,
@@ -109,3 +112,41 @@ async def test_reader_sees_detections_but_may_not_command() -> None:
     assert isinstance(answer, str)
     assert "access control" in answer
     assert executed == ["hold operator"]
+
+
+@pytest.mark.usefixtures("folder")
+async def test_dashboard_and_recorder_connect_with_the_file_of_the_children() -> None:
+    endpoint, port = f"tls/127.0.0.1:{free_port(socket.SOCK_STREAM)}", free_port(socket.SOCK_STREAM)
+    files = {"config_file": "vehicle1.json5", "child_config_file": "operator.json5"}
+    settings = Settings.model_validate(
+        {
+            "vehicle": {"name": "alpha"},
+            "zenoh": {"listen": (endpoint,), **files},
+            "dashboard": {"listen": f"127.0.0.1:{port}"},
+            "recording": {"directory": "recordings"},
+        }
+    )
+
+    async def execute(text: str) -> dict[str, Any]:
+        return {"command": text, "success": True, "reason": "holding"}
+
+    lines: asyncio.Queue[str] = asyncio.Queue()
+    bus = Bus(settings.zenoh, "alpha", on_event=lambda *_: None, on_command=execute)
+    await bus.start()
+    try:
+        async with (
+            dashboard_process(settings, lines.put_nowait),
+            clients_of(settings, lambda _level, line: lines.put_nowait(line)),
+            asyncio.timeout(60.0),
+        ):
+            begun = sorted([await lines.get(), await lines.get()])
+            assert begun[0] == f"dashboard: http://127.0.0.1:{port}/"
+            assert begun[1].startswith("recorder: recording to ")
+            stream = await EventStream.open(port)
+            while (news := await stream.next()) is not None and news["alive"] is not True:
+                pass
+            stream.close()
+            _, _, body = await request(port, "POST", "/command", POST, {"text": "hold"})
+            assert json.loads(body)["reason"] == "holding"
+    finally:
+        await bus.close()
