@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from companion.cli.bench import bench
+from companion.cli.cloud import CLOUD_SETTINGS, cloud
 from companion.cli.dashboard import dashboard
 from companion.cli.evaluate import evaluate
 from companion.cli.flags import EXIT_BAD_INPUT, plain_errors, settings_command
@@ -51,6 +52,7 @@ ORDER = (
     "commands",
     "topics",
     "mission",
+    "cloud",
     "record",
     "replay",
     "config",
@@ -70,6 +72,7 @@ app.add_typer(models, name="models")
 app.command()(evaluate)
 app.command()(topics)
 settings_command(app, *CLIENT_SETTINGS, "plugins", "detector")(mission)
+settings_command(app, *CLOUD_SETTINGS)(cloud)
 settings_command(app)(play)
 settings_command(app, *CLIENT_SETTINGS, "dashboard")(dashboard)
 app.add_typer(bench, name="bench")

@@ -1,0 +1,160 @@
+"""The command line of `companion cloud`."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
+
+import cv2
+import numpy as np
+import typer
+from numpy.typing import NDArray
+
+from companion.cli.flags import EXIT_BAD_INPUT, plain_errors
+from companion.settings import Settings
+from companion.settings.perception import CameraSection
+from vision.gc_pause import gc_paused
+
+if TYPE_CHECKING:
+    from vision.frame import Frame
+    from vision.point_cloud import Cluster
+
+CLOUD_SETTINGS = ("camera", "source.width", "source.height", "source.rate_hz", "source.pixel_format")
+_PICTURES = (".png", ".jpg")
+
+
+def cloud(
+    settings: Settings,
+    source: Annotated[str, typer.Argument(help="Source with depth: shm://NAME.")],
+    output: Annotated[Path, typer.Argument(help="Output file: .ply or .pcd.")],
+    frame: Annotated[
+        Literal["camera", "body", "ned"], typer.Option(help="Frame of the points; NED is from the vehicle.")
+    ] = "body",
+    attitude: Annotated[
+        tuple[float, float, float],
+        typer.Option(help="The vehicle's roll, pitch and yaw, degrees.", metavar="ROLL PITCH YAW"),
+    ] = (0.0, 0.0, 0.0),
+    max_range: Annotated[float, typer.Option(min=0.1, help="Maximum depth, metres.")] = 20.0,
+    voxel: Annotated[
+        float | None, typer.Option(min=0.005, max=10, help="Voxel grid: one point per cube, metres.")
+    ] = None,
+    average: Annotated[
+        int | None,
+        typer.Option(min=1, max=32, help="Make one point of N x N pixels, against a stereo camera's noise."),
+    ] = None,
+    clusters: Annotated[
+        bool,
+        typer.Option(
+            "--clusters", help="List the objects above the ground. Unless set: --voxel 0.1 --average 4."
+        ),
+    ] = False,
+    picture: Annotated[
+        Path | None, typer.Option(help="Picture of the cloud from behind and above: .png or .jpg.")
+    ] = None,
+    text: Annotated[bool, typer.Option("--text", help="Write numbers as text instead of binary.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Write one frame's depth as a point cloud, with the colours of its image."""
+    with gc_paused():
+        from vision.point_cloud import CloudFileError, cloud_from_depth, scene_of, voxel_grid, write_cloud
+        from vision.point_cloud.drawing import draw_cloud
+        from vision.rotation import matrix_from_euler
+        from vision.sources import SourceError
+
+    if picture is not None and picture.suffix not in _PICTURES:
+        _refuse(f"{picture}: expected a name that ends in {' or '.join(_PICTURES)}")
+    if clusters:
+        voxel, average = voxel or 0.1, average or 4
+    ned_from_body = matrix_from_euler(*(math.radians(angle) for angle in attitude))
+    # ValueError: a camera on a gimbal has no fixed mount, or the voxels are too small.
+    with plain_errors(SourceError, CloudFileError, ValueError, OSError):
+        captured, depth_m, camera = _capture(settings, source)
+        mount = camera.mount()
+        points = cloud_from_depth(
+            depth_m,
+            camera.model(captured.width, captured.height),
+            image=captured.image,
+            frame=frame,
+            mount=mount,
+            ned_from_body=ned_from_body,
+            range_m=(0.0, max_range),
+            average=average or 1,
+            stamp_ns=captured.captured_ns,
+        )
+        if not len(points):
+            _refuse(f"{source}: the cloud is empty: no pixel has a depth of up to {max_range:g} m")
+        down = np.array([0.0, 0.0, 1.0])
+        if frame == "body":
+            down = ned_from_body[2]
+        elif frame == "camera":
+            # A gimbal's attitude is unknown here: as if it were at rest.
+            held = mount.held(ned_from_body) if mount.on_gimbal else mount
+            down = held.ned_from_optical(ned_from_body)[2]
+        written = points
+        found: list[Cluster] = []
+        if clusters and voxel is not None:
+            scene = scene_of(points, down, voxel_m=voxel)
+            written, found = scene.voxels, scene.clusters
+        elif voxel is not None:
+            written = voxel_grid(points, voxel)
+        write_cloud(output, written, binary=not text)
+        if picture is not None:
+            drawn = draw_cloud(written, down, clusters=found, point_m=0.03 if voxel is None else voxel)
+            if not cv2.imwrite(str(picture), drawn):
+                raise OSError(f"cannot write {picture}: check its folder and the free disk space")
+    objects = [_record(cluster, down) for cluster in found]
+    if as_json:
+        report = {"source": source, "file": str(output), "frame": frame, "stamp_ns": points.stamp_ns}
+        report |= {"points": len(written)}
+        print(json.dumps(report | ({"clusters": objects} if clusters else {})))
+        return
+    print(f"{output}: {len(written)} points, frame {frame}")
+    for each in objects:
+        size = " x ".join(f"{side:.1f}" for side in each["size_m"])
+        print(f"{each['range_m']:6.1f} m  {size} m  {each['points']} points")
+
+
+def _capture(settings: Settings, uri: str) -> tuple[Frame, NDArray[np.float32], CameraSection]:
+    """The source's first frame, its depth, and its camera."""
+    from companion.settings.calibration import adopt_calibration
+    from vision.sources import open_source
+
+    camera = settings.camera
+    with open_source(uri, settings.source.opening()) as frames:
+        captured = next(iter(frames))
+        if frames.calibration is not None:
+            camera, conflict = adopt_calibration(camera, frames.calibration)
+            if conflict:
+                typer.echo(
+                    f"companion: camera: settings override the camera's calibration: {conflict}", err=True
+                )
+    if captured.depth_m is None:
+        _refuse(
+            f"{uri}: its frames have no depth, and a point cloud needs it: use shm://NAME of a depth camera"
+        )
+    return captured, captured.depth_m, camera
+
+
+def _record(cluster: Cluster, down: NDArray[np.float64]) -> dict[str, Any]:
+    """One object above the ground, as JSON-able data."""
+    centre = cluster.centre_m
+    level = centre - (centre @ down) * down
+    numbers: dict[str, NDArray[Any]] = {
+        "centre_m": centre,
+        "size_m": cluster.size_m,
+        "axes": cluster.axes.T,  # one axis in each row
+        "low_m": cluster.low_m,
+        "high_m": cluster.high_m,
+    }
+    return {
+        "points": len(cluster),
+        "range_m": round(float(np.linalg.norm(level)), 3),
+        **{name: np.round(values.astype(np.float64), 4).tolist() for name, values in numbers.items()},
+    }
+
+
+def _refuse(text: str) -> NoReturn:
+    typer.echo(f"companion: {text}", err=True)
+    raise typer.Exit(EXIT_BAD_INPUT)
