@@ -117,3 +117,15 @@ def test_python_in_readme_runs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     names, position = capsys.readouterr().out.splitlines()
     assert "car" in names
     assert float(position.strip("()").split(", ")[2]) < -4.0
+
+
+def test_python_in_point_clouds_runs(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (ROOT / "docs" / "how-to" / "point-clouds.md").read_text()
+    (block,) = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    exec(compile(block, "point-clouds.md", "exec"), {})
+    voxels, _ = capsys.readouterr().out.split()
+    assert int(voxels) > 1000
+    assert (tmp_path / "wall.ply").stat().st_size > 1000

@@ -215,6 +215,25 @@ class ImageBody(TypedDict):
     """the detections are drawn in it"""
 
 
+class CloudBody(TypedDict):
+    """The attachment of a point cloud.
+
+    The payload has 16 bytes for each point: x, y, z as little-endian float32, metres, then red, green, blue,
+    255. The axes are those of the camera: right, down, forward.
+    """
+
+    camera: str | None
+    """name of the camera; null: the first"""
+    sequence: int
+    """number of the frame, as in detections"""
+    captured_ns: int
+    """capture of the frame"""
+    frame_id: str
+    """the camera's frame, as in transforms"""
+    points: int
+    """number of points"""
+
+
 class MountBody(TypedDict):
     """How a camera is mounted."""
 

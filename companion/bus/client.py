@@ -221,7 +221,7 @@ def subscribe_kept(
 
 
 def _text_of(sample: zenoh.Sample) -> str:
-    if sample.encoding != zenoh.Encoding.IMAGE_JPEG:
+    if sample.encoding not in (zenoh.Encoding.IMAGE_JPEG, zenoh.Encoding.APPLICATION_OCTET_STREAM):
         return sample.payload.to_string()
     attachment = "" if sample.attachment is None else f" {sample.attachment.to_string()}"
     return f"<{sample.encoding}, {len(sample.payload)} bytes>{attachment}"

@@ -8,6 +8,7 @@ from typing import Any
 
 from companion.bus.bodies import (
     CameraInfoBody,
+    CloudBody,
     DetectionBody,
     DetectionsBody,
     FrameBody,
@@ -178,6 +179,19 @@ def labels_message(result: PerceptionResult) -> str:
 def image_attachment(sequence: int, captured_ns: int, view: str | None, *, annotated: bool) -> ImageBody:
     """Create the attachment of one image."""
     return {"camera": view, "sequence": sequence, "captured_ns": captured_ns, "annotated": annotated}
+
+
+def cloud_attachment(
+    sequence: int, captured_ns: int, vehicle: str, view: str | None, points: int
+) -> CloudBody:
+    """Create the attachment of one point cloud."""
+    return {
+        "camera": view,
+        "sequence": sequence,
+        "captured_ns": captured_ns,
+        "frame_id": camera_frame_id(vehicle, view),
+        "points": points,
+    }
 
 
 def markers_message(

@@ -63,6 +63,8 @@ def payload_of(topic: Topic) -> str:
     """Return the kind of payload, in one word."""
     if topic.encoding == zenoh.Encoding.IMAGE_JPEG:
         return "JPEG"
+    if topic.encoding == zenoh.Encoding.APPLICATION_OCTET_STREAM:
+        return "binary"
     return "text" if topic.encoding == zenoh.Encoding.TEXT_PLAIN else "JSON"
 
 

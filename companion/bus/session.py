@@ -23,7 +23,7 @@ import zenoh
 from pydantic_core import to_json
 from zenoh import ext
 
-from companion.bus.bodies import ImageBody
+from companion.bus.bodies import CloudBody, ImageBody
 from companion.bus.command_intake import COMMANDS_PER_S, Allowance, CommandIntake
 from companion.bus.config import BusError, first_line, zenoh_config
 from companion.bus.topics import (
@@ -201,13 +201,13 @@ class Bus:
             key = f"{alive_key(self._vehicle)}/{part}"
             self._tokens[part] = session.liveliness().declare_token(key)
 
-    def publish_image(
-        self, topic: Topic, image: bytes, attachment: ImageBody, view: str | None = None
+    def publish_large(
+        self, topic: Topic, data: bytes, attachment: ImageBody | CloudBody, view: str | None = None
     ) -> None:
         """Publish bytes that are too large for one packet, with an attachment as JSON.
 
-        zenoh waits for buffer space for each fragment of such a message, so it is sent in a thread. An
-        image that arrives while the previous one is being sent is dropped.
+        zenoh waits for buffer space for each fragment of such a message, so it is sent in a thread. One
+        that arrives while the topic's previous one is being sent is dropped.
         """
         path = topic.path(view)
         publisher = self._publishers.get(path)
@@ -217,11 +217,11 @@ class Bus:
         if not self._watched[path]:
             return  # it was made for a query
         self._sending.add(path)
-        self._spawn(self._send(path, publisher, image, json.dumps(attachment)))
+        self._spawn(self._send(path, publisher, data, json.dumps(attachment)))
 
-    async def _send(self, path: str, publisher: _Publisher, image: bytes, attachment: str) -> None:
+    async def _send(self, path: str, publisher: _Publisher, data: bytes, attachment: str) -> None:
         try:
-            await asyncio.to_thread(publisher.put, image, attachment=attachment)
+            await asyncio.to_thread(publisher.put, data, attachment=attachment)
             self.published[path] += 1
         except zenoh.ZError as error:
             self.publish_failed += 1

@@ -28,7 +28,7 @@ class Topic:
     """One stream.
 
     Attributes:
-        body: type of the payload; of `image` that of its attachment.
+        body: type of the payload; of `LARGE_TOPICS` that of the attachment.
         published: when, in words.
         rate_hz: nominal; None if it follows the camera or is irregular.
         max_age_s: max age of a valid message; None if it does not age (events).
@@ -128,6 +128,17 @@ IMAGE: Final = Topic(
     encoding=zenoh.Encoding.IMAGE_JPEG,
     priority=zenoh.Priority.BACKGROUND,
 )
+CLOUD: Final = Topic(
+    "cloud",
+    bodies.CloudBody,
+    "the points of a depth image with their colours; the attachment has their number and frame",
+    "at most `preview.cloud_rate_hz`, only with subscribers, of cameras with depth",
+    rate_hz=2.0,
+    max_age_s=1.0,
+    of_camera=True,
+    encoding=zenoh.Encoding.APPLICATION_OCTET_STREAM,
+    priority=zenoh.Priority.BACKGROUND,
+)
 VEHICLE: Final = Topic(
     "vehicle",
     bodies.VehicleBody,
@@ -222,6 +233,7 @@ TOPICS: Final = (
     TRANSFORMS,
     CAMERA_INFO,
     IMAGE,
+    CLOUD,
     VEHICLE,
     SETPOINT,
     OBSTACLES,
@@ -229,6 +241,9 @@ TOPICS: Final = (
     STATUS,
     EVENTS,
 )
+
+# Large ones, of which a reader chooses whether it wants them; their body is that of the attachment.
+LARGE_TOPICS: Final = (IMAGE, CLOUD)
 
 # Topics published by every view.
 VIEW_TOPICS: Final = tuple(topic for topic in TOPICS if topic.of_camera)

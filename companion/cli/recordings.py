@@ -18,7 +18,7 @@ from companion.settings import Settings
 
 EXIT_DIFFERENT = 1
 RECORD_SETTINGS = tuple(
-    f"recording.{key}" for key in ("images", "max_file_mb", "max_file_minutes", "max_total_mb")
+    f"recording.{key}" for key in ("images", "clouds", "max_file_mb", "max_file_minutes", "max_total_mb")
 )
 
 log = typer.Typer(
@@ -62,6 +62,7 @@ def record(
             vehicle=settings.vehicle.name,
             directory=str(directory),
             images=recording.images,
+            clouds=recording.clouds,
             max_file_mb=recording.max_file_mb,
             max_file_minutes=recording.max_file_minutes,
             max_total_mb=recording.max_total_mb,

@@ -31,7 +31,7 @@ from companion.guidance.targets.from_markers import (
 )
 from companion.guidance.targets.ranging import ALL_MEANS, RangeMeans, sees_ground
 from companion.guidance.targets.target import Target
-from companion.perception.messages import Preview
+from companion.perception.messages import CloudPreview, Preview
 from companion.perception.process import START_S
 from companion.perception.supervisor import PerceptionStartError, PerceptionState, PerceptionSupervisor
 from companion.settings import DetectorSection, Section, Settings
@@ -141,7 +141,7 @@ class WorkerCamera(PerceptionCamera):
         name: str | None,
         *,
         on_result: Callable[[WorkerCamera, PerceptionResult], None],
-        on_preview: Callable[[WorkerCamera, Preview], None],
+        on_preview: Callable[[WorkerCamera, Preview | CloudPreview], None],
         on_event: Callable[[str, str], None],
         on_calibration: Callable[[], None],
     ) -> None:
@@ -233,7 +233,7 @@ def open_cameras(
     settings: Settings,
     *,
     on_result: Callable[[WorkerCamera, PerceptionResult], None],
-    on_preview: Callable[[WorkerCamera, Preview], None],
+    on_preview: Callable[[WorkerCamera, Preview | CloudPreview], None],
     on_event: Callable[[str, str], None],
     on_calibration: Callable[[], None],
 ) -> tuple[WorkerCamera, ...]:

@@ -67,9 +67,10 @@ class GimbalAttitude:
 
 @dataclass(frozen=True, slots=True)
 class Watched:
-    """Whether preview images are wanted."""
+    """Whether preview images and point clouds are wanted."""
 
     watched: bool
+    clouds: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,6 +130,16 @@ class Preview:
 
 
 @dataclass(frozen=True, slots=True)
+class CloudPreview:
+    """The point cloud of one frame, in the camera's optical frame; `data` is of `PointCloud.packed`."""
+
+    sequence: int
+    captured_ns: int
+    points: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
 class Heartbeat:
     """The loop is alive without a processed frame. `dropped` and `frames_skipped`: as in a result."""
 
@@ -168,6 +179,7 @@ Message = (
     | Report
     | Selected
     | Preview
+    | CloudPreview
     | Heartbeat
     | LogLine
     | Ended
@@ -259,7 +271,7 @@ class ResultSender:
         self._changed = threading.Condition()
         self._queue: deque[Message] = deque(maxlen=_QUEUED_LINES)
         self._newest: Report | Heartbeat | None = None
-        self._preview: Preview | None = None
+        self._previews: dict[type, Preview | CloudPreview] = {}
         self._replaced = 0
         self._last: Message | None = None
         self._busy = False
@@ -288,10 +300,10 @@ class ResultSender:
             if not self._send_newest():
                 self._changed.notify()
 
-    def put_preview(self, preview: Preview) -> None:
-        """Send a preview when nothing else waits, unless a newer one replaces it."""
+    def put_preview(self, preview: Preview | CloudPreview) -> None:
+        """Send a preview when nothing else waits, unless a newer one of its kind replaces it."""
         with self._changed:
-            self._preview = preview
+            self._previews[type(preview)] = preview
             self._changed.notify()
 
     def close(self, last: Ended | StartFailed, timeout_s: float) -> None:
@@ -325,7 +337,7 @@ class ResultSender:
         with self._changed:
             self._busy = False
             self._changed.wait_for(
-                lambda: self._rest or self._queue or self._newest or self._preview or self._last
+                lambda: self._rest or self._queue or self._newest or self._previews or self._last
             )
             self._busy = True
             if self._rest:
@@ -337,9 +349,7 @@ class ResultSender:
                 return self._take_newest()
             if self._last is not None:
                 return self._last
-            preview, self._preview = self._preview, None
-            assert preview is not None
-            return preview
+            return self._previews.pop(next(iter(self._previews)))
 
     def _run(self) -> None:
         try:

@@ -133,9 +133,9 @@ class PerceptionProcess:
         if not self._control.transport.get_write_buffer_size():
             self._put(attitude)
 
-    def watch(self, watched: bool) -> None:
-        """Send whether previews are wanted."""
-        self._put(Watched(watched))
+    def watch(self, watched: Watched) -> None:
+        """Send which previews are wanted."""
+        self._put(watched)
 
     def select(self, request: SelectRequest) -> None:
         """Send what to select; a `Selected` answers it."""

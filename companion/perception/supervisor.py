@@ -18,6 +18,7 @@ from pathlib import Path
 
 from companion.perception.messages import (
     Attitude,
+    CloudPreview,
     Ended,
     GimbalAttitude,
     Heartbeat,
@@ -29,6 +30,7 @@ from companion.perception.messages import (
     Ready,
     Report,
     StartFailed,
+    Watched,
 )
 from companion.perception.process import PerceptionProcess, RateLimiter, Watchdog
 from companion.perception.standard_input import STANDARD_INPUT, StandardInput
@@ -86,7 +88,7 @@ class PerceptionSupervisor:
         settings: the sections source, detector, recording and log are used by the worker.
         on_result: called with every result. Sequence numbers continue when a worker is replaced.
         on_event: called with a level (`info`, `warning`, `error`) and a line of text.
-        on_preview: called with preview images, while `watch(True)`.
+        on_preview: called with preview images and point clouds, while `watch` wants them.
         on_calibration: called when a worker is ready, with its camera's calibration or None.
     """
 
@@ -96,13 +98,13 @@ class PerceptionSupervisor:
         *,
         on_result: Callable[[PerceptionResult], None],
         on_event: Callable[[str, str], None],
-        on_preview: Callable[[Preview], None] = lambda _: None,
+        on_preview: Callable[[Preview | CloudPreview], None] = lambda _: None,
         on_calibration: Callable[[CameraCalibration | None], None] = lambda _: None,
     ) -> None:
         self._settings = settings
         self._on_calibration = on_calibration
         self._on_preview = on_preview
-        self._watched = False
+        self._watched = Watched(False)
         self._on_result = on_result
         self._on_event = on_event
         self._state = PerceptionState.STOPPED
@@ -187,12 +189,13 @@ class PerceptionSupervisor:
         """Record the publication of a result: the duration of its last stage, since the inference."""
         self._times.add({"publish": (time.monotonic_ns() - result.inferred_ns) / 1e6})
 
-    def watch(self, watched: bool) -> None:
-        """Set whether preview images are wanted; initially not."""
-        if watched != self._watched:
-            self._watched = watched
+    def watch(self, watched: bool, clouds: bool | None = None) -> None:
+        """Set whether preview images and point clouds (None: as before) are wanted; initially not."""
+        wanted = Watched(watched, self._watched.clouds if clouds is None else clouds)
+        if wanted != self._watched:
+            self._watched = wanted
             if self._process is not None:
-                self._process.watch(watched)
+                self._process.watch(wanted)
 
     async def select(self, request: SelectRequest) -> Selected:
         """Select an object in the worker's images, or end the selection. Never raises."""
@@ -433,7 +436,7 @@ class PerceptionSupervisor:
                     self._on_ready(message, process)
                     if not started.done():
                         started.set_result(None)
-                case Preview():
+                case Preview() | CloudPreview():
                     self._on_preview(replace(message, sequence=message.sequence + self._first_sequence))
                 case StartFailed():
                     return _End(False, message.text)

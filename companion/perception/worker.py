@@ -18,11 +18,8 @@ import threading
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-
-import cv2
-import numpy as np
 
 from companion.perception.assembly import CameraTelemetry, build_pipeline, load_detector
 from companion.perception.messages import (
@@ -32,7 +29,6 @@ from companion.perception.messages import (
     GimbalAttitude,
     Heartbeat,
     Hud,
-    Preview,
     Ready,
     Report,
     ResultLogHandler,
@@ -42,10 +38,10 @@ from companion.perception.messages import (
     Watched,
     receive,
 )
+from companion.perception.previews import CloudEncoder, PreviewEncoder
 from companion.plugins import PluginError, load_plugins
-from companion.settings import PreviewSection, Settings
+from companion.settings import Settings
 from companion.settings.calibration import adopt_calibration
-from vision.annotate import annotate
 from vision.detections import Detections
 from vision.frame import Frame
 from vision.object_detector import YOLO, ObjectDetector
@@ -66,8 +62,6 @@ _LOADING_PERIOD_S = 2.0
 GRACE_S = 5.0
 # The service's guidance loop has priority on a shared core.
 NICENESS = 5
-# In the worker the network has priority over preview images.
-_PREVIEW_NICER = 5
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
@@ -78,14 +72,14 @@ class ControlChannel:
         stopping: end now.
         hud: overlay of the recorded video's next frames.
         telemetry: of the vehicle.
-        watched: whether previews are wanted.
+        watched: which previews are wanted.
         selections: what to select, oldest first; the reader removes them.
     """
 
     def __init__(self, connection: socket.socket) -> None:
         self.stopping = False
         self.hud = Hud((), None)
-        self.watched = False
+        self.watched = Watched(False)
         self.selections: deque[SelectRequest] = deque()
         self.telemetry = CameraTelemetry()
         self._connection = connection
@@ -110,7 +104,7 @@ class ControlChannel:
             elif isinstance(message, GimbalAttitude):
                 self.telemetry.gimbal.add(message.stamp_ns, message.wxyz)
             elif isinstance(message, Watched):
-                self.watched = message.watched
+                self.watched = message
             elif isinstance(message, SelectRequest):
                 self.selections.append(message)
             elif isinstance(message, Stop):
@@ -121,67 +115,6 @@ class ControlChannel:
             os._exit(1)
 
 
-class PreviewEncoder:
-    """Encodes preview images in a thread, at most `rate_hz` a second; only the newest frame waits.
-
-    Attributes:
-        watched: whether previews are wanted; if not, a frame costs nothing.
-
-    Args:
-        deliver: called with each preview, in the encoder's thread.
-    """
-
-    def __init__(self, settings: PreviewSection, deliver: Callable[[Preview], None]) -> None:
-        self.watched = False
-        self._settings = settings
-        self._deliver = deliver
-        self._due_ns = 0
-        self._changed = threading.Condition()
-        self._waiting: tuple[Frame, Detections] | None = None
-        self._closed = False
-        self._thread = threading.Thread(target=self._run, name="preview", daemon=True)
-        self._thread.start()
-
-    def write(self, frame: Frame, detections: Detections) -> None:
-        """Queue a frame with the newest detections. Never waits."""
-        if not self.watched or frame.captured_ns < self._due_ns:
-            return
-        self._due_ns = frame.captured_ns + round(1e9 / self._settings.rate_hz)
-        with self._changed:
-            self._waiting = (frame, detections)
-            self._changed.notify()
-
-    def close(self) -> None:
-        """End the thread."""
-        with self._changed:
-            self._closed = True
-            self._changed.notify()
-        self._thread.join()
-
-    def _run(self) -> None:
-        nice = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), min(nice + _PREVIEW_NICER, 19))
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._waiting or self._closed)
-                if self._closed or self._waiting is None:
-                    return
-                (frame, detections), self._waiting = self._waiting, None
-            try:
-                self._deliver(self._encoded(frame, detections))
-            except Exception:  # a failed preview must not end the thread
-                logger.exception("preview of %dx%d failed", frame.width, frame.height)
-
-    def _encoded(self, frame: Frame, detections: Detections) -> Preview:
-        image = annotate(frame.image, detections) if self._settings.annotate else frame.image
-        if frame.width > self._settings.width:
-            height = max(1, round(frame.height * self._settings.width / frame.width))
-            smaller = cv2.resize(image, (self._settings.width, height), interpolation=cv2.INTER_AREA)
-            image = smaller.astype(np.uint8, copy=False)
-        _, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, self._settings.quality])
-        return Preview(frame.sequence, frame.captured_ns, jpeg.tobytes())
-
-
 @dataclass(frozen=True, slots=True)
 class Perception:
     """The opened parts of the worker."""
@@ -190,12 +123,14 @@ class Perception:
     detector: ObjectDetector | None
     recording: Recording | None
     preview: PreviewEncoder
+    clouds: CloudEncoder
 
     def write(self, frame: Frame, detections: Detections) -> None:
-        """Pass a frame, after its result was sent, to recording and preview."""
+        """Pass a frame, after its result was sent, to recording and previews."""
         if self.recording is not None:
             self.recording.write(frame, detections)
         self.preview.write(frame, detections)
+        self.clouds.write(frame, detections)
 
 
 def main(arguments: list[str]) -> int:
@@ -255,6 +190,7 @@ def _work(begin: Begin, control: ControlChannel, sender: ResultSender) -> Ended 
         if perception.source.calibration is not None:
             adopted = adopt_calibration(settings.camera, perception.source.calibration).camera
             settings = settings.model_copy(update={"camera": adopted})
+            perception.clouds.camera = adopted
         pipeline = build_pipeline(
             settings,
             perception.source,
@@ -313,7 +249,9 @@ def _open(settings: Settings, stack: contextlib.ExitStack, sender: ResultSender)
         stack.callback(recording.close)
     preview = PreviewEncoder(settings.preview, sender.put_preview)
     stack.callback(preview.close)
-    return Perception(source, detector, recording, preview)
+    clouds = CloudEncoder(settings.preview, settings.camera, sender.put_preview)
+    stack.callback(clouds.close)
+    return Perception(source, detector, recording, preview, clouds)
 
 
 def _ready(perception: Perception) -> Ready:
@@ -347,7 +285,8 @@ def _run(pipeline: Pipeline, perception: Perception, control: ControlChannel, se
         if perception.recording is not None:
             perception.recording.lines = control.hud.lines
             perception.recording.highlight = control.hud.highlight
-        perception.preview.watched = control.watched
+        watched = control.watched
+        perception.preview.watched, perception.clouds.watched = watched.watched, watched.clouds
         while control.selections:
             request = control.selections.popleft()
             if selection is None:

@@ -18,6 +18,7 @@ from typing_extensions import TypedDict
 
 from companion.bus.schema import schema_of
 from companion.bus.topics import (
+    CLOUD,
     DETECTIONS,
     EVENTS,
     GUIDANCE_INPUT,
@@ -48,6 +49,12 @@ _OF_RECORDER = {
 }
 _STAMPS = ("published_ns", "stamp_ns", "now_ns")
 _LEVELS = {"info": 2, "warning": 3, "error": 4}  # foxglove.LogLevel
+# Of `PointCloud.packed`: name, offset, and foxglove.PackedElementField's type (1: uint8, 7: float32).
+_POINT_BYTES = 16
+_POINT_FIELDS = (
+    *((name, 4 * index, 7) for index, name in enumerate(("x", "y", "z"))),
+    *((name, 12 + index, 1) for index, name in enumerate(("red", "green", "blue", "alpha"))),
+)
 _LINE_LOOP = 2  # foxglove.PointsAnnotationType
 _COLORS = {"confirmed": (0.2, 1.0, 0.3), "tentative": (1.0, 0.8, 0.1)}
 _OTHER_COLOR = (0.4, 0.7, 1.0)
@@ -97,7 +104,7 @@ class Converter:
 
         Args:
             path: the key after the vehicle's name.
-            attachment: of an image.
+            attachment: of an image or a point cloud.
 
         Raises:
             ValueError, KeyError, TypeError: the message is not what its topic says.
@@ -108,6 +115,9 @@ class Converter:
             return
         if name == IMAGE.name:
             yield self._image(camera, payload, json.loads(attachment or b"{}"))
+            return
+        if name == CLOUD.name:
+            yield self._cloud(camera, payload, json.loads(attachment or b"{}"))
             return
         if name == LABELS.name:
             text = json.dumps({"labels": payload.decode()}).encode()
@@ -168,7 +178,27 @@ class Converter:
             "format": "jpeg",
         }
         text = json.dumps(body, separators=(",", ":")).encode()
-        return Recorded(image_channel(camera), captured_ns + self._offset_ns, text)
+        return Recorded(large_channels(camera)[0], captured_ns + self._offset_ns, text)
+
+    def _cloud(self, camera: str, packed: bytes, about: dict[str, Any]) -> Recorded:
+        captured_ns = about["captured_ns"]
+        if len(packed) != about["points"] * _POINT_BYTES:
+            raise ValueError(f"a cloud of {about['points']} points has {len(packed)} bytes")
+        body = {
+            "timestamp": self._time(captured_ns),
+            "frame_id": about["frame_id"],
+            "pose": {
+                "position": {"x": 0.0, "y": 0.0, "z": 0.0},
+                "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
+            },
+            "point_stride": _POINT_BYTES,
+            "fields": [
+                {"name": name, "offset": offset, "type": kind} for name, offset, kind in _POINT_FIELDS
+            ],
+            "data": base64.b64encode(packed).decode(),
+        }
+        text = json.dumps(body, separators=(",", ":")).encode()
+        return Recorded(large_channels(camera)[1], captured_ns + self._offset_ns, text)
 
     def _annotations(self, camera: str, message: dict[str, Any]) -> Iterator[tuple[str, str, Any]]:
         # The image is scaled down where it is wider than `preview.width`.
@@ -284,10 +314,13 @@ def _unix_time(unix_ns: int) -> dict[str, int]:
     return {"sec": seconds, "nsec": rest}
 
 
-def image_channel(camera: str) -> Channel:
-    """Return the channel of a camera's images. `camera`: empty, or `cameras/NAME`."""
-    name = "foxglove.CompressedImage"
-    return Channel(_joined("", camera, IMAGE.name), name, SCHEMAS[name])
+def large_channels(camera: str) -> tuple[Channel, Channel]:
+    """Return the channels of a camera's images and point clouds. `camera`: empty, or `cameras/NAME`."""
+    image, cloud = "foxglove.CompressedImage", "foxglove.PointCloud"
+    return (
+        Channel(_joined("", camera, IMAGE.name), image, SCHEMAS[image]),
+        Channel(_joined("", camera, CLOUD.name), cloud, SCHEMAS[cloud]),
+    )
 
 
 def _joined(*parts: str) -> str:

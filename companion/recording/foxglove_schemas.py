@@ -36,6 +36,8 @@ _POINTS = _object(
     thickness=_NUMBER,
     metadata=_list(_KEY_VALUE),
 )
+_POSE = _object("foxglove.Pose", position=_VECTOR3, orientation=_QUATERNION)
+_FIELD = _object("foxglove.PackedElementField", name=_TEXT, offset=_COUNT, type=_COUNT)
 _LABEL = _object(
     "foxglove.TextAnnotation",
     timestamp=_TIME,
@@ -95,6 +97,15 @@ SCHEMAS = {
             K=_list(_NUMBER, 9),
             R=_list(_NUMBER, 9),
             P=_list(_NUMBER, 12),
+        ),
+        _object(
+            "foxglove.PointCloud",
+            timestamp=_TIME,
+            frame_id=_TEXT,
+            pose=_POSE,
+            point_stride=_COUNT,
+            fields=_list(_FIELD),
+            data={"type": "string", "contentEncoding": "base64"},
         ),
         _object(
             "foxglove.Log",

@@ -14,9 +14,9 @@ import zenoh
 from foxglove.websocket import ChannelView, Client, ServerListener
 
 from companion.bus.client import open_client
-from companion.bus.topics import IMAGE, ROOT, RUN, TOPICS
+from companion.bus.topics import LARGE_TOPICS, ROOT, RUN, TOPICS
 from companion.recording import RecordingError
-from companion.recording.convert import Converter, image_channel
+from companion.recording.convert import Converter, large_channels
 from companion.recording.files import Channel
 from companion.recording.recorder import subscribe_all
 from companion.settings import ZenohSection
@@ -32,24 +32,25 @@ class LiveOptions:
 
 
 class Live(ServerListener):
-    """Sends messages to viewers. Images are subscribed to only while a viewer shows them."""
+    """Sends messages to viewers. Images and point clouds are subscribed to only while a viewer shows them."""
 
     def __init__(self, options: LiveOptions, session: zenoh.Session) -> None:
         self._vehicle, self._session = options.vehicle, session
         self._converter = Converter(options.vehicle)
         self._channels: dict[str, foxglove.Channel] = {}
         self._viewers: Counter[str] = Counter()
-        self._images: dict[str, zenoh.Subscriber[None]] = {}
+        self._large: dict[str, zenoh.Subscriber[None]] = {}
         self._lock = Lock()  # zenoh's threads, and the server's
         host, _, port = options.listen.rpartition(":")
-        self._channel(image_channel(""))
+        for large in large_channels(""):
+            self._channel(large)
         try:
             self._server = foxglove.start_server(
                 name=f"companion {options.vehicle}", host=host, port=int(port), server_listener=self
             )
         except Exception as error:  # of the SDK, without a common base
             raise RecordingError(f"foxglove.listen: {options.listen} cannot be served: {error}") from error
-        topics = [topic for topic in (*TOPICS, RUN) if topic is not IMAGE]
+        topics = [topic for topic in (*TOPICS, RUN) if topic not in LARGE_TOPICS]
         self._subscribers = subscribe_all(session, options.vehicle, topics, self._on_sample)
 
     @property
@@ -59,7 +60,7 @@ class Live(ServerListener):
 
     def close(self) -> None:
         """Stop serving."""
-        for subscriber in (*self._subscribers, *self._images.values()):
+        for subscriber in (*self._subscribers, *self._large.values()):
             subscriber.undeclare()
         self._server.stop()
 
@@ -67,17 +68,18 @@ class Live(ServerListener):
         """Called by the server: a viewer shows a topic."""
         with self._lock:
             self._viewers[channel.topic] += 1
-            if self._viewers[channel.topic] == 1 and channel.topic.endswith(f"/{IMAGE.name}"):
+            name = channel.topic.rpartition("/")[2]
+            if self._viewers[channel.topic] == 1 and name in {topic.name for topic in LARGE_TOPICS}:
                 key = f"{ROOT}/{self._vehicle}{channel.topic}"
-                self._images[channel.topic] = self._session.declare_subscriber(key, self._on_sample)
+                self._large[channel.topic] = self._session.declare_subscriber(key, self._on_sample)
 
     def on_unsubscribe(self, client: Client, channel: ChannelView) -> None:
         """Called by the server: a viewer shows a topic no more."""
         with self._lock:
             self._viewers[channel.topic] -= 1
-            images = None if self._viewers[channel.topic] else self._images.pop(channel.topic, None)
-        if images is not None:
-            images.undeclare()  # type: ignore[no-untyped-call]
+            unused = None if self._viewers[channel.topic] else self._large.pop(channel.topic, None)
+        if unused is not None:
+            unused.undeclare()  # type: ignore[no-untyped-call]
 
     def _on_sample(self, sample: zenoh.Sample) -> None:
         attachment = sample.attachment
@@ -91,7 +93,8 @@ class Live(ServerListener):
                 )
                 if path == RUN.name:
                     for camera in json.loads(messages[0].data)["settings"]["cameras"]:
-                        self._channel(image_channel(f"cameras/{camera}"))
+                        for large in large_channels(f"cameras/{camera}"):
+                            self._channel(large)
                 channels = [self._channel(message.channel) for message in messages]
         except (ValueError, KeyError, TypeError):
             return  # of another version, or another program's

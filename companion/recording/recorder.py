@@ -16,7 +16,7 @@ import zenoh
 from typing_extensions import TypedDict
 
 from companion.bus.client import open_client, subscribe_kept
-from companion.bus.topics import IMAGE, MAVLINK, RECORDER_TOPICS, ROOT, TOPICS, Topic
+from companion.bus.topics import CLOUD, IMAGE, MAVLINK, RECORDER_TOPICS, ROOT, TOPICS, Topic
 from companion.recording.convert import RECORDER_CHANNEL, RUN_CHANNEL, Converter, stored_schema
 from companion.recording.files import FLUSH_S, Channel, Recorded, RecordingWriter
 from companion.settings import ZenohSection
@@ -48,13 +48,14 @@ class RecorderOptions:
 
     Attributes:
         zenoh: settings of a client. vehicle: its name in the keys.
-        images: record the preview images too.
+        images, clouds: record the preview images, the point clouds too.
     """
 
     zenoh: ZenohSection
     vehicle: str
     directory: str
     images: bool
+    clouds: bool
     max_file_mb: int
     max_file_minutes: int
     max_total_mb: int
@@ -139,7 +140,8 @@ class Recorder:
 
 def topics_of(options: RecorderOptions) -> list[Topic]:
     """Return the topics to subscribe to; the one that says that a recorder listens is the last."""
-    topics = [topic for topic in TOPICS if options.images or topic is not IMAGE]
+    unwanted = [topic for topic, wanted in ((IMAGE, options.images), (CLOUD, options.clouds)) if not wanted]
+    topics = [topic for topic in TOPICS if topic not in unwanted]
     return [*topics, *(topic for topic in RECORDER_TOPICS if topic is not MAVLINK), MAVLINK]
 
 

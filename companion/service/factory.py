@@ -102,7 +102,7 @@ async def clients_of(settings: Settings, on_event: Callable[[str, str], None]) -
     """Run meanwhile the clients that are set: the recorder, and Foxglove live."""
     programs: dict[str, dict[str, Any]] = {}
     if settings.recording.directory:
-        keys = {"directory", "images", "max_file_mb", "max_file_minutes", "max_total_mb"}
+        keys = {"directory", "images", "clouds", "max_file_mb", "max_file_minutes", "max_total_mb"}
         programs["recorder"] = settings.recording.model_dump(include=keys)
     if settings.foxglove.listen is not None:
         programs["foxglove"] = settings.foxglove.model_dump()

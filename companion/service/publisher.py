@@ -15,6 +15,7 @@ from companion.bus.messages import (
     Localization,
     ModelIdentity,
     camera_info_message,
+    cloud_attachment,
     detections_message,
     image_attachment,
     labels_message,
@@ -34,7 +35,7 @@ from companion.guidance.core import Guidance
 from companion.guidance.targets.from_detections import HistoryError
 from companion.guidance.targets.from_markers import LocalizedMarkers
 from companion.perception.cameras import WorkerCamera
-from companion.perception.messages import Preview
+from companion.perception.messages import CloudPreview, Preview
 from companion.perception.supervisor import PerceptionState
 from companion.service.inputs import InputAssembler
 from companion.service.queries import Queries
@@ -135,13 +136,19 @@ class Publisher:
             )
             self._bus.publish(topics.CAMERA_INFO, message, camera.name)
 
-    def publish_preview(self, camera: WorkerCamera, preview: Preview) -> None:
-        """Publish a preview image with its stamps, and answer the queries for one."""
+    def publish_preview(self, camera: WorkerCamera, preview: Preview | CloudPreview) -> None:
+        """Publish a point cloud, or a preview image, which also answers the queries for one."""
+        if isinstance(preview, CloudPreview):
+            about = cloud_attachment(
+                preview.sequence, preview.captured_ns, self._vehicle, camera.name, preview.points
+            )
+            self._bus.publish_large(topics.CLOUD, preview.data, about, camera.name)
+            return
         self._queries.on_image(camera, preview.jpeg)
         attachment = image_attachment(
             preview.sequence, preview.captured_ns, camera.name, annotated=camera.settings.preview.annotate
         )
-        self._bus.publish_image(topics.IMAGE, preview.jpeg, attachment, camera.name)
+        self._bus.publish_large(topics.IMAGE, preview.jpeg, attachment, camera.name)
 
     async def publish_vehicle(
         self, guidance: Guidance, streamer: Streamer, cameras: Sequence[WorkerCamera]
@@ -152,7 +159,8 @@ class Publisher:
             self._publish_vehicle(guidance, streamer, time.monotonic_ns())
             for camera in cameras:
                 watched = self._bus.watched(topics.IMAGE, camera.name)
-                camera.supervisor.watch(watched or self._queries.image_wanted(camera))
+                clouds = self._bus.watched(topics.CLOUD, camera.name)
+                camera.supervisor.watch(watched or self._queries.image_wanted(camera), clouds)
             self._bus.set_alive(_alive(cameras))
             await asyncio.sleep(period_s)
 

@@ -27,6 +27,8 @@ class RecordingSection(VideoSection):
     """folder of the MCAP recordings, one per run (extra `recording`); empty: none"""
     images: bool = True
     """record the preview images too"""
+    clouds: bool = False
+    """record the point clouds of cameras with depth too; some 0.5 MB/s"""
     max_file_mb: Annotated[int, Field(ge=1, le=1_000_000)] = 1000
     """size at which the next file begins, megabytes"""
     max_file_minutes: Annotated[int, Field(ge=1, le=10_000)] = 60

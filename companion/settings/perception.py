@@ -319,7 +319,7 @@ class VideoSection(Section):
 
 
 class PreviewSection(Section):
-    """Preview images on the network: JPEG, only while there is a subscriber."""
+    """Preview images and point clouds on the network, only while there is a subscriber."""
 
     rate_hz: Annotated[float, Field(gt=0, le=60)] = 15.0
     """maximum rate, Hz"""
@@ -329,3 +329,9 @@ class PreviewSection(Section):
     """maximum width, pixels; larger frames are scaled down"""
     annotate: bool = False
     """draw the detections; the dashboard draws them itself"""
+    cloud_rate_hz: Annotated[float, Field(gt=0, le=30)] = 2.0
+    """maximum rate of point clouds, Hz"""
+    cloud_voxel_m: Annotated[float, Field(ge=0.02, le=5)] = 0.1
+    """one point of a point cloud per cube of this side, metres; at most 20,000 points"""
+    cloud_range_m: Annotated[float, Field(gt=0, le=1000)] = 20.0
+    """maximum depth in a point cloud, metres"""

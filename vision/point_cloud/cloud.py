@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, Literal
 
 import cv2
@@ -13,6 +14,7 @@ from vision.camera_model import CameraModel, CameraMount
 
 CloudFrame = Literal["camera", "body", "ned"]
 FRAMES: tuple[CloudFrame, ...] = ("camera", "body", "ned")
+_PACKED = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3), ("a", "u1")])
 # Of a square of pixels that is averaged: those of one surface, and the least share of them.
 _SAME_SURFACE, _LEAST_SHARE = 0.1, 0.5
 
@@ -74,6 +76,14 @@ class PointCloud:
         """A cloud of the body in NED, for its (3, 3) attitude. Raises ValueError for another frame."""
         self._require("body")
         return self.transformed(ned_from_body, np.zeros(3), "ned")
+
+    def packed(self) -> bytes:
+        """16 bytes for each point: x, y, z as little-endian float32, then red, green, blue, 255."""
+        values = np.full(len(self), 255, _PACKED)
+        values["xyz"] = self.points
+        if self.colours is not None:
+            values["rgb"] = self.colours
+        return values.tobytes()
 
     def _require(self, frame: CloudFrame) -> None:
         if self.frame != frame:
@@ -185,17 +195,11 @@ def _averaged(
     return smaller_m, image, cropped_camera.scaled(columns, rows)
 
 
-_cached: dict[CameraModel, NDArray[np.float32]] = {}
-
-
+@lru_cache(maxsize=2)
 def _rays(camera: CameraModel) -> NDArray[np.float32]:
-    """(3, N) float32 rays of the pixels with z = 1; the last two cameras' are cached."""
-    rays = _cached.get(camera)
-    if rays is None:
-        columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-        unit = camera.rays(np.column_stack([columns.ravel(), rows.ravel()]))
-        rays = np.ascontiguousarray((unit / unit[:, 2:]).T, np.float32)
-        while len(_cached) > 1:
-            _cached.pop(next(iter(_cached)), None)
-        _cached[camera] = rays
+    """(3, N) float32 rays of the pixels with z = 1; read-only."""
+    columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    unit = camera.rays(np.column_stack([columns.ravel(), rows.ravel()]))
+    rays = np.ascontiguousarray((unit / unit[:, 2:]).T, np.float32)
+    rays.flags.writeable = False
     return rays

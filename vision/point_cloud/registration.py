@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -12,6 +13,9 @@ from vision.point_cloud.cloud import PointCloud
 
 Method = Literal["icp", "plane_icp", "gicp"]
 MIN_POINTS = 20
+# Of pairs of rendered views with walls and boxes in them it was 0.019 or more, of flat ground with a few
+# objects 0.002 to 0.015, there with errors of up to 0.5 m.
+MIN_OBSERVABILITY = 0.01
 
 
 class RegistrationError(ValueError):
@@ -24,13 +28,18 @@ class Alignment:
 
     Attributes:
         rotation: (3, 3) float64. translation_m: (3,) float64. `target = rotation @ source + translation_m`.
-        converged: the last step was small enough.
+        converged: the last step was small enough. It says nothing about surfaces that do not determine it.
+        observability: how well the surfaces determine the translation in the worst direction, relative to the
+            best one (after Zhang, Kaess and Singh 2016, "On degeneracy of optimization-based state
+            estimation"). Below `MIN_OBSERVABILITY` it may slide in that direction, as along flat ground. NaN
+            for `icp`, which does not know surfaces.
         inlier_share: of the source's points (after the voxel grid), those with a partner in the target.
     """
 
     rotation: NDArray[np.float64]
     translation_m: NDArray[np.float64]
     converged: bool
+    observability: float
     inlier_share: float
 
 
@@ -89,6 +98,22 @@ def align(
         max_iterations=50,
     )
     pose = np.asarray(result.T_target_source, np.float64)
+    observability = math.nan if method == "icp" else _observability(np.asarray(result.H, np.float64))
     return Alignment(
-        pose[:3, :3].copy(), pose[:3, 3].copy(), bool(result.converged), result.num_inliers / moving.size()
+        pose[:3, :3].copy(),
+        pose[:3, 3].copy(),
+        bool(result.converged),
+        observability,
+        result.num_inliers / moving.size(),
     )
+
+
+def _observability(information: NDArray[np.float64]) -> float:
+    """Smallest by largest eigenvalue of the translation's information, the rotation being unknown too.
+
+    Args:
+        information: (6, 6), rotation first.
+    """
+    turn, both, move = information[:3, :3], information[3:, :3], information[3:, 3:]
+    values = np.linalg.eigvalsh(move - both @ np.linalg.pinv(turn) @ both.T)
+    return float(max(values[0], 0.0) / values[2]) if values[2] > 0.0 else 0.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import queue
 import threading
+import uuid
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,10 @@ import pytest
 import zenoh
 
 from companion.bus.client import listen
-from companion.perception.messages import Preview
-from companion.perception.worker import PreviewEncoder
+from companion.perception.messages import CloudPreview, Preview
+from companion.perception.previews import MAX_CLOUD_POINTS, CloudEncoder, PreviewEncoder
 from companion.settings import PreviewSection
+from companion.settings.perception import CameraSection
 from mavlink_sim.testing import running_simulator
 from tests.companion.service_process import running_service
 from vision.detections import Detections
@@ -64,6 +66,72 @@ def test_previews_are_rate_limited_and_on_demand() -> None:
     stamps_ns = [number * 100_000_000 for number in range(10)]
     assert [p.sequence for p in previews_of(PreviewSection(rate_hz=2.5), stamps_ns)] == [0, 4, 8]
     assert previews_of(PreviewSection(), stamps_ns, watched=False) == []
+
+
+def clouds_of(settings: PreviewSection, frames: list[Frame], *, watched: bool = True) -> list[CloudPreview]:
+    made: queue.SimpleQueue[CloudPreview] = queue.SimpleQueue()
+    encoder = CloudEncoder(settings, CameraSection(), made.put)
+    encoder.watched = watched
+    clouds = []
+    for frame in frames:
+        before = encoder._due_ns
+        encoder.write(frame, CAR)
+        if encoder._due_ns != before:
+            clouds.append(made.get(timeout=10))
+    encoder.close()
+    return clouds
+
+
+def wall(width: int, height: int, stamp_ns: int = 0) -> Frame:
+    depth_m = np.full((height, width), 4.0, np.float32)
+    return Frame(np.full((height, width, 3), (1, 2, 3), np.uint8), stamp_ns, stamp_ns // 100_000_000, depth_m)
+
+
+def test_cloud_has_points_and_colours_of_the_frame() -> None:
+    (cloud,) = clouds_of(PreviewSection(cloud_voxel_m=0.5), [wall(160, 120, 500_000_000)])
+    assert (cloud.sequence, cloud.captured_ns) == (5, 500_000_000)
+    points = np.frombuffer(cloud.data, [("xyz", "<f4", 3), ("rgba", "u1", 4)])
+    assert len(points) == cloud.points > 50
+    np.testing.assert_allclose(points["xyz"][:, 2], 4.0, atol=1e-4)
+    assert (points["rgba"] == (3, 2, 1, 255)).all()
+
+
+def test_clouds_of_large_frames_are_bounded() -> None:
+    (cloud,) = clouds_of(PreviewSection(cloud_voxel_m=0.02), [wall(1920, 1080)])
+    assert 10_000 < cloud.points <= MAX_CLOUD_POINTS
+    assert len(cloud.data) <= 320_000
+
+
+def test_clouds_are_rate_limited_and_on_demand() -> None:
+    frames = [wall(64, 48, number * 100_000_000) for number in range(10)]
+    assert [cloud.sequence for cloud in clouds_of(PreviewSection(), frames)] == [0, 5]
+    assert clouds_of(PreviewSection(), frames, watched=False) == []
+    assert clouds_of(PreviewSection(), [Frame(IMAGE, 0, 0)]) == []
+
+
+def test_clouds_only_with_a_subscriber(tmp_path: Path) -> None:
+    camera = f"cloud-{uuid.uuid4().hex[:8]}"
+    flags = [
+        *("--source", f"shm://{camera}", "--detector-enabled", "false"),
+        *("--guidance-perception-max-age-s", "3"),
+    ]
+    samples: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
+    statuses: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+    with (
+        running_simulator(camera=camera, seed=5) as simulator,
+        running_service(simulator.onboard_port, flags, cwd=tmp_path) as service,
+        service.client() as session,
+    ):
+        listen(session, "status", lambda _key, text: statuses.put(json.loads(text)))
+        assert statuses.get(timeout=10)["bus"]["published"]["cloud"] == 0
+        with session.declare_subscriber("companion/*/cloud", samples.put):
+            sample = samples.get(timeout=30)
+    assert sample.attachment is not None
+    about = json.loads(sample.attachment.to_string())
+    assert about["frame_id"] == "vehicle1/camera"
+    points = np.frombuffer(sample.payload.to_bytes(), [("xyz", "<f4", 3), ("rgba", "u1", 4)])
+    assert len(points) == about["points"] > 100
+    assert 0.3 < points["xyz"][:, 2].min() < points["xyz"][:, 2].max() < 20.5
 
 
 def test_previews_only_with_a_subscriber(seeing: list[str], tmp_path: Path) -> None:

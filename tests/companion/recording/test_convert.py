@@ -8,10 +8,12 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import jsonschema
+import numpy as np
 import pytest
 
 from companion.bench.lockstep_flight import plain_settings
-from companion.bus.messages import detections_message
+from companion.bus.messages import cloud_attachment, detections_message
+from companion.bus.topics import RECORDER_TOPICS, TOPICS
 from companion.bus.vehicle_messages import vehicle_message
 from companion.guidance.core import GuidanceOptions
 from companion.recording.convert import Converter
@@ -19,10 +21,13 @@ from companion.recording.encoding import dumps
 from companion.recording.files import Recorded
 from companion.recording.foxglove_schemas import SCHEMAS
 from companion.recording.link_bytes import LinkBytes, pack_link_bytes, unpack_link_bytes
+from companion.recording.recorder import RecorderOptions, topics_of
 from companion.recording.tap import run_record
+from companion.settings import ZenohSection
 from companion.vehicle.state import VehicleState
 from vision.detections import Detections
 from vision.pipeline import PerceptionResult
+from vision.point_cloud import PointCloud
 
 CAPTURED_NS, PUBLISHED_NS = 91_000_000_123, 91_050_000_000
 STATE = VehicleState(
@@ -104,6 +109,40 @@ def test_image_and_annotations_have_the_capture_as_time(converter: Converter) ->
     assert image["timestamp"] == annotations["timestamp"]
     assert image["timestamp"]["nsec"] == annotations["points"][0]["timestamp"]["nsec"]
     assert base64.b64decode(image["data"]) == b"\xff\xd8"
+
+
+def test_cloud_becomes_foxgloves_points(converter: Converter) -> None:
+    cloud = PointCloud(
+        np.array([[1.0, 2.0, 3.0], [-4.0, 5.5, 6.0]], np.float32), np.array([[9, 8, 7], [1, 2, 3]], np.uint8)
+    )
+    about = dumps(cloud_attachment(7, CAPTURED_NS, "vehicle1", "down", len(cloud)))
+    (message,) = converter.convert("cameras/down/cloud", cloud.packed(), about)
+    body = foxglove(iter([message]))["/cameras/down/cloud"]
+    assert body["frame_id"] == "vehicle1/cameras/down"
+    stamp_ns = body["timestamp"]["sec"] * 10**9 + body["timestamp"]["nsec"]
+    assert stamp_ns == message.log_time_ns
+    # foxglove.PackedElementField: 1 is uint8, 7 float32.
+    kinds = {1: "u1", 7: "<f4"}
+    fields = {field["name"]: (kinds[field["type"]], field["offset"]) for field in body["fields"]}
+    layout = np.dtype(
+        {
+            "names": list(fields),
+            "formats": [kind for kind, _ in fields.values()],
+            "offsets": [offset for _, offset in fields.values()],
+            "itemsize": body["point_stride"],
+        }
+    )
+    points = np.frombuffer(base64.b64decode(body["data"]), layout)
+    np.testing.assert_array_equal(np.column_stack([points[name] for name in "xyz"]), cloud.points)
+    colours = np.column_stack([points[name] for name in ("red", "green", "blue")])
+    np.testing.assert_array_equal(colours, cloud.colours)
+    assert points["alpha"].tolist() == [255, 255]
+
+
+def test_cloud_of_another_length_is_refused(converter: Converter) -> None:
+    about = dumps(cloud_attachment(7, CAPTURED_NS, "vehicle1", None, 2))
+    with pytest.raises(ValueError, match="31 bytes"):
+        list(converter.convert("cloud", bytes(31), about))
 
 
 def test_annotations_are_scaled_to_the_preview(converter: Converter) -> None:
@@ -196,3 +235,12 @@ def test_lost_steps_are_counted(converter: Converter) -> None:
     for step in (3, 4, 8):
         list(converter.convert("@record/guidance_input", dumps({"step": step, "now_ns": step})))
     assert (converter.first_step, converter.lost_steps) == (3, 3)
+
+
+@pytest.mark.parametrize(("images", "clouds"), [(True, False), (False, True)])
+def test_recorder_subscribes_to_the_chosen_large_topics(images: bool, clouds: bool) -> None:
+    options = RecorderOptions(ZenohSection(), "vehicle1", "", images, clouds, 1, 1, 1)
+    names = [topic.name for topic in topics_of(options)]
+    assert ("image" in names, "cloud" in names) == (images, clouds)
+    assert names[-1] == "@record/mavlink"
+    assert len(names) == len(TOPICS) - 1 + len(RECORDER_TOPICS)

@@ -14,7 +14,7 @@ import zenoh
 
 from companion.bus.bodies import CommandReplyBody
 from companion.bus.schema import schema_of
-from companion.bus.topics import TOPICS
+from companion.bus.topics import LARGE_TOPICS, TOPICS
 from mavlink_sim.testing import running_simulator
 from tests.companion.bus.message_check import check_message, closed
 from tests.companion.service_process import running_service
@@ -78,7 +78,7 @@ def test_every_message_of_a_flight_is_valid(tmp_path: Path) -> None:
     while not samples.empty():
         sample = samples.get()
         name = str(sample.key_expr).rpartition("/")[2]
-        data = sample.attachment if name == "image" else sample.payload
+        data = sample.attachment if name in {topic.name for topic in LARGE_TOPICS} else sample.payload
         assert data is not None
         body = data.to_string() if name == "labels" else json.loads(data.to_string())
         check_message(name, body)

@@ -1,18 +1,15 @@
-"""Strategies and rendered clouds of the point cloud tests."""
+"""Strategies and clouds of the point cloud tests."""
 
 from __future__ import annotations
 
 import math
-from functools import cache
 
 import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from mavlink_sim.camera.renderer import DEFAULT_CAMERA, DEFAULT_MOUNT, Renderer
-from mavlink_sim.camera.scene_file import load_scene
 from vision.camera_model import CameraModel, CameraMount
-from vision.point_cloud import PointCloud, cloud_from_depth
+from vision.point_cloud import PointCloud
 from vision.rotation import matrix_from_euler
 
 SMALL = CameraModel(40, 30, 35.0, 33.0, 19.0, 15.5, (-0.2, 0.05, 0.001, -0.002, 0.01))
@@ -37,24 +34,3 @@ def blobs(seed: int, centres: NDArray[np.float64], count: int = 60, sigma_m: flo
     rng = np.random.default_rng(seed)
     spread = rng.normal(0.0, sigma_m, (len(centres), count, 3)) * (2.0, 1.0, 0.5)
     return PointCloud((centres[:, None] + spread).reshape(-1, 3).astype(np.float32))
-
-
-@cache
-def obstacle_course() -> Renderer:
-    """Walls, boxes, trees and poles, 8 to 24 m north of the origin."""
-    return Renderer(load_scene("obstacle_course").world_at(0.0))
-
-
-def rendered_cloud(position_ned_m: NDArray[np.float64], ned_from_body: NDArray[np.float64]) -> PointCloud:
-    """What the built-in camera sees there, in the body's frame, up to 20 m; true depth."""
-    north, east, down = position_ned_m.tolist()
-    rendered = obstacle_course().render((north, east, down), ned_from_body)
-    return cloud_from_depth(
-        np.asarray(rendered.depth_m, np.float32),
-        DEFAULT_CAMERA,
-        image=rendered.image,
-        frame="body",
-        mount=DEFAULT_MOUNT,
-        range_m=(0.3, 20.0),
-        average=2,
-    )

@@ -7,37 +7,35 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.vision.point_cloud.clouds import rendered_cloud
-from vision.point_cloud import PointCloud, RegistrationError, align
-from vision.rotation import matrix_from_euler
-
-
-def moved_pair(seed: int) -> tuple[PointCloud, PointCloud, np.ndarray, np.ndarray]:
-    """Two rendered clouds, and the true pose of the second camera in the first one's frame."""
-    rng = np.random.default_rng(seed)
-    roll_rad, pitch_rad, yaw_rad = rng.uniform(-1, 1, 3) * (0.05, 0.05, 0.3)
-    attitude = matrix_from_euler(roll_rad, pitch_rad, yaw_rad)
-    position = np.array([rng.uniform(-1, 3), rng.uniform(-2, 2), rng.uniform(-4, -2)])
-    turned, step = matrix_from_euler(*rng.uniform(-0.04, 0.04, 3)), rng.uniform(-0.2, 0.2, 3)
-    target = rendered_cloud(position, attitude)
-    source = rendered_cloud(position + attitude @ step, attitude @ turned)
-    return source, target, turned, step
+from benchmarks.cloud_alignment import angle_deg, pair
+from vision.point_cloud import MIN_OBSERVABILITY, PointCloud, RegistrationError, align
 
 
 @pytest.mark.parametrize("method", ["plane_icp", "gicp"])
 @pytest.mark.parametrize("seed", [101, 102, 103, 104])
 def test_alignment_recovers_the_motion_of_a_rendered_camera(method: Any, seed: int) -> None:
-    source, target, rotation, translation_m = moved_pair(seed)
-    found = align(source, target, method=method)
-    angle = math.acos(min(1.0, (np.trace(found.rotation.T @ rotation) - 1.0) / 2.0))
+    views = pair("obstacle_course", seed)
+    found = align(views.source, views.target, method=method)
     assert found.converged
     assert found.inlier_share > 0.9
-    assert math.degrees(angle) < 0.3
-    assert np.linalg.norm(found.translation_m - translation_m) < 0.05
+    assert found.observability > MIN_OBSERVABILITY
+    assert angle_deg(found.rotation, views.rotation) < 0.3
+    assert np.linalg.norm(found.translation_m - views.translation_m) < 0.05
+
+
+@pytest.mark.parametrize("method", ["plane_icp", "gicp"])
+def test_flat_ground_does_not_determine_the_motion(method: Any) -> None:
+    rng = np.random.default_rng(6)
+    flat = np.column_stack([rng.uniform(0, 10, (20_000, 2)), rng.normal(2.0, 0.002, 20_000)])
+    cloud = PointCloud(flat.astype(np.float32))
+    found = align(cloud, cloud.transformed(np.eye(3), np.array([0.2, 0.1, 0.1])), method=method)
+    assert found.observability < 0.3 * MIN_OBSERVABILITY
+    assert found.translation_m[2] == pytest.approx(0.1, abs=0.01)
 
 
 def test_point_to_point_recovers_an_exact_motion_from_a_start() -> None:
-    _, target, rotation, translation_m = moved_pair(104)
+    views = pair("obstacle_course", 104)
+    target, rotation, translation_m = views.target, views.rotation, views.translation_m
     source = target.transformed(rotation.T, -rotation.T @ translation_m)
     found = align(
         source,
@@ -47,6 +45,7 @@ def test_point_to_point_recovers_an_exact_motion_from_a_start() -> None:
         translation_m=translation_m + 0.02,
         max_distance_m=0.3,
     )
+    assert math.isnan(found.observability)
     assert np.abs(found.rotation - rotation).max() < 0.005
     assert np.linalg.norm(found.translation_m - translation_m) < 0.03
 
