@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from vision.detections import Detections
 from vision.frame import Frame
 from vision.frame_selection import TOO_OLD, FrameSelector, Selection
+from vision.marker_boards import BoardPose
 from vision.markers import Marker
 from vision.object_detector import Timing
 from vision.obstacle_sectors import ObstacleSectors
@@ -45,6 +46,7 @@ class PerceptionResult:
         track_events: oldest first; all since the previous result.
         markers: those in the frame; None if marker detection is off.
         obstacles: distance of the nearest one in each direction; None without depth or attitude.
+        boards: those of the markers that belong to a board.
     """
 
     sequence: int
@@ -59,6 +61,7 @@ class PerceptionResult:
     frames_skipped: Mapping[str, int] = field(default_factory=dict)
     markers: tuple[Marker, ...] | None = None
     obstacles: ObstacleSectors | None = None
+    boards: tuple[BoardPose, ...] = ()
 
 
 class FrameDetector(Protocol):
@@ -94,7 +97,7 @@ class Pipeline:
         recorder: FrameRecorder | None = None,
         tracker: Tracker | None = None,
         view_at: Callable[[Frame], CameraView | None] = lambda _: None,
-        find_markers: Callable[[Frame], tuple[Marker, ...]] | None = None,
+        find_markers: Callable[[Frame], tuple[tuple[Marker, ...], tuple[BoardPose, ...]]] | None = None,
         obstacles_in: Callable[[Frame], ObstacleSectors | None] = lambda _: None,
         nearest_in: Callable[[Frame, NDArray[np.float32]], NDArray[np.float32]] | None = None,
         clock_ns: Callable[[], int] = time.monotonic_ns,
@@ -108,7 +111,7 @@ class Pipeline:
             tracker: receives the detections of every processed frame.
             view_at: returns the camera orientation at a frame's capture, None if unknown. Called after the
                 detection, when the vehicle's attitude of that moment has arrived.
-            find_markers: called for every processed frame.
+            find_markers: called for every processed frame; returns the markers and the boards.
             obstacles_in: called for every processed frame with depth.
             nearest_in: returns the nearest points (N, 3) of the objects in boxes (N, 4) of a frame with
                 depth, see `vision.depth.nearest_points`; None: no ranges are measured.
@@ -215,7 +218,7 @@ class Pipeline:
                 detections = replace(detections, nearest_camera_m=nearest)
         ranged_ns = time.perf_counter_ns()
         timing_ms["range"] = (ranged_ns - tracked_ns) / 1e6
-        markers = None if self._find_markers is None else self._find_markers(frame)
+        markers, boards = (None, ()) if self._find_markers is None else self._find_markers(frame)
         done_ns = time.perf_counter_ns()
         if markers is not None:
             timing_ms["markers"] = (done_ns - ranged_ns) / 1e6
@@ -233,4 +236,5 @@ class Pipeline:
             frames_skipped=self.frames_skipped,
             markers=markers,
             obstacles=obstacles,
+            boards=boards,
         )

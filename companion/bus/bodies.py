@@ -160,6 +160,9 @@ class TracksBody(FrameBody):
     """oldest first"""
 
 
+Covariance = Annotated[list[float], Field(min_length=21, max_length=21)]
+
+
 class MarkerBody(TypedDict):
     """One marker. The fields from `pad` on are null where the vehicle's pose at the capture is unknown."""
 
@@ -191,6 +194,35 @@ class MarkerBody(TypedDict):
     """local NED, of its centre"""
     pad_ned_m: Three | None
     """local NED, of the pad's centre"""
+    resolved: bool | None
+    """which of the two poses of a square is true is known; false: the one nearer to level is assumed"""
+    position_body_m: Three | None
+    """metres forward, right, down of the vehicle"""
+    rotation_body_wxyz: Four | None
+    """quaternion from the marker's axes (right, upper edge, out of it) to the body's (FRD)"""
+    covariance_body: Covariance | None
+    """upper right triangle, row by row, of position (m²) and rotation about the body's axes (rad²)"""
+
+
+class BoardBody(TypedDict):
+    """One board: several markers solved together."""
+
+    name: str
+    """of the board"""
+    ids: list[int]
+    """its markers that were used"""
+    reprojection_px: float
+    """reprojection error"""
+    ambiguous: bool
+    """another pose fits about equally well"""
+    position_ned_m: Three
+    """local NED, of its origin"""
+    position_body_m: Three
+    """metres forward, right, down of the vehicle, of its origin"""
+    rotation_body_wxyz: Four
+    """quaternion from the board's axes to the body's (FRD)"""
+    covariance_body: Covariance
+    """as of a marker"""
 
 
 class MarkersBody(FrameBody):
@@ -200,6 +232,8 @@ class MarkersBody(FrameBody):
     """why the markers have no position; empty if they have"""
     markers: list[MarkerBody]
     """the markers"""
+    boards: list[BoardBody]
+    """the boards of `markers.boards_file`; empty where the vehicle's pose is unknown"""
 
 
 class ImageBody(TypedDict):

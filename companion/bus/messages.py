@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from companion.bus.bodies import (
+    BoardBody,
     CameraInfoBody,
     CloudBody,
     DetectionBody,
@@ -24,7 +25,7 @@ from companion.bus.bodies import (
 from companion.bus.topics import NO_OBJECTS
 from companion.geometry.geodesy import GeodeticOrigin
 from companion.guidance.targets.from_detections import StateHistory, mount_at
-from companion.guidance.targets.from_markers import LocalizedMarkers, MarkerTarget
+from companion.guidance.targets.from_markers import BoardTarget, BodyPose, LocalizedMarkers, MarkerTarget
 from companion.guidance.targets.target import Target
 from companion.vehicle.clock_sync import ClockOffset
 from vision.camera_model import CameraModel, CameraMount
@@ -208,6 +209,7 @@ def markers_message(
         **_of_frame(result, vehicle, published_ns, view),
         "localization_error": localized.error,
         "markers": [_marker(marker, target) for marker, target in zip(markers, targets, strict=True)],
+        "boards": [_board(board) for board in localized.boards],
     }
 
 
@@ -227,7 +229,29 @@ def _marker(marker: Marker, target: MarkerTarget | None) -> MarkerBody:
         "heading_rad": None if target is None else round(target.heading_rad, 4),
         "position_ned_m": None if target is None else [round(value, 3) for value in target.position_ned_m],
         "pad_ned_m": None if target is None else [round(value, 3) for value in target.pad_ned_m],
+        "resolved": None if target is None else target.resolved,
+        "position_body_m": None if target is None else [round(value, 4) for value in target.body.position_m],
+        "rotation_body_wxyz": None if target is None else [round(value, 5) for value in target.body.rotation],
+        "covariance_body": None if target is None else _covariance(target.body),
     }
+
+
+def _board(board: BoardTarget) -> BoardBody:
+    return {
+        "name": board.name,
+        "ids": list(board.identifiers),
+        "reprojection_px": round(board.reprojection_px, 3),
+        "ambiguous": board.ambiguous,
+        "position_ned_m": [round(value, 3) for value in board.position_ned_m],
+        "position_body_m": [round(value, 4) for value in board.body.position_m],
+        "rotation_body_wxyz": [round(value, 5) for value in board.body.rotation],
+        "covariance_body": _covariance(board.body),
+    }
+
+
+def _covariance(pose: BodyPose) -> list[float]:
+    """Return the covariance with three digits."""
+    return [float(f"{value:.2e}") for value in pose.covariance]
 
 
 def obstacles_message(seen: ObstacleSectors, vehicle: str) -> ObstaclesBody:

@@ -14,6 +14,7 @@ from vision.camera_model import CameraMount
 from vision.depth import nearest_points
 from vision.frame import Frame
 from vision.gc_pause import gc_paused
+from vision.marker_boards import BoardPose, locate_board
 from vision.markers import Marker, MarkerDetector
 from vision.object_detector import ObjectDetector
 from vision.obstacle_sectors import ObstacleSectors, obstacle_sectors
@@ -143,13 +144,22 @@ def _view_at(settings: Settings, telemetry: CameraTelemetry) -> Callable[[Frame]
     return view_at
 
 
-def _find_markers(settings: Settings) -> Callable[[Frame], tuple[Marker, ...]] | None:
+def _find_markers(
+    settings: Settings,
+) -> Callable[[Frame], tuple[tuple[Marker, ...], tuple[BoardPose, ...]]] | None:
     """Return the marker detector of frames; None if markers are disabled."""
     kind = settings.markers.kind()
     if kind is None:
         return None
-    detector = MarkerDetector(kind)
-    return lambda frame: detector.detect(frame.image, settings.camera.model(frame.width, frame.height))
+    detector, boards = MarkerDetector(kind), settings.markers.boards()
+
+    def find_markers(frame: Frame) -> tuple[tuple[Marker, ...], tuple[BoardPose, ...]]:
+        camera = settings.camera.model(frame.width, frame.height)
+        markers = detector.detect(frame.image, camera)
+        located = (locate_board(board, markers, camera) for board in boards)
+        return markers, tuple(board for board in located if board is not None)
+
+    return find_markers
 
 
 def _obstacles_in(

@@ -23,9 +23,11 @@ from companion.guidance.targets.from_detections import (
     targets_from_detections,
 )
 from companion.guidance.targets.from_markers import (
+    BoardTarget,
     LocalizedMarkers,
     MarkerSight,
     MarkerTarget,
+    board_targets,
     looks_down,
     marker_targets,
 )
@@ -39,6 +41,7 @@ from companion.settings.calibration import adopt_calibration
 from companion.settings.perception import NO_SOURCE
 from companion.vehicle.state import VehicleState
 from vision.camera_model import CameraCalibration
+from vision.marker_ambiguity import AmbiguityResolver
 from vision.pipeline import PerceptionResult
 from vision.tracking import Selected, SelectRequest
 
@@ -296,6 +299,7 @@ class MarkerTracker:
             camera.name: {marker.identifier: marker for marker in camera.settings.markers.pad_markers()}
             for camera in self._detecting
         }
+        self._resolvers = {camera.name: AmbiguityResolver() for camera in self._detecting}
         self._seen: dict[str | None, _SeenMarkers] = {}
 
     def localize(
@@ -305,16 +309,25 @@ class MarkerTracker:
         markers, section = result.markers or (), camera.settings.camera
         error_text, down = "", False
         targets: tuple[MarkerTarget, ...] = ()
+        boards: tuple[BoardTarget, ...] = ()
         try:
             # The mount first: whether the camera looks down does not depend on the vehicle's position.
             mount = mount_at(section.mount(), history, result.captured_ns)
             down = looks_down(section.model(result.width, result.height), mount)
-            targets = marker_targets(markers, result.captured_ns, mount, history, self._on_pads[camera.name])
+            targets = marker_targets(
+                markers,
+                result.captured_ns,
+                mount,
+                history,
+                self._on_pads[camera.name],
+                self._resolvers[camera.name],
+            )
+            boards = board_targets(result.boards, result.captured_ns, mount, history)
         except HistoryError as error:
             # As with detections: without an attitude at the capture they are published, but not targets.
             error_text = str(error)
         self._seen[camera.name] = _SeenMarkers(result.captured_ns, targets, down)
-        return LocalizedMarkers(targets, error_text)
+        return LocalizedMarkers(targets, boards, error_text)
 
     def sight(self, now_ns: int, max_age_s: float) -> MarkerSight:
         """Return the markers of the cameras that look down, for behaviours."""

@@ -8,11 +8,13 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
+from companion.settings.marker_files import read_boards
 from companion.settings.section import Section
 from companion.settings.texts import HEIGHT_TEXT, KEY_WORD, MARKER_TEXT
 from vision.camera_model import CameraModel, CameraMount
 from vision.frame import Frame
 from vision.frame_selection import Selection
+from vision.marker_boards import Board
 from vision.markers import MarkerKind, PadMarker, markers_in
 from vision.object_detector import YOLO, DetectorSettings
 from vision.sources.source import SourceSettings
@@ -272,6 +274,8 @@ class MarkersSection(Section):
     """side of a marker's black square, metres"""
     others: tuple[Annotated[str, MARKER_TEXT], ...] = ()
     """other sizes: ID:SIZE; on the pad of marker PAD: ID:SIZE@PAD, off its centre ID:SIZE@PAD:RIGHT:UP"""
+    boards_file: str | None = None
+    """TOML file of boards, rigid sets of markers that are solved together; unset: none"""
 
     @model_validator(mode="after")
     def _can_be_found(self) -> Self:
@@ -287,7 +291,18 @@ class MarkersSection(Section):
         sizes = {identifier: size for identifier, size, _ in map(_other_marker, self.others)}
         if len(sizes) < len(self.others):
             raise ValueError(f"others: an id is given twice in {', '.join(self.others)}")
+        for board in self.boards():
+            for identifier, size_m in board.sizes_m.items():
+                if sizes.setdefault(identifier, size_m) != size_m:
+                    raise ValueError(
+                        f"marker {identifier} is {sizes[identifier]:g} m in others or another board, and "
+                        f"{size_m:g} m in board {board.name!r}"
+                    )
         return None if self.dictionary is None else MarkerKind(self.dictionary, self.size_m, sizes)
+
+    def boards(self) -> tuple[Board, ...]:
+        """Read the boards. Raises BoardError, a ValueError."""
+        return () if self.boards_file is None else read_boards(self.boards_file)
 
     def pad_markers(self) -> tuple[PadMarker, ...]:
         """Return the markers on the pad of another one."""

@@ -14,14 +14,52 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.guidance.targets.from_detections import Pose, StateHistory, mount_at
-from companion.vehicle.state import Vector3
+from companion.vehicle.state import Quaternion, Vector3
 from vision.camera_model import CameraModel, CameraMount
+from vision.marker_ambiguity import AmbiguityResolver
+from vision.marker_boards import BoardPose
 from vision.markers import Marker, MarkerPose, PadMarker
+from vision.rotation import quaternion_from_matrix
 
-# Above this ambiguity (see `Marker.ambiguity`) the pose nearer to level is chosen, as pads are level.
-AMBIGUOUS = 0.25
 # Margin, as a fraction of the image size, by which straight down must be inside the image to land.
 DOWN_MARGIN = 0.08
+
+
+@dataclass(frozen=True, slots=True)
+class BodyPose:
+    """Pose of a marker or a board in the body frame (FRD) at the capture time.
+
+    Attributes:
+        position_m: from the vehicle to its centre, or to a board's origin.
+        rotation: (w, x, y, z), `body_from_marker`; x to its right, y to its upper edge, z out of it.
+        covariance: upper right triangle, row by row (21 values), of the position, m², and of a small rotation
+            about the body's axes, rad²; from the noise of the corners alone.
+    """
+
+    position_m: Vector3
+    rotation: Quaternion
+    covariance: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class BoardTarget:
+    """One board that was seen.
+
+    Attributes:
+        name: of the board. identifiers: of its markers that were used.
+        captured_ns: CLOCK_MONOTONIC stamp of the frame.
+        body: pose of the board. position_ned_m: of its origin, local NED.
+        reprojection_px: RMS reprojection error of the corners.
+        ambiguous: another pose fits about equally well.
+    """
+
+    name: str
+    identifiers: tuple[int, ...]
+    captured_ns: int
+    body: BodyPose
+    position_ned_m: Vector3
+    reprojection_px: float
+    ambiguous: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +75,9 @@ class MarkerTarget:
         pad_offset_frd_m: from the vehicle to the pad's centre, in the body frame at the capture time.
         heading_rad: direction of its upper edge, clockwise from north.
         size_m, side_px: side length, and the same in the image. reprojection_px: reprojection error.
+        body: its pose in the body frame.
+        resolved: which of the two poses of a square is the true one is known; else the one nearer to level is
+            assumed, as pads are level.
     """
 
     identifier: int
@@ -53,6 +94,8 @@ class MarkerTarget:
     size_m: float
     side_px: float
     reprojection_px: float
+    body: BodyPose
+    resolved: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,10 +104,12 @@ class LocalizedMarkers:
 
     Attributes:
         targets: one per marker, in their order; empty if `error` gives the reason.
+        boards: the boards; empty too.
         error: why they have no position; empty if they have.
     """
 
     targets: tuple[MarkerTarget, ...]
+    boards: tuple[BoardTarget, ...] = ()
     error: str = ""
 
 
@@ -106,11 +151,13 @@ def marker_targets(
     mount: CameraMount,
     history: StateHistory,
     on_pads: Mapping[int, PadMarker],
+    resolver: AmbiguityResolver | None = None,
 ) -> tuple[MarkerTarget, ...]:
     """The marker targets of one frame, in order.
 
     Args:
         on_pads: markers that lie on another marker's pad, by their own id.
+        resolver: of this camera, which remembers earlier frames; None: one frame decides.
 
     Raises:
         HistoryError: the pose of the vehicle or its gimbal at `captured_ns` is unknown.
@@ -118,7 +165,32 @@ def marker_targets(
     if not markers:
         return ()
     pose, mount = history.at(captured_ns), mount_at(mount, history, captured_ns)
-    return tuple(_target(marker, captured_ns, mount, pose, on_pads) for marker in markers)
+    resolver = resolver or AmbiguityResolver()
+    return tuple(_target(marker, captured_ns, mount, pose, on_pads, resolver) for marker in markers)
+
+
+def board_targets(
+    boards: Sequence[BoardPose], captured_ns: int, mount: CameraMount, history: StateHistory
+) -> tuple[BoardTarget, ...]:
+    """The boards of one frame. Raises HistoryError as `marker_targets`."""
+    if not boards:
+        return ()
+    pose, mount = history.at(captured_ns), mount_at(mount, history, captured_ns)
+    ned_from_optical = mount.ned_from_optical(pose.ned_from_body)
+    lens = pose.ned_from_body @ mount.position_frd_m + pose.position_ned_m
+    return tuple(
+        BoardTarget(
+            board.name,
+            board.identifiers,
+            captured_ns,
+            _body_pose(origin, mount, pose),
+            _vector(lens + ned_from_optical @ origin.position_camera_m),
+            origin.reprojection_px,
+            board.ambiguous,
+        )
+        for board in boards
+        for origin in (board.at_origin(),)
+    )
 
 
 def looks_down(camera: CameraModel, mount: CameraMount) -> bool:
@@ -134,15 +206,18 @@ def looks_down(camera: CameraModel, mount: CameraMount) -> bool:
 
 
 def _target(
-    marker: Marker, captured_ns: int, mount: CameraMount, pose: Pose, on_pads: Mapping[int, PadMarker]
+    marker: Marker,
+    captured_ns: int,
+    mount: CameraMount,
+    pose: Pose,
+    on_pads: Mapping[int, PadMarker],
+    resolver: AmbiguityResolver,
 ) -> MarkerTarget:
     ned_from_optical = mount.ned_from_optical(pose.ned_from_body)
-    position, rotation = marker.position_camera_m, marker.rotation
-    if marker.other is not None and marker.ambiguity > AMBIGUOUS:
-        # The pose whose face points up more: NED, so up is -z.
-        both = (MarkerPose(position, rotation, marker.reprojection_px), marker.other)
-        level = min(both, key=lambda fit: (ned_from_optical @ fit.rotation)[2, 2])
-        position, rotation = level.position_camera_m, level.rotation
+    resolved = resolver.resolve(marker, captured_ns, ned_from_optical)
+    # Else the pose whose face points up more: NED, so up is -z.
+    fit = resolved or min(marker.poses, key=lambda fit: (ned_from_optical @ fit.rotation)[2, 2])
+    position, rotation = fit.position_camera_m, fit.rotation
     offset = ned_from_optical @ position + pose.ned_from_body @ mount.position_frd_m
     heading_rad = _heading(ned_from_optical @ rotation)
     on_pad = on_pads.get(marker.identifier)
@@ -168,6 +243,19 @@ def _target(
         size_m=marker.size_m,
         side_px=marker.side_px,
         reprojection_px=marker.reprojection_px,
+        body=_body_pose(fit, mount, pose),
+        resolved=resolved is not None,
+    )
+
+
+def _body_pose(fit: MarkerPose, mount: CameraMount, pose: Pose) -> BodyPose:
+    body_from_optical = pose.ned_from_body.T @ mount.ned_from_optical(pose.ned_from_body)
+    both = np.kron(np.eye(2), body_from_optical)
+    covariance = both @ fit.covariance @ both.T
+    return BodyPose(
+        _vector(body_from_optical @ fit.position_camera_m + mount.position_frd_m),
+        quaternion_from_matrix(body_from_optical @ fit.rotation),
+        tuple(covariance[np.triu_indices(6)].tolist()),
     )
 
 

@@ -76,6 +76,30 @@ def test_banking_does_not_displace_the_marker(
 
 
 @settings(max_examples=30, deadline=None)
+@given(
+    roll=st.floats(-0.3, 0.3), pitch=st.floats(-0.3, 0.3), yaw=st.floats(-3.0, 3.0), heading=st.floats(-3, 3)
+)
+def test_pose_in_the_body_frame(roll: float, pitch: float, yaw: float, heading: float) -> None:
+    position = (1.0, -2.0, -3.0)
+    target = seen(position, roll, pitch, yaw, (1.3, -2.2), heading)
+    body_from_ned = matrix_from_quaternion(quaternion_from_euler(roll, pitch, yaw)).T
+    offset = body_from_ned @ np.subtract((1.3, -2.2, 0.0), position)
+    assert target.body.position_m == pytest.approx(tuple(offset), abs=0.01)
+    upper = body_from_ned @ [math.cos(heading), math.sin(heading), 0.0]
+    axes = matrix_from_quaternion(target.body.rotation)
+    assert axes[:, 1] == pytest.approx(upper, abs=0.05)
+    covariance = np.zeros((6, 6))
+    covariance[np.triu_indices(6)] = target.body.covariance
+    covariance += np.triu(covariance, 1).T
+    assert np.linalg.eigvalsh(covariance).min() > 0.0
+    # 0.1 px of 90 px is a thousandth of the range of 3 m along the line of sight, and less across.
+    along = offset / np.linalg.norm(offset)
+    sigma_m = math.sqrt(along @ covariance[:3, :3] @ along)
+    assert 0.0005 * 3.0 < sigma_m < 0.003 * 3.0
+    assert np.linalg.eigvalsh(covariance[:3, :3])[0] < (0.3 * sigma_m) ** 2
+
+
+@settings(max_examples=30, deadline=None)
 @given(heading=st.floats(-3.1, 3.1), seed=st.integers(0, 1000))
 def test_off_centre_marker_gives_the_pad_position(heading: float, seed: int) -> None:
     """The small marker is seen nearly face on, where its rotation is ambiguous."""
