@@ -31,6 +31,7 @@ FLOORS = {
     "detect": 9,
     "evaluate": 9,
     "flight_log": 9,
+    "markers": 9,
     "models": 9,
     "replay": 9,
     "replay_detections": 9,

@@ -10,12 +10,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vision.camera_model import CameraModel
 from vision.detections import NO_TRACK, Detections
+from vision.markers import Marker
 
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _GOLDEN_RATIO = 0.618033988749895
 _DARK = (24, 22, 20)
 _LIGHT = (250, 250, 250)
+_AXIS_COLOURS = ((40, 40, 230), (60, 200, 60), (230, 120, 40))
+_SHIFT = 4
 
 Colour = tuple[int, int, int]
 Rectangle = tuple[int, int, int, int]  # left, top, right, bottom; the last two outside
@@ -88,6 +92,39 @@ def annotate(
     for index in reversed(order):  # the most confident choose their label's position first
         occupied.append(_draw_label(drawn, boxes[index], detections, index, sizes, occupied))
     return drawn
+
+
+def annotate_markers(
+    image: NDArray[np.uint8], markers: Sequence[Marker], camera: CameraModel
+) -> NDArray[np.uint8]:
+    """A copy of the image with each marker's outline, axes (right red, upper edge green, out blue) and range.
+
+    Args:
+        image: (height, width, 3) uint8, BGR.
+    """
+    drawn = image.copy()
+    sizes = _Sizes.of(drawn.shape[1], drawn.shape[0])
+    for marker in markers:
+        outline = _subpixels(marker.corners_px)
+        cv2.polylines(drawn, [outline], True, _LIGHT, sizes.line, cv2.LINE_AA, _SHIFT)
+        ends = marker.position_camera_m + np.vstack([np.zeros(3), marker.rotation.T * marker.size_m / 2])
+        centre, *tips = _subpixels(camera.project(ends))
+        for tip, colour in zip(tips, _AXIS_COLOURS, strict=True):
+            cv2.line(drawn, centre, tip, colour, sizes.line, cv2.LINE_AA, _SHIFT)
+        text = f"{marker.identifier}  {float(np.linalg.norm(marker.position_camera_m)):.2f} m"
+        (width, height), baseline = cv2.getTextSize(text, _FONT, sizes.font_scale, sizes.stroke)
+        left, top = round(float(marker.corners_px[:, 0].min())), round(float(marker.corners_px[:, 1].max()))
+        top += sizes.padding
+        right, bottom = left + width + 2 * sizes.padding, top + height + baseline + sizes.padding
+        cv2.rectangle(drawn, (left, top), (right, bottom), _DARK, cv2.FILLED)
+        at = (left + sizes.padding, top + sizes.padding // 2 + height)
+        cv2.putText(drawn, text, at, _FONT, sizes.font_scale, _LIGHT, sizes.stroke, cv2.LINE_AA)
+    return drawn
+
+
+def _subpixels(points: NDArray[np.float64]) -> NDArray[np.int32]:
+    """Fixed-point coordinates for OpenCV's drawing, with `_SHIFT` fractional bits."""
+    return np.round(points * (1 << _SHIFT)).astype(np.int32)
 
 
 def _pixels(xyxy: NDArray[np.float32], width: int, height: int) -> Rectangle:

@@ -202,6 +202,10 @@ class MarkerBody(TypedDict):
     """quaternion from the marker's axes (right, upper edge, out of it) to the body's (FRD)"""
     covariance_body: Covariance | None
     """upper right triangle, row by row, of position (m²) and rotation about the body's axes (rad²)"""
+    range_sigma_m: float | None
+    """one sigma of the distance, from that"""
+    angle_sigma_rad: float | None
+    """one sigma of the rotation about the least certain axis, from that"""
 
 
 class BoardBody(TypedDict):
@@ -222,6 +226,10 @@ class BoardBody(TypedDict):
     rotation_body_wxyz: Four
     """quaternion from the board's axes to the body's (FRD)"""
     covariance_body: Covariance
+    """as of a marker"""
+    range_sigma_m: float
+    """as of a marker"""
+    angle_sigma_rad: float
     """as of a marker"""
 
 

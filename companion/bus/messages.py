@@ -208,12 +208,13 @@ def markers_message(
     return {
         **_of_frame(result, vehicle, published_ns, view),
         "localization_error": localized.error,
-        "markers": [_marker(marker, target) for marker, target in zip(markers, targets, strict=True)],
-        "boards": [_board(board) for board in localized.boards],
+        "markers": [marker_body(marker, target) for marker, target in zip(markers, targets, strict=True)],
+        "boards": [board_body(board) for board in localized.boards],
     }
 
 
-def _marker(marker: Marker, target: MarkerTarget | None) -> MarkerBody:
+def marker_body(marker: Marker, target: MarkerTarget | None) -> MarkerBody:
+    """Create the part of one marker; `target` is None where the vehicle's pose is unknown."""
     return {
         "id": marker.identifier,
         "size_m": marker.size_m,
@@ -233,10 +234,13 @@ def _marker(marker: Marker, target: MarkerTarget | None) -> MarkerBody:
         "position_body_m": None if target is None else [round(value, 4) for value in target.body.position_m],
         "rotation_body_wxyz": None if target is None else [round(value, 5) for value in target.body.rotation],
         "covariance_body": None if target is None else _covariance(target.body),
+        "range_sigma_m": None if target is None else _rounded(target.body.range_sigma_m),
+        "angle_sigma_rad": None if target is None else _rounded(target.body.angle_sigma_rad),
     }
 
 
-def _board(board: BoardTarget) -> BoardBody:
+def board_body(board: BoardTarget) -> BoardBody:
+    """Create the part of one board."""
     return {
         "name": board.name,
         "ids": list(board.identifiers),
@@ -246,12 +250,18 @@ def _board(board: BoardTarget) -> BoardBody:
         "position_body_m": [round(value, 4) for value in board.body.position_m],
         "rotation_body_wxyz": [round(value, 5) for value in board.body.rotation],
         "covariance_body": _covariance(board.body),
+        "range_sigma_m": _rounded(board.body.range_sigma_m),
+        "angle_sigma_rad": _rounded(board.body.angle_sigma_rad),
     }
 
 
 def _covariance(pose: BodyPose) -> list[float]:
-    """Return the covariance with three digits."""
-    return [float(f"{value:.2e}") for value in pose.covariance]
+    return [_rounded(value) for value in pose.covariance]
+
+
+def _rounded(value: float) -> float:
+    """Return three digits."""
+    return float(f"{value:.2e}")
 
 
 def obstacles_message(seen: ObstacleSectors, vehicle: str) -> ObstaclesBody:

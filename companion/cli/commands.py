@@ -25,6 +25,7 @@ from companion.cli.cloud import CLOUD_SETTINGS, cloud
 from companion.cli.dashboard import dashboard
 from companion.cli.evaluate import evaluate
 from companion.cli.flags import EXIT_BAD_INPUT, plain_errors, settings_command
+from companion.cli.markers import MARKER_SETTINGS, markers
 from companion.cli.mission import mission
 from companion.cli.models import models
 from companion.cli.play import play
@@ -56,6 +57,7 @@ ORDER = (
     "record",
     "replay",
     "config",
+    "markers",
     "evaluate",
     "train",
 )
@@ -74,6 +76,7 @@ app.command()(topics)
 settings_command(app, *CLIENT_SETTINGS, "plugins", "detector")(mission)
 settings_command(app, *CLOUD_SETTINGS)(cloud)
 settings_command(app)(play)
+settings_command(app, *MARKER_SETTINGS)(markers)
 settings_command(app, *CLIENT_SETTINGS, "dashboard")(dashboard)
 app.add_typer(bench, name="bench")
 settings_command(app, *CLIENT_SETTINGS, *RECORD_SETTINGS)(record)

@@ -60,7 +60,7 @@ def build_pipeline(
         recorder=recorder,
         tracker=_tracker(settings, first_track_id),
         view_at=_view_at(settings, telemetry),
-        find_markers=_find_markers(settings),
+        find_markers=marker_finder(settings),
         obstacles_in=_obstacles_in(settings, telemetry),
         nearest_in=_nearest_in(settings, telemetry),
         clock_ns=clock_ns,
@@ -144,10 +144,10 @@ def _view_at(settings: Settings, telemetry: CameraTelemetry) -> Callable[[Frame]
     return view_at
 
 
-def _find_markers(
+def marker_finder(
     settings: Settings,
 ) -> Callable[[Frame], tuple[tuple[Marker, ...], tuple[BoardPose, ...]]] | None:
-    """Return the marker detector of frames; None if markers are disabled."""
+    """Return a function from a frame to its markers and boards; None if markers are disabled."""
     kind = settings.markers.kind()
     if kind is None:
         return None

@@ -40,6 +40,24 @@ class BodyPose:
     rotation: Quaternion
     covariance: tuple[float, ...]
 
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """(6, 6) the whole covariance."""
+        upper = np.zeros((6, 6))
+        upper[np.triu_indices(6)] = self.covariance
+        return upper + np.triu(upper, 1).T
+
+    @property
+    def range_sigma_m(self) -> float:
+        """One sigma of the distance from the vehicle."""
+        line = np.array(self.position_m) / max(float(np.linalg.norm(self.position_m)), 1e-9)
+        return math.sqrt(float(line @ self.matrix[:3, :3] @ line))
+
+    @property
+    def angle_sigma_rad(self) -> float:
+        """One sigma of the rotation about the least certain axis."""
+        return math.sqrt(float(np.linalg.eigvalsh(self.matrix[3:, 3:])[-1]))
+
 
 @dataclass(frozen=True, slots=True)
 class BoardTarget:

@@ -88,13 +88,10 @@ def test_pose_in_the_body_frame(roll: float, pitch: float, yaw: float, heading: 
     upper = body_from_ned @ [math.cos(heading), math.sin(heading), 0.0]
     axes = matrix_from_quaternion(target.body.rotation)
     assert axes[:, 1] == pytest.approx(upper, abs=0.05)
-    covariance = np.zeros((6, 6))
-    covariance[np.triu_indices(6)] = target.body.covariance
-    covariance += np.triu(covariance, 1).T
+    covariance = target.body.matrix
     assert np.linalg.eigvalsh(covariance).min() > 0.0
     # 0.1 px of 90 px is a thousandth of the range of 3 m along the line of sight, and less across.
-    along = offset / np.linalg.norm(offset)
-    sigma_m = math.sqrt(along @ covariance[:3, :3] @ along)
+    sigma_m = target.body.range_sigma_m
     assert 0.0005 * 3.0 < sigma_m < 0.003 * 3.0
     assert np.linalg.eigvalsh(covariance[:3, :3])[0] < (0.3 * sigma_m) ** 2
 

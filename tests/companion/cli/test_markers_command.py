@@ -1,0 +1,105 @@
+"""`companion markers`: output, images and exit codes."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import cv2
+import pytest
+from typer.testing import CliRunner
+
+from companion.cli.commands import app
+from mavlink_sim.camera.renderer import Renderer
+from mavlink_sim.world.fiducials import Print
+from mavlink_sim.world.structures import PLATE_THICKNESS_M
+from mavlink_sim.world.world import Ground, World, WorldObject
+from vision.camera_model import CameraModel, CameraMount
+from vision.rotation import matrix_from_euler
+
+LENS = ("--camera-horizontal-fov-deg", "70", "--camera-mount-pitch-deg", "-60")
+PRINTED = ("--dictionary", "APRILTAG_36h11", "--size", "0.5")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two images of a marker on the ground, 2 m ahead and 0.5 m to the right of a camera 3 m up."""
+    plate = WorldObject(0, "plate", (2.0, 0.5, 0.0), 0.4, printed=Print("APRILTAG_36h11", 7, 0.5))
+    camera = CameraModel.from_horizontal_fov(640, 480, math.radians(70.0))
+    renderer = Renderer(World((plate,), Ground(("concrete",), 0, 256, 0.05)), camera, CameraMount())
+    image = renderer.render((0.0, 0.0, -3.0), matrix_from_euler(0.0, math.radians(-60.0), 0.0)).image
+    folder = tmp_path_factory.mktemp("images")
+    for name in ("0.png", "1.png"):
+        assert cv2.imwrite(str(folder / name), image)
+    return folder
+
+
+def test_one_json_object_per_frame_with_the_true_pose(folder: Path, tmp_path: Path) -> None:
+    done = CliRunner().invoke(
+        app, ["markers", str(folder), *PRINTED, *LENS, "--json", "--save", str(tmp_path / "saved")]
+    )
+    assert done.exit_code == 0, done.output
+    messages = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [message["sequence"] for message in messages] == [0, 1]
+    for message in messages:
+        assert set(message) == {"sequence", "captured_ns", "width", "height", "markers", "boards"}
+        (marker,) = message["markers"]
+        assert marker["id"] == 7
+        assert marker["position_body_m"] == pytest.approx([2.0, 0.5, 3.0 - PLATE_THICKNESS_M], abs=0.01)
+        assert marker["bearing_rad"] == pytest.approx(math.atan2(0.5, 2.0), abs=0.005)
+        assert marker["heading_rad"] == pytest.approx(0.4, abs=0.02)
+        assert 0.0 < marker["range_sigma_m"] < 0.02
+        assert 0.0 < marker["angle_sigma_rad"] < 0.1
+        assert marker["resolved"] is True
+    image, drawn = cv2.imread(str(folder / "0.png")), cv2.imread(str(tmp_path / "saved" / "000000.jpg"))
+    assert image is not None
+    assert drawn is not None
+    assert sorted(path.name for path in (tmp_path / "saved").iterdir()) == ["000000.jpg", "000001.jpg"]
+    assert cv2.absdiff(image, drawn).max() > 100
+
+
+def test_one_readable_line_per_marker_and_board(folder: Path, tmp_path: Path) -> None:
+    board = tmp_path / "dock.toml"
+    board.write_text(
+        '[[boards]]\nname = "dock"\n[[boards.markers]]\nid = 7\nsize_m = 0.5\nposition_m = [0, 0, 0]\n'
+    )
+    done = CliRunner().invoke(
+        app, ["markers", str(folder), *PRINTED, *LENS, "--limit", "1", "--markers-boards-file", str(board)]
+    )
+    assert done.exit_code == 0, done.output
+    marker, dock = done.stdout.splitlines()
+    assert marker.split()[:3] == ["0", "id", "7"]
+    assert dock.split()[:3] == ["0", "board", "dock"]
+    for line in (marker, dock):
+        assert float(line.split()[3]) == pytest.approx(3.64, abs=0.02)
+    none = CliRunner().invoke(
+        app, ["markers", str(folder), *PRINTED[2:], "--dictionary", "6X6_50", "--limit", "1"]
+    )
+    assert none.stdout == "     0  no markers\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], ["--dictionary"]),
+        (["--dictionary", "4x4"], ["'4x4'", "4X4_50"]),
+        (["--dictionary", "4X4_50", "--size", "-1"], ["-1"]),
+        (["--dictionary", "4X4_50", "--markers-boards-file", "none.toml"], ["none.toml"]),
+        (["--dictionary", "4X4_50", "--camera-on-gimbal", "true"], ["camera.on_gimbal"]),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(arguments: list[str], words: list[str], folder: Path) -> None:
+    done = CliRunner().invoke(app, ["markers", str(folder), *arguments])
+    assert (done.exit_code, done.stdout) == (2, "")
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("companion: ")
+    assert all(word in line for word in words), line
+
+
+def test_missing_and_empty_sources_exit_with_code_2(tmp_path: Path) -> None:
+    for source in (tmp_path / "none.png", tmp_path):
+        done = CliRunner().invoke(app, ["markers", str(source), *PRINTED])
+        assert (done.exit_code, done.stdout) == (2, "")
+        assert str(source) in done.stderr
+        assert len(done.stderr.splitlines()) == 1
