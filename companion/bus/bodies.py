@@ -28,7 +28,7 @@ def _one_of(*words: str) -> Any:
 
 TrackWord = Annotated[str, _one_of("confirmed", "tentative", "none")]
 TrackEventWord = Annotated[str, _one_of("new", "update", "lost", "end")]
-RangeWord = Annotated[str, _one_of("depth", "ground_plane", "known_height", "none")]
+RangeWord = Annotated[str, _one_of("depth", "ground_plane", "known_height", "marker", "none")]
 RoleWord = Annotated[str, _one_of("alone", "leader", "follower", "virtual")]
 LevelWord = Annotated[str, _one_of("info", "warning", "error")]
 

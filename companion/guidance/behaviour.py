@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from companion.guidance.formation.neighbours import Neighbour, Neighbourhood
-from companion.guidance.targets.chosen import NO_TRACKS, RecentTracks
+from companion.guidance.targets.chosen import NO_TRACKS, RecentTracks, Wanted
 from companion.guidance.targets.from_markers import NO_MARKERS, MarkerSight
 from companion.guidance.targets.ranging import ALL_MEANS, RangeMeans
 from companion.guidance.targets.target import Target
@@ -28,7 +28,8 @@ class Requirement(StrEnum):
     PERCEPTION = "perception"  # a perception worker that delivers frames
     BATTERY = "battery"  # more charge than guidance.min_battery_percent
     DEPTH_OR_SIZE = "depth_or_size"  # a range: depth, the ground in the image, or classes of known height
-    MARKER = "marker"  # marker detection
+    MARKER = "marker"  # marker detection with a camera that looks down
+    STEERING_MARKER = "steering_marker"  # marker detection with the steering camera
     GIMBAL = "gimbal"  # a gimbal manager that responds
     NEIGHBOURS = "neighbours"  # fresh poses of other vehicles
 
@@ -69,7 +70,8 @@ class BehaviourContext:
         sent: the last setpoint after the envelope; None before the first.
         neighbourhood: the other vehicles; None: poses are not shared.
         min_separation_m: minimum distance to each of them.
-        markers: detected markers, or why there can be none.
+        markers: detected markers of cameras that look down, or why there can be none.
+        steering_markers: the same of the steering camera.
         gimbal: control and mounting of the gimbal; its attitude is in `state`.
         ranging: which means of range estimation are available.
         max_acceleration_mps2: the envelope's limit.
@@ -92,6 +94,17 @@ class BehaviourContext:
     max_acceleration_mps2: float = 3.0
     goal_ned_m: Vector3 | None = None
     tracks: RecentTracks = NO_TRACKS
+    steering_markers: MarkerSight = NO_MARKERS
+
+    def targets_of(self, wanted: Wanted) -> tuple[Target, ...]:
+        """The newest frame's targets among which those of a command are."""
+        if wanted.marker_id is None:
+            return self.targets
+        return tuple(marker.as_target() for marker in self.steering_markers.targets)
+
+    def fresh(self, wanted: Wanted) -> bool:
+        """Whether that frame is not too old."""
+        return self.perception_fresh if wanted.marker_id is None else self.steering_markers.fresh
 
     def perception_fault(self, default: str) -> str:
         """Why targets cannot be used, in words; `default` where the gimbal is not the reason."""
@@ -136,6 +149,13 @@ class ModeRequest:
 
 # What an update returns: a setpoint, an autopilot mode, or the end of the behaviour.
 BehaviourOutput = Setpoint | ModeRequest | Outcome
+
+
+def needs_to_see(wanted: Wanted) -> frozenset[Requirement]:
+    """The requirements of a behaviour that flies to an object."""
+    if wanted.marker_id is not None:
+        return frozenset({Requirement.STEERING_MARKER})
+    return frozenset({Requirement.PERCEPTION, Requirement.DEPTH_OR_SIZE})
 
 
 class Behaviour(ABC):

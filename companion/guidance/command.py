@@ -32,6 +32,8 @@ from companion.vehicle.gimbal import GimbalAim
 MOST_POINTS = 500
 FARTHEST_M = 5000.0
 LAST_TRACK_ID = 2**63 - 1  # of an int64
+LAST_MARKER_ID = 1023
+MARKER_ID_TEXT = "the id of a marker, a whole number from 0 to 1023"
 TRACK_ID_TEXT = "a track_id of the topic detections, a whole number from 1"
 
 
@@ -107,7 +109,15 @@ class TrackId:
     meaning: str
 
 
-Argument = Number | ClassName | EnumArgument | Points | FileName | ClassNames | Word | TrackId
+@dataclass(frozen=True, slots=True)
+class MarkerId:
+    """The id of a printed marker."""
+
+    key: str
+    meaning: str
+
+
+Argument = Number | ClassName | EnumArgument | Points | FileName | ClassNames | Word | TrackId | MarkerId
 
 
 def names_in(text: str) -> tuple[str, ...]:
@@ -135,6 +145,9 @@ def check(word: str, argument: Argument, value: Any, default: Any) -> None:
         case TrackId(key):
             if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= LAST_TRACK_ID:
                 raise GrammarError(f"{word}: {key} must be {TRACK_ID_TEXT}, got {value!r}")
+        case MarkerId(key):
+            if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= LAST_MARKER_ID:
+                raise GrammarError(f"{word}: {key} must be {MARKER_ID_TEXT}, got {value!r}")
         case EnumArgument(key, words):
             if value not in words:
                 raise GrammarError(f"{word}: {key} must be {' or '.join(words)}, got {value!r}")
@@ -237,7 +250,7 @@ class Command(ABC):
         if self.either and len(given) != 1:
             wanted = " or ".join(self.either)
             if given:
-                raise GrammarError(f"{self.word}: give either {wanted}, got both")
+                raise GrammarError(f"{self.word}: give either {wanted}, got {' and '.join(given)}")
             raise GrammarError(f"{self.word}: {wanted} is missing")
 
     @abstractmethod

@@ -266,6 +266,7 @@ class Guidance:
             gimbal=gimbal,
             ranging=inputs.ranging,
             tracks=self._tracks,
+            steering_markers=inputs.steering_markers,
         )
 
     def _output(self, landing_target: LandingTarget | None, *, released: bool = False) -> GuidanceOutput:

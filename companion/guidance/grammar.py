@@ -19,6 +19,8 @@ from typing import Any
 
 from companion.guidance.command import (
     COMMANDS,
+    LAST_MARKER_ID,
+    MARKER_ID_TEXT,
     TRACK_ID_TEXT,
     Argument,
     ClassName,
@@ -27,6 +29,7 @@ from companion.guidance.command import (
     EnumArgument,
     FileName,
     GrammarError,
+    MarkerId,
     Number,
     Points,
     TrackId,
@@ -148,6 +151,8 @@ def allowed_values(argument: Argument) -> str:
             return " or ".join(words)
         case TrackId():
             return "a track_id"
+        case MarkerId():
+            return f"0 to {LAST_MARKER_ID}"
     return ""
 
 
@@ -185,6 +190,8 @@ def _argument_schema(argument: Argument, class_names: Sequence[str] | None) -> d
                 schema["unit"] = unit
         case TrackId():
             schema |= {"type": "integer", "minimum": 1}
+        case MarkerId():
+            schema |= {"type": "integer", "minimum": 0, "maximum": LAST_MARKER_ID}
         case EnumArgument(_, words):
             schema["enum"] = list(words)
         case ClassName() if class_names is not None:
@@ -265,6 +272,10 @@ def _value(word: str, argument: Argument, text: str, class_names: Sequence[str] 
             # At most as many digits as the greatest one has: Python refuses to read thousands.
             if not re.fullmatch(r"[0-9]{1,19}", text):
                 raise GrammarError(f"{word}: {key} must be {TRACK_ID_TEXT}, got {text!r}")
+            return int(text)
+        case MarkerId(key):
+            if not re.fullmatch(r"[0-9]{1,4}", text):
+                raise GrammarError(f"{word}: {key} must be {MARKER_ID_TEXT}, got {text!r}")
             return int(text)
         case EnumArgument():
             return text.lower()

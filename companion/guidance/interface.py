@@ -174,7 +174,8 @@ class GuidanceInput:
         targets: from the steering camera's newest frame, local NED.
         seen_ns: capture stamp of that frame; None: none received yet.
         obstacles: from the newest depth image, of any age; None: none received.
-        markers: detected markers, or why there can be none.
+        markers: detected markers of cameras that look down, or why there can be none.
+        steering_markers: the same of the steering camera.
         neighbourhood: the other vehicles; None: poses are not shared.
         ranging: which means of range estimation are available.
         class_names: the detector's classes; None: not known, so not checked.
@@ -198,6 +199,7 @@ class GuidanceInput:
     # A behaviour has no encoding: commands are recorded by what they were built from (`CommandSource`).
     commands: tuple[CommandInput, ...] = field(default=(), metadata={"recorded": False})
     ending: bool = False
+    steering_markers: MarkerSight = NO_MARKERS
 
 
 @dataclass(frozen=True, slots=True)

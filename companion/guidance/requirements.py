@@ -55,13 +55,20 @@ def check_requirements(
                 missing.append(f"the camera's direction ({context.gimbal.direction_fault})")
             case Requirement.GIMBAL:
                 missing += missing_gimbal(state, now_ns, context.gimbal, behaviour.gimbal_pitches_rad)
-                if Requirement.PERCEPTION in behaviour.requirements and not context.gimbal.carries_camera:
+                seeing = {Requirement.PERCEPTION, Requirement.STEERING_MARKER} & behaviour.requirements
+                if seeing and not context.gimbal.carries_camera:
                     missing.append("the camera on the gimbal (camera.on_gimbal is not set)")
             case Requirement.DEPTH_OR_SIZE:
                 if (why := context.ranging.missing(_class_names(behaviour, context))) is not None:
                     missing.append(why)
             case Requirement.NEIGHBOURS:
                 missing += missing_neighbours(context.neighbourhood, behaviour.neighbour_names)
+            case Requirement.STEERING_MARKER if (
+                what := context.steering_markers.unavailable(PERCEPTION_GAP_S)
+            ) is not None:
+                missing.append(what)
+            case Requirement.STEERING_MARKER if context.gimbal.direction_fault:
+                missing.append(f"the camera's direction ({context.gimbal.direction_fault})")
             case Requirement.MARKER if (what := context.markers.unavailable(PERCEPTION_GAP_S)) is not None:
                 missing.append(what)
     if (charge := battery.missing(behaviour, state, now_ns)) is not None:

@@ -12,7 +12,7 @@ import os
 import statistics
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,6 +23,9 @@ from companion.guidance.targets.from_detections import (
     targets_from_detections,
 )
 from companion.guidance.targets.from_markers import (
+    CONFIRM_FRAMES,
+    CONFIRM_GAP_S,
+    NO_MARKERS,
     BoardTarget,
     LocalizedMarkers,
     MarkerSight,
@@ -301,6 +304,8 @@ class MarkerTracker:
         }
         self._resolvers = {camera.name: AmbiguityResolver() for camera in self._detecting}
         self._seen: dict[str | None, _SeenMarkers] = {}
+        # Camera and id → frames in a row with the marker, and the newest.
+        self._frames: dict[tuple[str | None, int], tuple[int, int]] = {}
 
     def localize(
         self, camera: PerceptionCamera, result: PerceptionResult, history: StateHistory
@@ -322,12 +327,32 @@ class MarkerTracker:
                 self._on_pads[camera.name],
                 self._resolvers[camera.name],
             )
+            targets = tuple(self._confirmed(camera.name, target) for target in targets)
             boards = board_targets(result.boards, result.captured_ns, mount, history)
         except HistoryError as error:
             # As with detections: without an attitude at the capture they are published, but not targets.
             error_text = str(error)
         self._seen[camera.name] = _SeenMarkers(result.captured_ns, targets, down)
         return LocalizedMarkers(targets, boards, error_text)
+
+    def _confirmed(self, camera: str | None, target: MarkerTarget) -> MarkerTarget:
+        key = (camera, target.identifier)
+        count, newest_ns = self._frames.get(key, (0, 0))
+        kept = target.captured_ns - newest_ns <= CONFIRM_GAP_S * 1e9
+        count = count + 1 if kept else 1
+        self._frames[key] = (count, target.captured_ns)
+        return replace(target, confirmed=count >= CONFIRM_FRAMES)
+
+    def steering_sight(self, camera: PerceptionCamera, now_ns: int, max_age_s: float) -> MarkerSight:
+        """Return the markers of the steering camera, for behaviours that fly to one."""
+        if camera not in self._detecting:
+            return NO_MARKERS
+        seen = self._seen.get(camera.name)
+        if seen is None:
+            return MarkerSight(missing="")
+        age_s = (now_ns - seen.captured_ns) / 1e9
+        fresh = age_s <= max_age_s
+        return MarkerSight(seen.targets if fresh else (), seen.captured_ns, age_s, fresh, "")
 
     def sight(self, now_ns: int, max_age_s: float) -> MarkerSight:
         """Return the markers of the cameras that look down, for behaviours."""

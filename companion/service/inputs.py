@@ -129,6 +129,7 @@ class InputAssembler:
             tuple(answers),
             tuple(commands),
             ending,
+            self._markers.steering_sight(self.steering, now_ns, self._settings.guidance.perception_max_age_s),
         )
 
     def camera_pitch_rad(self, state: VehicleState) -> float:

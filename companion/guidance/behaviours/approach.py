@@ -5,7 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome, Requirement
+from companion.guidance.behaviour import (
+    Behaviour,
+    BehaviourContext,
+    BehaviourOutput,
+    Outcome,
+    Requirement,
+    needs_to_see,
+)
 from companion.guidance.gimbal.pitch import GimbalTracking
 from companion.guidance.motion import (
     ARRIVED_M,
@@ -22,7 +29,7 @@ from companion.guidance.motion import (
 )
 from companion.guidance.targets.choosing import TargetSelector
 from companion.guidance.targets.chosen import Wanted
-from companion.guidance.targets.target import DOUBTED, RangeSource, Target
+from companion.guidance.targets.target import RangeSource, Target
 from companion.guidance.targets.track import ObjectTrack
 from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.setpoint import Setpoint
@@ -59,11 +66,11 @@ BASE_TIMEOUT_S = 45.0
 class ApproachBehaviour(Behaviour):
     """Keeps the height, yaws to the object and stops `distance_m` before its nearest surface.
 
-    It selects the confirmed object of the class ahead (see `TargetSelector`), or the track, and stays with
-    it. After losing it, it brakes and waits for `lost_timeout_s` before it fails.
+    It selects the confirmed object of the class ahead (see `TargetSelector`), or the track or marker, and
+    stays with it. After losing it, it brakes and waits for `lost_timeout_s` before it fails.
 
     Args:
-        class_name, track_id: exactly one of them.
+        class_name, track_id, marker_id: exactly one of them.
         tracking: keeps the camera's gimbal on the object; None: the gimbal is not used.
 
     Attributes:
@@ -71,15 +78,14 @@ class ApproachBehaviour(Behaviour):
     """
 
     name = "approach"
-    requirements = frozenset(
-        {Requirement.POSITION, Requirement.IN_AIR, Requirement.PERCEPTION, Requirement.DEPTH_OR_SIZE}
-    )
+    requirements = frozenset({Requirement.POSITION, Requirement.IN_AIR})
 
     def __init__(
         self,
         class_name: str = "",
         *,
         track_id: int | None = None,
+        marker_id: int | None = None,
         distance_m: float = 5.0,
         speed_mps: float = 2.0,
         confidence: float = 0.3,
@@ -87,9 +93,10 @@ class ApproachBehaviour(Behaviour):
         tracking: GimbalTracking | None = None,
     ) -> None:
         self._tracking = tracking
+        self._subject = Wanted(class_name, track_id, marker_id)
+        self.requirements = ApproachBehaviour.requirements | needs_to_see(self._subject)
         if tracking is not None:
-            self.requirements = ApproachBehaviour.requirements | {Requirement.GIMBAL}
-        self._subject = Wanted(class_name, track_id)
+            self.requirements |= {Requirement.GIMBAL}
         self.class_names, self.track_id = self._subject.class_names, track_id
         self.lost_at: Vector3 | None = None
         self._distance_m, self._speed_mps = distance_m, speed_mps
@@ -143,7 +150,7 @@ class ApproachBehaviour(Behaviour):
             away = f"still {self._range_m:.1f} m away" if track else "range never known"
             took_s = (now_ns - self._started_ns) / 1e9
             return Outcome(False, f"did not reach {self._subject.phrase} in {took_s:.0f} s: {away}")
-        if track is None or unseen_s > LOST_AFTER_S or not context.perception_fresh:
+        if track is None or unseen_s > LOST_AFTER_S or not context.fresh(self._subject):
             return self._wait(dt_s, context, position, unseen_s)
         if self._wait_point is not None:
             self._wait_point, self._controller = None, PositionController()
@@ -190,15 +197,18 @@ class ApproachBehaviour(Behaviour):
 
     def _observe(self, context: BehaviourContext, position: Vector3, yaw_rad: float) -> None:
         if (track := self._track) is not None:
-            if track.update(self._subject.same(context.targets, track.newest, self._confidence), position):
+            if track.update(
+                self._subject.same(context.targets_of(self._subject), track.newest, self._confidence),
+                position,
+            ):
                 self._seen_ns = track.captured_ns
             elif context.now_ns - self._seen_ns > LOST_AFTER_S * 1e9:
-                fitting = self._subject.of(context.targets, self._confidence)
+                fitting = self._subject.of(context.targets_of(self._subject), self._confidence)
                 self._track = track = self._found_again(track, fitting, position)
             self._notes += self._subject.new_id(self._last_id, track.track_id)
             self._last_id = track.track_id
             return
-        fitting = self._subject.of(context.targets, self._confidence)
+        fitting = self._subject.of(context.targets_of(self._subject), self._confidence)
         if fitting:
             self._doubted = not any(target.trusted for target in fitting)
         chosen = self._selector.update(fitting, yaw_rad, context.now_ns)
@@ -263,7 +273,10 @@ class ApproachBehaviour(Behaviour):
 
     @property
     def _by_depth(self) -> bool:
-        return self._track is not None and self._track.newest.range_source is RangeSource.DEPTH
+        return self._track is not None and self._track.newest.range_source in (
+            RangeSource.DEPTH,
+            RangeSource.MARKER,
+        )
 
     def _leave_goal(self) -> None:
         self._anchor_rad = None
@@ -276,10 +289,10 @@ class ApproachBehaviour(Behaviour):
         if self._wait_point is None:
             self._leave_goal()
         if unseen_s > self._lost_timeout_s:
-            if not context.perception_fresh:
+            if not context.fresh(self._subject):
                 why = context.perception_fault("no detections received")
             elif self._doubted:
-                why = DOUBTED
+                why = self._subject.doubted
             elif self._track is None:
                 why = "never seen with a known range"
             else:

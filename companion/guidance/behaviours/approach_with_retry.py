@@ -15,6 +15,7 @@ from companion.guidance.command import (
     ClassName,
     Command,
     GrammarError,
+    MarkerId,
     Number,
     TrackId,
     behaviour,
@@ -39,9 +40,11 @@ LOOK_BACK_LIMIT_S = 12.0
 POINTED_RAD = math.radians(6.0)
 
 
-@behaviour("approach", "fly to an object of the class, or to a track, keeping the height, and stop before it")
+@behaviour(
+    "approach", "fly to an object of the class, a track or a marker, keeping the height, and stop before it"
+)
 class Approach(Command):
-    either: ClassVar[tuple[str, ...]] = ("class", "track")
+    either: ClassVar[tuple[str, ...]] = ("class", "track", "marker")
     class_name: Annotated[str, ClassName("class", "what to fly to")] = ""
     distance_m: Annotated[float, Number("distance", "m", 1.0, 100.0, "where to stop, to its surface")] = 5.0
     speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 10.0, "maximum speed")] = 2.0
@@ -51,10 +54,17 @@ class Approach(Command):
     ] = 5.0
     retries: Annotated[
         float,
-        Number("retries", "", 0.0, 20.0, "how often to search for a lost object, unless it is a track"),
+        Number(
+            "retries",
+            "",
+            0.0,
+            20.0,
+            "how often to search for a lost object, unless it is a track or a marker",
+        ),
     ] = 2.0
     gimbal: GimbalUse = "leave"
     track_id: Annotated[int | None, TrackId("track", "fly to this track, instead of a class")] = None
+    marker_id: Annotated[int | None, MarkerId("marker", "fly to this marker, instead of a class")] = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -68,6 +78,7 @@ class Approach(Command):
             return ApproachBehaviour(
                 self.class_name,
                 track_id=self.track_id,
+                marker_id=self.marker_id,
                 distance_m=self.distance_m,
                 speed_mps=self.speed_mps,
                 confidence=self.confidence,
@@ -75,7 +86,7 @@ class Approach(Command):
                 tracking=tracking,
             )
 
-        if self.track_id is not None:
+        if not self.class_name:
             return approach()  # a search would find another track
         return PersistentApproach(
             approach,

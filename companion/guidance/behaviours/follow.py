@@ -6,12 +6,20 @@ import math
 from collections.abc import Sequence
 from typing import Annotated, ClassVar
 
-from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome, Requirement
+from companion.guidance.behaviour import (
+    Behaviour,
+    BehaviourContext,
+    BehaviourOutput,
+    Outcome,
+    Requirement,
+    needs_to_see,
+)
 from companion.guidance.command import (
     BuildContext,
     ClassName,
     Command,
     EnumArgument,
+    MarkerId,
     Number,
     TrackId,
     behaviour,
@@ -21,7 +29,6 @@ from companion.guidance.motion import add_velocity_error, correction, in_degrees
 from companion.guidance.targets.choosing import TargetSelector
 from companion.guidance.targets.chosen import Wanted
 from companion.guidance.targets.moving_track import MovingTrack
-from companion.guidance.targets.target import DOUBTED
 from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.setpoint import Setpoint
 from vision.attitude import wrap_angle
@@ -43,9 +50,9 @@ SURE_OF_SPEED_MPS = 1.0
 UNSEEN_S = 0.6
 
 
-@behaviour("follow", "keep a distance and a bearing to a moving object of the class, or to a track")
+@behaviour("follow", "keep a distance and a bearing to a moving object of the class, a track or a marker")
 class Follow(Command):
-    either: ClassVar[tuple[str, ...]] = ("class", "track")
+    either: ClassVar[tuple[str, ...]] = ("class", "track", "marker")
     class_name: Annotated[str, ClassName("class", "what to follow")] = ""
     distance_m: Annotated[float, Number("distance", "m", 1.5, 100.0, "to keep, to its surface")] = 8.0
     bearing: Annotated[
@@ -76,6 +83,7 @@ class Follow(Command):
     ] = 0.0
     gimbal: GimbalUse = "leave"
     track_id: Annotated[int | None, TrackId("track", "follow this track, instead of a class")] = None
+    marker_id: Annotated[int | None, MarkerId("marker", "follow this marker, instead of a class")] = None
 
     @property
     def endless(self) -> bool:
@@ -85,6 +93,7 @@ class Follow(Command):
         return FollowBehaviour(
             self.class_name,
             track_id=self.track_id,
+            marker_id=self.marker_id,
             distance_m=self.distance_m,
             bearing=self.bearing,
             angle_rad=math.radians(self.angle_deg),
@@ -99,11 +108,11 @@ class Follow(Command):
 class FollowBehaviour(Behaviour):
     """Keeps the height, yaws to the object and keeps `distance_m` from its nearest surface.
 
-    It selects the confirmed object of the class ahead (see `TargetSelector`), or the track, and stays with
-    it. Unseen, it follows the prediction for `occlusion_s`; then it fails.
+    It selects the confirmed object of the class ahead (see `TargetSelector`), or the track or marker, and
+    stays with it. Unseen, it follows the prediction for `occlusion_s`; then it fails.
 
     Args:
-        class_name, track_id: exactly one of them.
+        class_name, track_id, marker_id: exactly one of them.
         bearing: where the vehicle stays, seen from the object: "here", its current direction; "compass",
             `angle_rad` clockwise from north; "course", that far clockwise from the object's direction of
             motion (π is behind it).
@@ -117,8 +126,6 @@ class FollowBehaviour(Behaviour):
         {
             Requirement.POSITION,
             Requirement.IN_AIR,
-            Requirement.PERCEPTION,
-            Requirement.DEPTH_OR_SIZE,
             Requirement.BATTERY,
         }
     )
@@ -128,6 +135,7 @@ class FollowBehaviour(Behaviour):
         class_name: str = "",
         *,
         track_id: int | None = None,
+        marker_id: int | None = None,
         distance_m: float = 8.0,
         bearing: str = "here",
         angle_rad: float = math.pi,
@@ -138,9 +146,10 @@ class FollowBehaviour(Behaviour):
         tracking: GimbalTracking | None = None,
     ) -> None:
         self._tracking = tracking
+        self._subject = Wanted(class_name, track_id, marker_id)
+        self.requirements = FollowBehaviour.requirements | needs_to_see(self._subject)
         if tracking is not None:
-            self.requirements = FollowBehaviour.requirements | {Requirement.GIMBAL}
-        self._subject = Wanted(class_name, track_id)
+            self.requirements |= {Requirement.GIMBAL}
         self.class_names, self.track_id = self._subject.class_names, track_id
         self._distance_m, self._speed_mps = distance_m, speed_mps
         self._bearing, self._angle_rad = bearing, angle_rad
@@ -239,16 +248,19 @@ class FollowBehaviour(Behaviour):
         return None if self._course_rad is None else wrap_angle(self._course_rad + self._angle_rad)
 
     def _observe(self, context: BehaviourContext, yaw_rad: float) -> None:
-        if not context.perception_fresh:
+        if not context.fresh(self._subject):
             return
         position, _ = position_and_yaw(context.state)
         if (track := self._track) is not None:
             before = track.track_id
-            if track.update(self._subject.same(context.targets, track.newest, self._confidence), position):
+            if track.update(
+                self._subject.same(context.targets_of(self._subject), track.newest, self._confidence),
+                position,
+            ):
                 self._seen_ns = track.captured_ns
                 self._notes += self._subject.new_id(before, track.track_id)
             return
-        fitting = self._subject.of(context.targets, self._confidence)
+        fitting = self._subject.of(context.targets_of(self._subject), self._confidence)
         if fitting:
             self._doubted = not any(target.trusted for target in fitting)
         chosen = self._selector.update(fitting, yaw_rad, context.now_ns)
@@ -263,7 +275,7 @@ class FollowBehaviour(Behaviour):
         self._track, self._seen_ns = MovingTrack(chosen, position), chosen.captured_ns
 
     def _lost(self, context: BehaviourContext) -> str:
-        if not context.perception_fresh:
+        if not context.fresh(self._subject):
             why = context.perception_fault("no detections received")
         elif self._track is not None:
             north, east = self._track.velocity
@@ -274,7 +286,7 @@ class FollowBehaviour(Behaviour):
             expected = self._track.position_at(context.now_ns)
             why += context.tracks.replacement(self._track.newest, context.now_ns, expected)
         elif self._doubted:
-            why = DOUBTED
+            why = self._subject.doubted
         else:
             why = "never seen with a known range"
         return f"lost {self._subject.phrase} for {self._unseen_s:.1f} s: {why}"

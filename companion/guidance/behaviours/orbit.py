@@ -5,13 +5,21 @@ from __future__ import annotations
 import math
 from typing import Annotated
 
-from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome, Requirement
+from companion.guidance.behaviour import (
+    Behaviour,
+    BehaviourContext,
+    BehaviourOutput,
+    Outcome,
+    Requirement,
+    needs_to_see,
+)
 from companion.guidance.command import (
     BuildContext,
     ClassName,
     Command,
     EnumArgument,
     GrammarError,
+    MarkerId,
     Number,
     TrackId,
     behaviour,
@@ -64,7 +72,9 @@ SLOWEST_MPS = 0.5
 MAX_CENTRIPETAL_MPS2 = 2.0
 
 
-@behaviour("orbit", "circle, nose to the centre: the point `radius` ahead, an object of a class, or a track")
+@behaviour(
+    "orbit", "circle, nose to the centre: the point `radius` ahead, an object of a class, a track or a marker"
+)
 class Orbit(Command):
     class_name: Annotated[str, ClassName("class", "object to circle about, optional")] = ""
     radius_m: Annotated[float, Number("radius", "m", 1.0, 100.0, "of the circle")] = 10.0
@@ -76,6 +86,9 @@ class Orbit(Command):
     track_id: Annotated[
         int | None, TrackId("track", "circle about this track's object, instead of a class")
     ] = None
+    marker_id: Annotated[int | None, MarkerId("marker", "circle about this marker, instead of a class")] = (
+        None
+    )
 
     @property
     def endless(self) -> bool:
@@ -83,8 +96,9 @@ class Orbit(Command):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.class_name and self.track_id is not None:
-            raise GrammarError("orbit: give either class or track, got both")
+        given = {"class": self.class_name or None, "track": self.track_id, "marker": self.marker_id}
+        if len(both := [key for key, value in given.items() if value is not None]) > 1:
+            raise GrammarError(f"orbit: give either class or track or marker, got {' and '.join(both)}")
         fastest = math.sqrt(MAX_CENTRIPETAL_MPS2 * self.radius_m)
         if self.speed_mps > fastest:
             raise GrammarError(
@@ -101,6 +115,7 @@ class Orbit(Command):
             clockwise=clockwise,
             class_name=self.class_name,
             track_id=self.track_id,
+            marker_id=self.marker_id,
         )
 
 
@@ -112,7 +127,7 @@ class OrbitBehaviour(Behaviour):
     the radius.
 
     The centre is the point `radius_m` ahead of the vehicle at the start or, with a class name, the position
-    of the object of that class nearest to the nose or, with a track, of its object; determined once.
+    of the object of that class nearest to the nose or, with a track or a marker, of that; determined once.
     """
 
     name = "orbit"
@@ -126,11 +141,13 @@ class OrbitBehaviour(Behaviour):
         clockwise: bool = True,
         class_name: str = "",
         track_id: int | None = None,
+        marker_id: int | None = None,
     ) -> None:
         needs = {Requirement.POSITION, Requirement.IN_AIR}
-        self._subject = Wanted(class_name, track_id) if class_name or track_id is not None else None
-        if self._subject is not None:
-            needs |= {Requirement.PERCEPTION, Requirement.DEPTH_OR_SIZE}
+        self._subject = None
+        if class_name or track_id is not None or marker_id is not None:
+            self._subject = Wanted(class_name, track_id, marker_id)
+            needs |= needs_to_see(self._subject)
         self.requirements = frozenset(needs)
         self.class_names, self.track_id = ((class_name,) if class_name else ()), track_id
         self._radius_m, self._speed_mps, self._laps = radius_m, speed_mps, laps
@@ -253,7 +270,11 @@ class OrbitBehaviour(Behaviour):
 
 def _position_of(wanted: Wanted, context: BehaviourContext, yaw_rad: float) -> Vector3 | None:
     """Of the object nearest to the nose; of a track that is missed in this frame, the newest position."""
-    seen: list[Target] = wanted.of(context.targets if wanted.class_name else context.tracks.targets)
+    seen: list[Target] = wanted.of(
+        context.targets_of(wanted) if wanted.track_id is None else context.tracks.targets
+    )
+    if wanted.marker_id is not None:
+        seen = [target for target in seen if target.trusted]
     located = [target for target in seen if target.position_ned_m is not None]
     nearest = min(located, key=lambda t: abs(wrap_angle(t.bearing_rad - yaw_rad)), default=None)
     return None if nearest is None else nearest.position_ned_m

@@ -13,7 +13,8 @@ from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass
 
-from companion.guidance.targets.target import Target
+from companion.guidance.targets.from_markers import marker_name
+from companion.guidance.targets.target import DOUBTED, UNCONFIRMED_MARKER, Target
 from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.state import VehicleState
 from vision.attitude import wrap_angle
@@ -30,14 +31,19 @@ NEAREST_M = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """The objects that a command is about: those of a class, or one track."""
+    """The objects that a command is about: those of a class, one track, or one printed marker."""
 
     class_name: str = ""
     track_id: int | None = None
+    marker_id: int | None = None
 
     def __post_init__(self) -> None:
-        if bool(self.class_name) is (self.track_id is not None):
-            raise ValueError(f"expected a class or a track, got {self.class_name!r} and {self.track_id}")
+        given = (bool(self.class_name), self.track_id is not None, self.marker_id is not None)
+        if sum(given) != 1:
+            raise ValueError(
+                "expected one of class, track and marker, got "
+                f"{self.class_name!r}, {self.track_id} and {self.marker_id}"
+            )
 
     @property
     def class_names(self) -> tuple[str, ...]:
@@ -46,23 +52,25 @@ class Wanted:
 
     @property
     def name(self) -> str:
-        """`car`, or `track 17`."""
+        """`car`, `track 17`, or `marker 7`."""
+        if self.marker_id is not None:
+            return marker_name(self.marker_id)
         return self.class_name or f"track {self.track_id}"
 
     @property
     def phrase(self) -> str:
-        """`the car`, or `track 17`."""
+        """`the car`, `track 17`, or `marker 7`."""
         return f"the {self.class_name}" if self.class_name else self.name
 
     def of(self, targets: Collection[Target], confidence: float = 0.0) -> list[Target]:
-        """These objects' targets with at least a confidence."""
+        """These objects' targets with at least a confidence; of `BehaviourContext.targets_of`."""
         return [
             target
             for target in targets
             if (
                 target.track_id == self.track_id
                 if self.track_id is not None
-                else target.class_name == self.class_name
+                else target.class_name == (self.class_name or self.name)
             )
             and target.score >= confidence
         ]
@@ -70,6 +78,11 @@ class Wanted:
     def same(self, targets: Collection[Target], last: Target, confidence: float = 0.0) -> list[Target]:
         """Those that may be the object that was seen last: of its class, with any id."""
         return Wanted(last.class_name).of(targets, confidence)
+
+    @property
+    def doubted(self) -> str:
+        """The reason when it was seen and never trusted."""
+        return DOUBTED if self.marker_id is None else UNCONFIRMED_MARKER
 
     def new_id(self, before: int | None, after: int | None) -> list[str]:
         """The note that the object of a track has another id now; empty: there is nothing to say."""

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.guidance.targets.from_detections import Pose, StateHistory, mount_at
+from companion.guidance.targets.target import RangeSource, Target
 from companion.vehicle.state import Quaternion, Vector3
 from vision.camera_model import CameraModel, CameraMount
 from vision.marker_ambiguity import AmbiguityResolver
@@ -21,6 +22,11 @@ from vision.marker_boards import BoardPose
 from vision.markers import Marker, MarkerPose, PadMarker
 from vision.rotation import quaternion_from_matrix
 
+# One sigma of a marker's horizontal range, in addition to its own: mount and clocks, metres; and one degree
+# of the vehicle's attitude, times the difference in height.
+FIXED_SIGMA_M, TILT_SIGMA_RAD = 0.05, math.radians(1.0)
+# A marker is confirmed after so many frames in a row, with gaps of at most this.
+CONFIRM_FRAMES, CONFIRM_GAP_S = 3, 0.5
 # Margin, as a fraction of the image size, by which straight down must be inside the image to land.
 DOWN_MARGIN = 0.08
 
@@ -96,6 +102,7 @@ class MarkerTarget:
         body: its pose in the body frame.
         resolved: which of the two poses of a square is the true one is known; else the one nearer to level is
             assumed, as pads are level.
+        confirmed: detected in enough frames in a row to be flown to.
     """
 
     identifier: int
@@ -114,6 +121,30 @@ class MarkerTarget:
     reprojection_px: float
     body: BodyPose
     resolved: bool
+    confirmed: bool = False
+
+    def as_target(self) -> Target:
+        """The target for behaviours that fly to an object; its surface is the marker's centre."""
+        height_m = self.distance_m * math.sin(abs(self.elevation_rad))
+        return Target(
+            marker_name(self.identifier),
+            1.0,
+            self.captured_ns,
+            self.bearing_rad,
+            self.elevation_rad,
+            ground_range_m=self.ground_range_m,
+            range_source=RangeSource.MARKER,
+            position_ned_m=self.position_ned_m,
+            track_id=self.identifier,
+            trusted=self.confirmed,
+            distance_m=self.distance_m,
+            range_sigma_m=math.hypot(FIXED_SIGMA_M, TILT_SIGMA_RAD * height_m, self.body.range_sigma_m),
+        )
+
+
+def marker_name(identifier: int) -> str:
+    """The class name of a marker's target."""
+    return f"marker {identifier}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +171,7 @@ class MarkerSight:
         captured_ns: of that frame; 0: none received.
         age_s: since then; None: none received.
         fresh: that age is within the configured maximum.
-        missing: what is missing for landing on markers; empty: nothing.
+        missing: what is missing for using markers; empty: nothing.
     """
 
     targets: tuple[MarkerTarget, ...] = ()

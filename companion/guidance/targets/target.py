@@ -10,6 +10,7 @@ from companion.vehicle.state import Vector3
 
 # The reason when no seen object was trusted.
 DOUBTED = "target not confirmed (score < tracker.confirm_score) or class ambiguous"
+UNCONFIRMED_MARKER = "not confirmed: detected in too few frames in a row"
 
 
 class RangeSource(StrEnum):
@@ -18,6 +19,7 @@ class RangeSource(StrEnum):
     DEPTH = "depth"
     GROUND_PLANE = "ground_plane"
     KNOWN_HEIGHT = "known_height"
+    MARKER = "marker"
     NONE = "none"
 
 

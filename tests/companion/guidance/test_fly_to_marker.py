@@ -1,0 +1,176 @@
+"""`approach`, `follow` and `orbit` of a printed marker: rendered images, in lockstep through guidance."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from companion.bench.lockstep_flight import FlightLog, LockstepFlight, camera_settings
+from companion.bench.rendered_camera import RenderedCamera
+from companion.guidance.command import NO_CONTEXT, GrammarError
+from companion.guidance.grammar import json_schema, parse
+from companion.guidance.targets.target import UNCONFIRMED_MARKER
+from companion.settings import Settings
+from companion.vehicle.state import Vector3
+from mavlink_sim.camera.scene import CameraSettings, Scene
+from mavlink_sim.lockstep import LockstepVehicle
+from mavlink_sim.world.fiducials import Print
+from mavlink_sim.world.world import Ground, World, WorldObject
+from vision.camera_model import CameraModel, CameraMount
+
+CAMERA = CameraModel.from_horizontal_fov(480, 360, math.radians(75.0))
+MOUNT = CameraMount(forward_m=0.1, pitch_rad=math.radians(-8.0))
+SETTINGS = {"detector.enabled": "false", "markers.dictionary": "APRILTAG_36h11", "markers.size_m": "0.8"}
+HEIGHT_M, AHEAD_M = 3.0, 11.0
+FAR_AWAY = (500.0, 500.0)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Of the marker: (north, east) by the seconds of the flight; it stands and faces south."""
+
+    at: Callable[[float], tuple[float, float]]
+    speed_mps: float = 0.0
+    period_s: float = 0.0
+
+    def pose_at(self, time_s: float) -> tuple[Vector3, float]:
+        return (*self.at(time_s), -2.2), math.pi
+
+
+def flight_with(
+    at: Callable[[float], tuple[float, float]] = lambda _: (AHEAD_M, 1.0),
+    *,
+    seed: int = 1,
+) -> LockstepFlight:
+    printed = Print("APRILTAG_36h11", 7, 0.8, standing=True)
+    world = World(
+        (WorldObject(0, "plate", (0.0, 0.0, 0.0), printed=printed),), Ground(("grass",), seed, 256, 0.1)
+    )
+    scene = Scene(world, {0: Motion(at)}, CameraSettings(model=CAMERA, mount=MOUNT, seed=seed), "marker")
+    settings: Settings = camera_settings(CAMERA, MOUNT, SETTINGS)
+
+    def camera(vehicle: LockstepVehicle) -> RenderedCamera:
+        return RenderedCamera(settings, scene, vehicle, by_flight=True, depth=False)
+
+    flight = LockstepFlight.airborne(seed=seed, height_m=HEIGHT_M, wind_mps=1.5, camera=camera)
+    flight.turn_to(0.0)
+    return flight
+
+
+def reason(log: FlightLog) -> str:
+    assert log.outcome is not None
+    return log.outcome.reason
+
+
+@pytest.mark.parametrize("seed", [3, 8])
+def test_approach_stops_before_the_marker(seed: int) -> None:
+    flight = flight_with(seed=seed)
+    log = flight.fly("approach marker=7 distance=4", 60.0)
+    assert log.outcome is not None
+    assert log.outcome.success, log.outcome
+    assert "marker 7" in log.outcome.reason
+    north, east, _ = flight.vehicle.truth.position_ned_m
+    assert math.hypot(AHEAD_M - north, 1.0 - east) == pytest.approx(4.0, abs=0.35)
+    assert not log.violations
+
+
+def test_follow_keeps_its_distance_to_a_moving_marker() -> None:
+    def path(time_s: float) -> tuple[float, float]:
+        return AHEAD_M + 0.8 * min(time_s, 30.0), 0.5
+
+    flight = flight_with(path)
+    distances: list[float] = []
+
+    def note() -> None:
+        if flight.seconds > 14.0:
+            north, east, _ = flight.vehicle.truth.position_ned_m
+            goal = path(flight.seconds)
+            distances.append(math.hypot(goal[0] - north, goal[1] - east))
+
+    log = flight.fly("follow marker=7 distance=5 duration=28", 40.0, on_tick=note)
+    assert log.outcome is not None
+    assert log.outcome.success, log.outcome
+    assert np.percentile(np.abs(np.array(distances) - 5.0), 90) < 0.8
+    assert not log.violations
+
+
+def test_orbit_circles_about_the_marker() -> None:
+    flight = flight_with(lambda _: (8.0, 0.0))
+    radii: list[float] = []
+
+    def note() -> None:
+        if flight.seconds > 10.0:
+            north, east, _ = flight.vehicle.truth.position_ned_m
+            radii.append(math.hypot(8.0 - north, east))
+
+    log = flight.fly("orbit marker=7 radius=6 speed=2 laps=0.5", 40.0, on_tick=note)
+    assert log.outcome is not None
+    assert log.outcome.success, log.outcome
+    assert np.percentile(np.abs(np.array(radii) - 6.0), 90) < 0.6
+
+
+def test_marker_that_disappears_ends_the_command() -> None:
+    def path(time_s: float) -> tuple[float, float]:
+        return (AHEAD_M, 1.0) if time_s < 3.0 else FAR_AWAY
+
+    log = flight_with(path).fly("approach marker=7 distance=3 lost_timeout=2", 30.0)
+    assert log.outcome is not None
+    assert not log.outcome.success
+    assert reason(log).startswith("lost marker 7 for 2.")
+    assert "last seen" in reason(log)
+    assert log.moments[-1].seconds < 8.0
+
+
+def test_another_marker_and_one_seen_too_briefly_are_not_flown_to() -> None:
+    other = flight_with(lambda _: (6.0, 0.0))
+    log = other.fly("approach marker=8 lost_timeout=1.5", 20.0)
+    assert "never seen" in reason(log)
+    assert math.dist(other.vehicle.truth.position_ned_m[:2], (0.0, 0.0)) < 1.0
+
+    def glimpse(time_s: float) -> tuple[float, float]:
+        return (6.0, 0.0) if 0.45 < time_s < 0.65 else FAR_AWAY
+
+    log = flight_with(glimpse).fly("approach marker=7 lost_timeout=2", 20.0)
+    assert UNCONFIRMED_MARKER in reason(log)
+    assert "no localized 'marker 7'" in reason(flight_with(lambda _: FAR_AWAY).fly("orbit marker=7", 20.0))
+
+
+def test_marker_needs_detection_with_the_steering_camera() -> None:
+    without = LockstepFlight.airborne(seed=1, height_m=HEIGHT_M)
+    for command in ("approach marker=7", "follow marker=7", "orbit marker=7"):
+        outcome = without.fly(command, 5.0).outcome
+        assert outcome is not None
+        assert not outcome.success
+        assert "markers.dictionary is not set" in outcome.reason
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("approach marker=7.5", ["marker", "'7.5'"]),
+        ("follow marker=1024", ["marker", "1024", "0 to 1023"]),
+        ("orbit car marker=7", ["class", "marker"]),
+        ("orbit track=3 marker=7", ["track", "marker"]),
+        ("approach car marker=7", ["class", "marker"]),
+        ("follow", ["class or track or marker"]),
+    ],
+)
+def test_bad_commands_name_the_argument(text: str, words: list[str]) -> None:
+    with pytest.raises(GrammarError) as caught:
+        parse(text)
+    assert all(word in str(caught.value) for word in words), caught.value
+
+
+@pytest.mark.parametrize(
+    "text", ["approach marker=0", "follow distance=3 marker=7", "orbit radius=6 marker=7"]
+)
+def test_command_round_trip(text: str) -> None:
+    command = parse(text)
+    assert str(command) == text
+    assert command.build(NO_CONTEXT).class_names == ()
+    marker = json_schema()["$defs"][text.split()[0]]["properties"]["marker"]
+    assert (marker["type"], marker["minimum"], marker["maximum"]) == ("integer", 0, 1023)
