@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from companion.cli.bench import bench
+from companion.cli.cameras import cameras
 from companion.cli.cloud import CLOUD_SETTINGS, cloud
 from companion.cli.dashboard import dashboard
 from companion.cli.evaluate import evaluate
@@ -49,6 +50,7 @@ ORDER = (
     "detect",
     "send",
     "echo",
+    "cameras",
     "dashboard",
     "commands",
     "topics",
@@ -73,6 +75,7 @@ app = typer.Typer(
 app.add_typer(models, name="models")
 app.command()(evaluate)
 app.command()(topics)
+app.command()(cameras)
 settings_command(app, *CLIENT_SETTINGS, "plugins", "detector")(mission)
 settings_command(app, *CLOUD_SETTINGS)(cloud)
 settings_command(app)(play)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -11,7 +13,8 @@ import numpy as np
 import pytest
 
 from vision.sources import SourceError, SourceSettings, open_source
-from vision.sources.camera import camera_device, fourcc_text
+from vision.sources.camera import camera_device
+from vision.sources.v4l2 import fourcc_text
 
 pytestmark = pytest.mark.realtime
 
@@ -137,6 +140,23 @@ def test_a_camera_without_permission_names_the_group(device: Path, monkeypatch: 
     monkeypatch.setattr("vision.sources.camera.os.access", lambda path, mode: False)
     with pytest.raises(SourceError, match="group video"):
         open_source("0")
+
+
+@pytest.mark.parametrize("opens", [True, False])
+def test_busy_camera_names_the_program_that_holds_it(
+    device: Path, monkeypatch: pytest.MonkeyPatch, opens: bool
+) -> None:
+    """Of a busy camera the driver refuses the format, or gives no frames."""
+    monkeypatch.setattr(FakeCamera, "isOpened", lambda self: opens)
+    monkeypatch.setattr(FakeCamera, "grab", lambda self: False)
+    code = "import sys; file = open(sys.argv[1]); print('open', flush=True); sys.stdin.read()"
+    with subprocess.Popen(
+        [sys.executable, "-c", code, device], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == b"open\n"
+        with pytest.raises(SourceError, match=rf"busy: \S+ \({other.pid}\) has it open"):
+            open_source("0", SourceSettings(open_timeout_s=0.3))
 
 
 def test_pipe_pixel_format_is_rejected_for_a_camera(device: Path) -> None:

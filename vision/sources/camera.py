@@ -20,6 +20,7 @@ import cv2
 from vision.sources.capture import Capture, CaptureError, RawFrame
 from vision.sources.opencv import quiet_opencv, read_capture
 from vision.sources.source import PIPE_PIXEL_FORMATS, SourceError, SourceSettings
+from vision.sources.v4l2 import fourcc_text, holders
 
 logger = logging.getLogger(__name__)
 
@@ -81,10 +82,7 @@ class CameraCapture(Capture):
         self._capture = cv2.VideoCapture(str(device), cv2.CAP_V4L2)
         if not self._capture.isOpened():
             self._capture.release()
-            raise CaptureError(
-                "it does not open as a camera; another program may be using it, or it is a camera's metadata "
-                "device"
-            )
+            raise CaptureError(_unopened(device))
         self._configure(settings)
 
     def _configure(self, settings: SourceSettings) -> None:
@@ -122,8 +120,7 @@ class CameraCapture(Capture):
     def read(self, timeout_s: float) -> RawFrame | None:
         image, now_ns, decode_ms = read_capture(self._capture)
         if image is None:
-            gone = "" if self._device.exists() else "; it was unplugged"
-            raise CaptureError(f"the camera delivered no frame{gone}")
+            raise CaptureError(f"the camera delivered no frame{_why_silent(self._device)}")
         driver_ns = round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
         captured_ns = driver_ns if 0 <= now_ns - driver_ns < _OLDEST_STAMP_NS else now_ns
         return RawFrame(image, captured_ns, decode_ms=decode_ms)
@@ -132,7 +129,18 @@ class CameraCapture(Capture):
         self._capture.release()
 
 
-def fourcc_text(code: int) -> str:
-    """The four letters of a FOURCC; in hexadecimal if they are not printable."""
-    letters = code.to_bytes(4, "little", signed=code < 0)
-    return letters.decode("ascii") if all(32 <= letter < 127 for letter in letters) else f"0x{code:08x}"
+def _unopened(device: Path) -> str:
+    if held_by := holders(device):
+        return f"it is busy: {', '.join(held_by)} has it open"
+    return (
+        "it does not open as a camera; another user's program may be using it, or it is a camera's metadata "
+        "node (see `companion cameras`)"
+    )
+
+
+def _why_silent(device: Path) -> str:
+    """V4L2 lets several programs open a camera and only one stream; OpenCV does not report which failed."""
+    if not device.exists():
+        return "; it was unplugged"
+    held_by = holders(device)
+    return f"; it is busy: {', '.join(held_by)} has it open" if held_by else ""

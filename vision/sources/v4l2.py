@@ -1,0 +1,205 @@
+"""Video4Linux devices by their ioctls: what they are, what they offer, and who holds them.
+
+Structures and numbers are those of linux/videodev2.h. Not tested with a real device: the tests inject the
+ioctl function and answer with the kernel's structures.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+_QUERYCAP, _ENUM_FMT, _ENUM_FRAMESIZES, _ENUM_FRAMEINTERVALS = 0x80685600, 0xC0405602, 0xC02C564A, 0xC034564B
+_CAPABILITY = struct.Struct("=16s32s32s6I")
+_FMTDESC = struct.Struct("=3I32s2I12x")
+_FRMSIZEENUM = struct.Struct("=9I8x")
+_FRMIVALENUM = struct.Struct("=11I8x")
+
+_CAP_DEVICE_CAPS = 0x80000000
+_CAP_VIDEO_CAPTURE, _CAP_VIDEO_CAPTURE_MPLANE, _CAP_M2M, _CAP_META_CAPTURE = 0x1, 0x1000, 0xC000, 0x800000
+_BUF_TYPE_VIDEO_CAPTURE, _BUF_TYPE_VIDEO_CAPTURE_MPLANE = 1, 9
+_DISCRETE = 1
+
+_MOST = 256  # entries of an enumeration: a driver that never ends it must not block us
+
+Ioctl = Callable[[int, int, bytearray], Any]
+"""`fcntl.ioctl`, which changes the buffer; raises OSError."""
+
+
+@dataclass(frozen=True, slots=True)
+class FrameSize:
+    """One picture size of a pixel format. Of a range of sizes, its largest.
+
+    Attributes:
+        rates_hz: frame rates, highest first; empty if the driver does not say.
+        smallest: width and height of the smallest size, if these are the largest of a range.
+    """
+
+    width: int
+    height: int
+    rates_hz: tuple[float, ...] = ()
+    smallest: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class PixelFormat:
+    """One pixel format: its FOURCC, the driver's description, its sizes."""
+
+    fourcc: str
+    description: str
+    sizes: tuple[FrameSize, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class VideoDevice:
+    """One /dev/video node.
+
+    Attributes:
+        path: /dev/videoN. stable_path: its name under /dev/v4l/by-id (or by-path), which stays the same;
+            None without one.
+        driver, card, bus: as the driver reports them.
+        kind: `camera`; `metadata`, the second node of many USB cameras, which delivers no pictures; `codec`,
+            a converter or encoder; `other`, for example an output.
+        formats: of a camera.
+        holders: programs that have it open.
+        error: why it could not be queried; empty if it was.
+    """
+
+    path: Path
+    stable_path: Path | None = None
+    driver: str = ""
+    card: str = ""
+    bus: str = ""
+    kind: str = "other"
+    formats: tuple[PixelFormat, ...] = ()
+    holders: tuple[str, ...] = ()
+    error: str = ""
+
+
+def video_devices(dev: Path = Path("/dev"), ioctl: Ioctl = fcntl.ioctl) -> tuple[VideoDevice, ...]:
+    """All video nodes under `dev`, by their number."""
+    paths = sorted(
+        (path for path in dev.glob("video*") if path.name[5:].isdecimal()),
+        key=lambda path: int(path.name[5:]),
+    )
+    stable = {}
+    for folder in ("by-path", "by-id"):  # by-id last: it also survives another USB port
+        for link in sorted((dev / "v4l" / folder).glob("*")):
+            stable[link.resolve()] = link
+    return tuple(_query(path, stable.get(path.resolve()), ioctl) for path in paths)
+
+
+def _query(path: Path, stable_path: Path | None, ioctl: Ioctl) -> VideoDevice:
+    held_by = holders(path)
+    try:
+        # Opening takes nothing from another program: only streaming is exclusive.
+        descriptor = os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError as error:
+        reason = "no permission; the group video has it" if error.errno == 13 else str(error.strerror)
+        return VideoDevice(path, stable_path, holders=held_by, error=reason)
+    try:
+        buffer = bytearray(_CAPABILITY.size)
+        ioctl(descriptor, _QUERYCAP, buffer)
+        driver, card, bus, _, capabilities, device_caps, *_ = _CAPABILITY.unpack(buffer)
+        # `capabilities` are those of all nodes of the physical device together.
+        caps = device_caps if capabilities & _CAP_DEVICE_CAPS else capabilities
+        kind = _kind(caps)
+        formats: tuple[PixelFormat, ...] = ()
+        if kind == "camera":
+            buffer_type = (
+                _BUF_TYPE_VIDEO_CAPTURE if caps & _CAP_VIDEO_CAPTURE else _BUF_TYPE_VIDEO_CAPTURE_MPLANE
+            )
+            formats = tuple(_formats(descriptor, buffer_type, ioctl))
+        return VideoDevice(path, stable_path, _text(driver), _text(card), _text(bus), kind, formats, held_by)
+    except OSError as error:
+        return VideoDevice(path, stable_path, holders=held_by, error=str(error.strerror))
+    finally:
+        os.close(descriptor)
+
+
+def _kind(caps: int) -> str:
+    if caps & _CAP_M2M:
+        return "codec"
+    if caps & (_CAP_VIDEO_CAPTURE | _CAP_VIDEO_CAPTURE_MPLANE):
+        return "camera"
+    return "metadata" if caps & _CAP_META_CAPTURE else "other"
+
+
+def _enumerate(
+    descriptor: int, request: int, packing: struct.Struct, ioctl: Ioctl, *rest: int
+) -> Iterator[Any]:
+    """Each structure of an enumeration, unpacked; the driver ends it with an error (EINVAL)."""
+    for index in range(_MOST):
+        buffer = bytearray(packing.size)
+        struct.pack_into(f"={1 + len(rest)}I", buffer, 0, index, *rest)
+        try:
+            ioctl(descriptor, request, buffer)
+        except OSError:
+            return
+        yield packing.unpack(buffer)
+
+
+def _formats(descriptor: int, buffer_type: int, ioctl: Ioctl) -> Iterator[PixelFormat]:
+    for _, _, _, description, code, _ in _enumerate(descriptor, _ENUM_FMT, _FMTDESC, ioctl, buffer_type):
+        yield PixelFormat(fourcc_text(code), _text(description), tuple(_sizes(descriptor, code, ioctl)))
+
+
+def _sizes(descriptor: int, code: int, ioctl: Ioctl) -> Iterator[FrameSize]:
+    for _, _, kind, *union in _enumerate(descriptor, _ENUM_FRAMESIZES, _FRMSIZEENUM, ioctl, code):
+        if kind == _DISCRETE:
+            width, height = union[:2]
+            yield FrameSize(width, height, _rates_hz(descriptor, code, width, height, ioctl))
+            continue
+        least_width, width, _, least_height, height, _ = union  # one entry for the whole range
+        rates_hz = _rates_hz(descriptor, code, width, height, ioctl)
+        yield FrameSize(width, height, rates_hz, (least_width, least_height))
+        return
+
+
+def _rates_hz(descriptor: int, code: int, width: int, height: int, ioctl: Ioctl) -> tuple[float, ...]:
+    rates: list[float] = []
+    for _, _, _, _, kind, *union in _enumerate(
+        descriptor, _ENUM_FRAMEINTERVALS, _FRMIVALENUM, ioctl, code, width, height
+    ):
+        # A range gives its shortest and longest interval, and one entry.
+        fractions = (union[:2],) if kind == _DISCRETE else (union[:2], union[2:4])
+        rates += [round(below / above, 3) for above, below in fractions if above]
+        if kind != _DISCRETE:
+            break
+    return tuple(sorted(set(rates), reverse=True))
+
+
+def holders(device: Path, proc: Path = Path("/proc")) -> tuple[str, ...]:
+    """Programs that have a device open, `NAME (PID)`, without this process.
+
+    Other users' programs are visible to root only.
+    """
+    try:
+        wanted = device.resolve(strict=True)
+    except OSError:
+        return ()
+    found = []
+    for folder in sorted((p for p in proc.iterdir() if p.name.isdecimal()), key=lambda p: int(p.name)):
+        if int(folder.name) == os.getpid():
+            continue
+        try:
+            if any(Path(os.readlink(fd.path)) == wanted for fd in os.scandir(folder / "fd")):
+                found.append(f"{(folder / 'comm').read_text().strip()} ({folder.name})")
+        except OSError:  # it has ended, or belongs to another user
+            continue
+    return tuple(found)
+
+
+def fourcc_text(code: int) -> str:
+    """The four letters of a FOURCC; in hexadecimal if they are not printable."""
+    letters = code.to_bytes(4, "little", signed=code < 0)
+    return letters.decode("ascii") if all(32 <= letter < 127 for letter in letters) else f"0x{code:08x}"
+
+
+def _text(field: bytes) -> str:
+    return field.split(b"\0", 1)[0].decode("utf-8", "replace")
