@@ -335,7 +335,7 @@ def detect(
         float | None, typer.Option(min=0.1, help="Frame rate of a camera or raw file, Hz.")
     ] = None,
     pixel_format: Annotated[
-        str | None, typer.Option(help="Pixel format: bgr24, rgb24, gray8, y4m, mjpeg, YUYV…")
+        str | None, typer.Option(help="Pixel format: bgr24, rgb24, gray8, yuv420, y4m, mjpeg, YUYV…")
     ] = None,
     plugins_modules: Annotated[
         str | None, typer.Option(help="Plug-ins to load: modules or names, comma separated.")

@@ -129,7 +129,8 @@ class StandardInput:
     def _recognise(self) -> _Framing:
         source = self._source
         if source.pixel_format in RAW_PIXEL_FORMATS and source.width and source.height:
-            return _Framing(frame_bytes=source.width * source.height * RAW_PIXEL_FORMATS[source.pixel_format])
+            pixels = source.width * source.height
+            return _Framing(frame_bytes=int(pixels * RAW_PIXEL_FORMATS[source.pixel_format]))
         if source.pixel_format not in (None, "y4m"):
             return _Framing()
         beginning = b""

@@ -30,7 +30,7 @@ class SourceSection(Section):
     """Where frames come from."""
 
     uri: Annotated[str, Field(min_length=1)] = "/dev/video0"
-    """video file, folder of images, /dev/video0, FIFO, - (standard input), rtsp://, http://, udp://; none"""
+    """/dev/video0, csi://0, file, folder of images, FIFO, - (standard input), rtsp, http, udp://…; none"""
     width: Annotated[int | None, Field(ge=16, le=16384)] = None
     """frame width, pixels; requested from a camera, required for raw frames from a pipe"""
     height: Annotated[int | None, Field(ge=16, le=16384)] = None
@@ -38,7 +38,7 @@ class SourceSection(Section):
     rate_hz: Annotated[float | None, Field(gt=0, le=1000)] = None
     """frame rate, Hz; requested from a camera, playback rate of images and raw files"""
     pixel_format: str | None = None
-    """a camera's FourCC (MJPG, YUYV), or the format of a pipe: bgr24, rgb24, gray8, y4m, mjpeg"""
+    """a camera's FourCC (MJPG, YUYV), or the format of a pipe: bgr24, rgb24, gray8, yuv420, y4m, mjpeg"""
     loop: bool = False
     """repeat a file or folder"""
     realtime: bool = True

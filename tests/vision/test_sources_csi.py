@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
+from vision.sources import SourceError, SourceSettings, open_source
 from vision.sources.csi import CsiCamera, csi_cameras, parse_camera_list
 from vision.sources.v4l2 import FrameSize, PixelFormat, VideoDevice
 
@@ -52,3 +61,177 @@ def test_cameras_of_a_jetson_come_from_its_nodes(monkeypatch: pytest.MonkeyPatch
         ),
     ]
     assert csi_cameras(devices) == (CsiCamera(0, "imx219 9-0010", ((1920, 1080, 60.0),)),)
+
+
+# A stand-in for both programs: notes its arguments, then writes the pictures of `size` until it is ended.
+# A picture is grey: 16 + 10 per picture, in the limited range of yuv420.
+PROGRAM = """#!{python}
+import os, signal, sys, time
+arguments = sys.argv[1:]
+with open({notes!r}, "a") as notes:
+    print(os.getpid(), *sys.argv, file=notes)
+def end(*_):
+    open({notes!r} + ".ended", "a").write("SIGINT ")
+    sys.exit(0)
+signal.signal(signal.SIGINT, end)
+{body}
+"""
+WRITE = """
+print("GST_ARGUS: Creating output stream", file=sys.stderr if "--output" in arguments else sys.stdout)
+sys.stdout.flush()
+fd = 1 if "--output" in arguments else int(arguments[-1].removeprefix("fd="))
+for index in range({pictures}):
+    os.write(fd, bytes([16 + 10 * index]) * ({width} * {height}) + b"\\x80" * ({width} * {height} // 2))
+    time.sleep(0.01)
+{after}
+"""
+
+
+class Board:
+    """The programs of a board, in a folder that is the whole PATH."""
+
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.folder, self.notes = folder, folder / "notes"
+        monkeypatch.setenv("PATH", str(folder))
+
+    def install(self, name: str, body: str) -> None:
+        path = self.folder / name
+        path.write_text(PROGRAM.format(python=sys.executable, notes=str(self.notes), body=body))
+        path.chmod(0o755)
+
+    def writes(self, name: str, *, pictures: int = 20, after: str = "time.sleep(60)") -> None:
+        self.install(name, WRITE.format(width=128, height=64, pictures=pictures, after=after))
+
+    def started(self) -> list[list[str]]:
+        """Of each start: process id, program, arguments."""
+        return [line.split() for line in self.notes.read_text().splitlines()]
+
+
+@pytest.fixture
+def board(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Board:
+    return Board(tmp_path, monkeypatch)
+
+
+SIZE = SourceSettings(width=128, height=64, rate_hz=30.0, retry_min_s=0.01, open_timeout_s=20.0)
+
+
+def is_running(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def wait_until_ended(pid: int) -> bool:
+    deadline_s = time.monotonic() + 20.0
+    while is_running(pid) and time.monotonic() < deadline_s:
+        time.sleep(0.02)
+    return not is_running(pid)
+
+
+@pytest.mark.realtime
+@pytest.mark.parametrize("name", ["rpicam-vid", "gst-launch-1.0"])
+def test_pictures_of_the_board_program_are_delivered(board: Board, name: str) -> None:
+    board.writes(name)
+    with open_source("csi://1", SIZE) as source:
+        assert source.live
+        frame = source.read(20.0)
+        assert frame is not None
+        assert frame.image.shape == (64, 128, 3)
+        assert frame.media_s is None
+        values = np.unique(frame.image)
+        # The picture's luma in the full range: 0 for 16, and 255/219 more per step.
+        assert len(values) == 1
+        assert abs(int(values[0]) - 255 / 219 * 10 * frame.sequence) <= 1
+        ((pid, _, *arguments),) = board.started()
+        assert is_running(int(pid))
+    assert wait_until_ended(int(pid))
+    assert (board.folder / "notes.ended").read_text() == "SIGINT "
+    text = " ".join(arguments)
+    if name == "rpicam-vid":
+        for wanted in ("--camera 1", "--width 128", "--height 64", "--framerate 30", "--codec yuv420"):
+            assert wanted in text
+        assert {"--nopreview", "--flush"} <= set(arguments)
+        assert "--timeout 0" in text
+    else:
+        assert "nvarguscamerasrc sensor-id=1 ! video/x-raw(memory:NVMM)" in text
+        assert "width=128,height=64,framerate=30/1" in text
+        assert "format=I420 ! fdsink fd=" in text
+
+
+@pytest.mark.realtime
+def test_mjpeg_of_the_board_program_is_delivered(board: Board) -> None:
+    ok, jpeg = cv2.imencode(".jpg", np.full((50, 100, 3), 77, np.uint8))
+    assert ok
+    (board.folder / "picture.jpg").write_bytes(jpeg.tobytes())
+    board.install(
+        "rpicam-vid",
+        f"data = open({str(board.folder / 'picture.jpg')!r}, 'rb').read()\n"
+        "assert '--codec mjpeg' in ' '.join(arguments)\n"
+        "while True:\n    os.write(1, data)\n    time.sleep(0.01)",
+    )
+    settings = replace(SIZE, pixel_format="mjpeg", width=100, height=50)
+    with open_source("csi://0", settings) as source:
+        frame = source.read(20.0)
+    assert frame is not None
+    assert frame.image.shape == (50, 100, 3)
+    assert abs(float(frame.image.mean()) - 77) < 2
+
+
+@pytest.mark.realtime
+def test_program_that_ends_is_started_again(board: Board, caplog: pytest.LogCaptureFixture) -> None:
+    board.writes("rpicam-vid", pictures=3, after="sys.exit('ERROR: *** camera timed out ***')")
+    with open_source("csi://0", SIZE) as source:
+        deadline_s = time.monotonic() + 20.0
+        while source.statistics.reopened < 2 and time.monotonic() < deadline_s:
+            source.read(0.1)
+        assert source.statistics.reopened >= 2
+    assert len(board.started()) >= 3
+    assert "lost: rpicam-vid ended with code 1: ERROR: *** camera timed out ***" in caplog.text
+    assert all(wait_until_ended(int(pid)) for pid, *_ in board.started())
+
+
+@pytest.mark.realtime
+def test_program_without_a_camera_is_a_one_line_error(board: Board) -> None:
+    board.install("rpicam-vid", "sys.exit('[0:01] INFO Camera\\nERROR: *** no cameras available ***')")
+    with pytest.raises(SourceError, match=r"^csi://0: .*code 1: ERROR: \*\*\* no cameras available") as error:
+        open_source("csi://0", replace(SIZE, open_timeout_s=1.0))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.realtime
+def test_program_ends_when_its_parent_is_killed(board: Board) -> None:
+    board.writes("rpicam-vid", pictures=1)
+    code = (
+        "import os, signal\nfrom vision.sources import SourceSettings, open_source\n"
+        "source = open_source('csi://0', SourceSettings(width=128, height=64))\n"
+        "os.kill(os.getpid(), signal.SIGKILL)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}, check=False
+    )
+    assert done.returncode == -signal.SIGKILL
+    ((pid, *_),) = board.started()
+    assert wait_until_ended(int(pid))
+
+
+def test_board_without_program_names_the_packages(board: Board) -> None:
+    with pytest.raises(SourceError, match=r"rpicam-apps.*gstreamer1\.0-tools, nvidia-l4t-gstreamer"):
+        open_source("csi://0")
+
+
+@pytest.mark.parametrize(
+    ("uri", "settings", "message"),
+    [
+        ("csi://front", SourceSettings(), "csi://NUMBER"),
+        ("csi://0", SourceSettings(width=640), "both width and height"),
+        ("csi://0", SourceSettings(width=650, height=480), "multiple of 64"),
+        ("csi://0", SourceSettings(width=640, height=481), "even width and height"),
+        ("csi://0", SourceSettings(pixel_format="YUYV"), "yuv420 or mjpeg"),
+    ],
+)
+def test_settings_that_a_csi_camera_cannot_have_are_refused(
+    uri: str, settings: SourceSettings, message: str
+) -> None:
+    with pytest.raises(SourceError, match=message):
+        open_source(uri, settings)

@@ -80,6 +80,16 @@ def planes(colour: tuple[int, int, int], width: int, height: int, space: str, fu
     return bytes([y]) * (width * height) + bytes([u]) * chroma + bytes([v]) * chroma + alpha
 
 
+def test_raw_yuv420_is_decoded_by_bt601() -> None:
+    colour = (200, 90, 30)
+    parser = RawParser(6, 4, "yuv420")
+    data = planes(colour, 6, 4, "420", full=False)
+    (image,) = parser.push(data + data[:10])
+    assert image.shape == (4, 6, 3)
+    assert np.abs(image.astype(int) - colour).max() <= 3
+    assert "10 of 36 bytes" in parser.leftover()
+
+
 @settings(max_examples=60, deadline=None)
 @given(
     st.sampled_from(sorted(SUBSAMPLING)),

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from vision.sources.camera import CameraCapture, camera_device, check_camera
 from vision.sources.capture import Capture, LoopingCapture
+from vision.sources.csi import CsiCapture, check_csi_program, csi_settings, parse_csi_number
 from vision.sources.files import ImagesCapture, VideoFileCapture, images_in, is_image
 from vision.sources.latest import LatestSource
 from vision.sources.network import UdpStream, open_http, open_rtsp, without_password
@@ -34,6 +35,7 @@ def open_source(uri: str, settings: SourceSettings = SourceSettings()) -> Source
     | `-` | standard input: raw, YUV4MPEG2 or MJPEG | the newest; every one from a file or with `every_frame`
     | | `/run/camera.fifo` | a FIFO with the same | the newest; every one with `every_frame` |
     | `/dev/video0`, `0`, `/dev/v4l/by-id/…` | a camera | the newest |
+    | `csi://0` | a CSI camera of a Raspberry Pi or Jetson | the newest |
     | `rtsp://camera/stream` | RTSP | the newest |
     | `http://camera/video.mjpg` | Motion JPEG over HTTP, or what FFmpeg reads | the newest |
     | `udp://:5600`, `udp://239.1.2.3:5600` | MPEG-TS | the newest |
@@ -99,6 +101,13 @@ def _open_udp(uri: str, settings: SourceSettings) -> Source:
     return LatestSource(
         without_password(uri), stream.open_capture, settings, advice="is the sender sending here?"
     )
+
+
+@source("csi", "a CSI camera of a Raspberry Pi or Jetson")
+def _open_csi(uri: str, settings: SourceSettings) -> Source:
+    number, wanted = parse_csi_number(uri), csi_settings(uri, settings)
+    check_csi_program(uri)
+    return LatestSource(uri, lambda: CsiCapture(number, wanted), wanted)
 
 
 @source("shm", "shared memory of this host")

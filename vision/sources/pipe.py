@@ -15,7 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vision.sources.capture import Capture, CaptureError, RawFrame
-from vision.sources.source import RAW_PIXEL_FORMATS, EndOfStream, SourceError, SourceSettings
+from vision.sources.source import (
+    PIPE_PIXEL_FORMATS,
+    RAW_PIXEL_FORMATS,
+    EndOfStream,
+    SourceError,
+    SourceSettings,
+)
 from vision.sources.stream_formats import MAGIC, MjpegParser, RawParser, StreamError, StreamParser, Y4mParser
 
 _PIPE_BYTES = 1 << 20  # one frame of 640x480 in one read; the kernel's default is 64 KiB
@@ -146,12 +152,16 @@ def check_pipe_settings(name: str, settings: SourceSettings) -> None:
         SourceError: a camera's pixel format, or raw pixels without their size.
     """
     pixel_format = settings.pixel_format
-    if pixel_format is not None and pixel_format not in (*RAW_PIXEL_FORMATS, "y4m", "mjpeg"):
+    if pixel_format is not None and pixel_format not in PIPE_PIXEL_FORMATS:
         raise SourceError(
-            f"{name}: a pipe carries bgr24, rgb24, gray8, y4m or mjpeg, but pixel_format is {pixel_format!r}"
+            f"{name}: a pipe carries {', '.join(PIPE_PIXEL_FORMATS)}, but pixel_format is {pixel_format!r}"
         )
     if pixel_format in RAW_PIXEL_FORMATS and (settings.width is None or settings.height is None):
         raise SourceError(f"{name}: {pixel_format} needs width and height")
+    if pixel_format == "yuv420" and (settings.width or 0) % 2 + (settings.height or 0) % 2:
+        raise SourceError(
+            f"{name}: yuv420 needs an even width and height, got {settings.width}x{settings.height}"
+        )
 
 
 def _parser_from_settings(settings: SourceSettings) -> StreamParser | None:
@@ -173,5 +183,5 @@ def _parser_from_magic(head: bytes) -> StreamParser:
         return MjpegParser()
     raise StreamError(
         f"neither YUV4MPEG2 nor JPEG (it starts with {head[:8].hex(' ')}); for raw pixels give pixel_format "
-        f"bgr24, rgb24 or gray8 with width and height"
+        f"{', '.join(RAW_PIXEL_FORMATS)} with width and height"
     )

@@ -10,7 +10,7 @@ from typing import Self
 from vision.camera_model import CameraCalibration
 from vision.frame import Frame
 
-RAW_PIXEL_FORMATS = {"bgr24": 3, "rgb24": 3, "gray8": 1}
+RAW_PIXEL_FORMATS = {"bgr24": 3.0, "rgb24": 3.0, "gray8": 1.0, "yuv420": 1.5}
 """Raw pixel formats of a pipe → bytes per pixel."""
 
 PIPE_PIXEL_FORMATS = (*RAW_PIXEL_FORMATS, "y4m", "mjpeg")
@@ -35,9 +35,9 @@ class SourceSettings:
     Attributes:
         width, height: pixels. Requested from a camera; required for a raw pipe; unused otherwise.
         rate_hz: frames per second. Requested from a camera; the rate of images and raw files with `realtime`.
-        pixel_format: a camera's FOURCC (`MJPG`, `YUYV`), or the format of a pipe: `bgr24`, `rgb24`, `gray8`
-            (these need width and height), `y4m`, `mjpeg`. None: the driver's default, or y4m/mjpeg detected
-            from the pipe's first bytes.
+        pixel_format: a camera's FOURCC (`MJPG`, `YUYV`), or the format of a pipe: `bgr24`, `rgb24`, `gray8`,
+            `yuv420` (these need width and height), `y4m`, `mjpeg`. None: the driver's default, or y4m/mjpeg
+            detected from the pipe's first bytes. Of a CSI camera: `yuv420` (default) or `mjpeg`.
         loop: restart a file at its end.
         realtime: read a file at its own frame rate, newest frame wins: a file used as a camera. A pipe has
             its writer's rate.

@@ -70,7 +70,10 @@ class StreamParser(Protocol):
 
 
 class RawParser:
-    """Consecutive frames of `width` × `height` pixels in `bgr24`, `rgb24` or `gray8`."""
+    """Consecutive frames of `width` × `height` pixels in `bgr24`, `rgb24`, `gray8` or `yuv420`.
+
+    `yuv420` is I420: the planes Y, U and V without padding, BT.601 in the limited range.
+    """
 
     unreadable = 0
     rate_hz: float | None = None
@@ -79,8 +82,7 @@ class RawParser:
         self._width = width
         self._height = height
         self._format = pixel_format
-        self._channels = RAW_PIXEL_FORMATS[pixel_format]
-        self._frame_bytes = width * height * self._channels
+        self._frame_bytes = int(width * height * RAW_PIXEL_FORMATS[pixel_format])
         self._buffer = bytearray()
 
     def push(self, data: bytes) -> list[NDArray[np.uint8]]:
@@ -93,11 +95,15 @@ class RawParser:
         return images
 
     def _decode(self, data: bytearray) -> NDArray[np.uint8]:
-        pixels = np.frombuffer(data, np.uint8).reshape(self._height, self._width, self._channels)
+        pixels = np.frombuffer(data, np.uint8)
         if self._format == "bgr24":
-            return pixels  # the slice is a copy, so it is writable
-        code = cv2.COLOR_RGB2BGR if self._format == "rgb24" else cv2.COLOR_GRAY2BGR
-        return np.asarray(cv2.cvtColor(pixels, code), dtype=np.uint8)
+            return pixels.reshape(self._height, self._width, 3)  # the slice is a copy, so it is writable
+        code, shape = {
+            "rgb24": (cv2.COLOR_RGB2BGR, (self._height, self._width, 3)),
+            "gray8": (cv2.COLOR_GRAY2BGR, (self._height, self._width)),
+            "yuv420": (cv2.COLOR_YUV2BGR_I420, (self._height * 3 // 2, self._width)),
+        }[self._format]
+        return np.asarray(cv2.cvtColor(pixels.reshape(shape), code), dtype=np.uint8)
 
     def leftover(self) -> str:
         if not self._buffer:
