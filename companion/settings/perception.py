@@ -39,6 +39,16 @@ class SourceSection(Section):
     """frame rate, Hz; requested from a camera, playback rate of images and raw files"""
     pixel_format: str | None = None
     """a camera's FourCC (MJPG, YUYV), or the format of a pipe: bgr24, rgb24, gray8, yuv420, y4m, mjpeg"""
+    exposure_us: Annotated[float | None, Field(ge=1, le=1e7)] = None
+    """exposure time of a camera, microseconds; unset: automatic"""
+    gain: Annotated[float | None, Field(ge=0, le=1e6)] = None
+    """gain of a camera: a factor (csi://), the driver's unit (/dev/video0); unset: automatic"""
+    mirror: bool = False
+    """the source delivers a mirror image: exchange left and right, of picture and depth"""
+    rotate_deg: Annotated[int, Field(ge=0, le=270, multiple_of=90)] = 0
+    """rotate picture and depth clockwise, degrees; section camera describes the rotated picture"""
+    name: Annotated[str | None, Field(min_length=1, max_length=40)] = None
+    """the source's name in messages and preview; unset: its address"""
     loop: bool = False
     """repeat a file or folder"""
     realtime: bool = True

@@ -213,6 +213,31 @@ def test_open_failure_is_a_one_line_error(
     assert capfd.readouterr().err == ""  # no output of OpenCV or FFmpeg
 
 
+@pytest.mark.parametrize("uri", ["photo.png", "-", "rtsp://u:secret@cam/1", "udp://:5600", "shm://front"])
+@pytest.mark.parametrize("key", ["exposure_us", "gain"])
+def test_exposure_of_pictures_already_taken_is_refused(uri: str, key: str) -> None:
+    with pytest.raises(SourceError, match=rf"source\.{key} is for cameras") as error:
+        open_source(uri, SourceSettings(**{key: 100.0}))  # type: ignore[arg-type]
+    assert "secret" not in str(error.value)
+
+
+def test_rotated_file_is_delivered_rotated_under_its_name(tmp_path: Path) -> None:
+    path = tmp_path / "photo.png"
+    image = np.zeros((2, 3, 3), np.uint8)
+    image[0, 0] = 200
+    cv2.imwrite(str(path), image)
+    shared: list[tuple[int, int]] = []
+    wanted = SourceSettings(
+        rotate_deg=90, name="front", on_frame=lambda frame: shared.append((frame.width, frame.height))
+    )
+    with open_source(str(path), wanted) as source:
+        assert source.uri == f"front ({path})"
+        frame = source.read()
+    assert frame is not None
+    assert frame.image[:, :, 0].tolist() == [[0, 200], [0, 0], [0, 0]]
+    assert shared == [(2, 3)]
+
+
 @pytest.mark.parametrize(
     ("values", "words"),
     [

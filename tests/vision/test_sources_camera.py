@@ -159,6 +159,13 @@ def test_busy_camera_names_the_program_that_holds_it(
             open_source("0", SourceSettings(open_timeout_s=0.3))
 
 
+def test_camera_without_the_control_is_refused(device: Path) -> None:
+    """The file in the camera's place has no controls at all."""
+    with pytest.raises(SourceError, match=r"video0: this camera has no control for source\.gain; remove it"):
+        open_source("0", SourceSettings(gain=3.0))
+    assert all(camera.released for camera in FakeCamera.opened)
+
+
 def test_pipe_pixel_format_is_rejected_for_a_camera(device: Path) -> None:
     with pytest.raises(SourceError, match="FOURCC"):
         open_source("0", SourceSettings(pixel_format="bgr24", width=4, height=4))

@@ -215,6 +215,17 @@ def test_program_ends_when_its_parent_is_killed(board: Board) -> None:
     assert wait_until_ended(int(pid))
 
 
+@pytest.mark.realtime
+def test_exposure_and_gain_are_arguments_of_the_program(board: Board) -> None:
+    wanted = replace(SIZE, exposure_us=8333.4, gain=2.5)
+    board.writes("gst-launch-1.0")
+    open_source("csi://0", wanted).close()
+    assert "exposuretimerange=8333400 8333400 gainrange=2.5 2.5" in " ".join(board.started()[0])
+    board.writes("rpicam-vid")
+    open_source("csi://0", wanted).close()
+    assert "--shutter 8333 --gain 2.5" in " ".join(board.started()[1])
+
+
 def test_board_without_program_names_the_packages(board: Board) -> None:
     with pytest.raises(SourceError, match=r"rpicam-apps.*gstreamer1\.0-tools, nvidia-l4t-gstreamer"):
         open_source("csi://0")

@@ -16,7 +16,15 @@ from typing import Any
 
 import pytest
 
-from vision.sources.v4l2 import FrameSize, PixelFormat, VideoDevice, holders, video_devices
+from vision.sources.v4l2 import (
+    ControlError,
+    FrameSize,
+    PixelFormat,
+    VideoDevice,
+    holders,
+    set_exposure,
+    video_devices,
+)
 
 U32, CHAR = ctypes.c_uint32, ctypes.c_char
 NODES = ("video0", "video1", "video2", "video10")
@@ -188,3 +196,72 @@ def test_holder_of_a_device_is_named(dev: Path) -> None:
         other.communicate(timeout=20)
     assert holders(dev / "video0") == ()
     assert holders(dev / "video7") == ()
+
+
+class QueryCtrl(ctypes.Structure):
+    _fields_ = [("id", U32), ("type", U32), ("name", CHAR * 32), ("minimum", ctypes.c_int32),
+                ("maximum", ctypes.c_int32), ("step", ctypes.c_int32), ("default", ctypes.c_int32),
+                ("flags", U32), ("reserved", U32 * 2)]  # fmt: skip
+
+
+class Control(ctypes.Structure):
+    _fields_ = [("id", U32), ("value", ctypes.c_int32)]
+
+
+class FakeControls:
+    """A driver's controls: id → minimum, maximum, flags. `made` are the values set, in order."""
+
+    def __init__(self, controls: dict[int, tuple[int, int, int]]) -> None:
+        self._controls = controls
+        self.made: list[tuple[int, int]] = []
+
+    def __call__(self, _descriptor: int, number: int, buffer: bytearray) -> int:
+        if number == request(28, Control):
+            control = Control.from_buffer(buffer)
+            if self._controls[control.id][2]:
+                raise OSError(errno.EACCES, "Permission denied")
+            self.made.append((control.id, control.value))
+            return 0
+        assert number == request(36, QueryCtrl)
+        answer = QueryCtrl.from_buffer(buffer)
+        if answer.id not in self._controls:
+            raise OSError(errno.EINVAL, "Invalid argument")
+        answer.minimum, answer.maximum, answer.flags = self._controls[answer.id]
+        return 0
+
+
+EXPOSURE_AUTO, EXPOSURE, AUTOGAIN, GAIN = 0x9A0901, 0x9A0902, 0x980912, 0x980913
+WEBCAM = {EXPOSURE_AUTO: (0, 3, 0), EXPOSURE: (3, 2047, 0), GAIN: (0, 100, 0)}
+
+
+def test_exposure_is_set_after_the_automatic_is_off(dev: Path) -> None:
+    controls = FakeControls(WEBCAM)
+    set_exposure(dev / "video0", 8333.0, None, controls)
+    assert controls.made == [(EXPOSURE_AUTO, 1), (EXPOSURE, 83)]
+    controls = FakeControls({**WEBCAM, AUTOGAIN: (0, 1, 0)})
+    set_exposure(dev / "video0", None, 40.0, controls)
+    assert controls.made == [(AUTOGAIN, 0), (GAIN, 40)]
+    controls = FakeControls({})
+    set_exposure(dev / "video0", None, None, controls)
+    assert controls.made == []
+
+
+@pytest.mark.parametrize(
+    ("controls", "exposure_us", "gain", "message"),
+    [
+        (WEBCAM, 100.0, None, r"source.exposure_us is 100; this camera has 300 to 204700"),
+        (WEBCAM, None, 101.0, r"source.gain is 101; this camera has 0 to 100"),
+        ({}, 8000.0, None, r"no control for source.exposure_us"),
+        ({GAIN: (0, 100, 4)}, None, 5.0, r"no control for source.gain"),
+        ({GAIN: (0, 100, 0x10)}, None, 5.0, r"refuses source.gain 5: Permission denied"),
+    ],
+)
+def test_control_that_a_camera_cannot_set_is_refused(
+    dev: Path,
+    controls: dict[int, tuple[int, int, int]],
+    exposure_us: float | None,
+    gain: float | None,
+    message: str,
+) -> None:
+    with pytest.raises(ControlError, match=message):
+        set_exposure(dev / "video0", exposure_us, gain, FakeControls(controls))

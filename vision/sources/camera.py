@@ -20,7 +20,7 @@ import cv2
 from vision.sources.capture import Capture, CaptureError, RawFrame
 from vision.sources.opencv import quiet_opencv, read_capture
 from vision.sources.source import PIPE_PIXEL_FORMATS, SourceError, SourceSettings
-from vision.sources.v4l2 import fourcc_text, holders
+from vision.sources.v4l2 import ControlError, fourcc_text, holders, set_exposure
 
 logger = logging.getLogger(__name__)
 
@@ -84,6 +84,12 @@ class CameraCapture(Capture):
             self._capture.release()
             raise CaptureError(_unopened(device))
         self._configure(settings)
+        try:
+            # After the format: some drivers set their controls to the defaults with it.
+            set_exposure(device, settings.exposure_us, settings.gain)
+        except (ControlError, OSError) as error:
+            self._capture.release()
+            raise SourceError(f"{device}: {error}") from error
 
     def _configure(self, settings: SourceSettings) -> None:
         capture = self._capture

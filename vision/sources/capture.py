@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from vision.camera_model import CameraCalibration
 from vision.frame import Frame
-from vision.sources.source import EndOfStream
+from vision.orientation import Orientation
+from vision.sources.source import EndOfStream, SourceSettings
 
 
 class CaptureError(Exception):
@@ -126,3 +127,41 @@ class LoopingCapture(Capture):
 
     def close(self) -> None:
         self._capture.close()
+
+
+class OrientedCapture(Capture):
+    """A capture whose pictures, depth and calibration are mirrored and rotated."""
+
+    def __init__(self, capture: Capture, orientation: Orientation) -> None:
+        self._capture = capture
+        self._orientation = orientation
+        self.total_frames = capture.total_frames
+        self.silence_is_loss = capture.silence_is_loss
+        if capture.calibration is not None:
+            self.calibration = orientation.calibration(capture.calibration)
+
+    def read(self, timeout_s: float) -> RawFrame | None:
+        raw = self._capture.read(timeout_s)
+        self.unreadable = self._capture.unreadable
+        self.interval_s = self._capture.interval_s
+        if raw is None:
+            return None
+        depth_m = None if raw.depth_m is None else self._orientation.pixels(raw.depth_m)
+        return replace(raw, image=self._orientation.pixels(raw.image), depth_m=depth_m)
+
+    def close(self) -> None:
+        self._capture.close()
+
+    def interrupt(self) -> None:
+        self._capture.interrupt()
+
+
+def adapted(open_capture: OpenCapture, settings: SourceSettings) -> OpenCapture:
+    """Apply the settings that hold for every kind of source: its orientation."""
+    orientation = settings.orientation
+    return (lambda: OrientedCapture(open_capture(), orientation)) if orientation else open_capture
+
+
+def label(uri: str, settings: SourceSettings) -> str:
+    """A source in messages: its address, after its name if it has one."""
+    return uri if settings.name is None else f"{settings.name} ({uri})"

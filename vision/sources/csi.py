@@ -231,14 +231,22 @@ def check_csi_program(uri: str) -> None:
 def _command(number: int, settings: SourceSettings, descriptor: int) -> list[str]:
     """The program and its arguments; it writes to standard output (rpicam-vid) or to `descriptor`."""
     width, height, rate_hz = settings.width, settings.height, settings.rate_hz or DEFAULT_RATE_HZ
-    mjpeg = settings.pixel_format == "mjpeg"
+    mjpeg, exposure_us, gain = settings.pixel_format == "mjpeg", settings.exposure_us, settings.gain
     if shutil.which("rpicam-vid"):
         words = f"rpicam-vid --camera {number} --timeout 0 --nopreview --flush --output - --width {width} "
         words += f"--height {height} --framerate {rate_hz:g} --codec {'mjpeg' if mjpeg else 'yuv420'}"
+        if exposure_us is not None:
+            words += f" --shutter {exposure_us:.0f}"
+        if gain is not None:
+            words += f" --gain {gain:g}"
         return words.split()
     rate = Fraction(rate_hz).limit_denominator(1001)
-    words = f"gst-launch-1.0 -q nvarguscamerasrc sensor-id={number} ! "
-    words += f"video/x-raw(memory:NVMM),format=NV12,width={width},height={height},"
+    camera = ["gst-launch-1.0", "-q", "nvarguscamerasrc", f"sensor-id={number}"]
+    if exposure_us is not None:  # a range of nanoseconds
+        camera.append(f"exposuretimerange={exposure_us * 1000:.0f} {exposure_us * 1000:.0f}")
+    if gain is not None:
+        camera.append(f"gainrange={gain:g} {gain:g}")
+    words = f"! video/x-raw(memory:NVMM),format=NV12,width={width},height={height},"
     words += f"framerate={rate.numerator}/{rate.denominator} ! "
     words += "nvjpegenc" if mjpeg else "nvvidconv ! video/x-raw,format=I420"
-    return [*words.split(), "!", "fdsink", f"fd={descriptor}"]
+    return [*camera, *words.split(), "!", "fdsink", f"fd={descriptor}"]

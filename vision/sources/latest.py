@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from vision.frame import Frame
-from vision.sources.capture import Capture, CaptureError, OpenCapture, RawFrame
+from vision.sources.capture import Capture, CaptureError, OpenCapture, RawFrame, adapted, label
 from vision.sources.source import (
     CameraChangedError,
     EndOfStream,
@@ -55,8 +55,8 @@ class LatestSource(Source):
         advice: str = "",
         on_close: Callable[[], None] | None = None,
     ) -> None:
-        self.uri = uri
-        self._open_capture = open_capture
+        self.uri = label(uri, settings)
+        self._open_capture = adapted(open_capture, settings)
         self._settings = settings
         self._reopen = reopen
         self._paced = paced

@@ -22,6 +22,8 @@ from vision.sources.shared import SharedFrameCapture, check_name
 from vision.sources.source import RAW_PIXEL_FORMATS, Source, SourceError, SourceSettings
 
 _IMAGE_RATE_HZ = 10.0  # of images used as a camera without rate_hz
+# Their pictures are already taken when they arrive. A plug-in's scheme decides itself.
+_WITHOUT_EXPOSURE = ("file", "rtsp", "rtsps", "http", "https", "udp", "shm")
 
 
 def open_source(uri: str, settings: SourceSettings = SourceSettings()) -> Source:  # noqa: B008 - frozen
@@ -54,11 +56,14 @@ def open_source(uri: str, settings: SourceSettings = SourceSettings()) -> Source
     """
     quiet_opencv()
     if uri == "-":
+        _refuse_exposure("standard input", settings)
         return _open_standard_input(settings)
     if (device := camera_device(uri)) is not None:
         check_camera(device, settings)
         return LatestSource(str(device), lambda: CameraCapture(device, settings), settings)
     scheme, separator, _ = uri.partition("://")
+    if not separator or scheme in _WITHOUT_EXPOSURE:
+        _refuse_exposure(without_password(uri), settings)
     if not separator:
         return _open_path(Path(uri).expanduser(), settings)
     if (opener := SOURCES.get(scheme)) is None:
@@ -68,6 +73,15 @@ def open_source(uri: str, settings: SourceSettings = SourceSettings()) -> Source
             "once its module is loaded (plugins.modules, --plugins-modules)"
         )
     return opener(uri, settings)
+
+
+def _refuse_exposure(name: str, settings: SourceSettings) -> None:
+    for key in ("exposure_us", "gain"):
+        if getattr(settings, key) is not None:
+            raise SourceError(
+                f"{name}: source.{key} is for cameras (/dev/video0, csi://0); set it in what makes these "
+                f"pictures, and remove source.{key}"
+            )
 
 
 @source("file", "a file or folder")

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 
 from vision.frame import Frame
-from vision.sources.capture import CaptureError, OpenCapture, RawFrame
+from vision.sources.capture import CaptureError, OpenCapture, RawFrame, adapted, label
 from vision.sources.source import EndOfStream, Source, SourceError, SourceSettings, SourceStatistics
 
 logger = logging.getLogger(__name__)
@@ -26,13 +26,13 @@ class SequentialSource(Source):
         *,
         on_close: Callable[[], None] | None = None,
     ) -> None:
-        self.uri = uri
+        self.uri = label(uri, settings)
         self._on_close = on_close
         self._on_frame = settings.on_frame
         try:
-            self._capture = open_capture()
+            self._capture = adapted(open_capture, settings)()
         except CaptureError as lost:
-            raise SourceError(f"{uri}: {lost}") from lost
+            raise SourceError(f"{self.uri}: {lost}") from lost
         self._sequence = 0
         self._delivered = 0
         self._dropped = 0
@@ -40,6 +40,7 @@ class SequentialSource(Source):
         self._closed = False
         self._ended = False
         self.total_frames = self._capture.total_frames
+        self.calibration = self._capture.calibration
         try:
             self._first: RawFrame | None = self._read_first(settings.open_timeout_s)
         except BaseException:

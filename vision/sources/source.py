@@ -9,6 +9,7 @@ from typing import Self
 
 from vision.camera_model import CameraCalibration
 from vision.frame import Frame
+from vision.orientation import Orientation
 
 RAW_PIXEL_FORMATS = {"bgr24": 3.0, "rgb24": 3.0, "gray8": 1.0, "yuv420": 1.5}
 """Raw pixel formats of a pipe → bytes per pixel."""
@@ -38,6 +39,13 @@ class SourceSettings:
         pixel_format: a camera's FOURCC (`MJPG`, `YUYV`), or the format of a pipe: `bgr24`, `rgb24`, `gray8`,
             `yuv420` (these need width and height), `y4m`, `mjpeg`. None: the driver's default, or y4m/mjpeg
             detected from the pipe's first bytes. Of a CSI camera: `yuv420` (default) or `mjpeg`.
+        exposure_us: exposure time of a camera, microseconds; None: automatic.
+        gain: of a camera; of a CSI camera a factor, of a V4L2 camera in the driver's unit; None: automatic.
+            Sources without exposure time or gain refuse them.
+        rotate_deg, mirror: mirror the picture left to right, then rotate it clockwise by 0, 90, 180 or 270
+            degrees; depth and the source's own calibration as well, see `vision.orientation`. `width` and
+            `height` are those before it.
+        name: for people, in messages before the address.
         loop: restart a file at its end.
         realtime: read a file at its own frame rate, newest frame wins: a file used as a camera. A pipe has
             its writer's rate.
@@ -57,6 +65,11 @@ class SourceSettings:
     height: int | None = None
     rate_hz: float | None = None
     pixel_format: str | None = None
+    exposure_us: float | None = None
+    gain: float | None = None
+    rotate_deg: int = 0
+    mirror: bool = False
+    name: str | None = None
     loop: bool = False
     realtime: bool = False
     every_frame: bool | None = None
@@ -73,6 +86,11 @@ class SourceSettings:
                 raise ValueError(f"{name} must be 1..32768 pixels, got {value}")
         if self.rate_hz is not None and not 0.0 < self.rate_hz <= 1000.0:
             raise ValueError(f"rate_hz must be above 0 and at most 1000, got {self.rate_hz}")
+        if self.exposure_us is not None and not 1.0 <= self.exposure_us <= 1e7:
+            raise ValueError(f"exposure_us must be 1..10000000 us, got {self.exposure_us}")
+        if self.gain is not None and not 0.0 <= self.gain <= 1e6:
+            raise ValueError(f"gain must be 0..1000000, got {self.gain}")
+        Orientation(self.rotate_deg)
         for name in ("open_timeout_s", "read_timeout_s", "retry_min_s"):
             if not 0.0 < getattr(self, name) <= 3600.0:
                 raise ValueError(f"{name} must be above 0 and at most 3600 s, got {getattr(self, name)}")
@@ -87,6 +105,11 @@ class SourceSettings:
                 f"pixel_format must be a camera's FOURCC (MJPG, YUYV) or one of "
                 f"{', '.join(PIPE_PIXEL_FORMATS)}, got {self.pixel_format!r}"
             )
+
+    @property
+    def orientation(self) -> Orientation:
+        """What is done with each picture; false if nothing."""
+        return Orientation(self.rotate_deg, self.mirror)
 
 
 @dataclass(frozen=True, slots=True)

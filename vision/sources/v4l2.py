@@ -1,4 +1,4 @@
-"""Video4Linux devices by their ioctls: what they are, what they offer, and who holds them.
+"""Video4Linux devices by their ioctls: what they are, what they offer, who holds them, exposure and gain.
 
 Structures and numbers are those of linux/videodev2.h. Not tested with a real device: the tests inject the
 ioctl function and answer with the kernel's structures.
@@ -15,20 +15,31 @@ from pathlib import Path
 from typing import Any
 
 _QUERYCAP, _ENUM_FMT, _ENUM_FRAMESIZES, _ENUM_FRAMEINTERVALS = 0x80685600, 0xC0405602, 0xC02C564A, 0xC034564B
+_QUERYCTRL, _S_CTRL = 0xC0445624, 0xC008561C
 _CAPABILITY = struct.Struct("=16s32s32s6I")
 _FMTDESC = struct.Struct("=3I32s2I12x")
 _FRMSIZEENUM = struct.Struct("=9I8x")
 _FRMIVALENUM = struct.Struct("=11I8x")
+_QUERYCTRL_STRUCT = struct.Struct("=2I32s4iI8x")
+_CONTROL = struct.Struct("=Ii")
 
 _CAP_DEVICE_CAPS = 0x80000000
 _CAP_VIDEO_CAPTURE, _CAP_VIDEO_CAPTURE_MPLANE, _CAP_M2M, _CAP_META_CAPTURE = 0x1, 0x1000, 0xC000, 0x800000
 _BUF_TYPE_VIDEO_CAPTURE, _BUF_TYPE_VIDEO_CAPTURE_MPLANE = 1, 9
 _DISCRETE = 1
+_CTRL_DISABLED, _CTRL_READ_ONLY = 0x1, 0x4
+_CID_EXPOSURE_AUTO, _CID_EXPOSURE_ABSOLUTE, _EXPOSURE_MANUAL = 0x009A0901, 0x009A0902, 1
+_CID_AUTOGAIN, _CID_GAIN, _CID_ANALOGUE_GAIN = 0x00980912, 0x00980913, 0x009E0903
+_EXPOSURE_UNIT_US = 100.0  # of V4L2_CID_EXPOSURE_ABSOLUTE
 
 _MOST = 256  # entries of an enumeration: a driver that never ends it must not block us
 
 Ioctl = Callable[[int, int, bytearray], Any]
 """`fcntl.ioctl`, which changes the buffer; raises OSError."""
+
+
+class ControlError(Exception):
+    """A control cannot be set. The text says why."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,6 +183,66 @@ def _rates_hz(descriptor: int, code: int, width: int, height: int, ioctl: Ioctl)
         if kind != _DISCRETE:
             break
     return tuple(sorted(set(rates), reverse=True))
+
+
+def set_exposure(
+    device: Path, exposure_us: float | None, gain: float | None, ioctl: Ioctl = fcntl.ioctl
+) -> None:
+    """Set a camera's exposure time, microseconds, and gain, in the driver's unit; None leaves it as it is.
+
+    The automatic control of what is set is switched off, where the camera has one.
+
+    Raises:
+        ControlError: the camera has no such control, its range does not contain the value, or the driver
+            refuses.
+    """
+    if exposure_us is None and gain is None:
+        return
+    descriptor = os.open(device, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        if exposure_us is not None:
+            _switch_off(descriptor, _CID_EXPOSURE_AUTO, _EXPOSURE_MANUAL, ioctl)
+            _set("exposure_us", descriptor, (_CID_EXPOSURE_ABSOLUTE,), exposure_us, _EXPOSURE_UNIT_US, ioctl)
+        if gain is not None:
+            _switch_off(descriptor, _CID_AUTOGAIN, 0, ioctl)
+            _set("gain", descriptor, (_CID_GAIN, _CID_ANALOGUE_GAIN), gain, 1.0, ioctl)
+    finally:
+        os.close(descriptor)
+
+
+def _switch_off(descriptor: int, automatic: int, value: int, ioctl: Ioctl) -> None:
+    if _control_range(descriptor, automatic, ioctl) is not None:
+        ioctl(descriptor, _S_CTRL, bytearray(_CONTROL.pack(automatic, value)))
+
+
+def _set(
+    name: str, descriptor: int, controls: tuple[int, ...], value: float, unit: float, ioctl: Ioctl
+) -> None:
+    """Set the first of `controls` that the camera has to `value`, of which one step is `unit`."""
+    for control in controls:
+        if (limits := _control_range(descriptor, control, ioctl)) is None:
+            continue
+        least, most = (limit * unit for limit in limits)
+        if not least <= value <= most:
+            raise ControlError(f"source.{name} is {value:g}; this camera has {least:g} to {most:g}")
+        try:
+            ioctl(descriptor, _S_CTRL, bytearray(_CONTROL.pack(control, round(value / unit))))
+        except OSError as error:
+            raise ControlError(f"the camera refuses source.{name} {value:g}: {error.strerror}") from error
+        return
+    raise ControlError(f"this camera has no control for source.{name}; remove it")
+
+
+def _control_range(descriptor: int, control: int, ioctl: Ioctl) -> tuple[int, int] | None:
+    """The smallest and largest value of a control; None if the camera does not have it."""
+    buffer = bytearray(_QUERYCTRL_STRUCT.size)
+    struct.pack_into("=I", buffer, 0, control)
+    try:
+        ioctl(descriptor, _QUERYCTRL, buffer)
+    except OSError:
+        return None
+    _, _, _, least, most, _, _, flags = _QUERYCTRL_STRUCT.unpack(buffer)
+    return None if flags & (_CTRL_DISABLED | _CTRL_READ_ONLY) else (least, most)
 
 
 def holders(device: Path, proc: Path = Path("/proc")) -> tuple[str, ...]:

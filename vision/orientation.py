@@ -1,0 +1,92 @@
+"""Mirrors and rotates what a camera delivers: picture, depth, lens model and mount.
+
+The picture is mirrored left to right first, and then rotated clockwise. Both only move pixels:
+
+* Lens: focal lengths and principal point move with the pixels; by 90 or 270 degrees x and y are exchanged.
+  The radial distortion stays, the tangential one (p1, p2) rotates as a vector does.
+* Mount: the position stays. The optical frame turns about its own axis z, which is the mount's innermost
+  angle: only roll changes, by `-rotate_deg`. Mirroring changes nothing: it undoes the mirror image that the
+  source delivers (a mirror in front of the lens, a webcam's selfie picture), of which no mount exists.
+
+So a camera that is fixed upside down, with `rotate_deg=180`, has a roll of 0. What a person calibrates or
+measures is that of the delivered picture; only a calibration that the source brings is converted here.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vision.camera_model import CameraCalibration, CameraModel, CameraMount
+
+ROTATIONS_DEG = (0, 90, 180, 270)
+_ROTATE_CODES = {90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_COUNTERCLOCKWISE}
+
+_NONE = (0.0, 0.0, 0.0, 0.0)
+
+_Number = TypeVar("_Number", np.uint8, np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class Orientation:
+    """Mirror left to right, then rotate by `rotate_deg` (0, 90, 180, 270) clockwise."""
+
+    rotate_deg: int = 0
+    mirror: bool = False
+
+    def __post_init__(self) -> None:
+        if self.rotate_deg not in ROTATIONS_DEG:
+            raise ValueError(f"rotate_deg must be 0, 90, 180 or 270, got {self.rotate_deg}")
+
+    def __bool__(self) -> bool:
+        """Whether it changes anything."""
+        return self.mirror or self.rotate_deg != 0
+
+    def pixels(self, picture: NDArray[_Number]) -> NDArray[_Number]:
+        """A picture (height, width, 3) or depth (height, width); 90 and 270 degrees exchange its sides."""
+        if self.mirror:
+            picture = cv2.flip(picture, 1).astype(picture.dtype, copy=False)
+        if self.rotate_deg:
+            picture = cv2.rotate(picture, _ROTATE_CODES[self.rotate_deg]).astype(picture.dtype, copy=False)
+        return picture
+
+    def model(self, model: CameraModel) -> CameraModel:
+        """The lens of the picture that `pixels` returns."""
+        if self.mirror:
+            k1, k2, p1, p2, *rest = model.distortion or _NONE
+            model = replace(
+                model, cx=model.width - 1 - model.cx, distortion=_distortion(k1, k2, p1, -p2, *rest)
+            )
+        for _ in range(self.rotate_deg // 90):
+            # Clockwise by 90 degrees: the new x is the old -y, the new y the old x.
+            k1, k2, p1, p2, *rest = model.distortion or _NONE
+            model = replace(
+                model,
+                width=model.height,
+                height=model.width,
+                fx=model.fy,
+                fy=model.fx,
+                cx=model.height - 1 - model.cy,
+                cy=model.cx,
+                distortion=_distortion(k1, k2, p2, -p1, *rest),
+            )
+        return model
+
+    def mount(self, mount: CameraMount) -> CameraMount:
+        """The mount of the picture that `pixels` returns."""
+        roll_rad = mount.roll_rad - math.radians(self.rotate_deg)
+        return replace(mount, roll_rad=math.remainder(roll_rad, math.tau))
+
+    def calibration(self, calibration: CameraCalibration) -> CameraCalibration:
+        """Lens and mount of the picture that `pixels` returns."""
+        mount = None if calibration.mount is None else self.mount(calibration.mount)
+        return CameraCalibration(self.model(calibration.model), mount)
+
+
+def _distortion(*coefficients: float) -> tuple[float, ...]:
+    return coefficients if any(coefficients) else ()
