@@ -28,6 +28,7 @@ FLOORS = {
     "sim_session": 8,
     "demo": 9,
     "play": 9,
+    "preview": 9,
     "detect": 9,
     "evaluate": 9,
     "flight_log": 9,

@@ -1,15 +1,24 @@
-"""The command line of `companion cameras`."""
+"""The command lines of `companion cameras` and `companion preview`."""
 
 from __future__ import annotations
 
+import functools
 import json
+import logging
+import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from companion.cli.flags import plain_errors
+from companion.settings import Settings
+
 if TYPE_CHECKING:
+    from vision.sources import Source
     from vision.sources.csi import CsiCamera
     from vision.sources.v4l2 import FrameSize, VideoDevice
 
@@ -61,3 +70,42 @@ def _size_text(size: FrameSize) -> str:
         text = f"{size.smallest[0]}x{size.smallest[1]} to {text}"
     rates = ", ".join(f"{rate_hz:g}" for rate_hz in size.rates_hz)
     return f"{text}  {rates} Hz" if rates else text
+
+
+SOURCE_HELP = "/dev/video0, csi://0, file, folder, FIFO, - (standard input) or URL. Default: source.uri."
+
+
+def preview(
+    settings: Settings,
+    source: Annotated[str | None, typer.Argument(help=SOURCE_HELP)] = None,
+    save: Annotated[Path | None, typer.Option(help="Folder for a picture with each line.")] = None,
+    grey: Annotated[bool, typer.Option("--grey", help="Pictures in grey, a third as wide and high.")] = False,
+    period: Annotated[
+        float, typer.Option(min=0, help="Seconds between lines and pictures; 0: every frame.")
+    ] = 1.0,
+    limit: Annotated[int | None, typer.Option(min=1, help="Maximum number of lines.")] = None,
+) -> None:
+    """Show what a source delivers. Prints size, measured rate and stamp once a second. Ends on Ctrl-C."""
+    from companion.bus import topics
+    from companion.preview import PreviewOptions, preview_source
+
+    topic = topics.IMAGE.key(settings.vehicle.name)
+    with opened(settings, source) as frames:
+        options = PreviewOptions(topic, save, grey, period, limit)
+        preview_source(frames, options, functools.partial(print, flush=True))
+
+
+@contextmanager
+def opened(settings: Settings, uri: str | None) -> Iterator[Source]:
+    """Open a source with the settings of section `source`; errors are one line, Ctrl-C ends."""
+    from companion.plugins import PluginError, load_plugins
+    from vision.sources import SourceError, open_source
+
+    logging.basicConfig(level=logging.WARNING, format="companion: %(message)s", stream=sys.stderr)
+    with plain_errors(PluginError, SourceError, OSError):
+        load_plugins(settings.plugins.modules)
+        try:
+            with open_source(uri or settings.source.uri, settings.source.opening()) as source:
+                yield source
+        except KeyboardInterrupt:
+            raise typer.Exit from None

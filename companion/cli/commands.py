@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from companion.cli.bench import bench
-from companion.cli.cameras import cameras
+from companion.cli.cameras import cameras, preview
 from companion.cli.cloud import CLOUD_SETTINGS, cloud
 from companion.cli.dashboard import dashboard
 from companion.cli.evaluate import evaluate
@@ -51,6 +51,7 @@ ORDER = (
     "send",
     "echo",
     "cameras",
+    "preview",
     "dashboard",
     "commands",
     "topics",
@@ -76,6 +77,7 @@ app.add_typer(models, name="models")
 app.command()(evaluate)
 app.command()(topics)
 app.command()(cameras)
+settings_command(app, "source", "vehicle.name", "plugins")(preview)
 settings_command(app, *CLIENT_SETTINGS, "plugins", "detector")(mission)
 settings_command(app, *CLOUD_SETTINGS)(cloud)
 settings_command(app)(play)
@@ -548,6 +550,6 @@ app.registered_commands.sort(key=_help_position)
 def main() -> None:
     """Run the console script."""
     # End quietly when the reader of a pipe has gone (`| head`).
-    if sys.argv[1:2] in (["detect"], ["echo"]):
+    if sys.argv[1:2] in (["detect"], ["echo"], ["preview"]):
         signal.signal(signal.SIGPIPE, signal.SIG_DFL)
     app()
