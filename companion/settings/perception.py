@@ -49,6 +49,10 @@ class SourceSection(Section):
     """rotate picture and depth clockwise, degrees; section camera describes the rotated picture"""
     name: Annotated[str | None, Field(min_length=1, max_length=40)] = None
     """the source's name in messages and preview; unset: its address"""
+    depth: Annotated[str | None, Field(min_length=1)] = None
+    """second source, the depth of the first one's pixels: 16-bit PNG, TIFF, NPY, gray16 pipe, shm://NAME"""
+    depth_scale: Annotated[float | None, Field(gt=0, le=1000)] = None
+    """metres per unit of depth; unset: 0.001 for 16-bit integers, 1 for floats"""
     loop: bool = False
     """repeat a file or folder"""
     realtime: bool = True

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from vision.camera_model import CameraCalibration
 from vision.frame import Frame
 from vision.orientation import Orientation
-from vision.sources.source import EndOfStream, SourceSettings
+from vision.sources.depth_pictures import to_metres
+from vision.sources.source import EndOfStream, SourceError, SourceSettings
 
 
 class CaptureError(Exception):
@@ -156,10 +157,48 @@ class OrientedCapture(Capture):
         self._capture.interrupt()
 
 
+class DepthCapture(Capture):
+    """A capture of depth pictures (uint16 or float), which it converts to metres; the image is black.
+
+    One that has depth in metres beside its image (shared memory) is passed on.
+    """
+
+    def __init__(self, capture: Capture, scale_m: float | None) -> None:
+        self._capture = capture
+        self._scale_m = scale_m
+        self.total_frames = capture.total_frames
+        self.silence_is_loss = capture.silence_is_loss
+        self.calibration = capture.calibration
+
+    def read(self, timeout_s: float) -> RawFrame | None:
+        raw = self._capture.read(timeout_s)
+        self.unreadable = self._capture.unreadable
+        self.interval_s = self._capture.interval_s
+        if raw is None or raw.depth_m is not None:
+            return raw
+        if raw.image.ndim != 2:
+            raise SourceError("it delivers colour pictures, not depth")
+        depth_m = to_metres(raw.image, self._scale_m)
+        return replace(raw, image=np.zeros((*depth_m.shape, 3), np.uint8), depth_m=depth_m)
+
+    def close(self) -> None:
+        self._capture.close()
+
+    def interrupt(self) -> None:
+        self._capture.interrupt()
+
+
 def adapted(open_capture: OpenCapture, settings: SourceSettings) -> OpenCapture:
-    """Apply the settings that hold for every kind of source: its orientation."""
+    """Apply the settings that hold for every kind of source: depth in metres, then orientation."""
     orientation = settings.orientation
-    return (lambda: OrientedCapture(open_capture(), orientation)) if orientation else open_capture
+
+    def open_adapted() -> Capture:
+        capture = open_capture()
+        if settings.as_depth:
+            capture = DepthCapture(capture, settings.depth_scale)
+        return OrientedCapture(capture, orientation) if orientation else capture
+
+    return open_adapted
 
 
 def label(uri: str, settings: SourceSettings) -> str:

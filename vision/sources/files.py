@@ -5,7 +5,9 @@ from __future__ import annotations
 import logging
 import re
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -33,17 +35,19 @@ def natural_key(path: Path) -> tuple[tuple[int, int, str], ...]:
     return tuple((0, int(part), part) if part.isdecimal() else (1, 0, part) for part in parts if part)
 
 
-def images_in(folder: Path) -> list[Path]:
+def images_in(folder: Path, suffixes: frozenset[str] = IMAGE_SUFFIXES) -> list[Path]:
     """The images directly in a folder, in natural order.
 
     Raises:
         SourceError: there are none.
     """
-    paths = sorted((path for path in folder.iterdir() if is_image(path) and path.is_file()), key=natural_key)
+    paths = sorted(
+        (path for path in folder.iterdir() if path.suffix.lower() in suffixes and path.is_file()),
+        key=natural_key,
+    )
     if not paths:
         raise SourceError(
-            f"{folder}: no images in this folder; expected names ending in "
-            f"{', '.join(sorted(IMAGE_SUFFIXES))}"
+            f"{folder}: no images in this folder; expected names ending in {', '.join(sorted(suffixes))}"
         )
     return paths
 
@@ -59,11 +63,25 @@ def decode_image(data: bytes) -> NDArray[np.uint8] | None:
     return None if image is None else np.ascontiguousarray(image, dtype=np.uint8)
 
 
-class ImagesCapture(Capture):
-    """Images in order. An unreadable one is logged, counted and skipped."""
+def _decode_colour(_path: Path, data: bytes) -> NDArray[np.uint8] | None:
+    return decode_image(data)
 
-    def __init__(self, paths: list[Path], rate_hz: float) -> None:
+
+class ImagesCapture(Capture):
+    """Images in order. An unreadable one is logged, counted and skipped.
+
+    Args:
+        decode: returns the picture of a file's bytes, None if unreadable.
+    """
+
+    def __init__(
+        self,
+        paths: list[Path],
+        rate_hz: float,
+        decode: Callable[[Path, bytes], NDArray[Any] | None] = _decode_colour,
+    ) -> None:
         quiet_opencv()
+        self._decode = decode
         self._paths = paths
         self.interval_s = 1 / rate_hz
         self._next = 0
@@ -76,7 +94,7 @@ class ImagesCapture(Capture):
             path = self._paths[index]
             started_ns = time.monotonic_ns()
             try:
-                image = decode_image(path.read_bytes())
+                image = self._decode(path, path.read_bytes())
                 reason = "not an image that OpenCV can read; it may be truncated or damaged"
             except OSError as error:
                 image, reason = None, error.strerror or str(error)

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import os
 import stat
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 from vision.sources.camera import CameraCapture, camera_device, check_camera
 from vision.sources.capture import Capture, LoopingCapture
 from vision.sources.csi import CsiCapture, check_csi_program, csi_settings, parse_csi_number
+from vision.sources.depth_pictures import DEPTH_SUFFIXES, decode_depth, is_depth_picture
 from vision.sources.files import ImagesCapture, VideoFileCapture, images_in, is_image
 from vision.sources.latest import LatestSource
 from vision.sources.network import UdpStream, open_http, open_rtsp, without_password
 from vision.sources.opencv import quiet_opencv
+from vision.sources.paired import DepthPictures, paired_source
 from vision.sources.pipe import Fifo, PipeCapture, check_pipe_settings
 from vision.sources.registry import SOURCES, source
 from vision.sources.sequential import SequentialSource
@@ -24,6 +29,7 @@ from vision.sources.source import RAW_PIXEL_FORMATS, Source, SourceError, Source
 _IMAGE_RATE_HZ = 10.0  # of images used as a camera without rate_hz
 # Their pictures are already taken when they arrive. A plug-in's scheme decides itself.
 _WITHOUT_EXPOSURE = ("file", "rtsp", "rtsps", "http", "https", "udp", "shm")
+_WITHOUT_DEPTH = ("csi", "rtsp", "rtsps", "http", "https", "udp")
 
 
 def open_source(uri: str, settings: SourceSettings = SourceSettings()) -> Source:  # noqa: B008 - frozen
@@ -55,24 +61,57 @@ def open_source(uri: str, settings: SourceSettings = SourceSettings()) -> Source
             reason.
     """
     quiet_opencv()
+    if settings.depth is not None:
+        return _open_with_depth(uri, settings.depth, settings)
+    device = camera_device(uri)
+    scheme = uri.partition("://")[0] if "://" in uri else ""
+    name = "standard input" if uri == "-" else without_password(uri)
+    if settings.as_depth:
+        if device is not None or scheme in _WITHOUT_DEPTH:
+            raise SourceError(
+                f"{name}: delivers colour; source.depth is a file, folder, pipe of gray16 or shared memory"
+            )
+        settings = replace(settings, pixel_format="gray16")  # of pipes; files have their own
+    if device is None and (not scheme or scheme in _WITHOUT_EXPOSURE):
+        _refuse_exposure(name, settings)
     if uri == "-":
-        _refuse_exposure("standard input", settings)
         return _open_standard_input(settings)
-    if (device := camera_device(uri)) is not None:
+    if device is not None:
         check_camera(device, settings)
         return LatestSource(str(device), lambda: CameraCapture(device, settings), settings)
-    scheme, separator, _ = uri.partition("://")
-    if not separator or scheme in _WITHOUT_EXPOSURE:
-        _refuse_exposure(without_password(uri), settings)
-    if not separator:
+    if not scheme:
         return _open_path(Path(uri).expanduser(), settings)
     if (opener := SOURCES.get(scheme)) is None:
         raise SourceError(
-            f"{without_password(uri)}: unknown scheme {scheme}://; known: {SOURCES.known()}, cameras "
+            f"{name}: unknown scheme {scheme}://; known: {SOURCES.known()}, cameras "
             "(/dev/video0), files, folders, FIFOs and - for standard input. Schemes of a plug-in are known "
             "once its module is loaded (plugins.modules, --plugins-modules)"
         )
     return opener(uri, settings)
+
+
+def _open_with_depth(uri: str, depth_uri: str, settings: SourceSettings) -> Source:
+    if uri == depth_uri == "-":
+        raise SourceError("standard input cannot be both source.uri and source.depth")
+    pictures = DepthPictures()
+    # Recordings are read frame by frame, so that their pictures pair; the pair is played in real time.
+    each = replace(settings, depth=None, realtime=False, on_frame=None)
+    of_depth = replace(each, as_depth=True, exposure_us=None, gain=None, name=None, on_frame=pictures.add)
+    # At the same time: one writer may wait until both its pipes are opened.
+    with ThreadPoolExecutor(1, "depth") as executor:
+        opening = executor.submit(open_source, depth_uri, of_depth)
+        try:
+            colour = open_source(uri, each)
+        except BaseException:
+            with contextlib.suppress(SourceError):
+                opening.result().close()
+            raise
+        try:
+            depth = opening.result()
+        except BaseException:
+            colour.close()
+            raise
+    return paired_source(colour, depth, pictures, settings)
 
 
 def _refuse_exposure(name: str, settings: SourceSettings) -> None:
@@ -148,18 +187,25 @@ def _open_path(path: Path, settings: SourceSettings) -> Source:
         return _open_fifo(path, settings)
     if not os.access(path, os.R_OK):
         raise SourceError(f"{path}: no permission to read it")
+    if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
+        raise SourceError(f"{path}: neither a file, a folder, a FIFO nor a video device")
+    if settings.as_depth and (stat.S_ISDIR(mode) or is_depth_picture(path)):
+        return _open_file(str(path), lambda: _depth_images(path, settings), settings)
     if stat.S_ISDIR(mode):
         return _open_file(
             str(path), lambda: ImagesCapture(images_in(path), _image_rate_hz(settings)), settings
         )
-    if not stat.S_ISREG(mode):
-        raise SourceError(f"{path}: neither a file, a folder, a FIFO nor a video device")
     if settings.pixel_format in RAW_PIXEL_FORMATS:
         check_pipe_settings(str(path), settings)
         return _open_file(str(path), lambda: PipeCapture(os.open(path, os.O_RDONLY), settings), settings)
     if is_image(path):
         return _open_file(str(path), lambda: ImagesCapture([path], _image_rate_hz(settings)), settings)
     return _open_file(str(path), lambda: VideoFileCapture(path), settings)
+
+
+def _depth_images(path: Path, settings: SourceSettings) -> ImagesCapture:
+    paths = images_in(path, DEPTH_SUFFIXES) if path.is_dir() else [path]
+    return ImagesCapture(paths, _image_rate_hz(settings), decode_depth)
 
 
 def _open_file(name: str, open_capture: Callable[[], Capture], settings: SourceSettings) -> Source:

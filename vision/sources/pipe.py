@@ -156,6 +156,8 @@ def check_pipe_settings(name: str, settings: SourceSettings) -> None:
         raise SourceError(
             f"{name}: a pipe carries {', '.join(PIPE_PIXEL_FORMATS)}, but pixel_format is {pixel_format!r}"
         )
+    if pixel_format == "gray16" and not settings.as_depth:
+        raise SourceError(f"{name}: gray16 is depth: set it as source.depth, beside a colour source")
     if pixel_format in RAW_PIXEL_FORMATS and (settings.width is None or settings.height is None):
         raise SourceError(f"{name}: {pixel_format} needs width and height")
     if pixel_format == "yuv420" and (settings.width or 0) % 2 + (settings.height or 0) % 2:
@@ -183,5 +185,5 @@ def _parser_from_magic(head: bytes) -> StreamParser:
         return MjpegParser()
     raise StreamError(
         f"neither YUV4MPEG2 nor JPEG (it starts with {head[:8].hex(' ')}); for raw pixels give pixel_format "
-        f"{', '.join(RAW_PIXEL_FORMATS)} with width and height"
+        f"{', '.join(sorted(RAW_PIXEL_FORMATS.keys() - {'gray16'}))} with width and height"
     )

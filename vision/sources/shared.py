@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from threading import Lock
+
+import numpy as np
 
 from vision.frame import Frame
 from vision.shared_frame import SharedFrameReader, SharedFrameWriter, segment_path
@@ -94,14 +97,20 @@ class FrameSharing:
         """
         with self._lock:
             if not self._closed:
-                self._writer_for(frame).write(frame)
+                writer = self._writer_for(frame)
+                if writer.depth and frame.depth_m is None:
+                    unknown = np.full((frame.height, frame.width), np.nan, np.float32)
+                    frame = replace(frame, depth_m=unknown)
+                writer.write(frame)
 
     def _writer_for(self, frame: Frame) -> SharedFrameWriter:
         """The writer for frames of this size: a stream may change its size."""
-        size = (frame.width, frame.height, frame.depth_m is not None)
         writer = self._writer
-        if writer is not None and (writer.width, writer.height, writer.depth) == size:
+        # A source with depth has frames without it; these are shared with unknown depth.
+        usable = writer is not None and (writer.depth or frame.depth_m is None)
+        if writer is not None and usable and (writer.width, writer.height) == (frame.width, frame.height):
             return writer
+        size = (frame.width, frame.height, frame.depth_m is not None)
         self._remove()
         try:
             self._writer = SharedFrameWriter(self._name, *size)

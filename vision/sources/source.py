@@ -11,7 +11,7 @@ from vision.camera_model import CameraCalibration
 from vision.frame import Frame
 from vision.orientation import Orientation
 
-RAW_PIXEL_FORMATS = {"bgr24": 3.0, "rgb24": 3.0, "gray8": 1.0, "yuv420": 1.5}
+RAW_PIXEL_FORMATS = {"bgr24": 3.0, "rgb24": 3.0, "gray8": 1.0, "yuv420": 1.5, "gray16": 2.0}
 """Raw pixel formats of a pipe → bytes per pixel."""
 
 PIPE_PIXEL_FORMATS = (*RAW_PIXEL_FORMATS, "y4m", "mjpeg")
@@ -46,6 +46,11 @@ class SourceSettings:
             degrees; depth and the source's own calibration as well, see `vision.orientation`. `width` and
             `height` are those before it.
         name: for people, in messages before the address.
+        depth: address of a second source with the depth of this one's pictures, registered to them: 16-bit
+            PNG, 32-bit TIFF or OpenEXR, NPY, a pipe of raw `gray16`, or shared memory with depth. Paired by
+            stamp, see `vision.sources.paired`.
+        depth_scale: metres per unit of that depth; None: 0.001 for 16-bit integers, 1 for floats.
+        as_depth: deliver depth pictures: `depth_m` with a black image. Set for the source that `depth` names.
         loop: restart a file at its end.
         realtime: read a file at its own frame rate, newest frame wins: a file used as a camera. A pipe has
             its writer's rate.
@@ -70,6 +75,9 @@ class SourceSettings:
     rotate_deg: int = 0
     mirror: bool = False
     name: str | None = None
+    depth: str | None = None
+    depth_scale: float | None = None
+    as_depth: bool = False
     loop: bool = False
     realtime: bool = False
     every_frame: bool | None = None
@@ -90,6 +98,8 @@ class SourceSettings:
             raise ValueError(f"exposure_us must be 1..10000000 us, got {self.exposure_us}")
         if self.gain is not None and not 0.0 <= self.gain <= 1e6:
             raise ValueError(f"gain must be 0..1000000, got {self.gain}")
+        if self.depth_scale is not None and not 0.0 < self.depth_scale <= 1000.0:
+            raise ValueError(f"depth_scale must be above 0 and at most 1000 m, got {self.depth_scale}")
         Orientation(self.rotate_deg)
         for name in ("open_timeout_s", "read_timeout_s", "retry_min_s"):
             if not 0.0 < getattr(self, name) <= 3600.0:

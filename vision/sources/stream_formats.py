@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import re
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -72,7 +72,8 @@ class StreamParser(Protocol):
 class RawParser:
     """Consecutive frames of `width` × `height` pixels in `bgr24`, `rgb24`, `gray8` or `yuv420`.
 
-    `yuv420` is I420: the planes Y, U and V without padding, BT.601 in the limited range.
+    `yuv420` is I420: the planes Y, U and V without padding, BT.601 in the limited range. Of depth in
+    `gray16`, little-endian, (height, width) uint16 are returned.
     """
 
     unreadable = 0
@@ -96,6 +97,9 @@ class RawParser:
 
     def _decode(self, data: bytearray) -> NDArray[np.uint8]:
         pixels = np.frombuffer(data, np.uint8)
+        if self._format == "gray16":  # depth, which `DepthCapture` converts
+            depth: NDArray[Any] = np.frombuffer(data, "<u2").reshape(self._height, self._width)
+            return depth
         if self._format == "bgr24":
             return pixels.reshape(self._height, self._width, 3)  # the slice is a copy, so it is writable
         code, shape = {

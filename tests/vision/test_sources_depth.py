@@ -1,0 +1,323 @@
+"""Depth as a second source: files, pipes, pairing by stamp."""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from vision.frame import Frame
+from vision.shared_frame import SharedFrameReader
+from vision.sources import (
+    EndOfStream,
+    Source,
+    SourceError,
+    SourceSettings,
+    SourceStatistics,
+    open_source,
+)
+from vision.sources.depth_pictures import decode_depth, to_metres
+from vision.sources.paired import DepthPictures, PairedCapture, paired_source
+from vision.sources.shared import FrameSharing
+
+MILLIMETRES = np.array([[1500, 0], [65535, 250]], np.uint16)
+METRES = np.array([[1.5, np.nan], [np.inf, -1.0]], np.float32)
+
+
+def saved(path: Path, picture: NDArray[Any]) -> Path:
+    path.parent.mkdir(exist_ok=True)
+    if path.suffix == ".npy":
+        np.save(path, picture)
+    else:
+        assert cv2.imwrite(str(path), picture)
+    return path
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.npy", "a.tiff", "a.pgm"])
+def test_16_bit_integers_are_millimetres(tmp_path: Path, name: str) -> None:
+    with open_source(str(saved(tmp_path / name, MILLIMETRES)), SourceSettings(as_depth=True)) as source:
+        frame = source.read()
+    assert frame is not None
+    assert frame.depth_m is not None
+    assert frame.depth_m.dtype == np.float32
+    np.testing.assert_allclose(frame.depth_m, [[1.5, np.nan], [65.535, 0.25]], rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["a.npy", "a.tiff"])
+def test_floats_are_metres_and_holes_are_nan(tmp_path: Path, name: str) -> None:
+    path = saved(tmp_path / name, METRES)
+    for scale, expected in ((None, 1.5), (0.1, 0.15)):
+        with open_source(str(path), SourceSettings(as_depth=True, depth_scale=scale)) as source:
+            frame = source.read()
+        assert frame is not None
+        assert frame.depth_m is not None
+        np.testing.assert_allclose(frame.depth_m, [[expected, np.nan], [np.nan, np.nan]], rtol=1e-6)
+
+
+def test_openexr_is_read_or_refused_with_a_way_out(tmp_path: Path) -> None:
+    path = tmp_path / "a.exr"
+    if "OpenEXR:                     NO" in cv2.getBuildInformation():
+        with pytest.raises(SourceError, match="convert it to 32-bit TIFF or NPY"):
+            decode_depth(path, b"\x76\x2f\x31\x01")
+    else:
+        picture = decode_depth(path, saved(path, METRES).read_bytes())
+        assert picture is not None
+        np.testing.assert_array_equal(picture, METRES)
+
+
+def test_floats_in_millimetres_are_refused_with_the_key() -> None:
+    metres = np.full((4, 4), 3.0, np.float32)
+    with pytest.raises(SourceError, match=r"median of depth is 3000 m.*source\.depth_scale"):
+        to_metres(metres * 1000, None)
+    np.testing.assert_allclose(to_metres(metres * 1000, 0.001), metres)
+    assert np.isnan(to_metres(np.zeros((2, 2), np.float32), None)).all()
+
+
+@pytest.mark.parametrize(
+    ("picture", "words"),
+    [
+        (np.zeros((4, 4), np.uint8), r"16-bit integers or floats, got shape \(4, 4\) uint8"),
+        (np.zeros((4, 4, 3), np.uint16), r"one channel.*got shape \(4, 4, 3\)"),
+    ],
+)
+def test_picture_that_is_not_depth_is_refused(tmp_path: Path, picture: NDArray[Any], words: str) -> None:
+    with pytest.raises(SourceError, match=words):
+        open_source(str(saved(tmp_path / "a.png", picture)), SourceSettings(as_depth=True))
+
+
+def folders(
+    tmp_path: Path, count: int, depth_count: int, size: tuple[int, int] = (12, 16)
+) -> tuple[str, SourceSettings]:
+    """A folder of colour pictures, and settings with one of depth: picture N is N + 1 metres away."""
+    for index in range(count):
+        saved(tmp_path / "colour" / f"{index}.png", np.full((12, 16, 3), index, np.uint8))
+    for index in range(depth_count):
+        saved(tmp_path / "depth" / f"{index}.png", np.full(size, (index + 1) * 1000, np.uint16))
+    return str(tmp_path / "colour"), SourceSettings(depth=str(tmp_path / "depth"))
+
+
+def test_folders_are_paired_picture_by_picture(tmp_path: Path) -> None:
+    uri, settings = folders(tmp_path, 4, 3)
+    with open_source(uri, settings) as source:
+        assert not source.live
+        assert source.total_frames == 4
+        assert source.uri == f"{uri} with depth of {settings.depth}"
+        frames = list(source)
+    assert [int(frame.image[0, 0, 0]) for frame in frames] == [0, 1, 2, 3]
+    depths = [None if frame.depth_m is None else round(float(frame.depth_m[0, 0]), 4) for frame in frames]
+    assert depths == [1.0, 2.0, 3.0, None]
+
+
+@pytest.mark.realtime
+def test_folders_in_real_time_stay_paired_and_rotated(tmp_path: Path) -> None:
+    uri, settings = folders(tmp_path, 6, 6)
+    shared: list[bool] = []
+    live = SourceSettings(
+        depth=settings.depth, realtime=True, rate_hz=50.0, rotate_deg=90, name="front",
+        on_frame=lambda frame: shared.append(frame.depth_m is not None),
+    )  # fmt: skip
+    frames = []
+    with open_source(uri, live) as source:
+        assert source.live
+        assert source.uri.startswith(f"front ({uri})")
+        frames = list(source)
+    assert frames
+    for frame in frames:
+        assert frame.depth_m is not None
+        assert frame.depth_m.shape == (16, 12)
+        assert frame.depth_m[0, 0] == pytest.approx(int(frame.image[0, 0, 0]) + 1)
+    assert shared == [True] * 6
+
+
+@pytest.mark.parametrize("realtime", [True, False])
+def test_depth_of_another_size_is_refused(tmp_path: Path, realtime: bool) -> None:
+    uri, settings = folders(tmp_path, 2, 2, size=(6, 8))
+    with pytest.raises(SourceError, match="depth is 8x6, the picture 16x12"):
+        open_source(uri, SourceSettings(depth=settings.depth, realtime=realtime))
+
+
+def test_depth_that_cannot_be_paired_is_refused(tmp_path: Path) -> None:
+    uri, settings = folders(tmp_path, 1, 1)
+    fifo = tmp_path / "depth.fifo"
+    os.mkfifo(fifo)
+    held = os.open(fifo, os.O_RDWR)
+    os.write(held, bytes(16 * 12 * 2))
+    try:
+        with pytest.raises(SourceError, match=r"depth\.fifo is live and .* a recording"):
+            open_source(uri, SourceSettings(depth=str(fifo), width=16, height=12))
+        with pytest.raises(SourceError, match="gray16 needs width and height"):
+            open_source(uri, SourceSettings(depth=str(fifo)))
+    finally:
+        os.close(held)
+    with pytest.raises(SourceError, match=r"cannot be both source\.uri and source\.depth"):
+        open_source("-", SourceSettings(depth="-"))
+    with pytest.raises(SourceError, match="delivers colour"):
+        open_source(uri, SourceSettings(depth="rtsp://camera/1"))
+    with pytest.raises(SourceError, match=r"gray16 is depth: set it as source\.depth"):
+        open_source(str(fifo), SourceSettings(pixel_format="gray16", width=16, height=12))
+    assert settings.depth is not None
+
+
+@pytest.mark.realtime
+def test_pipes_of_colour_and_gray16_are_paired(tmp_path: Path) -> None:
+    """The writer writes picture N and depth of N metres together, at 50 Hz."""
+    paths = [tmp_path / "colour.fifo", tmp_path / "depth.fifo"]
+    for path in paths:
+        os.mkfifo(path)
+    stop = threading.Event()
+
+    def write() -> None:
+        with open(paths[0], "wb", buffering=0) as colour, open(paths[1], "wb", buffering=0) as depth:
+            for index in range(1, 250):
+                if stop.wait(0.02):
+                    return
+                depth.write(np.full((12, 16), index * 1000, "<u2").tobytes())
+                colour.write(np.full((12, 16, 3), index, np.uint8).tobytes())
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    settings = SourceSettings(depth=str(paths[1]), pixel_format="bgr24", width=16, height=12)
+    try:
+        with open_source(str(paths[0]), settings) as source:
+            assert source.live
+            frames: list[Frame] = []
+            while len(frames) < 10:
+                frame = source.read(20.0)
+                assert frame is not None
+                frames.append(frame)
+            stop.set()
+    finally:
+        stop.set()
+        writer.join(20.0)
+    # A loaded machine may read one of the two later, and then the neighbour is nearer.
+    errors = [
+        abs(float(frame.depth_m[0, 0]) - int(frame.image[0, 0, 0]))
+        for frame in frames
+        if frame.depth_m is not None and float(frame.depth_m[0, 0]) < 65
+    ]
+    assert len(errors) >= 5
+    assert sorted(errors)[len(errors) // 2] <= 1.0
+
+
+class ScriptedSource(Source):
+    """Delivers the frames given, then ends or stays silent."""
+
+    def __init__(self, frames: list[Frame], *, live: bool, ends: bool = True, uri: str = "scripted") -> None:
+        self.uri, self.live = uri, live
+        self._frames, self._ends = frames, ends
+        self.closed = False
+
+    def read(self, timeout_s: float = 1.0) -> Frame | None:
+        if self._frames:
+            return self._frames.pop(0)
+        if self._ends:
+            raise EndOfStream
+        return None
+
+    @property
+    def statistics(self) -> SourceStatistics:
+        return SourceStatistics()
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def frame_at(stamp_s: float, sequence: int = 0, depth_m: float | None = None) -> Frame:
+    depth = None if depth_m is None else np.full((4, 4), depth_m, np.float32)
+    return Frame(np.zeros((4, 4, 3), np.uint8), round(stamp_s * 1e9), sequence, depth, media_s=stamp_s)
+
+
+def paired(colour: list[Frame], depth: list[Frame]) -> Iterator[float | None]:
+    """The depth of each frame that a live pair delivers; the depth pictures have all arrived."""
+    pictures = DepthPictures()
+    for frame in depth:
+        pictures.add(frame)
+    capture = PairedCapture(
+        ScriptedSource(colour, live=True),
+        ScriptedSource([], live=True, ends=False),
+        pictures,
+        SourceSettings(open_timeout_s=0.2),
+    )
+    while True:
+        try:
+            raw = capture.read(0.1)
+        except EndOfStream:
+            return
+        assert raw is not None
+        yield None if raw.depth_m is None else float(raw.depth_m[0, 0])
+
+
+def test_live_pictures_are_paired_by_the_nearest_stamp() -> None:
+    depth = [frame_at(1.000, depth_m=1.0), frame_at(1.033, depth_m=2.0), frame_at(1.066, depth_m=3.0)]
+    colour = [frame_at(0.5), frame_at(1.004, 1), frame_at(1.030, 2), frame_at(1.055, 3), frame_at(1.090, 4)]
+    # The first has no partner before the first pair, and is skipped; the last one's is 24 ms away.
+    assert list(paired(colour, depth)) == [1.0, 2.0, 3.0, None]
+
+
+def test_stamps_of_another_clock_are_refused() -> None:
+    with pytest.raises(SourceError, match="the nearest is 5 s away"):
+        list(paired([frame_at(10.0 + index / 30, index) for index in range(3)], [frame_at(5.0, depth_m=1.0)]))
+    with pytest.raises(SourceError, match="none came"):
+        list(paired([frame_at(10.0)], []))
+
+
+def test_depth_that_arrives_late_is_waited_for() -> None:
+    pictures = DepthPictures()
+    late = threading.Timer(0.01, pictures.add, [frame_at(1.0, depth_m=7.0)])
+    late.start()
+    found = pictures.nearest(1.0)
+    late.join()
+    assert found is not None
+    assert found[1][0, 0] == 7.0
+    started_s = time.monotonic()
+    assert pictures.nearest(2.0) == found
+    assert 0.03 < time.monotonic() - started_s < 1.0
+
+
+def test_recordings_of_different_rates_are_paired_by_time() -> None:
+    colour = ScriptedSource([frame_at(index / 30, index) for index in range(7)], live=False)
+    depth = ScriptedSource(
+        [frame_at(index / 15, index, depth_m=1.0 + index) for index in range(3)], live=False
+    )
+    with paired_source(colour, depth, DepthPictures(), SourceSettings()) as source:
+        depths = [None if frame.depth_m is None else float(frame.depth_m[0, 0]) for frame in source]
+    assert depths == [1.0, None, 2.0, None, 3.0, None, None]
+    assert colour.closed
+    assert depth.closed
+
+
+def test_error_of_the_depth_source_ends_the_pair(caplog: pytest.LogCaptureFixture) -> None:
+    class Failing(ScriptedSource):
+        def read(self, timeout_s: float = 1.0) -> Frame | None:
+            raise SourceError("the median of depth is 3000 m")
+
+    caplog.set_level(logging.WARNING)
+    colour = ScriptedSource([frame_at(index / 30, index) for index in range(7)], live=True)
+    depth = Failing([], live=True, uri="depth.tiff")
+    with pytest.raises(SourceError, match="median of depth is 3000 m"):
+        paired_source(colour, depth, DepthPictures(), SourceSettings())
+    assert colour.closed
+    assert depth.closed
+
+
+def test_frame_without_depth_is_shared_with_unknown_depth() -> None:
+    name = f"depth-test-{os.getpid()}"
+    with FrameSharing(name) as sharing:
+        sharing.write(frame_at(1.0, 0, depth_m=2.0))
+        reader = SharedFrameReader(name)
+        sharing.write(frame_at(2.0, 1))
+        frame = reader.latest(None)
+        reader.close()
+    assert frame is not None
+    assert frame.captured_ns == 2_000_000_000
+    assert frame.depth_m is not None
+    assert np.isnan(frame.depth_m).all()

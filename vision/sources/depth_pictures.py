@@ -1,0 +1,89 @@
+"""Depth pictures as files and pipes hold them, and their conversion to metres."""
+
+from __future__ import annotations
+
+import io
+import os
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vision.sources.source import SourceError
+
+DEPTH_SUFFIXES = frozenset((".png", ".pgm", ".tif", ".tiff", ".exr", ".npy"))
+INTEGER_SCALE_M, FLOAT_SCALE_M = 0.001, 1.0
+"""Metres per unit without `depth_scale`: 16-bit integers are millimetres, floats metres."""
+# Floats in millimetres are common, and depth cameras for vehicles do not see this far.
+IMPLAUSIBLE_MEDIAN_M = 200.0
+
+# OpenCV 4 has an OpenEXR reader that this enables; OpenCV 5.0 on PyPI is built without it.
+os.environ.setdefault("OPENCV_IO_ENABLE_OPENEXR", "1")
+
+
+def is_depth_picture(path: Path) -> bool:
+    """Whether the file name has the suffix of a depth picture."""
+    return path.suffix.lower() in DEPTH_SUFFIXES
+
+
+def decode_depth(path: Path, data: bytes) -> NDArray[Any] | None:
+    """(height, width) uint16 or float of a file's bytes, in the file's units; None if it cannot be read.
+
+    Raises:
+        SourceError: it holds something else than one channel of 16-bit integers or floats, or OpenCV has no
+            OpenEXR reader.
+    """
+    picture: Any = None
+    if path.suffix.lower() == ".npy":
+        try:
+            picture = np.load(io.BytesIO(data), allow_pickle=False)
+        except (ValueError, EOFError, OSError):
+            return None
+    elif data:
+        try:
+            picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        except cv2.error:
+            picture = None
+        if picture is None and path.suffix.lower() == ".exr":
+            raise SourceError(
+                f"{path}: this OpenCV ({cv2.__version__}) cannot read OpenEXR or this file; convert it to "
+                f"32-bit TIFF or NPY"
+            )
+    if picture is None:
+        return None
+    if picture.ndim == 3 and picture.shape[2] == 1:
+        picture = picture[:, :, 0]
+    if picture.ndim != 2 or not (picture.dtype == np.uint16 or picture.dtype.kind == "f"):
+        raise SourceError(
+            f"{path}: depth must be one channel of 16-bit integers or floats, got shape {picture.shape} "
+            f"{picture.dtype}"
+        )
+    return np.asarray(picture)
+
+
+def to_metres(picture: NDArray[Any], scale_m: float | None) -> NDArray[np.float32]:
+    """(height, width) float32 metres, NaN for holes: 0, negative, NaN and infinity.
+
+    Args:
+        picture: (height, width), uint16 or float.
+        scale_m: metres per unit; None: by the type, see INTEGER_SCALE_M.
+
+    Raises:
+        SourceError: half of a float picture is farther than 200 m: it is in another unit.
+    """
+    integer = picture.dtype.kind == "u"
+    scale = (INTEGER_SCALE_M if integer else FLOAT_SCALE_M) if scale_m is None else scale_m
+    with np.errstate(over="ignore", invalid="ignore"):
+        depth_m = picture.astype(np.float32) * np.float32(scale)
+        known = (depth_m > 0.0) & (depth_m < np.inf)
+    depth_m[~known] = np.nan
+    if not integer and known.any():
+        median_m = float(np.median(depth_m[known]))
+        if median_m > IMPLAUSIBLE_MEDIAN_M:
+            raise SourceError(
+                f"the median of depth is {median_m:.0f} m; floats are metres unless source.depth_scale "
+                f"(metres per unit) says otherwise: for millimetres set it to 0.001"
+            )
+    return depth_m

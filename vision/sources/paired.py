@@ -1,0 +1,207 @@
+"""A colour source and a second source with its depth, paired by their stamps."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import deque
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vision.frame import Frame
+from vision.sources.capture import Capture, RawFrame
+from vision.sources.latest import LatestSource
+from vision.sources.sequential import SequentialSource
+from vision.sources.source import EndOfStream, Source, SourceError, SourceSettings
+
+logger = logging.getLogger(__name__)
+
+TOLERANCE_S = 0.02
+"""Largest difference of the stamps of a pair: cameras of 30 Hz that are not synchronized stay below it."""
+_WAIT_S = 0.04  # for a depth picture that arrives after its colour picture
+_KEPT = 8  # depth pictures of a live source
+
+
+class DepthPictures:
+    """The newest depth pictures of a live source, as they arrive."""
+
+    def __init__(self) -> None:
+        self._kept: deque[tuple[float, NDArray[np.float32]]] = deque(maxlen=_KEPT)
+        self._changed = threading.Condition()
+
+    def add(self, frame: Frame) -> None:
+        """`on_frame` of the depth source."""
+        assert frame.depth_m is not None
+        with self._changed:
+            self._kept.append((frame.captured_ns / 1e9, frame.depth_m))
+            self._changed.notify()
+
+    def nearest(self, stamp_s: float) -> tuple[float, NDArray[np.float32]] | None:
+        """The picture with the nearest stamp, waiting for it to arrive; None before the first."""
+        with self._changed:
+            self._changed.wait_for(
+                lambda: self._kept and self._kept[-1][0] >= stamp_s - TOLERANCE_S / 2, _WAIT_S
+            )
+            return min(self._kept, key=lambda kept: abs(kept[0] - stamp_s), default=None)
+
+
+class PairedCapture(Capture):
+    """The frames of `colour` with the depth of `depth`. Both are open; the caller closes them.
+
+    Live sources are paired by their capture stamps, recordings by their media time. Frames before the first
+    pair are skipped; later ones without a partner are delivered without depth.
+
+    Args:
+        pictures: `on_frame` of the depth source, for live ones.
+    """
+
+    silence_is_loss = False
+
+    def __init__(
+        self, colour: Source, depth: Source, pictures: DepthPictures, settings: SourceSettings
+    ) -> None:
+        self._colour, self._depth, self._pictures = colour, depth, pictures
+        self._timeout_s = settings.open_timeout_s
+        self._current: Frame | None = None
+        self._next: Frame | None = None
+        self._depth_ended = False
+        self._paired = False
+        self._smallest_gap_s = float("inf")
+        self._first_s: float | None = None
+        self._paired_s = 0.0
+        self._next_sequence = 0
+        self.total_frames = colour.total_frames
+        self.calibration = colour.calibration
+
+    def read(self, timeout_s: float) -> RawFrame | None:
+        deadline_s = time.monotonic() + timeout_s
+        while True:
+            try:
+                frame = self._colour.read(max(deadline_s - time.monotonic(), 0.0))
+            except EndOfStream:
+                if not self._paired:
+                    raise self._never_paired() from None
+                raise
+            if frame is None:
+                return None
+            depth_m = self._depth_of(frame)
+            if depth_m is not None or self._paired:
+                break
+            if self._first_s is None:
+                self._first_s = time.monotonic()
+            if self._colour.live and time.monotonic() - self._first_s > self._timeout_s:
+                raise self._never_paired()
+        self._note_loss(depth_m is not None)
+        unreadable = self._colour.statistics.unreadable
+        skipped = frame.sequence - self._next_sequence - (unreadable - self.unreadable)
+        self._next_sequence = frame.sequence + 1
+        self.unreadable = unreadable
+        captured_ns = frame.captured_ns if self._colour.live else None
+        return RawFrame(frame.image, captured_ns, depth_m, frame.media_s, max(skipped, 0), frame.decode_ms)
+
+    def _never_paired(self) -> SourceError:
+        gap = (
+            f"the nearest is {self._smallest_gap_s:.3g} s away" if self._smallest_gap_s < 1e9 else "none came"
+        )
+        return SourceError(
+            f"no depth within {TOLERANCE_S * 1000:.0f} ms of a picture, {gap}; both sources need the same "
+            f"clock, and recordings the same rate (source.rate_hz)"
+        )
+
+    def _depth_of(self, frame: Frame) -> NDArray[np.float32] | None:
+        """The depth of a frame, None without a partner. Raises SourceError if it has another size."""
+        found = self._live_depth(frame) if self._colour.live else self._recorded_depth(frame)
+        if found is None:
+            return None
+        gap_s, depth_m = found
+        self._smallest_gap_s = min(self._smallest_gap_s, gap_s)
+        if gap_s > TOLERANCE_S:
+            return None
+        if depth_m.shape != (frame.height, frame.width):
+            raise SourceError(
+                f"depth is {depth_m.shape[1]}x{depth_m.shape[0]}, the picture {frame.width}x{frame.height}: "
+                f"depth must be registered to the colour picture and have its size"
+            )
+        self._paired = True
+        return depth_m
+
+    def _live_depth(self, frame: Frame) -> tuple[float, NDArray[np.float32]] | None:
+        stamp_s = frame.captured_ns / 1e9
+        nearest = self._pictures.nearest(stamp_s)
+        if not self._depth_ended:
+            try:
+                self._depth.read(0.0)  # raises its error
+            except EndOfStream:
+                self._depth_ended = True
+        return None if nearest is None else (abs(nearest[0] - stamp_s), nearest[1])
+
+    def _recorded_depth(self, frame: Frame) -> tuple[float, NDArray[np.float32]] | None:
+        """Advance through the recording while its next picture is nearer than the current one."""
+        while not self._depth_ended:
+            if self._next is None:
+                try:
+                    self._next = self._depth.read()
+                except EndOfStream:
+                    self._depth_ended = True
+            if self._next is None:
+                continue
+            if self._current is not None and _gap_s(self._current, frame) < _gap_s(self._next, frame):
+                break
+            self._current, self._next = self._next, None
+        if self._current is None or self._current.depth_m is None:
+            return None
+        return _gap_s(self._current, frame), self._current.depth_m
+
+    def _note_loss(self, has_depth: bool) -> None:
+        """Log once that depth is missing, and once that it is back."""
+        now_s = time.monotonic()
+        if has_depth:
+            if self._paired_s < 0.0:
+                logger.warning("%s: depth is back", self._depth.uri)
+            self._paired_s = now_s
+        elif self._paired_s >= 0.0 and now_s - self._paired_s > 1.0:
+            logger.warning("%s: no depth with the stamps of the pictures for 1 s", self._depth.uri)
+            self._paired_s = -1.0
+
+    def close(self) -> None:
+        """The sources are closed by `open_paired`'s source."""
+
+
+def _gap_s(one: Frame, other: Frame) -> float:
+    return abs((one.media_s or 0.0) - (other.media_s or 0.0))
+
+
+def paired_source(colour: Source, depth: Source, pictures: DepthPictures, settings: SourceSettings) -> Source:
+    """One source of both, which it closes.
+
+    Raises:
+        SourceError: one is live and the other a recording, their stamps never agree, or their sizes differ.
+    """
+
+    def close() -> None:
+        colour.close()
+        depth.close()
+
+    try:
+        if colour.live != depth.live:
+            live, recorded = (colour, depth) if colour.live else (depth, colour)
+            raise SourceError(
+                f"{live.uri} is live and {recorded.uri} a recording: their pictures have no common time"
+            )
+    except SourceError:
+        close()
+        raise
+    # Both are rotated already, and named.
+    outer = replace(settings, depth=None, rotate_deg=0, mirror=False, name=None)
+    uri = f"{colour.uri} with depth of {depth.uri}"
+
+    def open_capture() -> Capture:
+        return PairedCapture(colour, depth, pictures, settings)
+
+    if colour.live or settings.realtime:
+        paced = not colour.live
+        return LatestSource(uri, open_capture, outer, reopen=False, paced=paced, on_close=close)
+    return SequentialSource(uri, open_capture, outer, on_close=close)
