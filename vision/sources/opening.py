@@ -14,6 +14,7 @@ from pathlib import Path
 from vision.sources.camera import CameraCapture, camera_device, check_camera
 from vision.sources.capture import Capture, LoopingCapture
 from vision.sources.csi import CsiCapture, check_csi_program, csi_settings, parse_csi_number
+from vision.sources.depth_cameras import OakCapture, RealsenseCapture, load_module
 from vision.sources.depth_pictures import DEPTH_SUFFIXES, decode_depth, is_depth_picture
 from vision.sources.files import ImagesCapture, VideoFileCapture, images_in, is_image
 from vision.sources.latest import LatestSource
@@ -28,7 +29,7 @@ from vision.sources.source import RAW_PIXEL_FORMATS, Source, SourceError, Source
 
 _IMAGE_RATE_HZ = 10.0  # of images used as a camera without rate_hz
 # Their pictures are already taken when they arrive. A plug-in's scheme decides itself.
-_WITHOUT_EXPOSURE = ("file", "rtsp", "rtsps", "http", "https", "udp", "shm")
+_WITHOUT_EXPOSURE = ("file", "rtsp", "rtsps", "http", "https", "udp", "shm", "realsense", "oak")
 _WITHOUT_DEPTH = ("csi", "rtsp", "rtsps", "http", "https", "udp")
 
 
@@ -44,6 +45,7 @@ def open_source(uri: str, settings: SourceSettings = SourceSettings()) -> Source
     | | `/run/camera.fifo` | a FIFO with the same | the newest; every one with `every_frame` |
     | `/dev/video0`, `0`, `/dev/v4l/by-id/…` | a camera | the newest |
     | `csi://0` | a CSI camera of a Raspberry Pi or Jetson | the newest |
+    | `realsense://SERIAL`, `oak://ID` | a depth camera | the newest, with depth |
     | `rtsp://camera/stream` | RTSP | the newest |
     | `http://camera/video.mjpg` | Motion JPEG over HTTP, or what FFmpeg reads | the newest |
     | `udp://:5600`, `udp://239.1.2.3:5600` | MPEG-TS | the newest |
@@ -118,8 +120,8 @@ def _refuse_exposure(name: str, settings: SourceSettings) -> None:
     for key in ("exposure_us", "gain"):
         if getattr(settings, key) is not None:
             raise SourceError(
-                f"{name}: source.{key} is for cameras (/dev/video0, csi://0); set it in what makes these "
-                f"pictures, and remove source.{key}"
+                f"{name}: source.{key} is for cameras (/dev/video0, csi://0); remove it, and set it in the "
+                f"program that makes these pictures"
             )
 
 
@@ -161,6 +163,22 @@ def _open_csi(uri: str, settings: SourceSettings) -> Source:
     number, wanted = parse_csi_number(uri), csi_settings(uri, settings)
     check_csi_program(uri)
     return LatestSource(uri, lambda: CsiCapture(number, wanted), wanted)
+
+
+@source("realsense", "a RealSense depth camera (extra `realsense`)")
+def _open_realsense(uri: str, settings: SourceSettings) -> Source:
+    module = load_module("pyrealsense2", uri)
+    return LatestSource(
+        uri, lambda: RealsenseCapture(_rest(uri), settings, module), settings, advice="is it plugged in?"
+    )
+
+
+@source("oak", "an OAK depth camera (extra `oak`)")
+def _open_oak(uri: str, settings: SourceSettings) -> Source:
+    module = load_module("depthai", uri)
+    return LatestSource(
+        uri, lambda: OakCapture(_rest(uri), settings, module), settings, advice="is it plugged in?"
+    )
 
 
 @source("shm", "shared memory of this host")
