@@ -1,7 +1,9 @@
-"""`companion preview`: what a source delivers, as a status line and as pictures in a folder; no window."""
+"""`companion preview` and `companion depth`: what a source delivers, as lines and as pictures in a folder."""
 
 from __future__ import annotations
 
+import contextlib
+import json
 import time
 from collections import deque
 from collections.abc import Callable
@@ -12,10 +14,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.bus.bodies import DepthBody
+from companion.bus.messages import depth_message
 from vision.annotate import annotate
+from vision.depth import centre_depth
 from vision.detections import Detections
 from vision.frame import Frame
-from vision.sources import Source
+from vision.pipeline import PerceptionResult, Pipeline
+from vision.sources import EndOfStream, Source, SourceError
 
 GREY_DIVISOR = 3
 _RATE_WINDOW_S = 2.0
@@ -38,6 +44,13 @@ class PreviewOptions:
     grey: bool = False
     period_s: float = 1.0
     limit: int | None = None
+
+
+def save_picture(folder: Path, frame: Frame, image: NDArray[np.uint8]) -> None:
+    """Write `<sequence>.jpg`. Raises OSError if it cannot be written."""
+    path = folder / f"{frame.sequence:06d}.jpg"
+    if not cv2.imwrite(str(path), image):
+        raise OSError(f"cannot write {path}: check free disk space and write permission")
 
 
 class RateMeter:
@@ -77,9 +90,7 @@ def preview_source(source: Source, options: PreviewOptions, write: Callable[[str
         lines = status_lines(source, frame, rate_hz, options.topic)
         write("  ".join(lines))
         if options.save is not None:
-            path = options.save / f"{frame.sequence:06d}.jpg"
-            if not cv2.imwrite(str(path), picture(frame, lines, grey=options.grey)):
-                raise OSError(f"cannot write {path}: check free disk space and write permission")
+            save_picture(options.save, frame, picture(frame, lines, grey=options.grey))
         shown += 1
         if shown == options.limit:
             break
@@ -107,4 +118,76 @@ def picture(frame: Frame, lines: tuple[str, ...], *, grey: bool) -> NDArray[np.u
         size = (max(frame.width // GREY_DIVISOR, 1), max(frame.height // GREY_DIVISOR, 1))
         small = cv2.resize(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), size, interpolation=cv2.INTER_AREA)
         image = cv2.cvtColor(small, cv2.COLOR_GRAY2BGR).astype(np.uint8, copy=False)
-    return annotate(image, Detections.empty(()), lines=lines)
+    centre_m = None if frame.depth_m is None else centre_depth(frame.depth_m)
+    return annotate(image, Detections.empty(()), lines=lines, centre_m=centre_m)
+
+
+class DepthRecorder:
+    """Saves the frames of a pipeline with their detections and the depth at the centre.
+
+    Args:
+        folder: of the pictures; None: none are saved.
+    """
+
+    def __init__(self, folder: Path | None) -> None:
+        self._folder = folder
+        if folder is not None:
+            folder.mkdir(parents=True, exist_ok=True)
+
+    def write(self, frame: Frame, detections: Detections, /) -> None:
+        """Save a frame. Raises OSError if it cannot be written."""
+        if self._folder is not None and frame.depth_m is not None:
+            centre_m = centre_depth(frame.depth_m)
+            save_picture(self._folder, frame, annotate(frame.image, detections, centre_m=centre_m))
+
+
+def depth_source(
+    pipeline: Pipeline,
+    *,
+    vehicle: str,
+    limit: int | None,
+    as_json: bool,
+    write: Callable[[str], None],
+) -> int:
+    """Print the depth of each frame until the source ends.
+
+    Args:
+        pipeline: of an open source with depth.
+        as_json: each line is the message of the topic `depth`.
+
+    Returns:
+        Number of lines.
+
+    Raises:
+        SourceError: the first frame has no depth, or the source failed.
+    """
+    shown = 0
+
+    def deliver(result: PerceptionResult) -> None:
+        nonlocal shown
+        if result.depth is None:
+            if not shown:
+                raise SourceError(
+                    "the source delivers no depth; name the depth of its pictures in source.depth"
+                )
+            return
+        shown += 1
+        message = depth_message(result, vehicle, time.monotonic_ns())
+        write(json.dumps(message) if as_json else _depth_line(message))
+
+    with contextlib.suppress(EndOfStream):
+        while limit is None or shown < limit:
+            pipeline.step(1.0, deliver)
+    return shown
+
+
+def _depth_line(message: DepthBody) -> str:
+    boxes = ", ".join(f"{box['class_name']} {_metres(box['depth_m'])}" for box in message["boxes"])
+    return (
+        f"{message['sequence']:6d}  centre {_metres(message['centre_m'])}  "
+        f"{message['valid_share']:6.1%} valid  {boxes}"
+    ).rstrip()
+
+
+def _metres(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.2f} m"

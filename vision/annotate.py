@@ -20,6 +20,7 @@ _DARK = (24, 22, 20)
 _LIGHT = (250, 250, 250)
 _AXIS_COLOURS = ((40, 40, 230), (60, 200, 60), (230, 120, 40))
 _SHIFT = 4
+_RED = (0, 0, 255)
 
 Colour = tuple[int, int, int]
 Rectangle = tuple[int, int, int, int]  # left, top, right, bottom; the last two outside
@@ -56,6 +57,7 @@ def annotate(
     *,
     lines: Sequence[str] = (),
     highlight: int | None = None,
+    centre_m: float | None = None,
 ) -> NDArray[np.uint8]:
     """A copy of the image with boxes, labels and a panel of text.
 
@@ -65,6 +67,8 @@ def annotate(
             confidence.
         lines: text for a panel at the top left.
         highlight: index of the detection to highlight: drawn last, tinted, with bracketed corners.
+        centre_m: depth at the image's centre, metres, drawn beside a red point there; NaN: unknown; None: no
+            point.
 
     Returns:
         (height, width, 3) uint8, BGR.
@@ -89,6 +93,8 @@ def annotate(
     occupied: list[Rectangle] = []
     if lines:
         occupied.append(_draw_panel(drawn, lines, sizes))
+    if centre_m is not None:
+        occupied.append(_draw_centre(drawn, centre_m, sizes))
     for index in reversed(order):  # the most confident choose their label's position first
         occupied.append(_draw_label(drawn, boxes[index], detections, index, sizes, occupied))
     return drawn
@@ -257,6 +263,27 @@ def _draw_panel(image: NDArray[np.uint8], lines: Sequence[str], sizes: _Sizes) -
         at = (margin + inside, margin + inside + row * pitch + text_height)
         cv2.putText(image, line, at, _FONT, scale, _LIGHT, sizes.stroke, cv2.LINE_AA)
     return panel
+
+
+def _draw_centre(image: NDArray[np.uint8], centre_m: float, sizes: _Sizes) -> Rectangle:
+    height, width = image.shape[:2]
+    x, y = width // 2, height // 2
+    radius = 2 * sizes.line
+    cv2.circle(image, (x, y), radius + 1, _LIGHT, cv2.FILLED, cv2.LINE_AA)
+    cv2.circle(image, (x, y), radius, _RED, cv2.FILLED, cv2.LINE_AA)
+    text = "no depth" if np.isnan(centre_m) else f"{centre_m:.2f} m"
+    (text_width, text_height), baseline = cv2.getTextSize(text, _FONT, sizes.font_scale, sizes.stroke)
+    left, bottom = x + 2 * radius, y + text_height // 2
+    panel = (
+        left,
+        bottom - text_height - sizes.padding,
+        left + text_width + 2 * sizes.padding,
+        bottom + baseline,
+    )
+    _blend(image, panel, _DARK, 0.62)
+    at = (left + sizes.padding, bottom)
+    cv2.putText(image, text, at, _FONT, sizes.font_scale, _LIGHT, sizes.stroke, cv2.LINE_AA)
+    return x - radius, panel[1], panel[2], panel[3]
 
 
 def _blend(image: NDArray[np.uint8], area: Rectangle, colour: Colour, opacity: float) -> None:

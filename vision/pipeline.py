@@ -11,6 +11,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from vision.depth import DepthSummary, depth_summary
 from vision.detections import Detections
 from vision.frame import Frame
 from vision.frame_selection import TOO_OLD, FrameSelector, Selection
@@ -47,6 +48,7 @@ class PerceptionResult:
         markers: those in the frame; None if marker detection is off.
         obstacles: distance of the nearest one in each direction; None without depth or attitude.
         boards: those of the markers that belong to a board.
+        depth: of the frame's depth image; None without one.
     """
 
     sequence: int
@@ -62,6 +64,7 @@ class PerceptionResult:
     markers: tuple[Marker, ...] | None = None
     obstacles: ObstacleSectors | None = None
     boards: tuple[BoardPose, ...] = ()
+    depth: DepthSummary | None = None
 
 
 class FrameDetector(Protocol):
@@ -210,9 +213,9 @@ class Pipeline:
             detections, events = tracked.detections, tracked.events
         tracked_ns = time.perf_counter_ns()
         timing_ms["track"] = (tracked_ns - detected_ns) / 1e6
-        obstacles = None
+        obstacles, depth = None, None
         if frame.depth_m is not None:
-            obstacles = self._obstacles_in(frame)
+            obstacles, depth = self._obstacles_in(frame), depth_summary(frame.depth_m)
             if self._nearest_in is not None:
                 nearest = self._nearest_in(frame, detections.xyxy)
                 detections = replace(detections, nearest_camera_m=nearest)
@@ -237,4 +240,5 @@ class Pipeline:
             markers=markers,
             obstacles=obstacles,
             boards=boards,
+            depth=depth,
         )

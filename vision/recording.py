@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from vision.annotate import annotate
+from vision.depth import centre_depth
 from vision.detections import Detections
 from vision.frame import Frame
 from vision.video_writer import VideoWriter, VideoWriterError
@@ -153,7 +154,11 @@ class Recording:
 def _add(writer: VideoWriter, queued: _QueuedFrame) -> None:
     names = queued.detections.names
     highlight = names.index(queued.highlight) if queued.highlight in names else None
-    drawn = annotate(queued.frame.image, queued.detections, lines=queued.lines, highlight=highlight)
+    frame = queued.frame
+    centre_m = None if frame.depth_m is None else centre_depth(frame.depth_m)
+    drawn = annotate(
+        frame.image, queued.detections, lines=queued.lines, highlight=highlight, centre_m=centre_m
+    )
     size = (writer.width, writer.height)
     if (queued.frame.width, queued.frame.height) != size:
         drawn = cv2.resize(drawn, size).astype(np.uint8, copy=False)

@@ -244,6 +244,30 @@ class MarkersBody(FrameBody):
     """the boards of `markers.boards_file`; empty where the vehicle's pose is unknown"""
 
 
+class DepthBoxBody(TypedDict):
+    """The distance of one detection."""
+
+    class_name: str
+    """name of its class"""
+    track_id: int | None
+    """its track; null: none"""
+    xyxy: Four
+    """edges of its box, pixels: left, top, right, bottom"""
+    depth_m: float | None
+    """distance of its nearest point along the optical axis, as in detections; null: unknown"""
+
+
+class DepthBody(FrameBody):
+    """The depth image of one frame."""
+
+    centre_m: float | None
+    """distance at the centre of the image along the optical axis; null: unknown"""
+    valid_share: Annotated[float, Field(ge=0, le=1)]
+    """share of the pixels with known depth"""
+    boxes: list[DepthBoxBody]
+    """the detections"""
+
+
 class ImageBody(TypedDict):
     """The attachment of an image; the payload is the JPEG itself."""
 

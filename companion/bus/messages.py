@@ -10,6 +10,7 @@ from companion.bus.bodies import (
     BoardBody,
     CameraInfoBody,
     CloudBody,
+    DepthBody,
     DetectionBody,
     DetectionsBody,
     FrameBody,
@@ -262,6 +263,27 @@ def _covariance(pose: BodyPose) -> list[float]:
 def _rounded(value: float) -> float:
     """Return three digits."""
     return float(f"{value:.2e}")
+
+
+def depth_message(
+    result: PerceptionResult, vehicle: str, published_ns: int, view: str | None = None
+) -> DepthBody:
+    """Create the message of one frame's depth image, which it must have."""
+    assert result.depth is not None
+    return {
+        **_of_frame(result, vehicle, published_ns, view),
+        "centre_m": _number(result.depth.centre_m),
+        "valid_share": round(result.depth.valid_share, 4),
+        "boxes": [
+            {
+                "class_name": record["class_name"],
+                "track_id": record["track_id"],
+                "xyxy": record["xyxy"],
+                "depth_m": record["depth_m"],
+            }
+            for record in result.detections.records()
+        ],
+    }
 
 
 def obstacles_message(seen: ObstacleSectors, vehicle: str) -> ObstaclesBody:

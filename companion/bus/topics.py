@@ -98,6 +98,14 @@ MARKERS: Final = Topic(
     priority=_REAL_TIME,
     express=True,
 )
+DEPTH: Final = Topic(
+    "depth",
+    bodies.DepthBody,
+    "distance at the centre of the image and of each detection, share of pixels with depth",
+    "per processed frame with depth",
+    max_age_s=0.5,
+    of_camera=True,
+)
 TRANSFORMS: Final = Topic(
     "transforms",
     bodies.TransformsBody,
@@ -230,6 +238,7 @@ TOPICS: Final = (
     LABELS,
     TRACKS,
     MARKERS,
+    DEPTH,
     TRANSFORMS,
     CAMERA_INFO,
     IMAGE,

@@ -1,4 +1,4 @@
-"""The command lines of `companion cameras` and `companion preview`."""
+"""The command lines of `companion cameras`, `companion preview` and `companion depth`."""
 
 from __future__ import annotations
 
@@ -93,6 +93,31 @@ def preview(
     with opened(settings, source) as frames:
         options = PreviewOptions(topic, save, grey, period, limit)
         preview_source(frames, options, functools.partial(print, flush=True))
+
+
+def depth(
+    settings: Settings,
+    source: Annotated[str | None, typer.Argument(help=SOURCE_HELP)] = None,
+    detect: Annotated[bool, typer.Option("--detect", help="Detect objects, and print their depth.")] = False,
+    save: Annotated[Path | None, typer.Option(help="Folder for a picture of each frame.")] = None,
+    limit: Annotated[int | None, typer.Option(min=1, help="Maximum number of frames.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the messages of the topic `depth`.")] = False,
+) -> None:
+    """Measure the depth of a source: at the centre and of each object. Prints one line per frame."""
+    from companion.perception.assembly import CameraTelemetry, build_pipeline, load_detector
+    from companion.preview import DepthRecorder, depth_source
+    from companion.settings.calibration import adopt_calibration
+
+    played = settings.source.model_copy(update={"realtime": False})  # every frame of a recording
+    settings = settings.model_copy(update={"source": played})
+    with opened(settings, source) as frames, plain_errors(ValueError):
+        if frames.calibration is not None:
+            camera = adopt_calibration(settings.camera, frames.calibration).camera
+            settings = settings.model_copy(update={"camera": camera})
+        detector = load_detector(settings) if detect else None
+        pipeline = build_pipeline(settings, frames, detector, CameraTelemetry(), recorder=DepthRecorder(save))
+        write = functools.partial(print, flush=True)
+        depth_source(pipeline, vehicle=settings.vehicle.name, limit=limit, as_json=as_json, write=write)
 
 
 @contextmanager

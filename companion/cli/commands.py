@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from companion.cli.bench import bench
-from companion.cli.cameras import cameras, preview
+from companion.cli.cameras import cameras, depth, preview
 from companion.cli.cloud import CLOUD_SETTINGS, cloud
 from companion.cli.dashboard import dashboard
 from companion.cli.evaluate import evaluate
@@ -52,6 +52,7 @@ ORDER = (
     "echo",
     "cameras",
     "preview",
+    "depth",
     "dashboard",
     "commands",
     "topics",
@@ -78,6 +79,7 @@ app.command()(evaluate)
 app.command()(topics)
 app.command()(cameras)
 settings_command(app, "source", "vehicle.name", "plugins")(preview)
+settings_command(app, "source", "camera", "detector", "tracker", "vehicle.name", "plugins")(depth)
 settings_command(app, *CLIENT_SETTINGS, "plugins", "detector")(mission)
 settings_command(app, *CLOUD_SETTINGS)(cloud)
 settings_command(app)(play)
@@ -550,6 +552,6 @@ app.registered_commands.sort(key=_help_position)
 def main() -> None:
     """Run the console script."""
     # End quietly when the reader of a pipe has gone (`| head`).
-    if sys.argv[1:2] in (["detect"], ["echo"], ["preview"]):
+    if sys.argv[1:2] in (["detect"], ["echo"], ["preview"], ["depth"]):
         signal.signal(signal.SIGPIPE, signal.SIG_DFL)
     app()

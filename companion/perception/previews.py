@@ -17,6 +17,7 @@ from companion.perception.messages import CloudPreview, Preview
 from companion.settings import PreviewSection
 from companion.settings.perception import CameraSection
 from vision.annotate import annotate
+from vision.depth import centre_depth
 from vision.detections import Detections
 from vision.frame import Frame
 from vision.point_cloud import cloud_from_depth, voxel_grid
@@ -95,7 +96,10 @@ class PreviewEncoder(_Encoder[Preview]):
         super().__init__("preview", settings.rate_hz, deliver)
 
     def _encoded(self, frame: Frame, detections: Detections) -> Preview:
-        image = annotate(frame.image, detections) if self._settings.annotate else frame.image
+        image = frame.image
+        if self._settings.annotate:
+            centre_m = None if frame.depth_m is None else centre_depth(frame.depth_m)
+            image = annotate(image, detections, centre_m=centre_m)
         if frame.width > self._settings.width:
             height = max(1, round(frame.height * self._settings.width / frame.width))
             smaller = cv2.resize(image, (self._settings.width, height), interpolation=cv2.INTER_AREA)

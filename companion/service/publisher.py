@@ -16,6 +16,7 @@ from companion.bus.messages import (
     ModelIdentity,
     camera_info_message,
     cloud_attachment,
+    depth_message,
     detections_message,
     image_attachment,
     labels_message,
@@ -105,6 +106,8 @@ class Publisher:
             bus.publish(topics.TRACKS, lambda: tracks_message(result, vehicle, now_ns, name), name)
         if markers is not None:
             bus.publish(topics.MARKERS, lambda: markers_message(result, markers, vehicle, now_ns, name), name)
+        if result.depth is not None:
+            bus.publish(topics.DEPTH, lambda: depth_message(result, vehicle, now_ns, name), name)
         if (obstacles := result.obstacles) is not None and steering:
             bus.publish(topics.OBSTACLES, lambda: obstacles_message(obstacles, vehicle))
         bus.publish(topics.TRANSFORMS, lambda: self._transforms(camera, result), name)

@@ -1,4 +1,4 @@
-"""`companion cameras` and `companion preview`."""
+"""`companion cameras`, `companion preview` and `companion depth`."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from companion.preview import PreviewOptions, RateMeter, preview_source
+from tests.companion.bus.message_check import check_message
 from tests.companion.command_line import companion
 from vision.sources import open_source
 
@@ -84,3 +85,68 @@ def test_cameras_are_one_json_object(tmp_path: Path) -> None:
         map(str, Path("/dev").glob("video[0-9]*")), key=lambda path: int(path.removeprefix("/dev/video"))
     )
     assert companion("cameras", cwd=tmp_path).returncode == 0
+
+
+@pytest.fixture
+def depth(pictures: Path) -> Path:
+    """Depth of the pictures: 3.42 m and more, with a hole of a quarter."""
+    folder = pictures.parent / "depth"
+    folder.mkdir()
+    for index in range(4):
+        picture = np.full((240, 480), 3420 + index, np.uint16)
+        picture[:, :120] = 0
+        cv2.imwrite(str(folder / f"{index}.png"), picture)
+    return folder
+
+
+def test_depth_prints_the_messages_of_its_topic(pictures: Path, depth: Path, tmp_path: Path) -> None:
+    done = companion(
+        "depth", pictures, "--source-depth", depth, "--json", "--save", tmp_path / "out", cwd=tmp_path
+    )
+    assert done.returncode == 0, done.stderr
+    messages = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [message["centre_m"] for message in messages] == [3.42, 3.421, 3.422, 3.423]
+    for message in messages:
+        check_message("depth", message)
+        assert message["valid_share"] == 0.75
+        assert message["boxes"] == []
+    image = cv2.imread(str(tmp_path / "out" / "000000.jpg"))
+    assert image is not None
+    blue, green, red = image[120, 240].tolist()
+    assert red > 200
+    assert max(blue, green) < 90
+
+
+def test_depth_of_detections(pictures: Path, depth: Path, tmp_path: Path, small_model: Path) -> None:
+    done = companion(
+        "depth", pictures, "--source-depth", depth, "--source-depth-scale", "0.002", "--limit", "1", "--json",
+        "--detect", "--detector-model", small_model, "--detector-confidence", "0",
+        "--detector-image-size", "160", "--tracker-enabled", "false", cwd=tmp_path,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    (message,) = map(json.loads, done.stdout.splitlines())
+    assert message["centre_m"] == 6.84
+    assert message["boxes"]
+    known = [box["depth_m"] for box in message["boxes"] if box["depth_m"] is not None]
+    assert known
+    assert all(depth_m == pytest.approx(6.84, abs=0.01) for depth_m in known)
+
+
+def test_source_without_usable_depth_is_one_line(pictures: Path, depth: Path, tmp_path: Path) -> None:
+    small = tmp_path / "small"
+    small.mkdir()
+    cv2.imwrite(str(small / "0.png"), np.full((24, 48), 1000, np.uint16))
+    cv2.imwrite(str(tmp_path / "far.tiff"), np.full((240, 480), 3420.0, np.float32))
+    cases: tuple[tuple[list[str | Path], str], ...] = (
+        ([], "delivers no depth"),
+        (["--source-depth", small], "depth is 48x24, the picture 480x240"),
+        (["--source-depth", tmp_path / "far.tiff"], "source.depth_scale"),
+        (["--source-depth", pictures], "16-bit integers or floats"),
+        (["--source-depth", tmp_path / "nothing"], "no such file"),
+    )
+    for options, words in cases:
+        done = companion("depth", pictures, *options, cwd=tmp_path)
+        assert done.returncode == 2, done.stdout
+        (line,) = done.stderr.splitlines()
+        assert words in line
+    assert depth.is_dir()

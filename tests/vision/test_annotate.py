@@ -161,3 +161,18 @@ def test_any_box_and_text_can_be_drawn(
 ) -> None:
     drawn = annotate(make_image(width, height), seen(boxes.tolist()), lines=lines, highlight=highlight)
     assert drawn.shape == (height, width, 3)
+
+
+def test_depth_at_the_centre_is_a_red_point_and_a_number() -> None:
+    image = make_image()
+    drawn = annotate(image, seen([]), centre_m=3.42)
+    assert drawn[240, 320].tolist() == [0, 0, 255]
+    left, top, right, bottom = changed(image, drawn)
+    assert 310 <= left < 320
+    assert top > 225
+    assert bottom < 260
+    assert 350 < right < 420  # the number is to the right of the point
+    unknown = annotate(image, seen([]), centre_m=float("nan"))
+    assert unknown[240, 320].tolist() == [0, 0, 255]
+    assert (unknown != drawn).any()
+    np.testing.assert_array_equal(annotate(image, seen([])), image)

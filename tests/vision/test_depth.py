@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from mavlink_sim.camera.depth_camera import DepthSensor, measured_depth
 from vision.camera_model import CameraModel, CameraMount
-from vision.depth import nearest_points
+from vision.depth import depth_summary, nearest_points
 from vision.rotation import matrix_from_euler
 
 HEIGHT, WIDTH = 48, 64
@@ -226,3 +226,17 @@ def test_small_object_in_front_is_ignored() -> None:
     depth_m = scene.depth_m.copy()
     depth_m[top + 4 : top + 12, left + 10 : left + 13] = 3.0
     assert ground_range_m(scene, depth_m, scene.box) == pytest.approx(scene.true_m, abs=0.15)
+
+
+def test_summary_of_a_depth_image() -> None:
+    depth_m = np.full((480, 640), np.nan, np.float32)
+    depth_m[:, 160:] = 3.42
+    depth_m[0, 160:164] = (0.0, np.inf, -1.0, np.nan)
+    summary = depth_summary(depth_m)
+    assert summary.centre_m == pytest.approx(3.42)
+    assert summary.valid_share == pytest.approx(0.75 - 4 / (480 * 640))
+    depth_m[238, 320] = 100.0  # a wrong pixel
+    assert depth_summary(depth_m).centre_m == pytest.approx(3.42)
+    depth_m[:, :321] = 0.0  # more than half of the centre is unknown
+    assert math.isnan(depth_summary(depth_m).centre_m)
+    assert depth_summary(np.zeros((1, 1), np.float32)).valid_share == 0.0

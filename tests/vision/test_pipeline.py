@@ -108,6 +108,9 @@ def test_depth_gives_every_detection_its_range() -> None:
     frames = Frames(frame_of(0, depth_m=6.5), frame_of(1))
     near, none = run(Pipeline(frames, BrightSpot(), nearest_in=nearest_in))
     assert near.detections.depth_m == pytest.approx([6.5])
+    assert near.depth is not None
+    assert near.depth.valid_share == 1.0
+    assert none.depth is None
     assert np.isnan(none.detections.depth_m).all()
 
 

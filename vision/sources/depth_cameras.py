@@ -151,7 +151,7 @@ class OakCapture(Capture):
             self._pipeline = dai.Pipeline(self._device)
             self._queue = self._build(dai, settings)
             self._pipeline.start()
-            # The first pair tells the lens, which must be known before it is delivered.
+            # The first pair has the lens, which must be known before it is delivered.
             self._first: Any = self._queue.get(timedelta(seconds=settings.open_timeout_s))
             if self._first is None:
                 raise CaptureError("it delivers no pictures with depth")

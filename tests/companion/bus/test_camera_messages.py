@@ -14,6 +14,7 @@ from companion.bus.messages import (
     Localization,
     ModelIdentity,
     camera_info_message,
+    depth_message,
     detections_message,
     transforms_message,
 )
@@ -25,6 +26,7 @@ from companion.vehicle.state import VehicleState
 from tests.companion.bus.message_check import check_message
 from vision.attitude import quaternion_from_euler
 from vision.camera_model import CameraModel, CameraMount
+from vision.depth import DepthSummary
 from vision.detections import NO_TRACK, Detections
 from vision.pipeline import PerceptionResult
 from vision.rotation import matrix_from_quaternion
@@ -173,3 +175,20 @@ def test_detections_without_a_pose_say_why() -> None:
     check_message("detections", message)
     assert message["localization_error"] == "no attitude"
     assert [car["bearing_rad"] for car in message["detections"]] == [None, None]
+
+
+def test_depth_has_the_centre_and_each_detection() -> None:
+    cars = two_cars()
+    nearest = np.array([[0.5, 0.1, 13.4124], [np.nan] * 3], np.float32)
+    depth = DepthSummary(math.nan, 0.87654321)
+    result = replace(cars, depth=depth, detections=replace(cars.detections, nearest_camera_m=nearest))
+    message = depth_message(result, "v", 9, "down")
+    check_message("depth", message)
+    assert (message["vehicle"], message["camera"], message["sequence"]) == ("v", "down", 7)
+    assert message["centre_m"] is None
+    assert message["valid_share"] == 0.8765
+    assert [(box["class_name"], box["track_id"], box["depth_m"]) for box in message["boxes"]] == [
+        ("car", 7, 13.412),
+        ("car", None, None),
+    ]
+    assert depth_message(replace(result, depth=DepthSummary(3.4249, 1.0)), "v", 9)["centre_m"] == 3.425

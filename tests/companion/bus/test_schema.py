@@ -71,7 +71,7 @@ def test_example_bodies_in_the_document_are_valid() -> None:
             continue
         check_message(name, json.loads(block.partition("```")[0]))
         checked.add(name)
-    assert checked == {"detections", "tracks", "pose", "markers", "camera_info", "transforms"}
+    assert checked == {"detections", "tracks", "pose", "markers", "depth", "camera_info", "transforms"}
 
 
 def test_schema_files(tmp_path: Path) -> None:
