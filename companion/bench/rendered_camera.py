@@ -63,7 +63,7 @@ class RenderedCamera:
     def on_state(self, state: VehicleState, history: StateHistory) -> None:
         """As `WorkerCamera.send_state` sends it to the worker."""
         if state.attitude is not None:
-            self._perception.add_attitude(state.attitude_ns, state.attitude, state.altitude_m)
+            self._perception.add_attitude(state.attitude_ns, state.attitude, state.height_m)
         gimbal = state.gimbal
         if gimbal is not None and gimbal.attitude is not None and self.perceived.settings.camera.on_gimbal:
             with contextlib.suppress(HistoryError):

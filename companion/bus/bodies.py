@@ -31,6 +31,33 @@ TrackEventWord = Annotated[str, _one_of("new", "update", "lost", "end")]
 RangeWord = Annotated[str, _one_of("depth", "ground_plane", "known_height", "marker", "none")]
 RoleWord = Annotated[str, _one_of("alone", "leader", "follower", "virtual")]
 LevelWord = Annotated[str, _one_of("info", "warning", "error")]
+HeightWord = Annotated[str, _one_of("distance_sensor", "home")]
+
+
+class ErrorEllipseBody(TypedDict):
+    """One-sigma error ellipse of a horizontal position; 95 % are within 2.45 times its axes."""
+
+    semi_major_m: float
+    """half of the longer axis"""
+    semi_minor_m: float
+    """half of the shorter axis"""
+    orientation_rad: float
+    """of the longer axis, clockwise from north, 0 to pi"""
+
+
+class PositionBody(TypedDict):
+    """Position of an object, null where unknown."""
+
+    position_ned_m: Three | None
+    """local NED"""
+    latitude_deg: float | None
+    """WGS 84"""
+    longitude_deg: float | None
+    """WGS 84"""
+    altitude_amsl_m: float | None
+    """above mean sea level"""
+    error_ellipse: ErrorEllipseBody | None
+    """of the position, with the vehicle's own position error"""
 
 
 class FrameBody(TypedDict):
@@ -52,9 +79,9 @@ class FrameBody(TypedDict):
     """height of the frame, pixels"""
 
 
-class DetectionBody(TypedDict):
-    """One detection. The fields from `bearing_rad` on are null where unknown, and for other cameras than the
-    steering one.
+class DetectionBody(PositionBody):
+    """One detection. Its position and the fields from `bearing_rad` on are null where unknown, and for other
+    cameras than the steering one.
     """
 
     class_id: int
@@ -91,14 +118,6 @@ class DetectionBody(TypedDict):
     """what the range was measured by; none: no range"""
     range_sigma_m: float | None
     """one-sigma error of ground_range_m"""
-    position_ned_m: Three | None
-    """local NED"""
-    latitude_deg: float | None
-    """WGS 84"""
-    longitude_deg: float | None
-    """WGS 84"""
-    altitude_amsl_m: float | None
-    """above mean sea level"""
 
 
 class DetectionsBody(FrameBody):
@@ -124,8 +143,10 @@ class DetectionsBody(FrameBody):
     """the detections"""
 
 
-class TrackEventBody(TypedDict):
-    """One event of a confirmed track."""
+class TrackEventBody(PositionBody):
+    """One event of a confirmed track. The position is fused over its detections; it is null without a range,
+    and for other cameras than the steering one.
+    """
 
     event: TrackEventWord
     """what happened"""
@@ -151,6 +172,8 @@ class TrackEventBody(TypedDict):
     """capture of the first of these frames"""
     last_ns: int
     """capture of the newest of these frames"""
+    moving: bool | None
+    """the object moves; the position is the newest, not fused over the track"""
 
 
 class TracksBody(FrameBody):
@@ -430,6 +453,10 @@ class VehicleBody(TypedDict):
     """home, as position_ned_m; null until known"""
     altitude_m: float | None
     """above home"""
+    ground_height_m: float | None
+    """above the ground, by a range finder that looks down; null while it does not meet the ground"""
+    height_source: HeightWord | None
+    """the height from which ranges to objects are computed"""
     latitude_deg: float | None
     """WGS 84"""
     longitude_deg: float | None

@@ -6,6 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from companion.bus.bodies import (
     BoardBody,
     CameraInfoBody,
@@ -13,11 +15,13 @@ from companion.bus.bodies import (
     DepthBody,
     DetectionBody,
     DetectionsBody,
+    ErrorEllipseBody,
     FrameBody,
     ImageBody,
     MarkerBody,
     MarkersBody,
     ObstaclesBody,
+    PositionBody,
     TrackEventBody,
     TracksBody,
     TransformBody,
@@ -27,10 +31,13 @@ from companion.bus.topics import NO_OBJECTS
 from companion.geometry.geodesy import GeodeticOrigin
 from companion.guidance.targets.from_detections import StateHistory, mount_at
 from companion.guidance.targets.from_markers import BoardTarget, BodyPose, LocalizedMarkers, MarkerTarget
+from companion.guidance.targets.fused import FusedPosition, FusedTracks
 from companion.guidance.targets.target import Target
 from companion.vehicle.clock_sync import ClockOffset
+from companion.vehicle.state import Vector3
 from vision.camera_model import CameraModel, CameraMount
 from vision.detections import DetectionRecord
+from vision.geolocation import ErrorEllipse
 from vision.markers import Marker
 from vision.obstacle_sectors import SECTOR_RAD, ObstacleSectors
 from vision.pipeline import PerceptionResult
@@ -46,11 +53,13 @@ class Localization:
         targets: one per detection, in their order; empty if `error` gives the reason.
         error: why the detections have no direction; empty if they have.
         origin: of local NED; None while latitude and longitude are unknown.
+        fused: the positions of the confirmed tracks; None: unknown.
     """
 
     targets: tuple[Target, ...] = ()
     error: str = ""
     origin: GeodeticOrigin | None = None
+    fused: FusedTracks | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +116,10 @@ def _detection(
     record: DetectionRecord, age_s: float | None, target: Target | None, origin: GeodeticOrigin | None
 ) -> DetectionBody:
     position = None if target is None else target.position_ned_m
-    place = None if position is None or origin is None else origin.place(position)
+    covariance = None if target is None else target.position_covariance
+    ellipse = None
+    if target is not None and covariance is not None:
+        ellipse = ErrorEllipse.of(covariance + np.eye(2) * target.vehicle_sigma_m**2)
     return {
         "class_id": record["class_id"],
         "class_name": record["class_name"],
@@ -126,20 +138,46 @@ def _detection(
         "distance_m": None if target is None else _number(target.distance_m),
         "range_source": None if target is None else target.range_source.value,
         "range_sigma_m": None if target is None else _number(target.range_sigma_m),
+        **_position_fields(position, origin, ellipse),
+    }
+
+
+def _position_fields(
+    position: Vector3 | None, origin: GeodeticOrigin | None, ellipse: ErrorEllipse | None
+) -> PositionBody:
+    place = None if position is None or origin is None else origin.place(position)
+    return {
         "position_ned_m": None if position is None else [round(value, 3) for value in position],
         "latitude_deg": None if place is None else round(place[0], 8),
         "longitude_deg": None if place is None else round(place[1], 8),
         "altitude_amsl_m": None if place is None else round(place[2], 3),
+        "error_ellipse": None if ellipse is None else _ellipse(ellipse),
+    }
+
+
+def _ellipse(ellipse: ErrorEllipse) -> ErrorEllipseBody:
+    return {
+        "semi_major_m": round(ellipse.semi_major_m, 3),
+        "semi_minor_m": round(ellipse.semi_minor_m, 3),
+        "orientation_rad": round(ellipse.orientation_rad, 4),
     }
 
 
 def tracks_message(
-    result: PerceptionResult, vehicle: str, published_ns: int, view: str | None = None
+    result: PerceptionResult,
+    vehicle: str,
+    published_ns: int,
+    view: str | None = None,
+    localization: Localization | None = None,
 ) -> TracksBody:
     """Create the message of one frame's track events; every track in it is or was confirmed."""
+    fused, origin = (None, None) if localization is None else (localization.fused, localization.origin)
     return {
         **_of_frame(result, vehicle, published_ns, view),
-        "events": [_track_event(event) for event in result.track_events],
+        "events": [
+            _track_event(event, None if fused is None else fused.position(event.track.track_id), origin)
+            for event in result.track_events
+        ],
     }
 
 
@@ -155,8 +193,11 @@ def _of_frame(result: PerceptionResult, vehicle: str, published_ns: int, view: s
     }
 
 
-def _track_event(event: TrackEvent) -> TrackEventBody:
+def _track_event(
+    event: TrackEvent, fused: FusedPosition | None, origin: GeodeticOrigin | None
+) -> TrackEventBody:
     track = event.track
+    position, ellipse = (None, None) if fused is None else (fused.position_ned_m, fused.ellipse)
     return {
         "event": event.kind.value,
         "stamp_ns": event.stamp_ns,
@@ -170,6 +211,8 @@ def _track_event(event: TrackEvent) -> TrackEventBody:
         "seen": track.seen,
         "first_ns": track.first_ns,
         "last_ns": track.last_ns,
+        **_position_fields(position, origin, ellipse),
+        "moving": None if fused is None else fused.moving,
     }
 
 

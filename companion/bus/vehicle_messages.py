@@ -24,6 +24,7 @@ from companion.vehicle.streamer import Streamer
 
 def vehicle_message(state: VehicleState, now_ns: int) -> VehicleBody:
     """Create the vehicle's message. Metres, metres a second, radians; NED; `attitude_wxyz`: FRD to NED."""
+    ground_height_m = state.ground_height_m
     return {
         "stamp_ns": now_ns,
         "connected": state.connected(now_ns),
@@ -44,6 +45,8 @@ def vehicle_message(state: VehicleState, now_ns: int) -> VehicleBody:
         "yaw_rad": None if state.yaw_rad is None else round(state.yaw_rad, 4),
         "home_ned_m": _rounded(state.home_position_ned_m),
         "altitude_m": None if state.altitude_m is None else round(state.altitude_m, 3),
+        "ground_height_m": None if ground_height_m is None else round(ground_height_m, 3),
+        "height_source": None if state.height_source is None else state.height_source.value,
         "latitude_deg": _finite(state.latitude_deg),
         "longitude_deg": _finite(state.longitude_deg),
         "altitude_amsl_m": _finite(state.altitude_amsl_m),

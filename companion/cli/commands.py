@@ -30,7 +30,7 @@ from companion.cli.markers import MARKER_SETTINGS, markers
 from companion.cli.mission import mission
 from companion.cli.models import models
 from companion.cli.play import play
-from companion.cli.recordings import RECORD_SETTINGS, log, record, replay
+from companion.cli.recordings import RECORD_SETTINGS, log, record, replay, sightings
 from companion.cli.topics import topics
 from companion.settings import Settings
 from companion.settings.perception import DEFAULT_MODEL, NO_SOURCE
@@ -60,6 +60,7 @@ ORDER = (
     "cloud",
     "record",
     "replay",
+    "sightings",
     "config",
     "markers",
     "evaluate",
@@ -88,6 +89,7 @@ settings_command(app, *CLIENT_SETTINGS, "dashboard")(dashboard)
 app.add_typer(bench, name="bench")
 settings_command(app, *CLIENT_SETTINGS, *RECORD_SETTINGS)(record)
 settings_command(app, "plugins")(replay)
+app.command()(sightings)
 app.add_typer(log, name="log")
 
 EXIT_FAILED = 1

@@ -1,4 +1,4 @@
-"""`companion record`, `replay` and `log`: recordings of flights."""
+"""`companion record`, `replay`, `sightings` and `log`: recordings of flights."""
 
 from __future__ import annotations
 
@@ -119,6 +119,25 @@ def _key_and_value(text: str) -> tuple[str, str]:
     if not equals:
         raise typer.BadParameter(f"expected KEY=VALUE, got {text!r}", param_hint="--set")
     return key.strip(), value.strip()
+
+
+def sightings(
+    files: Annotated[list[Path], typer.Argument(metavar="FILE…", help="Recordings.")],
+    as_geojson: Annotated[bool, typer.Option("--geojson", help="Print GeoJSON (RFC 7946).")] = False,
+    as_kml: Annotated[bool, typer.Option("--kml", help="Print KML 2.2.")] = False,
+) -> None:
+    """Print the objects in recordings: each confirmed track, its fused position and 95 % error ellipse."""
+    if as_geojson == as_kml:
+        typer.echo("companion: expected --geojson or --kml, one of them", err=True)
+        raise typer.Exit(EXIT_BAD_INPUT)
+    with _with_library():
+        from companion import sightings as found_in
+        from companion.recording import RecordingError
+    with plain_errors(RecordingError):
+        found = found_in.sightings(files)
+    typer.echo(found_in.geojson(found) if as_geojson else found_in.kml(found))
+    if unplaced := sum(sighting.position is None for sighting in found):
+        typer.echo(f"companion: {unplaced} of {len(found)} tracks have no position", err=True)
 
 
 @log.command("list")

@@ -34,6 +34,7 @@ from companion.guidance.targets.from_markers import (
     looks_down,
     marker_targets,
 )
+from companion.guidance.targets.fused import FusedTracks
 from companion.guidance.targets.ranging import ALL_MEANS, RangeMeans, sees_ground
 from companion.guidance.targets.target import Target
 from companion.perception.messages import CloudPreview, Preview
@@ -63,6 +64,7 @@ class PerceptionCamera:
         newest: the newest result; None before the first.
         targets: the newest result's localized objects, after `localize`.
         localization_error: why they could not be localized; empty if they were.
+        fused: the positions of its confirmed tracks, after `localize`.
         class_names: classes of the detector; None before it is loaded.
     """
 
@@ -74,6 +76,7 @@ class PerceptionCamera:
         self.newest: PerceptionResult | None = None
         self.targets: tuple[Target, ...] = ()
         self.localization_error = ""
+        self.fused = FusedTracks()
         self._class_names = class_names
         self._has_depth = False
         self._between_s: deque[float] = deque(maxlen=9)
@@ -121,6 +124,9 @@ class PerceptionCamera:
                 self.settings.detector.heights(),
             )
             self.localization_error = ""
+            if self.targets:
+                vehicle = history.at(result.captured_ns).position_ned_m
+                self.fused.update(self.targets, vehicle, result.captured_ns)
         except HistoryError as error:
             # Without an attitude at the capture a box has no direction: it is published, but not a target.
             self.targets, self.localization_error = (), str(error)
@@ -194,7 +200,7 @@ class WorkerCamera(PerceptionCamera):
     def send_state(self, state: VehicleState, history: StateHistory) -> None:
         """Send the attitudes of vehicle and gimbal to the worker, for its tracker."""
         if state.attitude is not None:
-            self.supervisor.send_attitude(state.attitude_ns, state.attitude, state.altitude_m)
+            self.supervisor.send_attitude(state.attitude_ns, state.attitude, state.height_m)
         gimbal = state.gimbal
         if gimbal is None or not self.settings.camera.on_gimbal or gimbal.attitude is None:
             return

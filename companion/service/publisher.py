@@ -103,7 +103,13 @@ class Publisher:
         )
         bus.publish(topics.LABELS, lambda: labels_message(result), name)
         if result.track_events:
-            bus.publish(topics.TRACKS, lambda: tracks_message(result, vehicle, now_ns, name), name)
+            bus.publish(
+                topics.TRACKS,
+                lambda: tracks_message(
+                    result, vehicle, now_ns, name, localization=located() if steering else None
+                ),
+                name,
+            )
         if markers is not None:
             bus.publish(topics.MARKERS, lambda: markers_message(result, markers, vehicle, now_ns, name), name)
         if result.depth is not None:

@@ -272,7 +272,7 @@ class Service:
         markers, localization = None, Localization(error="failed")
         try:
             markers = self.inputs.on_result(camera, result)
-            localization = Localization(camera.targets, camera.localization_error)
+            localization = Localization(camera.targets, camera.localization_error, fused=camera.fused)
             if camera is self.inputs.steering or markers is not None:
                 self._loop.on_perception()
         finally:

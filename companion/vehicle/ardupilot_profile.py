@@ -27,7 +27,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from companion.vehicle.autopilot_profile import HOME_POSITION_ID, AutopilotProfile
+from companion.vehicle.autopilot_profile import DISTANCE_SENSOR_ID, HOME_POSITION_ID, AutopilotProfile
 from companion.vehicle.driver import CommandRefusedError
 from companion.vehicle.framing import EKF_STATUS_REPORT_ID
 from companion.vehicle.setpoint import IGNORE_ACCELERATION, IGNORE_YAW, IGNORE_YAW_RATE
@@ -88,6 +88,7 @@ class ArduPilotProfile(AutopilotProfile):
         HOME_POSITION_ID: 0.5,
         GPS_GLOBAL_ORIGIN_ID: 0.5,
         EKF_STATUS_REPORT_ID: 5.0,
+        DISTANCE_SENSOR_ID: 10.0,
     }
     optional = (EKF_STATUS_REPORT_ID,)
 

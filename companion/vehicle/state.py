@@ -10,12 +10,13 @@ of them handles resets. The autopilot keeps home in its own coordinates, so here
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 from companion.vehicle.clock_sync import ClockOffset
 from companion.vehicle.commander import Commander
 from companion.vehicle.gimbal import GimbalState
+from companion.vehicle.ground import GROUND_MAX_AGE_S, GroundLevel
 from companion.vehicle.report import WARNING, Report
 
 Vector3 = tuple[float, float, float]
@@ -61,6 +62,13 @@ class LandedState(StrEnum):
     LANDING = "landing"
 
 
+class HeightSource(StrEnum):
+    """What the height above the ground is measured by."""
+
+    HOME = "home"
+    DISTANCE_SENSOR = "distance_sensor"
+
+
 @dataclass(frozen=True, slots=True)
 class Odometry:
     """The newest ODOMETRY, the reference for measuring the next reset.
@@ -97,6 +105,9 @@ class VehicleState:
         angular_velocity_frd_radps: body rates.
         latitude_deg, longitude_deg, altitude_amsl_m: global position, NaN when unknown.
         home_altitude_amsl_m, home_position_ned_m: of the home position; None until received.
+        ground: by the range finder that looks down; None without one.
+        horizontal_sigma_m, vertical_sigma_m: one sigma of the position as the estimator states it; None: not
+            stated.
         battery_fraction: 0..1, None when unknown.
         ready_to_arm: the autopilot's own pre-arm checks pass, in its current mode.
         failsafe: the autopilot reports MAV_STATE_CRITICAL or EMERGENCY.
@@ -137,6 +148,9 @@ class VehicleState:
     reset_count: int = 0
     reset_offset_ned_m: Vector3 = (0.0, 0.0, 0.0)
     odometry: Odometry | None = None
+    ground: GroundLevel | None = field(default=None, metadata={"recorded": False})
+    horizontal_sigma_m: float | None = None
+    vertical_sigma_m: float | None = None
     battery_fraction: float | None = None
     clock: ClockOffset | None = None
     gimbal: GimbalState | None = None
@@ -160,6 +174,29 @@ class VehicleState:
             return None
         home_down = self.home_position_ned_m[2] if self.home_position_ned_m else 0.0
         return home_down - self.position_ned_m[2]
+
+    @property
+    def ground_height_m(self) -> float | None:
+        """Height above the ground by the range finder; None while that has not met it in the last 5 s."""
+        ground, position = self.ground, self.position_ned_m
+        if ground is None or position is None or not ground.measured_ns:
+            return None
+        if self.position_ns - ground.measured_ns > GROUND_MAX_AGE_S * 1e9:
+            return None
+        return ground.position_ned_m[2] - position[2]
+
+    @property
+    def height_m(self) -> float | None:
+        """Height above the ground, for ranges to objects: by the range finder, else above home."""
+        measured_m = self.ground_height_m
+        return self.altitude_m if measured_m is None else measured_m
+
+    @property
+    def height_source(self) -> HeightSource | None:
+        """Source of `height_m`; None while that is unknown."""
+        if self.position_ned_m is None:
+            return None
+        return HeightSource.HOME if self.ground_height_m is None else HeightSource.DISTANCE_SENSOR
 
     @property
     def without_setpoints(self) -> str:

@@ -53,6 +53,7 @@ class StreamMonitor:
     Args:
         expected_hz: message id → expected rate.
         optional: message ids that an autopilot may refuse; then they are not missing.
+        once: message ids that a vehicle may lack: after one answer they are not missing.
         first_window_s: length of the first window after `restart`, before the first requests.
     """
 
@@ -62,9 +63,11 @@ class StreamMonitor:
         now_ns: int,
         *,
         optional: Collection[int] = (),
+        once: Collection[int] = (),
         first_window_s: float = WINDOW_S,
     ) -> None:
         self._expected_hz, self._optional = dict(expected_hz), frozenset(optional)
+        self._once = frozenset(once)
         self._first_window_s = first_window_s
         self.restart(now_ns)
 
@@ -100,14 +103,16 @@ class StreamMonitor:
 
     def asked(self, message_id: int, now_ns: int) -> None:
         """Note a request: a new window starts, and the pause doubles."""
-        stream = self._streams[message_id]
+        stream = self._streams.get(message_id)
+        if stream is None:  # an earlier answer has removed it
+            return
         stream.ask_at_ns = now_ns + round(stream.pause_s * 1e9)
         stream.pause_s = min(2.0 * stream.pause_s, _LONGEST_PAUSE_S)
         stream.begin_window(now_ns, max(WINDOW_S, _MESSAGES_PER_WINDOW / stream.expected_hz))
 
-    def refused(self, message_id: int) -> None:
-        """Note a refusal: an optional stream is not requested again until `restart`."""
-        if message_id in self._optional:
+    def answered(self, message_id: int, *, accepted: bool) -> None:
+        """Note an answer: an optional stream, if refused, is not requested again until `restart`."""
+        if message_id in self._once or (not accepted and message_id in self._optional):
             self._streams.pop(message_id, None)
 
     @property
@@ -134,6 +139,7 @@ class StreamRequests:
             {**telemetry.profile.rates_hz, **telemetry.profile.expected_hz},
             time.monotonic_ns(),
             optional=telemetry.profile.optional,
+            once=telemetry.profile.once,
             first_window_s=_MEASURE_S,
         )
 
@@ -192,10 +198,10 @@ class StreamRequests:
 
     def _on_answer(self, message_id: int, result: int) -> None:
         self.monitor.asked(message_id, time.monotonic_ns())
+        self.monitor.answered(message_id, accepted=result == ACCEPTED)
         if result == ACCEPTED:
             self._refused.discard(message_id)
             return
-        self.monitor.refused(message_id)
         if message_id not in self._refused:
             self._refused.add(message_id)
             logger.info(

@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from companion.vehicle.gimbal_telemetry import GIMBAL_STEPS
+from companion.vehicle.ground import GroundLevel, may_measure, range_below_m
 from companion.vehicle.px4_modes import mode_of_custom_mode
 from companion.vehicle.state import FlightMode, LandedState, Odometry, Vector3, VehicleState
 
@@ -160,10 +161,29 @@ def _subtract(position: Vector3, offset: Vector3) -> Vector3:
 
 
 def _estimator_status(state: VehicleState, fields: Fields, _now_ns: int) -> VehicleState:
-    """Apply the validity flags; they hold until the next message, since a missing stream is requested."""
+    """Apply flags and accuracies; they hold until the next message, since a missing stream is requested."""
     flags = fields["flags"]
     valid = all(flags & group for group in (_VELOCITY_HORIZ, _POS_HORIZ, _POS_VERT))
-    return state if valid is state.position_valid else replace(state, position_valid=valid)
+    horizontal, vertical = (
+        _positive(fields.get(f"pos_{axis}_accuracy")) for axis in ("horiz", "vert")
+    )  # EKF_STATUS_REPORT has none
+    new = (valid, horizontal, vertical)
+    if new == (state.position_valid, state.horizontal_sigma_m, state.vertical_sigma_m):
+        return state
+    return replace(state, position_valid=valid, horizontal_sigma_m=horizontal, vertical_sigma_m=vertical)
+
+
+def _distance_sensor(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:
+    slant_m, position, attitude = range_below_m(fields), state.position_ned_m, state.attitude
+    if slant_m is None or position is None or attitude is None or not state.position_fresh(now_ns):
+        return state
+    _, x, y, _ = attitude
+    cosine = 1.0 - 2.0 * (x * x + y * y)  # of the angle between body down and down
+    if not may_measure(cosine):
+        return state
+    home_down = state.home_position_ned_m[2] if state.home_position_ned_m else 0.0
+    ground = state.ground or GroundLevel()
+    return replace(state, ground=ground.measure(now_ns, slant_m, position, cosine, home_down))
 
 
 def _global_position_int(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:
@@ -207,6 +227,11 @@ def _number(value: float | None) -> float:
     return math.nan if value is None else float(value)
 
 
+def _positive(value: float | None) -> float | None:
+    """Return a finite number above zero, else None."""
+    return float(value) if value is not None and 0.0 < value < math.inf else None
+
+
 def _vector(fields: Fields, *names: str) -> tuple[float, float, float] | None:
     """Return three fields as a vector; None if any is not finite."""
     x, y, z = (_number(fields[name]) for name in names)
@@ -221,6 +246,7 @@ _STEPS: dict[str, Callable[[VehicleState, Fields, int], VehicleState]] = {
     "LOCAL_POSITION_NED": _local_position_ned,
     "ODOMETRY": _odometry,
     "ESTIMATOR_STATUS": _estimator_status,
+    "DISTANCE_SENSOR": _distance_sensor,
     "GLOBAL_POSITION_INT": _global_position_int,
     "HOME_POSITION": _home_position,
     "SYS_STATUS": _sys_status,

@@ -168,6 +168,7 @@ class TelemetryState:
             home_altitude_amsl_m=None,
             home_position_ned_m=None,
             position_valid=None,
+            ground=None,
             odometry=None,
             clock=None,
             gimbal=None,

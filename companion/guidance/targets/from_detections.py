@@ -16,6 +16,16 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.guidance.targets.range_error import (
+    UNSTATED_POSITION_SIGMA_M,
+    BoxError,
+    PoseError,
+    across_sigma_m,
+    depth_sigma_m,
+    ground_sigma_m,
+    height_sigma_m,
+    size_sigma_m,
+)
 from companion.guidance.targets.target import RangeSource, Target
 from companion.vehicle.gimbal import YawFrame
 from companion.vehicle.state import Quaternion, Vector3, VehicleState
@@ -47,16 +57,8 @@ CONTACT_INSET_M = 0.2
 # rectangle would. 95 % of errors, rendered frames, up to 20° of roll: 1.20 m with 0.25, 1.23 with 0, 1.49
 # with 0.5. Of synthetic approaches (to boxes) in wind, fewer arrive with 0.
 CONTACT_SHARE = 0.25
-# One sigma of that offset, fraction of the box's width. Beyond this roll it is not corrected.
-CONTACT_SIGMA = 0.25
+# Beyond this roll it is not corrected.
 MAX_CONTACT_ROLL_RAD = math.radians(30.0)
-# One sigma of the range, metres, from the same measurement. Depth: fixed, and per metre of range.
-DEPTH_SIGMA = (0.15, 0.02)
-# The nearest point of a box cut off by the image edge may be outside.
-CUT_SIGMA_M = 0.3
-# Ground: fixed, and per radian of depression; two pixels of the box's edge and half a degree of attitude.
-GROUND_SIGMA_M, GROUND_SIGMA_RAD = 0.3, 0.015
-HEIGHT_SIGMA = (0.3, 0.2)
 # Boxes with at least this IoU belong to one object (those of a rider and the bicycle do not). A class is
 # unambiguous if its score exceeds that of every other class of the object by this.
 SAME_OBJECT_IOU, CLEAR_MARGIN = 0.7, 0.1
@@ -72,12 +74,14 @@ class Pose(NamedTuple):
     Attributes:
         ned_from_body: (3, 3) float64 rotation from body FRD to NED.
         position_ned_m: local NED, metres.
-        height_m: above home; taken as the height above flat ground.
+        height_m: above flat ground: by a range finder if there is one, else above home.
+        error: one sigma of all of it.
     """
 
     ned_from_body: NDArray[np.float64]
     position_ned_m: Vector3
     height_m: float
+    error: PoseError
 
 
 class StateHistory:
@@ -89,7 +93,7 @@ class StateHistory:
     def __init__(self, duration_s: float = HISTORY_S) -> None:
         self._duration_ns = round(duration_s * 1e9)
         self._attitudes: deque[tuple[int, Quaternion]] = deque()
-        self._positions: deque[tuple[int, tuple[float, float, float, float]]] = deque()
+        self._positions: deque[tuple[int, tuple[float, ...]]] = deque()
         self._gimbal: deque[tuple[int, tuple[Quaternion, YawFrame]]] = deque()
 
     def add(self, state: VehicleState) -> None:
@@ -97,9 +101,11 @@ class StateHistory:
         if state.attitude is not None and _newer(self._attitudes, state.attitude_ns):
             self._attitudes.append((state.attitude_ns, state.attitude))
             self._forget(self._attitudes)
-        position, height_m = state.position_ned_m, state.altitude_m
+        position, height_m = state.position_ned_m, state.height_m
         if position is not None and height_m is not None and _newer(self._positions, state.position_ns):
-            self._positions.append((state.position_ns, (*position, height_m)))
+            sigma_m = height_sigma_m(state.height_source, height_m, state.vertical_sigma_m)
+            error_m = (sigma_m, state.horizontal_sigma_m or UNSTATED_POSITION_SIGMA_M)
+            self._positions.append((state.position_ns, (*position, height_m, *error_m)))
             self._forget(self._positions)
         gimbal = state.gimbal
         if gimbal is not None and gimbal.attitude is not None and _newer(self._gimbal, gimbal.attitude_ns):
@@ -114,8 +120,10 @@ class StateHistory:
         """
         ned_from_body = self._ned_from_body(stamp_ns)
         before, after, fraction = _around(self._positions, stamp_ns, "position of the vehicle")
-        north, east, down, height = (a + (b - a) * fraction for a, b in zip(before, after, strict=True))
-        return Pose(ned_from_body, (north, east, down), height)
+        north, east, down, height, *error_m = (
+            a + (b - a) * fraction for a, b in zip(before, after, strict=True)
+        )
+        return Pose(ned_from_body, (north, east, down), height, PoseError(*error_m))
 
     def gimbal_at(self, stamp_ns: int) -> Quaternion:
         """Quaternion (w, x, y, z) from the gimbal's frame (FRD) to NED at a time, by slerp.
@@ -168,9 +176,9 @@ def targets_from_detections(
 
     The range comes from the detection's nearest point if it has one (`nearest_camera_m`, from depth), else
     from the intersection of the ray through the box's lower edge with the ground, less `CONTACT_INSET_M`. The
-    ground is assumed flat and level with home. That gives no range if the box touches the image's lower edge,
-    or the ray points less than 2° down; then the class's height in `heights_m` is used, if the box is not cut
-    off at its top or bottom.
+    ground is assumed flat, at the level below the vehicle (`VehicleState.ground`) or else of home. That gives
+    no range if the box touches the image's lower edge, or the ray points less than 2° down; then the class's
+    height in `heights_m` is used, if the box is not cut off at its top or bottom.
 
     A detection that has a similar score as another class is not `trusted`: a car that may be a truck is not
     flown to.
@@ -206,12 +214,14 @@ class _Sight(NamedTuple):
         nearest: to the nearest point of its surface, by depth.
         on_ground: to the intersection of the middle of its lower edge with the ground.
         lens: to the optical centre.
+        pixel_rad: depression of one row at the lower edge, radians.
     """
 
     direction: list[float]
     nearest: list[float]
     on_ground: list[float]
     lens: list[float]
+    pixel_rad: float
 
 
 def _sights(
@@ -223,18 +233,20 @@ def _sights(
     left, top, right, bottom = np.array([detection["xyxy"] for detection in detections]).T - 0.5
     unknown = [math.nan] * 3
     nearest = np.array([detection["nearest_camera_m"] or unknown for detection in detections], np.float64)
-    pixels = np.empty((2 * count, 2))
+    pixels = np.empty((3 * count, 2))
     middle = (left + right) / 2
-    pixels[:count, 0] = middle
-    pixels[count:, 0] = middle + _contact_px(right - left, bottom - top, _roll_rad(mount, pose))
-    pixels[:count, 1], pixels[count:, 1] = (top + bottom) / 2, bottom
+    contact = middle + _contact_px(right - left, bottom - top, _roll_rad(mount, pose))
+    pixels[:, 0] = np.concatenate([middle, contact, contact])
+    pixels[:, 1] = np.concatenate([(top + bottom) / 2, bottom, bottom + 1.0])
     lines = PixelRays.of(camera, mount, pose.ned_from_body, pixels)
-    centres, feet = lines[:count], lines[count:]
+    centres, feet, below = lines[:count], lines[count : 2 * count], lines[2 * count :]
     on_ground = feet.on_ground(pose.height_m, MIN_DEPRESSION_RAD)
+    # Between two rays one row apart; the angle is too small for the arc cosine of their product.
+    pixel_rad = np.linalg.norm(below.directions - feet.directions, axis=1)
     offsets = lines.camera_ned_m + nearest @ mount.ned_from_optical(pose.ned_from_body).T
-    of_each, lens = (centres.directions, offsets, on_ground), lines.camera_ned_m.tolist()
+    of_each, lens = (centres.directions, offsets, on_ground, pixel_rad), lines.camera_ned_m.tolist()
     geometry = zip(*(values.tolist() for values in of_each), strict=True)
-    return [_Sight(direction, at, foot, lens) for direction, at, foot in geometry]
+    return [_Sight(direction, at, foot, lens, row_rad) for direction, at, foot, row_rad in geometry]
 
 
 def _contact_px(
@@ -293,30 +305,26 @@ def _target(
 ) -> Target:
     left, top, right, bottom = detection["xyxy"]
     direction = sight.direction
-    source, offset, fixed_m, growing_m = RangeSource.NONE, [math.nan] * 3, math.nan, math.nan
+    source, offset, sigma_m = RangeSource.NONE, [math.nan] * 3, math.nan
     whole_below = bottom < camera.height - 1 - EDGE_PX
     inside = left > EDGE_PX and right < camera.width - EDGE_PX and whole_below
-    cut_m = 0.0 if inside else CUT_SIGMA_M
+    box = BoxError(sight.pixel_rad, right - left, bottom - top, _roll_rad(mount, pose), not inside)
     if all(map(math.isfinite, sight.nearest)):
         source = RangeSource.DEPTH
         offset = _towards(sight.lens, direction, sight.nearest)
-        fixed_m = DEPTH_SIGMA[0] + cut_m
-        growing_m = DEPTH_SIGMA[1] * math.hypot(offset[0], offset[1])
+        depth_m = detection["nearest_camera_m"][2] if detection["nearest_camera_m"] else math.nan
+        sigma_m = depth_sigma_m(*_range_and_drop(offset, sight.lens), depth_m, box, pose.error)
     elif whole_below and pose.height_m > MIN_HEIGHT_M and math.isfinite(sight.on_ground[0]):
         source = RangeSource.GROUND_PLANE
         offset = _nearer(sight.lens, sight.direction, sight.on_ground, CONTACT_INSET_M)
-        fixed_m = GROUND_SIGMA_M + cut_m
-        unknown_rad = CONTACT_SIGMA * (right - left) * math.sin(_roll_rad(mount, pose)) / camera.fy
-        growing_m = math.hypot(GROUND_SIGMA_RAD, unknown_rad) * (
-            math.hypot(offset[0], offset[1]) ** 2 / offset[2] + offset[2]
-        )
+        sigma_m = ground_sigma_m(*_range_and_drop(sight.on_ground, sight.lens), box, pose.error)
     elif height_m is not None and _measurable(camera, top, bottom):
         offset = range_from_known_height(
             camera, mount, pose.ned_from_body, detection["xyxy"], height_m
         ).tolist()
         if all(map(math.isfinite, offset)):
             source = RangeSource.KNOWN_HEIGHT
-            fixed_m, growing_m = HEIGHT_SIGMA[0], HEIGHT_SIGMA[1] * math.hypot(offset[0], offset[1])
+            sigma_m = size_sigma_m(*_range_and_drop(offset, sight.lens), height_m, box, pose.error)
     known = source is not RangeSource.NONE
     north, east, down = (origin + away for origin, away in zip(pose.position_ned_m, offset, strict=True))
     return Target(
@@ -334,8 +342,15 @@ def _target(
         trusted=trusted and detection.get("track_state") in (None, TRACK_CONFIRMED),
         depth_m=math.nan if detection["depth_m"] is None else detection["depth_m"],
         distance_m=math.hypot(*offset),
-        range_sigma_m=math.hypot(fixed_m, growing_m),
+        range_sigma_m=sigma_m,
+        across_sigma_m=across_sigma_m(*_range_and_drop(offset, sight.lens), box, pose.error),
+        vehicle_sigma_m=pose.error.horizontal_m,
     )
+
+
+def _range_and_drop(offset: list[float], lens: list[float]) -> tuple[float, float]:
+    """Horizontal range from the lens to a point, and how much lower the point is."""
+    return math.hypot(offset[0] - lens[0], offset[1] - lens[1]), offset[2] - lens[2]
 
 
 def _towards(lens: list[float], direction: list[float], nearest: list[float]) -> list[float]:

@@ -6,7 +6,11 @@ import math
 from dataclasses import dataclass
 from enum import StrEnum
 
+import numpy as np
+from numpy.typing import NDArray
+
 from companion.vehicle.state import Vector3
+from vision.geolocation import position_covariance
 
 # The reason when no seen object was trusted.
 DOUBTED = "target not confirmed (score < tracker.confirm_score) or class ambiguous"
@@ -46,6 +50,9 @@ class Target:
         depth_m: along the camera's optical axis to the nearest surface; NaN without a depth image.
         distance_m: from the vehicle to the nearest surface; NaN when the range is unknown.
         range_sigma_m: one sigma of `ground_range_m`; NaN: not stated.
+        across_sigma_m: the same across the line of sight, horizontal.
+        vehicle_sigma_m: one sigma of the vehicle's own horizontal position, on each axis, common to all of
+            its targets and not part of the two above.
     """
 
     class_name: str
@@ -63,6 +70,15 @@ class Target:
     depth_m: float = math.nan
     distance_m: float = math.nan
     range_sigma_m: float = math.nan
+    across_sigma_m: float = math.nan
+    vehicle_sigma_m: float = 0.0
+
+    @property
+    def position_covariance(self) -> NDArray[np.float64] | None:
+        """(2, 2) covariance, m², of the horizontal position, without the vehicle's own; None: unknown."""
+        if self.position_ned_m is None or not math.isfinite(self.range_sigma_m + self.across_sigma_m):
+            return None
+        return position_covariance(self.bearing_rad, self.range_sigma_m, self.across_sigma_m)
 
     @property
     def score(self) -> float:

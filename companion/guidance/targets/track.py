@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from companion.guidance.targets.target import RangeSource, Target
 from companion.vehicle.state import Vector3
 from vision.attitude import wrap_angle
+from vision.geolocation import position_covariance
 
 # Random walk of an object: 1 m in 1 s, one sigma, a walking person's pace.
 RANDOM_WALK_M2_PER_S = 1.0
@@ -144,8 +145,6 @@ class ObjectTrack:
 def measurement_noise(target: Target, line_of_sight: NDArray[np.float64]) -> NDArray[np.float64]:
     """(2, 2) covariance of a measured position, given the vector from the vehicle to it."""
     range_m = max(NEAREST_M, float(np.hypot(*line_of_sight)))
-    along = line_of_sight / range_m
-    across = np.array([-along[1], along[0]])
     if target.range_source is RangeSource.NONE:
         sigma_along = UNKNOWN_RANGE_SIGMA_M
     elif math.isfinite(target.range_sigma_m):
@@ -153,7 +152,5 @@ def measurement_noise(target: Target, line_of_sight: NDArray[np.float64]) -> NDA
     else:
         sigma_along = math.hypot(UNSTATED_SIGMA[0], UNSTATED_SIGMA[1] * range_m)
     sigma_across = math.hypot(ACROSS_SIGMA_M, BEARING_SIGMA_RAD * range_m)
-    covariance: NDArray[np.float64] = sigma_along**2 * np.outer(along, along) + sigma_across**2 * np.outer(
-        across, across
-    )
-    return covariance
+    bearing_rad = math.atan2(line_of_sight[1], line_of_sight[0])
+    return position_covariance(bearing_rad, sigma_along, sigma_across)

@@ -16,11 +16,14 @@ from companion.bus.messages import (
     camera_info_message,
     depth_message,
     detections_message,
+    tracks_message,
     transforms_message,
 )
 from companion.bus.vehicle_messages import geodetic_origin
 from companion.geometry.geodesy import GeodeticOrigin, north_east
 from companion.guidance.targets.from_detections import HistoryError, StateHistory, targets_from_detections
+from companion.guidance.targets.fused import FusedTracks
+from companion.guidance.targets.target import RangeSource, Target
 from companion.vehicle.gimbal import GimbalState
 from companion.vehicle.state import VehicleState
 from tests.companion.bus.message_check import check_message
@@ -30,6 +33,7 @@ from vision.depth import DepthSummary
 from vision.detections import NO_TRACK, Detections
 from vision.pipeline import PerceptionResult
 from vision.rotation import matrix_from_quaternion
+from vision.tracking import Track, TrackEvent, TrackEventKind, TrackState
 
 NOW_NS = 5_000_000_000
 CAMERA = CameraModel(640, 480, 400.0, 410.0, 320.0, 239.0, (0.1, -0.02, 0.001, 0.002))
@@ -164,10 +168,48 @@ def test_detections_of_the_steering_camera_have_their_targets() -> None:
     there = north_east(origin[:2], (near["latitude_deg"], near["longitude_deg"]))
     assert there == pytest.approx(position[:2], abs=0.01)
     assert near["altitude_amsl_m"] == pytest.approx(500.0 - position[2], abs=1e-3)
+    ellipse, sigma_m = near["error_ellipse"], targets[0].vehicle_sigma_m
+    assert ellipse is not None
+    along, across = (math.hypot(sigma_m, s) for s in (targets[0].range_sigma_m, targets[0].across_sigma_m))
+    assert (ellipse["semi_major_m"], ellipse["semi_minor_m"]) == pytest.approx(
+        (max(along, across), min(along, across)), abs=1e-3
+    )
     # Above the horizon: a direction, no range.
     assert (far["range_source"], far["ground_range_m"], far["position_ned_m"]) == ("none", None, None)
     assert far["elevation_rad"] is not None
-    assert far["latitude_deg"] is None
+    assert (far["latitude_deg"], far["error_ellipse"]) == (None, None)
+
+
+def test_track_events_have_the_fused_position() -> None:
+    target = Target(
+        "car", 0.9, NOW_NS, 0.0, -0.3, 20.0, RangeSource.GROUND_PLANE, (20.0, 0.0, 0.0),
+        track_id=7, range_sigma_m=2.0, across_sigma_m=0.4, vehicle_sigma_m=0.3,
+    )  # fmt: skip
+    fused, origin = FusedTracks(), GeodeticOrigin(47.4, 8.5, 500.0)
+    fused.update([target], (0.0, 0.0, -5.0), NOW_NS)
+    box = (1.0, 2.0, 3.0, 4.0)
+    events = tuple(
+        TrackEvent(
+            TrackEventKind.UPDATE,
+            NOW_NS,
+            Track(track_id, 0, "car", TrackState.CONFIRMED, box, 0.9, 0.8, 5, 1, NOW_NS),
+        )
+        for track_id in (7, 8)
+    )
+    message = tracks_message(
+        replace(two_cars(), track_events=events),
+        "v",
+        NOW_NS,
+        localization=Localization((target,), "", origin, fused),
+    )
+    check_message("tracks", message)
+    ours, other = message["events"]
+    assert ours["position_ned_m"] == [20.0, 0.0, 0.0]
+    assert ours["latitude_deg"] == pytest.approx(47.4 + 20.0 / 111_180, abs=1e-6)
+    assert (ours["longitude_deg"], ours["altitude_amsl_m"], ours["moving"]) == (8.5, 500.0, False)
+    ellipse = {"semi_major_m": 2.022, "semi_minor_m": 0.5, "orientation_rad": 0.0}
+    assert ours["error_ellipse"] == ellipse
+    assert (other["position_ned_m"], other["error_ellipse"], other["moving"]) == (None, None, None)
 
 
 def test_detections_without_a_pose_say_why() -> None:

@@ -86,6 +86,7 @@ def test_detection_message() -> None:
                 "latitude_deg": None,
                 "longitude_deg": None,
                 "altitude_amsl_m": None,
+                "error_ellipse": None,
             }
         ],
     }
@@ -142,6 +143,12 @@ def test_tracks_message() -> None:
                 "seen": 5,
                 "first_ns": 100,
                 "last_ns": 900,
+                "position_ned_m": None,
+                "latitude_deg": None,
+                "longitude_deg": None,
+                "altitude_amsl_m": None,
+                "error_ellipse": None,
+                "moving": None,
             }
         ],
     }

@@ -13,7 +13,7 @@ from companion.vehicle.telemetry_state import TelemetryState
 from mavlink_sim import LockstepVehicle
 from mavlink_sim.wire.messages import dialect
 
-ATTITUDE, POSITION, MODE, HOME = 31, 32, 436, 242
+ATTITUDE, POSITION, MODE, HOME, RANGE = 31, 32, 436, 242, 132
 STEP_S = 0.1
 
 
@@ -86,11 +86,24 @@ def test_refused_optional_stream_is_not_missing() -> None:
     assert monitor.due(ns(2.0)) == [POSITION, MODE]
     for message_id in (POSITION, MODE):
         monitor.asked(message_id, ns(2.0))
-        monitor.refused(message_id)
+        monitor.answered(message_id, accepted=False)
     assert monitor.missing == (POSITION,)
     assert monitor.due(ns(30.0)) == [POSITION]
     monitor.restart(ns(30.0))
     assert MODE in monitor.due(ns(32.0))
+
+
+def test_stream_of_missing_equipment_is_requested_once() -> None:
+    monitor = StreamMonitor({POSITION: 30.0, RANGE: 10.0}, 0, once=(RANGE,))
+    assert monitor.due(ns(2.0)) == [POSITION, RANGE]
+    for message_id in (POSITION, RANGE):
+        monitor.asked(message_id, ns(2.0))
+        monitor.answered(message_id, accepted=True)
+    assert monitor.missing == (POSITION,)
+    assert monitor.due(ns(30.0)) == [POSITION]
+    monitor.asked(RANGE, ns(30.0))
+    monitor.restart(ns(30.0))
+    assert RANGE in monitor.due(ns(32.0))
 
 
 class CopterClient:

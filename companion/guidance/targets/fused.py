@@ -1,0 +1,131 @@
+"""The position of each confirmed track, fused over its detections, with its error."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.guidance.targets.moving_estimate import MovingEstimate
+from companion.guidance.targets.target import Target
+from companion.vehicle.state import Vector3
+from vision.geolocation import ErrorEllipse
+
+# An object moves if its estimated speed exceeds this and so many sigma. Errors of the range of a vehicle that
+# flies towards a standing object show as some tenths of its own speed.
+MOVING_MPS, MOVING_SIGMA = 0.8, 3.0
+# A track that was not seen for this long has ended (`tracker.max_age_s` is less by default).
+FORGET_S = 60.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FusedPosition:
+    """The position of one track.
+
+    Attributes:
+        position_ned_m: local NED.
+        ellipse: its horizontal error, the vehicle's own position error included.
+        moving: whether the object moves; then the position is that of the newest detection's time.
+        captured_ns: capture of the newest detection with a position.
+    """
+
+    position_ned_m: Vector3
+    ellipse: ErrorEllipse
+    moving: bool
+    captured_ns: int
+
+
+class _Track:
+    """Of a standing object, detections weighted by their information; of a moving one, a filter's estimate.
+
+    Most errors of two frames have one cause: attitude, height, the object's size. Covariance intersection
+    with equal weights (Julier & Uhlmann 1997) holds for any correlation: the covariance is the inverse of the
+    mean information, and the position is the one that independent errors would give.
+    """
+
+    def __init__(self, target: Target, vehicle: Vector3, covariance: NDArray[np.float64]) -> None:
+        self._motion = MovingEstimate.initialize(target, vehicle)
+        self._restart()
+        self._add(target, covariance)
+
+    def update(self, target: Target, vehicle: Vector3, covariance: NDArray[np.float64]) -> None:
+        expected = self._motion.at(target.captured_ns)
+        self._motion = expected.update(expected.fit(target, vehicle))
+        if self.moving:
+            self._restart()
+        self._add(target, covariance)
+
+    @property
+    def moving(self) -> bool:
+        speed_sigma_mps = math.sqrt(float(np.trace(self._motion.covariance[2:, 2:])))
+        return math.hypot(*self._motion.velocity) > max(MOVING_MPS, MOVING_SIGMA * speed_sigma_mps)
+
+    @property
+    def position(self) -> FusedPosition:
+        moving, newest = self.moving, self._newest
+        mean = np.linalg.inv(self._information / self._count)
+        place = self._motion.state[:2] if moving else mean @ (self._weighted / self._count)
+        covariance = mean + np.eye(2) * newest.vehicle_sigma_m**2
+        down = self._weighted_down / self._weight
+        return FusedPosition(
+            (float(place[0]), float(place[1]), down),
+            ErrorEllipse.of(covariance),
+            moving,
+            newest.captured_ns,
+        )
+
+    @property
+    def captured_ns(self) -> int:
+        return self._newest.captured_ns
+
+    def _restart(self) -> None:
+        self._information, self._weighted = np.zeros((2, 2)), np.zeros(2)
+        self._weight = self._weighted_down = 0.0
+        self._count = 0
+
+    def _add(self, target: Target, covariance: NDArray[np.float64]) -> None:
+        assert target.position_ned_m is not None
+        north, east, down = target.position_ned_m
+        information = np.linalg.inv(covariance)
+        self._information += information
+        self._weighted += information @ (north, east)
+        weight = float(np.trace(information))
+        self._weight += weight
+        self._weighted_down += weight * down
+        self._count += 1
+        self._newest = target
+
+
+class FusedTracks:
+    """The fused positions of one camera's confirmed tracks."""
+
+    def __init__(self) -> None:
+        self._tracks: dict[int, _Track] = {}
+
+    def update(self, targets: Sequence[Target], vehicle: Vector3, now_ns: int) -> None:
+        """Add the targets of one frame.
+
+        Args:
+            vehicle: its position at the capture, local NED.
+            now_ns: the capture.
+        """
+        for target in targets:
+            covariance = target.position_covariance
+            if covariance is None or target.track_id is None or not target.trusted:
+                continue
+            track = self._tracks.get(target.track_id)
+            if track is None:
+                self._tracks[target.track_id] = _Track(target, vehicle, covariance)
+            elif target.captured_ns > track.captured_ns:
+                track.update(target, vehicle, covariance)
+        ended = [key for key, track in self._tracks.items() if now_ns - track.captured_ns > FORGET_S * 1e9]
+        for key in ended:
+            del self._tracks[key]
+
+    def position(self, track_id: int) -> FusedPosition | None:
+        """The position of a track; None: it never had one."""
+        track = self._tracks.get(track_id)
+        return None if track is None else track.position

@@ -1,0 +1,149 @@
+"""One-sigma errors of a range and a direction, propagated from their causes to first order.
+
+Causes are independent of each other: pixels of the box's edges, attitude, height, depth noise, and what is
+not known of the object. Errors of several frames are not: most of them change slowly.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from companion.vehicle.state import HeightSource
+from vision.geolocation import DEPTH_OF_WIDTH
+
+# Attitude. PX4's estimate in its own simulation errs by 0.003 rad of tilt and 0.008 rad of heading (as in
+# mavlink_sim/physics/estimate_errors.py). Assumed: 0.005 rad (0.3 degrees) of the camera's mount, and 10 ms
+# between the stamps of frame and attitude while the vehicle turns at 0.6 rad/s. The compass of a real
+# vehicle, which the simulation lacks: 0.014 rad.
+TILT_SIGMA_RAD = 0.0084
+HEADING_SIGMA_RAD = 0.0180
+# Height above home, if the autopilot states none or less: the drift of PX4's estimate (0.06 m, measured as
+# above) and ground that is not level with home.
+HOME_SIGMA_M, LEAST_HOME_SIGMA_M = 0.3, 0.1
+# Height by a range finder. Data sheet of a common one (Benewake TFmini-S): 0.06 m up to 6 m, 1 % above.
+SENSOR_SIGMA_M, SENSOR_SIGMA_SHARE = 0.06, 0.01
+# Horizontal position, if the autopilot states none. Data sheet of u-blox M8: CEP 2.5 m, 1.18 sigma.
+UNSTATED_POSITION_SIGMA_M = 2.1
+
+# The following were measured by benchmarks/range_error.py on seeds other than the published ones.
+# Edge of a detected box: pixels, and a share of the box's height.
+EDGE_SIGMA_PX, EDGE_SIGMA_SHARE = 1.0, 0.01
+# Depth of the nearest point: fixed, and per metre.
+DEPTH_SIGMA_M, DEPTH_SIGMA_SHARE = 0.07, 0.005
+# From the ground contact to the nearest surface.
+INSET_SIGMA_M = 0.2
+# Where an object touches the lower edge of its box in a rolled image, a share of the box's width.
+CONTACT_SIGMA = 0.25
+# Height of an object of a class with a known height, a share of it.
+SIZE_SIGMA_SHARE = 0.15
+# Depth of an object along the line of sight, as a share of its width.
+DEPTH_OF_WIDTH_SIGMA = 0.4
+# The nearest point of a box cut off by the image's edge may be outside.
+CUT_SIGMA_M = 0.3
+
+
+class PoseError(NamedTuple):
+    """One sigma of the vehicle's pose.
+
+    Attributes:
+        height_m: of the height above the ground. horizontal_m: of the position, on each axis.
+        tilt_rad: of roll and pitch. heading_rad: of the heading.
+    """
+
+    height_m: float = HOME_SIGMA_M
+    horizontal_m: float = UNSTATED_POSITION_SIGMA_M
+    tilt_rad: float = TILT_SIGMA_RAD
+    heading_rad: float = HEADING_SIGMA_RAD
+
+
+class BoxError(NamedTuple):
+    """What the errors of a box are made of.
+
+    Attributes:
+        pixel_rad: depression of one row, at the box's lower edge.
+        width_px, height_px: its size.
+        roll_rad: between the image's rows and the horizontal.
+        cut: the image's edge cuts it off.
+    """
+
+    pixel_rad: float
+    width_px: float
+    height_px: float
+    roll_rad: float
+    cut: bool
+
+    @property
+    def edge_rad(self) -> float:
+        """One sigma of an edge."""
+        return self.pixel_rad * math.hypot(EDGE_SIGMA_PX, EDGE_SIGMA_SHARE * self.height_px)
+
+    @property
+    def contact_rad(self) -> float:
+        """One sigma of the lower edge as the depression of the object's ground contact."""
+        rolled_rad = self.pixel_rad * CONTACT_SIGMA * self.width_px * math.sin(self.roll_rad)
+        return math.hypot(self.edge_rad, rolled_rad)
+
+
+def height_sigma_m(source: HeightSource | None, height_m: float, stated_m: float | None) -> float:
+    """Error of the height above the ground.
+
+    Args:
+        stated_m: the estimator's own error of the height; None: not stated.
+    """
+    if source is HeightSource.DISTANCE_SENSOR:
+        return math.hypot(SENSOR_SIGMA_M, SENSOR_SIGMA_SHARE * height_m)
+    return HOME_SIGMA_M if stated_m is None else max(stated_m, LEAST_HOME_SIGMA_M)
+
+
+def depth_sigma_m(range_m: float, drop_m: float, depth_m: float, box: BoxError, pose: PoseError) -> float:
+    """Error of a horizontal range from depth.
+
+    Args:
+        drop_m: from the lens down to the point.
+        depth_m: along the optical axis.
+    """
+    noise_m = math.hypot(DEPTH_SIGMA_M, DEPTH_SIGMA_SHARE * depth_m) * range_m / max(depth_m, 1e-3)
+    return math.hypot(noise_m, drop_m * pose.tilt_rad, CUT_SIGMA_M if box.cut else 0.0)
+
+
+def ground_sigma_m(range_m: float, drop_m: float, box: BoxError, pose: PoseError) -> float:
+    """Error of a horizontal range from the ground, `drop_m` below the lens."""
+    # range = drop / tan(depression)
+    per_rad = range_m**2 / drop_m + drop_m
+    return math.hypot(
+        per_rad * math.hypot(box.contact_rad, pose.tilt_rad),
+        pose.height_m * range_m / drop_m,
+        INSET_SIGMA_M,
+        CUT_SIGMA_M if box.cut else 0.0,
+    )
+
+
+def size_sigma_m(range_m: float, drop_m: float, size_m: float, box: BoxError, pose: PoseError) -> float:
+    """Error of a horizontal range from the known height of an object (`range_from_known_height`).
+
+    Args:
+        drop_m: from the lens down to its foot. size_m: the known height.
+    """
+    # range = size / spread; spread = tan(top) - tan(foot) - share * width * max(-tan(top), 0).
+    spread = size_m / range_m
+    foot = -drop_m / range_m
+    width_rad = box.width_px * box.pixel_rad * math.sqrt(1.0 + foot * foot)
+    top, far_edge = spread + foot, 0.0
+    if top < 0.0:
+        far_edge = DEPTH_OF_WIDTH * width_rad
+        top /= 1.0 + far_edge
+    of_top, of_foot = (1.0 + top * top) * (1.0 + far_edge), 1.0 + foot * foot
+    spread_sigma = math.hypot(
+        of_top * box.edge_rad,
+        of_foot * box.contact_rad,
+        (of_top - of_foot) * pose.tilt_rad,
+        DEPTH_OF_WIDTH_SIGMA * width_rad * max(-top, 0.0),
+    )
+    return range_m * math.hypot(SIZE_SIGMA_SHARE, spread_sigma / spread)
+
+
+def across_sigma_m(range_m: float, drop_m: float, box: BoxError, pose: PoseError) -> float:
+    """Horizontal error across the line of sight of a point; `drop_m` as above."""
+    centre_m = box.edge_rad / math.sqrt(2.0) * math.hypot(range_m, drop_m)  # the mean of two edges
+    return math.hypot(range_m * pose.heading_rad, drop_m * pose.tilt_rad, centre_m)

@@ -1,0 +1,159 @@
+"""Positions of tracks, fused over their detections, and their error ellipses."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from companion.guidance.targets.fused import FusedPosition, FusedTracks
+from companion.guidance.targets.target import RangeSource, Target
+from companion.vehicle.state import Vector3
+
+T0, PERIOD_NS = 10_000_000_000, 100_000_000
+VEHICLE_SIGMA_M = 0.2
+
+
+def seen(
+    vehicle: Vector3,
+    at: tuple[float, float],
+    frame: int,
+    *,
+    sigma_m: float = 1.0,
+    across_m: float = 0.3,
+    along_error_m: float = 0.0,
+    across_error_m: float = 0.0,
+    track_id: int = 7,
+) -> Target:
+    """A target measured from the vehicle, with these errors along and across the line of sight."""
+    north, east = at[0] - vehicle[0], at[1] - vehicle[1]
+    range_m, bearing = math.hypot(north, east) + along_error_m, math.atan2(east, north)
+    bearing += across_error_m / range_m
+    position = (vehicle[0] + range_m * math.cos(bearing), vehicle[1] + range_m * math.sin(bearing), 0.0)
+    return Target(
+        "car",
+        0.9,
+        T0 + frame * PERIOD_NS,
+        bearing,
+        -0.3,
+        range_m,
+        RangeSource.GROUND_PLANE,
+        position,
+        track_id=track_id,
+        range_sigma_m=sigma_m,
+        across_sigma_m=across_m,
+        vehicle_sigma_m=VEHICLE_SIGMA_M,
+    )
+
+
+def position_of(tracks: FusedTracks) -> FusedPosition:
+    fused = tracks.position(7)
+    assert fused is not None
+    return fused
+
+
+def test_one_detection_has_its_own_ellipse() -> None:
+    tracks = FusedTracks()
+    tracks.update([seen((0.0, 0.0, -5.0), (0.0, 20.0), 0)], (0.0, 0.0, -5.0), T0)
+    fused = position_of(tracks)
+    assert fused.position_ned_m == pytest.approx((0.0, 20.0, 0.0))
+    assert fused.ellipse.semi_major_m == pytest.approx(math.hypot(1.0, VEHICLE_SIGMA_M))
+    assert fused.ellipse.semi_minor_m == pytest.approx(math.hypot(0.3, VEHICLE_SIGMA_M))
+    assert math.degrees(fused.ellipse.orientation_rad) == pytest.approx(90.0)
+
+
+def test_near_detection_outweighs_far_ones() -> None:
+    tracks = FusedTracks()
+    for frame in range(10):
+        far = seen((0.0, 0.0, -5.0), (20.0, 0.0), frame, sigma_m=4.0, along_error_m=4.0)
+        tracks.update([far], (0.0, 0.0, -5.0), far.captured_ns)
+    for frame in range(10, 20):
+        near = seen((12.0, 0.0, -5.0), (20.0, 0.0), frame, sigma_m=0.5)
+        tracks.update([near], (12.0, 0.0, -5.0), near.captured_ns)
+    assert position_of(tracks).position_ned_m[0] == pytest.approx(20.0, abs=0.1)
+    # The mean information of both halves, not the sum of all.
+    assert 0.5 < position_of(tracks).ellipse.semi_major_m < 0.8
+
+
+def test_views_from_two_sides_shrink_the_ellipse() -> None:
+    one, two = FusedTracks(), FusedTracks()
+    for frame in range(20):
+        south, west = (-15.0, 0.0, -5.0), (0.0, -15.0, -5.0)
+        for tracks, vehicle in ((one, south), (two, south if frame % 2 else west)):
+            target = seen(vehicle, (0.0, 0.0), frame)
+            tracks.update([target], vehicle, target.captured_ns)
+    assert position_of(one).ellipse.semi_major_m == pytest.approx(math.hypot(1.0, VEHICLE_SIGMA_M))
+    assert position_of(two).ellipse.semi_major_m < 0.6
+
+
+def test_ellipse_covers_the_error_that_all_frames_share() -> None:
+    """Half of each flight's variance is one error of the whole flight, such as of the camera's mount."""
+    rng, inside, errors_m = np.random.default_rng(31), [], []
+    for _ in range(300):
+        tracks, common = FusedTracks(), rng.normal(0.0, math.sqrt(0.5), 3)
+        turn = float(rng.uniform(0.0, math.pi))
+        for frame in range(60):
+            angle = turn * frame / 60
+            vehicle = (-12.0 * math.cos(angle), -12.0 * math.sin(angle), -5.0)
+            own = rng.normal(0.0, math.sqrt(0.5), 2)
+            target = seen(
+                vehicle,
+                (0.0, 0.0),
+                frame,
+                along_error_m=float(common[0] + own[0]),
+                across_error_m=0.3 * float(common[1] + own[1]),
+            )
+            tracks.update([target], vehicle, target.captured_ns)
+        fused = position_of(tracks)
+        error = np.array(fused.position_ned_m[:2]) + rng.normal(0.0, VEHICLE_SIGMA_M, 2)
+        major_m, minor_m, orientation = fused.ellipse
+        axis = np.array((math.cos(orientation), math.sin(orientation)))
+        along, across = float(error @ axis), float(error @ (-axis[1], axis[0]))
+        inside.append((along / major_m) ** 2 + (across / minor_m) ** 2 < 5.99)
+        errors_m.append(math.hypot(*error))
+    assert np.mean(inside) >= 0.95
+    assert np.median(errors_m) < 0.7
+
+
+def test_moving_object_has_its_newest_position() -> None:
+    tracks, vehicle = FusedTracks(), (0.0, 0.0, -5.0)
+    rng = np.random.default_rng(5)
+    for frame in range(60):
+        at = (12.0, 0.3 * frame - 9.0)  # 3 m/s
+        target = seen(vehicle, at, frame, sigma_m=0.5, along_error_m=float(rng.normal(0.0, 0.1)))
+        tracks.update([target], vehicle, target.captured_ns)
+    fused = position_of(tracks)
+    assert fused.moving
+    assert fused.captured_ns == T0 + 59 * PERIOD_NS
+    assert math.dist(fused.position_ned_m[:2], (12.0, 8.7)) < 0.5
+
+
+def test_standing_object_seen_from_a_moving_vehicle_stands() -> None:
+    tracks = FusedTracks()
+    for frame in range(60):
+        vehicle = (0.3 * frame - 30.0, 0.0, -5.0)  # towards it at 3 m/s, the range 5 % too long
+        target = seen(vehicle, (0.0, 0.0), frame, along_error_m=0.05 * -vehicle[0])
+        tracks.update([target], vehicle, target.captured_ns)
+    assert not position_of(tracks).moving
+
+
+def test_only_trusted_tracks_with_a_range_are_fused() -> None:
+    tracks, vehicle = FusedTracks(), (0.0, 0.0, -5.0)
+    target = seen(vehicle, (10.0, 0.0), 0)
+    no_range = replace(
+        target, position_ned_m=None, range_source=RangeSource.NONE, range_sigma_m=math.nan, track_id=3
+    )
+    targets = [no_range, replace(target, trusted=False, track_id=4), replace(target, track_id=None)]
+    tracks.update(targets, vehicle, T0)
+    assert [tracks.position(track_id) for track_id in (3, 4, 7)] == [None] * 3
+
+
+def test_track_is_forgotten_after_a_minute() -> None:
+    tracks, vehicle = FusedTracks(), (0.0, 0.0, -5.0)
+    tracks.update([seen(vehicle, (10.0, 0.0), 0)], vehicle, T0)
+    tracks.update([], vehicle, T0 + 59_000_000_000)
+    assert tracks.position(7) is not None
+    tracks.update([], vehicle, T0 + 61_000_000_000)
+    assert tracks.position(7) is None
