@@ -158,12 +158,15 @@ def _view(renderer: Renderer, rng: np.random.Generator) -> View | None:
     exact_m = rendered.depth_m.astype(np.float32, copy=False)
     depth_m = measured_depth(exact_m, DEFAULT_CAMERA.fx, DepthSensor(), rng)
     image = np.ascontiguousarray(rendered.image)
-    error = PoseError()
-    roll_rad, pitch_rad = np.array((roll_rad, pitch_rad)) + rng.normal(0.0, error.tilt_rad, 2)
-    yaw_rad += rng.normal(0.0, error.heading_rad)
+    error, noise = PoseError(), rng.spawn(1)[0]
+    tilt_rad = noise.normal(0.0, error.tilt_rad, 2)
     estimated = (
-        (position[0], position[1], position[2] + float(rng.normal(0.0, error.height_m))),
-        quaternion_from_euler(float(roll_rad), float(pitch_rad), float(yaw_rad)),
+        (position[0], position[1], position[2] + float(noise.normal(0.0, error.height_m))),
+        quaternion_from_euler(
+            float(roll_rad + tilt_rad[0]),
+            float(pitch_rad + tilt_rad[1]),
+            float(yaw_rad + noise.normal(0.0, error.heading_rad)),
+        ),
     )
     return View(image, depth_m, exact_m, position, attitude, estimated, rendered.objects)
 

@@ -33,6 +33,7 @@ FLOORS = {
     "evaluate": 9,
     "flight_log": 9,
     "markers": 9,
+    "sightings": 9,
     "models": 9,
     "replay": 9,
     "replay_detections": 9,

@@ -13,7 +13,7 @@ import pytest
 
 from companion.vehicle.driver import CommandRefusedError, Driver
 from companion.vehicle.drivers import DriverKind, open_driver
-from companion.vehicle.state import FlightMode, LandedState, VehicleState
+from companion.vehicle.state import FlightMode, HeightSource, LandedState, VehicleState
 from mavlink_sim.testing import RunningSimulator, running_simulator
 from tests.companion.vehicle.fake_autopilot import streaming, wait_for_state, wait_until
 
@@ -90,6 +90,9 @@ async def test_px4_failsafe_acts_when_setpoints_end(kind: DriverKind) -> None:
                 driver, lambda s: s.landed is LandedState.IN_AIR and s.mode is FlightMode.HOLD
             )
             assert driver.state.altitude_m == pytest.approx(3.0, abs=1.0)
+            assert driver.state.height_source is HeightSource.DISTANCE_SENSOR
+            assert driver.state.ground_height_m == pytest.approx(driver.state.altitude_m, abs=0.5)
+            assert driver.state.horizontal_sigma_m == pytest.approx(0.28)
 
             with pytest.raises(CommandRefusedError, match="in air"):
                 await driver.disarm()
