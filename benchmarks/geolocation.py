@@ -9,8 +9,8 @@ of 5 cm. Errors: those of the simulated autopilot's estimate (those of PX4, see
 `mavlink_sim/physics/estimate_errors.py`), and of the camera's mount, 0.3° one sigma on each axis, constant
 over a flight.
 
-The truth of a detection is the point of the object's footprint that is nearest to the vehicle, in the
-direction of the object's middle; of a track it is the mean of those. The range is the mean of the ranges.
+The truth of a detection is a point in the direction of the object's middle, at the range of the nearest point
+of its surface; of a track it is the mean of those. The range is the mean of the ranges.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -30,6 +30,8 @@ from companion.bench.synthetic_detector import SceneObject, ScenePose
 from companion.guidance.targets.target import Target
 from companion.vehicle.state import Vector3
 from mavlink_sim.lockstep import LockstepVehicle
+from mavlink_sim.world.mesh import surface_range_to
+from mavlink_sim.world.world import WorldObject
 from vision.camera_model import CameraModel, CameraMount
 
 CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(80.0))
@@ -65,7 +67,7 @@ def flight_of(seed: int, *, depth: bool) -> list[Located]:
     """The tracks of one flight that were seen in at least ten frames; the same seed gives the same."""
     rng = np.random.default_rng((seed, 57))
     placed = [_object(name, number, rng) for number, name in enumerate(SIZES_M)]
-    scene, objects = rendered_scene(placed, CAMERA, MOUNT, seed, depth=depth)
+    scene, _ = rendered_scene(placed, CAMERA, MOUNT, seed, depth=depth)
     errors = rng.normal(0.0, MOUNT_SIGMA_RAD, 3)
     believed = replace(MOUNT, roll_rad=errors[0], pitch_rad=MOUNT.pitch_rad + errors[1], yaw_rad=errors[2])
     settings = camera_settings(CAMERA, believed, {"detector.image_size": "320", "detector.threads": "1"})
@@ -90,7 +92,7 @@ def flight_of(seed: int, *, depth: bool) -> list[Located]:
 
     forward_m, right_m = rng.uniform(10.0, 15.0), rng.uniform(-8.0, 8.0)
     flight.fly(f"goto north={forward_m:.1f} east={right_m:.1f} heading=0 speed=3", 30.0, on_tick=collect)
-    return list(_located(flight, objects, seen, vehicle_at))
+    return list(_located(flight, scene.world_at(0.0).objects, seen, vehicle_at))
 
 
 def _object(name: str, number: int, rng: np.random.Generator) -> SceneObject:
@@ -101,7 +103,7 @@ def _object(name: str, number: int, rng: np.random.Generator) -> SceneObject:
 
 def _located(
     flight: LockstepFlight,
-    objects: tuple[SceneObject, ...],
+    objects: Sequence[WorldObject],
     seen: dict[int, list[Target]],
     vehicle_at: dict[int, Vector3],
 ) -> Iterator[Located]:
@@ -128,12 +130,11 @@ def _located(
         )
 
 
-def _truth(item: SceneObject, vehicle: Vector3) -> NDArray[np.float64]:
+def _truth(item: WorldObject, vehicle: Vector3) -> NDArray[np.float64]:
     """(2,) metres north and east of the point whose position is measured."""
-    pose = item.pose(0.0)
-    middle, own = np.array((pose.north_m, pose.east_m)), np.array(vehicle[:2])
+    middle, own = np.array(item.position_ned_m[:2]), np.array(vehicle[:2])
     direction = (middle - own) / np.hypot(*(middle - own))
-    point: NDArray[np.float64] = own + direction * item.range_m(vehicle, 0.0)
+    point: NDArray[np.float64] = own + direction * surface_range_to(item, vehicle)
     return point
 
 

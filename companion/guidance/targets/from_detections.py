@@ -308,7 +308,9 @@ def _target(
     source, offset, sigma_m = RangeSource.NONE, [math.nan] * 3, math.nan
     whole_below = bottom < camera.height - 1 - EDGE_PX
     inside = left > EDGE_PX and right < camera.width - EDGE_PX and whole_below
-    box = BoxError(sight.pixel_rad, right - left, bottom - top, _roll_rad(mount, pose), not inside)
+    box = BoxError(
+        sight.pixel_rad, right - left, bottom - top, camera.width, _roll_rad(mount, pose), not inside
+    )
     if all(map(math.isfinite, sight.nearest)):
         source = RangeSource.DEPTH
         offset = _towards(sight.lens, direction, sight.nearest)
