@@ -1,7 +1,13 @@
-"""The pinhole camera with lens distortion, and how it is mounted on the vehicle.
+"""The camera with lens distortion, and how it is mounted on the vehicle.
 
 Optical frame: x right, y down, z forward. Pixel (0, 0) is the centre of the top-left pixel.
-Distortion is the Brown–Conrady model in OpenCV's order (k1, k2, p1, p2, k3).
+The distortion models have ROS's names (`sensor_msgs/CameraInfo`) and OpenCV's coefficients:
+
+| name | coefficients | |
+|---|---|---|
+| `plumb_bob` | k1, k2, p1, p2, k3 (none, four or five) | Brown-Conrady |
+| `rational_polynomial` | k1, k2, p1, p2, k3, k4, k5, k6 | the same with a divisor |
+| `equidistant` | k1, k2, k3, k4 | fisheye: Kannala and Brandt 2006 |
 """
 
 from __future__ import annotations
@@ -9,7 +15,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, Literal, get_args
 
 import cv2
 import numpy as np
@@ -17,10 +23,24 @@ from numpy.typing import NDArray
 
 from vision.rotation import BODY_FROM_OPTICAL, matrix_from_euler
 
+PLUMB_BOB, RATIONAL, EQUIDISTANT = "plumb_bob", "rational_polynomial", "equidistant"
+DistortionModel = Literal["plumb_bob", "rational_polynomial", "equidistant"]
+DISTORTION_MODELS: tuple[DistortionModel, ...] = get_args(DistortionModel)
+_COEFFICIENTS = {PLUMB_BOB: (0, 4, 5), RATIONAL: (8,), EQUIDISTANT: (4,)}
+# Rays nearer than this to the plane across the optical axis have no usable point at unit depth.
+MIN_COSINE = 0.02
+_MAX_STEPS = 20
+# Largest error of an inverted distortion, at unit depth.
+_INVERTED = 1e-9
+
 
 @dataclass(frozen=True, slots=True)
 class CameraModel:
-    """Intrinsics of one camera. Focal lengths and principal point in pixels."""
+    """Intrinsics of one camera. Focal lengths and principal point in pixels.
+
+    Raises ValueError for a size or focal length that is not positive, or coefficients that do not belong to
+    the distortion model.
+    """
 
     width: int
     height: int
@@ -29,6 +49,7 @@ class CameraModel:
     cx: float
     cy: float
     distortion: tuple[float, ...] = ()
+    distortion_model: DistortionModel = "plumb_bob"
 
     def __post_init__(self) -> None:
         if self.width <= 0 or self.height <= 0 or self.fx <= 0 or self.fy <= 0:
@@ -36,8 +57,7 @@ class CameraModel:
                 f"a camera needs a positive size and focal length, got {self.width}x{self.height}, "
                 f"fx {self.fx}, fy {self.fy}"
             )
-        if len(self.distortion) not in (0, 4, 5):
-            raise ValueError(f"distortion must have 0, 4 or 5 coefficients, got {len(self.distortion)}")
+        check_distortion(self.distortion_model, self.distortion)
 
     @classmethod
     def from_horizontal_fov(cls, width: int, height: int, fov_rad: float) -> CameraModel:
@@ -52,56 +72,163 @@ class CameraModel:
         """(3, 3) camera matrix K."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
+    @property
+    def coefficients(self) -> tuple[float, ...]:
+        """All coefficients of the distortion model, as in ROS's CameraInfo: five, eight or four."""
+        return (*self.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[: max(_COEFFICIENTS[self.distortion_model])]
+
+    @property
+    def rectilinear(self) -> bool:
+        """Whether straight lines are straight in the image: an ideal pinhole camera."""
+        return self.distortion_model != EQUIDISTANT and not any(self.distortion)
+
+    @property
+    def horizontal_fov_rad(self) -> float:
+        """Horizontal field of view; that of a pinhole camera is without its distortion."""
+        if self.distortion_model != EQUIDISTANT:
+            return 2 * math.atan(self.width / 2 / self.fx)
+        left, right = self.rays(np.array([[-0.5, self.cy], [self.width - 0.5, self.cy]]))
+        edges = (math.atan2(-left[0], left[2]), math.atan2(right[0], right[2]))
+        return sum(_max_theta(self.distortion) if math.isnan(edge) else edge for edge in edges)
+
     def scaled(self, width: int, height: int) -> CameraModel:
         """The same camera at another image size."""
         sx, sy = width / self.width, height / self.height
-        return CameraModel(
-            width,
-            height,
-            self.fx * sx,
-            self.fy * sy,
-            (self.cx + 0.5) * sx - 0.5,
-            (self.cy + 0.5) * sy - 0.5,
-            self.distortion,
+        return replace(
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * sx,
+            fy=self.fy * sy,
+            cx=(self.cx + 0.5) * sx - 0.5,
+            cy=(self.cy + 0.5) * sy - 0.5,
         )
 
     def project(self, points_optical: NDArray[Any]) -> NDArray[np.float64]:
-        """(N, 3) points in the optical frame → (N, 2) pixels; NaN for points not in front of the camera."""
+        """(N, 3) points in the optical frame → (N, 2) pixels; NaN for points that the lens cannot see.
+
+        A pinhole camera sees what is in front of it; a fisheye what is within the angle from its axis up to
+        which its polynomial ascends.
+        """
         points = np.asarray(points_optical, np.float64).reshape(-1, 3)
         pixels = np.full((len(points), 2), np.nan)
+        if self.distortion_model == EQUIDISTANT:
+            across = np.sqrt((points[:, :2] ** 2).sum(axis=1))
+            theta = np.arctan2(across, points[:, 2])
+            seen = (theta <= _max_theta(self.distortion)) & (points.any(axis=1))
+            # On the axis, where the direction is undefined, the image is its centre.
+            scale = _equidistant(self.distortion, theta)[0] / np.where(across > 0.0, across, 1.0)
+            pixels[seen] = (points[:, :2] * scale[:, None] * (self.fx, self.fy) + (self.cx, self.cy))[seen]
+            return pixels
         ahead = points[:, 2] > 1e-9
         if ahead.any():
             plane = points[ahead, :2] / points[ahead, 2:]
             if self.distortion:
-                plane = self._distort(plane)
+                plane = _distorted(self.distortion, plane)[0]
             pixels[ahead] = plane * (self.fx, self.fy) + (self.cx, self.cy)
         return pixels
 
     def rays(self, pixels: NDArray[Any]) -> NDArray[np.float64]:
-        """(N, 2) pixels → (N, 3) unit vectors in the optical frame."""
+        """(N, 2) pixels → (N, 3) unit vectors in the optical frame; NaN where no ray reaches the pixel.
+
+        A fisheye of more than 180 degrees also has rays with z below zero.
+        """
         points = np.asarray(pixels, np.float64).reshape(-1, 2)
+        plane = (points - (self.cx, self.cy)) / (self.fx, self.fy)
+        if self.distortion_model == EQUIDISTANT:
+            return _equidistant_rays(self.distortion, plane)
         if self.distortion and len(points):
-            plane = cv2.undistortPoints(
-                points.reshape(-1, 1, 2), self.matrix, np.array(self.distortion)
-            ).reshape(-1, 2)
-        else:
-            plane = (points - (self.cx, self.cy)) / (self.fx, self.fy)
+            start = cv2.undistortPoints(points.reshape(-1, 1, 2), self.matrix, np.array(self.distortion))
+            plane = _undistorted(self.distortion, plane, np.asarray(start, np.float64).reshape(-1, 2))
         rays = np.ones((len(plane), 3))
         rays[:, :2] = plane
         rays /= np.sqrt((rays * rays).sum(axis=1, keepdims=True))
         return rays
 
-    def _distort(self, plane: NDArray[np.float64]) -> NDArray[np.float64]:
-        k1, k2, p1, p2, k3 = (*self.distortion, 0.0)[:5]
-        x, y = plane[:, 0], plane[:, 1]
-        r2 = x * x + y * y
-        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        return np.column_stack(
-            [
-                x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-                y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-            ]
-        )
+
+def check_distortion(model: str, coefficients: tuple[float, ...]) -> None:
+    """Raise ValueError for an unknown distortion model or a number of coefficients that it does not have."""
+    if model not in _COEFFICIENTS:
+        raise ValueError(f"distortion_model must be one of {', '.join(DISTORTION_MODELS)}, got {model!r}")
+    if len(coefficients) not in _COEFFICIENTS[model]:
+        *others, last = map(str, _COEFFICIENTS[model])
+        counts = f"{', '.join(others)} or {last}" if others else last
+        raise ValueError(f"distortion of {model} must have {counts} coefficients, got {len(coefficients)}")
+
+
+def _distorted(
+    coefficients: tuple[float, ...], plane: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(N, 2) points at unit depth → (N, 2) distorted, and (N, 3) their derivatives: xx, xy = yx, yy."""
+    k1, k2, p1, p2, k3, k4, k5, k6 = (*coefficients, 0.0, 0.0, 0.0, 0.0)[:8]
+    x, y = plane[:, 0], plane[:, 1]
+    r2 = x * x + y * y
+    over, under = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    radial = over / under
+    slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3) - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / under
+    points = np.column_stack(
+        [
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+        ]
+    )
+    mixed = x * y * slope + 2 * p1 * x + 2 * p2 * y
+    across = radial + x * x * slope + 2 * p1 * y + 6 * p2 * x
+    along = radial + y * y * slope + 6 * p1 * y + 2 * p2 * x
+    return points, np.column_stack([across, mixed, along])
+
+
+def _undistorted(
+    coefficients: tuple[float, ...], wanted: NDArray[np.float64], plane: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Newton's method from `plane`; NaN where it does not converge, and where the image is folded."""
+    with np.errstate(all="ignore"):
+        for _ in range(_MAX_STEPS):
+            points, slope = _distorted(coefficients, plane)
+            error = points - wanted
+            xx, xy, yy = slope.T
+            determinant = xx * yy - xy * xy
+            found = (np.abs(error) < _INVERTED).all(axis=1) & (determinant > 0.0) & (xx > 0.0)
+            if found.all():
+                break
+            step = np.column_stack([yy * error[:, 0] - xy * error[:, 1], xx * error[:, 1] - xy * error[:, 0]])
+            plane = np.where(found[:, None], plane, plane - step / determinant[:, None])
+    return np.where(found[:, None], plane, np.nan)
+
+
+def _equidistant(
+    coefficients: tuple[float, ...], theta: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Angle from the axis → distance from the image's centre at unit focal length, and its derivative."""
+    k1, k2, k3, k4 = coefficients
+    square = theta * theta
+    radius = theta * (1 + square * (k1 + square * (k2 + square * (k3 + square * k4))))
+    slope = 1 + square * (3 * k1 + square * (5 * k2 + square * (7 * k3 + square * 9 * k4)))
+    return radius, slope
+
+
+@lru_cache(maxsize=16)
+def _max_theta(coefficients: tuple[float, ...]) -> float:
+    """Angle from the axis up to which an equidistant lens's polynomial ascends, at most π."""
+    k1, k2, k3, k4 = coefficients
+    roots = np.roots([9 * k4, 7 * k3, 5 * k2, 3 * k1, 1.0])
+    turning = [math.sqrt(root.real) for root in roots if abs(root.imag) < 1e-12 and root.real > 0.0]
+    return min([math.pi, *turning])
+
+
+def _equidistant_rays(coefficients: tuple[float, ...], plane: NDArray[np.float64]) -> NDArray[np.float64]:
+    largest = _max_theta(coefficients)
+    radius = np.sqrt((plane * plane).sum(axis=1))
+    theta = np.minimum(radius, largest)
+    with np.errstate(all="ignore"):
+        for _ in range(_MAX_STEPS):
+            reached, slope = _equidistant(coefficients, theta)
+            if (np.abs(reached - radius) < _INVERTED / 100).all():
+                break
+            theta = np.clip(theta - (reached - radius) / slope, 0.0, largest)
+        theta[np.abs(_equidistant(coefficients, theta)[0] - radius) > _INVERTED] = np.nan
+        sine = np.where(radius > 0.0, np.sin(theta) / radius, 1.0)
+    return np.column_stack([plane * sine[:, None], np.cos(theta)])
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vision.camera_model import CameraModel
+from vision.camera_model import MIN_COSINE, CameraModel
 
 # With a smaller share of pixels with known depth, these may belong to something else.
 MIN_KNOWN_FRACTION = 0.1
@@ -205,8 +205,9 @@ def _averaged(
     pixels = np.empty((len(rows), 2))
     pixels[:, 0] = left - 0.5 + (columns + 0.5) * ((right - left) / wide)
     pixels[:, 1] = top - 0.5 + (rows + 0.5) * ((bottom - top) / high)
-    rays = camera.rays(pixels)
-    return rays / rays[:, 2:], (shares[rows, columns] / sums[rows, columns]).astype(np.float64)
+    rays, along_m = camera.rays(pixels), (shares[rows, columns] / sums[rows, columns]).astype(np.float64)
+    ahead = rays[:, 2] > MIN_COSINE  # a fisheye also has pixels without a ray, and rays across its axis
+    return rays[ahead] / rays[ahead, 2:], along_m[ahead]
 
 
 def _ground(

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vision.camera_model import CameraModel, CameraMount
+from vision.camera_model import MIN_COSINE, CameraModel, CameraMount
 
 # Assumed depth of an object along the line of sight, as a share of its width. On rendered people, cars and
 # bicycles 0.6 has the smallest median error, and 0.4 fewer ranges that are too far.
@@ -81,7 +81,7 @@ class PixelRays:
 
     def at_depth(self, depth_m: NDArray[Any]) -> NDArray[np.float64]:
         """(N, 3) NED offsets of the points at depths (N,) along the optical axis."""
-        along_m = np.asarray(depth_m, np.float64) / self.cosines
+        along_m = np.asarray(depth_m, np.float64) / np.where(self.cosines > MIN_COSINE, self.cosines, np.nan)
         offsets: NDArray[np.float64] = self.camera_ned_m + self.directions * along_m[:, None]
         return offsets
 

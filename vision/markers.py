@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vision.camera_model import CameraModel
+from vision.camera_model import MIN_COSINE, CameraModel
 
 # A false detection, or corners displaced by blur, fits no pose: largest RMS over the corners, as a share of
 # the marker's side in the image, and never less than this many pixels.
@@ -236,6 +236,8 @@ def marker_poses(corners_px: NDArray[np.float64], size_m: float, camera: CameraM
         corners_px: (4, 2) pixels, as `marker_from_corners`.
     """
     if not np.isfinite(corners_px).all():
+        return []
+    if not (camera.rays(corners_px)[:, 2] > MIN_COSINE).all():
         return []
     plane = _plane(camera, corners_px)
     model = square(size_m)

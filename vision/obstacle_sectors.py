@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vision.camera_model import CameraModel, CameraMount
+from vision.camera_model import MIN_COSINE, CameraModel, CameraMount
 
 SECTORS = 72
 SECTOR_RAD = math.tau / SECTORS
@@ -76,7 +76,9 @@ def obstacle_sectors(
     rows = slice(None, None, max(1, math.ceil(camera.height / GRID_ROWS)))
     columns = slice(None, None, max(1, math.ceil(camera.width / GRID_COLUMNS)))
     depth = depth_m[rows, columns].ravel().astype(np.float32, copy=False)
-    rays = _rays(camera, rows.step, columns.step)
+    rays, ahead = _rays(camera, rows.step, columns.step)
+    if ahead is not None:
+        depth = depth[ahead]
     turn = mount.ned_from_optical(ned_from_body).astype(np.float32)
     lens = (ned_from_body @ mount.position_frd_m).astype(np.float32)
 
@@ -123,11 +125,16 @@ def _sector(north: NDArray[np.float32], east: NDArray[np.float32]) -> NDArray[np
     return sector
 
 
-_cached: dict[tuple[CameraModel, int, int], NDArray[np.float32]] = {}
+_Rays = tuple[NDArray[np.float32], NDArray[np.intp] | None]
+_cached: dict[tuple[CameraModel, int, int], _Rays] = {}
 
 
-def _rays(camera: CameraModel, row_step: int, column_step: int) -> NDArray[np.float32]:
-    """(3, N) float32 rays of the sampled pixels with z = 1; the last camera's are cached."""
+def _rays(camera: CameraModel, row_step: int, column_step: int) -> _Rays:
+    """(3, N) float32 rays with z = 1 of the sampled pixels, and which these are, cached for one camera.
+
+    None: all of them. A fisheye has pixels without a ray, and rays across its axis, along which there is no
+    depth.
+    """
     key = (camera, row_step, column_step)
     if key not in _cached:
         across, down = np.meshgrid(
@@ -135,5 +142,8 @@ def _rays(camera: CameraModel, row_step: int, column_step: int) -> NDArray[np.fl
         )
         rays = camera.rays(np.column_stack([across.ravel(), down.ravel()]))
         _cached.clear()
-        _cached[key] = np.ascontiguousarray((rays / rays[:, 2:]).T, np.float32)
+        ahead = np.flatnonzero(rays[:, 2] > MIN_COSINE)
+        rays = rays[ahead]
+        plane = np.ascontiguousarray((rays / rays[:, 2:]).T, np.float32)
+        _cached[key] = (plane, ahead if len(ahead) < across.size else None)
     return _cached[key]

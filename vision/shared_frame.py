@@ -20,11 +20,12 @@ Layout, in 64-bit words of the host's byte order; the slots begin at the second 
 | 9 | 1 when the writer has closed | |
 | 10 | the writer's process number | |
 | 11 | calibration, bits: 1 lens, 2 mount, 4 stabilized, 8 on a gimbal | |
-| 12 | number of distortion coefficients: 0, 4 or 5 | |
+| 12 | number of distortion coefficients: 0, 4, 5 or 8 | |
 | 13 to 16 | fx, fy, cx, cy in pixels (float64, as all below) | |
-| 17 to 21 | distortion k1, k2, p1, p2, k3 (Brown–Conrady, OpenCV's order) | |
-| 22 to 24 | mount: forward, right, down of the body (FRD) in metres | |
-| 25 to 27 | mount: roll, pitch, yaw in radians | |
+| 17 to 24 | distortion coefficients, see `vision.camera_model` | |
+| 25 to 27 | mount: forward, right, down of the body (FRD) in metres | |
+| 28 to 30 | mount: roll, pitch, yaw in radians | |
+| 31 | distortion model: 0 plumb_bob, 1 rational_polynomial, 2 equidistant (an integer) | |
 
 A slot's image starts 64 bytes into it, its depth after the image, at a multiple of 64. The slot's lock is a
 sequence lock (Lameter 2005, "Effective synchronization on Linux/NUMA systems"): a reader copies and then
@@ -46,12 +47,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vision.camera_model import CameraCalibration, CameraModel, CameraMount
+from vision.camera_model import DISTORTION_MODELS, CameraCalibration, CameraModel, CameraMount
 from vision.frame import Frame
 
 SHARED_MEMORY_DIRECTORY = Path("/dev/shm")
 MAGIC = 0x4D43_4652_414D_4531
-VERSION = 2
+VERSION = 3
 PAGE = 4096
 SLOT_HEADER_BYTES = 64
 MAX_ATTEMPTS = 50
@@ -60,8 +61,8 @@ LOOK_FOR_SUCCESSOR_NS = 100_000_000
 _MAGIC, _VERSION, _WIDTH, _HEIGHT, _DEPTH, _SLOTS, _SLOT_BYTES, _WRITTEN, _HEARTBEAT, _CLOSED, _PID = range(
     11
 )
-_CALIBRATION, _COEFFICIENTS = 11, 12
-_LENS, _DISTORTION, _POSITION, _ROTATION = slice(13, 17), slice(17, 22), slice(22, 25), slice(25, 28)
+_CALIBRATION, _COEFFICIENTS, _DISTORTION_MODEL = 11, 12, 31
+_LENS, _DISTORTION, _POSITION, _ROTATION = slice(13, 17), slice(17, 25), slice(25, 28), slice(28, 31)
 _HAS_LENS, _HAS_MOUNT, _STABILIZED, _ON_GIMBAL = 1, 2, 4, 8
 _LOCK, _SEQUENCE, _CAPTURED = range(3)
 
@@ -115,6 +116,7 @@ def _write_calibration(header: Words, calibration: CameraCalibration) -> None:
     flags = _HAS_LENS
     floats[_LENS] = (model.fx, model.fy, model.cx, model.cy)
     header[_COEFFICIENTS] = len(model.distortion)
+    header[_DISTORTION_MODEL] = DISTORTION_MODELS.index(model.distortion_model)
     floats[_DISTORTION][: len(model.distortion)] = model.distortion
     if mount is not None:
         flags |= _HAS_MOUNT | (mount.stabilized and _STABILIZED) | (mount.on_gimbal and _ON_GIMBAL)
@@ -133,13 +135,17 @@ def _read_calibration(header: Words, width: int, height: int) -> CameraCalibrati
         raise ValueError("the calibration contains numbers that are not finite")
     fx, fy, cx, cy = floats[_LENS].tolist()
     distortion = tuple(floats[_DISTORTION].tolist()[:count])
+    kind = int(header[_DISTORTION_MODEL])
+    if kind >= len(DISTORTION_MODELS):
+        raise ValueError(f"the calibration has the unknown distortion model {kind}")
     mount = None
     if flags & _HAS_MOUNT:
         forward_m, right_m, down_m = floats[_POSITION].tolist()
         roll_rad, pitch_rad, yaw_rad = floats[_ROTATION].tolist()
         stabilized, on_gimbal = bool(flags & _STABILIZED), bool(flags & _ON_GIMBAL)
         mount = CameraMount(forward_m, right_m, down_m, roll_rad, pitch_rad, yaw_rad, stabilized, on_gimbal)
-    return CameraCalibration(CameraModel(width, height, fx, fy, cx, cy, distortion), mount)
+    model = CameraModel(width, height, fx, fy, cx, cy, distortion, DISTORTION_MODELS[kind])
+    return CameraCalibration(model, mount)
 
 
 class SharedFrameWriter:

@@ -354,9 +354,9 @@ class CameraInfoBody(TypedDict):
     height: int
     """height of the frames, pixels"""
     distortion_model: str
-    """plumb_bob (Brown-Conrady)"""
-    d: Annotated[list[float], Field(min_length=5, max_length=5)]
-    """k1, k2, p1, p2, k3"""
+    """plumb_bob (Brown-Conrady), rational_polynomial or equidistant (fisheye)"""
+    d: Annotated[list[float], Field(min_length=4, max_length=8)]
+    """plumb_bob: k1, k2, p1, p2, k3; rational_polynomial: and k4, k5, k6; equidistant: k1, k2, k3, k4"""
     k: Matrix3
     """camera matrix by rows; pixel (0, 0) is the centre of the upper left pixel"""
     r: Matrix3

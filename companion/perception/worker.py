@@ -240,9 +240,18 @@ def _open(settings: Settings, stack: contextlib.ExitStack, sender: ResultSender)
         recording = Recording(settings.recording.video, settings.recording.rate_hz)
         stack.callback(recording.close)
     detector = load_detector(settings) if settings.detector.enabled else None
-    on_frame = None
+    share = None
     if settings.source.share is not None:
-        on_frame = stack.enter_context(FrameSharing(settings.source.share)).write
+        share = stack.enter_context(FrameSharing(settings.source.share)).write
+
+    def on_frame(frame: Frame) -> None:
+        try:
+            settings.camera.model(frame.width, frame.height)
+        except ValueError as error:
+            raise SourceError(f"{settings.source.uri}: {error}") from error
+        if share is not None:
+            share(frame)
+
     source = stack.enter_context(open_source(settings.source.uri, settings.source.opening(on_frame)))
     if recording is not None:
         # Again, to finish it before the source closes, which may be slow in a driver.

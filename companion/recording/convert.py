@@ -48,6 +48,8 @@ _OF_RECORDER = {
     GUIDANCE_OUTPUT.name: OUTPUT_CHANNEL,
 }
 _STAMPS = ("published_ns", "stamp_ns", "now_ns")
+# Foxglove's names of distortion models; the others are as in ROS.
+_FOXGLOVE_MODELS = {"equidistant": "kannala_brandt"}
 _LEVELS = {"info": 2, "warning": 3, "error": 4}  # foxglove.LogLevel
 # Of `PointCloud.packed`: name, offset, and foxglove.PackedElementField's type (1: uint8, 7: float32).
 _POINT_BYTES = 16
@@ -281,7 +283,10 @@ class Converter:
     def _calibration(self, camera: str, message: dict[str, Any]) -> Iterator[tuple[str, str, Any]]:
         body = {
             "timestamp": self._time(message["stamp_ns"]),
-            **{key: message[key] for key in ("frame_id", "width", "height", "distortion_model")},
+            **{key: message[key] for key in ("frame_id", "width", "height")},
+            "distortion_model": _FOXGLOVE_MODELS.get(
+                message["distortion_model"], message["distortion_model"]
+            ),
             **{key.upper(): message[key] for key in ("d", "k", "r", "p")},
         }
         yield _joined("", camera, "camera_info"), "CameraCalibration", body

@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-from companion.settings.perception import CameraSection
+from companion.settings.perception import LENS_KEYS, CameraSection, lens_settings
 from vision.camera_model import CameraCalibration, CameraModel, CameraMount
 
-_LENS = frozenset(
-    ("horizontal_fov_deg", "fx_px", "fy_px", "cx_px", "cy_px", "calibrated_width", "calibrated_height")
-)
+_DISTORTION = frozenset(("distortion", "distortion_model"))
+_LENS = LENS_KEYS - _DISTORTION
 _SAME_SHARE, _SAME_M, _SAME_DEG, _SAME_DISTORTION = 0.005, 0.001, 0.1, 1e-4
 """Tolerances of agreement: share of the frame's width for a lens, mount position and angle, coefficient."""
 
@@ -49,18 +48,14 @@ def _adopt_lens(
         ):
             conflicts.append(f"lens {_lens_text(own)} (camera: {_lens_text(lens)})")
     else:
-        changes |= {
-            "fx_px": lens.fx,
-            "fy_px": lens.fy,
-            "cx_px": lens.cx,
-            "cy_px": lens.cy,
-            "calibrated_width": lens.width,
-            "calibrated_height": lens.height,
-        }
-    if "distortion" not in given and not given & _LENS:
-        changes["distortion"] = lens.distortion
+        changes |= {key: value for key, value in lens_settings(lens).items() if key in _LENS}
+    if not given & (_DISTORTION | _LENS):
+        changes |= {"distortion": lens.distortion, "distortion_model": lens.distortion_model}
         return
-    own_terms, terms = (tuple(d) + (0.0,) * (5 - len(d)) for d in (section.distortion, lens.distortion))
+    if section.distortion_model != lens.distortion_model:
+        conflicts.append(f"distortion_model {section.distortion_model} (camera: {lens.distortion_model})")
+        return
+    own_terms, terms = (tuple(d) + (0.0,) * (8 - len(d)) for d in (section.distortion, lens.distortion))
     if any(abs(a - b) > _SAME_DISTORTION for a, b in zip(own_terms, terms, strict=True)):
         conflicts.append(f"distortion {section.distortion} (camera: {lens.distortion})")
 

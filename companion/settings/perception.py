@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Annotated, Literal, Self
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
 from companion.settings.marker_files import read_boards
 from companion.settings.section import Section
 from companion.settings.texts import HEIGHT_TEXT, KEY_WORD, MARKER_TEXT
-from vision.camera_model import CameraModel, CameraMount
+from vision.calibration.camera_info import read_camera_info
+from vision.camera_model import CameraModel, CameraMount, DistortionModel, check_distortion
 from vision.frame import Frame
 from vision.frame_selection import Selection
 from vision.marker_boards import Board
@@ -76,9 +79,21 @@ class SourceSection(Section):
         return SourceSettings(**self.model_dump(exclude={"uri", "share"}), on_frame=on_frame)
 
 
+# The keys of the lens; `camera.calibration_file` sets them all.
+LENS_KEYS = frozenset(
+    (
+        *("horizontal_fov_deg", "fx_px", "fy_px", "cx_px", "cy_px", "calibrated_width", "calibrated_height"),
+        *("distortion", "distortion_model"),
+    )
+)
+_SAME_ASPECT = 0.01
+
+
 class CameraSection(Section):
     """Lens and mount; unset keys come from the camera's calibration, if any. Body: forward, right, down."""
 
+    calibration_file: Annotated[str | None, Field(min_length=1)] = None
+    """ROS camera_info YAML, as `companion calibrate` writes it, instead of the keys of the lens"""
     horizontal_fov_deg: Annotated[float, Field(gt=1, lt=179)] = 80.0
     """horizontal field of view, degrees; unused when fx_px is set"""
     mount_forward_m: Annotated[float, Field(ge=-10, le=10)] = 0.0
@@ -110,7 +125,21 @@ class CameraSection(Section):
     calibrated_height: Annotated[int | None, Field(ge=16, le=16384)] = None
     """height of the calibration images, pixels"""
     distortion: tuple[float, ...] = ()
-    """k1, k2, p1, p2, k3 in OpenCV's order: none, four or five numbers"""
+    """coefficients in OpenCV's order: k1, k2, p1, p2, k3 (none, four or five); eight or four, see below"""
+    distortion_model: DistortionModel = "plumb_bob"
+    """plumb_bob; rational_polynomial: eight coefficients; equidistant (fisheye): k1, k2, k3, k4"""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_calibration_file(cls, values: Any) -> Any:
+        """Replace the file by its numbers, which are then recorded with the other settings."""
+        if not isinstance(values, dict) or not isinstance(file := values.get("calibration_file"), str):
+            return values
+        if given := sorted(LENS_KEYS & values.keys()):
+            raise ValueError(f"calibration_file sets the lens, {', '.join(given)} too: remove one of them")
+        lens = read_camera_info(Path(file).expanduser())
+        others = {key: value for key, value in values.items() if key != "calibration_file"}
+        return others | lens_settings(lens)
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -126,12 +155,19 @@ class CameraSection(Section):
                 "on_gimbal and stabilized exclude each other: a gimbal reports its attitude (on_gimbal), "
                 "or one that reports nothing and holds the camera level (stabilized)"
             )
-        if len(self.distortion) not in (0, 4, 5):
-            raise ValueError(f"distortion must have 0, 4 or 5 numbers, got {len(self.distortion)}")
+        check_distortion(self.distortion_model, self.distortion)
+        if self.distortion_model == "equidistant" and missing:
+            raise ValueError(
+                "distortion_model equidistant needs a calibration: fx_px, fy_px… or calibration_file"
+            )
         return self
 
     def model(self, width: int, height: int) -> CameraModel:
-        """Return the camera model for frames of this size, pixels."""
+        """Return the camera model for frames of this size, pixels.
+
+        Raises:
+            ValueError: the lens was calibrated with images of another aspect.
+        """
         if (
             self.fx_px is None
             or self.fy_px is None
@@ -142,7 +178,7 @@ class CameraSection(Section):
         ):
             fov_rad = math.radians(self.horizontal_fov_deg)
             ideal = CameraModel.from_horizontal_fov(width, height, fov_rad)
-            return CameraModel(width, height, ideal.fx, ideal.fy, ideal.cx, ideal.cy, self.distortion)
+            return replace(ideal, distortion=self.distortion, distortion_model=self.distortion_model)
         calibrated = CameraModel(
             self.calibrated_width,
             self.calibrated_height,
@@ -151,7 +187,14 @@ class CameraSection(Section):
             self.cx_px,
             self.cy_px,
             self.distortion,
+            self.distortion_model,
         )
+        if abs(width * calibrated.height / (height * calibrated.width) - 1.0) > _SAME_ASPECT:
+            raise ValueError(
+                f"the lens was calibrated with images of {calibrated.width}x{calibrated.height}, the frames "
+                f"have {width}x{height}, another aspect: calibrate with such frames, or set source.width and "
+                "source.height"
+            )
         return calibrated.scaled(width, height)
 
     @property
@@ -159,7 +202,8 @@ class CameraSection(Section):
         """Horizontal field of view, radians; from the calibration, if any."""
         if self.fx_px is None or self.calibrated_width is None:
             return math.radians(self.horizontal_fov_deg)
-        return 2 * math.atan(self.calibrated_width / 2 / self.fx_px)
+        assert self.calibrated_height is not None
+        return self.model(self.calibrated_width, self.calibrated_height).horizontal_fov_rad
 
     def mount(self) -> CameraMount:
         """Return the camera's mount on the body."""
@@ -173,6 +217,20 @@ class CameraSection(Section):
             self.stabilized,
             self.on_gimbal,
         )
+
+
+def lens_settings(lens: CameraModel) -> dict[str, Any]:
+    """Return the `camera` keys of a calibrated lens."""
+    return {
+        "fx_px": lens.fx,
+        "fy_px": lens.fy,
+        "cx_px": lens.cx,
+        "cy_px": lens.cy,
+        "calibrated_width": lens.width,
+        "calibrated_height": lens.height,
+        "distortion": lens.distortion,
+        "distortion_model": lens.distortion_model,
+    }
 
 
 class DetectorSection(Section):

@@ -17,13 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mavlink_sim.world.textures import Image, Plane
-from vision.camera_model import CameraModel
+from vision.camera_model import MIN_COSINE, CameraModel
 
 MARGIN_SHARE = 0.1
 """Margin drawn on every side for a moving camera's rows, as a share of the width."""
 MAX_GROWTH = 2.5
 MOST_EXPOSURES = 8
-_ROUND_TRIP_PX = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +77,7 @@ class Lens:
         columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
         pixels = np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64)
         plane = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
-        if camera.distortion:
+        if not camera.rectilinear:
             plane = _undistorted(camera, pixels)
         shape = (camera.height, camera.width)
         self._x = plane[:, 0].reshape(shape).astype(np.float32)
@@ -200,15 +199,15 @@ def _rotations(rate_radps: NDArray[np.float64], times_s: NDArray[np.float64]) ->
 
 def _undistorted(camera: CameraModel, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
     """(N, 2) pixels → (N, 2) on the plane at depth 1 that the lens bends there."""
-    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-9)
-    plane = cv2.undistortPoints(
-        pixels.reshape(-1, 1, 2), camera.matrix, np.array(camera.distortion), criteria=criteria
-    ).reshape(-1, 2)
-    again = camera.project(np.column_stack([plane, np.ones(len(plane))]))
-    worst = float(np.abs(again - pixels).max()) if np.isfinite(again).all() else math.inf
-    if not worst < _ROUND_TRIP_PX:
+    rays = camera.rays(pixels)
+    if not np.isfinite(rays).all():
         raise ValueError(
             f"the distortion {camera.distortion} is not invertible within {camera.width}x{camera.height}: "
-            f"the error of the inverse is {worst:.1f} px; use weaker coefficients"
+            f"{np.isnan(rays[:, 0]).mean():.1%} of the pixels have no ray; use weaker coefficients"
         )
-    return np.asarray(plane, np.float64)
+    if not (rays[:, 2] > MIN_COSINE).all():
+        raise ValueError(
+            f"the {camera.distortion_model} lens sees 180 degrees or more, which no pinhole image shows; "
+            "use a longer focal length"
+        )
+    return np.asarray(rays[:, :2] / rays[:, 2:], np.float64)

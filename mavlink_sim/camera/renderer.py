@@ -314,7 +314,7 @@ class Renderer:
     ) -> None:
         self.world, self.camera, self.mount = world, camera, mount
         self._sensor = None if effects is None else Sensor(effects)
-        self._lens = Lens(camera, shutter) if any(camera.distortion) or shutter is not None else None
+        self._lens = Lens(camera, shutter) if not camera.rectilinear or shutter is not None else None
         self._drawn = camera if self._lens is None else self._lens.drawn
         self._buffers = buffers or Buffers(self._drawn.width, self._drawn.height)
         if (self._buffers.width, self._buffers.height) != (self._drawn.width, self._drawn.height):

@@ -34,7 +34,7 @@ from mavlink_sim.world.world import (
     WorldObject,
     demo_world,
 )
-from vision.camera_model import CameraModel, CameraMount
+from vision.camera_model import CameraModel, CameraMount, DistortionModel, check_distortion
 
 
 class SceneError(ValueError):
@@ -172,7 +172,8 @@ class _Camera(_Table):
     horizontal_fov_deg: Annotated[Number, Field(gt=1, lt=170)] | None = None
     focal_px: Annotated[list[Positive], Field(min_length=2, max_length=2)] | None = None
     centre_px: Annotated[list[Number], Field(min_length=2, max_length=2)] | None = None
-    distortion: Annotated[list[Number], Field(max_length=5)] = []
+    distortion: Annotated[list[Number], Field(max_length=8)] = []
+    distortion_model: DistortionModel = "plumb_bob"
     rate_hz: Annotated[Number, Field(gt=0, le=1000)] = 30.0
     exposure_ms: Annotated[Number, Field(ge=0, le=500)] = 0.0
     rolling_shutter_ms: Annotated[Number, Field(ge=0, le=500)] = 0.0
@@ -302,16 +303,15 @@ class _Builder:
             raise self._fail("camera", "must have horizontal_fov_deg or focal_px, got both")
         if table.centre_px is not None and table.focal_px is None:
             raise self._fail("camera.centre_px", "needs camera.focal_px beside it")
-        if len(table.distortion) not in (0, 4, 5):
-            raise self._fail(
-                "camera.distortion",
-                f"must be [k1, k2, p1, p2] or [k1, k2, p1, p2, k3], got {len(table.distortion)} numbers",
-            )
+        try:
+            check_distortion(table.distortion_model, tuple(table.distortion))
+        except ValueError as error:
+            raise self._fail("camera", error) from error
         shutter = None
         if table.exposure_ms > 0.0 or table.rolling_shutter_ms > 0.0:
             shutter = Shutter(table.exposure_ms / 1e3, table.rolling_shutter_ms / 1e3)
         model = _camera_model(table)
-        if model.distortion:
+        if not model.rectilinear:
             try:
                 Lens(model, shutter)
             except ValueError as error:
@@ -359,7 +359,11 @@ def _camera_model(table: _Camera) -> CameraModel:
         focal = table.focal_px
         centre = table.centre_px or [(table.width - 1) / 2, (table.height - 1) / 2]
     return CameraModel(
-        table.width, table.height, focal[0], focal[1], centre[0], centre[1], tuple(table.distortion)
+        table.width,
+        table.height,
+        *(focal[0], focal[1], centre[0], centre[1]),
+        tuple(table.distortion),
+        table.distortion_model,
     )
 
 

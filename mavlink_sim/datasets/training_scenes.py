@@ -133,7 +133,7 @@ def flight_frame(rng: np.random.Generator, width: int, height: int) -> Rendered:
     """The view ahead from a low vehicle: objects 3 to 70 m away, many distractors, ground, shadows."""
     low = rng.random() < 0.85
     altitude = float(math.exp(rng.uniform(math.log(1.5), math.log(10.0)) + (0.0 if low else math.log(5.0))))
-    camera = _wide_camera(width, height, float(rng.uniform(60.0, 92.0)))
+    camera = CameraModel.from_horizontal_fov(width, height, math.radians(float(rng.uniform(60.0, 92.0))))
     down = math.radians(float(rng.uniform(4.0, 32.0) if low else rng.uniform(12.0, 65.0)))
     yaw = float(rng.uniform(-math.pi, math.pi))
     attitude = matrix_from_euler(math.radians(float(rng.normal(0.0, 4.0))), -down, yaw)
@@ -170,8 +170,9 @@ def world_frame(rng: np.random.Generator, width: int, height: int) -> Rendered:
     effects = scene.camera.effects if rng.random() < 0.5 else _random_effects(rng)
     model = scene.camera.model
     seen_deg = math.degrees(2 * math.atan(model.width / 2 / model.fx)) * float(rng.uniform(0.85, 1.15))
-    camera = _wide_camera(width, height, seen_deg, model.distortion)
-    buffers = None if camera.distortion else _buffers(width, height)
+    ideal = CameraModel.from_horizontal_fov(width, height, math.radians(seen_deg))
+    camera = replace(ideal, distortion=model.distortion, distortion_model=model.distortion_model)
+    buffers = None if not camera.rectilinear else _buffers(width, height)
     shown = World(objects, world.ground, light, sky)
     renderer = Renderer(shown, camera, CameraMount(), effects, buffers, rng)
     return renderer.render(*_gaze(rng, objects, camera))
@@ -228,16 +229,6 @@ def _gaze(
     yaw += float(rng.uniform(-0.7, 0.7)) * across
     roll = math.radians(float(rng.normal(0.0, 4.0)))
     return (north, east, -altitude), matrix_from_euler(roll, pitch, yaw)
-
-
-def _wide_camera(
-    width: int,
-    height: int,
-    horizontal_fov_deg: float,
-    distortion: tuple[float, ...] = (),
-) -> CameraModel:
-    focal = width / 2 / math.tan(math.radians(horizontal_fov_deg) / 2)
-    return CameraModel(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2, distortion)
 
 
 def random_frame(

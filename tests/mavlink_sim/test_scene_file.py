@@ -121,7 +121,7 @@ def test_an_empty_file_is_an_empty_field_with_the_usual_camera() -> None:
         ("[camera]\nloss = 1.0", r"camera.loss: .*1, got 1.0"),
         ("[camera]\nfocal_px = [1, 2]\nhorizontal_fov_deg = 60", r"camera: .*got both"),
         ("[camera]\ncentre_px = [1, 2]", r"camera.centre_px: needs camera.focal_px"),
-        ("[camera]\ndistortion = [0.1]", r"camera.distortion: must be .*got 1 numbers"),
+        ("[camera]\ndistortion = [0.1]", r"camera: distortion of plumb_bob must have .*got 1"),
         ("[camera]\ndistortion = [-3, 0, 0, 0]", r"camera.distortion: .*weaker coefficients"),
         ("[camera.depth]\nminimum_m = 9\nmaximum_m = 3", r"camera.depth: minimum_m 9.0"),
         ("[ground]\nkinds = ['grass', 'lava']", r"ground.kinds\[1\]: .*grass, .*'lava'"),

@@ -18,7 +18,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vision.camera_model import CameraCalibration, CameraModel, CameraMount
+from vision.camera_model import CameraCalibration, CameraModel, CameraMount, DistortionModel
 from vision.frame import Frame
 from vision.shared_frame import (
     SHARED_MEMORY_DIRECTORY,
@@ -306,7 +306,16 @@ def test_the_segment_is_for_its_owner_only(name: str) -> None:
         assert Path(segment_path(name)).stat().st_mode & 0o077 == 0
 
 
-@pytest.mark.parametrize("distortion", [(), (-0.12, 0.03, 0.0005, -0.0003), (-0.12, 0.03, 5e-4, -3e-4, 0.01)])
+@pytest.mark.parametrize(
+    ("distortion", "model"),
+    [
+        ((), "plumb_bob"),
+        ((-0.12, 0.03, 0.0005, -0.0003), "plumb_bob"),
+        ((-0.12, 0.03, 5e-4, -3e-4, 0.01), "plumb_bob"),
+        ((0.6, 0.08, 4e-4, -3e-4, 0.002, 0.9, 0.2, 0.01), "rational_polynomial"),
+        ((-0.02, 0.004, -0.002, 0.0003), "equidistant"),
+    ],
+)
 @pytest.mark.parametrize(
     "mount",
     [
@@ -318,9 +327,9 @@ def test_the_segment_is_for_its_owner_only(name: str) -> None:
     ids=["none", "fixed", "stabilized", "gimbal"],
 )
 def test_calibration_is_read_unchanged(
-    name: str, distortion: tuple[float, ...], mount: CameraMount | None
+    name: str, distortion: tuple[float, ...], model: DistortionModel, mount: CameraMount | None
 ) -> None:
-    calibration = CameraCalibration(CameraModel(16, 12, 11.5, 11.25, 7.25, 5.75, distortion), mount)
+    calibration = CameraCalibration(CameraModel(16, 12, 11.5, 11.25, 7.25, 5.75, distortion, model), mount)
     with (
         SharedFrameWriter(name, 16, 12, depth=False, calibration=calibration),
         SharedFrameReader(name) as reader,
@@ -339,12 +348,23 @@ def test_calibration_of_another_size_is_rejected(name: str) -> None:
         SharedFrameWriter(name, 16, 12, depth=False, calibration=calibration)
 
 
-def test_a_segment_of_version_one_is_rejected(name: str) -> None:
+@pytest.mark.parametrize("version", [1, 2])
+def test_a_segment_of_an_older_version_is_rejected(name: str, version: int) -> None:
     with SharedFrameWriter(name, 16, 12, depth=False):
         with segment_path(name).open("r+b") as file:
             file.seek(8)
-            file.write((1).to_bytes(8, sys.byteorder))
-        with pytest.raises(ValueError, match=f"version 1, expected 2.*{os.getpid()}.*restart"):
+            file.write(version.to_bytes(8, sys.byteorder))
+        with pytest.raises(ValueError, match=f"version {version}, expected 3.*{os.getpid()}.*restart"):
+            SharedFrameReader(name)
+
+
+def test_an_unknown_distortion_model_is_rejected(name: str) -> None:
+    calibration = CameraCalibration(CameraModel.from_horizontal_fov(16, 12, 1.2))
+    with SharedFrameWriter(name, 16, 12, depth=False, calibration=calibration):
+        with segment_path(name).open("r+b") as file:
+            file.seek(31 * 8)
+            file.write((3).to_bytes(8, sys.byteorder))
+        with pytest.raises(ValueError, match=r"damaged.*distortion model 3"):
             SharedFrameReader(name)
 
 

@@ -240,6 +240,8 @@ def _sights(
     pixels[:, 1] = np.concatenate([(top + bottom) / 2, bottom, bottom + 1.0])
     lines = PixelRays.of(camera, mount, pose.ned_from_body, pixels)
     centres, feet, below = lines[:count], lines[count : 2 * count], lines[2 * count :]
+    if not np.isfinite(centres.directions).all():
+        raise HistoryError("a box lies where the lens has no rays: calibrate the camera again")
     on_ground = feet.on_ground(pose.height_m, MIN_DEPRESSION_RAD)
     # Between two rays one row apart; the angle is too small for the arc cosine of their product.
     pixel_rad = np.linalg.norm(below.directions - feet.directions, axis=1)

@@ -6,6 +6,8 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+import numpy as np
+
 from companion.guidance.targets.from_detections import MIN_DEPRESSION_RAD
 from vision.camera_model import CameraModel
 
@@ -46,5 +48,6 @@ def sees_ground(camera: CameraModel, pitch_rad: float) -> bool:
     Args:
         pitch_rad: of the camera above the horizon, with the vehicle level.
     """
-    below_axis_rad = math.atan2(camera.height - 1 - camera.cy, camera.fy)
+    _, down, forward = camera.rays(np.array([[camera.cx, camera.height - 1]]))[0]
+    below_axis_rad = math.atan2(down, forward)
     return below_axis_rad - pitch_rad > MIN_DEPRESSION_RAD

@@ -28,7 +28,7 @@ from companion.vehicle.gimbal import GimbalState
 from companion.vehicle.state import VehicleState
 from tests.companion.bus.message_check import check_message
 from vision.attitude import quaternion_from_euler
-from vision.camera_model import CameraModel, CameraMount
+from vision.camera_model import CameraModel, CameraMount, DistortionModel
 from vision.depth import DepthSummary
 from vision.detections import NO_TRACK, Detections
 from vision.pipeline import PerceptionResult
@@ -105,6 +105,22 @@ def test_camera_info_has_the_lens_and_the_mount() -> None:
     np.testing.assert_array_equal(np.reshape(message["p"], (3, 4))[:, :3], CAMERA.matrix)
     w, x, y, z = message["mount"]["rotation_wxyz"]
     np.testing.assert_allclose(matrix_from_quaternion((w, x, y, z)), mount.body_from_optical, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("model", "distortion"),
+    [
+        ("rational_polynomial", (0.6, 0.08, 4e-4, -3e-4, 0.002, 0.9, 0.2, 0.01)),
+        ("equidistant", (-0.02, 0.004, -0.002, 0.0003)),
+    ],
+)
+def test_camera_info_names_the_distortion_model(
+    model: DistortionModel, distortion: tuple[float, ...]
+) -> None:
+    lens = replace(CAMERA, distortion=distortion, distortion_model=model)
+    message = camera_info_message(lens, CameraMount(), calibrated=True, vehicle="v", view=None, now_ns=9)
+    check_message("camera_info", message)
+    assert (message["distortion_model"], message["d"]) == (model, list(distortion))
 
 
 def test_origin_is_where_the_global_position_says() -> None:

@@ -184,6 +184,12 @@ def test_message_is_kept_and_converted(
     assert list(foxglove(iter(others))) == [topic]
 
 
+def test_fisheye_has_foxgloves_name(converter: Converter) -> None:
+    message = {**CAMERA_INFO, "distortion_model": "equidistant", "d": [0.0] * 4}
+    found = foxglove(converter.convert("camera_info", dumps(message)))
+    assert found["/camera_info"]["distortion_model"] == "kannala_brandt"
+
+
 def test_log_time_is_the_stamp_in_unix_time(converter: Converter) -> None:
     (first, *_), (second, *_) = (
         list(converter.convert("pose", dumps({"published_ns": stamp_ns}))) for stamp_ns in (1_000, 3_500)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 import os
+from pathlib import Path
 
 import pytest
 
 from companion.settings.calibration import adopt_calibration
 from companion.settings.perception import CameraSection
-from companion.settings.reading import load_settings
+from companion.settings.reading import ConfigurationError, load_settings, to_toml
+from vision.calibration.camera_info import write_camera_info
 from vision.camera_model import CameraCalibration, CameraModel, CameraMount
 
 LENS = CameraModel.from_horizontal_fov(640, 480, math.radians(70.0))
@@ -84,3 +86,73 @@ def test_given_distortion_wins_alone() -> None:
     assert camera.distortion == (-0.2, 0.02, 0.0, 0.0)
     assert "-0.2" in conflict
     assert "-0.1" in conflict
+
+
+RATIONAL = CameraModel(
+    640,
+    480,
+    *(330.0, 331.0, 318.0, 242.0),
+    (0.6, 0.08, 4e-4, -3e-4, 0.002, 0.92, 0.22, 0.012),
+    "rational_polynomial",
+)
+FISHEYE = CameraModel(640, 480, 195.0, 196.0, 321.0, 238.0, (-0.02, 0.004, -0.002, 3e-4), "equidistant")
+
+
+@pytest.mark.parametrize("lens", [RATIONAL, FISHEYE], ids=["rational", "fisheye"])
+def test_every_distortion_model_comes_with_the_camera(lens: CameraModel) -> None:
+    camera, conflict = adopt_calibration(section_of(), CameraCalibration(lens))
+    assert conflict == ""
+    assert camera.model(640, 480) == lens
+    assert camera.field_rad == lens.horizontal_fov_rad
+
+
+def test_other_distortion_model_is_a_conflict() -> None:
+    given = section_of(distortion_model="plumb_bob", distortion="0.1, 0, 0, 0")
+    camera, conflict = adopt_calibration(given, CameraCalibration(FISHEYE))
+    assert camera.distortion_model == "plumb_bob"
+    assert "equidistant" in conflict
+
+
+@pytest.mark.parametrize("lens", [LENS, RATIONAL, FISHEYE], ids=["plain", "rational", "fisheye"])
+def test_calibration_file_gives_the_lens(tmp_path: Path, lens: CameraModel) -> None:
+    write_camera_info(file := tmp_path / "camera.yaml", lens, "front")
+    camera = section_of(calibration_file=str(file), mount_pitch_deg="-20")
+    read = camera.model(640, 480)
+    assert read.distortion_model == lens.distortion_model
+    assert (read.fx, read.fy, read.cx, read.cy) == pytest.approx((lens.fx, lens.fy, lens.cx, lens.cy))
+    assert read.coefficients == pytest.approx(lens.coefficients)
+    assert camera.model(1280, 960).fx == pytest.approx(2 * lens.fx)
+    assert camera.mount_pitch_deg == -20.0
+
+
+def test_settings_of_a_calibration_file_are_its_numbers(tmp_path: Path) -> None:
+    write_camera_info(file := tmp_path / "camera.yaml", FISHEYE, "front")
+    settings = load_settings(os.devnull, {"camera.calibration_file": str(file)}, environment={})
+    (effective := tmp_path / "effective.toml").write_text(to_toml(settings))
+    file.unlink()
+    assert load_settings(effective, {}, environment={}).camera == settings.camera
+
+
+def test_frames_of_another_aspect_are_refused(tmp_path: Path) -> None:
+    write_camera_info(file := tmp_path / "camera.yaml", LENS, "front")
+    camera = section_of(calibration_file=str(file))
+    with pytest.raises(ValueError, match=r"640x480.*1280x720"):
+        camera.model(1280, 720)
+
+
+@pytest.mark.parametrize("key", ["fx_px", "horizontal_fov_deg", "distortion"])
+def test_lens_given_twice_is_an_error(tmp_path: Path, key: str) -> None:
+    write_camera_info(file := tmp_path / "camera.yaml", LENS, "front")
+    value = "0.1, 0, 0, 0" if key == "distortion" else "90"
+    with pytest.raises(ConfigurationError, match=rf"camera: calibration_file.*{key}"):
+        section_of(**{"calibration_file": str(file), key: value})
+
+
+def test_missing_calibration_file_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match=r"camera: .*none\.yaml"):
+        section_of(calibration_file=str(tmp_path / "none.yaml"))
+
+
+def test_fisheye_needs_a_calibration() -> None:
+    with pytest.raises(ConfigurationError, match="equidistant"):
+        section_of(distortion_model="equidistant", distortion="0, 0, 0, 0")

@@ -226,7 +226,10 @@ def test_all_problems_are_reported_at_once(tmp_path: Path) -> None:
         ),
         ({"guidance.setpoint_lifetime_s": "0.04"}, "guidance: setpoint_lifetime_s must be longer than"),
         ({"camera.fx_px": "500"}, "camera: a calibration needs all of fx_px, fy_px"),
-        ({"camera.distortion": "1,2"}, "camera: distortion must have 0, 4 or 5 numbers, got 2"),
+        (
+            {"camera.distortion": "1,2"},
+            "camera: distortion of plumb_bob must have 0, 4 or 5 coefficients, got 2",
+        ),
         ({"source.pixel_format": "bgr"}, "source: pixel_format"),
         ({"recording.video": "a.mp4"}, "recording: video must end in .webm, got 'a.mp4'"),
         ({"zenoh.mode": "client"}, "zenoh: a client needs an endpoint in connect"),

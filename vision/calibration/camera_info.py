@@ -1,0 +1,95 @@
+"""Calibration files: ROS's `camera_info` YAML, as camera_calibration writes and image pipelines read it."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+from vision.camera_model import CameraModel
+from vision.plain_yaml import load_plain_yaml
+
+
+def write_camera_info(path: Path, model: CameraModel, name: str, notes: tuple[str, ...] = ()) -> None:
+    """Write a calibration file.
+
+    Args:
+        name: of the camera, `camera_name` in the file.
+        notes: lines of comment at its beginning.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    k = [model.fx, 0.0, model.cx, 0.0, model.fy, model.cy, 0.0, 0.0, 1.0]
+    projection = [model.fx, 0.0, model.cx, 0.0, 0.0, model.fy, model.cy, 0.0, 0.0, 0.0, 1.0, 0.0]
+    lines = [
+        *(f"# {note}" for note in notes),
+        f"image_width: {model.width}",
+        f"image_height: {model.height}",
+        f"camera_name: {name}",
+        *_matrix("camera_matrix", 3, 3, k),
+        f"distortion_model: {model.distortion_model}",
+        *_matrix("distortion_coefficients", 1, len(model.coefficients), model.coefficients),
+        *_matrix("rectification_matrix", 3, 3, [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]),
+        *_matrix("projection_matrix", 3, 4, projection),
+    ]
+    path.write_text("\n".join(lines) + "\n", "utf-8")
+
+
+def read_camera_info(path: Path) -> CameraModel:
+    """Read a calibration file: size, camera matrix and distortion.
+
+    Raises:
+        ValueError: it cannot be read, is not such a file, or has an unknown distortion model; one line that
+            names the file.
+    """
+    try:
+        content = load_plain_yaml(path.read_bytes().decode("utf-8"))
+        if not isinstance(content, dict):
+            raise ValueError("expected a table with image_width, image_height, camera_matrix…")
+        skew = (matrix := _numbers(content, "camera_matrix", 9))[1]
+        if skew != 0.0 or matrix[3] != 0.0 or matrix[6:] != (0.0, 0.0, 1.0):
+            raise ValueError(f"camera_matrix must be [fx, 0, cx, 0, fy, cy, 0, 0, 1], got {list(matrix)}")
+        return CameraModel(
+            _size(content, "image_width"),
+            _size(content, "image_height"),
+            *(matrix[0], matrix[4], matrix[2], matrix[5]),
+            _numbers(content, "distortion_coefficients"),
+            _value(content, "distortion_model"),
+        )
+    except OSError as error:
+        raise ValueError(f"cannot read the calibration file {path}: {error.strerror}") from None
+    except ValueError as error:  # UnicodeDecodeError and PlainYamlError are too
+        raise ValueError(f"the calibration file {path} cannot be used: {error}") from None
+
+
+def _matrix(key: str, rows: int, columns: int, values: tuple[float, ...] | list[float]) -> list[str]:
+    data = ", ".join(f"{value:.10g}" for value in values)
+    return [f"{key}:", f"  rows: {rows}", f"  cols: {columns}", f"  data: [{data}]"]
+
+
+def _value(content: dict[Any, Any], key: str) -> Any:
+    if key not in content:
+        raise ValueError(f"{key} is missing")
+    return content[key]
+
+
+def _size(content: dict[Any, Any], key: str) -> int:
+    value = _value(content, key)
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise ValueError(f"{key} must be a number of pixels, got {value!r}")
+    return value
+
+
+def _numbers(content: dict[Any, Any], key: str, count: int | None = None) -> tuple[float, ...]:
+    table = _value(content, key)
+    data = table.get("data") if isinstance(table, dict) else None
+    if not isinstance(data, list) or not all(_is_number(value) for value in data):
+        raise ValueError(f"{key} must have data: [numbers]")
+    if count is not None and len(data) != count:
+        raise ValueError(f"{key} must have {count} numbers, got {len(data)}")
+    return tuple(float(value) for value in data)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
