@@ -30,6 +30,7 @@ FLOORS = {
     "play": 9,
     "preview": 9,
     "detect": 9,
+    "calibrate": 9,
     "evaluate": 9,
     "flight_log": 9,
     "markers": 9,
@@ -91,6 +92,8 @@ SIMULATOR_LAYERS = {
 MAX_SIMULATOR_LAYERS = 10
 SIMULATOR_MAY_IMPORT = {
     "vision.attitude",
+    "vision.calibration.boards",
+    "vision.calibration.camera_info",
     "vision.camera_model",
     "vision.frame",
     "vision.geolocation",

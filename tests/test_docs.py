@@ -16,6 +16,7 @@ from companion.guidance.command import COMMANDS
 from mavlink_sim.camera.cli import app as camera_app
 from mavlink_sim.cli.bench import app as bench_app
 from mavlink_sim.cli.main import app as simulator_app
+from mavlink_sim.datasets.board_views import app as board_app
 from mavlink_sim.datasets.dataset import app as dataset_app
 
 ROOT = Path(__file__).parent.parent
@@ -27,7 +28,7 @@ DOCUMENTS = [
     ROOT / "systemd" / "companion.service",
 ]
 APPS = {"companion": companion_app, "mavlink-sim": simulator_app}
-SIMULATOR_SUBCOMMANDS = {"dataset": dataset_app, "bench": bench_app, "camera": camera_app}
+SIMULATOR_SUBCOMMANDS = {"dataset": dataset_app, "board": board_app, "bench": bench_app, "camera": camera_app}
 
 
 def shell_lines(document: Path) -> Iterator[str]:

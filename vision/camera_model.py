@@ -30,6 +30,7 @@ _COEFFICIENTS = {PLUMB_BOB: (0, 4, 5), RATIONAL: (8,), EQUIDISTANT: (4,)}
 # Rays nearer than this to the plane across the optical axis have no usable point at unit depth.
 MIN_COSINE = 0.02
 _MAX_STEPS = 20
+_SAME_ASPECT = 0.01
 # Largest error of an inverted distortion, at unit depth.
 _INVERTED = 1e-9
 
@@ -144,6 +145,16 @@ class CameraModel:
         rays[:, :2] = plane
         rays /= np.sqrt((rays * rays).sum(axis=1, keepdims=True))
         return rays
+
+
+def scaled_to_frames(model: CameraModel, width: int, height: int) -> CameraModel:
+    """A calibrated lens for frames of another size. Raises ValueError, naming both, for another aspect."""
+    if abs(width * model.height / (height * model.width) - 1.0) > _SAME_ASPECT:
+        raise ValueError(
+            f"the lens was calibrated with images of {model.width}x{model.height}, the frames have "
+            f"{width}x{height}, another aspect: calibrate with such frames, or set the width and height"
+        )
+    return model.scaled(width, height)
 
 
 def check_distortion(model: str, coefficients: tuple[float, ...]) -> None:

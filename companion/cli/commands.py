@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from companion.cli.bench import bench
+from companion.cli.calibrate import calibrate
 from companion.cli.cameras import cameras, depth, preview
 from companion.cli.cloud import CLOUD_SETTINGS, cloud
 from companion.cli.dashboard import dashboard
@@ -76,6 +77,7 @@ app = typer.Typer(
 )
 
 app.add_typer(models, name="models")
+app.add_typer(calibrate, name="calibrate")
 app.command()(evaluate)
 app.command()(topics)
 app.command()(cameras)

@@ -14,7 +14,7 @@ from companion.settings.marker_files import read_boards
 from companion.settings.section import Section
 from companion.settings.texts import HEIGHT_TEXT, KEY_WORD, MARKER_TEXT
 from vision.calibration.camera_info import read_camera_info
-from vision.camera_model import CameraModel, CameraMount, DistortionModel, check_distortion
+from vision.camera_model import CameraModel, CameraMount, DistortionModel, check_distortion, scaled_to_frames
 from vision.frame import Frame
 from vision.frame_selection import Selection
 from vision.marker_boards import Board
@@ -86,7 +86,6 @@ LENS_KEYS = frozenset(
         *("distortion", "distortion_model"),
     )
 )
-_SAME_ASPECT = 0.01
 
 
 class CameraSection(Section):
@@ -125,7 +124,7 @@ class CameraSection(Section):
     calibrated_height: Annotated[int | None, Field(ge=16, le=16384)] = None
     """height of the calibration images, pixels"""
     distortion: tuple[float, ...] = ()
-    """coefficients in OpenCV's order: k1, k2, p1, p2, k3 (none, four or five); eight or four, see below"""
+    """coefficients of distortion_model in OpenCV's order: k1, k2, p1, p2, k3; none: no distortion"""
     distortion_model: DistortionModel = "plumb_bob"
     """plumb_bob; rational_polynomial: eight coefficients; equidistant (fisheye): k1, k2, k3, k4"""
 
@@ -189,13 +188,7 @@ class CameraSection(Section):
             self.distortion,
             self.distortion_model,
         )
-        if abs(width * calibrated.height / (height * calibrated.width) - 1.0) > _SAME_ASPECT:
-            raise ValueError(
-                f"the lens was calibrated with images of {calibrated.width}x{calibrated.height}, the frames "
-                f"have {width}x{height}, another aspect: calibrate with such frames, or set source.width and "
-                "source.height"
-            )
-        return calibrated.scaled(width, height)
+        return scaled_to_frames(calibrated, width, height)
 
     @property
     def field_rad(self) -> float:

@@ -85,7 +85,8 @@ def _check(name: str, value: float, low: float, high: float) -> None:
 
 @app.command(
     epilog="Further commands: mavlink-sim camera (the built-in world seen from any autopilot's vehicle), "
-    "mavlink-sim dataset (labelled images for training), mavlink-sim bench (speed of this machine). "
+    "mavlink-sim dataset (labelled images for training), mavlink-sim board (images of a calibration board), "
+    "mavlink-sim bench (speed of this machine). "
     "Each has --help."
 )
 def simulate(
@@ -346,6 +347,10 @@ def main() -> None:
             from mavlink_sim.camera.cli import app as camera_app
 
             code = camera_app(sys.argv[2:], prog_name="mavlink-sim camera", standalone_mode=False)
+        elif sys.argv[1:2] == ["board"]:
+            from mavlink_sim.datasets.board_views import app as board_app
+
+            code = board_app(sys.argv[2:], prog_name="mavlink-sim board", standalone_mode=False)
         elif sys.argv[1:2] == ["bench"]:
             from mavlink_sim.cli.bench import app as bench_app
 

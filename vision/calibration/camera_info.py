@@ -47,8 +47,8 @@ def read_camera_info(path: Path) -> CameraModel:
         content = load_plain_yaml(path.read_bytes().decode("utf-8"))
         if not isinstance(content, dict):
             raise ValueError("expected a table with image_width, image_height, camera_matrix…")
-        skew = (matrix := _numbers(content, "camera_matrix", 9))[1]
-        if skew != 0.0 or matrix[3] != 0.0 or matrix[6:] != (0.0, 0.0, 1.0):
+        matrix = _numbers(content, "camera_matrix", 9)
+        if matrix[1] != 0.0 or matrix[3] != 0.0 or matrix[6:] != (0.0, 0.0, 1.0):
             raise ValueError(f"camera_matrix must be [fx, 0, cx, 0, fy, cy, 0, 0, 1], got {list(matrix)}")
         return CameraModel(
             _size(content, "image_width"),

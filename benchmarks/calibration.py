@@ -1,0 +1,163 @@
+"""Error of a calibration: rendered views of a board, and of a marker for the mount.
+
+    python -m benchmarks.calibration --seeds 1-50 [--mount] [--json]
+
+Lens: each seed takes one of the lenses of `mavlink-sim board` (plain, webcam, wide, fisheye) with other
+numbers (focal length +-20 %, centre +-2 %, coefficients +-20 %), and a chessboard of 10x7 corners or a
+ChArUco board of 10x7 squares; 40 views of 640x480, noise of 2 grey levels, blur of 0.5 px.
+
+Mount: a marker of 0.5 m lies level before a vehicle on a stand of 1 to 2 m, of known roll and pitch up to 5
+degrees; the camera of 640x480 looks 15 to 60 degrees down, up to 10 aside, and is rolled up to 5; 10 images,
+noise of 2 grey levels, blur of 0.5 px.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import asdict, dataclass, replace
+
+import cv2
+import numpy as np
+
+from mavlink_sim.camera.image_effects import ImageEffects
+from mavlink_sim.camera.renderer import Renderer
+from mavlink_sim.datasets.board_views import LENSES, BoardCamera, board_poses
+from mavlink_sim.world.fiducials import Print
+from mavlink_sim.world.world import Ground, World, WorldObject
+from vision.calibration.boards import Board
+from vision.calibration.calibrate import calibrate
+from vision.calibration.mount import mount_from_markers
+from vision.calibration.views import ViewCollector
+from vision.camera_model import CameraModel, CameraMount
+from vision.markers import Marker, MarkerDetector, MarkerKind
+from vision.rotation import matrix_from_euler
+
+VIEWS, MOUNT_IMAGES, MARKER_M = 40, 10, 0.5
+BOARDS = (Board("chessboard", 10, 7, 0.02), Board("charuco", 10, 7, 0.02, 0.015, "4X4_50"))
+
+
+@dataclass(frozen=True, slots=True)
+class LensError:
+    """Error of one calibration: focal length in per cent, centre in pixels, reprojection in pixels RMS.
+
+    `ray_px` is the RMS error of the rays of all pixels, in pixels at the centre.
+    """
+
+    seed: int
+    lens: str
+    board: str
+    model: str
+    views: int
+    focal_percent: float
+    centre_px: float
+    rms_px: float
+    ray_px: float
+
+
+@dataclass(frozen=True, slots=True)
+class MountError:
+    """Largest error of the three angles of a mount, degrees, and the number of used images."""
+
+    seed: int
+    views: int
+    angle_deg: float
+
+
+def random_lens(seed: int) -> tuple[str, CameraModel]:
+    """The lens of a seed, and the name of the one that it varies."""
+    rng = np.random.default_rng(seed)
+    name = tuple(LENSES)[seed % len(LENSES)]
+    lens = LENSES[name]
+    focal = float(rng.uniform(0.8, 1.2))
+    centre = rng.uniform(-0.02, 0.02, 2) * (lens.width, lens.height)
+    changed = replace(
+        lens,
+        fx=lens.fx * focal,
+        fy=lens.fy * focal * float(rng.uniform(0.99, 1.01)),
+        cx=lens.cx + float(centre[0]),
+        cy=lens.cy + float(centre[1]),
+        distortion=tuple(float(value) for value in np.array(lens.distortion) * rng.uniform(0.8, 1.2)),
+    )
+    return name, changed
+
+
+def lens_error(seed: int) -> LensError:
+    """Render the views of a seed and calibrate."""
+    name, lens = random_lens(seed)
+    board = BOARDS[seed // len(LENSES) % len(BOARDS)]
+    rng = np.random.default_rng(seed)
+    camera, collector = BoardCamera(board, lens), ViewCollector(board)
+    poses = board_poses(board, lens, rng)
+    for number in range(VIEWS):
+        view = board.detect(camera.render(next(poses), rng), f"{number}")
+        if view is not None:
+            collector.add(view)
+    result = calibrate(collector.chosen())
+    model = result.model
+    focal = max(abs(model.fx / lens.fx - 1.0), abs(model.fy / lens.fy - 1.0))
+    centre = max(abs(model.cx - lens.cx), abs(model.cy - lens.cy))
+    columns, rows = np.meshgrid(np.arange(0, lens.width, 8), np.arange(0, lens.height, 8))
+    pixels = np.column_stack([columns.ravel(), rows.ravel()])
+    off = (model.rays(pixels) - lens.rays(pixels)) * lens.fx
+    ray_px = float(np.sqrt((off**2).sum(axis=1).mean()))
+    views = len(result.views)
+    return LensError(
+        seed, name, board.kind, model.distortion_model, views, 100 * focal, centre, result.rms_px, ray_px
+    )
+
+
+def mount_error(seed: int) -> MountError:
+    """Render the marker of a seed and measure the camera's angles."""
+    rng = np.random.default_rng(seed)
+    _, lens = random_lens(4 * seed + 1)
+    angles = np.radians([rng.uniform(-5, 5), rng.uniform(-60, -15), rng.uniform(-10, 10)])
+    mount = CameraMount(0.1, 0.0, 0.05, *angles.tolist())
+    roll, pitch, nose, heading = np.radians(rng.uniform((-5, -5, -180, -20), (5, 5, 180, 20))).tolist()
+    height_m = float(rng.uniform(1.0, 2.0))
+    attitude = matrix_from_euler(roll, pitch, nose)
+    ahead = attitude @ mount.body_from_optical[:, 2]
+    reach = min(height_m / max(float(ahead[2]), 0.25), 3.5)
+    found: list[Marker] = []
+    detector = MarkerDetector(MarkerKind("4X4_50", MARKER_M))
+    effects = ImageEffects(blur_sigma_px=0.5, noise_sigma=2.0)
+    for _ in range(MOUNT_IMAGES):
+        north, east = ahead[:2] * reach + rng.normal(0.0, 0.1, 2)
+        printed = Print("4X4_50", 7, MARKER_M)
+        plate = WorldObject(0, "plate", (float(north), float(east), 0.0), nose + heading, printed=printed)
+        world = World((plate,), Ground(("concrete",), seed, 256, 0.05))
+        renderer = Renderer(world, lens, mount, effects, rng=rng)
+        image = renderer.render((0.0, 0.0, -height_m), attitude).image
+        found += detector.detect(image, lens)
+    result = mount_from_markers(found, heading, roll, pitch)
+    measured = np.array([result.roll_rad, result.pitch_rad, result.yaw_rad])
+    return MountError(seed, result.views, float(np.degrees(np.abs(measured - angles).max())))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--seeds", default="1-50", help="first-last")
+    parser.add_argument("--mount", action="store_true", help="the mount instead of the lens")
+    parser.add_argument("--json", action="store_true", help="one JSON object per seed")
+    arguments = parser.parse_args()
+    cv2.setNumThreads(1)
+    first, _, last = arguments.seeds.partition("-")
+    seeds = range(int(first), int(last or first) + 1)
+    results: list[LensError] | list[MountError] = []
+    if arguments.mount:
+        results = [mount_error(seed) for seed in seeds]
+    else:
+        results = [lens_error(seed) for seed in seeds]
+    for result in results:
+        row = asdict(result)
+        values = (f"{value:.3f}" if isinstance(value, float) else str(value) for value in row.values())
+        print(json.dumps(row) if arguments.json else "  ".join(values), flush=True)
+    for key in ("focal_percent", "centre_px", "rms_px", "ray_px", "angle_deg"):
+        if hasattr(results[0], key) and not arguments.json:
+            numbers = np.array([getattr(result, key) for result in results])
+            median, p95, worst = np.quantile(numbers, (0.5, 0.95, 1.0))
+            print(f"{key}: median {median:.3f}, p95 {p95:.3f}, worst {worst:.3f} of {len(numbers)}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,262 @@
+"""`companion calibrate`: collect views of a board from a source, and report on a calibration."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vision.calibration.boards import Board, BoardView
+from vision.calibration.calibrate import CalibrationError, CalibrationResult
+from vision.calibration.views import EDGES, ViewCollector
+from vision.camera_model import CameraModel, scaled_to_frames
+from vision.frame import Frame
+from vision.markers import Marker, MarkerDetector, MarkerKind
+from vision.sources import Source
+from vision.sources.files import images_in
+
+Image = NDArray[np.uint8]
+
+# Images of the report are at most so wide.
+_WIDTH = 640
+# Residuals are drawn longer by this factor.
+_ENLARGED = 100
+_GREEN, _RED, _GREY = (60, 160, 40), (40, 40, 220), (200, 200, 200)
+
+
+@dataclass(slots=True)
+class Collected:
+    """Views of a source.
+
+    Attributes:
+        collector: with the views that differ.
+        frames, found: numbers of processed frames, and of those with the board.
+        images: name → the view's image, small, as JPEG.
+        interrupted: whether Ctrl-C ended it.
+    """
+
+    collector: ViewCollector
+    frames: int = 0
+    found: int = 0
+    images: dict[str, bytes] = field(default_factory=dict)
+    interrupted: bool = False
+
+
+def collect_views(source: Source, board: Board, write: Callable[[str], None], every: int = 1) -> Collected:
+    """Collect views from every `every`-th frame; a live source until nothing is missing, or Ctrl-C.
+
+    Args:
+        write: called with a line on what is missing, for each new view of a live source.
+
+    Raises:
+        CalibrationError: no frame shows the board.
+        ValueError: the images differ in size.
+    """
+    collected = Collected(ViewCollector(board))
+    folder = Path(source.uri)
+    names = [path.name for path in images_in(folder)] if folder.is_dir() else []
+    if source.live:
+        write(f"show {_described(board)} to the camera; Ctrl-C ends")
+    try:
+        for frame in source:
+            if frame.sequence % every and not source.live:
+                continue
+            name = names[frame.sequence] if frame.sequence < len(names) else f"frame {frame.sequence}"
+            new = _process(frame, name, board, collected)
+            if new and source.live:
+                missing = collected.collector.missing()
+                views = len(collected.collector.views)
+                write(f"{views} views; missing: {'; '.join(missing) or 'nothing'}")
+                if not missing:
+                    break
+    except KeyboardInterrupt:
+        if not source.live:
+            raise
+        collected.interrupted = True
+    if not collected.collector.views:
+        raise CalibrationError(
+            f"{source.uri}: no board in any of {collected.frames} images; looked for {_described(board)}"
+        )
+    return collected
+
+
+def markers_of(
+    source: Source, kind: MarkerKind, identifier: int, model: CameraModel | None, limit: int
+) -> list[Marker]:
+    """The marker in the frames of a source, at most `limit` times; Ctrl-C ends a live source.
+
+    Args:
+        model: the lens; None: the source's own.
+
+    Raises:
+        CalibrationError: the lens is not known.
+        ValueError: the lens is of another aspect than the frames.
+    """
+    if model is None:
+        if source.calibration is None:
+            raise CalibrationError(f"{source.uri} has no calibration of its own: give --calibration FILE")
+        model = source.calibration.model
+    detector = MarkerDetector(kind)
+    found: list[Marker] = []
+    try:
+        for frame in source:
+            lens = scaled_to_frames(model, frame.width, frame.height)
+            seen = detector.detect(frame.image, lens)
+            found += [each for each in seen if each.identifier == identifier]
+            if len(found) >= limit:
+                break
+    except KeyboardInterrupt:
+        if not source.live:
+            raise
+    return found
+
+
+def _process(frame: Frame, name: str, board: Board, collected: Collected) -> bool:
+    """Add the board of a frame, if it has one; returns whether its view is new."""
+    collected.frames += 1
+    view = board.detect(frame.image, name)
+    if view is None:
+        return False
+    collected.found += 1
+    if not collected.collector.add(view):
+        return False
+    small, _ = _small(frame.image)
+    collected.images[name] = cv2.imencode(".jpg", small, (cv2.IMWRITE_JPEG_QUALITY, 90))[1].tobytes()
+    return True
+
+
+def _described(board: Board) -> str:
+    what = "inner corners" if board.kind == "chessboard" else f"squares, {board.dictionary}"
+    return f"a {board.kind} of {board.columns}x{board.rows} {what}"
+
+
+def result_lines(result: CalibrationResult) -> list[str]:
+    """The calibration in words: the lens, its errors, and why this distortion model."""
+    model, sigmas = result.model, result.fit.sigmas
+    held_out = ", ".join(f"{kind} {error:.3f}" for kind, error in result.held_out_px.items())
+    return [
+        f"{len(result.views)} views, {model.width}x{model.height}, {model.distortion_model}",
+        f"fx {model.fx:.2f} +- {sigmas[0]:.2f}, fy {model.fy:.2f} +- {sigmas[1]:.2f}, "
+        f"cx {model.cx:.2f} +- {sigmas[2]:.2f}, cy {model.cy:.2f} +- {sigmas[3]:.2f} px (one sigma)",
+        f"distortion {', '.join(f'{value:.5f}' for value in model.coefficients)}",
+        f"reprojection {result.rms_px:.3f} px RMS; on held-out views: {held_out}",
+    ]
+
+
+def write_report(folder: Path, result: CalibrationResult, collected: Collected) -> Path:
+    """Write `index.html` with its images; returns its path.
+
+    Raises:
+        OSError: a file cannot be written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    _save(folder / "corners.png", _corners_image(result))
+    largest = max(result.views, key=lambda view: float(np.ptp(view.corners_px, axis=0).prod()))
+    original = _decoded(collected.images[largest.name])
+    _save(folder / "undistorted.jpg", np.hstack([original, undistorted(original, result.model)]))
+    rows = []
+    views = [
+        *((view, error, False) for view, error in zip(result.views, result.fit.view_rms_px, strict=True)),
+        *((view, error, True) for view, error in result.rejected),
+    ]
+    for number, (view, error, rejected) in enumerate(sorted(views, key=lambda item: -item[1])):
+        file = f"view{number:02d}.jpg"
+        _save(folder / file, _view_image(_decoded(collected.images[view.name]), view, rejected))
+        name = html.escape(view.name) + (" (rejected)" if rejected else "")
+        rows.append(
+            f'<tr><td><img src="{file}" width="240"></td><td>{name}</td>'
+            f"<td>{len(view.points_m)}</td><td>{error:.3f}</td></tr>"
+        )
+    missing = collected.collector.missing()
+    page = _PAGE.format(
+        lines="".join(f"<li>{html.escape(line)}</li>" for line in result_lines(result)),
+        missing=html.escape("; ".join(missing) or "nothing"),
+        enlarged=_ENLARGED,
+        rows="\n".join(rows),
+    )
+    (path := folder / "index.html").write_text(page, "utf-8")
+    return path
+
+
+_PAGE = """<!doctype html>
+<html lang="en"><meta charset="utf-8"><title>Camera calibration</title>
+<style>
+body {{ font: 15px sans-serif; max-width: 60em; margin: 2em auto; padding: 0 1em }}
+img {{ max-width: 100%; display: block }}
+td, th {{ text-align: left; padding: 0.2em 1em 0.2em 0 }}
+</style>
+<h1>Camera calibration</h1>
+<ul>{lines}</ul>
+<p>Missing for a complete set of views: {missing}.</p>
+<h2>Corners in the image</h2>
+<p>Each dot is a corner, each line its reprojection error, {enlarged} times as long.</p>
+<img src="corners.png" alt="All corners, and their errors">
+<h2>As photographed, and undistorted</h2>
+<img src="undistorted.jpg" alt="The largest view, before and after">
+<h2>Views, the worst first</h2>
+<table><tr><th></th><th>view</th><th>corners</th><th>error, px RMS</th></tr>
+{rows}
+</table></html>
+"""
+
+
+def undistorted(image: Image, model: CameraModel) -> Image:
+    """The image as an ideal pinhole camera of the same size and focal length shows it."""
+    height, width = image.shape[:2]
+    lens = model.scaled(width, height)
+    columns, rows = np.meshgrid(np.arange(width), np.arange(height))
+    ideal = CameraModel(width, height, lens.fx, lens.fy, lens.cx, lens.cy)
+    pixels = lens.project(ideal.rays(np.column_stack([columns.ravel(), rows.ravel()])))
+    map_x, map_y = np.moveaxis(pixels.astype(np.float32).reshape(height, width, 2), -1, 0)
+    return np.asarray(cv2.remap(image, map_x, map_y, cv2.INTER_LINEAR), np.uint8)
+
+
+def _corners_image(result: CalibrationResult) -> Image:
+    model = result.model
+    scale = max(1.0, _WIDTH * 1.5 / model.width)
+    width, height = round(model.width * scale), round(model.height * scale)
+    image = np.full((height, width, 3), 255, np.uint8)
+    for edge in EDGES:
+        column, row = round(width * edge), round(height * edge)
+        cv2.line(image, (column, 0), (column, height), _GREY)
+        cv2.line(image, (0, row), (width, row), _GREY)
+    for view, residuals in zip(result.views, result.fit.residuals_px, strict=True):
+        for corner, residual in zip(view.corners_px * scale, residuals * _ENLARGED, strict=True):
+            cv2.line(image, _pixel(corner), _pixel(corner + residual), _GREEN, 1, cv2.LINE_AA)
+            cv2.circle(image, _pixel(corner), 2, _RED, -1, cv2.LINE_AA)
+    return image
+
+
+def _view_image(image: Image, view: BoardView, rejected: bool) -> Image:
+    scale = image.shape[1] / view.size[0]
+    for corner in view.corners_px * scale:
+        cv2.circle(image, _pixel(corner), 4, _RED if rejected else _GREEN, 1, cv2.LINE_AA)
+    return image
+
+
+def _pixel(point: NDArray[np.float64]) -> tuple[int, int]:
+    return round(float(point[0])), round(float(point[1]))
+
+
+def _small(image: Image) -> tuple[Image, float]:
+    """An image of at most the report's width, and the scale."""
+    scale = min(1.0, _WIDTH / image.shape[1])
+    if scale == 1.0:
+        return image, scale
+    return np.asarray(
+        cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8
+    ), scale
+
+
+def _decoded(data: bytes) -> Image:
+    return np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR), np.uint8)
+
+
+def _save(path: Path, image: Image) -> None:
+    if not cv2.imwrite(str(path), image, (cv2.IMWRITE_JPEG_QUALITY, 85)):
+        raise OSError(f"cannot write {path}: check free disk space and write permission")

@@ -1,0 +1,126 @@
+"""The command line of `companion calibrate SOURCE` and `companion calibrate mount`."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+import typer.core
+
+from companion.cli.flags import plain_errors
+
+
+class _LensByDefault(typer.core.TyperGroup):
+    """`companion calibrate SOURCE` is `companion calibrate lens SOURCE`."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        if args and args[0] not in (*self.commands, "--help"):
+            args = ["lens", *args]
+        return super().parse_args(ctx, args)
+
+
+calibrate = typer.Typer(
+    cls=_LensByDefault,
+    help="Calibrate a camera's lens (SOURCE), or its mount on the vehicle (mount).",
+    no_args_is_help=True,
+)
+
+
+@calibrate.command()
+def lens(
+    source: Annotated[str, typer.Argument(help="Folder of images, video, /dev/video0, shm://NAME or URL.")],
+    board: Annotated[
+        tuple[str, str],
+        typer.Option(help="chessboard COLUMNSxROWS (inner corners), or charuco COLUMNSxROWS (squares)."),
+    ],
+    square: Annotated[float, typer.Option(help="Side of a square, metres.")],
+    marker: Annotated[float | None, typer.Option(help="Side of a ChArUco board's markers, metres.")] = None,
+    dictionary: Annotated[
+        str | None, typer.Option(help="Dictionary of a ChArUco board's markers, such as 4X4_50.")
+    ] = None,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Calibration file to write: ROS camera_info YAML.")
+    ] = Path("camera.yaml"),
+    report: Annotated[Path | None, typer.Option(help="Folder for a report: index.html and images.")] = None,
+    name: Annotated[str, typer.Option(help="Name of the camera in the file.")] = "camera",
+    every: Annotated[int, typer.Option(min=1, help="Process every Nth frame of a video.")] = 1,
+    width: Annotated[int | None, typer.Option(min=16, help="Width requested from a camera, pixels.")] = None,
+    height: Annotated[
+        int | None, typer.Option(min=16, help="Height requested from a camera, pixels.")
+    ] = None,
+) -> None:
+    """Calibrate a lens from images of a board, and write camera.yaml for camera.calibration_file.
+
+    A live camera is read until the views are complete, or until Ctrl-C.
+    """
+    from companion.calibrate import collect_views, result_lines, write_report
+    from vision.calibration.boards import Board
+    from vision.calibration.calibrate import calibrate as calibrate_views
+    from vision.calibration.camera_info import write_camera_info
+    from vision.sources import SourceError, SourceSettings, open_source
+
+    logging.basicConfig(level=logging.WARNING, format="companion: %(message)s", stream=sys.stderr)
+
+    def note(text: str) -> None:
+        typer.echo(f"companion: {text}", err=True)
+
+    with plain_errors(SourceError, ValueError, OSError):  # CalibrationError is a ValueError
+        printed = Board.parse(*board, square, marker, dictionary)
+        settings = SourceSettings(width=width, height=height, every_frame=True)
+        with open_source(source, settings) as frames:
+            collected = collect_views(frames, printed, note, every)
+        note(
+            f"{collected.frames} images, {collected.found} with the board, "
+            f"{len(collected.collector.views)} different views"
+        )
+        if missing := collected.collector.missing():
+            note(f"missing for a complete set: {'; '.join(missing)}")
+        result = calibrate_views(collected.collector.chosen())
+        for view, error in result.rejected:
+            note(f"rejected {view.name}: its error is {error:.2f} px")
+        lines = result_lines(result)
+        write_camera_info(output, result.model, name, (f"companion calibrate: {lines[0]}", lines[3]))
+        page = None if report is None else write_report(report, result, collected)
+    for line in lines:
+        typer.echo(line)
+    typer.echo(f"written: {output}" + ("" if page is None else f", {page}"))
+
+
+@calibrate.command()
+def mount(
+    source: Annotated[str, typer.Argument(help="Folder of images, video, /dev/video0, shm://NAME or URL.")],
+    marker: Annotated[int, typer.Option(min=0, help="Id of the marker, which lies level, face up.")],
+    size: Annotated[float, typer.Option(help="Side of the marker's black square, metres.")],
+    calibration: Annotated[
+        Path | None, typer.Option(help="Calibration file. Default: the source's own calibration.")
+    ] = None,
+    dictionary: Annotated[str, typer.Option(help="Dictionary of the marker.")] = "4X4_50",
+    heading: Annotated[
+        float, typer.Option(help="Direction of the marker's upper edge, degrees clockwise from the nose.")
+    ] = 0.0,
+    roll: Annotated[float, typer.Option(help="Roll of the vehicle, degrees.")] = 0.0,
+    pitch: Annotated[float, typer.Option(help="Pitch of the vehicle, degrees, nose up.")] = 0.0,
+    frames: Annotated[int, typer.Option(min=1, help="Number of images with the marker.")] = 30,
+) -> None:
+    """Measure the camera's angles on the vehicle, and print them as settings."""
+    import math
+
+    from companion.calibrate import markers_of
+    from vision.calibration.camera_info import read_camera_info
+    from vision.calibration.mount import mount_from_markers
+    from vision.markers import MarkerKind
+    from vision.sources import SourceError, SourceSettings, open_source
+
+    logging.basicConfig(level=logging.WARNING, format="companion: %(message)s", stream=sys.stderr)
+    with plain_errors(SourceError, ValueError, OSError):
+        kind = MarkerKind(dictionary, size, {marker: size})
+        model = None if calibration is None else read_camera_info(calibration)
+        with open_source(source, SourceSettings(every_frame=True)) as images:
+            found = markers_of(images, kind, marker, model, frames)
+        angles = mount_from_markers(found, *map(math.radians, (heading, roll, pitch)))
+    typer.echo(f"# {angles.views} images, spread {math.degrees(angles.spread_rad):.2f} degrees")
+    for key in ("roll", "pitch", "yaw"):
+        typer.echo(f"mount_{key}_deg = {math.degrees(getattr(angles, f'{key}_rad')):.2f}")

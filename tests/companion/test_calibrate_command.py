@@ -1,0 +1,246 @@
+"""`companion calibrate` and `mavlink-sim board`, in this process."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import Result
+from typer.testing import CliRunner
+
+from companion.calibrate import collect_views
+from companion.cli.commands import app
+from mavlink_sim.camera.image_effects import ImageEffects
+from mavlink_sim.camera.renderer import Renderer
+from mavlink_sim.datasets.board_views import LENSES, BoardCamera, board_poses, write_board_views
+from mavlink_sim.datasets.board_views import app as board_app
+from mavlink_sim.world.fiducials import Print
+from mavlink_sim.world.world import Ground, World, WorldObject
+from vision.calibration.boards import Board
+from vision.calibration.camera_info import read_camera_info, write_camera_info
+from vision.camera_model import CameraModel, CameraMount
+from vision.frame import Frame
+from vision.rotation import matrix_from_euler
+from vision.sources import Source, SourceStatistics
+
+# A small lens and board, so that views are rendered and found fast.
+LENS = LENSES["webcam"].scaled(320, 240)
+BOARD = Board("chessboard", 7, 5, 0.03)
+BOARD_WORDS = ("--board", "chessboard", "7x5", "--square", "0.03")
+
+
+def calibrate(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(app, ["calibrate", *map(str, arguments)])
+
+
+def one_line_of_bad_input(done: Result) -> str:
+    """Return the last line on standard error; check that it is no traceback and the exit code is 2."""
+    assert done.exit_code == 2, done.output
+    lines = done.stderr.splitlines()
+    assert [line for line in lines if not line.startswith("companion: ")] == []
+    return lines[-1]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    write_board_views(path := tmp_path_factory.mktemp("views") / "board", BOARD, LENS, 18, 3)
+    return path
+
+
+def test_folder_gives_a_calibration_and_a_report(folder: Path, tmp_path: Path) -> None:
+    output, report = tmp_path / "camera.yaml", tmp_path / "report"
+    done = calibrate(folder, *BOARD_WORDS, "-o", output, "--report", report, "--name", "front")
+    assert done.exit_code == 0, done.output
+    lens = read_camera_info(output)
+    assert (lens.width, lens.height, lens.distortion_model) == (320, 240, "plumb_bob")
+    assert (lens.fx, lens.fy) == pytest.approx((LENS.fx, LENS.fy), rel=0.01)
+    assert "camera_name: front" in output.read_text()
+    assert "18 views" in done.stdout
+    rms = re.search(r"reprojection ([0-9.]+) px", done.stdout)
+    assert rms is not None
+    assert 0.0 < float(rms[1]) < 0.2
+    page = (report / "index.html").read_text()
+    files = set(re.findall(r'src="([^"]+)"', page))
+    assert {"corners.png", "undistorted.jpg", "view00.jpg", "view17.jpg"} <= files
+    for file in files:
+        assert cv2.imread(str(report / file)) is not None
+    assert all(f"view{number:02d}.png" in page for number in range(18))
+
+
+def test_video_gives_a_calibration(tmp_path: Path) -> None:
+    rng = np.random.default_rng(4)
+    camera, poses = BoardCamera(BOARD, LENS), board_poses(BOARD, LENS, rng)
+    writer = cv2.VideoWriter(
+        str(tmp_path / "views.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (LENS.width, LENS.height)
+    )
+    for _ in range(12):
+        grey = camera.render(next(poses), rng)
+        for _ in range(2):
+            writer.write(cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR))
+    writer.release()
+    done = calibrate(tmp_path / "views.avi", *BOARD_WORDS, "--every", "2", "-o", tmp_path / "camera.yaml")
+    assert done.exit_code == 0, done.output
+    assert "12 images, 12 with the board, 12 different views" in done.stderr
+    assert "missing" in done.stderr
+    assert read_camera_info(tmp_path / "camera.yaml").fx == pytest.approx(LENS.fx, rel=0.02)
+
+
+def test_written_file_is_accepted_by_the_settings(folder: Path, tmp_path: Path) -> None:
+    output = tmp_path / "camera.yaml"
+    assert calibrate(folder, *BOARD_WORDS, "-o", output).exit_code == 0
+    done = CliRunner().invoke(app, ["config", "--camera-calibration-file", str(output)])
+    assert done.exit_code == 0, done.output
+    assert f"fx_px = {read_camera_info(output).fx}" in done.stdout
+
+
+def test_no_board_in_any_view(folder: Path, tmp_path: Path) -> None:
+    words = ("--board", "chessboard", "8x5", "--square", "0.03")
+    line = one_line_of_bad_input(calibrate(folder, *words, "-o", tmp_path / "camera.yaml"))
+    assert "no board in any of 18 images" in line
+    assert "8x5" in line
+    assert not (tmp_path / "camera.yaml").exists()
+
+
+def test_too_few_views(folder: Path, tmp_path: Path) -> None:
+    few = tmp_path / "few"
+    few.mkdir()
+    for number in range(5):
+        (few / f"{number}.png").write_bytes((folder / f"view{number:02d}.png").read_bytes())
+    line = one_line_of_bad_input(calibrate(few, *BOARD_WORDS, "-o", tmp_path / "camera.yaml"))
+    assert "too few views" in line
+    assert "5" in line
+
+
+def test_images_of_different_sizes(folder: Path, tmp_path: Path) -> None:
+    mixed = tmp_path / "mixed"
+    mixed.mkdir()
+    for number in range(3):
+        image = cv2.imread(str(folder / f"view{number:02d}.png"))
+        assert image is not None
+        if number == 2:
+            image = cv2.resize(image, (640, 480))
+        cv2.imwrite(str(mixed / f"{number}.png"), image)
+    line = one_line_of_bad_input(calibrate(mixed, *BOARD_WORDS, "-o", tmp_path / "camera.yaml"))
+    assert "320x240" in line
+    assert "2.png 640x480" in line
+
+
+@pytest.mark.parametrize(
+    ("words", "fact"),
+    [
+        (("--board", "circles", "7x5", "--square", "0.03"), "circles"),
+        (("--board", "charuco", "7x5", "--square", "0.03"), "markers"),
+        (("--board", "chessboard", "7by5", "--square", "0.03"), "7by5"),
+    ],
+)
+def test_impossible_board(folder: Path, words: tuple[str, ...], fact: str) -> None:
+    assert fact in one_line_of_bad_input(calibrate(folder, *words))
+
+
+def test_missing_source(tmp_path: Path) -> None:
+    assert "none" in one_line_of_bad_input(calibrate(tmp_path / "none", *BOARD_WORDS))
+
+
+class Live(Source):
+    """A live source of rendered views, without end."""
+
+    uri, live = "test://board", True
+
+    def __init__(self, interrupt_after: int | None = None) -> None:
+        self.read_count, self._interrupt_after = 0, interrupt_after
+        self._frames = self._rendered()
+
+    def _rendered(self) -> Iterator[Frame]:
+        rng = np.random.default_rng(8)
+        camera, poses = BoardCamera(BOARD, LENS), board_poses(BOARD, LENS, rng)
+        while True:
+            grey = camera.render(next(poses), rng)
+            yield Frame(np.repeat(grey[:, :, None], 3, axis=2), self.read_count, self.read_count)
+
+    def read(self, timeout_s: float = 1.0) -> Frame | None:
+        if self.read_count == self._interrupt_after:
+            raise KeyboardInterrupt
+        self.read_count += 1
+        return next(self._frames)
+
+    @property
+    def statistics(self) -> SourceStatistics:
+        return SourceStatistics(self.read_count)
+
+    def close(self) -> None:
+        pass
+
+
+def test_live_source_is_read_until_nothing_is_missing() -> None:
+    lines: list[str] = []
+    collected = collect_views(source := Live(), BOARD, lines.append)
+    assert collected.collector.missing() == []
+    assert not collected.interrupted
+    assert source.read_count == collected.frames >= 15
+    assert len(lines) == 1 + len(collected.collector.views)
+    assert "tilted" in lines[1]
+    assert lines[-1].endswith("nothing")
+
+
+def test_interrupt_keeps_the_views_of_a_live_source() -> None:
+    collected = collect_views(Live(interrupt_after=4), BOARD, lambda _: None)
+    assert collected.interrupted
+    assert len(collected.collector.views) == 4
+
+
+def test_simulator_writes_views_with_their_truth(tmp_path: Path) -> None:
+    write_camera_info(tmp_path / "small.yaml", LENS, "small")
+    words = [str(tmp_path / "out"), "--lens", str(tmp_path / "small.yaml"), "--views", "2", "--seed", "5"]
+    charuco = ["--board", "charuco", "7x5", "--square", "0.03", "--marker", "0.02", "--dictionary", "4X4_50"]
+    done = CliRunner().invoke(board_app, words + charuco)
+    assert done.exit_code == 0, done.output
+    names = sorted(path.name for path in (tmp_path / "out").iterdir())
+    assert names == ["truth.json", "truth.yaml", "view00.png", "view01.png"]
+    assert read_camera_info(tmp_path / "out" / "truth.yaml") == LENS
+    again = CliRunner().invoke(board_app, words)
+    assert again.exit_code == 2
+    assert "empty" in again.stderr
+
+
+@pytest.fixture(scope="module")
+def marker_images(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A level marker before a level vehicle; the camera looks 30 degrees down, 4 to the right, rolled by 2."""
+    folder = tmp_path_factory.mktemp("marker")
+    lens = CameraModel.from_horizontal_fov(640, 480, 1.2)
+    write_camera_info(folder / "lens.yaml", lens, "lens")
+    mount = CameraMount(roll_rad=np.radians(2.0), pitch_rad=np.radians(-30.0), yaw_rad=np.radians(4.0))
+    plate = WorldObject(0, "plate", (2.0, 0.1, 0.0), 0.0, printed=Print("4X4_50", 7, 0.6))
+    world = World((plate,), Ground(("concrete",), 0, 256, 0.05))
+    renderer = Renderer(world, lens, mount, ImageEffects(noise_sigma=2.0), rng=np.random.default_rng(1))
+    for number in range(5):
+        image = renderer.render((0.0, 0.0, -1.2), matrix_from_euler(0.0, 0.0, 0.0)).image
+        cv2.imwrite(str(folder / f"{number}.png"), image)
+    return folder
+
+
+def test_mount_is_printed_as_settings(marker_images: Path) -> None:
+    words = ("--marker", "7", "--size", "0.6", "--calibration", marker_images / "lens.yaml")
+    done = calibrate("mount", marker_images, *words)
+    assert done.exit_code == 0, done.output
+    values = dict(re.findall(r"^mount_(\w+)_deg = (\S+)$", done.stdout, re.MULTILINE))
+    assert {key: float(value) for key, value in values.items()} == pytest.approx(
+        {"roll": 2.0, "pitch": -30.0, "yaw": 4.0}, abs=0.3
+    )
+
+
+def test_mount_without_its_marker_or_lens(marker_images: Path) -> None:
+    lens = ("--calibration", marker_images / "lens.yaml")
+    assert "none" in one_line_of_bad_input(
+        calibrate("mount", marker_images, "--marker", "9", "--size", "0.6", *lens)
+    )
+    line = one_line_of_bad_input(calibrate("mount", marker_images, "--marker", "7", "--size", "0.6"))
+    assert "--calibration" in line
+    write_camera_info(other := marker_images / "other.yaml", LENSES["plain"].scaled(640, 360), "other")
+    wide = ("--calibration", other)
+    line = one_line_of_bad_input(calibrate("mount", marker_images, "--marker", "7", "--size", "0.6", *wide))
+    assert "640x360" in line
+    assert "640x480" in line

@@ -1,0 +1,100 @@
+"""Boards: their description, their print, and the detection of rendered ones."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from mavlink_sim.datasets.board_views import LENSES, BoardCamera, BoardPose
+from vision.calibration.boards import Board
+from vision.camera_model import CameraModel
+from vision.rotation import matrix_from_euler
+
+CHESSBOARD = Board("chessboard", 10, 7, 0.02)
+CHARUCO = Board("charuco", 10, 7, 0.02, 0.015, "4X4_50")
+
+
+def test_chessboard_counts_corners_and_charuco_squares() -> None:
+    assert (CHESSBOARD.squares, len(CHESSBOARD.points_m)) == ((11, 8), 70)
+    assert (CHARUCO.squares, len(CHARUCO.points_m)) == ((10, 7), 54)
+    assert CHESSBOARD.points_m.mean(axis=0) == pytest.approx((0.0, 0.0))
+    assert CHESSBOARD.points_m[1] - CHESSBOARD.points_m[0] == pytest.approx((0.02, 0.0))
+    assert CHARUCO.size_m == pytest.approx((0.2, 0.14))
+
+
+@pytest.mark.parametrize("board", [CHESSBOARD, CHARUCO], ids=["chessboard", "charuco"])
+def test_corners_of_the_print_are_where_the_board_says(board: Board) -> None:
+    image = board.image(40)
+    assert image.shape == ((board.squares[1] + 2) * 40, (board.squares[0] + 2) * 40)
+    view = board.detect(image)
+    assert view is not None
+    assert len(view.points_m) == len(board.points_m)
+    middle = (np.array(image.shape[::-1]) - 1) / 2
+    expected = view.points_m / board.square_m * 40
+    if (view.corners_px[0] - middle) @ expected[0] < 0:  # a chessboard turned by half
+        expected = -expected
+    assert np.abs(view.corners_px - middle - expected).max() < 0.1
+
+
+@pytest.mark.parametrize("board", [CHESSBOARD, CHARUCO], ids=["chessboard", "charuco"])
+@pytest.mark.parametrize("lens", ["webcam", "fisheye"])
+def test_rendered_corners_are_found_where_the_lens_projects_them(board: Board, lens: str) -> None:
+    camera = LENSES[lens]
+    pose = BoardPose(matrix_from_euler(0.4, -0.3, 0.2), np.array([0.01, -0.02, 0.3]))
+    image = BoardCamera(board, camera).render(pose, np.random.default_rng(1))
+    assert image.shape == (480, 640)
+    view = board.detect(image)
+    assert view is not None
+    points = np.column_stack([view.points_m, np.zeros(len(view.points_m))])
+    errors = [
+        camera.project(turned @ pose.rotation.T + pose.position_m) - view.corners_px
+        for turned in (points, -points)
+    ]
+    error = min(errors, key=lambda each: float(np.abs(each).max()))
+    assert np.sqrt((error**2).sum(axis=1).mean()) < 0.2
+    assert np.abs(error.mean(axis=0)).max() < 0.06
+
+
+def test_partly_hidden_charuco_board_is_found_and_chessboard_is_not() -> None:
+    pose = BoardPose(np.eye(3), np.array([0.12, 0.0, 0.22]))
+    rng = np.random.default_rng(1)
+    charuco = CHARUCO.detect(BoardCamera(CHARUCO, LENSES["plain"]).render(pose, rng))
+    assert charuco is not None
+    assert 14 <= len(charuco.points_m) < 54
+    assert CHESSBOARD.detect(BoardCamera(CHESSBOARD, LENSES["plain"]).render(pose, rng)) is None
+
+
+def test_fisheye_sees_a_board_beyond_90_degrees() -> None:
+    camera = CameraModel(640, 480, 150.0, 150.0, 319.5, 239.5, (0.0,) * 4, "equidistant")
+    angle = math.radians(95.0)
+    position = np.array([math.sin(angle), 0.0, math.cos(angle)]) * 0.3
+    pose = BoardPose(matrix_from_euler(0.0, angle, 0.0), position)
+    assert (pose.rotation @ (0.0, 0.0, 1.0)) @ position == pytest.approx(0.3)
+    image = BoardCamera(CHESSBOARD, camera, noise=0.0).render(pose, np.random.default_rng(1))
+    x, y = np.rint(pose.project(CHESSBOARD, camera)).astype(int).T
+    assert x.min() > 480
+    assert np.ptp(image[y.min() : y.max(), x.min() : x.max()]) > 100
+    assert np.ptp(image[:, :320]) < 60
+
+
+@pytest.mark.parametrize(
+    ("arguments", "fact"),
+    [
+        (("circles", "10x7", 0.02), "circles"),
+        (("chessboard", "10", 0.02), "'10'"),
+        (("chessboard", "2x7", 0.02), "2x7"),
+        (("chessboard", "10x7", 0.0), "square"),
+        (("chessboard", "10x7", math.nan), "square"),
+        (("chessboard", "10x7", 0.02, 0.015, None), "chessboard has no markers"),
+        (("charuco", "10x7", 0.02), "markers"),
+        (("charuco", "10x7", 0.02, 0.02, "4X4_50"), "0.02"),
+        (("charuco", "10x7", 0.02, 0.015, "4X4_51"), "4X4_51"),
+        (("charuco", "11x10", 0.02, 0.015, "4X4_50"), "55 markers"),
+    ],
+)
+def test_impossible_board_is_refused(arguments: tuple[str, str, float], fact: str) -> None:
+    with pytest.raises(ValueError, match=r"\w") as caught:
+        Board.parse(*arguments)
+    assert fact in str(caught.value)
