@@ -208,7 +208,7 @@ def test_simulator_writes_views_with_their_truth(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def marker_images(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A level marker before a level vehicle; the camera looks 30 degrees down, 4 to the right, rolled by 2."""
+    """A level marker before a level vehicle; the camera looks 30 degrees down, 4 aside, rolled by 2."""
     folder = tmp_path_factory.mktemp("marker")
     lens = CameraModel.from_horizontal_fov(640, 480, 1.2)
     write_camera_info(folder / "lens.yaml", lens, "lens")

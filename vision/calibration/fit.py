@@ -25,7 +25,7 @@ COEFFICIENTS: dict[DistortionModel, int] = {"plumb_bob": 5, "rational_polynomial
 _STARTS = (0.23, 0.35, 0.5, 0.7, 1.0, 1.5, 2.5)
 _MAX_STEPS = 60
 # A relative decrease of the cost that ends the fit.
-_CONVERGED = 1e-9
+_CONVERGED = 1e-7
 _STEP = 1e-6
 # For the first pose of a board only corners well ahead of the camera are used.
 _AHEAD = 0.2
@@ -71,14 +71,16 @@ def fit(kind: DistortionModel, views: Sequence[BoardView], start: CameraModel | 
     Raises:
         ValueError: no lens fits at all.
     """
+    count = 4 + COEFFICIENTS[kind]
+    stages = (0, count)
     if start is None:
-        start = _start(kind, views)
+        start, stages = _start(kind, views), (0, 4, count)
     elif start.distortion_model != kind:
         assert (start.distortion_model, kind) == (PLUMB_BOB, RATIONAL)
         start = replace(start, distortion=(*start.coefficients, 0.0, 0.0, 0.0), distortion_model=kind)
     problem = _Problem(views)
     rotations, positions = problem.first_poses(start)
-    for free in (0, 4, 4 + COEFFICIENTS[kind]):
+    for free in stages:
         start, rotations, positions = problem.solve(start, rotations, positions, free)
     return problem.result(start, rotations, positions)
 
@@ -199,14 +201,17 @@ class _Problem:
         cross = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=1).reshape(-1, 3, 3)
         by_pose[:, :, :3] = by_point @ cross
         by_pose[:, :, 3:] = by_point
-        by_lens = np.empty((len(optical), 2, free))
-        for index, step in enumerate(_steps(model)[:free]):
-            change = np.zeros(free)
-            change[index] = step
-            ahead, back = _moved(model, change), _moved(model, -change)
+        by_lens = np.zeros((len(optical), 2, free))
+        if free:
+            u, v = (errors + self.corners).T
+            by_lens[:, 0, 0], by_lens[:, 1, 1] = (u - model.cx) / model.fx, (v - model.cy) / model.fy
+            by_lens[:, 0, 2] = by_lens[:, 1, 3] = 1.0
+        for index in range(4, free):
+            ahead, back = (_moved(model, sign * np.eye(free)[index]) for sign in (_STEP, -_STEP))
             assert ahead is not None
             assert back is not None
-            by_lens[:, :, index] = (ahead.project(optical) - back.project(optical)) / (2 * step) * weight
+            by_lens[:, :, index] = (ahead.project(optical) - back.project(optical)) / (2 * _STEP)
+        by_lens *= weight[:, :, None]
         np.nan_to_num(by_pose, copy=False)  # at the edge of a fisheye
         np.nan_to_num(by_lens, copy=False)
         wrong = -(errors * weight)
@@ -252,12 +257,6 @@ def _first_pose(view: BoardView, model: CameraModel) -> tuple[Array, Array]:
     first, second, position = first / scale, second / scale, position / scale
     left, _, right = np.linalg.svd(np.column_stack([first, second, np.cross(first, second)]))
     return np.asarray(left @ right, np.float64), position
-
-
-def _steps(model: CameraModel) -> list[float]:
-    """Steps of the numeric derivatives: fx, fy, cx, cy, coefficients."""
-    pixels = [_STEP * model.fx] * 4
-    return [*pixels, *([_STEP] * COEFFICIENTS[model.distortion_model])]
 
 
 def _moved(model: CameraModel, change: Array) -> CameraModel | None:

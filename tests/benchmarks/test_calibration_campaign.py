@@ -1,0 +1,45 @@
+"""Lenses and mounts calibrated from rendered images, within the errors of docs/how-to/calibrate.md."""
+
+from __future__ import annotations
+
+import pytest
+
+from benchmarks.calibration import lens_error, mount_error, random_lens
+from mavlink_sim.datasets.board_views import LENSES
+
+SEEDS = range(1, 51)
+
+
+def check_lens(seed: int) -> None:
+    error = lens_error(seed)
+    assert error.focal_percent < 0.3
+    assert error.centre_px < 1.0
+    assert error.rms_px < 0.2
+    assert error.model == LENSES[error.lens].distortion_model
+
+
+def test_seed_gives_its_lens() -> None:
+    assert random_lens(3) == random_lens(3)
+    assert {random_lens(seed)[0] for seed in range(4)} == set(LENSES)
+
+
+def test_fisheye_is_calibrated_from_rendered_views() -> None:
+    check_lens(3)
+
+
+def test_mount_is_measured_from_rendered_images() -> None:
+    error = mount_error(1)
+    assert error.angle_deg < 0.3
+    assert error.views == 10
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", SEEDS)
+def test_lens_of_every_seed(seed: int) -> None:
+    check_lens(seed)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", SEEDS)
+def test_mount_of_every_seed(seed: int) -> None:
+    assert mount_error(seed).angle_deg < 0.3
