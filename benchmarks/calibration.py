@@ -3,8 +3,9 @@
     python -m benchmarks.calibration --seeds 1-50 [--mount] [--json]
 
 Lens: each seed takes one of the lenses of `mavlink-sim board` (plain, webcam, wide, fisheye) with other
-numbers (focal length +-20 %, centre +-2 %, coefficients +-20 %), and a chessboard of 10x7 corners or a
-ChArUco board of 10x7 squares; 40 views of 640x480, noise of 2 grey levels, blur of 0.5 px.
+numbers (focal length +-20 %, centre +-2 %, coefficients +-20 %; none that folds the image), and a chessboard
+of 10x7 corners or a ChArUco board of 10x7 squares; 40 views of 640x480, noise of 2 grey levels, blur of
+0.5 px.
 
 Mount: a marker of 0.5 m lies level before a vehicle on a stand of 1 to 2 m, of known roll and pitch up to 5
 degrees; the camera of 640x480 looks 15 to 60 degrees down, up to 10 aside, and is rolled up to 5; 10 images,
@@ -26,7 +27,7 @@ from mavlink_sim.datasets.board_views import LENSES, BoardCamera, board_poses
 from mavlink_sim.world.fiducials import Print
 from mavlink_sim.world.world import Ground, World, WorldObject
 from vision.calibration.boards import Board
-from vision.calibration.calibrate import calibrate
+from vision.calibration.calibrate import calibrate, covers_image
 from vision.calibration.mount import mount_from_markers
 from vision.calibration.views import ViewCollector
 from vision.camera_model import CameraModel, CameraMount
@@ -69,27 +70,29 @@ def random_lens(seed: int) -> tuple[str, CameraModel]:
     rng = np.random.default_rng(seed)
     name = tuple(LENSES)[seed % len(LENSES)]
     lens = LENSES[name]
-    focal = float(rng.uniform(0.8, 1.2))
-    centre = rng.uniform(-0.02, 0.02, 2) * (lens.width, lens.height)
-    changed = replace(
-        lens,
-        fx=lens.fx * focal,
-        fy=lens.fy * focal * float(rng.uniform(0.99, 1.01)),
-        cx=lens.cx + float(centre[0]),
-        cy=lens.cy + float(centre[1]),
-        distortion=tuple(float(value) for value in np.array(lens.distortion) * rng.uniform(0.8, 1.2)),
-    )
-    return name, changed
+    while True:
+        focal = float(rng.uniform(0.8, 1.2))
+        centre = rng.uniform(-0.02, 0.02, 2) * (lens.width, lens.height)
+        changed = replace(
+            lens,
+            fx=lens.fx * focal,
+            fy=lens.fy * focal * float(rng.uniform(0.99, 1.01)),
+            cx=lens.cx + float(centre[0]),
+            cy=lens.cy + float(centre[1]),
+            distortion=tuple(float(value) for value in np.array(lens.distortion) * rng.uniform(0.8, 1.2)),
+        )
+        if covers_image(changed):
+            return name, changed
 
 
-def lens_error(seed: int) -> LensError:
+def lens_error(seed: int, views: int = VIEWS) -> LensError:
     """Render the views of a seed and calibrate."""
     name, lens = random_lens(seed)
     board = BOARDS[seed // len(LENSES) % len(BOARDS)]
     rng = np.random.default_rng(seed)
     camera, collector = BoardCamera(board, lens), ViewCollector(board)
     poses = board_poses(board, lens, rng)
-    for number in range(VIEWS):
+    for number in range(views):
         view = board.detect(camera.render(next(poses), rng), f"{number}")
         if view is not None:
             collector.add(view)
@@ -101,10 +104,8 @@ def lens_error(seed: int) -> LensError:
     pixels = np.column_stack([columns.ravel(), rows.ravel()])
     off = (model.rays(pixels) - lens.rays(pixels)) * lens.fx
     ray_px = float(np.sqrt((off**2).sum(axis=1).mean()))
-    views = len(result.views)
-    return LensError(
-        seed, name, board.kind, model.distortion_model, views, 100 * focal, centre, result.rms_px, ray_px
-    )
+    kind, used = model.distortion_model, len(result.views)
+    return LensError(seed, name, board.kind, kind, used, 100 * focal, centre, result.rms_px, ray_px)
 
 
 def mount_error(seed: int) -> MountError:
@@ -143,12 +144,10 @@ def main() -> None:
     cv2.setNumThreads(1)
     first, _, last = arguments.seeds.partition("-")
     seeds = range(int(first), int(last or first) + 1)
-    results: list[LensError] | list[MountError] = []
-    if arguments.mount:
-        results = [mount_error(seed) for seed in seeds]
-    else:
-        results = [lens_error(seed) for seed in seeds]
-    for result in results:
+    results: list[LensError | MountError] = []
+    for seed in seeds:
+        result = mount_error(seed) if arguments.mount else lens_error(seed)
+        results.append(result)
         row = asdict(result)
         values = (f"{value:.3f}" if isinstance(value, float) else str(value) for value in row.values())
         print(json.dumps(row) if arguments.json else "  ".join(values), flush=True)

@@ -68,9 +68,7 @@ class BoardCamera:
     def __init__(self, board: Board, camera: CameraModel, noise: float = 2.0, blur_px: float = 0.5) -> None:
         self.board, self.camera = board, camera
         self._noise, self._blur_px = noise, blur_px
-        self._print = cv2.copyMakeBorder(
-            board.image(_SQUARE_PX), *([_SQUARE_PX // 2] * 4), cv2.BORDER_CONSTANT, value=128
-        )
+        self._print = np.pad(board.image(_SQUARE_PX), _SQUARE_PX // 2, constant_values=128)
         # Between pixels the rays are interpolated, which is exact to a thousandth of a pixel.
         pixels = np.stack(
             np.meshgrid(np.arange(-1, camera.width + 1), np.arange(-1, camera.height + 1)), axis=-1
@@ -158,7 +156,8 @@ def _light(rng: np.random.Generator, camera: CameraModel) -> NDArray[np.float32]
     """(H, W) brightness: uneven light from one side."""
     slope = rng.uniform(-0.15, 0.15, 2)
     across, down = np.linspace(-1, 1, camera.width), np.linspace(-1, 1, camera.height)
-    return (rng.uniform(0.75, 1.0) * (1.0 + slope[0] * across + slope[1] * down[:, None])).astype(np.float32)
+    light = rng.uniform(0.75, 1.0) * (1.0 + slope[0] * across + slope[1] * down[:, None])
+    return np.asarray(light, np.float32)
 
 
 def write_board_views(folder: Path, board: Board, camera: CameraModel, views: int, seed: int) -> None:

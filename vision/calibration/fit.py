@@ -72,7 +72,7 @@ def fit(kind: DistortionModel, views: Sequence[BoardView], start: CameraModel | 
         ValueError: no lens fits at all.
     """
     count = 4 + COEFFICIENTS[kind]
-    stages = (0, count)
+    stages: tuple[int, ...] = (0, count)
     if start is None:
         start, stages = _start(kind, views), (0, 4, count)
     elif start.distortion_model != kind:
@@ -137,7 +137,8 @@ class _Problem:
 
     def residuals(self, model: CameraModel, rotations: Array, positions: Array) -> Array:
         """(N, 2) projected minus detected, pixels."""
-        return model.project(self.optical(rotations, positions)[1]) - self.corners
+        residuals: Array = model.project(self.optical(rotations, positions)[1]) - self.corners
+        return residuals
 
     def solve(
         self, model: CameraModel, rotations: Array, positions: Array, free: int
@@ -292,7 +293,7 @@ def _solve(
 def _weights(errors: Array) -> Array:
     """(N,) Huber's weights of the corners."""
     length = np.sqrt((errors**2).sum(axis=1))
-    return HUBER_PX / np.maximum(length, HUBER_PX)
+    return np.asarray(HUBER_PX / np.maximum(length, HUBER_PX), np.float64)
 
 
 def _cost(errors: Array) -> float:

@@ -81,4 +81,4 @@ def mount_from_markers(
 def _angles(rotations: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
     """(N,) angles between rotations (N, 3, 3) and another one, radians."""
     difference = np.linalg.norm(rotations - other, axis=(1, 2))
-    return 2 * np.arcsin(np.minimum(difference / math.sqrt(8.0), 1.0))
+    return np.asarray(2 * np.arcsin(np.minimum(difference / math.sqrt(8.0), 1.0)), np.float64)
