@@ -454,6 +454,8 @@ def _lines_met(
     weight = rise.sum(axis=2)
     place = (rise @ ((offsets[:-1] + offsets[1:]) / 2)) / np.maximum(weight, 1e-9)
     points = _plane(camera, (bases + outward[:, None] * place[..., None]).reshape(-1, 2)).reshape(4, -1, 2)
+    if not np.isfinite(points).all():  # beyond the lens's rays
+        return np.full((4, 2), np.nan)
     weight = (weight / np.maximum(weight.sum(axis=1, keepdims=True), 1e-9))[..., None]
     centres = (points * weight).sum(axis=1, keepdims=True)
     normals = np.linalg.svd((points - centres) * np.sqrt(weight), full_matrices=False)[2][:, 1]

@@ -15,6 +15,7 @@ measures is that of the delivered picture; only a calibration that the source br
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
@@ -22,12 +23,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vision.camera_model import CameraCalibration, CameraModel, CameraMount
+from vision.camera_model import EQUIDISTANT, CameraCalibration, CameraModel, CameraMount
 
 ROTATIONS_DEG = (0, 90, 180, 270)
 _ROTATE_CODES = {90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_COUNTERCLOCKWISE}
 
-_NONE = (0.0, 0.0, 0.0, 0.0)
 
 _Number = TypeVar("_Number", np.uint8, np.float32)
 
@@ -58,13 +58,10 @@ class Orientation:
     def model(self, model: CameraModel) -> CameraModel:
         """The lens of the picture that `pixels` returns."""
         if self.mirror:
-            k1, k2, p1, p2, *rest = model.distortion or _NONE
-            model = replace(
-                model, cx=model.width - 1 - model.cx, distortion=_distortion(k1, k2, p1, -p2, *rest)
-            )
+            distortion = _with_tangential(model, lambda p1, p2: (p1, -p2))
+            model = replace(model, cx=model.width - 1 - model.cx, distortion=distortion)
         for _ in range(self.rotate_deg // 90):
             # Clockwise by 90 degrees: the new x is the old -y, the new y the old x.
-            k1, k2, p1, p2, *rest = model.distortion or _NONE
             model = replace(
                 model,
                 width=model.height,
@@ -73,7 +70,7 @@ class Orientation:
                 fy=model.fx,
                 cx=model.height - 1 - model.cy,
                 cy=model.cx,
-                distortion=_distortion(k1, k2, p2, -p1, *rest),
+                distortion=_with_tangential(model, lambda p1, p2: (p2, -p1)),
             )
         return model
 
@@ -88,5 +85,11 @@ class Orientation:
         return CameraCalibration(self.model(calibration.model), mount)
 
 
-def _distortion(*coefficients: float) -> tuple[float, ...]:
-    return coefficients if any(coefficients) else ()
+def _with_tangential(
+    model: CameraModel, change: Callable[[float, float], tuple[float, float]]
+) -> tuple[float, ...]:
+    """The distortion with other tangential coefficients; a fisheye has none."""
+    if not model.distortion or model.distortion_model == EQUIDISTANT:
+        return model.distortion
+    k1, k2, p1, p2, *rest = model.distortion
+    return (k1, k2, *change(p1, p2), *rest)

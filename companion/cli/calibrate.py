@@ -22,6 +22,11 @@ class _LensByDefault(typer.core.TyperGroup):
         return super().parse_args(ctx, args)
 
 
+_ROTATE = Annotated[
+    int, typer.Option(help="Rotate the images clockwise by 0, 90, 180 or 270 degrees, as source.rotate_deg.")
+]
+_MIRROR = Annotated[bool, typer.Option("--mirror", help="Exchange left and right first, as source.mirror.")]
+
 calibrate = typer.Typer(
     cls=_LensByDefault,
     help="Calibrate a camera's lens (SOURCE), or its mount on the vehicle (mount).",
@@ -51,6 +56,8 @@ def lens(
     height: Annotated[
         int | None, typer.Option(min=16, help="Height requested from a camera, pixels.")
     ] = None,
+    rotate: _ROTATE = 0,
+    mirror: _MIRROR = False,
 ) -> None:
     """Calibrate a lens from images of a board, and write camera.yaml for camera.calibration_file.
 
@@ -69,7 +76,9 @@ def lens(
 
     with plain_errors(SourceError, ValueError, OSError):  # CalibrationError is a ValueError
         printed = Board.parse(*board, square, marker, dictionary)
-        settings = SourceSettings(width=width, height=height, every_frame=True)
+        settings = SourceSettings(
+            width=width, height=height, every_frame=True, rotate_deg=rotate, mirror=mirror
+        )
         with open_source(source, settings) as frames:
             collected = collect_views(frames, printed, note, every)
         note(
@@ -104,6 +113,8 @@ def mount(
     roll: Annotated[float, typer.Option(help="Roll of the vehicle, degrees.")] = 0.0,
     pitch: Annotated[float, typer.Option(help="Pitch of the vehicle, degrees, nose up.")] = 0.0,
     frames: Annotated[int, typer.Option(min=1, help="Number of images with the marker.")] = 30,
+    rotate: _ROTATE = 0,
+    mirror: _MIRROR = False,
 ) -> None:
     """Measure the camera's angles on the vehicle, and print them as settings."""
     import math
@@ -118,7 +129,8 @@ def mount(
     with plain_errors(SourceError, ValueError, OSError):
         kind = MarkerKind(dictionary, size, {marker: size})
         model = None if calibration is None else read_camera_info(calibration)
-        with open_source(source, SourceSettings(every_frame=True)) as images:
+        settings = SourceSettings(every_frame=True, rotate_deg=rotate, mirror=mirror)
+        with open_source(source, settings) as images:
             found = markers_of(images, kind, marker, model, frames)
         angles = mount_from_markers(found, *map(math.radians, (heading, roll, pitch)))
     typer.echo(f"# {angles.views} images, spread {math.degrees(angles.spread_rad):.2f} degrees")

@@ -22,6 +22,14 @@ from vision.sources import Capture, EndOfStream, RawFrame, SequentialSource, Sou
 LENS = CameraModel(640, 480, 455.0, 490.0, 301.0, 251.0, (-0.12, 0.03, 0.004, -0.003))
 ORIENTATIONS = [Orientation(angle, mirror) for angle in ROTATIONS_DEG for mirror in (False, True)]
 orientations = st.sampled_from(ORIENTATIONS)
+RATIONAL = CameraModel(
+    *(640, 480, 330.0, 331.0, 318.0, 242.0),
+    (0.6, 0.08, 0.004, -0.003, 0.002, 0.92, 0.22, 0.012),
+    "rational_polynomial",
+)
+FISHEYE = CameraModel(*(640, 480, 240.0, 250.0, 321.0, 238.0), (-0.02, 0.004, -0.002, 0.0003), "equidistant")
+IDEAL_FISHEYE = CameraModel(*(640, 480, 240.0, 250.0, 321.0, 238.0), (0.0,) * 4, "equidistant")
+lenses = st.sampled_from([LENS, RATIONAL, FISHEYE, IDEAL_FISHEYE])
 
 
 def moved(pixel: tuple[int, int], orientation: Orientation) -> tuple[int, int]:
@@ -46,10 +54,12 @@ def test_picture_is_mirrored_and_then_rotated_clockwise() -> None:
 
 
 @settings(max_examples=60, deadline=None)
-@given(orientations, st.integers(0, 639), st.integers(0, 479))
-def test_ray_of_a_pixel_turns_with_the_picture(orientation: Orientation, column: int, row: int) -> None:
-    (before,) = LENS.rays(np.array([[column, row]]))
-    (after,) = orientation.model(LENS).rays(np.array([moved((column, row), orientation)]))
+@given(lenses, orientations, st.integers(0, 639), st.integers(0, 479))
+def test_ray_of_a_pixel_turns_with_the_picture(
+    lens: CameraModel, orientation: Orientation, column: int, row: int
+) -> None:
+    (before,) = lens.rays(np.array([[column, row]]))
+    (after,) = orientation.model(lens).rays(np.array([moved((column, row), orientation)]))
     turn = matrix_from_euler(0.0, 0.0, math.radians(orientation.rotate_deg))
     flipped = before * ((-1.0, 1.0, 1.0) if orientation.mirror else (1.0, 1.0, 1.0))
     np.testing.assert_allclose(after, turn @ flipped, atol=1e-6)

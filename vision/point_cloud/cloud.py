@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vision.camera_model import CameraModel, CameraMount
+from vision.camera_model import MIN_COSINE, CameraModel, CameraMount
 
 CloudFrame = Literal["camera", "body", "ned"]
 FRAMES: tuple[CloudFrame, ...] = ("camera", "body", "ned")
@@ -132,8 +132,8 @@ def cloud_from_depth(
     depth = depth_m.ravel()
     with np.errstate(invalid="ignore"):
         known = (depth > max(range_m[0], 0.0)) & (depth <= range_m[1]) & (depth < np.inf)
-    pixels = np.flatnonzero(known)
     rays = _rays(camera)
+    pixels = np.flatnonzero(known & np.isfinite(rays[0]))
     if rotation is not None:
         rays = rotation.astype(np.float32) @ rays
     along = depth[pixels]
@@ -197,9 +197,10 @@ def _averaged(
 
 @lru_cache(maxsize=2)
 def _rays(camera: CameraModel) -> NDArray[np.float32]:
-    """(3, N) float32 rays of the pixels with z = 1; read-only."""
+    """(3, N) float32 rays of the pixels with z = 1; read-only. NaN across a fisheye's axis and beyond."""
     columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     unit = camera.rays(np.column_stack([columns.ravel(), rows.ravel()]))
+    unit[~(unit[:, 2] > MIN_COSINE)] = np.nan
     rays = np.ascontiguousarray((unit / unit[:, 2:]).T, np.float32)
     rays.flags.writeable = False
     return rays
