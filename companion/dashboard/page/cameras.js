@@ -2,6 +2,7 @@
 // fewer pictures, never older ones. The cameras take turns: a browser has six connections to one host, and one
 // has to be free for a stop command.
 
+import { drawBox } from "./canvas.js";
 import { openMenu, send } from "./commands.js";
 import { $, button, cameras, pause, setText, state } from "./state.js";
 
@@ -9,9 +10,6 @@ const PICTURE_PERIOD_MS = 60;
 const IDLE_PERIOD_MS = 500;
 const FAULT_PERIOD_MS = 1000;
 const DRAG_PX = 8;
-const CHOSEN = "#ffd23f";
-const CONFIRMED = "#39e07f";
-const TENTATIVE = "#c9d1dc";
 
 // Returns the view of a camera, and begins it; an empty name is the first camera.
 export function camera(name) {
@@ -167,7 +165,7 @@ export class Camera {
     g.setLineDash(about.boxes_sequence === about.sequence ? [] : [6 * scale, 4 * scale]);
     for (const box of about.boxes) {
       const isChosen = box[6] != null && box[6] === state.chosen;
-      if (!about.annotated || isChosen) this.drawBox(g, box, isChosen, scale); // else it is in the picture
+      if (!about.annotated || isChosen) drawBox(g, box, isChosen, scale); // else it is in the picture
     }
     g.setLineDash([]);
     if (this.drag && this.drag.moved) {
@@ -179,32 +177,6 @@ export class Camera {
       g.fillRect(...rectangle);
       g.strokeRect(...rectangle);
     }
-  }
-
-  drawBox(g, [l, t, r, b, name, confidence, id, kind], isChosen, scale) {
-    const { width, height, clientWidth } = this.canvas;
-    const isTentative = kind === "tentative" || kind === "none";
-    const colour = isChosen ? CHOSEN : isTentative ? TENTATIVE : CONFIRMED;
-    const x = l * width;
-    const y = t * height;
-    const h = (b - t) * height;
-    for (const [style, thickness] of [["#000a", 2], [colour, 0]]) {
-      g.strokeStyle = style;
-      g.lineWidth = ((isChosen ? 4 : 2) + thickness) * scale;
-      g.strokeRect(x, y, (r - l) * width, h);
-    }
-    const words = [name];
-    if (id != null) words.push(`#${id}`);
-    if (clientWidth >= 420) words.push(Number(confidence).toFixed(2));
-    const text = words.join(" ");
-    const line = 18 * scale;
-    const size = g.measureText(text).width + 8 * scale;
-    const left = Math.max(0, Math.min(x, width - size));
-    const top = y >= line ? y - line : Math.min(y + h, height - line);
-    g.fillStyle = colour;
-    g.fillRect(left, top, size, line);
-    g.fillStyle = "#0b0e12";
-    g.fillText(text, left + 4 * scale, top + 2 * scale);
   }
 
   writeCaption() {
