@@ -25,23 +25,24 @@ export function drawMap(vehicle, limits) {
   drawFence(view, include, exclude);
   for (const trail of state.trails.values()) drawTrail(view, trail, css("--soft"));
   drawTrail(view, state.trail, css("--accent"));
+  for (const track of tracks) {
+    drawTrail(view, track.trail, css("--second"));
+    drawDot(view, track.at, track.chosen ? 7 : 5);
+  }
+  drawHome(view, home);
   for (const one of others) {
     view.g.globalAlpha = one.state_age_s > STALE_S ? .4 : 1;
     drawArrow(view, one.at_ned_m, one.yaw_rad, css("--soft"));
-    drawLabel(view, one.name, one.at_ned_m);
     view.g.globalAlpha = 1;
   }
-  for (const track of [...tracks].reverse()) { // the newest first: a label is drawn where no other is
-    drawTrail(view, track.trail, css("--second"));
-    drawDot(view, track.at, track.chosen ? 7 : 5);
-    drawLabel(view, track.text, track.at);
-  }
-  drawHome(view, home);
   if (own) {
     drawSetpoint(view, own);
     drawArrow(view, own, vehicle.yaw_rad, css("--accent"));
     if (isFleet()) drawLabel(view, state.vehicle, own);
   }
+  // A label is drawn where no other is: vehicles first, then the newest tracks.
+  for (const one of others) drawLabel(view, one.name, one.at_ned_m);
+  for (const track of [...tracks].reverse()) drawLabel(view, track.text, track.at);
   drawScale(view);
 
   const north = own && (own[0] - home[0]).toFixed(0);
@@ -126,7 +127,7 @@ function drawTrail({ g, xy }, trail, colour) {
 function drawLabel({ g, width, xy, labels }, text, at) {
   const [x, y] = xy(at);
   const size = g.measureText(text).width;
-  const left = Math.max(2, Math.min(x + 8, width - size - 2));
+  const left = x + 8 + size < width ? x + 8 : Math.max(2, x - 8 - size);
   if (labels.some((one) => Math.abs(one.y - y) < 13 && left < one.right && one.left < left + size)) return;
   labels.push({ y, left, right: left + size });
   g.fillStyle = css("--ink");
