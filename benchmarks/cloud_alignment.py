@@ -1,11 +1,11 @@
-"""Error of the alignment of two rendered views, and whether `observability` tells the good ones.
+"""Error of the alignment of two rendered views, and whether `observability` separates good from bad ones.
 
     python -m benchmarks.cloud_alignment --pairs 20 --seed 500 [--json]
 
 Conditions: true depth of the built-in camera up to 20 m, the mean of 2x2 pixels, 2 to 4 m above the ground.
 The second view is up to 0.2 m away along each axis and turned by up to 2.3 degrees about each; the start is
-the first one's pose. Scenes: `obstacle_course` (walls, boxes, poles), `village`, and a demo world for each seed
-(flat ground with a few cars and people). `trusted`: `observability` is `MIN_OBSERVABILITY` or more.
+the first one's pose. Scenes: `obstacle_course` (walls, boxes, poles), `village`, and a demo world for each
+seed (flat ground with a few cars and people). `trusted`: `observability` is `MIN_OBSERVABILITY` or more.
 """
 
 from __future__ import annotations
