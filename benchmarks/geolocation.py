@@ -10,7 +10,8 @@ of 5 cm. Errors: those of the simulated autopilot's estimate (those of PX4, see
 over a flight.
 
 The truth of a detection is a point in the direction of the object's middle, at the range of the nearest point
-of its surface; of a track it is the mean of those. The range is the mean of the ranges.
+of its surface; the object is the one whose true box agrees best. Of a track it is the mean of those, weighted
+as the track's position is. The range is the mean of the ranges.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections import Counter
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -27,12 +28,15 @@ from numpy.typing import NDArray
 from companion.bench.lockstep_flight import LockstepFlight, camera_settings
 from companion.bench.rendered_camera import RenderedCamera, rendered_scene
 from companion.bench.synthetic_detector import SceneObject, ScenePose
+from companion.guidance.targets.fused import FusedPosition
 from companion.guidance.targets.target import Target
 from companion.vehicle.state import Vector3
+from mavlink_sim.camera.renderer import Rendered
 from mavlink_sim.lockstep import LockstepVehicle
 from mavlink_sim.world.mesh import surface_range_to
 from mavlink_sim.world.world import WorldObject
 from vision.camera_model import CameraModel, CameraMount
+from vision.tracking.association import overlaps
 
 CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(80.0))
 MOUNT = CameraMount(forward_m=0.1, pitch_rad=math.radians(-20.0))
@@ -44,6 +48,7 @@ SIZES_M = {
     "bicycle": (1.7, 0.5, 1.1),
 }
 CHI_SQUARED_95 = 5.99
+MIN_FRAMES = 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +57,7 @@ class Located:
 
     Attributes:
         error_m: of the fused position; single_m: median of its detections. range_m: mean of its detections.
+        moving: it was taken for moving.
         within_95: the truth is in the 95 % ellipse.
     """
 
@@ -60,6 +66,7 @@ class Located:
     range_m: float
     error_m: float
     single_m: float
+    moving: bool
     within_95: bool
 
 
@@ -72,27 +79,38 @@ def flight_of(seed: int, *, depth: bool) -> list[Located]:
     believed = replace(MOUNT, roll_rad=errors[0], pitch_rad=MOUNT.pitch_rad + errors[1], yaw_rad=errors[2])
     settings = camera_settings(CAMERA, believed, {"detector.image_size": "320", "detector.threads": "1"})
 
+    cameras: list[RenderedCamera] = []
+
     def camera(vehicle: LockstepVehicle) -> RenderedCamera:
-        return RenderedCamera(settings, scene, vehicle, depth=depth)
+        cameras.append(RenderedCamera(settings, scene, vehicle, depth=depth))
+        return cameras[0]
 
     height_m = float(rng.uniform(3.0, 8.0))
     flight = LockstepFlight.airborne(seed=seed, height_m=height_m, wind_mps=2.0, camera=camera)
     flight.turn_to(0.0)
-    seen: dict[int, list[Target]] = {}
-    vehicle_at: dict[int, Vector3] = {}
+    seen: dict[int, dict[int, Target]] = {}
+    shown: dict[int, tuple[Vector3, Rendered]] = {}
+    before = flight.now_ns, flight.vehicle.truth.position_ned_m
 
     def collect() -> None:
-        vehicle_at[flight.now_ns] = flight.vehicle.truth.position_ned_m
+        nonlocal before
+        newest = cameras[0].shown
+        if newest is not None and (not shown or shown[max(shown)][1] is not newest):
+            shown[before[0]] = before[1], newest  # captured at the beginning of the tick
+        before = flight.now_ns, flight.vehicle.truth.position_ned_m
         for target in flight.inputs.steering.targets:
-            if target.track_id is None or not target.trusted or target.position_ned_m is None:
-                continue
-            of_track = seen.setdefault(target.track_id, [])
-            if not of_track or of_track[-1].captured_ns < target.captured_ns:
-                of_track.append(target)
+            if target.track_id is not None and target.trusted and target.position_covariance is not None:
+                seen.setdefault(target.track_id, {})[target.captured_ns] = target
 
     forward_m, right_m = rng.uniform(10.0, 15.0), rng.uniform(-8.0, 8.0)
     flight.fly(f"goto north={forward_m:.1f} east={right_m:.1f} heading=0 speed=3", 30.0, on_tick=collect)
-    return list(_located(flight, scene.world_at(0.0).objects, seen, vehicle_at))
+    fused = flight.inputs.steering.fused
+    tracks = [
+        _located(position, [(target, *shown[ns]) for ns, target in of_track.items() if ns in shown])
+        for track_id, of_track in seen.items()
+        if (position := fused.position(track_id)) is not None
+    ]
+    return [track for track in tracks if track is not None]
 
 
 def _object(name: str, number: int, rng: np.random.Generator) -> SceneObject:
@@ -101,33 +119,50 @@ def _object(name: str, number: int, rng: np.random.Generator) -> SceneObject:
     return SceneObject(name, SIZES_M[name], lambda _: ScenePose(float(north), float(east), float(yaw)))
 
 
-def _located(
-    flight: LockstepFlight,
-    objects: Sequence[WorldObject],
-    seen: dict[int, list[Target]],
-    vehicle_at: dict[int, Vector3],
-) -> Iterator[Located]:
-    by_class = {item.class_name: item for item in objects}
-    for track_id, targets in seen.items():
-        fused = flight.inputs.steering.fused.position(track_id)
-        item = by_class.get(targets[0].class_name)
-        timed = [target for target in targets if target.captured_ns in vehicle_at]
-        if fused is None or item is None or len(timed) < 10:
-            continue
-        truths = np.array([_truth(item, vehicle_at[target.captured_ns]) for target in timed])
-        singles = np.array([target.position_ned_m for target in timed])[:, :2] - truths
-        error = np.array(fused.position_ned_m[:2]) - truths.mean(axis=0)
-        major_m, minor_m, orientation = fused.ellipse
-        axis = np.array((math.cos(orientation), math.sin(orientation)))
-        along, across = error @ axis, error @ (-axis[1], axis[0])
-        yield Located(
-            item.class_name,
-            len(timed),
-            round(float(np.mean([target.ground_range_m for target in timed])), 2),
-            round(math.hypot(*error), 3),
-            round(float(np.median(np.hypot(*singles.T))), 3),
-            bool((along / major_m) ** 2 + (across / minor_m) ** 2 <= CHI_SQUARED_95),
-        )
+def _located(fused: FusedPosition, seen: list[tuple[Target, Vector3, Rendered]]) -> Located | None:
+    """The track against the object that most of its boxes show; None: fewer than ten show it."""
+    truths = [_object_of(target, rendered) for target, _, rendered in seen]
+    shown = [item for item in truths if item is not None]
+    if not shown:
+        return None
+    identifier = Counter(item.identifier for item in shown).most_common(1)[0][0]
+    of_object = [
+        (target, _truth(item, vehicle))
+        for (target, vehicle, _), item in zip(seen, truths, strict=True)
+        if item is not None and item.identifier == identifier
+    ]
+    if len(of_object) < MIN_FRAMES:
+        return None
+    singles = [
+        math.dist(target.position_ned_m[:2], truth)
+        for target, truth in of_object
+        if target.position_ned_m is not None
+    ]
+    weights = [np.linalg.inv(target.position_covariance) for target, _ in of_object]
+    weighted = sum(weight @ truth for weight, (_, truth) in zip(weights, of_object, strict=True))
+    truth = of_object[-1][1] if fused.moving else np.linalg.solve(sum(weights), weighted)
+    error = np.array(fused.position_ned_m[:2]) - truth
+    major_m, minor_m, orientation = fused.ellipse
+    axis = np.array((math.cos(orientation), math.sin(orientation)))
+    along, across = error @ axis, error @ (-axis[1], axis[0])
+    return Located(
+        next(item.class_name for item in shown if item.identifier == identifier),
+        len(of_object),
+        round(float(np.mean([target.ground_range_m for target, _ in of_object])), 2),
+        round(math.hypot(*error), 3),
+        round(float(np.median(singles)), 3),
+        fused.moving,
+        bool((along / major_m) ** 2 + (across / minor_m) ** 2 <= CHI_SQUARED_95),
+    )
+
+
+def _object_of(target: Target, rendered: Rendered) -> WorldObject | None:
+    """The object in the target's box; None: no box agrees by an IoU of 0.5."""
+    if not rendered.objects:
+        return None
+    overlap = overlaps(np.array([seen.xyxy for seen in rendered.objects]), np.array([target.box_xyxy]))[:, 0]
+    best = int(overlap.argmax())
+    return rendered.objects[best].world_object if overlap[best] >= 0.5 else None
 
 
 def _truth(item: WorldObject, vehicle: Vector3) -> NDArray[np.float64]:
