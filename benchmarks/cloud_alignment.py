@@ -1,11 +1,11 @@
-"""Error of the alignment of two rendered views, and whether `observability` separates good from bad ones.
+"""Error of the alignment of two rendered views, and whether `determined` separates good from bad ones.
 
     python -m benchmarks.cloud_alignment --pairs 20 --seed 500 [--json]
 
 Conditions: true depth of the built-in camera up to 20 m, the mean of 2x2 pixels, 2 to 4 m above the ground.
 The second view is up to 0.2 m away along each axis and turned by up to 2.3 degrees about each; the start is
-the first one's pose. Scenes: `obstacle_course` (walls, boxes, poles), `village`, and a demo world for each
-seed (flat ground with a few cars and people). `trusted`: `observability` is `MIN_OBSERVABILITY` or more.
+the first one's pose. Scenes: `obstacle_course` (walls, boxes, poles), `village`, a demo world for each seed
+(flat ground with a few cars and people). `determined`: as `align` says.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from mavlink_sim.camera.renderer import DEFAULT_CAMERA, DEFAULT_MOUNT, Renderer
 from mavlink_sim.camera.scene_file import load_scene
 from mavlink_sim.world.world import demo_world
-from vision.point_cloud import MIN_OBSERVABILITY, PointCloud, align, cloud_from_depth
+from vision.point_cloud import PointCloud, align, cloud_from_depth
 from vision.point_cloud.registration import Method
 from vision.rotation import matrix_from_euler
 
@@ -84,14 +84,14 @@ def angle_deg(rotation: NDArray[np.float64], other: NDArray[np.float64]) -> floa
 
 
 def measure(pairs: int, seed: int) -> dict[str, list[tuple[float, float]]]:
-    """Scene, method and trusted or refused → errors in metres and degrees."""
+    """Scene, method and whether it is determined → errors in metres and degrees."""
     errors: dict[str, list[tuple[float, float]]] = {}
     for scene in SCENES:
         for number in range(seed, seed + pairs):
             views = pair(scene, number)
             for method in METHODS:
                 found = align(views.source, views.target, method=method)
-                kind = "trusted" if found.observability >= MIN_OBSERVABILITY else "refused"
+                kind = "determined" if found.determined else "undetermined"
                 error_m = float(np.linalg.norm(found.translation_m - views.translation_m))
                 error = (error_m, angle_deg(found.rotation, views.rotation))
                 errors.setdefault(f"{scene} {method} {kind}", []).append(error)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from vision.point_cloud import Cluster
 
 CLOUD_SETTINGS = ("camera", "source.width", "source.height", "source.rate_hz", "source.pixel_format")
-_PICTURES = (".png", ".jpg")
+_QUALITY: dict[str, list[int]] = {".png": [], ".jpg": [cv2.IMWRITE_JPEG_QUALITY, 80]}
 
 
 def cloud(
@@ -63,8 +63,8 @@ def cloud(
         from vision.rotation import matrix_from_euler
         from vision.sources import SourceError
 
-    if picture is not None and picture.suffix not in _PICTURES:
-        _refuse(f"{picture}: expected a name that ends in {' or '.join(_PICTURES)}")
+    if picture is not None and picture.suffix not in _QUALITY:
+        _refuse(f"{picture}: expected a name that ends in {' or '.join(_QUALITY)}")
     if clusters:
         voxel, average = voxel or 0.1, average or 4
     ned_from_body = matrix_from_euler(*(math.radians(angle) for angle in attitude))
@@ -102,7 +102,7 @@ def cloud(
         write_cloud(output, written, binary=not text)
         if picture is not None:
             drawn = draw_cloud(written, down, clusters=found, point_m=0.03 if voxel is None else voxel)
-            if not cv2.imwrite(str(picture), drawn):
+            if not cv2.imwrite(str(picture), drawn, _QUALITY[picture.suffix]):
                 raise OSError(f"cannot write {picture}: check its folder and the free disk space")
     objects = [_record(cluster, down) for cluster in found]
     if as_json:

@@ -28,7 +28,7 @@ class RecordingSection(VideoSection):
     images: bool = True
     """record the preview images too"""
     clouds: bool = False
-    """record the point clouds of cameras with depth too; some 0.5 MB/s"""
+    """record the point clouds of cameras with depth too; some 0.2 MB/s"""
     max_file_mb: Annotated[int, Field(ge=1, le=1_000_000)] = 1000
     """size at which the next file begins, megabytes"""
     max_file_minutes: Annotated[int, Field(ge=1, le=10_000)] = 60

@@ -15,12 +15,11 @@ from vision.point_cloud.cloud import FRAMES, CloudFrame, PointCloud, cloud_from_
 from vision.point_cloud.clusters import Cluster, Scene, euclidean_clusters, scene_of
 from vision.point_cloud.files import CloudFileError, read_cloud, write_cloud
 from vision.point_cloud.filters import pass_through, remove_outliers, voxel_grid
-from vision.point_cloud.registration import MIN_OBSERVABILITY, Alignment, RegistrationError, align
+from vision.point_cloud.registration import Alignment, RegistrationError, align
 from vision.point_cloud.surfaces import Plane, estimate_normals, ground_plane, key_points
 
 __all__ = [
     "FRAMES",
-    "MIN_OBSERVABILITY",
     "Alignment",
     "CloudFileError",
     "CloudFrame",

@@ -134,12 +134,11 @@ def cloud_from_depth(
         known = (depth > max(range_m[0], 0.0)) & (depth <= range_m[1]) & (depth < np.inf)
     rays = _rays(camera)
     pixels = np.flatnonzero(known & np.isfinite(rays[0]))
-    if rotation is not None:
-        rays = rotation.astype(np.float32) @ rays
     along = depth[pixels]
+    optical = [ray[pixels] * along for ray in rays]
     points = np.empty((len(pixels), 3), np.float32)
-    for axis in range(3):
-        np.multiply(rays[axis][pixels], along, out=points[:, axis])
+    for axis, row in enumerate(rotation.astype(np.float32)):
+        points[:, axis] = row[0] * optical[0] + row[1] * optical[1] + row[2] * optical[2]
     points += translation.astype(np.float32)
     colours = None
     if image is not None:
@@ -150,10 +149,10 @@ def cloud_from_depth(
 
 def _pose(
     frame: CloudFrame, mount: CameraMount | None, ned_from_body: NDArray[np.float64] | None
-) -> tuple[NDArray[np.float64] | None, NDArray[np.float64]]:
-    """Rotation and translation from the optical frame to `frame`; no rotation for `camera`."""
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rotation and translation from the optical frame to `frame`."""
     if frame == "camera":
-        return None, np.zeros(3)
+        return np.eye(3), np.zeros(3)
     if mount is None:
         raise ValueError(f"points in the frame {frame!r} need the camera's mount")
     if frame == "body":
