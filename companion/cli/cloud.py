@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
+import time
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
@@ -12,6 +15,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
+from companion.cli.cameras import opened
 from companion.cli.flags import EXIT_BAD_INPUT, plain_errors
 from companion.settings import Settings
 from companion.settings.perception import CameraSection
@@ -21,13 +25,17 @@ if TYPE_CHECKING:
     from vision.frame import Frame
     from vision.point_cloud import Cluster
 
-CLOUD_SETTINGS = ("camera", "source.width", "source.height", "source.rate_hz", "source.pixel_format")
+logger = logging.getLogger(__name__)
+
+CLOUD_SETTINGS = ("camera", "source", "plugins")
+# Of a source whose depth is paired with its images, the first frames may have none.
+_DEPTH_TIMEOUT_S = 2.0
 _QUALITY: dict[str, list[int]] = {".png": [], ".jpg": [cv2.IMWRITE_JPEG_QUALITY, 80]}
 
 
 def cloud(
     settings: Settings,
-    source: Annotated[str, typer.Argument(help="Source with depth: shm://NAME.")],
+    source: Annotated[str, typer.Argument(help="Source with depth, or with --source-depth.")],
     output: Annotated[Path, typer.Argument(help="Output file: .ply or .pcd.")],
     frame: Annotated[
         Literal["camera", "body", "ned"], typer.Option(help="Frame of the points; NED is from the vehicle.")
@@ -61,7 +69,6 @@ def cloud(
         from vision.point_cloud import CloudFileError, cloud_from_depth, scene_of, voxel_grid, write_cloud
         from vision.point_cloud.drawing import draw_cloud
         from vision.rotation import matrix_from_euler
-        from vision.sources import SourceError
 
     if picture is not None and picture.suffix not in _QUALITY:
         _refuse(f"{picture}: expected a name that ends in {' or '.join(_QUALITY)}")
@@ -69,7 +76,7 @@ def cloud(
         voxel, average = voxel or 0.1, average or 4
     ned_from_body = matrix_from_euler(*(math.radians(angle) for angle in attitude))
     # ValueError: a camera on a gimbal has no fixed mount, or the voxels are too small.
-    with plain_errors(SourceError, CloudFileError, ValueError, OSError):
+    with plain_errors(CloudFileError, ValueError, OSError):
         captured, depth_m, camera = _capture(settings, source)
         mount = camera.mount()
         points = cloud_from_depth(
@@ -117,24 +124,23 @@ def cloud(
 
 
 def _capture(settings: Settings, uri: str) -> tuple[Frame, NDArray[np.float32], CameraSection]:
-    """The source's first frame, its depth, and its camera."""
+    """The source's first frame with depth, its depth, and its camera."""
     from companion.settings.calibration import adopt_calibration
-    from vision.sources import open_source
+    from vision.sources import EndOfStream
 
     camera = settings.camera
-    with open_source(uri, settings.source.opening()) as frames:
-        captured = next(iter(frames))
+    with opened(settings, uri) as frames:
         if frames.calibration is not None:
             camera, conflict = adopt_calibration(camera, frames.calibration)
             if conflict:
-                typer.echo(
-                    f"companion: camera: settings override the camera's calibration: {conflict}", err=True
-                )
-    if captured.depth_m is None:
-        _refuse(
-            f"{uri}: its frames have no depth, and a point cloud needs it: use shm://NAME of a depth camera"
-        )
-    return captured, captured.depth_m, camera
+                logger.warning("camera: settings override the camera's calibration: %s", conflict)
+        end_s = time.monotonic() + _DEPTH_TIMEOUT_S
+        with suppress(EndOfStream):
+            while time.monotonic() < end_s:
+                captured = frames.read(_DEPTH_TIMEOUT_S / 4)
+                if captured is not None and captured.depth_m is not None:
+                    return captured, captured.depth_m, camera
+    _refuse(f"{uri}: its frames have no depth: use a source with depth (shm://NAME), or set source.depth")
 
 
 def _record(cluster: Cluster, down: NDArray[np.float64]) -> dict[str, Any]:

@@ -124,6 +124,19 @@ def test_clusters_are_the_walls_and_the_pole(frame: Frame, tmp_path: Path) -> No
     assert len(np.unique(drawn.reshape(-1, 3), axis=0)) > 500
 
 
+def test_depth_of_a_second_source_is_used(frame: Frame, tmp_path: Path) -> None:
+    depth_mm = np.full((frame.height, frame.width), 4000, np.uint16)
+    for name, picture in (("image", frame.image), ("depth", depth_mm)):
+        (tmp_path / name).mkdir()
+        cv2.imwrite(str(tmp_path / name / "000.png"), picture)
+    folders = (tmp_path / "image", tmp_path / "a.ply", "--source-depth", tmp_path / "depth")
+    result = run(*folders, "--camera-mount-pitch-deg", "-90", "--max-range", "5")
+    assert result.exit_code == 0, result.output
+    cloud = read_cloud(tmp_path / "a.ply")
+    assert len(cloud) == frame.height * frame.width
+    np.testing.assert_allclose(cloud.points[:, 2], 4.0, atol=1e-3)  # it looks down
+
+
 def test_a_frame_without_depth_is_one_line(frame: Frame, tmp_path: Path) -> None:
     with shared(replace(frame, depth_m=None)):
         assert "depth" in refused(URI, tmp_path / "a.ply")
