@@ -33,6 +33,15 @@ def test_projected_points_are_the_known_pixels(seed: int) -> None:
     np.testing.assert_array_equal(cloud.points[:, 2], depth_m[rows, columns])
 
 
+def test_pixels_of_a_fisheye_across_its_axis_give_no_points() -> None:
+    wide = CameraModel(200, 200, 60.0, 60.0, 99.5, 99.5, (0.01, 0.0, 0.0, 0.0), "equidistant")
+    cloud = cloud_from_depth(np.full((200, 200), 2.0, np.float32), wide)
+    assert 0.5 < len(cloud) / 40_000 < 0.9  # of the square the circle of some 180 degrees
+    pixels = wide.project(cloud.points)
+    assert np.abs(pixels - np.rint(pixels)).max() < 0.01
+    np.testing.assert_allclose(cloud.points[:, 2], 2.0, rtol=1e-6)
+
+
 @given(seeds, mounts, rotations)
 @settings(max_examples=30, deadline=None)
 def test_camera_to_body_to_ned_equals_the_single_step(
