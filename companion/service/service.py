@@ -23,13 +23,7 @@ from companion.perception.cameras import WorkerCamera, open_cameras
 from companion.perception.supervisor import PerceptionSupervisor
 from companion.recording.tap import FlightTap, run_record
 from companion.service.event import Event, EventLog
-from companion.service.factory import (
-    clients_of,
-    driver_of,
-    gimbal_mounting,
-    guidance_options,
-    streamer_of,
-)
+from companion.service.factory import clients_of, driver_of, gimbal_mounting, guidance_options, streamer_of
 from companion.service.guidance_loop import GuidanceLoop
 from companion.service.health import Health
 from companion.service.inputs import InputAssembler
@@ -37,6 +31,7 @@ from companion.service.other_commanders import OtherCommanders
 from companion.service.publisher import Publisher
 from companion.service.queries import Queries
 from companion.service.systemd_notify import SystemdNotifier
+from companion.service.tasks import run_until, start_together
 from companion.settings import Settings
 from companion.vehicle.driver import CommandRefusedError, Driver
 from companion.vehicle.state import FlightMode, VehicleState
@@ -104,10 +99,7 @@ class Service:
         )
         self._publisher = Publisher(settings.vehicle.name, self.bus, self.driver, self.inputs, self._queries)
         self._loop = GuidanceLoop(
-            self.guidance,
-            self.inputs,
-            self.driver,
-            self.streamer,
+            *(self.guidance, self.inputs, self.driver, self.streamer),
             rate_hz=settings.guidance.rate_hz,
             on_event=self._event,
             on_step=lambda now_ns: self._health.after_step(now_ns, self.guidance),
@@ -141,7 +133,11 @@ class Service:
             if self.settings.metrics.listen is not None:
                 metrics = MetricsServer(self.settings.metrics.listen, lambda: self._status)
                 self._event("info", f"metrics on port {metrics.port}")
-            await self._start()
+            await start_together(
+                self.bus.start(),
+                self.driver.connect(self.settings.vehicle.connect_timeout_s),
+                *(camera.start() for camera in self.cameras),
+            )
             loops = [self._loop.run(), self.streamer.run(), self._publish_status(), self._health.check()]
             loops.append(self._publisher.publish_vehicle(self.guidance, self.streamer, self.cameras))
             if self._console and all(terminal_is_free(camera.settings.source.uri) for camera in self.cameras):
@@ -153,7 +149,7 @@ class Service:
             if ready is not None:
                 ready()
             try:
-                await self._until_stopped(tasks)
+                await run_until(self._stop, tasks)
             finally:
                 await self._shut_down()
         finally:
@@ -207,33 +203,6 @@ class Service:
         """The supervisor of the steering camera."""
         return next(camera for camera in self.cameras if camera is self.inputs.steering).supervisor
 
-    async def _start(self) -> None:
-        starts = [
-            asyncio.create_task(self.bus.start()),
-            asyncio.create_task(self.driver.connect(self.settings.vehicle.connect_timeout_s)),
-            *(asyncio.create_task(camera.start()) for camera in self.cameras),
-        ]
-        try:
-            done, _ = await asyncio.wait(starts, return_when=asyncio.FIRST_EXCEPTION)
-            for task in done:
-                task.result()
-        finally:
-            for task in starts:
-                task.cancel()
-            await asyncio.gather(*starts, return_exceptions=True)
-
-    async def _until_stopped(self, tasks: list[asyncio.Task[None]]) -> None:
-        """Wait for `stop()`, or until a loop fails: its error is raised."""
-        stopped = asyncio.create_task(self._stop.wait())
-        waiting: set[asyncio.Task[Any]] = {stopped, *tasks}
-        try:
-            while not stopped.done():
-                done, waiting = await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
-                for task in done:
-                    task.result()  # raises a failure; the console may end (end of file)
-        finally:
-            stopped.cancel()
-
     async def _shut_down(self) -> None:
         """Accept no more commands; switch a vehicle that flies our setpoints to the autopilot's HOLD."""
         self._ending = True
@@ -277,6 +246,5 @@ class Service:
                 self._loop.on_perception()
         finally:
             # The guidance loop runs first: a subscriber can wait for a millisecond, a setpoint cannot.
-            asyncio.get_running_loop().call_soon(
-                self._publisher.publish_result, camera, result, markers, localization
-            )
+            publish = self._publisher.publish_result
+            asyncio.get_running_loop().call_soon(publish, camera, result, markers, localization)
