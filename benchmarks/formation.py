@@ -29,6 +29,7 @@ from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, Vector3, VehicleState
 from companion.vehicle.telemetry import TELEMETRY_MESSAGES
+from companion.vehicle.vision_position import VisionPosition
 from mavlink_sim import LockstepVehicle
 from mavlink_sim.lockstep import COMPANION
 from mavlink_sim.vehicles.vehicle import BACKGROUND_GUSTS_MPS, GUST_SHARE_OF_WIND
@@ -113,6 +114,9 @@ class PointAirframe:
 
     def send_obstacle_distance(self, sectors: ObstacleSectors) -> None:
         raise NotImplementedError("a point sees no obstacles")
+
+    def send_vision_position(self, vision: VisionPosition) -> None:
+        raise NotImplementedError("a point knows its position")
 
     def start(self, request: Request) -> None:
         """It does at once what it is asked."""

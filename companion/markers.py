@@ -50,7 +50,7 @@ def print_markers(
         OSError: an image cannot be written.
     """
     if source.calibration is not None:
-        camera = adopt_calibration(settings.camera, source.calibration).section
+        camera = adopt_calibration(settings.camera, source.calibration).camera
         settings = settings.model_copy(update={"camera": camera})
     find, mount = marker_finder(settings), settings.camera.mount()
     assert find is not None
@@ -75,8 +75,8 @@ def print_markers(
             }
             write(json.dumps(message))
         else:
-            lines = [_line(target) for target in (*targets, *located)] or [NO_MARKERS]
-            for line in lines:
+            lines = [_line(target) for target in targets] + [_line(board) for board in located]
+            for line in lines or [NO_MARKERS]:
                 write(f"{frame.sequence:6d}  {line}")
         if save is not None:
             path = save / f"{frame.sequence:06d}.jpg"

@@ -52,15 +52,25 @@ class BoardPose:
     Attributes:
         name: of the board. identifiers: of its markers that were used.
         centre_m: (3,) mean of their corners, in the board's frame; the fit is about this point.
-        pose: position of `centre_m` in the optical frame, and rotation `optical_from_board`.
-        ambiguous: another pose fits about equally well.
+        poses: that fit, the best first: position of `centre_m` in the optical frame, and rotation
+            `optical_from_board`.
     """
 
     name: str
     identifiers: tuple[int, ...]
     centre_m: NDArray[np.float64]
-    pose: MarkerPose
-    ambiguous: bool
+    poses: tuple[MarkerPose, ...]
+
+    @property
+    def pose(self) -> MarkerPose:
+        """The best one."""
+        return self.poses[0]
+
+    @property
+    def ambiguous(self) -> bool:
+        """Another pose fits about equally well."""
+        worse_px = [pose.reprojection_px for pose in self.poses[1:]]
+        return bool(worse_px) and self.pose.reprojection_px > AMBIGUOUS * worse_px[0]
 
     def at_origin(self) -> MarkerPose:
         """The pose of the board's own origin, with its covariance."""
@@ -111,8 +121,8 @@ def _fit(board: Board, used: Sequence[Marker], camera: CameraModel) -> BoardPose
     poses = fit_poses(model - centre, pixels, camera, starts)
     if not poses:
         return None
-    ambiguous = len(poses) > 1 and poses[0].reprojection_px > AMBIGUOUS * poses[1].reprojection_px
-    return BoardPose(board.name, tuple(marker.identifier for marker in used), centre, poses[0], ambiguous)
+    # A third one fits far worse.
+    return BoardPose(board.name, tuple(marker.identifier for marker in used), centre, tuple(poses[:2]))
 
 
 def _fits(fit: BoardPose | None, used: Sequence[Marker]) -> bool:

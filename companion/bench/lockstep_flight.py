@@ -322,6 +322,8 @@ class LockstepFlight:
                 continue
             camera.update(result)
             markers = self.inputs.on_result(camera, result)
+            if markers is not None and markers.vision is not None:
+                self.driver.send_vision_position(markers.vision)
             seen = seen or camera is self.inputs.steering or markers is not None
         return seen
 

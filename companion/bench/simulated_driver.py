@@ -28,6 +28,7 @@ from companion.vehicle.obstacle_distance import obstacle_distance_fields
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import VehicleState
 from companion.vehicle.telemetry import TELEMETRY_MESSAGES, apply_message
+from companion.vehicle.vision_position import VisionPosition, vision_position_fields
 from mavlink_sim.lockstep import COMPANION, LockstepVehicle
 from mavlink_sim.vehicles.ardupilot.copter import CopterVehicle
 from mavlink_sim.wire.messages import dialect
@@ -65,6 +66,9 @@ class LockstepDriver(Protocol):
 
     def send_obstacle_distance(self, sectors: ObstacleSectors) -> None:
         """One OBSTACLE_DISTANCE, now."""
+
+    def send_vision_position(self, vision: VisionPosition) -> None:
+        """One position from a map, now."""
 
     def start(self, request: Request) -> None:
         """Begin to carry out a request of guidance."""
@@ -139,6 +143,10 @@ class SimulatedDriver:
         if self._state.yaw_rad is not None:
             fields = obstacle_distance_fields(sectors, self._state.yaw_rad)
             self.vehicle.send(dialect.MAVLink_obstacle_distance_message(**fields))
+
+    def send_vision_position(self, vision: VisionPosition) -> None:
+        fields = vision_position_fields(vision)
+        self.vehicle.send(dialect.MAVLink_vision_position_estimate_message(**fields))
 
     def start(self, request: Request) -> None:
         mav, state = dialect, self._state

@@ -22,6 +22,7 @@ from companion.guidance.targets.from_detections import (
     mount_at,
     targets_from_detections,
 )
+from companion.guidance.targets.from_map import map_origin_ned_m, position_from_map
 from companion.guidance.targets.from_markers import (
     CONFIRM_FRAMES,
     CONFIRM_GAP_S,
@@ -44,8 +45,10 @@ from companion.settings import DetectorSection, Section, Settings
 from companion.settings.calibration import adopt_calibration
 from companion.settings.perception import NO_SOURCE
 from companion.vehicle.state import VehicleState
+from companion.vehicle.vision_position import VisionPosition
 from vision.camera_model import CameraCalibration
 from vision.marker_ambiguity import AmbiguityResolver
+from vision.marker_boards import MAP
 from vision.pipeline import PerceptionResult
 from vision.tracking import Selected, SelectRequest
 
@@ -53,6 +56,8 @@ logger = logging.getLogger(__name__)
 
 # A camera is unhealthy when its newest result is older than this plus its usual interval.
 _SEEING_S = 1.0
+# The fastest that positions from a map are sent; slower cameras send one for each frame with a map.
+MAX_VISION_HZ = 50.0
 
 
 class PerceptionCamera:
@@ -312,15 +317,28 @@ class MarkerTracker:
         self._seen: dict[str | None, _SeenMarkers] = {}
         # Camera and id → frames in a row with the marker, and the newest.
         self._frames: dict[tuple[str | None, int], tuple[int, int]] = {}
+        self._origins = {
+            camera.name: board.origin
+            for camera in self._detecting
+            if camera.settings.markers.localise
+            for board in camera.settings.markers.boards()
+            if board.name == MAP
+        }
+        self._vision_ns = 0
 
     def localize(
-        self, camera: PerceptionCamera, result: PerceptionResult, history: StateHistory
+        self,
+        camera: PerceptionCamera,
+        result: PerceptionResult,
+        history: StateHistory,
+        state: VehicleState | None = None,
     ) -> LocalizedMarkers:
-        """Localize the markers of one frame."""
+        """Localize the markers of one frame. `state`: the newest, for a map with an origin on the earth."""
         markers, section = result.markers or (), camera.settings.camera
         error_text, down = "", False
         targets: tuple[MarkerTarget, ...] = ()
         boards: tuple[BoardTarget, ...] = ()
+        vision = None
         try:
             # The mount first: whether the camera looks down does not depend on the vehicle's position.
             mount = mount_at(section.mount(), history, result.captured_ns)
@@ -335,11 +353,28 @@ class MarkerTracker:
             )
             targets = tuple(self._confirmed(camera.name, target) for target in targets)
             boards = board_targets(result.boards, result.captured_ns, mount, history)
+            if camera.name in self._origins and state is not None:
+                vision = self._vision(camera, result, history, state)
         except HistoryError as error:
             # As with detections: without an attitude at the capture they are published, but not targets.
             error_text = str(error)
         self._seen[camera.name] = _SeenMarkers(result.captured_ns, targets, down)
-        return LocalizedMarkers(targets, boards, error_text)
+        return LocalizedMarkers(targets, boards, error_text, vision)
+
+    def _vision(
+        self, camera: PerceptionCamera, result: PerceptionResult, history: StateHistory, state: VehicleState
+    ) -> VisionPosition | None:
+        """The vehicle's position from the map, at most `MAX_VISION_HZ` times a second."""
+        origin_ned_m = map_origin_ned_m(self._origins[camera.name], state)
+        board = next((board for board in result.boards if board.name == MAP), None)
+        early = result.captured_ns - self._vision_ns < 0.9e9 / MAX_VISION_HZ
+        if board is None or origin_ned_m is None or early:
+            return None
+        mount = camera.settings.camera.mount()
+        vision = position_from_map(board, result.captured_ns, mount, history, origin_ned_m)
+        if vision is not None:
+            self._vision_ns = result.captured_ns
+        return vision
 
     def _confirmed(self, camera: str | None, target: MarkerTarget) -> MarkerTarget:
         key = (camera, target.identifier)

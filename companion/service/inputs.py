@@ -63,6 +63,7 @@ class InputAssembler:
         self.history = StateHistory()
         self.poses = PoseSharing(settings.vehicle.name, on_event)
         self._markers = MarkerTracker(cameras)
+        self._state: VehicleState | None = None
         self._obstacles: ObstacleSectors | None = None
         self._shown: tuple[FlightMode, bool] | None = None
         self._mode_changes = 0
@@ -77,6 +78,7 @@ class InputAssembler:
         if (state.mode, state.armed) != self._shown:
             self._shown = (state.mode, state.armed)
             self._mode_changes += 1
+        self._state = state
         self.history.add(state)
 
     def _log_reports(self, state: VehicleState) -> None:
@@ -96,7 +98,7 @@ class InputAssembler:
         """Process a camera's result; returns its markers if marker detection is on."""
         markers = None
         if result.markers is not None:
-            markers = self._markers.localize(camera, result, self.history)
+            markers = self._markers.localize(camera, result, self.history, self._state)
         if camera is self.steering:
             camera.localize(result, self.history)
             if result.obstacles is not None:

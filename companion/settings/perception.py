@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from companion.settings.marker_files import read_boards
+from companion.settings.marker_files import read_boards, read_map
 from companion.settings.section import Section
 from companion.settings.texts import HEIGHT_TEXT, KEY_WORD, MARKER_TEXT
 from vision.calibration.camera_info import read_camera_info
@@ -341,10 +341,16 @@ class MarkersSection(Section):
     """other sizes: ID:SIZE; on the pad of marker PAD: ID:SIZE@PAD, off its centre ID:SIZE@PAD:RIGHT:UP"""
     boards_file: str | None = None
     """TOML file of boards, rigid sets of markers that are solved together; unset: none"""
+    map_file: str | None = None
+    """TOML file of a map: where markers are, in local NED or from an origin on the earth; unset: none"""
+    localise: bool = False
+    """send the autopilot the position that the map gives, for its estimator (VISION_POSITION_ESTIMATE)"""
 
     @model_validator(mode="after")
     def _can_be_found(self) -> Self:
         self.kind()
+        if self.localise and (self.map_file is None or self.dictionary is None):
+            raise ValueError("localise needs map_file and dictionary")
         count = None if self.dictionary is None else markers_in(self.dictionary)
         for marker in self.pad_markers():
             if marker.identifier == marker.pad or (count is not None and marker.pad >= count):
@@ -366,8 +372,9 @@ class MarkersSection(Section):
         return None if self.dictionary is None else MarkerKind(self.dictionary, self.size_m, sizes)
 
     def boards(self) -> tuple[Board, ...]:
-        """Read the boards. Raises BoardError, a ValueError."""
-        return () if self.boards_file is None else read_boards(self.boards_file)
+        """Read the boards, and the map, which is one. Raises BoardError, a ValueError."""
+        boards = () if self.boards_file is None else read_boards(self.boards_file)
+        return boards if self.map_file is None else (*boards, read_map(self.map_file))
 
     def pad_markers(self) -> tuple[PadMarker, ...]:
         """Return the markers on the pad of another one."""

@@ -37,6 +37,7 @@ from companion.vehicle.state import HEARTBEAT_MAX_AGE_S, FlightMode, VehicleStat
 from companion.vehicle.stream_requests import StreamRequests
 from companion.vehicle.telemetry import Fields
 from companion.vehicle.telemetry_state import TelemetryState
+from companion.vehicle.vision_position import VisionPosition, vision_position_fields
 from vision.obstacle_sectors import ObstacleSectors
 
 logger = logging.getLogger(__name__)
@@ -448,6 +449,11 @@ class AutopilotDriver(ABC):
         yaw_rad = self._telemetry.state.yaw_rad
         if self._link is not None and self._system_id is not None and yaw_rad is not None:
             self._send_message("OBSTACLE_DISTANCE", obstacle_distance_fields(sectors, yaw_rad))
+
+    def send_vision_position(self, vision: VisionPosition) -> None:
+        """See Driver."""
+        if self._link is not None and self._system_id is not None:
+            self._send_message("VISION_POSITION_ESTIMATE", vision_position_fields(vision))
 
     # --- commands -----------------------------------------------------------------------------------
 

@@ -14,6 +14,7 @@ from companion.vehicle.gimbal import Address, GimbalAim
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, VehicleState
+from companion.vehicle.vision_position import VisionPosition
 from vision.obstacle_sectors import ObstacleSectors
 
 # Called with every piece of bytes on the link: whether we sent it, and the bytes. Must return at once.
@@ -94,6 +95,9 @@ class Driver(Protocol):
 
     def send_obstacle_distance(self, sectors: ObstacleSectors) -> None:
         """Send one OBSTACLE_DISTANCE now, relative to the vehicle's nose. Not without a yaw."""
+
+    def send_vision_position(self, vision: VisionPosition) -> None:
+        """Send one VISION_POSITION_ESTIMATE now. Never raises for a lost link."""
 
     def send_heartbeat(
         self, status: SystemStatus, *, uptime_s: float | None = None, in_command: bool = False

@@ -11,6 +11,7 @@ from mavlink_sim.autopilot.commander import Autopilot
 from mavlink_sim.faults.grammar import Fault
 from mavlink_sim.physics.airframe import Multirotor, Vector
 from mavlink_sim.physics.estimate_errors import FallibleEstimate
+from mavlink_sim.physics.vision_aiding import VisionAiding
 from mavlink_sim.wire.link_faults import LinkStage
 from mavlink_sim.wire.links import Link
 from mavlink_sim.wire.messages import Outgoing
@@ -80,6 +81,7 @@ class FaultTarget(Protocol):
     autopilot: Autopilot
     airframe: Multirotor
     estimate: FallibleEstimate
+    vision: VisionAiding
 
     @property
     def faults(self) -> FaultState: ...

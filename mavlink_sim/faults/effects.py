@@ -284,18 +284,27 @@ _DO_SET_MODE = 176
 
 
 def gps_loss(vehicle: FaultTarget, one: ActiveFault) -> None:
-    """No fix: dead reckoning drifts for 5 s, then the position is invalid until shortly after the end."""
+    """No fix: dead reckoning drifts for 5 s, then the position is invalid until shortly after the end.
+
+    While vision is fused nothing drifts, and the 5 s begin after it.
+    """
     estimate, faults = vehicle.estimate, vehicle.faults
     angle = random.Random(one.seed).uniform(0.0, math.tau)
     north, east = DEAD_RECKONING_BIAS_MPS2 * math.cos(angle), DEAD_RECKONING_BIAS_MPS2 * math.sin(angle)
-    began_s = faults.now_s
+    began_s, drifted_m = faults.now_s, 0.0
     estimate.fix_lost += 1
     vehicle.autopilot.texts.append(Text(WARNING, "GNSS data fusion stopped\t"))
 
     def each_step(dt_s: float) -> None:
+        nonlocal began_s, drifted_m
         since_s = faults.now_s - began_s
-        if since_s < DEAD_RECKONING_S:
-            drift = since_s * since_s / 2.0
+        drift = drifted_m + since_s * since_s / 2.0
+        if vehicle.vision.position_fused:
+            if since_s > dt_s:
+                drifted_m = min(drift, drifted_m + DEAD_RECKONING_S**2 / 2.0)
+            began_s = faults.now_s
+            vehicle.estimate.set_error(one.number, (north * drifted_m, east * drifted_m, 0.0))
+        elif since_s < DEAD_RECKONING_S:
             error = (north * drift, east * drift, 0.0)
             vehicle.estimate.set_error(one.number, error, (north * since_s, east * since_s, 0.0))
         elif estimate.held_xy_m is None:
@@ -317,6 +326,7 @@ def _fuse_again(vehicle: FaultTarget, number: int) -> None:
     estimate.set_error(number, None)
     if estimate.fix_lost:
         return
+    vehicle.vision.on_gnss()
     if estimate.held_xy_m is not None:
         estimate.held_xy_m = None
         estimate.position_valid = vehicle.autopilot.position_valid = True

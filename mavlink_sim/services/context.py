@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Protocol
 
+from mavlink_sim.physics.vision_aiding import VisionAiding
 from mavlink_sim.releases import Release
 from mavlink_sim.services.event_protocol import EventContext
 from mavlink_sim.services.file_transfer import FileContext
@@ -24,13 +25,14 @@ class ServiceContext(EventContext, FileContext, GimbalContext, Protocol):
 
     Attributes:
         links: by name. clock_ns: the boot clock of TIMESYNC. utc_ns: the time of SYSTEM_TIME.
-        release: the PX4 release to be like.
+        release: the PX4 release to be like. vision: what takes positions from a camera.
     """
 
     links: dict[str, Link]
     clock_ns: Callable[[], int]
     utc_ns: Callable[[], int]
     release: Release
+    vision: VisionAiding
 
     @property
     def faults(self) -> CommandFilter: ...

@@ -122,6 +122,14 @@ def _timesync(vehicle: ServiceContext, link: Link, message: Any) -> None:
         link.send(dialect.MAVLink_timesync_message(vehicle.clock_ns(), message.ts1))
 
 
+def _vision_position(vehicle: ServiceContext, link: Link, message: Any) -> None:
+    covariance = message.covariance
+    variances = (covariance[0], covariance[6], covariance[11], covariance[20])
+    position = (message.x, message.y, message.z)
+    vehicle.vision.add(vehicle.boot_us / 1e6, position, message.yaw, variances, message.reset_counter)
+    vehicle.autopilot.position_valid = vehicle.estimate.position_valid
+
+
 def _setup_signing(vehicle: ServiceContext, link: Link, message: Any) -> None:
     """SETUP_SIGNING: PX4 takes a key on its USB port only and answers nothing; elsewhere it is ignored."""
     if not link.signing.is_usb:
@@ -164,4 +172,5 @@ HANDLERS: dict[str, Handler] = {
     **dict.fromkeys(mission_transfer.MESSAGES, mission_transfer.handle),
     "LANDING_TARGET": mission_link.landing_target,
     "OBSTACLE_DISTANCE": mission_link.obstacle_distance,
+    "VISION_POSITION_ESTIMATE": _vision_position,
 }

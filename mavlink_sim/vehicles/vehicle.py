@@ -24,6 +24,7 @@ from mavlink_sim.physics.estimate_errors import FallibleEstimate
 from mavlink_sim.physics.gaussian import BITS, NORMAL
 from mavlink_sim.physics.geography import LocalFrame
 from mavlink_sim.physics.gimbal import Gimbal
+from mavlink_sim.physics.vision_aiding import VisionAiding
 from mavlink_sim.px4.modes import Mode
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.releases import NEWEST, release_named
@@ -222,6 +223,7 @@ class Vehicle:
             on_event=self._on_event,
         )
         self.autopilot.position_valid = self.estimate.position_valid
+        self.vision = VisionAiding(self.estimate, self.parameters)
         self.events = EventBuffer()
         self._ping_sequence = itertools.count()
         self._companion_seen_s: float | None = None
@@ -473,6 +475,7 @@ class Vehicle:
             estimate.refresh()
             self.autopilot.update(CONTROL_STEP_S)
             mission_link.update(self)
+            self.vision.update(self.now_s)
             if self.gimbal_manager is not None:
                 self.gimbal_manager.step(CONTROL_STEP_S)
             self._check_companion()

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from companion.guidance.targets.from_detections import Pose, StateHistory, mount_at
 from companion.guidance.targets.target import RangeSource, Target
 from companion.vehicle.state import Quaternion, Vector3
+from companion.vehicle.vision_position import VisionPosition
 from vision.camera_model import CameraModel, CameraMount
 from vision.marker_ambiguity import AmbiguityResolver
 from vision.marker_boards import BoardPose
@@ -154,12 +155,14 @@ class LocalizedMarkers:
     Attributes:
         targets: one per marker, in their order; empty if `error` gives the reason.
         boards: the boards; empty too.
+        vision: the vehicle's position from the map, for the autopilot; None: none, or not asked for.
         error: why they have no position; empty if they have.
     """
 
     targets: tuple[MarkerTarget, ...]
     boards: tuple[BoardTarget, ...] = ()
     error: str = ""
+    vision: VisionPosition | None = None
 
 
 @dataclass(frozen=True, slots=True)

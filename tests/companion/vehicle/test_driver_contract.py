@@ -14,6 +14,7 @@ import pytest
 from companion.vehicle.driver import CommandRefusedError, Driver
 from companion.vehicle.drivers import DriverKind, open_driver
 from companion.vehicle.state import FlightMode, HeightSource, LandedState, VehicleState
+from companion.vehicle.vision_position import VisionPosition
 from mavlink_sim.testing import RunningSimulator, running_simulator
 from tests.companion.vehicle.fake_autopilot import streaming, wait_for_state, wait_until
 
@@ -140,3 +141,23 @@ async def test_two_vehicles_are_independent(kind: DriverKind) -> None:
             assert first.state.altitude_m is not None
             assert first.state.altitude_m < 0.5
             await second.set_mode(FlightMode.LAND)
+
+
+async def test_vision_position_reaches_the_estimator(kind: DriverKind) -> None:
+    covariance = tuple(0.01 if index in (0, 6, 11, 15, 18, 20) else 0.0 for index in range(21))
+    with running_simulator(parameters={"EKF2_EV_CTRL": 1}) as simulator:
+        async with connected(kind, simulator) as driver:
+            await wait_for_state(driver, complete)
+            simulator.fault("gps_loss")
+            until_s = time.monotonic() + 10.0
+            while time.monotonic() < until_s:
+                now_ns = time.monotonic_ns()
+                driver.send_vision_position(
+                    VisionPosition(now_ns, (3.0, -2.0, 0.0), (0.0, 0.0, 0.0), covariance)
+                )
+                await asyncio.sleep(0.04)
+                state = driver.state
+                if math.hypot(*state.reset_offset_ned_m[:2]) > 3.0:
+                    break
+            north, east, _ = driver.state.reset_offset_ned_m
+            assert (north, east) == pytest.approx((3.0, -2.0), abs=0.6)

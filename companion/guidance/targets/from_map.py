@@ -1,0 +1,104 @@
+"""The vehicle's position from a map of markers.
+
+The fit of the map's markers gives the camera's pose with its covariance. Tilt and position are strongly
+correlated in it, and of a single marker seen face on the tilt is nearly unknown; the autopilot knows its tilt
+well. So that tilt is fused (a Kalman update), and of two poses that fit, the one nearer to it is used. The
+heading is the map's alone.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.geometry.geodesy import north_east
+from companion.guidance.targets.from_detections import StateHistory, mount_at
+from companion.vehicle.state import Vector3, VehicleState
+from companion.vehicle.vision_position import VisionPosition
+from vision.attitude import euler_from_quaternion
+from vision.camera_model import CameraMount
+from vision.marker_boards import BoardPose, cross_matrix
+from vision.markers import MarkerPose
+from vision.rotation import quaternion_from_matrix
+
+# One sigma of the autopilot's tilt and of the camera's mount.
+TILT_SIGMA_RAD = np.radians(1.0)
+# A pose whose tilt differs from the autopilot's by more is wrong.
+FARTHEST_TILT_RAD = np.radians(15.0)
+
+
+def map_origin_ned_m(origin: tuple[float, float, float] | None, state: VehicleState) -> Vector3 | None:
+    """The origin of a map in the autopilot's local NED; None: its position on the earth is not known.
+
+    Args:
+        origin: latitude, longitude in degrees, altitude above mean sea level; None: that of local NED.
+    """
+    if origin is None:
+        return (0.0, 0.0, 0.0)
+    values = (state.latitude_deg, state.longitude_deg, state.altitude_amsl_m)
+    if state.position_ned_m is None or not np.isfinite(values).all():
+        return None
+    # The two positions have different stamps.
+    later_s = (state.global_ns - state.position_ns) / 1e9
+    velocity = state.velocity_ned_mps or (0.0, 0.0, 0.0)
+    moved = zip(state.position_ned_m, state.reset_offset_ned_m, velocity, strict=True)
+    north, east, down = (place + offset + speed * later_s for place, offset, speed in moved)
+    away_north, away_east = north_east((state.latitude_deg, state.longitude_deg), origin[:2])
+    return (north + away_north, east + away_east, down + state.altitude_amsl_m - origin[2])
+
+
+def position_from_map(
+    board: BoardPose, captured_ns: int, mount: CameraMount, history: StateHistory, origin_ned_m: Vector3
+) -> VisionPosition | None:
+    """The vehicle's pose from the pose of a map; None: none agrees with the autopilot's tilt.
+
+    Raises:
+        HistoryError: the pose of the vehicle or its gimbal at `captured_ns` is unknown.
+    """
+    ned_from_body = history.at(captured_ns).ned_from_body
+    mount = mount_at(mount, history, captured_ns)
+    ned_from_optical = mount.ned_from_optical(ned_from_body)
+    down_optical = ned_from_optical[2]
+    fit = min(board.poses, key=lambda pose: _tilt_rad(pose, down_optical))
+    if _tilt_rad(fit, down_optical) > FARTHEST_TILT_RAD:
+        return None
+    centre, rotation, covariance = _with_tilt(fit, down_optical)
+    map_from_optical = rotation.T
+    # Derivatives of the camera's position, and of a rotation about the map's axes, by the fit's errors.
+    jacobian = np.zeros((6, 6))
+    jacobian[:3, :3] = -map_from_optical
+    jacobian[:3, 3:] = -map_from_optical @ cross_matrix(centre)
+    jacobian[3:, 3:] = -map_from_optical
+    body_from_optical = ned_from_body.T @ ned_from_optical
+    attitude = map_from_optical @ body_from_optical.T
+    position = board.centre_m - map_from_optical @ centre - attitude @ mount.position_frd_m + origin_ned_m
+    spread = jacobian @ covariance @ jacobian.T
+    return VisionPosition(
+        captured_ns,
+        (float(position[0]), float(position[1]), float(position[2])),
+        euler_from_quaternion(quaternion_from_matrix(attitude)),
+        tuple(spread[np.triu_indices(6)].tolist()),
+    )
+
+
+def _tilt_rad(pose: MarkerPose, down_optical: NDArray[np.float64]) -> float:
+    """Angle between a map's down and the autopilot's."""
+    return float(np.arccos(np.clip(pose.rotation[:, 2] @ down_optical, -1.0, 1.0)))
+
+
+def _with_tilt(
+    pose: MarkerPose, down_optical: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Position, rotation `optical_from_map` and covariance of a pose after the autopilot's tilt is fused."""
+    down = pose.rotation.T @ down_optical
+    # A rotation of the map by e turns its down by e x down: the two components that a tilt shows.
+    measured = np.array([down[1], -down[0]])
+    model = np.zeros((2, 6))
+    model[:, 3:] = -pose.rotation.T[:2]
+    spread = model @ pose.covariance @ model.T + np.eye(2) * TILT_SIGMA_RAD**2
+    gain = np.linalg.solve(spread, model @ pose.covariance).T
+    change = gain @ measured
+    covariance = (np.eye(6) - gain @ model) @ pose.covariance
+    rotation = cv2.Rodrigues(change[3:])[0] @ pose.rotation
+    return pose.position_camera_m + change[:3], rotation, (covariance + covariance.T) / 2
