@@ -23,6 +23,12 @@ MAP = "map"
 AMBIGUOUS = 0.5
 # A fit starts from the poses of so many markers, the largest in the image.
 _START_MARKERS = 2
+# Trace of the rotation between two starts that are 10° apart.
+_TURNED_TRACE = 1.0 + 2.0 * math.cos(math.radians(10.0))
+
+
+# Rotation `optical_from_board`, and position.
+_Start = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,11 +124,30 @@ def _fit(board: Board, used: Sequence[Marker], camera: CameraModel) -> BoardPose
         for marker in used[:_START_MARKERS]
         for pose in marker.poses
     ]
+    if len(used) > 1:
+        starts = _promising(starts, model - centre, pixels, camera)
     poses = fit_poses(model - centre, pixels, camera, starts)
     if not poses:
         return None
     # A third one fits far worse.
     return BoardPose(board.name, tuple(marker.identifier for marker in used), centre, tuple(poses[:2]))
+
+
+def _promising(
+    starts: Sequence[_Start],
+    model: NDArray[np.float64],
+    pixels: NDArray[np.float64],
+    camera: CameraModel,
+) -> list[_Start]:
+    """The start with the least error, and the best of those that are turned from it: fits take time."""
+
+    def error_px(start: _Start) -> float:
+        error = camera.project(model @ start[0].T + start[1]) - pixels
+        return float(np.nan_to_num(np.square(error), nan=1e6).sum())
+
+    best, *others = sorted(starts, key=error_px)
+    turned = [other for other in others if np.trace(best[0].T @ other[0]) < _TURNED_TRACE]
+    return [best, *turned[:1]]
 
 
 def _fits(fit: BoardPose | None, used: Sequence[Marker]) -> bool:
@@ -135,9 +160,7 @@ def _error_px(fit: BoardPose | None) -> float:
     return math.inf if fit is None else fit.pose.reprojection_px
 
 
-def _start(
-    marker: Marker, pose: MarkerPose, corners_m: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _start(marker: Marker, pose: MarkerPose, corners_m: NDArray[np.float64]) -> _Start:
     """The board's pose that follows from that of one of its markers: (3, 3) rotation, (3,) position."""
     right, up = corners_m[1] - corners_m[0], corners_m[0] - corners_m[3]
     right, up = right / np.linalg.norm(right), up / np.linalg.norm(up)
