@@ -250,7 +250,7 @@ class Command(ABC):
         if self.either and len(given) != 1:
             wanted = " or ".join(self.either)
             if given:
-                raise GrammarError(f"{self.word}: give either {wanted}, got {' and '.join(given)}")
+                raise GrammarError(f"{self.word}: give either {wanted}, got {both_of(given)}")
             raise GrammarError(f"{self.word}: {wanted} is missing")
 
     @abstractmethod
@@ -282,6 +282,11 @@ class Command(ABC):
             bare = index == 0 and (field.default is MISSING or isinstance(argument, ClassName))
             words.append(written if bare else f"{argument.key}={written}")
         return " ".join(words)
+
+
+def both_of(keys: Sequence[str]) -> str:
+    """Keys of which only one may be given, in words."""
+    return f"{'both ' if len(keys) == 2 else ''}{' and '.join(keys)}"
 
 
 def arguments_of(kind: type[Command]) -> list[tuple[Field[Any], Argument]]:

@@ -23,6 +23,7 @@ from companion.guidance.command import (
     Number,
     TrackId,
     behaviour,
+    both_of,
 )
 from companion.guidance.motion import (
     STOPPING_MPS2,
@@ -97,8 +98,8 @@ class Orbit(Command):
     def __post_init__(self) -> None:
         super().__post_init__()
         given = {"class": self.class_name or None, "track": self.track_id, "marker": self.marker_id}
-        if len(both := [key for key, value in given.items() if value is not None]) > 1:
-            raise GrammarError(f"orbit: give either class or track or marker, got {' and '.join(both)}")
+        if len(keys := [key for key, value in given.items() if value is not None]) > 1:
+            raise GrammarError(f"orbit: give either class or track or marker, got {both_of(keys)}")
         fastest = math.sqrt(MAX_CENTRIPETAL_MPS2 * self.radius_m)
         if self.speed_mps > fastest:
             raise GrammarError(

@@ -85,13 +85,13 @@ def test_errors_name_what_to_give(text: str, parts: list[str]) -> None:
 
 
 def test_help_and_schema_show_the_choice() -> None:
-    assert usage(Follow).startswith("follow CLASS|track=… [distance=8]")
+    assert usage(Follow).startswith("follow CLASS|track=…|marker=… [distance=8]")
     schema = json_schema()["$defs"]["follow"]
     assert schema["required"] == []
-    assert schema["oneOf"] == [{"required": ["class"]}, {"required": ["track"]}]
+    assert schema["oneOf"] == [{"required": [key]} for key in ("class", "track", "marker")]
     assert schema["properties"]["track"]["type"] == "integer"
     assert (
-        "| `track` | follow this track, instead of a class | a track_id | class or track required |"
+        "| `track` | follow this track, instead of a class | a track_id | class or track or marker required |"
         in markdown()
     )
 
@@ -276,9 +276,9 @@ def test_unconfirmed_track_is_not_flown_to() -> None:
     assert "not confirmed" in outcome.reason
 
 
-def test_wanted_is_a_class_or_a_track() -> None:
-    for wrong in ({}, {"class_name": "car", "track_id": 1}):
-        with pytest.raises(ValueError, match="a class or a track"):
+def test_wanted_is_a_class_a_track_or_a_marker() -> None:
+    for wrong in ({}, {"class_name": "car", "track_id": 1}, {"track_id": 1, "marker_id": 7}):
+        with pytest.raises(ValueError, match="one of class, track and marker"):
             Wanted(**wrong)  # type: ignore[arg-type]
 
 

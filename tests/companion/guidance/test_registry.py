@@ -103,7 +103,7 @@ def test_schema_has_every_command_and_its_ranges() -> None:
     assert set(schema["$defs"]) == set(COMMANDS)
     approach = schema["$defs"]["approach"]
     assert schema["$defs"]["seek"]["required"] == ["class"]
-    assert approach["oneOf"] == [{"required": ["class"]}, {"required": ["track"]}]
+    assert approach["oneOf"] == [{"required": ["class"]}, {"required": ["track"]}, {"required": ["marker"]}]
     assert approach["properties"]["class"]["enum"] == ["car", "dog"]
     assert approach["properties"]["distance"] == {
         "type": "number",
