@@ -11,7 +11,9 @@ over a flight.
 
 The truth of a detection is a point in the direction of the object's middle, at the range of the nearest point
 of its surface; the object is the one whose true box agrees best. Of a track it is the mean of those, weighted
-as the track's position is. The range is the mean of the ranges.
+as the track's position is. A part of a long object, where the image's edge or another object hides the rest,
+has its middle elsewhere: so the distance to the object's footprint is printed too, 0 on it. The range is the
+mean of the ranges.
 """
 
 from __future__ import annotations
@@ -34,7 +36,7 @@ from companion.vehicle.state import Vector3
 from mavlink_sim.camera.renderer import Rendered
 from mavlink_sim.lockstep import LockstepVehicle
 from mavlink_sim.world.mesh import surface_range_to
-from mavlink_sim.world.world import WorldObject
+from mavlink_sim.world.world import WorldObject, range_to
 from vision.camera_model import CameraModel, CameraMount
 from vision.tracking.association import overlaps
 
@@ -56,7 +58,8 @@ class Located:
     """One track against the truth.
 
     Attributes:
-        error_m: of the fused position; single_m: median of its detections. range_m: mean of its detections.
+        error_m: of the fused position. off_m: its distance to the object's footprint.
+        single_m: median error of its detections. range_m: mean of them.
         moving: it was taken for moving.
         within_95: the truth is in the 95 % ellipse.
     """
@@ -65,6 +68,7 @@ class Located:
     count: int
     range_m: float
     error_m: float
+    off_m: float
     single_m: float
     moving: bool
     within_95: bool
@@ -138,18 +142,21 @@ def _located(fused: FusedPosition, seen: list[tuple[Target, Vector3, Rendered]])
         for target, truth in of_object
         if target.position_ned_m is not None
     ]
-    weights = [np.linalg.inv(target.position_covariance) for target, _ in of_object]
+    covariances = [target.position_covariance for target, _ in of_object]
+    weights = [np.linalg.inv(each) for each in covariances if each is not None]
     weighted = sum(weight @ truth for weight, (_, truth) in zip(weights, of_object, strict=True))
     truth = of_object[-1][1] if fused.moving else np.linalg.solve(sum(weights), weighted)
     error = np.array(fused.position_ned_m[:2]) - truth
     major_m, minor_m, orientation = fused.ellipse
     axis = np.array((math.cos(orientation), math.sin(orientation)))
     along, across = error @ axis, error @ (-axis[1], axis[0])
+    item = next(item for item in shown if item.identifier == identifier)
     return Located(
-        next(item.class_name for item in shown if item.identifier == identifier),
+        item.class_name,
         len(of_object),
         round(float(np.mean([target.ground_range_m for target, _ in of_object])), 2),
         round(math.hypot(*error), 3),
+        round(range_to(item, fused.position_ned_m), 3),
         round(float(np.median(singles)), 3),
         fused.moving,
         bool((along / major_m) ** 2 + (across / minor_m) ** 2 <= CHI_SQUARED_95),
@@ -177,6 +184,7 @@ def summary(found: list[Located]) -> dict[str, float]:
     """Medians and 95th percentiles."""
     share = np.array([each.error_m / each.range_m for each in found])
     errors = np.array([each.error_m for each in found])
+    off = np.array([each.off_m / each.range_m for each in found])
     singles = np.array([each.single_m / each.range_m for each in found])
     return {
         "tracks": len(found),
@@ -185,6 +193,9 @@ def summary(found: list[Located]) -> dict[str, float]:
         "median_of_range": round(float(np.median(share)), 4),
         "p95_of_range": round(float(np.percentile(share, 95)), 4),
         "within_3_percent": round(float(np.mean(share <= 0.03)), 3),
+        "off_median_of_range": round(float(np.median(off)), 4),
+        "off_p95_of_range": round(float(np.percentile(off, 95)), 4),
+        "off_within_3_percent": round(float(np.mean(off <= 0.03)), 3),
         "single_median_of_range": round(float(np.median(singles)), 4),
         "within_95_ellipse": round(float(np.mean([each.within_95 for each in found])), 3),
     }

@@ -266,6 +266,7 @@ def _detections(sequence: int) -> DetectionsBody:
         "latitude_deg": 47.39781404,
         "longitude_deg": 8.54560773,
         "altitude_amsl_m": 490.41,
+        "error_ellipse": {"semi_major_m": 0.42, "semi_minor_m": 0.36, "orientation_rad": 0.0512},
     }
     now_ns = time.monotonic_ns()
     return {

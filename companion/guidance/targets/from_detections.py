@@ -346,6 +346,7 @@ def _target(
         trusted=trusted and detection.get("track_state") in (None, TRACK_CONFIRMED),
         depth_m=math.nan if detection["depth_m"] is None else detection["depth_m"],
         distance_m=math.hypot(*offset),
+        cut=box.cut,
         range_sigma_m=sigma_m,
         across_sigma_m=across_sigma_m(*_range_and_drop(offset, sight.lens), box, pose.error),
         vehicle_sigma_m=pose.error.horizontal_m,

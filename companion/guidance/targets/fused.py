@@ -16,7 +16,7 @@ from vision.geolocation import ErrorEllipse
 
 # An object moves if its estimated speed exceeds this and so many sigma. Errors of the range of a vehicle that
 # flies towards a standing object show as some tenths of its own speed.
-MOVING_MPS, MOVING_SIGMA = 0.8, 3.0
+MOVING_MPS, MOVING_SIGMA = 1.0, 3.0
 # A track that was not seen for this long has ended (`tracker.max_age_s` is less by default).
 FORGET_S = 60.0
 
@@ -108,6 +108,8 @@ class FusedTracks:
     def update(self, targets: Sequence[Target], vehicle: Vector3, now_ns: int) -> None:
         """Add the targets of one frame.
 
+        Where the image's edge cuts a box off, an object seems to move: such a target only begins a track.
+
         Args:
             vehicle: its position at the capture, local NED.
             now_ns: the capture.
@@ -119,7 +121,7 @@ class FusedTracks:
             track = self._tracks.get(target.track_id)
             if track is None:
                 self._tracks[target.track_id] = _Track(target, vehicle, covariance)
-            elif target.captured_ns > track.captured_ns:
+            elif target.captured_ns > track.captured_ns and not target.cut:
                 track.update(target, vehicle, covariance)
         ended = [key for key, track in self._tracks.items() if now_ns - track.captured_ns > FORGET_S * 1e9]
         for key in ended:

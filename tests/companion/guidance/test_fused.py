@@ -139,6 +139,16 @@ def test_standing_object_seen_from_a_moving_vehicle_stands() -> None:
     assert not position_of(tracks).moving
 
 
+def test_object_that_leaves_the_image_keeps_its_position() -> None:
+    tracks, vehicle = FusedTracks(), (0.0, 0.0, -5.0)
+    for frame in range(40):
+        leaving = max(frame - 20, 0)
+        target = replace(seen(vehicle, (12.0, 0.2 * leaving), frame, sigma_m=0.5), cut=leaving > 0)
+        tracks.update([target], vehicle, target.captured_ns)
+    assert position_of(tracks).position_ned_m[:2] == pytest.approx((12.0, 0.0))
+    assert not position_of(tracks).moving
+
+
 def test_only_trusted_tracks_with_a_range_are_fused() -> None:
     tracks, vehicle = FusedTracks(), (0.0, 0.0, -5.0)
     target = seen(vehicle, (10.0, 0.0), 0)

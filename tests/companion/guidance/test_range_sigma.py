@@ -76,7 +76,8 @@ def random_view(rng: np.random.Generator) -> View:
 
 
 def pixel(view: View, point: Vector) -> Vector:
-    return CAMERA.project(point @ view.ned_from_optical)[0]
+    x, y = CAMERA.project(point @ view.ned_from_optical)[0]
+    return np.array((x, y))
 
 
 def edge_px(rng: np.random.Generator, height_px: float) -> float:
@@ -131,7 +132,7 @@ def by_size(view: View, rng: np.random.Generator) -> Ranged:
 
 def slope_of(view: View, x: float, y: float) -> float:
     north, east, down = CAMERA.rays(np.array((x, y)))[0] @ view.ned_from_optical.T
-    return -down / math.hypot(north, east)
+    return float(-down / math.hypot(north, east))
 
 
 def ranged_target(view: View, ranged: Ranged, rng: np.random.Generator) -> Target:
@@ -203,7 +204,6 @@ def test_two_thirds_of_the_errors_are_within_one_sigma(
     true_m, in_sigma = errors(source, measure, seed=23)
     within = np.abs(in_sigma) <= 1.0
     near = true_m < np.median(true_m)
-    print(source, within.mean(), within[near].mean(), within[~near].mean(), np.median(in_sigma))
     for share in (within.mean(), within[near].mean(), within[~near].mean()):
         assert 0.63 <= share <= 0.73
     assert abs(float(np.median(in_sigma))) < 0.15

@@ -227,6 +227,7 @@ def test_box_cut_by_the_edge_has_a_larger_sigma() -> None:
         history,
     )
     assert cut.range_sigma_m > whole.range_sigma_m + 0.05
+    assert (whole.cut, cut.cut) == (False, True)
 
 
 @given(scene=scenes, tall_m=st.floats(0.8, 4.0))
