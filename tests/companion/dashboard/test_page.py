@@ -181,10 +181,8 @@ def pictures(tab: Tab) -> list[dict[str, Any]]:
 
 
 def most_at_once(requests: list[dict[str, Any]]) -> int:
-    return max(
-        sum(one["startTime"] <= other["startTime"] < one["responseEnd"] for one in requests)
-        for other in requests
-    )
+    spans: list[tuple[float, float]] = [(one["startTime"], one["responseEnd"]) for one in requests]
+    return max(sum(begun <= at < ended for begun, ended in spans) for at, _ in spans)
 
 
 def test_cameras_take_turns_and_stop_has_a_free_connection(browser: Browser) -> None:
