@@ -287,6 +287,7 @@ def test_page_of_a_fleet_switches_the_vehicle_and_stops_all(browser: Browser) ->
         assert tab.value(f"{far}; state.trails.get('other').length") == 300
         tab.value("document.querySelectorAll('#fleet button')[1].click()")
         until(f"{text('#vehicle', 'textContent')} === 'vehicle2' && location.search === '?vehicle=vehicle2'")
+        until("state.at > 0 && state.vehicles.length === 2")  # of the new stream
         until(f"{text('#map', 'ariaLabel')}.includes('car vehicle1 #7, vehicle2 #3')")
         until(f"{text('#map', 'ariaLabel')}.includes('vehicle 2 m north and 1 m east of home')")
         tab.value("document.querySelector('[data-command=land]').click()")
