@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vision.calibration.boards import Board, BoardView
-from vision.calibration.calibrate import CalibrationError, CalibrationResult
+from vision.calibration.calibrate import CalibrationError, CalibrationResult, covers_image
 from vision.calibration.views import EDGES, ViewCollector
 from vision.camera_model import CameraModel, scaled_to_frames
 from vision.frame import Frame
@@ -145,6 +145,7 @@ def result_lines(result: CalibrationResult) -> list[str]:
         f"cx {model.cx:.2f} +- {sigmas[2]:.2f}, cy {model.cy:.2f} +- {sigmas[3]:.2f} px (one sigma)",
         f"distortion {', '.join(f'{value:.5f}' for value in model.coefficients)}",
         f"reprojection {result.rms_px:.3f} px RMS; on held-out views: {held_out}",
+        *(() if covers_image(model) else ("the image's corners have no rays: add views of the board there",)),
     ]
 
 

@@ -55,7 +55,8 @@ def calibrate(views: Sequence[BoardView]) -> CalibrationResult:
     """Calibrate a lens.
 
     Views whose error stands out are rejected. The distortion model is plumb_bob, unless another one is at
-    least 10 % better on held-out views.
+    least 10 % better on held-out views. The same holds for a model that leaves pixels of the image without a
+    ray, compared with those that do not.
 
     Args:
         views: of images of one size, see `ViewCollector`.
@@ -76,7 +77,7 @@ def calibrate(views: Sequence[BoardView]) -> CalibrationResult:
         _check_count(len(used), f", after {len(rejected)} with wrong corners were rejected")
         fits = _fits(used, {kind: found.model for kind, found in fits.items()})
     held_out = {kind: _held_out_px(found, used) for kind, found in fits.items()}
-    result = fits[_chosen(held_out)]
+    result = fits[_chosen(fits, held_out)]
     focal_sigma = float(max(result.sigmas[0] / result.model.fx, result.sigmas[1] / result.model.fy))
     if not focal_sigma < WORST_FOCAL:
         raise CalibrationError(
@@ -86,10 +87,14 @@ def calibrate(views: Sequence[BoardView]) -> CalibrationResult:
     return CalibrationResult(result.model, tuple(used), result, tuple(rejected), held_out)
 
 
-def _chosen(held_out_px: dict[DistortionModel, float]) -> DistortionModel:
-    chosen, *others = held_out_px
+def _chosen(fits: dict[DistortionModel, Fit], held_out_px: dict[DistortionModel, float]) -> DistortionModel:
+    covering = [kind for kind, found in fits.items() if covers_image(found.model)]
+    chosen, *others = covering or fits
     for kind in others:
         if held_out_px[kind] <= (BETTER if chosen == PLUMB_BOB else BETTER_OF_OTHERS) * held_out_px[chosen]:
+            chosen = kind
+    for kind in fits:
+        if kind not in covering and held_out_px[kind] <= BETTER * held_out_px[chosen]:
             chosen = kind
     return chosen
 
@@ -104,18 +109,16 @@ def _check_count(count: int, after: str) -> None:
 def _fits(
     views: Sequence[BoardView], starts: dict[DistortionModel, CameraModel] | None = None
 ) -> dict[DistortionModel, Fit]:
-    """A fit of each distortion model that fits the views and has a ray for each pixel."""
+    """A fit of each distortion model that fits the views."""
     fits: dict[DistortionModel, Fit] = {}
     for kind in _MODELS:
         start = None if starts is None else starts.get(kind)
         if start is None and kind == "rational_polynomial" and "plumb_bob" in fits:
             start = fits["plumb_bob"].model
         try:
-            found = fit(kind, views, start)
+            fits[kind] = fit(kind, views, start)
         except ValueError:
             continue
-        if covers_image(found.model):
-            fits[kind] = found
     if not fits:
         raise CalibrationError("no lens fits the views: are the board's size and kind right?")
     return fits

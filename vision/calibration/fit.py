@@ -82,6 +82,10 @@ def fit(kind: DistortionModel, views: Sequence[BoardView], start: CameraModel | 
     rotations, positions = problem.first_poses(start)
     for free in stages:
         start, rotations, positions = problem.solve(start, rotations, positions, free)
+    # With the fitted lens a board whose first pose led to a wrong minimum may have a better one.
+    better = problem.better_poses(start, rotations, positions)
+    if better is not None:
+        start, rotations, positions = problem.solve(start, *better, count)
     return problem.result(start, rotations, positions)
 
 
@@ -129,6 +133,26 @@ class _Problem:
         """The board's poses from homographies. Raises ValueError where there is none."""
         poses = [_first_pose(view, model) for view in self.views]
         return np.array([rotation for rotation, _ in poses]), np.array([position for _, position in poses])
+
+    def better_poses(
+        self, model: CameraModel, rotations: Array, positions: Array
+    ) -> tuple[Array, Array] | None:
+        """The poses, with those from homographies where they fit much better; None: they do nowhere."""
+        try:
+            others = self.first_poses(model)
+        except ValueError:
+            return None
+        errors = [
+            np.add.reduceat((self.residuals(model, *poses) ** 2).sum(axis=1), self.starts)
+            for poses in ((rotations, positions), others)
+        ]
+        wrong = errors[1] < 0.5 * errors[0]
+        if not wrong.any():
+            return None
+        return (
+            np.where(wrong[:, None, None], others[0], rotations),
+            np.where(wrong[:, None], others[1], positions),
+        )
 
     def optical(self, rotations: Array, positions: Array) -> tuple[Array, Array]:
         """(N, 3) the corners rotated, and in the optical frame."""

@@ -10,7 +10,7 @@ import pytest
 from mavlink_sim.datasets.board_views import LENSES, BoardPose, board_poses
 from vision.calibration.boards import Board, BoardView
 from vision.calibration.calibrate import CalibrationError, calibrate, covers_image
-from vision.calibration.fit import fit
+from vision.calibration.fit import _Problem, fit
 from vision.camera_model import CameraModel
 
 BOARD = Board("chessboard", 8, 6, 0.03)
@@ -99,6 +99,20 @@ def test_views_without_tilt_do_not_determine_the_lens() -> None:
     ]
     with pytest.raises(CalibrationError, match="focal length"):
         calibrate(views_of(LENSES["plain"], 9, poses=poses))
+
+
+def test_first_poses_in_a_wrong_minimum_are_replaced() -> None:
+    true = LENSES["wide"]
+    views = views_of(true, 20, seed=4)
+    found = fit("rational_polynomial", views)
+    problem = _Problem(views)
+    poses = (found.rotations.copy(), found.positions_m.copy())
+    assert problem.better_poses(found.model, *poses) is None
+    poses[0][3] = poses[0][3] @ np.diag([-1.0, 1.0, -1.0])  # seen from behind
+    better = problem.better_poses(found.model, *poses)
+    assert better is not None
+    assert np.abs(better[0][3] - found.rotations[3]).max() < 0.1
+    assert np.array_equal(better[0][4], found.rotations[4])
 
 
 def test_lens_that_folds_the_image_does_not_cover_it() -> None:
