@@ -248,7 +248,7 @@ def _open(settings: Settings, stack: contextlib.ExitStack, sender: ResultSender)
         try:
             settings.camera.model(frame.width, frame.height)
         except ValueError as error:
-            raise SourceError(f"{settings.source.uri}: {error}") from error
+            raise SourceError(f"camera: {error}") from error
         if share is not None:
             share(frame)
 
