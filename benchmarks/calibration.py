@@ -42,7 +42,7 @@ BOARDS = (Board("chessboard", 10, 7, 0.02), Board("charuco", 10, 7, 0.02, 0.015,
 class LensError:
     """Error of one calibration: focal length in per cent, centre in pixels, reprojection in pixels RMS.
 
-    `ray_px` is the RMS error of the rays of all pixels, in pixels at the centre.
+    `ray_px` is the RMS error of the rays of all pixels that have one, in pixels at the centre.
     """
 
     seed: int
@@ -103,7 +103,7 @@ def lens_error(seed: int, views: int = VIEWS) -> LensError:
     columns, rows = np.meshgrid(np.arange(0, lens.width, 8), np.arange(0, lens.height, 8))
     pixels = np.column_stack([columns.ravel(), rows.ravel()])
     off = (model.rays(pixels) - lens.rays(pixels)) * lens.fx
-    ray_px = float(np.sqrt((off**2).sum(axis=1).mean()))
+    ray_px = float(np.sqrt(np.nanmean((off**2).sum(axis=1))))
     kind, used = model.distortion_model, len(result.views)
     return LensError(seed, name, board.kind, kind, used, 100 * focal, centre, result.rms_px, ray_px)
 
