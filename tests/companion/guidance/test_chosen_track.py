@@ -279,7 +279,7 @@ def test_unconfirmed_track_is_not_flown_to() -> None:
 def test_wanted_is_a_class_a_track_or_a_marker() -> None:
     for wrong in ({}, {"class_name": "car", "track_id": 1}, {"track_id": 1, "marker_id": 7}):
         with pytest.raises(ValueError, match="one of class, track and marker"):
-            Wanted(**wrong)  # type: ignore[arg-type]
+            Wanted(**wrong)
 
 
 def test_memory_of_tracks_is_bounded() -> None:
