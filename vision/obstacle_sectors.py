@@ -57,7 +57,20 @@ def obstacle_sectors(
     ned_from_body: NDArray[np.float64],
     height_m: float | None = None,
 ) -> ObstacleSectors:
-    """The nearest obstacle of each sector.
+    """The nearest obstacle of each sector. Arguments and errors as of `nearest_ranges`."""
+    distance = nearest_ranges(depth_m, camera, mount, ned_from_body, height_m, SECTORS)
+    return ObstacleSectors(captured_ns, tuple(distance.tolist()))
+
+
+def nearest_ranges(
+    depth_m: NDArray[np.float32],
+    camera: CameraModel,
+    mount: CameraMount,
+    ned_from_body: NDArray[np.float64],
+    height_m: float | None,
+    sectors: int,
+) -> NDArray[np.float64]:
+    """(sectors,) horizontal distances from the vehicle, metres, as `ObstacleSectors.distance_m`.
 
     Args:
         depth_m: (H, W) float32, metres along the optical axis; NaN, infinite or not above zero where unknown.
@@ -65,6 +78,7 @@ def obstacle_sectors(
         ned_from_body: (3, 3) float64, the attitude at the capture, body FRD to NED.
         height_m: of the vehicle above the ground, which limits the band; None: unknown, and the vehicle must
             be higher than 0.8 m.
+        sectors: equal parts of the circle, the first one centred on north.
 
     Raises:
         ValueError: the image's size differs from the camera's.
@@ -83,10 +97,10 @@ def obstacle_sectors(
     lens = (ned_from_body @ mount.position_frd_m).astype(np.float32)
 
     north, east, down = turn @ rays
-    sampled_sector = _sector(north, east)
+    sampled_sector = _sector(north, east, sectors)
     known = np.isfinite(depth) & (depth > 0.0)
-    counted = np.bincount(sampled_sector, minlength=SECTORS)
-    with_depth = np.bincount(sampled_sector[known], minlength=SECTORS)
+    counted = np.bincount(sampled_sector, minlength=sectors)
+    with_depth = np.bincount(sampled_sector[known], minlength=sectors)
     seen = (counted >= LEAST_POINTS) & (with_depth >= LEAST_KNOWN_SHARE * counted)
 
     below_m = BELOW_M if height_m is None else min(BELOW_M, height_m - GROUND_GAP_M)
@@ -95,10 +109,10 @@ def obstacle_sectors(
     in_band = known & (below > -ABOVE_M) & (below < below_m)
     away = depth[in_band]
     north, east = north[in_band] * away + lens[0], east[in_band] * away + lens[1]
-    distance = np.full(SECTORS, np.nan)
+    distance = np.full(sectors, np.nan)
     distance[seen] = np.inf
-    _nearest_of_each(_sector(north, east), np.hypot(north, east), distance)
-    return ObstacleSectors(captured_ns, tuple(distance.tolist()))
+    _nearest_of_each(_sector(north, east, sectors), np.hypot(north, east), distance)
+    return distance
 
 
 def _nearest_of_each(
@@ -107,21 +121,21 @@ def _nearest_of_each(
     """Write each sector's low percentile where it has enough points."""
     # One integer sort by sector, then by range: the bits of a positive float ascend with its value.
     ordered = np.sort((sector << 32) | range_m.view(np.int32))
-    counts = np.bincount(sector, minlength=SECTORS)
+    counts = np.bincount(sector, minlength=len(distance))
     firsts = np.concatenate(([0], np.cumsum(counts)[:-1]))
     enough = counts >= LEAST_POINTS
     indices = firsts + (counts * (NEAR_PERCENTILE / 100.0)).astype(np.int64)
     distance[enough] = ordered[indices[enough]].astype(np.int32).view(np.float32)
 
 
-def _sector(north: NDArray[np.float32], east: NDArray[np.float32]) -> NDArray[np.int64]:
+def _sector(north: NDArray[np.float32], east: NDArray[np.float32], sectors: int) -> NDArray[np.int64]:
     if not north.size:
         return np.zeros(0, np.int64)
     # Accurate to a hundredth of a degree, and many times faster than arctan2.
-    scaled = cv2.phase(north, east).ravel() * np.float32(1.0 / SECTOR_RAD)
+    scaled = cv2.phase(north, east).ravel() * np.float32(sectors / math.tau)
     sector: NDArray[np.int64] = np.rint(scaled).astype(np.int64)
     # A quarter of the time of a remainder. NaN became negative, and is in no band.
-    sector[(sector < 0) | (sector >= SECTORS)] = 0
+    sector[(sector < 0) | (sector >= sectors)] = 0
     return sector
 
 
