@@ -41,6 +41,7 @@ class RenderedCamera:
 
     Attributes:
         shown: the truth of the newest frame; None before the first.
+        planning: as of `RenderedPerception`.
     """
 
     def __init__(
@@ -55,6 +56,7 @@ class RenderedCamera:
         depth: bool = True,
     ) -> None:
         self._perception = RenderedPerception(settings, vehicle, scene)
+        self.planning = self._perception.planning
         self.perceived = PerceptionCamera(settings, None, self._perception.class_names or None)
         self.rate_hz, self.latency_s = rate_hz, latency_s
         self._by_flight, self._depth = by_flight, depth
@@ -63,7 +65,8 @@ class RenderedCamera:
     def on_state(self, state: VehicleState, history: StateHistory) -> None:
         """As `WorkerCamera.send_state` sends it to the worker."""
         if state.attitude is not None:
-            self._perception.add_attitude(state.attitude_ns, state.attitude, state.height_m)
+            position = None if state.position_ned_m is None else (state.position_ns, state.position_ned_m)
+            self._perception.add_attitude(state.attitude_ns, state.attitude, state.height_m, position)
         gimbal = state.gimbal
         if gimbal is not None and gimbal.attitude is not None and self.perceived.settings.camera.on_gimbal:
             with contextlib.suppress(HistoryError):
@@ -82,7 +85,12 @@ class RenderedCamera:
             if taken is None:
                 return None
             frame = taken.frame if self._depth else replace(taken.frame, depth_m=None)
-            return self._perception.process(frame, flight.now_ns)
+            result = self._perception.process(frame, flight.now_ns)
+            if (planning := self.planning) is not None:
+                if (request := self.perceived.path_request) is not None:
+                    planning.request(request, flight.now_ns)
+                self.perceived.planned = planning.update(frame, flight.now_ns) or self.perceived.planned
+            return result
 
         return finish
 

@@ -12,10 +12,16 @@ from typing import Any
 
 import cv2
 
-from companion.perception.assembly import CameraTelemetry, build_pipeline, load_detector
+from companion.perception.assembly import (
+    CameraTelemetry,
+    build_path_planning,
+    build_pipeline,
+    load_detector,
+)
 from companion.plugins import load_plugins
 from companion.settings import Settings
 from companion.settings.perception import DetectorSection, TrackerSection
+from companion.vehicle.state import Vector3
 from mavlink_sim.camera.scene import Scene
 from mavlink_sim.camera.simulated_camera import Captured, SimulatedCamera
 from mavlink_sim.lockstep import LockstepVehicle
@@ -58,6 +64,7 @@ class RenderedPerception:
 
     Attributes:
         scene: what the camera sees.
+        planning: the map and the path planning; None without `guidance.avoid`.
         class_names: of the detector; empty without one.
 
     Raises:
@@ -85,15 +92,25 @@ class RenderedPerception:
         self._pipeline = build_pipeline(
             settings, self._source, detector, self._telemetry, clock_ns=lambda: self._now_ns
         )
+        self.planning = build_path_planning(settings, self._telemetry)
 
-    def add_attitude(self, stamp_ns: int, wxyz: Quaternion, height_m: float | None) -> None:
+    def add_attitude(
+        self,
+        stamp_ns: int,
+        wxyz: Quaternion,
+        height_m: float | None,
+        position: tuple[int, Vector3] | None = None,
+    ) -> None:
         """Receive the vehicle's attitude, as the service sends it to the worker.
 
         Args:
             wxyz: `ned_from_body`. height_m: above home; None: not known.
+            position: its own stamp, and local NED metres.
         """
         self._telemetry.attitudes.add(stamp_ns, wxyz)
         self._telemetry.height_m = height_m
+        if position is not None:
+            self._telemetry.positions.add(*position)
 
     def add_gimbal(self, stamp_ns: int, wxyz: Quaternion) -> None:
         """Receive the gimbal's attitude (its frame to NED, as `StateHistory.gimbal_at` gives it)."""

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.perception.path_planning import PathPlanning, PositionHistory
 from companion.settings import Settings
 from vision.camera_model import CameraMount
 from vision.depth import nearest_points
@@ -30,10 +31,12 @@ class CameraTelemetry:
     Attributes:
         attitudes: of the vehicle, the last few seconds. height_m: the newest above home; None: unknown.
         gimbal: attitudes of the camera's gimbal; empty for a fixed camera.
+        positions: of the vehicle, the last few seconds.
     """
 
     def __init__(self) -> None:
         self.attitudes, self.gimbal = AttitudeHistory(), AttitudeHistory()
+        self.positions = PositionHistory()
         self.height_m: float | None = None
 
 
@@ -65,6 +68,14 @@ def build_pipeline(
         nearest_in=_nearest_in(settings, telemetry),
         clock_ns=clock_ns,
     )
+
+
+def build_path_planning(settings: Settings, telemetry: CameraTelemetry) -> PathPlanning | None:
+    """Build the path planning of a camera; None without `guidance.avoid`."""
+    if not settings.guidance.avoid:
+        return None
+    pose_at, model = _pose_at(settings, telemetry), settings.camera.model
+    return PathPlanning(telemetry.positions, pose_at, model, lambda: telemetry.height_m)
 
 
 def tiled(settings: Settings, detector: ObjectDetector | None) -> FrameDetector | None:

@@ -49,6 +49,7 @@ from companion.vehicle.vision_position import VisionPosition
 from vision.camera_model import CameraCalibration
 from vision.marker_ambiguity import AmbiguityResolver
 from vision.marker_boards import MAP
+from vision.path_planner import PathRequest, PlannedPath
 from vision.pipeline import PerceptionResult
 from vision.tracking import Selected, SelectRequest
 
@@ -71,6 +72,8 @@ class PerceptionCamera:
         localization_error: why they could not be localized; empty if they were.
         fused: the positions of its confirmed tracks, after `localize`.
         class_names: classes of the detector; None before it is loaded.
+        planned: the newest planned path; None before the first.
+        path_request: what path to plan, the newest request.
     """
 
     def __init__(
@@ -82,6 +85,8 @@ class PerceptionCamera:
         self.targets: tuple[Target, ...] = ()
         self.localization_error = ""
         self.fused = FusedTracks()
+        self.planned: PlannedPath | None = None
+        self.path_request: PathRequest | None = None
         self._class_names = class_names
         self._has_depth = False
         self._between_s: deque[float] = deque(maxlen=9)
@@ -140,6 +145,10 @@ class PerceptionCamera:
         """Select an object in this camera's images."""
         return Selected(False, "this camera has no perception process")
 
+    def request_path(self, request: PathRequest) -> None:
+        """Set what path to plan."""
+        self.path_request = request
+
     def update(self, result: PerceptionResult) -> None:
         """Set the newest result; `localize` sets its targets."""
         if self.newest is not None:
@@ -175,6 +184,7 @@ class WorkerCamera(PerceptionCamera):
             on_event=self._event,
             on_preview=lambda preview: on_preview(self, preview),
             on_calibration=self._adopt,
+            on_path=self._on_path,
         )
 
     @property
@@ -205,7 +215,8 @@ class WorkerCamera(PerceptionCamera):
     def send_state(self, state: VehicleState, history: StateHistory) -> None:
         """Send the attitudes of vehicle and gimbal to the worker, for its tracker."""
         if state.attitude is not None:
-            self.supervisor.send_attitude(state.attitude_ns, state.attitude, state.height_m)
+            position = None if state.position_ned_m is None else (state.position_ns, state.position_ned_m)
+            self.supervisor.send_attitude(state.attitude_ns, state.attitude, state.height_m, position)
         gimbal = state.gimbal
         if gimbal is None or not self.settings.camera.on_gimbal or gimbal.attitude is None:
             return
@@ -213,6 +224,13 @@ class WorkerCamera(PerceptionCamera):
             self._gimbal_ns = gimbal.attitude_ns
             with contextlib.suppress(HistoryError):
                 self.supervisor.send_gimbal(gimbal.attitude_ns, history.gimbal_at(gimbal.attitude_ns))
+
+    def request_path(self, request: PathRequest) -> None:
+        super().request_path(request)
+        self.supervisor.request_path(request)
+
+    def _on_path(self, planned: PlannedPath) -> None:
+        self.planned = planned
 
     def _on_report(self, result: PerceptionResult) -> None:
         self.update(result)
@@ -270,6 +288,8 @@ def open_cameras(
             # The process that shares it loads its model first.
             timeout_s = own.source.open_timeout_s + START_S
             changes["source"] = own.source.model_copy(update={"open_timeout_s": timeout_s})
+        if name != settings.guidance.camera:
+            changes["guidance"] = own.guidance.model_copy(update={"avoid": False})
         own = own.model_copy(update=changes)
         cameras.append(
             WorkerCamera(

@@ -19,8 +19,10 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from companion.settings import Settings
+from companion.vehicle.state import Vector3
 from vision.attitude import Quaternion
 from vision.camera_model import CameraCalibration
+from vision.path_planner import PathRequest, PlannedPath
 from vision.pipeline import PerceptionResult
 from vision.tracking import Selected, SelectRequest, TrackEventKind
 
@@ -50,11 +52,18 @@ class Hud:
 
 @dataclass(frozen=True, slots=True)
 class Attitude:
-    """The vehicle's attitude (w, x, y, z), body FRD to NED, at a CLOCK_MONOTONIC stamp; height above home."""
+    """The vehicle's attitude and position.
+
+    Attributes:
+        stamp_ns: of the attitude, CLOCK_MONOTONIC. wxyz: (w, x, y, z), body FRD to NED.
+        height_m: above home.
+        position: its own stamp, and local NED metres.
+    """
 
     stamp_ns: int
     wxyz: Quaternion
     height_m: float | None = None
+    position: tuple[int, Vector3] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,11 +182,13 @@ Message = (
     | GimbalAttitude
     | Watched
     | SelectRequest
+    | PathRequest
     | Stop
     | Ready
     | StartFailed
     | Report
     | Selected
+    | PlannedPath
     | Preview
     | CloudPreview
     | Heartbeat

@@ -27,6 +27,7 @@ from companion.perception.messages import (
     read_message,
 )
 from companion.settings import Settings
+from vision.path_planner import PathRequest
 from vision.tracking import SelectRequest
 
 logger = logging.getLogger(__name__)
@@ -132,6 +133,11 @@ class PerceptionProcess:
         """Send an attitude of vehicle or gimbal; skipped while an older one is unsent."""
         if not self._control.transport.get_write_buffer_size():
             self._put(attitude)
+
+    def request_path(self, request: PathRequest) -> None:
+        """Send what path to plan, as `send_attitude`."""
+        if not self._control.transport.get_write_buffer_size():
+            self._put(request)
 
     def watch(self, watched: Watched) -> None:
         """Send which previews are wanted."""

@@ -36,8 +36,10 @@ from companion.perception.process import PerceptionProcess, RateLimiter, Watchdo
 from companion.perception.standard_input import STANDARD_INPUT, StandardInput
 from companion.perception.status import LiveTracks, PerceptionState, PerceptionStatus, StageTimes
 from companion.settings import Settings
+from companion.vehicle.state import Vector3
 from vision.attitude import Quaternion
 from vision.camera_model import CameraCalibration
+from vision.path_planner import PathRequest, PlannedPath
 from vision.pipeline import PerceptionResult
 from vision.tracking import TARGET_CLASS, Selected, SelectRequest, TrackEventKind
 
@@ -90,6 +92,7 @@ class PerceptionSupervisor:
         on_event: called with a level (`info`, `warning`, `error`) and a line of text.
         on_preview: called with preview images and point clouds, while `watch` wants them.
         on_calibration: called when a worker is ready, with its camera's calibration or None.
+        on_path: called with every planned path.
     """
 
     def __init__(
@@ -100,8 +103,10 @@ class PerceptionSupervisor:
         on_event: Callable[[str, str], None],
         on_preview: Callable[[Preview | CloudPreview], None] = lambda _: None,
         on_calibration: Callable[[CameraCalibration | None], None] = lambda _: None,
+        on_path: Callable[[PlannedPath], None] = lambda _: None,
     ) -> None:
         self._settings = settings
+        self._on_path = on_path
         self._on_calibration = on_calibration
         self._on_preview = on_preview
         self._watched = Watched(False)
@@ -129,6 +134,7 @@ class PerceptionSupervisor:
         self._tracks = LiveTracks()
         self._selecting: deque[asyncio.Future[Selected]] = deque()
         self._vehicle_limiter, self._gimbal_limiter = RateLimiter(), RateLimiter()
+        self._path_limiter = RateLimiter()
 
     async def start(self) -> None:
         """Start the worker; returns when its model is loaded and its source has given a frame.
@@ -210,16 +216,28 @@ class PerceptionSupervisor:
         answer.cancel()
         return Selected(False, f"no image was processed within {SELECT_TIMEOUT_S:g} s")
 
-    def send_attitude(self, stamp_ns: int, attitude: Quaternion, height_m: float | None = None) -> None:
+    def send_attitude(
+        self,
+        stamp_ns: int,
+        attitude: Quaternion,
+        height_m: float | None = None,
+        position: tuple[int, Vector3] | None = None,
+    ) -> None:
         """Send the vehicle's attitude, for tracker and obstacles; at most 50 a second. Never waits.
 
         Args:
             stamp_ns: CLOCK_MONOTONIC nanoseconds.
             attitude: (w, x, y, z), body FRD to NED.
             height_m: above home, None if unknown.
+            position: its own stamp, and local NED metres.
         """
         if self._needs_attitude and self._process is not None and self._vehicle_limiter.due(stamp_ns):
-            self._process.send_attitude(Attitude(stamp_ns, attitude, height_m))
+            self._process.send_attitude(Attitude(stamp_ns, attitude, height_m, position))
+
+    def request_path(self, request: PathRequest) -> None:
+        """Send what path to plan; repeat it while it is wanted. Never waits."""
+        if self._process is not None and self._path_limiter.due(time.monotonic_ns()):
+            self._process.request_path(request)
 
     def send_gimbal(self, stamp_ns: int, attitude: Quaternion) -> None:
         """Send the gimbal's attitude, as `send_attitude`; (w, x, y, z), gimbal FRD to NED."""
@@ -436,6 +454,8 @@ class PerceptionSupervisor:
                     self._on_ready(message, process)
                     if not started.done():
                         started.set_result(None)
+                case PlannedPath():
+                    self._on_path(message)
                 case Preview() | CloudPreview():
                     self._on_preview(replace(message, sequence=message.sequence + self._first_sequence))
                 case StartFailed():

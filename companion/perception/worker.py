@@ -18,10 +18,15 @@ import threading
 import time
 import traceback
 from collections import deque
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 
-from companion.perception.assembly import CameraTelemetry, build_pipeline, load_detector
+from companion.perception.assembly import (
+    CameraTelemetry,
+    build_path_planning,
+    build_pipeline,
+    load_detector,
+)
 from companion.perception.messages import (
     Attitude,
     Begin,
@@ -45,6 +50,7 @@ from companion.settings.calibration import adopt_calibration
 from vision.detections import Detections
 from vision.frame import Frame
 from vision.object_detector import YOLO, ObjectDetector
+from vision.path_planner import PathRequest
 from vision.pipeline import PerceptionResult, Pipeline
 from vision.recording import Recording
 from vision.sources import EndOfStream, Source, SourceError, open_source
@@ -74,6 +80,7 @@ class ControlChannel:
         telemetry: of the vehicle.
         watched: which previews are wanted.
         selections: what to select, oldest first; the reader removes them.
+        path_request: the newest, and when it was received.
     """
 
     def __init__(self, connection: socket.socket) -> None:
@@ -81,6 +88,7 @@ class ControlChannel:
         self.hud = Hud((), None)
         self.watched = Watched(False)
         self.selections: deque[SelectRequest] = deque()
+        self.path_request: tuple[PathRequest, int] | None = None
         self.telemetry = CameraTelemetry()
         self._connection = connection
         self._finished = threading.Event()
@@ -101,10 +109,14 @@ class ControlChannel:
             elif isinstance(message, Attitude):
                 self.telemetry.attitudes.add(message.stamp_ns, message.wxyz)
                 self.telemetry.height_m = message.height_m
+                if message.position is not None:
+                    self.telemetry.positions.add(*message.position)
             elif isinstance(message, GimbalAttitude):
                 self.telemetry.gimbal.add(message.stamp_ns, message.wxyz)
             elif isinstance(message, Watched):
                 self.watched = message
+            elif isinstance(message, PathRequest):
+                self.path_request = (message, time.monotonic_ns())
             elif isinstance(message, SelectRequest):
                 self.selections.append(message)
             elif isinstance(message, Stop):
@@ -124,9 +136,11 @@ class Perception:
     recording: Recording | None
     preview: PreviewEncoder
     clouds: CloudEncoder
+    plan: Callable[[Frame], None] = lambda frame: None
 
     def write(self, frame: Frame, detections: Detections) -> None:
-        """Pass a frame, after its result was sent, to recording and previews."""
+        """Pass a frame, after its result was sent, to path planning, recording and previews."""
+        self.plan(frame)
         if self.recording is not None:
             self.recording.write(frame, detections)
         self.preview.write(frame, detections)
@@ -191,6 +205,7 @@ def _work(begin: Begin, control: ControlChannel, sender: ResultSender) -> Ended 
             adopted = adopt_calibration(settings.camera, perception.source.calibration).camera
             settings = settings.model_copy(update={"camera": adopted})
             perception.clouds.camera = adopted
+        perception = replace(perception, plan=_planner(settings, control, sender))
         pipeline = build_pipeline(
             settings,
             perception.source,
@@ -261,6 +276,21 @@ def _open(settings: Settings, stack: contextlib.ExitStack, sender: ResultSender)
     clouds = CloudEncoder(settings.preview, settings.camera, sender.put_preview)
     stack.callback(clouds.close)
     return Perception(source, detector, recording, preview, clouds)
+
+
+def _planner(settings: Settings, control: ControlChannel, sender: ResultSender) -> Callable[[Frame], None]:
+    """Return a function that adds a frame to the map and sends the path that is requested."""
+    planning = build_path_planning(settings, control.telemetry)
+
+    def plan(frame: Frame) -> None:
+        if planning is None:
+            return
+        if control.path_request is not None:
+            planning.request(*control.path_request)
+        if (planned := planning.update(frame, time.monotonic_ns())) is not None:
+            sender.put(planned)
+
+    return plan
 
 
 def _ready(perception: Perception) -> Ready:

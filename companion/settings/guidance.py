@@ -53,6 +53,8 @@ class GuidanceSection(Section):
     """slow down towards obstacles by depth: if available (auto), or refuse to fly without (required)"""
     obstacle_margin_m: Annotated[float, Field(gt=0, le=50)] = 2.0
     """minimum distance of obstacles from the vehicle's centre, metres"""
+    avoid: bool = False
+    """fly around obstacles that the depth camera sees: goto, follow-path, figure-eight, patrol, approach"""
     max_speed_unobserved_mps: Annotated[float | None, Field(gt=0, le=30)] = None
     """maximum speed in directions that the depth camera does not see, metres a second; unset: no limit"""
     send_obstacle_distance: bool = False
@@ -74,8 +76,9 @@ class GuidanceSection(Section):
                 f"setpoint_lifetime_s must be longer than one period of rate_hz ({1 / self.rate_hz:.3g} s), "
                 f"got {self.setpoint_lifetime_s:g}: each setpoint would expire before the next"
             )
-        if self.send_obstacle_distance and self.obstacles == "off":
-            raise ValueError("send_obstacle_distance needs obstacles auto or required, got off")
+        for name in ("avoid", "send_obstacle_distance"):
+            if getattr(self, name) and self.obstacles == "off":
+                raise ValueError(f"{name} needs obstacles auto or required, got off")
         self.fence()
         return self
 
