@@ -50,6 +50,7 @@ GUIDANCE_FLOORS = {
     "path": 1,
     "formation": 2,
     "behaviour": 3,
+    "avoidance": 4,
     "command": 4,
     "interface": 4,
     "gimbal": 5,

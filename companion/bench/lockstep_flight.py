@@ -304,6 +304,7 @@ class LockstepFlight:
             cancel=self.driver.cancel,
             send_landing_target=self.driver.send_landing_target,
             send_obstacle_distance=self.driver.send_obstacle_distance,
+            request_path=self.inputs.steering.request_path,
         )
         self.events += output.events
         self._results |= {result.identifier: result.outcome for result in output.results}

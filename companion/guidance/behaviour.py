@@ -17,6 +17,7 @@ from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, Vector3, VehicleState
 from vision.obstacle_sectors import ObstacleSectors
+from vision.path_planner import PlannedPath
 
 
 class Requirement(StrEnum):
@@ -67,6 +68,8 @@ class BehaviourContext:
         perception_age_s: age of the newest detection message by its capture stamp; None: none received.
         perception_fresh: that age is within the configured maximum.
         obstacles: from the newest depth image, of any age; None: none received.
+        planned: the newest path around obstacles, of any age; None: none received.
+        avoiding: paths around obstacles are flown (`guidance.avoid`): return `RoutedSetpoint`.
         sent: the last setpoint after the envelope; None before the first.
         neighbourhood: the other vehicles; None: poses are not shared.
         min_separation_m: minimum distance to each of them.
@@ -95,6 +98,8 @@ class BehaviourContext:
     goal_ned_m: Vector3 | None = None
     tracks: RecentTracks = NO_TRACKS
     steering_markers: MarkerSight = NO_MARKERS
+    planned: PlannedPath | None = None
+    avoiding: bool = False
 
     def targets_of(self, wanted: Wanted) -> tuple[Target, ...]:
         """The newest frame's targets among which those of a command are."""
@@ -147,8 +152,23 @@ class ModeRequest:
             raise ValueError("ModeRequest(TAKEOFF) needs altitude_m")
 
 
+@dataclass(frozen=True, slots=True)
+class RoutedSetpoint:
+    """A velocity setpoint along a route, for a path around obstacles near that route.
+
+    Attributes:
+        setpoint: what to fly without obstacles; its horizontal speed and vertical velocity are kept.
+        route: the line ahead, local NED, from about the vehicle on; at least one point.
+        facing: the yaw stays near the setpoint's (an object in view); False: it follows the path.
+    """
+
+    setpoint: Setpoint
+    route: tuple[Vector3, ...]
+    facing: bool = False
+
+
 # What an update returns: a setpoint, an autopilot mode, or the end of the behaviour.
-BehaviourOutput = Setpoint | ModeRequest | Outcome
+BehaviourOutput = Setpoint | RoutedSetpoint | ModeRequest | Outcome
 
 
 def needs_to_see(wanted: Wanted) -> frozenset[Requirement]:

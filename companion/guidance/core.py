@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from companion.guidance.authority import Authority, silence
+from companion.guidance.avoidance import Avoidance
 from companion.guidance.behaviour import (
     Behaviour,
     BehaviourContext,
@@ -22,6 +23,7 @@ from companion.guidance.behaviour import (
     ModeRequest,
     Outcome,
     Requirement,
+    RoutedSetpoint,
 )
 from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.command_queue import CommandQueue
@@ -87,6 +89,7 @@ class GuidanceOptions:
     lifetime_s: float = DEFAULT_LIFETIME_S
     battery: BatteryMinimum = NO_MINIMUM
     obstacles: ObstacleRules = NO_RULES
+    avoid: bool = False
     send_obstacle_distance: bool = False
     perception_max_age_s: float = 0.5
     track_max_age_s: float = 2.0
@@ -119,6 +122,7 @@ class Guidance:
         self._authority = Authority()
         self._battery = BatteryMonitor(options.battery)
         self._memory = ObstacleMemory()
+        self._avoidance = Avoidance(options.obstacles.margin_m)
         self._tracks = RecentTracks(max_age_s=options.track_max_age_s)
         self._queue = CommandQueue(self.gimbal)
         self._behaviour: Behaviour | None = None
@@ -267,6 +271,8 @@ class Guidance:
             ranging=inputs.ranging,
             tracks=self._tracks,
             steering_markers=inputs.steering_markers,
+            planned=inputs.planned,
+            avoiding=self.options.avoid,
         )
 
     def _output(self, landing_target: LandingTarget | None, *, released: bool = False) -> GuidanceOutput:
@@ -277,6 +283,7 @@ class Guidance:
             tuple(out.cancelled),
             landing_target,
             self._due_obstacles(),
+            self._avoidance.take_request(),
             tuple(out.events),
             tuple(out.results),
             released,
@@ -382,6 +389,7 @@ class Guidance:
             return
         if not self._activated:
             self._activated, self._stepped_ns = True, None
+            self._avoidance.reset()
             behaviour.on_activate(context)
             if self.busy:
                 self._goal_ned_m = None
@@ -390,6 +398,10 @@ class Guidance:
         for note in behaviour.take_notes():
             self._out.event(EventKind.NOTED, behaviour.name, note)
         self._stepped_ns = context.now_ns
+        if isinstance(step, RoutedSetpoint):
+            step = self._avoidance.steer(step, context, flying=self.phase is Phase.OFFBOARD)
+            for note, warning in self._avoidance.take_notes():
+                self._out.event(EventKind.NOTED, behaviour.name, note, warning=warning)
         self._active = active = behaviour.active
         self._landing = active.landing
         self._gimbal_user = active.name if active.gimbal_aim is not None else ""

@@ -19,6 +19,7 @@ from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, VehicleState
 from companion.vehicle.streamer import StreamState
 from vision.obstacle_sectors import ObstacleSectors
+from vision.path_planner import PathRequest, PlannedPath
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,6 +175,7 @@ class GuidanceInput:
         targets: from the steering camera's newest frame, local NED.
         seen_ns: capture stamp of that frame; None: none received yet.
         obstacles: from the newest depth image, of any age; None: none received.
+        planned: the newest path around obstacles, of any age; None: none received.
         markers: detected markers of cameras that look down, or why there can be none.
         steering_markers: the same of the steering camera.
         neighbourhood: the other vehicles; None: poses are not shared.
@@ -190,6 +192,7 @@ class GuidanceInput:
     targets: tuple[Target, ...] = ()
     seen_ns: int | None = None
     obstacles: ObstacleSectors | None = None
+    planned: PlannedPath | None = None
     markers: MarkerSight = NO_MARKERS
     neighbourhood: Neighbourhood | None = None
     ranging: RangeMeans = ALL_MEANS
@@ -210,6 +213,7 @@ class GuidanceOutput:
         setpoint: to stream from now on, a brake included; None: stop streaming.
         requests: new ones. cancelled: identifiers of abandoned requests.
         landing_target: for the autopilot, once per frame that shows one.
+        path_request: what path to plan around obstacles; None: none is needed.
         obstacle_distance: for the autopilot's collision prevention, 10 times a second; never stale.
         released: after `ending`: no request is pending and no control is held.
     """
@@ -219,6 +223,7 @@ class GuidanceOutput:
     cancelled: tuple[int, ...] = ()
     landing_target: LandingTarget | None = None
     obstacle_distance: ObstacleSectors | None = None
+    path_request: PathRequest | None = None
     events: tuple[GuidanceEvent, ...] = ()
     results: tuple[CommandResult, ...] = ()
     released: bool = False

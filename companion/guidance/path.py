@@ -28,6 +28,8 @@ DELAY_S = 0.4
 SEARCH_AHEAD_M = 3.0
 # A reversal of the path counts as reached within this distance.
 CORNER_M = 0.5
+# Scalar product of the path's directions before and after a reversal.
+TURNED_BACK = -0.1
 LONGEST_M = 5_000.0
 # Bends are computed from directions 2·BEND_M apart, so a shorter loop has none.
 SHORTEST_LAP_M = 4.0 * BEND_M
@@ -208,12 +210,29 @@ class PathFollower:
         north, east, down = (d * along_mps + o * scale for d, o in zip(ahead.direction, offset, strict=True))
         return (north, east, down)
 
+    def ahead(self, length_m: float) -> tuple[Vector3, ...]:
+        """Points about a metre apart along the path from here, the last one included.
+
+        They reach as far as `length_m`, the path's end or a reversal. A reversal within `CORNER_M` counts as
+        reached.
+        """
+        if not self._joined:
+            return (self.path.point(0.0).position_ned_m,)
+        beyond_m = self.along_m + CORNER_M + SPACING_M / 2
+        here, beyond = self.path.direction(self.along_m), self.path.direction(beyond_m)
+        if beyond_m < self.end_m and _dot(here, beyond) < TURNED_BACK:
+            self.along_m = beyond_m
+        length_m = self._before_turning_back(self.along_m + min(length_m, self.left_m)) - self.along_m
+        count = max(1, math.ceil(length_m))
+        steps = (self.along_m + length_m * step / count for step in range(count + 1))
+        return tuple(self.path.point(along_m).position_ned_m for along_m in steps)
+
     def _before_turning_back(self, reach_m: float) -> float:
         """Limit the search to the next reversal of the path, where both legs are equally near."""
         here, at = self.path.direction(self.along_m), self.along_m + CORNER_M
         while at < reach_m:
             at += SPACING_M / 2
-            if _dot(here, self.path.direction(at)) < -0.1:
+            if _dot(here, self.path.direction(at)) < TURNED_BACK:
                 return min(at, reach_m)
         return reach_m
 

@@ -56,6 +56,7 @@ def guidance_options(settings: Settings, own_address: Address) -> GuidanceOption
             guidance.max_speed_unobserved_mps,
             guidance.perception_max_age_s,
         ),
+        avoid=guidance.avoid,
         send_obstacle_distance=guidance.send_obstacle_distance,
         perception_max_age_s=guidance.perception_max_age_s,
         track_max_age_s=settings.of_camera(guidance.camera).tracker.max_age_s,

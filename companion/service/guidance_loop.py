@@ -150,6 +150,7 @@ class GuidanceLoop:
             cancel=self._requests.cancel,
             send_landing_target=self._driver.send_landing_target,
             send_obstacle_distance=self._driver.send_obstacle_distance,
+            request_path=self._inputs.steering.request_path,
         )
         for event in output.events:
             if event.kind not in _ANSWERED:

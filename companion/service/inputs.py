@@ -123,6 +123,7 @@ class InputAssembler:
             steering.targets,
             None if newest is None else newest.captured_ns,
             self._obstacles,
+            steering.planned,
             self._markers.sight(now_ns, self._settings.guidance.perception_max_age_s),
             self.poses.neighbourhood(state, now_ns),
             steering.ranging(self.camera_pitch_rad(state)),

@@ -23,6 +23,7 @@ from companion.vehicle.driver import CommandRefusedError, Driver, LinkError
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.streamer import Streamer
 from vision.obstacle_sectors import ObstacleSectors
+from vision.path_planner import PathRequest
 
 logger = logging.getLogger(__name__)
 
@@ -35,8 +36,9 @@ def apply_output(
     cancel: Callable[[int], None],
     send_landing_target: Callable[[LandingTarget], None],
     send_obstacle_distance: Callable[[ObstacleSectors], None],
+    request_path: Callable[[PathRequest], None],
 ) -> None:
-    """Pass the setpoint, requests, landing target and obstacles of one step on to the vehicle."""
+    """Pass the setpoint, requests, landing target, obstacles and path request of one step on."""
     if output.setpoint is None:
         streamer.stop()
     else:
@@ -49,6 +51,8 @@ def apply_output(
         send_landing_target(output.landing_target)
     if output.obstacle_distance is not None:
         send_obstacle_distance(output.obstacle_distance)
+    if output.path_request is not None:
+        request_path(output.path_request)
 
 
 class RequestRunner:

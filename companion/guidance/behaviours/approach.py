@@ -11,6 +11,7 @@ from companion.guidance.behaviour import (
     BehaviourOutput,
     Outcome,
     Requirement,
+    RoutedSetpoint,
     needs_to_see,
 )
 from companion.guidance.gimbal.pitch import GimbalTracking
@@ -150,7 +151,9 @@ class ApproachBehaviour(Behaviour):
             away = f"still {self._range_m:.1f} m away" if track else "range never known"
             took_s = (now_ns - self._started_ns) / 1e9
             return Outcome(False, f"did not reach {self._subject.phrase} in {took_s:.0f} s: {away}")
-        if track is None or unseen_s > LOST_AFTER_S or not context.fresh(self._subject):
+        # On a way around obstacles they hide the object: it is flown on to where it was last seen.
+        lost_s = self._lost_timeout_s if context.avoiding else LOST_AFTER_S
+        if track is None or unseen_s > lost_s or not context.fresh(self._subject):
             return self._wait(dt_s, context, position, unseen_s)
         if self._wait_point is not None:
             self._wait_point, self._controller = None, PositionController()
@@ -177,7 +180,11 @@ class ApproachBehaviour(Behaviour):
         wanted = (speed * math.cos(bearing), speed * math.sin(bearing))
         north_mps, east_mps = add_velocity_error(wanted, state, self._speed_mps)
         velocity = (north_mps, east_mps, correction(self._down_m - position[2]))
-        return Setpoint.velocity(velocity, now_ns, yaw_rad=self._bearing_rad)
+        setpoint = Setpoint.velocity(velocity, now_ns, yaw_rad=self._bearing_rad)
+        if not context.avoiding or error_m <= 0.0:
+            return setpoint
+        stop = (north - self._distance_m * math.cos(bearing), east - self._distance_m * math.sin(bearing))
+        return RoutedSetpoint(setpoint, (position, (*stop, self._down_m)), facing=True)
 
     def take_notes(self) -> Sequence[str]:
         notes, self._notes = self._notes, []

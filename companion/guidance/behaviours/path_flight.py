@@ -5,7 +5,14 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 
-from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome, Requirement
+from companion.guidance.behaviour import (
+    Behaviour,
+    BehaviourContext,
+    BehaviourOutput,
+    Outcome,
+    Requirement,
+    RoutedSetpoint,
+)
 from companion.guidance.motion import (
     Arrival,
     PositionController,
@@ -26,6 +33,10 @@ HEADING_RAD = math.radians(5.0)
 # No progress of GAIN_M in this time: a limit or the wind holds the vehicle.
 STUCK_S = 12.0
 GAIN_M = 0.5
+# A way around obstacles leads away from the path meanwhile.
+AVOIDING_STUCK_S = 60.0
+# How far ahead a way around obstacles is planned.
+ROUTE_M = 15.0
 # A vehicle that stays for so long within this distance of the end has arrived, whatever speed its estimate
 # shows: PX4's, in its own simulation on a busy computer, showed 0.5 m/s for 8 s at a constant position.
 STAYS_M = 0.5
@@ -96,7 +107,7 @@ class PathFlight(Behaviour):
         away_m = math.inf if end is None or follower.left_m > END_M else math.dist(end, position)
         aligned = self._heading_rad is None or abs(wrap_angle(self._heading_rad - yaw_rad)) <= HEADING_RAD
         arrived = self._arrival.update(away_m, speed_of(state), now_ns)
-        stuck = self._stuck(follower, now_ns)
+        stuck = self._stuck(follower, now_ns, AVOIDING_STUCK_S if context.avoiding else STUCK_S)
         if aligned and (arrived or (stuck and away_m <= STAYS_M)):
             return Outcome(True, self._success_text(), end)
         if stuck:
@@ -113,18 +124,21 @@ class PathFlight(Behaviour):
                 (velocity[0], velocity[1]), state, SPEED_MARGIN * self._speed_mps
             )
             velocity = (*over_ground, velocity[2])
-        return Setpoint.velocity(velocity, now_ns, yaw_rad=self._yaw_rad)
+        setpoint = Setpoint.velocity(velocity, now_ns, yaw_rad=self._yaw_rad)
+        if context.avoiding and away_m >= END_M:
+            return RoutedSetpoint(setpoint, follower.ahead(ROUTE_M))
+        return setpoint
 
-    def _stuck(self, follower: PathFollower, now_ns: int) -> str | None:
-        """The reason if there was no progress for `STUCK_S`; None: there was."""
+    def _stuck(self, follower: PathFollower, now_ns: int, stuck_s: float) -> str | None:
+        """The reason if there was no progress for so long; None: there was."""
         gained_m = follower.along_m - follower.off_m
         if gained_m > self._best_m + GAIN_M:
             self._best_m, self._best_ns = gained_m, now_ns
-        if now_ns - self._best_ns < STUCK_S * 1e9:
+        if now_ns - self._best_ns < stuck_s * 1e9:
             return None
         left = f", {follower.left_m:.0f} m before its end" if math.isfinite(follower.left_m) else ""
         return (
-            f"{self.name}: no progress for {STUCK_S:g} s, {follower.off_m:.1f} m off the path{left}: "
+            f"{self.name}: no progress for {stuck_s:g} s, {follower.off_m:.1f} m off the path{left}: "
             f"held by a limit of [guidance] or by wind"
         )
 

@@ -160,6 +160,19 @@ def test_path_reversal_is_flown_to_its_end() -> None:
     assert sum(a[0] < 3.4 <= b[0] for a, b in itertools.pairwise(flight.track)) == 3
 
 
+def test_route_ahead_ends_at_a_reversal_until_it_is_reached() -> None:
+    follower = PathFollower(Path([(0.0, 0.0, -3.0), (10.0, 0.0, -3.0), (2.0, 0.0, -3.0)], 2.0))
+    follower.velocity((3.0, 0.5, -3.0), 1.0)
+    ahead = follower.ahead(15.0)
+    assert ahead[0] == pytest.approx((3.0, 0.0, -3.0), abs=0.01)
+    assert ahead[-1] == pytest.approx((10.0, 0.0, -3.0), abs=0.3)
+    assert follower.ahead(4.0)[-1] == pytest.approx((7.0, 0.0, -3.0), abs=0.01)
+    follower.velocity((6.5, 0.0, -3.0), 1.0)
+    follower.velocity((9.6, 0.0, -3.0), 1.0)
+    assert follower.ahead(15.0)[-1] == pytest.approx((2.0, 0.0, -3.0), abs=0.01)
+    assert follower.along_m >= 10.0
+
+
 def test_closed_path_starts_at_its_first_point() -> None:
     points = [(0.0, 0.0), (30.0, 0.0), (30.0, 30.0), (0.0, 30.0)]
     vehicle = KinematicVehicle(position=[30.0, -30.0, -5.0])

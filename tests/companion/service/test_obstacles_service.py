@@ -1,4 +1,4 @@
-"""The whole service before a wall: rendered depth, zenoh, MAVLink, and a wall with collisions."""
+"""The whole service before a wall or a pillar: rendered depth, zenoh, MAVLink, and collisions."""
 
 from __future__ import annotations
 
@@ -7,31 +7,33 @@ import os
 import signal
 import time
 import uuid
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from mavlink_sim.testing import running_simulator
-from tests.companion.service_process import running_service
+from mavlink_sim.testing import RunningSimulator, running_simulator
+from tests.companion.service_process import ServiceProcess, running_service
 
 pytestmark = pytest.mark.realtime
 
 WALL_NORTH_M, THICKNESS_M, MARGIN_M = 12.0, 0.4, 2.0
 # As for `python -m benchmarks.flights obstacles`: gusts push it a little into the margin.
 ALLOWED_M = 1.0
-SCENE = f"""
-name = "wall"
+SCENE = """
+name = "obstacle"
 [ground]
 kinds = ["gravel"]
 tile_texels = 256
 texel_m = 0.05
 [[objects]]
-class = "wall"
-place_m = [{WALL_NORTH_M}, 0.0]
+class = "{kind}"
+place_m = [{north_m}, 0.2]
 yaw_deg = 180
-size_m = [30.0, {THICKNESS_M}, 6.0]
+size_m = {size_m}
 [camera]
 width = 320
 height = 240
@@ -69,25 +71,48 @@ def camera_pid(simulator_pid: int) -> int:
     return max(map(int, children))
 
 
-def test_brakes_before_a_wall_and_without_depth(tmp_path: Path) -> None:
-    scene, path = tmp_path / "wall.toml", tmp_path / "truth.jsonl"
-    scene.write_text(SCENE)
-    camera = f"wall-{uuid.uuid4().hex[:8]}"
-    flags = [
+@contextmanager
+def in_the_air(
+    folder: Path, scene_text: str, *flags: str
+) -> Iterator[tuple[RunningSimulator, ServiceProcess, Truth]]:
+    """The service with a vehicle 2.5 m above the ground, south of the obstacle."""
+    scene, path = folder / "scene.toml", folder / "truth.jsonl"
+    scene.write_text(scene_text)
+    camera = f"obstacle-{uuid.uuid4().hex[:8]}"
+    flags = (
         "--source-uri", f"shm://{camera}", "--detector-enabled", "false",
         "--camera-horizontal-fov-deg", "80", "--camera-mount-pitch-deg", "0",
-        "--guidance-obstacles", "required", "--guidance-obstacle-margin-m", f"{MARGIN_M}",
-    ]  # fmt: skip
+        "--guidance-obstacles", "required", *flags,
+    )  # fmt: skip
     with (
         running_simulator(scene=scene, camera=camera, truth=path, seed=2) as simulator,
-        running_service(simulator.onboard_port, flags, cwd=tmp_path) as service,
+        running_service(simulator.onboard_port, flags, cwd=folder) as service,
     ):
         simulator.wait_for_event("camera")
         service.take_off(2.5)
-        truth = Truth(path)
+        yield simulator, service, Truth(path)
 
-        def north_m(row: dict[str, Any]) -> float:
-            return float(row["position_ned_m"][0])
+
+def north_m(row: dict[str, Any]) -> float:
+    return float(row["position_ned_m"][0])
+
+
+def test_flies_around_a_pillar_to_the_goal(tmp_path: Path) -> None:
+    scene = SCENE.format(kind="box", north_m=8.0, size_m=[1.0, 1.0, 6.0])
+    flags = ("--guidance-avoid", "true", "--guidance-obstacle-margin-m", "1")
+    with in_the_air(tmp_path, scene, *flags) as (_, service, truth):
+        reply = service.command_when_it_can("goto north=15 east=0 speed=2", 90.0)
+        assert reply["success"], reply
+        last = truth.wait_for(lambda row: north_m(row) > 14.0)
+        assert last["collisions"] == 0
+        passing = [row["position_ned_m"][:2] for row in truth.rows if 7.0 < north_m(row) < 9.0]
+        assert min(abs(east - 0.2) for _, east in passing) > 0.5 + 0.6  # half its width
+
+
+def test_brakes_before_a_wall_and_without_depth(tmp_path: Path) -> None:
+    scene = SCENE.format(kind="wall", north_m=WALL_NORTH_M, size_m=[30.0, THICKNESS_M, 6.0])
+    flags = ("--guidance-obstacle-margin-m", f"{MARGIN_M}")
+    with in_the_air(tmp_path, scene, *flags) as (simulator, service, truth):
 
         def north_mps(row: dict[str, Any]) -> float:
             return float(row["velocity_ned_mps"][0])
