@@ -6,6 +6,7 @@ import math
 
 import pytest
 
+from benchmarks.flights_forest import Map, forest, run
 from companion.bench.lockstep_flight import FlightLog, LockstepFlight, camera_settings
 from companion.bench.rendered_camera import RenderedCamera
 from mavlink_sim.camera.depth_camera import DepthSensor
@@ -86,3 +87,15 @@ def test_approach_flies_around_a_pillar() -> None:
     log = flown.fly("approach car distance=5 speed=2")
     flown.assert_passed(log)
     assert range_to(car, flown.flight.vehicle.truth.position_ned_m) == pytest.approx(5.0, abs=0.7)
+
+
+@pytest.mark.slow
+def test_forest_is_crossed_and_drawn() -> None:
+    drawing = Map(3)
+    result = run(3, drawing.add)
+    assert result.success, result.reason
+    assert result.values["nearest_m"] > MARGIN_M - ALLOWED_M
+    assert result.values["flown_m"] > 40.0
+    image = drawing.image()
+    assert len({tuple(colour) for colour in image.reshape(-1, 3)[::97].tolist()}) >= 3
+    assert len(forest(3)) == 45
