@@ -103,7 +103,8 @@ def nearest_ranges(
     with_depth = np.bincount(sampled_sector[known], minlength=sectors)
     seen = (counted >= LEAST_POINTS) & (with_depth >= LEAST_KNOWN_SHARE * counted)
 
-    below_m = BELOW_M if height_m is None else min(BELOW_M, height_m - GROUND_GAP_M)
+    # What is level with the vehicle is never ground, also below the place whose height is 0.
+    below_m = BELOW_M if height_m is None else max(0.0, min(BELOW_M, height_m - GROUND_GAP_M))
     with np.errstate(invalid="ignore"):  # an unknown depth is NaN, and in no band
         below = down * depth + lens[2]
     in_band = known & (below > -ABOVE_M) & (below < below_m)

@@ -1,6 +1,7 @@
 import math
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -25,7 +26,8 @@ from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, Vector3
 from tests.companion.guidance.guidance_harness import GuidanceHarness
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle
-from vision.obstacle_sectors import SECTORS, ObstacleSectors
+from vision.camera_model import CameraModel, CameraMount
+from vision.obstacle_sectors import SECTORS, ObstacleSectors, obstacle_sectors
 
 NAN, INF = math.nan, math.inf
 
@@ -196,3 +198,11 @@ def test_goto_stops_before_an_obstacle(seed: int) -> None:
     result = run(seed)
     assert result.success, result.reason
     assert result.values["nearest_m"] >= MARGIN_M - ALLOWED_M
+
+
+@pytest.mark.parametrize("height_m", [-2.0, 0.0, 0.3, 3.0])
+def test_wall_is_seen_at_every_height_relative_to_home(height_m: float) -> None:
+    wall = np.full((480, 640), 3.0, np.float32)
+    camera = CameraModel.from_horizontal_fov(640, 480, 1.2)
+    seen = obstacle_sectors(wall, 1, camera, CameraMount(), np.eye(3), height_m)
+    assert seen.distance_m[0] == pytest.approx(3.0, abs=0.01)
