@@ -218,13 +218,13 @@ def test_cameras_take_turns_and_stop_has_a_free_connection(browser: Browser) -> 
         assert most_at_once(pictures(tab)) == 2
         counts = answered()
         assert set(counts) == set(names)
-        assert min(counts.values()) > max(0.7 * max(counts.values()), 4.0 * 3.0)  # of 15 a second at most
-        # Cameras without pictures delay the others little.
+        assert min(counts.values()) > 0.5 * max(counts.values())
+        # Cameras without pictures take no turns of the others.
         publish(1.0, "right")
         begin()
         publish(4.0, "right")
         assert most_at_once(pictures(tab)) == 2
-        assert answered()["right"] > 4.0 * 5.0
+        assert answered()["right"] > 0.5 * max(counts.values())
         # A second window takes its part of the connections.
         other = open_page(browser, url)
         other.until("state.maxPictures === 1 && cameras.size === 4")
