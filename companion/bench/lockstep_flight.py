@@ -162,7 +162,8 @@ class LockstepFlight:
         chosen = settings or (plain_settings() if seen is None else seen.perceived.settings)
         guided = guidance_options(chosen, COMPANION)
         guided = replace(guided, limits=limits or guided.limits, obstacles=rules or guided.obstacles)
-        return cls(SimulatedDriver(vehicle), chosen, [] if seen is None else [seen], guided)
+        driver = SimulatedDriver(vehicle, range_finder_height=chosen.guidance.range_finder_height)
+        return cls(driver, chosen, [] if seen is None else [seen], guided)
 
     @property
     def vehicle(self) -> LockstepVehicle:

@@ -99,14 +99,17 @@ class SimulatedDriver:
         vehicle: with the streams of `RATES_HZ` on its first link, if it is PX4-like; an ArduPilot's are asked
             for here.
         boot_ns: the flight's clock when the vehicle booted.
+        range_finder_height: as in `VehicleState`.
     """
 
-    def __init__(self, vehicle: LockstepVehicle, boot_ns: int = START_NS) -> None:
+    def __init__(
+        self, vehicle: LockstepVehicle, boot_ns: int = START_NS, *, range_finder_height: bool = False
+    ) -> None:
         self.vehicle, self._boot_ns = vehicle, boot_ns
         copter = isinstance(vehicle.vehicle, CopterVehicle)
         self._kind = ARDUPILOT if copter else PX4
         self._profile: AutopilotProfile = ArduPilotProfile() if copter else Px4Profile()
-        self._state = VehicleState(autopilot=self._profile.name)
+        self._state = VehicleState(autopilot=self._profile.name, range_finder_height=range_finder_height)
         self._mode_ns = 0
         self._pending: list[_Pending] = []
         self._answers: list[Answer] = []

@@ -37,6 +37,7 @@ def driver_of(settings: Settings, on_bytes: OnBytes | None = None) -> Driver:
         signing_key=None
         if settings.vehicle.signing_key_file is None
         else read_key(settings.vehicle.signing_key_file),
+        range_finder_height=settings.guidance.range_finder_height,
         on_bytes=on_bytes,
     )
 

@@ -57,6 +57,8 @@ class GuidanceSection(Section):
     """fly around obstacles that the depth camera sees: goto, follow-path, figure-eight, patrol, approach"""
     max_speed_unobserved_mps: Annotated[float | None, Field(gt=0, le=30)] = None
     """maximum speed in directions that the depth camera does not see, metres a second; unset: no limit"""
+    range_finder_height: bool = False
+    """use a range finder that looks down for ranges from the ground: only over slopes without objects"""
     send_obstacle_distance: bool = False
     """send OBSTACLE_DISTANCE to the autopilot, for its collision prevention in the pilot's Position mode"""
     perception_max_age_s: Annotated[float, Field(gt=0, le=10)] = 0.5

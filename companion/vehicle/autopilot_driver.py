@@ -75,6 +75,7 @@ class AutopilotDriver(ABC):
         own_system_id: int,
         own_component_id: int,
         signing_key: bytes | None = None,
+        range_finder_height: bool = False,
         on_bytes: OnBytes | None = None,
     ) -> None:
         self.url = url
@@ -84,7 +85,7 @@ class AutopilotDriver(ABC):
         self._own_system_id = own_system_id
         self._own_component_id = own_component_id
         self._started_ns = time.monotonic_ns()
-        self._telemetry = TelemetryState(url, self._warn_other_autopilot)
+        self._telemetry = TelemetryState(url, self._warn_other_autopilot, range_finder_height)
         self._flight_commands = FlightCommands(url, self._telemetry, self._command, self._ack_is_ours)
         self._gimbal_commands = GimbalCommands(url, self._telemetry, self._command, self.own_address)
         self._command_locks: dict[int, asyncio.Lock] = {}

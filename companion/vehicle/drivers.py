@@ -21,6 +21,7 @@ def open_driver(
     own_system_id: int = 1,
     own_component_id: int = 191,
     signing_key: bytes | None = None,
+    range_finder_height: bool = False,
     on_bytes: OnBytes | None = None,
 ) -> Driver:
     """Create a driver, not connected yet.
@@ -31,6 +32,7 @@ def open_driver(
         system_id: the autopilot's MAVLink system id; None: the first autopilot received.
         own_system_id, own_component_id: of our messages; 191 is MAV_COMP_ID_ONBOARD_COMPUTER.
         signing_key: 32 bytes of MAVLink 2 signing; None: nothing is signed and everything is accepted.
+        range_finder_height: as in `VehicleState`.
         on_bytes: called in the loop with everything received and sent.
 
     Raises:
@@ -62,5 +64,6 @@ def open_driver(
         own_system_id=own_system_id,
         own_component_id=own_component_id,
         signing_key=signing_key,
+        range_finder_height=range_finder_height,
         on_bytes=on_bytes,
     )

@@ -67,6 +67,7 @@ class PymavlinkDriver(AutopilotDriver):
         own_system_id: int,
         own_component_id: int,
         signing_key: bytes | None = None,
+        range_finder_height: bool = False,
         on_bytes: OnBytes | None = None,
     ) -> None:
         super().__init__(
@@ -75,6 +76,7 @@ class PymavlinkDriver(AutopilotDriver):
             own_system_id=own_system_id,
             own_component_id=own_component_id,
             signing_key=signing_key,
+            range_finder_height=range_finder_height,
             on_bytes=on_bytes,
         )
         self._codec = mavlink.MAVLink(None, own_system_id, own_component_id)

@@ -106,6 +106,7 @@ class VehicleState:
         latitude_deg, longitude_deg, altitude_amsl_m: global position, NaN when unknown.
         home_altitude_amsl_m, home_position_ned_m: of the home position; None until received.
         ground: by the range finder that looks down; None without one.
+        range_finder_height: `height_m` may come from it; else it is always that above home.
         horizontal_sigma_m, vertical_sigma_m: one sigma of the position as the estimator states it; None: not
             stated.
         battery_fraction: 0..1, None when unknown.
@@ -149,6 +150,7 @@ class VehicleState:
     reset_offset_ned_m: Vector3 = (0.0, 0.0, 0.0)
     odometry: Odometry | None = None
     ground: GroundLevel | None = field(default=None, metadata={"recorded": False})
+    range_finder_height: bool = field(default=False, metadata={"recorded": False})
     horizontal_sigma_m: float | None = None
     vertical_sigma_m: float | None = None
     battery_fraction: float | None = None
@@ -187,16 +189,17 @@ class VehicleState:
 
     @property
     def height_m(self) -> float | None:
-        """Height above the ground, for ranges to objects: by the range finder, else above home."""
-        measured_m = self.ground_height_m
-        return self.altitude_m if measured_m is None else measured_m
+        """Height above the ground, for ranges to objects, by `height_source`."""
+        by_sensor = self.height_source is HeightSource.DISTANCE_SENSOR
+        return self.ground_height_m if by_sensor else self.altitude_m
 
     @property
     def height_source(self) -> HeightSource | None:
         """Source of `height_m`; None while that is unknown."""
         if self.position_ned_m is None:
             return None
-        return HeightSource.HOME if self.ground_height_m is None else HeightSource.DISTANCE_SENSOR
+        measured = self.range_finder_height and self.ground_height_m is not None
+        return HeightSource.DISTANCE_SENSOR if measured else HeightSource.HOME
 
     @property
     def without_setpoints(self) -> str:

@@ -38,6 +38,7 @@ class TelemetryState:
 
     Args:
         url: of the link, for the log. on_two_autopilots: called when two autopilots send with one id.
+        range_finder_height: as in `VehicleState`.
 
     Attributes:
         state: the newest snapshot.
@@ -47,15 +48,18 @@ class TelemetryState:
         restarted: set when it has restarted; cleared by the link's supervision.
     """
 
-    def __init__(self, url: object, on_two_autopilots: Callable[[], None]) -> None:
+    def __init__(
+        self, url: object, on_two_autopilots: Callable[[], None], range_finder_height: bool = False
+    ) -> None:
         self._url, self._on_two_autopilots = url, on_two_autopilots
+        self._range_finder_height = range_finder_height
         self._subscribers: dict[object, Callable[[VehicleState], None]] = {}
         self._watchers: dict[object, Callable[[str, Fields], None]] = {}
         self.reset()
 
     def reset(self) -> None:
         """Reset to the state before the first message."""
-        self.state = VehicleState()
+        self.state = VehicleState(range_finder_height=self._range_finder_height)
         self.profile: AutopilotProfile = Px4Profile()
         self.clock = ClockSync()
         self.mode_ns = 0

@@ -28,7 +28,8 @@ FLIGHT = {"COM_OF_LOSS_T": 4.0, "COM_OBL_RC_ACT": 4.0}
 async def connected(
     kind: DriverKind, simulator: RunningSimulator, *, system_id: int | None = None
 ) -> AsyncIterator[Driver]:
-    driver = open_driver(kind, f"udpin://127.0.0.1:{simulator.onboard_port}", system_id=system_id)
+    url = f"udpin://127.0.0.1:{simulator.onboard_port}"
+    driver = open_driver(kind, url, system_id=system_id, range_finder_height=True)
     await driver.connect(20.0)
     try:
         yield driver

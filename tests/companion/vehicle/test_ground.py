@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from companion.settings import Settings
 from companion.vehicle.state import HeightSource, VehicleState
 from companion.vehicle.telemetry import apply_message
 from vision.attitude import quaternion_from_euler
@@ -36,7 +37,7 @@ class Flight:
         self.north_m = 0.0
         self.down_m = 2.0 - height_m
         self.attitude = quaternion_from_euler(0.0, 0.0, 0.0)
-        self.state = VehicleState(home_position_ned_m=(0.0, 0.0, 2.0))
+        self.state = VehicleState(home_position_ned_m=(0.0, 0.0, 2.0), range_finder_height=True)
 
     def measure(self, range_m: float, count: int = 1, moved_m: float = 0.0, **changes: Any) -> VehicleState:
         """Receive as many measurements, the vehicle having moved on before each."""
@@ -73,6 +74,16 @@ def test_height_is_that_of_the_range_finder() -> None:
     assert state.altitude_m == pytest.approx(5.0)
     flight.down_m -= 1.0
     assert flight.wait(0.05).height_m == pytest.approx(6.6)
+
+
+def test_ranges_use_the_height_above_home_by_default() -> None:
+    flight = Flight()
+    flight.state = replace(flight.state, range_finder_height=False)
+    state = flight.measure(5.6, count=5)
+    assert state.ground_height_m == pytest.approx(5.6)
+    assert state.height_m == pytest.approx(5.0)
+    assert state.height_source is HeightSource.HOME
+    assert Settings().guidance.range_finder_height is False
 
 
 def test_tilt_of_the_vehicle_is_compensated() -> None:
