@@ -88,8 +88,11 @@ def detections_message(
     """
     detections = result.detections
     records = detections.records()
-    unknown: list[Target | None] = [None] * len(records)
-    targets = list(localization.targets) if localization is not None and localization.targets else unknown
+    # A box where the lens has no rays has no target.
+    targets = {
+        (target.class_name, target.box_xyxy): target
+        for target in (() if localization is None else localization.targets)
+    }
     ages_s: list[float | None] = [None] * len(records)
     if detections.track_first_ns is not None:
         first_ns = detections.track_first_ns.tolist()
@@ -106,8 +109,8 @@ def detections_message(
         "timing_ms": {stage: round(value, 2) for stage, value in result.timing_ms.items()},
         "dropped": result.dropped,
         "detections": [
-            _detection(record, age_s, target, origin)
-            for record, age_s, target in zip(records, ages_s, targets, strict=True)
+            _detection(record, age_s, targets.get((record["class_name"], tuple(record["xyxy"]))), origin)
+            for record, age_s in zip(records, ages_s, strict=True)
         ],
     }
 

@@ -172,7 +172,7 @@ def targets_from_detections(
     history: StateHistory,
     heights_m: Mapping[str, float] = MappingProxyType({}),
 ) -> tuple[Target, ...]:
-    """The targets of one frame, in the order of its detections.
+    """The targets of one frame, in the order of its detections. Boxes where the lens has no rays have none.
 
     The range comes from the detection's nearest point if it has one (`nearest_camera_m`, from depth), else
     from the intersection of the ray through the box's lower edge with the ground, less `CONTACT_INSET_M`. The
@@ -203,6 +203,7 @@ def targets_from_detections(
             trusted=not doubtful,
         )
         for detection, sight, doubtful in zip(detections, sights, ambiguous, strict=True)
+        if all(map(math.isfinite, sight.direction))
     )
 
 
@@ -210,7 +211,7 @@ class _Sight(NamedTuple):
     """The geometry of one box: NED vectors from the vehicle, offsets in metres; NaN: unknown.
 
     Attributes:
-        direction: unit vector to the box's centre.
+        direction: unit vector to the box's centre; NaN where the lens has no rays.
         nearest: to the nearest point of its surface, by depth.
         on_ground: to the intersection of the middle of its lower edge with the ground.
         lens: to the optical centre.
@@ -240,11 +241,10 @@ def _sights(
     pixels[:, 1] = np.concatenate([(top + bottom) / 2, bottom, bottom + 1.0])
     lines = PixelRays.of(camera, mount, pose.ned_from_body, pixels)
     centres, feet, below = lines[:count], lines[count : 2 * count], lines[2 * count :]
-    if not np.isfinite(centres.directions).all():
-        raise HistoryError("a box lies where the lens has no rays: calibrate the camera again")
     on_ground = feet.on_ground(pose.height_m, MIN_DEPRESSION_RAD)
     # Between two rays one row apart; the angle is too small for the arc cosine of their product.
     pixel_rad = np.linalg.norm(below.directions - feet.directions, axis=1)
+    pixel_rad = np.where(np.isfinite(pixel_rad), pixel_rad, 1.0 / camera.fy)  # the lower edge has no rays
     offsets = lines.camera_ned_m + nearest @ mount.ned_from_optical(pose.ned_from_body).T
     of_each, lens = (centres.directions, offsets, on_ground, pixel_rad), lines.camera_ned_m.tolist()
     geometry = zip(*(values.tolist() for values in of_each), strict=True)

@@ -154,6 +154,19 @@ def two_cars() -> PerceptionResult:
     return PerceptionResult(7, NOW_NS, NOW_NS, 640, 480, cars, {}, 0)
 
 
+def test_detection_without_a_target_has_no_direction() -> None:
+    result = two_cars()
+    history = history_of(replace(STATE, attitude=(1.0, 0.0, 0.0, 0.0)))
+    targets = targets_from_detections(
+        result.detections.records()[1:], NOW_NS, CAMERA, CameraMount(pitch_rad=-0.4), history
+    )
+    message = detections_message(result, "v", NOW_NS, localization=Localization(targets))
+    without, has = message["detections"]
+    assert without["bearing_rad"] is None
+    assert without["range_source"] is None
+    assert has["bearing_rad"] == pytest.approx(targets[0].bearing_rad, abs=1e-3)
+
+
 def test_detections_of_the_steering_camera_have_their_targets() -> None:
     result = two_cars()
     history = history_of(replace(STATE, attitude=(1.0, 0.0, 0.0, 0.0)))

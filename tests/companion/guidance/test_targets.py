@@ -84,6 +84,21 @@ def optical_point(
     return mount.body_from_optical.T @ body
 
 
+def test_only_boxes_where_the_lens_has_no_rays_have_no_target() -> None:
+    fisheye = CameraModel(640, 480, 160.0, 160.0, 319.5, 239.5, (0.05, -0.02, 0.0, 0.0), "equidistant")
+    boxes = ((300, 300, 360, 340), (0, 0, 60, 40), (130, 60, 190, 100), (575, 0, 635, 40))
+    found = [detection(box, nearest=(0.0, 1.0, 8.0)) for box in boxes]
+    history = history_of(quaternion_from_euler(0.0, 0.0, 0.0))
+    assert np.isfinite(fisheye.rays(np.array([(160.0, 80.0)]))).all()
+    targets = targets_from_detections(found, T0, fisheye, MOUNT, history)
+    assert [target.box_xyxy for target in targets] == [boxes[0], boxes[2]]
+    # Its lower edge has no rays, its middle has.
+    below = detection((160, 300, 220, 460), nearest=(0.0, 1.0, 8.0))
+    (target,) = targets_from_detections([below], T0, fisheye, MOUNT, history)
+    assert math.isfinite(target.range_sigma_m)
+    assert math.isfinite(target.across_sigma_m)
+
+
 def test_target_is_trusted_only_with_a_confirmed_track() -> None:
     tracks: list[dict[str, Any]] = [
         {},  # tracking is off
