@@ -17,6 +17,10 @@ from vision.geolocation import ErrorEllipse
 # An object moves if its estimated speed exceeds this and so many sigma. Errors of the range of a vehicle that
 # flies towards a standing object show as some tenths of its own speed.
 MOVING_MPS, MOVING_SIGMA = 1.0, 3.0
+# Older detections count less, by this time constant: an object slower than `MOVING_MPS` may still move.
+MEMORY_S = 5.0
+# A detection this many sigma from the fused position shows that the object has moved: the fusion restarts.
+RESTART_SIGMA = 3.0
 # A track that was not seen for this long has ended (`tracker.max_age_s` is less by default).
 FORGET_S = 60.0
 
@@ -43,7 +47,8 @@ class _Track:
 
     Most errors of two frames have one cause: attitude, height, the object's size. Covariance intersection
     with equal weights (Julier & Uhlmann 1997) holds for any correlation: the covariance is the inverse of the
-    mean information, and the position is the one that independent errors would give.
+    mean information, and the position is the one that independent errors would give. Slow motion leaves the
+    position behind the object, so detections are forgotten, and one that disagrees begins anew.
     """
 
     def __init__(self, target: Target, vehicle: Vector3, covariance: NDArray[np.float64]) -> None:
@@ -54,8 +59,9 @@ class _Track:
     def update(self, target: Target, vehicle: Vector3, covariance: NDArray[np.float64]) -> None:
         expected = self._motion.at(target.captured_ns)
         self._motion = expected.update(expected.fit(target, vehicle))
-        if self.moving:
+        if self.moving or self._disagrees(target, covariance):
             self._restart()
+        self._forget((target.captured_ns - self._newest.captured_ns) / 1e9)
         self._add(target, covariance)
 
     @property
@@ -66,9 +72,14 @@ class _Track:
     @property
     def position(self) -> FusedPosition:
         moving, newest = self.moving, self._newest
-        mean = np.linalg.inv(self._information / self._count)
-        place = self._motion.state[:2] if moving else mean @ (self._weighted / self._count)
-        covariance = mean + np.eye(2) * newest.vehicle_sigma_m**2
+        place, covariance = self._fused()
+        if moving:
+            place = self._motion.state[:2]
+        else:
+            # How far the newest detections are from the fused position is part of its error.
+            behind = self._motion.state[:2] - place
+            covariance = covariance + np.outer(behind, behind)
+        covariance = covariance + np.eye(2) * newest.vehicle_sigma_m**2
         down = self._weighted_down / self._weight
         return FusedPosition(
             (float(place[0]), float(place[1]), down),
@@ -81,10 +92,26 @@ class _Track:
     def captured_ns(self) -> int:
         return self._newest.captured_ns
 
+    def _fused(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Position and covariance of the mean information."""
+        covariance: NDArray[np.float64] = np.linalg.inv(self._information / self._count)
+        return covariance @ (self._weighted / self._count), covariance
+
+    def _disagrees(self, target: Target, covariance: NDArray[np.float64]) -> bool:
+        assert target.position_ned_m is not None
+        place, fused = self._fused()
+        away = np.array(target.position_ned_m[:2]) - place
+        return float(away @ np.linalg.solve(fused + covariance, away)) > RESTART_SIGMA**2
+
     def _restart(self) -> None:
         self._information, self._weighted = np.zeros((2, 2)), np.zeros(2)
-        self._weight = self._weighted_down = 0.0
-        self._count = 0
+        self._weight = self._weighted_down = self._count = 0.0
+
+    def _forget(self, elapsed_s: float) -> None:
+        kept = math.exp(-elapsed_s / MEMORY_S)
+        self._information, self._weighted = self._information * kept, self._weighted * kept
+        self._weight, self._weighted_down = self._weight * kept, self._weighted_down * kept
+        self._count *= kept
 
     def _add(self, target: Target, covariance: NDArray[np.float64]) -> None:
         assert target.position_ned_m is not None

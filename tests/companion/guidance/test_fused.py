@@ -139,6 +139,33 @@ def test_standing_object_seen_from_a_moving_vehicle_stands() -> None:
     assert not position_of(tracks).moving
 
 
+@pytest.mark.parametrize("speed_mps", [0.7, 1.2])
+@pytest.mark.parametrize("along", [False, True], ids=["across", "away"])
+def test_ellipse_covers_a_slow_walker(speed_mps: float, along: bool) -> None:
+    tracks, vehicle, rng = FusedTracks(), (0.0, 0.0, -5.0), np.random.default_rng(17)
+    for frame in range(200):
+        walked_m = speed_mps * 0.1 * frame
+        at = (8.0 + walked_m, 0.0) if along else (12.0, walked_m - 10.0 * speed_mps)
+        noise = {"along_error_m": float(rng.normal(0.3, 0.2)), "across_error_m": float(rng.normal(0.0, 0.1))}
+        target = seen(vehicle, at, frame, sigma_m=0.5, **noise)
+        tracks.update([target], vehicle, target.captured_ns)
+        fused = position_of(tracks)
+        error = np.array(fused.position_ned_m[:2]) - at
+        major_m, minor_m, orientation = fused.ellipse
+        axis = np.array((math.cos(orientation), math.sin(orientation)))
+        across = float(error @ (-axis[1], axis[0]))
+        assert (float(error @ axis) / major_m) ** 2 + (across / minor_m) ** 2 < 5.99
+        assert along or math.hypot(*error) < 1.5
+
+
+def test_object_that_was_moved_is_located_anew() -> None:
+    tracks, vehicle = FusedTracks(), (0.0, 0.0, -5.0)
+    for frame in range(40):
+        target = seen(vehicle, (12.0, 0.0 if frame < 20 else 4.0), frame, sigma_m=0.5)
+        tracks.update([target], vehicle, target.captured_ns)
+    assert position_of(tracks).position_ned_m[:2] == pytest.approx((12.0, 4.0), abs=0.01)
+
+
 def test_object_that_leaves_the_image_keeps_its_position() -> None:
     tracks, vehicle = FusedTracks(), (0.0, 0.0, -5.0)
     for frame in range(40):
