@@ -57,7 +57,7 @@ class SourceSection(Section):
     depth_scale: Annotated[float | None, Field(gt=0, le=1000)] = None
     """metres per unit of depth; unset: 0.001 for 16-bit integers, 1 for floats"""
     loop: bool = False
-    """repeat a file or folder"""
+    """repeat a file or folder; not with depth"""
     realtime: bool = True
     """play a file or folder at its frame rate, like a camera; false: every frame, as fast as possible"""
     every_frame: bool | None = None

@@ -117,6 +117,42 @@ def test_folders_are_paired_picture_by_picture(tmp_path: Path) -> None:
     assert depths == [1.0, 2.0, 3.0, None]
 
 
+@pytest.mark.parametrize("rate_hz", [None, 100.0])
+def test_folders_are_paired_by_file_name(tmp_path: Path, rate_hz: float | None) -> None:
+    for index in range(10):
+        saved(tmp_path / "col" / f"{index:06d}.png", np.full((12, 16, 3), index, np.uint8))
+        if index not in (0, 3):
+            saved(tmp_path / "dep" / f"{index:06d}.npy", np.full((12, 16), 1.0 + index, np.float32))
+    settings = SourceSettings(depth=f"file://{tmp_path}/dep", rate_hz=rate_hz)
+    with open_source(str(tmp_path / "col"), settings) as source:
+        frames = {int(frame.image[0, 0, 0]): frame.depth_m for frame in source}
+    # The first has no partner before the first pair, and is skipped.
+    assert list(frames) == list(range(1, 10))
+    depths = {index: None if depth is None else float(depth[0, 0]) for index, depth in frames.items()}
+    assert depths == {index: None if index == 3 else 1.0 + index for index in range(1, 10)}
+
+
+def test_folders_with_other_names_are_paired_by_position(tmp_path: Path) -> None:
+    uri, settings = folders(tmp_path, 3, 3)
+    for path in (tmp_path / "depth").iterdir():
+        path.rename(path.with_name(f"depth_{path.name}"))
+    with open_source(uri, settings) as source:
+        depths = [float(frame.depth_m[0, 0]) for frame in source if frame.depth_m is not None]
+    assert depths == pytest.approx([1.0, 2.0, 3.0])
+    (tmp_path / "depth" / "depth_1.png").unlink()
+    with pytest.raises(SourceError, match=r"^3 images in .*colour and 2 depth pictures in .* 0 is the first"):
+        open_source(uri, settings)
+    saved(tmp_path / "depth" / "depth_0.npy", METRES)
+    with pytest.raises(SourceError, match="two depth pictures have the same name"):
+        open_source(uri, settings)
+
+
+def test_loop_is_refused_with_depth(tmp_path: Path) -> None:
+    uri, settings = folders(tmp_path, 2, 2)
+    with pytest.raises(SourceError, match=r"source\.loop"):
+        open_source(uri, SourceSettings(depth=settings.depth, loop=True))
+
+
 @pytest.mark.realtime
 def test_folders_in_real_time_stay_paired_and_rotated(tmp_path: Path) -> None:
     uri, settings = folders(tmp_path, 6, 6)
@@ -281,6 +317,30 @@ def test_depth_that_arrives_late_is_waited_for() -> None:
     started_s = time.monotonic()
     assert pictures.nearest(2.0) == found
     assert 0.03 < time.monotonic() - started_s < 1.0
+
+
+def test_lost_depth_is_not_waited_for_until_it_is_back() -> None:
+    pictures = DepthPictures()
+    pictures.add(frame_at(1.0, depth_m=1.0))
+    colour = ScriptedSource([frame_at(1.0 + index / 10, index) for index in range(30)], live=True)
+    depth = ScriptedSource([], live=True, ends=False)
+    capture = PairedCapture(colour, depth, pictures, SourceSettings())
+    for _ in range(4):
+        assert capture.read(0.1) is not None
+    started_s = time.monotonic()
+    for _ in range(20):
+        raw = capture.read(0.1)
+        assert raw is not None
+        assert raw.depth_m is None
+    assert time.monotonic() - started_s < 0.4  # 40 ms for each would be 0.8 s
+    pictures.add(frame_at(3.3, depth_m=1.0))
+    back = threading.Timer(0.01, pictures.add, [frame_at(3.4, depth_m=2.0)])
+    back.start()
+    raw = capture.read(0.1)
+    back.join()
+    assert raw is not None
+    assert raw.depth_m is not None
+    assert raw.depth_m[0, 0] == 2.0
 
 
 def test_recordings_of_different_rates_are_paired_by_time() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -67,31 +67,58 @@ def _decode_colour(_path: Path, data: bytes) -> NDArray[np.uint8] | None:
     return decode_image(data)
 
 
+def partners(images: list[Path], depths: list[Path]) -> list[Path | None]:
+    """The depth picture of each image: of the same name without suffix, or of the same position.
+
+    Images without a partner have None. The position decides if no names agree and the numbers are the same.
+
+    Raises:
+        SourceError: neither names nor numbers agree, or two depth pictures have one name.
+    """
+    by_stem = {path.stem: path for path in depths}
+    if len(by_stem) < len(depths):
+        raise SourceError(
+            f"{depths[0].parent}: two depth pictures have the same name without suffix; keep one of each"
+        )
+    paired = [by_stem.get(path.stem) for path in images]
+    count = sum(path is not None for path in paired)
+    if count * 2 >= min(len(images), len(depths)):
+        return paired
+    if not count and len(images) == len(depths):
+        return list(depths)
+    alone = next(path for path, partner in zip(images, paired, strict=True) if partner is None)
+    raise SourceError(
+        f"{len(images)} images in {images[0].parent} and {len(depths)} depth pictures in {depths[0].parent} "
+        f"cannot be paired: {count} names without suffix agree, {alone.stem} is the first without a partner; "
+        f"give each depth picture the name of its image"
+    )
+
+
 class ImagesCapture(Capture):
     """Images in order. An unreadable one is logged, counted and skipped.
 
     Args:
+        paths: the images; None: no image for this interval.
         decode: returns the picture of a file's bytes, None if unreadable.
     """
 
     def __init__(
         self,
-        paths: list[Path],
+        paths: Sequence[Path | None],
         rate_hz: float,
         decode: Callable[[Path, bytes], NDArray[Any] | None] = _decode_colour,
     ) -> None:
         quiet_opencv()
         self._decode = decode
-        self._paths = paths
+        self._paths = [(index, path) for index, path in enumerate(paths) if path is not None]
         self.interval_s = 1 / rate_hz
         self._next = 0
-        self.total_frames = len(paths)
+        self.total_frames = len(self._paths)
 
     def read(self, timeout_s: float) -> RawFrame | None:
         while self._next < len(self._paths):
-            index = self._next
+            index, path = self._paths[self._next]
             self._next += 1
-            path = self._paths[index]
             started_ns = time.monotonic_ns()
             try:
                 image = self._decode(path, path.read_bytes())
@@ -104,7 +131,7 @@ class ImagesCapture(Capture):
             self.unreadable += 1
             logger.warning("%s: skipped: %s", path, reason)
         if self.unreadable == len(self._paths):
-            raise SourceError(f"{self._paths[0]}: none of the {len(self._paths)} images could be read")
+            raise SourceError(f"{self._paths[0][1]}: none of the {len(self._paths)} images could be read")
         raise EndOfStream
 
     def close(self) -> None:

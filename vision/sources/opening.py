@@ -16,7 +16,7 @@ from vision.sources.capture import Capture, LoopingCapture
 from vision.sources.csi import CsiCapture, check_csi_program, csi_settings, parse_csi_number
 from vision.sources.depth_cameras import OakCapture, RealsenseCapture, load_module
 from vision.sources.depth_pictures import DEPTH_SUFFIXES, decode_depth, is_depth_picture
-from vision.sources.files import ImagesCapture, VideoFileCapture, images_in, is_image
+from vision.sources.files import ImagesCapture, VideoFileCapture, images_in, is_image, partners
 from vision.sources.latest import LatestSource
 from vision.sources.network import UdpStream, open_http, open_rtsp, without_password
 from vision.sources.opencv import quiet_opencv
@@ -95,10 +95,26 @@ def open_source(uri: str, settings: SourceSettings = SourceSettings()) -> Source
 def _open_with_depth(uri: str, depth_uri: str, settings: SourceSettings) -> Source:
     if uri == depth_uri == "-":
         raise SourceError("standard input cannot be both source.uri and source.depth")
+    if settings.loop:
+        raise SourceError("source.loop cannot repeat two sources in step: remove it, or source.depth")
     pictures = DepthPictures()
     # Recordings are read frame by frame, so that their pictures pair; the pair is played in real time.
     each = replace(settings, depth=None, realtime=False, on_frame=None)
     of_depth = replace(each, as_depth=True, exposure_us=None, gain=None, name=None, on_frame=pictures.add)
+    colour_folder, depth_folder = _folder(uri), _folder(depth_uri)
+    if colour_folder is not None and depth_folder is not None:
+        paths = partners(images_in(colour_folder), images_in(depth_folder, DEPTH_SUFFIXES))
+        rate_hz = _image_rate_hz(settings)
+        colour = open_source(uri, each)
+        try:
+            depth = SequentialSource(
+                str(depth_folder), lambda: ImagesCapture(paths, rate_hz, decode_depth), of_depth
+            )
+        except BaseException:
+            colour.close()
+            raise
+        # Their times are multiples of the interval: a picture pairs with its partner alone.
+        return paired_source(colour, depth, pictures, settings, tolerance_s=0.25 / rate_hz)
     # At the same time: one writer may wait until both its pipes are opened.
     with ThreadPoolExecutor(1, "depth") as executor:
         opening = executor.submit(open_source, depth_uri, of_depth)
@@ -219,6 +235,12 @@ def _open_path(path: Path, settings: SourceSettings) -> Source:
     if is_image(path):
         return _open_file(str(path), lambda: ImagesCapture([path], _image_rate_hz(settings)), settings)
     return _open_file(str(path), lambda: VideoFileCapture(path), settings)
+
+
+def _folder(uri: str) -> Path | None:
+    """The folder that an address names, None if it names something else."""
+    path = Path(_rest(uri)) if uri.startswith("file://") else Path(uri).expanduser()
+    return path if path.is_dir() else None
 
 
 def _depth_images(path: Path, settings: SourceSettings) -> ImagesCapture:

@@ -23,6 +23,7 @@ TOLERANCE_S = 0.02
 """Largest difference of the stamps of a pair: cameras of 30 Hz that are not synchronized stay below it."""
 _WAIT_S = 0.04  # for a depth picture that arrives after its colour picture
 _KEPT = 8  # depth pictures of a live source
+_LOST_WAITS = 3  # in vain and in a row: the depth source is lost
 
 
 class DepthPictures:
@@ -31,20 +32,29 @@ class DepthPictures:
     def __init__(self) -> None:
         self._kept: deque[tuple[float, NDArray[np.float32]]] = deque(maxlen=_KEPT)
         self._changed = threading.Condition()
+        self._waits_in_vain = 0
 
     def add(self, frame: Frame) -> None:
         """`on_frame` of the depth source."""
         assert frame.depth_m is not None
         with self._changed:
             self._kept.append((frame.captured_ns / 1e9, frame.depth_m))
+            self._waits_in_vain = 0
             self._changed.notify()
 
     def nearest(self, stamp_s: float) -> tuple[float, NDArray[np.float32]] | None:
-        """The picture with the nearest stamp, waiting for it to arrive; None before the first."""
+        """The picture with the nearest stamp; None before the first.
+
+        Waits for it to arrive, but not while the depth source is lost: colour would be late for nothing.
+        """
         with self._changed:
-            self._changed.wait_for(
-                lambda: self._kept and self._kept[-1][0] >= stamp_s - TOLERANCE_S / 2, _WAIT_S
-            )
+            if self._waits_in_vain < _LOST_WAITS:
+                self._waits_in_vain += 1
+                arrived = self._changed.wait_for(
+                    lambda: self._kept and self._kept[-1][0] >= stamp_s - TOLERANCE_S / 2, _WAIT_S
+                )
+                if arrived:
+                    self._waits_in_vain = 0
             return min(self._kept, key=lambda kept: abs(kept[0] - stamp_s), default=None)
 
 
@@ -56,13 +66,20 @@ class PairedCapture(Capture):
 
     Args:
         pictures: `on_frame` of the depth source, for live ones.
+        tolerance_s: largest difference of the stamps of a pair.
     """
 
     silence_is_loss = False
 
     def __init__(
-        self, colour: Source, depth: Source, pictures: DepthPictures, settings: SourceSettings
+        self,
+        colour: Source,
+        depth: Source,
+        pictures: DepthPictures,
+        settings: SourceSettings,
+        tolerance_s: float = TOLERANCE_S,
     ) -> None:
+        self._tolerance_s = tolerance_s
         self._colour, self._depth, self._pictures = colour, depth, pictures
         self._timeout_s = settings.open_timeout_s
         self._current: Frame | None = None
@@ -107,8 +124,8 @@ class PairedCapture(Capture):
             f"the nearest is {self._smallest_gap_s:.3g} s away" if self._smallest_gap_s < 1e9 else "none came"
         )
         return SourceError(
-            f"no depth within {TOLERANCE_S * 1000:.0f} ms of a picture, {gap}; both sources need the same "
-            f"clock, and recordings the same rate (source.rate_hz)"
+            f"no depth within {self._tolerance_s * 1000:.3g} ms of a picture, {gap}; both sources need "
+            f"the same clock, and recordings the same rate (source.rate_hz)"
         )
 
     def _depth_of(self, frame: Frame) -> NDArray[np.float32] | None:
@@ -118,7 +135,7 @@ class PairedCapture(Capture):
             return None
         gap_s, depth_m = found
         self._smallest_gap_s = min(self._smallest_gap_s, gap_s)
-        if gap_s > TOLERANCE_S:
+        if gap_s > self._tolerance_s:
             return None
         if depth_m.shape != (frame.height, frame.width):
             raise SourceError(
@@ -174,7 +191,14 @@ def _gap_s(one: Frame, other: Frame) -> float:
     return abs((one.media_s or 0.0) - (other.media_s or 0.0))
 
 
-def paired_source(colour: Source, depth: Source, pictures: DepthPictures, settings: SourceSettings) -> Source:
+def paired_source(
+    colour: Source,
+    depth: Source,
+    pictures: DepthPictures,
+    settings: SourceSettings,
+    *,
+    tolerance_s: float = TOLERANCE_S,
+) -> Source:
     """One source of both, which it closes.
 
     Raises:
@@ -199,7 +223,7 @@ def paired_source(colour: Source, depth: Source, pictures: DepthPictures, settin
     uri = f"{colour.uri} with depth of {depth.uri}"
 
     def open_capture() -> Capture:
-        return PairedCapture(colour, depth, pictures, settings)
+        return PairedCapture(colour, depth, pictures, settings, tolerance_s)
 
     if colour.live or settings.realtime:
         paced = not colour.live

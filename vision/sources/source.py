@@ -47,11 +47,11 @@ class SourceSettings:
             `height` are those before it.
         name: for people, in messages before the address.
         depth: address of a second source with the depth of this one's pictures, registered to them: 16-bit
-            PNG, 32-bit TIFF or OpenEXR, NPY, a pipe of raw `gray16`, or shared memory with depth. Paired by
-            stamp, see `vision.sources.paired`.
+            PNG, 32-bit TIFF or OpenEXR, NPY, a pipe of raw `gray16`, or shared memory with depth. Two folders
+            are paired by file name, other sources by stamp, see `vision.sources.paired`.
         depth_scale: metres per unit of that depth; None: 0.001 for 16-bit integers, 1 for floats.
         as_depth: deliver depth pictures: `depth_m` with a black image. Set for the source that `depth` names.
-        loop: restart a file at its end.
+        loop: restart a file at its end. Refused with `depth`.
         realtime: read a file at its own frame rate, newest frame wins: a file used as a camera. A pipe has
             its writer's rate.
         every_frame: pipes only. True: every frame in order, the writer waits for the reader, and the writer's
