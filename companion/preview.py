@@ -54,7 +54,7 @@ def save_picture(folder: Path, frame: Frame, image: NDArray[np.uint8]) -> None:
 
 
 class RateMeter:
-    """The rate of a source over the last two seconds, from stamps and sequence numbers: lost frames count."""
+    """The rate of a source over the last two seconds, at least two frames, by stamps: lost frames count."""
 
     def __init__(self) -> None:
         self._seen: deque[tuple[int, int]] = deque()
@@ -62,7 +62,7 @@ class RateMeter:
     def add(self, captured_ns: int, sequence: int) -> float | None:
         """Add a frame; returns the rate in Hz, None before the second frame."""
         self._seen.append((captured_ns, sequence))
-        while captured_ns - self._seen[0][0] > _RATE_WINDOW_S * 1e9:
+        while len(self._seen) > 2 and captured_ns - self._seen[0][0] > _RATE_WINDOW_S * 1e9:
             self._seen.popleft()
         first_ns, first = self._seen[0]
         return (sequence - first) * 1e9 / (captured_ns - first_ns) if captured_ns > first_ns else None
@@ -70,6 +70,8 @@ class RateMeter:
 
 def preview_source(source: Source, options: PreviewOptions, write: Callable[[str], None]) -> int:
     """Print a line, and save a picture, every `period_s` until the source ends.
+
+    A source that ends after its first frame has one line.
 
     Returns:
         Number of lines.
@@ -81,19 +83,28 @@ def preview_source(source: Source, options: PreviewOptions, write: Callable[[str
         options.save.mkdir(parents=True, exist_ok=True)
     meter = RateMeter()
     shown, due_s = 0, time.monotonic()
-    for frame in source:
-        rate_hz = meter.add(frame.captured_ns, frame.sequence)
-        # The first frame has no rate yet.
-        if time.monotonic() < due_s or (rate_hz is None and options.period_s > 0.0 and shown == 0):
-            continue
-        due_s = time.monotonic() + options.period_s
+    only: Frame | None = None
+
+    def show(frame: Frame, rate_hz: float | None) -> None:
+        nonlocal shown
         lines = status_lines(source, frame, rate_hz, options.topic)
         write("  ".join(lines))
         if options.save is not None:
             save_picture(options.save, frame, picture(frame, lines, grey=options.grey))
         shown += 1
+
+    for frame in source:
+        rate_hz = meter.add(frame.captured_ns, frame.sequence)
+        # The first frame has no rate yet.
+        if time.monotonic() < due_s or (rate_hz is None and options.period_s > 0.0 and shown == 0):
+            only = frame
+            continue
+        due_s = time.monotonic() + options.period_s
+        show(frame, rate_hz)
         if shown == options.limit:
             break
+    if only is not None and shown == 0:
+        show(only, None)
     return shown
 
 

@@ -36,6 +36,22 @@ def test_rate_counts_lost_frames() -> None:
     assert rate_hz == pytest.approx(10.0)
 
 
+def test_rate_of_a_slow_source_is_of_its_last_two_frames() -> None:
+    meter = RateMeter()
+    meter.add(0, 0)
+    for index in range(1, 4):
+        assert meter.add(index * 5_000_000_000, index) == pytest.approx(0.2)
+
+
+def test_single_image_is_shown_and_saved(pictures: Path, tmp_path: Path) -> None:
+    lines: list[str] = []
+    with open_source(str(pictures / "2.png")) as source:
+        assert preview_source(source, PreviewOptions("v/image", tmp_path / "out"), lines.append) == 1
+    assert len(lines) == 1
+    assert "480x240  stamp" in lines[0]
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["000000.jpg"]
+
+
 @pytest.mark.parametrize(("grey", "shape"), [(False, (240, 480, 3)), (True, (80, 160, 3))])
 def test_every_frame_is_saved_with_its_lines(
     pictures: Path, tmp_path: Path, grey: bool, shape: tuple[int, ...]

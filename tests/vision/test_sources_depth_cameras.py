@@ -13,6 +13,7 @@ import pytest
 
 from vision.camera_model import CameraModel
 from vision.sources import SourceError, SourceSettings, open_source
+from vision.sources.depth_cameras import _warn_ignored_distortion
 
 pytestmark = pytest.mark.realtime
 
@@ -128,10 +129,22 @@ def test_realsense_delivers_registered_depth_in_metres(monkeypatch: pytest.Monke
 def test_unsupported_distortion_of_a_realsense_is_not_used(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setitem(sys.modules, "pyrealsense2", FakeRealsense((0.1,), "inverse_brown_conrady"))
+    monkeypatch.setitem(sys.modules, "pyrealsense2", FakeRealsense((0.1,), "kannala_brandt4"))
     with open_source("realsense://") as source:
         assert source.calibration is None
-    assert "inverse_brown_conrady, which is not supported" in caplog.text
+    assert "kannala_brandt4, which is not supported" in caplog.text
+
+
+def test_inverse_distortion_of_a_realsense_is_ignored_once(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    _warn_ignored_distortion.cache_clear()
+    monkeypatch.setitem(sys.modules, "pyrealsense2", FakeRealsense((-0.05, 0.06), "inverse_brown_conrady"))
+    for _ in range(2):
+        with open_source("realsense://") as source:
+            assert source.calibration is not None
+            assert source.calibration.model == CameraModel(WIDTH, HEIGHT, 30.0, 31.0, 15.0, 12.0)
+    assert caplog.text.count("-0.05, 0.06") == 1
 
 
 def test_missing_depth_camera_is_a_one_line_error(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,6 +14,7 @@ import logging
 import os
 import time
 from datetime import timedelta
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -54,6 +55,15 @@ def _stamp_ns(stamp_ns: float) -> int:
     return round(stamp_ns) if 0 <= now_ns - stamp_ns < _OLDEST_STAMP_NS else now_ns
 
 
+@cache  # once, not for each reopening
+def _warn_ignored_distortion(coefficients: tuple[float, ...]) -> None:
+    logger.warning(
+        "the camera's distortion is inverse Brown-Conrady, %s, and is ignored: its focal lengths and centre "
+        "are used. If positions near the image's edge matter, calibrate the lens (companion calibrate)",
+        coefficients,
+    )
+
+
 class RealsenseCapture(Capture):
     """Colour and depth of a RealSense camera.
 
@@ -88,8 +98,11 @@ class RealsenseCapture(Capture):
     def _calibration(self, lens: Any) -> CameraCalibration | None:
         distortion = tuple(float(value) for value in lens.coeffs)
         if any(distortion) and lens.model != self._rs.distortion.brown_conrady:
-            logger.warning("the camera's lens has the distortion %s, which is not supported", lens.model)
-            return None
+            if lens.model != self._rs.distortion.inverse_brown_conrady:
+                logger.warning("the camera's lens has the distortion %s, which is not supported", lens.model)
+                return None
+            _warn_ignored_distortion(distortion)
+            distortion = ()
         return CameraCalibration(
             CameraModel(
                 lens.width,
