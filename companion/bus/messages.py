@@ -89,7 +89,7 @@ def detections_message(
     detections = result.detections
     records = detections.records()
     # A box where the lens has no rays has no target.
-    targets = {
+    targets: dict[tuple[str, tuple[float, ...]], Target] = {
         (target.class_name, target.box_xyxy): target
         for target in (() if localization is None else localization.targets)
     }

@@ -78,8 +78,8 @@ class _Track:
         else:
             # How far the newest detections are from the fused position is part of its error.
             behind = self._motion.state[:2] - place
-            covariance = covariance + np.outer(behind, behind)
-        covariance = covariance + np.eye(2) * newest.vehicle_sigma_m**2
+            covariance += np.outer(behind, behind)
+        covariance += np.eye(2) * newest.vehicle_sigma_m**2
         down = self._weighted_down / self._weight
         return FusedPosition(
             (float(place[0]), float(place[1]), down),
@@ -94,7 +94,7 @@ class _Track:
 
     def _fused(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Position and covariance of the mean information."""
-        covariance: NDArray[np.float64] = np.linalg.inv(self._information / self._count)
+        covariance = np.asarray(np.linalg.inv(self._information / self._count), np.float64)
         return covariance @ (self._weighted / self._count), covariance
 
     def _disagrees(self, target: Target, covariance: NDArray[np.float64]) -> bool:

@@ -146,8 +146,8 @@ def test_ellipse_covers_a_slow_walker(speed_mps: float, along: bool) -> None:
     for frame in range(200):
         walked_m = speed_mps * 0.1 * frame
         at = (8.0 + walked_m, 0.0) if along else (12.0, walked_m - 10.0 * speed_mps)
-        noise = {"along_error_m": float(rng.normal(0.3, 0.2)), "across_error_m": float(rng.normal(0.0, 0.1))}
-        target = seen(vehicle, at, frame, sigma_m=0.5, **noise)
+        off_m = [float(rng.normal(0.3, 0.2)), float(rng.normal(0.0, 0.1))]
+        target = seen(vehicle, at, frame, sigma_m=0.5, along_error_m=off_m[0], across_error_m=off_m[1])
         tracks.update([target], vehicle, target.captured_ns)
         fused = position_of(tracks)
         error = np.array(fused.position_ned_m[:2]) - at
