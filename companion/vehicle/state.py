@@ -202,6 +202,16 @@ class VehicleState:
         return HeightSource.DISTANCE_SENSOR if measured else HeightSource.HOME
 
     @property
+    def height_disagreement_m(self) -> float:
+        """Between the level of `height_m` and others measured by the range finder; 0 without one."""
+        if self.ground is None or not self.range_finder_height:
+            return 0.0
+        level = self.home_position_ned_m[2] if self.home_position_ned_m else 0.0
+        if self.height_source is HeightSource.DISTANCE_SENSOR:
+            level = self.ground.position_ned_m[2]
+        return self.ground.disagreement_m(level, self.position_ns)
+
+    @property
     def without_setpoints(self) -> str:
         """What the autopilot does when setpoints stop, as text."""
         return _WITHOUT_SETPOINTS.get(self.autopilot or "", "the autopilot performs its configured failsafe")

@@ -104,6 +104,7 @@ class StateHistory:
         position, height_m = state.position_ned_m, state.height_m
         if position is not None and height_m is not None and _newer(self._positions, state.position_ns):
             sigma_m = height_sigma_m(state.height_source, height_m, state.vertical_sigma_m)
+            sigma_m = max(sigma_m, state.height_disagreement_m)
             error_m = (sigma_m, state.horizontal_sigma_m or UNSTATED_POSITION_SIGMA_M)
             self._positions.append((state.position_ns, (*position, height_m, *error_m)))
             self._forget(self._positions)

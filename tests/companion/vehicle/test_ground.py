@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from companion.guidance.targets.from_detections import StateHistory
 from companion.settings import Settings
 from companion.vehicle.state import HeightSource, VehicleState
 from companion.vehicle.telemetry import apply_message
@@ -153,7 +154,7 @@ def test_hover_above_an_object_ends_at_the_height_above_home() -> None:
 def test_first_surface_above_home_is_not_taken_for_the_ground() -> None:
     flight = Flight()
     assert flight.measure(3.5, count=20).height_source is HeightSource.HOME
-    assert flight.measure(5.8, count=5).height_m == pytest.approx(5.8)
+    assert flight.measure(5.7, count=5).height_m == pytest.approx(5.7)
 
 
 def test_ledge_is_followed_and_one_outlier_is_not() -> None:
@@ -161,16 +162,91 @@ def test_ledge_is_followed_and_one_outlier_is_not() -> None:
     flight.measure(5.0, count=10)
     assert flight.measure(9.0).height_m == pytest.approx(5.0)
     assert flight.measure(5.0, count=5).height_m == pytest.approx(5.0)
-    assert flight.measure(9.0, count=3).height_m == pytest.approx(9.0)
+    assert flight.measure(9.0, count=13).height_m == pytest.approx(9.0)
+    assert flight.state.height_disagreement_m == pytest.approx(4.0)
+    assert flight.measure(9.0, count=12, moved_m=0.4).height_disagreement_m == 0.0
+
+
+def test_false_echoes_do_not_change_the_height() -> None:
+    flight = Flight()
+    flight.measure(5.0, count=10)
+    state = flight.measure(10.0, count=3)
+    assert state.height_m == pytest.approx(5.0)
+    assert state.height_disagreement_m == pytest.approx(5.0)
+    # Even where they last: the ground at home's level is accepted again.
+    flight.measure(10.0, count=20)
+    assert flight.measure(5.0, count=5, moved_m=0.05).height_m == pytest.approx(5.0)
+
+
+def test_measurements_before_a_gap_do_not_count() -> None:
+    flight = Flight()
+    flight.measure(5.0, count=10)
+    flight.measure(9.0, count=5)
+    flight.wait(3.0)
+    assert flight.measure(5.2).height_m == pytest.approx(5.2)
+    flight.wait(3.0)
+    assert flight.measure(9.0).height_m == pytest.approx(5.2)
+
+
+def test_error_of_the_height_is_the_disagreement() -> None:
+    flight, history = Flight(), StateHistory()
+    flight.measure(5.0, count=10)
+    history.add(flight.measure(3.8, count=5))
+    assert history.at(flight.now_ns).height_m == pytest.approx(5.0)
+    assert history.at(flight.now_ns).error.height_m == pytest.approx(1.2)
+    # After 5 s the height is that above home, and the sensor still measures another one.
+    state = flight.measure(3.8, count=50)
+    assert state.height_source is HeightSource.HOME
+    assert state.height_disagreement_m == pytest.approx(1.2)
+    assert replace(state, range_finder_height=False).height_disagreement_m == 0.0
+
+
+def test_quay_at_the_level_of_home_ends_the_water_below() -> None:
+    flight = Flight(height_m=3.0)
+    assert flight.measure(8.0, count=20, moved_m=0.2).height_m == pytest.approx(8.0)
+    state = flight.measure(3.0, count=3, moved_m=0.2)
+    assert state.height_m == pytest.approx(3.0)
+    assert state.height_disagreement_m == pytest.approx(5.0)
+
+
+@pytest.mark.parametrize("moved_m", [0.05, 0.2], ids=["0.5 m/s", "2 m/s"])
+@pytest.mark.parametrize(
+    "tops_m",
+    [((0.9, 1.1), (1.45, 2.3), (1.05, 1.2)), ((1.2, 13.6),), ((0.9, 3.0),)],
+    ids=["car with a boot", "flatbed", "bonnet"],
+)
+def test_low_object_does_not_become_the_ground(
+    tops_m: tuple[tuple[float, float], ...], moved_m: float
+) -> None:
+    flight = Flight()
+    flight.measure(5.0, count=50, moved_m=moved_m)
+    for top_m, length_m in tops_m:
+        for _ in range(round(length_m / moved_m)):
+            assert flight.measure(5.0 - top_m, moved_m=moved_m).height_m == pytest.approx(5.0)
+    assert flight.state.height_disagreement_m == pytest.approx(tops_m[-1][0])
+    assert flight.measure(5.0, count=10, moved_m=moved_m).height_m == pytest.approx(5.0)
+
+
+def test_tent_is_within_the_stated_error() -> None:
+    flight = Flight()
+    flight.measure(5.0, count=100, moved_m=0.1)
+    for step in range(41):
+        top_m = 2.0 - abs(step - 20) * 0.1
+        state = flight.measure(5.0 - top_m, moved_m=0.0625)
+        assert state.height_m is not None
+        error_m = abs(state.height_m - 5.0)
+        assert error_m < 0.8
+        assert error_m < max(state.height_disagreement_m + 0.01, 0.51)
 
 
 def test_rising_slope_is_followed() -> None:
     flight = Flight()
     flight.measure(5.0, count=10)
-    for step in range(40):
-        flight.measure(5.0 - 0.1 * step, moved_m=0.3)
+    for step in range(120):
+        flight.measure(5.0 - 0.03 * step, moved_m=0.3)
     # The median is two measurements old.
-    assert flight.state.height_m == pytest.approx(1.1 + 0.2, abs=0.01)
+    assert flight.state.height_m == pytest.approx(1.43 + 0.06, abs=0.01)
+    assert flight.state.height_disagreement_m < 0.1
 
 
 def test_old_level_is_not_used() -> None:
