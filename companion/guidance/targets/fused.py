@@ -48,7 +48,7 @@ class _Track:
     Most errors of two frames have one cause: attitude, height, the object's size. Covariance intersection
     with equal weights (Julier & Uhlmann 1997) holds for any correlation: the covariance is the inverse of the
     mean information, and the position is the one that independent errors would give. Slow motion leaves the
-    position behind the object, so detections are forgotten, and one that disagrees begins anew.
+    position behind the object, so detections are forgotten, and one that disagrees restarts the fusion.
     """
 
     def __init__(self, target: Target, vehicle: Vector3, covariance: NDArray[np.float64]) -> None:

@@ -158,7 +158,7 @@ def test_ellipse_covers_a_slow_walker(speed_mps: float, along: bool) -> None:
         assert along or math.hypot(*error) < 1.5
 
 
-def test_object_that_was_moved_is_located_anew() -> None:
+def test_object_that_was_moved_is_located_again() -> None:
     tracks, vehicle = FusedTracks(), (0.0, 0.0, -5.0)
     for frame in range(40):
         target = seen(vehicle, (12.0, 0.0 if frame < 20 else 4.0), frame, sigma_m=0.5)

@@ -93,7 +93,7 @@ def test_only_boxes_where_the_lens_has_no_rays_have_no_target() -> None:
     targets = targets_from_detections(found, T0, fisheye, MOUNT, history)
     assert [target.box_xyxy for target in targets] == [boxes[0], boxes[2]]
     # Its lower edge has no rays, its middle has.
-    below = detection((160, 300, 220, 460), nearest=(0.0, 1.0, 8.0))
+    below = detection((120, 300, 180, 475), nearest=(0.0, 1.0, 8.0))
     (target,) = targets_from_detections([below], T0, fisheye, MOUNT, history)
     assert math.isfinite(target.range_sigma_m)
     assert math.isfinite(target.across_sigma_m)
