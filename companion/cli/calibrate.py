@@ -91,7 +91,8 @@ def lens(
         for view, error in result.rejected:
             note(f"rejected {view.name}: its error is {error:.2f} px")
         lines = result_lines(result)
-        write_camera_info(output, result.model, name, (f"companion calibrate: {lines[0]}", lines[3]))
+        notes = (f"companion calibrate: {lines[0]}", lines[3])
+        write_camera_info(output, result.model, name, notes, settings.orientation)
         page = None if report is None else write_report(report, result, collected)
     for line in lines:
         typer.echo(line)
@@ -128,8 +129,12 @@ def mount(
     logging.basicConfig(level=logging.WARNING, format="companion: %(message)s", stream=sys.stderr)
     with plain_errors(SourceError, ValueError, OSError):
         kind = MarkerKind(dictionary, size, {marker: size})
-        model = None if calibration is None else read_camera_info(calibration)
         settings = SourceSettings(every_frame=True, rotate_deg=rotate, mirror=mirror)
+        model = None
+        if calibration is not None:
+            info = read_camera_info(calibration)
+            info.check_source(settings.orientation)
+            model = info.model
         with open_source(source, settings) as images:
             found = markers_of(images, kind, marker, model, frames)
         angles = mount_from_markers(found, *map(math.radians, (heading, roll, pitch)))

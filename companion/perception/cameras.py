@@ -202,6 +202,13 @@ class WorkerCamera(PerceptionCamera):
         """Start the worker. Raises PerceptionStartError, with the camera's name in its message."""
         if self.settings.source.uri == NO_SOURCE:
             return
+        rotate_deg, roll_deg = self.settings.source.rotate_deg, self._given.mount_roll_deg
+        if rotate_deg == 180 and abs(roll_deg) > 90.0:
+            self._event(
+                "warning",
+                f"source.rotate_deg is 180 and camera.mount_roll_deg {roll_deg:g}: the mount is that of the "
+                f"rotated picture; a camera fixed upside down has mount_roll_deg 0",
+            )
         try:
             await self.supervisor.start()
         except PerceptionStartError as error:

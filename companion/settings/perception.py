@@ -136,7 +136,7 @@ class CameraSection(Section):
             return values
         if given := sorted(LENS_KEYS & values.keys()):
             raise ValueError(f"calibration_file sets the lens, {', '.join(given)} too: remove one of them")
-        lens = read_camera_info(Path(file).expanduser())
+        lens = read_camera_info(Path(file).expanduser()).model
         others = {key: value for key, value in values.items() if key != "calibration_file"}
         return others | lens_settings(lens)
 
@@ -210,6 +210,18 @@ class CameraSection(Section):
             self.stabilized,
             self.on_gimbal,
         )
+
+
+def check_calibration_file(values: Any, source: SourceSection) -> None:
+    """Check that `camera.calibration_file` in a table of sections is of the images of its source.
+
+    Raises:
+        ValueError: it is of another camera, or of images that are turned otherwise.
+    """
+    camera = values.get("camera") if isinstance(values, dict) else None
+    if isinstance(camera, dict) and isinstance(file := camera.get("calibration_file"), str):
+        info = read_camera_info(Path(file).expanduser())
+        info.check_source(source.opening().orientation, source.name)
 
 
 def lens_settings(lens: CameraModel) -> dict[str, Any]:

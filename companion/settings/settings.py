@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Self
+from typing import Any, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, ModelWrapValidatorHandler, model_validator
 
 from companion.settings.bus import ZenohSection
 from companion.settings.guidance import GuidanceSection
@@ -24,6 +24,7 @@ from companion.settings.perception import (
     SourceSection,
     TrackerSection,
     VideoSection,
+    check_calibration_file,
 )
 from companion.settings.section import Section
 from companion.settings.texts import CameraName
@@ -39,6 +40,13 @@ class CameraSections(Section):
     tracker: TrackerSection = TrackerSection()
     markers: MarkersSection = MarkersSection()
     recording: VideoSection = VideoSection()
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _calibration_fits(cls, values: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        sections = handler(values)
+        check_calibration_file(values, sections.source)
+        return sections
 
 
 class Settings(Section):
@@ -60,6 +68,13 @@ class Settings(Section):
     log: LogSection = LogSection()
     plugins: PluginsSection = PluginsSection()
     cameras: dict[CameraName, CameraSections] = Field(default_factory=dict)
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _calibration_fits(cls, values: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        settings = handler(values)
+        check_calibration_file(values, settings.source)
+        return settings
 
     @model_validator(mode="after")
     def _cameras_fit_together(self) -> Self:

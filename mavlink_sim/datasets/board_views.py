@@ -212,7 +212,7 @@ def board(
     """Write images of a calibration board, for `companion calibrate`, with the true lens."""
     try:
         printed = Board.parse(*board, square, marker, dictionary)
-        camera = LENSES[lens] if lens in LENSES else read_camera_info(Path(lens))
+        camera = LENSES[lens] if lens in LENSES else read_camera_info(Path(lens)).model
         write_board_views(folder, printed, camera, views, seed)
     except (ValueError, OSError) as error:
         print(f"mavlink-sim board: {error}", file=sys.stderr)

@@ -54,7 +54,7 @@ def test_folder_gives_a_calibration_and_a_report(folder: Path, tmp_path: Path) -
     output, report = tmp_path / "camera.yaml", tmp_path / "report"
     done = calibrate(folder, *BOARD_WORDS, "-o", output, "--report", report, "--name", "front")
     assert done.exit_code == 0, done.output
-    lens = read_camera_info(output)
+    lens = read_camera_info(output).model
     assert (lens.width, lens.height, lens.distortion_model) == (320, 240, "plumb_bob")
     assert (lens.fx, lens.fy) == pytest.approx((LENS.fx, LENS.fy), rel=0.01)
     assert "camera_name: front" in output.read_text()
@@ -85,7 +85,7 @@ def test_video_gives_a_calibration(tmp_path: Path) -> None:
     assert done.exit_code == 0, done.output
     assert "12 images, 12 with the board, 12 different views" in done.stderr
     assert "missing" in done.stderr
-    assert read_camera_info(tmp_path / "camera.yaml").fx == pytest.approx(LENS.fx, rel=0.02)
+    assert read_camera_info(tmp_path / "camera.yaml").model.fx == pytest.approx(LENS.fx, rel=0.02)
 
 
 def test_written_file_is_accepted_by_the_settings(folder: Path, tmp_path: Path) -> None:
@@ -93,7 +93,20 @@ def test_written_file_is_accepted_by_the_settings(folder: Path, tmp_path: Path) 
     assert calibrate(folder, *BOARD_WORDS, "-o", output).exit_code == 0
     done = CliRunner().invoke(app, ["config", "--camera-calibration-file", str(output)])
     assert done.exit_code == 0, done.output
-    assert f"fx_px = {read_camera_info(output).fx}" in done.stdout
+    assert f"fx_px = {read_camera_info(output).model.fx}" in done.stdout
+
+
+def test_calibration_of_turned_images_says_so(folder: Path, marker_images: Path, tmp_path: Path) -> None:
+    output = tmp_path / "camera.yaml"
+    assert calibrate(folder, *BOARD_WORDS, "-o", output, "--rotate", "180", "--mirror").exit_code == 0
+    assert {"rotate_deg: 180", "mirror: true"} <= set(output.read_text().splitlines())
+    flags = ("--camera-calibration-file", str(output))
+    done = CliRunner().invoke(app, ["config", *flags])
+    assert "source.rotate_deg is 0" in one_line_of_bad_input(done)
+    turned = ("--source-rotate-deg", "180", "--source-mirror", "true")
+    assert CliRunner().invoke(app, ["config", *flags, *turned]).exit_code == 0
+    done = calibrate("mount", marker_images, "--marker", "7", "--size", "0.6", "--calibration", output)
+    assert "rotate_deg" in one_line_of_bad_input(done)
 
 
 def test_no_board_in_any_view(folder: Path, tmp_path: Path) -> None:
@@ -199,7 +212,7 @@ def test_simulator_writes_views_with_their_truth(tmp_path: Path) -> None:
     assert done.exit_code == 0, done.output
     names = sorted(path.name for path in (tmp_path / "out").iterdir())
     assert names == ["truth.json", "truth.yaml", "view00.png", "view01.png"]
-    assert read_camera_info(tmp_path / "out" / "truth.yaml") == LENS
+    assert read_camera_info(tmp_path / "out" / "truth.yaml").model == LENS
     again = CliRunner().invoke(board_app, words)
     assert again.exit_code == 2
     assert "empty" in again.stderr

@@ -3,18 +3,67 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from vision.camera_model import CameraModel
+from vision.orientation import Orientation
 from vision.plain_yaml import load_plain_yaml
 
+# The names that `companion calibrate` and ROS's camera_calibration write if none is given.
+_DEFAULT_NAMES = ("camera", "narrow_stereo")
 
-def write_camera_info(path: Path, model: CameraModel, name: str, notes: tuple[str, ...] = ()) -> None:
+
+@dataclass(frozen=True, slots=True)
+class CameraInfo:
+    """What a calibration file says.
+
+    Attributes:
+        path: of the file.
+        model: size, camera matrix and distortion.
+        name: of the camera; None if it has none, or a program's default.
+        orientation: how the images were turned before the calibration; None if the file does not say.
+    """
+
+    path: Path
+    model: CameraModel
+    name: str | None
+    orientation: Orientation | None
+
+    def check_source(self, orientation: Orientation, name: str | None = None) -> None:
+        """Check that the calibration is of this source's images.
+
+        Raises:
+            ValueError: the source is turned otherwise, or is another camera; one line that names both.
+        """
+        own = self.orientation
+        for key in ("rotate_deg", "mirror"):
+            if own is not None and (value := getattr(own, key)) != getattr(orientation, key):
+                raise ValueError(
+                    f"the calibration file {self.path} has {key} {_text(value)}, but source.{key} is "
+                    f"{_text(getattr(orientation, key))}: calibrate with the same --rotate and --mirror, or "
+                    f"correct one of them"
+                )
+        if self.name is not None and name is not None and self.name != name:
+            raise ValueError(
+                f"the calibration file {self.path} is the calibration of another camera: camera_name is "
+                f"{self.name!r}, source.name {name!r}"
+            )
+
+
+def write_camera_info(
+    path: Path,
+    model: CameraModel,
+    name: str,
+    notes: tuple[str, ...] = (),
+    orientation: Orientation | None = None,
+) -> None:
     """Write a calibration file.
 
     Args:
         name: of the camera, `camera_name` in the file.
+        orientation: how the images were turned, written as keys that ROS ignores; None: not written.
         notes: lines of comment at its beginning.
 
     Raises:
@@ -33,11 +82,13 @@ def write_camera_info(path: Path, model: CameraModel, name: str, notes: tuple[st
         *_matrix("rectification_matrix", 3, 3, [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]),
         *_matrix("projection_matrix", 3, 4, projection),
     ]
+    if orientation is not None:
+        lines += [f"rotate_deg: {orientation.rotate_deg}", f"mirror: {_text(orientation.mirror)}"]
     path.write_text("\n".join(lines) + "\n", "utf-8")
 
 
-def read_camera_info(path: Path) -> CameraModel:
-    """Read a calibration file: size, camera matrix and distortion.
+def read_camera_info(path: Path) -> CameraInfo:
+    """Read a calibration file.
 
     Raises:
         ValueError: it cannot be read, is not such a file, or has an unknown distortion model; one line that
@@ -50,13 +101,15 @@ def read_camera_info(path: Path) -> CameraModel:
         matrix = _numbers(content, "camera_matrix", 9)
         if matrix[1] != 0.0 or matrix[3] != 0.0 or matrix[6:] != (0.0, 0.0, 1.0):
             raise ValueError(f"camera_matrix must be [fx, 0, cx, 0, fy, cy, 0, 0, 1], got {list(matrix)}")
-        return CameraModel(
+        model = CameraModel(
             _size(content, "image_width"),
             _size(content, "image_height"),
             *(matrix[0], matrix[4], matrix[2], matrix[5]),
             _numbers(content, "distortion_coefficients"),
             _value(content, "distortion_model"),
         )
+        name = str(content.get("camera_name") or "")
+        return CameraInfo(path, model, None if name in ("", *_DEFAULT_NAMES) else name, _orientation(content))
     except OSError as error:
         raise ValueError(f"cannot read the calibration file {path}: {error.strerror}") from None
     except ValueError as error:  # UnicodeDecodeError and PlainYamlError are too
@@ -66,6 +119,21 @@ def read_camera_info(path: Path) -> CameraModel:
 def _matrix(key: str, rows: int, columns: int, values: tuple[float, ...] | list[float]) -> list[str]:
     data = ", ".join(f"{value:.10g}" for value in values)
     return [f"{key}:", f"  rows: {rows}", f"  cols: {columns}", f"  data: [{data}]"]
+
+
+def _orientation(content: dict[Any, Any]) -> Orientation | None:
+    if not content.keys() & {"rotate_deg", "mirror"}:
+        return None
+    rotate_deg, mirror = content.get("rotate_deg", 0), content.get("mirror", False)
+    if isinstance(rotate_deg, bool) or not isinstance(rotate_deg, int) or not isinstance(mirror, bool):
+        raise ValueError(
+            f"rotate_deg must be 0, 90, 180 or 270, mirror true or false, got {rotate_deg!r} and {mirror!r}"
+        )
+    return Orientation(rotate_deg, mirror)
+
+
+def _text(value: int | bool) -> str:
+    return str(value).lower()
 
 
 def _value(content: dict[Any, Any], key: str) -> Any:

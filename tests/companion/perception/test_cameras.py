@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import queue
@@ -13,8 +14,9 @@ from typing import Any
 import pytest
 
 from companion.bus.client import listen
-from companion.perception.cameras import threads_each
-from companion.settings import DetectorSection
+from companion.perception.cameras import open_cameras, threads_each
+from companion.perception.supervisor import PerceptionSupervisor
+from companion.settings import CameraSection, DetectorSection, Settings, SourceSection
 from companion.settings.reading import ConfigurationError, load_settings, to_toml
 from mavlink_sim.testing import running_simulator
 from tests.companion.service_process import running_service
@@ -148,3 +150,24 @@ def test_automatic_threads_leave_a_processor_free() -> None:
     # A disabled detector gets no threads, a configured number is not changed.
     assert threads_each([off, asking, off]) == threads_each([asking])
     assert threads_each([DetectorSection(threads=processors), asking]) == 1
+
+
+@pytest.mark.parametrize(("roll_deg", "warnings"), [(180.0, 1), (0.0, 0)])
+def test_camera_turned_twice_is_warned_about(
+    roll_deg: float, warnings: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def started(_: PerceptionSupervisor) -> None:
+        """No worker."""
+
+    monkeypatch.setattr(PerceptionSupervisor, "start", started)
+    events: list[tuple[str, str]] = []
+    (camera,) = open_cameras(
+        Settings(source=SourceSection(rotate_deg=180), camera=CameraSection(mount_roll_deg=roll_deg)),
+        on_result=lambda camera, result: None,
+        on_preview=lambda camera, preview: None,
+        on_event=lambda level, text: events.append((level, text)),
+        on_calibration=lambda: None,
+    )
+    asyncio.run(camera.start())
+    assert [level for level, _ in events] == ["warning"] * warnings
+    assert all("source.rotate_deg" in text and "camera.mount_roll_deg" in text for _, text in events)

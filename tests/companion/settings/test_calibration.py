@@ -13,6 +13,7 @@ from companion.settings.perception import CameraSection
 from companion.settings.reading import ConfigurationError, load_settings, to_toml
 from vision.calibration.camera_info import write_camera_info
 from vision.camera_model import CameraCalibration, CameraModel, CameraMount
+from vision.orientation import Orientation
 
 LENS = CameraModel.from_horizontal_fov(640, 480, math.radians(70.0))
 MOUNT = CameraMount(0.12, 0.0, 0.05, 0.0, math.radians(-20.0), 0.0)
@@ -131,6 +132,39 @@ def test_settings_of_a_calibration_file_are_its_numbers(tmp_path: Path) -> None:
     (effective := tmp_path / "effective.toml").write_text(to_toml(settings))
     file.unlink()
     assert load_settings(effective, {}, environment={}).camera == settings.camera
+
+
+@pytest.mark.parametrize(
+    ("source", "facts"),
+    [
+        ({}, ("rotate_deg 180", "source.rotate_deg is 0")),
+        ({"rotate_deg": "180"}, ("mirror true", "source.mirror is false")),
+        ({"rotate_deg": "180", "mirror": "true", "name": "rear"}, ("'front'", "'rear'", "another camera")),
+    ],
+)
+@pytest.mark.parametrize("prefix", ["", "cameras.second."])
+def test_calibration_of_other_images_is_refused(
+    tmp_path: Path, prefix: str, source: dict[str, str], facts: tuple[str, ...]
+) -> None:
+    write_camera_info(file := tmp_path / "camera.yaml", LENS, "front", (), Orientation(180, True))
+    values = {f"{prefix}source.{key}": value for key, value in source.items()}
+    values[f"{prefix}camera.calibration_file"] = str(file)
+    if prefix:
+        values[f"{prefix}source.uri"] = "photos"
+    with pytest.raises(ConfigurationError) as caught:
+        load_settings(os.devnull, values, environment={})
+    (problem,) = caught.value.problems
+    assert all(fact in problem for fact in (str(file), *facts))
+
+
+def test_calibration_of_the_same_images_is_used(tmp_path: Path) -> None:
+    write_camera_info(file := tmp_path / "camera.yaml", LENS, "front", (), Orientation(180, True))
+    values = {"source.rotate_deg": "180", "source.mirror": "true", "source.name": "front"}
+    values["camera.calibration_file"] = str(file)
+    assert load_settings(os.devnull, values, environment={}).camera.fx_px == pytest.approx(LENS.fx)
+    # A file of ROS does not say how its images were turned.
+    write_camera_info(file, LENS, "camera")
+    assert load_settings(os.devnull, values, environment={}).camera.fx_px == pytest.approx(LENS.fx)
 
 
 def test_frames_of_another_aspect_are_refused(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import pytest
 
 from vision.calibration.camera_info import read_camera_info, write_camera_info
 from vision.camera_model import CameraModel
+from vision.orientation import Orientation
 
 # As ROS's camera_calibration writes it.
 ROS = """\
@@ -36,7 +37,7 @@ projection_matrix:
 
 def test_file_of_ros_is_read(tmp_path: Path) -> None:
     (file := tmp_path / "ost.yaml").write_text(ROS)
-    assert read_camera_info(file) == CameraModel(
+    assert read_camera_info(file).model == CameraModel(
         640,
         480,
         438.783367,
@@ -58,8 +59,25 @@ def test_file_of_ros_is_read(tmp_path: Path) -> None:
 def test_written_file_is_read_unchanged(tmp_path: Path, model: str, distortion: tuple[float, ...]) -> None:
     lens = CameraModel(1920, 1080, 1100.25, 1101.5, 958.75, 541.125, distortion, model)  # type: ignore[arg-type]
     write_camera_info(file := tmp_path / "camera.yaml", lens, "front", ("24 views", "0.08 px"))
-    assert read_camera_info(file) == lens
+    assert read_camera_info(file).model == lens
     assert file.read_text().startswith("# 24 views\n# 0.08 px\nimage_width: 1920\n")
+
+
+@pytest.mark.parametrize("orientation", [None, Orientation(), Orientation(180, True)])
+def test_orientation_and_name_are_read_back(tmp_path: Path, orientation: Orientation | None) -> None:
+    lens = CameraModel(640, 480, 400.0, 400.0, 320.0, 240.0, (-0.3, 0.1, 0.0, 0.0, 0.0))
+    write_camera_info(file := tmp_path / "camera.yaml", lens, "front", (), orientation)
+    info = read_camera_info(file)
+    assert (info.model, info.name, info.orientation) == (lens, "front", orientation)
+    write_camera_info(file, lens, "camera")
+    assert read_camera_info(file).name is None
+
+
+@pytest.mark.parametrize("keys", ["rotate_deg: 45", "rotate_deg: true", "mirror: 1"])
+def test_unknown_orientation_is_refused(tmp_path: Path, keys: str) -> None:
+    (file := tmp_path / "ost.yaml").write_text(f"{ROS}{keys}\n")
+    with pytest.raises(ValueError, match=r"ost\.yaml.*rotate_deg"):
+        read_camera_info(file)
 
 
 @pytest.mark.parametrize(
