@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,6 +25,8 @@ Image = NDArray[np.uint8]
 
 # Images of the report are at most so wide.
 _WIDTH = 640
+# A live source without the marker gives a line each so many seconds.
+_MISSING_S = 3.0
 # Residuals are drawn longer by this factor.
 _ENLARGED = 100
 _GREEN, _RED, _GREY = (60, 160, 40), (40, 40, 220), (200, 200, 200)
@@ -86,12 +89,18 @@ def collect_views(source: Source, board: Board, write: Callable[[str], None], ev
 
 
 def markers_of(
-    source: Source, kind: MarkerKind, identifier: int, model: CameraModel | None, limit: int
+    source: Source,
+    kind: MarkerKind,
+    identifier: int,
+    model: CameraModel | None,
+    limit: int,
+    write: Callable[[str], None],
 ) -> list[Marker]:
     """The marker in the frames of a source, at most `limit` times; Ctrl-C ends a live source.
 
     Args:
         model: the lens; None: the source's own.
+        write: called with a line at the start of a live source, and while the marker is not seen.
 
     Raises:
         CalibrationError: the lens is not known.
@@ -103,11 +112,22 @@ def markers_of(
         model = source.calibration.model
     detector = MarkerDetector(kind)
     found: list[Marker] = []
+    if source.live:
+        write(f"show marker {identifier} to the camera; Ctrl-C ends")
+    others: set[int] = set()
+    due_s = time.monotonic() + _MISSING_S
     try:
         for frame in source:
             lens = scaled_to_frames(model, frame.width, frame.height)
             seen = detector.detect(frame.image, lens)
-            found += [each for each in seen if each.identifier == identifier]
+            found += (own := [each for each in seen if each.identifier == identifier])
+            others |= {each.identifier for each in seen}
+            if own:
+                due_s, others = time.monotonic() + _MISSING_S, set()
+            elif source.live and time.monotonic() >= due_s:
+                names = ", ".join(map(str, sorted(others))) or "no marker"
+                write(f"marker {identifier} not seen; seen: {names}")
+                due_s, others = time.monotonic() + _MISSING_S, set()
             if len(found) >= limit:
                 break
     except KeyboardInterrupt:

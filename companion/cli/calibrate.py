@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 import typer.core
 
-from companion.cli.flags import plain_errors
+from companion.cli.flags import check_finite, check_folder, plain_errors
 
 
 class _LensByDefault(typer.core.TyperGroup):
@@ -32,6 +32,10 @@ calibrate = typer.Typer(
     help="Calibrate a camera's lens (SOURCE), or its mount on the vehicle (mount).",
     no_args_is_help=True,
 )
+
+
+def _note(text: str) -> None:
+    typer.echo(f"companion: {text}", err=True)
 
 
 @calibrate.command()
@@ -71,25 +75,23 @@ def lens(
 
     logging.basicConfig(level=logging.WARNING, format="companion: %(message)s", stream=sys.stderr)
 
-    def note(text: str) -> None:
-        typer.echo(f"companion: {text}", err=True)
-
     with plain_errors(SourceError, ValueError, OSError):  # CalibrationError is a ValueError
+        check_folder(output)
         printed = Board.parse(*board, square, marker, dictionary)
         settings = SourceSettings(
             width=width, height=height, every_frame=True, rotate_deg=rotate, mirror=mirror
         )
         with open_source(source, settings) as frames:
-            collected = collect_views(frames, printed, note, every)
-        note(
+            collected = collect_views(frames, printed, _note, every)
+        _note(
             f"{collected.frames} images, {collected.found} with the board, "
             f"{len(collected.collector.views)} different views"
         )
         if missing := collected.collector.missing():
-            note(f"missing for a complete set: {'; '.join(missing)}")
+            _note(f"missing for a complete set: {'; '.join(missing)}")
         result = calibrate_views(collected.collector.chosen())
         for view, error in result.rejected:
-            note(f"rejected {view.name}: its error is {error:.2f} px")
+            _note(f"rejected {view.name}: its error is {error:.2f} px")
         lines = result_lines(result)
         notes = (f"companion calibrate: {lines[0]}", lines[3])
         write_camera_info(output, result.model, name, notes, settings.orientation)
@@ -128,6 +130,8 @@ def mount(
 
     logging.basicConfig(level=logging.WARNING, format="companion: %(message)s", stream=sys.stderr)
     with plain_errors(SourceError, ValueError, OSError):
+        for flag, angle in (("--heading", heading), ("--roll", roll), ("--pitch", pitch)):
+            check_finite(flag, angle)
         kind = MarkerKind(dictionary, size, {marker: size})
         settings = SourceSettings(every_frame=True, rotate_deg=rotate, mirror=mirror)
         model = None
@@ -136,7 +140,7 @@ def mount(
             info.check_source(settings.orientation)
             model = info.model
         with open_source(source, settings) as images:
-            found = markers_of(images, kind, marker, model, frames)
+            found = markers_of(images, kind, marker, model, frames, _note)
         angles = mount_from_markers(found, *map(math.radians, (heading, roll, pitch)))
     typer.echo(f"# {angles.views} images, spread {math.degrees(angles.spread_rad):.2f} degrees")
     for key in ("roll", "pitch", "yaw"):

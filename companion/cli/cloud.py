@@ -16,7 +16,7 @@ import typer
 from numpy.typing import NDArray
 
 from companion.cli.cameras import opened
-from companion.cli.flags import EXIT_BAD_INPUT, plain_errors
+from companion.cli.flags import EXIT_BAD_INPUT, check_finite, check_folder, plain_errors
 from companion.settings import Settings
 from companion.settings.perception import CameraSection
 from vision.gc_pause import gc_paused
@@ -74,9 +74,13 @@ def cloud(
         _refuse(f"{picture}: expected a name that ends in {' or '.join(_QUALITY)}")
     if clusters:
         voxel, average = voxel or 0.1, average or 4
-    ned_from_body = matrix_from_euler(*(math.radians(angle) for angle in attitude))
     # ValueError: a camera on a gimbal has no fixed mount, or the voxels are too small.
     with plain_errors(CloudFileError, ValueError, OSError):
+        check_finite("--attitude", *attitude)
+        for path in (output, picture):
+            if path is not None:
+                check_folder(path)
+        ned_from_body = matrix_from_euler(*(math.radians(angle) for angle in attitude))
         captured, depth_m, camera = _capture(settings, source)
         mount = camera.mount()
         points = cloud_from_depth(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -42,6 +43,18 @@ def plain_errors(*expected: type[Exception]) -> Iterator[None]:
         for line in str(error).splitlines():
             typer.echo(f"companion: {line}", err=True)
         raise typer.Exit(EXIT_BAD_INPUT) from error
+
+
+def check_finite(flag: str, *values: float) -> None:
+    """Raise ValueError, which names the flag, if a value is no finite number."""
+    if not all(map(math.isfinite, values)):
+        raise ValueError(f"{flag} must be finite, got {' '.join(f'{value:g}' for value in values)}")
+
+
+def check_folder(path: Path) -> None:
+    """Raise OSError if the folder of a file to be written does not exist."""
+    if not path.parent.is_dir():
+        raise OSError(f"cannot write {path}: no such folder")
 
 
 def settings_command(

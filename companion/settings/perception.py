@@ -43,9 +43,9 @@ class SourceSection(Section):
     pixel_format: str | None = None
     """a camera's FourCC (MJPG, YUYV), or the format of a pipe: bgr24, rgb24, gray8, yuv420, y4m, mjpeg"""
     exposure_us: Annotated[float | None, Field(ge=1, le=1e7)] = None
-    """exposure time of a camera, microseconds; unset: automatic"""
+    """exposure time of a camera, microseconds; unset: automatic (csi://), left as it is (/dev/video0)"""
     gain: Annotated[float | None, Field(ge=0, le=1e6)] = None
-    """gain of a camera: a factor (csi://), the driver's unit (/dev/video0); unset: automatic"""
+    """gain of a camera: a factor (csi://), the driver's unit (/dev/video0); unset as exposure_us"""
     mirror: bool = False
     """the source delivers a mirror image: exchange left and right, of picture and depth"""
     rotate_deg: Annotated[int, Field(ge=0, le=270, multiple_of=90)] = 0
@@ -72,6 +72,8 @@ class SourceSection(Section):
     @model_validator(mode="after")
     def _can_be_opened(self) -> Self:
         self.opening()
+        if self.depth_scale is not None and self.depth is None:
+            raise ValueError("depth_scale is the unit of depth, which is not set: set depth, or remove it")
         return self
 
     def opening(self, on_frame: Callable[[Frame], None] | None = None) -> SourceSettings:

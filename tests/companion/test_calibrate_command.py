@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from companion.calibrate import collect_views
+from companion import calibrate as calibrate_module
+from companion.calibrate import collect_views, markers_of
 from companion.cli.commands import app
 from mavlink_sim.camera.image_effects import ImageEffects
 from mavlink_sim.camera.renderer import Renderer
@@ -23,6 +24,7 @@ from vision.calibration.boards import Board
 from vision.calibration.camera_info import read_camera_info, write_camera_info
 from vision.camera_model import CameraModel, CameraMount
 from vision.frame import Frame
+from vision.markers import MarkerKind
 from vision.rotation import matrix_from_euler
 from vision.sources import Source, SourceStatistics
 
@@ -256,3 +258,31 @@ def test_mount_without_its_marker_or_lens(marker_images: Path) -> None:
     line = one_line_of_bad_input(calibrate("mount", marker_images, "--marker", "7", "--size", "0.6", *wide))
     assert "640x360" in line
     assert "640x480" in line
+
+
+@pytest.mark.parametrize("flag", ["--heading", "--roll", "--pitch"])
+def test_angle_that_is_no_number_is_refused(flag: str) -> None:
+    done = calibrate("mount", "none", "--marker", "7", "--size", "0.6", flag, "nan")
+    assert one_line_of_bad_input(done).startswith(f"companion: {flag} ")
+
+
+def test_missing_output_folder_is_refused_before_the_source_opens(tmp_path: Path) -> None:
+    line = one_line_of_bad_input(calibrate("none", *BOARD_WORDS, "-o", tmp_path / "no" / "camera.yaml"))
+    assert line == f"companion: cannot write {tmp_path / 'no' / 'camera.yaml'}: no such folder"
+
+
+def test_live_camera_without_the_marker_says_what_it_sees(
+    marker_images: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(calibrate_module, "_MISSING_S", 0.0)
+    image = cv2.imread(str(marker_images / "0.png"))
+    assert image is not None
+    frames = iter([np.zeros_like(image, np.uint8), np.asarray(image, np.uint8)])
+    live = Live()
+    live._frames = (Frame(image, number, number) for number, image in enumerate(frames))
+    live._interrupt_after = 2
+    kind, lens = MarkerKind("4X4_50", 0.6), read_camera_info(marker_images / "lens.yaml").model
+    lines: list[str] = []
+    assert markers_of(live, kind, 9, lens, 1, lines.append) == []
+    assert ["marker 9" in line for line in lines] == [True] * 3
+    assert [line.rpartition(": ")[2] for line in lines[1:]] == ["no marker", "7"]

@@ -363,7 +363,7 @@ def test_error_of_the_depth_source_ends_the_pair(caplog: pytest.LogCaptureFixtur
     caplog.set_level(logging.WARNING)
     colour = ScriptedSource([frame_at(index / 30, index) for index in range(7)], live=True)
     depth = Failing([], live=True, uri="depth.tiff")
-    with pytest.raises(SourceError, match="median of depth is 3000 m"):
+    with pytest.raises(SourceError, match=r"source\.depth depth\.tiff: the median of depth is 3000 m"):
         paired_source(colour, depth, DepthPictures(), SourceSettings())
     assert colour.closed
     assert depth.closed

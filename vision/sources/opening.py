@@ -20,7 +20,7 @@ from vision.sources.files import ImagesCapture, VideoFileCapture, images_in, is_
 from vision.sources.latest import LatestSource
 from vision.sources.network import UdpStream, open_http, open_rtsp, without_password
 from vision.sources.opencv import quiet_opencv
-from vision.sources.paired import DepthPictures, paired_source
+from vision.sources.paired import DepthPictures, depth_error, paired_source
 from vision.sources.pipe import Fifo, PipeCapture, check_pipe_settings
 from vision.sources.registry import SOURCES, source
 from vision.sources.sequential import SequentialSource
@@ -110,6 +110,9 @@ def _open_with_depth(uri: str, depth_uri: str, settings: SourceSettings) -> Sour
             depth = SequentialSource(
                 str(depth_folder), lambda: ImagesCapture(paths, rate_hz, decode_depth), of_depth
             )
+        except SourceError as error:
+            colour.close()
+            raise depth_error(error, depth_uri) from error
         except BaseException:
             colour.close()
             raise
@@ -126,6 +129,9 @@ def _open_with_depth(uri: str, depth_uri: str, settings: SourceSettings) -> Sour
             raise
         try:
             depth = opening.result()
+        except SourceError as error:
+            colour.close()
+            raise depth_error(error, without_password(depth_uri)) from error
         except BaseException:
             colour.close()
             raise

@@ -139,8 +139,9 @@ class PairedCapture(Capture):
             return None
         if depth_m.shape != (frame.height, frame.width):
             raise SourceError(
-                f"depth is {depth_m.shape[1]}x{depth_m.shape[0]}, the picture {frame.width}x{frame.height}: "
-                f"depth must be registered to the colour picture and have its size"
+                f"{self._depth.uri}: depth is {depth_m.shape[1]}x{depth_m.shape[0]}, the picture "
+                f"{frame.width}x{frame.height}: depth must be registered to the "
+                f"colour picture and have its size"
             )
         self._paired = True
         return depth_m
@@ -153,6 +154,8 @@ class PairedCapture(Capture):
                 self._depth.read(0.0)  # raises its error
             except EndOfStream:
                 self._depth_ended = True
+            except SourceError as error:
+                raise depth_error(error, self._depth.uri) from error
         return None if nearest is None else (abs(nearest[0] - stamp_s), nearest[1])
 
     def _recorded_depth(self, frame: Frame) -> tuple[float, NDArray[np.float32]] | None:
@@ -163,6 +166,8 @@ class PairedCapture(Capture):
                     self._next = self._depth.read()
                 except EndOfStream:
                     self._depth_ended = True
+                except SourceError as error:
+                    raise depth_error(error, self._depth.uri) from error
             if self._next is None:
                 continue
             if self._current is not None and _gap_s(self._current, frame) < _gap_s(self._next, frame):
@@ -185,6 +190,11 @@ class PairedCapture(Capture):
 
     def close(self) -> None:
         """The sources are closed by `open_paired`'s source."""
+
+
+def depth_error(error: SourceError, uri: str) -> SourceError:
+    """The error of a depth source, with its address."""
+    return error if uri in str(error) else SourceError(f"source.depth {uri}: {error}")
 
 
 def _gap_s(one: Frame, other: Frame) -> float:

@@ -39,8 +39,9 @@ class SourceSettings:
         pixel_format: a camera's FOURCC (`MJPG`, `YUYV`), or the format of a pipe: `bgr24`, `rgb24`, `gray8`,
             `yuv420` (these need width and height), `y4m`, `mjpeg`. None: the driver's default, or y4m/mjpeg
             detected from the pipe's first bytes. Of a CSI camera: `yuv420` (default) or `mjpeg`.
-        exposure_us: exposure time of a camera, microseconds; None: automatic.
-        gain: of a camera; of a CSI camera a factor, of a V4L2 camera in the driver's unit; None: automatic.
+        exposure_us: exposure time of a camera, microseconds; None: automatic, of V4L2 left as it is.
+        gain: of a camera; of a CSI camera a factor, of a V4L2 camera in the driver's unit; None as
+            `exposure_us`.
             Sources without exposure time or gain refuse them.
         rotate_deg, mirror: mirror the picture left to right, then rotate it clockwise by 0, 90, 180 or 270
             degrees; depth and the source's own calibration as well, see `vision.orientation`. `width` and

@@ -160,7 +160,9 @@ def test_other_bad_input_is_one_line(frame: Frame, tmp_path: Path) -> None:
     with shared(frame):
         assert "a.las" in refused(URI, tmp_path / "a.las")
         assert "a.gif" in refused(URI, output, "--picture", tmp_path / "a.gif")
-        assert "missing" in refused(URI, tmp_path / "missing" / "a.ply")
+        assert "--attitude" in refused(URI, output, "--attitude", "0", "nan", "0")
+        missing = tmp_path / "missing" / "a.ply"
+        assert refused(URI, missing) == f"companion: cannot write {missing}: no such folder"
         assert "missing" in refused(URI, output, "--picture", tmp_path / "missing" / "a.png")
         assert "camera.fx_px" in refused(URI, output, "--camera-fx-px", "-1")
     with shared(frame, replace(DEFAULT_MOUNT, on_gimbal=True)):

@@ -386,3 +386,8 @@ def test_changed_settings_keep_the_rest() -> None:
     assert after.cameras == before.cameras != {}
     with pytest.raises(ConfigurationError, match=r"guidance\.brake_s"):
         changed(before, {"guidance.brake_s": "fast"})
+
+
+def test_unit_of_depth_needs_a_depth_source() -> None:
+    with pytest.raises(ConfigurationError, match=r"source: depth_scale"):
+        load_settings(os.devnull, {"source.depth_scale": "0.001"}, environment={})
