@@ -19,7 +19,6 @@ from companion.settings.calibration import adopt_calibration
 from companion.vehicle.state import VehicleState
 from vision.annotate import annotate_markers
 from vision.attitude import euler_from_quaternion
-from vision.marker_ambiguity import AmbiguityResolver
 from vision.sources import Source
 
 NO_MARKERS = "no markers"
@@ -57,12 +56,13 @@ def print_markers(
     on_pads = {marker.identifier: marker for marker in settings.markers.pad_markers()}
     if save is not None:
         save.mkdir(parents=True, exist_ok=True)
-    resolver, processed = AmbiguityResolver(), 0
+    processed = 0
     for frame in source:
         markers, boards = find(frame)
         stamp_ns = frame.captured_ns if frame.media_s is None else round(frame.media_s * 1e9)
         history = _level_at(stamp_ns)
-        targets = marker_targets(markers, stamp_ns, mount, history, on_pads, resolver)
+        # Each frame by itself: the camera's own motion between frames is unknown.
+        targets = marker_targets(markers, stamp_ns, mount, history, on_pads)
         located = board_targets(boards, stamp_ns, mount, history)
         if as_json:
             message: dict[str, Any] = {

@@ -3,7 +3,8 @@
 Both poses of a frame fit the corners. Over time they differ: the true one keeps its attitude in a world frame
 while the camera moves around the marker, the other one turns by about twice the change of the line of sight;
 and the corners' noise, which decides within one frame, averages out. Each marker has up to two hypotheses,
-which collect the negative log-likelihood of the poses that continue them.
+which collect the negative log-likelihood of the poses that continue them. A frame that is clear by itself
+restarts them: the marker may have been turned, and it is cheap.
 """
 
 from __future__ import annotations
@@ -36,7 +37,8 @@ class _Hypothesis:
 
     def mismatch(self, attitude: NDArray[np.float64]) -> float:
         """Angle to another attitude, radians."""
-        return math.acos(max(-1.0, min(1.0, (float(np.trace(self.attitude.T @ attitude)) - 1.0) / 2.0)))
+        # The trace of the rotation between them.
+        return math.acos(max(-1.0, min(1.0, (float(np.vdot(self.attitude, attitude)) - 1.0) / 2.0)))
 
 
 @dataclass(slots=True)
@@ -62,6 +64,11 @@ class AmbiguityResolver:
         """
         poses = marker.poses
         attitudes = [world_from_optical @ pose.rotation for pose in poses]
+        if len(poses) > 1 and _clear(marker):
+            # Further frames that are not clear change it only after several.
+            hypotheses = [_Hypothesis(attitudes[0], 0.0), _Hypothesis(attitudes[1], 2.0 * RESOLVED_COST)]
+            self._seen[marker.identifier] = _Seen(stamp_ns, stamp_ns, hypotheses)
+            return poses[0]
         seen = self._seen.get(marker.identifier)
         if seen is None or not 0 <= stamp_ns - seen.stamp_ns <= MEMORY_S * 1e9:
             best_px = marker.reprojection_px
@@ -115,10 +122,18 @@ class AmbiguityResolver:
         return order
 
 
+def _clear(marker: Marker) -> bool:
+    """Whether the corners of one frame decide, by more than their noise explains."""
+    best_px, other_px = (pose.reprojection_px for pose in marker.poses)
+    return marker.ambiguity <= CLEAR_AMBIGUITY and _fit_cost(other_px, best_px) >= RESOLVED_COST
+
+
+def _fit_cost(fit_px: float, best_px: float) -> float:
+    # Four corners have two degrees of freedom more than a pose: the best fit shows their noise.
+    return 2.0 * (fit_px**2 - best_px**2) / max(CORNER_SIGMA_PX**2, 2.0 * best_px**2)
+
+
 def _cost(pose: MarkerPose, best_px: float, mismatch_rad: float = 0.0) -> float:
     """Negative log-likelihood of a pose in a frame, less that of the best fit there; limited."""
-    # Four corners have two degrees of freedom more than a pose: the best fit shows their noise.
-    noise = max(CORNER_SIGMA_PX**2, 2.0 * best_px**2)
-    fit = 2.0 * (pose.reprojection_px**2 - best_px**2) / noise
     variance = ATTITUDE_SIGMA_RAD**2 + float(np.linalg.eigvalsh(pose.covariance[3:, 3:])[-1])
-    return min(MAX_COST, fit + mismatch_rad**2 / (2.0 * variance))
+    return min(MAX_COST, _fit_cost(pose.reprojection_px, best_px) + mismatch_rad**2 / (2.0 * variance))

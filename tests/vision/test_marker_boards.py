@@ -136,6 +136,19 @@ def test_one_frame_from_far_away_is_not_resolved() -> None:
     assert AmbiguityResolver().resolve(near, 0, np.eye(3)) is not None
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_clear_frame_restarts_a_marker_that_was_turned(seed: int) -> None:
+    """To about the attitude of its other pose, where the memory of the first one would prevail."""
+    rng, resolver = np.random.default_rng(seed), AmbiguityResolver()
+    position = np.array([0.1, 0.0, 2.5])
+    for frame in range(60):
+        tilt = 0.6 if frame < 40 else -0.6
+        rotation = matrix_from_euler(tilt, 0.0, 0.3) @ np.diag([1.0, -1.0, -1.0])
+        pose = resolver.resolve(seen(rotation, position, rng), 1 + frame * 50_000_000, np.eye(3))
+        assert pose is not None
+        assert angle_deg(pose.rotation, rotation) < 5.0
+
+
 def board_of(places: dict[int, tuple[float, float]], size_m: float) -> Board:
     corners = {identifier: square(size_m) + np.array([*place, 0.0]) for identifier, place in places.items()}
     return Board("dock", corners)

@@ -7,6 +7,7 @@ import math
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -16,7 +17,8 @@ from mavlink_sim.world.fiducials import Print
 from mavlink_sim.world.structures import PLATE_THICKNESS_M
 from mavlink_sim.world.world import Ground, World, WorldObject
 from vision.camera_model import CameraModel, CameraMount
-from vision.rotation import matrix_from_euler
+from vision.marker_boards import ned_from_marker
+from vision.rotation import matrix_from_euler, matrix_from_quaternion
 
 LENS = ("--camera-horizontal-fov-deg", "70", "--camera-mount-pitch-deg", "-60")
 PRINTED = ("--dictionary", "APRILTAG_36h11", "--size", "0.5")
@@ -77,6 +79,36 @@ def test_one_readable_line_per_marker_and_board(folder: Path, tmp_path: Path) ->
         app, ["markers", str(folder), *PRINTED[2:], "--dictionary", "6X6_50", "--limit", "1"]
     )
     assert none.stdout == "     0  no markers\n"
+
+
+def test_unrelated_images_are_judged_by_themselves(tmp_path: Path) -> None:
+    """The last ones show the marker in about the second pose of the first ones."""
+    camera, rng, truth = (
+        CameraModel.from_horizontal_fov(640, 480, math.radians(70.0)),
+        np.random.default_rng(5),
+        [],
+    )
+    plate = WorldObject(0, "plate", (0.0, 0.0, 0.0), 0.4, printed=Print("APRILTAG_36h11", 7, 0.5))
+    renderer = Renderer(World((plate,), Ground(("concrete",), 0, 256, 0.05)), camera, CameraMount())
+    lens = matrix_from_euler(0.0, math.radians(-60.0), 0.0)
+    for index in range(20):
+        turned = rng.uniform(0.5, 0.7) * (1.0 if index < 14 else -1.0)
+        attitude = matrix_from_euler(0.0, -math.pi / 2, 0.0) @ matrix_from_euler(0.0, 0.0, turned)
+        body = attitude @ lens.T
+        offset = lens @ [2.5, *rng.uniform(-0.1, 0.1, 2)]
+        eye = (0.0, 0.0, -PLATE_THICKNESS_M) - body @ offset
+        image = renderer.render(tuple(eye), attitude).image
+        assert cv2.imwrite(str(tmp_path / f"{index:02d}.png"), image)
+        truth.append((offset, body.T @ ned_from_marker(0.4, False)))
+    done = CliRunner().invoke(app, ["markers", str(tmp_path), *PRINTED, *LENS, "--json"])
+    assert done.exit_code == 0, done.output
+    messages = [json.loads(line) for line in done.stdout.splitlines()]
+    for message, (offset, rotation) in zip(messages, truth, strict=True):
+        (marker,) = message["markers"]
+        assert marker["position_body_m"] == pytest.approx(offset, abs=0.02)
+        found = matrix_from_quaternion(tuple(marker["rotation_body_wxyz"]))
+        assert np.trace(found.T @ rotation) > 1.0 + 2.0 * math.cos(math.radians(3.0))
+        assert marker["resolved"] is True
 
 
 @pytest.mark.parametrize(
