@@ -154,8 +154,8 @@ class Marker:
     @property
     def side_px(self) -> float:
         """Mean length of its sides in the image, pixels."""
-        sides = self.corners_px - np.roll(self.corners_px, 1, axis=0)
-        return float(np.linalg.norm(sides, axis=1).mean())
+        corners = self.corners_px.tolist()
+        return sum(map(math.dist, corners, corners[1:] + corners[:1])) / 4.0
 
 
 def markers_in(dictionary: str) -> int:

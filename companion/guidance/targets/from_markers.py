@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +27,7 @@ from vision.rotation import quaternion_from_matrix
 # One sigma of a marker's horizontal range, in addition to its own: mount and clocks, metres; and one degree
 # of the vehicle's attitude, times the difference in height.
 FIXED_SIGMA_M, TILT_SIGMA_RAD = 0.05, math.radians(1.0)
-# A marker is confirmed after so many frames in a row, with gaps of at most this.
+# A marker is confirmed after so many processed frames in a row, with gaps of at most this.
 CONFIRM_FRAMES, CONFIRM_GAP_S = 3, 0.5
 # Margin, as a fraction of the image size, by which straight down must be inside the image to land.
 DOWN_MARGIN = 0.08
@@ -87,7 +88,7 @@ class BoardTarget:
     ambiguous: bool
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class MarkerTarget:
     """One detected marker.
 
@@ -100,10 +101,12 @@ class MarkerTarget:
         pad_offset_frd_m: from the vehicle to the pad's centre, in the body frame at the capture time.
         heading_rad: direction of its upper edge, clockwise from north.
         size_m, side_px: side length, and the same in the image. reprojection_px: reprojection error.
-        body: its pose in the body frame.
+        range_sigma_m: one sigma of its horizontal range from the vehicle.
         resolved: which of the two poses of a square is the true one is known; else the one nearer to level is
             assumed, as pads are level.
-        confirmed: detected in enough frames in a row to be flown to.
+        confirmed: detected in enough frames in a row, at one position, to be flown to.
+        located: its pose relative to the camera, the camera's mount and the vehicle's pose, for `body`; None
+            in a recording.
     """
 
     identifier: int
@@ -120,13 +123,21 @@ class MarkerTarget:
     size_m: float
     side_px: float
     reprojection_px: float
-    body: BodyPose
+    range_sigma_m: float
     resolved: bool
     confirmed: bool = False
+    located: tuple[MarkerPose, CameraMount, Pose] | None = field(
+        default=None, repr=False, compare=False, metadata={"recorded": False}
+    )
+
+    @cached_property
+    def body(self) -> BodyPose:
+        """Its pose in the body frame; computed when it is used, as few markers of a frame are."""
+        assert self.located is not None
+        return _body_pose(*self.located)
 
     def as_target(self) -> Target:
         """The target for behaviours that fly to an object; its surface is the marker's centre."""
-        height_m = self.distance_m * math.sin(abs(self.elevation_rad))
         return Target(
             marker_name(self.identifier),
             1.0,
@@ -139,7 +150,7 @@ class MarkerTarget:
             track_id=self.identifier,
             trusted=self.confirmed,
             distance_m=self.distance_m,
-            range_sigma_m=math.hypot(FIXED_SIGMA_M, TILT_SIGMA_RAD * height_m, self.body.range_sigma_m),
+            range_sigma_m=self.range_sigma_m,
         )
 
 
@@ -280,6 +291,8 @@ def _target(
         pad_offset = offset - right * on_pad.right_m - upper * on_pad.up_m
     origin = np.array(pose.position_ned_m)
     ground_range_m = math.hypot(offset[0], offset[1])
+    line = position / np.linalg.norm(position)
+    own_sigma_m = math.sqrt(float(line @ fit.covariance[:3, :3] @ line))
     return MarkerTarget(
         identifier=marker.identifier,
         pad=marker.identifier if on_pad is None else on_pad.pad,
@@ -295,8 +308,9 @@ def _target(
         size_m=marker.size_m,
         side_px=marker.side_px,
         reprojection_px=marker.reprojection_px,
-        body=_body_pose(fit, mount, pose),
+        range_sigma_m=math.hypot(FIXED_SIGMA_M, TILT_SIGMA_RAD * abs(float(offset[2])), own_sigma_m),
         resolved=resolved is not None,
+        located=(fit, mount, pose),
     )
 
 
