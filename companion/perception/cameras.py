@@ -1,4 +1,4 @@
-"""Cameras: each with its model in a separate process, published under its own name, and with its markers.
+"""Cameras: each with its model in a separate process, published under its own name.
 
 The first camera uses the sections `source`, `camera` and `detector`; it has no name. One camera is the
 steering one.
@@ -12,28 +12,13 @@ import os
 import statistics
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
 
 import numpy as np
 
 from companion.guidance.targets.from_detections import (
     HistoryError,
     StateHistory,
-    mount_at,
     targets_from_detections,
-)
-from companion.guidance.targets.from_map import map_origin_ned_m, position_from_map
-from companion.guidance.targets.from_markers import (
-    CONFIRM_FRAMES,
-    CONFIRM_GAP_S,
-    NO_MARKERS,
-    BoardTarget,
-    LocalizedMarkers,
-    MarkerSight,
-    MarkerTarget,
-    board_targets,
-    looks_down,
-    marker_targets,
 )
 from companion.guidance.targets.fused import FusedTracks
 from companion.guidance.targets.ranging import ALL_MEANS, RangeMeans, sees_ground
@@ -45,10 +30,7 @@ from companion.settings import DetectorSection, Section, Settings
 from companion.settings.calibration import adopt_calibration
 from companion.settings.perception import NO_SOURCE
 from companion.vehicle.state import VehicleState
-from companion.vehicle.vision_position import VisionPosition
 from vision.camera_model import CameraCalibration
-from vision.marker_ambiguity import AmbiguityResolver
-from vision.marker_boards import MAP
 from vision.path_planner import PathRequest, PlannedPath
 from vision.pipeline import PerceptionResult
 from vision.tracking import Selected, SelectRequest
@@ -57,8 +39,6 @@ logger = logging.getLogger(__name__)
 
 # A camera is unhealthy when its newest result is older than this plus its usual interval.
 _SEEING_S = 1.0
-# The fastest that positions from a map are sent; slower cameras send one for each frame with a map.
-MAX_VISION_HZ = 50.0
 
 
 class PerceptionCamera:
@@ -320,131 +300,3 @@ def threads_each(detectors: Sequence[DetectorSection]) -> int:
     automatic = [detector for detector in enabled if detector.threads is None]
     configured = sum(detector.threads or 0 for detector in enabled)
     return max(1, (len(os.sched_getaffinity(0)) - 1 - configured) // max(1, len(automatic)))
-
-
-@dataclass(frozen=True, slots=True)
-class _SeenMarkers:
-    captured_ns: int
-    targets: tuple[MarkerTarget, ...]
-    looks_down: bool
-
-
-class MarkerTracker:
-    """The markers of all cameras with marker detection; not only the steering camera may look down."""
-
-    def __init__(self, cameras: Sequence[PerceptionCamera]) -> None:
-        self._detecting = tuple(
-            camera for camera in cameras if camera.settings.markers.dictionary is not None
-        )
-        self._on_pads = {
-            camera.name: {marker.identifier: marker for marker in camera.settings.markers.pad_markers()}
-            for camera in self._detecting
-        }
-        self._resolvers = {camera.name: AmbiguityResolver() for camera in self._detecting}
-        self._seen: dict[str | None, _SeenMarkers] = {}
-        # Camera and id → frames in a row with the marker, and the newest.
-        self._frames: dict[tuple[str | None, int], tuple[int, int]] = {}
-        self._origins = {
-            camera.name: board.origin
-            for camera in self._detecting
-            if camera.settings.markers.localise
-            for board in camera.settings.markers.boards()
-            if board.name == MAP
-        }
-        self._vision_ns = 0
-
-    def localize(
-        self,
-        camera: PerceptionCamera,
-        result: PerceptionResult,
-        history: StateHistory,
-        state: VehicleState | None = None,
-    ) -> LocalizedMarkers:
-        """Localize the markers of one frame. `state`: the newest, for a map with an origin on the earth."""
-        markers, section = result.markers or (), camera.settings.camera
-        error_text, down = "", False
-        targets: tuple[MarkerTarget, ...] = ()
-        boards: tuple[BoardTarget, ...] = ()
-        vision = None
-        try:
-            # The mount first: whether the camera looks down does not depend on the vehicle's position.
-            mount = mount_at(section.mount(), history, result.captured_ns)
-            down = looks_down(section.model(result.width, result.height), mount)
-            targets = marker_targets(
-                markers,
-                result.captured_ns,
-                mount,
-                history,
-                self._on_pads[camera.name],
-                self._resolvers[camera.name],
-            )
-            targets = tuple(self._confirmed(camera.name, target) for target in targets)
-            boards = board_targets(result.boards, result.captured_ns, mount, history)
-            if camera.name in self._origins and state is not None:
-                vision = self._vision(camera, result, history, state)
-        except HistoryError as error:
-            # As with detections: without an attitude at the capture they are published, but not targets.
-            error_text = str(error)
-        self._seen[camera.name] = _SeenMarkers(result.captured_ns, targets, down)
-        return LocalizedMarkers(targets, boards, error_text, vision)
-
-    def _vision(
-        self, camera: PerceptionCamera, result: PerceptionResult, history: StateHistory, state: VehicleState
-    ) -> VisionPosition | None:
-        """The vehicle's position from the map, at most `MAX_VISION_HZ` times a second."""
-        origin_ned_m = map_origin_ned_m(self._origins[camera.name], state)
-        board = next((board for board in result.boards if board.name == MAP), None)
-        early = result.captured_ns - self._vision_ns < 0.9e9 / MAX_VISION_HZ
-        if board is None or origin_ned_m is None or early:
-            return None
-        mount = camera.settings.camera.mount()
-        vision = position_from_map(board, result.captured_ns, mount, history, origin_ned_m)
-        if vision is not None:
-            self._vision_ns = result.captured_ns
-        return vision
-
-    def _confirmed(self, camera: str | None, target: MarkerTarget) -> MarkerTarget:
-        key = (camera, target.identifier)
-        count, newest_ns = self._frames.get(key, (0, 0))
-        kept = target.captured_ns - newest_ns <= CONFIRM_GAP_S * 1e9
-        count = count + 1 if kept else 1
-        self._frames[key] = (count, target.captured_ns)
-        return replace(target, confirmed=count >= CONFIRM_FRAMES)
-
-    def steering_sight(self, camera: PerceptionCamera, now_ns: int, max_age_s: float) -> MarkerSight:
-        """Return the markers of the steering camera, for behaviours that fly to one."""
-        if camera not in self._detecting:
-            return NO_MARKERS
-        seen = self._seen.get(camera.name)
-        if seen is None:
-            return MarkerSight(missing="")
-        age_s = (now_ns - seen.captured_ns) / 1e9
-        fresh = age_s <= max_age_s
-        return MarkerSight(seen.targets if fresh else (), seen.captured_ns, age_s, fresh, "")
-
-    def sight(self, now_ns: int, max_age_s: float) -> MarkerSight:
-        """Return the markers of the cameras that look down, for behaviours."""
-        if not self._detecting:
-            return MarkerSight()
-        down = [seen for seen in self._seen.values() if seen.looks_down]
-        if self._seen and not down:
-            return MarkerSight(missing=self._no_camera_below())
-        if not down:
-            return MarkerSight(missing="")
-        newest_ns = max(seen.captured_ns for seen in down)
-        age_s = (now_ns - newest_ns) / 1e9
-        fresh = [seen for seen in down if now_ns - seen.captured_ns <= max_age_s * 1e9]
-        targets = tuple(target for seen in fresh for target in seen.targets)
-        return MarkerSight(targets, newest_ns, age_s, bool(fresh), "")
-
-    def _no_camera_below(self) -> str:
-        cameras = ", ".join(
-            ("camera" if camera.name is None else f"cameras.{camera.name}.camera")
-            + (
-                "'s gimbal does not look down, or its attitude is unknown: use gimbal pitch=-90"
-                if camera.settings.camera.on_gimbal
-                else f".mount_pitch_deg is {camera.settings.camera.mount_pitch_deg:g}"
-            )
-            for camera in self._detecting
-        )
-        return f"a camera that sees straight down ({cameras})"

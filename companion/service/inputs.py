@@ -19,7 +19,8 @@ from companion.guidance.pose_sharing import PoseSharing
 from companion.guidance.search_pattern import Footprint
 from companion.guidance.targets.from_detections import StateHistory
 from companion.guidance.targets.from_markers import LocalizedMarkers
-from companion.perception.cameras import MarkerTracker, PerceptionCamera
+from companion.perception.cameras import PerceptionCamera
+from companion.perception.marker_tracker import MarkerTracker
 from companion.plugins import load_plugins
 from companion.settings import Settings
 from companion.vehicle.px4_modes import among_modes
@@ -62,7 +63,7 @@ class InputAssembler:
         self.steering = next(camera for camera in cameras if camera.name == settings.guidance.camera)
         self.history = StateHistory()
         self.poses = PoseSharing(settings.vehicle.name, on_event)
-        self._markers = MarkerTracker(cameras)
+        self._markers = MarkerTracker(cameras, on_event)
         self._state: VehicleState | None = None
         self._obstacles: ObstacleSectors | None = None
         self._shown: tuple[FlightMode, bool] | None = None

@@ -8,6 +8,8 @@ heading is the map's alone.
 
 from __future__ import annotations
 
+import math
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +28,46 @@ from vision.rotation import quaternion_from_matrix
 TILT_SIGMA_RAD = np.radians(1.0)
 # A pose whose tilt differs from the autopilot's by more is wrong.
 FARTHEST_TILT_RAD = np.radians(15.0)
+# A position that the vehicle cannot have reached since the last one is sent only after positions have agreed
+# for this long, with gaps of at most this. No multirotor above markers is faster.
+FASTEST_MPS, AGREED_S, AGREED_GAP_S = 15.0, 1.0, 0.5
+
+
+class VisionGate:
+    """Drops positions that the vehicle cannot have reached since the last one sent.
+
+    Attributes:
+        dropped: number of positions dropped so far.
+    """
+
+    def __init__(self) -> None:
+        self.dropped = 0
+        self._sent: VisionPosition | None = None
+        # The newest dropped one, and since when those agree with each other.
+        self._other: VisionPosition | None = None
+        self._since_ns = 0
+
+    def check(self, vision: VisionPosition) -> float | None:
+        """None: send it. Else it is dropped, and this is its distance from the last one sent, metres."""
+        if self._sent is not None and not _reachable(self._sent, vision):
+            other = self._other
+            gap_s = 0.0 if other is None else (vision.captured_ns - other.captured_ns) / 1e9
+            if other is None or gap_s > AGREED_GAP_S or not _reachable(other, vision):
+                self._since_ns = vision.captured_ns
+            self._other = vision
+            if vision.captured_ns - self._since_ns < AGREED_S * 1e9:
+                self.dropped += 1
+                return math.dist(self._sent.position_ned_m, vision.position_ned_m)
+        self._sent, self._other = vision, None
+        return None
+
+
+def _reachable(one: VisionPosition, other: VisionPosition) -> bool:
+    """Whether the vehicle can have flown from one position to the other in the time between them."""
+    # Places 0, 6 and 11 are the variances of north, east and down.
+    variance = sum(vision.covariance[index] for vision in (one, other) for index in (0, 6, 11))
+    allowed_m = FASTEST_MPS * abs(other.captured_ns - one.captured_ns) / 1e9 + 3.0 * math.sqrt(variance)
+    return math.dist(one.position_ned_m, other.position_ned_m) <= allowed_m
 
 
 def map_origin_ned_m(origin: tuple[float, float, float] | None, state: VehicleState) -> Vector3 | None:

@@ -1,0 +1,211 @@
+"""The markers of all cameras: which are confirmed, and the position that a map of them gives."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+from companion.guidance.targets.from_detections import HistoryError, StateHistory, mount_at
+from companion.guidance.targets.from_map import VisionGate, map_origin_ned_m, position_from_map
+from companion.guidance.targets.from_markers import (
+    CONFIRM_FRAMES,
+    CONFIRM_GAP_S,
+    NO_MARKERS,
+    BoardTarget,
+    LocalizedMarkers,
+    MarkerSight,
+    MarkerTarget,
+    board_targets,
+    looks_down,
+    marker_targets,
+)
+from companion.perception.cameras import PerceptionCamera
+from companion.vehicle.state import VehicleState
+from companion.vehicle.vision_position import VisionPosition
+from vision.marker_ambiguity import AmbiguityResolver
+from vision.marker_boards import MAP
+from vision.pipeline import PerceptionResult
+
+# The fastest that positions from a map are sent; slower cameras send one for each frame with a map.
+MAX_VISION_HZ = 50.0
+# A marker whose position changes by more between two frames begins again: metres, or three sigma of both.
+CONFIRM_DISTANCE_M = 1.0
+# Shortest time between two events about dropped positions.
+EVENT_INTERVAL_S = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class _SeenMarkers:
+    captured_ns: int
+    targets: tuple[MarkerTarget, ...]
+    looks_down: bool
+
+
+class MarkerTracker:
+    """The markers of all cameras with marker detection; not only the steering camera may look down."""
+
+    def __init__(self, cameras: Sequence[PerceptionCamera], on_event: Callable[[str, str], None]) -> None:
+        self._detecting = tuple(
+            camera for camera in cameras if camera.settings.markers.dictionary is not None
+        )
+        self._on_pads = {
+            camera.name: {marker.identifier: marker for marker in camera.settings.markers.pad_markers()}
+            for camera in self._detecting
+        }
+        self._resolvers = {camera.name: AmbiguityResolver() for camera in self._detecting}
+        self._seen: dict[str | None, _SeenMarkers] = {}
+        # Camera → id → frames in a row with the marker, and the newest.
+        self._runs: dict[str | None, dict[int, tuple[int, MarkerTarget]]] = {}
+        self._origins = {
+            camera.name: board.origin
+            for camera in self._detecting
+            if camera.settings.markers.localise
+            for board in camera.settings.markers.boards()
+            if board.name == MAP
+        }
+        self._gate, self._vision_ns, self._event_ns = VisionGate(), 0, 0
+        self._on_event = on_event
+
+    def localize(
+        self,
+        camera: PerceptionCamera,
+        result: PerceptionResult,
+        history: StateHistory,
+        state: VehicleState | None = None,
+    ) -> LocalizedMarkers:
+        """Localize the markers of one frame. `state`: the newest, for a map with an origin on the earth."""
+        markers, section = result.markers or (), camera.settings.camera
+        error_text, down = "", False
+        targets: tuple[MarkerTarget, ...] = ()
+        boards: tuple[BoardTarget, ...] = ()
+        vision = None
+        try:
+            # The mount first: whether the camera looks down does not depend on the vehicle's position.
+            mount = mount_at(section.mount(), history, result.captured_ns)
+            down = looks_down(section.model(result.width, result.height), mount)
+            targets = marker_targets(
+                markers,
+                result.captured_ns,
+                mount,
+                history,
+                self._on_pads[camera.name],
+                self._resolvers[camera.name],
+            )
+            targets = self._confirmed(camera.name, targets)
+            boards = board_targets(result.boards, result.captured_ns, mount, history)
+            if camera.name in self._origins and state is not None:
+                confirmed = {target.identifier for target in targets if target.confirmed}
+                vision = self._vision(camera, result, history, state, confirmed)
+        except HistoryError as error:
+            # As with detections: without an attitude at the capture they are published, but not targets.
+            error_text, targets = str(error), ()
+            self._runs.pop(camera.name, None)
+        # Of an id that is seen twice at most one is true.
+        times = Counter(target.identifier for target in targets)
+        once = tuple(target for target in targets if times[target.identifier] == 1)
+        self._seen[camera.name] = _SeenMarkers(result.captured_ns, once, down)
+        return LocalizedMarkers(targets, boards, error_text, vision)
+
+    def _vision(
+        self,
+        camera: PerceptionCamera,
+        result: PerceptionResult,
+        history: StateHistory,
+        state: VehicleState,
+        confirmed: set[int],
+    ) -> VisionPosition | None:
+        """The vehicle's position from the map, at most `MAX_VISION_HZ` times a second.
+
+        One marker in one frame may be a false detection; two that agree with the map hardly are.
+        """
+        origin_ned_m = map_origin_ned_m(self._origins[camera.name], state)
+        board = next((board for board in result.boards if board.name == MAP), None)
+        early = result.captured_ns - self._vision_ns < 0.9e9 / MAX_VISION_HZ
+        if board is None or origin_ned_m is None or early:
+            return None
+        used = set(board.identifiers)
+        if len(used) < 2 and not used <= confirmed:
+            return None
+        mount = camera.settings.camera.mount()
+        vision = position_from_map(board, result.captured_ns, mount, history, origin_ned_m)
+        if vision is None:
+            return None
+        jump_m = self._gate.check(vision)
+        if jump_m is None:
+            self._vision_ns = result.captured_ns
+            return vision
+        if result.captured_ns - self._event_ns >= EVENT_INTERVAL_S * 1e9:
+            self._event_ns = result.captured_ns
+            self._on_event(
+                "warning",
+                f"markers: position from the map dropped, {jump_m:.1f} m from the last one sent "
+                f"(markers {', '.join(map(str, sorted(used)))}; {self._gate.dropped} dropped so far): "
+                "check markers.map_file",
+            )
+        return None
+
+    def _confirmed(self, camera: str | None, targets: tuple[MarkerTarget, ...]) -> tuple[MarkerTarget, ...]:
+        """The markers of one processed frame, `confirmed` where the frames before show them at that position.
+
+        A frame without a marker, or with its id twice, begins again.
+        """
+        times = Counter(target.identifier for target in targets)
+        before, runs = self._runs.get(camera, {}), {}
+        for target in targets:
+            if times[target.identifier] == 1:
+                count, last = before.get(target.identifier, (0, target))
+                runs[target.identifier] = (count + 1 if _continues(last, target) else 1, target)
+        self._runs[camera] = runs
+        return tuple(
+            replace(target, confirmed=runs.get(target.identifier, (0, target))[0] >= CONFIRM_FRAMES)
+            for target in targets
+        )
+
+    def steering_sight(self, camera: PerceptionCamera, now_ns: int, max_age_s: float) -> MarkerSight:
+        """Return the markers of the steering camera, for behaviours that fly to one."""
+        if camera not in self._detecting:
+            return NO_MARKERS
+        seen = self._seen.get(camera.name)
+        if seen is None:
+            return MarkerSight(missing="")
+        age_s = (now_ns - seen.captured_ns) / 1e9
+        fresh = age_s <= max_age_s
+        return MarkerSight(seen.targets if fresh else (), seen.captured_ns, age_s, fresh, "")
+
+    def sight(self, now_ns: int, max_age_s: float) -> MarkerSight:
+        """Return the markers of the cameras that look down, for behaviours."""
+        if not self._detecting:
+            return MarkerSight()
+        down = [seen for seen in self._seen.values() if seen.looks_down]
+        if self._seen and not down:
+            return MarkerSight(missing=self._no_camera_below())
+        if not down:
+            return MarkerSight(missing="")
+        newest_ns = max(seen.captured_ns for seen in down)
+        age_s = (now_ns - newest_ns) / 1e9
+        fresh = [seen for seen in down if now_ns - seen.captured_ns <= max_age_s * 1e9]
+        targets = tuple(target for seen in fresh for target in seen.targets)
+        return MarkerSight(targets, newest_ns, age_s, bool(fresh), "")
+
+    def _no_camera_below(self) -> str:
+        cameras = ", ".join(
+            ("camera" if camera.name is None else f"cameras.{camera.name}.camera")
+            + (
+                "'s gimbal does not look down, or its attitude is unknown: use gimbal pitch=-90"
+                if camera.settings.camera.on_gimbal
+                else f".mount_pitch_deg is {camera.settings.camera.mount_pitch_deg:g}"
+            )
+            for camera in self._detecting
+        )
+        return f"a camera that sees straight down ({cameras})"
+
+
+def _continues(last: MarkerTarget, target: MarkerTarget) -> bool:
+    """Whether two detections of an id in successive frames are one marker."""
+    allowed_m = max(CONFIRM_DISTANCE_M, 3.0 * math.hypot(last.range_sigma_m, target.range_sigma_m))
+    return (
+        target.captured_ns - last.captured_ns <= CONFIRM_GAP_S * 1e9
+        and math.dist(last.position_ned_m, target.position_ned_m) <= allowed_m
+    )
