@@ -107,7 +107,7 @@ def _open_with_depth(uri: str, depth_uri: str, settings: SourceSettings) -> Sour
         rate_hz = _image_rate_hz(settings)
         colour = open_source(uri, each)
         try:
-            depth = SequentialSource(
+            depth: Source = SequentialSource(
                 str(depth_folder), lambda: ImagesCapture(paths, rate_hz, decode_depth), of_depth
             )
         except SourceError as error:
