@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -97,7 +98,7 @@ class Flight:
         assert marker is not None
         return marker
 
-    def confirmed(self, *seen: tuple[int, tuple[float, float]], **frame: float) -> list[bool]:
+    def confirmed(self, *seen: tuple[int, tuple[float, float]], **frame: Any) -> list[bool]:
         return [target.confirmed for target in self.frame(seen, **frame).targets]
 
 
