@@ -101,7 +101,7 @@ def replay(paths: Sequence[Path], changes: Mapping[str, str]) -> Replay:
         )
     try:
         options = decode(GuidanceOptions, run["options"])
-        recorded_settings = Settings.model_validate_json(json.dumps(run["settings"]))
+        recorded_settings = Settings.from_json(run["settings"])
     except ValueError as error:  # also of pydantic
         raise RecordingError(f"{paths[0]}: its settings cannot be read: {_first_line(error)}") from error
     options, changed_settings = _changed_options(options, recorded_settings, run["own_address"], changes)

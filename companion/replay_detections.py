@@ -135,7 +135,7 @@ def report(found: DetectionReplay) -> Iterator[str]:
 def _settings_of(paths: Sequence[Path]) -> Settings:
     for message in RecordingReader(paths[0]).messages(RUN_CHANNEL):
         try:
-            return Settings.model_validate_json(json.dumps(json.loads(message.data)["settings"]))
+            return Settings.from_json(json.loads(message.data)["settings"])
         except (ValueError, KeyError) as error:
             raise RecordingError(f"{paths[0]}: its settings cannot be read: {error}") from error
     raise RecordingError(f"{paths[0]}: not a recording of the service: it has no message on 'run'")

@@ -125,7 +125,7 @@ class CameraSection(Section):
     """width of the calibration images, pixels"""
     calibrated_height: Annotated[int | None, Field(ge=16, le=16384)] = None
     """height of the calibration images, pixels"""
-    distortion: Annotated[tuple[float, ...], Field(strict=False)] = ()  # JSON's lists: a validator is before
+    distortion: tuple[float, ...] = ()
     """coefficients of distortion_model in OpenCV's order: k1, k2, p1, p2, k3; none: no distortion"""
     distortion_model: DistortionModel = "plumb_bob"
     """plumb_bob; rational_polynomial: eight coefficients; equidistant (fisheye): k1, k2, k3, k4"""

@@ -76,6 +76,15 @@ class Settings(Section):
         check_calibration_file(values, settings.source)
         return settings
 
+    @classmethod
+    def from_json(cls, values: dict[str, Any]) -> Self:
+        """Read what `model_dump(mode="json")` has written, where a tuple is a list.
+
+        Raises:
+            ValueError: not valid, for example written by another version.
+        """
+        return cls.model_validate(values, strict=False)
+
     @model_validator(mode="after")
     def _cameras_fit_together(self) -> Self:
         if self.guidance.camera is not None and self.guidance.camera not in self.cameras:
