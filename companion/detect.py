@@ -1,12 +1,15 @@
-"""`companion detect`: run the detector on a source's frames, one line per frame."""
+"""`companion detect`: run the detector on a source's frames, one line per frame, and a summary."""
 
 from __future__ import annotations
 
 import json
 import logging
 import sys
+import time
+from collections import Counter
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +24,31 @@ from vision.detections import TRACK_CONFIRMED, DetectionRecord, Detections
 from vision.frame import Frame
 from vision.pipeline import FrameDetector
 from vision.sources import Source
-from vision.tracking import Tracker
+from vision.sources.files import is_image
+from vision.tracking import Tracker, TrackerSettings
 
 logger = logging.getLogger(__name__)
 
 TRACK_FIELDS = ("track_id", "track_score", "track_state")
+# Weaker detections do not confirm a track by default, so the service does not act on them.
+FAINT_BELOW = TrackerSettings().confirm_score
+
+
+@dataclass
+class Summary:
+    """What `detect_source` processed."""
+
+    frames: int = 0
+    elapsed_s: float = 0.0
+    objects: Counter[str] = field(default_factory=Counter)
+    """class name → number of detections in all frames"""
+
+    def __str__(self) -> str:
+        found = ", ".join(f"{count} {name}" for name, count in self.objects.most_common())
+        return (
+            f"{self.frames} frame{'' if self.frames == 1 else 's'}, "
+            f"{self.frames / max(self.elapsed_s, 1e-9):.1f} frames/s: {found or 'no objects detected'}"
+        )
 
 
 def detect_source(
@@ -38,24 +61,21 @@ def detect_source(
     as_json: bool = False,
     tracker: Tracker | None = None,
     write: Callable[[str], None],
-) -> int:
+) -> Summary:
     """Detect in every `every`-th frame, at most `limit` of them.
 
     Args:
         tracker: assigns tracks; a recording is tracked by its own time.
-        save: folder for `<sequence>.jpg` (the input) and `<sequence>_detections.jpg` (annotated).
+        save: folder for each input and, with `_detections` in its name, the annotated image. An image keeps
+            its file name; the frames of a video are `<name>_<sequence>.jpg`, others `<sequence>.jpg`.
         as_json: one JSON object per frame instead of a readable line.
         write: called with each line.
-
-    Returns:
-        Number of processed frames.
 
     Raises:
         OSError: an image cannot be written.
     """
-    if save is not None:
-        save.mkdir(parents=True, exist_ok=True)
-    processed = 0
+    summary = Summary()
+    started_s = time.monotonic()
     with _progress(source, every, limit) as advance:
         for index, frame in enumerate(source):
             if index % every:
@@ -66,14 +86,35 @@ def detect_source(
             write(_line(frame, detections, detector, as_json))
             if save is not None:
                 _save(save, frame, detections)
-            processed += 1
+            summary.objects.update(record["class_name"] for record in detections.records())
+            summary.frames += 1
+            summary.elapsed_s = time.monotonic() - started_s
             advance()
-            if processed == limit:
+            if summary.frames == limit:
                 break
     statistics = source.statistics
     if statistics.dropped or statistics.unreadable:
         logger.warning("%d frames dropped, %d unreadable", statistics.dropped, statistics.unreadable)
-    return processed
+    return summary
+
+
+def make_save_folder(folder: Path, source: str) -> None:
+    """Create the folder for `detect_source`'s images.
+
+    Raises:
+        ValueError: it is a file, cannot be created, or contains the source's images.
+    """
+    pictures = Path(source)
+    if pictures.exists() and folder.resolve() in (pictures.resolve(), pictures.resolve().parent):
+        raise ValueError(
+            f"--save {folder}: this folder contains the source; give another, so that no image is overwritten"
+        )
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise ValueError(f"--save {folder}: expected a folder, got a file; give another name") from None
+    except OSError as error:
+        raise ValueError(f"--save {folder}: the folder cannot be created: {error.strerror}") from error
 
 
 def _stamp_ns(frame: Frame) -> int:
@@ -86,7 +127,7 @@ def _line(frame: Frame, detections: Detections, detector: FrameDetector, as_json
     if not as_json:
         total_ms = timing.preprocess_ms + timing.inference_ms + timing.postprocess_ms
         objects = ", ".join(_label(record) for record in detections.records())
-        return f"{frame.sequence:6d}  {total_ms:6.1f} ms  {objects or 'no objects detected'}"
+        return f"{_place(frame)}  {total_ms:6.1f} ms  {objects or 'no objects detected'}"
     # There are no ranges here, and without a tracker no tracks.
     omitted = (
         ("depth_m", "nearest_camera_m")
@@ -94,6 +135,8 @@ def _line(frame: Frame, detections: Detections, detector: FrameDetector, as_json
         else ("depth_m", "nearest_camera_m", *TRACK_FIELDS)
     )
     message: dict[str, Any] = {
+        **({"file": frame.file_name} if frame.file_name else {}),
+        **({"media_s": round(frame.media_s, 3)} if frame.media_s is not None and _is_video(frame) else {}),
         "sequence": frame.sequence,
         "captured_ns": frame.captured_ns,
         "width": frame.width,
@@ -107,6 +150,19 @@ def _line(frame: Frame, detections: Detections, detector: FrameDetector, as_json
     return json.dumps(message)
 
 
+def _is_video(frame: Frame) -> bool:
+    return bool(frame.file_name) and not is_image(Path(frame.file_name))
+
+
+def _place(frame: Frame) -> str:
+    """Return `photo.jpg`, `street.mp4  12.480 s`, or the sequence number of a frame without a file."""
+    if not frame.file_name:
+        return f"{frame.sequence:6d}"
+    if frame.media_s is None or not _is_video(frame):
+        return frame.file_name
+    return f"{frame.file_name}  {frame.media_s:8.3f} s"
+
+
 def _label(record: DetectionRecord) -> str:
     """Return `car 0.83 #7`, with a question mark if the track is not confirmed."""
     label = f"{record['class_name']} {record['confidence']:.2f}"
@@ -116,8 +172,16 @@ def _label(record: DetectionRecord) -> str:
 
 
 def _save(folder: Path, frame: Frame, detections: Detections) -> None:
-    _write_image(folder / f"{frame.sequence:06d}.jpg", frame.image)
-    _write_image(folder / f"{frame.sequence:06d}_detections.jpg", annotate(frame.image, detections))
+    name = Path(frame.file_name)
+    stem, suffix = f"{frame.sequence:06d}", ".jpg"
+    if _is_video(frame):
+        stem = f"{name.stem}_{stem}"
+    elif frame.file_name:
+        stem = name.stem
+        suffix = name.suffix if cv2.haveImageWriter(frame.file_name) else f"{name.suffix}.jpg"
+    _write_image(folder / f"{stem}{suffix}", frame.image)
+    drawn = annotate(frame.image, detections, faint_below=FAINT_BELOW)
+    _write_image(folder / f"{stem}_detections{suffix}", drawn)
 
 
 def _write_image(path: Path, image: NDArray[np.uint8]) -> None:

@@ -58,6 +58,7 @@ def annotate(
     lines: Sequence[str] = (),
     highlight: int | None = None,
     centre_m: float | None = None,
+    faint_below: float = 0.0,
 ) -> NDArray[np.uint8]:
     """A copy of the image with boxes, labels and a panel of text.
 
@@ -69,6 +70,7 @@ def annotate(
         highlight: index of the detection to highlight: drawn last, tinted, with bracketed corners.
         centre_m: depth at the image's centre, metres, drawn beside a red point there; NaN: unknown; None: no
             point.
+        faint_below: boxes and labels of a lower confidence are drawn half transparent.
 
     Returns:
         (height, width, 3) uint8, BGR.
@@ -87,16 +89,29 @@ def annotate(
         order.remove(highlight)
         order.append(highlight)
     boxes = {index: _pixels(detections.xyxy[index], width, height) for index in order}
-    for index in order:
-        colour = class_colour(int(detections.class_id[index]))
-        _draw_box(drawn, boxes[index], colour, sizes, marked=index == highlight)
     occupied: list[Rectangle] = []
+
+    def draw_boxes(indices: Sequence[int]) -> None:
+        for index in indices:
+            colour = class_colour(int(detections.class_id[index]))
+            _draw_box(drawn, boxes[index], colour, sizes, marked=index == highlight)
+
+    def draw_labels(indices: Sequence[int]) -> None:
+        for index in reversed(indices):  # the most confident choose their label's position first
+            occupied.append(_draw_label(drawn, boxes[index], detections, index, sizes, occupied))
+
+    faint = [index for index in order if float(detections.confidence[index]) < faint_below]
+    if faint:
+        draw_boxes(faint)
+        draw_labels(faint)
+        cv2.addWeighted(image, 0.5, drawn, 0.5, 0.0, dst=drawn)
+    strong = [index for index in order if index not in faint]
+    draw_boxes(strong)
     if lines:
         occupied.append(_draw_panel(drawn, lines, sizes))
     if centre_m is not None:
         occupied.append(_draw_centre(drawn, centre_m, sizes))
-    for index in reversed(order):  # the most confident choose their label's position first
-        occupied.append(_draw_label(drawn, boxes[index], detections, index, sizes, occupied))
+    draw_labels(strong)
     return drawn
 
 

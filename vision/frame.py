@@ -22,6 +22,7 @@ class Frame:
         ready_ns: CLOCK_MONOTONIC nanoseconds when the image was decoded; 0 if unknown.
         decode_ms: decoding time, milliseconds.
         media_s: position in the recording, seconds; None for a live source.
+        file_name: of the image or video, without folder; empty if the frame is not from a file.
     """
 
     image: NDArray[np.uint8]
@@ -31,6 +32,7 @@ class Frame:
     ready_ns: int = 0
     decode_ms: float = 0.0
     media_s: float | None = None
+    file_name: str = ""
 
     def __post_init__(self) -> None:
         if self.image.ndim != 3 or self.image.shape[2] != 3 or self.image.dtype != np.uint8:

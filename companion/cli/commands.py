@@ -349,9 +349,9 @@ def detect(
         str | None, typer.Option(help="Plug-ins to load: modules or names, comma separated.")
     ] = None,
 ) -> None:
-    """Detect objects in the frames of a source. Prints one line per frame."""
+    """Detect objects in the frames of a source. Prints a line per frame, and a summary on standard error."""
     with gc_paused():
-        from companion.detect import detect_source
+        from companion.detect import detect_source, make_save_folder
         from companion.plugins import PluginError, load_plugins
         from vision.detector import open_detector
         from vision.object_detector import DetectorSettings
@@ -363,6 +363,8 @@ def detect(
     logging.basicConfig(level=logging.WARNING, format="companion: %(message)s", stream=sys.stderr)
     tracking = TrackerSettings(keep_confidence=confidence)
     with plain_errors(PluginError, ValueError):  # CheckpointError is a ValueError
+        if save is not None:
+            make_save_folder(save, source)
         load_plugins(parse_words(plugins_modules))
         wanted = DetectorSettings(
             model,
@@ -388,7 +390,7 @@ def detect(
     with plain_errors(SourceError, OSError), open_source(source, settings) as frames:
         if detector_kind == YOLO:
             _warn_synthetic_model([(source, model)])
-        processed = detect_source(
+        summary = detect_source(
             frames,
             frame_detector,
             every=every,
@@ -398,9 +400,10 @@ def detect(
             tracker=Tracker(tracking) if track else None,
             write=write,
         )
-    if not processed:
+    if not summary.frames:
         typer.echo(f"companion: {source}: contains no frames", err=True)
         raise typer.Exit(EXIT_BAD_INPUT)
+    typer.echo(f"companion: {summary}", err=True)
 
 
 def parse_words(text: str | None) -> list[str]:

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from companion.detect import detect_source
+from companion.detect import detect_source, make_save_folder
+from vision.annotate import annotate
 from vision.detections import Detections
 from vision.object_detector import Timing
 from vision.sources import open_source
@@ -93,3 +94,62 @@ def test_without_tracker_there_are_no_track_fields(two_squares: Path) -> None:
     records = [record for line in lines for record in json.loads(line)["detections"]]
     assert len(records) == 4
     assert not any(key.startswith("track_") for record in records for key in record)
+
+
+def test_lines_name_the_video_and_its_time(two_squares: Path) -> None:
+    text: list[str] = []
+    lines: list[str] = []
+    for as_json, written in ((False, text), (True, lines)):
+        with open_source(str(two_squares)) as source:
+            detect_source(source, WhiteBlobDetector(), limit=3, as_json=as_json, write=written.append)
+    assert [line.split()[:2] for line in text] == [
+        ["squares.avi", time] for time in ("0.000", "0.200", "0.400")
+    ]
+    messages = [json.loads(line) for line in lines]
+    assert [(message["file"], message["media_s"]) for message in messages] == [
+        ("squares.avi", 0.0), ("squares.avi", 0.2), ("squares.avi", 0.4),
+    ]  # fmt: skip
+
+
+def test_summary_counts_frames_and_objects(two_squares: Path) -> None:
+    with open_source(str(two_squares)) as source:
+        summary = detect_source(source, WhiteBlobDetector(), limit=5, write=lambda line: None)
+    assert summary.frames == 5
+    assert summary.objects == {"blob": 10}
+    assert str(summary).startswith("5 frames, ")
+    assert str(summary).endswith(": 10 blob")
+
+
+def test_saved_images_keep_their_names(two_squares: Path, tmp_path: Path) -> None:
+    photos, saved = tmp_path / "photos", tmp_path / "saved"
+    photos.mkdir()
+    for name in ("boat.png", "boat.jpg"):
+        cv2.imwrite(str(photos / name), np.full((60, 80, 3), 255, np.uint8))
+    make_save_folder(saved, str(photos))
+    lines: list[str] = []
+    for path, limit in ((photos, None), (two_squares, 1)):
+        with open_source(str(path)) as source:
+            detect_source(source, WhiteBlobDetector(), limit=limit, save=saved, write=lines.append)
+    assert sorted(path.name for path in saved.iterdir()) == [
+        "boat.jpg", "boat.png", "boat_detections.jpg", "boat_detections.png",
+        "squares_000000.jpg", "squares_000000_detections.jpg",
+    ]  # fmt: skip
+    assert [line.split()[0] for line in lines] == ["boat.jpg", "boat.png", "squares.avi"]
+
+
+def test_a_save_folder_that_holds_the_source_or_is_a_file_is_refused(two_squares: Path) -> None:
+    with pytest.raises(ValueError, match="contains the source"):
+        make_save_folder(two_squares.parent, str(two_squares))
+    with pytest.raises(ValueError, match="contains the source"):
+        make_save_folder(two_squares.parent, str(two_squares.parent))
+    with pytest.raises(ValueError, match="expected a folder, got a file"):
+        make_save_folder(two_squares, "photos")
+
+
+def test_detections_below_the_service_confidence_are_drawn_fainter() -> None:
+    image = np.zeros((120, 160, 3), np.uint8)
+    boxes = np.array([(10, 40, 60, 100), (90, 40, 150, 100)], np.float32)
+    found = Detections(boxes, np.array([0.9, 0.3], np.float32), np.zeros(2, np.int64), ("blob",))
+    drawn = annotate(image, found, faint_below=0.4)
+    left, right = (int(drawn[45:95, x].max()) for x in (10, 90))
+    assert right == pytest.approx(left / 2, abs=2)

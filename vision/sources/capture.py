@@ -32,6 +32,7 @@ class RawFrame:
         media_s: seconds since the start of the recording, for pacing; None where there is no such time.
         skipped: frames that the writer overwrote since the previous one.
         decode_ms: decoding time, milliseconds, as far as the library exposes it.
+        file_name: of the image or video, without folder; empty if the frame is not from a file.
     """
 
     image: NDArray[np.uint8]
@@ -40,12 +41,22 @@ class RawFrame:
     media_s: float | None = None
     skipped: int = 0
     decode_ms: float = 0.0
+    file_name: str = ""
 
     def numbered(self, sequence: int) -> Frame:
         """The frame to deliver, ready now; one of a file is captured now."""
         now_ns = time.monotonic_ns()
         captured_ns = now_ns if self.captured_ns is None else self.captured_ns
-        return Frame(self.image, captured_ns, sequence, self.depth_m, now_ns, self.decode_ms, self.media_s)
+        return Frame(
+            self.image,
+            captured_ns,
+            sequence,
+            self.depth_m,
+            now_ns,
+            self.decode_ms,
+            self.media_s,
+            self.file_name,
+        )
 
 
 class Capture(ABC):

@@ -127,7 +127,8 @@ class ImagesCapture(Capture):
                 image, reason = None, error.strerror or str(error)
             if image is not None:
                 decode_ms = (time.monotonic_ns() - started_ns) / 1e6
-                return RawFrame(image, media_s=index * self.interval_s, decode_ms=decode_ms)
+                media_s = index * self.interval_s
+                return RawFrame(image, media_s=media_s, decode_ms=decode_ms, file_name=path.name)
             self.unreadable += 1
             logger.warning("%s: skipped: %s", path, reason)
         if self.unreadable == len(self._paths):
@@ -177,7 +178,8 @@ class VideoFileCapture(Capture):
         if not stamp_s > self._last_s:  # some containers carry no stamps, or repeat them
             stamp_s = self._last_s + self.interval_s
         self._last_s = stamp_s
-        return RawFrame(np.ascontiguousarray(image, dtype=np.uint8), media_s=stamp_s, decode_ms=decode_ms)
+        picture = np.ascontiguousarray(image, dtype=np.uint8)
+        return RawFrame(picture, media_s=stamp_s, decode_ms=decode_ms, file_name=self._path.name)
 
     def close(self) -> None:
         self._capture.release()

@@ -117,7 +117,15 @@ class PairedCapture(Capture):
         self._next_sequence = frame.sequence + 1
         self.unreadable = unreadable
         captured_ns = frame.captured_ns if self._colour.live else None
-        return RawFrame(frame.image, captured_ns, depth_m, frame.media_s, max(skipped, 0), frame.decode_ms)
+        return RawFrame(
+            frame.image,
+            captured_ns,
+            depth_m,
+            frame.media_s,
+            max(skipped, 0),
+            frame.decode_ms,
+            frame.file_name,
+        )
 
     def _never_paired(self) -> SourceError:
         gap = (

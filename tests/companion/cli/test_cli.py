@@ -51,7 +51,8 @@ def test_detect_writes_one_json_object_per_frame(small_model: Path, pictures: Pa
     messages = [json.loads(line) for line in done.stdout.splitlines()]
     assert [message["sequence"] for message in messages] == [0, 3, 6, 9]
     for message in messages:
-        assert set(message) == {"sequence", "captured_ns", "width", "height", "inference_ms", "detections"}
+        fields = {"file", "sequence", "captured_ns", "width", "height", "inference_ms", "detections"}
+        assert set(message) == fields
         assert (message["width"], message["height"]) == (160, 120)
         assert message["inference_ms"] > 0
         for found in message["detections"]:
@@ -61,9 +62,9 @@ def test_detect_writes_one_json_object_per_frame(small_model: Path, pictures: Pa
             assert 0 <= top <= bottom <= 120
     assert any(message["detections"] for message in messages)
     saved = sorted(path.name for path in (tmp_path / "saved").iterdir())
-    assert saved[:2] == ["000000.jpg", "000000_detections.jpg"]
+    assert saved[:2] == ["000.png", "000_detections.png"]
     assert len(saved) == 8
-    drawn = cv2.imread(str(tmp_path / "saved" / "000000_detections.jpg"))
+    drawn = cv2.imread(str(tmp_path / "saved" / "000_detections.png"))
     assert drawn is not None
     assert drawn.shape == (120, 160, 3)
 
