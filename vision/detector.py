@@ -29,6 +29,7 @@ from vision.object_detector import (
 from vision.runtimes.base import PRECISIONS, Precision
 from vision.runtimes.selection import RuntimeChoice, check_runtime, start_runtime
 from vision.runtimes.source import read_source
+from vision.runtimes.stored_choice import forget_choices
 from vision.weights import DEFAULT_WEIGHTS
 from vision.yolo.checkpoint_pair import weights_sha256
 from vision.yolo.postprocess import boxes_from, candidates_of, decode_ltrb
@@ -266,6 +267,16 @@ def class_names_of(model: str | Path = DEFAULT_MODEL, runtime: RuntimeChoice = "
     source = read_source(_model_path(model))
     check_runtime(source, runtime)
     return source.class_names
+
+
+def forget_measurements(model: str | Path) -> None:
+    """Let the next start of a model measure runtime and precision again on this board.
+
+    Raises:
+        CheckpointError: there is no such model.
+        OSError: a stored measurement cannot be deleted.
+    """
+    forget_choices(weights_sha256(_model_path(model)))
 
 
 def _model_path(model: str | Path) -> Path:

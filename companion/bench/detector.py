@@ -181,7 +181,7 @@ def draw_pictures(path: Path, width: int, height: int) -> Path:
 
 def machine() -> dict[str, Any]:
     """Conditions that affect the figures."""
-    from vision.runtimes.autotune import board
+    from vision.runtimes.stored_choice import board
 
     return {"board": board(), "processors": len(os.sched_getaffinity(0)), "python": platform.python_version()}
 

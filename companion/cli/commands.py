@@ -323,6 +323,9 @@ def detect(
     ] = "torch",
     precision: Annotated[str, typer.Option(help="Precision: auto, float32, bfloat16 or float16.")] = "auto",
     threads: Annotated[int | None, typer.Option(min=1, help="CPU threads of the network.")] = None,
+    retune: Annotated[
+        bool, typer.Option("--retune", help="Measure this model's runtimes and precisions again.")
+    ] = False,
     every: Annotated[int, typer.Option(min=1, help="Process every Nth frame.")] = 1,
     limit: Annotated[int | None, typer.Option(min=1, help="Maximum number of frames.")] = None,
     tiles: Annotated[
@@ -353,7 +356,7 @@ def detect(
     with gc_paused():
         from companion.detect import detect_source, make_save_folder
         from companion.plugins import PluginError, load_plugins
-        from vision.detector import open_detector
+        from vision.detector import forget_measurements, open_detector
         from vision.object_detector import DetectorSettings
         from vision.pipeline import FrameDetector
         from vision.sources import SourceError, SourceSettings, open_source
@@ -362,7 +365,7 @@ def detect(
 
     logging.basicConfig(level=logging.WARNING, format="companion: %(message)s", stream=sys.stderr)
     tracking = TrackerSettings(keep_confidence=confidence)
-    with plain_errors(PluginError, ValueError):  # CheckpointError is a ValueError
+    with plain_errors(PluginError, OSError, ValueError):  # CheckpointError is a ValueError
         if save is not None:
             make_save_folder(save, source)
         load_plugins(parse_words(plugins_modules))
@@ -377,6 +380,8 @@ def detect(
             threads=threads,
             runtime=runtime,  # type: ignore[arg-type]
         )
+        if retune and detector_kind == YOLO:
+            forget_measurements(model)
         detector = open_detector(detector_kind, wanted)
         if runtime == "auto" and detector.runtime is not None:
             typer.echo(f"companion: on {detector.runtime} ({detector.reason})", err=True)

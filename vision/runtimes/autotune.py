@@ -7,11 +7,9 @@ this board does not affect the service, and its memory is released.
 from __future__ import annotations
 
 import ctypes
-import hashlib
 import json
 import logging
 import os
-import platform
 import signal
 import subprocess
 import sys
@@ -24,7 +22,8 @@ import numpy as np
 
 from vision.runtimes.base import Precision, RuntimeName, RuntimeUnusableError, version
 from vision.runtimes.source import ModelSource, read_source
-from vision.runtimes.start import cache_folder, start_named
+from vision.runtimes.start import start_named
+from vision.runtimes.stored_choice import StoredChoice
 from vision.yolo.checkpoint_pair import weights_sha256
 
 logger = logging.getLogger(__name__)
@@ -54,24 +53,21 @@ def fastest_runtime(
         RuntimeUnusableError: none of them runs the model; the message has each one's reason.
     """
     question = {
-        "model": weights_sha256(source.path),
         "class_ids": None if class_ids is None else list(class_ids),
-        "board": board(),
         "versions": {name: version(name) for name in candidates},
         "image_size": image_size,
         "precision": precision,
         "threads": threads,
     }
-    key = hashlib.sha256(json.dumps(question, sort_keys=True).encode()).hexdigest()[:24]
-    cached = cache_folder() / f"trial-{key}.json"
-    answer = _read_cache(cached, question)
+    stored = StoredChoice(weights_sha256(source.path), question)
+    answer = stored.read(set(candidates))
     when = "measured before"
     if answer is None:
         when = "measured now"
         answer = _measure_all(source, candidates, class_ids, precision, threads, image_size)
         # A failure may be temporary: a missing package, a full disk.
         if all(isinstance(value, float) for value in answer.values()):
-            _write_cache(cached, {"question": question, "answer": answer})
+            stored.write(answer)
     times = {name: value for name, value in answer.items() if isinstance(value, float)}
     for name, value in answer.items():
         if name not in times:
@@ -86,22 +82,6 @@ def fastest_runtime(
     reason = f"{when}: {listed}"
     logger.info("runtime auto: %s (%s)", best, reason)
     return best, reason  # type: ignore[return-value]
-
-
-def board() -> list[str]:
-    """Identification of this computer, as far as it affects speed."""
-    device_tree = Path("/proc/device-tree/model")
-    try:
-        model = device_tree.read_bytes().rstrip(b"\0").decode(errors="replace")
-    except OSError:
-        model = ""
-    names = {"model name", "Hardware", "CPU part"}
-    try:
-        lines = Path("/proc/cpuinfo").read_text(errors="replace").splitlines()
-    except OSError:
-        lines = []
-    parts = sorted({line for line in lines if line.partition(":")[0].strip() in names})
-    return [platform.machine(), model, str(len(os.sched_getaffinity(0))), *parts]
 
 
 def _measure_all(
@@ -159,27 +139,6 @@ def measure(
         started.infer(image)
         times.append((time.perf_counter() - before) * 1e3)
     return min(times[2:])
-
-
-def _read_cache(path: Path, question: dict[str, Any]) -> dict[str, Any] | None:
-    try:
-        cached = json.loads(path.read_text())
-    except (OSError, ValueError):
-        return None
-    if not isinstance(cached, dict) or cached.get("question") != question:
-        return None
-    answer = cached.get("answer")
-    return answer if isinstance(answer, dict) and set(answer) == set(question["versions"]) else None
-
-
-def _write_cache(path: Path, content: dict[str, Any]) -> None:
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_text(json.dumps(content))
-        os.replace(partial, path)
-    except OSError as error:
-        logger.warning("the choice of a runtime cannot be cached and is measured again next time: %s", error)
 
 
 def _end_with_parent(parent: int) -> None:

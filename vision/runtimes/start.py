@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING
 from vision.runtimes.base import Precision, Runtime, RuntimeName, RuntimeUnusableError, version
 from vision.runtimes.exported import FORMAT, SUFFIXES, ExportedFacts, ExportKind
 from vision.runtimes.source import ModelSource, runtime_of_file
+from vision.runtimes.stored_choice import cache_folder
 from vision.yolo.checkpoint_pair import weights_sha256
 
 if TYPE_CHECKING:
@@ -26,13 +26,6 @@ _EXPORTS: dict[RuntimeName, ExportKind] = {
     "openvino": "openvino",
     "tensorrt": "tensorrt",
 }
-
-
-def cache_folder() -> Path:
-    """Folder of converted networks and cached choices: below `$XDG_CACHE_HOME` or `~/.cache`."""
-    base = os.environ.get("XDG_CACHE_HOME", "")
-    root = Path(base) if os.path.isabs(base) else Path.home() / ".cache"
-    return root / "mavlink-companion" / "runtimes"
 
 
 def start_named(
@@ -57,6 +50,7 @@ def start_named(
             precision=precision,
             threads=threads,
             sparse_boxes=sparse_boxes,
+            model_sha256=weights_sha256(source.path),
         )
     from vision.runtimes.network import Network
 

@@ -21,6 +21,7 @@ from vision.runtimes import base
 from vision.runtimes.base import Precision, RuntimeName, RuntimeUnusableError
 from vision.runtimes.exported import KEY, ExportedFacts, not_ours
 from vision.runtimes.network import Network
+from vision.runtimes.stored_choice import StoredChoice
 from vision.yolo.architecture import YoloModel
 from vision.yolo.level_outputs import Head, LevelOutput, Product
 
@@ -32,11 +33,11 @@ _DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 _MOST_GRAPHS = 4
 # Input sizes for tracing and for checking the graph, in strides: height and width.
 _TRACED, _TRIED = (2, 4), (4, 6)
-# Enough to distinguish two precisions without delaying the start: as many pairs of runs as fit.
-_TRIAL_PAIRS = range(3, 20)
-_TRIAL_S = 0.1
+# Enough to distinguish two precisions: as many pairs of runs as fit. Measured once, see `StoredChoice`.
+_TRIAL_PAIRS = range(5, 40)
+_TRIAL_S = 0.5
 _TRIAL_SIDE = 320
-# bfloat16 must save at least a fifth; below that the choice would vary from start to start.
+# bfloat16 must save at least a fifth; for less it is not worth its rounding.
 _WORTH = 0.8
 
 
@@ -56,6 +57,7 @@ class TorchRuntime:
         precision: `auto` selects bfloat16 only if the processor supports it (a fifth less time).
         threads: processor threads, of torch in the whole process; None: unchanged.
         sparse_boxes: see `Network`.
+        model_sha256: of the weights; with it, a measured precision is stored for later starts.
     """
 
     product: Product = staticmethod(torch_product)
@@ -69,6 +71,7 @@ class TorchRuntime:
         precision: Precision = "auto",
         threads: int | None = None,
         sparse_boxes: bool = False,
+        model_sha256: str | None = None,
     ) -> None:
         if precision not in ("auto", *_DTYPES):
             raise RuntimeUnusableError(
@@ -78,7 +81,7 @@ class TorchRuntime:
             torch.set_num_threads(threads)
         self._network = Network(model, class_ids, sparse_boxes=sparse_boxes).channels_last()
         self.head: Head = self._network.head
-        self.precision, self.precision_reason = self._choose_precision(precision)
+        self.precision, self.precision_reason = self._choose_precision(precision, model_sha256)
         self._network.in_precision(_DTYPES[self.precision])
         self._graphs: collections.OrderedDict[tuple[int, int], Graph] = collections.OrderedDict()
         self._graph = self._any_size()
@@ -134,7 +137,7 @@ class TorchRuntime:
             self._graphs.move_to_end(size)
         return graph
 
-    def _choose_precision(self, requested: Precision) -> tuple[str, str]:
+    def _choose_precision(self, requested: Precision, model_sha256: str | None) -> tuple[str, str]:
         native = base.bfloat16_instructions()
         if requested == "bfloat16" and not native:
             logger.warning("this processor does not support bfloat16; it is emulated and slow")
@@ -142,12 +145,26 @@ class TorchRuntime:
             return requested, "as requested"
         if not native:
             return "float32", "this processor does not support bfloat16"
-        full, half = self._measured_ms(torch.float32, torch.bfloat16)
+        stored = None
+        if model_sha256 is not None:
+            question = {"torch": torch.__version__, "threads": self.threads, "precisions": list(_DTYPES)}
+            stored = StoredChoice(model_sha256, question)
+        times = stored.read(set(_DTYPES)) if stored is not None else None
+        when = "measured before"
+        if times is None:
+            when = "measured now"
+            times = dict(zip(_DTYPES, self._measured_ms(*_DTYPES.values()), strict=True))
+            if stored is not None:
+                stored.write(times)
+        full, half = times["float32"], times["bfloat16"]
         chosen = "bfloat16" if half < _WORTH * full else "float32"
-        return chosen, f"measured {full:.1f} ms in float32, {half:.1f} ms in bfloat16 ({native})"
+        return chosen, f"{when}: {full:.1f} ms in float32, {half:.1f} ms in bfloat16 ({native})"
 
     def _measured_ms(self, *dtypes: torch.dtype) -> list[float]:
-        """The minimum time of a small input in each dtype, measured alternately: other load slows both."""
+        """The minimum processor time, of all threads, of a small input in each dtype.
+
+        Measured alternately. Other load changes the wall time far more than the processor time.
+        """
         pixels = torch.zeros(1, _TRIAL_SIDE, _TRIAL_SIDE, 3, dtype=torch.uint8)
         with torch.inference_mode():
             graphs = [traced(copy.deepcopy(self._network).in_precision(dtype), pixels) for dtype in dtypes]
@@ -159,9 +176,9 @@ class TorchRuntime:
                 if count >= _TRIAL_PAIRS.start and time.perf_counter() - began > _TRIAL_S:
                     break
                 for graph, spent in zip(graphs, times, strict=True):
-                    started = time.perf_counter()
+                    started = time.process_time()
                     graph(pixels)
-                    spent.append((time.perf_counter() - started) * 1e3)
+                    spent.append((time.process_time() - started) * 1e3)
         return [min(spent) for spent in times]
 
 

@@ -13,12 +13,13 @@ import pytest
 
 from tests.vision.runtimes.conftest import make_image
 from vision.detector import Detector
-from vision.runtimes import autotune, base
+from vision.runtimes import autotune, base, stored_choice
 from vision.runtimes.base import RuntimeMissingError, RuntimeName, RuntimeUnusableError, installed
 from vision.runtimes.export import export
 from vision.runtimes.selection import start_runtime
 from vision.runtimes.source import read_source, runtime_of_file
-from vision.runtimes.start import cache_folder
+from vision.runtimes.stored_choice import cache_folder, forget_choices
+from vision.yolo.checkpoint_pair import weights_sha256
 
 
 def only(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
@@ -151,13 +152,17 @@ def test_choice_is_remeasured_when_its_inputs_change(
     autotune.fastest_runtime(source, names, **CHOICE | {"threads": 1})
     monkeypatch.setattr(autotune, "version", lambda name: "2.0")
     autotune.fastest_runtime(source, names, **CHOICE)
-    monkeypatch.setattr(autotune, "board", lambda: ["another"])
+    monkeypatch.setattr(stored_choice, "board", lambda: ["another"])
     autotune.fastest_runtime(source, names, **CHOICE)
     assert asked.asked == 5
     for kept in cache_folder().glob("trial-*.json"):
         kept.write_text(json.dumps({"question": {}, "answer": []}))
     autotune.fastest_runtime(source, names, **CHOICE)
     assert asked.asked == 6
+    assert forget_choices("of another model") == 0
+    assert forget_choices(weights_sha256(checkpoint)) == 1
+    autotune.fastest_runtime(source, names, **CHOICE)
+    assert asked.asked == 7
 
 
 def test_uncacheable_choice_is_still_used(
@@ -168,7 +173,7 @@ def test_uncacheable_choice_is_still_used(
     Trial(monkeypatch, {"torch": 2.0, "openvino": 1.0})
     name, _ = autotune.fastest_runtime(read_source(checkpoint), ["torch", "openvino"], **CHOICE)
     assert name == "openvino"
-    assert "cannot be cached" in caplog.text
+    assert "cannot be stored" in caplog.text
 
 
 def test_error_lists_every_runtimes_reason(

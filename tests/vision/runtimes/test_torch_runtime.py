@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -11,6 +13,7 @@ from vision.runtimes import base
 from vision.runtimes import torch_runtime as torch_runtime_module
 from vision.runtimes.base import RuntimeUnusableError
 from vision.runtimes.network import Network
+from vision.runtimes.stored_choice import forget_choices
 from vision.runtimes.torch_runtime import TorchRuntime, torch_product
 
 
@@ -85,6 +88,25 @@ def test_auto_uses_native_bfloat16_if_much_faster(
     runtime = TorchRuntime(lively_model())
     assert runtime.precision == chosen
     assert "5.0 ms in float32" in runtime.precision_reason
+
+
+@pytest.mark.usefixtures("with_bfloat16")
+def test_measured_precision_is_stored_for_later_starts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    measured = iter([[5.0, 2.0], [5.0, 9.0], [5.0, 9.0]])
+    monkeypatch.setattr(TorchRuntime, "_measured_ms", lambda self, *dtypes: next(measured))
+
+    def chosen(model_sha256: str) -> tuple[str, str]:
+        runtime = TorchRuntime(lively_model(), model_sha256=model_sha256)
+        return runtime.precision, runtime.precision_reason.partition(":")[0]
+
+    assert chosen("a") == ("bfloat16", "measured now")
+    assert chosen("a") == ("bfloat16", "measured before")
+    assert chosen("b") == ("float32", "measured now")
+    forget_choices("a")
+    assert chosen("a") == ("float32", "measured now")
 
 
 @pytest.mark.usefixtures("with_bfloat16")
