@@ -24,7 +24,6 @@ from benchmarks.scenes import (
     SceneFrame,
     SyntheticDetector,
     scene_frames,
-    without_image,
 )
 from companion.bench.percentiles import percentiles
 from vision.detections import NO_TRACK, Detections
@@ -65,14 +64,15 @@ def measure_tracking(
     figures: dict[str, object] = {"detector": model or "drawn", "rate_hz": rate_hz, "dropped_share": drop}
     for motion in MOTIONS:
         sequence = [
-            Seen(without_image(frame), detect(frame))
+            Seen(frame, detect(frame))
             for frame in scene_frames(motion, seconds=seconds, rate_hz=rate_hz, seed=seed, drop=drop)
         ]
         attitudes = attitudes_of(motion, seconds, seed)
         ways = {
             "last frame": no_tracking(sequence, settings.keep_confidence),
             "tracker": tracked(sequence, settings, None),
-            "tracker, attitude": tracked(sequence, settings, attitudes, timing_ms),
+            "tracker, attitude": tracked(sequence, settings, attitudes),
+            "tracker, attitude, image": tracked(sequence, settings, attitudes, timing_ms, look=True),
             "tracks, attitude": believed(sequence, settings, attitudes),
         }
         for way, labelled in ways.items():
@@ -146,14 +146,17 @@ def tracked(
     settings: TrackerSettings,
     attitudes: AttitudeHistory | None,
     timing_ms: list[float] | None = None,
+    *,
+    look: bool = False,
 ) -> list[tuple[Labelled, Labelled]]:
     """The truth, and the confirmed tracks."""
     tracker = Tracker(settings)
     labelled = []
     for seen in sequence:
         view = view_of(attitudes, seen.frame.captured_ns)
+        image = seen.frame.image if look else None
         started_s = time.perf_counter()
-        detections = tracker.update(seen.detections, seen.frame.captured_ns, view).detections
+        detections = tracker.update(seen.detections, seen.frame.captured_ns, view, image).detections
         if timing_ms is not None:
             timing_ms.append((time.perf_counter() - started_s) * 1e3)
         assert detections.track_id is not None

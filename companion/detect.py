@@ -82,7 +82,7 @@ def detect_source(
                 continue
             detections = detector.detect(frame.image)
             if tracker is not None:
-                detections = tracker.update(detections, _stamp_ns(frame)).detections
+                detections = tracker.update(detections, _stamp_ns(frame), image=frame.image).detections
             write(_line(frame, detections, detector, as_json))
             if save is not None:
                 _save(save, frame, detections)

@@ -93,7 +93,7 @@ def replay_detections(paths: Sequence[Path], model: str) -> DetectionReplay:
     for captured_ns, image, message in _frames(paths, f"/{prefix}image", f"{prefix}{DETECTIONS.name}"):
         replayed = detector.detect(image)
         if tracker is not None:
-            replayed = tracker.update(replayed, captured_ns).detections
+            replayed = tracker.update(replayed, captured_ns, image=image).detections
         scale = image.shape[1] / message["width"]
         old = message["detections"]
         new = replayed.records()

@@ -207,7 +207,7 @@ class Pipeline:
         events: tuple[TrackEvent, ...] = ()
         if self._tracker is not None:
             view = self._view_at(frame)
-            tracked = self._tracker.update(detections, frame.captured_ns, view)
+            tracked = self._tracker.update(detections, frame.captured_ns, view, frame.image)
             if self.object_selection is not None:
                 tracked = self.object_selection.update(frame, tracked, view)
             detections, events = tracked.detections, tracked.events

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from vision.detections import NO_TRACK, Detections
 from vision.tracking import kalman
+from vision.tracking.appearance import appearances
 from vision.tracking.association import enlarge, match, overlaps
 from vision.tracking.camera_motion import CameraView, rotate_boxes
 from vision.tracking.kalman import BoxStates
@@ -50,6 +51,12 @@ SAME_OBJECT_IOU = 0.7
 # its own. Of confirmed rendered tracks, 0.25, 0.5, 0.75 and 1.0 leave 142, 160, 169 and 172 of 174 of the
 # right class, 77, 85, 90 and 94 of 114 of a wrong one. Sums decay as if only `SCORES_KEPT` frames counted.
 RIVAL_SHARE = 0.5
+# Least similarity of appearance of a box that continues a track after a gap, or whose box it overlaps only
+# enlarged. Of a street's cars and people, other objects had up to 0.945 and 99 % of the same had more. Boxes
+# with a side below `MIN_LOOK_PX` are too few pixels for that; rendered ones of 32 pixels lost tracks by it.
+SAME_LOOK, MIN_LOOK_PX = 0.95, 48.0
+# Share of the newest detection in a track's appearance.
+LOOK_SHARE = 0.3
 _DECAY = 1.0 - 1.0 / SCORES_KEPT
 
 
@@ -76,6 +83,8 @@ class _TrackRecord:
     scores: ScoreHistory = field(default_factory=ScoreHistory)
     # Class id → sum of this class's confidences on the object.
     evidence: dict[int, float] = field(default_factory=dict)
+    # See `appearances`; None without images.
+    look: NDArray[np.float32] | None = None
 
     @property
     def class_in_doubt(self) -> bool:
@@ -91,6 +100,10 @@ class _TrackRecord:
         self.seen += 1
         self.scores.add(confidence)
         self.lost = False
+
+    def add_look(self, look: NDArray[np.float32]) -> None:
+        mixed = look if self.look is None else (1 - LOOK_SHARE) * self.look + LOOK_SHARE * look
+        self.look = mixed / np.linalg.norm(mixed)
 
 
 class Tracker:
@@ -109,6 +122,7 @@ class Tracker:
         self._states = BoxStates.none()
         self._records: list[_TrackRecord] = []
         self._newest_ns: int | None = None
+        self._before_ns = 0
         self._warned_frame_rate = False
         self._view: CameraView | None = None
         self._class_names: tuple[str, ...] = ()
@@ -128,7 +142,11 @@ class Tracker:
         return self._next_id - 1
 
     def update(
-        self, detections: Detections, captured_ns: int, view: CameraView | None = None
+        self,
+        detections: Detections,
+        captured_ns: int,
+        view: CameraView | None = None,
+        image: NDArray[np.uint8] | None = None,
     ) -> TrackedFrame:
         """Process one frame.
 
@@ -137,6 +155,8 @@ class Tracker:
             captured_ns: capture stamp, nanoseconds; any monotonic clock.
             view: camera orientation at the capture, in NED. The rotation between two frames is compensated
                 when both are known.
+            image: (height, width, 3) uint8, BGR; with it, a large box that looks different does not continue
+                a track that was not detected in the previous frame, or whose box it does not overlap.
 
         Returns:
             The detections in their order, each with its track. Those below `keep_confidence` without a track
@@ -148,7 +168,8 @@ class Tracker:
         confidence, class_id = detections.confidence, detections.class_id
         boxes: list[list[float]] = detections.xyxy.tolist()
         track_of = np.full(len(detections), -1)
-        self._associate(detections, captured_ns, track_of)
+        looks = None if image is None else appearances(image, detections.xyxy)
+        self._associate(detections, captured_ns, track_of, looks)
         records: dict[int, _TrackRecord] = {}
         matched = np.flatnonzero(track_of >= 0)
         tracks = track_of[matched]
@@ -161,6 +182,8 @@ class Tracker:
         for index, track in zip(matched.tolist(), tracks.tolist(), strict=True):
             records[index] = record = self._records[track]
             record.add_detection(float(confidence[index]), captured_ns)
+            if looks is not None and confidence[index] >= self.settings.high_confidence:
+                record.add_look(looks[index])
             self._on_detected(record, boxes[index], captured_ns, events)
         new = np.flatnonzero((track_of < 0) & (confidence >= self.settings.high_confidence))
         on_object = overlaps(detections.xyxy[new], estimated)
@@ -170,6 +193,8 @@ class Tracker:
             record = _TrackRecord(self._next_id, int(class_id[index]), captured_ns, captured_ns)
             self._next_id += 1
             record.add_detection(float(confidence[index]), captured_ns)
+            if looks is not None:
+                record.add_look(looks[index])
             if known and on_object[row].max() >= SAME_OBJECT_IOU:
                 # The same object under another class: its earlier evidence applies to this track too.
                 record.evidence = dict(known[int(on_object[row].argmax())])
@@ -185,6 +210,7 @@ class Tracker:
     def _predict(self, captured_ns: int, view: CameraView | None, events: list[TrackEvent]) -> None:
         """Predict every box to this frame; end tracks that are too old or out of view."""
         before_ns, before = self._newest_ns, self._view
+        self._before_ns = before_ns or 0
         self._newest_ns, self._view = captured_ns, view
         if before_ns is None or not self._records:
             return
@@ -213,7 +239,9 @@ class Tracker:
                 self.settings.max_age_s,
             )
 
-    def _associate(self, detections: Detections, captured_ns: int, track_of: Indices) -> None:
+    def _associate(
+        self, detections: Detections, captured_ns: int, track_of: Indices, looks: NDArray[np.float32] | None
+    ) -> None:
         """Fill in `track_of` (N,): the index of each detection's track."""
         if not len(detections) or not self._records:
             return
@@ -227,6 +255,9 @@ class Tracker:
         )
         class_ids = np.array([record.class_id for record in self._records])
         predicted, same_class = self._states.xyxy, class_ids[:, None] == detections.class_id
+        alike = np.ones_like(same_class) if looks is None else self._look_alike(detections, looks)
+        # After a gap the predicted box fits many objects.
+        gap = np.array([record.last_ns < self._before_ns for record in self._records])
         free = np.ones(len(self._records), np.bool_)
         for of_tracks, of_detections, least, reach in (
             (known, strong, settings.min_iou, 0.0),
@@ -241,9 +272,19 @@ class Tracker:
                 continue
             similarity = overlaps(enlarge(predicted[rows], reach), enlarge(detections.xyxy[columns], reach))
             similarity *= same_class[rows[:, None], columns]
+            similarity *= alike[rows[:, None], columns] | ((reach == 0.0) & ~gap[rows, None])
             for row, column in match(similarity, least):
                 track_of[columns[column]] = rows[row]
                 free[rows[row]] = False
+
+    def _look_alike(self, detections: Detections, looks: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """(tracks, detections): whether it may be the same object by its appearance."""
+        small = (detections.xyxy[:, 2:] - detections.xyxy[:, :2]).min(axis=1) < MIN_LOOK_PX
+        alike = np.ones((len(self._records), len(detections)), np.bool_)
+        for row, record in enumerate(self._records):
+            if record.look is not None:
+                alike[row] = small | (looks @ record.look >= SAME_LOOK)
+        return alike
 
     def _update_class_evidence(
         self, records: Sequence[_TrackRecord], boxes: NDArray[np.floating], detections: Detections
