@@ -112,11 +112,8 @@ def _fits(
     """A fit of each distortion model that fits the views."""
     fits: dict[DistortionModel, Fit] = {}
     for kind in _MODELS:
-        start = None if starts is None else starts.get(kind)
-        if start is None and kind == "rational_polynomial" and "plumb_bob" in fits:
-            start = fits["plumb_bob"].model
         try:
-            fits[kind] = fit(kind, views, start)
+            fits[kind] = fit(kind, views, None if starts is None else starts.get(kind))
         except ValueError:
             continue
     if not fits:
