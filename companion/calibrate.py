@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -12,6 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.bus.topics import VEHICLE
+from vision.attitude import euler_from_quaternion
 from vision.calibration.boards import Board, BoardView
 from vision.calibration.calibrate import CalibrationError, CalibrationResult, covers_image
 from vision.calibration.views import EDGES, ViewCollector
@@ -22,6 +25,8 @@ from vision.sources import Source
 from vision.sources.files import images_in
 
 Image = NDArray[np.uint8]
+Tilt = tuple[float, float]
+"""Roll and pitch of the vehicle, radians."""
 
 # Images of the report are at most so wide.
 _WIDTH = 640
@@ -95,11 +100,15 @@ def markers_of(
     model: CameraModel | None,
     limit: int,
     write: Callable[[str], None],
-) -> list[Marker]:
-    """The marker in the frames of a source, at most `limit` times; Ctrl-C ends a live source.
+    tilt: Callable[[], Tilt | None] = lambda: (0.0, 0.0),
+) -> tuple[list[Marker], list[Tilt]]:
+    """The marker in the frames of a source, at most `limit` times, and the vehicle's tilt at each.
+
+    Ctrl-C ends a live source.
 
     Args:
         model: the lens; None: the source's own.
+        tilt: of the vehicle at present; None: unknown, the frame is not used.
         write: called with a line at the start of a live source, and while the marker is not seen.
 
     Raises:
@@ -112,6 +121,7 @@ def markers_of(
         model = source.calibration.model
     detector = MarkerDetector(kind)
     found: list[Marker] = []
+    tilts: list[Tilt] = []
     if source.live:
         write(f"show marker {identifier} to the camera; Ctrl-C ends")
     others: set[int] = set()
@@ -120,20 +130,48 @@ def markers_of(
         for frame in source:
             lens = scaled_to_frames(model, frame.width, frame.height)
             seen = detector.detect(frame.image, lens)
-            found += (own := [each for each in seen if each.identifier == identifier])
+            own = [each for each in seen if each.identifier == identifier]
             others |= {each.identifier for each in seen}
-            if own:
+            present = tilt()
+            if own and present is not None:
+                found += own
+                tilts += [present] * len(own)
                 due_s, others = time.monotonic() + _MISSING_S, set()
             elif source.live and time.monotonic() >= due_s:
                 names = ", ".join(map(str, sorted(others))) or "no marker"
-                write(f"marker {identifier} not seen; seen: {names}")
+                write(
+                    f"marker {identifier} not seen; seen: {names}"
+                    if present is not None
+                    else "no attitude received from the vehicle"
+                )
                 due_s, others = time.monotonic() + _MISSING_S, set()
             if len(found) >= limit:
                 break
     except KeyboardInterrupt:
         if not source.live:
             raise
-    return found
+    return found, tilts
+
+
+class LiveTilt:
+    """The vehicle's tilt from its service's `vehicle` messages."""
+
+    def __init__(self, clock_s: Callable[[], float] = time.monotonic) -> None:
+        self._clock_s = clock_s
+        self._newest: tuple[float, Tilt] | None = None
+
+    def on_message(self, _key: str, text: str) -> None:
+        """Process a message of topic `vehicle`, on any thread."""
+        attitude = json.loads(text)["attitude_wxyz"]
+        if attitude is not None:
+            roll, pitch, _ = euler_from_quaternion(tuple(attitude))
+            self._newest = self._clock_s(), (roll, pitch)
+
+    def __call__(self) -> Tilt | None:
+        """Roll and pitch, radians; None if none was received within the topic's maximum age."""
+        newest, limit_s = self._newest, VEHICLE.max_age_s
+        assert limit_s is not None
+        return None if newest is None or self._clock_s() - newest[0] > limit_s else newest[1]
 
 
 def _process(frame: Frame, name: str, board: Board, collected: Collected) -> bool:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import logging
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 import typer.core
 
-from companion.cli.flags import check_finite, check_folder, plain_errors
+from companion.cli.flags import check_finite, check_folder, plain_errors, settings_command
+from companion.settings import Settings
 
 
 class _LensByDefault(typer.core.TyperGroup):
@@ -101,8 +103,9 @@ def lens(
     typer.echo(f"written: {output}" + ("" if page is None else f", {page}"))
 
 
-@calibrate.command()
+@settings_command(calibrate, "zenoh", "vehicle.name")
 def mount(
+    settings: Settings,
     source: Annotated[str, typer.Argument(help="Folder of images, video, /dev/video0, shm://NAME or URL.")],
     marker: Annotated[int, typer.Option(min=0, help="Id of the marker, which lies level, face up.")],
     size: Annotated[float, typer.Option(help="Side of the marker's black square, metres.")],
@@ -115,6 +118,10 @@ def mount(
     ] = 0.0,
     roll: Annotated[float, typer.Option(help="Roll of the vehicle, degrees.")] = 0.0,
     pitch: Annotated[float, typer.Option(help="Pitch of the vehicle, degrees, nose up.")] = 0.0,
+    live: Annotated[
+        bool, typer.Option("--live", help="Take roll and pitch from the running service of vehicle.name.")
+    ] = False,
+    connect: Annotated[str | None, typer.Option(help="Zenoh endpoint of the service, with --live.")] = None,
     frames: Annotated[int, typer.Option(min=1, help="Number of images with the marker.")] = 30,
     rotate: _ROTATE = 0,
     mirror: _MIRROR = False,
@@ -122,26 +129,45 @@ def mount(
     """Measure the camera's angles on the vehicle, and print them as settings."""
     import math
 
-    from companion.calibrate import markers_of
+    from companion.bus.client import NoAnswerError, client_settings, listen, open_client
+    from companion.bus.session import BusError
+    from companion.bus.topics import VEHICLE
+    from companion.calibrate import LiveTilt, markers_of
     from vision.calibration.camera_info import read_camera_info
     from vision.calibration.mount import mount_from_markers
     from vision.markers import MarkerKind
     from vision.sources import SourceError, SourceSettings, open_source
 
     logging.basicConfig(level=logging.WARNING, format="companion: %(message)s", stream=sys.stderr)
-    with plain_errors(SourceError, ValueError, OSError):
+    with plain_errors(SourceError, ValueError, OSError, NoAnswerError, BusError):
+        if live and (roll or pitch):
+            raise ValueError("--live replaces --roll and --pitch: leave them out")
+        if connect and not live:
+            raise ValueError("--connect is for --live")
         for flag, angle in (("--heading", heading), ("--roll", roll), ("--pitch", pitch)):
             check_finite(flag, angle)
         kind = MarkerKind(dictionary, size, {marker: size})
-        settings = SourceSettings(every_frame=True, rotate_deg=rotate, mirror=mirror)
+        reading = SourceSettings(every_frame=True, rotate_deg=rotate, mirror=mirror)
         model = None
         if calibration is not None:
             info = read_camera_info(calibration)
-            info.check_source(settings.orientation)
+            info.check_source(reading.orientation)
             model = info.model
-        with open_source(source, settings) as images:
-            found = markers_of(images, kind, marker, model, frames, _note)
-        angles = mount_from_markers(found, *map(math.radians, (heading, roll, pitch)))
+        given = math.radians(roll), math.radians(pitch)
+        with ExitStack() as opened:
+            images = opened.enter_context(open_source(source, reading))
+            if live and not images.live:
+                raise ValueError(f"--live needs a live source, got {source}: give --roll and --pitch")
+            tilt = LiveTilt()
+            if live:
+                client = client_settings(settings.zenoh, (connect,) if connect else ())
+                session = opened.enter_context(open_client(client))
+                subscriber = listen(session, VEHICLE.key(settings.vehicle.name), tilt.on_message)
+                opened.callback(subscriber.undeclare)
+            found, tilts = markers_of(
+                images, kind, marker, model, frames, _note, tilt if live else lambda: given
+            )
+        angles = mount_from_markers(found, math.radians(heading), *zip(*tilts, strict=True))
     typer.echo(f"# {angles.views} images, spread {math.degrees(angles.spread_rad):.2f} degrees")
     for key in ("roll", "pitch", "yaw"):
         typer.echo(f"mount_{key}_deg = {math.degrees(getattr(angles, f'{key}_rad')):.2f}")

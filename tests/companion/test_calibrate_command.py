@@ -2,24 +2,34 @@
 
 from __future__ import annotations
 
+import itertools
+import json
+import math
 import re
+import socket
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import zenoh
 from typer.testing import CliRunner, Result
 
 from companion import calibrate as calibrate_module
-from companion.calibrate import collect_views, markers_of
+from companion.bus.config import zenoh_config
+from companion.calibrate import LiveTilt, collect_views, markers_of
 from companion.cli.commands import app
+from companion.settings.bus import ZenohSection
 from mavlink_sim.camera.image_effects import ImageEffects
 from mavlink_sim.camera.renderer import Renderer
 from mavlink_sim.datasets.board_views import LENSES, BoardCamera, board_poses, write_board_views
 from mavlink_sim.datasets.board_views import app as board_app
+from mavlink_sim.testing import free_port
 from mavlink_sim.world.fiducials import Print
 from mavlink_sim.world.world import Ground, World, WorldObject
+from vision.attitude import quaternion_from_euler
 from vision.calibration.boards import Board
 from vision.calibration.camera_info import read_camera_info, write_camera_info
 from vision.camera_model import CameraModel, CameraMount
@@ -283,6 +293,84 @@ def test_live_camera_without_the_marker_says_what_it_sees(
     live._interrupt_after = 2
     kind, lens = MarkerKind("4X4_50", 0.6), read_camera_info(marker_images / "lens.yaml").model
     lines: list[str] = []
-    assert markers_of(live, kind, 9, lens, 1, lines.append) == []
+    assert markers_of(live, kind, 9, lens, 1, lines.append) == ([], [])
     assert ["marker 9" in line for line in lines] == [True] * 3
     assert [line.rpartition(": ")[2] for line in lines[1:]] == ["no marker", "7"]
+
+
+def live_marker(marker_images: Path) -> Live:
+    """A live source of the marker, without end."""
+    image = np.asarray(cv2.imread(str(marker_images / "0.png")), np.uint8)
+    live = Live()
+    live._frames = (Frame(image, number, number) for number in itertools.count())
+    return live
+
+
+def vehicle_text(roll: float, pitch: float) -> str:
+    return json.dumps({"attitude_wxyz": quaternion_from_euler(roll, pitch, 1.0)})
+
+
+def test_live_tilt_is_the_newest_attitude_until_it_is_stale() -> None:
+    now_s = 10.0
+    tilt = LiveTilt(lambda: now_s)
+    assert tilt() is None
+    tilt.on_message("companion/alpha/vehicle", vehicle_text(0.2, -0.1))
+    assert tilt() == pytest.approx((0.2, -0.1))
+    tilt.on_message("companion/alpha/vehicle", '{"attitude_wxyz": null}')
+    now_s = 10.4
+    assert tilt() == pytest.approx((0.2, -0.1))
+    now_s = 10.6
+    assert tilt() is None
+
+
+def test_frames_without_an_attitude_are_not_used(
+    marker_images: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(calibrate_module, "_MISSING_S", 0.0)
+    tilts = iter([None, (0.1, 0.0), None, (0.0, 0.1)])
+    kind, lens = MarkerKind("4X4_50", 0.6), read_camera_info(marker_images / "lens.yaml").model
+    lines: list[str] = []
+    found = markers_of(live_marker(marker_images), kind, 7, lens, 2, lines.append, lambda: next(tilts))
+    assert [marker.identifier for marker in found[0]] == [7, 7]
+    assert found[1] == [(0.1, 0.0), (0.0, 0.1)]
+    assert ["attitude" in line for line in lines] == [False, True, True]
+
+
+@pytest.mark.realtime
+def test_mount_uses_the_attitude_of_the_running_service(
+    marker_images: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    ended = threading.Event()
+
+    def publish(session: zenoh.Session) -> None:
+        while not ended.wait(0.05):
+            session.put("companion/alpha/vehicle", vehicle_text(0.0, math.radians(6.0)))
+
+    monkeypatch.setattr("vision.sources.open_source", lambda *_: live_marker(marker_images))
+    words = ("--marker", "7", "--size", "0.6", "--calibration", marker_images / "lens.yaml", "--frames", "5")
+    with zenoh.open(zenoh_config(ZenohSection(listen=(endpoint,)))) as session:
+        publisher = threading.Thread(target=publish, args=(session,))
+        publisher.start()
+        try:
+            done = calibrate(
+                "mount", "test://board", *words, "--live", "--connect", endpoint, "--vehicle-name", "alpha"
+            )
+        finally:
+            ended.set()
+            publisher.join()
+    assert done.exit_code == 0, done.output
+    values = dict(re.findall(r"^mount_(\w+)_deg = (\S+)$", done.stdout, re.MULTILINE))
+    # Nose up by 6 degrees: the camera looks down by as much more on the body.
+    assert float(values["pitch"]) == pytest.approx(-36.0, abs=0.4)
+
+
+@pytest.mark.parametrize(
+    ("flags", "named"),
+    [(("--live",), "--pitch"), (("--live", "--roll", "2"), "--roll"), (("--connect", "tcp/x"), "--live")],
+)
+def test_live_attitude_where_there_is_none_is_refused(
+    marker_images: Path, flags: tuple[str, ...], named: str
+) -> None:
+    done = calibrate("mount", marker_images, "--marker", "7", "--size", "0.6", *flags)
+    assert named in one_line_of_bad_input(done)

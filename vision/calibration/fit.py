@@ -29,9 +29,9 @@ _CONVERGED = 1e-7
 _STEP = 1e-6
 # Views determine little more of a rational lens than the quotient of its two polynomials, so that fits differ
 # widely where no corner is. The coefficients are therefore observed, weakly: as those of an ideal equidistant
-# lens (the Padé approximant of atan(r) / r in r²), with this one-sigma error, at the weight of one corner with
-# an error of _PRIOR_PX. In 8 lenses of benchmarks/calibration.py all pixels then have rays (5 without it), and
-# the error of rays in the image's corners is smaller.
+# lens (the Padé approximant of atan(r) / r in r²), with this one-sigma error, at the weight of one corner
+# with an error of _PRIOR_PX. All pixels of 8 of the lenses of benchmarks/calibration.py then have rays (of 5
+# without it), and the rays in the images' corners are closer to the true ones.
 _IDEAL = np.array([50 / 39, 283 / 715, 0.0, 0.0, 256 / 15015, 21 / 13, 105 / 143, 35 / 429])
 _IDEAL_SIGMA = np.array([0.3, 0.3, np.inf, np.inf, 0.1, 0.3, 0.3, 0.1])
 _PRIOR_PX = 0.1

@@ -40,21 +40,29 @@ class MountAngles:
 
 
 def mount_from_markers(
-    markers: Sequence[Marker], heading_rad: float = 0.0, roll_rad: float = 0.0, pitch_rad: float = 0.0
+    markers: Sequence[Marker],
+    heading_rad: float = 0.0,
+    roll_rad: float | Sequence[float] = 0.0,
+    pitch_rad: float | Sequence[float] = 0.0,
 ) -> MountAngles:
     """The camera's angles on the body.
 
     Args:
         markers: one marker lying level, face up, in several images.
         heading_rad: direction of the marker's upper edge, clockwise from the vehicle's nose.
-        roll_rad, pitch_rad: attitude of the vehicle.
+        roll_rad, pitch_rad: attitude of the vehicle, for all images or for each.
 
     Raises:
         CalibrationError: no marker, none whose pose is unambiguous, or the camera is upside down.
     """
     if not markers:
         raise CalibrationError("the marker is in none of the images")
-    clear = [marker for marker in markers if marker.ambiguity <= UNAMBIGUOUS]
+    rolls, pitches = (np.broadcast_to(angle, len(markers)) for angle in (roll_rad, pitch_rad))
+    clear = [
+        (marker, matrix_from_euler(float(roll), float(pitch), 0.0))
+        for marker, roll, pitch in zip(markers, rolls, pitches, strict=True)
+        if marker.ambiguity <= UNAMBIGUOUS
+    ]
     if not clear:
         raise CalibrationError(
             f"the marker's pose is ambiguous in all of {len(markers)} images: place it nearer, or where it "
@@ -63,8 +71,12 @@ def mount_from_markers(
     sine, cosine = math.sin(heading_rad), math.cos(heading_rad)
     # Columns: the marker's right, its upper edge, and out of its face, in a level frame along the nose (FRD).
     level_from_marker = np.array([[-sine, cosine, 0.0], [cosine, sine, 0.0], [0.0, 0.0, -1.0]])
-    body_from_marker = matrix_from_euler(roll_rad, pitch_rad, 0.0).T @ level_from_marker
-    found = np.array([body_from_marker @ marker.rotation.T @ BODY_FROM_OPTICAL.T for marker in clear])
+    found = np.array(
+        [
+            level_from_body.T @ level_from_marker @ marker.rotation.T @ BODY_FROM_OPTICAL.T
+            for marker, level_from_body in clear
+        ]
+    )
     middle = found[np.argmin([np.median(_angles(found, each)) for each in found])]
     found = found[_angles(found, middle) < OUTLIER_RAD]
     left, _, right = np.linalg.svd(found.mean(axis=0))

@@ -64,6 +64,15 @@ def test_mean_of_many_views_is_within_a_third_of_a_degree() -> None:
     assert 0.0 < math.degrees(found.spread_rad) < 1.0
 
 
+def test_each_image_has_its_own_attitude() -> None:
+    mount = CameraMount(roll_rad=0.03, pitch_rad=-0.6, yaw_rad=0.1)
+    rolls, pitches = (-0.06, 0.0, 0.05), (0.04, -0.07, 0.01)
+    markers = [marker_of(mount, roll, pitch, 0.2) for roll, pitch in zip(rolls, pitches, strict=True)]
+    found = mount_from_markers([each for each in markers if each], 0.2, rolls, pitches)
+    assert (found.roll_rad, found.pitch_rad, found.yaw_rad) == pytest.approx((0.03, -0.6, 0.1), abs=2e-3)
+    assert found.views == 3
+
+
 def test_upside_down_camera_is_refused() -> None:
     marker = marker_of(CameraMount(roll_rad=math.pi, pitch_rad=-0.6), 0.0, 0.0, 0.0)
     assert marker is not None
