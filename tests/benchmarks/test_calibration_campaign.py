@@ -32,12 +32,8 @@ def test_mount_is_measured_from_rendered_images() -> None:
     assert error.views == 10
 
 
-# Seed 26 is a wide lens that is fitted as a fisheye: its centre is 1.32 px off (docs/how-to/calibrate.md).
-TOO_WIDE = pytest.mark.xfail(strict=True, reason="the centre of a wide lens is 1.32 px off")
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [pytest.param(26, marks=TOO_WIDE) if seed == 26 else seed for seed in SEEDS])
+@pytest.mark.parametrize("seed", SEEDS)
 def test_lens_of_every_seed(seed: int) -> None:
     check_lens(seed)
 
