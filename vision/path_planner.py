@@ -1,15 +1,17 @@
 """Paths around obstacles on an occupancy grid: A*, shortcuts, rounded corners. Local NED, metres.
 
 Cells nearer to an occupied cell than the clearance are blocked. Cells that were never observed may be crossed
-at a higher cost; how far a path is observed free is part of the result, and only that far may be flown.
+at a higher cost; how far a path is observed free is part of the result, and only that far may be flown. Where
+no point of the reference can be reached, the path leads to the reachable cell nearest to its end.
 """
 
 from __future__ import annotations
 
 import heapq
+import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -23,10 +25,13 @@ UNKNOWN_COST = 1.0
 NEAR_COST, NEAR_M = 1.0, 0.6
 # Away from the reference, per metre up to the limit: a path is followed where it is free.
 AWAY_COST_PER_M, AWAY_LIMIT_M = 0.7, 2.0
+# Away from the newest path: of two ways of about the same cost the vehicle stays on the one it has begun.
+SWITCH_COST, SWITCH_M = 0.4, 1.0
 # The search uses every second cell in each direction.
 STRIDE = 2
 # A vehicle inside the clearance first flies out of it, to a cell within this distance.
 ESCAPE_M = 2.0
+INSIDE_M = 0.3
 # The path ends at the last point of the reference that can be reached, at least this far from the vehicle.
 LEAST_M = 2.0
 BORDER_M = 1.0
@@ -64,6 +69,8 @@ class PlannedPath:
         free_m: length of its beginning that was observed to be free.
         reason: why there is no way; empty if there is one.
         number: of the request.
+        inside: the vehicle is nearer to an obstacle than the clearance by more than `INSIDE_M`; the path
+            first leads away from it.
     """
 
     captured_ns: int
@@ -71,20 +78,26 @@ class PlannedPath:
     free_m: float = 0.0
     reason: str = ""
     number: int = 0
+    inside: bool = False
 
 
-def plan_path(grid: OccupancyGrid, request: PathRequest, position: Point) -> PlannedPath:
+def plan_path(
+    grid: OccupancyGrid, request: PathRequest, position: Point, newest: PlannedPath | None = None
+) -> PlannedPath:
     """Plan from the vehicle's position along the reference.
+
+    Args:
+        newest: the path before, of the same request number; None: there is none.
 
     Raises:
         ValueError: the reference has no points.
     """
     if not request.reference:
         raise ValueError("a path request needs at least one point")
-    field = _Field(grid, request)
+    field = _Field(grid, request, () if newest is None else newest.points)
     try:
-        start, ends = field.start(position), field.ends(position)
-        end = field.last_reached(start, ends)
+        start = field.start(position)
+        end = field.end(start, position)
     except _NoWayError as why:
         return PlannedPath(grid.captured_ns, (), reason=str(why), number=request.number)
     cells = field.search(start, field.cell(end))
@@ -92,7 +105,7 @@ def plan_path(grid: OccupancyGrid, request: PathRequest, position: Point) -> Pla
     points = field.rounded(field.shortened(points))
     free_m = field.free_length(points)
     path = tuple((float(north), float(east)) for north, east in points)
-    return PlannedPath(grid.captured_ns, path, free_m, number=request.number)
+    return PlannedPath(grid.captured_ns, path, free_m, "", request.number, field.inside(position))
 
 
 class _NoWayError(Exception):
@@ -102,18 +115,25 @@ class _NoWayError(Exception):
 class _Field:
     """Clearance and cost of every cell for one request."""
 
-    def __init__(self, grid: OccupancyGrid, request: PathRequest) -> None:
+    def __init__(self, grid: OccupancyGrid, request: PathRequest, newest: Sequence[Point]) -> None:
         self._grid, self._clearance_m = grid, request.clearance_m
         self.reference = np.array(request.reference, np.float64)
         blocked = grid.occupied.astype(np.uint8)
         self._gap_m = cv2.distanceTransform(1 - blocked, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * CELL_M
         self.passable = self._gap_m >= self._clearance_m
         near = np.clip(1.0 - (self._gap_m - self._clearance_m) / NEAR_M, 0.0, 1.0)
-        away = np.minimum(self._away_m(), AWAY_LIMIT_M)
+        away = np.minimum(self._away_m(self.reference), AWAY_LIMIT_M)
         unknown = ~(grid.free | grid.occupied)
         self.cost = 1.0 + UNKNOWN_COST * unknown + NEAR_COST * near + AWAY_COST_PER_M * away
+        if newest:
+            self.cost += SWITCH_COST * np.minimum(self._away_m(np.array(newest)) / SWITCH_M, 1.0)
         coarse = np.ascontiguousarray(self.passable[::STRIDE, ::STRIDE]).astype(np.uint8)
         _, self._region = cv2.connectedComponents(coarse, connectivity=8)
+
+    def inside(self, position: Point) -> bool:
+        """Whether the vehicle is inside the clearance by more than the deviation from a path."""
+        row, column = self._grid.cells(np.array([position]))[0]
+        return bool(self._gap_m[row, column] < self._clearance_m - INSIDE_M)
 
     def start(self, position: Point) -> tuple[int, int]:
         """The passable cell (of the search) nearest to the vehicle. Raises _NoWayError."""
@@ -128,28 +148,30 @@ class _Field:
         row, column = cells[int(np.argmin(away_m))]
         return int(row), int(column)
 
-    def ends(self, position: Point) -> NDArray[np.float64]:
-        """(N, 2) points of the reference in the grid where the path may end, in order. Raises _NoWayError."""
+    def end(self, start: tuple[int, int], position: Point) -> NDArray[np.float64]:
+        """Where the path may end: the last point of the reference that can be reached. Raises _NoWayError."""
         points = _sampled(self.reference, CELL_M)
         cells = self._grid.cells(points)
         border = math.ceil(BORDER_M / CELL_M)
         inside = ((cells >= border) & (cells < SIZE - border)).all(axis=1)
         far = np.hypot(*(points - position).T) >= LEAST_M
         far[-1] = True  # the goal itself may be near
-        ends: NDArray[np.float64] = points[inside & far]
-        if not len(ends):
+        points, cells = points[inside & far], cells[inside & far]
+        if not len(points):
             raise _NoWayError("the path to follow is outside the map around the vehicle")
-        return ends
-
-    def last_reached(self, start: tuple[int, int], ends: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The last of the points that is passable and connected with the start. Raises _NoWayError."""
-        cells = self._grid.cells(ends)
         passable = self.passable[cells[:, 0], cells[:, 1]]
-        region = self._region[cells[:, 0] // STRIDE, cells[:, 1] // STRIDE]
-        reached = np.flatnonzero(passable & (region == self._region[start[0] // STRIDE, start[1] // STRIDE]))
+        here = self._region[start[0] // STRIDE, start[1] // STRIDE]
+        reached = np.flatnonzero(
+            passable & (self._region[cells[:, 0] // STRIDE, cells[:, 1] // STRIDE] == here)
+        )
         if len(reached):
-            end: NDArray[np.float64] = ends[reached[-1]]
+            end: NDArray[np.float64] = points[reached[-1]]
             return end
+        part = self._grid.points(np.argwhere(self._region == here) * STRIDE)
+        left_m = np.hypot(*(part - self.reference[-1]).T)
+        if left_m.min() < math.dist(position, self.reference[-1]) - LEAST_M:
+            nearest: NDArray[np.float64] = part[np.argmin(left_m)]
+            return nearest
         if passable[-1]:
             raise _NoWayError(f"no gap of {2 * self._clearance_m:.1f} m between the obstacles seen")
         gap_m = self._gap_m[cells[-1][0], cells[-1][1]]
@@ -162,64 +184,62 @@ class _Field:
 
     def search(self, start: tuple[int, int], end: tuple[int, int]) -> list[tuple[int, int]]:
         """A*: the cells of the cheapest path, both ends included; they must be connected."""
-        cost = self.cost[::STRIDE, ::STRIDE]
-        # Plain lists: element access is several times faster than in an array.
-        costs: list[list[float]] = np.where(self._region == 0, math.inf, cost).tolist()
-        goal = (end[0] // STRIDE, end[1] // STRIDE)
-        first = (start[0] // STRIDE, start[1] // STRIDE)
-        side = len(costs)
-        best = {first: 0.0}
-        before: dict[tuple[int, int], tuple[int, int]] = {}
-        queue = [(0.0, first)]
-        done: set[tuple[int, int]] = set()
+        # Plain lists with a blocked border: element access is several times faster than in an array.
+        half = np.pad(np.where(self._region == 0, math.inf, self.cost[::STRIDE, ::STRIDE]) / 2.0, 1)
+        half[[0, -1], :] = half[:, [0, -1]] = math.inf
+        side = len(half)
+        rows, columns = np.indices(half.shape)
+        left = np.hypot(rows - end[0] // STRIDE - 1, columns - end[1] // STRIDE - 1).ravel().tolist()
+        costs: list[float] = half.ravel().tolist()
+        first, goal = ((row // STRIDE + 1) * side + column // STRIDE + 1 for row, column in (start, end))
+        moves = [(down * side + right, math.hypot(down, right)) for down, right in _NEIGHBOURS]
+        best, before = [math.inf] * len(costs), [first] * len(costs)
+        best[first] = 0.0
+        queue = [(left[first], first)]
+        done = bytearray(len(costs))
         while queue:
             _, here = heapq.heappop(queue)
             if here == goal:
                 break
-            if here in done:
+            if done[here]:
                 continue
-            done.add(here)
-            row, column = here
-            so_far, here_cost = best[here], costs[row][column]
-            for down, right in _NEIGHBOURS:
-                there = (row + down, column + right)
-                if not (0 <= there[0] < side and 0 <= there[1] < side):
-                    continue
-                length = math.sqrt(2.0) if down and right else 1.0
-                total = so_far + length * 0.5 * (here_cost + costs[there[0]][there[1]])
-                if total < best.get(there, math.inf):
+            done[here] = 1
+            so_far, here_cost = best[here], costs[here]
+            for by, length in moves:
+                there = here + by
+                total = so_far + length * (here_cost + costs[there])
+                if total < best[there]:
                     best[there], before[there] = total, here
-                    left = math.hypot(there[0] - goal[0], there[1] - goal[1])
-                    heapq.heappush(queue, (total + left, there))
+                    heapq.heappush(queue, (total + left[there], there))
         path = [goal]
         while path[-1] != first:
             path.append(before[path[-1]])
-        return [(row * STRIDE, column * STRIDE) for row, column in reversed(path)]
+        return [((at // side - 1) * STRIDE, (at % side - 1) * STRIDE) for at in reversed(path)]
 
     def shortened(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """The same path with straight lines wherever these are passable and cost no more."""
-        kept, index = [0], 0
-        legs = [min(self._cost(start, end), BLOCKED_COST) for start, end in pairwise(points)]
+        legs = np.minimum(self._costs(points[:-1], points[1:]), BLOCKED_COST)
         along = np.concatenate(([0.0], np.cumsum(legs)))
-        while index < len(points) - 1:
-            # The farthest of ever nearer points; the next one always is passable.
-            for further in range(len(points) - 1, index, -1):
-                least = 1.02 * (along[further] - along[index])
-                if further == index + 1 or self._cost(points[index], points[further]) <= least:
-                    break
-            index = further
-            kept.append(index)
+        kept = [0]
+        while (index := kept[-1]) < len(points) - 1:
+            costs = self._costs(points[index], points[index + 1 :])
+            costs[0] = -math.inf  # the next one always is passable
+            kept.append(
+                index + 1 + int(np.flatnonzero(costs <= 1.02 * (along[index + 1 :] - along[index]))[-1])
+            )
         return points[kept]
 
     def rounded(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """The path with its corners cut twice (Chaikin 1974), where the cut is passable."""
         for _ in range(2):
-            rounded = [points[0]]
-            for before, corner, after in zip(points[:-2], points[1:-1], points[2:], strict=True):
-                entry, leaving = corner + 0.25 * (before - corner), corner + 0.25 * (after - corner)
-                cut = math.isfinite(self._cost(entry, leaving))
-                rounded += [entry, leaving] if cut else [corner]
-            points = np.array([*rounded, points[-1]])
+            corners = points[1:-1]
+            entries, leavings = (corners + 0.25 * (other - corners) for other in (points[:-2], points[2:]))
+            cut = np.isfinite(self._costs(entries, leavings))
+            parts = [
+                (entry, leaving) if passable else (corner,)
+                for entry, corner, leaving, passable in zip(entries, corners, leavings, cut, strict=True)
+            ]
+            points = np.array([points[0], *itertools.chain(*parts), points[-1]])
         return points
 
     def free_length(self, points: NDArray[np.float64]) -> float:
@@ -230,18 +250,22 @@ class _Field:
         unseen = ~self._grid.free[cells[:, 0], cells[:, 1]] & (along > UNSEEN_M)
         return float(along[np.argmax(unseen)] if unseen.any() else along[-1])
 
-    def _cost(self, start: NDArray[np.float64], end: NDArray[np.float64]) -> float:
-        """Cost of a straight line; infinite if it is blocked."""
-        cells = self._grid.cells(_sampled(np.array([start, end]), SPACING_M))
-        rows, columns = cells[:, 0], cells[:, 1]
-        if not self.passable[rows, columns].all():
-            return math.inf
-        return float(self.cost[rows, columns].mean() * math.dist(start, end))
+    def _costs(self, starts: NDArray[np.float64], ends: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(N,) costs of straight lines between points, (N, 2) or (2,); infinite where one is blocked."""
+        spans = ends - starts
+        lengths = np.hypot(spans[:, 0], spans[:, 1])
+        share = np.linspace(0.0, 1.0, max(2, math.ceil(lengths.max(initial=0.0) / SPACING_M) + 1))
+        points = (starts + share[:, None, None] * spans).reshape(-1, 2)
+        rows, columns = self._grid.cells(points).T
+        shape = (len(share), len(spans))
+        passable = self.passable[rows, columns].reshape(shape).all(axis=0)
+        mean = self.cost[rows, columns].reshape(shape).mean(axis=0)
+        return np.where(passable, mean * lengths, math.inf)
 
-    def _away_m(self) -> NDArray[np.float32]:
-        """Distance of every cell from the reference."""
+    def _away_m(self, points: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Distance of every cell from a line."""
         line = np.ones((SIZE, SIZE), np.uint8)
-        cells = self._grid.cells(self.reference)[:, ::-1]  # OpenCV's x is the column
+        cells = self._grid.cells(points)[:, ::-1]  # OpenCV's x is the column
         cv2.polylines(line, [cells.astype(np.int32)], False, 0)
         away: NDArray[np.float32] = cv2.distanceTransform(line, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * CELL_M
         return away

@@ -10,7 +10,9 @@ import math
 from collections.abc import Sequence
 
 from companion.guidance.behaviour import BehaviourContext, Outcome, RoutedSetpoint
+from companion.guidance.limits.obstacles import Constraint
 from companion.guidance.motion import (
+    HOLD_VELOCITY_GAIN,
     PositionController,
     add_velocity_error,
     ground_speed,
@@ -21,10 +23,11 @@ from companion.guidance.path import ACCELERATION_MPS2, Path, PathFollower
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
 from vision.attitude import wrap_angle
+from vision.occupancy_grid import Point
 from vision.path_planner import PathRequest, PlannedPath
 
 # Beyond the obstacle limits' margin: cells of 0.2 m, and the deviation from the path.
-EXTRA_CLEARANCE_M = 0.3
+EXTRA_CLEARANCE_M = 0.2
 # Planned five times a second or more; so old, the worker is late or has ended.
 MAX_AGE_S = 1.0
 NO_WAY_S = 8.0
@@ -32,7 +35,15 @@ NO_WAY_S = 8.0
 UNSEEN_GAP_M = 0.5
 # A camera with a field of 80 degrees keeps an object in view while it also sees where the vehicle flies.
 FACING_RAD = math.radians(25.0)
-STANDING_MPS = 0.3
+# Slower than this the vehicle does not fly along the path but holds its position, until it may be so fast.
+HOLD_MPS, LEAVE_MPS = 0.25, 0.5
+# The obstacle limits do not slow the vehicle below this before they are applied: it would never arrive.
+SLOW_MPS = 0.3
+# Out of the clearance of an obstacle, wherever the camera looks.
+ESCAPE_MPS = 0.5
+MOST_STEP_S = 0.1
+# Nearer than this to the route's end, its bearing says nothing.
+NEAR_M = 0.5
 SPEED_MARGIN = 1.25
 
 
@@ -41,6 +52,9 @@ class Avoidance:
 
     Args:
         margin_m: of the obstacle limits.
+
+    Attributes:
+        path: (north, east) points of the path of the newest step; empty: none is flown.
     """
 
     def __init__(self, margin_m: float) -> None:
@@ -53,11 +67,13 @@ class Avoidance:
     def reset(self) -> None:
         """A new behaviour begins: only a path that is planned for it is flown."""
         self._number += 1
+        self.path: tuple[Point, ...] = ()
         self._planned: PlannedPath | None = None
         self._follower: PathFollower | None = None
         self._no_way_ns: int | None = None
         self._said = ""
         self._stop_at: Vector3 | None = None
+        self._held_ns = 0
         self._controller = PositionController()
 
     def take_request(self) -> PathRequest | None:
@@ -70,30 +86,39 @@ class Avoidance:
         notes, self._notes = self._notes, []
         return notes
 
-    def steer(self, routed: RoutedSetpoint, context: BehaviourContext, *, flying: bool) -> Setpoint | Outcome:
+    def steer(
+        self,
+        routed: RoutedSetpoint,
+        context: BehaviourContext,
+        constraints: Sequence[Constraint],
+        *,
+        flying: bool,
+    ) -> Setpoint | Outcome:
         """The setpoint along the planned path; the end of the behaviour after `NO_WAY_S` without a way.
 
         Args:
+            constraints: the obstacle limits, which are applied to the setpoint afterwards.
             flying: the vehicle flies our setpoints; before, only the path is requested.
         """
         route = tuple((north, east) for north, east, _ in routed.route)
         self._request = PathRequest(route, self._clearance_m, self._number)
-        asked = routed.setpoint
+        asked, self.path = routed.setpoint, ()
         if not flying:
             return asked
         why = self._no_way(context)
         if why:
-            return self._stay(asked, context, why)
+            return self._stay(routed, context, why)
         assert context.planned is not None
         if self._no_way_ns is not None:
             if self._said:
                 self._notes.append(("a way was found", False))
-            self._no_way_ns, self._said, self._stop_at = None, "", None
+            self._no_way_ns, self._said = None, ""
         if context.planned is not self._planned:
             self._planned = context.planned
             self._follower = PathFollower(_path(context.planned, asked))
         assert self._follower is not None
-        return self._along(self._follower, context.planned, routed, context)
+        self.path = context.planned.points
+        return self._along(self._follower, context.planned, routed, context, constraints)
 
     def _no_way(self, context: BehaviourContext) -> str:
         """Why the newest path cannot be flown; empty: it can."""
@@ -111,6 +136,7 @@ class Avoidance:
         planned: PlannedPath,
         routed: RoutedSetpoint,
         context: BehaviourContext,
+        constraints: Sequence[Constraint],
     ) -> Setpoint:
         """Fly along the path, no faster than what was observed allows, and look where it leads."""
         asked, state = routed.setpoint, context.state
@@ -124,18 +150,36 @@ class Avoidance:
             nose_rad = asked.yaw_rad + max(-FACING_RAD, min(FACING_RAD, off))
         left_m = max(0.0, planned.free_m - follower.along_m - UNSEEN_GAP_M)
         most_mps = min(_level_speed(asked), math.sqrt(2.0 * ACCELERATION_MPS2 * left_m))
-        # Slower while the camera does not look there yet.
-        most_mps *= max(0.0, math.cos(wrap_angle(bearing_rad - yaw_rad))) ** 2
-        speed = math.hypot(north, east)
-        scale = min(1.0, most_mps / speed) if speed > 1e-6 else 0.0
-        level = add_velocity_error((north * scale, east * scale), state, SPEED_MARGIN * _level_speed(asked))
+        if planned.inside:
+            most_mps = min(_level_speed(asked), ESCAPE_MPS)
+        else:  # slower while the camera does not look there yet
+            most_mps *= max(0.0, math.cos(wrap_angle(bearing_rad - yaw_rad))) ** 2
+        if most_mps < (HOLD_MPS if self._stop_at is None else LEAVE_MPS):
+            level = self._hold(context)[:2]
+        else:
+            self._stop_at = None
+            speed = max(math.hypot(north, east), 1e-6)
+            direction = (north / speed, east / speed)
+            # The limits remove the velocity towards an obstacle, not that beside it, and bend the way flown.
+            most_mps = min(most_mps, max(SLOW_MPS, _allowed_mps(direction, constraints)), speed)
+            flown = (most_mps * direction[0], most_mps * direction[1])
+            top_mps = SPEED_MARGIN * _level_speed(asked)
+            level = add_velocity_error(flown, state, top_mps, HOLD_VELOCITY_GAIN)
         return Setpoint.velocity((*level, _down_mps(asked)), context.now_ns, yaw_rad=wrap_angle(nose_rad))
 
-    def _stay(self, asked: Setpoint, context: BehaviourContext, why: str) -> Setpoint | Outcome:
-        """Brake, hold where the vehicle comes to rest; end after `NO_WAY_S`."""
+    def _hold(self, context: BehaviourContext) -> Vector3:
+        """The velocity that keeps the vehicle where it comes to rest: in gusts a zero velocity drifts."""
+        if self._stop_at is None:
+            self._stop_at, self._controller = stopping_point(context.state), PositionController()
+        dt_s = max(0.0, min(MOST_STEP_S, (context.now_ns - self._held_ns) / 1e9))
+        self._held_ns = context.now_ns
+        return self._controller.velocity(self._stop_at, context.state, dt_s)
+
+    def _stay(self, routed: RoutedSetpoint, context: BehaviourContext, why: str) -> Setpoint | Outcome:
+        """Brake, hold where the vehicle comes to rest, look to the route's end; end after `NO_WAY_S`."""
         now_ns, state = context.now_ns, context.state
         if self._no_way_ns is None:
-            self._no_way_ns, self._controller = now_ns, PositionController()
+            self._no_way_ns = now_ns
         waited_s = (now_ns - self._no_way_ns) / 1e9
         if waited_s > NO_WAY_S:
             return Outcome(False, f"no way for {NO_WAY_S:g} s: {why}")
@@ -143,12 +187,12 @@ class Avoidance:
         if waited_s > MAX_AGE_S and not self._said:
             self._said = why
             self._notes.append((f"holding: no way ({why})", True))
-        if self._stop_at is None and ground_speed(state) < STANDING_MPS:
-            self._stop_at = stopping_point(state)
-        velocity = (0.0, 0.0, 0.0)
-        if self._stop_at is not None:
-            velocity = self._controller.velocity(self._stop_at, state, 0.0)
-        return Setpoint.velocity((velocity[0], velocity[1], 0.0), now_ns, yaw_rad=asked.yaw_rad)
+        velocity = self._hold(context)
+        yaw_rad = routed.setpoint.yaw_rad
+        (north, east, _), (here_north, here_east, _) = routed.route[-1], position_and_yaw(state)[0]
+        if not routed.facing and math.hypot(north - here_north, east - here_east) > NEAR_M:
+            yaw_rad = math.atan2(east - here_east, north - here_north)  # an obstacle there may have gone
+        return Setpoint.velocity((velocity[0], velocity[1], 0.0), now_ns, yaw_rad=yaw_rad)
 
 
 def _path(planned: PlannedPath, asked: Setpoint) -> Path:
@@ -156,6 +200,14 @@ def _path(planned: PlannedPath, asked: Setpoint) -> Path:
     if math.dist(points[0], points[-1]) < 0.05:
         points.append((points[-1][0] + 0.05, points[-1][1], 0.0))  # a path needs a length
     return Path(points, max(0.2, _level_speed(asked)))
+
+
+def _allowed_mps(direction: tuple[float, float], constraints: Sequence[Constraint]) -> float:
+    """The speed in a direction that the constraints leave as it is."""
+    towards = (
+        (north * direction[0] + east * direction[1], most_mps) for north, east, most_mps in constraints
+    )
+    return min((most_mps / share for share, most_mps in towards if share > 1e-3), default=math.inf)
 
 
 def _level_speed(asked: Setpoint) -> float:

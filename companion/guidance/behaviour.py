@@ -157,7 +157,8 @@ class RoutedSetpoint:
     """A velocity setpoint along a route, for a path around obstacles near that route.
 
     Attributes:
-        setpoint: what to fly without obstacles; its horizontal speed and vertical velocity are kept.
+        setpoint: what to fly without obstacles; its horizontal speed and vertical velocity are kept. It does
+            not contain a correction of the velocity error, which follows for the path that is flown.
         route: the line ahead, local NED, from about the vehicle on; at least one point.
         facing: the yaw stays near the setpoint's (an object in view); False: it follows the path.
     """

@@ -39,7 +39,7 @@ from companion.guidance.interface import (
 )
 from companion.guidance.limits.battery import ENDINGS, NO_MINIMUM, BatteryMinimum, BatteryMonitor
 from companion.guidance.limits.envelope import Envelope, Limits
-from companion.guidance.limits.obstacles import NO_RULES, ObstacleMemory, ObstacleRules
+from companion.guidance.limits.obstacles import NO_RULES, Constraint, ObstacleMemory, ObstacleRules
 from companion.guidance.mode_sequence import ModeSequence
 from companion.guidance.requirements import check_requirements
 from companion.guidance.targets.chosen import RecentTracks
@@ -49,6 +49,7 @@ from companion.vehicle.setpoint import DEFAULT_LIFETIME_S, Setpoint
 from companion.vehicle.state import FlightMode, Vector3
 from companion.vehicle.streamer import StreamState
 from vision.obstacle_sectors import ObstacleSectors
+from vision.occupancy_grid import Point
 
 logger = logging.getLogger(__name__)
 
@@ -106,6 +107,7 @@ class Guidance:
         asked: the last setpoint of a behaviour; None while none is flown.
         sent: the same after the envelope (or the brake that is streamed while a mode is requested).
         limited_by: which limits acted on it.
+        path: (north, east) points of the way around obstacles that is flown; empty: none.
         phase: state of our command.
         gimbal: the gimbal controller; for its status.
     """
@@ -116,12 +118,14 @@ class Guidance:
         self.asked: Setpoint | None = None
         self.sent: Setpoint | None = None
         self.limited_by: tuple[str, ...] = ()
+        self.path: tuple[Point, ...] = ()
         self.phase = Phase.IDLE
         self._out = OutputCollector()
         self._envelope = Envelope(options.limits)
         self._authority = Authority()
         self._battery = BatteryMonitor(options.battery)
         self._memory = ObstacleMemory()
+        self._constrained: tuple[BehaviourContext, tuple[Constraint, ...]] | None = None
         self._avoidance = Avoidance(options.obstacles.margin_m)
         self._tracks = RecentTracks(max_age_s=options.track_max_age_s)
         self._queue = CommandQueue(self.gimbal)
@@ -385,6 +389,7 @@ class Guidance:
 
     def _run(self, behaviour: Behaviour, context: BehaviourContext, sent_count: int) -> None:
         """Update the behaviour and act on its output."""
+        self.path = ()
         if Requirement.POSITION in behaviour.requirements and not self._position_known(context):
             return
         if not self._activated:
@@ -399,9 +404,11 @@ class Guidance:
             self._out.event(EventKind.NOTED, behaviour.name, note)
         self._stepped_ns = context.now_ns
         if isinstance(step, RoutedSetpoint):
-            step = self._avoidance.steer(step, context, flying=self.phase is Phase.OFFBOARD)
+            flying = self.phase is Phase.OFFBOARD
+            step = self._avoidance.steer(step, context, self._obstacle_constraints(context), flying=flying)
             for note, warning in self._avoidance.take_notes():
                 self._out.event(EventKind.NOTED, behaviour.name, note, warning=warning)
+            self.path = self._avoidance.path
         self._active = active = behaviour.active
         self._landing = active.landing
         self._gimbal_user = active.name if active.gimbal_aim is not None else ""
@@ -452,7 +459,7 @@ class Guidance:
             self._brake(context)
             self.asked, self.limited_by = asked, (blind,)
             return
-        self._envelope.obstacle_constraints = rules.constraints(self._memory.filled(context))
+        self._envelope.obstacle_constraints = self._obstacle_constraints(context)
         self.asked = asked
         self.sent, self.limited_by = self._envelope.apply(
             asked,
@@ -462,6 +469,13 @@ class Guidance:
             context.neighbours,
             landing=self._landing,
         )
+
+    def _obstacle_constraints(self, context: BehaviourContext) -> tuple[Constraint, ...]:
+        """The obstacle limits of this step."""
+        if self._constrained is None or self._constrained[0] is not context:
+            rules = self.options.obstacles
+            self._constrained = (context, rules.constraints(self._memory.filled(context)))
+        return self._constrained[1]
 
     def _report_perception_fault(self, behaviour: Behaviour, blind: str | None) -> None:
         """Log once that the vehicle brakes without depth, and once that depth is back."""
@@ -675,7 +689,7 @@ class Guidance:
         self._envelope.reset()
         self._streaming = False
         self.asked = self.sent = None
-        self.limited_by = ()
+        self.limited_by = self.path = ()
 
     def _drop_request(self) -> None:
         """Abandon the pending request: it is not repeated, but may still take effect."""

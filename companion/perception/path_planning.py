@@ -81,6 +81,7 @@ class PathPlanning:
         self._positions, self._pose_at = positions, pose_at
         self._camera_of, self._height_m = camera_of, height_m
         self._request: tuple[PathRequest, int] | None = None
+        self._newest: PlannedPath | None = None
         self._due_ns = 0
 
     def request(self, request: PathRequest, now_ns: int) -> None:
@@ -103,4 +104,6 @@ class PathPlanning:
         if now_ns - request[1] > REQUEST_MAX_AGE_NS:
             return None
         self._due_ns = now_ns + PERIOD_NS
-        return plan_path(self.grid, request[0], newest[:2])
+        path = self._newest if self._newest and self._newest.number == request[0].number else None
+        self._newest = plan_path(self.grid, request[0], newest[:2], path)
+        return self._newest

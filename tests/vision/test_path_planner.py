@@ -131,6 +131,24 @@ def test_blocked_goal_is_approached_then_refused() -> None:
     assert "1.3 m" in near.reason
 
 
+def test_blocked_reference_is_passed_to_the_point_nearest_its_end() -> None:
+    path = planned(grid_with(((6.0, 0.0), 0.5)), ((6.0, 0.0), (6.4, 0.0)))
+    assert path.reason == ""
+    assert math.dist(path.points[-1], (6.4, 0.0)) < 1.0
+    assert nearest_m(path, (5.5, 0.0)) > CLEARANCE_M - CELL_TOLERANCE_M
+
+
+def test_of_two_ways_the_one_begun_is_kept() -> None:
+    grid = grid_with(((6.0, 0.0), 0.6))
+    references = [((0.0, side), (15.0, side)) for side in (-0.1, 0.1)]
+    west, east = (planned(grid, reference) for reference in references)
+    kept = plan_path(grid, PathRequest(references[1], CLEARANCE_M), (0.0, 0.0), west)
+    sides = [max((point[1] for point in path.points), key=abs) for path in (west, east, kept)]
+    assert sides[0] < -1.0
+    assert sides[1] > 1.0
+    assert sides[2] < -1.0
+
+
 def test_enclosed_vehicle_has_no_way() -> None:
     ring = [((5.0 * math.cos(a), 5.0 * math.sin(a)), 0.6) for a in np.arange(0.0, math.tau, 0.3)]
     path = planned(grid_with(*ring), ((0.0, 0.0), (1.0, 0.0), (9.0, 0.0)))
@@ -145,6 +163,8 @@ def test_vehicle_inside_the_clearance_flies_out_of_it() -> None:
     path = planned(grid_with(((1.2, 0.0), 0.4)))
     assert path.points
     assert path.points[-1][0] == pytest.approx(15.0)
+    assert path.inside
+    assert not planned(grid_with()).inside
     crowded = [((1.2 * math.cos(a), 1.2 * math.sin(a)), 0.4) for a in np.arange(0.0, math.tau, 0.5)]
     assert "all sides" in planned(grid_with(*crowded)).reason
 

@@ -178,11 +178,11 @@ class ApproachBehaviour(Behaviour):
         # Slower while the nose does not point at the object yet.
         speed *= max(0.0, math.cos(wrap_angle(bearing - yaw_rad))) ** 2
         wanted = (speed * math.cos(bearing), speed * math.sin(bearing))
-        north_mps, east_mps = add_velocity_error(wanted, state, self._speed_mps)
-        velocity = (north_mps, east_mps, correction(self._down_m - position[2]))
-        setpoint = Setpoint.velocity(velocity, now_ns, yaw_rad=self._bearing_rad)
+        down_mps = correction(self._down_m - position[2])
         if not context.avoiding or error_m <= 0.0:
-            return setpoint
+            flown = add_velocity_error(wanted, state, self._speed_mps)
+            return Setpoint.velocity((*flown, down_mps), now_ns, yaw_rad=self._bearing_rad)
+        setpoint = Setpoint.velocity((*wanted, down_mps), now_ns, yaw_rad=self._bearing_rad)
         stop = (north - self._distance_m * math.cos(bearing), east - self._distance_m * math.sin(bearing))
         return RoutedSetpoint(setpoint, (position, (*stop, self._down_m)), facing=True)
 

@@ -34,7 +34,7 @@ HEADING_RAD = math.radians(5.0)
 STUCK_S = 12.0
 GAIN_M = 0.5
 # A way around obstacles leads away from the path meanwhile.
-AVOIDING_STUCK_S = 60.0
+AVOIDING_STUCK_S = 120.0
 # How far ahead a way around obstacles is planned.
 ROUTE_M = 15.0
 # A vehicle that stays for so long within this distance of the end has arrived, whatever speed its estimate
@@ -117,6 +117,9 @@ class PathFlight(Behaviour):
             self._yaw_rad = self._heading_rad
         elif self._nose_along and bearing is not None and follower.left_m > KEEP_NOSE_M:
             self._yaw_rad = bearing
+        if context.avoiding and away_m >= END_M:
+            setpoint = Setpoint.velocity(velocity, now_ns, yaw_rad=self._yaw_rad)
+            return RoutedSetpoint(setpoint, follower.ahead(ROUTE_M))
         if end is not None and away_m < END_M:
             velocity = self._controller.velocity(end, state, dt_s, self._speed_mps)
         else:
@@ -124,10 +127,7 @@ class PathFlight(Behaviour):
                 (velocity[0], velocity[1]), state, SPEED_MARGIN * self._speed_mps
             )
             velocity = (*over_ground, velocity[2])
-        setpoint = Setpoint.velocity(velocity, now_ns, yaw_rad=self._yaw_rad)
-        if context.avoiding and away_m >= END_M:
-            return RoutedSetpoint(setpoint, follower.ahead(ROUTE_M))
-        return setpoint
+        return Setpoint.velocity(velocity, now_ns, yaw_rad=self._yaw_rad)
 
     def _stuck(self, follower: PathFollower, now_ns: int, stuck_s: float) -> str | None:
         """The reason if there was no progress for so long; None: there was."""
