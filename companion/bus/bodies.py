@@ -501,6 +501,8 @@ class SetpointsBody(TypedDict):
     """state of the streamer"""
     limited_by: list[str]
     """limits of the envelope that changed it"""
+    path_ned_m: list[Two]
+    """north and east of the points of the way around obstacles that is flown; empty: none"""
 
 
 class PlanBody(TypedDict):

@@ -74,6 +74,7 @@ def setpoints_message(guidance: Guidance, streamer: Streamer, now_ns: int) -> Se
         "sent_ns": streamer.last_sent_ns,
         "stream": streamer.state.value,
         "limited_by": list(guidance.limited_by),
+        "path_ned_m": [[round(north, 2), round(east, 2)] for north, east in guidance.path],
     }
 
 

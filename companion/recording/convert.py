@@ -27,6 +27,7 @@ from companion.bus.topics import (
     LABELS,
     MAVLINK,
     RUN,
+    SETPOINT,
     TOPICS,
     VEHICLE,
 )
@@ -57,6 +58,10 @@ _POINT_FIELDS = (
     *((name, 4 * index, 7) for index, name in enumerate(("x", "y", "z"))),
     *((name, 12 + index, 1) for index, name in enumerate(("red", "green", "blue", "alpha"))),
 )
+_NO_POSE = {
+    "position": {"x": 0.0, "y": 0.0, "z": 0.0},
+    "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
+}
 _LINE_LOOP = 2  # foxglove.PointsAnnotationType
 _COLORS = {"confirmed": (0.2, 1.0, 0.3), "tentative": (1.0, 0.8, 0.1)}
 _OTHER_COLOR = (0.4, 0.7, 1.0)
@@ -96,6 +101,8 @@ class Converter:
         # Of this host, until the service's own is received; both are equal on one host.
         self._offset_ns = time.time_ns() - time.monotonic_ns()
         self._preview_width = 0
+        self._has_path = False
+        self._down_m = 0.0  # of the vehicle: a path around obstacles is level
         self._service: str | None = None
         self.lost_steps = self.lost_pieces = 0
         self.first_step: int | None = None
@@ -141,6 +148,7 @@ class Converter:
         make = {
             DETECTIONS.name: self._annotations,
             VEHICLE.name: self._vehicle_state,
+            SETPOINT.name: self._path,
             EVENTS.name: self._log,
             "transforms": self._transforms,
             "camera_info": self._calibration,
@@ -189,10 +197,7 @@ class Converter:
         body = {
             "timestamp": self._time(captured_ns),
             "frame_id": about["frame_id"],
-            "pose": {
-                "position": {"x": 0.0, "y": 0.0, "z": 0.0},
-                "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
-            },
+            "pose": _NO_POSE,
             "point_stride": _POINT_BYTES,
             "fields": [
                 {"name": name, "offset": offset, "type": kind} for name, offset, kind in _POINT_FIELDS
@@ -246,6 +251,7 @@ class Converter:
         stamp = self._time(message["stamp_ns"])
         position, attitude = message["position_ned_m"], message["attitude_wxyz"]
         if position is not None and attitude is not None:
+            self._down_m = position[2]
             # A root with z up, so that a viewer shows down as down: x is east, y north.
             half = math.sqrt(0.5)
             yield _transforms_body(
@@ -264,6 +270,20 @@ class Converter:
                 "position_covariance_type": 0,  # UNKNOWN
             }
             yield "/location", "LocationFix", body
+
+    def _path(self, _camera: str, message: dict[str, Any]) -> Iterator[tuple[str, str, Any]]:
+        shown, self._has_path = self._has_path, bool(message["path_ned_m"])
+        if not (shown or self._has_path):
+            return
+        body = {
+            "timestamp": self._time(message["stamp_ns"]),
+            "frame_id": f"{self._vehicle}/ned",
+            "poses": [
+                {**_NO_POSE, "position": {"x": north, "y": east, "z": self._down_m}}
+                for north, east in message["path_ned_m"]
+            ],
+        }
+        yield "/path", "PosesInFrame", body
 
     def _transforms(self, _camera: str, message: dict[str, Any]) -> Iterator[tuple[str, str, Any]]:
         stamp = self._time(message["captured_ns"])

@@ -98,6 +98,7 @@ SCHEMAS = {
             R=_list(_NUMBER, 9),
             P=_list(_NUMBER, 12),
         ),
+        _object("foxglove.PosesInFrame", timestamp=_TIME, frame_id=_TEXT, poses=_list(_POSE)),
         _object(
             "foxglove.PointCloud",
             timestamp=_TIME,

@@ -164,11 +164,12 @@ function drawHome({ g, xy }, home) {
 }
 
 function drawSetpoint({ g, xy }, own) {
-  const sent = age("setpoint") < 1 && state.topics.setpoint && state.topics.setpoint.sent;
+  const { sent, path_ned_m: path } = age("setpoint") < 1 && state.topics.setpoint || {};
+  g.strokeStyle = css("--second");
+  if (path && path.length > 1) drawLine(g, ...path.map(xy)); // around obstacles
   if (!sent || !sent.velocity_ned_mps) return;
   const [north, east] = sent.velocity_ned_mps;
   const [x, y] = xy(own);
-  g.strokeStyle = css("--second");
   drawLine(g, [x, y], [x + 12 * east, y - 12 * north]);
 }
 

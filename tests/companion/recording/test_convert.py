@@ -168,6 +168,17 @@ def test_vehicle_becomes_transforms_and_a_location(converter: Converter) -> None
     assert unknown == {}
 
 
+def test_way_around_obstacles_becomes_level_poses(converter: Converter) -> None:
+    list(converter.convert("vehicle", dumps(vehicle_message(STATE, PUBLISHED_NS))))
+    positions = []
+    for path in ([], [[1.0, 2.0], [5.0, 3.5]], [], []):
+        body = {"stamp_ns": PUBLISHED_NS, "path_ned_m": path}
+        found = foxglove(converter.convert("setpoint", dumps(body)))
+        positions.append([pose["position"] for pose in found["/path"]["poses"]] if found else None)
+    flown = [{"x": 1.0, "y": 2.0, "z": -3.0}, {"x": 5.0, "y": 3.5, "z": -3.0}]
+    assert positions == [None, flown, [], None]
+
+
 @pytest.mark.parametrize(
     ("path", "message", "topic"),
     [
