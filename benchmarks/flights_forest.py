@@ -30,17 +30,23 @@ from mavlink_sim.camera.depth_camera import DepthSensor
 from mavlink_sim.camera.scene import CameraSettings, Scene
 from mavlink_sim.physics.contact import HALF_HEIGHT_M, RADIUS_M
 from mavlink_sim.world.obstacles import Obstacles
-from mavlink_sim.world.world import World, WorldObject
+from mavlink_sim.world.world import Light, World, WorldObject
 from vision.camera_model import CameraModel, CameraMount
 from vision.occupancy_grid import CELL_M, SIZE
 
-CAMERA = CameraModel.from_horizontal_fov(320, 240, math.radians(80.0))
+# The obstacle sectors and the grid use 160 by 120 pixels of any depth image.
+CAMERA = CameraModel.from_horizontal_fov(160, 120, math.radians(80.0))
+# Half the pixels' width: with half the disparity's errors the depth has those of the 320 by 240 sensor.
+SENSOR = DepthSensor(step_px=0.0625, noise_px=0.04)
+# The grid ends at 10 m, and at 2 m/s the obstacle limits ignore what is farther than that.
+DRAW_WITHIN_M = 12.0
 MOUNT = CameraMount(forward_m=0.1)
+RATE_HZ = 6.0
 MARGIN_M, HEIGHT_M, SPEED_MPS = 1.0, 2.5, 2.0
 AWAY_M, WIDTH_M, TREES, APART_M = 40.0, 30.0, 45, 3.0
 # No tree stands this near the start or the goal.
 CLEAR_M = 4.0
-FLIGHT_S = 120.0
+FLIGHT_S = 240.0
 PIXELS_PER_M = 16
 
 
@@ -70,14 +76,18 @@ def run(seed: int, each: Callable[[RenderedCamera, LockstepFlight], None] | None
     }
     settings = camera_settings(CAMERA, MOUNT, flags)
     trees = forest(seed)
-    sensed = CameraSettings(model=CAMERA, mount=MOUNT, depth=DepthSensor(), seed=seed)
-    scene = Scene(World(trees), {}, sensed, "forest")
+    sensed = CameraSettings(
+        model=CAMERA, mount=MOUNT, effects=None, depth=SENSOR, draw_within_m=DRAW_WITHIN_M, seed=seed
+    )
+    scene = Scene(World(trees, light=Light(shadow=0.0)), {}, sensed, "forest")
     cameras: list[RenderedCamera] = []
     flight = LockstepFlight.airborne(
         seed=seed,
         height_m=HEIGHT_M,
         wind_mps=float(rng.uniform(0.0, 3.0)),
-        camera=lambda vehicle: cameras.append(RenderedCamera(settings, scene, vehicle)) or cameras[0],  # type: ignore[func-returns-value]
+        camera=lambda vehicle: (
+            cameras.append(RenderedCamera(settings, scene, vehicle, rate_hz=RATE_HZ)) or cameras[0]
+        ),  # type: ignore[func-returns-value]
         scene=scene,
     )
     obstacles = Obstacles(trees, {}, RADIUS_M, HALF_HEIGHT_M)

@@ -369,9 +369,13 @@ class PlacedObject:
 
 
 def within_view(
-    placed: list[PlacedObject], middles: NDArray[np.float64], radii: NDArray[np.float64], view: View
+    placed: list[PlacedObject],
+    middles: NDArray[np.float64],
+    radii: NDArray[np.float64],
+    view: View,
+    within_m: float = math.inf,
 ) -> list[PlacedObject]:
-    """The objects whose bounding sphere, (N, 3) and (N,) NED, may be in the image."""
+    """The objects whose bounding sphere, (N, 3) and (N,) NED, may be in the image, so near along its axis."""
     if not placed:
         return []
     seen = (middles - view.eye) @ view.pixel_from_ned.T
@@ -381,7 +385,8 @@ def within_view(
     safe = np.maximum(depth, 1e-3)
     across = np.abs(seen[:, 0] / safe - view.width / 2) < view.width / 2 + reach
     along = np.abs(seen[:, 1] / safe - view.height / 2) < view.height / 2 + reach
-    kept = (depth > NEAR_M - radii) & ((depth <= 1.5 * radii) | (across & along))
+    within = (depth > NEAR_M - radii) & (depth <= within_m + radii)
+    kept = within & ((depth <= 1.5 * radii) | (across & along))
     return [placed[index] for index in np.flatnonzero(kept)]
 
 

@@ -311,8 +311,10 @@ class Renderer:
         buffers: Buffers | None = None,
         rng: np.random.Generator | None = None,
         shutter: Shutter | None = None,
+        draw_within_m: float = math.inf,
     ) -> None:
         self.world, self.camera, self.mount = world, camera, mount
+        self._draw_within_m = draw_within_m
         self._sensor = None if effects is None else Sensor(effects)
         self._lens = Lens(camera, shutter) if not camera.rectilinear or shutter is not None else None
         self._drawn = camera if self._lens is None else self._lens.drawn
@@ -367,7 +369,7 @@ class Renderer:
         inverse_depth = np.empty((view.height, view.width), np.float32)
         image = draw_ground(world, view, buffers, inverse_depth)
         self._shadows.cast(view, world.light.shadow, image)
-        seen = within_view(self._placed, self._middles, self._radii, view)
+        seen = within_view(self._placed, self._middles, self._radii, view, self._draw_within_m)
         painted = paint_objects(seen, view, image, inverse_depth)
         add_haze(world.sky, inverse_depth, buffers, image)
         draw_sky(world.sky, world.light, view, inverse_depth, image)

@@ -123,6 +123,7 @@ class CameraSettings:
         shutter: rolling shutter and exposure; None for an instantaneous image.
         effects: of lens and sensor on colours; None: none.
         depth: the depth camera; None for true depth.
+        draw_within_m: objects farther than this are not drawn.
         loss: share of lost frames, 0..1.
         latency_s: from a frame's capture to its arrival.
         seed: of noise, dropouts and losses.
@@ -134,6 +135,7 @@ class CameraSettings:
     shutter: Shutter | None = None
     effects: ImageEffects | None = MILD_EFFECTS
     depth: DepthSensor | None = None
+    draw_within_m: float = math.inf
     loss: float = 0.0
     latency_s: float = 0.0
     seed: int = 0

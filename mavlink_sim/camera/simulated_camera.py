@@ -57,6 +57,7 @@ class SimulatedCamera:
             settings.effects,
             rng=self._noise,
             shutter=settings.shutter,
+            draw_within_m=settings.draw_within_m,
         )
         self._identifier_offset = identifier_offset(scene.world)
         self._others_shown = False

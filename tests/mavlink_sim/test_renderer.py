@@ -415,3 +415,11 @@ def test_a_training_scene_is_drawn_as_recorded(seed: int) -> None:
 
 if __name__ == "__main__":
     RECORD.write_text(json.dumps(_record()) + "\n", encoding="utf-8")
+
+
+def test_far_objects_are_not_drawn_within_a_distance() -> None:
+    near, far = scene_object(1, "car", 8.0), scene_object(2, "car", 30.0, 6.0)
+    for within_m, identifiers in ((math.inf, [1, 2]), (15.0, [1])):
+        renderer = Renderer(world_of(near, far), CAMERA, DEFAULT_MOUNT, draw_within_m=within_m)
+        rendered = renderer.render((0.0, 0.0, -3.0), LEVEL)
+        assert [item.world_object.identifier for item in rendered.objects] == identifiers
