@@ -78,6 +78,7 @@ class AutopilotLink:
         boots: how often its clock has begun again.
         other_senders: other addresses from which datagrams came; those are dropped.
         signed: its newest message bears a signature.
+        attitude_rad: its newest roll, pitch and yaw.
     """
 
     def __init__(self, url: LinkUrl) -> None:
@@ -101,6 +102,7 @@ class AutopilotLink:
         self._heartbeat_s = -math.inf
         self._boot_ms = 0
         self._yaw_rad = math.nan
+        self.attitude_rad = (0.0, 0.0, 0.0)
         self._parameters: dict[str, tuple[float, int]] = {}
         self._changed = threading.Condition()
         self._peer: tuple[str, int] | None = None
@@ -298,6 +300,9 @@ class AutopilotLink:
             case "ATTITUDE_QUATERNION":
                 w, x, y, z = message.q1, message.q2, message.q3, message.q4
                 self._yaw_rad = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+                roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+                pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
+                self.attitude_rad = (roll, pitch, self._yaw_rad)
             case "LOCAL_POSITION_NED":
                 self.boots += message.time_boot_ms + 1000 < self._boot_ms
                 self._boot_ms = message.time_boot_ms
