@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vision.obstacle_sectors import SECTOR_RAD, SECTORS
 from vision.occupancy_grid import CELL_M, SIZE, OccupancyGrid, Point
 
 # Cost per metre: 1, plus these.
@@ -32,6 +33,7 @@ STRIDE = 2
 # A vehicle inside the clearance first flies out of it, to a cell within this distance.
 ESCAPE_M = 2.0
 INSIDE_M = 0.3
+NEARBY_M = 3.0
 # The path ends at the last point of the reference that can be reached, at least this far from the vehicle.
 LEAST_M = 2.0
 BORDER_M = 1.0
@@ -71,6 +73,8 @@ class PlannedPath:
         number: of the request.
         inside: the vehicle is nearer to an obstacle than the clearance by more than `INSIDE_M`; the path
             first leads away from it.
+        near: (north, east) metres, the nearest occupied cell within `NEARBY_M` of the vehicle in each of 72
+            directions.
     """
 
     captured_ns: int
@@ -79,6 +83,7 @@ class PlannedPath:
     reason: str = ""
     number: int = 0
     inside: bool = False
+    near: tuple[Point, ...] = ()
 
 
 def plan_path(
@@ -95,17 +100,18 @@ def plan_path(
     if not request.reference:
         raise ValueError("a path request needs at least one point")
     field = _Field(grid, request, () if newest is None else newest.points)
+    near = _nearby(grid, position)
     try:
         start = field.start(position)
         end = field.end(start, position)
     except _NoWayError as why:
-        return PlannedPath(grid.captured_ns, (), reason=str(why), number=request.number)
+        return PlannedPath(grid.captured_ns, (), reason=str(why), number=request.number, near=near)
     cells = field.search(start, field.cell(end))
     points = np.vstack((position, grid.points(np.array(cells[1:-1] or [start])), end))
     points = field.rounded(field.shortened(points))
     free_m = field.free_length(points)
     path = tuple((float(north), float(east)) for north, east in points)
-    return PlannedPath(grid.captured_ns, path, free_m, "", request.number, field.inside(position))
+    return PlannedPath(grid.captured_ns, path, free_m, "", request.number, field.inside(position), near)
 
 
 class _NoWayError(Exception):
@@ -269,6 +275,18 @@ class _Field:
         cv2.polylines(line, [cells.astype(np.int32)], False, 0)
         away: NDArray[np.float32] = cv2.distanceTransform(line, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * CELL_M
         return away
+
+
+def _nearby(grid: OccupancyGrid, position: Point) -> tuple[Point, ...]:
+    """`PlannedPath.near`."""
+    points = grid.points(np.argwhere(grid.occupied))
+    north, east = (points - position).T
+    away_m = np.hypot(north, east)
+    order = np.argsort(away_m)[: np.count_nonzero(away_m <= NEARBY_M)]
+    _, first = np.unique(
+        np.rint(np.arctan2(east[order], north[order]) / SECTOR_RAD) % SECTORS, return_index=True
+    )
+    return tuple((float(north), float(east)) for north, east in points[order[first]])
 
 
 def _sampled(points: NDArray[np.float64], spacing_m: float) -> NDArray[np.float64]:

@@ -13,15 +13,15 @@ from companion.guidance.behaviour import BehaviourContext, Outcome, RoutedSetpoi
 from companion.guidance.limits.obstacles import Constraint
 from companion.guidance.motion import (
     HOLD_VELOCITY_GAIN,
+    VELOCITY_GAIN,
     PositionController,
-    add_velocity_error,
     ground_speed,
     position_and_yaw,
     stopping_point,
 )
 from companion.guidance.path import ACCELERATION_MPS2, Path, PathFollower
 from companion.vehicle.setpoint import Setpoint
-from companion.vehicle.state import Vector3
+from companion.vehicle.state import Vector3, VehicleState
 from vision.attitude import wrap_angle
 from vision.occupancy_grid import Point
 from vision.path_planner import PathRequest, PlannedPath
@@ -37,8 +37,9 @@ UNSEEN_GAP_M = 0.5
 FACING_RAD = math.radians(25.0)
 # Slower than this the vehicle does not fly along the path but holds its position, until it may be so fast.
 HOLD_MPS, LEAVE_MPS = 0.25, 0.5
-# The obstacle limits do not slow the vehicle below this before they are applied: it would never arrive.
-SLOW_MPS = 0.3
+# The obstacle limits remove the velocity towards an obstacle, not that beside it, and so bend the way flown:
+# a command is at most so many times as fast as they allow in its direction, and may always be SLOW_MPS fast.
+BENT_FACTOR, SLOW_MPS = 2.0, 0.3
 # Out of the clearance of an obstacle, wherever the camera looks.
 ESCAPE_MPS = 0.5
 MOST_STEP_S = 0.1
@@ -160,11 +161,9 @@ class Avoidance:
             self._stop_at = None
             speed = max(math.hypot(north, east), 1e-6)
             direction = (north / speed, east / speed)
-            # The limits remove the velocity towards an obstacle, not that beside it, and bend the way flown.
-            most_mps = min(most_mps, max(SLOW_MPS, _allowed_mps(direction, constraints)), speed)
-            flown = (most_mps * direction[0], most_mps * direction[1])
-            top_mps = SPEED_MARGIN * _level_speed(asked)
-            level = add_velocity_error(flown, state, top_mps, HOLD_VELOCITY_GAIN)
+            allowed_mps = max(SLOW_MPS, BENT_FACTOR * _allowed_mps(direction, constraints))
+            along_mps = min(most_mps, allowed_mps, speed)
+            level = _corrected(direction, along_mps, SPEED_MARGIN * _level_speed(asked), state)
         return Setpoint.velocity((*level, _down_mps(asked)), context.now_ns, yaw_rad=wrap_angle(nose_rad))
 
     def _hold(self, context: BehaviourContext) -> Vector3:
@@ -208,6 +207,21 @@ def _allowed_mps(direction: tuple[float, float], constraints: Sequence[Constrain
         (north * direction[0] + east * direction[1], most_mps) for north, east, most_mps in constraints
     )
     return min((most_mps / share for share, most_mps in towards if share > 1e-3), default=math.inf)
+
+
+def _corrected(
+    direction: tuple[float, float], along_mps: float, top_mps: float, state: VehicleState
+) -> tuple[float, float]:
+    """The velocity command for a speed in a direction, at most `top_mps`, against the velocity beside it."""
+    flown = (along_mps * direction[0], along_mps * direction[1])
+    north, east, _ = state.velocity_ned_mps or (*flown, 0.0)
+    is_mps = north * direction[0] + east * direction[1]
+    wanted_mps = min(top_mps, along_mps + VELOCITY_GAIN * (along_mps - is_mps))
+    beside = (north - is_mps * direction[0], east - is_mps * direction[1])
+    return (
+        wanted_mps * direction[0] - HOLD_VELOCITY_GAIN * beside[0],
+        wanted_mps * direction[1] - HOLD_VELOCITY_GAIN * beside[1],
+    )
 
 
 def _level_speed(asked: Setpoint) -> float:

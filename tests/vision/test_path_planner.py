@@ -169,6 +169,15 @@ def test_vehicle_inside_the_clearance_flies_out_of_it() -> None:
     assert "all sides" in planned(grid_with(*crowded)).reason
 
 
+def test_nearest_occupied_cells_are_in_the_result() -> None:
+    path = planned(grid_with(((2.0, 0.0), 0.4), ((0.0, -2.5), 0.4), ((8.0, 0.0), 0.4)))
+    away = [math.hypot(*point) for point in path.near]
+    assert min(away) == pytest.approx(1.6, abs=CELL_M)
+    assert max(away) <= 3.0
+    assert min(point[1] for point in path.near) < -1.9
+    assert planned(grid_with()).near == ()
+
+
 def test_goal_outside_the_map_is_refused() -> None:
     assert "outside" in planned(grid_with(), ((100.0, 0.0), (120.0, 0.0))).reason
 

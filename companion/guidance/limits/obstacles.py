@@ -117,7 +117,7 @@ NO_RULES = ObstacleRules()
 
 
 class ObstacleMemory:
-    """Obstacles that were seen recently and have left the image.
+    """Obstacles that were seen recently and have left the image, and those of the map (`guidance.avoid`).
 
     Their positions (local NED) are kept for `REMEMBERED_S` and fill unseen sectors. A sector that is seen
     again uses the measurement.
@@ -132,23 +132,29 @@ class ObstacleMemory:
         seen, position = context.obstacles, context.state.position_ned_m
         if seen is None or position is None:
             return context
-        oldest_ns = context.now_ns - REMEMBERED_S * 1e9
-        kept, distances = [], list(seen.distance_m)
-        for stamp_ns, north, east in self._points:
+        distances = list(seen.distance_m)
+
+        def fill(north: float, east: float) -> bool:
+            """Enter a point in its sector, if that is unseen."""
             away = (north - position[0], east - position[1])
             sector = round(math.atan2(away[1], away[0]) / SECTOR_RAD) % SECTORS
-            if stamp_ns < oldest_ns or not math.isnan(seen.distance_m[sector]):
-                continue
-            kept.append((stamp_ns, north, east))
+            if not math.isnan(seen.distance_m[sector]):
+                return False
             known = distances[sector]
             distances[sector] = math.hypot(*away) if math.isnan(known) else min(known, math.hypot(*away))
-        self._points = kept
+            return True
+
+        oldest_ns = context.now_ns - REMEMBERED_S * 1e9
+        self._points = [point for point in self._points if point[0] >= oldest_ns and fill(*point[1:])]
+        if context.planned is not None and context.planned.captured_ns >= oldest_ns:
+            for point in context.planned.near:
+                fill(*point)
         if seen.captured_ns != self._newest_ns:
             self._newest_ns = seen.captured_ns
             for (north, east), distance_m in zip(DIRECTIONS, seen.distance_m, strict=True):
                 if distance_m <= REMEMBERED_WITHIN_M:
-                    point = (position[0] + distance_m * north, position[1] + distance_m * east)
-                    self._points.append((seen.captured_ns, *point))
+                    place = (position[0] + distance_m * north, position[1] + distance_m * east)
+                    self._points.append((seen.captured_ns, *place))
         return replace(context, obstacles=replace(seen, distance_m=tuple(distances)))
 
 

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ from tests.companion.guidance.guidance_harness import GuidanceHarness
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle
 from vision.camera_model import CameraModel, CameraMount
 from vision.obstacle_sectors import SECTORS, ObstacleSectors, obstacle_sectors
+from vision.path_planner import PlannedPath
 
 NAN, INF = math.nan, math.inf
 
@@ -185,6 +187,19 @@ def test_obstacle_outside_the_image_is_remembered() -> None:
     assert ahead_m(memory, vehicle) == pytest.approx(3.0)
     vehicle.now_ns += 10**10
     assert math.isnan(ahead_m(memory, vehicle))
+
+
+def test_obstacles_of_the_map_fill_unseen_directions() -> None:
+    vehicle = KinematicVehicle()
+    planned = PlannedPath(vehicle.now_ns, (), near=((2.0, 0.0), (0.0, -1.5), (-1.2, 0.0)))
+    seen = context(sectors(vehicle.now_ns, {0: 4.0, 1: 5.0}, rest=NAN), vehicle=vehicle)
+    filled = ObstacleMemory().filled(replace(seen, planned=planned)).obstacles
+    assert filled is not None
+    assert filled.distance_m[:2] == (4.0, 5.0)  # as seen now
+    assert [filled.distance_m[index] for index in (36, 54)] == pytest.approx([1.2, 1.5])
+    assert sum(math.isnan(value) for value in filled.distance_m) == SECTORS - 4
+    old = replace(seen, planned=replace(planned, captured_ns=vehicle.now_ns - 10**10))
+    assert ObstacleMemory().filled(old).obstacles == seen.obstacles
 
 
 def test_message_distinguishes_unknown_from_free() -> None:
