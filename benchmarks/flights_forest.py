@@ -1,7 +1,7 @@
 """Flights of `goto` through a rendered forest, around the trees (`guidance.avoid`).
 
 The goal is 40 m away; between it and the start 45 trees stand at random, 3 m or more apart, over 40 by 30 m.
-Depth comes ten times a second with a stereo camera's noise, 100 ms late, from the real pipeline; grid and
+Depth comes six times a second with a stereo camera's noise, 100 ms late, from the real pipeline; grid and
 paths are the perception worker's own, simulated time waits meanwhile. Wind up to 3 m/s with gusts, 2 m/s of
 speed. A flight succeeds when it arrives without touching a tree.
 
@@ -28,6 +28,7 @@ from companion.bench.rendered_camera import RenderedCamera
 from companion.guidance.behaviours.goto import GotoBehaviour
 from mavlink_sim.camera.depth_camera import DepthSensor
 from mavlink_sim.camera.scene import CameraSettings, Scene
+from mavlink_sim.lockstep import LockstepVehicle
 from mavlink_sim.physics.contact import HALF_HEIGHT_M, RADIUS_M
 from mavlink_sim.world.obstacles import Obstacles
 from mavlink_sim.world.world import Light, World, WorldObject
@@ -81,13 +82,16 @@ def run(seed: int, each: Callable[[RenderedCamera, LockstepFlight], None] | None
     )
     scene = Scene(World(trees, light=Light(shadow=0.0)), {}, sensed, "forest")
     cameras: list[RenderedCamera] = []
+
+    def camera_of(vehicle: LockstepVehicle) -> RenderedCamera:
+        cameras.append(RenderedCamera(settings, scene, vehicle, rate_hz=RATE_HZ))
+        return cameras[0]
+
     flight = LockstepFlight.airborne(
         seed=seed,
         height_m=HEIGHT_M,
         wind_mps=float(rng.uniform(0.0, 3.0)),
-        camera=lambda vehicle: (
-            cameras.append(RenderedCamera(settings, scene, vehicle, rate_hz=RATE_HZ)) or cameras[0]
-        ),  # type: ignore[func-returns-value]
+        camera=camera_of,
         scene=scene,
     )
     obstacles = Obstacles(trees, {}, RADIUS_M, HALF_HEIGHT_M)

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from benchmarks.flights_forest import Map, forest, run
+from benchmarks.flights_forest import CAMERA, SENSOR, Map, forest, run
 from companion.bench.lockstep_flight import FlightLog, LockstepFlight, camera_settings
 from companion.bench.rendered_camera import RenderedCamera
 from mavlink_sim.camera.depth_camera import DepthSensor
@@ -14,7 +14,6 @@ from mavlink_sim.camera.scene import CameraSettings, Scene
 from mavlink_sim.world.world import Ground, World, WorldObject, range_to
 from vision.camera_model import CameraModel, CameraMount
 
-SMALL = CameraModel.from_horizontal_fov(320, 240, math.radians(80.0))
 LARGE = CameraModel.from_horizontal_fov(640, 480, math.radians(80.0))
 MOUNT = CameraMount(forward_m=0.1)
 MARGIN_M, ALLOWED_M = 1.0, 0.4
@@ -34,9 +33,9 @@ class Flight:
             "guidance.obstacle_margin_m": str(MARGIN_M),
             "guidance.avoid": "true",
         }
-        camera = LARGE if detector else SMALL
+        camera, sensor = (LARGE, DepthSensor()) if detector else (CAMERA, SENSOR)
         settings = camera_settings(camera, MOUNT, flags)
-        sensed = CameraSettings(model=camera, mount=MOUNT, depth=DepthSensor(), seed=seed)
+        sensed = CameraSettings(model=camera, mount=MOUNT, depth=sensor, seed=seed)
         self.scene = Scene(World((PILLAR, *objects), GROUND), {}, sensed, "pillar")
         self.flight = LockstepFlight.airborne(
             seed=seed,
