@@ -122,8 +122,8 @@ class Bridge:
             return False
         return self._alive
 
-    def set_alive(self, alive: bool | None) -> None:
-        """Note that the service's liveliness token has come or gone; None: unknown."""
+    def set_alive(self, alive: bool) -> None:
+        """Note that the service's liveliness token has come or gone."""
         self._alive = alive
 
     def subscribe(self) -> None:
@@ -141,7 +141,6 @@ class Bridge:
     def unsubscribe(self) -> None:
         """End what `subscribe` began."""
         undeclare(self._subscribers)
-        self._alive = None
 
     def close(self) -> None:
         """End all subscriptions, those of pictures too."""

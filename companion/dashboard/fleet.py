@@ -1,6 +1,6 @@
 """The connection to zenoh, a bridge for each vehicle that is alive, and their commands.
 
-Nothing is subscribed without a visible page, and at most `MAX_VEHICLES` are kept.
+Without a visible page only the vehicles' presence is subscribed. At most `MAX_VEHICLES` are kept.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import zenoh
 from companion.bus.client import NoAnswerError, send_command
 from companion.bus.session import zenoh_config
 from companion.bus.topics import alive_key
-from companion.dashboard.bridge import Bridge, Link, undeclare
+from companion.dashboard.bridge import Bridge, Link
 from companion.dashboard.merge import SeenObject, merged
 from companion.geometry.geodesy import north_east
 from companion.settings import ZenohSection
@@ -107,7 +107,6 @@ class Fleet:
             if not self._watched[bridge.vehicle]:
                 del self._watched[bridge.vehicle]
             if not self._watched:
-                undeclare(self._subscribers)
                 for other in self._bridges.values():
                     other.unsubscribe()
 
@@ -230,6 +229,7 @@ class Fleet:
             return
         self._link.problem = ""
         self._subscribe()
+        self._watch_presence(self._link.session)
 
     def _watch_link(self, session: zenoh.Session) -> None:
         """Note a lost connection; zenoh itself connects again."""
@@ -238,17 +238,17 @@ class Fleet:
         self._link.problem = "" if linked else lost
 
     def _subscribe(self) -> None:
-        session = self._link.session
-        if session is None or not self._watched:
-            return
-        for bridge in self._bridges.values():
-            bridge.subscribe()
-        if not self._subscribers:
-            # The access control may allow the first vehicle only.
-            for key in (alive_key(self.first.vehicle), alive_key("*")):
-                self._subscribers.append(
-                    session.liveliness().declare_subscriber(key, self._on_alive, history=True)
-                )
+        if self._watched:
+            for bridge in self._bridges.values():
+                bridge.subscribe()
+
+    def _watch_presence(self, session: zenoh.Session) -> None:
+        """Subscribe to the vehicles' presence for the whole session, so that a new page has all at once."""
+        # The access control may allow the first vehicle only.
+        for key in (alive_key(self.first.vehicle), alive_key("*")):
+            self._subscribers.append(
+                session.liveliness().declare_subscriber(key, self._on_alive, history=True)
+            )
 
     def _on_alive(self, sample: zenoh.Sample) -> None:
         """Runs on a zenoh thread."""
@@ -258,8 +258,6 @@ class Fleet:
             loop.call_soon_threadsafe(self._set_alive, name, alive)
 
     def _set_alive(self, name: str, alive: bool) -> None:
-        if not self._watched:
-            return
         bridge = self.bridge(name) if alive else self._bridges.get(name)
         if bridge is not None:
             bridge.set_alive(alive)

@@ -125,6 +125,19 @@ async def test_no_vehicle_is_subscribed_without_a_page() -> None:
             await until(lambda: not watched())
 
 
+async def test_new_page_has_all_vehicles_in_its_first_message() -> None:
+    with two_vehicles() as (_, endpoint):
+        async with serving(endpoint) as port:
+            async for news in stream_of(port, ""):
+                if len(news["vehicles"]) == 2:
+                    break
+            # Switched to the other one, and without any page meanwhile.
+            async for news in stream_of(port, f"?vehicle={OTHER}"):
+                listed = [(one["name"], one["alive"]) for one in news["vehicles"]]
+                assert listed == [(NAME, True), (OTHER, True)]
+                break
+
+
 async def test_number_of_kept_vehicles_is_limited() -> None:
     with publishing() as (_, endpoint):
         async with bridging(endpoint) as fleet:
