@@ -13,6 +13,7 @@ import zenoh
 from pydantic import ValidationError
 from zenoh import ext
 
+from companion.bus.config import read_config_file
 from companion.bus.session import zenoh_config
 from companion.bus.topics import ROOT, TOPICS, alive_key, command_key
 from companion.settings import ZenohSection
@@ -60,7 +61,10 @@ def settings_for_child(zenoh: ZenohSection) -> dict[str, Any]:
 
     Raises:
         NoAnswerError: as `client_settings`.
+        BusError: the file `child_config_file` cannot be read.
     """
+    if zenoh.child_config_file is not None:
+        read_config_file("child_config_file", zenoh.child_config_file)
     file = zenoh.child_config_file or zenoh.config_file
     client = client_settings(zenoh.model_copy(update={"config_file": file}))
     return {"values": client.model_dump(mode="json"), "given": sorted(client.model_fields_set)}

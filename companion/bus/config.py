@@ -25,10 +25,7 @@ def zenoh_config(settings: ZenohSection) -> zenoh.Config:
     """
     defaults, config = zenoh.Config(), zenoh.Config()
     if settings.config_file is not None:
-        try:
-            config = zenoh.Config.from_file(settings.config_file)
-        except zenoh.ZError as error:
-            raise BusError(f"zenoh.config_file {settings.config_file}: {first_line(error)}") from error
+        config = read_config_file("config_file", settings.config_file)
     ours: dict[str, tuple[str, Any]] = {
         "mode": ("mode", settings.mode),
         "connect": ("connect/endpoints", list(settings.connect)),
@@ -50,6 +47,14 @@ def zenoh_config(settings: ZenohSection) -> zenoh.Config:
         # A peer starts without its router and keeps retrying.
         config.insert_json5("connect/exit_on_failure", "false")
     return config
+
+
+def read_config_file(setting: str, path: str) -> zenoh.Config:
+    """Read a configuration file of zenoh, named by a setting. Raises BusError."""
+    try:
+        return zenoh.Config.from_file(path)
+    except zenoh.ZError as error:
+        raise BusError(f"zenoh.{setting} {path}: {first_line(error)}") from error
 
 
 def first_line(error: BaseException) -> str:

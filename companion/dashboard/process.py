@@ -7,6 +7,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 
 from companion.bus.client import NoAnswerError, settings_for_child
+from companion.bus.config import BusError
 from companion.child_process import child_process
 from companion.settings import Settings
 
@@ -23,7 +24,7 @@ async def dashboard_process(settings: Settings, say: Callable[[str], None]) -> A
         return
     try:
         zenoh = settings_for_child(settings.zenoh)
-    except NoAnswerError as error:
+    except (NoAnswerError, BusError) as error:
         say(f"dashboard: {error}")
         yield
         return

@@ -9,6 +9,7 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from typing import Any
 
 from companion.bus.client import NoAnswerError, settings_for_child
+from companion.bus.config import BusError
 from companion.child_process import child_process
 from companion.guidance.core import GuidanceOptions
 from companion.guidance.gimbal.controller import GimbalMounting
@@ -116,7 +117,7 @@ async def clients_of(settings: Settings, on_event: Callable[[str, str], None]) -
         for name, options in programs.items():
             try:
                 zenoh = settings_for_child(settings.zenoh)
-            except NoAnswerError as error:
+            except (NoAnswerError, BusError) as error:
                 on_event("warning", f"{name}: {error}")
                 continue
             argument = json.dumps({"zenoh": zenoh, "vehicle": settings.vehicle.name, **options})

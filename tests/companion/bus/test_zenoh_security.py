@@ -114,6 +114,27 @@ async def test_reader_sees_detections_but_may_not_command() -> None:
     assert executed == ["hold operator"]
 
 
+@pytest.mark.parametrize(("name", "text"), [("missing.json5", None), ("bad.json5", "{ mode: ")])
+async def test_unusable_file_of_the_children_is_named(tmp_path: Path, name: str, text: str | None) -> None:
+    path = tmp_path / name
+    if text is not None:
+        path.write_text(text)
+    settings = Settings.model_validate(
+        {"zenoh": {"child_config_file": str(path)}, "recording": {"directory": str(tmp_path)}}
+    )
+    lines: list[str] = []
+    async with (
+        dashboard_process(settings, lines.append),
+        clients_of(settings, lambda _level, line: lines.append(line)),
+    ):
+        pass
+    assert [line.partition(f" {path}: ")[0] for line in lines] == [
+        "dashboard: zenoh.child_config_file",
+        "recorder: zenoh.child_config_file",
+    ]
+    assert all(line.partition(f" {path}: ")[2] for line in lines)
+
+
 @pytest.mark.usefixtures("folder")
 async def test_dashboard_and_recorder_connect_with_the_file_of_the_children() -> None:
     endpoint, port = f"tls/127.0.0.1:{free_port(socket.SOCK_STREAM)}", free_port(socket.SOCK_STREAM)
