@@ -114,6 +114,7 @@ class Fleet:
         """Return the vehicles that are alive, and the one that is shown, by name.
 
         `at_ned_m`: north and east in local NED of the one that is shown; None while a position is unknown.
+        `own_ned_m`: the same in its own local NED.
         """
         return [
             {
@@ -126,6 +127,9 @@ class Fleet:
                 "yaw_rad": bridge.state.get("yaw_rad"),
                 "at_ned_m": _local(
                     shown.state, bridge.state.get("latitude_deg"), bridge.state.get("longitude_deg")
+                ),
+                "own_ned_m": _local(
+                    bridge.state, bridge.state.get("latitude_deg"), bridge.state.get("longitude_deg")
                 ),
             }
             for name, bridge in sorted(self._bridges.items())

@@ -7,8 +7,12 @@ const GRIDS_M = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000];
 const MIN_SPAN_M = 20;
 const MIN_GRID_PX = 45;
 const MAX_NAMED = 20; // for a screen reader
+const ARROW_PX = 11; // from the middle of a vehicle's arrow to its edge
+const DOT_PX = 6;
+const LINE_PX = 14; // height of a label
 
 export function drawMap(vehicle, limits) {
+  if (!state.at) return; // the map of the vehicle before is left until the new one's state has come
   const home = vehicle.home_ned_m || [0, 0, 0];
   const own = vehicle.position_ned_m;
   const around = (corners) => (corners || []).map(([n, e]) => [n + home[0], e + home[1]]);
@@ -16,15 +20,17 @@ export function drawMap(vehicle, limits) {
   const exclude = (limits.fence_exclude || []).map(around);
   const others = state.vehicles.filter((one) => one.name !== state.vehicle && one.at_ned_m);
   const tracks = mapTracks();
+  const ownTrail = state.trails.get(state.vehicle) || [];
+  const otherTrails = others.map(trailOf);
   const view = fit([
-    home, ...state.trail, ...tracks.map((track) => track.at), ...others.map((one) => one.at_ned_m),
-    ...[...state.trails.values()].flat(), ...include, ...exclude.flat(), ...(own ? [own] : []),
+    home, ...ownTrail, ...tracks.map((track) => track.at), ...others.map((one) => one.at_ned_m),
+    ...otherTrails.flat(), ...include, ...exclude.flat(), ...(own ? [own] : []),
   ]);
 
   drawGrid(view);
   drawFence(view, include, exclude);
-  for (const trail of state.trails.values()) drawTrail(view, trail, css("--soft"));
-  drawTrail(view, state.trail, css("--accent"));
+  for (const trail of otherTrails) drawTrail(view, trail, css("--soft"));
+  drawTrail(view, ownTrail, css("--accent"));
   for (const track of tracks) {
     drawTrail(view, track.trail, css("--second"));
     drawDot(view, track.at, track.chosen ? 7 : 5);
@@ -38,12 +44,15 @@ export function drawMap(vehicle, limits) {
   if (own) {
     drawSetpoint(view, own);
     drawArrow(view, own, vehicle.yaw_rad, css("--accent"));
-    if (isFleet()) drawLabel(view, state.vehicle, own);
   }
-  // A label is drawn where no other is: vehicles first, then the newest tracks.
-  for (const one of others) drawLabel(view, one.name, one.at_ned_m);
-  for (const track of [...tracks].reverse()) drawLabel(view, track.text, track.at);
   drawScale(view);
+  for (const one of others) reserve(view, one.at_ned_m, ARROW_PX);
+  if (own) reserve(view, own, ARROW_PX);
+  for (const track of tracks) reserve(view, track.at, DOT_PX);
+  // A label is drawn where nothing else is: vehicles first, then the newest tracks.
+  if (own && isFleet()) drawLabel(view, own, ARROW_PX, state.vehicle);
+  for (const one of others) drawLabel(view, one.at_ned_m, ARROW_PX, one.name);
+  for (const track of [...tracks].reverse()) drawLabel(view, track.at, DOT_PX, track.text, track.short);
 
   const north = own && (own[0] - home[0]).toFixed(0);
   const east = own && (own[1] - home[1]).toFixed(0);
@@ -53,6 +62,12 @@ export function drawMap(vehicle, limits) {
   $("map").setAttribute("aria-label", `Map, north up: ${where}, ${tracks.length} tracks${listed}`);
 }
 
+// The trail of another vehicle, in the shown one's local NED.
+function trailOf({ name, at_ned_m: at, own_ned_m: own }) {
+  const trail = own ? state.trails.get(name) || [] : [];
+  return trail.map(([n, e]) => [n + at[0] - own[0], e + at[1] - own[1]]);
+}
+
 // The shown vehicle's tracks with their trails, and what only others see. An object that several see is drawn once.
 function mapTracks() {
   const drawn = [];
@@ -60,12 +75,14 @@ function mapTracks() {
   for (const { class_name: name, at_ned_m: at, tracks } of state.objects) {
     const own = tracks.find(([vehicle, id]) => vehicle === state.vehicle && state.tracks.has(id));
     const text = `${name} ${tracks.map(([vehicle, id]) => `${vehicle} #${id}`).join(", ")}`;
-    if (own) merged.set(own[1], text);
-    else if (at) drawn.push({ at, trail: [], text });
+    const short = own ? `${name} #${own[1]}` : name;
+    if (own) merged.set(own[1], { text, short });
+    else if (at) drawn.push({ at, trail: [], text, short });
   }
   for (const [id, { at, trail, name }] of state.tracks) {
-    const text = merged.get(id) || `${name} ${isFleet() ? `${state.vehicle} ` : ""}#${id}`;
-    drawn.push({ at, trail, text, chosen: id === state.chosen });
+    const short = `${name} #${id}`;
+    const text = isFleet() ? `${name} ${state.vehicle} #${id}` : short;
+    drawn.push({ at, trail, text, short, ...merged.get(id), chosen: id === state.chosen });
   }
   return drawn;
 }
@@ -82,7 +99,7 @@ function fit(points) {
   const middle = [(north + south) / 2, (east + west) / 2];
   const xy = ([n, e]) => [width / 2 + (e - middle[1]) * scale, height / 2 - (n - middle[0]) * scale];
   const grid = GRIDS_M.find((m) => m * scale >= MIN_GRID_PX) || 2000;
-  return { g, width, height, scale, middle, xy, grid, labels: [] };
+  return { g, width, height, scale, middle, xy, grid, taken: [] };
 }
 
 function drawGrid({ g, width, height, scale, middle, xy, grid }) {
@@ -124,14 +141,36 @@ function drawTrail({ g, xy }, trail, colour) {
   g.globalAlpha = 1;
 }
 
-function drawLabel({ g, width, xy, labels }, text, at) {
+// Notes that no label may be drawn at a symbol.
+function reserve({ xy, taken }, at, radius) {
   const [x, y] = xy(at);
-  const size = g.measureText(text).width;
-  const left = x + 8 + size < width ? x + 8 : Math.max(2, x - 8 - size);
-  if (labels.some((one) => Math.abs(one.y - y) < 13 && left < one.right && one.left < left + size)) return;
-  labels.push({ y, left, right: left + size });
-  g.fillStyle = css("--ink");
-  g.fillText(text, left, y + 4);
+  taken.push({ left: x - radius, right: x + radius, top: y - radius, bottom: y + radius });
+}
+
+// Draws the first of some texts that has room beside, above or below a symbol; none without room.
+function drawLabel({ g, width, height, xy, taken }, at, radius, ...texts) {
+  const [x, y] = xy(at);
+  for (const text of texts) {
+    const size = g.measureText(text).width;
+    const gap = radius + 3;
+    const places = [
+      [x + gap, y - LINE_PX / 2], [x - gap - size, y - LINE_PX / 2],
+      [x - size / 2, y - radius - LINE_PX], [x - size / 2, y + radius],
+    ];
+    const boxes = places.map(([left, top]) => ({ left, right: left + size, top, bottom: top + LINE_PX }));
+    const isFree = (box) => box.left >= 0 && box.right <= width && box.top >= 0 && box.bottom <= height
+      && !taken.some((one) => box.left < one.right && one.left < box.right
+        && box.top < one.bottom && one.top < box.bottom);
+    const box = boxes.find(isFree);
+    if (!box) continue;
+    taken.push(box);
+    g.strokeStyle = css("--water");
+    g.lineWidth = 3;
+    g.strokeText(text, box.left, box.bottom - 3);
+    g.fillStyle = css("--ink");
+    g.fillText(text, box.left, box.bottom - 3);
+    return;
+  }
 }
 
 function drawArrow({ g, xy }, at, yaw, colour) {
@@ -173,7 +212,9 @@ function drawSetpoint({ g, xy }, own) {
   drawLine(g, [x, y], [x + 12 * east, y - 12 * north]);
 }
 
-function drawScale({ g, width, height, scale, grid }) {
+function drawScale({ g, width, height, scale, grid, taken }) {
+  taken.push({ left: 0, right: 14 + grid * scale, top: height - 28, bottom: height });
+  taken.push({ left: width - 24, right: width, top: 0, bottom: 28 });
   g.fillStyle = g.strokeStyle = css("--soft");
   g.fillText(`${grid} m`, 10, height - 14);
   drawLine(g, [10, height - 8], [10 + grid * scale, height - 8]);

@@ -83,8 +83,12 @@ function renderFleet() {
   state.vehicles.forEach(({ name, alive, mode, altitude_m: altitude }, index) => {
     const words = [name, alive === false ? "gone" : mode || "–"];
     if (alive && altitude != null) words.push(`${number(altitude, 1)} m`);
-    setText(fleet.children[index], words.join(" · "));
-    fleet.children[index].setAttribute("aria-pressed", name === state.vehicle);
+    const item = fleet.children[index];
+    setText(item, words.join(" · "));
+    const isShown = name === state.vehicle;
+    if (item.ariaPressed === String(isShown)) return;
+    item.ariaPressed = isShown;
+    if (isShown) item.scrollIntoView({ block: "nearest", inline: "nearest" }); // the list scrolls on a phone
   });
 }
 

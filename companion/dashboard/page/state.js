@@ -18,6 +18,7 @@ export const state = {
   vehicle: address.get("vehicle") || "",
   vehicles: [],
   objects: [],
+  trails: new Map(), // of all vehicles, by name; each in its own local NED
   ...ofOneVehicle(),
 };
 
@@ -26,8 +27,6 @@ export function ofOneVehicle() {
   return {
     topics: {},
     ages: {},
-    trail: [],
-    trails: new Map(), // of the other vehicles, by name; in local NED of the shown one
     tracks: new Map(), // by id
     latency: [],
     drops: [],

@@ -5,8 +5,7 @@ import { closeMenu, onReply } from "./commands.js";
 import { $, browserId, ofOneVehicle, record, showAddress, state } from "./state.js";
 
 const TRAIL_M = 0.3; // between two points of a trail
-const TRAIL_POINTS = 800;
-const OTHER_TRAIL_POINTS = 300;
+const TRAIL_POINTS = 500;
 const TRACK_TRAIL_POINTS = 100;
 const TRACK_SHOWN_MS = 10000;
 const LOG_LINES = 200;
@@ -74,7 +73,6 @@ function onNews(news) {
   for (const [path, message] of Object.entries(news.topics)) {
     if (path.endsWith("detections")) onDetections(path, message);
   }
-  if (news.topics.vehicle) extend(state.trail, news.topics.vehicle.position_ned_m, TRAIL_POINTS);
   if (news.topics.status) onStatus(news.topics.status);
   for (const event of news.events) log(event.level, event.text, (news.now_ns - event.stamp_ns) / 1e9);
   news.replies.forEach(onReply);
@@ -82,10 +80,10 @@ function onNews(news) {
 
 export function extendTrails(vehicles) {
   const trails = new Map();
-  for (const { name, at_ned_m: at } of vehicles) {
-    if (name === state.vehicle) continue;
+  for (const { name, own_ned_m: own } of vehicles) {
+    const shown = name === state.vehicle && state.topics.vehicle;
     trails.set(name, state.trails.get(name) || []);
-    extend(trails.get(name), at, OTHER_TRAIL_POINTS);
+    extend(trails.get(name), shown ? shown.position_ned_m : own, TRAIL_POINTS);
   }
   state.trails = trails; // those of vehicles that are gone are dropped
 }

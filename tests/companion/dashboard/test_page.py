@@ -276,18 +276,25 @@ def test_page_of_a_fleet_switches_the_vehicle_and_stops_all(browser: Browser) ->
         until(f"{text('#map', 'ariaLabel')}.includes('car vehicle1 #7, vehicle2 #3')")
         until(f"{text('#map', 'ariaLabel')}.includes('person vehicle2 #4')")
         # The other one's trail, of points that are 0.3 m apart.
-        assert tab.value("[...state.trails].map(([name, trail]) => [name, trail.length])") == [[OTHER, 1]]
+        points = "[...state.trails].map(([name, trail]) => [name, trail.length])"
+        assert tab.value(points) == [[NAME, 1], [OTHER, 1]]
         latest = "state.trails.get('vehicle2').at(-1)[1]"
         for east_m in (1.2, 2.0):
             services[OTHER].publish(VEHICLE.key(OTHER), state_at(OTHER, 2.0, east_m))
             tab.until(f"Math.abs(state.vehicles[1].at_ned_m[1] - {5.0 + east_m}) < 0.1")
-        tab.until(f"Math.abs({latest} - 7) < 0.1")
-        assert tab.value("state.trails.get('vehicle2').length") == 2
-        far = "for (let n = 0; n < 900; n++) extendTrails([{name: 'other', at_ned_m: [n, 0]}])"
-        assert tab.value(f"{far}; state.trails.get('other').length") == 300
+        tab.until(f"Math.abs({latest} - 2) < 0.1")  # in its own local NED
+        assert tab.value(points) == [[NAME, 1], [OTHER, 2]]
+        hidden = "new MutationObserver(() => { wasHidden ||= document.querySelector('#stop-all').hidden })"
+        observe = "observe(document.body, {subtree: true, attributes: true})"
+        tab.value(f"globalThis.wasHidden = false; {hidden}.{observe}")
         tab.value("document.querySelectorAll('#fleet button')[1].click()")
         until(f"{text('#vehicle', 'textContent')} === 'vehicle2' && location.search === '?vehicle=vehicle2'")
         until("state.at > 0 && state.vehicles.length === 2")  # of the new stream
+        assert tab.value("wasHidden") is False  # STOP ALL
+        assert tab.value(f"{points}.map(([name, length]) => [name, length > 1])") == [
+            [NAME, False],
+            [OTHER, True],
+        ]
         until(f"{text('#map', 'ariaLabel')}.includes('car vehicle1 #7, vehicle2 #3')")
         until(f"{text('#map', 'ariaLabel')}.includes('vehicle 2 m north and 1 m east of home')")
         tab.value("document.querySelector('[data-command=land]').click()")
@@ -299,7 +306,15 @@ def test_page_of_a_fleet_switches_the_vehicle_and_stops_all(browser: Browser) ->
         tab.value("document.querySelector('#stop-all').click()")
         tab.until(f"{REPLY} === 'stop all: done: vehicle1: holding; vehicle2: holding'")
         assert sorted(received[2:]) == [("vehicle1", "stop"), ("vehicle2", "stop")]
+        far = "for (let n = 0; n < 900; n++) extendTrails([{name: 'other', own_ned_m: [n, 0]}])"
+        assert tab.value(f"{far}; state.trails.get('other').length") == 500
         tab.resize(390, 844, phone=True)
+        assert rectangle(tab, "header")[3] < 0.2 * 844
+        for number in (0, 1):
+            tab.value(f"document.querySelectorAll('#fleet button')[{number}].click()")
+            left, _, width, _ = rectangle(tab, "#fleet [aria-pressed=true]")
+            assert left >= 0
+            assert left + width <= 390
         stop, stop_all = rectangle(tab, "#stop"), rectangle(tab, "#stop-all")
         assert stop[0] + stop[2] <= stop_all[0]
         assert stop_all[0] + stop_all[2] <= 390
