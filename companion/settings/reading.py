@@ -49,8 +49,6 @@ RENAMED = {
     "tracker.true_frames": "tracker.min_hits",
     "tracker.true_score": "tracker.confirm_score",
 }
-# The same for values of the settings.
-RENAMED_VALUES = {("vehicle.driver", "auto"): "pymavlink"}
 
 
 class ConfigurationError(ValueError):
@@ -248,9 +246,6 @@ class _Reading:
         key = f"{table}.{name}"
         if self._field(table, name) is None:
             self._problems.append(self._unknown(table, name, origin))
-            return
-        if isinstance(value, str) and (now := RENAMED_VALUES.get((key, value))):
-            self._problems.append(f"{key} = {value!r} ({origin}) was renamed to {now!r} in version 0.2.0")
             return
         # TOML has arrays; the settings are frozen and hold tuples.
         self._values.setdefault(table, {})[name] = tuple(value) if isinstance(value, list) else value

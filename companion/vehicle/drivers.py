@@ -10,7 +10,7 @@ from companion.vehicle.link_url import parse_link_url
 if TYPE_CHECKING:
     from companion.vehicle.autopilot_driver import AutopilotDriver
 
-DriverKind = Literal["pymavlink", "mavsdk"]
+DriverKind = Literal["pymavlink", "mavsdk", "auto"]
 
 
 def open_driver(
@@ -27,7 +27,8 @@ def open_driver(
     """Create a driver, not connected yet.
 
     Args:
-        kind: the MAVLink library. Both have the same contract; "mavsdk" supports PX4 only.
+        kind: the MAVLink library. Both have the same contract; "mavsdk" supports PX4 only, so "auto", which
+            fits every supported autopilot, is "pymavlink".
         url: `udpin://HOST:PORT`, `udpout://HOST:PORT`, `tcp://HOST:PORT` or `serial:///dev/X:BAUD`.
         system_id: the autopilot's MAVLink system id; None: the first autopilot received.
         own_system_id, own_component_id: of our messages; 191 is MAV_COMP_ID_ONBOARD_COMPUTER.

@@ -360,17 +360,6 @@ def test_renamed_key_names_the_new_one(old: str, new: str, tmp_path: Path) -> No
         assert any(f"cameras.down.{new} in version" in line for line in failure.value.problems)
 
 
-def test_driver_auto_names_pymavlink(tmp_path: Path) -> None:
-    path = tmp_path / "companion.toml"
-    path.write_text('[vehicle]\ndriver = "auto"\n')
-    with pytest.raises(ConfigurationError) as failure:
-        load_settings(path, {"vehicle.driver": "auto"}, {"COMPANION_VEHICLE_DRIVER": "auto"})
-    assert len(failure.value.problems) == 3
-    for line in failure.value.problems:
-        assert "'auto'" in line
-        assert "was renamed to 'pymavlink'" in line
-
-
 def test_renamed_views_section_names_cameras(tmp_path: Path) -> None:
     path = tmp_path / "companion.toml"
     path.write_text('[views.down.source]\nuri = "down.mp4"\n')

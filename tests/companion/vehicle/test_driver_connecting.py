@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import time
 
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
+from companion.service.factory import driver_of
+from companion.settings.reading import load_settings
 from companion.vehicle.autopilot_driver import AutopilotDriver
 from companion.vehicle.driver import CommandRefusedError, Driver, LinkError, NoAnswerError, SystemStatus
 from companion.vehicle.drivers import DriverKind, open_driver
@@ -80,6 +83,23 @@ async def test_unsupported_autopilot_is_refused(
             await open_driver(kind, f"udpin://127.0.0.1:{port}").connect(5.0)
     finally:
         await other.stop()
+
+
+@pytest.mark.parametrize(
+    ("autopilot_kind", "name"),
+    [(mavlink.MAV_AUTOPILOT_PX4, "PX4"), (mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, "ArduPilot")],
+)
+async def test_auto_supports_either_autopilot(autopilot_kind: int, name: str, port: int) -> None:
+    answering = FakeAutopilot(port, autopilot=autopilot_kind)
+    answering.start()
+    chosen = {"vehicle.driver": "auto", "vehicle.url": f"udpin://127.0.0.1:{port}"}
+    driver = driver_of(load_settings(os.devnull, chosen, {}))
+    try:
+        await driver.connect(5.0)
+        assert (driver.library, driver.state.autopilot) == ("pymavlink", name)
+    finally:
+        await driver.close()
+        await answering.stop()
 
 
 async def test_one_heartbeat_suffices_to_connect(
@@ -211,7 +231,7 @@ async def test_udp_out_sends_the_first_heartbeat(kind: DriverKind, port: int) ->
 
 
 def test_open_driver_refuses_bad_arguments() -> None:
-    with pytest.raises(ValueError, match=r"'dronekit'.*pymavlink, mavsdk"):
+    with pytest.raises(ValueError, match=r"'dronekit'.*pymavlink, mavsdk, auto"):
         open_driver("dronekit", "udpin://0.0.0.0:14540")  # type: ignore[arg-type]  # refused
     with pytest.raises(ValueError, match="not a link url"):
         open_driver("mavsdk", "14540")
