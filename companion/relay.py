@@ -27,6 +27,7 @@ _HEARTBEAT = struct.Struct("<IBBBBB")  # custom_mode, type, autopilot, base_mode
 _FIRST_HEARTBEAT_S = 10.0
 # Heartbeats are sent once a second: a second autopilot on the port is received in this time.
 _LISTEN_S = 1.5
+_AUTOPILOTS = frozenset({mavlink.MAV_AUTOPILOT_PX4, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA})
 _MULTIROTORS = frozenset(
     {
         mavlink.MAV_TYPE_QUADROTOR,
@@ -42,10 +43,11 @@ _MULTIROTORS = frozenset(
 
 
 class AutopilotHeartbeat(NamedTuple):
-    """Fields of an autopilot's HEARTBEAT: system id, MAV_TYPE and MAV_MODE_FLAG."""
+    """Fields of an autopilot's HEARTBEAT: system id, MAV_TYPE, MAV_AUTOPILOT and MAV_MODE_FLAG."""
 
     system_id: int
     vehicle_type: int
+    autopilot: int
     base_mode: int
 
 
@@ -100,7 +102,7 @@ class Relay:
         """Wait for the autopilot and check that it is one multirotor, disarmed.
 
         Raises:
-            ValueError: no autopilot, several, not a multirotor, or armed; one line.
+            ValueError: no autopilot, several, neither PX4 nor ArduPilot, not a multirotor, or armed; one line.
         """
         try:
             async with asyncio.timeout(_FIRST_HEARTBEAT_S):
@@ -112,13 +114,15 @@ class Relay:
             ) from None
         await asyncio.sleep(_LISTEN_S)
         assert self.heartbeat is not None
-        system_id, vehicle_type, base_mode = self.heartbeat
+        system_id, vehicle_type, autopilot, base_mode = self.heartbeat
         if self.others:
             senders = ", ".join(f"{host}:{port}" for host, port, *_ in (self._source, *self.others))
             raise ValueError(f"{self.url}: two autopilots send to this port ({senders}); end one of them")
+        if autopilot not in _AUTOPILOTS:
+            name = _name("MAV_AUTOPILOT", autopilot)
+            raise ValueError(f"{self.url}: system {system_id} is a {name}; expected PX4 or ArduPilot")
         if vehicle_type not in _MULTIROTORS:
-            entry = mavlink.enums["MAV_TYPE"].get(vehicle_type)
-            name = f"MAV_TYPE {vehicle_type}" if entry is None else entry.name
+            name = _name("MAV_TYPE", vehicle_type)
             raise ValueError(f"{self.url}: system {system_id} is a {name}; expected a multirotor")
         if base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED:
             raise ValueError(f"{self.url}: system {system_id} is armed; it must be disarmed on the ground")
@@ -156,9 +160,10 @@ class Relay:
             self._vehicle.answer_to(source)
         elif source not in self.others:
             self.others.add(source)
-            logger.warning(
-                "%s: a second autopilot sends from %s:%s: its messages are dropped", self.url, *source[:2]
-            )
+            if self._checked:  # else the check refuses it
+                logger.warning(
+                    "%s: a second autopilot sends from %s:%s: its messages are dropped", self.url, *source[:2]
+                )
 
     def _from_program(self, data: bytes, _source: Source) -> None:
         if self._vehicle is not None:
@@ -174,5 +179,10 @@ def _heartbeat_in(data: bytes) -> AutopilotHeartbeat | None:
         ):
             _, vehicle_type, autopilot, base_mode, _, _ = _HEARTBEAT.unpack(frame.padded(_HEARTBEAT.size))
             if autopilot != mavlink.MAV_AUTOPILOT_INVALID:
-                return AutopilotHeartbeat(frame.system_id, vehicle_type, base_mode)
+                return AutopilotHeartbeat(frame.system_id, vehicle_type, autopilot, base_mode)
     return None
+
+
+def _name(enumeration: str, value: int) -> str:
+    entry = mavlink.enums[enumeration].get(value)
+    return f"{enumeration} {value}" if entry is None else str(entry.name)

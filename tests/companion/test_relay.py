@@ -25,13 +25,17 @@ def short_waits(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def heartbeat(
-    *, vehicle_type: int = mavlink.MAV_TYPE_QUADROTOR, armed: bool = False, system: int = 1
+    *,
+    vehicle_type: int = mavlink.MAV_TYPE_QUADROTOR,
+    autopilot: int = mavlink.MAV_AUTOPILOT_PX4,
+    armed: bool = False,
+    system: int = 1,
 ) -> bytes:
     sender = mavlink.MAVLink(None, srcSystem=system, srcComponent=mavlink.MAV_COMP_ID_AUTOPILOT1)
     mode = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
     mode |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED if armed else 0
     message = mavlink.MAVLink_heartbeat_message(
-        vehicle_type, mavlink.MAV_AUTOPILOT_PX4, mode, 0, mavlink.MAV_STATE_STANDBY, 3
+        vehicle_type, autopilot, mode, 0, mavlink.MAV_STATE_STANDBY, 3
     )
     packed: bytes = message.pack(sender)
     return packed
@@ -156,6 +160,7 @@ async def test_autopilot_back_on_another_port_is_answered(monkeypatch: pytest.Mo
     [
         (heartbeat(vehicle_type=mavlink.MAV_TYPE_FIXED_WING), "MAV_TYPE_FIXED_WING"),
         (heartbeat(vehicle_type=mavlink.MAV_TYPE_GROUND_ROVER), "MAV_TYPE_GROUND_ROVER"),
+        (heartbeat(autopilot=mavlink.MAV_AUTOPILOT_GENERIC), "MAV_AUTOPILOT_GENERIC"),
         (heartbeat(armed=True), "armed"),
         (b"", "no autopilot heartbeat"),
     ],
