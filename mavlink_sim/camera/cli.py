@@ -190,10 +190,15 @@ class _Run:
                 f"no autopilot within {VEHICLE_TIMEOUT_S:g} s: expected its HEARTBEAT on --vehicle-url; "
                 "check that it runs and sends to that address"
             )
-        self._until(lambda: len(link.systems) > 1, OTHERS_S)
+        self._until(lambda: max(len(link.systems), len(link.senders)) > 1, OTHERS_S)
         if len(link.systems) > 1:
             found = " and ".join(map(str, sorted(link.systems)))
             raise CameraError(f"autopilots of system ids {found} on one link; use a separate port for each")
+        if len(link.senders) > 1:
+            found = " and ".join(f"{host}:{port}" for _, (host, port) in sorted(link.senders))
+            raise CameraError(
+                f"two autopilots of system id {next(iter(link.systems))} on one link ({found}); end one of them"
+            )
         if link.systems:
             (link.system_id,) = link.systems
 

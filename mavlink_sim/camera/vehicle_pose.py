@@ -16,7 +16,7 @@ from bisect import bisect_left
 from collections import Counter, deque
 from typing import Any, NamedTuple
 
-from mavlink_sim.wire.endpoint import UdpEndpoint
+from mavlink_sim.wire.endpoint import Address, UdpEndpoint
 from mavlink_sim.wire.messages import Outgoing, dialect, parser
 from vision.attitude import Quaternion, quaternion_from_euler, slerp
 
@@ -38,7 +38,8 @@ class _TcpEndpoint:
     """A connection to an autopilot that listens, as ArduPilot's SITL does on port 5760."""
 
     def __init__(self, host: str, port: int) -> None:
-        self._socket = socket.create_connection((host, port), timeout=CONNECT_S)
+        self._address = (host, port)
+        self._socket = socket.create_connection(self._address, timeout=CONNECT_S)
         self._socket.setblocking(False)
         self._codec = parser()
         self._closed = False
@@ -46,7 +47,8 @@ class _TcpEndpoint:
     def fileno(self) -> int:
         return self._socket.fileno()
 
-    def receive(self) -> list[Any]:
+    def receive_from(self) -> list[tuple[Any, Address]]:
+        """The messages that have arrived, each with its sender."""
         messages: list[Any] = []
         while not self._closed:
             try:
@@ -59,7 +61,7 @@ class _TcpEndpoint:
             messages += self._codec.parse_buffer(data) or []
         if self._closed and not messages:
             raise ConnectionError("the autopilot closed its TCP connection")
-        return [message for message in messages if message.get_type() != "BAD_DATA"]
+        return [(message, self._address) for message in messages if message.get_type() != "BAD_DATA"]
 
     def send(self, outgoing: list[Outgoing]) -> None:
         try:
@@ -88,6 +90,7 @@ class AutopilotLink:
 
     Attributes:
         systems: of the autopilots received, system id → armed.
+        senders: of the heartbeats of these autopilots: (system id, address).
         system_id: of the one whose messages `receive` returns; None: not yet selected.
     """
 
@@ -101,6 +104,7 @@ class AutopilotLink:
         if listen_only and scheme == "udpout":
             raise LinkError(f"link {url!r}: udpout:// must send first; listen only with udpin:// or tcp://")
         self.systems: dict[int, bool] = {}
+        self.senders: set[tuple[int, Address]] = set()
         self.system_id: int | None = None
         self._listen_only = listen_only
         self._sends_first = scheme == "udpout"
@@ -126,12 +130,14 @@ class AutopilotLink:
         """
         select.select([self._endpoint], [], [], timeout_s)
         wanted = []
-        for message in self._endpoint.receive():
+        for message, sender in self._endpoint.receive_from():
             system = message.get_srcSystem()
             if message.get_srcComponent() != dialect.MAV_COMP_ID_AUTOPILOT1:
                 continue
             if message.get_type() == "HEARTBEAT" and message.autopilot != dialect.MAV_AUTOPILOT_INVALID:
                 self.systems[system] = bool(message.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
+                if self.system_id is None:
+                    self.senders.add((system, sender))
             elif message.get_type() == "HIL_STATE_QUATERNION":
                 self.systems.setdefault(
                     system, False

@@ -192,7 +192,11 @@ class UdpEndpoint:
 
     def receive(self) -> list[Any]:
         """Every message that has arrived; damaged bytes are skipped and counted by the codec."""
-        messages: list[Any] = []
+        return [message for message, _ in self.receive_from()]
+
+    def receive_from(self) -> list[tuple[Any, Address]]:
+        """As `receive`, each message with its sender."""
+        messages: list[tuple[Any, Address]] = []
         for _ in range(MAX_DATAGRAMS_PER_READ):
             try:
                 datagram, sender = self.socket.recvfrom(65535)
@@ -207,7 +211,7 @@ class UdpEndpoint:
             ]
             if found:
                 self._note_sender(sender)
-                messages.extend(found)
+                messages += [(message, sender) for message in found]
                 if self.on_packet is not None:
                     for message in found:
                         self.on_packet(bytes(message.get_msgbuf()))

@@ -130,7 +130,8 @@ def test_no_autopilot_is_refused_after_ten_seconds(name: str) -> None:
     assert finished.stdout == ""
 
 
-def test_two_autopilots_on_one_port_are_refused_by_their_ids(name: str) -> None:
+@pytest.mark.parametrize("systems", [(4, 9), (4, 4)])
+def test_two_autopilots_on_one_port_are_refused(name: str, systems: tuple[int, int]) -> None:
     port = free_port()
     ends = [UdpEndpoint("127.0.0.1", 0, port) for _ in range(2)]
     command = [sys.executable, "-m", "mavlink_sim", "camera", "--vehicle-url", f"udpin://127.0.0.1:{port}"]
@@ -139,10 +140,11 @@ def test_two_autopilots_on_one_port_are_refused_by_their_ids(name: str) -> None:
         deadline_s = time.monotonic() + DEADLINE_S
         while process.poll() is None:
             assert time.monotonic() < deadline_s
-            for system, end in zip((4, 9), ends, strict=True):
+            for system, end in zip(systems, ends, strict=True):
                 end.receive()
                 end.send([heartbeat(system)])
             time.sleep(0.05)
+        ports = [end.port for end in ends]
     finally:
         process.kill()
         _, events = process.communicate()
@@ -150,7 +152,8 @@ def test_two_autopilots_on_one_port_are_refused_by_their_ids(name: str) -> None:
             end.close()
     assert process.returncode == 2
     (line,) = events.splitlines()
-    assert "4 and 9" in line
+    for word in ("4 and 9",) if systems == (4, 9) else ("system id 4", *(f":{port}" for port in ports)):
+        assert word in line
 
 
 def test_missing_pose_messages_are_requested() -> None:
