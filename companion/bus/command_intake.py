@@ -27,7 +27,7 @@ class CommandIntake:
     """
 
     def __init__(self, clock_s: Callable[[], float] = time.monotonic) -> None:
-        self._others, self._stops = Allowance(clock_s), Allowance(clock_s)
+        self._others, self._stops = Allowance(clock_s=clock_s), Allowance(clock_s=clock_s)
         self._lock = threading.Lock()
         self.refused = 0
 
@@ -57,15 +57,18 @@ class CommandIntake:
 
 
 class Allowance:
-    """A token bucket: `COMMANDS_PER_S`, and `BURST` at once."""
+    """A token bucket: `per_s`, and `burst` at once."""
 
-    def __init__(self, clock_s: Callable[[], float] = time.monotonic) -> None:
-        self._clock_s, self._tokens, self._filled_s = clock_s, float(BURST), clock_s()
+    def __init__(
+        self, per_s: float = COMMANDS_PER_S, burst: int = BURST, clock_s: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._per_s, self._burst, self._clock_s = per_s, float(burst), clock_s
+        self._tokens, self._filled_s = self._burst, clock_s()
 
     def take(self) -> bool:
         """Whether one more is allowed now."""
         now_s = self._clock_s()
-        self._tokens = min(float(BURST), self._tokens + COMMANDS_PER_S * (now_s - self._filled_s))
+        self._tokens = min(self._burst, self._tokens + self._per_s * (now_s - self._filled_s))
         self._filled_s = now_s
         if self._tokens < 1.0:
             return False

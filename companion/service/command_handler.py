@@ -8,16 +8,26 @@ from collections.abc import Awaitable, Callable
 from dataclasses import asdict
 from typing import Any
 
+from companion.bus.command_intake import Allowance
 from companion.guidance.behaviour import Outcome
 from companion.guidance.behaviours.select import Select
+from companion.guidance.behaviours.stop import StopBehaviour
 from companion.guidance.command import GrammarError
 from companion.guidance.interface import CommandInput, CommandResult
 from companion.guidance.missions.sequence import SequenceBehaviour
 from vision.tracking import Selected
 
+# Commands reported as events: so many a second, and so many at once, which is more than a person sends.
+# `stop` has a separate allowance of the same size.
+REPORTED_PER_S, REPORTED_AT_ONCE = 1.0, 10
+# A command that is not reported at once is reported when it has lasted this long.
+LASTING_S = 1.0
+
 
 class CommandHandler:
     """The entry point of all commands.
+
+    In a flood of commands most are not reported as events: only one a second, and those that last a second.
 
     Args:
         read: parses a command from an identifier and a text; raises GrammarError.
@@ -42,6 +52,8 @@ class CommandHandler:
         self._identifiers = itertools.count(1)
         self._new: list[CommandInput] = []
         self._awaited: dict[int, asyncio.Future[Outcome]] = {}
+        self._reported, self._stops_reported = (Allowance(REPORTED_PER_S, REPORTED_AT_ONCE) for _ in range(2))
+        self._unreported = 0
 
     async def execute(self, text: str) -> dict[str, Any]:
         """Execute a command and return its result. See `Service.command`."""
@@ -52,28 +64,46 @@ class CommandHandler:
             return {"command": first_line, "success": False, "reason": "; ".join(str(error).splitlines())}
         if isinstance(command, Select):
             return await self._select_object(command)
-        self._on_event("info", f"command: {command.text}")
+        is_stop = isinstance(command.behaviour, StopBehaviour)
+        reported = (self._stops_reported if is_stop else self._reported).take()
+        if reported:
+            self._report(command)
+        else:
+            self._unreported += 1
         if (reason := self._refusal(command)) is not None:
-            self._on_event("warning", f"{command.text}: {reason}")
+            if reported:
+                self._on_event("warning", f"{command.text}: {reason}")
             return {"command": command.text, "success": False, "reason": reason}
         ended: asyncio.Future[Outcome] = asyncio.get_running_loop().create_future()
         self._awaited[command.identifier] = ended
         self._new.append(command)
         self._on_command()
+        if not reported:
+            await asyncio.wait({ended}, timeout=LASTING_S)
+            if not ended.done():  # it is flown, and no newer one has superseded it
+                reported, self._unreported = True, self._unreported - 1
+                self._report(command)
         # A cancelled caller does not stop the behaviour.
         outcome = await asyncio.shield(ended)
         more: dict[str, Any] = {}
         if isinstance(command.behaviour, SequenceBehaviour):
             outcome = command.behaviour.with_step(outcome)
             more = {"steps": [asdict(step) for step in command.behaviour.records]}
-        self._on_event("info" if outcome.success else "warning", f"{command.text}: {outcome.reason}")
+        if reported:
+            self._on_event("info" if outcome.success else "warning", f"{command.text}: {outcome.reason}")
         answer = {"success": outcome.success, "reason": outcome.reason}
         return {"command": command.text, **answer, **more}
+
+    def _report(self, command: CommandInput) -> None:
+        before, self._unreported = self._unreported, 0
+        skipped = f" ({before} before it not logged)" if before else ""
+        self._on_event("info", f"command: {command.text}{skipped}")
 
     async def _select_object(self, command: Select) -> dict[str, Any]:
         """Guidance is not asked: what is flown goes on."""
         answer = await self._select(command)
-        self._on_event("info" if answer.success else "warning", f"{command}: {answer.reason}")
+        if self._reported.take():
+            self._on_event("info" if answer.success else "warning", f"{command}: {answer.reason}")
         track = {"track": answer.track_id, "class": answer.class_name}
         return {"command": str(command), "success": answer.success, "reason": answer.reason, **track}
 

@@ -1,0 +1,87 @@
+"""Events of the command handler in a flood of commands."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import pytest
+
+from companion.bus.command_intake import Allowance
+from companion.guidance.behaviour import Outcome
+from companion.guidance.behaviours.hold import HoldBehaviour
+from companion.guidance.behaviours.stop import StopBehaviour
+from companion.guidance.interface import CommandInput, CommandResult
+from companion.service import command_handler
+from companion.service.command_handler import REPORTED_AT_ONCE, REPORTED_PER_S, CommandHandler
+from vision.tracking import Selected
+
+FLOOD = 300
+
+
+async def no_selection(_request: object) -> Selected:
+    raise AssertionError("no selection is sent")
+
+
+class Handler(CommandHandler):
+    """A handler that refuses `goto`, at a clock that stands still. `lines`: the texts of its events."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+        super().__init__(
+            lambda identifier, text: CommandInput(
+                identifier, text, StopBehaviour() if text == "stop" else HoldBehaviour()
+            ),
+            no_selection,
+            lambda: None,
+            lambda _level, text: self.lines.append(text),
+            check_requirements=lambda command: "on the ground" if "goto" in command.text else None,
+        )
+        self._reported, self._stops_reported = (
+            Allowance(REPORTED_PER_S, REPORTED_AT_ONCE, lambda: 0.0) for _ in range(2)
+        )
+
+    async def until_started(self, text: str) -> tuple[int, asyncio.Task[dict[str, Any]]]:
+        """Execute a command; returns when guidance can take it, with its identifier."""
+        answer = asyncio.create_task(self.execute(text))
+        while not (commands := self.take_commands()):
+            await asyncio.sleep(0)
+        return commands[0].identifier, answer
+
+
+async def flooded() -> Handler:
+    handler = Handler()
+    for number in range(FLOOD):
+        assert (await handler.execute(f"goto {number} 0"))["reason"] == "on the ground"
+    return handler
+
+
+async def test_flood_of_refused_commands_is_answered_but_not_logged() -> None:
+    handler = await flooded()
+    assert len(handler.lines) == 2 * REPORTED_AT_ONCE  # each with its refusal
+
+
+async def test_command_flown_in_a_flood_is_logged(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(command_handler, "LASTING_S", 0.02)
+    handler = await flooded()
+    before = len(handler.lines)
+    short, superseded = await handler.until_started("hold")
+    long, flown = await handler.until_started("orbit")
+    handler.on_result(CommandResult(short, Outcome(False, "superseded by orbit")))
+    assert not (await superseded)["success"]
+    while len(handler.lines) == before:
+        await asyncio.sleep(0.005)
+    handler.on_result(CommandResult(long, Outcome(True, "flown")))
+    assert (await flown)["success"]
+    unlogged = FLOOD - REPORTED_AT_ONCE + 1  # and the superseded one
+    assert handler.lines[before:] == [f"command: orbit ({unlogged} before it not logged)", "orbit: flown"]
+
+
+async def test_stop_in_a_flood_is_logged_at_once() -> None:
+    handler = await flooded()
+    before = len(handler.lines)
+    identifier, answer = await handler.until_started("stop")
+    assert handler.lines[before].startswith("command: stop")
+    handler.on_result(CommandResult(identifier, Outcome(True, "holding")))
+    assert (await answer)["success"]
+    assert handler.lines[before + 1 :] == ["stop: holding"]
