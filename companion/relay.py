@@ -102,7 +102,7 @@ class Relay:
         """Wait for the autopilot and check that it is one multirotor, disarmed.
 
         Raises:
-            ValueError: no autopilot, several, neither PX4 nor ArduPilot, not a multirotor, or armed; one line.
+            ValueError: no autopilot, several, not PX4 or ArduPilot, not a multirotor, or armed; one line.
         """
         try:
             async with asyncio.timeout(_FIRST_HEARTBEAT_S):

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any, Protocol
 
 from companion.guidance.interface import (
@@ -25,11 +26,14 @@ from companion.vehicle.gimbal_commands import CONFIGURE, FOLLOWING_NOSE, PITCHYA
 from companion.vehicle.landing_target import LandingTarget, landing_target_fields
 from companion.vehicle.mav_result import ACCEPTED, IN_PROGRESS, result_name
 from companion.vehicle.obstacle_distance import obstacle_distance_fields
+from companion.vehicle.report_reader import Event, EventCatalogue
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import VehicleState
 from companion.vehicle.telemetry import TELEMETRY_MESSAGES, apply_message
+from companion.vehicle.telemetry_state import REPORTS_KEPT
 from companion.vehicle.vision_position import VisionPosition, vision_position_fields
 from mavlink_sim.lockstep import COMPANION, LockstepVehicle
+from mavlink_sim.services.vehicle_files import event_metadata
 from mavlink_sim.vehicles.ardupilot.copter import CopterVehicle
 from mavlink_sim.wire.messages import dialect
 from vision.obstacle_sectors import ObstacleSectors
@@ -224,6 +228,8 @@ class SimulatedDriver:
             name = message.get_type()
             if name == "COMMAND_ACK":
                 self._acknowledge(message)
+            elif name == "EVENT":
+                self._on_event(message, now_ns)
             elif name in TELEMETRY_MESSAGES or self._kind == ARDUPILOT:
                 for name_now, fields in self._profile.translate(name, message.to_dict(), self._state):
                     if name_now in ("HEARTBEAT", "CURRENT_MODE"):
@@ -234,6 +240,12 @@ class SimulatedDriver:
                 self._answer(pending, None)
             elif now_ns > pending.until_ns:
                 self._answer(pending, f"{pending.refusal}: nothing shows after {SHOWN_TIMEOUT_S:g} s")
+
+    def _on_event(self, message: Any, now_ns: int) -> None:
+        event = Event(message.id, message.sequence, message.log_levels, message.arguments)
+        report = _events_of_px4().report(event, now_ns)
+        if report is not None:
+            self._state = replace(self._state, reports=(*self._state.reports, report)[-REPORTS_KEPT:])
 
     def _command(
         self,
@@ -264,6 +276,12 @@ class SimulatedDriver:
     def _answer(self, pending: _Pending, refused: str | None) -> None:
         self._pending.remove(pending)
         self._answers.append(Answer(pending.identifier, refused))
+
+
+@cache
+def _events_of_px4() -> EventCatalogue:
+    """The events that the drivers read from the vehicle's file."""
+    return EventCatalogue(event_metadata())
 
 
 def setpoint_message(setpoint: Setpoint, system_id: int = 1) -> Any:

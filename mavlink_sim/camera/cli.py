@@ -196,9 +196,8 @@ class _Run:
             raise CameraError(f"autopilots of system ids {found} on one link; use a separate port for each")
         if len(link.senders) > 1:
             found = " and ".join(f"{host}:{port}" for _, (host, port) in sorted(link.senders))
-            raise CameraError(
-                f"two autopilots of system id {next(iter(link.systems))} on one link ({found}); end one of them"
-            )
+            (system,) = link.systems
+            raise CameraError(f"two autopilots of system id {system} on one link ({found}); end one of them")
         if link.systems:
             (link.system_id,) = link.systems
 

@@ -12,33 +12,49 @@ from companion.guidance.interface import GuidanceInput
 from companion.vehicle.report import Report
 from companion.vehicle.state import FlightMode
 from mavlink_sim.px4.modes import Mode
+from mavlink_sim.wire.messages import dialect
 from tests.companion.guidance.guidance_harness import GuidanceHarness, assert_failed, engaged, flying
 
 
+SOON = {"COM_FAIL_ACT_T": 0.0}
+FENCE = {"GF_MAX_HOR_DIST": 10.0}
+BREACH = "Geofence violation: exceeding maximum distance to Home"
+
+
 @pytest.mark.parametrize(
-    ("parameters", "fault", "mode"),
+    ("parameters", "fault", "mode", "cause", "later"),
     [
-        ({"GF_ACTION": 2.0, "GF_MAX_HOR_DIST": 10.0}, None, "hold"),
-        ({"GF_ACTION": 3.0, "GF_MAX_HOR_DIST": 10.0}, None, "hold"),  # for COM_FAIL_ACT_T
-        ({"GF_ACTION": 3.0, "GF_MAX_HOR_DIST": 10.0, "COM_FAIL_ACT_T": 0.0}, None, "return"),
-        ({}, "battery critical", "hold"),
-        ({"COM_FAIL_ACT_T": 0.0}, "battery critical", "return"),
-        ({"COM_FAIL_ACT_T": 0.0}, "battery emergency", "land"),
+        ({"GF_ACTION": 2.0, **FENCE}, None, "hold", BREACH, Mode.HOLD),
+        ({"GF_ACTION": 3.0, **FENCE}, None, "hold", BREACH, Mode.RTL),  # after COM_FAIL_ACT_T
+        ({"GF_ACTION": 3.0, **FENCE, **SOON}, None, "return", BREACH, Mode.RTL),
+        ({}, "battery critical", "hold", "Critical battery level", Mode.RTL),
+        (SOON, "battery critical", "return", "Critical battery level", Mode.RTL),
+        (SOON, "battery emergency", "land", "Emergency battery level", Mode.LAND),
+        ({"COM_RC_IN_MODE": 1.0, "COM_RCL_EXCEPT": 0.0}, "sticks", "hold", "Manual control loss", Mode.RTL),
     ],
 )
-def test_px4_failsafe_is_not_reported_as_pilot(
-    parameters: dict[str, float], fault: str | None, mode: str
+def test_px4_failsafe_has_its_cause_and_is_left_to_px4(
+    parameters: dict[str, float], fault: str | None, mode: str, cause: str, later: Mode
 ) -> None:
+    """Also its hold, which PX4 would leave for a return 1.2 s after our last setpoint."""
     settings = plain_settings({"guidance.min_battery_percent": "0"})
     flight = LockstepFlight.airborne(seed=4, settings=settings)
     for name, value in parameters.items():
         flight.vehicle.vehicle.parameters.set(name, value)
     identifier = flight.command("goto 45 0")
-    flight.run(2.0)
-    if fault is not None:
-        flight.vehicle.vehicle.faults.begin(fault)
+    if fault == "sticks":
+        for _ in range(20):
+            flight.vehicle.send(dialect.MAVLink_manual_control_message(1, 0, 0, 500, 0, 0))
+            flight.run(0.1)
+        assert flight.outcome(identifier) is None
+    else:
+        flight.run(2.0)
+        if fault is not None:
+            flight.vehicle.vehicle.faults.begin(fault)
     assert flight.run_until(lambda: flight.outcome(identifier), 30.0)
-    assert_failed(flight.outcome(identifier), "autopilot failsafe", f"{mode} mode")
+    assert_failed(flight.outcome(identifier), "autopilot failsafe", f"{mode} mode", cause)
+    flight.run(7.0)
+    assert flight.vehicle.vehicle.autopilot.mode is later
 
 
 def test_other_mode_change_is_reported_as_pilot() -> None:
