@@ -15,7 +15,6 @@ from mavlink_sim.px4.modes import Mode
 from mavlink_sim.wire.messages import dialect
 from tests.companion.guidance.guidance_harness import GuidanceHarness, assert_failed, engaged, flying
 
-
 SOON = {"COM_FAIL_ACT_T": 0.0}
 FENCE = {"GF_MAX_HOR_DIST": 10.0}
 BREACH = "Geofence violation: exceeding maximum distance to Home"
