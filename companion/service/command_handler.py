@@ -19,7 +19,7 @@ from vision.tracking import Selected
 
 # Commands reported as events: so many a second, and so many at once, which is more than a person sends.
 # `stop` has a separate allowance of the same size.
-REPORTED_PER_S, REPORTED_AT_ONCE = 1.0, 10
+REPORTED_PER_S, REPORTED_AT_ONCE = 1.0, 20
 # A command that is not reported at once is reported when it has lasted this long.
 LASTING_S = 1.0
 

@@ -150,9 +150,8 @@ def test_service_works_with_an_unread_log(filming: list[str], pipe: Pipe, tmp_pa
                 status = statuses.get(timeout=60)
                 while not status["vehicle"]["connected"] or status["vehicle"]["missing_streams"]:
                     status = statuses.get(timeout=30)
-                # Ten of them are more than the queue holds: each is logged, and refused on the ground.
-                points = (f"{number}.25000000000001,0.25000000000001" for number in range(1, 500))
-                path = f"follow-path {' '.join(points)}"
+                # Twenty of them are more than the queue holds: each is logged, and refused on the ground.
+                path = "follow-path " + " ".join(f"{number}.25,0.250001" for number in range(1, 470))
                 while not status["log"]["dropped_lines"]:
                     for _ in range(15):  # twenty a second are accepted
                         send_command(session, "vehicle1", path)
