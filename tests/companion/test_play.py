@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
@@ -19,7 +19,7 @@ import zenoh
 from companion.bus.client import send_command
 from companion.bus.topics import DETECTIONS
 from companion.play import PlayOptions
-from mavlink_sim.testing import free_port
+from mavlink_sim.testing import free_port, running_simulator
 from tests.companion.command_line import companion
 from tests.companion.service_process import ServiceProcess
 
@@ -77,18 +77,23 @@ def until_gone(pids: set[int], timeout_s: float = 10.0) -> set[int]:
     return left
 
 
-def test_play_takes_commands_and_ends_on_ctrl_c(tmp_path: Path) -> None:
-    with playing(tmp_path) as running:
+def test_play_flies_an_autopilot_at_a_url_and_ends_on_ctrl_c(tmp_path: Path) -> None:
+    """Any autopilot: here a simulated vehicle that has no camera of its own, with system id 7."""
+    with ExitStack() as stack:
+        simulator = stack.enter_context(running_simulator(system_id=7))
+        url = f"udpin://127.0.0.1:{simulator.onboard_port}"
+        running = stack.enter_context(playing(tmp_path, "--vehicle-url", url))
         assert any("bicycle, boat, car" in line for line in running.lines)
         for text in ("takeoff 3", "land"):
             sent = companion("send", "--connect", running.endpoint, text, cwd=tmp_path, timeout_s=120.0)
             assert sent.returncode == 0, sent.stdout + sent.stderr
+        assert any("armed" in event for event in simulator.events)
         busy = companion("play", "--zenoh-listen", running.endpoint, cwd=tmp_path)
         assert busy.returncode == 2
         (line,) = busy.stderr.splitlines()
         assert running.endpoint in line
         started = descendants(running.pid)
-        assert len(started) >= 3  # the vehicle, its camera, perception
+        assert len(started) >= 2  # the camera, perception
         running.signal(signal.SIGINT)
         assert running.process.wait(20) == 0
         assert not until_gone(started)
