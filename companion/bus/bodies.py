@@ -19,6 +19,7 @@ Four = Annotated[list[float], Field(min_length=4, max_length=4)]
 Corners = list[Two]
 Matrix3 = Annotated[list[float], Field(min_length=9, max_length=9)]
 Matrix34 = Annotated[list[float], Field(min_length=12, max_length=12)]
+Speed = Annotated[float, Field(ge=-50, le=50, allow_inf_nan=False)]
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
@@ -587,6 +588,25 @@ class PoseBody(TypedDict):
     """armed and not on the ground"""
     formation: FormationBody | None
     """its formation, if any"""
+
+
+class VelocityBody(TypedDict):
+    """A velocity to fly, in the vehicle's level frame, sent again before its lifetime is over."""
+
+    source: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")]
+    """identifier of the sender, a new one at each start"""
+    stamp_ns: Annotated[int, Field(ge=0, le=2**63 - 1)]
+    """when it was sent, on the sender's own steady clock"""
+    forward_mps: NotRequired[Speed]
+    """horizontally along the heading; default 0"""
+    right_mps: NotRequired[Speed]
+    """horizontally across the heading; default 0"""
+    up_mps: NotRequired[Speed]
+    """default 0"""
+    turn_radps: NotRequired[Annotated[float, Field(ge=-10, le=10, allow_inf_nan=False)]]
+    """clockwise seen from above; default 0"""
+    lifetime_s: NotRequired[Annotated[float, Field(gt=0, le=0.5, allow_inf_nan=False)]]
+    """the vehicle brakes if no newer message has arrived by then; default 0.5"""
 
 
 class ObstaclesBody(TypedDict):

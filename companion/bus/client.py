@@ -15,7 +15,7 @@ from zenoh import ext
 
 from companion.bus.config import read_config_file
 from companion.bus.session import zenoh_config
-from companion.bus.topics import ROOT, TOPICS, alive_key, command_key
+from companion.bus.topics import INPUT_TOPICS, ROOT, TOPICS, alive_key, command_key
 from companion.settings import ZenohSection
 
 _DISCOVERY_S = 2.0
@@ -181,7 +181,7 @@ def _is(item: zenoh.Sample | zenoh.Reply | None, kind: zenoh.SampleKind) -> bool
 
 def check_topic(key: str) -> None:
     """Raise ValueError for a single word that is not a topic: nothing would ever be received."""
-    names = [topic.name for topic in TOPICS]
+    names = [topic.name for topic in (*TOPICS, *INPUT_TOPICS)]
     if not set("/*") & set(key) and key not in names:
         raise ValueError(
             f"unknown topic {key!r}: expected one of {', '.join(names)}, or a zenoh key with / or wildcards"

@@ -12,10 +12,11 @@ from pydantic.json_schema import GenerateJsonSchema
 from typing_extensions import get_original_bases
 
 from companion.bus import bodies
-from companion.bus.topics import TOPICS, Topic
+from companion.bus.topics import INPUT_TOPICS, TOPICS, Topic
 from companion.settings.section import texts_below_keys
 
 DIALECT = GenerateJsonSchema.schema_dialect
+ALL_TOPICS = (*TOPICS, *INPUT_TOPICS)
 
 
 class _WithoutTitles(GenerateJsonSchema):
@@ -55,7 +56,7 @@ def topic_table() -> list[dict[str, Any]]:
             "cached": topic.cached,
             "description": topic.description,
         }
-        for topic in TOPICS
+        for topic in ALL_TOPICS
     ]
 
 
@@ -81,7 +82,7 @@ def topic_rows() -> list[tuple[str, ...]]:
             "–" if topic.max_age_s is None else f"{topic.max_age_s:g} s",
             str(topic.cached or "–"),
         )
-        for topic in TOPICS
+        for topic in ALL_TOPICS
     ]
 
 
@@ -96,7 +97,7 @@ def write_schemas(folder: Path) -> list[Path]:
     """Write NAME.schema.json for every topic. Raises OSError."""
     folder.mkdir(parents=True, exist_ok=True)
     written = []
-    for topic in TOPICS:
+    for topic in ALL_TOPICS:
         path = folder / f"{topic.name}.schema.json"
         path.write_text(json.dumps(schema_of(topic.body), indent=2, ensure_ascii=False) + "\n")
         written.append(path)

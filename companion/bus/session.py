@@ -33,7 +33,6 @@ from companion.bus.topics import (
     VIEW_TOPICS,
     Topic,
     alive_key,
-    all_vehicles_key,
     command_key,
 )
 from companion.settings import ZenohSection
@@ -44,6 +43,7 @@ __all__ = ["Bus", "BusError", "encode", "zenoh_config"]
 logger = logging.getLogger(__name__)
 
 CommandHandler = Callable[[str], Awaitable[dict[str, Any]]]
+Listener = Callable[[bytes, int], None]
 QueryHandler = Callable[[], Awaitable[Any]]
 _Publisher = zenoh.Publisher | ext.AdvancedPublisher
 
@@ -77,7 +77,8 @@ class Bus:
         queries: path of a queryable → function that returns its reply, a body or a JPEG; called as
             `on_command`. A TimeoutError or KeyError is replied as an error.
         views: names of the views that publish besides the first.
-        listeners: topics, each with a callback in the loop for its messages, of any vehicle.
+        listeners: keys, each with a callback in the loop for its messages and their time of receipt
+            (CLOCK_MONOTONIC nanoseconds).
 
     Attributes:
         published: path of a topic (`Topic.path`) → messages so far. Without a subscriber they are neither
@@ -95,7 +96,7 @@ class Bus:
         on_command: CommandHandler,
         queries: Mapping[str, QueryHandler] = MappingProxyType({}),
         views: Sequence[str] = (),
-        listeners: Sequence[tuple[Topic, Callable[[bytes], None]]] = (),
+        listeners: Sequence[tuple[str, Listener]] = (),
     ) -> None:
         self._settings = settings
         self._vehicle = vehicle
@@ -284,8 +285,8 @@ class Bus:
             for path in self._queries
         ]
         self._subscribers = [
-            session.declare_subscriber(all_vehicles_key(topic), partial(self._on_sample, listener))
-            for topic, listener in self._listeners
+            session.declare_subscriber(key, partial(self._on_sample, listener))
+            for key, listener in self._listeners
         ]
 
     def _declare(self, session: zenoh.Session, topic: Topic, view: str | None) -> None:
@@ -330,9 +331,10 @@ class Bus:
         if publisher.matching_status.matching:  # type: ignore[attr-defined]
             self._watched[path] = True
 
-    def _on_sample(self, listener: Callable[[bytes], None], sample: zenoh.Sample) -> None:
+    def _on_sample(self, listener: Listener, sample: zenoh.Sample) -> None:
+        received_ns = time.monotonic_ns()
         if self._loop is not None and not self._loop.is_closed():
-            self._loop.call_soon_threadsafe(listener, sample.payload.to_bytes())
+            self._loop.call_soon_threadsafe(listener, sample.payload.to_bytes(), received_ns)
 
     def _from_zenoh_thread(self, query: zenoh.Query) -> None:
         text, why = self.intake.read(*_payload(query))

@@ -201,6 +201,17 @@ EVENTS: Final = Topic(
     cached=100,
 )
 
+# Received by the service.
+VELOCITY: Final = Topic(
+    "velocity",
+    bodies.VelocityBody,
+    "a velocity to fly, for the command `velocity`",
+    "by the program that steers, at least twice a second",
+    max_age_s=0.5,
+    priority=_REAL_TIME,
+    express=True,
+)
+
 # Published only while a recorder listens. A key part with @ matches no wildcard: no other reader gets them.
 RUN: Final = Topic(
     "@record/run",
@@ -250,6 +261,9 @@ TOPICS: Final = (
     STATUS,
     EVENTS,
 )
+
+# Those that the service receives.
+INPUT_TOPICS: Final = (VELOCITY,)
 
 # Large ones, of which a reader chooses whether it wants them; their body is that of the attachment.
 LARGE_TOPICS: Final = (IMAGE, CLOUD)

@@ -9,6 +9,7 @@ from companion.guidance.behaviours.takeoff import Takeoff
 from companion.guidance.behaviours.land import Land, Rtl
 from companion.guidance.behaviours.stop import Stop
 from companion.guidance.behaviours.hold import Hold
+from companion.guidance.behaviours.velocity import Velocity
 from companion.guidance.behaviours.goto import Goto
 from companion.guidance.behaviours.follow_path import FollowPath
 from companion.guidance.behaviours.figure_eight import FigureEight
@@ -42,4 +43,5 @@ __all__ = [
     "Select",
     "Stop",
     "Takeoff",
+    "Velocity",
 ]

@@ -58,6 +58,26 @@ NO_GIMBAL = GimbalStatus()
 
 
 @dataclass(frozen=True, slots=True)
+class VelocityInput:
+    """The newest message of one sender on the topic `velocity`. Stamps are CLOCK_MONOTONIC nanoseconds.
+
+    Attributes:
+        source: identifier of the sender.
+        forward_mps, right_mps: horizontally, along and across the heading. up_mps: vertically.
+        turn_radps: clockwise seen from above.
+        expires_ns: it must not be flown after that.
+    """
+
+    source: str
+    received_ns: int
+    expires_ns: int
+    forward_mps: float = 0.0
+    right_mps: float = 0.0
+    up_mps: float = 0.0
+    turn_radps: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
 class BehaviourContext:
     """The input of one update of a behaviour.
 
@@ -80,6 +100,7 @@ class BehaviourContext:
         max_acceleration_mps2: the envelope's limit.
         goal_ned_m: `Outcome.goal_ned_m` of the previous behaviour; None: it had none.
         tracks: of the steering camera, those that have ended included.
+        velocities: the newest message of each sender on the topic `velocity`, the first sender first.
     """
 
     now_ns: int
@@ -100,6 +121,7 @@ class BehaviourContext:
     steering_markers: MarkerSight = NO_MARKERS
     planned: PlannedPath | None = None
     avoiding: bool = False
+    velocities: tuple[VelocityInput, ...] = ()
 
     def targets_of(self, wanted: Wanted) -> tuple[Target, ...]:
         """The newest frame's targets among which those of a command are."""

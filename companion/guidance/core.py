@@ -277,6 +277,7 @@ class Guidance:
             steering_markers=inputs.steering_markers,
             planned=inputs.planned,
             avoiding=self.options.avoid,
+            velocities=inputs.velocities,
         )
 
     def _output(self, landing_target: LandingTarget | None, *, released: bool = False) -> GuidanceOutput:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Literal
 
-from companion.guidance.behaviour import Behaviour, Outcome
+from companion.guidance.behaviour import Behaviour, Outcome, VelocityInput
 from companion.guidance.formation.neighbours import Neighbourhood
 from companion.guidance.search_pattern import Footprint
 from companion.guidance.targets.chosen import TrackAim
@@ -185,6 +185,7 @@ class GuidanceInput:
             reverted between two steps.
         answers: to requests of earlier steps. commands: the new ones, oldest first.
         ending: the service ends: no command begins, and control is released.
+        velocities: the newest message of each sender on the topic `velocity`, the first sender first.
     """
 
     state: VehicleState
@@ -203,6 +204,7 @@ class GuidanceInput:
     commands: tuple[CommandInput, ...] = field(default=(), metadata={"recorded": False})
     ending: bool = False
     steering_markers: MarkerSight = NO_MARKERS
+    velocities: tuple[VelocityInput, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,6 +22,7 @@ from companion.guidance.targets.from_markers import LocalizedMarkers
 from companion.perception.cameras import PerceptionCamera
 from companion.perception.marker_tracker import MarkerTracker
 from companion.plugins import load_plugins
+from companion.service.velocity_senders import VelocitySenders
 from companion.settings import Settings
 from companion.vehicle.px4_modes import among_modes
 from companion.vehicle.report import Report
@@ -51,7 +52,7 @@ class InputAssembler:
     Attributes:
         steering: the camera whose targets behaviours get.
         history: the vehicle's states of the last few seconds.
-        poses: the other vehicles.
+        poses: the other vehicles. velocities: the messages on the topic `velocity`.
     """
 
     def __init__(
@@ -63,6 +64,7 @@ class InputAssembler:
         self.steering = next(camera for camera in cameras if camera.name == settings.guidance.camera)
         self.history = StateHistory()
         self.poses = PoseSharing(settings.vehicle.name, on_event)
+        self.velocities = VelocitySenders(on_event)
         self._markers = MarkerTracker(cameras, on_event)
         self._state: VehicleState | None = None
         self._obstacles: ObstacleSectors | None = None
@@ -134,6 +136,7 @@ class InputAssembler:
             tuple(commands),
             ending,
             self._markers.steering_sight(self.steering, now_ns, self._settings.guidance.perception_max_age_s),
+            self.velocities.newest(now_ns),
         )
 
     def camera_pitch_rad(self, state: VehicleState) -> float:

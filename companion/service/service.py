@@ -88,8 +88,9 @@ class Service:
             queries=self._queries.handlers(self.cameras),
             views=tuple(settings.cameras),
             listeners=[
-                (topics.POSE, lambda data: self.inputs.poses.on_message(data, time.monotonic_ns())),
-                (topics.STATUS, lambda data: self.others.on_status(data, time.monotonic_ns())),
+                (topics.all_vehicles_key(topics.POSE), self.inputs.poses.on_message),
+                (topics.all_vehicles_key(topics.STATUS), self.others.on_status),
+                (topics.VELOCITY.key(settings.vehicle.name), self.inputs.velocities.on_message),
             ],
         )
         self._tap = FlightTap(

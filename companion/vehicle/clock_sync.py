@@ -16,6 +16,8 @@ DRIFT = 100e-6
 LONGEST_TRIP_NS = 500_000_000
 # A stamp this far from its arrival comes from another clock, not from a slow link.
 WRONG_CLOCK_NS = 2_000_000_000
+# `SenderDelay`: the minimum is taken over this window and the one before. 50 ppm drift by 3 ms in a minute.
+_WINDOW_NS = 30 * 10**9
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,3 +87,25 @@ class ClockSync:
             self.reset()
             return arrived_ns
         return min(stamp_ns, arrived_ns)
+
+
+class SenderDelay:
+    """Delay of the messages of one sender beyond its minimum, by stamps of the sender's own clock.
+
+    Receipt minus stamp is the unknown offset of the two clocks plus the delay. Its minimum over the last
+    minute belongs to the least delayed message.
+    """
+
+    def __init__(self) -> None:
+        self._began_ns: int | None = None
+        self._least_ns = self._least_before_ns = 0
+
+    def update(self, stamp_ns: int, receipt_ns: int) -> int:
+        """Add a message; returns its additional delay, nanoseconds."""
+        difference_ns = receipt_ns - stamp_ns
+        if self._began_ns is None:
+            self._began_ns, self._least_ns, self._least_before_ns = receipt_ns, difference_ns, difference_ns
+        elif receipt_ns - self._began_ns > _WINDOW_NS:
+            self._began_ns, self._least_before_ns, self._least_ns = receipt_ns, self._least_ns, difference_ns
+        self._least_ns = min(self._least_ns, difference_ns)
+        return difference_ns - min(self._least_ns, self._least_before_ns)

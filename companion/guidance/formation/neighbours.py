@@ -1,10 +1,8 @@
 """Neighbours: the received poses of other vehicles, predicted to now in the own local frame.
 
-Age of a pose: the clocks of sender and receiver differ by an unknown offset. Receipt minus sending time is
-that offset plus the message's delay. Its minimum over the last minute belongs to the least delayed message;
-the excess over the minimum is additional delay. The age of a pose is its age when sent, plus that additional
-delay, plus the time since receipt. It is too small by the network's minimum delay, a few milliseconds on a
-radio network (1–2 cm at 5 m/s). Clocks drift by some 50 ppm: 3 ms in a minute.
+Age of a pose: its age when sent, plus the message's additional delay (`SenderDelay`), plus the time since
+receipt. It is too small by the network's minimum delay, a few milliseconds on a radio network (1–2 cm at
+5 m/s).
 """
 
 from __future__ import annotations
@@ -14,6 +12,7 @@ from dataclasses import dataclass, field
 
 from companion.geometry.geodesy import north_east
 from companion.guidance.formation.pose import FormationNote, Pose, global_problem
+from companion.vehicle.clock_sync import SenderDelay
 from companion.vehicle.state import Vector3, VehicleState
 from vision.attitude import wrap_angle
 
@@ -21,8 +20,6 @@ from vision.attitude import wrap_angle
 SILENT_S = 1.0
 # A silent vehicle remains an obstacle where it should have come to rest, for this long.
 FORGET_S = 30.0
-# The minimum delay is taken over this window and the one before.
-_WINDOW_NS = 30 * 10**9
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,11 +139,8 @@ class Anchor:
 class _Received:
     pose: Pose
     receipt_ns: int
+    delay: SenderDelay
     delay_s: float
-    # Minimum of receipt minus sending time, of this window and of the one before.
-    least_ns: int
-    least_before_ns: int
-    window_began_ns: int
 
 
 @dataclass
@@ -176,22 +170,14 @@ class Neighbours:
             # Another vehicle with our name: keep away from it, under a name that cannot be followed.
             self.namesakes.add(pose.source)
             name = f"{name} ({pose.source})"
-        difference_ns = receipt_ns - pose.published_ns
         before = self._received.get(name)
-        if before is None or before.pose.source != pose.source:
-            received = _Received(pose, receipt_ns, 0.0, difference_ns, difference_ns, receipt_ns)
-        elif pose.published_ns <= before.pose.published_ns:
+        same = before is not None and before.pose.source == pose.source
+        if before is not None and same and pose.published_ns <= before.pose.published_ns:
             self.refused += 1
             return
-        else:
-            received = before
-            if receipt_ns - received.window_began_ns > _WINDOW_NS:
-                received.least_before_ns, received.least_ns = received.least_ns, difference_ns
-                received.window_began_ns = receipt_ns
-            received.least_ns = min(received.least_ns, difference_ns)
-            received.pose, received.receipt_ns = pose, receipt_ns
-            received.delay_s = (difference_ns - min(received.least_ns, received.least_before_ns)) / 1e9
-        self._received[name] = received
+        delay = before.delay if before is not None and same else SenderDelay()
+        delay_s = delay.update(pose.published_ns, receipt_ns) / 1e9
+        self._received[name] = _Received(pose, receipt_ns, delay, delay_s)
 
     def neighbourhood(self, state: VehicleState, now_ns: int) -> Neighbourhood:
         """The other vehicles now. Those silent for more than `FORGET_S` are removed."""

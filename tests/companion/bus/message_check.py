@@ -8,8 +8,7 @@ from typing import Any
 
 from jsonschema import Draft202012Validator
 
-from companion.bus.schema import schema_of
-from companion.bus.topics import TOPICS
+from companion.bus.schema import ALL_TOPICS, schema_of
 
 
 def closed(schema: dict[str, Any]) -> dict[str, Any]:
@@ -22,7 +21,7 @@ def closed(schema: dict[str, Any]) -> dict[str, Any]:
 
 @cache
 def validator(name: str) -> Draft202012Validator:
-    (topic,) = (topic for topic in TOPICS if topic.name == name)
+    (topic,) = (topic for topic in ALL_TOPICS if topic.name == name)
     return Draft202012Validator(closed(schema_of(topic.body)))
 
 

@@ -10,8 +10,7 @@ import pytest
 from jsonschema import Draft202012Validator, ValidationError
 
 from companion.bus.bodies import CommandReplyBody, EventBody
-from companion.bus.schema import schema_of, topic_table, topics_markdown, write_schemas
-from companion.bus.topics import TOPICS
+from companion.bus.schema import ALL_TOPICS, schema_of, topic_table, topics_markdown, write_schemas
 from companion.guidance.formation.pose import ROLES
 from companion.guidance.targets.target import RangeSource
 from tests.companion.bus.message_check import check_message, closed, validator
@@ -22,7 +21,7 @@ from vision.tracking import TrackEventKind
 ROOT = Path(__file__).parents[3]
 
 
-@pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.name)
+@pytest.mark.parametrize("topic", ALL_TOPICS, ids=lambda topic: topic.name)
 def test_schema_is_valid_and_describes_every_field(topic: Any) -> None:
     schema = schema_of(topic.body)
     Draft202012Validator.check_schema(schema)
@@ -67,16 +66,25 @@ def test_example_bodies_in_the_document_are_valid() -> None:
     for section in text.split("\n## ")[1:]:
         name = section.partition("\n")[0].split(",")[0].strip()
         _, found, block = section.partition("```json\n")
-        if not found or name not in {topic.name for topic in TOPICS} - {"vehicle", "status"}:
+        if not found or name not in {topic.name for topic in ALL_TOPICS} - {"vehicle", "status"}:
             continue
         check_message(name, json.loads(block.partition("```")[0]))
         checked.add(name)
-    assert checked == {"detections", "tracks", "pose", "markers", "depth", "camera_info", "transforms"}
+    assert checked == {
+        "detections",
+        "tracks",
+        "pose",
+        "markers",
+        "depth",
+        "camera_info",
+        "transforms",
+        "velocity",
+    }
 
 
 def test_schema_files(tmp_path: Path) -> None:
     written = write_schemas(tmp_path / "schemas")
-    assert [path.name for path in written] == [f"{topic.name}.schema.json" for topic in TOPICS]
+    assert [path.name for path in written] == [f"{topic.name}.schema.json" for topic in ALL_TOPICS]
     schema = json.loads((tmp_path / "schemas" / "events.schema.json").read_text())
     assert schema["required"] == ["stamp_ns", "level", "text"]
 
@@ -86,6 +94,6 @@ def test_topics_on_the_command_line(tmp_path: Path) -> None:
     assert [json.loads(line) for line in printed.stdout.splitlines()] == topic_table()
     assert companion("topics", "--markdown", cwd=tmp_path).stdout == topics_markdown()
     listed = companion("topics", "--schema", tmp_path / "schemas", cwd=tmp_path)
-    assert len(listed.stdout.splitlines()) == len(TOPICS)
+    assert len(listed.stdout.splitlines()) == len(ALL_TOPICS)
     plain = companion("topics", cwd=tmp_path).stdout
-    assert all(topic.name in plain for topic in TOPICS)
+    assert all(topic.name in plain for topic in ALL_TOPICS)

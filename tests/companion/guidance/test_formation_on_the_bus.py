@@ -45,7 +45,7 @@ class Companion:
             name,
             on_event=lambda level, text: None,
             on_command=self.flight.loop.execute,
-            listeners=[(topics.POSE, lambda data: self.poses.on_message(data, time.monotonic_ns()))],
+            listeners=[(topics.all_vehicles_key(topics.POSE), self.poses.on_message)],
         )
 
     async def command(self, text: str) -> dict[str, Any]:

@@ -1,0 +1,213 @@
+"""Velocities on the bus: which are flown, a gap, two senders, the pilot."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from companion.bench.lockstep_flight import LockstepFlight
+from companion.guidance.behaviour import VelocityInput
+from companion.guidance.behaviours.stop import StopBehaviour
+from companion.guidance.behaviours.velocity import VelocityBehaviour
+from companion.guidance.core import Phase
+from companion.guidance.interface import EventKind, GuidanceInput
+from companion.service.velocity_senders import MAX_SENDERS, VelocitySenders
+from companion.vehicle.state import FlightMode
+from tests.companion.guidance.guidance_harness import GuidanceHarness, Pending, engaged, flying
+
+S = 1_000_000_000
+
+
+class Steered(GuidanceHarness):
+    """A vehicle in the air under `velocity`. `sending`: sender → its velocity, while it sends."""
+
+    def __init__(self, source: str | None = None, yaw_rad: float = 0.0) -> None:
+        super().__init__(replace(flying(), yaw_rad=yaw_rad), inputs=self._with_velocities)
+        self.sending: dict[str, dict[str, float]] = {}
+        self.command_of_velocity: Pending = engaged(self, VelocityBehaviour(source))
+
+    def _with_velocities(self, inputs: GuidanceInput) -> GuidanceInput:
+        now_ns = self.vehicle.now_ns
+        velocities = tuple(
+            VelocityInput(source, now_ns, now_ns + S // 5, **values)
+            for source, values in self.sending.items()
+        )
+        return replace(inputs, velocities=velocities)
+
+    @property
+    def notes(self) -> list[str]:
+        return [event.message for event in self.events if event.kind is EventKind.NOTED]
+
+
+def test_axes_are_those_of_the_level_frame() -> None:
+    harness = Steered(yaw_rad=math.pi / 2)
+    harness.sending["a"] = {"forward_mps": 1.0, "right_mps": 0.5, "up_mps": 0.25}
+    harness.run(2.0)
+    assert harness.vehicle.velocity == pytest.approx([-0.5, 1.0, -0.25], abs=0.05)
+    harness.sending["a"] = {"turn_radps": 0.5}
+    harness.run(2.0)
+    before = harness.vehicle.yaw_rad
+    harness.run(1.0)
+    assert harness.vehicle.yaw_rad - before == pytest.approx(0.5, abs=0.02)
+    assert math.hypot(*harness.vehicle.velocity) < 0.1
+
+
+def test_heading_and_height_are_held_without_turn_and_climb() -> None:
+    harness = Steered()
+    harness.sending["a"] = {"turn_radps": 1.0}
+    harness.run(1.0)
+    harness.sending["a"] = {"forward_mps": 1.0}
+    harness.run(2.0)
+    heading = harness.vehicle.yaw_rad
+    harness.vehicle.position[2] -= 0.4  # a gust
+    harness.run(6.0)
+    assert harness.vehicle.yaw_rad == pytest.approx(heading, abs=0.02)
+    assert harness.vehicle.position[2] == pytest.approx(-5.0, abs=0.05)
+
+
+def test_gap_brakes_then_holds_and_a_new_message_flies_again() -> None:
+    harness = Steered()
+    harness.sending["a"] = {"forward_mps": 2.0}
+    harness.run(3.0)
+    assert harness.vehicle.velocity[0] == pytest.approx(2.0, abs=0.05)
+    del harness.sending["a"]
+    harness.run(3.0)
+    held = list(harness.vehicle.position)
+    harness.run(5.0)
+    assert math.dist(held, harness.vehicle.position) < 0.1
+    assert harness.guidance.status == "velocity of a, silent"
+    harness.sending["a"] = {"forward_mps": 1.0}
+    harness.run(2.0)
+    assert harness.vehicle.velocity[0] == pytest.approx(1.0, abs=0.05)
+    assert harness.notes == ["a steers", "a is silent: holding", "a steers"]
+
+
+@pytest.mark.parametrize("source", [None, "first"])
+def test_first_sender_keeps_it_and_the_other_is_reported(source: str | None) -> None:
+    harness = Steered(source)
+    harness.sending["first"] = {"forward_mps": 1.0}
+    harness.run(1.0)
+    harness.sending["second"] = {"forward_mps": -1.0}
+    harness.run(1.0)
+    assert harness.vehicle.velocity[0] == pytest.approx(1.0, abs=0.1)
+    assert harness.notes == ["first steers", "velocities of second ignored: first steers"]
+    del harness.sending["first"]
+    harness.run(4.0)
+    assert abs(harness.vehicle.velocity[0]) < 0.05
+
+
+def test_named_sender_is_waited_for() -> None:
+    harness = Steered("page")
+    harness.sending["other"] = {"forward_mps": 1.0}
+    harness.run(1.0)
+    assert math.hypot(*harness.vehicle.velocity) < 0.05
+    harness.sending["page"] = {"forward_mps": 1.0}
+    harness.run(2.0)
+    assert harness.vehicle.velocity[0] == pytest.approx(1.0, abs=0.05)
+
+
+def test_command_is_answered_in_progress_and_ended_by_stop() -> None:
+    harness = Steered()
+    harness.sending["a"] = {"forward_mps": 1.0}
+    harness.run(0.5)
+    assert harness.outcome(harness.command(StopBehaviour())).success
+    assert harness.guidance.phase is Phase.IDLE
+    sent = len(harness.autopilot.setpoints)
+    harness.run(1.0)
+    assert len(harness.autopilot.setpoints) == sent
+
+
+def test_pilot_ends_it_while_messages_arrive() -> None:
+    harness = Steered()
+    harness.sending["a"] = {"forward_mps": 1.0}
+    harness.run(0.5)
+    harness.autopilot.change_mode(FlightMode.POSITION)
+    harness.run(1.0)
+    assert harness.guidance.phase is Phase.IDLE
+    assert harness.outputs[-1].setpoint is None
+
+
+def test_envelope_limits_the_velocity() -> None:
+    harness = Steered()
+    harness.sending["a"] = {"forward_mps": 20.0, "turn_radps": 9.0}
+    harness.run(5.0)
+    setpoint = harness.autopilot.setpoints[-1]
+    assert math.hypot(*setpoint.velocity_ned_mps or ()) <= 5.0 + 1e-9
+    assert abs(setpoint.yaw_rate_radps or 0.0) <= 1.0
+
+
+def message(**changes: Any) -> bytes:
+    return json.dumps({"source": "a", "stamp_ns": 5 * S, "forward_mps": 1, **changes}).encode()
+
+
+def senders() -> tuple[VelocitySenders, list[tuple[str, str]]]:
+    events: list[tuple[str, str]] = []
+    return VelocitySenders(lambda *event: events.append(event)), events
+
+
+def test_lifetime_counts_from_the_sending_of_a_late_message() -> None:
+    received, events = senders()
+    received.on_message(message(), 100 * S)
+    assert received.newest(100 * S)[0].expires_ns == 100 * S + S // 2
+    received.on_message(message(stamp_ns=6 * S, lifetime_s=0.3), 101 * S + S // 5)  # 0.2 s late
+    assert received.newest(102 * S)[0].expires_ns == 101 * S + 3 * S // 10
+    assert received.newest(130 * S) == ()
+    assert not events
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"",
+        b"\xff",
+        b"[]",
+        b'{"forward_mps": 1}',
+        message(source="a b"),
+        message(source="x" * 65),
+        message(lifetime_s=0.6),
+        message(lifetime_s=0),
+        message(forward_mps="1"),
+        message(forward_mps=51),
+        message(turn_radps=math.nan),
+        message(more="x" * 1024),
+    ],
+)
+def test_invalid_message_is_ignored_and_reported_once(payload: bytes) -> None:
+    received, events = senders()
+    for _ in range(3):
+        received.on_message(payload, 100 * S)
+    assert received.newest(100 * S) == ()
+    assert [level for level, _ in events] == ["warning"]
+
+
+def test_senders_are_bounded_and_the_first_stay() -> None:
+    received, events = senders()
+    for number in range(MAX_SENDERS + 2):
+        received.on_message(message(source=f"s{number}"), 100 * S)
+    assert [one.source for one in received.newest(100 * S)] == [f"s{number}" for number in range(MAX_SENDERS)]
+    assert len(events) == 1
+
+
+def test_simulated_vehicle_flies_messages_and_stops_in_a_gap() -> None:
+    flight = LockstepFlight.airborne(seed=11, height_m=5.0)
+    identifier = flight.command("velocity source=a")
+    flight.run_until(lambda: flight.outcome(identifier), 5.0)
+    start = flight.vehicle.truth.position_ned_m
+    heading = flight.state.yaw_rad or 0.0
+
+    for _ in range(60):
+        payload = message(stamp_ns=flight.now_ns, forward_mps=1.5, lifetime_s=0.2)
+        flight.inputs.velocities.on_message(payload, flight.now_ns)
+        flight.run(0.1)
+    flown = [now - before for now, before in zip(flight.vehicle.truth.position_ned_m, start, strict=True)]
+    forward_m = flown[0] * math.cos(heading) + flown[1] * math.sin(heading)
+    right_m = flown[1] * math.cos(heading) - flown[0] * math.sin(heading)
+    assert (forward_m, right_m, flown[2]) == pytest.approx((7.5, 0.0, 0.0), abs=0.9)
+    flight.run(6.0)
+    held = flight.vehicle.truth.position_ned_m
+    flight.run(5.0)
+    assert math.dist(held, flight.vehicle.truth.position_ned_m) < 0.4
