@@ -4,6 +4,8 @@ A behaviour of one's own needs no more than these names; `docs/how-to/plug-ins.m
 
     from companion import Behaviour, Command, Number, Setpoint, behaviour
 
+A program that flies vehicles needs `connect` alone (`docs/how-to/client.md`).
+
 They are imported when they are first used: `import companion` itself costs nothing.
 """
 
@@ -13,6 +15,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from companion.client import connect
     from companion.guidance.behaviour import (
         Behaviour,
         BehaviourContext,
@@ -52,6 +55,7 @@ _MODULES = {
         "Number",
         "behaviour",
     ),
+    "companion.client": ("connect",),
     "companion.service": ("Service",),
     "companion.settings": ("Settings",),
     "companion.vehicle.setpoint": ("Setpoint",),
@@ -76,6 +80,7 @@ __all__ = [
     "Settings",
     "__version__",
     "behaviour",
+    "connect",
 ]
 
 

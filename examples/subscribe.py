@@ -3,31 +3,32 @@
 python subscribe.py tcp/127.0.0.1:7447 "takeoff altitude=3"
 """
 
-import json
+import asyncio
 import sys
 
-from companion.bus.client import client_settings, listen, open_client, send_command
-from companion.settings import ZenohSection
+from companion import connect
+from companion.client import Drone
 
 
-def on_detections(key: str, text: str) -> None:
-    """Print one message; called in a zenoh thread. Fields: docs/messages.md."""
-    message = json.loads(text)
-    for record in message["detections"]:
-        x, y = record["center"]
-        print(
-            f"{message['vehicle']} frame {message['sequence']}: {record['class_name']} "
-            f"{record['confidence']:.2f} at {x:.0f}, {y:.0f} px, track {record['track_id']}",
-            flush=True,
-        )
+async def print_detections(drone: Drone) -> None:
+    """Fields: docs/messages.md."""
+    async for frame in drone.detections():
+        for found in frame["detections"]:
+            x, y = found["center"]
+            print(
+                f"{drone.name} frame {frame['sequence']}: {found['class_name']} "
+                f"{found['confidence']:.2f} at {x:.0f}, {y:.0f} px, track {found['track_id']}",
+                flush=True,
+            )
 
 
-def main(endpoint: str, command: str, vehicle: str = "vehicle1") -> None:
-    with open_client(client_settings(ZenohSection(), (endpoint,))) as session:
-        listen(session, "detections", on_detections)
-        reply = send_command(session, vehicle, command, timeout_s=60.0)
-    print(f"{command}: {'done' if reply['success'] else 'failed'}: {reply['reason']}")
+async def main(endpoint: str, command: str) -> None:
+    async with connect(endpoint) as drone:
+        printing = asyncio.create_task(print_detections(drone))
+        reply = await drone.command(command)
+        printing.cancel()
+    print(f"{command}: done: {reply['reason']}")
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    asyncio.run(main(*sys.argv[1:]))

@@ -19,6 +19,7 @@ FLOORS = {
     "vehicle": 2,
     "relay": 3,
     "guidance": 3,
+    "client": 6,
     "dashboard": 6,
     "operator": 4,
     "perception": 4,

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import ast
+import asyncio
 import json
+import math
 import os
 import queue
 import re
 import subprocess
 import sys
+from collections.abc import Callable, Coroutine
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +20,7 @@ import cv2
 import pytest
 
 from benchmarks.scenes import MOTIONS, scene_frames
+from companion import connect
 from companion.bus.client import listen
 from mavlink_sim.testing import RunningSimulator
 from tests.companion.command_line import companion
@@ -23,12 +29,30 @@ from tests.companion.service_process import running_service
 pytestmark = pytest.mark.realtime
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
+CLIENT_PAGE = EXAMPLES.parent / "docs" / "how-to" / "client.md"
 PLUGINS = ("--plugins-modules", "red,square")
+
+
+def main_of(page: Path) -> Callable[[str], Coroutine[Any, Any, None]]:
+    """The function `main` of the page's first program."""
+    names: dict[str, Any] = {}
+    block = page.read_text().partition("```python\n")[2].partition("```")[0]
+    exec(compile(block, page.name, "exec"), names)
+    main: Callable[[str], Coroutine[Any, Any, None]] = names["main"]
+    return main
 
 
 def run_python(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, *map(str, arguments)]
     return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=100, check=False)
+
+
+async def wait_until_it_can_take_off(endpoint: str) -> None:
+    async with asyncio.timeout(30.0), connect(endpoint) as drone:
+        async for state in drone.vehicle():
+            known = (state["position_ned_m"], state["home_ned_m"], state["battery_fraction"])
+            if None not in known and state["landed"] == "on_ground":
+                return
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +132,9 @@ def test_mission_is_checked_for_the_classes_of_the_plugin(tmp_path: Path) -> Non
 
 @pytest.mark.usefixtures("installed")
 @pytest.mark.timeout(200)
-def test_service_publishes_detections_of_plugins(vehicle: RunningSimulator, tmp_path: Path) -> None:
+def test_service_publishes_detections_of_plugins(
+    vehicle: RunningSimulator, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     flags = [*("--source", "square://320x240?rate=10", "--detector-kind", "red"), *PLUGINS]
     with running_service(vehicle.onboard_port, flags, cwd=tmp_path) as service:
         with service.client() as session:
@@ -123,14 +149,30 @@ def test_service_publishes_detections_of_plugins(vehicle: RunningSimulator, tmp_
         assert (perception["state"], perception["runtime"]) == ("running", None)
         assert perception["class_names"] == ["blob"]
         assert service.wait_for_line("model red with 1 classes")
-        service.take_off(3.0)
-        done = run_python(EXAMPLES / "subscribe.py", service.endpoint, "land", cwd=tmp_path)
+        asyncio.run(wait_until_it_can_take_off(service.endpoint))
+        asyncio.run(main_of(CLIENT_PAGE)(service.endpoint))
+        names = ast.literal_eval(capsys.readouterr().out)
+        done = run_python(EXAMPLES / "subscribe.py", service.endpoint, "takeoff 2", cwd=tmp_path)
+    assert set(names) <= {"blob"}
     assert done.returncode == 0, done.stderr
     *lines, reply = done.stdout.splitlines()
-    assert reply.startswith("land: done")
+    assert reply.startswith("takeoff 2: done")
     assert lines
     pattern = re.compile(r"vehicle1 frame \d+: blob 0\.82 at \d+, \d+ px, track \d+")
     assert all(pattern.match(line) for line in lines)
+
+
+@pytest.mark.timeout(200)
+def test_square_is_flown_by_velocities(vehicle: RunningSimulator, filming: list[str], tmp_path: Path) -> None:
+    with running_service(vehicle.onboard_port, filming, cwd=tmp_path) as service:
+        asyncio.run(wait_until_it_can_take_off(service.endpoint))
+        done = run_python(EXAMPLES / "steer.py", service.endpoint, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    corners = [ast.literal_eval(line.removeprefix("corner at ")) for line in done.stdout.splitlines()]
+    sides_m = [math.dist(one[:2], other[:2]) for one, other in pairwise(corners)]
+    assert sides_m == pytest.approx([3.0] * 3, abs=1.2)
+    assert math.hypot(*corners[-1][:2]) < 1.5  # where it began
+    assert math.dist(corners[0][:2], corners[2][:2]) > 3.0
 
 
 def test_video_is_detected_and_tracked(tmp_path: Path) -> None:

@@ -1,0 +1,264 @@
+"""The client of one vehicle's service, and the connection to it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import threading
+import time
+import uuid
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
+from functools import cache
+from typing import Any
+
+import zenoh
+from pydantic import TypeAdapter, ValidationError
+
+from companion.bus import bodies, topics
+from companion.bus.client import NoAnswerError, client_settings, open_client, send_command
+from companion.client.commands import NOT_FLOWN, Commands, Reply
+from companion.client.stream import Stream
+from companion.settings import ZenohSection
+
+# Longer than any command; a caller's `asyncio.timeout` ends it earlier.
+_COMMAND_TIMEOUT_S = 24 * 3600.0
+_STOP_TIMEOUT_S = 5.0
+# After `stop`, the outcome of the stopped command arrives within this.
+_STOPPED_WITHIN_S = 1.0
+_DISCOVERY_S = 2.0
+
+
+class CommandFailedError(RuntimeError):
+    """The command was refused or failed. `reply`: the service's reply; the message is its reason."""
+
+    def __init__(self, reply: Reply) -> None:
+        super().__init__(f"{reply.get('command', '')}: {reply.get('reason', '')}")
+        self.reply = reply
+
+
+class Steering:
+    """Sends velocities under the command `velocity`."""
+
+    def __init__(self, publisher: zenoh.Publisher, source: str) -> None:
+        self._publisher, self.source = publisher, source
+
+    def send(
+        self,
+        forward: float = 0.0,
+        right: float = 0.0,
+        up: float = 0.0,
+        turn: float = 0.0,
+        *,
+        lifetime: float = 0.5,
+    ) -> None:
+        """Fly this velocity until the next one, for at most its lifetime; then the vehicle brakes and holds.
+
+        Nothing repeats it: a program that hangs or ends stops the vehicle.
+
+        Args:
+            forward, right, up: m/s, in the level frame. turn: rad/s, clockwise seen from above.
+            lifetime: seconds, at most 0.5.
+
+        Raises:
+            ValueError: a value is not finite or out of range.
+        """
+        body: bodies.VelocityBody = {
+            "source": self.source,
+            "stamp_ns": time.monotonic_ns(),
+            "forward_mps": float(forward),
+            "right_mps": float(right),
+            "up_mps": float(up),
+            "turn_radps": float(turn),
+            "lifetime_s": float(lifetime),
+        }
+        try:
+            _velocity_body().validate_python(body)
+        except ValidationError as error:
+            first = error.errors()[0]
+            name = str(first["loc"][0]).partition("_")[0]
+            raise ValueError(f"{name}: {first['msg']}, got {first['input']}") from None
+        self._publisher.put(json.dumps(body))
+
+
+@cache
+def _velocity_body() -> TypeAdapter[bodies.VelocityBody]:
+    return TypeAdapter(bodies.VelocityBody)
+
+
+class Drone(Commands):
+    """One vehicle. Its commands wait until they have ended; an endless one until the vehicle flies it.
+
+    Cancelling a waiting command sends `stop`. A command that is refused or fails raises CommandFailedError.
+
+    Attributes:
+        name: `vehicle.name` of its service.
+    """
+
+    def __init__(self, session: zenoh.Session, name: str) -> None:
+        self._session, self.name = session, name
+
+    def other(self, name: str) -> Drone:
+        """Another vehicle on the same connection."""
+        return Drone(self._session, name)
+
+    async def vehicles(self) -> list[str]:
+        """The names of all vehicles whose service runs."""
+        return await asyncio.to_thread(_alive, self._session)
+
+    async def command(self, text: str) -> Reply:
+        """Send any command, a plug-in's too; for a mission, its file's lines may follow the first line.
+
+        Raises:
+            CommandFailedError: it was refused or failed. NoAnswerError: no service, or it has gone.
+        """
+        outcome = self._send(text, _COMMAND_TIMEOUT_S)
+        try:
+            reply = await asyncio.shield(outcome)
+        except asyncio.CancelledError:
+            if text.split(maxsplit=1)[0].lower() not in NOT_FLOWN:
+                await asyncio.shield(self._stop(outcome))
+            raise
+        if not reply["success"]:
+            raise CommandFailedError(reply)
+        return reply
+
+    async def _stop(self, outcome: asyncio.Future[Reply]) -> None:
+        """End a command: `stop`, again if the command reached the service after it."""
+        for _ in range(3):
+            if outcome.done():
+                return
+            with suppress(NoAnswerError):
+                await self._send("stop", _STOP_TIMEOUT_S)
+            await asyncio.wait([outcome], timeout=_STOPPED_WITHIN_S)
+
+    def _send(self, text: str, timeout_s: float) -> asyncio.Future[Reply]:
+        """Send a command from a thread of its own: a pool would let endless ones delay a `stop`."""
+        loop = asyncio.get_running_loop()
+        outcome: asyncio.Future[Reply] = loop.create_future()
+        outcome.add_done_callback(lambda done: done.cancelled() or done.exception())  # it may not be awaited
+
+        def finish(reply: Reply | None, error: Exception | None) -> None:
+            if error is not None:
+                outcome.set_exception(error)
+            elif reply is not None:
+                outcome.set_result(reply)
+
+        def send() -> None:
+            reply: Reply | None = None
+            failure: Exception | None = None
+            try:
+                reply = send_command(self._session, self.name, text, timeout_s=timeout_s)
+            except (NoAnswerError, ValueError, zenoh.ZError) as error:
+                failure = error
+            with suppress(RuntimeError):  # the loop is closed
+                loop.call_soon_threadsafe(finish, reply, failure)
+
+        threading.Thread(target=send, name=f"command {self.name}", daemon=True).start()
+        return outcome
+
+    @asynccontextmanager
+    async def steer(self) -> AsyncIterator[Steering]:
+        """Begin the command `velocity` for this program's messages; afterwards the vehicle brakes and holds.
+
+        Raises:
+            CommandFailedError, NoAnswerError: as `command`.
+        """
+        topic, source = topics.VELOCITY, f"client-{uuid.uuid4().hex[:8]}"
+        publisher = self._session.declare_publisher(
+            topic.key(self.name),
+            encoding=topic.encoding,
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=topic.priority,
+            express=topic.express,
+        )
+        steering = Steering(publisher, source)
+        try:
+            await self.velocity(source=source)
+            yield steering
+        finally:
+            steering.send()
+            publisher.undeclare()  # type: ignore[no-untyped-call]
+
+    # --- messages: the bodies of docs/messages.md
+
+    def detections(self, camera: str | None = None, *, size: int = 1) -> Stream[bodies.DetectionsBody]:
+        """Detections of each frame. `camera`: one of the settings' table; None: the first."""
+        return self._stream(topics.DETECTIONS, camera, size)
+
+    def tracks(self, camera: str | None = None, *, size: int = 100) -> Stream[bodies.TracksBody]:
+        """Events of tracks, the kept ones first."""
+        return self._stream(topics.TRACKS, camera, size)
+
+    def markers(self, camera: str | None = None, *, size: int = 1) -> Stream[bodies.MarkersBody]:
+        """Markers of each frame."""
+        return self._stream(topics.MARKERS, camera, size)
+
+    def depth(self, camera: str | None = None, *, size: int = 1) -> Stream[bodies.DepthBody]:
+        """Distances of each frame with depth."""
+        return self._stream(topics.DEPTH, camera, size)
+
+    def vehicle(self, *, size: int = 1) -> Stream[bodies.VehicleBody]:
+        """State of the vehicle, 10 times a second."""
+        return self._stream(topics.VEHICLE, None, size)
+
+    def obstacles(self, *, size: int = 1) -> Stream[bodies.ObstaclesBody]:
+        """The nearest obstacle in 72 directions, per depth image."""
+        return self._stream(topics.OBSTACLES, None, size)
+
+    def status(self, *, size: int = 1) -> Stream[bodies.StatusBody]:
+        """State of the service, once a second, the kept one first."""
+        return self._stream(topics.STATUS, None, size)
+
+    def events(self, *, size: int = 100) -> Stream[bodies.EventBody]:
+        """Events of the service, the kept ones first."""
+        return self._stream(topics.EVENTS, None, size)
+
+    def image(self, camera: str | None = None, *, size: int = 1) -> Stream[bytes]:
+        """Preview images, JPEG."""
+        return self._stream(topics.IMAGE, camera, size)
+
+    def _stream(self, topic: topics.Topic, camera: str | None, size: int) -> Stream[Any]:
+        key = topic.key(self.name, camera)
+        decode = bytes if topic is topics.IMAGE else json.loads
+        return Stream(self._session, topic, key, decode, size=size, max_age_s=topic.max_age_s)
+
+
+@asynccontextmanager
+async def connect(
+    endpoint: str = "tcp/127.0.0.1:7447", vehicle: str | None = None, *, config_file: str | None = None
+) -> AsyncIterator[Drone]:
+    """Connect to the service at a zenoh endpoint, or through its router.
+
+    Args:
+        endpoint: `zenoh.listen` of the service, or its router.
+        vehicle: `vehicle.name` of the service; None: the only one there.
+        config_file: zenoh's configuration file, for TLS.
+
+    Raises:
+        NoAnswerError: no service there. ValueError: several vehicles, and no name was given.
+        BusError: the file cannot be used.
+    """
+    settings = client_settings(ZenohSection(config_file=config_file), (endpoint,))
+    opened = open_client(settings)
+    session = await asyncio.to_thread(opened.__enter__)
+    try:
+        yield Drone(session, vehicle or await asyncio.to_thread(_only_vehicle, session, endpoint))
+    finally:
+        await asyncio.to_thread(opened.__exit__, None, None, None)
+
+
+def _only_vehicle(session: zenoh.Session, endpoint: str) -> str:
+    until_s = time.monotonic() + _DISCOVERY_S
+    while not (names := _alive(session)):
+        if time.monotonic() > until_s:
+            raise NoAnswerError(f"no service at {endpoint}: is `companion run` running?")
+        time.sleep(0.05)
+    if len(names) > 1:
+        raise ValueError(f"several vehicles at {endpoint}: give vehicle=, one of {', '.join(names)}")
+    return names[0]
+
+
+def _alive(session: zenoh.Session) -> list[str]:
+    replies = session.liveliness().get(topics.alive_key("*"), timeout=_DISCOVERY_S)
+    return sorted(str(reply.ok.key_expr).split("/")[1] for reply in replies if reply.ok is not None)

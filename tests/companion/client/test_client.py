@@ -1,0 +1,278 @@
+"""The asyncio client at real buses over loopback: commands, cancellation, messages, steering, its imports."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import json
+import socket
+import subprocess
+import sys
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from companion import connect
+from companion.bus import topics
+from companion.bus.session import Bus
+from companion.client import CommandFailedError, Drone, NoAnswerError, Stream
+from companion.client.commands import Commands, Reply
+from companion.guidance.command import COMMANDS
+from companion.guidance.grammar import parse
+from companion.settings import ZenohSection
+from mavlink_sim.testing import free_port
+from tools import client_commands
+
+IMPORT_S = 0.3
+
+
+class Vehicle:
+    """The bus of a service. A command `hold …` waits for `stop`; `land` fails; others succeed.
+
+    Attributes:
+        commands: texts in the order of arrival. velocities: messages on `velocity`.
+    """
+
+    def __init__(self, name: str = "alpha", router: str | None = None) -> None:
+        self.name, self.endpoint = name, f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+        self.commands: list[str] = []
+        self.velocities: list[dict[str, Any]] = []
+        self._stopped = asyncio.Event()
+        settings = ZenohSection(listen=(self.endpoint,))
+        if router is not None:
+            settings = ZenohSection(mode="client", connect=(router,), listen=())
+        self.bus = Bus(
+            settings,
+            name,
+            on_event=lambda *_: None,
+            on_command=self._execute,
+            listeners=[
+                (topics.VELOCITY.key(name), lambda data, _ns: self.velocities.append(json.loads(data)))
+            ],
+        )
+
+    async def _execute(self, text: str) -> dict[str, Any]:
+        self.commands.append(text)
+        if text == "stop":
+            self._stopped.set()
+        if text.startswith(("hold", "gimbal")):
+            self._stopped.clear()
+            await self._stopped.wait()
+            return {"command": text, "success": False, "reason": "replaced by stop"}
+        return {"command": text, "success": text != "land", "reason": "on the ground"}
+
+
+@asynccontextmanager
+async def vehicle(name: str = "alpha", router: str | None = None) -> AsyncIterator[Vehicle]:
+    opened = Vehicle(name, router)
+    await opened.bus.start()
+    try:
+        yield opened
+    finally:
+        await opened.bus.close()
+
+
+@asynccontextmanager
+async def connected() -> AsyncIterator[tuple[Vehicle, Drone]]:
+    async with vehicle() as there, connect(there.endpoint) as drone:
+        yield there, drone
+
+
+async def until(condition: Any) -> None:
+    async with asyncio.timeout(20.0):
+        while not condition():
+            await asyncio.sleep(0.01)
+
+
+async def watched(there: Vehicle, topic: topics.Topic) -> None:
+    await until(lambda: there.bus.watched(topic))
+
+
+def test_import_loads_nothing_heavy_and_is_fast() -> None:
+    text = (
+        "import sys, time; begun = time.process_time(); from companion import connect; connect;"
+        "print(time.process_time() - begun);"
+        "print(*{'torch', 'cv2', 'numpy', 'vision', 'pymavlink'} & set(sys.modules))"
+    )
+    runs = [
+        subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=True).stdout
+        for _ in range(2)
+    ]
+    assert min(float(run.splitlines()[0]) for run in runs) < IMPORT_S
+    assert [run.splitlines()[1] for run in runs] == ["", ""]
+
+
+def test_methods_are_those_of_the_command_table() -> None:
+    assert Path(client_commands.FILE).read_text() == client_commands.source()
+
+
+class Written(Commands):
+    async def command(self, text: str) -> Reply:
+        return {"command": text}
+
+
+@pytest.mark.parametrize("kind", COMMANDS.values(), ids=lambda kind: kind.word)
+async def test_texts_of_methods_are_valid_commands(kind: Any) -> None:
+    method = getattr(Written(), kind.word.replace("-", "_"))
+    needed: dict[str, Any] = {
+        "goto": {"north": 1.5, "east": -2e-7},
+        "follow-path": {"points": "0,0 10,0,5"},
+        "seek": {"class_": "traffic light"},
+        "approach": {"track": 7},
+        "follow": {"class_": 'a "quoted\\ name'},
+        "patrol": {"points": "0,0 1,1 2,0", "classes": "person,car"},
+        "mission": {"file": "my mission.toml"},
+        "formation": {"shape": "wedge", "leader": "beta"},
+        "land-on-marker": {"id": 7},
+        "velocity": {"source": "a-1"},
+        "select": {"x": 0.1, "y": 0.2, "width": 0.3, "height": 0.4, "stamp_ns": 91000000},
+    }
+    arguments = needed.get(kind.word, {})
+    assert set(arguments) <= set(inspect.signature(method).parameters)
+    command = parse((await method(**arguments))["command"])
+    assert type(command) is kind
+    values = {key.removesuffix("_"): value for key, value in arguments.items()}
+    given = {
+        argument.key: getattr(command, field.name) for field, argument in client_commands.arguments_of(kind)
+    }
+    assert {key: given[key] for key in values} == values
+
+
+@pytest.mark.realtime
+async def test_command_returns_its_reply_or_raises() -> None:
+    async with connected() as (there, drone):
+        assert drone.name == "alpha"
+        assert (await drone.takeoff(5))["success"]
+        with pytest.raises(CommandFailedError, match="on the ground") as failed:
+            await drone.land()
+    assert failed.value.reply["success"] is False
+    assert there.commands == ["takeoff altitude=5", "land"]
+
+
+@pytest.mark.realtime
+@pytest.mark.parametrize("moment", ["active", "not sent yet"])
+async def test_cancelled_command_is_stopped(moment: str) -> None:
+    async with connected() as (there, drone):
+        task = asyncio.create_task(drone.hold(duration=60))
+        if moment == "active":
+            await until(lambda: there.commands)
+        else:
+            await asyncio.sleep(0)
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+        assert there.commands.index("hold duration=60") < len(there.commands) - 1
+        assert there.commands[-1] == "stop"
+
+
+@pytest.mark.realtime
+async def test_timeout_stops_a_flight_but_not_for_the_gimbal() -> None:
+    async with connected() as (there, drone):
+        with pytest.raises(TimeoutError):
+            async with asyncio.timeout(0.5):
+                await drone.gimbal(pitch=-30)
+        with pytest.raises(TimeoutError):
+            async with asyncio.timeout(0.5):
+                await drone.hold()
+    assert there.commands == ["gimbal pitch=-30", "hold", "stop"]
+
+
+@pytest.mark.realtime
+async def test_slow_reader_gets_the_newest_messages() -> None:
+    async with connected() as (there, drone):
+        newest, three = drone.vehicle(), drone.vehicle(size=3)
+        await watched(there, topics.VEHICLE)
+        await asyncio.sleep(0.3)  # both subscriptions have reached the bus
+        for number in range(50):
+            there.bus.publish(topics.VEHICLE, {"number": number})
+        await until(lambda: three.dropped == 47 and newest.dropped == 49)
+        assert [(await anext(three))["number"] for _ in range(3)] == [47, 48, 49]  # type: ignore[typeddict-item]
+        assert (await anext(newest))["number"] == 49  # type: ignore[typeddict-item]
+        assert 0.0 <= newest.age_s < 5.0
+
+
+@pytest.mark.realtime
+async def test_message_that_waited_too_long_is_dropped() -> None:
+    async with connected() as (there, drone):
+        stream = drone.vehicle()
+        await watched(there, topics.VEHICLE)
+        there.bus.publish(topics.VEHICLE, {"number": 1})
+        await asyncio.sleep((topics.VEHICLE.max_age_s or 0.0) + 0.2)
+        waiting = asyncio.ensure_future(anext(stream))
+        await asyncio.sleep(0)
+        there.bus.publish(topics.VEHICLE, {"number": 2})
+        assert (await asyncio.wait_for(waiting, 10.0))["number"] == 2  # type: ignore[typeddict-item]
+        assert stream.dropped == 1
+
+
+@pytest.mark.realtime
+async def test_kept_events_come_first_and_a_deleted_stream_unsubscribes() -> None:
+    async with connected() as (there, drone):
+        there.bus.publish(topics.EVENTS, {"stamp_ns": 1, "level": "info", "text": "before"})
+        stream: Stream[Any] = drone.events()
+        assert (await asyncio.wait_for(anext(stream), 10.0))["text"] == "before"
+        frames = drone.detections()
+        await watched(there, topics.DETECTIONS)
+        del frames
+        await until(lambda: not there.bus.watched(topics.DETECTIONS))
+
+
+@pytest.mark.realtime
+async def test_images_are_bytes() -> None:
+    async with connected() as (there, drone):
+        images = drone.image()
+        await watched(there, topics.IMAGE)
+        there.bus.publish_large(topics.IMAGE, b"\xff\xd8", {})  # type: ignore[typeddict-item]
+        assert await asyncio.wait_for(anext(images), 10.0) == b"\xff\xd8"
+
+
+@pytest.mark.realtime
+async def test_steering_sends_velocities_and_ends_with_zero() -> None:
+    async with connected() as (there, drone):
+        async with drone.steer() as steering:
+            steering.send(forward=1.0, turn=-0.5, lifetime=0.3)
+            with pytest.raises(ValueError, match="forward"):
+                steering.send(forward=float("nan"))
+            with pytest.raises(ValueError, match="lifetime"):
+                steering.send(lifetime=0.6)
+        await until(lambda: len(there.velocities) == 2)
+    first, last = there.velocities
+    assert there.commands == [f'velocity source="{steering.source}"']
+    assert (first["source"], first["forward_mps"], first["turn_radps"]) == (steering.source, 1.0, -0.5)
+    assert {last[key] for key in ("forward_mps", "right_mps", "up_mps", "turn_radps")} == {0.0}
+
+
+@pytest.mark.realtime
+async def test_several_vehicles_on_one_connection() -> None:
+    async with vehicle() as first, vehicle("beta", router=first.endpoint) as second:
+        async with connect(first.endpoint, "beta") as beta:
+            await until(lambda: second.bus.connected)
+            assert await beta.vehicles() == ["alpha", "beta"]
+            await asyncio.gather(beta.takeoff(3), beta.other("alpha").takeoff(4))
+        with pytest.raises(ValueError, match="alpha, beta"):
+            async with connect(first.endpoint):
+                pass
+    assert (first.commands, second.commands) == (["takeoff altitude=4"], ["takeoff altitude=3"])
+
+
+@pytest.mark.realtime
+async def test_connection_without_a_service_is_an_error() -> None:
+    with pytest.raises(NoAnswerError, match="tcp/127"):
+        async with connect(f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"):
+            pass
+    with pytest.raises(NoAnswerError, match="endpoint"):
+        async with connect("nowhere"):
+            pass
+
+
+@pytest.mark.realtime
+async def test_service_that_ends_fails_a_waiting_command() -> None:
+    async with connected() as (there, drone):
+        task = asyncio.create_task(drone.hold())
+        await until(lambda: there.commands)
+        await there.bus.close()
+        with pytest.raises((NoAnswerError, CommandFailedError)):
+            await asyncio.wait_for(task, 20.0)
