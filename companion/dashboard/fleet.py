@@ -14,9 +14,10 @@ from typing import Any
 
 import zenoh
 
+from companion.bus.bodies import VelocityBody
 from companion.bus.client import NoAnswerError, send_command
-from companion.bus.session import zenoh_config
-from companion.bus.topics import alive_key
+from companion.bus.session import encode, zenoh_config
+from companion.bus.topics import VELOCITY, alive_key
 from companion.dashboard.bridge import Bridge, Link
 from companion.dashboard.merge import SeenObject, merged
 from companion.geometry.geodesy import north_east
@@ -185,6 +186,21 @@ class Fleet:
         # A thread each: a pool would let endless commands delay a stop.
         threading.Thread(target=send, daemon=True).start()
         return outcome
+
+    def steer(self, vehicle: str, body: VelocityBody) -> bool:
+        """Publish a velocity for a vehicle; False: there is no connection to zenoh."""
+        session = self._link.session
+        if session is None:
+            return False
+        session.put(
+            VELOCITY.key(vehicle),
+            encode(body),
+            encoding=VELOCITY.encoding,
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=VELOCITY.priority,
+            express=VELOCITY.express,
+        )
+        return True
 
     async def stop_all(self, identifier: str) -> dict[str, Any]:
         """Send `stop` to every vehicle that is alive; returns one outcome, of at most `_STOP_WAIT_S`."""

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import uvicorn
+from pydantic import TypeAdapter, ValidationError
 from starlette.applications import Starlette
 from starlette.datastructures import Headers
 from starlette.requests import Request
@@ -28,6 +29,7 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from companion.bus.bodies import VelocityBody
 from companion.dashboard.access import COOKIE, Access, DashboardError, Refusal, read_token
 from companion.dashboard.bridge import Bridge, News
 from companion.dashboard.fleet import MAX_VEHICLES, Fleet
@@ -50,6 +52,7 @@ MAX_STREAMS_PER_BROWSER = 2
 a stream and 1, so that a stop command has one at once."""
 _UNACCEPTED_MS = 15_000
 _SEND_BUFFER_BYTES = 256 * 1024
+_VELOCITY = TypeAdapter(VelocityBody)
 _TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript"}
 _SECURITY = {
     "cache-control": "no-store",
@@ -204,12 +207,39 @@ def create_app(fleet: Fleet, access: Access) -> ASGIApp:
             return Response(status_code=204)
         return Response(found.jpeg, media_type="image/jpeg", headers={"x-frame": json.dumps(found.about)})
 
-    async def command(request: Request) -> Response:
+    async def read_body(request: Request) -> bytearray | Response:
+        """Return a request's body, or a refusal."""
         body = bytearray()
         async for chunk in request.stream():
             body += chunk
             if len(body) > LARGEST_BODY_BYTES:
                 return PlainTextResponse(f"at most {LARGEST_BODY_BYTES} bytes are accepted", 413)
+        return body
+
+    async def velocity(request: Request) -> Response:
+        body = await read_body(request)
+        if isinstance(body, Response):
+            return body
+        try:
+            sent = json.loads(body)
+            vehicle = sent.pop("vehicle", "")
+            _VELOCITY.validate_python(sent, strict=True)
+        except ValidationError as error:
+            first = error.errors()[0]
+            return PlainTextResponse(f"{'.'.join(map(str, first['loc']))}: {first['msg']}", 400)
+        except (ValueError, AttributeError, TypeError, RecursionError):
+            return PlainTextResponse("expected a JSON object", 400)
+        bridge = bridge_of(vehicle)
+        if isinstance(bridge, Response):
+            return bridge
+        if not fleet.steer(bridge.vehicle, sent):
+            return PlainTextResponse(fleet.problem, 503)
+        return Response(status_code=204)
+
+    async def command(request: Request) -> Response:
+        body = await read_body(request)
+        if isinstance(body, Response):
+            return body
         try:
             sent = json.loads(body)
             text, identifier = sent["text"], str(sent.get("id", ""))[:64]
@@ -244,6 +274,7 @@ def create_app(fleet: Fleet, access: Access) -> ASGIApp:
         Route("/picture", picture),
         Route("/clock", clock),
         Route("/command", command, methods=["POST"]),
+        Route("/velocity", velocity, methods=["POST"]),
     ]
     return _Guard(Starlette(routes=routes), access)
 

@@ -2,7 +2,7 @@
 
 import { $, ALL, browserId, button, isFleet, state } from "./state.js";
 
-const HEADERS = { "Content-Type": "application/json", "X-Companion-Dashboard": "1" };
+export const HEADERS = { "Content-Type": "application/json", "X-Companion-Dashboard": "1" };
 
 const waiting = new Map(); // id of a command → what to call after its success
 let count = 0;

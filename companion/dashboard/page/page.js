@@ -3,6 +3,7 @@
 import { drawAttitude, drawChart } from "./charts.js";
 import { openMenu } from "./commands.js";
 import { drawMap } from "./map.js";
+import "./steer.js";
 import {
   $, age, button, cameras, heading, isFleet, measureClock, number, setText, STALE_S, state,
 } from "./state.js";

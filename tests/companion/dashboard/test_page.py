@@ -140,6 +140,53 @@ def test_takeoff_button_and_space_bar(service: ServiceProcess, tab: Tab) -> None
     tab.until(f"{REPLY}.startsWith('hold 1: ')")
 
 
+SPEED = "Math.hypot(...state.topics.vehicle.velocity_ned_mps.slice(0, 2))"
+STEERING = "document.querySelector('#steer').getAttribute('aria-pressed') === 'true'"
+PAD = "navigator.getGamepads = () => [null, {mapping: 'standard', axes: [0, 0, 0, AXIS]}]"
+
+
+def hold_key(tab: Tab, kind: str) -> None:
+    tab.send("Input.dispatchKeyEvent", type=kind, key="w", code="KeyW", windowsVirtualKeyCode=87)
+
+
+def test_keys_and_gamepad_steer_and_a_lost_page_brakes(
+    browser: Browser, service: ServiceProcess, tab: Tab
+) -> None:
+    other = open_page(browser, service.url)
+    tab.until("state.topics.vehicle && state.topics.status")
+    if tab.value("state.topics.vehicle.altitude_m < 1"):
+        service.take_off(3.0)
+    tab.send("Emulation.setFocusEmulationEnabled", enabled=True)
+    tab.value("document.querySelector('#steer').click()")
+    tab.until(STEERING)
+    assert tab.value(REPLY).startswith("velocity source=page-")
+    hold_key(tab, "rawKeyDown")
+    other.until(f"{SPEED} > 0.6")
+    hold_key(tab, "keyUp")
+    other.until(f"{SPEED} < 0.25")
+    tab.value(PAD.replace("AXIS", "1"))  # the stick back
+    other.until(f"{SPEED} > 0.6")
+    tab.value(PAD.replace("AXIS", "0.1"))  # in the dead zone
+    other.until(f"{SPEED} < 0.25")
+    hold_key(tab, "rawKeyDown")
+    other.until(f"{SPEED} > 0.6")
+    tab.send("Page.navigate", url="about:blank")
+    other.until(f"{SPEED} < 0.25")
+    other.until("/^velocity of page-.*, silent/.test(state.topics.status.pilot.behaviour)")
+    other.close()
+
+
+def test_another_command_ends_steering(service: ServiceProcess, tab: Tab) -> None:
+    tab.until("state.topics.vehicle && state.topics.status")
+    if tab.value("state.topics.vehicle.altitude_m < 1"):
+        service.take_off(3.0)
+    tab.value("document.querySelector('#steer').click()")
+    tab.until(STEERING)
+    tab.press(" ", " ")
+    tab.until(f"{REPLY}.startsWith('stop: done')")
+    tab.until(f"!({STEERING})")
+
+
 def test_page_shows_a_stop_button_and_names_on_a_phone(tab: Tab) -> None:
     tab.resize(390, 844, phone=True)
     left, top, width, height = rectangle(tab, "#stop")

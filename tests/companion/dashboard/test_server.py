@@ -196,6 +196,31 @@ async def test_bad_commands_are_refused(body: bytes, status: int) -> None:
         assert (await request(port, "GET", "/events?vehicle=a/b"))[0] == 400
 
 
+async def test_velocity_reaches_the_vehicle_that_it_names() -> None:
+    sent = {"source": "page-1", "stamp_ns": 5, "forward_mps": 1, "lifetime_s": 0.4}
+    with publishing() as (service, endpoint):
+        received: list[Any] = []
+        service.session.declare_subscriber(
+            "companion/*/velocity", lambda one: received.append((str(one.key_expr), one.payload.to_string()))
+        )
+        async with serving(endpoint) as port:
+
+            async def post(body: Any) -> int:
+                return (await request(port, "POST", "/velocity", POST, body))[0]
+
+            async with asyncio.timeout(15.0):
+                while not received:  # until the page's session is connected
+                    assert await post(sent) in (204, 503)
+            received.clear()
+            assert await post({**sent, "vehicle": "beta"}) == 204
+            key, text = await until(lambda: next((one for one in received if "beta" in one[0]), None))
+            assert (key, json.loads(text)) == ("companion/beta/velocity", sent)
+            for wrong in ({**sent, "lifetime_s": 0.6}, {"source": "a"}, [], {**sent, "vehicle": "a/*"}):
+                assert await post(wrong) == 400
+    async with serving() as port:
+        assert (await request(port, "POST", "/velocity", POST, sent))[0] == 503
+
+
 async def test_picture_has_its_frame_in_a_header() -> None:
     with publishing() as (service, endpoint):
         async with serving(endpoint) as port:

@@ -1,0 +1,108 @@
+// Steering by keys or a gamepad: while the command `velocity` flies, a velocity goes to the service ten times a
+// second, also a zero one. Without them the vehicle brakes: nothing here needs to be sent when the page is lost.
+
+import { HEADERS, send } from "./commands.js";
+import { $, setText, state } from "./state.js";
+
+const PERIOD_MS = 100;
+const LIFETIME_S = 0.4;
+const DEAD_ZONE = 0.12;
+const STATUS_AFTER_MS = 2500; // by then `status` names the command
+// By their position on the keyboard, whatever its layout.
+const KEYS = {
+  KeyW: ["forward", 1], KeyS: ["forward", -1], KeyD: ["right", 1], KeyA: ["right", -1],
+  ArrowUp: ["up", 1], ArrowDown: ["up", -1], ArrowRight: ["turn", 1], ArrowLeft: ["turn", -1],
+};
+// Axes of the Gamepad API's standard layout, as a remote control's in mode 2.
+const STICKS = { turn: [0, 1], up: [1, -1], right: [2, 1], forward: [3, -1] };
+
+const pressed = new Set();
+let steering = null; // { source, vehicle, since, timer, sending }
+
+function begin(source) {
+  if (steering) clearInterval(steering.timer);
+  pressed.clear();
+  document.activeElement.blur();
+  const timer = setInterval(tick, PERIOD_MS);
+  steering = { source, vehicle: state.vehicle, since: performance.now(), timer, sending: false };
+  show("Steering.");
+}
+
+function end(reason) {
+  if (!steering) return;
+  clearInterval(steering.timer);
+  post(steering, { forward: 0, right: 0, up: 0, turn: 0 });
+  steering = null;
+  pressed.clear();
+  show(reason);
+}
+
+function show(text) {
+  $("steer").setAttribute("aria-pressed", steering !== null);
+  setText($("steer"), steering ? "End steering" : "Steer");
+  setText($("steered"), text);
+}
+
+function tick() {
+  const { source, vehicle, since, sending } = steering;
+  const { behaviour = "" } = (state.topics.status || {}).pilot || {};
+  if (vehicle !== state.vehicle) {
+    end("Another vehicle is shown.");
+  } else if (performance.now() - since > STATUS_AFTER_MS && !behaviour.startsWith(`velocity of ${source}`)) {
+    end(`The vehicle flies something else: ${behaviour}.`);
+  } else if (!sending) {
+    post(steering, wanted());
+  }
+}
+
+// What keys and sticks ask for, each axis from -1 to 1.
+function wanted() {
+  const axes = { forward: 0, right: 0, up: 0, turn: 0 };
+  for (const code of pressed) axes[KEYS[code][0]] += KEYS[code][1];
+  const pad = document.hasFocus() && navigator.getGamepads().find((one) => one && one.mapping === "standard");
+  for (const [axis, [index, sign]] of Object.entries(pad ? STICKS : {})) axes[axis] += sign * stick(pad.axes[index]);
+  for (const axis of Object.keys(axes)) axes[axis] = Math.max(-1, Math.min(1, axes[axis]));
+  return axes;
+}
+
+const stick = (value) => Math.sign(value) * Math.max(0, Math.abs(value) - DEAD_ZONE) / (1 - DEAD_ZONE);
+
+async function post(to, { forward, right, up, turn }) {
+  const speed = Number($("steer-speed").value) || 0;
+  const body = JSON.stringify({
+    vehicle: to.vehicle, source: to.source, stamp_ns: Math.round(performance.now() * 1e6), lifetime_s: LIFETIME_S,
+    forward_mps: forward * speed, right_mps: right * speed, up_mps: up * speed,
+    turn_radps: turn * (Number($("steer-turn").value) || 0) * Math.PI / 180,
+  });
+  to.sending = true;
+  try {
+    // One at a time: late ones would only queue up.
+    const signal = AbortSignal.timeout(1000);
+    const response = await fetch("/velocity", { method: "POST", headers: HEADERS, body, signal, priority: "high" });
+    if (!response.ok && steering === to) show(`Not sent: ${(await response.text()).trim()}`);
+  } catch (error) {
+    if (steering === to) show(`Not sent: ${error.message}`);
+  } finally {
+    to.sending = false;
+  }
+}
+
+$("steer").addEventListener("click", () => {
+  if (steering) {
+    end("Ended: the vehicle holds.");
+  } else {
+    const source = `page-${Math.random().toString(36).slice(2, 10)}`;
+    send(`velocity source=${source}`, () => begin(source));
+  }
+});
+document.addEventListener("keydown", (event) => {
+  const typed = event.target instanceof HTMLInputElement || event.target instanceof HTMLSelectElement;
+  if (!steering || typed || !(event.code in KEYS) || event.ctrlKey || event.altKey || event.metaKey) return;
+  event.preventDefault();
+  pressed.add(event.code);
+});
+document.addEventListener("keyup", (event) => pressed.delete(event.code));
+addEventListener("blur", () => pressed.clear()); // a key that is released elsewhere is not seen here
+document.addEventListener("visibilitychange", () => {
+  if (document.hidden) end("Ended: the page was hidden.");
+});
