@@ -25,7 +25,7 @@ function begin(source) {
   document.activeElement.blur();
   const timer = setInterval(tick, PERIOD_MS);
   steering = { source, vehicle: state.vehicle, since: performance.now(), timer, sending: false };
-  show("Steering.");
+  show("Steering: W A S D fly, arrows climb and turn.");
 }
 
 function end(reason) {
@@ -39,7 +39,6 @@ function end(reason) {
 
 function show(text) {
   $("steer").setAttribute("aria-pressed", steering !== null);
-  setText($("steer"), steering ? "End steering" : "Steer");
   setText($("steered"), text);
 }
 
