@@ -243,7 +243,9 @@ async def connect(
     opened = open_client(settings)
     session = await asyncio.to_thread(opened.__enter__)
     try:
-        yield Drone(session, vehicle or await asyncio.to_thread(_only_vehicle, session, endpoint))
+        if vehicle is None:
+            vehicle = await asyncio.to_thread(_only_vehicle, session, endpoint)
+        yield Drone(session, vehicle)
     finally:
         await asyncio.to_thread(opened.__exit__, None, None, None)
 

@@ -20,7 +20,7 @@ from companion.bus import topics
 from companion.bus.session import Bus
 from companion.client import CommandFailedError, Drone, NoAnswerError, Stream
 from companion.client.commands import Commands, Reply
-from companion.guidance.command import COMMANDS
+from companion.guidance.command import COMMANDS, arguments_of
 from companion.guidance.grammar import parse
 from companion.settings import ZenohSection
 from mavlink_sim.testing import free_port
@@ -135,9 +135,7 @@ async def test_texts_of_methods_are_valid_commands(kind: Any) -> None:
     command = parse((await method(**arguments))["command"])
     assert type(command) is kind
     values = {key.removesuffix("_"): value for key, value in arguments.items()}
-    given = {
-        argument.key: getattr(command, field.name) for field, argument in client_commands.arguments_of(kind)
-    }
+    given = {argument.key: getattr(command, field.name) for field, argument in arguments_of(kind)}
     assert {key: given[key] for key in values} == values
 
 
@@ -225,7 +223,7 @@ async def test_images_are_bytes() -> None:
     async with connected() as (there, drone):
         images = drone.image()
         await watched(there, topics.IMAGE)
-        there.bus.publish_large(topics.IMAGE, b"\xff\xd8", {})  # type: ignore[typeddict-item]
+        there.bus.publish_large(topics.IMAGE, b"\xff\xd8", {})  # type: ignore[arg-type]
         assert await asyncio.wait_for(anext(images), 10.0) == b"\xff\xd8"
 
 

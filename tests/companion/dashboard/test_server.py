@@ -215,7 +215,8 @@ async def test_velocity_reaches_the_vehicle_that_it_names() -> None:
             assert await post({**sent, "vehicle": "beta"}) == 204
             key, text = await until(lambda: next((one for one in received if "beta" in one[0]), None))
             assert (key, json.loads(text)) == ("companion/beta/velocity", sent)
-            for wrong in ({**sent, "lifetime_s": 0.6}, {"source": "a"}, [], {**sent, "vehicle": "a/*"}):
+            wrongs: list[Any] = [{**sent, "lifetime_s": 0.6}, {"source": "a"}, [], {**sent, "vehicle": "a/*"}]
+            for wrong in wrongs:
                 assert await post(wrong) == 400
     async with serving() as port:
         assert (await request(port, "POST", "/velocity", POST, sent))[0] == 503
