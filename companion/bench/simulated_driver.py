@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
@@ -22,7 +21,7 @@ from companion.guidance.interface import (
 from companion.vehicle.ardupilot_profile import ArduPilotProfile
 from companion.vehicle.autopilot_profile import ARDUPILOT, PX4, AutopilotProfile, Px4Profile
 from companion.vehicle.driver import CommandRefusedError
-from companion.vehicle.gimbal_commands import CONFIGURE, FOLLOWING_NOSE, PITCHYAW, RELEASE, UNCHANGED
+from companion.vehicle.gimbal_commands import CONFIGURE, PITCHYAW, RELEASE, UNCHANGED, pitchyaw_parameters
 from companion.vehicle.landing_target import LandingTarget, landing_target_fields
 from companion.vehicle.mav_result import ACCEPTED, IN_PROGRESS, result_name
 from companion.vehicle.obstacle_distance import obstacle_distance_fields
@@ -196,13 +195,7 @@ class SimulatedDriver:
                 values = (*COMPANION, UNCHANGED, UNCHANGED)
                 self._command(request, "the vehicle refused control of the gimbal", None, CONFIGURE, *values)
             case PointGimbal(aim):
-                values = (
-                    math.degrees(aim.pitch_rad),
-                    math.degrees(aim.yaw_rad),
-                    math.nan,
-                    math.nan,
-                    FOLLOWING_NOSE,
-                )
+                values = pitchyaw_parameters(aim)
                 self._command(request, "the vehicle refused to point the gimbal", None, PITCHYAW, *values)
             case ReleaseGimbal():
                 values = (RELEASE, RELEASE, UNCHANGED, UNCHANGED)

@@ -26,8 +26,7 @@ from typing import Any, ClassVar, TypeVar, dataclass_transform, get_args, get_ty
 from companion.geometry.points import points_from
 from companion.guidance.behaviour import Behaviour
 from companion.guidance.search_pattern import Footprint
-from companion.guidance.targets.chosen import TrackAim
-from companion.vehicle.gimbal import GimbalAim
+from companion.guidance.targets.chosen import GimbalGoal
 
 MOST_POINTS = 500
 FARTHEST_M = 5000.0
@@ -267,7 +266,7 @@ class Command(ABC):
         return False
 
     @property
-    def aim(self) -> GimbalAim | TrackAim | None:
+    def aim(self) -> GimbalGoal | None:
         """For a command that only points the gimbal, where to; None: the command has a behaviour."""
         return None
 

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from companion.guidance.behaviour import Outcome, Requirement
+from companion.guidance.behaviour import BehaviourContext, Outcome, Requirement
 from companion.guidance.gimbal.controller import ENDING, FIND_TIMEOUT_S, GimbalController, is_known
 from companion.guidance.interface import CommandInput, OutputCollector
-from companion.guidance.targets.chosen import RecentTracks
 from companion.vehicle.state import VehicleState
 
 
@@ -83,17 +82,16 @@ class CommandQueue:
             out.result(waiting.command.identifier, Outcome(False, ENDING))
         self._waiting = []
 
-    def take_due(
-        self, now_ns: int, state: VehicleState, tracks: RecentTracks, out: OutputCollector
-    ) -> list[CommandInput]:
+    def take_due(self, context: BehaviourContext, out: OutputCollector) -> list[CommandInput]:
         """Remove and return the behaviours to begin now, in order. Gimbal commands go to the gimbal."""
-        known = is_known(state.gimbal, now_ns)
+        now_ns = context.now_ns
+        known = is_known(context.state.gimbal, now_ns)
         done = [w for w in self._waiting if known or now_ns > w.until_ns or self._gimbal.not_found]
         self._waiting = [w for w in self._waiting if w not in done]
         due, self._due = [*(w.command for w in done), *self._due], []
         for command in due:
             if command.aim is not None:
-                self._gimbal.point(command.identifier, command.aim, now_ns, state, out, tracks)
+                self._gimbal.point(command.identifier, command.aim, context, out)
         return [command for command in due if command.behaviour is not None]
 
 

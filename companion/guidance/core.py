@@ -26,6 +26,7 @@ from companion.guidance.behaviour import (
     RoutedSetpoint,
 )
 from companion.guidance.behaviours.hold import HoldBehaviour
+from companion.guidance.behaviours.stop import StopBehaviour
 from companion.guidance.command_queue import CommandQueue
 from companion.guidance.gimbal.controller import ENDING, GimbalController, GimbalMounting
 from companion.guidance.interface import (
@@ -219,7 +220,7 @@ class Guidance:
         self._queue.watch(inputs.mode_changes, inputs.state, out)
         for command in inputs.commands:
             self._queue.add(command, now_ns, inputs.state, self._gimbal_user, out)
-        for command in self._queue.take_due(now_ns, inputs.state, context.tracks, out):
+        for command in self._queue.take_due(context, out):
             self._begin_command(command, context)
         landing_target = None
         try:
@@ -228,7 +229,7 @@ class Guidance:
                 self._report_reset(self._behaviour, before, context)
                 self._update(context, inputs, paused_s)
             landing_target = self._new_landing_target()
-            self.gimbal.update(now_ns, inputs.state, self._active, out, context.tracks)
+            self.gimbal.update(context, self._active, out)
         except Exception as error:
             self._behaviour_failed(error, context, inputs.stream.sent_count)
         else:
@@ -321,6 +322,8 @@ class Guidance:
         self._battery.reset()
         self._begin(behaviour, command)
         self._out.event(EventKind.STARTED, behaviour.name, "started")
+        if isinstance(behaviour, StopBehaviour):
+            self.gimbal.end_goal(behaviour.name, self._out)
 
     def _answer_endless(self, inputs: GuidanceInput) -> None:
         """Answer an endless command when the vehicle flies it."""

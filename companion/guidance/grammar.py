@@ -84,7 +84,7 @@ def usage(kind: type[Command]) -> str:
                 words.append("|".join([argument.key.upper(), *others]))
         elif field.default is MISSING:
             words.append(argument.key.upper())
-        elif isinstance(argument, ClassName):
+        elif isinstance(argument, ClassName) and len(words) == 1:
             words.append(f"[{argument.key.upper()}]")
         elif default is None:
             words.append(f"[{argument.key}=…]")

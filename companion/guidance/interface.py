@@ -9,7 +9,7 @@ from typing import Literal
 from companion.guidance.behaviour import Behaviour, Outcome, VelocityInput
 from companion.guidance.formation.neighbours import Neighbourhood
 from companion.guidance.search_pattern import Footprint
-from companion.guidance.targets.chosen import TrackAim
+from companion.guidance.targets.chosen import GimbalGoal
 from companion.guidance.targets.from_markers import NO_MARKERS, MarkerSight
 from companion.guidance.targets.ranging import ALL_MEANS, RangeMeans
 from companion.guidance.targets.target import Target
@@ -108,7 +108,7 @@ class CommandInput:
     identifier: int
     text: str
     behaviour: Behaviour | None = None
-    aim: GimbalAim | TrackAim | None = None
+    aim: GimbalGoal | None = None
     endless: bool = False
     mode_changes: int | None = None
     source: CommandSource | None = None

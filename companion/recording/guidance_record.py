@@ -16,9 +16,8 @@ from companion.guidance.core import GuidanceOptions
 from companion.guidance.gimbal.controller import GimbalMounting
 from companion.guidance.grammar import parse
 from companion.guidance.interface import CommandInput, CommandSource, GuidanceInput, GuidanceOutput
-from companion.guidance.targets.chosen import TrackAim
+from companion.guidance.targets.chosen import GimbalGoal
 from companion.recording.encoding import decode, encode, layout_of
-from companion.vehicle.gimbal import GimbalAim
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +30,7 @@ class RecordedCommand:
 
     identifier: int
     text: str
-    aim: GimbalAim | TrackAim | None
+    aim: GimbalGoal | None
     endless: bool
     mode_changes: int | None
     source: CommandSource | None

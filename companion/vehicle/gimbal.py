@@ -36,11 +36,12 @@ class GimbalAim:
 
     Attributes:
         pitch_rad: above the horizon, stabilized.
-        yaw_rad: clockwise from the nose; it turns with the vehicle.
+        yaw_rad: clockwise from `yaw_frame`: from the nose it turns with the vehicle, from north it does not.
     """
 
     pitch_rad: float
     yaw_rad: float = 0.0
+    yaw_frame: YawFrame = YawFrame.NOSE
 
     def __post_init__(self) -> None:
         if not (abs(self.pitch_rad) <= math.pi / 2 + 1e-9 and abs(self.yaw_rad) <= math.pi + 1e-9):
@@ -90,7 +91,9 @@ class GimbalState:
             return None
         w, x, y, z = self.attitude
         axis = (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y))
-        yaw_rad = aim.yaw_rad + (heading_rad if self.yaw_frame is YawFrame.NORTH else 0.0)
+        yaw_rad = aim.yaw_rad
+        if self.yaw_frame is not aim.yaw_frame:
+            yaw_rad += heading_rad if self.yaw_frame is YawFrame.NORTH else -heading_rad
         level = math.cos(aim.pitch_rad)
         aimed = (level * math.cos(yaw_rad), level * math.sin(yaw_rad), -math.sin(aim.pitch_rad))
         return math.acos(max(-1.0, min(1.0, sum(a * b for a, b in zip(axis, aimed, strict=True)))))

@@ -12,7 +12,7 @@ import math
 from collections.abc import Awaitable, Callable
 
 from companion.vehicle.driver import CommandRefusedError
-from companion.vehicle.gimbal import Address, GimbalAim
+from companion.vehicle.gimbal import Address, GimbalAim, YawFrame
 from companion.vehicle.mav_result import ACCEPTED, result_name
 from companion.vehicle.telemetry_state import TelemetryState
 
@@ -26,9 +26,15 @@ _RATES_HZ = {285: 50.0, 281: 5.0}
 _INFORMATION_TIMEOUT_S = 1.0
 _PAUSE_S = 5.0
 UNCHANGED, RELEASE = -1.0, -3.0
-# GIMBAL_MANAGER_FLAGS: roll and pitch relative to the horizon, yaw relative to the nose.
-_ROLL_LOCK, _PITCH_LOCK, _YAW_IN_VEHICLE_FRAME = 4, 8, 32
-FOLLOWING_NOSE = float(_ROLL_LOCK | _PITCH_LOCK | _YAW_IN_VEHICLE_FRAME)
+# GIMBAL_MANAGER_FLAGS: roll and pitch relative to the horizon, yaw relative to the nose or to north.
+_ROLL_LOCK, _PITCH_LOCK, _YAW_LOCK, _YAW_IN_VEHICLE_FRAME, _YAW_IN_EARTH_FRAME = 4, 8, 16, 32, 64
+_YAW_FLAGS = {YawFrame.NOSE: _YAW_IN_VEHICLE_FRAME, YawFrame.NORTH: _YAW_LOCK | _YAW_IN_EARTH_FRAME}
+
+
+def pitchyaw_parameters(aim: GimbalAim) -> tuple[float, ...]:
+    """The first five parameters of DO_GIMBAL_MANAGER_PITCHYAW, without rates."""
+    flags = _ROLL_LOCK | _PITCH_LOCK | _YAW_FLAGS[aim.yaw_frame]
+    return (math.degrees(aim.pitch_rad), math.degrees(aim.yaw_rad), math.nan, math.nan, float(flags))
 
 
 class GimbalCommands:
@@ -108,9 +114,7 @@ class GimbalCommands:
 
     async def point(self, aim: GimbalAim) -> None:
         """Point the gimbal. Raises CommandRefusedError, also when another component has control."""
-        pitch, yaw = math.degrees(aim.pitch_rad), math.degrees(aim.yaw_rad)
-        nan = math.nan
-        await self._send_command("to point the gimbal", PITCHYAW, pitch, yaw, nan, nan, FOLLOWING_NOSE)
+        await self._send_command("to point the gimbal", PITCHYAW, *pitchyaw_parameters(aim))
 
     def _known(self) -> bool:
         gimbal = self._telemetry.state.gimbal

@@ -12,18 +12,24 @@ from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourO
 from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.command import (
     BuildContext,
+    ClassName,
     Command,
     GrammarError,
     Number,
     TrackId,
     behaviour,
+    both_of,
 )
 from companion.guidance.gimbal.controller import POINT_TIMEOUT_S, POINTED_RAD, direction_text
-from companion.guidance.targets.chosen import TrackAim
+from companion.guidance.gimbal.pointing import Pointing
+from companion.guidance.targets.chosen import GimbalGoal, GlobalPoint, Wanted
 from companion.vehicle.gimbal import GimbalAim
 
 
-@behaviour("gimbal", "point the gimbal during any behaviour, or keep it on a track; default: level and ahead")
+@behaviour(
+    "gimbal",
+    "point the gimbal during any behaviour, or keep it on an object or a place; default: level and ahead",
+)
 class Gimbal(Command):
     pitch_deg: Annotated[
         float, Number("pitch", "deg", -90.0, 90.0, "above the horizon; below is negative")
@@ -32,17 +38,42 @@ class Gimbal(Command):
     track_id: Annotated[
         int | None, TrackId("track", "keep it on this track until it is lost, instead of pitch and yaw")
     ] = None
+    class_name: Annotated[
+        str | None, ClassName("class", "keep it on the best object of this class, until none is seen")
+    ] = None
+    latitude_deg: Annotated[
+        float | None,
+        Number("latitude", "deg", -90.0, 90.0, "of a place to keep it on, WGS 84; needs longitude"),
+    ] = None
+    longitude_deg: Annotated[
+        float | None, Number("longitude", "deg", -180.0, 180.0, "WGS 84; needs latitude")
+    ] = None
+    altitude_m: Annotated[
+        float | None, Number("altitude", "m", -500.0, 5000.0, "of the place above home; default: 0")
+    ] = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.track_id is not None and (self.pitch_deg or self.yaw_deg):
-            raise GrammarError("gimbal: give either track, or pitch and yaw, got both")
+        place = (self.latitude_deg, self.longitude_deg, self.altitude_m)
+        given = {
+            "pitch and yaw": bool(self.pitch_deg or self.yaw_deg),
+            "track": self.track_id is not None,
+            "class": self.class_name is not None,
+            "latitude and longitude": place != (None, None, None),
+        }
+        if sum(given.values()) > 1:
+            got = both_of([name for name, is_given in given.items() if is_given])
+            raise GrammarError(f"gimbal: give only one of {', '.join(given)}; got {got}")
+        if given["latitude and longitude"] and None in place[:2]:
+            raise GrammarError("gimbal: give both latitude and longitude; one is missing")
 
     @property
-    def aim(self) -> GimbalAim | TrackAim:
+    def aim(self) -> GimbalGoal:
         """Where to point it."""
-        if self.track_id is not None:
-            return TrackAim(self.track_id)
+        if self.track_id is not None or self.class_name is not None:
+            return Wanted(self.class_name or "", self.track_id)
+        if self.latitude_deg is not None and self.longitude_deg is not None:
+            return GlobalPoint(self.latitude_deg, self.longitude_deg, self.altitude_m or 0.0)
         return GimbalAim(math.radians(self.pitch_deg), math.radians(self.yaw_deg))
 
     def build(self, context: BuildContext) -> Behaviour:
@@ -50,42 +81,46 @@ class Gimbal(Command):
 
 
 class PointGimbalBehaviour(HoldBehaviour):
-    """Holds, and ends when the gimbal points at the aim."""
+    """Holds, and ends when the gimbal points at the goal."""
 
     name = "gimbal"
     requirements = frozenset({Requirement.POSITION, Requirement.IN_AIR, Requirement.GIMBAL})
 
-    def __init__(self, aim: GimbalAim | TrackAim) -> None:
+    def __init__(self, goal: GimbalGoal) -> None:
         super().__init__()
-        self._track = aim if isinstance(aim, TrackAim) else None
-        self._aim = aim if isinstance(aim, GimbalAim) else GimbalAim(0.0)
-        if isinstance(aim, TrackAim):
-            self.track_id = aim.track_id
-        else:
-            self.gimbal_pitches_rad = (aim.pitch_rad,)
+        self._goal, self._pointing = goal, Pointing(goal)
+        self._problem: str | None = None
+        if isinstance(goal, Wanted):
+            self.track_id, self.class_names = goal.track_id, goal.class_names
+        elif isinstance(goal, GimbalAim):
+            self.gimbal_pitches_rad = (goal.pitch_rad,)
+
+    def on_activate(self, context: BehaviourContext) -> None:
+        super().on_activate(context)
+        self._pointing = Pointing(self._goal)
+        self._problem = self._pointing.begin(context)
 
     def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
         # The first update still shows the previous owner's problem.
         if context.gimbal.problem and context.now_ns > self._since_ns:
             return Outcome(False, f"gimbal: {context.gimbal.problem}")
-        state, gimbal = context.state, context.state.gimbal
-        if self._track is not None:
-            camera_pitch_rad = context.gimbal.camera_pitch_rad if context.gimbal.carries_camera else 0.0
-            self._aim = self._track.direction(context.tracks, state, camera_pitch_rad) or self._aim
-        off_rad = None if gimbal is None else gimbal.off_rad(self._aim, state.yaw_rad or 0.0)
+        if (why := self._problem or self._pointing.update(context)) is not None:
+            return Outcome(False, f"gimbal: {why}")
+        state, gimbal, aim = context.state, context.state.gimbal, self._pointing.aim
+        assert aim is not None
+        off_rad = None if gimbal is None else gimbal.off_rad(aim, state.yaw_rad or 0.0)
         known = gimbal is not None and gimbal.attitude_fresh(context.now_ns)
         if known and off_rad is not None and off_rad <= POINTED_RAD:
-            return Outcome(True, f"gimbal points {direction_text(self._aim)}")
+            return Outcome(True, f"gimbal points {direction_text(aim)}")
         if context.now_ns - self._since_ns > POINT_TIMEOUT_S * 1e9:
-            return Outcome(
-                False, f"gimbal: not pointing {direction_text(self._aim)} after {POINT_TIMEOUT_S:g} s"
-            )
+            return Outcome(False, f"gimbal: not pointing {direction_text(aim)} after {POINT_TIMEOUT_S:g} s")
         return super().update(dt_s, context)
 
     @property
     def gimbal_aim(self) -> GimbalAim | None:
-        return self._aim
+        return self._pointing.aim
 
     @property
     def status(self) -> str:
-        return f"pointing the gimbal {direction_text(self._aim)}"
+        aim = self._pointing.aim
+        return "pointing the gimbal" if aim is None else f"pointing the gimbal {direction_text(aim)}"

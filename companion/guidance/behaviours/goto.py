@@ -5,17 +5,14 @@ from __future__ import annotations
 import math
 from typing import Annotated
 
-from companion.geometry.geodesy import north_east
 from companion.guidance.behaviour import Behaviour, BehaviourContext
 from companion.guidance.behaviours.path_flight import PathFlight
 from companion.guidance.command import BuildContext, Command, GrammarError, Number, behaviour
-from companion.guidance.motion import home_of, position_and_yaw
+from companion.guidance.motion import home_of, local_from_global, position_and_yaw
 from companion.guidance.path import Path
 from companion.vehicle.state import Vector3
 
 NEAREST_M = 0.05
-# GLOBAL_POSITION_INT comes 5 to 50 times a second.
-GLOBAL_MAX_AGE_S = 0.5
 
 
 @behaviour("goto", "fly straight to a point, given by one pair of arguments")
@@ -127,13 +124,7 @@ class GotoBehaviour(PathFlight):
             east = forward * math.sin(yaw_rad) + right * math.cos(yaw_rad)
             return (position[0] + north, position[1] + east, down)
         assert self._global_deg is not None
-        if not (math.isfinite(state.latitude_deg) and math.isfinite(state.longitude_deg)):
-            raise ValueError("latitude and longitude not received")
-        age_s = (context.now_ns - state.global_ns) / 1e9
-        if age_s > GLOBAL_MAX_AGE_S:
-            raise ValueError(f"latitude and longitude stale ({age_s:.1f} s)")
-        north, east = north_east((state.latitude_deg, state.longitude_deg), self._global_deg)
-        return (position[0] + north, position[1] + east, down)
+        return (*local_from_global(state, context.now_ns, self._global_deg), down)
 
     def _success_text(self) -> str:
         return "goal reached"

@@ -16,7 +16,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
-from companion.guidance.behaviour import Behaviour, GimbalStatus, Outcome
+from companion.guidance.behaviour import Behaviour, BehaviourContext, GimbalStatus, Outcome
+from companion.guidance.gimbal.pointing import Pointing
 from companion.guidance.interface import (
     Answer,
     EventKind,
@@ -26,9 +27,10 @@ from companion.guidance.interface import (
     ReleaseGimbal,
     TakeGimbal,
 )
-from companion.guidance.targets.chosen import LOST_AFTER_S, NO_TRACKS, RecentTracks, TrackAim
-from companion.vehicle.gimbal import NOBODY, Address, GimbalAim, GimbalState, address_text
+from companion.guidance.targets.chosen import GimbalGoal
+from companion.vehicle.gimbal import NOBODY, Address, GimbalAim, GimbalState, YawFrame, address_text
 from companion.vehicle.state import VehicleState
+from vision.attitude import wrap_angle
 
 # Period of searching for a camera's gimbal that does not respond.
 SEARCH_PERIOD_S = 5.0
@@ -204,9 +206,9 @@ class GimbalControl:
 
 
 def _same(aim: GimbalAim, other: GimbalAim | None) -> bool:
-    if other is None:
+    if other is None or aim.yaw_frame is not other.yaw_frame:
         return False
-    off_rad = max(abs(aim.pitch_rad - other.pitch_rad), abs(aim.yaw_rad - other.yaw_rad))
+    off_rad = max(abs(aim.pitch_rad - other.pitch_rad), abs(wrap_angle(aim.yaw_rad - other.yaw_rad)))
     return off_rad < SAME_AIM_RAD
 
 
@@ -227,12 +229,11 @@ class GimbalMounting:
 
 @dataclass(slots=True, eq=False)
 class _PointRequest:
-    """An operator's request to point the gimbal; `track`: to keep it on, after it is answered too."""
+    """An operator's request to point the gimbal, and to keep it on its goal after it is answered."""
 
     identifier: int
-    aim: GimbalAim
+    pointing: Pointing
     until_ns: float
-    track: TrackAim | None = None
     answered: bool = False
 
 
@@ -301,29 +302,29 @@ class GimbalController:
     def point(
         self,
         identifier: int,
-        aim: GimbalAim | TrackAim,
-        now_ns: int,
-        state: VehicleState,
+        goal: GimbalGoal,
+        context: BehaviourContext,
         out: OutputCollector,
-        tracks: RecentTracks = NO_TRACKS,
     ) -> None:
-        """Point it for an operator and release it; it keeps its direction. At a track: until that is lost."""
-        track = aim if isinstance(aim, TrackAim) else None
-        pitches_rad = (aim.pitch_rad,) if isinstance(aim, GimbalAim) else ()
+        """Point it for an operator and release it; it keeps its direction.
+
+        At an object or a place: until that is lost, or the goal is ended.
+        """
+        now_ns, state, pointing = context.now_ns, context.state, Pointing(goal)
+        pitches_rad = (goal.pitch_rad,) if isinstance(goal, GimbalAim) else ()
         if missing := missing_gimbal(state, now_ns, self.snapshot(now_ns, state), pitches_rad):
             out.result(identifier, Outcome(False, f"gimbal needs {' and '.join(missing)}"))
             return
-        if isinstance(aim, TrackAim):
-            if (why := tracks.missing(aim.track_id, now_ns)) is not None:
-                out.result(identifier, Outcome(False, f"gimbal: {why}"))
-                return
-            direction = aim.direction(tracks, state, self._camera_pitch_rad)
-            if direction is None:
-                out.result(identifier, Outcome(False, "gimbal: the vehicle's heading is unknown"))
-                return
-            aim = direction
+        if (why := pointing.begin(context)) is not None:
+            out.result(identifier, Outcome(False, f"gimbal: {why}"))
+            return
         self._end_point(Outcome(False, "gimbal: superseded by a newer gimbal command"), out)
-        self._point = _PointRequest(identifier, aim, now_ns + POINT_TIMEOUT_S * 1e9, track)
+        self._point = _PointRequest(identifier, pointing, now_ns + POINT_TIMEOUT_S * 1e9)
+
+    def end_goal(self, by: str, out: OutputCollector) -> None:
+        """No longer keep it on an object or a place. `by`: the command that ends it."""
+        if self._point is not None and self._point.pointing.kept:
+            self._end_point(Outcome(False, f"gimbal: ended by {by}"), out)
 
     # --- the steps ---------------------------------------------------------------------------------------
 
@@ -343,21 +344,20 @@ class GimbalController:
 
     def update(
         self,
-        now_ns: int,
-        state: VehicleState,
+        context: BehaviourContext,
         active: Behaviour | None,
         out: OutputCollector,
-        tracks: RecentTracks = NO_TRACKS,
     ) -> None:
         """One step, after that of the active behaviour."""
+        now_ns, state = context.now_ns, context.state
         aim = None if active is None else active.gimbal_aim
         owner: object | None = active
         if self._point is not None and aim is not None and active is not None:
             self._end_point(Outcome(False, f"gimbal: superseded by {active.name}"), out)
-        if self._point is not None and self._point.track is not None:
-            self._aim_at_track(self._point, self._point.track, now_ns, state, tracks, out)
+        if self._point is not None and (why := self._point.pointing.update(context)) is not None:
+            self._end_point(Outcome(False, f"gimbal: {why}"), out)
         if self._point is not None:
-            aim, owner = self._point.aim, self._point
+            aim, owner = self._point.pointing.aim, self._point
         request = self._control.update(now_ns, state.gimbal, aim, owner)
         if request is not None:
             self._asked = (out.request(_action(request)), request.ask, now_ns)
@@ -397,28 +397,6 @@ class GimbalController:
             out.result(self._point.identifier, outcome)
         self._point = None
 
-    @property
-    def _camera_pitch_rad(self) -> float:
-        return self.mounting.camera_pitch_rad if self.mounting.carries_steering else 0.0
-
-    def _aim_at_track(
-        self,
-        request: _PointRequest,
-        track: TrackAim,
-        now_ns: int,
-        state: VehicleState,
-        tracks: RecentTracks,
-        out: OutputCollector,
-    ) -> None:
-        """Aim at the track's object; the request ends when the track is lost."""
-        target = tracks.newest(track.track_id)
-        if target is None or now_ns - target.captured_ns > LOST_AFTER_S * 1e9:
-            instead = "" if target is None else tracks.replacement(target, now_ns)
-            reason = f"gimbal: lost track {track.track_id} for {LOST_AFTER_S:.1f} s{instead}"
-            self._end_point(Outcome(False, reason), out)
-            return
-        request.aim = track.direction(tracks, state, self._camera_pitch_rad) or request.aim
-
     def problem(self, now_ns: int, state: VehicleState) -> str:
         if self._control.problem:
             return self._control.problem
@@ -438,17 +416,18 @@ class GimbalController:
         if self._control.problem:
             self._end_point(Outcome(False, f"gimbal: {self._control.problem}"), out)
             return
-        gimbal = state.gimbal
-        off_rad = None if gimbal is None else gimbal.off_rad(request.aim, state.yaw_rad or 0.0)
+        gimbal, aim = state.gimbal, request.pointing.aim
+        assert aim is not None
+        off_rad = None if gimbal is None else gimbal.off_rad(aim, state.yaw_rad or 0.0)
         known = gimbal is not None and gimbal.attitude_fresh(now_ns) and off_rad is not None
         there = known and off_rad is not None and off_rad <= POINTED_RAD
-        if request.track is not None and there:
+        if request.pointing.kept and there:
             if not request.answered:
-                text = f"gimbal kept on track {request.track.track_id}, now {direction_text(request.aim)}"
+                text = f"gimbal kept on {request.pointing.name}, now {direction_text(aim)}"
                 out.result(request.identifier, Outcome(True, text))
             request.answered, request.until_ns = True, now_ns + POINT_TIMEOUT_S * 1e9
-        elif self._control.pointed == request.aim and there:
-            self._end_point(Outcome(True, f"gimbal points {direction_text(request.aim)}"), out)
+        elif self._control.pointed == aim and there:
+            self._end_point(Outcome(True, f"gimbal points {direction_text(aim)}"), out)
         elif now_ns > request.until_ns:
             where = (
                 "has not reported its attitude" if off_rad is None else f"is {math.degrees(off_rad):.0f}° off"
@@ -509,6 +488,8 @@ def direction_text(aim: GimbalAim) -> str:
     """A direction in words."""
     pitch, yaw = round(math.degrees(aim.pitch_rad)), round(math.degrees(aim.yaw_rad))
     words = "level" if pitch == 0 else f"{abs(pitch)}° {'up' if pitch > 0 else 'down'}"
+    if aim.yaw_frame is YawFrame.NORTH:
+        return f"{words}, bearing {yaw % 360}°"
     return words if yaw == 0 else f"{words}, {abs(yaw)}° to the {'right' if yaw > 0 else 'left'}"
 
 

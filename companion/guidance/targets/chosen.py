@@ -16,17 +16,12 @@ from dataclasses import dataclass
 from companion.guidance.targets.from_markers import marker_name
 from companion.guidance.targets.target import DOUBTED, UNCONFIRMED_MARKER, Target
 from companion.vehicle.gimbal import GimbalAim
-from companion.vehicle.state import VehicleState
 from vision.attitude import wrap_angle
 
 # An ended track is remembered for this long, and at most so many are.
 MEMORY_S, MEMORY_TRACKS = 120.0, 256
 # A track took the place of a lost one if it is within this of it, and for each second since.
 NEAR_M, NEAR_MPS = 2.0, 1.0
-# A gimbal's track unseen for so long is lost; the default of `follow occlusion=`.
-LOST_AFTER_S = 3.0
-# Nearer than this the object is above or below, and its elevation is too sensitive.
-NEAREST_M = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,33 +172,37 @@ NO_TRACKS = RecentTracks()
 
 
 @dataclass(frozen=True, slots=True)
-class TrackAim:
-    """Where to point the gimbal: at a track's object."""
+class GlobalPoint:
+    """A place to point the gimbal at: WGS 84, and metres above home."""
 
-    track_id: int
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float = 0.0
 
-    def direction(
-        self, tracks: RecentTracks, state: VehicleState, camera_pitch_rad: float
-    ) -> GimbalAim | None:
-        """The aim by the newest target, from where the vehicle is now; None: no such track, or no heading.
 
-        Args:
-            camera_pitch_rad: pitch of the camera above the gimbal's axis.
-        """
-        target, yaw_rad = tracks.newest(self.track_id), state.yaw_rad
-        if target is None or yaw_rad is None:
-            return None
-        bearing_rad, elevation_rad = target.bearing_rad, target.elevation_rad
-        if target.position_ned_m is not None and state.position_ned_m is not None:
-            north = target.position_ned_m[0] - state.position_ned_m[0]
-            east = target.position_ned_m[1] - state.position_ned_m[1]
-            rise_m = target.ground_range_m * math.tan(elevation_rad)
-            bearing_rad = math.atan2(east, north)
-            elevation_rad = math.atan2(rise_m, max(math.hypot(north, east), NEAREST_M))
-        pitch_rad = elevation_rad - camera_pitch_rad
-        if state.gimbal is not None:
-            pitch_rad = state.gimbal.nearest_pitch_rad(pitch_rad)
-        return GimbalAim(pitch_rad, wrap_angle(bearing_rad - yaw_rad))
+# Where to point the gimbal: a direction, an object, or a place.
+GimbalGoal = GimbalAim | Wanted | GlobalPoint
+
+
+def newest_of(
+    wanted: Wanted, seen: Target | None, targets: Collection[Target], tracks: RecentTracks, now_ns: int
+) -> Target | None:
+    """The newest detection of a track, or of the best object of a class; None: none.
+
+    The object of a class stays the same until its track has ended. Without tracks it is the one in the
+    direction nearest to the last.
+
+    Args:
+        seen: the object's last detection. targets: of the newest frame.
+    """
+    if wanted.track_id is not None:
+        return tracks.newest(wanted.track_id)
+    trusted = [target for target in wanted.of((*targets, *tracks.present(now_ns))) if target.trusted]
+    if seen is None or now_ns - seen.captured_ns > tracks.max_age_s * 1e9:
+        return max(trusted, key=lambda target: target.score, default=None)
+    if seen.track_id is None:
+        return min(trusted, key=lambda target: _off_rad(seen, target), default=None)
+    return next((target for target in wanted.of(targets) if target.track_id == seen.track_id), None)
 
 
 def _distance_m(target: Target, place: tuple[float, float]) -> float:

@@ -28,9 +28,9 @@ def person(bearing_deg: float, distance_m: float = 4.0) -> SceneObject:
 
 
 def gimbal_flight(
-    scene_object: SceneObject, *, seed: int = 5, mount: CameraMount = ON_GIMBAL, **options: Any
+    *scene_objects: SceneObject, seed: int = 5, mount: CameraMount = ON_GIMBAL, **options: Any
 ) -> LockstepFlight:
-    """In the air, with a detector that sees the object through the gimbal's camera."""
+    """In the air, with a detector that sees the objects through the gimbal's camera."""
     vehicles: list[LockstepVehicle] = []
 
     def gimbal_attitude() -> Quaternion:
@@ -44,6 +44,6 @@ def gimbal_flight(
 
     # Box noise of the detector is tested elsewhere.
     detector = SyntheticDetector(
-        [scene_object], CAMERA, mount, seed=seed, faults=Faults(0.0, 0.05, 0.0, 0.0), gimbal=gimbal_attitude
+        scene_objects, CAMERA, mount, seed=seed, faults=Faults(0.0, 0.05, 0.0, 0.0), gimbal=gimbal_attitude
     )
     return LockstepFlight.airborne(seed=seed, height_m=HEIGHT_M, camera=camera, gimbal=True, **options)

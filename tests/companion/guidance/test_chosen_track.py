@@ -18,8 +18,9 @@ from companion.guidance.command import NO_CONTEXT, Command, GrammarError
 from companion.guidance.core import GuidanceOptions
 from companion.guidance.grammar import json_schema, markdown, parse, usage
 from companion.guidance.interface import EventKind, GuidanceInput
-from companion.guidance.targets.chosen import RecentTracks, TrackAim, Wanted
+from companion.guidance.targets.chosen import RecentTracks, Wanted
 from companion.guidance.targets.ranging import RangeMeans
+from companion.vehicle.gimbal import GimbalAim, YawFrame
 from tests.companion.guidance.gimbal_flight import gimbal_flight, person
 from tests.companion.guidance.guidance_harness import Flight, GuidanceHarness, engaged, flying
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject, look
@@ -309,8 +310,7 @@ def test_gimbal_is_kept_on_a_track_until_it_is_lost() -> None:
         gimbal, yaw_rad = flight.state.gimbal, flight.state.yaw_rad
         assert gimbal is not None
         assert yaw_rad is not None
-        wanted = TrackAim(1).direction(RecentTracks((target,)), flight.state, 0.0)
-        assert wanted is not None
+        wanted = GimbalAim(target.elevation_rad, target.bearing_rad, YawFrame.NORTH)
         off_rad = gimbal.off_rad(wanted, yaw_rad)
         assert off_rad is not None
         return math.degrees(off_rad)
@@ -337,7 +337,7 @@ def test_gimbal_is_refused_for_a_track_that_is_not_there() -> None:
 def test_mission_step_points_the_gimbal_at_a_track() -> None:
     flight = gimbal_flight(person(0.0, 25.0))
     flight.run(2.0)
-    log = flight.fly(PointGimbalBehaviour(TrackAim(1)), 15.0, warm_up_s=0.0)
+    log = flight.fly(PointGimbalBehaviour(Wanted(track_id=1)), 15.0, warm_up_s=0.0)
     assert log.outcome is not None
     assert log.outcome.success, log.outcome.reason
     gimbal = flight.state.gimbal

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 
+from companion.guidance.behaviour import BehaviourContext
 from companion.guidance.behaviours.gimbal_pointing import PointGimbalBehaviour
 from companion.guidance.gimbal.controller import (
     FIND_TIMEOUT_S,
@@ -61,7 +62,7 @@ class ControllerHarness:
             if ending:
                 self.controller.end(now_ns, self.state, self.out)
             else:
-                self.controller.update(now_ns, self.state, behaviour, self.out)
+                self.controller.update(BehaviourContext(now_ns, self.state), behaviour, self.out)
             self.messages += [event.message for event in self.out.events]
             for request in self.out.requests:
                 self.asked.append(_words(request.action))
@@ -173,7 +174,7 @@ def test_waiting_point_command_is_answered_at_the_end() -> None:
         information_ns=now_ns,
     )
     harness.out.begin(now_ns)
-    harness.controller.point(7, GimbalAim(-0.5), now_ns, harness.state, harness.out)
+    harness.controller.point(7, GimbalAim(-0.5), BehaviourContext(now_ns, harness.state), harness.out)
     assert harness.out.results == []
     harness.run(None, 1, ending=True)
     assert [result.identifier for result in harness.out.results] == [7]

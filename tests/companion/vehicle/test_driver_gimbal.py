@@ -67,18 +67,19 @@ async def test_gimbal_control_is_taken_used_and_released(kind: DriverKind) -> No
                 await driver.point_gimbal(GimbalAim(-0.5))
             await driver.take_gimbal()
             await wait_for_state(driver, lambda s: gimbal_of(s).primary_control == OURS)
-            aim = GimbalAim(math.radians(-40.0), math.radians(25.0))
-            await driver.point_gimbal(aim)
+            for frame in YawFrame:
+                aim = GimbalAim(math.radians(-40.0), math.radians(25.0), frame)
+                await driver.point_gimbal(aim)
 
-            def aimed(s: VehicleState) -> bool:
-                assert s.yaw_rad is not None
-                off_rad = gimbal_of(s).off_rad(aim, s.yaw_rad)
-                assert off_rad is not None
-                return off_rad < math.radians(1.0)
+                def aimed(s: VehicleState, aim: GimbalAim = aim) -> bool:
+                    assert s.yaw_rad is not None
+                    off_rad = gimbal_of(s).off_rad(aim, s.yaw_rad)
+                    assert off_rad is not None
+                    return off_rad < math.radians(1.0)
 
-            pitch_rad = gimbal_of(await wait_for_state(driver, aimed)).pitch_rad
-            assert pitch_rad is not None
-            assert math.degrees(pitch_rad) == pytest.approx(-40.0, abs=1.0)
+                pitch_rad = gimbal_of(await wait_for_state(driver, aimed)).pitch_rad
+                assert pitch_rad is not None
+                assert math.degrees(pitch_rad) == pytest.approx(-40.0, abs=1.0)
 
             # The ground station takes control: it is reported, and our command is denied.
             assert await asyncio.to_thread(station.wait_heartbeat, timeout=10)

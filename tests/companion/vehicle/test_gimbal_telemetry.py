@@ -142,6 +142,8 @@ def test_angle_between_gimbal_and_aim(frame_flags: int) -> None:
     assert gimbal.off_rad(GimbalAim(math.radians(-35.0), exact.yaw_rad), heading) == pytest.approx(
         math.radians(5.0)
     )
+    from_north = GimbalAim(exact.pitch_rad, math.radians(90.0), YawFrame.NORTH)
+    assert gimbal.off_rad(from_north, heading) == pytest.approx(0.0, abs=1e-6)
 
 
 @pytest.mark.parametrize("aim", [(-1.6, 0.0), (0.0, 3.2), (math.nan, 0.0)])
