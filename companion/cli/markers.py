@@ -52,7 +52,8 @@ def markers(
         if settings.camera.on_gimbal:
             raise ValueError("camera.on_gimbal: without a vehicle the gimbal's attitude is unknown; unset it")
         reading = SourceSettings(width=width, height=height, pixel_format=pixel_format, every_frame=True)
-    with plain_errors(SourceError, OSError), open_source(source, reading) as frames:
+    # ValueError: the lens is of images of another aspect.
+    with plain_errors(SourceError, OSError, ValueError), open_source(source, reading) as frames:
         frames_read = print_markers(
             frames,
             settings.model_copy(update={"markers": section}),

@@ -135,3 +135,13 @@ def test_missing_and_empty_sources_exit_with_code_2(tmp_path: Path) -> None:
         assert (done.exit_code, done.stdout) == (2, "")
         assert str(source) in done.stderr
         assert len(done.stderr.splitlines()) == 1
+
+
+def test_lens_of_images_of_another_aspect_is_one_line(folder: Path) -> None:
+    keys = ("fx-px", "fy-px", "cx-px", "cy-px", "calibrated-width", "calibrated-height")
+    lens = [text for key in keys for text in (f"--camera-{key}", "300")]
+    done = CliRunner().invoke(app, ["markers", str(folder), *PRINTED, *lens])
+    assert done.exit_code == 2
+    (line,) = done.stderr.splitlines()
+    assert "300x300" in line
+    assert "640x480" in line
