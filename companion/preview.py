@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
+import threading
 import time
 from collections import deque
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -16,10 +19,14 @@ from numpy.typing import NDArray
 
 from companion.bus.bodies import DepthBody
 from companion.bus.messages import depth_message
-from vision.annotate import annotate
+from companion.perception.assembly import CameraTelemetry
+from companion.settings import Settings
+from companion.vehicle.state import VehicleState
+from vision.annotate import annotate, annotate_level
 from vision.depth import centre_depth
 from vision.detections import Detections
 from vision.frame import Frame
+from vision.levelling import Levelling
 from vision.pipeline import PerceptionResult, Pipeline
 from vision.sources import EndOfStream, Source, SourceError
 
@@ -37,6 +44,7 @@ class PreviewOptions:
         grey: the picture in grey, a third as wide and high.
         period_s: interval of lines and pictures, seconds; 0: every frame.
         limit: number of lines after which it ends; None: with the source.
+        level: levels the pictures; None: they stay as they are.
     """
 
     topic: str
@@ -44,6 +52,7 @@ class PreviewOptions:
     grey: bool = False
     period_s: float = 1.0
     limit: int | None = None
+    level: Levelling | None = None
 
 
 def save_picture(folder: Path, frame: Frame, image: NDArray[np.uint8]) -> None:
@@ -90,7 +99,7 @@ def preview_source(source: Source, options: PreviewOptions, write: Callable[[str
         lines = status_lines(source, frame, rate_hz, options.topic)
         write("  ".join(lines))
         if options.save is not None:
-            save_picture(options.save, frame, picture(frame, lines, grey=options.grey))
+            save_picture(options.save, frame, picture(frame, lines, grey=options.grey, level=options.level))
         shown += 1
 
     for frame in source:
@@ -122,15 +131,75 @@ def status_lines(source: Source, frame: Frame, rate_hz: float | None, topic: str
     )
 
 
-def picture(frame: Frame, lines: tuple[str, ...], *, grey: bool) -> NDArray[np.uint8]:
+def picture(
+    frame: Frame, lines: tuple[str, ...], *, grey: bool, level: Levelling | None = None
+) -> NDArray[np.uint8]:
     """The frame with its lines, (height, width, 3) BGR; with `grey` a third as wide and high."""
-    image = frame.image
     if grey:
         size = (max(frame.width // GREY_DIVISOR, 1), max(frame.height // GREY_DIVISOR, 1))
-        small = cv2.resize(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), size, interpolation=cv2.INTER_AREA)
-        image = cv2.cvtColor(small, cv2.COLOR_GRAY2BGR).astype(np.uint8, copy=False)
-    centre_m = None if frame.depth_m is None else centre_depth(frame.depth_m)
-    return annotate(image, Detections.empty(()), lines=lines, centre_m=centre_m)
+        small = cv2.resize(cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY), size, interpolation=cv2.INTER_AREA)
+        frame = replace(frame, image=cv2.cvtColor(small, cv2.COLOR_GRAY2BGR).astype(np.uint8, copy=False))
+    return annotate_level(frame, Detections.empty(()), level, lines=lines)
+
+
+@contextlib.contextmanager
+def attitudes_of(settings: Settings) -> Iterator[CameraTelemetry]:
+    """Receive the attitudes of the vehicle, and of its gimbal, in a thread meanwhile.
+
+    Raises:
+        LinkError: no heartbeat or no attitude was received within `vehicle.connect_timeout_s`, or the link
+            cannot be opened.
+    """
+    from companion.guidance.targets.from_detections import HistoryError, StateHistory
+    from companion.service.factory import driver_of
+    from companion.vehicle.driver import LinkError
+
+    telemetry, history = CameraTelemetry(), StateHistory()
+    opened: Future[tuple[asyncio.AbstractEventLoop, asyncio.Event]] = Future()
+    url, timeout_s = settings.vehicle.url, settings.vehicle.connect_timeout_s
+
+    async def receive() -> None:
+        driver, known, ended = driver_of(settings), asyncio.Event(), asyncio.Event()
+
+        def on_state(state: VehicleState) -> None:
+            history.add(state)
+            if state.attitude is not None:
+                telemetry.attitudes.add(state.attitude_ns, state.attitude)
+            if state.gimbal is not None and state.gimbal.attitude is not None:
+                with contextlib.suppress(HistoryError):
+                    stamp_ns = state.gimbal.attitude_ns
+                    telemetry.gimbal.add(stamp_ns, history.gimbal_at(stamp_ns))
+            if telemetry.attitudes.at(time.monotonic_ns()) is not None:
+                known.set()
+
+        try:
+            await driver.connect(timeout_s)
+            driver.subscribe(on_state)
+            async with asyncio.timeout(timeout_s):
+                await known.wait()
+            opened.set_result((asyncio.get_running_loop(), ended))
+            await ended.wait()
+        except TimeoutError:
+            raise LinkError(f"{url}: no attitude received within {timeout_s:g} s") from None
+        finally:
+            await driver.close()
+
+    def run() -> None:
+        try:
+            asyncio.run(receive())
+        except Exception as error:
+            if opened.done():
+                raise
+            opened.set_exception(error)
+
+    thread = threading.Thread(target=run, name="attitudes", daemon=True)
+    thread.start()
+    loop, ended = opened.result()
+    try:
+        yield telemetry
+    finally:
+        loop.call_soon_threadsafe(ended.set)
+        thread.join()
 
 
 class DepthRecorder:

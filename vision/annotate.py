@@ -11,7 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vision.camera_model import CameraModel
+from vision.depth import centre_depth
 from vision.detections import NO_TRACK, Detections
+from vision.frame import Frame
+from vision.levelling import Levelling
 from vision.markers import Marker
 
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
@@ -21,6 +24,8 @@ _LIGHT = (250, 250, 250)
 _AXIS_COLOURS = ((40, 40, 230), (60, 200, 60), (230, 120, 40))
 _SHIFT = 4
 _RED = (0, 0, 255)
+
+NOT_LEVEL = "not level: no attitude at the capture"
 
 Colour = tuple[int, int, int]
 Rectangle = tuple[int, int, int, int]  # left, top, right, bottom; the last two outside
@@ -41,6 +46,28 @@ class _Sizes:
         return cls(
             max(1, round(2 * scale)), max(0.3, 0.47 * scale), max(1, round(scale)), max(2, round(4 * scale))
         )
+
+
+def annotate_level(
+    frame: Frame,
+    detections: Detections,
+    level: Levelling | None,
+    *,
+    lines: Sequence[str] = (),
+    highlight: int | None = None,
+) -> NDArray[np.uint8]:
+    """Draw on a frame's image, with the depth at its centre, and level it before the lines are written.
+
+    Without an attitude at its capture the image stays as it is, and a line says so.
+    """
+    centre_m = None if frame.depth_m is None else centre_depth(frame.depth_m)
+    if level is None:
+        return annotate(frame.image, detections, lines=lines, highlight=highlight, centre_m=centre_m)
+    drawn = annotate(frame.image, detections, highlight=highlight, centre_m=centre_m)
+    levelled = level(frame, drawn)
+    if levelled is None:
+        levelled, lines = drawn, (*lines, NOT_LEVEL)
+    return annotate(levelled, Detections.empty(()), lines=lines)
 
 
 def class_colour(class_id: int) -> Colour:

@@ -15,10 +15,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from vision.annotate import annotate
-from vision.depth import centre_depth
+from vision.annotate import annotate_level
 from vision.detections import Detections
 from vision.frame import Frame
+from vision.levelling import Levelling
 from vision.video_writer import VideoWriter, VideoWriterError
 
 logger = logging.getLogger(__name__)
@@ -48,6 +48,7 @@ class Recording:
     Attributes:
         lines: text to draw on the next frames.
         highlight: class whose most confident detection is highlighted, or None.
+        level: levels the images; None: they stay as they are. Called in the recording's thread.
         skipped: frames the encoder had no time for; the previous frame is repeated.
     """
 
@@ -62,6 +63,7 @@ class Recording:
         """
         self.lines: tuple[str, ...] = ()
         self.highlight: str | None = None
+        self.level: Levelling | None = None
         self.skipped = 0
         self._path = Path(path)
         self._period_ns = 1e9 / rate_hz
@@ -131,7 +133,7 @@ class Recording:
             try:
                 if writer is None:
                     writer = VideoWriter(self._path, queued.frame.width, queued.frame.height, self._rate_hz)
-                _add(writer, queued)
+                _add(writer, queued, self.level)
             except Exception as error:
                 self._fail(error)
         try:
@@ -151,14 +153,10 @@ class Recording:
         logger.error("recording failed: %s", error, exc_info=fault)
 
 
-def _add(writer: VideoWriter, queued: _QueuedFrame) -> None:
+def _add(writer: VideoWriter, queued: _QueuedFrame, level: Levelling | None) -> None:
     names = queued.detections.names
     highlight = names.index(queued.highlight) if queued.highlight in names else None
-    frame = queued.frame
-    centre_m = None if frame.depth_m is None else centre_depth(frame.depth_m)
-    drawn = annotate(
-        frame.image, queued.detections, lines=queued.lines, highlight=highlight, centre_m=centre_m
-    )
+    drawn = annotate_level(queued.frame, queued.detections, level, lines=queued.lines, highlight=highlight)
     size = (writer.width, writer.height)
     if (queued.frame.width, queued.frame.height) != size:
         drawn = cv2.resize(drawn, size).astype(np.uint8, copy=False)

@@ -7,7 +7,7 @@ import json
 import logging
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -84,14 +84,28 @@ def preview(
         float, typer.Option(min=0, help="Seconds between lines and pictures; 0: every frame.")
     ] = 1.0,
     limit: Annotated[int | None, typer.Option(min=1, help="Maximum number of lines.")] = None,
+    level: Annotated[
+        bool,
+        typer.Option("--level", help="Level the pictures by the attitude of the vehicle (--vehicle-url)."),
+    ] = False,
 ) -> None:
     """Show what a source delivers. Prints size, measured rate and stamp once a second. Ends on Ctrl-C."""
     from companion.bus import topics
-    from companion.preview import PreviewOptions, preview_source
+    from companion.perception.assembly import build_levelling
+    from companion.preview import PreviewOptions, attitudes_of, preview_source
+    from companion.vehicle.driver import LinkError
 
     topic = topics.IMAGE.key(settings.vehicle.name)
-    with opened(settings, source) as frames:
-        options = PreviewOptions(topic, save, grey, period, limit)
+    with ExitStack() as stack:
+        stack.enter_context(plain_errors(LinkError, ValueError))
+        if level and save is None:
+            raise ValueError("--level is for the pictures of --save DIR, which is not given")
+        telemetry = stack.enter_context(attitudes_of(settings)) if level else None
+        frames = stack.enter_context(opened(settings, source))
+        levelling = None
+        if telemetry is not None:
+            levelling = build_levelling(_with_calibration(settings, frames), telemetry)
+        options = PreviewOptions(topic, save, grey, period, limit, levelling)
         preview_source(frames, options, functools.partial(print, flush=True))
 
 
@@ -106,18 +120,25 @@ def depth(
     """Measure the depth of a source: at the centre and of each object. Prints one line per frame."""
     from companion.perception.assembly import CameraTelemetry, build_pipeline, load_detector
     from companion.preview import DepthRecorder, depth_source
-    from companion.settings.calibration import adopt_calibration
 
     played = settings.source.model_copy(update={"realtime": False})  # every frame of a recording
     settings = settings.model_copy(update={"source": played})
     with opened(settings, source) as frames, plain_errors(ValueError):
-        if frames.calibration is not None:
-            camera = adopt_calibration(settings.camera, frames.calibration).camera
-            settings = settings.model_copy(update={"camera": camera})
+        settings = _with_calibration(settings, frames)
         detector = load_detector(settings) if detect else None
         pipeline = build_pipeline(settings, frames, detector, CameraTelemetry(), recorder=DepthRecorder(save))
         write = functools.partial(print, flush=True)
         depth_source(pipeline, vehicle=settings.vehicle.name, limit=limit, as_json=as_json, write=write)
+
+
+def _with_calibration(settings: Settings, source: Source) -> Settings:
+    """The settings with the lens and mount that a source brings, if any."""
+    from companion.settings.calibration import adopt_calibration
+
+    if source.calibration is None:
+        return settings
+    camera = adopt_calibration(settings.camera, source.calibration).camera
+    return settings.model_copy(update={"camera": camera})
 
 
 @contextmanager

@@ -15,6 +15,7 @@ from vision.camera_model import CameraMount
 from vision.depth import nearest_points
 from vision.frame import Frame
 from vision.gc_pause import gc_paused
+from vision.levelling import Levelling, level_image, level_rotations, poses_of_readout
 from vision.marker_boards import BoardPose, locate_board
 from vision.markers import Marker, MarkerDetector
 from vision.object_detector import ObjectDetector
@@ -24,18 +25,21 @@ from vision.sources import Source
 from vision.tracking import AttitudeHistory, CameraView, Tracker
 from vision.tracking.camera_motion import Array
 
+# A frame of the video may wait for its encoder: two seconds of frames, ten times as long on a busy computer.
+ATTITUDES_S = 20.0
+
 
 class CameraTelemetry:
     """The vehicle telemetry that the pipeline of one camera uses.
 
     Attributes:
-        attitudes: of the vehicle, the last few seconds. height_m: the newest above home; None: unknown.
+        attitudes: of the vehicle, the last `ATTITUDES_S`. height_m: the newest above home; None: unknown.
         gimbal: attitudes of the camera's gimbal; empty for a fixed camera.
         positions: of the vehicle, the last few seconds.
     """
 
     def __init__(self) -> None:
-        self.attitudes, self.gimbal = AttitudeHistory(), AttitudeHistory()
+        self.attitudes, self.gimbal = AttitudeHistory(ATTITUDES_S), AttitudeHistory(ATTITUDES_S)
         self.positions = PositionHistory()
         self.height_m: float | None = None
 
@@ -68,6 +72,20 @@ def build_pipeline(
         nearest_in=_nearest_in(settings, telemetry),
         clock_ns=clock_ns,
     )
+
+
+def build_levelling(settings: Settings, telemetry: CameraTelemetry) -> Levelling:
+    """Build the function that levels a frame's image; it returns None without an attitude at its capture."""
+    pose_at, readout_s = _pose_at(settings, telemetry), settings.camera.rolling_shutter_ms / 1e3
+
+    def level(frame: Frame, image: NDArray[np.uint8]) -> NDArray[np.uint8] | None:
+        poses = poses_of_readout(pose_at, frame.captured_ns, readout_s)
+        if poses is None:
+            return None
+        model = settings.camera.model(frame.width, frame.height)
+        return level_image(image, model, level_rotations(poses), settings.source.rotate_deg)
+
+    return level
 
 
 def build_path_planning(settings: Settings, telemetry: CameraTelemetry) -> PathPlanning | None:

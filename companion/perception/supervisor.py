@@ -247,7 +247,8 @@ class PerceptionSupervisor:
     @property
     def _needs_attitude(self) -> bool:
         # The tracker compensates the camera's rotation; ranges from depth need the direction of gravity.
-        return self._settings.detector.enabled or self._settings.guidance.obstacles != "off"
+        settings = self._settings
+        return settings.detector.enabled or settings.guidance.obstacles != "off" or settings.recording.level
 
     @property
     def state(self) -> PerceptionState:

@@ -23,6 +23,7 @@ from dataclasses import dataclass, replace
 
 from companion.perception.assembly import (
     CameraTelemetry,
+    build_levelling,
     build_path_planning,
     build_pipeline,
     load_detector,
@@ -206,6 +207,8 @@ def _work(begin: Begin, control: ControlChannel, sender: ResultSender) -> Ended 
             settings = settings.model_copy(update={"camera": adopted})
             perception.clouds.camera = adopted
         perception = replace(perception, plan=_planner(settings, control, sender))
+        if perception.recording is not None and settings.recording.level:
+            perception.recording.level = build_levelling(settings, control.telemetry)
         pipeline = build_pipeline(
             settings,
             perception.source,

@@ -127,6 +127,8 @@ class CameraSection(Section):
     """height of the calibration images, pixels"""
     distortion: tuple[float, ...] = ()
     """coefficients of distortion_model in OpenCV's order: k1, k2, p1, p2, k3; none: no distortion"""
+    rolling_shutter_ms: Annotated[float, Field(ge=0, le=500)] = 0.0
+    """time from the first row's exposure to the last row's, ms, for levelled images; 0: a global shutter"""
     distortion_model: DistortionModel = "plumb_bob"
     """plumb_bob; rational_polynomial: eight coefficients; equidistant (fisheye): k1, k2, k3, k4"""
 
@@ -411,11 +413,15 @@ class VideoSection(Section):
     """file of the annotated video, .webm; unset: none"""
     rate_hz: Annotated[float, Field(ge=0.1, le=240)] = 15.0
     """frame rate, Hz; one of 640x480 costs some 20 ms of a core with the extra `video`, up to 150 without"""
+    level: bool = False
+    """level the video's images by the attitude at capture, row by row with camera.rolling_shutter_ms"""
 
     @model_validator(mode="after")
     def _is_webm(self) -> Self:
         if self.video is not None and not self.video.lower().endswith(".webm"):
             raise ValueError(f"video must end in .webm, got {self.video!r}")
+        if self.level and self.video is None:
+            raise ValueError("level is of the video, which is not set: set video, or remove it")
         return self
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from companion.preview import PreviewOptions, RateMeter, preview_source
+from mavlink_sim.testing import free_udp_ports, running_simulator
 from tests.companion.bus.message_check import check_message
 from tests.companion.command_line import companion
 from vision.sources import open_source
@@ -90,6 +91,39 @@ def test_bad_source_of_preview_is_one_line(tmp_path: Path) -> None:
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()
     assert line.startswith("companion: /dev/video98765: no such camera")
+
+
+def test_preview_is_levelled_by_the_attitude_of_the_vehicle(pictures: Path, tmp_path: Path) -> None:
+    with running_simulator() as simulator:
+        done = companion(
+            "preview", pictures, "--level", "--save", tmp_path / "out", "--period", "0", "--limit", "2",
+            "--vehicle-url", simulator.mavsdk_url, "--camera-mount-roll-deg", "30", "--source-rate-hz", "5",
+            cwd=tmp_path,
+        )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    image = cv2.imread(str(tmp_path / "out" / "000001.jpg"))
+    assert image is not None
+    # Turned by 30 degrees: the picture's blue in the middle, black in the corners.
+    assert abs(image[120, 300].astype(int) - (200, 40, 40)).max() < 8
+    assert image[-1, 0].max() < 8
+    assert image[-1, -1].max() < 8
+
+
+@pytest.mark.parametrize(
+    ("options", "part"),
+    [
+        (("--level",), "--save DIR"),
+        (("--level", "--save", "out", "--vehicle-connect-timeout-s", "0.3"), "no autopilot heartbeat"),
+    ],
+)
+def test_preview_that_cannot_be_levelled_is_one_line(
+    pictures: Path, tmp_path: Path, options: tuple[str, ...], part: str
+) -> None:
+    url = f"udpin://127.0.0.1:{free_udp_ports(1)[0]}"
+    done = companion("preview", pictures, *options, "--vehicle-url", url, cwd=tmp_path)
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert part in line
 
 
 def test_cameras_are_one_json_object(tmp_path: Path) -> None:

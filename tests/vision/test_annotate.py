@@ -11,8 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from vision.annotate import annotate, class_colour
+from vision.annotate import NOT_LEVEL, annotate, annotate_level, class_colour
 from vision.detections import NO_TRACK, Detections
+from vision.frame import Frame
 
 NAMES = ("person", "bicycle", "car")
 
@@ -176,3 +177,23 @@ def test_depth_at_the_centre_is_a_red_point_and_a_number() -> None:
     assert unknown[240, 320].tolist() == [0, 0, 255]
     assert (unknown != drawn).any()
     np.testing.assert_array_equal(annotate(image, seen([])), image)
+
+
+def test_boxes_are_levelled_with_the_image_and_lines_are_not() -> None:
+    frame, boxes = Frame(make_image(), 1, 0), seen([[100, 200, 200, 300]])
+    lines = ("height 5.0 m",)
+
+    def level(levelled: Frame, image: np.ndarray) -> np.ndarray:
+        assert levelled is frame
+        return np.ascontiguousarray(image[::-1])
+
+    drawn = annotate_level(frame, boxes, level, lines=lines)
+    expected = annotate(annotate(frame.image, boxes)[::-1].copy(), seen([]), lines=lines)
+    assert np.array_equal(drawn, expected)
+
+
+def test_image_that_cannot_be_levelled_says_so() -> None:
+    frame, boxes = Frame(make_image(), 1, 0), seen([[300, 200, 400, 300]])
+    drawn = annotate_level(frame, boxes, lambda frame, image: None, lines=("a",))
+    assert np.array_equal(drawn, annotate(annotate(frame.image, boxes), seen([]), lines=("a", NOT_LEVEL)))
+    assert np.array_equal(annotate_level(frame, boxes, None), annotate(frame.image, boxes))

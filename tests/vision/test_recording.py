@@ -56,6 +56,18 @@ def test_video_contains_every_frame_with_detections(tmp_path: Path) -> None:
     assert recording.skipped == 0
 
 
+def test_images_of_a_levelled_video_are_those_of_its_level(tmp_path: Path) -> None:
+    path = tmp_path / "flight.webm"
+    recording = Recording(path, 20.0)
+    recording.level = lambda frame, image: np.full_like(image, 200) if frame.sequence else None
+    for sequence in range(2):
+        give(recording, frame_of(sequence), SPOT[:0])
+    recording.close()
+    first, second = played(path)
+    assert np.ptp(first) > 60, "it says that it is not level"
+    assert abs(int(second.mean()) - 200) < 5
+
+
 def test_lines_and_highlight_change_the_image(tmp_path: Path) -> None:
     videos = []
     for name, lines, highlight in (
@@ -120,12 +132,12 @@ def test_close_does_not_wait_for_a_slow_encoder(
     monkeypatch.setattr("vision.recording._FINISHING_S", -1.0)
     drawing, may_go_on = threading.Event(), threading.Event()
 
-    def slowly(image: np.ndarray, *_: object, **__: object) -> np.ndarray:
+    def slowly(frame: Frame, *_: object, **__: object) -> np.ndarray:
         drawing.set()
         assert may_go_on.wait(30)
-        return image
+        return frame.image
 
-    monkeypatch.setattr("vision.recording.annotate", slowly)
+    monkeypatch.setattr("vision.recording.annotate_level", slowly)
     path = tmp_path / "flight.webm"
     recording = Recording(path, 20.0)
     for sequence in range(4):
@@ -145,10 +157,10 @@ def test_close_does_not_wait_for_a_slow_encoder(
 def test_internal_error_ends_the_recording_with_a_log(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def faulty(image: np.ndarray, detections: Detections, **_: object) -> np.ndarray:
-        return image if len(detections) else [][0]
+    def faulty(frame: Frame, detections: Detections, *_: object, **__: object) -> np.ndarray:
+        return frame.image if len(detections) else [][0]
 
-    monkeypatch.setattr("vision.recording.annotate", faulty)
+    monkeypatch.setattr("vision.recording.annotate_level", faulty)
     path = tmp_path / "flight.webm"
     recording = Recording(path, 20.0)
     give(recording, frame_of(0))

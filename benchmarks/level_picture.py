@@ -1,0 +1,174 @@
+"""How level levelled pictures are: the horizon in rendered pictures of an orbit, before and after.
+
+    python -m benchmarks.level_picture --seeds 1..5 [--rolling-shutter-ms 30] [--save FILE.jpg] [--json]
+
+The vehicle flies an orbit of 13 m at 5 m/s, 8 m above the ground, in wind of 2 m/s. The camera (640x480, 80°
+across, a lens with distortion) looks ahead and is fixed to the body. The pictures are levelled by the
+autopilot's attitude, received 50 times a second, as the perception worker has it. Errors: the slope of a line
+through the horizon, its offset from where a level camera with that axis has it, and its bend: the greatest
+distance of the horizon from that line. `--save` writes the picture of median slope before and after.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.bench.lockstep_flight import LockstepFlight, plain_settings
+from companion.bench.rendered_camera import rendered_scene
+from companion.bench.synthetic_detector import SceneObject, ScenePose
+from mavlink_sim.camera.lens import Shutter
+from mavlink_sim.camera.simulated_camera import SimulatedCamera
+from vision.camera_model import CameraModel, CameraMount
+from vision.levelling import level_camera, level_image, level_rotations, poses_of_readout
+from vision.rotation import matrix_from_quaternion
+from vision.tracking import AttitudeHistory
+
+CAMERA = replace(
+    CameraModel.from_horizontal_fov(640, 480, math.radians(80.0)), distortion=(-0.1, 0.02, 0.001, -0.001)
+)
+MOUNT = CameraMount(forward_m=0.1)
+ORBIT = "orbit radius=13 speed=5"
+PERIOD_S, PICTURES, SETTLED_S = 1.3, 12, 6.0
+TICK_S = 0.01
+# Between the capture and the levelling the attitude of that moment is received.
+LATENCY_S = 0.06
+
+Image = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True)
+class Horizon:
+    """The horizon of a picture, degrees. `offset_deg`: below the row where it should be."""
+
+    slope_deg: float
+    offset_deg: float
+    bend_deg: float
+
+
+@dataclass(frozen=True, slots=True)
+class Pair:
+    """A picture and its horizon, before and after levelling."""
+
+    before: Image
+    after: Image
+    tilted: Horizon
+    level: Horizon
+
+
+def pairs(seed: int, rolling_shutter_s: float, count: int = PICTURES) -> Iterator[Pair]:
+    """The pictures of one orbit; the same seed gives the same."""
+    car = SceneObject("car", (4.2, 1.8, 1.5), lambda _: ScenePose(14.0, 3.0, 0.7))
+    scene, _ = rendered_scene([car], CAMERA, MOUNT, seed)
+    shutter = Shutter(0.0, rolling_shutter_s) if rolling_shutter_s else None
+    camera = SimulatedCamera(replace(scene, camera=replace(scene.camera, shutter=shutter)))
+    settings = plain_settings({"guidance.max_horizontal_speed_mps": "6"})
+    flight = LockstepFlight.airborne(seed=seed, height_m=8.0, wind_mps=2.0, settings=settings)
+    attitudes = AttitudeHistory()
+
+    def fly(seconds: float) -> None:
+        for _ in range(round(seconds / TICK_S)):
+            flight.run(TICK_S)
+            if flight.state.attitude is not None:
+                attitudes.add(flight.state.attitude_ns, flight.state.attitude)
+
+    def pose_at(stamp_ns: int) -> tuple[CameraMount, NDArray[np.float64]] | None:
+        attitude = attitudes.at(stamp_ns)
+        return None if attitude is None else (MOUNT, attitude)
+
+    flight.command(ORBIT)
+    fly(SETTLED_S)
+    for _ in range(count):
+        fly(PERIOD_S)
+        for _ in range(2):  # the motion during the readout is that between two captures
+            fly(TICK_S)
+            truth, stamp_ns = flight.vehicle.truth, flight.now_ns
+            attitude = matrix_from_quaternion(truth.quaternion)
+            captured = camera.capture(truth.position_ned_m, attitude, stamp_ns, flight.seconds)
+        assert captured is not None
+        fly(LATENCY_S)
+        poses = poses_of_readout(pose_at, stamp_ns, rolling_shutter_s)
+        assert poses is not None
+        before = captured.frame.image
+        after = level_image(before, CAMERA, level_rotations(poses))
+        north, east, down = (attitude @ MOUNT.body_from_optical)[:, 2]
+        elevation_rad = math.atan2(-down, math.hypot(north, east))
+        yield Pair(before, after, horizon_of(before, elevation_rad), horizon_of(after, elevation_rad))
+
+
+def horizon_of(image: Image, elevation_rad: float) -> Horizon:
+    """Find the horizon: in each column the first pixel from above that is greener than blue.
+
+    Args:
+        elevation_rad: of the true optical axis.
+    """
+    colours = cv2.blur(image, (5, 5)).astype(np.int16)
+    seen = image.any(axis=2)
+    ground = (colours[:, :, 1] > colours[:, :, 0]) & seen
+    edge, top, columns = ground.argmax(axis=0), seen.argmax(axis=0), np.arange(image.shape[1])
+    # Not where the ground begins with the picture.
+    shown = ground.any(axis=0) & (edge > top + 5)
+    x, y = columns[shown].astype(np.float64), edge[shown].astype(np.float64)
+    if len(x) < 100:
+        raise ValueError(f"the horizon is in {len(x)} columns of the picture, expected at least 100")
+    for _ in range(3):  # without what stands in front of it
+        slope, start = np.polyfit(x, y, 1)
+        off = y - (slope * x + start)
+        near = np.abs(off) <= max(3.0, 2.5 * float(off.std()))
+        x, y = x[near], y[near]
+    lens = level_camera(CAMERA)
+    wanted = lens.cy + lens.fy * math.tan(elevation_rad)
+    smooth = np.convolve(y - (slope * x + start), np.full(15, 1 / 15), "valid")
+    px_deg = math.degrees(1.0 / lens.fy)
+    return Horizon(
+        math.degrees(math.atan(slope)),
+        (slope * lens.cx + start - wanted) * px_deg,
+        float(np.abs(smooth).max()) * px_deg,
+    )
+
+
+def write_picture(path: Path, pair: Pair) -> None:
+    """The picture before and after, beside each other. Raises OSError if it cannot be written."""
+    if not cv2.imwrite(str(path), np.hstack([pair.before, pair.after]), [cv2.IMWRITE_JPEG_QUALITY, 85]):
+        raise OSError(f"cannot write {path}: check free disk space and write permission")
+
+
+def main() -> None:
+    """Print the errors of all pictures, and save one."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
+    parser.add_argument("--seeds", default="1..3", help="FIRST..LAST")
+    parser.add_argument("--rolling-shutter-ms", type=float, default=0.0)
+    parser.add_argument("--save", type=Path, help="File of the picture of median slope, before and after.")
+    parser.add_argument("--json", action="store_true", help="Print one line for each picture.")
+    arguments = parser.parse_args()
+    first, _, last = arguments.seeds.partition("..")
+    taken: list[Pair] = []
+    for seed in range(int(first), int(last or first) + 1):
+        for pair in pairs(seed, arguments.rolling_shutter_ms / 1e3):
+            taken.append(pair)
+            if arguments.json:
+                print(json.dumps({"seed": seed, "before": asdict(pair.tilted), "after": asdict(pair.level)}))
+    for key in ("slope_deg", "offset_deg", "bend_deg"):
+        before, after = (
+            [abs(getattr(horizon, key)) for horizon in horizons]
+            for horizons in ([pair.tilted for pair in taken], [pair.level for pair in taken])
+        )
+        print(
+            f"{key}: before median {np.median(before):.2f}, largest {max(before):.2f}; "
+            f"after {np.median(after):.2f}, {max(after):.2f}; {len(taken)} pictures"
+        )
+    if arguments.save is not None:
+        by_slope = sorted(taken, key=lambda pair: abs(pair.tilted.slope_deg))
+        write_picture(arguments.save, by_slope[len(by_slope) // 2])
+
+
+if __name__ == "__main__":
+    main()
