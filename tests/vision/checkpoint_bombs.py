@@ -64,13 +64,54 @@ def described(path: Path, **changes: Any) -> Path:
     return path
 
 
+EMPTY_MEMBER = struct.pack("<4s4B4HL2L5H2L", b"PK\x01\x02", *[0] * 18)
+
+
 def many_members(path: Path) -> Path:
     """A table of contents without members, forty-six bytes per entry."""
-    member = struct.pack("<4s4B4HL2L5H2L", b"PK\x01\x02", *[0] * 18)
-    contents = b"PK\x03\x04" + member * 200_000
+    contents = b"PK\x03\x04" + EMPTY_MEMBER * 200_000
     end = struct.pack("<4s4H2LH", b"PK\x05\x06", 0, 0, 0xFFFF, 0xFFFF, len(contents) - 4, 4, 0)
     path.write_bytes(contents + end)
     return path
+
+
+def hidden_members(path: Path) -> Path:
+    """The same with zip64 records; in one, the signature is repeated where another size would follow."""
+    contents = EMPTY_MEMBER * 40_000
+    record = struct.pack("<4s4sL2H2L4Q", b"PK\x06\x06", b"PK\x06\x06", *[0] * 5, 9, 9, len(contents), 0)
+    locator = struct.pack("<4sLQL", b"PK\x06\x07", 0, 4 + len(contents), 1)
+    end = struct.pack("<4s4H2LH", b"PK\x05\x06", 0, 0, 0xFFFF, 0xFFFF, 0xFFFFFFFF, 0xFFFFFFFF, 0)
+    path.write_bytes(b"PK\x03\x04" + contents + record + locator + end)
+    return path
+
+
+def two_sizes(path: Path) -> Path:
+    """The end record has another size of the contents than the zip64 record."""
+    content = bytearray(hidden_members(path).read_bytes())
+    content[-10:-6] = (46).to_bytes(4, "little")
+    path.write_bytes(content)
+    return path
+
+
+def member_without_bytes(path: Path) -> Path:
+    """A storage whose member has 16 bytes, of which none are stored."""
+    content = bytearray(pickled(path, tensor(storage("0", 4), 4), _0=b"").read_bytes())
+    # The last entry's uncompressed size (APPNOTE 4.3.12).
+    content[content.rfind(b"PK\x01\x02") + 24] = 16
+    path.write_bytes(content)
+    return path
+
+
+def colliding_set(path: Path) -> Path:
+    numbers = b"".join(b"\x8a\x0a" + (k * ((1 << 61) - 1)).to_bytes(10, "little") for k in range(9_999))
+    return pickled(path, named("builtins.set") + b"](" + numbers + b"e\x85R")
+
+
+def long_texts(path: Path, key: str, before: bytes = b"](", after: bytes = b"e") -> Path:
+    """A description in which `key` has one long text many times."""
+    texts = before + text("n" * 60_000) + b"q\x08" + b"h\x08" * 50_000 + after
+    table = b"}(" + text("names") + b"]" + text("car") + b"a" + text(key) + texts + b"u"
+    return pickled(path, b"}(" + text("format") + text(FORMAT) + text("description") + table + b"u")
 
 
 def compressed(path: Path) -> Path:
@@ -84,6 +125,13 @@ def colliding(path: Path) -> Path:
         b"\x8a\x0a" + (k * ((1 << 61) - 1)).to_bytes(10, "little") + b"N" for k in range(60_000)
     )
     return pickled(path, b"}(" + numbers + b"u")
+
+
+def numbered_weight(path: Path) -> Path:
+    plain = yolov8_description((0.1, 0.01, 64), ("car",)).to_plain()
+    weights = {"a": torch.zeros(1), 1: torch.zeros(1)}
+    torch.save({"format": FORMAT, "description": plain, "state_dict": weights, "metadata": {}}, path)
+    return path
 
 
 def one_storage_for_all(path: Path) -> Path:
@@ -109,6 +157,7 @@ def pair(
     return path
 
 
+# Each tuple contains the one before twice.
 MAZE = b"]q\x09" + b"h\x09h\x09\x86q\x09" * 200
 BOMBS: dict[str, tuple[Callable[[Path], Path], str]] = {
     "lists": (lambda p: pickled(p, b"]" * (6 << 20)), "makes more values"),
@@ -155,7 +204,18 @@ BOMBS: dict[str, tuple[Callable[[Path], Path], str]] = {
         ),
         "a module whose name has",
     ),
-    "a maze": (lambda p: pickled(p, b"}" + text("format") + b"(" + MAZE + b"ts"), "has format a tuple"),
+    "a maze": (lambda p: pickled(p, b"}" + text("format") + b"(" + MAZE + b"ts"), r"has format \(\[\], \("),
+    "a maze as a type's name": (
+        lambda p: pickled(p, named("dill._dill._load_type") + b"(" + MAZE + b"tR"),
+        r"asks for the type \(\[\], \(\[\], \[\]\)",
+    ),
+    "members hidden by a repeated signature": (hidden_members, "table of contents has 1840000 bytes"),
+    "two sizes of the contents": (two_sizes, "46 and 1840000 bytes"),
+    "a member without its bytes": (member_without_bytes, "a member of two sizes"),
+    "a set of colliding numbers": (colliding_set, "member of a set 2305843009213693951"),
+    "a row of one text": (lambda p: long_texts(p, "backbone", b"](](", b"ee"), "too deep or too long"),
+    "one text as all class names": (lambda p: long_texts(p, "names"), "too deep or too long"),
+    "a number as a weight's name": (numbered_weight, "a weight named 1"),
     "layers": (
         lambda p: described(p, backbone=[[-1, 64, "C2f", [64]]] * 100, depth_multiple=1.0),
         "describes 6",

@@ -12,6 +12,7 @@ from vision.yolo.description import ArchitectureError, LayerSpec, ModelDescripti
 from vision.yolo.heads import Detect
 from vision.yolo.layer_config import HEADS, LAYERS, build_layer
 from vision.yolo.layers import ACTIVATIONS, Concat, Conv, LargeKernelDWConv
+from vision.yolo.safe_pickle import shown
 
 __all__ = ["ArchitectureError", "LayerSpec", "ModelDescription", "YoloModel", "build", "build_shapes"]
 
@@ -117,13 +118,13 @@ def _build_layers(
             raise ArchitectureError(f"row {index} ({row.layer}) reads {row.source}, rows before it only")
         if (row.layer in HEADS) != (index == last):
             raise ArchitectureError(
-                f"row {index} is {row.layer!r:.100}: the last row, and no other, must be 'Detect'"
+                f"row {index} is {shown(row.layer)}: the last row, and no other, must be 'Detect'"
             )
         if len({reduction[source] for source in reads}) > 1 and row.layer not in HEADS:
             raise ArchitectureError(f"row {index} ({row.layer}) joins inputs of different sizes")
         if row.layer not in LAYERS:
             raise ArchitectureError(
-                f"row {index}: unknown layer {row.layer!r:.100}; known: {', '.join(LAYERS)}"
+                f"row {index}: unknown layer {shown(row.layer)}; known: {', '.join(LAYERS)}"
             )
         try:
             built = build_layer(row, [channels[source] for source in reads], description)

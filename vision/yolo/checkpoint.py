@@ -53,7 +53,8 @@ _DEEPEST = 16
 _MOST_NODES = 100_000
 _MOST_MODULES = 20_000
 _LONGEST_NAME = 500
-_LONGEST_TEXT = 100_000
+# Of all texts of a description together, each counted where it is used: a file can refer to one many times.
+_LONGEST_TEXT = 1 << 20
 # Of all layers together: the largest published networks have about eighty.
 _MOST_REPEATS = 256
 
@@ -151,6 +152,8 @@ def _from_description(content: dict[Any, Any]) -> LoadedModel:
     weights = content.get("state_dict")
     if not isinstance(weights, dict) or not all(isinstance(value, Tensor) for value in weights.values()):
         raise CheckpointError("has no state_dict of tensors")
+    for name in weights:
+        _check_name(name)
     model = _with_weights(description, weights)
     return LoadedModel(model, description.class_names, description, _plain_dictionary(content, "metadata"))
 
@@ -166,7 +169,7 @@ def _interpret_ultralytics(record: Stub, content: dict[Any, Any]) -> LoadedModel
     stride = modules[f"model.{len(description.rows) - 1}"].state.get("stride")
     # Only the first few: a large tensor as a list of numbers would be many times as large.
     if isinstance(stride, Tensor) and (found := stride.flatten()[:9].tolist()) != list(model.strides):
-        raise CheckpointError(f"its head has strides {found!r:.100}, not {model.strides}")
+        raise CheckpointError(f"its head has strides {shown(found)}, not {model.strides}")
     for name, module in model.named_modules():
         trained = modules.get(name)
         if isinstance(module, nn.BatchNorm2d) and trained is not None:
@@ -195,7 +198,7 @@ def _class_names(record: Stub, table: dict[Any, Any]) -> list[str]:
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise CheckpointError("has no class names")
     if table.get("nc") != len(names):
-        raise CheckpointError(f"names {len(names)} classes, its network has {table.get('nc')!r:.100}")
+        raise CheckpointError(f"names {len(names)} classes, its network has {shown(table.get('nc'))}")
     return names
 
 
@@ -230,12 +233,18 @@ def _weights(modules: dict[str, Stub]) -> Iterator[tuple[str, Tensor]]:
             if not isinstance(tensors, dict):
                 raise CheckpointError(f"{name}'s {kind} are not a dictionary")
             for key in list(tensors):
+                _check_name(key)
                 tensor = tensors.pop(key)
                 if tensor is None or (isinstance(non_persistent, frozenset) and key in non_persistent):
                     continue
                 if not isinstance(tensor, Tensor):
                     raise CheckpointError(f"{name}.{key} is not a tensor")
                 yield f"{name}.{key}", tensor
+
+
+def _check_name(name: object) -> None:
+    if not isinstance(name, str) or len(name) > _LONGEST_NAME:
+        raise CheckpointError(f"has a weight named {shown(name)}")
 
 
 def _with_weights(description: ModelDescription, weights: dict[str, Tensor]) -> YoloModel:
@@ -298,15 +307,15 @@ def _plain_dictionary(content: Mapping[Any, Any], key: str) -> dict[Any, Any]:
 
 def _plain(value: Any) -> Any:
     """A bounded copy of containers and scalars, so that later code never follows shared references."""
-    nodes_left = _MOST_NODES
+    nodes_left, text_left = _MOST_NODES, _LONGEST_TEXT
 
     def copy(value: Any, depth: int) -> Any:
-        nonlocal nodes_left
+        nonlocal nodes_left, text_left
         nodes_left -= 1
-        if depth > _DEEPEST or nodes_left < 0:
+        if isinstance(value, str):
+            text_left -= len(value)
+        if depth > _DEEPEST or nodes_left < 0 or text_left < 0:
             raise CheckpointError("its description is too deep or too long")
-        if isinstance(value, str) and len(value) > _LONGEST_TEXT:
-            raise CheckpointError(f"has a text of {len(value)} characters in its description")
         if value is None or type(value) in (bool, int, float, str):
             return value
         if isinstance(value, dict):

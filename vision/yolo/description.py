@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from vision.yolo.layers import ACTIVATIONS
+from vision.yolo.safe_pickle import shown
 
 _LARGEST_REPEATS = 64
 # Defaults of omitted arguments; the first, the channels, has none.
@@ -41,18 +42,18 @@ class LayerSpec:
         """From `[from, repeats, layer, arguments]`; raises `ArchitectureError` naming row `index`."""
         if not isinstance(row, list | tuple) or len(row) != 4:
             raise ArchitectureError(
-                f"row {index} must be [from, repeats, layer, arguments], got {row!r:.200}"
+                f"row {index} must be [from, repeats, layer, arguments], got {shown(row)}"
             )
         source, repeats, layer, arguments = row
         sources = tuple(source) if isinstance(source, list | tuple) else (source,)
         if not sources or not all(type(value) is int for value in sources):
-            raise ArchitectureError(f"row {index}: 'from' must be row numbers, got {source!r:.200}")
+            raise ArchitectureError(f"row {index}: 'from' must be row numbers, got {shown(source)}")
         if type(repeats) is not int or not 1 <= repeats <= _LARGEST_REPEATS:
             raise ArchitectureError(
-                f"row {index}: repeats must be 1..{_LARGEST_REPEATS}, got {repeats!r:.200}"
+                f"row {index}: repeats must be 1..{_LARGEST_REPEATS}, got {shown(repeats)}"
             )
         if not isinstance(layer, str) or not isinstance(arguments, list | tuple):
-            raise ArchitectureError(f"row {index}: expected a layer's name and arguments, got {row!r:.99}")
+            raise ArchitectureError(f"row {index}: expected a layer's name and arguments, got {shown(row)}")
         return cls(sources, repeats, layer, tuple(arguments))
 
     def to_plain(self) -> list[Any]:
@@ -130,31 +131,31 @@ class ModelDescription:
 
     def __post_init__(self) -> None:
         if not self.class_names or not all(isinstance(name, str) for name in self.class_names):
-            raise ArchitectureError(f"a model needs the names of its classes, got {self.class_names!s:.200}")
+            raise ArchitectureError(f"a model needs the names of its classes, got {shown(self.class_names)}")
         for name in self.class_names:
             if not name or not name.isprintable():
-                raise ArchitectureError(f"a class name must be printable text, got {name!r:.100}")
+                raise ArchitectureError(f"a class name must be printable text, got {shown(name)}")
         for name in ("depth_multiple", "width_multiple"):
             value = getattr(self, name)
             if type(value) not in (int, float) or not 0 < value <= 16:
-                raise ArchitectureError(f"{name} must be a number in 0..16, got {value!r:.200}")
+                raise ArchitectureError(f"{name} must be a number in 0..16, got {shown(value)}")
         limits = {"channels": 64, "reg_max": 256, "max_channels": None, "class_width": _LARGEST_CLASS_WIDTH}
         for name, largest in limits.items():
             value = getattr(self, name)
             if name in ("max_channels", "class_width") and value is None:
                 continue
             if type(value) is not int or value < 1 or (largest is not None and value > largest):
-                raise ArchitectureError(f"{name} must be a whole number from 1, got {value!r:.200}")
+                raise ArchitectureError(f"{name} must be a whole number from 1, got {shown(value)}")
         if not all(type(count) is int for count in self.unscaled_channels):
             raise ArchitectureError(
-                f"unscaled_channels must be whole numbers, got {self.unscaled_channels!r:.99}"
+                f"unscaled_channels must be whole numbers, got {shown(self.unscaled_channels)}"
             )
         for name in ("light_classes", "end_to_end"):
             if not isinstance(getattr(self, name), bool):
-                raise ArchitectureError(f"{name} must be true or false, got {getattr(self, name)!r:.200}")
+                raise ArchitectureError(f"{name} must be true or false, got {shown(getattr(self, name))}")
         if not isinstance(self.activation, str) or self.activation not in ACTIVATIONS:
             raise ArchitectureError(
-                f"unknown activation {self.activation!r:.200}; known: {', '.join(ACTIVATIONS)}"
+                f"unknown activation {shown(self.activation)}; known: {', '.join(ACTIVATIONS)}"
             )
         if not 1 <= len(self.rows) <= _LARGEST_ROWS:
             raise ArchitectureError(f"a network needs 1..{_LARGEST_ROWS} rows, got {len(self.rows)}")
@@ -194,7 +195,7 @@ class ModelDescription:
         """
         names = plain.get("names") if class_names is None else class_names
         if isinstance(names, str) or not isinstance(names, Sequence):
-            raise ArchitectureError(f"a model needs a list of class names, got {names!r:.200}")
+            raise ArchitectureError(f"a model needs a list of class names, got {shown(names)}")
         letter, depth, width, max_channels = _scale(plain)
         plain_rows = [*_list(plain, "backbone"), *_list(plain, "head")]
         rows = tuple(
@@ -227,7 +228,7 @@ def _first(plain: Mapping[Any, Any], default: Any, *keys: str) -> Any:
 def _list(plain: Mapping[Any, Any], key: str) -> Sequence[Any]:
     value = plain.get(key, ())
     if not isinstance(value, list | tuple):
-        raise ArchitectureError(f"`{key}` must be a list, got {value!r:.200}")
+        raise ArchitectureError(f"`{key}` must be a list, got {shown(value)}")
     return value
 
 
@@ -245,11 +246,13 @@ def _scale(plain: Mapping[Any, Any]) -> tuple[str, Any, Any, Any]:
         multiples = (_first(plain, 1.0, key) for key in ("depth_multiple", "width_multiple"))
         return (letter if isinstance(letter, str) else "", *multiples, plain.get("max_channels"))
     if not isinstance(scales, Mapping):
-        raise ArchitectureError(f"`scales` must be a table, got {scales!r:.200}")
+        raise ArchitectureError(f"`scales` must be a table, got {shown(scales)}")
     letter = letter or next(iter(scales))
     if not isinstance(letter, str) or letter not in scales:
-        raise ArchitectureError(f"scale {letter!r:.100} is not in the table {', '.join(map(str, scales))}")
+        raise ArchitectureError(f"scale {shown(letter)} is not in the table {shown(list(scales))}")
     row = scales[letter]
     if not isinstance(row, list | tuple) or len(row) != 3:
-        raise ArchitectureError(f"scale {letter!r} must be [depth, width, max_channels], got {row!r:.200}")
+        raise ArchitectureError(
+            f"scale {shown(letter)} must be [depth, width, max_channels], got {shown(row)}"
+        )
     return (letter, *row)

@@ -28,6 +28,7 @@ from vision.yolo.layers import (
     SCDown,
     same_padding,
 )
+from vision.yolo.safe_pickle import shown
 
 LARGEST_KERNEL = 31
 _LARGEST_CHANNELS = 1 << 14
@@ -56,7 +57,7 @@ class LayerArguments:
     def number(self, position: int, name: str, largest: int, default: int | None = None) -> int:
         value = self._argument(position, default)
         if type(value) is not int or not 1 <= value <= largest:
-            raise ArchitectureError(f"{name} must be a whole number in 1..{largest}, got {value!r:.100}")
+            raise ArchitectureError(f"{name} must be a whole number in 1..{largest}, got {shown(value)}")
         return value
 
     def odd(self, position: int, name: str, default: int) -> int:
@@ -68,18 +69,18 @@ class LayerArguments:
     def flag(self, position: int, name: str, default: bool) -> bool:
         value = self._argument(position, default)
         if not isinstance(value, bool):
-            raise ArchitectureError(f"the {name} must be true or false, got {value!r:.100}")
+            raise ArchitectureError(f"the {name} must be true or false, got {shown(value)}")
         return value
 
     def ratio(self, position: int, name: str, default: float, largest: float = 1.0) -> float:
         value = self._argument(position, default)
         if not isinstance(value, int | float) or isinstance(value, bool) or not 0 < value <= largest:
-            raise ArchitectureError(f"the {name} must be a number in 0..{largest:g}, got {value!r:.100}")
+            raise ArchitectureError(f"the {name} must be a number in 0..{largest:g}, got {shown(value)}")
         return float(value)
 
     def ungrouped(self, position: int) -> None:
         if self._argument(position, 1) != 1:
-            raise ArchitectureError(f"does not support groups, got {self._argument(position, 1)!r:.100}")
+            raise ArchitectureError(f"does not support groups, got {shown(self._argument(position, 1))}")
 
     def _argument(self, position: int, default: object) -> object:
         return self.row.arguments[position] if position < len(self.row.arguments) else default
@@ -123,7 +124,7 @@ def build_layer(row: LayerSpec, inputs: Sequence[int], description: ModelDescrip
     """
     builder, most_arguments, repeats = _BUILDERS[row.layer]
     if most_arguments is not None and len(row.arguments) > most_arguments:
-        raise ArchitectureError(f"takes at most {most_arguments} arguments, got {list(row.arguments)!r:.200}")
+        raise ArchitectureError(f"takes at most {most_arguments} arguments, got {shown(list(row.arguments))}")
     if row.repeats != 1 and not repeats:
         raise ArchitectureError(f"cannot repeat, got repeats {row.repeats}")
     return builder(LayerArguments(row, tuple(inputs), description))
@@ -295,7 +296,7 @@ def _upsample(row: LayerArguments) -> BuiltLayer:
     size, factor, mode = (*row.row.arguments, None, None, None)[:3]
     if size not in (None, "None") or type(factor) is not int or factor != 2 or mode != "nearest":
         raise ArchitectureError(
-            f"only [None, 2, 'nearest'] is supported, got {list(row.row.arguments)!r:.200}"
+            f"only [None, 2, 'nearest'] is supported, got {shown(list(row.row.arguments))}"
         )
     return BuiltLayer(nn.Upsample(scale_factor=2, mode="nearest"), row.single(), enlargement=2)
 
@@ -303,7 +304,7 @@ def _upsample(row: LayerArguments) -> BuiltLayer:
 @_builds("Concat")
 def _concat(row: LayerArguments) -> BuiltLayer:
     if tuple(row.row.arguments) not in ((), (1,)):
-        raise ArchitectureError(f"concatenates channels (axis 1), got {list(row.row.arguments)!r:.200}")
+        raise ArchitectureError(f"concatenates channels (axis 1), got {shown(list(row.row.arguments))}")
     return BuiltLayer(Concat(1), sum(row.inputs))
 
 
@@ -313,7 +314,7 @@ def _detect(row: LayerArguments) -> BuiltLayer:
     classes = len(description.class_names)
     if tuple(row.row.arguments) not in (("nc",), (classes,)):
         raise ArchitectureError(
-            f"takes the number of classes, {classes}, got {list(row.row.arguments)!r:.200}"
+            f"takes the number of classes, {classes}, got {shown(list(row.row.arguments))}"
         )
     module = Detect(
         classes,

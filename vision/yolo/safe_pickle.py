@@ -12,6 +12,7 @@ list is one byte in the file and sixty in memory, and a filled dictionary can be
 
 from __future__ import annotations
 
+import reprlib
 import struct
 import sys
 from collections.abc import Callable, Mapping
@@ -51,10 +52,14 @@ class AllowedGlobal:
 
 
 def one_line(message: str) -> str:
-    """Escape control characters in a message that may quote the file, to protect the terminal."""
-    return "".join(character if character.isprintable() else repr(character)[1:-1] for character in message)
+    """A message that may quote the file: control characters escaped, at most 2000 characters."""
+    return "".join(
+        character if character.isprintable() else repr(character)[1:-1]
+        for character in message[:_LONGEST_MESSAGE]
+    )
 
 
+_LONGEST_MESSAGE = 2000
 _MARK = object()
 _SCALARS = (str, int, float, bool, type(None))
 # No checkpoint has larger integer keys; larger ones can be chosen to collide in a dictionary.
@@ -68,12 +73,30 @@ _CALL_BYTES = 768
 _DEFAULT_ALLOWANCE_BYTES = 16 << 20
 
 
-def shown(value: object) -> str:
-    """A value from a file for a message: a scalar as it is, for anything else its type.
+class _Excerpt(reprlib.Repr):
+    """The beginning of a value's text: the whole text of a container can exceed any memory."""
 
-    The text of a container can exceed any memory: each tuple may contain the one before twice.
-    """
-    return f"{value!r:.100}" if isinstance(value, _SCALARS) else f"a {type(value).__name__}"
+    def __init__(self) -> None:
+        super().__init__()
+        self.maxlevel, self.maxstring = 3, 100
+        self.maxlist = self.maxtuple = self.maxdict = 8
+
+    def repr_instance(self, value: object, level: int) -> str:
+        return repr(value) if isinstance(value, _SCALARS) else f"a {type(value).__name__}"
+
+
+def shown(value: object) -> str:
+    """A value from a file for a message: at most 200 characters, made in bounded time and memory."""
+    return _Excerpt().repr(value)[:200]
+
+
+def check_key(value: object, what: str) -> None:
+    """Reject a dictionary's key or a set's member whose hash is slow to compute, or chosen to collide."""
+    # Hashing a nested tuple can be made very slow; no checkpoint needs one as a key.
+    if not isinstance(value, _SCALARS):
+        raise CheckpointError(f"its pickle has a {what} of type {type(value).__name__}")
+    if isinstance(value, int | float) and not -_LARGEST_KEY < value < _LARGEST_KEY:
+        raise CheckpointError(f"its pickle has the {what} {shown(value)}; expected a small number")
 
 
 def unpickle(
@@ -232,11 +255,7 @@ class _Machine:
             raise CheckpointError("its pickle has a dictionary key without a value")
         self._spend(_OBJECT_BYTES + _PAIR_BYTES * (len(values) // 2))
         for key, value in zip(values[::2], values[1::2], strict=True):
-            # Hashing a nested tuple can be made very slow; no checkpoint needs one as a key.
-            if not isinstance(key, _SCALARS):
-                raise CheckpointError(f"its pickle has a dictionary key of type {type(key).__name__}")
-            if isinstance(key, int | float) and not -_LARGEST_KEY < key < _LARGEST_KEY:
-                raise CheckpointError(f"its pickle has the dictionary key {key!r}; expected a small number")
+            check_key(key, "dictionary key")
             target[key] = value
 
     def put(self, width: int) -> None:

@@ -20,7 +20,9 @@ from vision.yolo.safe_pickle import (
     CheckpointError,
     Stub,
     UnsafeCheckpointError,
+    check_key,
     one_line,
+    shown,
     unpickle,
 )
 
@@ -77,14 +79,13 @@ _LARGEST_PICKLE_BYTES = 16 << 20
 # Every member becomes an object; the largest checkpoints have some thousands.
 _LARGEST_CONTENTS_BYTES = 1 << 20
 _MOST_MEMBERS = 10_000
-# The end record with the longest comment, and the two zip64 records before it.
-_LONGEST_ENDING_BYTES = 22 + 65535 + 20 + 56
+# The end records of an archive without a comment: zip64 record, its locator, end record.
+_ZIP64_BYTES, _LOCATOR_BYTES, _END_BYTES = 56, 20, 22
 _MOST_DIMENSIONS = 8
 # Views may share a storage (a state dictionary beside its model), up to this limit.
 _MOST_VIEWS_PER_ELEMENT = 4
 # Memory limit of the pickle's values, in addition to the file's size.
 _VALUES_BYTES = 16 << 20
-# A set's numbers can be chosen to collide, which is slow.
 _LARGEST_SET = 10_000
 
 
@@ -122,16 +123,18 @@ def _read(path: Path) -> Any:
             file.seek(0)
             with zipfile.ZipFile(file) as archive:
                 return _Archive(archive, size).value()
-        # Raised by the zip module for damaged headers, encryption, unknown compression and bad names.
+        except CheckpointError:
+            raise
+        # Raised by the zip module for damaged headers, encryption, unknown compression and bad names, and by
+        # torch for tensors that cannot be.
         except (
             zipfile.BadZipFile,
             zlib.error,
             struct.error,
-            NotImplementedError,
             EOFError,
             KeyError,
             RuntimeError,
-            UnicodeError,
+            ValueError,
             OverflowError,
         ) as error:
             raise CheckpointError(
@@ -140,23 +143,37 @@ def _read(path: Path) -> Any:
 
 
 def _check_contents(file: BinaryIO, size: int) -> None:
-    """Check the size of the table of contents (APPNOTE 4.3.16, 4.3.14) before the zip module reads it."""
-    start = max(0, size - _LONGEST_ENDING_BYTES)
-    file.seek(start)
+    """Check the size of the table of contents before the zip module reads it.
+
+    The end records (APPNOTE 4.3.14 to 4.3.16) must be the last bytes of the file and agree with each other,
+    so that the zip module finds the same ones.
+    """
+    file.seek(max(0, size - _ZIP64_BYTES - _LOCATOR_BYTES - _END_BYTES))
     ending = file.read()
-    found = ending.rfind(b"PK\x05\x06")
-    if found < 0 or len(ending) - found < 22:
+    end = ending[-_END_BYTES:]
+    if len(end) != _END_BYTES or not end.startswith(b"PK\x05\x06") or end[-2:] != bytes(2):
         raise CheckpointError(
-            "the archive is truncated or damaged (no end record); copy or download it again"
+            "the archive is truncated or damaged (no end record at its end); copy or download it again"
         )
-    (contents,) = struct.unpack_from("<L", ending, found + 12)
-    large = ending.rfind(b"PK\x06\x06", 0, found)
-    if 0 <= large <= found - 56:
-        (contents,) = struct.unpack_from("<Q", ending, large + 40)
-    if contents > _LARGEST_CONTENTS_BYTES:
+    (contents,) = struct.unpack_from("<L", end, 12)
+    last = size - _END_BYTES
+    locator = ending[-_LOCATOR_BYTES - _END_BYTES : -_END_BYTES]
+    if locator.startswith(b"PK\x06\x07"):
+        last -= _LOCATOR_BYTES + _ZIP64_BYTES
+        record = ending[: -_LOCATOR_BYTES - _END_BYTES]
+        if not record.startswith(b"PK\x06\x06") or struct.unpack_from("<Q", locator, 8) != (last,):
+            raise CheckpointError("the archive's zip64 records are damaged; copy or download it again")
+        short = contents
+        (contents,) = struct.unpack_from("<Q", record, 40)
+        if short not in (contents, 0xFFFFFFFF):
+            raise CheckpointError(
+                f"the archive's end records give its table of contents {short} and {contents} bytes; "
+                "it is not a checkpoint"
+            )
+    if contents > min(_LARGEST_CONTENTS_BYTES, last):
         raise CheckpointError(
             f"the archive's table of contents has {contents} bytes, a checkpoint's at most "
-            f"{_LARGEST_CONTENTS_BYTES}"
+            f"{min(_LARGEST_CONTENTS_BYTES, last)}"
         )
 
 
@@ -171,6 +188,8 @@ class _Archive:
             raise CheckpointError(f"the archive has {len(members)} members, a checkpoint far fewer")
         if any(member.compress_type != zipfile.ZIP_STORED for member in members):
             raise CheckpointError("the archive is compressed, torch.save never does; save the model again")
+        if any(member.compress_size != member.file_size for member in members):
+            raise CheckpointError("the archive has a member of two sizes; it is not a checkpoint")
         if sum(member.file_size for member in members) > size:
             raise CheckpointError("the archive's members are larger than the file; it is not a checkpoint")
         self._members = {member.filename: member for member in members}
@@ -197,7 +216,10 @@ class _Archive:
     def _bytes(self, member: zipfile.ZipInfo, largest: int | None = None) -> bytes:
         if largest is not None and member.file_size > largest:
             raise CheckpointError(f"{member.filename} has {member.file_size} bytes, the limit is {largest}")
-        return self._archive.read(member)
+        data = self._archive.read(member)
+        if len(data) != member.file_size:
+            raise CheckpointError(f"{member.filename} has {len(data)} of its {member.file_size} bytes")
+        return data
 
     def _allowed(self) -> dict[str, AllowedGlobal]:
         calls = {
@@ -231,17 +253,17 @@ class _Archive:
         if stored is None:
             member = self._members.get(f"{self._root}data/{key}")
             if member is None:
-                raise CheckpointError(f"storage {key!r:.100} is missing from the archive")
+                raise CheckpointError(f"storage {shown(key)} is missing from the archive")
             if member.file_size != count * dtype.itemsize:
                 raise CheckpointError(
-                    f"storage {key!r:.100} should have {count} numbers of {dtype.itemsize} bytes, "
+                    f"storage {shown(key)} should have {count} numbers of {dtype.itemsize} bytes, "
                     f"it has {member.file_size} bytes"
                 )
             data = bytearray(self._bytes(member))
             stored = torch.frombuffer(data, dtype=dtype) if count else torch.empty(0, dtype=dtype)
             self._storages[key] = stored
         if stored.dtype != dtype or stored.numel() != count:
-            raise CheckpointError(f"storage {key!r:.100} is described in two ways")
+            raise CheckpointError(f"storage {shown(key)} is described in two ways")
         return stored
 
     def _tensor(self, arguments: tuple[Any, ...]) -> Tensor:
@@ -264,7 +286,8 @@ class _Archive:
         last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True)) if count else -1
         if last >= storage.numel() or count > storage.numel():
             raise CheckpointError(
-                f"its pickle has a tensor of size {size} that is larger than its storage ({storage.numel()})"
+                f"its pickle has a tensor of size {shown(size)} that is larger than its storage "
+                f"({storage.numel()})"
             )
         self._views_left -= count
         if self._views_left < 0:
@@ -308,12 +331,10 @@ def _default_dictionary(arguments: tuple[Any, ...]) -> dict[Any, Any]:
 
 def _set(arguments: tuple[Any, ...]) -> frozenset[Any]:
     values = arguments[0] if len(arguments) == 1 else None
-    if (
-        not isinstance(values, list)
-        or len(values) > _LARGEST_SET
-        or not all(isinstance(value, str | int | float) for value in values)
-    ):
+    if not isinstance(values, list) or len(values) > _LARGEST_SET:
         raise CheckpointError("its pickle has a set of something else than names and numbers")
+    for value in values:
+        check_key(value, "member of a set")
     return frozenset(values)
 
 
@@ -326,7 +347,5 @@ def _folded_forward(arguments: tuple[Any, ...]) -> Stub:
 
 def _type_by_name(arguments: tuple[Any, ...]) -> AllowedGlobal:
     if arguments not in (("set",), ("frozenset",)):
-        raise UnsafeCheckpointError(
-            f"its pickle asks for the type {', '.join(map(repr, arguments))!s:.100}; nothing was run"
-        )
+        raise UnsafeCheckpointError(f"its pickle asks for the type {shown(arguments)}; nothing was run")
     return AllowedGlobal(f"builtins.{arguments[0]}", _set)
