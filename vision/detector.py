@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vision.detections import Detections
+from vision.foreign.engines import ForeignRuntime
 from vision.letterbox import Letterbox, fit
 from vision.model_files import find_model
 from vision.object_detector import (
@@ -32,10 +33,11 @@ from vision.runtimes.source import read_source
 from vision.runtimes.stored_choice import forget_choices
 from vision.weights import DEFAULT_WEIGHTS
 from vision.yolo.checkpoint_pair import weights_sha256
-from vision.yolo.postprocess import boxes_from, candidates_of, decode_ltrb
+from vision.yolo.postprocess import Boxes, boxes_from, candidates_of, decode_ltrb
 from vision.yolo.safe_pickle import CheckpointError
 
 if TYPE_CHECKING:
+    from vision.foreign.layouts import ForeignFacts
     from vision.yolo.description import ModelDescription
 
 logger = logging.getLogger(__name__)
@@ -58,6 +60,7 @@ class Detector(ObjectDetector):
         model_name: the value of `model`.
         model_sha256: of the checkpoint, of a pair's weights, or of the exported file.
         description: what the network was built from; None for an exported file.
+        foreign: the recognised network of another exporter's file; else None.
         metadata: of the file (licence, origin, score).
         last_timing: of the latest `detect`; None before the first.
     """
@@ -79,12 +82,14 @@ class Detector(ObjectDetector):
 
         Args:
             model: `default`, the bundled one, or the path of a checkpoint (our own, or an Ultralytics `.pt`),
-                or of a file exported by `vision.runtimes.export`.
+                of a file exported by `vision.runtimes.export`, or of another exporter's that is recognised
+                (`vision.foreign.layouts`).
             classes: names or ids to report; None for all. The network does not compute the others.
             confidence: boxes not above this are dropped, 0..1.
             iou: NMS IoU threshold, 0..1: of two boxes of one class overlapping more, the less confident is
                 dropped.
-            image_size: longer side of the network's input, pixels, a multiple of its largest stride (32).
+            image_size: longer side of the network's input, pixels, a multiple of its largest stride (32). A
+                file of a fixed size keeps its own.
             precision: `auto` selects bfloat16 only where the processor supports it (a fifth less time).
             threads: processor threads of the runtime (torch: of the whole process); None: its default.
             square: pad the input to a square rather than to the next multiple of the stride.
@@ -104,15 +109,15 @@ class Detector(ObjectDetector):
         if threads is not None and threads < 1:
             raise ValueError(f"threads must be at least 1, got {threads}")
         fit(image_size, image_size, image_size)  # Rejects a bad size now, not at the first frame.
-        path = _model_path(model)
-        source = read_source(path)
+        source = read_source(_model_path(model))
         self._stride = max(source.strides)
-        fit(image_size, image_size, image_size, stride=self._stride)
+        if source.foreign is None or source.foreign.fixed_size is None:
+            fit(image_size, image_size, image_size, stride=self._stride)
         self.class_names: tuple[str, ...] = source.class_names
         self.class_ids = None if classes is None else resolve_classes(classes, source.class_names)
         self.description: ModelDescription | None = source.description
         self.metadata: dict[str, Any] = source.metadata
-        self.model_name, self.model_sha256 = str(model), weights_sha256(path)
+        self.model_name, self.model_sha256 = str(model), weights_sha256(source.weights_path)
         self.confidence = confidence
         self.iou = iou
         self.image_size = image_size
@@ -129,6 +134,11 @@ class Detector(ObjectDetector):
             sparse_boxes=confidence >= _SPARSE_FROM,
         )
         self._runtime = started.runtime
+        self.foreign: ForeignFacts | None = None
+        if isinstance(started.runtime, ForeignRuntime):
+            self.foreign = started.runtime.facts
+            box = started.runtime.fit(image_size, image_size, image_size, square=square)
+            self.image_size = max(box.width, box.height)
         self.runtime: str = self._runtime.name
         self.runtime_reason = started.reason
         self.precision: str = self._runtime.precision
@@ -136,7 +146,7 @@ class Detector(ObjectDetector):
         self.reason = f"{self.runtime_reason}; {self.precision}: {self.precision_reason}"
         logger.info(
             "model %s: %d classes, on %s (%s), in %s (%s)",
-            path,
+            source.path,
             len(self.class_names),
             self.runtime,
             self.runtime_reason,
@@ -174,6 +184,25 @@ class Detector(ObjectDetector):
             # Runtimes read the memory directly in this order, and some require it to be writable.
             boxed = boxed.copy(order="C")
         prepared = time.perf_counter()
+        boxes, network_s = self._boxes(boxed)
+        detections = Detections(box.to_frame(boxes.xyxy), boxes.confidence, boxes.class_id, self.class_names)
+        done = time.perf_counter()
+        self.last_timing = Timing(
+            preprocess_ms=(prepared - started) * 1e3,
+            inference_ms=network_s * 1e3,
+            postprocess_ms=(done - prepared - network_s) * 1e3,
+        )
+        return detections
+
+    def _boxes(self, boxed: NDArray[np.uint8]) -> tuple[Boxes, float]:
+        """The boxes in an input, in its pixels, and the network's share of the time, seconds."""
+        started = time.perf_counter()
+        if isinstance(self._runtime, ForeignRuntime):
+            raw = self._runtime.infer(boxed)
+            computed = time.perf_counter()
+            size = (boxed.shape[0], boxed.shape[1])
+            boxes = self._runtime.decode(raw, size, self.confidence, self.iou, self.class_ids)
+            return boxes, computed - started
         head, outputs = self._runtime.head, self._runtime.infer(boxed)
         computed = time.perf_counter()
         candidates = candidates_of(head, outputs, self.confidence, self.class_ids)
@@ -182,20 +211,15 @@ class Detector(ObjectDetector):
         sides = decode_ltrb(head, outputs, candidates, self._runtime.product)
         inferred = time.perf_counter()
         boxes = boxes_from(head, outputs, candidates, sides, self.iou)
-        detections = Detections(box.to_frame(boxes.xyxy), boxes.confidence, boxes.class_id, self.class_names)
-        done = time.perf_counter()
-        network_s = (computed - prepared) + (inferred - selected)
-        self.last_timing = Timing(
-            preprocess_ms=(prepared - started) * 1e3,
-            inference_ms=network_s * 1e3,
-            postprocess_ms=(done - prepared - network_s) * 1e3,
-        )
-        return detections
+        return boxes, (computed - started) + (inferred - selected)
 
     def _fit(self, width: int, height: int) -> Letterbox:
         box = self._letterbox
         if box is None or (box.frame_width, box.frame_height) != (width, height):
-            box = fit(width, height, self.image_size, square=self.square, stride=self._stride)
+            if isinstance(self._runtime, ForeignRuntime):
+                box = self._runtime.fit(width, height, self.image_size, square=self.square)
+            else:
+                box = fit(width, height, self.image_size, square=self.square, stride=self._stride)
             self._letterbox, self._boxed = box, box.blank()
         return box
 

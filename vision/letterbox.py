@@ -7,11 +7,13 @@ half a pixel of offset costs accuracy.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+Placement = Literal["centre", "corner", "stretch"]
 
 PADDING = 114
 STRIDE = 32
@@ -89,6 +91,36 @@ class Letterbox:
     @property
     def _corner(self) -> NDArray[np.float32]:
         return np.array([self.left, self.top] * 2, np.float32)
+
+
+def fit_into(
+    frame_width: int, frame_height: int, width: int, height: int, placement: Placement = "centre"
+) -> Letterbox:
+    """Compute the letterbox for an input of a fixed size.
+
+    Args:
+        placement: `centre` or `corner` (upper left), the rest is padding; or `stretch`, without padding.
+    """
+    if frame_width < 1 or frame_height < 1:
+        raise ValueError(f"a frame must have a positive size, got {frame_width}x{frame_height}")
+    resized_width, resized_height = width, height
+    if placement != "stretch":
+        scale = min(width / frame_width, height / frame_height)
+        # YOLOX, which pads at the right and the bottom, rounds down.
+        rounded = int if placement == "corner" else round
+        resized_width = min(width, max(1, rounded(frame_width * scale)))
+        resized_height = min(height, max(1, rounded(frame_height * scale)))
+    centred = placement == "centre"
+    return Letterbox(
+        frame_width=frame_width,
+        frame_height=frame_height,
+        width=width,
+        height=height,
+        resized_width=resized_width,
+        resized_height=resized_height,
+        left=(width - resized_width) // 2 if centred else 0,
+        top=(height - resized_height) // 2 if centred else 0,
+    )
 
 
 def fit(

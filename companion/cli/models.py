@@ -43,23 +43,37 @@ def list_models(folder: _FOLDER = None, as_json: _JSON = False) -> None:
 
 @models.command()
 def info(
-    file: Annotated[str, typer.Argument(help="Checkpoint, `default`, or name in the models folder.")],
+    file: Annotated[
+        str, typer.Argument(help="Checkpoint, exported file, `default`, or name in the models folder.")
+    ],
     image_size: Annotated[int, typer.Option(min=32, help="Image size for the GFLOPs, pixels.")] = 640,
     runtime: Annotated[
-        str, typer.Option(help="Runtime: torch, onnxruntime, openvino, tensorrt or auto.")
-    ] = "torch",
+        str | None,
+        typer.Option(
+            help="Runtime: torch, onnxruntime, openvino, tensorrt or auto. Default: torch for a checkpoint, "
+            "the first installed one for an exported file."
+        ),
+    ] = None,
     as_json: _JSON = False,
 ) -> None:
     """Describe a model file. Prints family, classes, GFLOPs, licence, runtime and precision."""
+    from companion.models.export_info import export_info, export_lines
     from companion.models.info import info_lines, model_info
+    from vision.runtimes.source import read_source
     from vision.yolo.safe_pickle import CheckpointError
 
     with plain_errors(CheckpointError, ValueError):
-        found = model_info(_path(file), image_size, runtime)  # type: ignore[arg-type]  # checked there
+        source = read_source(_path(file))
+        if source.kind is not None or source.foreign is not None:
+            export = export_info(source, image_size, runtime)  # type: ignore[arg-type]  # checked there
+            plain, lines = export.plain(), export_lines(export)
+        else:
+            found = model_info(source.path, image_size, runtime or "torch")  # type: ignore[arg-type]
+            plain, lines = found.plain(), info_lines(found)
     if as_json:
-        typer.echo(json.dumps(found.plain()))
+        typer.echo(json.dumps(plain))
         return
-    for line in info_lines(found):
+    for line in lines:
         typer.echo(line)
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from mavlink_sim.datasets.training_scenes import random_scene
 from vision.evaluation.datasets import image_files, read_image
+from vision.foreign.engines import ForeignRuntime
 from vision.letterbox import fit
 from vision.runtimes.base import Precision, Runtime, RuntimeUnusableError
 from vision.runtimes.exported import KEY
@@ -99,17 +100,20 @@ def verify(
         raise RuntimeUnusableError(f"{exported_path}: is a checkpoint, expected a file from `models export`")
     if source.kind is not None:
         raise RuntimeUnusableError(f"{source_path}: is an export, expected its checkpoint")
+    if exported.facts is None:
+        raise RuntimeUnusableError(
+            f"{exported_path}: is of another exporter, expected a file from `models export`"
+        )
     _check_same_kind(source, exported)
-    assert exported.facts is not None
-    original = start_runtime(
-        source, "torch", precision="float32", threads=threads, image_size=image_size
-    ).runtime
+    original = _levels(
+        start_runtime(source, "torch", precision="float32", threads=threads, image_size=image_size).runtime
+    )
     runner = exported.runners()[0]
     # The precision of a plan is fixed.
     precision: Precision = "auto" if exported.kind == "tensorrt" else "float32"
-    other = start_runtime(
-        exported, runner, precision=precision, threads=threads, image_size=image_size
-    ).runtime
+    other = _levels(
+        start_runtime(exported, runner, precision=precision, threads=threads, image_size=image_size).runtime
+    )
     largest = _Largest()
     for image in images:
         box = fit(image.shape[1], image.shape[0], image_size, stride=max(source.strides))
@@ -140,6 +144,11 @@ def parity_lines(parity: Parity, map_tolerance: float, box_tolerance_px: float) 
     if not parity.same_source:
         lines.append("note: the export names another source file")
     return lines
+
+
+def _levels(runtime: Runtime | ForeignRuntime) -> Runtime:
+    assert not isinstance(runtime, ForeignRuntime)
+    return runtime
 
 
 def _check_same_kind(source: ModelSource, exported: ModelSource) -> None:

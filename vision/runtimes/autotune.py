@@ -129,10 +129,12 @@ def measure(
 ) -> float:
     """Milliseconds of one inference of a 4:3 input: the minimum, which excludes other load."""
     started = start_named(source, runtime, class_ids, precision, threads, image_size, sparse_boxes=True)
-    stride = max(started.head.strides)
-    height = max(stride, image_size * 3 // 4 // stride * stride)
-    image = np.random.default_rng(0).integers(0, 256, (height, image_size, 3), np.uint8)
-    started.prepare(height, image_size)
+    stride = max(source.strides)
+    height, width = max(stride, image_size * 3 // 4 // stride * stride), image_size
+    if source.foreign is not None and source.foreign.fixed_size is not None:
+        height, width = source.foreign.fixed_size
+    image = np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
+    started.prepare(height, width)
     times = []
     for _ in range(_RUNS):
         before = time.perf_counter()

@@ -96,6 +96,13 @@ class ExportedFacts:
         )
 
 
+def own_facts(facts: object, path: Path) -> ExportedFacts:
+    """`facts`, if they are of our own export. Raises `RuntimeUnusableError`."""
+    if not isinstance(facts, ExportedFacts):
+        raise not_ours(path)
+    return facts
+
+
 def not_ours(path: Path) -> RuntimeUnusableError:
     """The error for a file without facts."""
     return RuntimeUnusableError(

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vision.foreign.layouts import ForeignFacts, Port, recognise
 from vision.runtimes.base import Precision, RuntimeName, RuntimeUnusableError, required
-from vision.runtimes.exported import INPUT, KEY, ExportedFacts, not_ours
+from vision.runtimes.exported import INPUT, KEY, ExportedFacts, own_facts
 from vision.yolo.level_outputs import Head, LevelOutput, Product
 
 # As ONNX Runtime names them. An available provider is used: its package was chosen for it.
@@ -43,22 +44,9 @@ class OnnxRuntime:
             raise RuntimeUnusableError(
                 f"onnxruntime computes in float32, the precision of its files; not in {precision}"
             )
-        onnxruntime = required("onnxruntime")
-        options = onnxruntime.SessionOptions()
-        options.log_severity_level = _ERRORS_ONLY
-        if threads is not None:
-            options.intra_op_num_threads = threads
-        available = onnxruntime.get_available_providers()
-        providers = [provider for provider in _PROVIDERS if provider in available]
-        self._session = _session(onnxruntime, path, options, providers)
-        started = self._session.get_providers()
-        if started[:1] != providers[:1]:
-            raise RuntimeUnusableError(
-                f"onnxruntime cannot start {providers[0]}, which its package is built for; "
-                f"started {started}. Install its GPU libraries, or the package for processors"
-            )
-        self.head = head if head is not None else onnx_facts(path, self._session).head()
-        self.precision, self.precision_reason = "float32", f"precision of the file ({started[0]})"
+        self._session, provider = open_session(path, threads)
+        self.head = head if head is not None else own_facts(onnx_facts(path, self._session), path).head()
+        self.precision, self.precision_reason = "float32", f"precision of the file ({provider})"
         self._threads = threads
 
     @property
@@ -73,8 +61,27 @@ class OnnxRuntime:
         return self.head.levels(outputs)
 
 
-def onnx_facts(path: Path, session: Any = None) -> ExportedFacts:
-    """Read the metadata of an exported ONNX file."""
+def open_session(path: Path, threads: int | None) -> tuple[Any, str]:
+    """An inference session on the best available provider, and the provider's name."""
+    onnxruntime = required("onnxruntime")
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = _ERRORS_ONLY
+    if threads is not None:
+        options.intra_op_num_threads = threads
+    available = onnxruntime.get_available_providers()
+    providers = [provider for provider in _PROVIDERS if provider in available]
+    session = _session(onnxruntime, path, options, providers)
+    started = session.get_providers()
+    if started[:1] != providers[:1]:
+        raise RuntimeUnusableError(
+            f"onnxruntime cannot start {providers[0]}, which its package is built for; "
+            f"started {started}. Install its GPU libraries, or the package for processors"
+        )
+    return session, str(started[0])
+
+
+def onnx_facts(path: Path, session: Any = None) -> ExportedFacts | ForeignFacts:
+    """Read the metadata of an ONNX file: of our own export, or of a recognised network."""
     if session is None:
         onnxruntime = required("onnxruntime")
         options = onnxruntime.SessionOptions()
@@ -82,10 +89,23 @@ def onnx_facts(path: Path, session: Any = None) -> ExportedFacts:
         # Only the metadata is read: no optimisation.
         options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
         session = _session(onnxruntime, path, options, ["CPUExecutionProvider"])
-    text = session.get_modelmeta().custom_metadata_map.get(KEY)
-    if text is None:
-        raise not_ours(path)
-    return ExportedFacts.from_json(text, path)
+    stated = session.get_modelmeta().custom_metadata_map
+    if KEY in stated:
+        return ExportedFacts.from_json(stated[KEY], path)
+    return recognise(path, stated, _ports(session.get_inputs()), _ports(session.get_outputs()))
+
+
+def _ports(nodes: Any) -> list[Port]:
+    names = {"float": "float32", "double": "float64"}
+    return [
+        Port(
+            node.name,
+            # A dynamic length has a name, or none.
+            tuple(length if type(length) is int else None for length in node.shape),
+            names.get(kind := node.type.removeprefix("tensor(").removesuffix(")"), kind),
+        )
+        for node in nodes
+    ]
 
 
 def _session(onnxruntime: Any, path: Path, options: Any, providers: list[str]) -> Any:

@@ -9,42 +9,33 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vision.foreign.layouts import ForeignFacts, Port, recognise
+from vision.plain_yaml import PlainYamlError, load_plain_yaml
 from vision.runtimes import base
 from vision.runtimes.base import Precision, RuntimeName, RuntimeUnusableError, required
-from vision.runtimes.exported import KEY, ExportedFacts, not_ours
+from vision.runtimes.exported import KEY, ExportedFacts, own_facts
 from vision.yolo.level_outputs import Head, LevelOutput, Product
 
 _HINTS = {"float32": "f32", "bfloat16": "bf16", "float16": "f16"}
 _MOST_SIZES = 2
+_LARGEST_METADATA_BYTES = 1 << 20
 
 
-class OpenVinoRuntime:
-    """An OpenVINO or ONNX file written by `export`. See `base.Runtime`.
-
-    The network is compiled for each input size, which is faster than a dynamic size.
+class OpenVinoNetwork:
+    """An OpenVINO or ONNX file, compiled for each input size, which is faster than a dynamic size.
 
     Args:
         path: the `.xml` (its `.bin` beside it) or `.onnx`.
-        head: layout of its outputs; None: from the file's metadata.
         precision: `auto`: bfloat16 if the processor supports it, else float32.
         threads: of the processor; None: OpenVINO's default.
     """
 
-    product: Product = staticmethod(np.matmul)
     name: RuntimeName = "openvino"
 
-    def __init__(
-        self,
-        path: Path,
-        head: Head | None = None,
-        *,
-        precision: Precision = "auto",
-        threads: int | None = None,
-    ) -> None:
+    def __init__(self, path: Path, *, precision: Precision = "auto", threads: int | None = None) -> None:
         self._openvino = required("openvino")
         self._core = self._openvino.Core()
         self._model = _read(self._core, path)
-        self.head = head if head is not None else openvino_facts(path, self._model).head()
         native = base.bfloat16_instructions()
         self._automatic = precision == "auto"
         if precision == "auto":
@@ -63,33 +54,35 @@ class OpenVinoRuntime:
         if threads is not None:
             self._settings["INFERENCE_NUM_THREADS"] = threads
         self._threads = threads
-        self._requests: collections.OrderedDict[tuple[int, int], Any] = collections.OrderedDict()
+        self._requests: collections.OrderedDict[tuple[int, ...], Any] = collections.OrderedDict()
 
     @property
     def threads(self) -> int:
         """As compiled; before the first inference as requested, 0 for unknown."""
         return self._threads or 0
 
-    def prepare(self, height: int, width: int) -> None:
-        self.infer(np.zeros((height, width, 3), np.uint8))
+    def run(self, *inputs: NDArray[Any]) -> list[NDArray[Any]]:
+        """The outputs for one image; they are the network's memory, valid until the next call.
 
-    def infer(self, image_bgr: NDArray[np.uint8]) -> list[LevelOutput]:
-        size = (image_bgr.shape[0], image_bgr.shape[1])
-        request = self._requests.get(size) or self._compiled(size)
-        # No copies: the tensor is the image, the outputs are the request's memory.
-        request.set_input_tensor(self._openvino.Tensor(image_bgr[None], shared_memory=True))
+        Args:
+            inputs: C-contiguous and writeable; the first is the image. They are not copied.
+        """
+        shape = inputs[0].shape
+        request = self._requests.get(shape) or self._compiled(shape)
+        for index, array in enumerate(inputs):
+            request.set_input_tensor(index, self._openvino.Tensor(array, shared_memory=True))
         request.infer()
-        outputs = [request.get_output_tensor(index).data[0] for index in range(len(self._model.outputs))]
-        return self.head.levels(outputs)
+        return [request.get_output_tensor(index).data for index in range(len(self._model.outputs))]
 
-    def _compiled(self, size: tuple[int, int]) -> Any:
+    def _compiled(self, size: tuple[int, ...]) -> Any:
         try:
             sized = self._model.clone()
-            sized.reshape([1, *size, 3])
+            if sized.inputs[0].partial_shape != self._openvino.PartialShape(list(size)):
+                sized.reshape({sized.inputs[0]: list(size)})
             compiled = self._core.compile_model(sized, "CPU", self._settings)
         except RuntimeError as error:
             raise RuntimeUnusableError(
-                f"openvino cannot compile the network for {size[1]}x{size[0]}: {' '.join(str(error).split())}"
+                f"openvino cannot compile the network for {size}: {' '.join(str(error).split())}"
             ) from error
         used = str(compiled.get_property("INFERENCE_PRECISION_HINT"))
         if _HINTS[self.precision] not in used.replace("float", "f"):
@@ -108,15 +101,72 @@ class OpenVinoRuntime:
         return request
 
 
-def openvino_facts(path: Path, model: Any = None) -> ExportedFacts:
-    """Read the metadata of an exported OpenVINO or ONNX file."""
+class OpenVinoRuntime(OpenVinoNetwork):
+    """An OpenVINO or ONNX file written by `export`. See `base.Runtime`, and `OpenVinoNetwork`.
+
+    Args:
+        head: layout of its outputs; None: from the file's metadata.
+    """
+
+    product: Product = staticmethod(np.matmul)
+
+    def __init__(
+        self,
+        path: Path,
+        head: Head | None = None,
+        *,
+        precision: Precision = "auto",
+        threads: int | None = None,
+    ) -> None:
+        super().__init__(path, precision=precision, threads=threads)
+        self.head = head if head is not None else own_facts(openvino_facts(path, self._model), path).head()
+
+    def prepare(self, height: int, width: int) -> None:
+        self.infer(np.zeros((height, width, 3), np.uint8))
+
+    def infer(self, image_bgr: NDArray[np.uint8]) -> list[LevelOutput]:
+        return self.head.levels([output[0] for output in self.run(image_bgr[None])])
+
+
+def openvino_facts(path: Path, model: Any = None) -> ExportedFacts | ForeignFacts:
+    """Read the metadata of an OpenVINO or ONNX file: of our own export, or of a recognised network."""
     if model is None:
         model = _read(required("openvino").Core(), path)
     # The metadata of an ONNX file is under its frontend's.
     for keys in ([KEY], ["framework", KEY]):
         if model.has_rt_info(keys):
             return ExportedFacts.from_json(str(model.get_rt_info(keys).value), path)
-    raise not_ours(path)
+    return recognise(path, _stated(path, model), _ports(model.inputs), _ports(model.outputs))
+
+
+def _stated(path: Path, model: Any) -> dict[str, Any]:
+    """Metadata of another exporter: `metadata.yaml` beside an OpenVINO file, an ONNX file's own."""
+    beside = path.with_name("metadata.yaml")
+    if path.suffix == ".onnx":
+        if not model.has_rt_info(["framework"]):
+            return {}
+        return {key: str(value.value) for key, value in dict(model.get_rt_info(["framework"])).items()}
+    if not beside.is_file():
+        return {}
+    try:
+        if beside.stat().st_size > _LARGEST_METADATA_BYTES:
+            raise PlainYamlError(f"has more than {_LARGEST_METADATA_BYTES} bytes")
+        stated = load_plain_yaml(beside.read_text(encoding="utf-8"))
+    except (PlainYamlError, UnicodeDecodeError, OSError) as error:
+        raise RuntimeUnusableError(f"{beside}: cannot be read ({error})") from None
+    return {str(key): value for key, value in stated.items()} if isinstance(stated, dict) else {}
+
+
+def _ports(nodes: Any) -> list[Port]:
+    names = {"f32": "float32", "f16": "float16", "i64": "int64", "i32": "int32"}
+    return [
+        Port(
+            node.get_any_name() if node.get_names() else "",
+            tuple(int(length.to_string()) if length.is_static else None for length in node.partial_shape),
+            names.get(node.element_type.get_type_name(), node.element_type.get_type_name()),
+        )
+        for node in nodes
+    ]
 
 
 def _read(core: Any, path: Path) -> Any:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from vision.foreign.engines import ForeignRuntime
 from vision.runtimes.autotune import fastest_runtime
 from vision.runtimes.base import RUNTIMES, Precision, Runtime, installed, required
 from vision.runtimes.source import ModelSource, cannot_run
@@ -22,7 +23,7 @@ class SelectedRuntime:
         reason: why this one, in words.
     """
 
-    runtime: Runtime
+    runtime: Runtime | ForeignRuntime
     reason: str
 
 

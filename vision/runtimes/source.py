@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vision.foreign.layouts import YOLOX_SUFFIX, ForeignFacts
 from vision.runtimes.base import Precision, Runtime, RuntimeName, RuntimeUnusableError, installed
 from vision.runtimes.exported import SUFFIXES, ExportedFacts, ExportKind, kind_of
 from vision.yolo.level_outputs import Head
@@ -35,7 +36,8 @@ class ModelSource:
         metadata: of the file: licence, origin, score.
         strides: one per level, pixels.
         description: architecture of a checkpoint's network.
-        facts: metadata of an exported file.
+        facts: metadata of our own exported file.
+        foreign: the recognised network of another exporter's file, or of a YOLOX checkpoint.
     """
 
     path: Path
@@ -45,6 +47,7 @@ class ModelSource:
     strides: tuple[int, ...]
     description: ModelDescription | None
     facts: ExportedFacts | None
+    foreign: ForeignFacts | None = None
     _model: YoloModel | None = None
 
     def take_model(self) -> YoloModel:
@@ -54,9 +57,16 @@ class ModelSource:
         model, self._model = self._model, None
         return load_checkpoint(self.path).model if model is None else model
 
+    @property
+    def weights_path(self) -> Path:
+        """The file that identifies the model: OpenVINO's `.xml` of another exporter has no weights."""
+        return self.path.with_suffix(".bin") if self.kind == "openvino" and self.foreign else self.path
+
     def runners(self) -> tuple[RuntimeName, ...]:
         """The runtimes that can run this kind of file."""
-        return ("torch", "onnxruntime", "openvino", "tensorrt") if self.kind is None else _RUNNERS[self.kind]
+        if self.kind is None:
+            return ("torch",) if self.foreign else ("torch", "onnxruntime", "openvino", "tensorrt")
+        return _RUNNERS[self.kind]
 
 
 def read_source(path: Path) -> ModelSource:
@@ -67,11 +77,19 @@ def read_source(path: Path) -> ModelSource:
         RuntimeMissingError: an exported file, and no runtime that reads it is installed.
         RuntimeUnusableError: an exported file that is damaged or has no metadata.
     """
+    if path.is_dir():
+        path = _file_in(path)
     kind = kind_of(path)
     if kind is None:
         if not path.exists():  # checked before torch is imported
             wanted = "a .pt checkpoint, or of NAME.safetensors beside its NAME.yaml"
             raise CheckpointError(f"{path}: no such file; give the path of {wanted}")
+        if path.suffix == YOLOX_SUFFIX:
+            from vision.foreign.yolox import load_yolox
+
+            if (yolox := load_yolox(path)) is not None:
+                facts = yolox[1]
+                return ModelSource(path, None, facts.class_names, {}, (facts.stride,), None, None, facts)
         from vision.yolo.checkpoint import load_checkpoint
 
         loaded = load_checkpoint(path)
@@ -83,15 +101,18 @@ def read_source(path: Path) -> ModelSource:
             tuple(loaded.model.strides),
             loaded.description,
             None,
-            loaded.model,
+            _model=loaded.model,
         )
     if not path.is_file():
         raise RuntimeUnusableError(f"{path}: no such file")
-    facts = _facts(path, kind)
-    return ModelSource(path, kind, facts.class_names, facts.metadata, facts.strides, None, facts)
+    found = _facts(path, kind)
+    if isinstance(found, ForeignFacts):
+        strides = (found.stride,)
+        return ModelSource(path, kind, found.class_names, found.metadata, strides, None, None, found)
+    return ModelSource(path, kind, found.class_names, found.metadata, found.strides, None, found)
 
 
-def _facts(path: Path, kind: ExportKind) -> ExportedFacts:
+def _facts(path: Path, kind: ExportKind) -> ExportedFacts | ForeignFacts:
     if kind == "torchscript":
         from vision.runtimes.torch_runtime import torchscript_facts
 
@@ -109,11 +130,25 @@ def _facts(path: Path, kind: ExportKind) -> ExportedFacts:
     return openvino_facts(path)
 
 
+def _file_in(folder: Path) -> Path:
+    """The `.xml` in a folder of OpenVINO files."""
+    try:
+        found = sorted(path for path in folder.iterdir() if path.suffix == SUFFIXES["openvino"])
+    except OSError as error:
+        raise CheckpointError(f"{folder}: cannot be read ({error.strerror or error})") from None
+    if len(found) != 1:
+        raise CheckpointError(
+            f"{folder}: is a folder with {len(found)} .xml files; give the path of a model file, "
+            "or a folder with one OpenVINO model"
+        )
+    return found[0]
+
+
 def cannot_run(source: ModelSource, runtime: RuntimeName) -> RuntimeUnusableError:
     """The error for a runtime requested by name that does not run this kind of file."""
-    assert source.kind is not None
+    suffix = YOLOX_SUFFIX if source.kind is None else SUFFIXES[source.kind]
     return RuntimeUnusableError(
-        f"{source.path}: {runtime} cannot run {SUFFIXES[source.kind]} files; "
+        f"{source.path}: {runtime} cannot run {suffix} files; "
         f"use the runtime {' or '.join(source.runners())}, or auto, or give the checkpoint"
     )
 

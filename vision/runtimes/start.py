@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from vision.foreign.engines import ForeignRuntime, start_foreign
 from vision.runtimes.base import Precision, Runtime, RuntimeName, RuntimeUnusableError, version
 from vision.runtimes.exported import FORMAT, SUFFIXES, ExportedFacts, ExportKind
 from vision.runtimes.source import ModelSource, runtime_of_file
@@ -36,8 +37,10 @@ def start_named(
     threads: int | None,
     image_size: int,
     sparse_boxes: bool,
-) -> Runtime:
+) -> Runtime | ForeignRuntime:
     """Load a model on this runtime, which is installed. Arguments and errors as of `start_runtime`."""
+    if source.foreign is not None:
+        return start_foreign(source.foreign, source.path, name, precision=precision, threads=threads)
     if source.kind is not None:
         return runtime_of_file(name, source.path, precision=precision, threads=threads)
     # torch builds and runs a checkpoint's network; a file for another runtime does not need it.

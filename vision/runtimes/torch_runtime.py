@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import copy
+import json
 import logging
 import time
 import warnings
@@ -17,9 +18,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from vision.foreign.layouts import ForeignFacts, recognise_by_metadata
 from vision.runtimes import base
 from vision.runtimes.base import Precision, RuntimeName, RuntimeUnusableError
-from vision.runtimes.exported import KEY, ExportedFacts, not_ours
+from vision.runtimes.exported import KEY, ExportedFacts, not_ours, own_facts
 from vision.runtimes.network import Network
 from vision.runtimes.stored_choice import StoredChoice
 from vision.yolo.architecture import YoloModel
@@ -32,6 +34,7 @@ _DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 # For graphs valid for one size only. A camera has one size; a folder of photographs a few.
 _MOST_GRAPHS = 4
 # Input sizes for tracing and for checking the graph, in strides: height and width.
+_LARGEST_METADATA_BYTES = 1 << 20
 _TRACED, _TRIED = (2, 4), (4, 6)
 # Enough to distinguish two precisions: as many pairs of runs as fit. Measured once, see `StoredChoice`.
 _TRIAL_PAIRS = range(5, 40)
@@ -214,18 +217,8 @@ class TorchScriptRuntime:
             raise RuntimeUnusableError(f"{path}: a TorchScript file computes in float32, not in {precision}")
         if threads is not None:
             torch.set_num_threads(threads)
-        if not path.is_file():
-            raise RuntimeUnusableError(f"{path}: no such file")
-        try:
-            with warnings.catch_warnings():
-                # torch deprecates this file format; existing files must still be readable.
-                warnings.simplefilter("ignore", DeprecationWarning)
-                load: Any = torch.jit.load
-                self._module: Any = torch.jit.freeze(load(str(path), map_location="cpu").eval())
-        except RuntimeError as error:
-            reason = " ".join(str(error).split())[:300]
-            raise RuntimeUnusableError(f"{path}: torch cannot load it: {reason}") from error
-        self.head = head if head is not None else torchscript_facts(path).head()
+        self._module = load_torchscript(path)
+        self.head = head if head is not None else own_facts(torchscript_facts(path), path).head()
         self.precision, self.precision_reason = "float32", "precision of the file"
 
     @property
@@ -242,14 +235,47 @@ class TorchScriptRuntime:
         return self.head.levels(outputs)
 
 
-def torchscript_facts(path: Path) -> ExportedFacts:
-    """Read the metadata of an exported TorchScript file; nothing in it is run."""
+def load_torchscript(path: Path) -> Any:
+    """The module in a TorchScript file, frozen. It is a program: its code runs."""
+    if not path.is_file():
+        raise RuntimeUnusableError(f"{path}: no such file")
+    try:
+        with warnings.catch_warnings():
+            # torch deprecates this file format; existing files must still be readable.
+            warnings.simplefilter("ignore", DeprecationWarning)
+            load: Any = torch.jit.load
+            return torch.jit.freeze(load(str(path), map_location="cpu").eval())
+    except RuntimeError as error:
+        reason = " ".join(str(error).split())[:300]
+        if "torchvision::nms" in reason:
+            reason = "it calls torchvision's NMS; export it without nms=True"
+        raise RuntimeUnusableError(f"{path}: torch cannot load it: {reason}") from error
+
+
+def torchscript_facts(path: Path) -> ExportedFacts | ForeignFacts:
+    """Read the metadata of a TorchScript file, our own or Ultralytics'; nothing in it is run.
+
+    The file does not have the shapes of its outputs: Ultralytics' are tried when it is started.
+    """
     try:
         with zipfile.ZipFile(path) as archive:
-            name = next((name for name in archive.namelist() if name.endswith(f"/extra/{KEY}")), None)
-            if name is None:
+            names = {name.partition("/")[2]: name for name in archive.namelist()}
+            key = next((key for key in (f"extra/{KEY}", "extra/config.txt") if key in names), None)
+            if key is None:
                 raise not_ours(path)
-            text = archive.read(name).decode(errors="replace")
+            if archive.getinfo(names[key]).file_size > _LARGEST_METADATA_BYTES:
+                raise RuntimeUnusableError(
+                    f"{path}: its metadata has more than {_LARGEST_METADATA_BYTES} bytes"
+                )
+            text = archive.read(names[key]).decode(errors="replace")
     except (zipfile.BadZipFile, OSError, EOFError) as error:
         raise RuntimeUnusableError(f"{path}: is not a TorchScript file ({error})") from error
-    return ExportedFacts.from_json(text, path)
+    if key.endswith(KEY):
+        return ExportedFacts.from_json(text, path)
+    try:
+        stated = json.loads(text)
+    except (ValueError, RecursionError):
+        stated = None
+    if not isinstance(stated, dict):
+        raise RuntimeUnusableError(f"{path}: its metadata (extra/config.txt) is not a table in JSON")
+    return recognise_by_metadata(path, stated)

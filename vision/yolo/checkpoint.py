@@ -285,6 +285,11 @@ def _check_sizes(description: ModelDescription, weights: dict[str, Tensor]) -> N
     repeats = sum(max(1, round(row.repeats * description.depth_multiple)) for row in description.rows)
     if repeats > _MOST_REPEATS:
         raise CheckpointError(f"describes {repeats} layers, the limit is {_MOST_REPEATS}")
+    check_storages(weights)
+
+
+def check_storages(weights: Mapping[str, Tensor]) -> None:
+    """Raise `CheckpointError` if several weights are views of the same numbers."""
     storages = {tensor.untyped_storage().data_ptr(): tensor.untyped_storage() for tensor in weights.values()}
     if sum(tensor.nbytes for tensor in weights.values()) > sum(map(len, storages.values())):
         raise CheckpointError("uses the same numbers for several weights; it is not a checkpoint")

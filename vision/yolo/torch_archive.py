@@ -186,12 +186,6 @@ class _Archive:
         members = archive.infolist()
         if len(members) > _MOST_MEMBERS:
             raise CheckpointError(f"the archive has {len(members)} members, a checkpoint far fewer")
-        if any(member.compress_type != zipfile.ZIP_STORED for member in members):
-            raise CheckpointError("the archive is compressed, torch.save never does; save the model again")
-        if any(member.compress_size != member.file_size for member in members):
-            raise CheckpointError("the archive has a member of two sizes; it is not a checkpoint")
-        if sum(member.file_size for member in members) > size:
-            raise CheckpointError("the archive's members are larger than the file; it is not a checkpoint")
         self._members = {member.filename: member for member in members}
         if len(self._members) != len(members):
             raise CheckpointError("the archive has two members of one name; it is not a checkpoint")
@@ -201,8 +195,15 @@ class _Archive:
         self._root = pickles[0].removesuffix("data.pkl")
         if any(name.startswith(f"{self._root}code/") for name in self._members):
             raise CheckpointError(
-                "the file is a TorchScript program, not a checkpoint; give the .pt of training"
+                "the file is a TorchScript program, not a checkpoint; rename it to end in .torchscript, "
+                "or give the .pt of training"
             )
+        if any(member.compress_type != zipfile.ZIP_STORED for member in members):
+            raise CheckpointError("the archive is compressed, torch.save never does; save the model again")
+        if any(member.compress_size != member.file_size for member in members):
+            raise CheckpointError("the archive has a member of two sizes; it is not a checkpoint")
+        if sum(member.file_size for member in members) > size:
+            raise CheckpointError("the archive's members are larger than the file; it is not a checkpoint")
         order = self._members.get(f"{self._root}byteorder")
         if order is not None and self._bytes(order, 16) != b"little":
             raise CheckpointError("its numbers are big-endian; save it on a little-endian machine")

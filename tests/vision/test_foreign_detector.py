@@ -1,0 +1,289 @@
+"""Files of other exporters: recognised, run and decoded to the boxes that are in them."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.vision.foreign_files import (
+    constant_onnx,
+    stated,
+    ultralytics_onnx,
+    ultralytics_openvino,
+    ultralytics_torchscript,
+)
+from tests.vision.runtimes.conftest import NAMES, lively_model, make_image
+from vision.detections import Detections
+from vision.detector import Detector, class_names_of
+from vision.foreign.class_names import COCO_NAMES
+from vision.runtimes.base import RuntimeUnusableError
+from vision.runtimes.selection import RuntimeChoice
+from vision.runtimes.source import read_source
+from vision.yolo.checkpoint import CheckpointError, save_checkpoint
+
+pytest.importorskip("onnx", reason="onnx is an optional extra")
+pytest.importorskip("onnxruntime", reason="onnxruntime is an optional extra")
+
+SIZE = (64, 96)
+TWO = ("car", "dog")
+
+
+@pytest.fixture(scope="module")
+def exports(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """One network as a checkpoint and as Ultralytics' exports of it."""
+    folder = tmp_path_factory.mktemp("exports")
+    save_checkpoint(folder / "net.pt", lively_model(), metadata={})
+    # The checkpoint has the weights in half precision.
+    from vision.yolo.checkpoint import load_checkpoint
+
+    def model() -> Any:
+        return load_checkpoint(folder / "net.pt").model
+
+    fixed = ultralytics_onnx(folder / "fixed.onnx", model(), SIZE)
+    found = {
+        "checkpoint": folder / "net.pt",
+        "fixed": fixed,
+        "dynamic": ultralytics_onnx(folder / "dynamic.onnx", model(), SIZE, dynamic=True),
+        "torchscript": ultralytics_torchscript(folder / "net.torchscript", model(), SIZE),
+    }
+    if _has_openvino():
+        found["folder"] = ultralytics_openvino(folder / "net_openvino_model", fixed, NAMES, SIZE)
+    return found
+
+
+def _has_openvino() -> bool:
+    import importlib.util
+
+    return importlib.util.find_spec("openvino") is not None
+
+
+def assert_same_boxes(expected: Detections, found: Detections) -> None:
+    assert len(expected) == len(found)
+    np.testing.assert_allclose(expected.xyxy, found.xyxy, atol=0.05)
+    np.testing.assert_allclose(expected.confidence, found.confidence, atol=1e-3)
+    assert expected.class_id.tolist() == found.class_id.tolist()
+
+
+@pytest.mark.parametrize(
+    ("kind", "runtime"),
+    [
+        ("fixed", "onnxruntime"),
+        ("fixed", "openvino"),
+        ("dynamic", "onnxruntime"),
+        ("folder", "openvino"),
+        ("torchscript", "torch"),
+    ],
+)
+def test_export_has_the_boxes_of_its_checkpoint(
+    exports: dict[str, Path], kind: str, runtime: RuntimeChoice
+) -> None:
+    if runtime == "openvino":
+        pytest.importorskip("openvino", reason="openvino is an optional extra")
+    options: dict[str, Any] = {"confidence": 0.3, "threads": 1, "precision": "float32"}
+    checkpoint = Detector(exports["checkpoint"], image_size=96, square=False, **options)
+    export = Detector(exports[kind], image_size=96, runtime=runtime, **options)
+    # Without padding, so that a fixed size and a multiple of the stride are the same input.
+    image = make_image(64, 96, seed=3)
+    expected = checkpoint.detect(image)
+    assert len(expected) > 3
+    assert_same_boxes(expected, export.detect(image))
+    assert export.class_names == NAMES
+    assert export.foreign is not None
+    assert export.foreign.layout == "cells"
+    assert export.foreign.fixed_size == (None if kind == "dynamic" else SIZE)
+
+
+def test_classes_are_filtered_after_the_best_is_known(exports: dict[str, Path]) -> None:
+    image = make_image(64, 96, seed=3)
+    every = Detector(exports["fixed"], confidence=0.3, runtime="onnxruntime").detect(image)
+    wanted = every.class_names[int(every.class_id[0])]
+    some = Detector(exports["fixed"], classes=[wanted], confidence=0.3, runtime="onnxruntime").detect(image)
+    assert_same_boxes(every[every.class_id == every.class_id[0]], some)
+    assert class_names_of(exports["fixed"], "onnxruntime") == NAMES
+
+
+def detect(path: Path, width: int = 96, height: int = 64, **options: Any) -> Detections:
+    image = np.zeros((height, width, 3), np.uint8)
+    return Detector(path, runtime="onnxruntime", **options).detect(image)
+
+
+def columns(*rows: list[float], cells: int = 126) -> Any:
+    """(1, channels, cells): the rows are the first cells, the others are zero."""
+    array = np.zeros((1, len(rows[0]), cells), np.float32)
+    array[0, :, : len(rows)] = np.transpose(rows)
+    return array
+
+
+def test_cells_are_suppressed_and_scaled_to_the_frame(tmp_path: Path) -> None:
+    cells = columns([30, 20, 20, 10, 0.1, 0.9], [31, 20, 20, 10, 0, 0.8], [70, 40, 10, 10, 0.6, 0.2])
+    path = constant_onnx(tmp_path / "a.onnx", {"output0": cells}, metadata=stated(TWO, SIZE))
+    found = detect(path, width=192, height=128)
+    np.testing.assert_allclose(found.xyxy, [[40, 30, 80, 50], [130, 70, 150, 90]])
+    np.testing.assert_allclose(found.confidence, [0.9, 0.6])
+    assert found.class_id.tolist() == [1, 0]
+
+
+@pytest.mark.parametrize("marked", [{"args": {"nms": True}}, {"end2end": True}, {}])
+def test_selected_boxes_are_taken_as_they_are(tmp_path: Path, marked: dict[str, Any]) -> None:
+    rows = np.zeros((1, 300, 6), np.float32)
+    rows[0, :3] = [[10, 10, 20, 20, 0.9, 2], [11, 10, 20, 20, 0.8, 2], [0, 0, 5, 5, 0.2, 1]]
+    metadata = stated(("a", "b", "c"), SIZE, **marked)
+    found = detect(constant_onnx(tmp_path / "a.onnx", {"output0": rows}, metadata=metadata))
+    np.testing.assert_allclose(found.xyxy, [[10, 10, 20, 20], [11, 10, 20, 20]])
+    assert found.class_id.tolist() == [2, 2]
+
+
+def test_objectness_multiplies_the_classes(tmp_path: Path) -> None:
+    """As of YOLOv5's own exporter, which states the same names and stride."""
+    rows = np.zeros((1, 126, 7), np.float32)
+    rows[0, :2] = [[30, 20, 20, 10, 0.5, 0.2, 0.8], [50, 50, 4, 4, 0.1, 1, 0]]
+    path = constant_onnx(tmp_path / "a.onnx", {"output": rows}, metadata=stated(TWO, SIZE))
+    found = detect(path)
+    np.testing.assert_allclose(found.xyxy, [[20, 15, 40, 25]])
+    np.testing.assert_allclose(found.confidence, [0.4])
+    assert found.class_id.tolist() == [1]
+
+
+@pytest.mark.parametrize("task", ["segment", "pose", "obb"])
+def test_other_tasks_give_their_boxes(tmp_path: Path, task: str) -> None:
+    turned = float(np.pi / 2)
+    extra = {"segment": [7.0] * 32, "pose": [5.0] * 51, "obb": [turned]}[task]
+    cells = columns([30, 20, 20, 10, 0.1, 0.9, *extra], cells=400)
+    outputs = {"output0": cells} | (
+        {"output1": np.zeros((1, 32, 4, 4), np.float32)} if task == "segment" else {}
+    )
+    path = constant_onnx(tmp_path / "a.onnx", outputs, metadata=stated(TWO, SIZE, task=task))
+    expected = [[25, 10, 35, 30]] if task == "obb" else [[20, 15, 40, 25]]
+    np.testing.assert_allclose(detect(path).xyxy, expected, atol=1e-4)
+
+
+@pytest.mark.parametrize(("channel", "value"), [(0, 30 / 255), (1, 20 / 255), (2, 10 / 255)])
+@pytest.mark.parametrize("kind", ["FLOAT", "FLOAT16"])
+def test_input_is_rgb_in_0_to_1(tmp_path: Path, channel: int, value: float, kind: str) -> None:
+    rows = np.zeros((1, 1, 6), np.float32 if kind == "FLOAT" else np.float16)
+    path = constant_onnx(
+        tmp_path / "a.onnx",
+        {"output0": rows},
+        red_at=(channel, 5, 7),
+        input_type=kind,
+        metadata=stated(TWO, SIZE, end2end=True),
+    )
+    image = np.empty((64, 96, 3), np.uint8)
+    image[:] = (10, 20, 30)
+    found = Detector(path, runtime="onnxruntime", confidence=0).detect(image)
+    np.testing.assert_allclose(found.confidence, [value], rtol=1e-3)
+
+
+def test_export_for_classification_is_refused(tmp_path: Path) -> None:
+    path = constant_onnx(
+        tmp_path / "a.onnx",
+        {"output0": np.zeros((1, 2), np.float32)},
+        metadata=stated(TWO, SIZE, task="classify"),
+    )
+    with pytest.raises(RuntimeUnusableError, match="export for 'classify'") as caught:
+        read_source(path)
+    assert str(caught.value).startswith(f"{path}: ")
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        ("{0: 'a', 2: 'b'}", "numbered from 0"),
+        ("{0: 'a\\n', 1: 'b'}", "printable"),
+        ("[" * 500, "printable texts"),
+        ("__import__('os').system('id')", "printable texts"),
+        ("{}", "printable texts"),
+    ],
+)
+def test_invalid_names_in_metadata_are_refused(tmp_path: Path, names: str, expected: str) -> None:
+    path = constant_onnx(
+        tmp_path / "a.onnx",
+        {"output0": np.zeros((1, 6, 126), np.float32)},
+        metadata={**stated(TWO, SIZE), "names": names},
+    )
+    with pytest.raises(RuntimeUnusableError, match=expected) as caught:
+        read_source(path)
+    assert str(caught.value).isprintable()
+
+
+def test_unknown_outputs_are_refused_with_their_shapes(tmp_path: Path) -> None:
+    outputs = {"out": np.zeros((1, 5, 5), np.float32)}
+    path = constant_onnx(tmp_path / "a.onnx", outputs, metadata=stated(TWO, SIZE))
+    with pytest.raises(RuntimeUnusableError, match=r"out \(1, 5, 5\) float32, which is no known layout"):
+        read_source(path)
+    with pytest.raises(RuntimeUnusableError, match=r"no metadata of a known exporter.*models export"):
+        read_source(constant_onnx(tmp_path / "b.onnx", outputs))
+    batch = constant_onnx(tmp_path / "c.onnx", outputs, size=(64, 96), input_type="UINT8")
+    with pytest.raises(RuntimeUnusableError, match="expected one image"):
+        read_source(batch)
+
+
+def test_folder_without_one_model_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match=r"0 \.xml files"):
+        read_source(tmp_path)
+
+
+def test_torchscript_must_give_what_it_states(tmp_path: Path) -> None:
+    path = ultralytics_torchscript(tmp_path / "a.torchscript", lively_model(), SIZE, args={"nms": True})
+    facts = read_source(path).foreign
+    assert facts is not None
+    assert facts.layout == "selected"
+    with pytest.raises(RuntimeUnusableError, match="not what its file states"):
+        Detector(path, runtime="torch").detect(make_image(64, 96))
+
+
+def test_torchscript_that_calls_nms_says_how_to_export(
+    exports: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def load(*_: Any, **__: Any) -> None:
+        raise RuntimeError("\nUnknown builtin op: torchvision::nms.\nCould not find")
+
+    monkeypatch.setattr("torch.jit.load", load)
+    with pytest.raises(RuntimeUnusableError, match="export it without nms=True"):
+        Detector(exports["torchscript"], runtime="torch")
+
+
+REAL = Path(os.environ.get("COMPANION_TEST_EXPORTS", "/nonexistent"))
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="COMPANION_TEST_EXPORTS names no folder of real exports")
+def test_real_exports_are_recognised() -> None:
+    for path in sorted(REAL.iterdir()):
+        if path.suffix in (".onnx", ".torchscript") or path.is_dir():
+            source = read_source(path)
+            assert source.foreign is not None, path
+            assert source.class_names, path
+
+
+def test_yolox_cells_are_decoded_here_or_in_the_file(tmp_path: Path) -> None:
+    """Strides 8, 16 and 32: 96 + 24 + 6 cells of an input of 96x64 pixels; BGR bytes, at the upper left."""
+    raw = np.zeros((1, 126, 85), np.float32)
+    raw[0, :, :2] = 0.4
+    raw[0, 96 + 7, :7] = [0.5, 0.25, np.log(2), np.log(1), 0.9, 0.0, 0.8]
+    decoded = np.zeros_like(raw)
+    first = 0
+    for stride, rows, across in ((8, 8, 12), (16, 4, 6), (32, 2, 3)):
+        y, x = np.divmod(np.arange(rows * across), across)
+        part = slice(first, first + rows * across)
+        decoded[0, part, 0], decoded[0, part, 1] = (
+            (raw[0, part, 0] + x) * stride,
+            (raw[0, part, 1] + y) * stride,
+        )
+        decoded[0, part, 2:4] = np.exp(raw[0, part, 2:4]) * stride
+        first += rows * across
+    decoded[0, :, 4:] = raw[0, :, 4:]
+    for name, array, layout in (("raw", raw, "yolox"), ("decoded", decoded, "objectness")):
+        path = constant_onnx(tmp_path / f"{name}.onnx", {"output": array})
+        detector = Detector(path, runtime="onnxruntime")
+        assert detector.foreign is not None
+        assert detector.foreign.layout == layout
+        assert detector.class_names == COCO_NAMES
+        found = detector.detect(np.zeros((128, 96, 3), np.uint8))
+        # Cell (1, 1) of stride 16; the frame is shown at half its size.
+        np.testing.assert_allclose(found.xyxy, [[16, 24, 80, 56]], rtol=1e-5)
+        np.testing.assert_allclose(found.confidence, [0.72], rtol=1e-5)
+        assert found.class_id.tolist() == [1]

@@ -1,0 +1,317 @@
+"""Recognises a network exported by another program: from what its file states, and from its shapes.
+
+Ultralytics writes names, stride, task and size into each export. Files of YOLOX, RT-DETR, D-FINE and RF-DETR
+state nothing; they are recognised by the names and shapes of their outputs.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from vision.foreign.class_names import names_beside
+from vision.letterbox import Placement
+from vision.plain_yaml import numbered
+from vision.runtimes.base import RuntimeUnusableError
+
+Layout = Literal["cells", "selected", "objectness", "yolox", "queries", "logits", "scored"]
+LAYOUTS: dict[Layout, str] = {
+    "cells": "boxes and class probabilities of all cells, before NMS",
+    "selected": "boxes selected inside the file: iou has no effect",
+    "objectness": "boxes, objectness and class probabilities of all cells, before NMS",
+    "yolox": "boxes in cells, objectness and class probabilities, before NMS",
+    "queries": "boxes and class probabilities of queries, without NMS",
+    "logits": "boxes and class logits of queries, without NMS",
+    "scored": "labels, boxes and scores, without NMS",
+}
+YOLOX_STRIDES = (8, 16, 32)
+YOLOX_SUFFIX = ".pth"
+_LONGEST_TEXT = 1 << 20
+_TASKS = ("detect", "segment", "pose", "obb")
+_IMAGENET = ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
+
+
+@dataclass(frozen=True, slots=True)
+class Port:
+    """An input or output: name, shape (None: any length), and type as numpy names it."""
+
+    name: str
+    shape: tuple[int | None, ...]
+    dtype: str = "float32"
+
+    def __str__(self) -> str:
+        return f"{self.name} ({', '.join('?' if n is None else str(n) for n in self.shape)}) {self.dtype}"
+
+
+@dataclass(frozen=True, slots=True)
+class Pixels:
+    """How a network takes its image: (1, 3, H, W), each value (pixel / divisor - mean) / deviation.
+
+    Attributes:
+        rgb: the order of the colours; False: BGR.
+        placement: of the frame in the input.
+    """
+
+    rgb: bool = True
+    divisor: float = 255.0
+    mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    deviation: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    placement: Placement = "centre"
+
+
+@dataclass(frozen=True, slots=True)
+class ForeignFacts:
+    """A recognised network.
+
+    Attributes:
+        class_names: id → name.
+        written_by: the program, as far as known.
+        task: `detect`, `segment`, `pose` or `obb`; of all of them only the boxes are used.
+        layout: of the outputs.
+        stride: the sides of the input are multiples of it.
+        fixed_size: (height, width) of the only accepted input; None: any.
+        pixels: the input.
+        dtype: of the input, `float32` or `float16`.
+        precision: the network computes in it.
+        names_from: where the class names are from.
+        takes_size: a second input takes (width, height), for `scored`.
+        boxes_at: index of the boxes among two outputs, for `logits`.
+        metadata: licence, version and date, as stated.
+    """
+
+    class_names: tuple[str, ...]
+    written_by: str
+    task: str
+    layout: Layout
+    stride: int
+    fixed_size: tuple[int, int] | None
+    pixels: Pixels = Pixels()
+    dtype: str = "float32"
+    precision: str = "float32"
+    names_from: str = "its metadata"
+    takes_size: bool = False
+    boxes_at: int = 0
+    metadata: dict[str, Any] = field(default_factory=dict)
+
+
+def recognise(
+    path: Path, stated: Mapping[str, Any], inputs: Sequence[Port], outputs: Sequence[Port]
+) -> ForeignFacts:
+    """Recognise the network in `path`.
+
+    Args:
+        stated: the file's metadata; values may be texts of Python literals.
+
+    Raises:
+        RuntimeUnusableError: not a known layout; one line with what was found.
+    """
+    try:
+        image = _image_input(inputs)
+        sides = image.shape[2], image.shape[3]
+        fixed = None if sides[0] is None or sides[1] is None else (sides[0], sides[1])
+        if "names" in stated and "stride" in stated:
+            return _ultralytics(stated, image, fixed, outputs)
+        return _by_shapes(path, image, fixed, inputs, outputs)
+    except ValueError as error:
+        text = str(error)
+        raise RuntimeUnusableError(text if text.startswith(f"{path.parent}") else f"{path}: {text}") from None
+
+
+def recognise_by_metadata(path: Path, stated: Mapping[str, Any]) -> ForeignFacts:
+    """Recognise Ultralytics' TorchScript, whose file does not state the shapes of inputs and outputs.
+
+    Raises:
+        RuntimeUnusableError: as `recognise`.
+    """
+    arguments = stated.get("args")
+    arguments = arguments if isinstance(arguments, dict) else {}
+    sides = stated.get("imgsz")
+    size: list[int | None] = [None, None]
+    if not arguments.get("dynamic") and isinstance(sides, list) and len(sides) == 2:
+        size = [side if type(side) is int and 0 < side < 1 << 14 else None for side in sides]
+    names = stated.get("names")
+    channels = 4 + (len(names) if isinstance(names, dict | list) else 0)
+    if stated.get("end2end") or arguments.get("nms"):
+        output: tuple[int | None, ...] = (1, None, 6)
+    elif "RTDETR" in str(stated.get("head", "")):
+        output = (1, None, channels)
+    else:
+        output = (1, channels, None)
+    return recognise(path, stated, [Port("image", (1, 3, *size))], [Port("output", output)])
+
+
+def _image_input(inputs: Sequence[Port]) -> Port:
+    image = inputs[0] if inputs else None
+    if (
+        image is None
+        or len(image.shape) != 4
+        or image.shape[0] not in (1, None)
+        or image.shape[1] not in (3, None)
+        or image.dtype not in ("float32", "float16")
+    ):
+        raise ValueError(
+            f"takes {_listed(inputs)}; expected one image, (1, 3, height, width) of float32 or float16"
+        )
+    return image
+
+
+def _ultralytics(
+    stated: Mapping[str, Any], image: Port, fixed: tuple[int, int] | None, outputs: Sequence[Port]
+) -> ForeignFacts:
+    task = str(stated.get("task", "detect"))
+    if task not in _TASKS:
+        raise ValueError(f"is an export for {task!r:.40}; boxes come of {', '.join(_TASKS)}")
+    names, stride = _class_names(stated["names"]), _literal(stated["stride"])
+    if type(stride) is not int or not 1 <= stride <= 256:
+        raise ValueError(f"states the stride {stride!r:.40}, expected a whole number of pixels")
+    arguments = _literal(stated.get("args", {}))
+    arguments = arguments if isinstance(arguments, dict) else {}
+    selected = str(stated.get("end2end", "")) == "True" or bool(arguments.get("nms"))
+    half = image.dtype == "float16" or arguments.get("half") is True or arguments.get("quantize") == 16
+    layout = _cell_layout(
+        outputs, len(names), task, selected=selected, queries="RTDETR" in str(stated.get("head", ""))
+    )
+    known = {"licence": "license", "version": "version", "date": "date", "about": "description"}
+    return ForeignFacts(
+        names,
+        f"Ultralytics {stated.get('version', '')!s:.40}".strip(),
+        task,
+        layout,
+        stride,
+        fixed,
+        Pixels(placement="stretch") if layout == "queries" else Pixels(),
+        image.dtype,
+        "float16" if half else "float32",
+        metadata={key: str(stated[name])[:200] for key, name in known.items() if name in stated},
+    )
+
+
+def _cell_layout(
+    outputs: Sequence[Port], classes: int, task: str, *, selected: bool, queries: bool
+) -> Layout:
+    """The layout of an output of Ultralytics; tasks other than `detect` have further channels."""
+    shape = outputs[0].shape if outputs else ()
+    if len(shape) != 3 or shape[0] not in (1, None):
+        raise ValueError(f"gives {_listed(outputs)}, which is no known layout for {classes} classes")
+    rows, columns = shape[1], shape[2]
+
+    def fits(length: int | None, least: int) -> bool:
+        return length is not None and (length == least if task == "detect" else length >= least)
+
+    if queries and fits(columns, 4 + classes):
+        return "queries"
+    if selected and fits(columns, 6):
+        return "selected"
+    if rows is None and columns is None:
+        return "cells"  # `decoding` checks the length.
+    # The cells are far more than the channels.
+    if fits(rows, 4 + classes) and (columns is None or columns > (rows or 0)):
+        return "cells"
+    if columns == 6 and task == "detect":
+        return "selected"
+    if task == "detect" and columns == 5 + classes:
+        return "objectness"
+    if task == "detect" and columns == 4 + classes:
+        return "queries"
+    raise ValueError(f"gives {_listed(outputs)}, which is no known layout for {classes} classes ({task})")
+
+
+def _by_shapes(
+    path: Path,
+    image: Port,
+    fixed: tuple[int, int] | None,
+    inputs: Sequence[Port],
+    outputs: Sequence[Port],
+) -> ForeignFacts:
+    by_name = {port.name: port for port in outputs}
+    shapes = [port.shape for port in outputs]
+    if by_name.keys() == {"labels", "boxes", "scores"} and [port.name for port in inputs[1:]] == [
+        "orig_target_sizes"
+    ]:
+        # The number of classes is not in the file: RT-DETR's and D-FINE's are trained on COCO's 80.
+        names, origin = names_beside(path, 80)
+        return ForeignFacts(
+            names,
+            "RT-DETR or D-FINE",
+            "detect",
+            "scored",
+            32,
+            fixed,
+            Pixels(placement="stretch"),
+            image.dtype,
+            image.dtype,
+            origin,
+            takes_size=True,
+        )
+    if len(shapes) == 2 and all(len(shape) == 3 for shape in shapes) and len(inputs) == 1:
+        at = next((at for at, port in enumerate(outputs) if port.name in ("dets", "pred_boxes")), None)
+        at = int(outputs[0].shape[2] != 4) if at is None else at
+        boxes, logits = outputs[at], outputs[1 - at]
+        if boxes.shape[2] == 4 and logits.shape[2] is not None and boxes.shape[1] == logits.shape[1]:
+            names, origin = names_beside(path, logits.shape[2])
+            normalised = "dets" in by_name
+            mean, deviation = _IMAGENET if normalised else ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+            return ForeignFacts(
+                names,
+                "RF-DETR" if normalised else "a DETR",
+                "detect",
+                "logits",
+                32,
+                fixed,
+                Pixels(mean=mean, deviation=deviation, placement="stretch"),
+                image.dtype,
+                image.dtype,
+                origin,
+                boxes_at=at,
+            )
+    if len(shapes) == 1 and len(shapes[0]) == 3 and len(inputs) == 1 and fixed is not None:
+        cells = sum((fixed[0] // stride) * (fixed[1] // stride) for stride in YOLOX_STRIDES)
+        channels = shapes[0][2]
+        if shapes[0][1] == cells and channels is not None and channels > 5:
+            names, origin = names_beside(path, channels - 5)
+            return ForeignFacts(
+                names,
+                "YOLOX",
+                "detect",
+                "yolox",
+                32,
+                fixed,
+                Pixels(rgb=False, divisor=1.0, placement="corner"),
+                image.dtype,
+                image.dtype,
+                origin,
+            )
+    raise ValueError(
+        f"has no metadata of a known exporter, and gives {_listed(outputs)}, which is no known layout; "
+        "export it from the checkpoint with `companion models export`"
+    )
+
+
+def _listed(ports: Sequence[Port]) -> str:
+    return ", ".join(map(str, ports[:4])) + (", …" if len(ports) > 4 else "") or "nothing"
+
+
+def _literal(value: Any) -> Any:
+    """The value of a text that is a Python literal; any other text or value as it is."""
+    if not isinstance(value, str) or len(value) > _LONGEST_TEXT:
+        return value
+    try:
+        return ast.literal_eval(value)
+    except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError):
+        return value
+
+
+def _class_names(stated: Any) -> tuple[str, ...]:
+    names = _literal(stated)
+    if isinstance(names, dict):
+        names = numbered(names)
+    if (
+        not isinstance(names, list)
+        or not names
+        or not all(isinstance(name, str) and name and name.isprintable() for name in names)
+    ):
+        raise ValueError("its class names are not a table of printable texts numbered from 0")
+    return tuple(names)
