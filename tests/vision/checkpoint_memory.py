@@ -1,7 +1,7 @@
 """Reads checkpoints in a separate process and reports the outcome, memory and time.
 
 Run as `python checkpoint_memory.py WARM_UP FILE…`: prints one line of JSON per file with the outcome, the
-growth of the process's peak memory, and its processor time in seconds. An attempt to run code ends the process.
+growth of the process's peak memory, and its processor time, s. An attempt to run code ends the process.
 """
 
 from __future__ import annotations
