@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import re
 import shlex
 from collections.abc import Iterator
@@ -27,6 +28,7 @@ DOCUMENTS = [
     *sorted((ROOT / "docs").glob("**/*.md")),
     ROOT / "systemd" / "companion.service",
 ]
+command_of = functools.cache(typer.main.get_command)
 APPS = {"companion": companion_app, "mavlink-sim": simulator_app}
 SIMULATOR_SUBCOMMANDS = {"dataset": dataset_app, "board": board_app, "bench": bench_app, "camera": camera_app}
 
@@ -57,10 +59,9 @@ COMMAND_LINES = [
 
 @pytest.mark.parametrize("words", COMMAND_LINES)
 def test_every_command_in_documents_is_valid(words: list[str]) -> None:
-    command = typer.main.get_command(APPS[words[0]])
-    arguments = words[1:]
+    command, arguments = command_of(APPS[words[0]]), words[1:]
     if words[0] == "mavlink-sim" and len(words) > 1 and words[1] in SIMULATOR_SUBCOMMANDS:
-        command, arguments = typer.main.get_command(SIMULATOR_SUBCOMMANDS[words[1]]), words[2:]
+        command, arguments = command_of(SIMULATOR_SUBCOMMANDS[words[1]]), words[2:]
     context = command.make_context(words[0], list(arguments), resilient_parsing=False)
     # A group passes the rest to its command, which must accept all of it.
     while hasattr(command, "resolve_command"):

@@ -16,7 +16,7 @@ def test_every_scene_is_judged_and_frames_are_drawn_once(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "frames"
-    arguments = ["--frames", "10", "--image-size", "320", "--folder", str(folder), "--json"]
+    arguments = ["--frames", "10", "--image-size", "160", "--folder", str(folder), "--json"]
     main(arguments)
     report = json.loads(capsys.readouterr().out)
     assert set(report["scenes"]) == {"random", "default world", *example_scenes()}

@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 import zenoh
@@ -19,7 +20,7 @@ import zenoh
 from companion.bus.client import send_command
 from companion.bus.topics import DETECTIONS
 from companion.play import PlayOptions
-from mavlink_sim.testing import free_port, running_simulator
+from mavlink_sim.testing import QUICK_FLIGHT, free_port, running_simulator, vehicle
 from tests.companion.command_line import companion
 from tests.companion.service_process import ServiceProcess
 
@@ -77,17 +78,40 @@ def until_gone(pids: set[int], timeout_s: float = 10.0) -> set[int]:
     return left
 
 
-def test_play_flies_an_autopilot_at_a_url_and_ends_on_ctrl_c(tmp_path: Path) -> None:
+@pytest.fixture
+def small(exported_model: Path, tmp_path: Path) -> list[str]:
+    """Flags for a scene and a model that cost little."""
+    scene = tmp_path / "small.toml"
+    scene.write_text(
+        '[ground]\nkinds = ["concrete"]\ntile_texels = 256\ntexel_m = 0.05\n'
+        '[[objects]]\nclass = "car"\nplace_m = [30, 0]\n[[objects]]\nclass = "boat"\nplace_m = [0, 30]\n'
+        "[camera]\nwidth = 160\nheight = 120\nhorizontal_fov_deg = 80\nrate_hz = 5\n"
+    )
+    model = ("--model", str(exported_model), "--detector-runtime", "onnxruntime")
+    return ["--scene", str(scene), *model, "--detector-image-size", "160"]
+
+
+def next_detections(session: zenoh.Session, vehicle: str) -> dict[str, Any]:
+    seen = session.declare_subscriber(DETECTIONS.key(vehicle), zenoh.handlers.FifoChannel(10))
+    message: dict[str, Any] = json.loads(seen.recv().payload.to_string())
+    seen.undeclare()  # type: ignore[no-untyped-call]
+    return message
+
+
+def test_play_flies_an_autopilot_at_a_url_and_ends_on_ctrl_c(tmp_path: Path, small: list[str]) -> None:
     """Any autopilot: here a simulated vehicle that has no camera of its own, with system id 7."""
     with ExitStack() as stack:
-        simulator = stack.enter_context(running_simulator(system_id=7))
+        simulator = stack.enter_context(running_simulator(system_id=7, parameters=QUICK_FLIGHT))
         url = f"udpin://127.0.0.1:{simulator.onboard_port}"
-        running = stack.enter_context(playing(tmp_path, "--vehicle-url", url))
-        assert any("bicycle, boat, car" in line for line in running.lines)
+        running = stack.enter_context(playing(tmp_path, "--vehicle-url", url, *small))
+        assert any("has: boat, car" in line for line in running.lines)
         for text in ("takeoff 3", "land"):
             sent = companion("send", "--connect", running.endpoint, text, cwd=tmp_path, timeout_s=120.0)
             assert sent.returncode == 0, sent.stdout + sent.stderr
         assert any("armed" in event for event in simulator.events)
+        with running.client() as session:
+            message = next_detections(session, "vehicle1")
+        assert (message["width"], message["height"]) == (160, 120)
         busy = companion("play", "--zenoh-listen", running.endpoint, cwd=tmp_path)
         assert busy.returncode == 2
         (line,) = busy.stderr.splitlines()
@@ -100,21 +124,32 @@ def test_play_flies_an_autopilot_at_a_url_and_ends_on_ctrl_c(tmp_path: Path) -> 
         assert not list(Path("/dev/shm").glob(f"*companion-play-{running.pid}*"))
 
 
-def test_play_in_the_air_holds_and_ends_on_ctrl_c(tmp_path: Path) -> None:
-    with playing(tmp_path, "--vehicles", "2") as running:
+def test_demonstration_refuses_an_armed_autopilot(tmp_path: Path) -> None:
+    with vehicle(parameters={"COM_DISARM_PRFLT": -1.0}) as simulator:
+        simulator.arm()
+        url = f"udpin://127.0.0.1:{simulator.onboard_port}"
+        done = companion("demo", "--output", tmp_path / "demo", "--vehicle-url", url, cwd=tmp_path)
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert "armed" in line
+
+
+def test_play_in_the_air_holds_and_ends_on_ctrl_c(tmp_path: Path, small: list[str]) -> None:
+    with playing(tmp_path, "--vehicles", "2", *small) as running:
         with running.client() as session:
             for text in ("takeoff 3", "hold"):
                 reply = send_command(session, "vehicle2", text, timeout_s=60.0)
                 assert reply["success"], reply
             # It sees by its own camera.
-            seen = session.declare_subscriber(DETECTIONS.key("vehicle2"), zenoh.handlers.FifoChannel(10))
-            message = json.loads(seen.recv().payload.to_string())
-            assert (message["vehicle"], message["width"], message["height"]) == ("vehicle2", 640, 480)
+            message = next_detections(session, "vehicle2")
+            assert (message["vehicle"], message["width"], message["height"]) == ("vehicle2", 160, 120)
             assert message["localization_error"] == ""
         started = descendants(running.pid)
+        assert len(started) >= 4  # the vehicles, their cameras, perception twice
         running.signal(signal.SIGINT)
         assert running.process.wait(20) == 0
         assert not until_gone(started)
+        assert not list(Path("/dev/shm").glob(f"*companion-play-{running.pid}*"))
 
 
 def test_up_to_four_vehicles_have_a_camera_each() -> None:
@@ -122,8 +157,8 @@ def test_up_to_four_vehicles_have_a_camera_each() -> None:
     assert cameras == [1, 2, 4, 1, 1]
 
 
-def test_play_exits_with_1_when_simulator_dies(tmp_path: Path) -> None:
-    with playing(tmp_path) as running:
+def test_play_exits_with_1_when_simulator_dies(tmp_path: Path, small: list[str]) -> None:
+    with playing(tmp_path, *small) as running:
         started = descendants(running.pid)
         vehicle = next(pid for pid in started if b"mavlink_sim" in Path(f"/proc/{pid}/cmdline").read_bytes())
         os.kill(vehicle, signal.SIGKILL)

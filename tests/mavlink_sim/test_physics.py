@@ -3,6 +3,7 @@
 import itertools
 import math
 import statistics
+from bisect import bisect_left
 from typing import Any
 
 import pytest
@@ -333,8 +334,9 @@ def test_held_position_error_matches_real_vehicle() -> None:
 def test_estimate_differs_slightly_from_truth() -> None:
     reported, truths, vehicle = holding(40.0, seed=4)
     errors = []
+    times_s = [truth.time_s for truth in truths]
     for one in reported["LOCAL_POSITION_NED"]:
-        then = min(truths, key=lambda truth: abs(truth.time_s - one.time_boot_ms / 1000))
+        then = truths[min(bisect_left(times_s, one.time_boot_ms / 1000), len(truths) - 1)]
         assert abs(then.time_s - one.time_boot_ms / 1000) < 0.06
         errors.append(math.dist((one.x, one.y, one.z), then.position_ned_m))
     assert len(errors) > 30

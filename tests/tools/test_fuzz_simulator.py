@@ -21,8 +21,8 @@ def test_a_vehicle_in_lockstep_bears_mutated_mavlink(seed: int, target: Target) 
 
 
 def test_a_running_vehicle_answers_its_client_through_a_flood() -> None:
-    report = fuzz_over_sockets(seed=4, seconds=4.0, target=Target(gimbal=True))
-    assert report.datagrams > 400
+    report = fuzz_over_sockets(seed=4, seconds=2.0, target=Target(gimbal=True))
+    assert report.datagrams > 200
     assert report.answers > 0
     # Of one processor's time, whatever else this machine does: it never works its loop full. That it keeps
     # its time as well, `python -m tools.fuzz_simulator` measures on a quiet machine.

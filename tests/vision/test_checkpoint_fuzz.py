@@ -95,13 +95,14 @@ def assert_harmless(path: Path, report: dict[str, Any]) -> None:
     assert report["seconds"] < LONGEST_S, (path.name, report)
 
 
-def test_mutations_are_read_or_rejected_by_name(tmp_path: Path) -> None:
+@pytest.mark.parametrize("count", [8, pytest.param(48, marks=pytest.mark.slow)])
+def test_mutations_are_read_or_rejected_by_name(tmp_path: Path, count: int) -> None:
     ours = small_pt(tmp_path)
     paths = [
-        *mutated_pickles(ours, tmp_path, 24),
-        *mutated_bytes(ours.read_bytes(), tmp_path, 24),
-        *mutated_archives(ours.read_bytes(), tmp_path, 40),
-        *mutated_pairs(ours, tmp_path, 24),
+        *mutated_pickles(ours, tmp_path, count),
+        *mutated_bytes(ours.read_bytes(), tmp_path, count),
+        *mutated_archives(ours.read_bytes(), tmp_path, count),
+        *mutated_pairs(ours, tmp_path, count),
     ]
     for path, report in zip(paths, read_apart(*paths), strict=True):
         assert_harmless(path, report)

@@ -16,12 +16,13 @@ from vision.yolo.checkpoint import save_checkpoint
 from vision.yolo.published import yolov8_description
 
 
-@pytest.fixture
-def small_model(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def small_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     torch.manual_seed(0)
     model = build(yolov8_description((0.1, 0.01, 64), ("person", "car")))
-    save_checkpoint(tmp_path / "small.pt", model, metadata={})
-    return tmp_path / "small.pt"
+    path = tmp_path_factory.mktemp("model") / "small.pt"
+    save_checkpoint(path, model, metadata={})
+    return path
 
 
 def bench(model: Path, *more: str) -> str:

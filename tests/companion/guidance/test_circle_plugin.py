@@ -13,7 +13,7 @@ import pytest
 
 from companion.bench.lockstep_flight import LockstepFlight, plain_settings
 from companion.guidance.command import COMMANDS
-from mavlink_sim.testing import RunningSimulator
+from mavlink_sim.testing import QUICK_FLIGHT, RunningSimulator
 from tests.companion.service_process import running_service
 
 pytestmark = pytest.mark.realtime
@@ -21,11 +21,12 @@ pytestmark = pytest.mark.realtime
 EXAMPLE = Path(__file__).parents[3] / "examples" / "circle"
 
 
-@pytest.fixture
-def installed(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the package, as pip installs it."""
     pytest.importorskip("setuptools")
-    source, target = tmp_path / "source", tmp_path / "site"
+    folder = tmp_path_factory.mktemp("circle")
+    source, target = folder / "source", folder / "site"
     source.mkdir()
     for file in EXAMPLE.iterdir():
         if file.is_file():
@@ -65,6 +66,7 @@ def test_plugin_flies_its_circle(installed: Path, monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.timeout(200)
+@pytest.mark.vehicle(parameters=QUICK_FLIGHT)
 def test_service_flies_an_installed_plugin(
     installed: Path,
     vehicle: RunningSimulator,

@@ -10,7 +10,7 @@ from pymavlink import mavutil
 
 from companion.guidance.behaviour import Outcome
 from companion.vehicle.state import FlightMode, Vector3, VehicleState
-from mavlink_sim.testing import running_simulator
+from mavlink_sim.testing import QUICK_FLIGHT, running_simulator
 from tests.companion.live_flight import LiveFlight, ground_station
 
 pytestmark = pytest.mark.realtime
@@ -30,7 +30,10 @@ def speed_mps(state: VehicleState) -> float:
 
 @pytest.mark.parametrize("kind", ["pymavlink", "mavsdk"])
 async def test_flight_until_the_pilot_takes_over(kind: str) -> None:
-    with running_simulator(speed=SPEED) as simulator, ground_station(simulator.gcs_port) as station:
+    with (
+        running_simulator(speed=SPEED, parameters=QUICK_FLIGHT) as simulator,
+        ground_station(simulator.gcs_port) as station,
+    ):
         service = LiveFlight(kind, simulator.onboard_port)
         async with service.running():
             driver, guidance = service.driver, service.guidance
@@ -73,28 +76,28 @@ async def test_flight_until_the_pilot_takes_over(kind: str) -> None:
 
 async def test_goto_and_follow_path_with_the_built_in_vehicle() -> None:
     """By the telemetry's position: where goto ends, and the cross-track error of follow-path."""
-    with running_simulator(speed=SPEED, seed=3) as simulator:
+    with running_simulator(speed=SPEED, seed=3, parameters=QUICK_FLIGHT) as simulator:
         service = LiveFlight("pymavlink", simulator.onboard_port)
         async with service.running():
             driver = service.driver
             await service.until(lambda: driver.state.ready_to_arm and driver.state.position_ned_m)
-            assert (await service.fly("takeoff 4")).success
+            assert (await service.fly("takeoff 3")).success
             home = driver.state.home_position_ned_m
             assert home is not None
 
-            outcome = await service.fly("goto 12 -6 altitude=6 speed=4")
+            outcome = await service.fly("goto 6 -3 altitude=5 speed=4")
             assert outcome.success, outcome.reason
             here = driver.state.position_ned_m
             assert here is not None
             north, east, down = here
-            assert math.dist((north - home[0], east - home[1], home[2] - down), (12, -6, 6)) < 1.2
+            assert math.dist((north - home[0], east - home[1], home[2] - down), (6, -3, 5)) < 1.2
 
             positions: list[Vector3 | None] = []
             unsubscribe = driver.subscribe(lambda state: positions.append(state.position_ned_m))
-            outcome = await service.fly("follow-path 12,6 0,6 0,0,4")
+            outcome = await service.fly("follow-path 6,5 0,5 0,0,3")
             unsubscribe()
             assert outcome.success, outcome.reason
-            for corner in ((12.0, 6.0), (0.0, 6.0), (0.0, 0.0)):
+            for corner in ((6.0, 5.0), (0.0, 5.0), (0.0, 0.0)):
                 wanted = (home[0] + corner[0], home[1] + corner[1])
                 assert min(math.dist(wanted, (position or ())[:2]) for position in positions) < 1.5, corner
             assert (await service.fly("land")).success

@@ -20,7 +20,7 @@ from companion.bus.vehicle_messages import pose_message
 from companion.guidance.behaviours.formation import FormationBehaviour
 from companion.guidance.formation.neighbours import Neighbourhood
 from companion.settings import ZenohSection
-from mavlink_sim.testing import FleetMember, RunningSimulator, free_port, running_simulator
+from mavlink_sim.testing import QUICK_FLIGHT, FleetMember, RunningSimulator, free_port, running_simulator
 from tests.companion.live_flight import LiveFlight
 
 pytestmark = pytest.mark.realtime
@@ -92,7 +92,9 @@ async def until(condition: Callable[[], object], timeout_s: float = 60.0) -> Non
 
 
 async def test_vehicles_share_poses_and_fly_in_formation() -> None:
-    with running_simulator(vehicles=VEHICLES, spacing=7.0, ready_after=0.0) as simulator:
+    with running_simulator(
+        vehicles=VEHICLES, spacing=7.0, ready_after=0.0, parameters=QUICK_FLIGHT
+    ) as simulator:
         async with companions(simulator, VEHICLES) as fleet:
             leader, followers = fleet[0], fleet[1:]
             names = {member.name for member in fleet}
@@ -115,7 +117,7 @@ async def test_vehicles_share_poses_and_fly_in_formation() -> None:
                 await asyncio.sleep(0.02)
                 refused = await followers[0].command("formation line leader=nobody")
             assert "pose of nobody" in refused["reason"]
-            taken_off = await asyncio.gather(*(member.command("takeoff 5") for member in fleet))
+            taken_off = await asyncio.gather(*(member.command("takeoff 3") for member in fleet))
             assert all(outcome["success"] for outcome in taken_off), taken_off
 
             formed = [member.command("formation line leader=vehicle1 spacing=6") for member in followers]
@@ -143,7 +145,7 @@ async def test_vehicles_share_poses_and_fly_in_formation() -> None:
                 least_m.extend(math.dist(v.position_ned_m, here) for v in leader.neighbourhood().vehicles)
                 return flight.done()
 
-            flight = asyncio.ensure_future(leader.command("goto forward=12 right=6 speed=2"))
+            flight = asyncio.ensure_future(leader.command("goto forward=6 right=3 speed=2"))
             await until(watch)
             assert flight.result()["success"], flight.result()
             await until(lambda: max(map(error_m, followers)) < 1.0)

@@ -147,9 +147,9 @@ def test_tracking_includes_the_camera_mount_pitch() -> None:
 def test_cut_off_object_gets_a_range_by_pointing_at_it(word: str) -> None:
     """The image ends 46° down, above its wheels: no range until the gimbal points at it."""
     scene_object = SceneObject("car", (4.0, 1.8, 1.5), person(0.0, 9.0).pose)
-    # an approach ends by itself long before; a follow has held there for half a minute
+    # an approach ends by itself long before; a follow holds there
     flight, log = fly(
-        command(f"{word} car distance=4 gimbal=track"), scene_object, begin_deg=-14.0, limit_s=50.0
+        command(f"{word} car distance=4 gimbal=track"), scene_object, begin_deg=-14.0, limit_s=30.0
     )
     first = next(seen for moment in log.moments for seen in moment.context.targets)
     assert first.position_ned_m is None

@@ -182,7 +182,7 @@ def test_message_has_the_capture_time_pose_and_covariance() -> None:
         VisionPosition(0, (math.nan, 0.0, 0.0), (0.0, 0.0, 0.0), covariance)
 
 
-@pytest.mark.parametrize("seed", [1, 6])
+@pytest.mark.parametrize("seed", [pytest.param(1, marks=pytest.mark.slow), 6])
 def test_without_gnss_above_a_map_the_vehicle_holds_0_3_m(tmp_path: Path, seed: int) -> None:
     flight = flight_above(tmp_path, seed)
     flight.run(1.0)

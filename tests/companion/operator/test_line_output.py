@@ -22,7 +22,7 @@ import pytest
 from companion.bus.client import client_settings, listen, open_client, send_command
 from companion.operator.line_output import LineOutput
 from companion.settings import ZenohSection
-from mavlink_sim.testing import free_port, running_simulator
+from mavlink_sim.testing import QUICK_FLIGHT, free_port, running_simulator
 
 pytestmark = pytest.mark.realtime
 
@@ -138,7 +138,7 @@ def test_service_works_with_an_unread_log(filming: list[str], pipe: Pipe, tmp_pa
     endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     settings = client_settings(ZenohSection(listen=(endpoint,)))
     statuses: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
-    with running_simulator() as simulator:
+    with running_simulator(parameters=QUICK_FLIGHT) as simulator:
         command = [sys.executable, "-m", "companion.cli", "run", *filming, "--log-level", "debug"]
         command += [f"--vehicle-url=udpin://127.0.0.1:{simulator.onboard_port}", f"--zenoh-listen={endpoint}"]
         process = subprocess.Popen(

@@ -19,7 +19,7 @@ from pymavlink import mavutil
 
 from companion.recording.files import RecordingReader
 from companion.replay import replay
-from mavlink_sim.testing import running_simulator
+from mavlink_sim.testing import QUICK_FLIGHT, running_simulator
 from tests.companion.service_process import ServiceProcess, running_service
 
 pytestmark = pytest.mark.realtime
@@ -65,7 +65,7 @@ def schema_errors(path: Path) -> list[str]:
 def test_flight_is_recorded_and_replays(filming: list[str], tmp_path: Path) -> None:
     folder = tmp_path / "recordings"
     with (
-        running_simulator() as simulator,
+        running_simulator(parameters=QUICK_FLIGHT) as simulator,
         running_service(
             simulator.onboard_port, [*filming, "--recording-directory", str(folder)], cwd=tmp_path
         ) as service,

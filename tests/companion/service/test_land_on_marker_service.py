@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from mavlink_sim.testing import running_simulator
+from mavlink_sim.testing import QUICK_FLIGHT, running_simulator
 from tests.companion.service_process import running_service
 
 pytestmark = pytest.mark.realtime
@@ -65,7 +65,9 @@ def test_service_lands_on_the_commanded_marker(tmp_path: Path, method: str) -> N
     )  # fmt: skip
     driver = "pymavlink" if method == "offboard" else "mavsdk"
     with (
-        running_simulator(scene=scene, camera=camera, truth=truth, seed=3) as simulator,
+        running_simulator(
+            scene=scene, camera=camera, truth=truth, seed=3, parameters=QUICK_FLIGHT
+        ) as simulator,
         running_service(
             simulator.onboard_port, [*wanted, "--vehicle-driver", driver], cwd=tmp_path
         ) as service,

@@ -15,7 +15,7 @@ import zenoh
 from companion.bus.bodies import CommandReplyBody
 from companion.bus.schema import schema_of
 from companion.bus.topics import LARGE_TOPICS, TOPICS
-from mavlink_sim.testing import running_simulator
+from mavlink_sim.testing import QUICK_FLIGHT, running_simulator
 from tests.companion.bus.message_check import check_message, closed
 from tests.companion.service_process import running_service
 from vision.weights import DEFAULT_WEIGHTS
@@ -63,7 +63,7 @@ def test_every_message_of_a_flight_is_valid(tmp_path: Path) -> None:
     ]  # fmt: skip
     samples: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
     with (
-        running_simulator(scene=scene, camera=camera, seed=3) as simulator,
+        running_simulator(scene=scene, camera=camera, seed=3, parameters=QUICK_FLIGHT) as simulator,
         running_service(simulator.onboard_port, flags, cwd=tmp_path) as service,
         service.client() as session,
     ):

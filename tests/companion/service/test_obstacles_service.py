@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from mavlink_sim.testing import RunningSimulator, running_simulator
+from mavlink_sim.testing import QUICK_FLIGHT, RunningSimulator, running_simulator
 from tests.companion.service_process import ServiceProcess, running_service
 
 pytestmark = pytest.mark.realtime
@@ -85,7 +85,9 @@ def in_the_air(
         "--guidance-obstacles", "required", *flags,
     )  # fmt: skip
     with (
-        running_simulator(scene=scene, camera=camera, truth=path, seed=2) as simulator,
+        running_simulator(
+            scene=scene, camera=camera, truth=path, seed=2, parameters=QUICK_FLIGHT
+        ) as simulator,
         running_service(simulator.onboard_port, flags, cwd=folder) as service,
     ):
         simulator.wait_for_event("camera")

@@ -17,7 +17,7 @@ from companion.service.other_commanders import OtherCommanders
 from companion.settings.vehicle import VehicleSection
 from companion.vehicle.commander import Commander
 from companion.vehicle.state import FlightMode, VehicleState
-from mavlink_sim.testing import running_simulator
+from mavlink_sim.testing import QUICK_FLIGHT, running_simulator
 from tests.companion.live_flight import LiveFlight
 
 pytestmark = pytest.mark.realtime
@@ -130,7 +130,8 @@ def test_appearance_and_loss_are_reported_once() -> None:
 
 @pytest.mark.parametrize(("kind", "autopilot"), [("mavsdk", "px4"), ("pymavlink", "ardupilot")])
 async def test_two_services_on_two_links_of_one_vehicle(kind: str, autopilot: str) -> None:
-    with running_simulator(autopilot=autopilot) as simulator:
+    parameters = QUICK_FLIGHT if autopilot == "px4" else None
+    with running_simulator(autopilot=autopilot, parameters=parameters) as simulator:
         first = LiveFlight(kind, simulator.onboard_port, ran_s=60.0)
         second = LiveFlight(kind, simulator.gcs_port)
         async with first.running(), second.running():

@@ -19,7 +19,7 @@ import zenoh
 
 from companion.bus.client import listen
 from companion.bus.topics import command_key
-from mavlink_sim.testing import free_port, running_simulator
+from mavlink_sim.testing import QUICK_FLIGHT, free_port, running_simulator
 from tests.companion.service_process import ServiceProcess, running_service
 
 pytestmark = pytest.mark.realtime
@@ -73,7 +73,7 @@ def test_ardupilot_works_with_default_settings(seeing: list[str], tmp_path: Path
 @pytest.mark.parametrize("driver", ["mavsdk", "pymavlink"])
 def test_flight_by_commands_with_a_subscriber(driver: str, seeing: list[str], tmp_path: Path) -> None:
     with (
-        running_simulator() as simulator,
+        running_simulator(parameters=QUICK_FLIGHT) as simulator,
         running_service(simulator.onboard_port, [*seeing, "--driver", driver], cwd=tmp_path) as service,
         service.client() as session,
     ):
@@ -98,7 +98,7 @@ def test_flight_by_commands_with_a_subscriber(driver: str, seeing: list[str], tm
 def test_stopped_service_does_not_retake_command(filming: list[str], tmp_path: Path) -> None:
     path = tmp_path / "truth.jsonl"
     with (
-        running_simulator(truth=path) as simulator,
+        running_simulator(truth=path, parameters=QUICK_FLIGHT) as simulator,
         running_service(simulator.onboard_port, filming, cwd=tmp_path) as service,
     ):
         fly(service)
@@ -119,7 +119,7 @@ def test_stopped_service_does_not_retake_command(filming: list[str], tmp_path: P
 def test_killed_perception_worker_is_replaced_in_flight(seeing: list[str], tmp_path: Path) -> None:
     path = tmp_path / "truth.jsonl"
     with (
-        running_simulator(truth=path) as simulator,
+        running_simulator(truth=path, parameters=QUICK_FLIGHT) as simulator,
         running_service(simulator.onboard_port, seeing, cwd=tmp_path) as service,
         service.client() as session,
     ):
@@ -147,14 +147,16 @@ def test_killed_perception_worker_is_replaced_in_flight(seeing: list[str], tmp_p
 
 def test_lost_vehicle_is_reported_and_reconnected(filming: list[str], tmp_path: Path) -> None:
     with (
-        running_simulator() as first,
+        running_simulator(parameters=QUICK_FLIGHT) as first,
         running_service(first.onboard_port, filming, cwd=tmp_path) as service,
     ):
         fly(service)
         first.kill()
         service.wait_for_line("autopilot heartbeat lost")
         count = len(service.lines)
-        with running_simulator(onboard_port=first.onboard_port, onboard_bind=first.onboard_bind) as second:
+        with running_simulator(
+            onboard_port=first.onboard_port, onboard_bind=first.onboard_bind, parameters=QUICK_FLIGHT
+        ) as second:
             service.wait_for_line("autopilot heartbeat received", after=count)
             service.take_off(2.5)
             second.wait_for_event("takeoff")
@@ -165,7 +167,7 @@ def test_shutdown_in_flight_switches_to_hold(
     number: signal.Signals, filming: list[str], tmp_path: Path
 ) -> None:
     with (
-        running_simulator() as simulator,
+        running_simulator(parameters=QUICK_FLIGHT) as simulator,
         running_service(simulator.onboard_port, filming, cwd=tmp_path) as service,
     ):
         fly(service)
@@ -226,7 +228,7 @@ def test_two_services_detect_each_other_and_one_flies(filming: list[str], tmp_pa
     second_endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     statuses: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
     with contextlib.ExitStack() as running:
-        simulator = running.enter_context(running_simulator())
+        simulator = running.enter_context(running_simulator(parameters=QUICK_FLIGHT))
         first = running.enter_context(running_service(simulator.onboard_port, filming, cwd=tmp_path))
         session = running.enter_context(first.client())
         listen(session, "status", lambda _key, text: statuses.put(json.loads(text)))
