@@ -24,12 +24,13 @@ demo: $(READY)
 # Hundreds of processes are started: bytecode is kept, whatever the environment says.
 test test-slow: export PYTHONDONTWRITEBYTECODE =
 test: $(READY)
-	$(BIN)/python -m pytest tests/alone
+	$(BIN)/python -m pytest tests/alone -m "not slow"
 	$(BIN)/python -m pytest --ignore tests/alone -n $(WORKERS) --dist worksteal -m "not realtime and not slow"
 	$(BIN)/python -m pytest --ignore tests/alone -n $(REALTIME_WORKERS) --dist worksteal -m "realtime and not slow" --reruns 1
 
 test-slow: $(READY)
-	$(BIN)/python -m pytest -n $(WORKERS) -m slow
+	$(BIN)/python -m pytest tests/alone -m slow
+	$(BIN)/python -m pytest --ignore tests/alone -n $(WORKERS) -m slow
 
 lint: $(READY)
 	$(BIN)/ruff check .

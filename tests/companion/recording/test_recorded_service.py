@@ -187,19 +187,3 @@ def test_recorder_joins_a_running_service(filming: list[str], tmp_path: Path) ->
     (path,) = files(folder)
     assert RecordingReader(path).problems == []
     assert replay([path], {}).inexact
-
-
-def test_folder_that_cannot_be_made_is_reported_and_the_service_runs(
-    filming: list[str], tmp_path: Path
-) -> None:
-    (tmp_path / "file").touch()
-    with (
-        running_simulator() as simulator,
-        running_service(
-            simulator.onboard_port,
-            [*filming, "--recording-directory", str(tmp_path / "file" / "folder")],
-            cwd=tmp_path,
-        ) as service,
-    ):
-        assert "recorder: " in service.wait_for_line("cannot be made")
-        assert service.command("stop")["success"]

@@ -41,7 +41,7 @@ place_m = [4.0, 0.0]
 width = 320
 height = 240
 horizontal_fov_deg = 80
-rate_hz = 10
+rate_hz = 5
 [camera.mount]
 pitch_deg = -25
 """

@@ -19,7 +19,7 @@ import zenoh
 
 from companion.bus.client import listen
 from companion.bus.topics import command_key
-from mavlink_sim.testing import QUICK_FLIGHT, free_port, running_simulator
+from mavlink_sim.testing import QUICK_FLIGHT, RunningSimulator, free_port, running_simulator
 from tests.companion.service_process import ServiceProcess, running_service
 
 pytestmark = pytest.mark.realtime
@@ -116,6 +116,14 @@ def test_stopped_service_does_not_retake_command(filming: list[str], tmp_path: P
         assert not back, f"in OFFBOARD again at {times_s} s: {service.lines}"
 
 
+def assert_ends_in_hold(service: ServiceProcess, simulator: RunningSimulator, number: signal.Signals) -> None:
+    simulator.wait_for_event("mode OFFBOARD")
+    offboard = simulator.events.index("mode OFFBOARD")
+    service.signal(number)
+    assert service.process.wait(20) == 0
+    simulator.wait_for_event("mode HOLD", since=offboard)
+
+
 def test_killed_perception_worker_is_replaced_in_flight(seeing: list[str], tmp_path: Path) -> None:
     path = tmp_path / "truth.jsonl"
     with (
@@ -143,6 +151,7 @@ def test_killed_perception_worker_is_replaced_in_flight(seeing: list[str], tmp_p
                 break
         assert after["restarts"] == 1
         assert truth(path)[-1]["mode"] == "OFFBOARD"
+        assert_ends_in_hold(service, simulator, signal.SIGINT)
 
 
 def test_lost_vehicle_is_reported_and_reconnected(filming: list[str], tmp_path: Path) -> None:
@@ -162,20 +171,13 @@ def test_lost_vehicle_is_reported_and_reconnected(filming: list[str], tmp_path: 
             second.wait_for_event("takeoff")
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_shutdown_in_flight_switches_to_hold(
-    number: signal.Signals, filming: list[str], tmp_path: Path
-) -> None:
+def test_shutdown_in_flight_switches_to_hold(filming: list[str], tmp_path: Path) -> None:
     with (
         running_simulator(parameters=QUICK_FLIGHT) as simulator,
         running_service(simulator.onboard_port, filming, cwd=tmp_path) as service,
     ):
         fly(service)
-        simulator.wait_for_event("mode OFFBOARD")
-        offboard = simulator.events.index("mode OFFBOARD")
-        service.signal(number)
-        assert service.process.wait(20) == 0
-        simulator.wait_for_event("mode HOLD", since=offboard)
+        assert_ends_in_hold(service, simulator, signal.SIGTERM)
 
 
 def test_frames_from_ffmpeg_on_standard_input(exported_model: Path, tmp_path: Path) -> None:
