@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.guidance.targets.moving_estimate import MovingEstimate
+from companion.guidance.targets.estimate import Estimate
 from companion.guidance.targets.target import Target
 from companion.vehicle.state import Vector3
 from vision.geolocation import ErrorEllipse
@@ -52,7 +52,7 @@ class _Track:
     """
 
     def __init__(self, target: Target, vehicle: Vector3, covariance: NDArray[np.float64]) -> None:
-        self._motion = MovingEstimate.initialize(target, vehicle)
+        self._motion = Estimate.initialize(target, vehicle)
         self._restart()
         self._add(target, covariance)
 

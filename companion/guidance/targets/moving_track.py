@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from companion.guidance.targets.moving_estimate import Fit, MovingEstimate
+from companion.guidance.targets.estimate import Estimate, Fit
 from companion.guidance.targets.target import Target
 from companion.vehicle.state import Vector3
 from vision.attitude import wrap_angle
@@ -41,7 +41,7 @@ SAME_BEARING_RAD = 0.03
 class _OcclusionHypothesis(NamedTuple):
     """The estimate before an occlusion, kept until the association afterwards is certain."""
 
-    estimate: MovingEstimate
+    estimate: Estimate
     others: frozenset[int]
     until_ns: float
 
@@ -55,7 +55,7 @@ class MovingTrack:
 
     def __init__(self, target: Target, vehicle: Vector3) -> None:
         self._class_name = target.class_name
-        self._estimate = MovingEstimate.initialize(target, vehicle)
+        self._estimate = Estimate.initialize(target, vehicle)
         self._track_id = target.track_id
         self._newest = target
         self._others: set[int] = set()
@@ -189,7 +189,7 @@ class MovingTrack:
             self._others.add(followed.track_id)
         return True
 
-    def _followed(self, seen: Sequence[Target], present: MovingEstimate, vehicle: Vector3) -> Target | None:
+    def _followed(self, seen: Sequence[Target], present: Estimate, vehicle: Vector3) -> Target | None:
         """The detection of the current association: the one with its id, or the nearest within `REACH_M`."""
         fits = [present.fit(target, vehicle) for target in seen]
         for fit in fits:

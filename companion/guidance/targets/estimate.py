@@ -1,8 +1,9 @@
-"""Horizontal motion estimate of one object: a constant-velocity Kalman filter.
+"""Horizontal position and velocity of one object: the Kalman filter of standing and moving objects.
 
-The state is position and velocity (north, east), local NED, driven by white acceleration (Bar-Shalom, Li &
-Kirubarajan 2001, "Estimation with Applications to Tracking and Navigation", ch. 6.2). A measurement is a
-position with the error ellipse of bearing and range, or a bearing alone.
+The state is position and velocity (north, east), local NED. A moving object is driven by white acceleration
+(Bar-Shalom, Li & Kirubarajan 2001, "Estimation with Applications to Tracking and Navigation", ch. 6.2); a
+standing one has no velocity, and its position is a random walk. A measurement is a position with the error
+ellipse of bearing and range, or a bearing alone, which corrects only across the line of sight.
 """
 
 from __future__ import annotations
@@ -15,17 +16,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.guidance.targets.target import RangeSource, Target
-from companion.guidance.targets.track import NEAREST_M, measurement_noise
 from companion.vehicle.state import Vector3
+from vision.geolocation import position_covariance
 
+# Random walk of a standing object: 1 m in 1 s, one sigma, a walking person's pace.
+RANDOM_WALK_M2_PER_S = 1.0
 # Spectral density of the acceleration, m²/s³: a walking person reverses in one or two seconds.
 ACCELERATION_M2_PER_S3 = 1.5
 # One sigma of the unknown initial velocity.
 FIRST_VELOCITY_SIGMA_MPS = 2.0
 FASTEST_MPS = 15.0
 # Range errors from attitude, height and slope are correlated between frames: relative to the last frame the
-# noise is this fraction of a sigma, unless the range source has changed.
+# noise of a moving object is this fraction of a sigma, unless the range source has changed.
 FRAME_TO_FRAME = 0.35
+# Noise of one measurement across the line of sight, one sigma: a few pixels and a degree of attitude.
+BEARING_SIGMA_RAD = 0.03
+ACROSS_SIGMA_M = 0.25
+# Along the line of sight, for targets without their own sigma: fixed, and per metre of range.
+UNSTATED_SIGMA = (0.3, 0.12)
+UNKNOWN_RANGE_SIGMA_M = 1e3
+NEAREST_M = 0.3
 
 Vector = NDArray[np.float64]
 
@@ -51,46 +61,51 @@ class Fit(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class MovingEstimate:
+class Estimate:
     """Horizontal position and velocity of an object at a time.
 
     Attributes:
         state: (4,) north, east, metres; north, east, m/s. covariance: (4, 4).
         captured_ns: that time.
         source: range source of the newest measurement.
+        moving: whether the object may have a velocity.
     """
 
     state: Vector
     covariance: Vector
     captured_ns: int
     source: RangeSource
+    moving: bool
 
     @classmethod
-    def initialize(cls, target: Target, vehicle: Vector3) -> Self:
+    def initialize(cls, target: Target, vehicle: Vector3, *, moving: bool = True) -> Self:
         """Initialize from a target. Raises ValueError if it has no range."""
         if target.position_ned_m is None:
             raise ValueError(f"cannot initialize a track: {target.class_name!r} has no range")
         position = np.array(target.position_ned_m[:2], np.float64)
         covariance = np.zeros((4, 4))
         covariance[:2, :2] = measurement_noise(target, position - vehicle[:2])
-        covariance[2:, 2:] = np.eye(2) * FIRST_VELOCITY_SIGMA_MPS**2
-        return cls(
-            np.concatenate([position, (0.0, 0.0)]), covariance, target.captured_ns, target.range_source
-        )
+        if moving:
+            covariance[2:, 2:] = np.eye(2) * FIRST_VELOCITY_SIGMA_MPS**2
+        state = np.concatenate([position, (0.0, 0.0)])
+        return cls(state, covariance, target.captured_ns, target.range_source, moving)
 
     @property
     def velocity(self) -> tuple[float, float]:
         """(north, east), m/s."""
         return (float(self.state[2]), float(self.state[3]))
 
-    def at(self, stamp_ns: int) -> MovingEstimate:
-        """Predict to a time with constant velocity and white acceleration."""
+    def at(self, stamp_ns: int) -> Estimate:
+        """Predict to a time."""
         elapsed_s = max(0.0, (stamp_ns - self.captured_ns) / 1e9)
         move = np.eye(4)
         move[0, 2] = move[1, 3] = elapsed_s
         q = ACCELERATION_M2_PER_S3
         noise = np.zeros((4, 4))
         for axis in (0, 1):
+            if not self.moving:
+                noise[axis, axis] = RANDOM_WALK_M2_PER_S * elapsed_s
+                continue
             noise[axis, axis] = q * elapsed_s**3 / 3.0
             noise[axis, axis + 2] = noise[axis + 2, axis] = q * elapsed_s**2 / 2.0
             noise[axis + 2, axis + 2] = q * elapsed_s
@@ -115,13 +130,13 @@ class MovingEstimate:
                 )
             )
         noise = measurement_noise(target, measured - vehicle[:2])
-        if target.range_source in (self.source, RangeSource.NONE):
+        if self.moving and target.range_source in (self.source, RangeSource.NONE):
             noise = noise * FRAME_TO_FRAME**2
         innovation = measured - self.state[:2]
         spread = self.covariance[:2, :2] + noise
         return Fit(float(innovation @ np.linalg.solve(spread, innovation)), target, innovation, spread)
 
-    def update(self, fit: Fit) -> MovingEstimate:
+    def update(self, fit: Fit) -> Estimate:
         """The estimate updated with a detection."""
         gain = np.linalg.solve(fit.spread, self.covariance[:2, :]).T
         state = self.state + gain @ fit.innovation
@@ -134,4 +149,18 @@ class MovingEstimate:
         noise = fit.spread - self.covariance[:2, :2]
         covariance = kept @ self.covariance @ kept.T + gain @ noise @ gain.T
         source = self.source if fit.target.position_ned_m is None else fit.target.range_source
-        return MovingEstimate(state, covariance, self.captured_ns, source)
+        return Estimate(state, covariance, self.captured_ns, source, self.moving)
+
+
+def measurement_noise(target: Target, line_of_sight: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(2, 2) covariance of a measured position, given the vector from the vehicle to it."""
+    range_m = max(NEAREST_M, float(np.hypot(*line_of_sight)))
+    if target.range_source is RangeSource.NONE:
+        sigma_along = UNKNOWN_RANGE_SIGMA_M
+    elif math.isfinite(target.range_sigma_m):
+        sigma_along = target.range_sigma_m
+    else:
+        sigma_along = math.hypot(UNSTATED_SIGMA[0], UNSTATED_SIGMA[1] * range_m)
+    sigma_across = math.hypot(ACROSS_SIGMA_M, BEARING_SIGMA_RAD * range_m)
+    bearing_rad = math.atan2(line_of_sight[1], line_of_sight[0])
+    return position_covariance(bearing_rad, sigma_along, sigma_across)
