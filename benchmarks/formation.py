@@ -12,10 +12,10 @@ import math
 import random
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any
 
 from companion.bench.lockstep_flight import TICK_S, LockstepFlight, plain_settings
-from companion.bench.simulated_driver import LockstepDriver, SimulatedDriver
+from companion.bench.simulated_driver import SimulatedDriver
 from companion.bus.vehicle_messages import pose_message
 from companion.guidance.behaviour import Behaviour, Outcome
 from companion.guidance.behaviours.formation import FormationBehaviour
@@ -42,13 +42,6 @@ POSES_HZ = 10.0
 _FOLDED_RATES_HZ = {name: rate_hz for name, rate_hz in ONBOARD_RATES_HZ.items() if name in TELEMETRY_MESSAGES}
 # Where the fleet's common frame has its origin; any place away from the poles would do.
 _ORIGIN = Anchor(47.3977, 8.5456, 488.0, (0.0, 0.0, 0.0))
-
-
-class Airframe(LockstepDriver, Protocol):
-    """A vehicle of a fleet, in a local frame of its own."""
-
-    def place(self) -> Vector3:
-        """Where it really is, in the fleet's common frame (NED)."""
 
 
 class LockstepAirframe(SimulatedDriver):

@@ -14,7 +14,6 @@ from mavlink_sim.wire.messages import dialect
 
 ARM, TAKEOFF, SET_MODE, PAUSE_CONTINUE = 400, 22, 176, 193
 POSITION, VELOCITY, ACCELERATION = 0b110111111000, 0b110111000111, 0b110000111111
-KEEP_HEADING = 0b010000000000  # clears the ignore bit of the yaw rate, which is zero
 
 
 @pytest.fixture

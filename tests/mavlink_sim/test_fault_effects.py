@@ -12,7 +12,6 @@ from mavlink_sim.wire.messages import dialect
 from tests.mavlink_sim.conftest import SimHarness, position_setpoint, velocity_setpoint
 
 DO_SET_MODE, LAND, ARM, REQUEST_MESSAGE = 176, 21, 400, 512
-GPS_ID, ESTIMATOR_ID = 24, 230
 
 
 def newest(harness: SimHarness, kind: str, within_s: float = 2.5) -> Any:

@@ -90,12 +90,6 @@ def test_limited_velocity_never_crosses_the_fence(
         assert fence.contains(here)
 
 
-def edge_m(polygon: Polygon, here: Point) -> float:
-    from companion.geometry.fence import _edges, _nearest
-
-    return min(math.dist(_nearest(a, b, here), here) for a, b in _edges(polygon))
-
-
 def test_velocity_along_or_away_from_an_edge_is_kept() -> None:
     fence = Fence(SQUARE)
     assert fence.limit_velocity((0.0, 3.0), (19.0, 0.0), braking) == (0.0, 3.0)
