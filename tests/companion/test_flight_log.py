@@ -103,6 +103,7 @@ def test_missing_path_is_one_line(command: tuple[str, ...], tmp_path: Path) -> N
     assert done.stderr.startswith("companion: none: ")
 
 
+@pytest.mark.realtime  # it waits for the service
 def test_record_without_a_service_is_one_line_and_leaves_no_file(tmp_path: Path) -> None:
     done = companion("record", "out", "--connect", "tcp/127.0.0.1:9", cwd=tmp_path)
     assert done.returncode == 2

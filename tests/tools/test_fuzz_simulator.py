@@ -20,6 +20,7 @@ def test_a_vehicle_in_lockstep_bears_mutated_mavlink(seed: int, target: Target) 
     assert report.simulated_s == pytest.approx(6.0)
 
 
+@pytest.mark.realtime
 def test_a_running_vehicle_answers_its_client_through_a_flood() -> None:
     report = fuzz_over_sockets(seed=4, seconds=2.0, target=Target(gimbal=True))
     assert report.datagrams > 200
