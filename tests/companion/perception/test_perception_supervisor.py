@@ -249,9 +249,9 @@ async def test_selection_without_a_detector_is_refused(photos: Path) -> None:
 
 
 async def test_selection_fails_when_the_worker_dies_before_it_answers(
-    patterned: Path, tiny_model: Path
+    patterned: Path, exported_model: Path
 ) -> None:
-    async with supervised(settings_of(patterned, tiny_model)) as (supervisor, recorder):
+    async with supervised(settings_of(patterned, exported_model)) as (supervisor, recorder):
         await until(lambda: recorder.results)
         pid = supervisor.status.pid
         assert pid is not None
