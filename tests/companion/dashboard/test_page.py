@@ -64,7 +64,8 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 @pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServiceProcess]:
     listen = f"127.0.0.1:{free_port(socket.SOCK_STREAM)}"
-    with playing(tmp_path_factory.mktemp("play"), "--dashboard-listen", listen) as running:
+    flags = ("--dashboard-listen", listen, "--detector-rate-hz", "8")
+    with playing(tmp_path_factory.mktemp("play"), *flags) as running:
         running.wait_for_line(f"dashboard: http://{listen}/", 60.0)
         running.url = f"http://{listen}/"
         yield running
