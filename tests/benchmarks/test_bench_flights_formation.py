@@ -7,7 +7,8 @@ import pytest
 from benchmarks.flights import fly, summary
 
 
-@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2])
 def test_five_vehicles_fly_in_formation_through_turns_and_never_come_too_near(seed: int) -> None:
     (result,) = fly("formation", [seed])
     assert result.success, result.reason

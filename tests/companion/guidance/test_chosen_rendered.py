@@ -96,6 +96,6 @@ def test_selected_object_of_no_class_is_approached_and_held(
     assert log.outcome is not None
     assert log.outcome.success, log.outcome.reason
     assert seen.range_m(0) == pytest.approx(6.0, abs=0.5 if depth else 1.5)
-    seen.flight.run(5.0)
+    seen.flight.run(3.0)
     assert seen.range_m(0) == pytest.approx(6.0, abs=0.6 if depth else 1.6)
     assert log.violations == {}

@@ -184,7 +184,7 @@ def test_message_has_the_capture_time_pose_and_covariance() -> None:
 
 @pytest.mark.parametrize("seed", [pytest.param(1, marks=pytest.mark.slow), 6])
 def test_without_gnss_above_a_map_the_vehicle_holds_0_3_m(tmp_path: Path, seed: int) -> None:
-    flight = flight_above(tmp_path, seed)
+    flight = flight_above(tmp_path, seed, rate_hz=8.0)
     flight.run(1.0)
     flight.vehicle.vehicle.faults.begin("gps_loss")
     flight.run(0.5)
@@ -200,7 +200,7 @@ def test_without_gnss_above_a_map_the_vehicle_holds_0_3_m(tmp_path: Path, seed: 
         assert log.outcome.success, log.outcome
     identifier = flight.command("hold")
     away: list[float] = []
-    for _ in range(round(6.0 / TICK_S)):
+    for _ in range(round(4.0 / TICK_S)):
         flight.tick()
         errors.append(error_m(flight))
         away.append(math.dist(flight.vehicle.truth.position_ned_m[:2], (1.0, -0.5)))

@@ -32,14 +32,14 @@ def views_of(
 @pytest.mark.parametrize("lens", LENSES)
 def test_lens_is_recovered_with_its_distortion_model(lens: str) -> None:
     true = LENSES[lens]
-    result = calibrate(views_of(true, 30))
+    result = calibrate(views_of(true, 20))
     model = result.model
     assert model.distortion_model == true.distortion_model
     assert (model.width, model.height) == (640, 480)
     assert (model.fx, model.fy) == pytest.approx((true.fx, true.fy), rel=0.003)
     assert (model.cx, model.cy) == pytest.approx((true.cx, true.cy), abs=1.0)
     assert result.rms_px == pytest.approx(0.07 * np.sqrt(2), rel=0.15)
-    assert len(result.fit.view_rms_px) == len(result.views) == 30
+    assert len(result.fit.view_rms_px) == len(result.views) == 20
     assert result.rejected == ()
 
 
