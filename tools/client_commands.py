@@ -83,12 +83,13 @@ def _method(kind: type[Command]) -> str:
         text = f"{name}: {argument.meaning}" + (f" ({'; '.join(facts)})" if facts else "")
         described += textwrap.wrap(text, 110, initial_indent=" " * 12, subsequent_indent=" " * 16)
     lines = [f"    async def {kind.word.replace('-', '_')}({', '.join(parameters)}) -> Reply:"]
-    summary = f"{kind.help[0].upper()}{kind.help[1:]}."
+    summary = f'"""{kind.help[0].upper()}{kind.help[1:]}.'
+    summary = textwrap.fill(summary, 110, initial_indent=" " * 8, subsequent_indent=" " * 8)
     if described:
-        lines += [f'        """{summary}', "", "        Args:", *described]
+        lines += [summary, "", "        Args:", *described]
         lines += ['        """']
     else:
-        lines += [f'        """{summary}"""']
+        lines += [f'{summary}"""']
     return "\n" + "\n".join([*lines, f"        return await self._run({', '.join(passed)})"]) + "\n"
 
 

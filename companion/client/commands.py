@@ -412,16 +412,37 @@ class Commands(ABC):
         )
 
     async def gimbal(
-        self, pitch: float | None = None, yaw: float | None = None, track: int | None = None
+        self,
+        pitch: float | None = None,
+        yaw: float | None = None,
+        track: int | None = None,
+        class_: str | None = None,
+        latitude: float | None = None,
+        longitude: float | None = None,
+        altitude: float | None = None,
     ) -> Reply:
-        """Point the gimbal during any behaviour, or keep it on a track; default: level and ahead.
+        """Point the gimbal during any behaviour, or keep it on an object or a place; default: level and
+        ahead.
 
         Args:
             pitch: above the horizon; below is negative (-90 to 90 deg; default 0)
             yaw: clockwise from the nose (-180 to 180 deg; default 0)
             track: keep it on this track until it is lost, instead of pitch and yaw
+            class_: keep it on the best object of this class, until none is seen
+            latitude: of a place to keep it on, WGS 84; needs longitude (-90 to 90 deg)
+            longitude: WGS 84; needs latitude (-180 to 180 deg)
+            altitude: of the place above home; default: 0 (-500 to 5000 m)
         """
-        return await self._run("gimbal", pitch=pitch, yaw=yaw, track=track)
+        return await self._run(
+            "gimbal",
+            pitch=pitch,
+            yaw=yaw,
+            track=track,
+            class_=class_,
+            latitude=latitude,
+            longitude=longitude,
+            altitude=altitude,
+        )
 
     async def select(
         self,

@@ -106,7 +106,8 @@ def test_import_loads_nothing_heavy_and_is_fast() -> None:
 
 
 def test_methods_are_those_of_the_command_table() -> None:
-    assert Path(client_commands.FILE).read_text() == client_commands.source()
+    written = Path(client_commands.FILE).read_text()
+    assert written == client_commands.source(), "run: python -m tools.client_commands"
 
 
 class Written(Commands):
