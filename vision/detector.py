@@ -144,6 +144,11 @@ class Detector(ObjectDetector):
         self.precision: str = self._runtime.precision
         self.precision_reason = self._runtime.precision_reason
         self.reason = f"{self.runtime_reason}; {self.precision}: {self.precision_reason}"
+        task = self.foreign.task if self.foreign else str(self.metadata.get("task", "detect"))
+        if task.partition(";")[0] != "detect":
+            logger.warning(
+                "%s is a network for %s; only its boxes are used", source.path, task.partition(";")[0]
+            )
         logger.info(
             "model %s: %d classes, on %s (%s), in %s (%s)",
             source.path,

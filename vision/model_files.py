@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 # Suffixes of model files, in the order in which a bare name is looked up.
-MODEL_SUFFIXES = (".safetensors", ".pt")
+MODEL_SUFFIXES = (".safetensors", ".pt", ".onnx", ".pth")
 
 
 def models_folder() -> Path:
@@ -26,7 +26,7 @@ def kept_models(folder: Path | None = None) -> list[Path]:
 
 
 def find_model(name: str | Path) -> Path:
-    """Resolve `name`: an existing path, else `NAME` or `NAME.pt` in the models folder.
+    """Resolve `name`: an existing path, else `NAME` or `NAME.pt`, `NAME.onnx` … in the models folder.
 
     A name found nowhere is returned as it is, so that the reader names it in its error.
     """

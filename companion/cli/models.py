@@ -36,8 +36,8 @@ def list_models(folder: _FOLDER = None, as_json: _JSON = False) -> None:
     for row in rows:
         size = "       " if row["size_bytes"] is None else f"{row['size_bytes'] / 1e6:5.1f} MB"
         typer.echo(
-            f"{row['name']:<{width}}  {row['state']:<13}  {size:>8}  {row['licence'] or '':<10}  "
-            f"{row['about']}"
+            f"{row['licence'] or 'licence unknown':<15}  {row['name']:<{width}}  {row['state']:<13}  "
+            f"{size:>8}  {row['about']}"
         )
 
 
@@ -92,7 +92,7 @@ def pull(
     from companion.models.pull import PullError, at_address, pull
     from vision.model_files import models_folder
 
-    known = KNOWN.get(name.removesuffix(".pt"))
+    known = KNOWN.get(name.removesuffix(".pt").removesuffix(".onnx"))
     if known is None:
         nearest = difflib.get_close_matches(name.lower(), KNOWN, n=3, cutoff=0.0)
         typer.echo(f"companion: unknown official model {name!r}; nearest: {', '.join(nearest)}", err=True)

@@ -1,22 +1,27 @@
 """The official models for download by name, with size and SHA-256.
 
-They are those of the assets of Ultralytics' release v8.4.0, from published tables. Every digest was found in
-at least two independent tables, except the scales m, l and x of YOLOv5u: these are from one table, whose n
-and s others confirm.
+They are YOLOX's of its authors' release 0.1.1rc0, and the assets of Ultralytics' release v8.4.0, from
+published tables. Every digest was found in at least two independent tables, except the scales m, l and x of
+YOLOv5u: these are from one table, whose n and s others confirm. YOLOX m, l and x were found in none.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+_YOLOX_RELEASE = "https://github.com/Megvii-BaseDetection/YOLOX/releases/download/0.1.1rc0"
 _RELEASE = "https://github.com/ultralytics/assets/releases/download/v8.4.0"
 AGPL = "AGPL-3.0"
+APACHE = "Apache-2.0"
 LICENCE_NOTES = {
+    APACHE: (
+        "these weights are Megvii's, under Apache-2.0: keep the licence and the notices when you ship them"
+    ),
     AGPL: (
         "these weights are Ultralytics', under AGPL-3.0 (or their commercial licence). AGPL-3.0 asks whoever "
         "lets others use a program over a network to offer them its source. That is between you and "
         "Ultralytics: https://www.ultralytics.com/license"
-    )
+    ),
 }
 
 
@@ -25,7 +30,7 @@ class KnownModel:
     """An official model file.
 
     Attributes:
-        name: argument of `pull`; the file is `NAME.pt`.
+        name: argument of `pull`; the file is the name with `suffix`.
         url: address of the file.
         size_bytes: of the file.
         sha256: 64 hexadecimal digits.
@@ -39,10 +44,11 @@ class KnownModel:
     sha256: str
     licence: str
     about: str
+    suffix: str = ".pt"
 
     @property
     def file(self) -> str:
-        return f"{self.name}.pt"
+        return f"{self.name}{self.suffix}"
 
 
 _PINNED = {
@@ -81,11 +87,30 @@ _FAMILIES = {
 }
 
 
+_YOLOX = {
+    "yolox_nano": (3659407, "c789161ed43c8269fcd4e67c67eeeb4e80c622da2eb296a20bc6007bd18a0b7d"),
+    "yolox_tiny": (20219662, "427cc366d34e27ff7a03e2899b5e3671425c262ea2291f88bb942bc1cc70b0f7"),
+    "yolox_s": (35858002, "c5c2d13e59ae883e6af3b45daea64af4833a4951c92d116ec270d9ddbe998063"),
+}
+
+
 def _about(name: str) -> str:
     return f"{_FAMILIES[name[:6]]}, scale {name[6]}, 80 classes of COCO"
 
 
+# The permissive ones first: `models list` shows them in this order.
 KNOWN: dict[str, KnownModel] = {
+    name: KnownModel(
+        name,
+        f"{_YOLOX_RELEASE}/{name}.onnx",
+        size,
+        digest,
+        APACHE,
+        f"YOLOX, scale {name.removeprefix('yolox_')}, 80 classes of COCO, ONNX",
+        ".onnx",
+    )
+    for name, (size, digest) in _YOLOX.items()
+} | {
     name: KnownModel(name, f"{_RELEASE}/{name}.pt", size, digest, AGPL, _about(name))
     for name, (size, digest) in _PINNED.items()
 }

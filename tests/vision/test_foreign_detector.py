@@ -148,6 +148,62 @@ def test_objectness_multiplies_the_classes(tmp_path: Path) -> None:
     assert found.class_id.tolist() == [1]
 
 
+def test_queries_are_stretched_and_not_suppressed(tmp_path: Path) -> None:
+    """As of Ultralytics' RT-DETR: centre and size in 0..1 of a frame that is not padded."""
+    queries = np.zeros((1, 300, 6), np.float32)
+    queries[0, :2] = [[0.5, 0.5, 0.2, 0.4, 0.9, 0.1], [0.5, 0.5, 0.2, 0.4, 0.8, 0.1]]
+    metadata = stated(TWO, SIZE, head="RTDETRDecoder")
+    found = detect(constant_onnx(tmp_path / "a.onnx", {"output0": queries}, metadata=metadata), 100, 200)
+    np.testing.assert_allclose(found.xyxy, [[40, 60, 60, 140]] * 2, rtol=1e-5)
+    np.testing.assert_allclose(found.confidence, [0.9, 0.8])
+
+
+@pytest.mark.parametrize(
+    ("boxes", "logits", "classes"),
+    [("dets", "labels", 91), ("pred_boxes", "logits", 80), ("pred_boxes", "logits", 4)],
+)
+def test_logits_of_queries_give_each_class_above_the_threshold(
+    tmp_path: Path, boxes: str, logits: str, classes: int
+) -> None:
+    places, values = np.zeros((1, 9, 4), np.float32), np.full((1, 9, classes), -9, np.float32)
+    places[0, 3] = [0.5, 0.25, 0.5, 0.5]
+    values[0, 3, [1, 3]] = [2, 1]
+    outputs = {boxes: places, logits: values}
+    if boxes == "pred_boxes":
+        outputs = {logits: values, boxes: places}
+    if classes == 4:
+        (tmp_path / "a.txt").write_text("a\nb\nc\nd\n")
+    path = constant_onnx(tmp_path / "a.onnx", outputs)
+    found = detect(path, 100, 200)
+    np.testing.assert_allclose(found.xyxy, [[25, 0, 75, 100]] * 2, rtol=1e-5)
+    np.testing.assert_allclose(found.confidence, 1 / (1 + np.exp([-2.0, -1.0])), rtol=1e-5)
+    names = {91: ("person", "car"), 80: ("bicycle", "motorcycle"), 4: ("b", "d")}[classes]
+    assert [record["class_name"] for record in found.records()] == list(names)
+
+
+def test_rf_detr_is_normalised_by_the_statistics_of_imagenet(tmp_path: Path) -> None:
+    boxes, logits = np.zeros((1, 9, 4), np.float32), np.zeros((1, 9, 91), np.float32)
+    path = constant_onnx(tmp_path / "a.onnx", {"labels": logits, "dets": boxes}, red_at=(0, 5, 7))
+    image = np.empty((64, 96, 3), np.uint8)
+    image[:] = (10, 20, 30)
+    found = Detector(path, runtime="onnxruntime", confidence=0).detect(image)
+    red = (30 / 255 - 0.485) / 0.229
+    np.testing.assert_allclose(found.confidence[0], 1 / (1 + np.exp(-red)), rtol=1e-5)
+
+
+def test_labels_boxes_and_scores_are_taken_as_they_are(tmp_path: Path) -> None:
+    """As the authors of RT-DETR and D-FINE export it: the file scales boxes to the size that it is given."""
+    outputs: dict[str, Any] = {
+        "labels": np.array([[2, 0, 0]], np.int64),
+        "boxes": np.array([[[48, 16, 96, 32], [0, 0, 9, 9], [0, 0, 9, 9]]], np.float32),
+        "scores": np.array([[0.9, 0.2, 0.1]], np.float32),
+    }
+    path = constant_onnx(tmp_path / "a.onnx", outputs, takes_size=True)
+    found = detect(path, 192, 64)
+    np.testing.assert_allclose(found.xyxy, [[96, 16, 192, 32]])
+    assert [record["class_name"] for record in found.records()] == ["car"]
+
+
 @pytest.mark.parametrize("task", ["segment", "pose", "obb"])
 def test_other_tasks_give_their_boxes(tmp_path: Path, task: str) -> None:
     turned = float(np.pi / 2)

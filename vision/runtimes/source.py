@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vision.foreign.layouts import YOLOX_SUFFIX, ForeignFacts
+from vision.model_files import models_folder
 from vision.runtimes.base import Precision, Runtime, RuntimeName, RuntimeUnusableError, installed
 from vision.runtimes.exported import SUFFIXES, ExportedFacts, ExportKind, kind_of
 from vision.yolo.level_outputs import Head
@@ -82,8 +83,7 @@ def read_source(path: Path) -> ModelSource:
     kind = kind_of(path)
     if kind is None:
         if not path.exists():  # checked before torch is imported
-            wanted = "a .pt checkpoint, or of NAME.safetensors beside its NAME.yaml"
-            raise CheckpointError(f"{path}: no such file; give the path of {wanted}")
+            raise CheckpointError(f"{path}: no such file; {_what_to_do(path)}")
         if path.suffix == YOLOX_SUFFIX:
             from vision.foreign.yolox import load_yolox
 
@@ -128,6 +128,15 @@ def _facts(path: Path, kind: ExportKind) -> ExportedFacts | ForeignFacts:
     from vision.runtimes.openvino_runtime import openvino_facts
 
     return openvino_facts(path)
+
+
+def _what_to_do(path: Path) -> str:
+    if path.suffix or path.name != str(path):
+        return "give the path of a .pt checkpoint, or of NAME.safetensors beside its NAME.yaml"
+    return (
+        f"nor is it in the models folder {models_folder()}; `companion models pull {path.name}` downloads "
+        "an official one, `companion models list` shows them"
+    )
 
 
 def _file_in(folder: Path) -> Path:

@@ -45,10 +45,16 @@ __all__ = [
 ]
 
 FORMAT = "mavlink-companion.yolo.v1"
-_DETECTION_MODELS = (
-    "ultralytics.nn.tasks.DetectionModel",
-    "ultralytics.nn.tasks.YOLOv10DetectionModel",  # As the authors of YOLOv10 published it.
-)
+# Class of model → its task. Boxes of segmentation and pose come from the same branches as a detector's.
+_MODELS = {
+    "ultralytics.nn.tasks.DetectionModel": "detect",
+    "ultralytics.nn.tasks.YOLOv10DetectionModel": "detect",  # As the authors of YOLOv10 published it.
+    "ultralytics.nn.tasks.SegmentationModel": "segment",
+    "ultralytics.nn.tasks.PoseModel": "pose",
+}
+_TASK_HEADS = ("Segment", "Pose")
+# Branches of such a head that are read past: masks, their prototypes, key points.
+_OTHER_BRANCHES = ("cv4", "proto", "one2one_cv4")
 _DEEPEST = 16
 _MOST_NODES = 100_000
 _MOST_MODULES = 20_000
@@ -159,10 +165,13 @@ def _from_description(content: dict[Any, Any]) -> LoadedModel:
 
 
 def _interpret_ultralytics(record: Stub, content: dict[Any, Any]) -> LoadedModel:
-    if record.name not in _DETECTION_MODELS:
+    task = _MODELS.get(record.name)
+    if task is None:
         raise CheckpointError(f"holds a {record.name.rpartition('.')[2]}; only detection models can be used")
     table = _plain_dictionary(record.state, "yaml")
     modules = dict(_modules(record))
+    if task != "detect":
+        table, modules = _boxes_only(table, modules)
     description = ModelDescription.from_plain(table, _class_names(record, table))
     description = as_trained(description, modules)
     model = _with_weights(description, dict(_weights(modules)))
@@ -178,10 +187,35 @@ def _interpret_ultralytics(record: Stub, content: dict[Any, Any]) -> LoadedModel
                 raise CheckpointError(f"{name} has the epsilon {shown(epsilon)}, expected a small number")
             module.eps = epsilon
     metadata = {"origin": f"Ultralytics {_text(content, 'version')}".strip()}
+    if task != "detect":
+        metadata["task"] = f"{task}; only its boxes are used"
     for key, source in (("licence", "license"), ("date", "date")):
         if _text(content, source):
             metadata[key] = _text(content, source)
     return LoadedModel(model, description.class_names, description, metadata)
+
+
+def _boxes_only(table: dict[Any, Any], modules: dict[str, Stub]) -> tuple[dict[Any, Any], dict[str, Stub]]:
+    """The table and the modules of a segmentation or pose network as those of a detector."""
+    rows = [*_rows(table, "backbone"), *_rows(table, "head")]
+    last = rows[-1] if rows else None
+    if not isinstance(last, list) or len(last) != 4 or last[2] not in _TASK_HEADS:
+        raise CheckpointError(f"its last row must be one of {', '.join(_TASK_HEADS)}, got {shown(last)}")
+    table = {**table, "head": [*_rows(table, "head")[:-1], [*last[:2], "Detect", ["nc"]]]}
+    past = tuple(f"model.{len(rows) - 1}.{branch}" for branch in _OTHER_BRANCHES)
+    kept = {
+        name: module
+        for name, module in modules.items()
+        if not any(name == branch or name.startswith(f"{branch}.") for branch in past)
+    }
+    return table, kept
+
+
+def _rows(table: dict[Any, Any], key: str) -> list[Any]:
+    rows = table.get(key)
+    if not isinstance(rows, list):
+        raise CheckpointError(f"its `{key}` is not a list")
+    return rows
 
 
 def _text(content: dict[Any, Any], key: str) -> str:

@@ -104,6 +104,7 @@ def unpickle(
     allowed: Mapping[str, AllowedGlobal],
     persistent: Callable[[tuple[Any, ...]], Any],
     allowance_bytes: int = _DEFAULT_ALLOWANCE_BYTES,
+    unsupported: Callable[[str], str | None] = lambda name: None,
 ) -> Any:
     """Read the value that `data` describes.
 
@@ -112,12 +113,13 @@ def unpickle(
         allowed: `module.name` → its replacement.
         persistent: resolves a persistent id (for torch: a storage).
         allowance_bytes: memory limit of the values, without storages.
+        unsupported: the error for a name that is genuine but not supported; None for any other name.
 
     Raises:
         UnsafeCheckpointError: a global that is not allowed; the message names it.
         CheckpointError: not such a pickle.
     """
-    return _Machine(data, allowed, persistent, allowance_bytes).run()
+    return _Machine(data, allowed, persistent, allowance_bytes, unsupported).run()
 
 
 class _Machine:
@@ -127,7 +129,9 @@ class _Machine:
         allowed: Mapping[str, AllowedGlobal],
         persistent: Callable[[tuple[Any, ...]], Any],
         allowance_bytes: int,
+        unsupported: Callable[[str], str | None],
     ) -> None:
+        self._unsupported = unsupported
         self._data = data
         self._position = 0
         self._allowed = allowed
@@ -274,6 +278,8 @@ class _Machine:
     def global_name(self) -> None:
         name = f"{self._line()}.{self._line()}"
         if name not in self._allowed:
+            if (reason := self._unsupported(name)) is not None:
+                raise CheckpointError(f"{reason}; nothing was run")
             raise UnsafeCheckpointError(
                 f"its pickle asks for {name!r:.200}, which is not part of a detection checkpoint; "
                 "nothing was run. Do not use this file, or save the model again from a source you trust"

@@ -35,12 +35,14 @@ _TORCH_MODULES = """activation.GELU activation.Hardswish activation.LeakyReLU ac
 _BLOCKS = """A2C2f AAttn ABlock Attention Bottleneck C2 C2PSA C2f C2fCIB C3 C3k C3k2 CIB DFL PSA PSABlock
     Proto RepVGGDW SCDown SPPF"""
 _CONVOLUTIONS = "Concat Conv DWConv"
-_HEADS = "Classify Detect OBB Pose Segment v10Detect"
+_HEADS = "Detect Pose Segment v10Detect"
 _LAYERS = f"{_BLOCKS} {_CONVOLUTIONS} {_HEADS}"
-_MODELS = "ClassificationModel DetectionModel OBBModel PoseModel SegmentationModel YOLOv10DetectionModel"
+_MODELS = "DetectionModel PoseModel SegmentationModel YOLOv10DetectionModel"
 # A model saved during training contains its loss; it is ignored.
 _LOSSES = """utils.loss.BboxLoss utils.loss.DFLoss utils.loss.E2EDetectLoss utils.loss.E2ELoss
-    utils.loss.v8DetectionLoss utils.tal.TaskAlignedAssigner yolo.utils.loss.BboxLoss
+    utils.loss.v8DetectionLoss utils.tal.TaskAlignedAssigner utils.loss.v8SegmentationLoss
+    utils.loss.v8PoseLoss utils.loss.KeypointLoss utils.loss.BCEDiceLoss utils.loss.MultiChannelDiceLoss
+    yolo.utils.loss.v8SegmentationLoss yolo.utils.loss.v8PoseLoss yolo.utils.loss.BboxLoss
     yolo.utils.loss.v8DetectionLoss yolo.utils.tal.TaskAlignedAssigner yolo.v8.detect.train.Loss"""
 # Until 8.0.6 the training settings were omegaconf objects, stored with the model.
 _OLD_SETTINGS = """__builtin__.dict omegaconf.base.ContainerMetadata omegaconf.base.Metadata typing.Any
@@ -60,6 +62,40 @@ _STUB_NAMES: tuple[str, ...] = (
     *_OLD_SETTINGS.split(),
     *_PLAIN_VALUES.split(),
 )
+
+
+# Genuine names of networks that are not supported, by their class of model.
+_UNSUPPORTED_MODELS = {
+    "OBBModel": "checkpoints of oriented boxes are not supported; export it to ONNX, which is",
+    "ClassificationModel": "a classification model has no boxes",
+    "WorldModel": "YOLO-World is not supported",
+    "YOLOEModel": "YOLOE is not supported",
+    "YOLOESegModel": "YOLOE is not supported",
+    "RTDETRDetectionModel": "RT-DETR checkpoints are not supported; export it to ONNX, which is",
+    "SemanticSegmentationModel": "semantic segmentation has no boxes",
+    "YOLOSemanticModel": "semantic segmentation has no boxes",
+}
+_GENUINE = ("ultralytics.nn.", "ultralytics.utils.loss.", "ultralytics.utils.tal.", "torch.nn.modules.")
+# Of repositories whose checkpoints name their own package's classes.
+_OTHER_PACKAGES = {
+    "models.": "checkpoints of the repositories YOLOv5 (not YOLOv5u) and YOLOv7 are not supported",
+    "yolov6.": "YOLOv6 is not supported",
+    "super_gradients.": "YOLO-NAS is not supported",
+}
+
+
+def unsupported(name: str) -> str | None:
+    """Why a genuine checkpoint that names this class is not supported; None for any other name."""
+    kind = name.rpartition(".")[2]
+    if name == f"ultralytics.nn.tasks.{kind}" and kind in _UNSUPPORTED_MODELS:
+        return _UNSUPPORTED_MODELS[kind]
+    for package, reason in _OTHER_PACKAGES.items():
+        if name.startswith(package) and kind[:1].isupper():
+            return f"{reason}; its ONNX export may be"
+    # A class, not a function: those are refused as calls.
+    if name.startswith(_GENUINE) and (kind[:1].isupper() or kind.startswith("v8")):
+        return f"it has the part {name!r:.100}, which is not supported; its ONNX export may be"
+    return None
 
 
 _STORAGES: dict[str, torch.dtype] = {
@@ -212,7 +248,7 @@ class _Archive:
 
     def value(self) -> Any:
         data = self._bytes(self._members[f"{self._root}data.pkl"], _LARGEST_PICKLE_BYTES)
-        return unpickle(data, self._allowed(), self._storage, _VALUES_BYTES + self._size)
+        return unpickle(data, self._allowed(), self._storage, _VALUES_BYTES + self._size, unsupported)
 
     def _bytes(self, member: zipfile.ZipInfo, largest: int | None = None) -> bytes:
         if largest is not None and member.file_size > largest:

@@ -42,6 +42,20 @@ def test_list_has_bundled_local_and_official_models(folder: Path, small_model: P
     assert [path.name for path in kept_models()] == ["mine.pt", "yolov8n.pt"]
 
 
+def test_list_has_permissive_licences_first(folder: Path) -> None:
+    licences = [row["licence"] for row in json.loads(run("list", "--json"))["models"]]
+    assert licences == sorted(licences, key=lambda licence: licence != "Apache-2.0")
+    assert licences.count("Apache-2.0") == 4
+    assert run("list").splitlines()[1].startswith("Apache-2.0")
+
+
+def test_missing_name_says_how_to_pull_it(folder: Path) -> None:
+    result = CliRunner().invoke(app, ["detect", "photo.jpg", "--model", "yolov8n"])
+    assert result.exit_code == 2
+    assert "`companion models pull yolov8n`" in result.stderr
+    assert str(folder) in result.stderr
+
+
 def test_bare_name_is_found_in_models_folder(folder: Path, small_model: Path) -> None:
     folder.mkdir()
     shutil.copy(small_model, folder / "mine.pt")

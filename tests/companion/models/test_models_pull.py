@@ -169,9 +169,14 @@ def test_command_shows_licence_and_manual_instructions(tmp_path: Path) -> None:
 
 
 def test_every_model_has_unique_digest_and_official_url() -> None:
-    assert len({model.sha256 for model in KNOWN.values()}) == len(KNOWN) == 25
+    assert len({model.sha256 for model in KNOWN.values()}) == len(KNOWN) == 28
+    releases = {
+        "AGPL-3.0": "https://github.com/ultralytics/assets/releases/download/v8.4.0",
+        "Apache-2.0": "https://github.com/Megvii-BaseDetection/YOLOX/releases/download/0.1.1rc0",
+    }
     for model in KNOWN.values():
-        assert model.url == f"https://github.com/ultralytics/assets/releases/download/v8.4.0/{model.file}"
+        assert model.url == f"{releases[model.licence]}/{model.file}"
+        assert model.file == f"{model.name}{'.onnx' if model.licence == 'Apache-2.0' else '.pt'}"
         assert len(bytes.fromhex(model.sha256)) == 32
-        assert model.size_bytes > 5_000_000
+        assert model.size_bytes > 3_000_000
     assert known_by_digest(KNOWN["yolo11n"].sha256) is KNOWN["yolo11n"]

@@ -1,0 +1,168 @@
+"""The table of file kinds in `docs/models.md`: each row is made here and read."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from torch import nn
+
+from tests.vision.checkpoint_bombs import named, pickled
+from tests.vision.foreign_checkpoints import FOREIGN, as_foreign, foreign_classes, save_foreign, trained_model
+from tests.vision.foreign_files import (
+    constant_onnx,
+    stated,
+    ultralytics_openvino,
+    ultralytics_torchscript,
+)
+from tests.vision.runtimes.conftest import lively_model, make_image
+from tests.vision.test_yolox import save_yolox
+from vision.detector import Detector
+from vision.runtimes.source import read_source
+from vision.weights import DEFAULT_WEIGHTS
+
+for package in ("onnx", "onnxruntime", "openvino"):
+    pytest.importorskip(package, reason=f"{package} is an optional extra")
+
+SIZE = (64, 96)
+TWO = ("car", "dog")
+TABLE = Path(__file__).parent.parent.parent / "docs" / "models.md"
+HEADS = {"Segment": "ultralytics.nn.modules.head", "Pose": "ultralytics.nn.modules.head"}
+
+
+def rows() -> dict[str, str]:
+    """Kind → result, of the table below its heading."""
+    text = TABLE.read_text().partition("## Kinds of files")[2].partition("\n## ")[0]
+    found = re.findall(r"^\| (.+?) \| (.+?) \|$", text, re.MULTILINE)
+    return {kind: result for kind, result in found if kind != "File"}
+
+
+def checkpoint(folder: Path, model: str = "DetectionModel", head: str = "Detect") -> Path:
+    """As Ultralytics saves one; other heads have further branches."""
+    with pytest.MonkeyPatch.context() as patch:
+        tasks = dict.fromkeys(("SegmentationModel", "PoseModel"), "ultralytics.nn.tasks")
+        classes = foreign_classes(patch, FOREIGN | tasks | HEADS)
+        whole = as_foreign(trained_model(), classes | {"DetectionModel": classes[model]})
+        if head != "Detect":
+            last = whole.model[-1]
+            other = nn.Module.__new__(classes[head])
+            other.__dict__ = dict(last.__dict__)
+            other.cv4 = nn.ModuleList([nn.Conv2d(8, 4, 1)])
+            other.proto = nn.Conv2d(8, 4, 1)
+            whole.model[-1] = other
+            whole.yaml["head"][-1] = [*whole.yaml["head"][-1][:2], head, ["nc", 4, 8]]
+        return save_foreign(folder / "net.pt", whole)
+
+
+def naming(name: str) -> Callable[[Path], Path]:
+    """A checkpoint of this class of model: the reader sees the name first."""
+    return lambda folder: pickled(folder / "net.pt", b"}X\x05\x00\x00\x00model" + named(name) + b")\x81s")
+
+
+def ultralytics(outputs: dict[str, Any], **others: Any) -> Callable[[Path], Path]:
+    return lambda folder: constant_onnx(folder / "net.onnx", outputs, metadata=stated(TWO, SIZE, **others))
+
+
+def bare(outputs: dict[str, Any], **others: Any) -> Callable[[Path], Path]:
+    return lambda folder: constant_onnx(folder / "net.onnx", outputs, **others)
+
+
+def openvino_folder(folder: Path) -> Path:
+    onnx = ultralytics({"output0": np.zeros((1, 6, 126), np.float32)})(folder)
+    return ultralytics_openvino(folder / "net_openvino_model", onnx, TWO, SIZE)
+
+
+def written(name: str, content: bytes) -> Callable[[Path], Path]:
+    def write(folder: Path) -> Path:
+        (folder / name).write_bytes(content)
+        return folder / name
+
+    return write
+
+
+def yolox_pth(folder: Path) -> Path:
+    save_yolox(folder / "x.pth")
+    return folder / "x.pth"
+
+
+def zeros(*shape: int) -> Any:
+    return np.zeros(shape, np.float32)
+
+
+SCORED: dict[str, Any] = {
+    "labels": np.zeros((1, 9), np.int64),
+    "boxes": zeros(1, 9, 4),
+    "scores": zeros(1, 9),
+}
+FILES: dict[str, Callable[[Path], Path]] = {
+    "our pair, `.safetensors` and `.yaml`": lambda folder: DEFAULT_WEIGHTS,
+    "Ultralytics `.pt`: YOLOv5u, v8, v10, 11, 12, 26": checkpoint,
+    "… segmentation, v8 and 11": lambda folder: checkpoint(folder, "SegmentationModel", "Segment"),
+    "… pose, v8 and 11": lambda folder: checkpoint(folder, "PoseModel", "Pose"),
+    "… oriented boxes": naming("ultralytics.nn.tasks.OBBModel"),
+    "… classification": naming("ultralytics.nn.tasks.ClassificationModel"),
+    "… YOLO-World": naming("ultralytics.nn.tasks.WorldModel"),
+    "… YOLOE": naming("ultralytics.nn.tasks.YOLOEModel"),
+    "… RT-DETR": naming("ultralytics.nn.tasks.RTDETRDetectionModel"),
+    "… YOLOv9": naming("ultralytics.nn.modules.block.ELAN1"),
+    "… YOLOv3-tiny": naming("torch.nn.modules.padding.ZeroPad2d"),
+    "`.pt` of the repositories YOLOv5 and YOLOv7": naming("models.yolo.Model"),
+    "`.pt` of YOLOv6": naming("yolov6.models.yolo.Model"),
+    "`.pth` of YOLO-NAS": naming("super_gradients.training.models.YoloNAS"),
+    "YOLOX `.pth`": yolox_pth,
+    "YOLOX `.onnx`": bare({"output": zeros(1, 126, 85)}),
+    "Ultralytics ONNX": ultralytics({"output0": zeros(1, 6, 126)}),
+    "… with `nms=True`, or of an end-to-end head": ultralytics({"output0": zeros(1, 300, 6)}),
+    "… segmentation, pose, oriented boxes": ultralytics({"output0": zeros(1, 7, 126)}, task="obb"),
+    "… classification (ONNX)": ultralytics({"output0": zeros(1, 2)}, task="classify"),
+    "… RT-DETR (ONNX)": ultralytics({"output0": zeros(1, 300, 6)}, head="RTDETRDecoder"),
+    "YOLOv5 ONNX": ultralytics({"output": zeros(1, 126, 7)}),
+    "RT-DETR, D-FINE ONNX of their authors": bare(SCORED, takes_size=True),
+    "RF-DETR ONNX": bare({"dets": zeros(1, 9, 4), "labels": zeros(1, 9, 91)}),
+    "ONNX with boxes and logits": bare({"logits": zeros(1, 9, 80), "pred_boxes": zeros(1, 9, 4)}),
+    "other ONNX": bare({"out": zeros(1, 5)}),
+    "Ultralytics OpenVINO folder": openvino_folder,
+    "Ultralytics TorchScript": lambda folder: ultralytics_torchscript(
+        folder / "net.torchscript", lively_model(), SIZE
+    ),
+    "TorchScript named `.pt`": lambda folder: ultralytics_torchscript(
+        folder / "net.pt", lively_model(), SIZE
+    ),
+    "TensorRT plan of others": written("net.engine", bytes(64)),
+    "`.tflite` and others": written("net.tflite", b"\x1c\x00\x00\x00TFL3"),
+}
+
+
+def test_every_row_of_the_table_is_made_here() -> None:
+    assert list(rows()) == list(FILES)
+
+
+@pytest.mark.parametrize("kind", list(FILES))
+def test_file_of_each_kind_does_what_the_table_says(tmp_path: Path, kind: str) -> None:
+    path, result = FILES[kind](tmp_path), rows()[kind]
+    if result.startswith("works"):
+        runner = read_source(path).runners()[0]
+        found = Detector(path, runtime=runner, image_size=96, threads=1).detect(make_image(64, 96))
+        assert found.xyxy.shape == (len(found), 4)
+        return
+    with pytest.raises(ValueError, match=re.escape(result.strip("`"))) as caught:
+        read_source(path)
+    assert "\n" not in str(caught.value)
+    assert str(path) in str(caught.value)
+    assert "Do not use this file" not in str(caught.value)
+
+
+def test_segmentation_has_the_boxes_of_its_detector(tmp_path: Path) -> None:
+    path = checkpoint(tmp_path, "SegmentationModel", "Segment")
+    image = make_image(64, 96)
+    segmentation = Detector(path, image_size=96, confidence=0, precision="float32", threads=1)
+    boxes = segmentation.detect(image)
+    detector = Detector(checkpoint(tmp_path), image_size=96, confidence=0, precision="float32", threads=1)
+    expected = detector.detect(image)
+    assert len(boxes) == len(expected) > 0
+    np.testing.assert_array_equal(boxes.xyxy, expected.xyxy)
+    assert segmentation.metadata["task"].startswith("segment")
