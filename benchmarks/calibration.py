@@ -1,6 +1,6 @@
 """Error of a calibration: rendered views of a board, and of a marker for the mount.
 
-    python -m benchmarks.calibration --seeds 1-50 [--mount] [--json]
+    python -m benchmarks.calibration --seeds 1-50 [--mount | --extrinsics] [--json]
 
 Lens: each seed takes one of the lenses of `mavlink-sim board` (plain, webcam, wide, fisheye) with other
 numbers (focal length +-20 %, centre +-2 %, coefficients +-20 %; none that folds the image), and a chessboard
@@ -10,12 +10,17 @@ of 10x7 corners or a ChArUco board of 10x7 squares; 40 views of 640x480, noise o
 Mount: a marker of 0.5 m lies level before a vehicle on a stand of 1 to 2 m, of known roll and pitch up to 5
 degrees; the camera of 640x480 looks 15 to 60 degrees down, up to 10 aside, and is rolled up to 5; 10 images,
 noise of 2 grey levels, blur of 0.5 px.
+
+Extrinsics: a depth camera with a lens of its own (that of another seed, the plain one), up to 8 cm beside the
+colour camera and turned by up to 3 degrees about each axis. Both lenses are calibrated as above, but from 30
+views each; then 20 pairs of views of both.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 
 import cv2
@@ -23,11 +28,12 @@ import numpy as np
 
 from mavlink_sim.camera.image_effects import ImageEffects
 from mavlink_sim.camera.renderer import Renderer
-from mavlink_sim.datasets.board_views import LENSES, BoardCamera, board_poses
+from mavlink_sim.datasets.board_views import LENSES, BoardCamera, board_pairs, board_poses, random_rig
 from mavlink_sim.world.fiducials import Print
 from mavlink_sim.world.world import Ground, World, WorldObject
 from vision.calibration.boards import Board
-from vision.calibration.calibrate import calibrate, covers_image
+from vision.calibration.calibrate import CalibrationResult, calibrate, covers_image
+from vision.calibration.extrinsics import extrinsics_from_views
 from vision.calibration.mount import mount_from_markers
 from vision.calibration.views import ViewCollector
 from vision.camera_model import CameraModel, CameraMount
@@ -35,6 +41,7 @@ from vision.markers import Marker, MarkerDetector, MarkerKind
 from vision.rotation import matrix_from_euler
 
 VIEWS, MOUNT_IMAGES, MARKER_M = 40, 10, 0.5
+RIG_VIEWS, PAIRS = 30, 20
 BOARDS = (Board("chessboard", 10, 7, 0.02), Board("charuco", 10, 7, 0.02, 0.015, "4X4_50"))
 
 
@@ -65,6 +72,19 @@ class MountError:
     angle_deg: float
 
 
+@dataclass(frozen=True, slots=True)
+class ExtrinsicsError:
+    """Error of a depth camera's place on a colour camera."""
+
+    seed: int
+    lens: str
+    board: str
+    views: int
+    position_mm: float
+    rotation_deg: float
+    rms_px: float
+
+
 def random_lens(seed: int) -> tuple[str, CameraModel]:
     """The lens of a seed, and the name of the one that it varies."""
     rng = np.random.default_rng(seed)
@@ -88,15 +108,8 @@ def random_lens(seed: int) -> tuple[str, CameraModel]:
 def lens_error(seed: int, views: int = VIEWS) -> LensError:
     """Render the views of a seed and calibrate."""
     name, lens = random_lens(seed)
-    board = BOARDS[seed // len(LENSES) % len(BOARDS)]
-    rng = np.random.default_rng(seed)
-    camera, collector = BoardCamera(board, lens), ViewCollector(board)
-    poses = board_poses(board, lens, rng)
-    for number in range(views):
-        view = board.detect(camera.render(next(poses), rng), f"{number}")
-        if view is not None:
-            collector.add(view)
-    result = calibrate(collector.chosen())
+    board = _board(seed)
+    result = _calibrated(board, lens, views, np.random.default_rng(seed))
     model = result.model
     focal = max(abs(model.fx / lens.fx - 1.0), abs(model.fy / lens.fy - 1.0))
     centre = max(abs(model.cx - lens.cx), abs(model.cy - lens.cy))
@@ -106,6 +119,42 @@ def lens_error(seed: int, views: int = VIEWS) -> LensError:
     ray_px = float(np.sqrt(np.nanmean((off**2).sum(axis=1))))
     kind, used = model.distortion_model, len(result.views)
     return LensError(seed, name, board.kind, kind, used, 100 * focal, centre, result.rms_px, ray_px)
+
+
+def _board(seed: int) -> Board:
+    return BOARDS[seed // len(LENSES) % len(BOARDS)]
+
+
+def _calibrated(board: Board, lens: CameraModel, views: int, rng: np.random.Generator) -> CalibrationResult:
+    camera, collector = BoardCamera(board, lens), ViewCollector(board)
+    poses = board_poses(board, lens, rng)
+    for number in range(views):
+        view = board.detect(camera.render(next(poses), rng), f"{number}")
+        if view is not None:
+            collector.add(view)
+    return calibrate(collector.chosen())
+
+
+def extrinsics_error(seed: int) -> ExtrinsicsError:
+    """Calibrate both lenses of a seed's rig, and the depth camera's place."""
+    rng = np.random.default_rng(seed)
+    (name, colour), (_, depth) = random_lens(seed), random_lens(4 * seed)
+    board = _board(seed)
+    models = [_calibrated(board, lens, RIG_VIEWS, rng).model for lens in (colour, depth)]
+    rig = random_rig(colour, depth, rng)
+    cameras = [BoardCamera(board, lens) for lens in (colour, depth)]
+    pairs = []
+    for _, poses in zip(range(PAIRS), board_pairs(board, rig, rng), strict=False):
+        one, two = (
+            board.detect(camera.render(pose, rng)) for camera, pose in zip(cameras, poses, strict=True)
+        )
+        if one is not None and two is not None:
+            pairs.append((one, two))
+    result = extrinsics_from_views(pairs, *models)
+    found = result.calibration
+    position_mm = float(np.linalg.norm(found.position_m - rig.position_m)) * 1000
+    turn = np.degrees(np.linalg.norm(cv2.Rodrigues(found.rotation @ rig.rotation.T)[0]))
+    return ExtrinsicsError(seed, name, board.kind, result.views, position_mm, float(turn), result.rms_px)
 
 
 def mount_error(seed: int) -> MountError:
@@ -138,20 +187,28 @@ def mount_error(seed: int) -> MountError:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--seeds", default="1-50", help="first-last")
-    parser.add_argument("--mount", action="store_true", help="the mount instead of the lens")
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument("--mount", action="store_true", help="the mount instead of the lens")
+    what.add_argument("--extrinsics", action="store_true", help="a depth camera's place on the colour camera")
     parser.add_argument("--json", action="store_true", help="one JSON object per seed")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     first, _, last = arguments.seeds.partition("-")
     seeds = range(int(first), int(last or first) + 1)
-    results: list[LensError | MountError] = []
+    measure: Callable[[int], LensError | MountError | ExtrinsicsError] = lens_error
+    if arguments.mount or arguments.extrinsics:
+        measure = mount_error if arguments.mount else extrinsics_error
+    results = []
     for seed in seeds:
-        result = mount_error(seed) if arguments.mount else lens_error(seed)
+        result = measure(seed)
         results.append(result)
         row = asdict(result)
         values = (f"{value:.3f}" if isinstance(value, float) else str(value) for value in row.values())
         print(json.dumps(row) if arguments.json else "  ".join(values), flush=True)
-    for key in ("focal_percent", "centre_px", "rms_px", "ray_px", "angle_deg"):
+    for key in (
+        *("focal_percent", "centre_px", "rms_px", "ray_px", "angle_deg"),
+        *("position_mm", "rotation_deg"),
+    ):
         if hasattr(results[0], key) and not arguments.json:
             numbers = np.array([getattr(result, key) for result in results])
             median, p95, worst = np.quantile(numbers, (0.5, 0.95, 1.0))

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import html
 import json
+import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -17,12 +18,14 @@ from companion.bus.topics import VEHICLE
 from vision.attitude import euler_from_quaternion
 from vision.calibration.boards import Board, BoardView
 from vision.calibration.calibrate import CalibrationError, CalibrationResult, covers_image
+from vision.calibration.extrinsics import Extrinsics
 from vision.calibration.views import EDGES, ViewCollector
 from vision.camera_model import CameraModel, scaled_to_frames
 from vision.frame import Frame
 from vision.markers import Marker, MarkerDetector, MarkerKind
-from vision.sources import Source
+from vision.sources import EndOfStream, Source
 from vision.sources.files import images_in
+from vision.sources.paired import TOLERANCE_S
 
 Image = NDArray[np.uint8]
 Tilt = tuple[float, float]
@@ -46,6 +49,7 @@ class Collected:
         frames, found: numbers of processed frames, and of those with the board.
         images: name → the view's image, small, as JPEG.
         interrupted: whether Ctrl-C ended it.
+        others: name → the second camera's view at the same time.
     """
 
     collector: ViewCollector
@@ -53,29 +57,42 @@ class Collected:
     found: int = 0
     images: dict[str, bytes] = field(default_factory=dict)
     interrupted: bool = False
+    others: dict[str, BoardView] = field(default_factory=dict)
+
+    @property
+    def pairs(self) -> list[tuple[BoardView, BoardView]]:
+        """The chosen views of both cameras."""
+        return [(view, self.others[view.name]) for view in self.collector.chosen()]
 
 
-def collect_views(source: Source, board: Board, write: Callable[[str], None], every: int = 1) -> Collected:
+def collect_views(
+    source: Source,
+    board: Board,
+    write: Callable[[str], None],
+    every: int = 1,
+    second: Source | None = None,
+) -> Collected:
     """Collect views from every `every`-th frame; a live source until nothing is missing, or Ctrl-C.
 
     Args:
         write: called with a line on what is missing, for each new view of a live source.
+        second: another camera: both must see the board at the same time.
 
     Raises:
         CalibrationError: no frame shows the board.
-        ValueError: the images differ in size.
+        ValueError: the images differ in size, or one source is live and the other is not.
     """
-    collected = Collected(ViewCollector(board))
+    collected = Collected(ViewCollector(board, whole_image=second is None))
     folder = Path(source.uri)
     names = [path.name for path in images_in(folder)] if folder.is_dir() else []
     if source.live:
         write(f"show {_described(board)} to the camera; Ctrl-C ends")
     try:
-        for frame in source:
+        for frame, other in ((each, None) for each in source) if second is None else _pairs(source, second):
             if frame.sequence % every and not source.live:
                 continue
             name = names[frame.sequence] if frame.sequence < len(names) else f"frame {frame.sequence}"
-            new = _process(frame, name, board, collected)
+            new = _process(frame, other, name, board, collected)
             if new and source.live:
                 missing = collected.collector.missing()
                 views = len(collected.collector.views)
@@ -87,8 +104,9 @@ def collect_views(source: Source, board: Board, write: Callable[[str], None], ev
             raise
         collected.interrupted = True
     if not collected.collector.views:
+        images = "images" if second is None else f"pairs of images with {second.uri}"
         raise CalibrationError(
-            f"{source.uri}: no board in any of {collected.frames} images; looked for {_described(board)}"
+            f"{source.uri}: no board in any of {collected.frames} {images}; looked for {_described(board)}"
         )
     return collected
 
@@ -174,15 +192,45 @@ class LiveTilt:
         return None if newest is None or self._clock_s() - newest[0] > limit_s else newest[1]
 
 
-def _process(frame: Frame, name: str, board: Board, collected: Collected) -> bool:
-    """Add the board of a frame, if it has one; returns whether its view is new."""
+def _pairs(first: Source, second: Source) -> Iterator[tuple[Frame, Frame]]:
+    """The frames of two sources at the same times."""
+    if first.live != second.live:
+        live, recorded = (first, second) if first.live else (second, first)
+        raise ValueError(f"{live.uri} is live and {recorded.uri} is not: they have no common time")
+    one: Frame | None = None
+    two: Frame | None = None
+    while True:
+        try:
+            one = one or first.read()
+            two = two or second.read()
+        except EndOfStream:
+            return
+        if one is None or two is None:
+            continue
+        gap_s = (one.captured_ns - two.captured_ns) / 1e9
+        if not first.live:
+            gap_s = (one.media_s or 0.0) - (two.media_s or 0.0)
+        if abs(gap_s) <= TOLERANCE_S:
+            yield one, two
+            one = two = None
+        elif gap_s < 0.0:
+            one = None
+        else:
+            two = None
+
+
+def _process(frame: Frame, other: Frame | None, name: str, board: Board, collected: Collected) -> bool:
+    """Add the board of a frame, if it has one (and the other one); returns whether its view is new."""
     collected.frames += 1
     view = board.detect(frame.image, name)
-    if view is None:
+    second = None if view is None or other is None else board.detect(other.image, name)
+    if view is None or (other is not None and second is None):
         return False
     collected.found += 1
     if not collected.collector.add(view):
         return False
+    if second is not None:
+        collected.others[name] = second
     small, _ = _small(frame.image)
     collected.images[name] = cv2.imencode(".jpg", small, (cv2.IMWRITE_JPEG_QUALITY, 90))[1].tobytes()
     return True
@@ -204,6 +252,19 @@ def result_lines(result: CalibrationResult) -> list[str]:
         f"distortion {', '.join(f'{value:.5f}' for value in model.coefficients)}",
         f"reprojection {result.rms_px:.3f} px RMS; on held-out views: {held_out}",
         *(() if covers_image(model) else ("the image's corners have no rays: add views of the board there",)),
+    ]
+
+
+def extrinsics_lines(result: Extrinsics) -> list[str]:
+    """The depth camera's place in words, and its errors."""
+    calibration = result.calibration
+    turn = np.degrees(np.linalg.norm(cv2.Rodrigues(calibration.rotation)[0]))
+    right, down, ahead = (calibration.position_m * 1000).tolist()
+    return [
+        f"{result.views} views that both cameras see, reprojection {result.rms_px:.3f} px RMS",
+        f"depth camera at {right:.1f} mm right, {down:.1f} down, {ahead:.1f} ahead of the colour camera, "
+        f"+- {result.position_sigma_m * 1000:.2f} (one sigma)",
+        f"turned by {turn:.3f} degrees, +- {math.degrees(result.rotation_sigma_rad):.4f}",
     ]
 
 

@@ -97,6 +97,7 @@ SIMULATOR_MAY_IMPORT = {
     "vision.calibration.boards",
     "vision.calibration.camera_info",
     "vision.camera_model",
+    "vision.depth_registration",
     "vision.frame",
     "vision.geolocation",
     "vision.gc_pause",

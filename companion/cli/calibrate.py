@@ -1,4 +1,4 @@
-"""The command line of `companion calibrate SOURCE` and `companion calibrate mount`."""
+"""The command line of `companion calibrate`: of a lens (SOURCE), `mount` and `extrinsics`."""
 
 from __future__ import annotations
 
@@ -27,11 +27,21 @@ class _LensByDefault(typer.core.TyperGroup):
 _ROTATE = Annotated[
     int, typer.Option(help="Rotate the images clockwise by 0, 90, 180 or 270 degrees, as source.rotate_deg.")
 ]
+_BOARD = Annotated[
+    tuple[str, str],
+    typer.Option(help="chessboard COLUMNSxROWS (inner corners), or charuco COLUMNSxROWS (squares)."),
+]
+_SQUARE = Annotated[float, typer.Option(help="Side of a square, metres.")]
+_MARKER = Annotated[float | None, typer.Option(help="Side of a ChArUco board's markers, metres.")]
+_DICTIONARY = Annotated[
+    str | None, typer.Option(help="Dictionary of a ChArUco board's markers, such as 4X4_50.")
+]
 _MIRROR = Annotated[bool, typer.Option("--mirror", help="Exchange left and right first, as source.mirror.")]
 
 calibrate = typer.Typer(
     cls=_LensByDefault,
-    help="Calibrate a camera's lens (SOURCE), or its mount on the vehicle (mount).",
+    help="Calibrate a camera's lens (SOURCE), its mount on the vehicle (mount), or a depth camera's place on "
+    "it (extrinsics).",
     no_args_is_help=True,
 )
 
@@ -43,15 +53,10 @@ def _note(text: str) -> None:
 @calibrate.command()
 def lens(
     source: Annotated[str, typer.Argument(help="Folder of images, video, /dev/video0, shm://NAME or URL.")],
-    board: Annotated[
-        tuple[str, str],
-        typer.Option(help="chessboard COLUMNSxROWS (inner corners), or charuco COLUMNSxROWS (squares)."),
-    ],
-    square: Annotated[float, typer.Option(help="Side of a square, metres.")],
-    marker: Annotated[float | None, typer.Option(help="Side of a ChArUco board's markers, metres.")] = None,
-    dictionary: Annotated[
-        str | None, typer.Option(help="Dictionary of a ChArUco board's markers, such as 4X4_50.")
-    ] = None,
+    board: _BOARD,
+    square: _SQUARE,
+    marker: _MARKER = None,
+    dictionary: _DICTIONARY = None,
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Calibration file to write: ROS camera_info YAML.")
     ] = Path("camera.yaml"),
@@ -101,6 +106,66 @@ def lens(
     for line in lines:
         typer.echo(line)
     typer.echo(f"written: {output}" + ("" if page is None else f", {page}"))
+
+
+@calibrate.command()
+def extrinsics(
+    colour: Annotated[str, typer.Argument(help="Colour camera: folder of images, video, /dev/video0, …")],
+    infrared: Annotated[
+        str, typer.Argument(help="Infrared images of the depth camera, taken at the same times.")
+    ],
+    board: _BOARD,
+    square: _SQUARE,
+    colour_calibration: Annotated[Path, typer.Option(help="Calibration file of the colour camera.")],
+    infrared_calibration: Annotated[Path, typer.Option(help="Calibration file of the infrared camera.")],
+    marker: _MARKER = None,
+    dictionary: _DICTIONARY = None,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Calibration file of the depth camera to write.")
+    ] = Path("depth.yaml"),
+    every: Annotated[int, typer.Option(min=1, help="Process every Nth frame of a video.")] = 1,
+    rotate: _ROTATE = 0,
+    mirror: _MIRROR = False,
+) -> None:
+    """Measure where a depth camera is on a colour camera: depth.yaml, for source.depth_calibration_file.
+
+    Both see one board at the same time. Two folders are paired by file name.
+    """
+    from companion.calibrate import collect_views, extrinsics_lines
+    from vision.calibration.boards import Board
+    from vision.calibration.camera_info import read_camera_info, write_camera_info
+    from vision.calibration.extrinsics import extrinsics_from_views
+    from vision.sources import SourceError, SourceSettings
+    from vision.sources.opening import open_two
+
+    logging.basicConfig(level=logging.WARNING, format="companion: %(message)s", stream=sys.stderr)
+    with plain_errors(SourceError, ValueError, OSError):
+        check_folder(output)
+        printed = Board.parse(*board, square, marker, dictionary)
+        settings = SourceSettings(every_frame=True, rotate_deg=rotate, mirror=mirror)
+        lenses = []
+        for file in (colour_calibration, infrared_calibration):
+            (info := read_camera_info(file)).check_source(settings.orientation)
+            lenses.append(info.model)
+        first, second = open_two(colour, infrared, settings, settings)
+        with first, second:
+            collected = collect_views(first, printed, _note, every, second)
+        views = len(collected.collector.views)
+        _note(
+            f"{collected.frames} pairs of images, {collected.found} with the board, {views} different views"
+        )
+        if missing := collected.collector.missing():
+            _note(f"missing for a complete set: {'; '.join(missing)}")
+        result = extrinsics_from_views(collected.pairs, *lenses)
+        for name, error in result.rejected:
+            _note(f"rejected {name}: its error is {error:.2f} px")
+        lines = extrinsics_lines(result)
+        notes = tuple(f"companion calibrate extrinsics: {line}" for line in lines)
+        calibration = result.calibration
+        write_camera_info(output, calibration.depth, "depth", notes, settings.orientation, calibration)
+    for line in lines:
+        typer.echo(line)
+    typer.echo(f"written: {output}")
 
 
 @settings_command(calibrate, "zenoh", "vehicle.name")

@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 from companion.settings.marker_files import read_boards, read_map
 from companion.settings.section import Section
 from companion.settings.texts import HEIGHT_TEXT, KEY_WORD, MARKER_TEXT
-from vision.calibration.camera_info import read_camera_info
+from vision.calibration.camera_info import read_camera_info, read_registration
 from vision.camera_model import CameraModel, CameraMount, DistortionModel, check_distortion, scaled_to_frames
 from vision.frame import Frame
 from vision.frame_selection import Selection
@@ -56,6 +56,8 @@ class SourceSection(Section):
     """second source, the depth of the first one's pixels: 16-bit PNG, TIFF, NPY, gray16 pipe, shm://NAME"""
     depth_scale: Annotated[float | None, Field(gt=0, le=1000)] = None
     """metres per unit of depth; unset: 0.001 for 16-bit integers, 1 for floats"""
+    depth_calibration_file: Annotated[str | None, Field(min_length=1)] = None
+    """calibration of a depth camera that is not registered, as companion calibrate extrinsics writes it"""
     loop: bool = False
     """repeat a file or folder; not with depth"""
     realtime: bool = True
@@ -74,6 +76,10 @@ class SourceSection(Section):
         self.opening()
         if self.depth_scale is not None and self.depth is None:
             raise ValueError("depth_scale is the unit of depth, which is not set: set depth, or remove it")
+        if self.depth_calibration_file is not None and self.depth is None:
+            raise ValueError("depth_calibration_file is for depth, which is not set: set depth, or remove it")
+        if self.depth_calibration_file is not None:
+            read_registration(self.depth_calibration_file, self.opening().orientation)
         return self
 
     def opening(self, on_frame: Callable[[Frame], None] | None = None) -> SourceSettings:

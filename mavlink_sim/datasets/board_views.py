@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from vision.calibration.boards import Board
 from vision.calibration.camera_info import read_camera_info, write_camera_info
 from vision.camera_model import CameraModel
+from vision.depth_registration import DepthCalibration
 from vision.rotation import matrix_from_euler
 
 Array = NDArray[np.float64]
@@ -56,6 +57,13 @@ class BoardPose:
         """(N, 2) pixels of the board's inner corners."""
         points = np.column_stack([board.points_m, np.zeros(len(board.points_m))])
         return camera.project(points @ self.rotation.T + self.position_m)
+
+    def within(self, board: Board, camera: CameraModel) -> bool:
+        """Whether all of the board's squares are within the image."""
+        half = np.array(board.size_m) / 2
+        outline = np.array([(x, y, 0.0) for x in (-1, 0, 1) for y in (-1, 0, 1)]) * (*half, 1.0)
+        seen = camera.project(outline @ self.rotation.T + self.position_m)
+        return bool((seen > 3).all() and (seen < (camera.width - 4, camera.height - 4)).all())
 
 
 class BoardCamera:
@@ -119,8 +127,6 @@ def board_poses(board: Board, camera: CameraModel, rng: np.random.Generator) -> 
 
     All of the board's squares are within the image. Raises ValueError where no such pose is found.
     """
-    half = np.array(board.size_m) / 2
-    outline = np.array([(x, y, 0.0) for x in (-1, 0, 1) for y in (-1, 0, 1)]) * (*half, 1.0)
     while True:
         for _ in range(_MAX_TRIES):
             pixel = rng.beta(0.6, 0.6, 2) * (camera.width, camera.height)
@@ -134,13 +140,41 @@ def board_poses(board: Board, camera: CameraModel, rng: np.random.Generator) -> 
             lean = matrix_from_euler(rng.uniform(math.radians(8.0), math.radians(45.0)), 0.0, 0.0)
             turn = matrix_from_euler(0.0, 0.0, rng.normal(0.0, math.radians(15.0)))
             rotation = facing @ tilt @ lean @ tilt.T @ turn
-            position = ray * range_m
-            seen = camera.project(outline @ rotation.T + position)
-            if (seen > 3).all() and (seen < (camera.width - 4, camera.height - 4)).all():
-                yield BoardPose(rotation, position)
+            pose = BoardPose(rotation, ray * range_m)
+            if pose.within(board, camera):
+                yield pose
                 break
         else:
             raise ValueError(f"no pose of the board was found within {camera.width}x{camera.height}")
+
+
+def random_rig(colour: CameraModel, depth: CameraModel, rng: np.random.Generator) -> DepthCalibration:
+    """A depth camera some centimetres beside a colour camera, turned by up to 3 degrees about each axis."""
+    rotation = matrix_from_euler(*np.radians(rng.uniform(-3.0, 3.0, 3)))
+    position = rng.uniform((-0.08, -0.02, -0.02), (0.08, 0.02, 0.02))
+    return DepthCalibration(depth, colour, rotation, position)
+
+
+def board_pairs(
+    board: Board, rig: DepthCalibration, rng: np.random.Generator
+) -> Iterator[tuple[BoardPose, BoardPose]]:
+    """Random poses of a board in the colour camera and in the depth camera, within both images."""
+    narrow = min(rig.depth, rig.colour, key=lambda lens: lens.horizontal_fov_rad)
+    while True:
+        for _, pose in zip(range(_MAX_TRIES), board_poses(board, narrow, rng), strict=False):
+            if narrow is rig.depth:
+                turned = BoardPose(
+                    rig.rotation @ pose.rotation, rig.rotation @ pose.position_m + rig.position_m
+                )
+                pair = turned, pose
+            else:
+                back = rig.rotation.T
+                pair = pose, BoardPose(back @ pose.rotation, back @ (pose.position_m - rig.position_m))
+            if pair[0].within(board, rig.colour) and pair[1].within(board, rig.depth):
+                yield pair
+                break
+        else:
+            raise ValueError("no pose of the board was found within the images of both cameras")
 
 
 def _facing(ray: Array) -> Array:
@@ -167,17 +201,14 @@ def write_board_views(folder: Path, board: Board, camera: CameraModel, views: in
         ValueError: the folder is not empty, or no pose shows the whole board.
         OSError: a file cannot be written.
     """
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise ValueError(f"{folder} exists and is not an empty folder")
-    folder.mkdir(parents=True, exist_ok=True)
+    _make_empty(folder)
     rng = np.random.default_rng(seed)
     renderer = BoardCamera(board, camera)
     poses = board_poses(board, camera, rng)
     truth = []
     for number in range(views):
         pose, name = next(poses), f"view{number:02d}.png"
-        if not cv2.imwrite(str(folder / name), renderer.render(pose, rng)):
-            raise OSError(f"cannot write {folder / name}")
+        _save(folder / name, renderer.render(pose, rng))
         truth.append(
             {
                 "image": name,
@@ -187,6 +218,40 @@ def write_board_views(folder: Path, board: Board, camera: CameraModel, views: in
         )
     (folder / "truth.json").write_text(json.dumps(truth, indent=1) + "\n", "utf-8")
     write_camera_info(folder / "truth.yaml", camera, "truth")
+
+
+def write_board_pairs(
+    folder: Path, board: Board, colour: CameraModel, depth: CameraModel, views: int, seed: int
+) -> None:
+    """Write `colour/view00.png`, `infrared/view00.png`, …, and the truth: `colour.yaml` and `depth.yaml`.
+
+    Raises:
+        ValueError: the folder is not empty, or no pose shows the whole board to both cameras.
+        OSError: a file cannot be written.
+    """
+    _make_empty(folder)
+    rng = np.random.default_rng(seed)
+    rig = random_rig(colour, depth, rng)
+    renderers = {"colour": BoardCamera(board, colour), "infrared": BoardCamera(board, depth)}
+    poses = board_pairs(board, rig, rng)
+    for name in renderers:
+        (folder / name).mkdir()
+    for number in range(views):
+        for (name, renderer), pose in zip(renderers.items(), next(poses), strict=True):
+            _save(folder / name / f"view{number:02d}.png", renderer.render(pose, rng))
+    write_camera_info(folder / "colour.yaml", colour, "colour")
+    write_camera_info(folder / "depth.yaml", depth, "depth", registration=rig)
+
+
+def _make_empty(folder: Path) -> None:
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise ValueError(f"{folder} exists and is not an empty folder")
+    folder.mkdir(parents=True, exist_ok=True)
+
+
+def _save(path: Path, image: NDArray[np.uint8]) -> None:
+    if not cv2.imwrite(str(path), image):
+        raise OSError(f"cannot write {path}")
 
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
@@ -206,15 +271,26 @@ def board(
     lens: Annotated[
         str, typer.Option(help=f"{', '.join(LENSES)}, or a calibration file (ROS camera_info YAML).")
     ] = "webcam",
+    infrared: Annotated[
+        str | None, typer.Option(help="Lens of a depth camera's infrared images: pairs of both cameras.")
+    ] = None,
     views: Annotated[int, typer.Option(min=1, max=1000, help="Number of images.")] = 40,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the poses and the noise.")] = 0,
 ) -> None:
     """Write images of a calibration board, for `companion calibrate`, with the true lens."""
     try:
         printed = Board.parse(*board, square, marker, dictionary)
-        camera = LENSES[lens] if lens in LENSES else read_camera_info(Path(lens)).model
-        write_board_views(folder, printed, camera, views, seed)
+        camera = _lens(lens)
+        if infrared is None:
+            write_board_views(folder, printed, camera, views, seed)
+        else:
+            write_board_pairs(folder, printed, camera, _lens(infrared), views, seed)
     except (ValueError, OSError) as error:
         print(f"mavlink-sim board: {error}", file=sys.stderr)
         raise typer.Exit(2) from error
-    print(f"{folder}: {views} views; the true lens is in {folder / 'truth.yaml'}", flush=True)
+    truth = "truth.yaml" if infrared is None else "depth.yaml"
+    print(f"{folder}: {views} views; the true lens is in {folder / truth}", flush=True)
+
+
+def _lens(name: str) -> CameraModel:
+    return LENSES[name] if name in LENSES else read_camera_info(Path(name)).model

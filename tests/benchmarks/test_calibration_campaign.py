@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks.calibration import lens_error, mount_error, random_lens
+from benchmarks.calibration import extrinsics_error, lens_error, mount_error, random_lens
 from mavlink_sim.datasets.board_views import LENSES
 
 SEEDS = range(1, 51)
@@ -30,6 +30,14 @@ def test_mount_is_measured_from_rendered_images() -> None:
     error = mount_error(1)
     assert error.angle_deg < 0.3
     assert error.views == 10
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(1, 17))
+def test_extrinsics_of_every_seed(seed: int) -> None:
+    error = extrinsics_error(seed)
+    assert error.position_mm < 2.0
+    assert error.rotation_deg < 0.1
 
 
 @pytest.mark.slow

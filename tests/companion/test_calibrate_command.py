@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 import zenoh
+from numpy.typing import NDArray
 from typer.testing import CliRunner, Result
 
 from companion import calibrate as calibrate_module
@@ -24,13 +25,20 @@ from companion.cli.commands import app
 from companion.settings.bus import ZenohSection
 from mavlink_sim.camera.image_effects import ImageEffects
 from mavlink_sim.camera.renderer import Renderer
-from mavlink_sim.datasets.board_views import LENSES, BoardCamera, board_poses, write_board_views
+from mavlink_sim.datasets.board_views import (
+    LENSES,
+    BoardCamera,
+    board_poses,
+    write_board_pairs,
+    write_board_views,
+)
 from mavlink_sim.datasets.board_views import app as board_app
 from mavlink_sim.testing import free_port
 from mavlink_sim.world.fiducials import Print
 from mavlink_sim.world.world import Ground, World, WorldObject
 from vision.attitude import quaternion_from_euler
 from vision.calibration.boards import Board
+from vision.calibration.calibrate import CalibrationError
 from vision.calibration.camera_info import read_camera_info, write_camera_info
 from vision.camera_model import CameraModel, CameraMount
 from vision.frame import Frame
@@ -119,6 +127,84 @@ def test_calibration_of_turned_images_says_so(folder: Path, marker_images: Path,
     assert CliRunner().invoke(app, ["config", *flags, *turned]).exit_code == 0
     done = calibrate("mount", marker_images, "--marker", "7", "--size", "0.6", "--calibration", output)
     assert "rotate_deg" in one_line_of_bad_input(done)
+
+
+@pytest.fixture(scope="module")
+def pairs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Views of a colour camera and of an infrared camera of half its size beside it."""
+    path = tmp_path_factory.mktemp("pairs") / "pairs"
+    write_board_pairs(path, BOARD, LENS, LENSES["plain"].scaled(280, 210), 9, 3)
+    return path
+
+
+def extrinsics(pairs: Path, *options: str | Path, **files: Path) -> Result:
+    lenses = {"colour": pairs / "colour.yaml", "infrared": pairs / "depth.yaml"} | files
+    words = [word for name, file in lenses.items() for word in (f"--{name}-calibration", file)]
+    return calibrate("extrinsics", pairs / "colour", pairs / "infrared", *BOARD_WORDS, *words, *options)
+
+
+def test_folders_of_two_cameras_give_their_places(pairs: Path, tmp_path: Path) -> None:
+    output = tmp_path / "depth.yaml"
+    done = extrinsics(pairs, "-o", output)
+    assert done.exit_code == 0, done.output
+    assert "9 pairs of images, 9 with the board" in done.stderr
+    assert "image's" not in done.stderr  # the board need not reach the image's corners
+    found, true = read_camera_info(output).registration, read_camera_info(pairs / "depth.yaml").registration
+    assert found is not None
+    assert true is not None
+    np.testing.assert_allclose(found.position_m, true.position_m, atol=0.002)
+    np.testing.assert_allclose(found.rotation, true.rotation, atol=0.002)
+    assert (found.depth, found.colour) == (true.depth, true.colour)
+    right = re.search(r"depth camera at (\S+) mm right", done.stdout)
+    assert right is not None
+    assert float(right[1]) == pytest.approx(true.position_m[0] * 1000, abs=2.0)
+    flags = ("--source-depth", "depth/", "--source-depth-calibration-file", str(output))
+    assert CliRunner().invoke(app, ["config", *flags]).exit_code == 0
+    turned = CliRunner().invoke(app, ["config", *flags, "--source-mirror", "true"])
+    assert "mirror" in one_line_of_bad_input(turned)
+
+
+def test_wrong_files_of_two_cameras_are_refused(pairs: Path, folder: Path, tmp_path: Path) -> None:
+    line = one_line_of_bad_input(extrinsics(pairs, infrared=pairs / "none.yaml"))
+    assert "none.yaml" in line
+    write_camera_info(other := tmp_path / "other.yaml", LENSES["plain"].scaled(640, 360), "other")
+    line = one_line_of_bad_input(extrinsics(pairs, "-o", tmp_path / "depth.yaml", infrared=other))
+    assert "640x360" in line
+    assert "280x210" in line
+    words = ("--colour-calibration", pairs / "colour.yaml", "--infrared-calibration", pairs / "depth.yaml")
+    line = one_line_of_bad_input(calibrate("extrinsics", pairs / "colour", folder, *BOARD_WORDS, *words))
+    assert "do not determine" in line
+    empty = ("--board", "chessboard", "8x5", "--square", "0.03")
+    line = one_line_of_bad_input(
+        calibrate("extrinsics", pairs / "colour", pairs / "infrared", *empty, *words)
+    )
+    assert "no board in any of 9 pairs" in line
+    flags = ("--source-depth", "depth/", "--source-depth-calibration-file", str(pairs / "colour.yaml"))
+    done = CliRunner().invoke(app, ["config", *flags])
+    assert "colour_from_depth" in one_line_of_bad_input(done)
+    done = CliRunner().invoke(app, ["config", *flags[2:]])
+    assert "set depth" in one_line_of_bad_input(done)
+
+
+def test_live_cameras_are_paired_by_their_stamps() -> None:
+    board = next(Live()._frames).image
+    blank = np.zeros_like(board)
+
+    class Camera(Live):
+        def __init__(self, times_ms: list[int], image: NDArray[np.uint8]) -> None:
+            super().__init__(interrupt_after=len(times_ms))
+            self._frames = (Frame(image, ms * 1_000_000, number) for number, ms in enumerate(times_ms))
+
+    colour = Camera([0, 33, 66, 99, 133], board)
+    collected = collect_views(colour, BOARD, lambda _: None, 1, Camera([40, 73, 140, 200], board))
+    assert (collected.frames, collected.found) == (3, 3)  # 33-40, 66-73, 133-140
+    assert len(collected.pairs) == 1  # the board did not move
+    with pytest.raises(CalibrationError, match="no board in any of 1 pairs"):
+        collect_views(Camera([0], board), BOARD, lambda _: None, 1, Camera([10], blank))
+    recorded = Camera([0], board)
+    recorded.live = False
+    with pytest.raises(ValueError, match="no common time"):
+        collect_views(Camera([0], board), BOARD, lambda _: None, 1, recorded)
 
 
 def test_no_board_in_any_view(folder: Path, tmp_path: Path) -> None:
@@ -228,6 +314,14 @@ def test_simulator_writes_views_with_their_truth(tmp_path: Path) -> None:
     again = CliRunner().invoke(board_app, words)
     assert again.exit_code == 2
     assert "empty" in again.stderr
+    pairs = [str(tmp_path / "pairs"), *words[1:], "--infrared", "plain"]
+    done = CliRunner().invoke(board_app, pairs)
+    assert done.exit_code == 0, done.output
+    rig = read_camera_info(tmp_path / "pairs" / "depth.yaml").registration
+    assert rig is not None
+    assert (rig.depth.width, rig.colour) == (640, LENS)
+    for camera in ("colour", "infrared"):
+        assert len(list((tmp_path / "pairs" / camera).iterdir())) == 2
 
 
 @pytest.fixture(scope="module")

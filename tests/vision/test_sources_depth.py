@@ -7,6 +7,7 @@ import os
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from vision.calibration.camera_info import write_camera_info
+from vision.camera_model import CameraModel
+from vision.depth_registration import DepthCalibration
 from vision.frame import Frame
+from vision.orientation import Orientation
 from vision.shared_frame import SharedFrameReader
 from vision.sources import (
     EndOfStream,
@@ -179,6 +184,29 @@ def test_depth_of_another_size_is_refused(tmp_path: Path, realtime: bool) -> Non
     uri, settings = folders(tmp_path, 2, 2, size=(6, 8))
     with pytest.raises(SourceError, match="depth is 8x6, the picture 16x12"):
         open_source(uri, SourceSettings(depth=settings.depth, realtime=realtime))
+
+
+def test_depth_of_a_camera_beside_the_colour_camera_is_registered(tmp_path: Path) -> None:
+    uri, settings = folders(tmp_path, 3, 3, size=(6, 8))
+    colour, depth = (CameraModel.from_horizontal_fov(*size, 1.0) for size in ((32, 24), (8, 6)))
+    rig = DepthCalibration(depth, colour, np.eye(3), np.array([0.0, 0.0, 0.25]))
+    file = tmp_path / "depth.yaml"
+    write_camera_info(file, depth, "depth", orientation=Orientation(), registration=rig)
+    registered = replace(settings, depth_calibration_file=str(file))
+    with open_source(uri, registered) as source:
+        frames = list(source)
+    for index, frame in enumerate(frames):
+        assert frame.depth_m is not None
+        assert frame.depth_m.shape == (12, 16)
+        known = frame.depth_m[np.isfinite(frame.depth_m)]
+        np.testing.assert_allclose(known, index + 1.25, rtol=1e-6)
+        assert len(known) > 100
+    assert len(frames) == 3
+    with pytest.raises(SourceError, match=r"depth\.yaml has rotate_deg 0.*rotate_deg is 90"):
+        open_source(uri, replace(registered, rotate_deg=90))
+    write_camera_info(file, depth.scaled(8, 4), "depth", registration=rig)
+    with pytest.raises(SourceError, match=r"depth: source\.depth_calibration_file: .* 8x4.* 8x6"):
+        open_source(uri, registered)
 
 
 def test_depth_that_cannot_be_paired_is_refused(tmp_path: Path) -> None:

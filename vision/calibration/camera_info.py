@@ -7,12 +7,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from vision.camera_model import CameraModel
+from vision.depth_registration import DepthCalibration
 from vision.orientation import Orientation
 from vision.plain_yaml import load_plain_yaml
 
 # The names that `companion calibrate` and ROS's camera_calibration write if none is given.
 _DEFAULT_NAMES = ("camera", "narrow_stereo")
+# Largest error of a product of rows of a rotation.
+_NO_ROTATION = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,12 +29,14 @@ class CameraInfo:
         model: size, camera matrix and distortion.
         name: of the camera; None if it has none, or a program's default.
         orientation: how the images were turned before the calibration; None if the file does not say.
+        registration: of a depth camera to its colour camera, as `companion calibrate extrinsics` writes it.
     """
 
     path: Path
     model: CameraModel
     name: str | None
     orientation: Orientation | None
+    registration: DepthCalibration | None = None
 
     def check_source(self, orientation: Orientation, name: str | None = None) -> None:
         """Check that the calibration is of this source's images.
@@ -58,32 +65,33 @@ def write_camera_info(
     name: str,
     notes: tuple[str, ...] = (),
     orientation: Orientation | None = None,
+    registration: DepthCalibration | None = None,
 ) -> None:
     """Write a calibration file.
 
     Args:
         name: of the camera, `camera_name` in the file.
         orientation: how the images were turned, written as keys that ROS ignores; None: not written.
+        registration: of a depth camera, `model`'s, to its colour camera: more such keys.
         notes: lines of comment at its beginning.
 
     Raises:
         OSError: the file cannot be written.
     """
-    k = [model.fx, 0.0, model.cx, 0.0, model.fy, model.cy, 0.0, 0.0, 1.0]
     projection = [model.fx, 0.0, model.cx, 0.0, 0.0, model.fy, model.cy, 0.0, 0.0, 0.0, 1.0, 0.0]
     lines = [
         *(f"# {note}" for note in notes),
-        f"image_width: {model.width}",
-        f"image_height: {model.height}",
+        *_lens_lines(model),
         f"camera_name: {name}",
-        *_matrix("camera_matrix", 3, 3, k),
-        f"distortion_model: {model.distortion_model}",
-        *_matrix("distortion_coefficients", 1, len(model.coefficients), model.coefficients),
         *_matrix("rectification_matrix", 3, 3, [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]),
         *_matrix("projection_matrix", 3, 4, projection),
     ]
     if orientation is not None:
         lines += [f"rotate_deg: {orientation.rotate_deg}", f"mirror: {_text(orientation.mirror)}"]
+    if registration is not None:
+        places = np.column_stack([registration.rotation, registration.position_m])
+        lines += _matrix("colour_from_depth", 3, 4, places.ravel().tolist())
+        lines += _lens_lines(registration.colour, "colour_")
     path.write_text("\n".join(lines) + "\n", "utf-8")
 
 
@@ -98,22 +106,64 @@ def read_camera_info(path: Path) -> CameraInfo:
         content = load_plain_yaml(path.read_bytes().decode("utf-8"))
         if not isinstance(content, dict):
             raise ValueError("expected a table with image_width, image_height, camera_matrix…")
-        matrix = _numbers(content, "camera_matrix", 9)
-        if matrix[1] != 0.0 or matrix[3] != 0.0 or matrix[6:] != (0.0, 0.0, 1.0):
-            raise ValueError(f"camera_matrix must be [fx, 0, cx, 0, fy, cy, 0, 0, 1], got {list(matrix)}")
-        model = CameraModel(
-            _size(content, "image_width"),
-            _size(content, "image_height"),
-            *(matrix[0], matrix[4], matrix[2], matrix[5]),
-            _numbers(content, "distortion_coefficients"),
-            _value(content, "distortion_model"),
-        )
+        model = _lens(content)
         name = str(content.get("camera_name") or "")
-        return CameraInfo(path, model, None if name in ("", *_DEFAULT_NAMES) else name, _orientation(content))
+        known = None if name in ("", *_DEFAULT_NAMES) else name
+        return CameraInfo(path, model, known, _orientation(content), _registration(content, model))
     except OSError as error:
         raise ValueError(f"cannot read the calibration file {path}: {error.strerror}") from None
     except ValueError as error:  # UnicodeDecodeError and PlainYamlError are too
         raise ValueError(f"the calibration file {path} cannot be used: {error}") from None
+
+
+def _lens_lines(model: CameraModel, prefix: str = "") -> list[str]:
+    k = [model.fx, 0.0, model.cx, 0.0, model.fy, model.cy, 0.0, 0.0, 1.0]
+    return [
+        f"{prefix}image_width: {model.width}",
+        f"{prefix}image_height: {model.height}",
+        *_matrix(f"{prefix}camera_matrix", 3, 3, k),
+        f"{prefix}distortion_model: {model.distortion_model}",
+        *_matrix(f"{prefix}distortion_coefficients", 1, len(model.coefficients), model.coefficients),
+    ]
+
+
+def _lens(content: dict[Any, Any], prefix: str = "") -> CameraModel:
+    matrix = _numbers(content, f"{prefix}camera_matrix", 9)
+    if matrix[1] != 0.0 or matrix[3] != 0.0 or matrix[6:] != (0.0, 0.0, 1.0):
+        raise ValueError(f"{prefix}camera_matrix must be [fx, 0, cx, 0, fy, cy, 0, 0, 1], got {list(matrix)}")
+    return CameraModel(
+        _size(content, f"{prefix}image_width"),
+        _size(content, f"{prefix}image_height"),
+        *(matrix[0], matrix[4], matrix[2], matrix[5]),
+        _numbers(content, f"{prefix}distortion_coefficients"),
+        _value(content, f"{prefix}distortion_model"),
+    )
+
+
+def _registration(content: dict[Any, Any], depth: CameraModel) -> DepthCalibration | None:
+    if "colour_from_depth" not in content:
+        return None
+    places = np.array(_numbers(content, "colour_from_depth", 12)).reshape(3, 4)
+    rotation = places[:, :3]
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > _NO_ROTATION or np.linalg.det(rotation) < 0.0:
+        raise ValueError("colour_from_depth must be three rows of a rotation and a position in metres")
+    return DepthCalibration(depth, _lens(content, "colour_"), rotation, places[:, 3])
+
+
+def read_registration(file: str, orientation: Orientation) -> DepthCalibration:
+    """Read the calibration of a depth camera to its colour camera.
+
+    Raises:
+        ValueError: as `read_camera_info`, the file has none, or its images are turned otherwise.
+    """
+    info = read_camera_info(Path(file).expanduser())
+    info.check_source(orientation)
+    if info.registration is None:
+        raise ValueError(
+            f"the calibration file {file} has no colour_from_depth: write it with companion calibrate "
+            f"extrinsics"
+        )
+    return info.registration
 
 
 def _matrix(key: str, rows: int, columns: int, values: tuple[float, ...] | list[float]) -> list[str]:

@@ -31,13 +31,17 @@ _TILTS = ("left", "right", "upper", "lower")
 class ViewCollector:
     """Collects views of a board that differ from each other.
 
+    Args:
+        whole_image: whether the board must reach all parts of the image, as for the fit of a lens.
+
     Attributes:
         views: the collected ones.
     """
 
-    def __init__(self, board: Board) -> None:
+    def __init__(self, board: Board, *, whole_image: bool = True) -> None:
         self.views: list[BoardView] = []
         self._board = board
+        self._whole_image = whole_image
         self._features: list[NDArray[np.float64]] = []
 
     def add(self, view: BoardView) -> bool:
@@ -67,7 +71,8 @@ class ViewCollector:
         corners = np.concatenate([view.corners_px for view in self.views])
         cells = np.digitize(corners / self.views[0].size, EDGES)
         seen = set((cells[:, 1] * 3 + cells[:, 0]).tolist())
-        if empty := [name for index, name in enumerate(CELLS) if index not in seen]:
+        empty = [name for index, name in enumerate(CELLS) if index not in seen]
+        if empty and self._whole_image:
             wanted.append(f"the board in the image's {', '.join(empty)}")
         features = np.array(self._features)
         spans, tilts = features[:, 2], features[:, 3:5]

@@ -9,8 +9,10 @@ import stat
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
+from vision.calibration.camera_info import read_registration
 from vision.sources.camera import CameraCapture, camera_device, check_camera
 from vision.sources.capture import Capture, LoopingCapture
 from vision.sources.csi import CsiCapture, check_csi_program, csi_settings, parse_csi_number
@@ -20,7 +22,7 @@ from vision.sources.files import ImagesCapture, VideoFileCapture, images_in, is_
 from vision.sources.latest import LatestSource
 from vision.sources.network import UdpStream, open_http, open_rtsp, without_password
 from vision.sources.opencv import quiet_opencv
-from vision.sources.paired import DepthPictures, depth_error, paired_source
+from vision.sources.paired import TOLERANCE_S, DepthPictures, depth_error, paired_source
 from vision.sources.pipe import Fifo, PipeCapture, check_pipe_settings
 from vision.sources.registry import SOURCES, source
 from vision.sources.sequential import SequentialSource
@@ -97,45 +99,67 @@ def _open_with_depth(uri: str, depth_uri: str, settings: SourceSettings) -> Sour
         raise SourceError("standard input cannot be both source.uri and source.depth")
     if settings.loop:
         raise SourceError("source.loop cannot repeat two sources in step: remove it, or source.depth")
+    registration = None
+    if settings.depth_calibration_file is not None:
+        try:
+            registration = read_registration(settings.depth_calibration_file, settings.orientation)
+        except ValueError as error:
+            raise SourceError(str(error)) from error
     pictures = DepthPictures()
     # Recordings are read frame by frame, so that their pictures pair; the pair is played in real time.
-    each = replace(settings, depth=None, realtime=False, on_frame=None)
+    each = replace(settings, depth=None, depth_calibration_file=None, realtime=False, on_frame=None)
     of_depth = replace(each, as_depth=True, exposure_us=None, gain=None, name=None, on_frame=pictures.add)
-    colour_folder, depth_folder = _folder(uri), _folder(depth_uri)
-    if colour_folder is not None and depth_folder is not None:
-        paths = partners(images_in(colour_folder), images_in(depth_folder, DEPTH_SUFFIXES))
-        rate_hz = _image_rate_hz(settings)
-        colour = open_source(uri, each)
-        try:
-            depth: Source = SequentialSource(
-                str(depth_folder), lambda: ImagesCapture(paths, rate_hz, decode_depth), of_depth
-            )
-        except SourceError as error:
-            colour.close()
-            raise depth_error(error, depth_uri) from error
-        except BaseException:
-            colour.close()
-            raise
+    colour, depth = open_two(uri, depth_uri, each, of_depth)
+    tolerance_s = TOLERANCE_S
+    if _folder(uri) is not None and _folder(depth_uri) is not None:
         # Their times are multiples of the interval: a picture pairs with its partner alone.
-        return paired_source(colour, depth, pictures, settings, tolerance_s=0.25 / rate_hz)
+        tolerance_s = 0.25 / _image_rate_hz(settings)
+    return paired_source(
+        colour, depth, pictures, settings, tolerance_s=tolerance_s, registration=registration
+    )
+
+
+def open_two(
+    uri: str, second_uri: str, settings: SourceSettings, second_settings: SourceSettings
+) -> tuple[Source, Source]:
+    """Open two sources at the same time; the images of two folders are paired by name, see `partners`.
+
+    Raises:
+        SourceError: one of them cannot be opened; the other one is closed.
+    """
+    folder, second_folder = _folder(uri), _folder(second_uri)
+
+    def open_second() -> Source:
+        if folder is None or second_folder is None:
+            return open_source(second_uri, second_settings)
+        rate_hz, images = _image_rate_hz(second_settings), images_in(folder)
+        if second_settings.as_depth:
+            paths = partners(images, images_in(second_folder, DEPTH_SUFFIXES))
+            capture = partial(ImagesCapture, paths, rate_hz, decode_depth)
+        else:
+            paths = partners(images, images_in(second_folder))
+            capture = partial(ImagesCapture, paths, rate_hz)
+        return SequentialSource(str(second_folder), capture, second_settings)
+
     # At the same time: one writer may wait until both its pipes are opened.
-    with ThreadPoolExecutor(1, "depth") as executor:
-        opening = executor.submit(open_source, depth_uri, of_depth)
+    with ThreadPoolExecutor(1, "second source") as executor:
+        opening = executor.submit(open_second)
         try:
-            colour = open_source(uri, each)
+            first = open_source(uri, settings)
         except BaseException:
             with contextlib.suppress(SourceError):
                 opening.result().close()
             raise
         try:
-            depth = opening.result()
+            return first, opening.result()
         except SourceError as error:
-            colour.close()
-            raise depth_error(error, without_password(depth_uri)) from error
-        except BaseException:
-            colour.close()
+            first.close()
+            if second_settings.as_depth:
+                raise depth_error(error, without_password(second_uri)) from error
             raise
-    return paired_source(colour, depth, pictures, settings)
+        except BaseException:
+            first.close()
+            raise
 
 
 def _refuse_exposure(name: str, settings: SourceSettings) -> None:

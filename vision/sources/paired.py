@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from vision.depth_registration import DepthCalibration
 from vision.frame import Frame
 from vision.sources.capture import Capture, RawFrame
 from vision.sources.latest import LatestSource
@@ -67,6 +68,7 @@ class PairedCapture(Capture):
     Args:
         pictures: `on_frame` of the depth source, for live ones.
         tolerance_s: largest difference of the stamps of a pair.
+        registration: of depth to the colour picture; None: it is registered.
     """
 
     silence_is_loss = False
@@ -78,8 +80,9 @@ class PairedCapture(Capture):
         pictures: DepthPictures,
         settings: SourceSettings,
         tolerance_s: float = TOLERANCE_S,
+        registration: DepthCalibration | None = None,
     ) -> None:
-        self._tolerance_s = tolerance_s
+        self._tolerance_s, self._registration = tolerance_s, registration
         self._colour, self._depth, self._pictures = colour, depth, pictures
         self._timeout_s = settings.open_timeout_s
         self._current: Frame | None = None
@@ -145,11 +148,16 @@ class PairedCapture(Capture):
         self._smallest_gap_s = min(self._smallest_gap_s, gap_s)
         if gap_s > self._tolerance_s:
             return None
+        if self._registration is not None:
+            try:
+                depth_m = self._registration.register(depth_m, frame.width, frame.height)
+            except ValueError as error:
+                raise SourceError(f"{self._depth.uri}: source.depth_calibration_file: {error}") from error
         if depth_m.shape != (frame.height, frame.width):
             raise SourceError(
                 f"{self._depth.uri}: depth is {depth_m.shape[1]}x{depth_m.shape[0]}, the picture "
-                f"{frame.width}x{frame.height}: depth must be registered to the "
-                f"colour picture and have its size"
+                f"{frame.width}x{frame.height}: depth must be registered to the colour picture and have its "
+                f"size, or source.depth_calibration_file must be set (companion calibrate extrinsics)"
             )
         self._paired = True
         return depth_m
@@ -216,6 +224,7 @@ def paired_source(
     settings: SourceSettings,
     *,
     tolerance_s: float = TOLERANCE_S,
+    registration: DepthCalibration | None = None,
 ) -> Source:
     """One source of both, which it closes.
 
@@ -237,11 +246,11 @@ def paired_source(
         close()
         raise
     # Both are rotated already, and named.
-    outer = replace(settings, depth=None, rotate_deg=0, mirror=False, name=None)
+    outer = replace(settings, depth=None, depth_calibration_file=None, rotate_deg=0, mirror=False, name=None)
     uri = f"{colour.uri} with depth of {depth.uri}"
 
     def open_capture() -> Capture:
-        return PairedCapture(colour, depth, pictures, settings, tolerance_s)
+        return PairedCapture(colour, depth, pictures, settings, tolerance_s, registration)
 
     if colour.live or settings.realtime:
         paced = not colour.live

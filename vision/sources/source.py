@@ -51,6 +51,8 @@ class SourceSettings:
             PNG, 32-bit TIFF or OpenEXR, NPY, a pipe of raw `gray16`, or shared memory with depth. Two folders
             are paired by file name, other sources by stamp, see `vision.sources.paired`.
         depth_scale: metres per unit of that depth; None: 0.001 for 16-bit integers, 1 for floats.
+        depth_calibration_file: of a depth camera whose pictures are not registered, as `companion calibrate
+            extrinsics` writes it.
         as_depth: deliver depth pictures: `depth_m` with a black image. Set for the source that `depth` names.
         loop: restart a file at its end. Refused with `depth`.
         realtime: read a file at its own frame rate, newest frame wins: a file used as a camera. A pipe has
@@ -78,6 +80,7 @@ class SourceSettings:
     name: str | None = None
     depth: str | None = None
     depth_scale: float | None = None
+    depth_calibration_file: str | None = None
     as_depth: bool = False
     loop: bool = False
     realtime: bool = False
