@@ -24,6 +24,7 @@ FLOORS = {
     "operator": 4,
     "perception": 4,
     "bus": 5,
+    "language": 7,
     "recording": 6,
     "service": 7,
     "sim_session": 8,

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from companion.cli.ask import ASK_SETTINGS, ask
 from companion.cli.bench import bench
 from companion.cli.calibrate import calibrate
 from companion.cli.cameras import cameras, depth, preview
@@ -50,6 +51,7 @@ ORDER = (
     "demo",
     "detect",
     "send",
+    "ask",
     "echo",
     "cameras",
     "preview",
@@ -85,6 +87,7 @@ settings_command(app, "source", "camera", "vehicle", "plugins")(preview)
 settings_command(app, "source", "camera", "detector", "tracker", "vehicle.name", "plugins")(depth)
 settings_command(app, *CLIENT_SETTINGS, "plugins", "detector")(mission)
 settings_command(app, *CLOUD_SETTINGS)(cloud)
+settings_command(app, *ASK_SETTINGS)(ask)
 settings_command(app)(play)
 settings_command(app, *MARKER_SETTINGS)(markers)
 settings_command(app, *CLIENT_SETTINGS, "dashboard")(dashboard)

@@ -98,6 +98,11 @@ class Drone(Commands):
     def __init__(self, session: zenoh.Session, name: str) -> None:
         self._session, self.name = session, name
 
+    @property
+    def session(self) -> zenoh.Session:
+        """The connection, for other keys."""
+        return self._session
+
     def other(self, name: str) -> Drone:
         """Another vehicle on the same connection."""
         return Drone(self._session, name)
@@ -179,6 +184,21 @@ class Drone(Commands):
         finally:
             steering.send()
             publisher.undeclare()  # type: ignore[no-untyped-call]
+
+    async def query(self, path: str) -> Any:
+        """Ask one of the queryables status, config, models, commands.
+
+        Raises:
+            NoAnswerError: no answer within 2 s.
+        """
+
+        def ask() -> Any:
+            for reply in self._session.get(f"{topics.ROOT}/{self.name}/{path}", timeout=_DISCOVERY_S):
+                if reply.ok is not None:
+                    return json.loads(reply.ok.payload.to_string())
+            raise NoAnswerError(f"{path}: no answer from vehicle {self.name!r} within {_DISCOVERY_S:g} s")
+
+        return await asyncio.to_thread(ask)
 
     # --- messages: the bodies of docs/messages.md
 

@@ -11,6 +11,7 @@ from companion.settings.guidance import GuidanceSection
 from companion.settings.operator import (
     DashboardSection,
     FoxgloveSection,
+    LanguageSection,
     LogSection,
     MetricsSection,
     PluginsSection,
@@ -63,6 +64,7 @@ class Settings(Section):
     recording: RecordingSection = RecordingSection()
     preview: PreviewSection = PreviewSection()
     dashboard: DashboardSection = DashboardSection()
+    language: LanguageSection = LanguageSection()
     foxglove: FoxgloveSection = FoxgloveSection()
     metrics: MetricsSection = MetricsSection()
     log: LogSection = LogSection()

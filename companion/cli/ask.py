@@ -1,0 +1,205 @@
+"""The command line of `companion ask`: one sentence, or a chat."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from companion.cli.flags import plain_errors
+from companion.settings import Settings
+
+if TYPE_CHECKING:
+    from companion.language.conversation import Conversation
+    from companion.language.endpoints import Endpoint
+
+ASK_SETTINGS = ("zenoh", "vehicle.name", "language", "plugins")
+EXIT_FAILED = 1
+_BANNER = "ask, or say what to fly; `stop` stops at once, `quit` ends"
+
+
+def ask(
+    settings: Settings,
+    sentence: Annotated[
+        str | None, typer.Argument(help='For example "find the red car and circle it". Without: a chat.')
+    ] = None,
+    connect: Annotated[str | None, typer.Option(help="Zenoh endpoint of the service or its router.")] = None,
+) -> None:
+    """Fly and answer plain sentences, by patterns or by a language model.
+
+    What moves the vehicle is shown first, and flown if you answer y. `stop` is sent at once.
+    """
+    from companion.bus.client import NoAnswerError
+    from companion.bus.session import BusError
+    from companion.language.endpoints import LanguageError
+    from companion.plugins import PluginError, load_plugins
+
+    with plain_errors(NoAnswerError, BusError, PluginError, LanguageError, ValueError):
+        load_plugins(settings.plugins.modules)
+        _check_may(settings)
+        endpoint = _endpoint(settings)
+        try:
+            done = asyncio.run(_converse(settings, endpoint, sentence, connect))
+        except KeyboardInterrupt:
+            done = False
+    if not done:
+        raise typer.Exit(EXIT_FAILED)
+
+
+def _check_may(settings: Settings) -> None:
+    """Raise ValueError for a command that does not exist."""
+    from companion.guidance.command import COMMANDS, nearest
+    from companion.guidance.grammar import parse  # noqa: F401  registers the commands
+
+    for word in settings.language.may:
+        if word not in COMMANDS:
+            raise ValueError(f"language.may: unknown command {word!r}; {nearest(word, list(COMMANDS))}")
+
+
+def _endpoint(settings: Settings) -> Endpoint | None:
+    """The language model of the settings; None: by patterns. Raises LanguageError."""
+    from companion.language.endpoints import LanguageError, endpoint_of
+
+    language = settings.language
+    if not language.model:
+        return None
+    key = None
+    if language.key_file is not None:
+        try:
+            key = Path(language.key_file).read_text(encoding="utf-8").strip()
+        except (OSError, UnicodeDecodeError) as error:
+            raise LanguageError(f"language.key_file {language.key_file}: cannot be read: {error}") from None
+    return endpoint_of(language.url, language.model, key=key, timeout_s=language.timeout_s)
+
+
+async def _converse(
+    settings: Settings, endpoint: Endpoint | None, sentence: str | None, connect: str | None
+) -> bool:
+    from companion.bus.client import client_settings
+    from companion.client import connect as connect_to
+    from companion.language.conversation import Conversation, Operator
+    from companion.language.live import LiveVehicle
+    from companion.language.tools import class_names_of
+
+    where = client_settings(settings.zenoh, (connect,) if connect else ()).connect[0]
+    terminal = Terminal()
+    async with connect_to(where, settings.vehicle.name, config_file=settings.zenoh.config_file) as drone:
+        schema, config = await drone.query("commands"), await drone.query("config")
+        class_names = class_names_of(schema)
+        vehicle = LiveVehicle(drone, class_names or (), config["guidance"]["camera"])
+        operator = Operator(terminal.write, terminal.show, terminal.confirm)
+        conversation = Conversation(
+            vehicle, operator, schema, class_names, endpoint=endpoint, may=settings.language.may
+        )
+        return await terminal.attend(conversation, sentence)
+
+
+class Terminal:
+    """Standard input and output. Lines are read while the model answers and while the vehicle flies."""
+
+    def __init__(self) -> None:
+        self._lines: asyncio.Queue[str | None] = asyncio.Queue()
+        self._asked: asyncio.Future[bool] | None = None
+        self._ended = self._in_line = False
+
+    def write(self, text: str) -> None:
+        """A piece of an answer."""
+        self._in_line = not text.endswith("\n")
+        print(text, end="", flush=True)
+
+    def show(self, line: str) -> None:
+        """A whole line; an empty one only ends the line before."""
+        if self._in_line:
+            print(flush=True)
+        self._in_line = False
+        if line:
+            print(line, flush=True)
+
+    async def confirm(self) -> bool:
+        """Ask whether to fly what was shown."""
+        if self._ended:
+            self.show("not flown: nobody confirms it; language.may lists what needs no confirmation")
+            return False
+        self.write("fly this? [y/N] ")
+        self._asked = asyncio.get_running_loop().create_future()
+        try:
+            return await self._asked
+        finally:
+            self._asked = None
+
+    async def attend(self, conversation: Conversation, sentence: str | None) -> bool:
+        """Run a sentence, or a chat until `quit` or the end of the input. Returns whether all was done."""
+        from companion.language.endpoints import LanguageError
+        from companion.language.sentences import is_stop
+
+        self._read_in_thread()
+        chat = sentence is None
+        if chat:
+            self.show(_BANNER)
+        running = None if sentence is None else asyncio.create_task(conversation.ask(sentence))
+        next_line = asyncio.create_task(self._lines.get())
+        success = True
+        try:
+            while not self._ended or running is not None:
+                waited = [task for task in (running, None if self._ended else next_line) if task is not None]
+                await asyncio.wait(waited, return_when=asyncio.FIRST_COMPLETED)
+                if running is not None and running.done():
+                    try:
+                        success = running.result() and success
+                    except LanguageError as error:
+                        if not chat:
+                            raise
+                        self.show(str(error))
+                    running = None
+                    if not chat:
+                        return success
+                if self._ended or not next_line.done():
+                    continue
+                line = next_line.result()
+                next_line = asyncio.create_task(self._lines.get())
+                if line is not None and is_stop(line):
+                    success = await conversation.stop() and success
+                    await _cancelled(running)
+                    running = None
+                    if not chat:
+                        return False
+                elif line is None or (chat and self._asked is None and line.strip() in ("quit", "exit")):
+                    self._ended = True
+                    if self._asked is not None:
+                        self._asked.set_result(False)
+                    if line is not None:
+                        return success
+                elif self._asked is not None:
+                    self._asked.set_result(line.strip().lower() in ("y", "yes"))
+                elif running is not None:
+                    self.show("busy; `stop` ends it")
+                elif line.strip():
+                    running = asyncio.create_task(conversation.ask(line))
+            return success
+        finally:
+            next_line.cancel()
+            await _cancelled(running)
+
+    def _read_in_thread(self) -> None:
+        """Standard input may be a terminal, a pipe or a file; asyncio reads only the first two."""
+        loop = asyncio.get_running_loop()
+
+        def read() -> None:
+            try:
+                for line in sys.stdin:
+                    loop.call_soon_threadsafe(self._lines.put_nowait, line.rstrip("\n"))
+                loop.call_soon_threadsafe(self._lines.put_nowait, None)
+            except (RuntimeError, ValueError):  # the loop or the file is closed
+                return
+
+        threading.Thread(target=read, name="standard input", daemon=True).start()
+
+
+async def _cancelled(task: asyncio.Task[bool] | None) -> None:
+    if task is not None:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)

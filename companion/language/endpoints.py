@@ -1,0 +1,254 @@
+"""Language models behind HTTP: Ollama's API, and OpenAI's chat completions. Both stream."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from companion.language.tools import ToolCall
+
+MAX_ANSWER_CHARACTERS = 20_000
+MAX_CALLS = 50
+
+
+class LanguageError(RuntimeError):
+    """The model cannot be reached or its answer cannot be read. The message is one line."""
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """One message of a conversation.
+
+    Attributes:
+        role: system, user, assistant or tool.
+        calls: of the assistant. answers: the call whose result this is, of role tool.
+    """
+
+    role: str
+    content: str
+    calls: tuple[ToolCall, ...] = ()
+    answers: ToolCall | None = None
+
+
+class Endpoint(Protocol):
+    """A language model."""
+
+    async def answer(
+        self, messages: Sequence[Message], tools: list[dict[str, Any]], on_text: Callable[[str], None]
+    ) -> Message:
+        """Answer a conversation. `on_text` gets the pieces of text as they come. Raises LanguageError."""
+
+
+def endpoint_of(url: str, model: str, *, key: str | None = None, timeout_s: float = 120.0) -> Endpoint:
+    """The model at an address: OpenAI's format where its path ends with /v1, else Ollama's.
+
+    Raises:
+        LanguageError: the extra `llm` is not installed.
+    """
+    try:
+        import ollama  # noqa: F401
+    except ImportError as error:
+        raise LanguageError(
+            f"a language model needs the extra `llm`: pip install '.[llm]' ({error})"
+        ) from None
+    kind = OpenAIEndpoint if url.rstrip("/").endswith("/v1") else OllamaEndpoint
+    return kind(url.rstrip("/"), model, key, timeout_s)
+
+
+@dataclass(frozen=True, slots=True)
+class OllamaEndpoint:
+    """Ollama, by its own client."""
+
+    url: str
+    model: str
+    key: str | None
+    timeout_s: float
+
+    async def answer(
+        self, messages: Sequence[Message], tools: list[dict[str, Any]], on_text: Callable[[str], None]
+    ) -> Message:
+        import ollama
+
+        client = ollama.AsyncClient(host=self.url, headers=_headers(self.key), timeout=self.timeout_s)
+        written = [_for_ollama(message) for message in messages]
+        answer = _Answer(on_text)
+        async with _readable(self, f"`ollama pull {self.model}`"):
+            async for part in await client.chat(self.model, written, tools=tools, stream=True):
+                answer.add_text(part.message.content or "")
+                for call in part.message.tool_calls or ():
+                    answer.add_call(ToolCall(call.function.name, dict(call.function.arguments)))
+                answer.whole = answer.whole or bool(part.done)
+        return answer.message(self.url)
+
+
+@dataclass(frozen=True, slots=True)
+class OpenAIEndpoint:
+    """Any server of OpenAI's chat completions: llama.cpp, vLLM, LM Studio, …"""
+
+    url: str
+    model: str
+    key: str | None
+    timeout_s: float
+
+    async def answer(
+        self, messages: Sequence[Message], tools: list[dict[str, Any]], on_text: Callable[[str], None]
+    ) -> Message:
+        import httpx
+
+        body = {
+            "model": self.model,
+            "messages": [_for_openai(message) for message in messages],
+            "tools": tools,
+            "stream": True,
+        }
+        answer, calls = _Answer(on_text), dict[int, dict[str, str]]()
+        async with (
+            _readable(self, "check language.model and language.url"),
+            httpx.AsyncClient(headers=_headers(self.key), timeout=self.timeout_s) as client,
+            client.stream("POST", f"{self.url}/chat/completions", json=body) as response,
+        ):
+            if response.is_error:
+                await response.aread()
+                response.raise_for_status()
+            async for line in response.aiter_lines():
+                data = line.removeprefix("data:").strip()
+                if not line.startswith("data:"):
+                    continue
+                if data == "[DONE]":
+                    answer.whole = True
+                    break
+                for choice in json.loads(data)["choices"][:1]:
+                    delta = choice.get("delta") or {}
+                    answer.add_text(delta.get("content") or "")
+                    for part in delta.get("tool_calls") or ():
+                        _add_part(calls, part)
+                    answer.whole = answer.whole or choice.get("finish_reason") is not None
+            for call in calls.values():
+                answer.add_call(ToolCall(call["name"], _object(call["arguments"]), call["id"]))
+        return answer.message(self.url)
+
+
+class _Answer:
+    """An answer as it comes; bounded, since a model may repeat itself without an end."""
+
+    def __init__(self, on_text: Callable[[str], None]) -> None:
+        self._on_text = on_text
+        self._text, self._calls = "", list[ToolCall]()
+        self.whole = False
+
+    def add_text(self, piece: str) -> None:
+        if len(self._text) + len(piece) > MAX_ANSWER_CHARACTERS:
+            raise LanguageError(f"the model's answer has more than {MAX_ANSWER_CHARACTERS} characters")
+        self._text += piece
+        if piece:
+            self._on_text(piece)
+
+    def add_call(self, call: ToolCall) -> None:
+        if len(self._calls) >= MAX_CALLS:
+            raise LanguageError(f"the model's answer has more than {MAX_CALLS} calls")
+        self._calls.append(call)
+
+    def message(self, url: str) -> Message:
+        if not self.whole:
+            raise LanguageError(f"{url}: the connection was lost during the answer")
+        return Message("assistant", self._text, tuple(self._calls))
+
+
+@asynccontextmanager
+async def _readable(endpoint: OllamaEndpoint | OpenAIEndpoint, advice: str) -> AsyncIterator[None]:
+    """Turn every error of an exchange into one line."""
+    import httpx
+    import ollama
+
+    url = endpoint.url
+    try:
+        async with asyncio.timeout(endpoint.timeout_s):
+            yield
+    except (TimeoutError, httpx.TimeoutException):
+        raise LanguageError(
+            f"{url}: no whole answer within {endpoint.timeout_s:g} s (language.timeout_s); try a smaller model"
+        ) from None
+    except (ConnectionError, httpx.ConnectError):
+        raise LanguageError(
+            f"no language model at {url}: start Ollama with `ollama serve`, or set language.url"
+        ) from None
+    except httpx.TransportError as error:
+        raise LanguageError(f"{url}: the connection was lost during the answer: {error}") from None
+    except httpx.InvalidURL as error:
+        raise LanguageError(f"language.url: {url!r} is not valid: {error}") from None
+    except (ollama.ResponseError, httpx.HTTPStatusError) as error:
+        raise LanguageError(_status_text(error, endpoint, advice)) from None
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        first = str(error).splitlines()[0] if str(error) else ""
+        raise LanguageError(
+            f"{url}: the answer is not in the expected format ({type(error).__name__}: {first[:120]}); "
+            "language.url ends with /v1 for OpenAI's format"
+        ) from None
+
+
+def _status_text(error: Any, endpoint: OllamaEndpoint | OpenAIEndpoint, advice: str) -> str:
+    response = getattr(error, "response", None)
+    status = error.status_code if response is None else response.status_code
+    reason = " ".join(str(error.error if response is None else response.text).split())[:200]
+    if status == 404:
+        return f"{endpoint.url}: model {endpoint.model!r} is not there: {advice} ({reason})"
+    if status in (401, 403):
+        return f"{endpoint.url}: access denied ({status}): set language.key_file"
+    return f"{endpoint.url}: the server answered {status}: {reason}"
+
+
+def _headers(key: str | None) -> dict[str, str]:
+    return {} if key is None else {"Authorization": f"Bearer {key}"}
+
+
+def _for_ollama(message: Message) -> dict[str, Any]:
+    written: dict[str, Any] = {"role": message.role, "content": message.content}
+    if message.calls:
+        written["tool_calls"] = [
+            {"function": {"name": call.name, "arguments": _mapping(call.arguments)}} for call in message.calls
+        ]
+    if message.answers is not None:
+        written["tool_name"] = message.answers.name
+    return written
+
+
+def _for_openai(message: Message) -> dict[str, Any]:
+    written: dict[str, Any] = {"role": message.role, "content": message.content}
+    if message.calls:
+        written["tool_calls"] = [
+            {
+                "id": call.identifier,
+                "type": "function",
+                "function": {"name": call.name, "arguments": json.dumps(_mapping(call.arguments))},
+            }
+            for call in message.calls
+        ]
+    if message.answers is not None:
+        written["tool_call_id"] = message.answers.identifier
+    return written
+
+
+def _mapping(arguments: Any) -> dict[str, Any]:
+    """The arguments for the history, where servers require an object."""
+    return arguments if isinstance(arguments, dict) else {}
+
+
+def _add_part(calls: dict[int, dict[str, str]], part: dict[str, Any]) -> None:
+    """Add a piece of a call, by its index; name and arguments come in pieces."""
+    call = calls.setdefault(part.get("index", 0), {"id": "", "name": "", "arguments": ""})
+    call["id"] = part.get("id") or call["id"]
+    function = part.get("function") or {}
+    call["name"] += function.get("name") or ""
+    call["arguments"] += function.get("arguments") or ""
+
+
+def _object(text: str) -> Any:
+    """The arguments of a call; the text itself where it is not JSON, which `read_call` refuses."""
+    try:
+        return json.loads(text or "{}")
+    except ValueError:
+        return text

@@ -1,0 +1,175 @@
+"""The vehicle of a conversation, through the asyncio client of its service."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+from contextlib import suppress
+from dataclasses import replace
+from typing import Any, TypeVar
+
+import zenoh
+
+from companion.bus import topics
+from companion.bus.bodies import DetectionBody, DetectionsBody
+from companion.client import CommandFailedError, Drone, Stream
+from companion.client.commands import Reply
+from companion.language.scene import Scene, SceneObject
+
+T = TypeVar("T")
+
+_STATE_S = 2.0
+# The kept events arrive within this.
+_EVENTS_S = 0.3
+# An image and the detections of the same frame: so many frames may lie between their messages.
+_FRAMES = 30
+
+
+class LiveVehicle:
+    """One vehicle. `camera`: the steering one."""
+
+    def __init__(self, drone: Drone, class_names: tuple[str, ...], camera: str | None) -> None:
+        self._drone, self._class_names, self._camera = drone, class_names, camera
+
+    async def command(self, text: str) -> Reply:
+        """Send a command and wait for its reply; a refused one is a reply too."""
+        try:
+            return await self._drone.command(text)
+        except CommandFailedError as error:
+            return error.reply
+
+    async def scene(self) -> Scene:
+        """The objects of the newest frame with an image, and the vehicle's pose."""
+        vehicle, (detections, colours) = await asyncio.gather(
+            _next(self._drone.vehicle(), _STATE_S), self._detections()
+        )
+        yaw_rad = None if vehicle is None else vehicle["yaw_rad"]
+        objects = tuple(
+            replace(_object(each, yaw_rad), colour=colour)
+            for each, colour in zip(detections, colours, strict=True)
+        )
+        height_m = None if vehicle is None else vehicle["altitude_m"]
+        return Scene(self._class_names, objects, yaw_rad, height_m)
+
+    async def state(self) -> dict[str, Any]:
+        """Facts in plain words and numbers; null where unknown."""
+        vehicle, status, warnings = await asyncio.gather(
+            _next(self._drone.vehicle(), _STATE_S),
+            _next(self._drone.status(), _STATE_S),
+            self._warnings(),
+        )
+        if vehicle is None or status is None:
+            return {"error": "no state received from the service", "warnings": warnings}
+        position, home, yaw_rad = vehicle["position_ned_m"], vehicle["home_ned_m"], vehicle["yaw_rad"]
+        charge = vehicle["battery_fraction"]
+        known = position is not None and home is not None
+        return {
+            "mode": vehicle["mode"],
+            "armed": vehicle["armed"],
+            "connected": vehicle["connected"],
+            "height_above_home_m": _rounded(vehicle["altitude_m"]),
+            "north_of_home_m": _rounded(position[0] - home[0]) if position and home and known else None,
+            "east_of_home_m": _rounded(position[1] - home[1]) if position and home and known else None,
+            "heading_deg": None if yaw_rad is None else round(math.degrees(yaw_rad)) % 360,
+            "battery_percent": None if charge is None else round(100 * charge),
+            "command": status["pilot"]["behaviour"],
+            "in_command": status["pilot"]["in_command"],
+            "camera": status["perception"]["state"],
+            "warnings": warnings,
+        }
+
+    async def _warnings(self) -> list[str]:
+        texts: list[str] = []
+        stream = self._drone.events()
+        try:
+            async with asyncio.timeout(_EVENTS_S):
+                async for event in stream:
+                    if event["level"] != "info":
+                        texts.append(event["text"])
+        except TimeoutError:
+            return texts[-5:]
+        finally:
+            stream.close()
+        return texts[-5:]
+
+    async def _detections(self) -> tuple[list[DetectionBody], list[str | None]]:
+        """The detections of a frame and their colours by its image; without an image, None for each."""
+        frames = self._drone.detections(self._camera, size=_FRAMES)
+        received: dict[int, DetectionsBody] = {}
+        jpegs: dict[int, bytes] = {}
+        newest: list[DetectionBody] = []
+        subscriber = self._images(jpegs)
+        try:
+            async with asyncio.timeout(_STATE_S):
+                async for frame in frames:
+                    received[frame["sequence"]] = frame
+                    newest = frame["detections"]
+                    if not newest:
+                        return [], []
+                    if common := received.keys() & jpegs.keys():
+                        both = received[max(common)]
+                        colours = await asyncio.to_thread(_colours, jpegs[max(common)], both)
+                        return both["detections"], colours
+        except TimeoutError:
+            return newest, [None] * len(newest)
+        finally:
+            frames.close()
+            subscriber.undeclare()  # type: ignore[no-untyped-call]
+        return newest, [None] * len(newest)
+
+    def _images(self, jpegs: dict[int, bytes]) -> zenoh.Subscriber[None]:
+        """Collect preview images by the number of their frame."""
+        loop = asyncio.get_running_loop()
+
+        def receive(sample: zenoh.Sample) -> None:
+            if sample.attachment is not None:
+                number = json.loads(sample.attachment.to_string())["sequence"]
+                with suppress(RuntimeError):  # the loop is closed
+                    loop.call_soon_threadsafe(jpegs.__setitem__, number, sample.payload.to_bytes())
+
+        key = topics.IMAGE.key(self._drone.name, self._camera)
+        return self._drone.session.declare_subscriber(key, receive)
+
+
+async def _next(stream: Stream[T], timeout_s: float) -> T | None:
+    """The next message; None: there was none in time."""
+    try:
+        async with asyncio.timeout(timeout_s):
+            return await anext(stream)
+    except TimeoutError:
+        return None
+    finally:
+        stream.close()
+
+
+def _object(detection: DetectionBody, yaw_rad: float | None) -> SceneObject:
+    bearing_rad = detection["bearing_rad"]
+    nose_deg = None
+    if bearing_rad is not None and yaw_rad is not None:
+        nose_deg = round(math.degrees(math.remainder(bearing_rad - yaw_rad, math.tau)), 1)
+    return SceneObject(
+        detection["class_name"],
+        detection["track_id"],
+        range_m=_rounded(detection["ground_range_m"]),
+        bearing_deg=nose_deg,
+    )
+
+
+def _colours(jpeg: bytes, frame: DetectionsBody) -> list[str | None]:
+    """The colour of each detection. The preview may be smaller than the frame."""
+    import cv2
+    import numpy as np
+
+    from vision.colour import colour_of
+
+    image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+    if image is None:
+        return [None] * len(frame["detections"])
+    scale = image.shape[1] / frame["width"]
+    pixels = image.astype(np.uint8, copy=False)
+    return [colour_of(pixels, [edge * scale for edge in each["xyxy"]]) for each in frame["detections"]]
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(value, 1)

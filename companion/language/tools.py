@@ -1,0 +1,101 @@
+"""The functions that a language model may call: the command table and the questions, as JSON Schema."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from companion.guidance.command import Command, GrammarError
+from companion.guidance.grammar import parse
+from companion.language.sentences import QUESTIONS, Question
+
+_QUESTION_HELP = {
+    "seen": "the objects in the camera's newest image: class, track, colour, range and bearing from the nose",
+    "battery": "the battery's charge, percent",
+    "state": "flight mode, whether armed, height, position and the active command",
+    "why_not": "why the newest command was refused or ended, and the newest warnings",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class ToolCall:
+    """A call as the model wrote it: nothing is checked. `identifier`: of OpenAI's format, else empty."""
+
+    name: str
+    arguments: Any
+    identifier: str = ""
+
+
+def tools_of(schema: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The tools in the format that Ollama and OpenAI share.
+
+    Args:
+        schema: what the queryable `commands` answers (`grammar.json_schema`).
+    """
+    tools = []
+    for word, command in schema["$defs"].items():
+        described = command["description"]
+        if exclusive := [key for each in command.get("oneOf", ()) for key in each["required"]]:
+            described += f". Give exactly one of {', '.join(exclusive)}"
+        properties = {key: _property(value) for key, value in command["properties"].items()}
+        parameters = {
+            "type": "object",
+            "properties": properties,
+            "required": command["required"],
+            "additionalProperties": False,
+        }
+        tools.append(_tool(word, described, parameters))
+    seen = {"class": {"type": "string", "description": "only this class"}}
+    for name in QUESTIONS:
+        parameters = {"type": "object", "properties": seen if name == "seen" else {}, "required": []}
+        tools.append(_tool(name, _QUESTION_HELP[name], parameters))
+    return tools
+
+
+def class_names_of(schema: Mapping[str, Any]) -> tuple[str, ...] | None:
+    """The detector's classes in the schema of the commands; None: not known."""
+    names = schema["$defs"].get("seek", {}).get("properties", {}).get("class", {}).get("enum")
+    return None if names is None else tuple(map(str, names))
+
+
+def read_call(call: ToolCall, class_names: Sequence[str] | None) -> Command | Question:
+    """Check a call by the grammar.
+
+    Raises:
+        GrammarError: an unknown tool or argument, a wrong type, a value out of its range.
+    """
+    arguments = {} if call.arguments is None else call.arguments
+    if not isinstance(arguments, Mapping):
+        raise GrammarError(f"{call.name}: the arguments must be an object, got {str(call.arguments)[:80]!r}")
+    given = {key: value for key, value in arguments.items() if value is not None}
+    if call.name in QUESTIONS:
+        about = given.get("class", "")
+        return Question(call.name, about if isinstance(about, str) else "")
+    if not isinstance(call.name, str) or len(call.name.split()) != 1:
+        raise GrammarError(f"unknown tool {str(call.name)[:80]!r}")
+    return parse(" ".join([call.name, *(_written(call.name, *item) for item in given.items())]), class_names)
+
+
+def _written(name: str, key: Any, value: Any) -> str:
+    if not isinstance(key, str) or not key.replace("_", "").isalpha() or not key.isascii():
+        raise GrammarError(f"{name}: unknown argument {str(key)[:40]!r}")
+    if isinstance(value, bool) or not isinstance(value, str | int | float):
+        raise GrammarError(f"{name}: {key} must be a number or a text, got {str(value)[:40]!r}")
+    text = value if isinstance(value, str) else repr(value)
+    return f'{key}="' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+
+
+def _property(schema: Mapping[str, Any]) -> dict[str, Any]:
+    """Without keys that are not JSON Schema's; the unit goes into the description."""
+    described = dict(schema)
+    if unit := described.pop("unit", None):
+        described["description"] += f", {unit}"
+    return described
+
+
+def _tool(name: str, description: str, parameters: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "type": "function",
+        "function": {"name": name, "description": description, "parameters": parameters},
+    }

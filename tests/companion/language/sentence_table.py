@@ -1,0 +1,186 @@
+"""Sentences with the commands and questions that they mean, in the scene of `SCENE`."""
+
+from __future__ import annotations
+
+import math
+
+from companion.guidance.grammar import parse
+from companion.language.scene import Scene, SceneObject
+
+CLASSES = ("person", "bicycle", "car", "truck", "bus", "boat", "dog", "cat", "traffic light")
+SCENE = Scene(
+    CLASSES,
+    (
+        SceneObject("car", 3, "red", 12.0, -20.0),
+        SceneObject("car", 5, "blue", 20.0, 10.0),
+        SceneObject("person", 7, "yellow", 8.0, 2.0),
+    ),
+    yaw_rad=math.pi / 2,
+    altitude_m=5.0,
+    last=parse("orbit boat radius=10"),
+)
+
+# Commands as in docs/flight.md; ?name: a question about the vehicle.
+SENTENCES: tuple[tuple[str, tuple[str, ...]], ...] = (
+    # take-off, landing, return, stop
+    ("Take off.", ("takeoff",)),
+    ("take off to five metres", ("takeoff altitude=5",)),
+    ("Please take off and climb to 12 m", ("takeoff altitude=12",)),
+    ("launch to two and a half meters", ("takeoff",)),
+    ("could you take off to twenty feet please", ("takeoff altitude=6.096",)),
+    ("take off to one point five metres", ("takeoff altitude=1.5",)),
+    ("lift off", ("takeoff",)),
+    ("land", ("land",)),
+    ("land here now", ("land",)),
+    ("touch down", ("land",)),
+    ("come down and land", ("land",)),
+    ("land on marker 17", ("land-on-marker id=17",)),
+    ("land on marker number twelve", ("land-on-marker id=12",)),
+    ("come home", ("rtl",)),
+    ("return to launch", ("rtl",)),
+    ("go back home", ("rtl",)),
+    ("fly home and land", ("rtl", "land")),
+    ("Stop!", ("stop",)),
+    ("halt now", ("stop",)),
+    ("abort", ("stop",)),
+    ("please stop", ("stop",)),
+    # hold
+    ("hold", ("hold",)),
+    ("stay where you are", ("hold",)),
+    ("hover for ten seconds", ("hold duration=10",)),
+    ("wait two minutes", ("hold duration=120",)),
+    ("hold your position for half a minute", ("hold duration=30",)),
+    # moves
+    ("go ten metres forward", ("goto forward=10 right=0",)),
+    ("fly forward by 3.5 m", ("goto forward=3.5 right=0",)),
+    ("move back two metres", ("goto forward=-2 right=0",)),
+    ("back up four metres", ("goto forward=-4 right=0",)),
+    ("go to the left by 6 metres", ("goto forward=0 right=-6",)),
+    ("fly twenty five metres to the right at two metres per second", ("goto forward=0 right=25 speed=2",)),
+    ("fly a hundred metres ahead", ("goto forward=100 right=0",)),
+    ("go ten metres east", ("goto forward=10 right=0",)),
+    ("fly 10 m north", ("goto forward=0 right=-10",)),
+    ("fly to 30 metres north of home", ("goto north=30 east=0",)),
+    ("go 20 metres north and 15 metres west of home", ("goto north=20 east=-15",)),
+    ("go up three metres", ("goto forward=0 right=0 altitude=8",)),
+    ("descend by two metres", ("goto forward=0 right=0 altitude=3",)),
+    ("climb to fifteen metres", ("goto forward=0 right=0 altitude=15",)),
+    ("go down to 3 m", ("goto forward=0 right=0 altitude=3",)),
+    ("fly at 30 metres altitude", ("goto forward=0 right=0 altitude=30",)),
+    ("turn left 90 degrees", ("goto forward=0 right=0 heading=0",)),
+    ("turn around", ("goto forward=0 right=0 heading=270",)),
+    ("face south", ("goto forward=0 right=0 heading=180",)),
+    ("fly a figure eight", ("figure-eight",)),
+    ("fly a figure of eight with a radius of fifteen metres three times", ("figure-eight radius=15 laps=3",)),
+    # search
+    ("find a car", ("seek car",)),
+    ("look for people", ("seek person",)),
+    ("search for a traffic light", ('seek class="traffic light"',)),
+    ("locate the boat", ("seek boat",)),
+    ("find someone", ("seek person",)),
+    ("look for a lorry", ("seek truck",)),
+    ("find a bike", ("seek bicycle",)),
+    ("find the red car", ("?seen car",)),
+    ("find the green car", ("seek car",)),
+    # approach
+    ("approach the person", ("approach person",)),
+    ("approach the red car", ("approach track=3",)),
+    ("go to the blue car", ("approach track=5",)),
+    ("fly to the nearest car", ("approach track=3",)),
+    ("fly to the farthest car", ("approach track=5",)),
+    ("approach the left car to within four metres", ("approach track=3 distance=4",)),
+    ("get closer to the car on the right", ("approach track=5",)),
+    ("approach a vehicle", ("approach car",)),
+    ("go to marker 9 and stop", ("approach marker=9", "stop")),
+    ("approach track 12 at 1 m/s", ("approach track=12 speed=1",)),
+    ("go near the person, distance 3 m", ("approach person distance=3",)),
+    # follow
+    ("follow the person", ("follow person",)),
+    ("chase the blue car at 15 metres", ("follow track=5 distance=15",)),
+    ("follow the dog for two minutes", ("follow dog duration=120",)),
+    ("follow the person from behind at six metres", ("follow person distance=6 bearing=course",)),
+    ("follow any car", ("follow car",)),
+    ("keep following it", ("follow boat",)),
+    ("track the yellow person", ("follow track=7",)),
+    ("follow the person at ten kilometres per hour", ("follow person speed=2.77778",)),
+    ("follow that blue one", ("follow track=5",)),
+    ("follow the left one", ("follow track=3",)),
+    # orbit
+    ("circle", ("orbit",)),
+    ("circle it", ("orbit boat",)),
+    ("circle the red car at ten metres", ("orbit track=3",)),
+    ("orbit the person twice at 6 m", ("orbit person radius=6 laps=2",)),
+    ("fly around the boat counterclockwise", ("orbit boat direction=counterclockwise",)),
+    (
+        "circle around track 5 once at 2.5 m/s with a radius of 12 metres",
+        ("orbit track=5 radius=12 laps=1 speed=2.5",),
+    ),
+    ("fly in a circle of 8 metres", ("orbit radius=8",)),
+    # changes
+    ("twice as far", ("orbit boat radius=20",)),
+    ("half as far", ("orbit boat radius=5",)),
+    ("twice as close", ("orbit boat radius=5",)),
+    ("five metres closer", ("orbit boat radius=5",)),
+    ("go three metres further away", ("orbit boat radius=13",)),
+    ("keep fifteen metres", ("orbit boat radius=15",)),
+    ("twice as fast", ("orbit boat speed=4",)),
+    ("the other way round", ("orbit boat direction=counterclockwise",)),
+    ("do it again", ("orbit boat",)),
+    # camera
+    ("look down", ("gimbal pitch=-90",)),
+    ("look 30 degrees down", ("gimbal pitch=-30",)),
+    ("point the camera at the person", ("gimbal track=7",)),
+    ("look ahead", ("gimbal",)),
+    ("turn the camera left 45 degrees", ("gimbal yaw=-45",)),
+    # several
+    ("find the red car and circle it at ten metres", ("orbit track=3",)),
+    ("find a boat and circle it twice at twelve metres", ("seek boat", "orbit boat radius=12 laps=2")),
+    (
+        "take off to 5 m, look for a person, then approach it",
+        ("takeoff altitude=5", "seek person", "approach person"),
+    ),
+    (
+        "take off, go ten metres forward, wait five seconds, come home",
+        ("takeoff", "goto forward=10 right=0", "hold duration=5", "rtl"),
+    ),
+    (
+        "find a truck, follow it for one minute and then return home",
+        ("seek truck", "follow truck duration=60", "rtl"),
+    ),
+    # questions
+    ("what do you see?", ("?seen",)),
+    ("What is in view?", ("?seen",)),
+    ("where is the car?", ("?seen car",)),
+    ("how far away is the person?", ("?seen person",)),
+    ("do you see any people?", ("?seen person",)),
+    ("how much battery is left?", ("?battery",)),
+    ("battery", ("?battery",)),
+    ("how high are you?", ("?state",)),
+    ("what are you doing?", ("?state",)),
+    ("status", ("?state",)),
+    ("why not?", ("?why_not",)),
+    ("why did you stop?", ("?why_not",)),
+)
+
+# Sentences that are ambiguous, or that no command expresses; and a word of the question back.
+UNCLEAR: tuple[tuple[str, str], ...] = (
+    ("follow the car", "which car"),
+    ("approach", "which object"),
+    ("find the unicorn", "unicorn"),
+    ("go up", "how many metres"),
+    ("go left", "how many metres"),
+    ("look up", "how many degrees"),
+    ("follow the person but never go above ten metres", "but never"),
+    ("circle the purple dog unless it barks", "unless"),
+    ("find an animal", "which animal"),
+    ("look for a dog or a plane", "plane"),
+    ("move away from the person", "away from"),
+    ("do not land", "begin with a verb"),
+    ("never follow the person", "begin with a verb"),
+    ("follow the one", "which one"),
+    ("closer", "how many metres"),
+    ("make me a sandwich", "begin with a verb"),
+    ("biggest car", "begin with a verb"),
+    ("approach the biggest car", "which is the biggest"),
+    ("do a barrel roll", "begin with a verb"),
+)

@@ -1,0 +1,106 @@
+"""Plain sentences to commands, without a model."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from companion.guidance.command import GrammarError
+from companion.guidance.grammar import parse
+from companion.language.numbers_in_words import with_numbers
+from companion.language.scene import SceneObject
+from companion.language.sentences import UnclearError, is_stop, understand
+from sentence_table import CLASSES, SCENE, SENTENCES, UNCLEAR
+
+
+def test_table_has_a_hundred_sentences() -> None:
+    assert len({text for text, _ in SENTENCES}) >= 100
+
+
+@pytest.mark.parametrize(("text", "expected"), SENTENCES, ids=[text for text, _ in SENTENCES])
+def test_sentence_means_these_commands(text: str, expected: tuple[str, ...]) -> None:
+    written = tuple(str(intent) for intent in understand(text, SCENE).intents)
+    assert written == tuple(word if word.startswith("?") else str(parse(word)) for word in expected)
+
+
+@pytest.mark.parametrize(("text", "word"), UNCLEAR, ids=[text for text, _ in UNCLEAR])
+def test_unclear_sentence_is_asked_back(text: str, word: str) -> None:
+    with pytest.raises(UnclearError) as caught:
+        understand(text, SCENE)
+    assert word in str(caught.value).lower()
+    assert "\n" not in str(caught.value)
+
+
+def test_vehicle_is_the_class_in_view_or_asked_back() -> None:
+    assert str(understand("find a vehicle", SCENE).intents[0]) == "seek car"
+    with pytest.raises(UnclearError, match="car or truck or bus"):
+        understand("find a vehicle", replace(SCENE, objects=()))
+
+
+def test_unseen_colour_is_searched_for_once() -> None:
+    text = "take off to 5 m, find the white truck and circle it"
+    first = understand(text, SCENE)
+    assert [str(each) for each in first.intents] == ["takeoff altitude=5", "seek truck"]
+    assert first.again
+    seen = replace(SCENE, objects=(SceneObject("truck", 9, "white"),))
+    assert str(understand(text, seen, searched=True).intents[-1]) == "orbit track=9"
+    with pytest.raises(UnclearError, match="red car"):
+        understand(text, SCENE, searched=True)
+
+
+def test_a_condition_no_command_expresses_is_not_dropped() -> None:
+    with pytest.raises(UnclearError):
+        understand("find the purple dog unless it barks", SCENE)
+
+
+def test_value_out_of_range_is_the_grammars_error() -> None:
+    with pytest.raises(GrammarError, match="altitude"):
+        understand("take off to nine hundred metres", SCENE)
+
+
+def test_unknown_height_and_heading_are_asked_back() -> None:
+    blind = replace(SCENE, altitude_m=None, yaw_rad=None, last=None)
+    for text in (
+        "go up three metres",
+        "go ten metres east",
+        "turn left",
+        "twice as far",
+        "circle it twice at 3 m",
+    ):
+        with pytest.raises(UnclearError):
+            understand(text, replace(blind, objects=()))
+
+
+@pytest.mark.parametrize("text", ["stop", "STOP!", "please stop", "Stop now.", "halt", "abort", "freeze!"])
+def test_stop_is_recognized_alone(text: str) -> None:
+    assert is_stop(text)
+
+
+@pytest.mark.parametrize("text", ["do not stop", "why did you stop?", "stop at the car", "stopped", ""])
+def test_other_sentences_are_not_stop(text: str) -> None:
+    assert not is_stop(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("two hundred and five metres", "205 m"),
+        ("a hundred feet", "30.48 m"),
+        ("one point two five km", "1250 m"),
+        ("thirty-six kilometres per hour", "10 m/s"),
+        ("a minute and a half", "90 s"),
+        ("half a minute", "30 s"),
+        ("twice as far", "twice as far"),
+        ("twice", "2 x"),
+        ("forty five degrees", "45 deg"),
+    ],
+)
+def test_numbers_and_units_in_words(text: str, expected: str) -> None:
+    assert with_numbers(text) == expected
+
+
+def test_every_class_has_a_singular_and_a_plural() -> None:
+    for name in CLASSES:
+        assert str(understand(f"look for a {name}", SCENE).intents[0]) == str(parse(f"seek {name}"))
+    assert str(understand("look for buses", SCENE).intents[0]) == "seek bus"
