@@ -53,7 +53,6 @@ def ask(
 def _check_may(settings: Settings) -> None:
     """Raise ValueError for a command that does not exist."""
     from companion.guidance.command import COMMANDS, nearest
-    from companion.guidance.grammar import parse  # noqa: F401  registers the commands
 
     for word in settings.language.may:
         if word not in COMMANDS:

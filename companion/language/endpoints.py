@@ -73,7 +73,7 @@ class OllamaEndpoint:
     ) -> Message:
         import ollama
 
-        client = ollama.AsyncClient(host=self.url, headers=_headers(self.key), timeout=self.timeout_s)
+        client = ollama.AsyncClient(host=self.url, **_options(self))
         written = [_for_ollama(message) for message in messages]
         answer = _Answer(on_text)
         async with _readable(self, f"`ollama pull {self.model}`"):
@@ -108,7 +108,7 @@ class OpenAIEndpoint:
         answer, calls = _Answer(on_text), dict[int, dict[str, str]]()
         async with (
             _readable(self, "check language.model and language.url"),
-            httpx.AsyncClient(headers=_headers(self.key), timeout=self.timeout_s) as client,
+            httpx.AsyncClient(**_options(self)) as client,
             client.stream("POST", f"{self.url}/chat/completions", json=body) as response,
         ):
             if response.is_error:
@@ -170,7 +170,8 @@ async def _readable(endpoint: OllamaEndpoint | OpenAIEndpoint, advice: str) -> A
             yield
     except (TimeoutError, httpx.TimeoutException):
         raise LanguageError(
-            f"{url}: no whole answer within {endpoint.timeout_s:g} s (language.timeout_s); try a smaller model"
+            f"{url}: no whole answer within {endpoint.timeout_s:g} s: try a smaller model, or a longer "
+            "language.timeout_s"
         ) from None
     except (ConnectionError, httpx.ConnectError):
         raise LanguageError(
@@ -201,8 +202,11 @@ def _status_text(error: Any, endpoint: OllamaEndpoint | OpenAIEndpoint, advice: 
     return f"{endpoint.url}: the server answered {status}: {reason}"
 
 
-def _headers(key: str | None) -> dict[str, str]:
-    return {} if key is None else {"Authorization": f"Bearer {key}"}
+def _options(endpoint: OllamaEndpoint | OpenAIEndpoint) -> dict[str, Any]:
+    """Options of httpx's client. Without https the certificates, which take 0.1 s, are not loaded."""
+    headers = {} if endpoint.key is None else {"Authorization": f"Bearer {endpoint.key}"}
+    verify = endpoint.url.startswith("https:")
+    return {"headers": headers, "timeout": endpoint.timeout_s, "verify": verify, "follow_redirects": False}
 
 
 def _for_ollama(message: Message) -> dict[str, Any]:

@@ -41,9 +41,8 @@ class LiveVehicle:
 
     async def scene(self) -> Scene:
         """The objects of the newest frame with an image, and the vehicle's pose."""
-        vehicle, (detections, colours) = await asyncio.gather(
-            _next(self._drone.vehicle(), _STATE_S), self._detections()
-        )
+        detections, colours = await self._detections()
+        vehicle = await _next(self._drone.vehicle(), _STATE_S)
         yaw_rad = None if vehicle is None else vehicle["yaw_rad"]
         objects = tuple(
             replace(_object(each, yaw_rad), colour=colour)
@@ -54,11 +53,9 @@ class LiveVehicle:
 
     async def state(self) -> dict[str, Any]:
         """Facts in plain words and numbers; null where unknown."""
-        vehicle, status, warnings = await asyncio.gather(
-            _next(self._drone.vehicle(), _STATE_S),
-            _next(self._drone.status(), _STATE_S),
-            self._warnings(),
-        )
+        warnings = await self._warnings()
+        vehicle = await _next(self._drone.vehicle(), _STATE_S)
+        status = await _next(self._drone.status(), _STATE_S)
         if vehicle is None or status is None:
             return {"error": "no state received from the service", "warnings": warnings}
         position, home, yaw_rad = vehicle["position_ned_m"], vehicle["home_ned_m"], vehicle["yaw_rad"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-# Everyday name → classes of COCO and of the bundled model. Those that the detector does not have are left out.
+# Everyday name → classes of COCO and of the bundled model. Those that the detector lacks are left out.
 _PEOPLE = "people man men woman women human humans someone somebody anyone anybody pedestrian pedestrians"
 SYNONYMS: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(_PEOPLE.split(), ("person",)),

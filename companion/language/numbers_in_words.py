@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+from functools import partial
 
-_SMALL = (
+_SMALL = re.findall(
+    r"\w+",
     "zero one two three four five six seven eight nine ten eleven twelve thirteen fourteen fifteen sixteen "
-    "seventeen eighteen nineteen"
-).split()
-_TENS = "twenty thirty forty fifty sixty seventy eighty ninety".split()
+    "seventeen eighteen nineteen",
+)
+_TENS = re.findall(r"\w+", "twenty thirty forty fifty sixty seventy eighty ninety")
 _VALUES = {word: index for index, word in enumerate(_SMALL)}
 _VALUES |= {word: 20 + 10 * index for index, word in enumerate(_TENS)}
 _WORD = "|".join(sorted(_VALUES, key=len, reverse=True))
@@ -48,10 +50,14 @@ def with_numbers(text: str) -> str:
     for pattern, unit, factor in _UNITS:
         text = re.sub(
             rf"{_NUMBER}[ -]?(?:{pattern})(?![\w/°])",
-            lambda found, unit=unit, factor=factor: f"{float(found[1]) * factor:.6g} {unit}",
+            partial(_in_unit, unit, factor),
             text,
         )
     return text
+
+
+def _in_unit(unit: str, factor: float, found: re.Match[str]) -> str:
+    return f"{float(found[1]) * factor:.6g} {unit}"
 
 
 def _value(words: str) -> int:

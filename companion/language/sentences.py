@@ -36,7 +36,7 @@ class Question:
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """What a sentence asks for, in order. `again`: read it again afterwards: the object must be found first."""
+    """What a sentence asks for, in order. `again`: read it again afterwards: it needs the object in view."""
 
     intents: tuple[Command | Question, ...]
     again: bool = False
@@ -66,7 +66,9 @@ _VERBS = (
 _SPLIT = re.compile(
     rf"(?:[,;.]? (?:and then|then|after that|afterwards|and)|[,;.]) (?=(?:please )?(?:{_VERBS})\b)"
 )
-_FILLERS = frozenset("the a an that this of to at in on it me us there here please now with for".split())
+_FILLERS = frozenset(
+    re.findall(r"\w+", "the a an that this of to at in on it me us there here please now with for")
+)
 _N = r"(-?\d+(?:\.\d+)?)"
 _TURN_BACK = {"left": -90.0, "right": 90.0, "around": 180.0, "round": 180.0}
 _COMPASS = {"north": 0.0, "east": 90.0, "south": 180.0, "west": 270.0}
@@ -147,15 +149,16 @@ def _question(text: str, scene: Scene) -> Question | None:
     if re.fullmatch(r"why(?: (?:not|did|do|does|will|can|cant|cannot|wont|didnt|dont|are|is)\b.*)?", text):
         return Question("why_not")
     if re.fullmatch(
-        r".*\b(?:how (?:much|is) (?:the |your )?(?:battery|charge|power).*|battery(?: level| state| left)?|charge left)",
+        r".*\b(?:how (?:much|is) (?:the |your )?(?:battery|charge|power).*|battery(?: level| state| left)?"
+        r"|charge left)",
         text,
     ):
         return Question("battery")
     if re.fullmatch(
-        r"(?:what(?: is| are)? (?:do )?(?:you|in view|there|visible|in sight)(?: can)?(?: see| seeing)?(?: now)?"
-        r"|what can you see(?: right)?(?: now)?|what is (?:in (?:front|view|sight)|there).*|report what you see)",
+        r"what (?:(?:do|can) you see|are you seeing|is visible)(?: right)?(?: now)?"
+        r"|what is (?:in (?:front|view|sight)|there).*|report what you see",
         text,
-    ) and text not in ("what are you", "what do you"):
+    ):
         return Question("seen")
     if found := re.fullmatch(
         r"(?:(?:can|do) you see|is there|are there|where (?:is|are)|how far(?: away)? (?:is|are)|how many"
@@ -165,8 +168,10 @@ def _question(text: str, scene: Scene) -> Question | None:
         names = classes_of(found["noun"], scene.class_names)
         return Question("seen", names[0] if len(names) == 1 else "")
     if re.fullmatch(
-        r"(?:how high|how fast|where) are you.*|what are you doing.*|(?:what is )?(?:the |your )?(?:state|status)"
-        r"|(?:what is )?your (?:altitude|height|speed|position|mode)|are you (?:flying|armed|ready|healthy|ok).*",
+        r"(?:how high|how fast|where) are you.*|what are you doing.*"
+        r"|(?:what is )?(?:the |your )?(?:state|status)"
+        r"|(?:what is )?your (?:altitude|height|speed|position|mode)"
+        r"|are you (?:flying|armed|ready|healthy|ok).*",
         text,
     ):
         return Question("state")
@@ -248,7 +253,9 @@ class _Clause:
             return self._same_object() if self.take(r"(?:it|that|them|him|her)") else {}
         names = classes_of(noun[0], self._scene.class_names)
         if len(names) > 1:
-            seen = [name for name in names if any(each.class_name == name for each in self._scene.objects)]
+            seen = tuple(
+                name for name in names if any(each.class_name == name for each in self._scene.objects)
+            )
             if len(seen) != 1:
                 raise UnclearError(f"which {noun[0]}: {' or '.join(seen or names)}?")
             names = seen
@@ -543,7 +550,7 @@ def _chosen(word: str, seen: Sequence[SceneObject]) -> SceneObject:
 _Handler = Callable[[_Clause, re.Match[str]], Command | Question]
 _HANDLERS: tuple[tuple[str, _Handler], ...] = (
     (
-        r"(?:make it |go |stay |be )?(twice|half|2 x) (?:as )?(?:the )?(far|close|distance|radius|fast|speed)",
+        r"(?:go |stay |be )?(twice|half|2 x) (?:as )?(?:the )?(far|close|distance|radius|fast|speed)",
         _Clause.scaled,
     ),
     (
@@ -566,7 +573,8 @@ _HANDLERS: tuple[tuple[str, _Handler], ...] = (
     (r"hold|hover|wait|stay", _Clause.hold),
     (r"fly (?:a )?figure (?:of )?(?:eight|8)|figure (?:of )?(?:eight|8)", _Clause.figure_eight),
     (
-        r"circle|orbit|(?:fly|go) (?:in )?(?:a )?circles?(?: (?:around|round|about))?|(?:fly|go) (?:around|round)",
+        r"circle|orbit|(?:fly|go) (?:in )?(?:a )?circles?(?: (?:around|round|about))?"
+        r"|(?:fly|go) (?:around|round)",
         _Clause.orbit,
     ),
     (r"follow|chase|tail|track(?! \d)|keep following", _Clause.follow),

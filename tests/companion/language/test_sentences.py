@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
+from sentence_table import CLASSES, SCENE, SENTENCES, UNCLEAR
 
 from companion.guidance.command import GrammarError
 from companion.guidance.grammar import parse
 from companion.language.numbers_in_words import with_numbers
 from companion.language.scene import SceneObject
 from companion.language.sentences import UnclearError, is_stop, understand
-from sentence_table import CLASSES, SCENE, SENTENCES, UNCLEAR
 
 
 def test_table_has_a_hundred_sentences() -> None:

@@ -1,0 +1,192 @@
+"""`companion ask` at a real bus over loopback: confirmation, stop, colours by the image, bad input."""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import os
+import socket
+import sys
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager
+from pathlib import Path
+from typing import Any, TextIO
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from companion.bench.lockstep_flight import plain_settings
+from companion.bus import topics
+from companion.bus.session import Bus
+from companion.cli import app
+from companion.cli.ask import _converse
+from companion.guidance.grammar import json_schema
+from companion.settings import ZenohSection
+from mavlink_sim.testing import free_port
+
+CLASSES = ("person", "car")
+BOXES = {3: (20.0, 40.0, 120.0, 100.0), 5: (180.0, 40.0, 280.0, 100.0)}
+
+
+class Service:
+    """The bus of a service that sees a red and a blue car. `orbit` flies until `stop`."""
+
+    def __init__(self) -> None:
+        self.endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+        self.commands: list[str] = []
+        self.flying, self.stopped = asyncio.Event(), asyncio.Event()
+        self.bus = Bus(
+            ZenohSection(listen=(self.endpoint,)),
+            "vehicle",
+            on_event=lambda *_: None,
+            on_command=self._execute,
+            queries={"commands": self._schema, "config": self._config},
+        )
+
+    async def _schema(self) -> Any:
+        return json_schema(CLASSES)
+
+    async def _config(self) -> Any:
+        return {"guidance": {"camera": None}}
+
+    async def _execute(self, text: str) -> dict[str, Any]:
+        self.commands.append(text)
+        if text == "stop":
+            self.stopped.set()
+        if text.startswith("orbit"):
+            self.flying.set()
+            await self.stopped.wait()
+        return {"command": text, "success": True, "reason": f"{text.split()[0]}: ended"}
+
+    async def publish(self) -> None:
+        """What the service sends, ten times a second."""
+        image = np.full((120, 160, 3), (60, 140, 80), np.uint8)  # half the frame's size
+        image[15:55, 5:65], image[15:55, 85:145] = (30, 25, 200), (200, 80, 30)
+        jpeg = cv2.imencode(".jpg", image)[1].tobytes()
+        for sequence in range(10_000):
+            common = {"class_name": "car", "bearing_rad": 1.6, "ground_range_m": 9.0}
+            objects = [{**common, "track_id": track, "xyxy": box} for track, box in BOXES.items()]
+            frame = {"sequence": sequence, "width": 320, "height": 240, "detections": objects}
+            self.bus.publish(topics.DETECTIONS, frame)
+            self.bus.publish(topics.VEHICLE, {"yaw_rad": 1.5, "altitude_m": 5.0})
+            self.bus.publish_large(
+                topics.IMAGE,
+                jpeg,
+                {"camera": None, "sequence": sequence, "captured_ns": 0, "annotated": False},
+            )
+            await asyncio.sleep(0.05)
+
+
+@asynccontextmanager
+async def service() -> AsyncIterator[Service]:
+    opened = Service()
+    await opened.bus.start()
+    publishing = asyncio.create_task(opened.publish())
+    try:
+        yield opened
+    finally:
+        publishing.cancel()
+        await opened.bus.close()
+
+
+async def ask(there: Service, sentence: str | None, **changes: str) -> bool:
+    settings = plain_settings(
+        {"vehicle.name": "vehicle"} | {key.replace("__", "."): value for key, value in changes.items()}
+    )
+    return await _converse(settings, None, sentence, there.endpoint)
+
+
+@contextmanager
+def keyboard(monkeypatch: pytest.MonkeyPatch) -> Iterator[TextIO]:
+    """Standard input as a pipe; what is written to it is typed."""
+    reading, writing = os.pipe()
+    with os.fdopen(reading) as standard_input, os.fdopen(writing, "w", buffering=1) as typed:
+        monkeypatch.setattr(sys, "stdin", standard_input)
+        yield typed
+        typed.close()
+
+
+async def shown(text: str, capsys: pytest.CaptureFixture[str]) -> str:
+    """Wait until a text is printed; everything printed until then."""
+    printed = ""
+    async with asyncio.timeout(20):
+        while text not in printed:
+            printed += capsys.readouterr().out
+            await asyncio.sleep(0.01)
+    return printed
+
+
+@pytest.mark.parametrize(("answer", "commands"), [("y", ["orbit track=3"]), ("n", [])])
+async def test_red_car_is_flown_to_if_confirmed(
+    answer: str, commands: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with keyboard(monkeypatch) as typed:
+        async with service() as there:
+            there.stopped.set()
+            asked = asyncio.create_task(ask(there, "find the red car and circle it at ten metres"))
+            assert "orbit track=3\n" in await shown("fly this?", capsys)
+            typed.write(f"{answer}\n")
+            assert await asyncio.wait_for(asked, 20) is bool(commands)
+            assert there.commands == commands
+
+
+@pytest.mark.parametrize("ahead", ["", "y\n"])  # an answer before the question confirms nothing
+async def test_nothing_is_flown_without_somebody_to_confirm(
+    ahead: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "stdin", io.StringIO(ahead))
+    async with service() as there:
+        assert not await ask(there, "circle the red car")
+    assert there.commands == []
+    assert "language.may" in capsys.readouterr().out
+
+
+async def test_stop_is_sent_while_the_vehicle_flies(monkeypatch: pytest.MonkeyPatch) -> None:
+    with keyboard(monkeypatch) as typed:
+        async with service() as there:
+            chat = asyncio.create_task(ask(there, None, language__may="orbit"))
+            typed.write("circle track 3\n")
+            await asyncio.wait_for(there.flying.wait(), 20)
+            typed.write("what do you see\nSTOP!\nquit\n")
+            assert await asyncio.wait_for(chat, 20) is True
+            assert there.commands[:2] == ["orbit track=3", "stop"]
+
+
+async def test_what_is_seen_has_colour_range_and_direction(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "stdin", io.StringIO(""))
+    async with service() as there:
+        assert await ask(there, "what do you see?")
+    where = "9 m away 6 deg to the right"
+    assert f"red car (track 3) {where}; blue car (track 5) {where}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (("--language-may", "fly"), "language.may"),
+        (("--language-url", "localhost"), "language.url"),
+        (("--language-model", "small", "--language-key-file", "missing"), "language.key_file"),
+        ((), "companion run"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(
+    flags: tuple[str, ...], words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    result = CliRunner().invoke(app, ["ask", "take off", "--connect", endpoint, *flags])
+    assert result.exit_code == 2
+    assert len(result.stderr.strip().splitlines()) == 1
+    assert words in result.stderr
+
+
+def test_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    from companion.language.endpoints import LanguageError, endpoint_of
+
+    monkeypatch.setitem(sys.modules, "ollama", None)
+    with pytest.raises(LanguageError, match=r"\[llm\]"):
+        endpoint_of("http://127.0.0.1:11434", "small")
