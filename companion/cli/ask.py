@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import sys
 import threading
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 
 ASK_SETTINGS = ("zenoh", "vehicle.name", "language", "plugins")
 EXIT_FAILED = 1
+_DETECTOR_S = 15.0
 _BANNER = "ask, or say what to fly; `stop` stops at once, `quit` ends"
 
 
@@ -87,8 +89,13 @@ async def _converse(
     where = client_settings(settings.zenoh, (connect,) if connect else ()).connect[0]
     terminal = Terminal()
     async with connect_to(where, settings.vehicle.name, config_file=settings.zenoh.config_file) as drone:
-        schema, config = await drone.query("commands"), await drone.query("config")
-        class_names = class_names_of(schema)
+        config = await drone.query("config")
+        until_s = time.monotonic() + (_DETECTOR_S if config["detector"]["enabled"] else 0.0)
+        # The classes are known when the detector has started.
+        while (class_names := class_names_of(schema := await drone.query("commands"))) is None:
+            if time.monotonic() >= until_s:
+                break
+            await asyncio.sleep(0.5)
         vehicle = LiveVehicle(drone, class_names or (), config["guidance"]["camera"])
         operator = Operator(terminal.write, terminal.show, terminal.confirm)
         conversation = Conversation(

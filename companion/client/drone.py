@@ -27,6 +27,7 @@ _STOP_TIMEOUT_S = 5.0
 # After `stop`, the outcome of the stopped command arrives within this.
 _STOPPED_WITHIN_S = 1.0
 _DISCOVERY_S = 2.0
+_QUERY_S = 10.0
 
 
 class CommandFailedError(RuntimeError):
@@ -189,14 +190,14 @@ class Drone(Commands):
         """Ask one of the queryables status, config, models, commands.
 
         Raises:
-            NoAnswerError: no answer within 2 s.
+            NoAnswerError: no answer within 10 s.
         """
 
         def ask() -> Any:
-            for reply in self._session.get(f"{topics.ROOT}/{self.name}/{path}", timeout=_DISCOVERY_S):
+            for reply in self._session.get(f"{topics.ROOT}/{self.name}/{path}", timeout=_QUERY_S):
                 if reply.ok is not None:
                     return json.loads(reply.ok.payload.to_string())
-            raise NoAnswerError(f"{path}: no answer from vehicle {self.name!r} within {_DISCOVERY_S:g} s")
+            raise NoAnswerError(f"{path}: no answer from vehicle {self.name!r} within {_QUERY_S:g} s")
 
         return await asyncio.to_thread(ask)
 

@@ -16,9 +16,10 @@ from typing import Any, Protocol
 from companion.client.commands import NOT_FLOWN, Reply
 from companion.guidance.command import Command, GrammarError
 from companion.guidance.missions.mission_file import Mission, describe, plan_from
+from companion.language.clauses import Question, UnclearError
 from companion.language.endpoints import Endpoint, Message
 from companion.language.scene import Scene, SceneObject
-from companion.language.sentences import Question, UnclearError, is_stop, understand
+from companion.language.sentences import is_stop, understand
 from companion.language.tools import read_call, tools_of
 
 MAX_TURNS = 8
@@ -113,22 +114,21 @@ class Conversation:
     # --- by patterns
 
     async def _ask_patterns(self, text: str) -> bool:
-        for searched in (False, True):
+        done: int | None = None
+        while True:
             scene = replace(await self._vehicle.scene(), last=self._last)
-            reading = understand(text, scene, searched=searched)
+            reading = understand(text, scene, done)
             commands = [intent for intent in reading.intents if isinstance(intent, Command)]
             for intent in reading.intents:
                 if isinstance(intent, Question):
                     self._operator.show(_in_words(intent, await self._answer(intent)))
-            if commands:
-                if reading.again:
-                    self._operator.show("not in view: search first")
-                reply = await self._propose(commands)
-                if not reply["success"]:
-                    return False
-            if not reading.again:
+            if reading.done is not None:
+                self._operator.show("not in view: search first")
+            if commands and not (await self._propose(commands))["success"]:
+                return False
+            if reading.done is None:
                 return True
-        return True
+            done = reading.done
 
     # --- by the model
 

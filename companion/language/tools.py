@@ -8,7 +8,7 @@ from typing import Any
 
 from companion.guidance.command import Command, GrammarError
 from companion.guidance.grammar import parse
-from companion.language.sentences import QUESTIONS, Question
+from companion.language.clauses import QUESTIONS, Question
 
 _QUESTION_HELP = {
     "seen": "the objects in the camera's newest image: class, track, colour, range and bearing from the nose",

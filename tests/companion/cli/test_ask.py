@@ -49,7 +49,7 @@ class Service:
         return json_schema(CLASSES)
 
     async def _config(self) -> Any:
-        return {"guidance": {"camera": None}}
+        return {"guidance": {"camera": None}, "detector": {"enabled": True}}
 
     async def _execute(self, text: str) -> dict[str, Any]:
         self.commands.append(text)

@@ -8,8 +8,6 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from language_server import Script, failure, ollama, openai, response, serving
-from sentence_table import CLASSES, SCENE, SENTENCES
 
 from companion.bench.lockstep_flight import LockstepFlight
 from companion.guidance.grammar import json_schema, parse
@@ -18,6 +16,8 @@ from companion.language.endpoints import LanguageError, endpoint_of
 from companion.language.scene import Scene, SceneObject
 from companion.language.tools import ToolCall, class_names_of, read_call, tools_of
 from mavlink_sim.testing import free_port
+from tests.companion.language.language_server import Call, Script, failure, ollama, openai, response, serving
+from tests.companion.language.sentence_table import CLASSES, SCENE, SENTENCES
 
 SCHEMA = json_schema(CLASSES)
 
@@ -192,7 +192,7 @@ def arguments_in(text: str) -> dict[str, Any]:
 
 
 async def test_several_calls_are_a_checked_mission() -> None:
-    calls = [
+    calls: list[Call] = [
         ("takeoff", {"altitude": 5}),
         ("seek", {"class": "boat"}),
         ("orbit", {"class": "boat", "radius": 12}),

@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from sentence_table import CLASSES, SCENE, SENTENCES, UNCLEAR
 
 from companion.guidance.command import GrammarError
 from companion.guidance.grammar import parse
+from companion.language.clauses import UnclearError
 from companion.language.numbers_in_words import with_numbers
 from companion.language.scene import SceneObject
-from companion.language.sentences import UnclearError, is_stop, understand
+from companion.language.sentences import is_stop, understand
+from tests.companion.language.sentence_table import CLASSES, SCENE, SENTENCES, UNCLEAR
 
 
 def test_table_has_a_hundred_sentences() -> None:
@@ -42,11 +43,11 @@ def test_unseen_colour_is_searched_for_once() -> None:
     text = "take off to 5 m, find the white truck and circle it"
     first = understand(text, SCENE)
     assert [str(each) for each in first.intents] == ["takeoff altitude=5", "seek truck"]
-    assert first.again
+    assert first.done == 1
     seen = replace(SCENE, objects=(SceneObject("truck", 9, "white"),))
-    assert str(understand(text, seen, searched=True).intents[-1]) == "orbit track=9"
+    assert [str(each) for each in understand(text, seen, first.done).intents] == ["orbit track=9"]
     with pytest.raises(UnclearError, match="red car"):
-        understand(text, SCENE, searched=True)
+        understand(text, SCENE, first.done)
 
 
 def test_a_condition_no_command_expresses_is_not_dropped() -> None:
