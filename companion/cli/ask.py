@@ -30,6 +30,9 @@ def ask(
         str | None, typer.Argument(help='For example "find the red car and circle it". Without: a chat.')
     ] = None,
     connect: Annotated[str | None, typer.Option(help="Zenoh endpoint of the service or its router.")] = None,
+    serve: Annotated[
+        bool, typer.Option("--serve", help="Answer what is asked on zenoh's key `ask`. Ends on Ctrl-C.")
+    ] = False,
 ) -> None:
     """Fly and answer plain sentences, by patterns or by a language model.
 
@@ -45,7 +48,7 @@ def ask(
         _check_may(settings)
         endpoint = _endpoint(settings)
         try:
-            done = asyncio.run(_converse(settings, endpoint, sentence, connect))
+            done = asyncio.run(_converse(settings, endpoint, sentence, connect, serve=serve))
         except KeyboardInterrupt:
             done = False
     if not done:
@@ -78,12 +81,20 @@ def _endpoint(settings: Settings) -> Endpoint | None:
 
 
 async def _converse(
-    settings: Settings, endpoint: Endpoint | None, sentence: str | None, connect: str | None
+    settings: Settings,
+    endpoint: Endpoint | None,
+    sentence: str | None,
+    connect: str | None,
+    *,
+    serve: bool = False,
 ) -> bool:
+    from companion.bus import topics
     from companion.bus.client import client_settings
     from companion.client import connect as connect_to
     from companion.language.conversation import Conversation, Operator
     from companion.language.live import LiveVehicle
+    from companion.language.serve import ASK
+    from companion.language.serve import serve as serve_queries
     from companion.language.tools import class_names_of
 
     where = client_settings(settings.zenoh, (connect,) if connect else ()).connect[0]
@@ -97,11 +108,16 @@ async def _converse(
                 break
             await asyncio.sleep(0.5)
         vehicle = LiveVehicle(drone, class_names or (), config["guidance"]["camera"])
+        may = settings.language.may
+
+        def converse(operator: Operator) -> Conversation:
+            return Conversation(vehicle, operator, schema, class_names, endpoint=endpoint, may=may)
+
+        if serve:
+            terminal.show(f"answering {topics.ROOT}/{drone.name}/{ASK}")
+            await serve_queries(drone.session, drone.name, converse)
         operator = Operator(terminal.write, terminal.show, terminal.confirm)
-        conversation = Conversation(
-            vehicle, operator, schema, class_names, endpoint=endpoint, may=settings.language.may
-        )
-        return await terminal.attend(conversation, sentence)
+        return await terminal.attend(converse(operator), sentence)
 
 
 class Terminal:

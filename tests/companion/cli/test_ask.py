@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import io
+import json
 import os
 import socket
 import sys
@@ -17,6 +18,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from companion import connect
 from companion.bench.lockstep_flight import plain_settings
 from companion.bus import topics
 from companion.bus.session import Bus
@@ -162,6 +164,38 @@ async def test_what_is_seen_has_colour_range_and_direction(
         assert await ask(there, "what do you see?")
     where = "9 m away 6 deg to the right"
     assert f"red car (track 3) {where}; blue car (track 5) {where}" in capsys.readouterr().out
+
+
+async def test_questions_on_zenoh_are_answered_and_fly_only_what_may_be() -> None:
+    async with service() as there:
+        settings = plain_settings({"vehicle.name": "vehicle", "language.may": "takeoff,orbit"})
+        serving = asyncio.create_task(_converse(settings, None, None, there.endpoint, serve=True))
+        async with connect(there.endpoint) as drone:
+
+            async def question(text: str) -> dict[str, Any]:
+                def get() -> dict[str, Any]:
+                    for _ in range(100):  # until the queryable is known here
+                        for reply in drone.session.get("companion/vehicle/ask", payload=text, timeout=10):
+                            if reply.ok is not None:
+                                answer: dict[str, Any] = json.loads(reply.ok.payload.to_string())
+                                return answer
+                    raise TimeoutError
+
+                return await asyncio.to_thread(get)
+
+            seen = await question("where is the car?")
+            assert seen["success"] is True
+            assert "red car (track 3)" in seen["answer"]
+            assert (await question("land"))["success"] is False
+            assert (await question("follow the car"))["answer"].startswith("which car")
+            assert there.commands == []
+            flying = asyncio.create_task(question("circle the red car"))
+            await asyncio.wait_for(there.flying.wait(), 20)
+            assert await question("stop") == {"success": True, "answer": "stop"}
+            assert (await flying)["success"] is True
+        assert there.commands == ["orbit track=3", "stop"]
+        serving.cancel()
+        await asyncio.gather(serving, return_exceptions=True)
 
 
 @pytest.mark.parametrize(
