@@ -72,11 +72,11 @@ async def serve(session: zenoh.Session, vehicle: str, converse: Callable[[Operat
             success = await _attempt(conversation, text)
             await reply(query, success, lines.text)
 
-    async def reply(query: zenoh.Query, success: bool | str, text: str) -> None:
-        if isinstance(success, str):
-            success, text = False, success
+    async def reply(query: zenoh.Query, outcome: bool | str, text: str) -> None:
+        failed = isinstance(outcome, str)
+        body = {"success": outcome is True, "answer": outcome if failed else text}
         with query, suppress(zenoh.ZError):  # the asker has gone
-            query.reply(query.key_expr, json.dumps({"success": success, "answer": text}))
+            query.reply(query.key_expr, json.dumps(body))
 
     def begin(query: zenoh.Query) -> None:
         task = loop.create_task(answer(query))
