@@ -2,7 +2,8 @@
 
 They are YOLOX's of its authors' release 0.1.1rc0, and the assets of Ultralytics' release v8.4.0, from
 published tables. Every digest was found in at least two independent tables, except the scales m, l and x of
-YOLOv5u: these are from one table, whose n and s others confirm. YOLOX m, l and x are left out: no digests are known here.
+YOLOv5u: these are from one table, whose n and s others confirm. No digests of YOLOX m, l
+and x are known here.
 """
 
 from __future__ import annotations
