@@ -50,7 +50,7 @@ def ask(
         try:
             done = asyncio.run(_converse(settings, endpoint, sentence, connect, serve=serve))
         except KeyboardInterrupt:
-            done = False
+            done = serve
     if not done:
         raise typer.Exit(EXIT_FAILED)
 
@@ -131,7 +131,7 @@ class Terminal:
     def write(self, text: str) -> None:
         """A piece of an answer."""
         self._in_line = not text.endswith("\n")
-        print(text, end="", flush=True)
+        print(_printable(text), end="", flush=True)
 
     def show(self, line: str) -> None:
         """A whole line; an empty one only ends the line before."""
@@ -139,7 +139,7 @@ class Terminal:
             print(flush=True)
         self._in_line = False
         if line:
-            print(line, flush=True)
+            print(_printable(line), flush=True)
 
     async def confirm(self) -> bool:
         """Ask whether to fly what was shown."""
@@ -219,6 +219,11 @@ class Terminal:
                 return
 
         threading.Thread(target=read, name="standard input", daemon=True).start()
+
+
+def _printable(text: str) -> str:
+    """Without control characters, which a model or a label could send to the terminal."""
+    return "".join(character for character in text if character.isprintable() or character == "\n")
 
 
 async def _cancelled(task: asyncio.Task[bool] | None) -> None:

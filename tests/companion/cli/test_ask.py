@@ -23,7 +23,7 @@ from companion.bench.lockstep_flight import plain_settings
 from companion.bus import topics
 from companion.bus.session import Bus
 from companion.cli import app
-from companion.cli.ask import _converse
+from companion.cli.ask import Terminal, _converse
 from companion.guidance.grammar import json_schema
 from companion.settings import ZenohSection
 from mavlink_sim.testing import free_port
@@ -216,6 +216,13 @@ def test_bad_input_is_one_line_and_exit_code_2(
     assert result.exit_code == 2
     assert len(result.stderr.strip().splitlines()) == 1
     assert words in result.stderr
+
+
+def test_control_characters_do_not_reach_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    terminal = Terminal()
+    terminal.write("\x1b[2Jred\x07 car")
+    terminal.show("\x1b]0;title\x07done")
+    assert capsys.readouterr().out == "[2Jred car\n]0;titledone\n"
 
 
 def test_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
