@@ -19,7 +19,7 @@ from companion.language.scene import Scene, SceneObject
 
 T = TypeVar("T")
 
-_STATE_S = 2.0
+_STATE_S = 4.0
 # The kept events arrive within this.
 _EVENTS_S = 0.3
 # An image and the detections of the same frame: so many frames may lie between their messages.

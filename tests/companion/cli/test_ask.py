@@ -8,6 +8,7 @@ import json
 import os
 import socket
 import sys
+import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
@@ -166,19 +167,24 @@ async def test_what_is_seen_has_colour_range_and_direction(
     assert f"red car (track 3) {where}; blue car (track 5) {where}" in capsys.readouterr().out
 
 
-async def test_questions_on_zenoh_are_answered_and_fly_only_what_may_be() -> None:
+async def test_questions_on_zenoh_are_answered_and_fly_only_what_may_be(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     async with service() as there:
         settings = plain_settings({"vehicle.name": "vehicle", "language.may": "takeoff,orbit"})
         serving = asyncio.create_task(_converse(settings, None, None, there.endpoint, serve=True))
+        await shown("answering companion/vehicle/ask", capsys)
         async with connect(there.endpoint) as drone:
 
             async def question(text: str) -> dict[str, Any]:
                 def get() -> dict[str, Any]:
-                    for _ in range(100):  # until the queryable is known here
-                        for reply in drone.session.get("companion/vehicle/ask", payload=text, timeout=10):
+                    until_s = time.monotonic() + 20.0
+                    while time.monotonic() < until_s:  # until the queryable is known here
+                        for reply in drone.session.get("companion/vehicle/ask", payload=text, timeout=20):
                             if reply.ok is not None:
                                 answer: dict[str, Any] = json.loads(reply.ok.payload.to_string())
                                 return answer
+                        time.sleep(0.05)
                     raise TimeoutError
 
                 return await asyncio.to_thread(get)
