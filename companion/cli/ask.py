@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import sys
 import threading
 import time
@@ -127,6 +128,7 @@ class Terminal:
         self._lines: asyncio.Queue[str | None] = asyncio.Queue()
         self._asked: asyncio.Future[bool] | None = None
         self._ended = self._in_line = False
+        self._busy_shown_s = -math.inf
 
     def write(self, text: str) -> None:
         """A piece of an answer."""
@@ -198,13 +200,20 @@ class Terminal:
                 elif self._asked is not None:
                     self._asked.set_result(line.strip().lower() in ("y", "yes"))
                 elif running is not None:
-                    self.show("busy; `stop` ends it")
+                    self._show_busy()
                 elif line.strip():
                     running = asyncio.create_task(conversation.ask(line))
             return success
         finally:
             next_line.cancel()
             await _cancelled(running)
+
+    def _show_busy(self) -> None:
+        """At most once a second: a pipe may deliver lines without end."""
+        now_s = time.monotonic()
+        if now_s - self._busy_shown_s >= 1.0:
+            self._busy_shown_s = now_s
+            self.show("busy; `stop` ends it")
 
     def _read_in_thread(self) -> None:
         """Standard input may be a terminal, a pipe or a file; asyncio reads only the first two."""
