@@ -19,6 +19,7 @@ from mavlink_sim.camera.simulated_camera import SimulatedCamera
 from mavlink_sim.wire.messages import dialect
 from mavlink_sim.world.world import Ground, World, WorldObject
 from tests.companion.service_process import running_service
+from tests.sitl.conftest import Services
 from tests.sitl.sitl_harness import (
     PX4,
     READY_S,
@@ -87,10 +88,13 @@ def sticks(link: AutopilotLink, forward: list[int]) -> Iterator[None]:
         yield
 
 
-def test_pilot_in_position_mode_stops_before_a_wall(link: AutopilotLink, tmp_path: Path) -> None:
+def test_pilot_in_position_mode_stops_before_a_wall(
+    link: AutopilotLink, services: Services, tmp_path: Path
+) -> None:
     if link.autopilot != PX4:
         pytest.skip("collision prevention in Position mode is PX4's")
     bring_down(link)
+    services.close()  # its own service takes the port
     before = set_for_test(link, {"CP_DIST": KEEP_M, "COM_RC_IN_MODE": 1.0})
     name, forward = f"sitl-{secrets.token_hex(6)}", [NEUTRAL]
     flags = [
