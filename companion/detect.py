@@ -30,6 +30,8 @@ from vision.tracking import Tracker, TrackerSettings
 logger = logging.getLogger(__name__)
 
 TRACK_FIELDS = ("track_id", "track_score", "track_state")
+# Subfolder of `--save` for the annotated images, so that no name of the source is taken twice.
+ANNOTATED = "detections"
 # Weaker detections do not confirm a track by default, so the service does not act on them.
 FAINT_BELOW = TrackerSettings().confirm_score
 
@@ -66,8 +68,9 @@ def detect_source(
 
     Args:
         tracker: assigns tracks; a recording is tracked by its own time.
-        save: folder for each input and, with `_detections` in its name, the annotated image. An image keeps
-            its file name; the frames of a video are `<name>_<sequence>.jpg`, others `<sequence>.jpg`.
+        save: folder for each input; its subfolder `detections` gets the annotated image of the same name. An
+            image keeps its file name; the frames of a video are `<name>_<sequence>.jpg`, others
+            `<sequence>.jpg`.
         as_json: one JSON object per frame instead of a readable line.
         write: called with each line.
 
@@ -110,8 +113,8 @@ def make_save_folder(folder: Path, source: str) -> None:
             f"--save {folder}: this folder contains the source; give another, so that no image is overwritten"
         )
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except FileExistsError:
+        (folder / ANNOTATED).mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError):
         raise ValueError(f"--save {folder}: expected a folder, got a file; give another name") from None
     except OSError as error:
         raise ValueError(f"--save {folder}: the folder cannot be created: {error.strerror}") from error
@@ -181,7 +184,7 @@ def _save(folder: Path, frame: Frame, detections: Detections) -> None:
         suffix = name.suffix if cv2.haveImageWriter(frame.file_name) else f"{name.suffix}.jpg"
     _write_image(folder / f"{stem}{suffix}", frame.image)
     drawn = annotate(frame.image, detections, faint_below=FAINT_BELOW)
-    _write_image(folder / f"{stem}_detections{suffix}", drawn)
+    _write_image(folder / ANNOTATED / f"{stem}{suffix}", drawn)
 
 
 def _write_image(path: Path, image: NDArray[np.uint8]) -> None:

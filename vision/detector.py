@@ -305,7 +305,7 @@ def forget_measurements(model: str | Path) -> None:
         CheckpointError: there is no such model.
         OSError: a stored measurement cannot be deleted.
     """
-    forget_choices(weights_sha256(_model_path(model)))
+    forget_choices(weights_sha256(read_source(_model_path(model)).weights_path))
 
 
 def _model_path(model: str | Path) -> Path:

@@ -59,7 +59,7 @@ def fastest_runtime(
         "precision": precision,
         "threads": threads,
     }
-    stored = StoredChoice(weights_sha256(source.path), question)
+    stored = StoredChoice(weights_sha256(source.weights_path), question)
     answer = stored.read(set(candidates))
     when = "measured before"
     if answer is None:

@@ -53,7 +53,7 @@ def start_named(
             precision=precision,
             threads=threads,
             sparse_boxes=sparse_boxes,
-            model_sha256=weights_sha256(source.path),
+            model_sha256=weights_sha256(source.weights_path),
         )
     from vision.runtimes.network import Network
 
@@ -71,7 +71,7 @@ def _converted(source: ModelSource, network: Network, name: RuntimeName, image_s
     assert source.description is not None
     kind = _EXPORTS[name]
     head = network.head
-    digest = weights_sha256(source.path)
+    digest = weights_sha256(source.weights_path)
     # A plan is built for a largest side; the others have a dynamic size.
     side = image_size if kind == "tensorrt" else 640
     plain = source.description.to_plain()

@@ -11,18 +11,23 @@ from numpy.typing import NDArray
 # Histograms are of this many pixels along each side of the inner part of a box, whatever its size.
 _SIDE, _INNER = 18, 0.9
 _BANDS = 3
-# Number of bins and range of luma and of the two colour differences, ITU-R BT.601.
-_LUMA = (8, 0.0, 256.0)
-_CHROMA = (6, -40.0, 40.0)
-_TO_YCC = np.array(
-    [[0.114, 0.500, -0.081], [0.587, -0.331, -0.419], [0.299, -0.169, 0.500]], np.float32
-)  # columns: Y, Cb, Cr of a BGR row
+# Bins and range of the logarithm to base 2 of the luma relative to the image's median, and of the two colour
+# differences relative to the luma.
+_LUMA = (8, -3.0, 3.0)
+_CHROMA = (6, -0.35, 0.35)
+_LUMA_OF_BGR = np.array([0.114, 0.587, 0.299], np.float32)
+# Every so many pixels of the image are a sample of its brightness and colour.
+_SAMPLED = 16
+# Darker values are noise.
+_DARK, _DARK_CHROMA = 2.0, 16.0
 
 
 def appearances(image: NDArray[np.uint8], xyxy: NDArray[np.floating]) -> NDArray[np.float32]:
     """The appearance of each box: (N, 60) float32 of length 1. The product of two is their similarity, 0..1.
 
     It is the Bhattacharyya coefficient, averaged over luma and colour of the upper, middle and lower third.
+    The colours are balanced and the luma is relative to the whole image's (gray world), so that another
+    exposure or white balance changes little.
 
     Args:
         image: (height, width, 3) uint8, BGR.
@@ -36,9 +41,17 @@ def appearances(image: NDArray[np.uint8], xyxy: NDArray[np.floating]) -> NDArray
     )
     columns = np.clip(across, 0, width - 1).astype(np.intp)
     rows = np.clip(down, 0, height - 1).astype(np.intp)
-    pixels = image[rows[:, :, None], columns[:, None, :]].reshape(count * _BANDS, _SIDE * _SIDE // _BANDS, 3)
-    luma, blue, red = np.moveaxis(pixels.astype(np.float32) @ _TO_YCC, 2, 0)
-    parts = [_histograms(luma, *_LUMA), _histograms(blue, *_CHROMA), _histograms(red, *_CHROMA)]
+    sample = image[_SAMPLED // 2 :: _SAMPLED, _SAMPLED // 2 :: _SAMPLED].reshape(-1, 3).astype(np.float32)
+    balance = np.maximum(sample.mean(axis=0), 1.0)
+    balance = balance.mean() / balance
+    median = max(float(np.median(sample @ (_LUMA_OF_BGR * balance))), _DARK) if len(sample) else 1.0
+    patches = image[rows[:, :, None], columns[:, None, :]]
+    pixels = patches.reshape(count * _BANDS, _SIDE * _SIDE // _BANDS, 3).astype(np.float32) * balance
+    luma = pixels @ _LUMA_OF_BGR
+    relative = np.log2(np.maximum(luma, _DARK) / median)
+    shade = np.maximum(luma, _DARK_CHROMA)
+    parts = [_histograms(relative, *_LUMA)]
+    parts += [_histograms((pixels[..., each] - luma) / shade, *_CHROMA) for each in (0, 2)]
     roots = np.sqrt(np.concatenate(parts, axis=1) / (len(parts) * _BANDS))
     return roots.reshape(count, _BANDS * roots.shape[1]).astype(np.float32)
 

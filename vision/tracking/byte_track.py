@@ -41,6 +41,8 @@ from vision.tracking.tracks import (
 logger = logging.getLogger(__name__)
 
 Indices = NDArray[np.int64]
+Looks = dict[int, NDArray[np.float32]]
+"""Index of a detection → its appearance, see `appearances`."""
 
 # How far boxes are enlarged for the second pass, in their own sizes. On rendered sequences 0.3 to 1.0 work
 # equally well with the vehicle's attitude; without it, 0.6 has the fewest switches.
@@ -51,10 +53,11 @@ SAME_OBJECT_IOU = 0.7
 # its own. Of confirmed rendered tracks, 0.25, 0.5, 0.75 and 1.0 leave 142, 160, 169 and 172 of 174 of the
 # right class, 77, 85, 90 and 94 of 114 of a wrong one. Sums decay as if only `SCORES_KEPT` frames counted.
 RIVAL_SHARE = 0.5
-# Least similarity of appearance of a box that continues a track after a gap, or whose box it overlaps only
-# enlarged. Of a street's cars and people, other objects had up to 0.945 and 99 % of the same had more. Boxes
-# with a side below `MIN_LOOK_PX` are too few pixels for that; rendered ones of 32 pixels lost tracks by it.
-SAME_LOOK, MIN_LOOK_PX = 0.95, 48.0
+# Least similarity of appearance of a box that continues a track after `GAP_S` without a detection, or whose
+# box it overlaps only enlarged. In a street video, 99 % of the same object's had 0.935 or more, and four of
+# five other objects at the predicted place less. Boxes with a side below `MIN_LOOK_PX` are too few pixels for
+# that; rendered ones of 32 pixels lost tracks by it.
+SAME_LOOK, MIN_LOOK_PX, GAP_S = 0.935, 48.0, 0.1
 # Share of the newest detection in a track's appearance.
 LOOK_SHARE = 0.3
 _DECAY = 1.0 - 1.0 / SCORES_KEPT
@@ -101,7 +104,10 @@ class _TrackRecord:
         self.scores.add(confidence)
         self.lost = False
 
-    def add_look(self, look: NDArray[np.float32]) -> None:
+    def add_look(self, look: NDArray[np.float32] | None) -> None:
+        """Add the appearance of a detection; None: it is too small."""
+        if look is None:
+            return
         mixed = look if self.look is None else (1 - LOOK_SHARE) * self.look + LOOK_SHARE * look
         self.look = mixed / np.linalg.norm(mixed)
 
@@ -168,7 +174,7 @@ class Tracker:
         confidence, class_id = detections.confidence, detections.class_id
         boxes: list[list[float]] = detections.xyxy.tolist()
         track_of = np.full(len(detections), -1)
-        looks = None if image is None else appearances(image, detections.xyxy)
+        looks = None if image is None else _looks(image, detections)
         self._associate(detections, captured_ns, track_of, looks)
         records: dict[int, _TrackRecord] = {}
         matched = np.flatnonzero(track_of >= 0)
@@ -183,7 +189,7 @@ class Tracker:
             records[index] = record = self._records[track]
             record.add_detection(float(confidence[index]), captured_ns)
             if looks is not None and confidence[index] >= self.settings.high_confidence:
-                record.add_look(looks[index])
+                record.add_look(looks.get(index))
             self._on_detected(record, boxes[index], captured_ns, events)
         new = np.flatnonzero((track_of < 0) & (confidence >= self.settings.high_confidence))
         on_object = overlaps(detections.xyxy[new], estimated)
@@ -194,7 +200,7 @@ class Tracker:
             self._next_id += 1
             record.add_detection(float(confidence[index]), captured_ns)
             if looks is not None:
-                record.add_look(looks[index])
+                record.add_look(looks.get(index))
             if known and on_object[row].max() >= SAME_OBJECT_IOU:
                 # The same object under another class: its earlier evidence applies to this track too.
                 record.evidence = dict(known[int(on_object[row].argmax())])
@@ -240,7 +246,7 @@ class Tracker:
             )
 
     def _associate(
-        self, detections: Detections, captured_ns: int, track_of: Indices, looks: NDArray[np.float32] | None
+        self, detections: Detections, captured_ns: int, track_of: Indices, looks: Looks | None
     ) -> None:
         """Fill in `track_of` (N,): the index of each detection's track."""
         if not len(detections) or not self._records:
@@ -257,7 +263,12 @@ class Tracker:
         predicted, same_class = self._states.xyxy, class_ids[:, None] == detections.class_id
         alike = np.ones_like(same_class) if looks is None else self._look_alike(detections, looks)
         # After a gap the predicted box fits many objects.
-        gap = np.array([record.last_ns < self._before_ns for record in self._records])
+        gap = np.array(
+            [
+                record.last_ns < self._before_ns and captured_ns - record.last_ns > GAP_S * 1e9
+                for record in self._records
+            ]
+        )
         free = np.ones(len(self._records), np.bool_)
         for of_tracks, of_detections, least, reach in (
             (known, strong, settings.min_iou, 0.0),
@@ -277,13 +288,13 @@ class Tracker:
                 track_of[columns[column]] = rows[row]
                 free[rows[row]] = False
 
-    def _look_alike(self, detections: Detections, looks: NDArray[np.float32]) -> NDArray[np.bool_]:
+    def _look_alike(self, detections: Detections, looks: Looks) -> NDArray[np.bool_]:
         """(tracks, detections): whether it may be the same object by its appearance."""
-        small = (detections.xyxy[:, 2:] - detections.xyxy[:, :2]).min(axis=1) < MIN_LOOK_PX
         alike = np.ones((len(self._records), len(detections)), np.bool_)
         for row, record in enumerate(self._records):
             if record.look is not None:
-                alike[row] = small | (looks @ record.look >= SAME_LOOK)
+                for column, look in looks.items():
+                    alike[row, column] = look @ record.look >= SAME_LOOK
         return alike
 
     def _update_class_evidence(
@@ -384,3 +395,10 @@ class Tracker:
         )
         kept = (track_id != NO_TRACK) | (detections.confidence >= self.settings.keep_confidence)
         return labelled if kept.all() else labelled[kept]
+
+
+def _looks(image: NDArray[np.uint8], detections: Detections) -> Looks:
+    """The appearances of those that are large enough."""
+    sides = (detections.xyxy[:, 2:] - detections.xyxy[:, :2]).min(axis=1)
+    large = np.flatnonzero(sides >= MIN_LOOK_PX)
+    return dict(zip(large.tolist(), appearances(image, detections.xyxy[large]), strict=True))

@@ -11,7 +11,7 @@ from vision.detections import Detections
 from vision.tracking import Tracker
 from vision.tracking.appearance import appearances
 
-RED, BLUE = (40, 40, 200), (200, 60, 30)
+RED, BLUE = (30, 30, 160), (160, 50, 25)
 FRAME_NS = 50_000_000
 
 
@@ -51,7 +51,10 @@ def test_the_same_object_is_alike_when_blurred_moved_or_darker_and_another_colou
     assert similarity(same, same) == pytest.approx(1.0, abs=1e-5)
     assert similarity(same, np.asarray(cv2.GaussianBlur(same, (9, 9), 3), np.uint8)) > 0.97
     assert similarity(same, picture(RED, left=106)) > 0.95
-    assert similarity(same, np.asarray(same * 0.93, np.uint8)) > 0.95
+    for gain in (0.7, 0.8, 1.25):
+        assert similarity(same, np.asarray(same * gain, np.uint8)) > 0.95
+    for blue in (0.9, 1.1):
+        assert similarity(same, np.asarray(same * [blue, 1.0, 1 / blue], np.uint8)) > 0.95
     assert similarity(same, picture(BLUE)) < 0.8
 
 
@@ -81,6 +84,16 @@ def test_an_object_that_changes_its_look_without_a_gap_keeps_its_track() -> None
     for frame in range(8):
         image = picture(RED if frame < 4 else BLUE)
         shown = tracker.update(seen(box()), frame * FRAME_NS + 1, image=image).detections
+    assert shown.track_id is not None
+    assert shown.track_id.tolist() == [1]
+
+
+def test_another_object_after_one_missed_frame_continues_the_track() -> None:
+    tracker = Tracker()
+    for frame in range(8):
+        found = seen(np.zeros((0, 4), np.float32) if frame == 4 else box())
+        image = picture(RED if frame < 4 else BLUE)
+        shown = tracker.update(found, frame * FRAME_NS + 1, image=image).detections
     assert shown.track_id is not None
     assert shown.track_id.tolist() == [1]
 
