@@ -417,16 +417,15 @@ class GimbalController:
             self._end_point(Outcome(False, f"gimbal: {self._control.problem}"), out)
             return
         gimbal, aim = state.gimbal, request.pointing.aim
-        assert aim is not None
-        off_rad = None if gimbal is None else gimbal.off_rad(aim, state.yaw_rad or 0.0)
+        off_rad = None if gimbal is None or aim is None else gimbal.off_rad(aim, state.yaw_rad or 0.0)
         known = gimbal is not None and gimbal.attitude_fresh(now_ns) and off_rad is not None
         there = known and off_rad is not None and off_rad <= POINTED_RAD
-        if request.pointing.kept and there:
+        if aim is not None and request.pointing.kept and there:
             if not request.answered:
                 text = f"gimbal kept on {request.pointing.name}, now {direction_text(aim)}"
                 out.result(request.identifier, Outcome(True, text))
             request.answered, request.until_ns = True, now_ns + POINT_TIMEOUT_S * 1e9
-        elif self._control.pointed == aim and there:
+        elif aim is not None and self._control.pointed == aim and there:
             self._end_point(Outcome(True, f"gimbal points {direction_text(aim)}"), out)
         elif now_ns > request.until_ns:
             where = (

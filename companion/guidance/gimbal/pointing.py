@@ -54,7 +54,10 @@ class Pointing:
                 why = _not_in_sight(self.goal, context)
             case GlobalPoint():
                 why = self._locate(self.goal, context) or self._beyond_reach(context)
-        return why or self.update(context)
+        why = why or self.update(context)
+        if why is None and self.aim is None:  # an object with a known place
+            return _position_missing(context)
+        return why
 
     def update(self, context: BehaviourContext) -> str | None:
         """Aim from where the vehicle is now. Returns why the goal is lost, in words; None: it is not."""
@@ -85,8 +88,8 @@ class Pointing:
 
     def _locate(self, place: GlobalPoint, context: BehaviourContext) -> str | None:
         state = context.state
-        if (fault := state.position_fault(context.now_ns)) is not None:
-            return f"position is missing ({fault})"
+        if state.position_fault(context.now_ns) is not None:
+            return _position_missing(context)
         try:
             north, east = local_from_global(state, context.now_ns, (place.latitude_deg, place.longitude_deg))
             self._point = (north, east, home_of(state)[2] - place.altitude_m)
@@ -139,6 +142,10 @@ def _not_in_sight(wanted: Wanted, context: BehaviourContext) -> str | None:
     if not context.perception_fresh:
         return context.perception_fault("no fresh detections of the steering camera")
     return f"no confirmed {wanted.name} in the image"
+
+
+def _position_missing(context: BehaviourContext) -> str:
+    return f"position is missing ({context.state.position_fault(context.now_ns)})"
 
 
 def _camera_pitch_rad(context: BehaviourContext) -> float:

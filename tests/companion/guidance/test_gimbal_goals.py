@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from companion.bench.lockstep_flight import LockstepFlight
+from companion.bench.simulated_driver import SimulatedDriver
 from companion.bench.synthetic_detector import SceneObject, ScenePose
 from companion.geometry.geodesy import latitude_longitude
 from companion.guidance import Gimbal
@@ -250,6 +251,25 @@ def test_place_needs_a_position(changes: dict[str, Any], reason: str) -> None:
     why = pointing.begin(BehaviourContext(vehicle.now_ns, replace(known, **changes)))
     assert why is not None
     assert why.startswith(reason)
+
+
+@pytest.mark.parametrize("text", ["gimbal class=person", "gimbal track={}"])
+def test_ranged_object_needs_a_position_and_the_flight_goes_on(
+    text: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flight = gimbal_flight(person(20.0, 18.0), seed=35)
+    flight.run(2.0)
+    landing = flight.command("land")
+    flight.run(1.0)
+    context = flight.guidance.context
+    assert context is not None
+    (seen,) = context.targets
+    assert seen.position_ned_m is not None
+    stale = replace(flight.state, position_ns=flight.now_ns - 900_000_000)
+    monkeypatch.setattr(SimulatedDriver, "state", stale)
+    assert "position is missing (0.9 s old)" in refused(flight, text.format(seen.track_id))
+    assert flight.outcome(landing) is None
+    assert flight.guidance.busy
 
 
 def test_place_is_given_up_without_a_position() -> None:
