@@ -478,7 +478,8 @@ class Guidance:
         """The obstacle limits of this step."""
         if self._constrained is None or self._constrained[0] is not context:
             rules = self.options.obstacles
-            self._constrained = (context, rules.constraints(self._memory.filled(context)))
+            filled = self._memory.filled(context, rules.margin_m)
+            self._constrained = (context, rules.constraints(filled))
         return self._constrained[1]
 
     def _report_perception_fault(self, behaviour: Behaviour, blind: str | None) -> None:

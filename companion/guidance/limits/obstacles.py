@@ -120,35 +120,36 @@ class ObstacleMemory:
     """Obstacles that were seen recently and have left the image, and those of the map (`guidance.avoid`).
 
     Their positions (local NED) are kept for `REMEMBERED_S` and fill unseen sectors. A sector that is seen
-    again uses the measurement.
+    again uses the measurement. A cell of the map may have been seen long ago, and the obstacle may have gone:
+    it stops the vehicle at the margin, but does not move it away.
     """
 
     def __init__(self) -> None:
         self._points: list[tuple[int, float, float]] = []
         self._newest_ns = 0
 
-    def filled(self, context: BehaviourContext) -> BehaviourContext:
-        """The context, with remembered obstacles in its unknown sectors."""
+    def filled(self, context: BehaviourContext, margin_m: float) -> BehaviourContext:
+        """The context, with remembered obstacles in its unknown sectors; the map's not inside the margin."""
         seen, position = context.obstacles, context.state.position_ned_m
         if seen is None or position is None:
             return context
         distances = list(seen.distance_m)
 
-        def fill(north: float, east: float) -> bool:
+        def fill(north: float, east: float, least_m: float = 0.0) -> bool:
             """Enter a point in its sector, if that is unseen."""
             away = (north - position[0], east - position[1])
             sector = round(math.atan2(away[1], away[0]) / SECTOR_RAD) % SECTORS
             if not math.isnan(seen.distance_m[sector]):
                 return False
-            known = distances[sector]
-            distances[sector] = math.hypot(*away) if math.isnan(known) else min(known, math.hypot(*away))
+            known, away_m = distances[sector], max(least_m, math.hypot(*away))
+            distances[sector] = away_m if math.isnan(known) else min(known, away_m)
             return True
 
         oldest_ns = context.now_ns - REMEMBERED_S * 1e9
         self._points = [point for point in self._points if point[0] >= oldest_ns and fill(*point[1:])]
         if context.planned is not None and context.planned.captured_ns >= oldest_ns:
             for point in context.planned.near:
-                fill(*point)
+                fill(*point, least_m=margin_m)
         if seen.captured_ns != self._newest_ns:
             self._newest_ns = seen.captured_ns
             for (north, east), distance_m in zip(DIRECTIONS, seen.distance_m, strict=True):

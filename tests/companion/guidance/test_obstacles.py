@@ -16,6 +16,7 @@ from companion.guidance.core import Guidance, GuidanceOptions
 from companion.guidance.interface import EventKind, GuidanceInput
 from companion.guidance.limits.envelope import Envelope
 from companion.guidance.limits.obstacles import (
+    Constraint,
     ObstacleMemory,
     ObstacleRules,
     speed_towards,
@@ -57,7 +58,7 @@ def sent_velocity(harness: GuidanceHarness) -> Vector3:
 
 def ahead_m(memory: ObstacleMemory, vehicle: KinematicVehicle) -> float:
     """The remembered distance ahead while nothing is seen."""
-    filled = memory.filled(context(sectors(vehicle.now_ns, rest=NAN), vehicle=vehicle)).obstacles
+    filled = memory.filled(context(sectors(vehicle.now_ns, rest=NAN), vehicle=vehicle), MARGIN_M).obstacles
     assert filled is not None
     return filled.distance_m[0]
 
@@ -181,7 +182,7 @@ def test_brake_is_sent_while_depth_is_missing() -> None:
 
 def test_obstacle_outside_the_image_is_remembered() -> None:
     memory, vehicle = ObstacleMemory(), KinematicVehicle()
-    memory.filled(context(sectors(vehicle.now_ns, {0: 4.0}, rest=NAN), vehicle=vehicle))
+    memory.filled(context(sectors(vehicle.now_ns, {0: 4.0}, rest=NAN), vehicle=vehicle), MARGIN_M)
     vehicle.position[0] += 1.0
     vehicle.now_ns += 10**9
     assert ahead_m(memory, vehicle) == pytest.approx(3.0)
@@ -193,13 +194,29 @@ def test_obstacles_of_the_map_fill_unseen_directions() -> None:
     vehicle = KinematicVehicle()
     planned = PlannedPath(vehicle.now_ns, (), near=((2.0, 0.0), (0.0, -1.5), (-1.2, 0.0)))
     seen = context(sectors(vehicle.now_ns, {0: 4.0, 1: 5.0}, rest=NAN), vehicle=vehicle)
-    filled = ObstacleMemory().filled(replace(seen, planned=planned)).obstacles
+    filled = ObstacleMemory().filled(replace(seen, planned=planned), 1.0).obstacles
     assert filled is not None
     assert filled.distance_m[:2] == (4.0, 5.0)  # as seen now
     assert [filled.distance_m[index] for index in (36, 54)] == pytest.approx([1.2, 1.5])
     assert sum(math.isnan(value) for value in filled.distance_m) == SECTORS - 4
     old = replace(seen, planned=replace(planned, captured_ns=vehicle.now_ns - 10**10))
-    assert ObstacleMemory().filled(old).obstacles == seen.obstacles
+    assert ObstacleMemory().filled(old, 1.0).obstacles == seen.obstacles
+
+
+def test_obstacle_of_the_map_stops_the_vehicle_but_does_not_push_it() -> None:
+    vehicle, rules = KinematicVehicle(), ObstacleRules("auto", 2.0)
+    planned = PlannedPath(vehicle.now_ns, (), near=((-1.2, 0.0),))
+
+    def slowest(south_mps: float, near: dict[int, float]) -> Constraint:
+        """The least speed that is allowed, and its direction."""
+        vehicle.velocity[0] = -south_mps
+        seen = context(sectors(vehicle.now_ns, near, rest=NAN), vehicle=vehicle)
+        filled = ObstacleMemory().filled(replace(seen, planned=planned), rules.margin_m)
+        return min(rules.constraints(filled), key=lambda one: one[2])
+
+    assert slowest(0.0, {}) == pytest.approx((-1.0, 0.0, 0.0))
+    assert slowest(1.0, {})[2] < 0.0, "it brakes while it flies there"
+    assert slowest(0.0, {18: 1.8}) == pytest.approx((0.0, 1.0, -0.5)), "it backs out of what it sees"
 
 
 def test_message_distinguishes_unknown_from_free() -> None:
