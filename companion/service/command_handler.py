@@ -54,6 +54,7 @@ class CommandHandler:
         self._awaited: dict[int, asyncio.Future[Outcome]] = {}
         self._reported, self._stops_reported = (Allowance(REPORTED_PER_S, REPORTED_AT_ONCE) for _ in range(2))
         self._unreported = 0
+        self._succeeded: CommandInput | None = None
 
     async def execute(self, text: str) -> dict[str, Any]:
         """Execute a command and return its result. See `Service.command`."""
@@ -91,6 +92,10 @@ class CommandHandler:
             more = {"steps": [asdict(step) for step in command.behaviour.records]}
         if reported:
             self._on_event("info" if outcome.success else "warning", f"{command.text}: {outcome.reason}")
+        if outcome.success and command.behaviour is not None:
+            self._succeeded = command
+            if command.endless and not reported:  # it is flown from now on
+                asyncio.get_running_loop().call_later(LASTING_S, self._report_lasting, command, outcome)
         answer = {"success": outcome.success, "reason": outcome.reason}
         return {"command": command.text, **answer, **more}
 
@@ -98,6 +103,13 @@ class CommandHandler:
         before, self._unreported = self._unreported, 0
         skipped = f" ({before} before it not logged)" if before else ""
         self._on_event("info", f"command: {command.text}{skipped}")
+
+    def _report_lasting(self, command: CommandInput, outcome: Outcome) -> None:
+        """Report an endless command, unless another one has succeeded since."""
+        if self._succeeded is command:
+            self._unreported -= 1
+            self._report(command)
+            self._on_event("info", f"{command.text}: {outcome.reason}")
 
     async def _select_object(self, command: Select) -> dict[str, Any]:
         """Guidance is not asked: what is flown goes on."""
@@ -120,5 +132,6 @@ class CommandHandler:
 
     def close(self, reason: str) -> None:
         """Fail every command that is still pending."""
+        self._succeeded = None
         for identifier in list(self._awaited):
             self.on_result(CommandResult(identifier, Outcome(False, reason)))

@@ -30,7 +30,10 @@ class Handler(CommandHandler):
         self.lines: list[str] = []
         super().__init__(
             lambda identifier, text: CommandInput(
-                identifier, text, StopBehaviour() if text == "stop" else HoldBehaviour()
+                identifier,
+                text,
+                StopBehaviour() if text == "stop" else HoldBehaviour(),
+                endless=text.startswith("orbit"),
             ),
             no_selection,
             lambda: None,
@@ -75,6 +78,24 @@ async def test_command_flown_in_a_flood_is_logged(monkeypatch: pytest.MonkeyPatc
     assert (await flown)["success"]
     unlogged = FLOOD - REPORTED_AT_ONCE + 1  # and the superseded one
     assert handler.lines[before:] == [f"command: orbit ({unlogged} before it not logged)", "orbit: flown"]
+
+
+async def test_endless_command_flown_in_a_flood_is_logged(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is answered as soon as it is flown; one that another supersedes at once is not logged."""
+    monkeypatch.setattr(command_handler, "LASTING_S", 0.02)
+    handler = await flooded()
+    before = len(handler.lines)
+    for text in ("orbit radius=6", "orbit radius=7"):
+        identifier, answer = await handler.until_started(text)
+        handler.on_result(CommandResult(identifier, Outcome(True, "in progress")))
+        assert (await answer)["success"]
+    while len(handler.lines) == before:
+        await asyncio.sleep(0.005)
+    unlogged = FLOOD - REPORTED_AT_ONCE + 1
+    assert handler.lines[before:] == [
+        f"command: orbit radius=7 ({unlogged} before it not logged)",
+        "orbit radius=7: in progress",
+    ]
 
 
 async def test_stop_in_a_flood_is_logged_at_once() -> None:
