@@ -122,7 +122,8 @@ class Drone(Commands):
         try:
             reply = await asyncio.shield(outcome)
         except asyncio.CancelledError:
-            if text.split(maxsplit=1)[0].lower() not in NOT_FLOWN:
+            word = text.lower().split()[:1]
+            if word and word[0] not in NOT_FLOWN:
                 await asyncio.shield(self._stop(outcome))
             raise
         if not reply["success"]:
@@ -130,12 +131,15 @@ class Drone(Commands):
         return reply
 
     async def _stop(self, outcome: asyncio.Future[Reply]) -> None:
-        """End a command: `stop`, again if the command reached the service after it."""
+        """End a command: `stop`, again if the command reached the service, or began to be flown, after it."""
         for _ in range(3):
-            if outcome.done():
+            answered = outcome.done()
+            if answered and (outcome.exception() is not None or not outcome.result()["success"]):
                 return
             with suppress(NoAnswerError):
                 await self._send("stop", _STOP_TIMEOUT_S)
+                if answered:  # with success: an endless one is flown
+                    return
             await asyncio.wait([outcome], timeout=_STOPPED_WITHIN_S)
 
     def _send(self, text: str, timeout_s: float) -> asyncio.Future[Reply]:

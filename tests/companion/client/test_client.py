@@ -167,6 +167,44 @@ async def test_cancelled_command_is_stopped(moment: str) -> None:
         assert there.commands[-1] == "stop"
 
 
+class Scripted(Drone):
+    """`stop` succeeds at once; other commands are answered by the test. `outcomes`: by their texts."""
+
+    def __init__(self, session: Any = None) -> None:
+        super().__init__(session, "alpha")
+        self.sent: list[str] = []
+        self.outcomes: dict[str, asyncio.Future[Reply]] = {}
+
+    def _send(self, text: str, timeout_s: float) -> asyncio.Future[Reply]:
+        self.sent.append(text)
+        self.outcomes[text] = asyncio.get_running_loop().create_future()
+        if text == "stop":
+            self.outcomes[text].set_result({"command": text, "success": True, "reason": "holding"})
+        return self.outcomes[text]
+
+
+@pytest.mark.parametrize(("success", "sent"), [(True, ["hold", "stop"]), (False, ["hold"])])
+async def test_command_answered_in_the_moment_of_its_cancellation(success: bool, sent: list[str]) -> None:
+    drone = Scripted()
+    task = asyncio.create_task(drone.hold())
+    await asyncio.sleep(0)
+    drone.outcomes["hold"].set_result({"command": "hold", "success": success, "reason": "in progress"})
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    assert drone.sent == sent
+
+
+async def test_empty_command_can_be_cancelled() -> None:
+    drone = Scripted()
+    task = asyncio.create_task(drone.command(" "))
+    await asyncio.sleep(0)
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    assert drone.sent == [" "]
+
+
 @pytest.mark.realtime
 async def test_timeout_stops_a_flight_but_not_for_the_gimbal() -> None:
     async with connected() as (there, drone):
