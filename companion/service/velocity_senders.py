@@ -11,7 +11,8 @@ from companion.guidance.behaviour import VelocityInput
 from companion.vehicle.clock_sync import SenderDelay
 
 MAX_LIFETIME_S = 0.5
-# A silent sender is forgotten after this; until then its clock is known, so that late messages are refused.
+# A sender without an accepted message is forgotten after this; until then its clock is known, so that late
+# messages are refused.
 FORGET_S = 10.0
 MAX_SENDERS = 8
 LARGEST_BYTES = 1024
@@ -31,6 +32,7 @@ class VelocitySenders:
         self._on_event = on_event
         self._newest: dict[str, VelocityInput] = {}
         self._delays: dict[str, SenderDelay] = {}
+        self._stamps_ns: dict[str, int] = {}
         self._warned_ns: int | None = None
 
     def on_message(self, payload: bytes, receipt_ns: int) -> None:
@@ -52,8 +54,20 @@ class VelocitySenders:
         if source not in self._newest and len(self._newest) >= MAX_SENDERS:
             self._warn(f"{source}: at most {MAX_SENDERS} senders are accepted", receipt_ns)
             return
+        older_ns = self._stamps_ns.get(source, body["stamp_ns"]) - body["stamp_ns"]
+        if older_ns > 0:  # overtaken by a newer one, or the sender's clock was set back
+            self._warn(
+                f"{source}: stamp_ns is {older_ns / 1e9:.3f} s older than the newest; "
+                f"a restarted sender needs a new source, or {FORGET_S:g} s",
+                receipt_ns,
+            )
+            return
+        self._stamps_ns[source] = body["stamp_ns"]
         late_ns = self._delays.setdefault(source, SenderDelay()).update(body["stamp_ns"], receipt_ns)
         lifetime_ns = round(body.get("lifetime_s", MAX_LIFETIME_S) * 1e9)
+        if late_ns > lifetime_ns:
+            late_s, lifetime_s = late_ns / 1e9, lifetime_ns / 1e9
+            self._warn(f"{source}: {late_s:.3f} s late, its lifetime is {lifetime_s:g} s", receipt_ns)
         self._newest[source] = VelocityInput(
             source,
             receipt_ns,
@@ -72,7 +86,7 @@ class VelocitySenders:
     def _forget(self, now_ns: int) -> None:
         for source, message in list(self._newest.items()):
             if now_ns - message.received_ns > FORGET_S * 1e9:
-                del self._newest[source], self._delays[source]
+                del self._newest[source], self._delays[source], self._stamps_ns[source]
 
     def _warn(self, problem: str, now_ns: int) -> None:
         if self._warned_ns is None or now_ns - self._warned_ns > WARN_INTERVAL_S * 1e9:

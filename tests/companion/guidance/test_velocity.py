@@ -15,7 +15,7 @@ from companion.guidance.behaviours.stop import StopBehaviour
 from companion.guidance.behaviours.velocity import VelocityBehaviour
 from companion.guidance.core import Phase
 from companion.guidance.interface import EventKind, GuidanceInput
-from companion.service.velocity_senders import MAX_SENDERS, VelocitySenders
+from companion.service.velocity_senders import FORGET_S, MAX_SENDERS, VelocitySenders
 from companion.vehicle.state import FlightMode
 from tests.companion.guidance.guidance_harness import GuidanceHarness, Pending, engaged, flying
 
@@ -157,6 +157,36 @@ def test_lifetime_counts_from_the_sending_of_a_late_message() -> None:
     assert received.newest(102 * S)[0].expires_ns == 101 * S + 3 * S // 10
     assert received.newest(130 * S) == ()
     assert not events
+
+
+def test_message_that_a_newer_one_has_overtaken_is_refused() -> None:
+    received, events = senders()
+    for stamp_ms, forward_mps in ((1000, 2.0), (1100, 0.0), (1090, 2.0)):
+        payload = message(stamp_ns=stamp_ms * S // 1000, forward_mps=forward_mps)
+        received.on_message(payload, 100 * S + stamp_ms * S // 1000)
+    (newest,) = received.newest(102 * S)
+    assert (newest.forward_mps, newest.expires_ns) == (0.0, 101 * S + 6 * S // 10)
+    assert [level for level, _ in events] == ["warning"]
+
+
+def test_sender_whose_clock_was_set_back_is_reported_and_accepted_later() -> None:
+    received, events = senders()
+    received.on_message(message(stamp_ns=50 * S, forward_mps=0.0), 100 * S)
+    accepted_s = []
+    for second in range(1, 14):
+        received.on_message(message(stamp_ns=second * S, forward_mps=2.0), (100 + second) * S)
+        if received.newest((100 + second) * S)[0].forward_mps:
+            accepted_s.append(second)
+    assert accepted_s[0] == FORGET_S + 1
+    assert [level for level, _ in events] == ["warning"]
+
+
+def test_message_that_arrives_expired_is_reported() -> None:
+    received, events = senders()
+    received.on_message(message(stamp_ns=5 * S), 100 * S)
+    received.on_message(message(stamp_ns=6 * S), 101 * S + 6 * S // 10)
+    assert received.newest(102 * S)[0].expires_ns == 101 * S + S // 2
+    assert [level for level, _ in events] == ["warning"]
 
 
 @pytest.mark.parametrize(
