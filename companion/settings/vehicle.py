@@ -16,7 +16,7 @@ class VehicleSection(Section):
     url: VehicleUrl = "udpin://127.0.0.1:14540"
     """the autopilot's link: udpin:// (listen), udpout:// or tcp://HOST:PORT, or serial:///dev/ttyAMA0:921600"""
     driver: Literal["pymavlink", "mavsdk", "auto"] = "pymavlink"
-    """MAVLink library; mavsdk supports PX4 only, auto selects one that fits the autopilot"""
+    """MAVLink library; pymavlink (also auto) flies PX4 and ArduPilot, mavsdk PX4 only"""
     system_id: Annotated[int, Field(ge=1, le=255)] = 1
     """the autopilot's MAVLink system id"""
     name: KeyWord = "vehicle1"
