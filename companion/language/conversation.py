@@ -23,6 +23,8 @@ from companion.language.sentences import is_stop, understand
 from companion.language.tools import read_call, tools_of
 
 MAX_TURNS = 8
+# A model's command of these alone needs no confirmation; its `stop` could end a pilot's flight.
+_UNCONFIRMED_OF_MODEL = NOT_FLOWN - {"stop"}
 KEPT_EXCHANGES = 10
 # An endless last step of a plan, such as a circle, ends after this.
 ENDLESS_S = 600.0
@@ -69,7 +71,7 @@ class Conversation:
         schema: the commands, as the queryable `commands` answers.
         class_names: the detector's; None: not known.
         endpoint: the language model; None: sentences are read by patterns.
-        may: commands that are flown without a confirmation.
+        may: commands that are flown without a confirmation, besides a single one that does not fly.
     """
 
     def __init__(
@@ -84,7 +86,7 @@ class Conversation:
     ) -> None:
         self._vehicle, self._operator = vehicle, operator
         self._tools, self._class_names = tools_of(schema), class_names
-        self._endpoint, self._may = endpoint, frozenset(may) | NOT_FLOWN
+        self._endpoint, self._may = endpoint, frozenset(may)
         self._history: deque[list[Message]] = deque(maxlen=KEPT_EXCHANGES)
         self._last: Command | None = None
         self._reply: Reply | None = None
@@ -124,7 +126,7 @@ class Conversation:
                     self._operator.show(_in_words(intent, await self._answer(intent)))
             if reading.done is not None:
                 self._operator.show("not in view: search first")
-            if commands and not (await self._propose(commands))["success"]:
+            if commands and not (await self._propose(commands, NOT_FLOWN))["success"]:
                 return False
             if reading.done is None:
                 return True
@@ -177,7 +179,7 @@ class Conversation:
         declined = False
         if commands and not invalid:
             try:
-                reply = await self._propose(commands)
+                reply = await self._propose(commands, _UNCONFIRMED_OF_MODEL)
                 declined = bool(reply.get("declined"))
             except GrammarError as error:
                 reply = {"success": False, "reason": str(error)}
@@ -191,8 +193,11 @@ class Conversation:
 
     # --- both
 
-    async def _propose(self, commands: Sequence[Command]) -> Reply:
+    async def _propose(self, commands: Sequence[Command], unconfirmed: Collection[str]) -> Reply:
         """Show a plan, have it confirmed where it must be, and fly it.
+
+        Args:
+            unconfirmed: commands that need no confirmation if they are alone.
 
         Raises:
             GrammarError: the plan is not a valid mission.
@@ -200,7 +205,13 @@ class Conversation:
         text, lines = plan_of(commands, self._class_names)
         for line in lines:
             self._operator.show(line)
-        if not {command.word for command in commands} <= self._may and not await self._operator.confirm():
+        words = {command.word for command in commands}
+        if len(commands) == 1:
+            free = words <= self._may.union(unconfirmed)
+        else:
+            # Several are a mission, which takes offboard control, also if none of them flies.
+            free = words <= self._may and not words <= NOT_FLOWN
+        if not free and not await self._operator.confirm():
             return {"success": False, "reason": "the operator declined", "declined": True}
         self._last = commands[-1]
         self._reply = reply = await self._vehicle.command(text)

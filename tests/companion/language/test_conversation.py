@@ -236,6 +236,34 @@ async def test_listed_commands_need_no_confirmation() -> None:
     assert talk.asked == 1
 
 
+@pytest.mark.parametrize(
+    ("calls", "may", "asked"),
+    [
+        ([("gimbal", {"pitch": -30})], (), 0),
+        ([("select", {})], (), 0),
+        ([("stop", {})], (), 1),
+        ([("stop", {})], ("stop",), 0),
+        ([("gimbal", {"pitch": -30}), ("gimbal", {"pitch": -60})], (), 1),
+        ([("gimbal", {"pitch": -30}), ("gimbal", {"pitch": -60})], ("gimbal",), 1),
+        ([("seek", {"class": "boat"}), ("gimbal", {})], ("seek",), 1),
+    ],
+)
+async def test_models_mission_and_stop_are_confirmed(
+    calls: list[Call], may: tuple[str, ...], asked: int
+) -> None:
+    async with serving(ollama(calls=calls), ollama("ok")) as script:
+        talk = Talk(script.url, yes=False, may=may)
+        assert await talk.ask("model: do it") is (asked == 0)
+    assert (talk.asked, len(talk.vehicle.commands)) == (asked, 1 - asked)
+
+
+@pytest.mark.parametrize(("text", "asked"), [("look down", 0), ("stop", 0), ("look down and look left", 1)])
+async def test_mission_of_gimbal_commands_is_confirmed(text: str, asked: int) -> None:
+    talk = Talk(yes=False)
+    assert await talk.ask(text) is (asked == 0)
+    assert (talk.asked, len(talk.vehicle.commands)) == (asked, 1 - asked)
+
+
 async def test_an_invalid_call_flies_nothing_of_its_answer() -> None:
     calls = [("takeoff", {"altitude": 5}), ("explode", {}), ("seek", {"class": 7})]
     async with serving(ollama(calls=calls), ollama("Sorry.")) as script:
