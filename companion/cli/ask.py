@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -16,6 +16,8 @@ from companion.cli.flags import plain_errors
 from companion.settings import Settings
 
 if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
     from companion.language.conversation import Conversation
     from companion.language.endpoints import Endpoint
 
@@ -92,8 +94,9 @@ async def _converse(
     from companion.bus import topics
     from companion.bus.client import client_settings
     from companion.client import connect as connect_to
-    from companion.language.conversation import Conversation, Operator
+    from companion.language.conversation import Conversation, Operator, send_stop
     from companion.language.live import LiveVehicle
+    from companion.language.sentences import is_stop
     from companion.language.serve import ASK
     from companion.language.serve import serve as serve_queries
     from companion.language.tools import class_names_of
@@ -101,24 +104,38 @@ async def _converse(
     where = client_settings(settings.zenoh, (connect,) if connect else ()).connect[0]
     terminal = Terminal()
     async with connect_to(where, settings.vehicle.name, config_file=settings.zenoh.config_file) as drone:
-        config = await drone.query("config")
-        until_s = time.monotonic() + (_DETECTOR_S if config["detector"]["enabled"] else 0.0)
-        # The classes are known when the detector has started.
-        while (class_names := class_names_of(schema := await drone.query("commands"))) is None:
-            if time.monotonic() >= until_s:
-                break
-            await asyncio.sleep(0.5)
-        vehicle = LiveVehicle(drone, class_names or (), config["guidance"]["camera"])
-        may = settings.language.may
 
-        def converse(operator: Operator) -> Conversation:
-            return Conversation(vehicle, operator, schema, class_names, endpoint=endpoint, may=may)
+        async def stop() -> bool:
+            return await send_stop(LiveVehicle(drone, (), None), terminal.show)
+
+        if sentence is not None and not serve and is_stop(sentence):
+            return await stop()
+
+        async def prepare() -> Callable[[Operator], Conversation]:
+            config = await drone.query("config")
+            until_s = time.monotonic() + (_DETECTOR_S if config["detector"]["enabled"] else 0.0)
+            # The classes are known when the detector has started.
+            while (class_names := class_names_of(schema := await drone.query("commands"))) is None:
+                if time.monotonic() >= until_s:
+                    break
+                await asyncio.sleep(0.5)
+            vehicle = LiveVehicle(drone, class_names or (), config["guidance"]["camera"])
+            may = settings.language.may
+
+            def converse(operator: Operator) -> Conversation:
+                return Conversation(vehicle, operator, schema, class_names, endpoint=endpoint, may=may)
+
+            return converse
 
         if serve:
+            converse = await prepare()
             terminal.show(f"answering {topics.ROOT}/{drone.name}/{ASK}")
             await serve_queries(drone.session, drone.name, converse)
-        operator = Operator(terminal.write, terminal.show, terminal.confirm)
-        return await terminal.attend(converse(operator), sentence)
+
+        async def begin() -> Conversation:
+            return (await prepare())(Operator(terminal.write, terminal.show, terminal.confirm))
+
+        return await terminal.attend(begin, stop, sentence)
 
 
 class Terminal:
@@ -155,8 +172,17 @@ class Terminal:
         finally:
             self._asked = None
 
-    async def attend(self, conversation: Conversation, sentence: str | None) -> bool:
-        """Run a sentence, or a chat until `quit` or the end of the input. Returns whether all was done."""
+    async def attend(
+        self,
+        begin: Callable[[], Awaitable[Conversation]],
+        stop: Callable[[], Awaitable[bool]],
+        sentence: str | None,
+    ) -> bool:
+        """Run a sentence, or a chat until `quit` or the end of the input. Returns whether all was done.
+
+        Args:
+            begin: makes the conversation; it may wait for the service. stop: waits for nothing.
+        """
         from companion.language.endpoints import LanguageError
         from companion.language.sentences import is_stop
 
@@ -164,13 +190,24 @@ class Terminal:
         chat = sentence is None
         if chat:
             self.show(_BANNER)
-        running = None if sentence is None else asyncio.create_task(conversation.ask(sentence))
+        beginning = asyncio.ensure_future(begin())
+
+        async def ask_it(text: str) -> bool:
+            return await (await asyncio.shield(beginning)).ask(text)
+
+        running = None if sentence is None else asyncio.create_task(ask_it(sentence))
         next_line = asyncio.create_task(self._lines.get())
         success = True
         try:
-            while not self._ended or running is not None:
-                waited = [task for task in (running, None if self._ended else next_line) if task is not None]
-                await asyncio.wait(waited, return_when=asyncio.FIRST_COMPLETED)
+            while not self._ended or running is not None or not beginning.done():
+                waited: list[asyncio.Future[Any] | None] = [
+                    running,
+                    None if self._ended else next_line,
+                    None if beginning.done() else beginning,
+                ]
+                await asyncio.wait(filter(None, waited), return_when=asyncio.FIRST_COMPLETED)
+                if beginning.done():
+                    beginning.result()  # its error ends the chat
                 if running is not None and running.done():
                     try:
                         success = running.result() and success
@@ -186,7 +223,9 @@ class Terminal:
                 line = next_line.result()
                 next_line = asyncio.create_task(self._lines.get())
                 if line is not None and is_stop(line):
-                    success = await conversation.stop() and success
+                    if running is not None:
+                        running.cancel()  # first: it sends nothing after the stop
+                    success = await stop() and success
                     await _cancelled(running)
                     running = None
                     if not chat:
@@ -202,11 +241,12 @@ class Terminal:
                 elif running is not None:
                     self._show_busy()
                 elif line.strip():
-                    running = asyncio.create_task(conversation.ask(line))
+                    running = asyncio.create_task(ask_it(line))
             return success
         finally:
             next_line.cancel()
             await _cancelled(running)
+            await _cancelled(beginning)
 
     def _show_busy(self) -> None:
         """At most once a second: a pipe may deliver lines without end."""
@@ -235,7 +275,7 @@ def _printable(text: str) -> str:
     return "".join(character for character in text if character.isprintable() or character == "\n")
 
 
-async def _cancelled(task: asyncio.Task[bool] | None) -> None:
+async def _cancelled(task: asyncio.Future[Any] | None) -> None:
     if task is not None:
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)

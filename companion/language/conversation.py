@@ -98,7 +98,7 @@ class Conversation:
             LanguageError: of the model. NoAnswerError: the service has gone.
         """
         if is_stop(text):
-            return await self.stop()
+            return await send_stop(self._vehicle, self._operator.show)
         try:
             if self._endpoint is not None:
                 return await self._ask_model(self._endpoint, text)
@@ -106,12 +106,6 @@ class Conversation:
         except (UnclearError, GrammarError) as error:
             self._operator.show(str(error))
             return False
-
-    async def stop(self) -> bool:
-        """End offboard control, at once."""
-        reply = await self._vehicle.command("stop")
-        self._operator.show(_outcome(reply))
-        return bool(reply["success"])
 
     # --- by patterns
 
@@ -232,6 +226,13 @@ class Conversation:
             newest = None if self._reply is None else self._reply.get("reason")
             return {"newest_command": newest, "warnings": warnings}
         return state
+
+
+async def send_stop(vehicle: Vehicle, show: Callable[[str], None]) -> bool:
+    """End offboard control, at once."""
+    reply = await vehicle.command("stop")
+    show(_outcome(reply))
+    return bool(reply["success"])
 
 
 def plan_of(commands: Sequence[Command], class_names: Sequence[str] | None) -> tuple[str, list[str]]:

@@ -32,7 +32,6 @@ class Reading:
     done: int | None = None
 
 
-_STOP = re.compile(r"(?:please )?(?:stop|halt|abort|freeze)(?: (?:now|it|everything|at once|please))*")
 _VERBS = (
     "take|launch|climb|land|come|return|go|fly|move|stop|halt|abort|freeze|hold|hover|wait|stay|circle|orbit"
     "|find|search|look|seek|locate|approach|follow|chase|tail|point|aim|turn|face|descend|rise|ascend|get|keep"
@@ -41,11 +40,19 @@ _VERBS = (
 _SPLIT = re.compile(
     rf"(?:[,;.]? (?:and then|then|after that|afterwards|and)|[,;.]) (?=(?:please )?(?:{_VERBS})\b)"
 )
+_STOP_WORDS = "stop|halt|abort|freeze"
+_STOP = re.compile(rf"[,;. ]*(?:emergency )?(?:{_STOP_WORDS})\b")
+# After these a verb is a noun: "stop the search", "abort landing".
+_NOUN_IN_STOP = re.compile(r"\b(?:the|this|that|your|my|abort) (?:take off|\w+)")
+_OTHER_IN_STOP = re.compile(
+    rf"\b(?:(?!(?:{_STOP_WORDS})\b)(?:{_VERBS})|at(?! once| 1 x)|in \d+|when|if|after|before|near|behind|until|unless)\b"
+)
 
 
 def is_stop(text: str) -> bool:
-    """Whether the line means `stop` and nothing else. It never waits for a model."""
-    return _STOP.fullmatch(_plain(text)) is not None
+    """Whether a line begins with stop and has no other verb and no condition. It never waits for a model."""
+    plain = _plain(text)
+    return _STOP.match(plain) is not None and _OTHER_IN_STOP.search(_NOUN_IN_STOP.sub("", plain)) is None
 
 
 def understand(text: str, scene: Scene, done: int | None = None) -> Reading:

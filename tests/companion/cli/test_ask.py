@@ -39,6 +39,7 @@ class Service:
     def __init__(self) -> None:
         self.endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
         self.commands: list[str] = []
+        self.ready = True
         self.flying, self.stopped = asyncio.Event(), asyncio.Event()
         self.bus = Bus(
             ZenohSection(listen=(self.endpoint,)),
@@ -49,7 +50,7 @@ class Service:
         )
 
     async def _schema(self) -> Any:
-        return json_schema(CLASSES)
+        return json_schema(CLASSES if self.ready else None)
 
     async def _config(self) -> Any:
         return {"guidance": {"camera": None}, "detector": {"enabled": True}}
@@ -155,6 +156,49 @@ async def test_stop_is_sent_while_the_vehicle_flies(monkeypatch: pytest.MonkeyPa
             typed.write("what do you see\nSTOP!\nquit\n")
             assert await asyncio.wait_for(chat, 20) is True
             assert there.commands[:2] == ["orbit track=3", "stop"]
+
+
+@pytest.mark.parametrize("sentence", ["stop the drone", None])
+async def test_stop_does_not_wait_for_the_detector(
+    sentence: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with keyboard(monkeypatch) as typed:
+        async with service() as there:
+            there.ready = False
+            typed.write("circle track 3\nstop\nquit\n")
+            assert await asyncio.wait_for(ask(there, sentence, language__may="orbit"), 5) is True
+            assert there.commands == ["stop"]
+
+
+async def test_a_running_sentence_sends_nothing_after_the_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its command is superseded by the stop before the stop is answered; its next command is not flown."""
+
+    class Two:
+        def __init__(self, drone: Any) -> None:
+            self.drone = drone
+
+        async def ask(self, _: str) -> bool:
+            await self.drone.command("orbit track=3")
+            await self.drone.command("takeoff")
+            return True
+
+    with keyboard(monkeypatch) as typed:
+        async with service() as there, connect(there.endpoint) as drone:
+
+            async def begin() -> Any:
+                return Two(drone)
+
+            async def stop() -> bool:
+                await drone.command("stop")
+                await asyncio.sleep(0.3)
+                return True
+
+            chat = asyncio.create_task(Terminal().attend(begin, stop, None))
+            typed.write("circle track 3, then take off\n")
+            await asyncio.wait_for(there.flying.wait(), 20)
+            typed.write("stop\nquit\n")
+            assert await asyncio.wait_for(chat, 20) is True
+    assert set(there.commands) == {"orbit track=3", "stop"}
 
 
 async def test_what_is_seen_has_colour_range_and_direction(

@@ -73,12 +73,32 @@ def test_unknown_height_and_heading_are_asked_back() -> None:
             understand(text, replace(blind, objects=()))
 
 
-@pytest.mark.parametrize("text", ["stop", "STOP!", "please stop", "Stop now.", "halt", "abort", "freeze!"])
-def test_stop_is_recognized_alone(text: str) -> None:
+STOPS = """stop|STOP!|please stop|Stop now.|halt|abort|freeze!|stop, now|stop, please|stop stop|Stop. Stop!
+stop right now|stop immediately|stop at once|stop the drone|stop following the car|stop flying|emergency stop
+Emergency stop!|hey drone, stop what you are doing|Please, stop|stop the search|abort the landing|abort take off|halt, halt"""
+
+
+@pytest.mark.parametrize("text", STOPS.replace("\n", "|").split("|"))
+def test_stop_is_recognized_without_another_verb(text: str) -> None:
     assert is_stop(text)
+    assert [str(intent) for intent in understand(text, SCENE).intents] == ["stop"]
 
 
-@pytest.mark.parametrize("text", ["do not stop", "why did you stop?", "stop at the car", "stopped", ""])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "do not stop",
+        "why did you stop?",
+        "stop at the car",
+        "stop when you see a car",
+        "stop in ten seconds",
+        "stop and land",
+        "stop, come home",
+        "abort and land",
+        "stopped",
+        "",
+    ],
+)
 def test_other_sentences_are_not_stop(text: str) -> None:
     assert not is_stop(text)
 
