@@ -43,9 +43,10 @@ class _Lines:
 
 
 async def serve(session: zenoh.Session, vehicle: str, converse: Callable[[Operator], Conversation]) -> None:
-    """Answer queries until cancelled, one after the other; `stop` waits for none.
+    """Answer queries until cancelled, one at a time; `stop` ends the one that is being answered.
 
-    The payload is a sentence, the reply JSON: {"success": bool, "answer": str}.
+    The payload is a sentence, the reply JSON: {"success": bool, "answer": str}. A sentence that comes meanwhile
+    is refused: it would be flown when its asker no longer expects it.
 
     Args:
         converse: makes the conversation, whose history all queries share.
@@ -54,23 +55,36 @@ async def serve(session: zenoh.Session, vehicle: str, converse: Callable[[Operat
     operator = Operator(
         lambda piece: lines.write(piece), lambda line: lines.show(line), lambda: lines.confirm()
     )
-    conversation, one_by_one = converse(operator), asyncio.Lock()
+    conversation = converse(operator)
+    running: asyncio.Task[bool | str] | None = None
     loop, tasks = asyncio.get_running_loop(), set[asyncio.Task[None]]()
 
     async def answer(query: zenoh.Query) -> None:
-        nonlocal lines
-        text = (
-            ""
-            if query.payload is None
-            else query.payload.to_bytes()[:MAX_SENTENCE_BYTES].decode(errors="replace")
-        )
-        if is_stop(text):
-            await reply(query, await _attempt(conversation, text), "stop")
+        nonlocal lines, running
+        payload = b"" if query.payload is None else query.payload.to_bytes()
+        if len(payload) > MAX_SENTENCE_BYTES:
+            await reply(query, f"the sentence has {len(payload)} bytes, at most {MAX_SENTENCE_BYTES}", "")
             return
-        async with one_by_one:
-            lines = _Lines()
-            success = await _attempt(conversation, text)
-            await reply(query, success, lines.text)
+        text = payload.decode(errors="replace")
+        if is_stop(text):
+            if running is not None:
+                running.cancel()  # first: it sends nothing after the stop
+            own = _Lines()
+            stopping = converse(Operator(own.write, own.show, own.confirm))
+            await reply(query, await _attempt(stopping, text), "stop")
+            return
+        if running is not None:
+            await reply(query, "busy with another sentence; `stop` ends it", "")
+            return
+        lines = _Lines()
+        running = loop.create_task(_attempt(conversation, text))
+        try:
+            await asyncio.wait((running,))
+            await reply(query, "ended by stop" if running.cancelled() else running.result(), lines.text)
+        finally:
+            running.cancel()
+            await asyncio.gather(running, return_exceptions=True)
+            running = None
 
     async def reply(query: zenoh.Query, outcome: bool | str, text: str) -> None:
         failed = isinstance(outcome, str)

@@ -241,9 +241,13 @@ async def test_questions_on_zenoh_are_answered_and_fly_only_what_may_be(
             assert there.commands == []
             flying = asyncio.create_task(question("circle the red car"))
             await asyncio.wait_for(there.flying.wait(), 20)
+            assert (await question("take off"))["answer"].startswith("busy")
             assert await question("stop") == {"success": True, "answer": "stop"}
-            assert (await flying)["success"] is True
-        assert there.commands == ["orbit track=3", "stop"]
+            assert await flying == {"success": False, "answer": "ended by stop"}
+            assert "at most 2000" in (await question("take off" + " " * 2000))["answer"]
+            assert set(there.commands) == {"orbit track=3", "stop"}
+            assert (await question("take off"))["success"] is True
+        assert there.commands[-1] == "takeoff"
         serving.cancel()
         await asyncio.gather(serving, return_exceptions=True)
 
