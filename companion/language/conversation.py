@@ -130,6 +130,19 @@ class Conversation:
 
     async def _ask_model(self, endpoint: Endpoint, text: str) -> bool:
         exchange = [Message("user", text)]
+        try:
+            return await self._turns(endpoint, exchange)
+        finally:
+            # What was flown is remembered, also after an error or a stop.
+            if len(exchange) > 1:
+                ended = json.dumps({"success": False, "reason": "ended"})
+                exchange += [Message("tool", ended, answers=call) for call in exchange[-1].calls]
+                if exchange[-1].role == "tool":
+                    exchange.append(Message("assistant", "The exchange has ended."))
+                self._history.append(exchange)
+
+    async def _turns(self, endpoint: Endpoint, exchange: list[Message]) -> bool:
+        """Extend an exchange until the model calls nothing. Returns success of the newest commands."""
         success = True
         for _ in range(MAX_TURNS):
             earlier = [message for each in self._history for message in each]
@@ -139,18 +152,20 @@ class Conversation:
             self._operator.show("")
             exchange.append(answer)
             if not answer.calls:
-                self._history.append(exchange)
                 return success
-            results, declined, success = await self._execute(answer)
+            results, declined, flown = await self._execute(answer)
+            success = success if flown is None else flown
             exchange += results
             if declined:
-                self._history.append([*exchange, Message("assistant", "The operator declined.")])
+                exchange.append(Message("assistant", "The operator declined."))
                 return False
         self._operator.show(f"the model has not come to an end in {MAX_TURNS} turns")
         return False
 
-    async def _execute(self, answer: Message) -> tuple[list[Message], bool, bool]:
+    async def _execute(self, answer: Message) -> tuple[list[Message], bool, bool | None]:
         """The results of all calls of one answer, whether the operator declined, and success.
+
+        Success is None if there were only questions.
 
         Nothing is flown if a call of the answer is invalid: the rest may depend on it.
         """
@@ -183,7 +198,7 @@ class Conversation:
             Message("tool", json.dumps(content), answers=call)
             for call, content in zip(answer.calls, contents, strict=True)
         ]
-        return results, declined, bool(reply["success"])
+        return results, declined, bool(reply["success"]) if commands or invalid else None
 
     # --- both
 

@@ -16,6 +16,8 @@ _QUESTION_HELP = {
     "state": "flight mode, whether armed, height, position and the active command",
     "why_not": "why the newest command was refused or ended, and the newest warnings",
 }
+# What they fly is not in the call, so nobody could confirm it.
+_NOT_FOR_MODELS = frozenset({"mission", "velocity"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +37,8 @@ def tools_of(schema: Mapping[str, Any]) -> list[dict[str, Any]]:
     """
     tools = []
     for word, command in schema["$defs"].items():
+        if word in _NOT_FOR_MODELS:
+            continue
         described = command["description"]
         if exclusive := [key for each in command.get("oneOf", ()) for key in each["required"]]:
             described += f". Give exactly one of {', '.join(exclusive)}"
@@ -74,6 +78,8 @@ def read_call(call: ToolCall, class_names: Sequence[str] | None) -> Command | Qu
         return Question(call.name, about if isinstance(about, str) else "")
     if not isinstance(call.name, str) or len(call.name.split()) != 1:
         raise GrammarError(f"unknown tool {str(call.name)[:80]!r}")
+    if call.name.lower() in _NOT_FOR_MODELS:
+        raise GrammarError(f"{call.name} is not for a model: the call does not show what is flown")
     return parse(" ".join([call.name, *(_written(call.name, *item) for item in given.items())]), class_names)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import socket
 from dataclasses import replace
@@ -86,6 +87,7 @@ def test_tools_have_units_ranges_and_classes() -> None:
     assert tools["seek"]["properties"]["class"]["enum"] == list(CLASSES)
     assert tools["seek"]["required"] == ["class"]
     assert {"seen", "battery", "state", "why_not", "stop", "takeoff"} <= set(tools)
+    assert not {"mission", "velocity"} & set(tools)
     assert class_names_of(SCHEMA) == CLASSES
     assert class_names_of(json_schema(None)) is None
 
@@ -110,6 +112,9 @@ def test_tools_have_units_ranges_and_classes() -> None:
         ("orbit", {"class": "car", "track": 3}),
         ("approach", {"track": 1.5}),
         ("mission", {"file": "demo\n[[step]]"}),
+        ("mission", {"file": "demo"}),
+        ("Mission", {"file": "demo"}),
+        ("velocity", {}),
     ],
 )
 def test_invalid_call_is_refused_by_the_grammar(name: str, arguments: Any) -> None:
@@ -312,6 +317,50 @@ async def test_history_reaches_the_next_exchange() -> None:
         await talk.ask("sure?")
     contents = [message["content"] for message in script.requests[-1][1]["messages"][1:]]
     assert contents == ["how high are we?", "Fivemetres.", "sure?"]
+
+
+async def test_refused_command_is_no_success_after_a_question() -> None:
+    answers = ollama(calls=[("hold", {})]), ollama(calls=[("why_not", {})]), ollama("It is on the ground.")
+    async with serving(*answers) as script:
+        assert not await Talk(script.url, vehicle=FakeVehicle(refused="hold")).ask("wait here")
+
+
+@pytest.mark.parametrize("end", ["turns", "error"])
+async def test_what_was_flown_is_remembered_after_an_error(end: str) -> None:
+    hold = ollama(calls=[("hold", {})])
+    asked = [hold] * MAX_TURNS if end == "turns" else [hold, ollama("half", cut=True)]
+    async with serving(*asked, ollama("Yes.")) as script:
+        talk = Talk(script.url)
+        if end == "turns":
+            assert not await talk.ask("wait here")
+        else:
+            with pytest.raises(LanguageError):
+                await talk.ask("wait here")
+        await talk.ask("second")
+        results = tool_results(script)
+        roles = [message["role"] for message in script.requests[-1][1]["messages"]]
+    assert [result["command"] for result in results] == talk.vehicle.commands
+    assert roles[-2:] == ["assistant", "user"]
+
+
+async def test_command_ended_by_the_operator_is_remembered() -> None:
+    vehicle = FakeVehicle()
+    begun = asyncio.Event()
+
+    async def fly(_: str) -> dict[str, Any]:
+        begun.set()
+        await asyncio.sleep(30)
+        raise TimeoutError
+
+    async with serving(ollama(calls=[("hold", {})]), ollama("Yes.")) as script:
+        talk = Talk(script.url, vehicle=vehicle)
+        vehicle.command = fly  # type: ignore[method-assign]
+        asked = asyncio.create_task(talk.ask("wait here"))
+        await begun.wait()
+        asked.cancel()
+        await asyncio.gather(asked, return_exceptions=True)
+        await talk.ask("second")
+        assert tool_results(script) == [{"success": False, "reason": "ended"}]
 
 
 async def test_failed_exchange_leaves_no_history() -> None:
