@@ -44,6 +44,8 @@ POLITE = re.compile(
 _FILLERS = frozenset(
     re.findall(r"\w+", "the a an that this of to at in on it me us there here please now with for")
 )
+# These refer to an object or a place; a command that took no object has not understood them.
+_REFERRING = frozenset(("that", "on", "it", "me", "us", "there"))
 _N = r"(-?\d+(?:\.\d+)?)"
 _TURN_BACK = {"left": -90.0, "right": 90.0, "around": 180.0, "round": 180.0}
 _COMPASS = {"north": 0.0, "east": 90.0, "south": 180.0, "west": 270.0}
@@ -71,6 +73,7 @@ class Clause:
         self._whole = self._rest = POLITE.sub("", words.strip(" ,;."))
         self._scene, self.focus = scene, focus
         self._missing: str | None = None
+        self._took_object = False
 
     def take(self, pattern: str) -> re.Match[str] | None:
         """The first occurrence of a pattern, as whole words, which is removed."""
@@ -95,7 +98,8 @@ class Clause:
                 continue
             self._rest = self._whole[found.end() :]
             intent = handler(self, found)
-            if left := [word for word in re.findall(r"[\w/.-]+", self._rest) if word not in _FILLERS]:
+            fillers = _FILLERS if self._took_object else _FILLERS - _REFERRING
+            if left := [word for word in re.findall(r"[\w/.-]+", self._rest) if word not in fillers]:
                 classes = ", ".join(self._scene.class_names[:12]) or "none"
                 raise UnclearError(
                     f"{self._whole!r}: not understood: {' '.join(left)!r}. The detector's classes: {classes}"
@@ -117,6 +121,7 @@ class Clause:
             UnclearError: several objects or classes fit.
         """
         self.focus = target = self._named()
+        self._took_object = bool(target)
         return target
 
     def _named(self) -> dict[str, Any]:
@@ -172,13 +177,25 @@ class Clause:
         return {"track_id": seen[0].track_id}
 
     def _tracked(self, class_name: str | None, colour: re.Match[str] | None) -> list[SceneObject]:
-        return [
+        """Objects with a track, of a class and of a colour.
+
+        Raises:
+            UnclearError: none is known to have the colour, and that of some is unknown.
+        """
+        of_class = [
             each
             for each in self._scene.objects
-            if each.track_id is not None
-            and class_name in (None, each.class_name)
-            and (colour is None or each.colour == COLOUR_WORDS[colour[0]])
+            if each.track_id is not None and class_name in (None, each.class_name)
         ]
+        if colour is None:
+            return of_class
+        matching = [each for each in of_class if each.colour == COLOUR_WORDS[colour[0]]]
+        if not matching and (unknown := [each for each in of_class if each.colour is None]):
+            raise UnclearError(
+                f"{self._whole!r}: colours are not known: no preview image, or too small in it: "
+                f"{_options(unknown)}, or ask again"
+            )
+        return matching
 
     def _same_object(self) -> dict[str, Any]:
         if self.focus:
@@ -198,7 +215,7 @@ class Clause:
         return make_command("takeoff", altitude_m=self.number("m"))
 
     def land(self, _: re.Match[str]) -> Command:
-        if marker := self.take(r"marker (?:number )?(\d+)"):
+        if marker := self.take(r"(?:on )?(?:the )?marker (?:number )?(\d+)"):
             return make_command("land-on-marker", identifier=float(marker[1]))
         self.take("(?:right here|where you are|immediately)")
         return make_command("land")
@@ -212,7 +229,7 @@ class Clause:
         return make_command("stop")
 
     def hold(self, _: re.Match[str]) -> Command:
-        self.take("(?:your position|position|still|where you are)")
+        self.take("(?:your position|position|still|where you are|on|it|there)")
         return make_command("hold", duration_s=self.number("s"))
 
     def seek(self, _: re.Match[str]) -> Command | Question:
@@ -288,7 +305,9 @@ class Clause:
         else:
             angle = self.number("deg")
             side = self.take(f"({'|'.join(_TURN_BACK)})")
-            if self._scene.yaw_rad is None or side is None:
+            if self._scene.yaw_rad is None:
+                raise UnclearError(f"{self._whole!r}: the heading is not known. Say for example 'face north'")
+            if side is None:
                 raise UnclearError(f"{self._whole!r}: which way? Say for example 'turn left 90 degrees'")
             by = _TURN_BACK[side[1]] if angle is None else math.copysign(angle, _TURN_BACK[side[1]])
             heading = round(math.degrees(self._scene.yaw_rad) + by) % 360
@@ -360,7 +379,7 @@ class Clause:
     def _distance(self) -> float | None:
         found = self.take(
             rf"(?:to )?(?:within )?(?:(?:with )?(?:a )?(?:distance|radius) (?:of )?)?{_N} m"
-            r"(?: (?:distance|radius|behind|away from|away))?"
+            r"(?: (?:distance|radius|away from|away))?"
         )
         return None if found is None else float(found[1])
 

@@ -40,6 +40,8 @@ _VERBS = (
 _SPLIT = re.compile(
     rf"(?:[,;.]? (?:and then|then|after that|afterwards|and)|[,;.]) (?=(?:please )?(?:{_VERBS})\b)"
 )
+# Further words of a question.
+_REST = rf"(?: (?!.*\b(?:{_VERBS})\b).*)?"
 _STOP_WORDS = "stop|halt|abort|freeze"
 _STOP = re.compile(rf"[,;. ]*(?:emergency )?(?:{_STOP_WORDS})\b")
 # After these a verb is a noun: "stop the search", "abort landing".
@@ -69,10 +71,14 @@ def understand(text: str, scene: Scene, done: int | None = None) -> Reading:
     plain = _plain(text)
     if is_stop(plain):
         return Reading((make_command("stop"),))
-    if question := _question(plain, scene):
-        return Reading((question,))
     intents: list[Command | Question] = []
     clauses, focus = _SPLIT.split(plain), dict[str, Any]()
+    if (question := _question(clauses[0], scene)) and len(clauses) == 1:
+        return Reading((question,))
+    if question or any(_question(words, scene) for words in clauses[1:]):
+        if any(map(is_stop, clauses)):
+            return Reading((make_command("stop"),))
+        raise UnclearError(f"{plain!r}: a question and an order. Say one after the other")
     for words in clauses:
         clause = Clause(words, scene, focus)
         try:
@@ -88,6 +94,8 @@ def understand(text: str, scene: Scene, done: int | None = None) -> Reading:
         intents.append(intent)
         if isinstance(intent, Command):
             scene = replace(scene, last=intent)
+            if len(intents) > (done or 0):  # flown before the next clause, so the pose there is not known
+                scene = replace(scene, yaw_rad=None, altitude_m=None)
     return Reading(tuple(intents[done or 0 :]))
 
 
@@ -108,34 +116,34 @@ def _not_seen(words: str, scene: Scene) -> str:
 
 
 def _question(text: str, scene: Scene) -> Question | None:
-    """A question, or None."""
+    """A question, or None. Only a question `why` may have a verb of a command."""
     nouns = noun_pattern(scene.class_names)
     if re.fullmatch(r"why(?: (?:not|did|do|does|will|can|cant|cannot|wont|didnt|dont|are|is)\b.*)?", text):
         return Question("why_not")
     if re.fullmatch(
-        r".*\b(?:how (?:much|is) (?:the |your )?(?:battery|charge|power).*|battery(?: level| state| left)?"
-        r"|charge left)",
+        rf"how (?:much|is) (?:the |your )?(?:battery|charge|power){_REST}"
+        r"|(?:(?:what is|tell me|report) )?(?:the |your )?(?:battery(?: charge| level| state| left)?|charge left)",
         text,
     ):
         return Question("battery")
     if re.fullmatch(
         r"what (?:(?:do|can) you see|are you seeing|is visible)(?: right)?(?: now)?"
-        r"|what is (?:in (?:front|view|sight)|there).*|report what you see",
+        rf"|what is (?:in (?:front|view|sight)|there){_REST}|report what you see",
         text,
     ):
         return Question("seen")
     if found := re.fullmatch(
         r"(?:(?:can|do) you see|is there|are there|where (?:is|are)|how far(?: away)? (?:is|are)|how many"
-        rf"|any)(?: any| a| an| the)? (?P<noun>{nouns})(?: .*)?",
+        rf"|any)(?: any| a| an| the)? (?P<noun>{nouns}){_REST}",
         text,
     ):
         names = classes_of(found["noun"], scene.class_names)
         return Question("seen", names[0] if len(names) == 1 else "")
     if re.fullmatch(
-        r"(?:how high|how fast|where) are you.*|what are you doing.*"
+        rf"(?:how high|how fast|where) are you{_REST}|what are you doing{_REST}"
         r"|(?:what is )?(?:the |your )?(?:state|status)"
         r"|(?:what is )?your (?:altitude|height|speed|position|mode)"
-        r"|are you (?:flying|armed|ready|healthy|ok).*",
+        rf"|are you (?:flying|armed|ready|healthy|ok){_REST}",
         text,
     ):
         return Question("state")

@@ -49,6 +49,8 @@ SENTENCES: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("stay where you are", ("hold",)),
     ("hover for ten seconds", ("hold duration=10",)),
     ("wait two minutes", ("hold duration=120",)),
+    ("hold on", ("hold",)),
+    ("stay there", ("hold",)),
     ("hold your position for half a minute", ("hold duration=30",)),
     # moves
     ("go ten metres forward", ("goto forward=10 right=0",)),
@@ -101,6 +103,7 @@ SENTENCES: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("follow the person from behind at six metres", ("follow person distance=6 bearing=course",)),
     ("follow any car", ("follow car",)),
     ("keep following it", ("follow boat",)),
+    ("follow the person 5 m behind", ("follow person distance=5 bearing=course",)),
     ("track the yellow person", ("follow track=7",)),
     ("follow the person at ten kilometres per hour", ("follow person speed=2.77778",)),
     ("follow that blue one", ("follow track=5",)),
@@ -160,6 +163,9 @@ SENTENCES: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("status", ("?state",)),
     ("why not?", ("?why_not",)),
     ("why did you stop?", ("?why_not",)),
+    ("what is the battery level", ("?battery",)),
+    ("where are you now?", ("?state",)),
+    ("what are you doing, stop", ("stop",)),
 )
 
 # Sentences that are ambiguous, or that no command expresses; and a word of the question back.
@@ -183,4 +189,22 @@ UNCLEAR: tuple[tuple[str, str], ...] = (
     ("biggest car", "begin with a verb"),
     ("approach the biggest car", "which is the biggest"),
     ("do a barrel roll", "begin with a verb"),
+    # a question does not swallow an order, nor an order a question
+    ("land, low battery", "low battery"),
+    ("go home because of the low battery", "because low battery"),
+    ("where are you, come home", "a question and an order"),
+    ("is there a car? then land", "a question and an order"),
+    ("take off and then what is your battery", "what is your battery"),
+    # heading and height after an earlier command
+    ("turn left and fly 10 m north", "heading is not known"),
+    ("turn left and turn left", "heading is not known"),
+    ("take off to 5 m, then go up 3 m", "height is not known"),
+    # words that refer to an object or a place
+    ("come back to me", "'me'"),
+    ("return to it", "'it'"),
+    ("land there", "'there'"),
+    ("land on it", "'on it'"),
+    ("circle there", "'there'"),
+    ("fly 10 m behind the person", "'behind'"),
+    ("approach the person 5 metres behind", "'behind'"),
 )

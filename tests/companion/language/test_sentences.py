@@ -50,6 +50,23 @@ def test_unseen_colour_is_searched_for_once() -> None:
         understand(text, SCENE, first.done)
 
 
+def test_pose_is_known_again_after_the_search() -> None:
+    text = "take off to 5 m, find the white truck and then go up three metres"
+    seen = replace(SCENE, objects=(SceneObject("truck", 9, "white"),))
+    again = understand(text, seen, understand(text, SCENE).done)
+    assert [str(each) for each in again.intents] == [str(parse("goto forward=0 right=0 altitude=8"))]
+
+
+@pytest.mark.parametrize("text", ["find the red car", "circle the red car", "follow the red one"])
+def test_unknown_colour_is_asked_back(text: str) -> None:
+    unknown = replace(SCENE, objects=tuple(replace(each, colour=None) for each in SCENE.objects))
+    for done in (None, 0):
+        with pytest.raises(UnclearError, match=r"colours are not known.*car \(track 3\)"):
+            understand(text, unknown, done)
+    one = replace(SCENE, objects=(SCENE.objects[0], SceneObject("car", 5)))
+    assert "track=3" in str(understand("circle the red car", one).intents[0])
+
+
 def test_a_condition_no_command_expresses_is_not_dropped() -> None:
     with pytest.raises(UnclearError):
         understand("find the purple dog unless it barks", SCENE)
