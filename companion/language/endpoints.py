@@ -125,7 +125,7 @@ class OpenAIEndpoint:
                     delta = choice.get("delta") or {}
                     answer.add_text(delta.get("content") or "")
                     for part in delta.get("tool_calls") or ():
-                        _add_part(calls, part)
+                        answer.add_part(calls, part)
                     answer.whole = answer.whole or choice.get("finish_reason") is not None
             for call in calls.values():
                 answer.add_call(ToolCall(call["name"], _object(call["arguments"]), call["id"]))
@@ -138,19 +138,36 @@ class _Answer:
     def __init__(self, on_text: Callable[[str], None]) -> None:
         self._on_text = on_text
         self._text, self._calls = "", list[ToolCall]()
+        self._characters = 0
         self.whole = False
 
     def add_text(self, piece: str) -> None:
-        if len(self._text) + len(piece) > MAX_ANSWER_CHARACTERS:
-            raise LanguageError(f"the model's answer has more than {MAX_ANSWER_CHARACTERS} characters")
+        self._count(piece)
         self._text += piece
         if piece:
             self._on_text(piece)
 
     def add_call(self, call: ToolCall) -> None:
-        if len(self._calls) >= MAX_CALLS:
-            raise LanguageError(f"the model's answer has more than {MAX_CALLS} calls")
+        _check_calls(len(self._calls))
         self._calls.append(call)
+
+    def add_part(self, calls: dict[int, dict[str, str]], part: dict[str, Any]) -> None:
+        """Add a piece of a call, by its index; name and arguments come in pieces."""
+        index = part.get("index", 0)
+        if index not in calls:
+            _check_calls(len(calls))
+        call = calls.setdefault(index, {"id": "", "name": "", "arguments": ""})
+        call["id"] = part.get("id") or call["id"]
+        function = part.get("function") or {}
+        for key in ("name", "arguments"):
+            piece = function.get(key) or ""
+            self._count(piece)
+            call[key] += piece
+
+    def _count(self, piece: str) -> None:
+        self._characters += len(piece)
+        if self._characters > MAX_ANSWER_CHARACTERS:
+            raise LanguageError(f"the model's answer has more than {MAX_ANSWER_CHARACTERS} characters")
 
     def message(self, url: str) -> Message:
         if not self.whole:
@@ -183,7 +200,7 @@ async def _readable(endpoint: OllamaEndpoint | OpenAIEndpoint, advice: str) -> A
         raise LanguageError(f"language.url: {url!r} is not valid: {error}") from None
     except (ollama.ResponseError, httpx.HTTPStatusError) as error:
         raise LanguageError(_status_text(error, endpoint, advice)) from None
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         first = str(error).splitlines()[0] if str(error) else ""
         raise LanguageError(
             f"{url}: the answer is not in the expected format ({type(error).__name__}: {first[:120]}); "
@@ -241,18 +258,14 @@ def _mapping(arguments: Any) -> dict[str, Any]:
     return arguments if isinstance(arguments, dict) else {}
 
 
-def _add_part(calls: dict[int, dict[str, str]], part: dict[str, Any]) -> None:
-    """Add a piece of a call, by its index; name and arguments come in pieces."""
-    call = calls.setdefault(part.get("index", 0), {"id": "", "name": "", "arguments": ""})
-    call["id"] = part.get("id") or call["id"]
-    function = part.get("function") or {}
-    call["name"] += function.get("name") or ""
-    call["arguments"] += function.get("arguments") or ""
+def _check_calls(calls: int) -> None:
+    if calls >= MAX_CALLS:
+        raise LanguageError(f"the model's answer has more than {MAX_CALLS} calls")
 
 
 def _object(text: str) -> Any:
     """The arguments of a call; the text itself where it is not JSON, which `read_call` refuses."""
     try:
         return json.loads(text or "{}")
-    except ValueError:
+    except (ValueError, RecursionError):
         return text

@@ -438,6 +438,42 @@ async def test_malformed_arguments_of_openai_are_refused() -> None:
     assert "must be an object" in tool_results(script)[0]["error"]
 
 
+def _events(parts: list[dict[str, Any]]) -> bytes:
+    """Server-sent events of calls in pieces, without an end."""
+    lines = [json.dumps({"choices": [{"delta": {"tool_calls": [part]}}]}) for part in parts]
+    return response([f"data: {line}\n\n".encode() for line in lines], "text/event-stream")
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        [{"index": 0, "function": {"name": "seek", "arguments": "x" * 1000}}] * 21,
+        [{"index": 0, "function": {"name": "x" * 1000}}] * 21,
+        [{"index": index, "function": {"name": "battery"}} for index in range(60)],
+    ],
+)
+async def test_endless_calls_in_pieces_are_refused_as_they_come(parts: list[dict[str, Any]]) -> None:
+    async with serving(_events(parts)) as script:
+        with pytest.raises(LanguageError, match="more than"):
+            await Talk(f"{script.url}/v1").ask("tired?")
+
+
+async def test_deeply_nested_arguments_are_refused() -> None:
+    nested = '{"altitude": ' + "[" * 9000 + "]" * 9000 + "}"
+    async with serving(openai(calls=[("takeoff", nested)]), openai("Sorry.")) as script:
+        talk = Talk(f"{script.url}/v1")
+        assert not await talk.ask("take off")
+    assert talk.vehicle.commands == []
+    assert set(tool_results(script)[0]) == {"error"}
+
+
+async def test_deeply_nested_answer_is_one_line() -> None:
+    line = b"data: " + b"[" * 100_000 + b"\n\n"
+    async with serving(response([line], "text/event-stream")) as script:
+        with pytest.raises(LanguageError, match="expected format"):
+            await Talk(f"{script.url}/v1").ask("hello")
+
+
 # --- by patterns
 
 
