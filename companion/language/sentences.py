@@ -47,7 +47,8 @@ _STOP = re.compile(rf"[,;. ]*(?:emergency )?(?:{_STOP_WORDS})\b")
 # After these a verb is a noun: "stop the search", "abort landing".
 _NOUN_IN_STOP = re.compile(r"\b(?:the|this|that|your|my|abort) (?:take off|\w+)")
 _OTHER_IN_STOP = re.compile(
-    rf"\b(?:(?!(?:{_STOP_WORDS})\b)(?:{_VERBS})|at(?! once| 1 x)|in \d+|when|if|after|before|near|behind|until|unless)\b"
+    rf"\b(?:(?!(?:{_STOP_WORDS})\b)(?:{_VERBS})|at(?! once| 1 x)|in \d+|when|if|after|before|near|behind"
+    r"|until|unless)\b"
 )
 
 
@@ -122,7 +123,7 @@ def _question(text: str, scene: Scene) -> Question | None:
         return Question("why_not")
     if re.fullmatch(
         rf"how (?:much|is) (?:the |your )?(?:battery|charge|power){_REST}"
-        r"|(?:(?:what is|tell me|report) )?(?:the |your )?(?:battery(?: charge| level| state| left)?|charge left)",
+        r"|(?:(?:what is|report) )?(?:the |your )?(?:battery(?: charge| level| state| left)?|charge left)",
         text,
     ):
         return Question("battery")

@@ -45,8 +45,8 @@ class _Lines:
 async def serve(session: zenoh.Session, vehicle: str, converse: Callable[[Operator], Conversation]) -> None:
     """Answer queries until cancelled, one at a time; `stop` ends the one that is being answered.
 
-    The payload is a sentence, the reply JSON: {"success": bool, "answer": str}. A sentence that comes meanwhile
-    is refused: it would be flown when its asker no longer expects it.
+    The payload is a sentence, the reply JSON: {"success": bool, "answer": str}. A sentence that comes
+    meanwhile is refused: it would be flown when its asker no longer expects it.
 
     Args:
         converse: makes the conversation, whose history all queries share.

@@ -347,7 +347,7 @@ async def test_command_ended_by_the_operator_is_remembered() -> None:
     vehicle = FakeVehicle()
     begun = asyncio.Event()
 
-    async def fly(_: str) -> dict[str, Any]:
+    async def fly(text: str) -> dict[str, Any]:
         begun.set()
         await asyncio.sleep(30)
         raise TimeoutError

@@ -92,7 +92,8 @@ def test_unknown_height_and_heading_are_asked_back() -> None:
 
 STOPS = """stop|STOP!|please stop|Stop now.|halt|abort|freeze!|stop, now|stop, please|stop stop|Stop. Stop!
 stop right now|stop immediately|stop at once|stop the drone|stop following the car|stop flying|emergency stop
-Emergency stop!|hey drone, stop what you are doing|Please, stop|stop the search|abort the landing|abort take off|halt, halt"""
+Emergency stop!|hey drone, stop what you are doing|Please, stop|stop the search|abort the landing
+abort take off|halt, halt"""
 
 
 @pytest.mark.parametrize("text", STOPS.replace("\n", "|").split("|"))
