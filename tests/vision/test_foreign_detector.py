@@ -20,6 +20,7 @@ from tests.vision.runtimes.conftest import NAMES, lively_model, make_image
 from vision.detections import Detections
 from vision.detector import Detector, class_names_of
 from vision.foreign.class_names import COCO_NAMES
+from vision.foreign.layouts import Port, recognise
 from vision.runtimes.base import RuntimeUnusableError
 from vision.runtimes.selection import RuntimeChoice
 from vision.runtimes.source import read_source
@@ -137,15 +138,55 @@ def test_selected_boxes_are_taken_as_they_are(tmp_path: Path, marked: dict[str, 
     assert found.class_id.tolist() == [2, 2]
 
 
-def test_objectness_multiplies_the_classes(tmp_path: Path) -> None:
-    """As of YOLOv5's own exporter, which states the same names and stride."""
+@pytest.mark.parametrize("classes", [1, 2])
+def test_objectness_multiplies_the_classes(tmp_path: Path, classes: int) -> None:
+    """As of YOLOv5's own exporter, which states only names and stride."""
     rows = np.zeros((1, 126, 7), np.float32)
     rows[0, :2] = [[30, 20, 20, 10, 0.5, 0.2, 0.8], [50, 50, 4, 4, 0.1, 1, 0]]
-    path = constant_onnx(tmp_path / "a.onnx", {"output": rows}, metadata=stated(TWO, SIZE))
-    found = detect(path)
+    rows = rows[..., [0, 1, 2, 3, 4, *((5, 6) if classes == 2 else (6,))]]
+    metadata = {"names": dict(enumerate(TWO[:classes])), "stride": 32}
+    found = detect(constant_onnx(tmp_path / "a.onnx", {"output": rows}, metadata=metadata))
     np.testing.assert_allclose(found.xyxy, [[20, 15, 40, 25]])
     np.testing.assert_allclose(found.confidence, [0.4])
-    assert found.class_id.tolist() == [1]
+    assert found.class_id.tolist() == [classes - 1]
+
+
+YOLOV5: dict[str, Any] = {"stride": 32}
+ULTRALYTICS: dict[str, Any] = {"stride": 32, "task": "detect"}
+
+
+@pytest.mark.parametrize(
+    ("shape", "classes", "others", "layout"),
+    [
+        ((1, 25200, 6), 1, YOLOV5, "objectness"),
+        ((1, None, 6), 1, YOLOV5, "objectness"),
+        ((1, 25200, 7), 2, YOLOV5, "objectness"),
+        ((1, None, 7), 2, YOLOV5, "objectness"),
+        ((1, 5, 84), 1, ULTRALYTICS, "cells"),
+        ((1, 6, None), 2, ULTRALYTICS, "cells"),
+        ((1, 84, 84), 80, ULTRALYTICS, "cells"),
+        ((1, 300, 6), 1, ULTRALYTICS, "selected"),
+        ((1, 300, 6), 2, {**ULTRALYTICS, "end2end": True}, "selected"),
+        ((1, 300, 6), 2, {**ULTRALYTICS, "args": {"nms": True}}, "selected"),
+        ((1, 300, 6), 2, {**ULTRALYTICS, "head": "v10Detect"}, "selected"),
+        ((1, 300, 5), 1, ULTRALYTICS, "queries"),
+        ((1, 300, 6), 2, {**ULTRALYTICS, "head": "RTDETRDecoder"}, "queries"),
+    ],
+)
+def test_few_classes_are_not_taken_for_another_layout(
+    shape: tuple[int | None, ...], classes: int, others: dict[str, Any], layout: str
+) -> None:
+    metadata = {"names": dict.fromkeys(range(classes), "a"), **others}
+    facts = recognise(Path("a.onnx"), metadata, [Port("images", (1, 3, None, None))], [Port("out", shape)])
+    assert facts.layout == layout
+
+
+@pytest.mark.parametrize("others", [YOLOV5, ULTRALYTICS, {**ULTRALYTICS, "end2end": False}])
+def test_two_classes_of_an_unknown_head_are_refused(others: dict[str, Any]) -> None:
+    """RT-DETR's queries and selected boxes have 6 columns each."""
+    metadata = {"names": {0: "a", 1: "b"}, **others}
+    with pytest.raises(RuntimeUnusableError, match="its head is not stated"):
+        recognise(Path("a.onnx"), metadata, [Port("images", (1, 3, 64, 64))], [Port("output0", (1, 300, 6))])
 
 
 def test_queries_are_stretched_and_not_suppressed(tmp_path: Path) -> None:

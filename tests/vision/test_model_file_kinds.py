@@ -116,7 +116,9 @@ FILES: dict[str, Callable[[Path], Path]] = {
     "YOLOX `.pth`": yolox_pth,
     "YOLOX `.onnx`": bare({"output": zeros(1, 126, 85)}),
     "Ultralytics ONNX": ultralytics({"output0": zeros(1, 6, 126)}),
-    "… with `nms=True`, or of an end-to-end head": ultralytics({"output0": zeros(1, 300, 6)}),
+    "… with `nms=True`, or of an end-to-end head": ultralytics(
+        {"output0": zeros(1, 300, 6)}, args={"nms": True}
+    ),
     "… segmentation, pose, oriented boxes": ultralytics({"output0": zeros(1, 7, 126)}, task="obb"),
     "… classification (ONNX)": ultralytics({"output0": zeros(1, 2)}, task="classify"),
     "… RT-DETR (ONNX)": ultralytics({"output0": zeros(1, 300, 6)}, head="RTDETRDecoder"),

@@ -171,9 +171,7 @@ def _ultralytics(
     arguments = arguments if isinstance(arguments, dict) else {}
     selected = str(stated.get("end2end", "")) == "True" or bool(arguments.get("nms"))
     half = image.dtype == "float16" or arguments.get("half") is True or arguments.get("quantize") == 16
-    layout = _cell_layout(
-        outputs, len(names), task, selected=selected, queries="RTDETR" in str(stated.get("head", ""))
-    )
+    layout = _cell_layout(outputs, len(names), task, stated, selected=selected)
     known = {"licence": "license", "version": "version", "date": "date", "about": "description"}
     return ForeignFacts(
         names,
@@ -190,7 +188,7 @@ def _ultralytics(
 
 
 def _cell_layout(
-    outputs: Sequence[Port], classes: int, task: str, *, selected: bool, queries: bool
+    outputs: Sequence[Port], classes: int, task: str, stated: Mapping[str, Any], *, selected: bool
 ) -> Layout:
     """The layout of an output of Ultralytics; tasks other than `detect` have further channels."""
     shape = outputs[0].shape if outputs else ()
@@ -201,16 +199,22 @@ def _cell_layout(
     def fits(length: int | None, least: int) -> bool:
         return length is not None and (length == least if task == "detect" else length >= least)
 
-    if queries and fits(columns, 4 + classes):
+    if "RTDETR" in str(stated.get("head", "")) and fits(columns, 4 + classes):
         return "queries"
     if selected and fits(columns, 6):
         return "selected"
     if rows is None and columns is None:
         return "cells"  # `decoding` checks the length.
-    # The cells are far more than the channels.
-    if fits(rows, 4 + classes) and (columns is None or columns > (rows or 0)):
+    # The cells are at least as many as the channels.
+    if fits(rows, 4 + classes) and (columns is None or columns >= (rows or 0)):
         return "cells"
-    if columns == 6 and task == "detect":
+    if columns == 6 == 4 + classes and task == "detect" and "head" not in stated:
+        raise ValueError(
+            f"gives {_listed(outputs)}, selected boxes or queries of {classes} classes: its head is "
+            "not stated; export it with a later release"
+        )
+    # The repository YOLOv5 states no task: with one class it has 6 columns too.
+    if columns == 6 and task == "detect" and "task" in stated:
         return "selected"
     if task == "detect" and columns == 5 + classes:
         return "objectness"
