@@ -319,6 +319,22 @@ def test_unknown_outputs_are_refused_with_their_shapes(tmp_path: Path) -> None:
         read_source(batch)
 
 
+def test_boxes_and_scores_of_yolo_nas_are_not_logits(tmp_path: Path) -> None:
+    outputs = {"boxes": np.zeros((1, 126, 4), np.float32), "scores": np.zeros((1, 126, 80), np.float32)}
+    with pytest.raises(RuntimeUnusableError, match="no metadata of a known exporter"):
+        read_source(constant_onnx(tmp_path / "a.onnx", outputs))
+
+
+def test_objectness_of_one_everywhere_is_not_yolox(tmp_path: Path) -> None:
+    """YOLOv6's export has YOLOX's shapes, but takes RGB in 0..1 from the middle."""
+    rows = np.zeros((1, 126, 85), np.float32)
+    rows[..., 4] = 1
+    path = constant_onnx(tmp_path / "a.onnx", {"outputs": rows})
+    with pytest.raises(RuntimeUnusableError, match="YOLOv6, which is not supported") as caught:
+        Detector(path, runtime="onnxruntime")
+    assert str(caught.value).startswith(f"{path}: ")
+
+
 def test_folder_without_one_model_is_refused(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match=r"0 \.xml files"):
         read_source(tmp_path)

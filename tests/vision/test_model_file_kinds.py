@@ -126,7 +126,7 @@ FILES: dict[str, Callable[[Path], Path]] = {
     "RT-DETR, D-FINE ONNX of their authors": bare(SCORED, takes_size=True),
     "RF-DETR ONNX": bare({"dets": zeros(1, 9, 4), "labels": zeros(1, 9, 91)}),
     "ONNX with boxes and logits": bare({"logits": zeros(1, 9, 80), "pred_boxes": zeros(1, 9, 4)}),
-    "other ONNX": bare({"out": zeros(1, 5)}),
+    "other ONNX, also of YOLO-NAS": bare({"out": zeros(1, 5)}),
     "Ultralytics OpenVINO folder": openvino_folder,
     "Ultralytics TorchScript": lambda folder: ultralytics_torchscript(
         folder / "net.torchscript", lively_model(), SIZE
@@ -156,6 +156,8 @@ def test_file_of_each_kind_does_what_the_table_says(tmp_path: Path, kind: str) -
     assert "\n" not in str(caught.value)
     assert str(path) in str(caught.value)
     assert "Do not use this file" not in str(caught.value)
+    if kind in ("`.pt` of YOLOv6", "`.pth` of YOLO-NAS"):
+        assert "export" not in str(caught.value)  # which is not supported either
 
 
 def test_segmentation_has_the_boxes_of_its_detector(tmp_path: Path) -> None:

@@ -30,13 +30,25 @@ class ForeignRuntime:
     """
 
     def __init__(
-        self, facts: ForeignFacts, name: RuntimeName, run: _Run, precision: str, reason: str, threads: int
+        self,
+        facts: ForeignFacts,
+        path: Path,
+        name: RuntimeName,
+        run: _Run,
+        precision: str,
+        reason: str,
+        threads: int,
     ) -> None:
         self.facts, self.name, self._run = facts, name, run
         self.precision, self.precision_reason, self._threads = precision, reason, threads
         if facts.layout == "yolox" and facts.fixed_size is not None:
             height, width = facts.fixed_size
             (output,) = self.infer(np.full((height, width, 3), 114, np.uint8))
+            if (output[..., 4] == 1).all():
+                raise RuntimeUnusableError(
+                    f"{path}: has the shapes of YOLOX, but objectness 1 in every cell, as YOLOv6, which "
+                    "is not supported"
+                )
             if is_decoded(output, facts.fixed_size):
                 self.facts = replace(facts, layout="objectness")
 
@@ -111,7 +123,7 @@ def start_foreign(
 
         network = OpenVinoNetwork(path, precision=precision, threads=threads)
         started = ForeignRuntime(
-            facts, name, network.run, network.precision, network.precision_reason, network.threads
+            facts, path, name, network.run, network.precision, network.precision_reason, network.threads
         )
         started.precision, started.precision_reason = network.precision, network.precision_reason
         return started
@@ -134,7 +146,7 @@ def start_foreign(
             return [output.numpy() for output in found if isinstance(output, torch.Tensor)]
 
         return ForeignRuntime(
-            facts, name, run_module, facts.precision, "precision of the file", torch.get_num_threads()
+            facts, path, name, run_module, facts.precision, "precision of the file", torch.get_num_threads()
         )
     from vision.runtimes.onnx_runtime import open_session
 
@@ -147,7 +159,7 @@ def start_foreign(
 
     count = threads or len(os.sched_getaffinity(0))
     return ForeignRuntime(
-        facts, name, run_session, facts.precision, f"precision of the file ({provider})", count
+        facts, path, name, run_session, facts.precision, f"precision of the file ({provider})", count
     )
 
 

@@ -250,13 +250,17 @@ def _by_shapes(
             origin,
             takes_size=True,
         )
-    if len(shapes) == 2 and all(len(shape) == 3 for shape in shapes) and len(inputs) == 1:
-        at = next((at for at, port in enumerate(outputs) if port.name in ("dets", "pred_boxes")), None)
-        at = int(outputs[0].shape[2] != 4) if at is None else at
+    normalised = by_name.keys() == {"dets", "labels"}
+    if (
+        # By the names alone: YOLO-NAS has outputs of the same shapes, in other units.
+        (normalised or by_name.keys() == {"pred_boxes", "logits"})
+        and all(len(shape) == 3 for shape in shapes)
+        and len(inputs) == 1
+    ):
+        at = int(outputs[0].name not in ("dets", "pred_boxes"))
         boxes, logits = outputs[at], outputs[1 - at]
         if boxes.shape[2] == 4 and logits.shape[2] is not None and boxes.shape[1] == logits.shape[1]:
             names, origin = names_beside(path, logits.shape[2])
-            normalised = "dets" in by_name
             mean, deviation = _IMAGENET if normalised else ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
             return ForeignFacts(
                 names,

@@ -78,7 +78,8 @@ _UNSUPPORTED_MODELS = {
 _GENUINE = ("ultralytics.nn.", "ultralytics.utils.loss.", "ultralytics.utils.tal.", "torch.nn.modules.")
 # Of repositories whose checkpoints name their own package's classes.
 _OTHER_PACKAGES = {
-    "models.": "checkpoints of the repositories YOLOv5 (not YOLOv5u) and YOLOv7 are not supported",
+    "models.": "checkpoints of the repositories YOLOv5 (not YOLOv5u) and YOLOv7 are not supported; "
+    "the ONNX export of YOLOv5 is",
     "yolov6.": "YOLOv6 is not supported",
     "super_gradients.": "YOLO-NAS is not supported",
 }
@@ -91,7 +92,7 @@ def unsupported(name: str) -> str | None:
         return _UNSUPPORTED_MODELS[kind]
     for package, reason in _OTHER_PACKAGES.items():
         if name.startswith(package) and kind[:1].isupper():
-            return f"{reason}; its ONNX export may be"
+            return reason
     # A class, not a function: those are refused as calls.
     if name.startswith(_GENUINE) and (kind[:1].isupper() or kind.startswith("v8")):
         return f"it has the part {name!r:.100}, which is not supported; its ONNX export may be"
