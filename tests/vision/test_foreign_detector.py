@@ -307,6 +307,14 @@ def test_invalid_names_in_metadata_are_refused(tmp_path: Path, names: str, expec
     assert str(caught.value).isprintable()
 
 
+@pytest.mark.parametrize("key", ["names", "stride", "args"])
+def test_long_text_in_metadata_is_not_parsed(key: str) -> None:
+    metadata = {"names": "['a']", "stride": "32", "args": "{}", key: "[" + "1," * (1 << 15) + "]"}
+    ports = [Port("images", (1, 3, 64, 64))], [Port("output0", (1, 5, 84))]
+    with pytest.raises(RuntimeUnusableError, match=r"a\.onnx: has a text of 65538 characters"):
+        recognise(Path("a.onnx"), metadata, *ports)
+
+
 def test_unknown_outputs_are_refused_with_their_shapes(tmp_path: Path) -> None:
     outputs = {"out": np.zeros((1, 5, 5), np.float32)}
     path = constant_onnx(tmp_path / "a.onnx", outputs, metadata=stated(TWO, SIZE))
