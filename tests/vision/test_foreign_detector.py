@@ -19,7 +19,7 @@ from tests.vision.foreign_files import (
 from tests.vision.runtimes.conftest import NAMES, lively_model, make_image
 from vision.detections import Detections
 from vision.detector import Detector, class_names_of
-from vision.foreign.class_names import COCO_NAMES
+from vision.foreign.class_names import COCO_NAMES, names_beside
 from vision.foreign.layouts import Port, recognise
 from vision.runtimes.base import RuntimeUnusableError
 from vision.runtimes.selection import RuntimeChoice
@@ -325,6 +325,41 @@ def test_unknown_outputs_are_refused_with_their_shapes(tmp_path: Path) -> None:
     batch = constant_onnx(tmp_path / "c.onnx", outputs, size=(64, 96), input_type="UINT8")
     with pytest.raises(RuntimeUnusableError, match="expected one image"):
         read_source(batch)
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        (b"caf\xe9\nb\n", "is not UTF-8"),
+        (b"\x1b[31mred\nb\n", "is not printable"),
+        (b"a\n", "has 1 names, rel.onnx has 2 classes"),
+        (b"a\n" * (1 << 20), "the limit is"),
+        (None, r"cannot be read \(Permission denied\)"),
+    ],
+)
+def test_unusable_names_beside_are_refused_with_their_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: bytes | None, expected: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    outputs = {"pred_boxes": np.zeros((1, 9, 4), np.float32), "logits": np.zeros((1, 9, 2), np.float32)}
+    path = constant_onnx(Path("rel.onnx"), outputs)
+    Path("rel.txt").write_bytes(content or b"a\nb\n")
+
+    def denied(*_: Any, **__: Any) -> bytes:
+        raise PermissionError(13, "Permission denied")
+
+    if content is None:
+        monkeypatch.setattr(Path, "read_bytes", denied)
+        monkeypatch.setattr(Path, "read_text", denied)
+    with pytest.raises(RuntimeUnusableError, match=expected) as caught:
+        read_source(path)
+    assert str(caught.value).startswith("rel.txt: ")
+    assert str(caught.value).isprintable()
+
+
+def test_names_beside_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_bytes(b"\xef\xbb\xbfcar\r\ndog\r\n")
+    assert names_beside(tmp_path / "a.onnx", 2) == (("car", "dog"), "a.txt")
 
 
 def test_boxes_and_scores_of_yolo_nas_are_not_logits(tmp_path: Path) -> None:

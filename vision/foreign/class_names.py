@@ -21,6 +21,10 @@ COCO_IDS: dict[int, str] = {
 COCO_NAMES: tuple[str, ...] = tuple(COCO_IDS.values())
 
 
+class NamesError(ValueError):
+    """Class names that are missing or cannot be used; one line that names the file."""
+
+
 def names_beside(path: Path, count: int) -> tuple[tuple[str, ...], str]:
     """(class names, where they are from) for a file of `count` classes that does not name them.
 
@@ -28,23 +32,35 @@ def names_beside(path: Path, count: int) -> tuple[tuple[str, ...], str]:
     id, of which 11 are unused (`unused 0`, …).
 
     Raises:
-        ValueError: no names, or another number of them.
+        NamesError: no names, another number of them, or a text that cannot be read.
     """
     beside = path.with_suffix(".txt")
     if beside.is_file():
-        if beside.stat().st_size > _LARGEST_BYTES:
-            raise ValueError(f"{beside}: has {beside.stat().st_size} bytes, the limit is {_LARGEST_BYTES}")
-        names = tuple(
-            line.strip() for line in beside.read_text(encoding="utf-8").splitlines() if line.strip()
-        )
+        names = _names_in(beside)
         if len(names) != count:
-            raise ValueError(f"{beside}: has {len(names)} names, {path.name} has {count} classes")
+            raise NamesError(f"{beside}: has {len(names)} names, {path.name} has {count} classes")
         return names, beside.name
     if count == len(COCO_NAMES):
         return COCO_NAMES, "COCO, as it has 80 classes"
     if count == max(COCO_IDS) + 1:
         names = tuple(COCO_IDS.get(number, f"unused {number}") for number in range(count))
         return names, "COCO's ids, as it has 91 classes"
-    raise ValueError(
+    raise NamesError(
         f"{path}: does not name its {count} classes; write them, one a line, into {beside.name} beside it"
     )
+
+
+def _names_in(path: Path) -> tuple[str, ...]:
+    try:
+        if (size := path.stat().st_size) > _LARGEST_BYTES:
+            raise NamesError(f"{path}: has {size} bytes, the limit is {_LARGEST_BYTES}")
+        lines = path.read_bytes().decode("utf-8-sig").splitlines()
+    except OSError as error:
+        raise NamesError(f"{path}: cannot be read ({error.strerror or error})") from None
+    except UnicodeDecodeError as error:
+        raise NamesError(f"{path}: is not UTF-8 (byte {error.start}); expected one name a line") from None
+    names = tuple(line.strip() for line in lines if line.strip())
+    for name in names:
+        if not name.isprintable():
+            raise NamesError(f"{path}: the name {name!r:.100} is not printable")
+    return names

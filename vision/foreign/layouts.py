@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from vision.foreign.class_names import names_beside
+from vision.foreign.class_names import NamesError, names_beside
 from vision.letterbox import Placement
 from vision.plain_yaml import numbered
 from vision.runtimes.base import RuntimeUnusableError
@@ -116,9 +116,10 @@ def recognise(
         if "names" in stated and "stride" in stated:
             return _ultralytics(stated, image, fixed, outputs)
         return _by_shapes(path, image, fixed, inputs, outputs)
+    except NamesError as error:
+        raise RuntimeUnusableError(str(error)) from None
     except ValueError as error:
-        text = str(error)
-        raise RuntimeUnusableError(text if text.startswith(f"{path.parent}") else f"{path}: {text}") from None
+        raise RuntimeUnusableError(f"{path}: {error}") from None
 
 
 def recognise_by_metadata(path: Path, stated: Mapping[str, Any]) -> ForeignFacts:

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from vision.foreign.class_names import names_beside
+from vision.foreign.class_names import NamesError, names_beside
 from vision.foreign.layouts import YOLOX_STRIDES, ForeignFacts, Pixels
 from vision.yolo.checkpoint import check_storages
 from vision.yolo.safe_pickle import CheckpointError, one_line, shown
@@ -248,7 +248,7 @@ def load_yolox(path: Path) -> tuple[Yolox, ForeignFacts] | None:
         names, origin = names_beside(path, model.classes)
     except CheckpointError as error:
         raise CheckpointError(one_line(f"{path}: {error}")) from None
-    except ValueError as error:
+    except NamesError as error:
         raise CheckpointError(one_line(str(error))) from None
     width = weights[_STEM].shape[0]
     facts = ForeignFacts(
