@@ -245,6 +245,24 @@ def test_labels_boxes_and_scores_are_taken_as_they_are(tmp_path: Path) -> None:
     assert [record["class_name"] for record in found.records()] == ["car"]
 
 
+def test_class_without_a_name_is_refused_and_names_may_be_given(tmp_path: Path) -> None:
+    """The number of classes is not in the file: the names of COCO are assumed."""
+    outputs: dict[str, Any] = {
+        "labels": np.array([[200]], np.int64),
+        "boxes": np.array([[[48, 16, 96, 32]]], np.float32),
+        "scores": np.array([[0.9]], np.float32),
+    }
+    path = constant_onnx(tmp_path / "a.onnx", outputs, takes_size=True)
+    facts = read_source(path).foreign
+    assert facts is not None
+    assert facts.names_from.startswith("COCO, assumed")
+    with pytest.raises(RuntimeUnusableError, match=r"has class 200, 80 names; write .*NAME\.txt") as caught:
+        detect(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    (tmp_path / "a.txt").write_text("\n".join(f"class {number}" for number in range(201)))
+    assert [record["class_name"] for record in detect(path).records()] == ["class 200"]
+
+
 @pytest.mark.parametrize("task", ["segment", "pose", "obb"])
 def test_other_tasks_give_their_boxes(tmp_path: Path, task: str) -> None:
     turned = float(np.pi / 2)

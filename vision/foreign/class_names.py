@@ -25,11 +25,12 @@ class NamesError(ValueError):
     """Class names that are missing or cannot be used; one line that names the file."""
 
 
-def names_beside(path: Path, count: int) -> tuple[tuple[str, ...], str]:
+def names_beside(path: Path, count: int | None) -> tuple[tuple[str, ...], str]:
     """(class names, where they are from) for a file of `count` classes that does not name them.
 
     `NAME.txt` beside `NAME.onnx` has one name a line; without it 80 classes are COCO's, and 91 are COCO's by
-    id, of which 11 are unused (`unused 0`, …).
+    id, of which 11 are unused (`unused 0`, …). A file that does not state its number of classes, None, has as
+    many as `NAME.txt`; without it COCO's 80 are assumed.
 
     Raises:
         NamesError: no names, another number of them, or a text that cannot be read.
@@ -37,9 +38,11 @@ def names_beside(path: Path, count: int) -> tuple[tuple[str, ...], str]:
     beside = path.with_suffix(".txt")
     if beside.is_file():
         names = _names_in(beside)
-        if len(names) != count:
-            raise NamesError(f"{beside}: has {len(names)} names, {path.name} has {count} classes")
+        if not names or count not in (None, len(names)):
+            raise NamesError(f"{beside}: has {len(names)} names, {path.name} has {count or 'some'} classes")
         return names, beside.name
+    if count is None:
+        return COCO_NAMES, f"COCO, assumed; if it is of other classes, write them into {beside.name}"
     if count == len(COCO_NAMES):
         return COCO_NAMES, "COCO, as it has 80 classes"
     if count == max(COCO_IDS) + 1:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vision.foreign.class_names import NamesError
 from vision.foreign.layouts import YOLOX_STRIDES, ForeignFacts
 from vision.yolo.postprocess import MOST_BOXES, Boxes, suppress
 
@@ -30,6 +31,10 @@ def boxes_of(
         size: (height, width) of the input.
         iou: NMS threshold; without effect for layouts whose boxes are selected already.
         class_ids: to report; None for all.
+
+    Raises:
+        NamesError: a class without a name; without the file's name.
+        ValueError: channels that do not fit the layout.
     """
     classes = len(facts.class_names)
     _check_channels(facts, outputs[0].shape, classes)
@@ -37,6 +42,8 @@ def boxes_of(
         xyxy, score, class_id = _query_logits(facts, outputs, size, confidence)
     elif facts.layout == "scored":
         xyxy, score, class_id = _scored(outputs)
+        if (highest := class_id.max(initial=0)) >= classes:
+            raise NamesError(f"has class {highest}, {classes} names; write all into NAME.txt beside it")
     elif facts.layout == "selected":
         rows = outputs[0][0].astype(np.float32, copy=False)
         xyxy = _enclosing(rows[:, :4], rows[:, -1]) if facts.task == "obb" else rows[:, :4]

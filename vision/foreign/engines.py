@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vision.foreign.class_names import NamesError
 from vision.foreign.decoding import boxes_of, is_decoded
 from vision.foreign.layouts import YOLOX_SUFFIX, ForeignFacts
 from vision.letterbox import Letterbox, fit, fit_into
@@ -39,7 +40,7 @@ class ForeignRuntime:
         reason: str,
         threads: int,
     ) -> None:
-        self.facts, self.name, self._run = facts, name, run
+        self.facts, self._path, self.name, self._run = facts, path, name, run
         self.precision, self.precision_reason, self._threads = precision, reason, threads
         if facts.layout == "yolox" and facts.fixed_size is not None:
             height, width = facts.fixed_size
@@ -86,6 +87,8 @@ class ForeignRuntime:
         """The boxes of `infer`'s outputs. Arguments as of `decoding.boxes_of`."""
         try:
             return boxes_of(self.facts, outputs, size, confidence=confidence, iou=iou, class_ids=class_ids)
+        except NamesError as error:
+            raise RuntimeUnusableError(f"{self._path}: {error}") from None
         except (IndexError, ValueError) as error:
             shapes = ", ".join(str(output.shape) for output in outputs)
             raise RuntimeUnusableError(

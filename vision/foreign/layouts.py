@@ -237,8 +237,8 @@ def _by_shapes(
     if by_name.keys() == {"labels", "boxes", "scores"} and [port.name for port in inputs[1:]] == [
         "orig_target_sizes"
     ]:
-        # The number of classes is not in the file: RT-DETR's and D-FINE's are trained on COCO's 80.
-        names, origin = names_beside(path, 80)
+        # The number of classes is not in the file.
+        names, origin = names_beside(path, None)
         return ForeignFacts(
             names,
             "RT-DETR or D-FINE",
