@@ -72,7 +72,7 @@ def bare(outputs: dict[str, Any], **others: Any) -> Callable[[Path], Path]:
 
 
 def openvino_folder(folder: Path) -> Path:
-    onnx = ultralytics({"output0": np.zeros((1, 6, 126), np.float32)})(folder)
+    onnx = CONSTANT["Ultralytics ONNX"](folder)
     return ultralytics_openvino(folder / "net_openvino_model", onnx, TWO, SIZE)
 
 
@@ -93,10 +93,46 @@ def zeros(*shape: int) -> Any:
     return np.zeros(shape, np.float32)
 
 
+def one(*row: float, rows: int, fill: float = 0) -> Any:
+    """(1, rows, channels): the first row is this, the others are `fill`."""
+    array = np.full((1, rows, len(row)), fill, np.float32)
+    array[0, 0] = row
+    return array
+
+
+# The only object of the constant outputs: class 1, confidence 0.9, (left, top, right, bottom) in pixels.
+BOX = (20, 15, 40, 25)
+CENTRED = (30, 20, 20, 10)
+IN_UNITS = (30 / 96, 20 / 64, 20 / 96, 10 / 64)
+IN_CELLS = (30 / 8, 20 / 8, np.log(20 / 8), np.log(10 / 8))
 SCORED: dict[str, Any] = {
-    "labels": np.zeros((1, 9), np.int64),
-    "boxes": zeros(1, 9, 4),
-    "scores": zeros(1, 9),
+    "labels": np.array([[1] + [0] * 8], np.int64),
+    "boxes": one(*BOX, rows=9),
+    "scores": np.array([[0.9] + [0] * 8], np.float32),
+}
+
+
+def logits(classes: int) -> Any:
+    return one(-9, np.log(9), *[-9] * (classes - 2), rows=9, fill=-9)
+
+
+CONSTANT: dict[str, Callable[[Path], Path]] = {
+    "YOLOX `.onnx`": bare({"output": one(*IN_CELLS, 0.9, 0, 1, *[0] * 78, rows=126)}),
+    "Ultralytics ONNX": ultralytics({"output0": one(*CENTRED, 0, 0.9, rows=126).swapaxes(1, 2)}),
+    "… with `nms=True`, or of an end-to-end head": ultralytics(
+        {"output0": one(*BOX, 0.9, 1, rows=300)}, args={"nms": True}
+    ),
+    "… segmentation, pose, oriented boxes": ultralytics(
+        {"output0": one(*CENTRED, 0, 0.9, 0, rows=126).swapaxes(1, 2)}, task="obb"
+    ),
+    "… RT-DETR (ONNX)": ultralytics({"output0": one(*IN_UNITS, 0, 0.9, rows=300)}, head="RTDETRDecoder"),
+    "YOLOv5 ONNX": bare(
+        {"output": one(*CENTRED, 0.9, 0, 1, rows=126)}, metadata={"stride": 32, "names": list(TWO)}
+    ),
+    "RT-DETR, D-FINE ONNX of their authors": bare(SCORED, takes_size=True),
+    "RF-DETR ONNX": bare({"dets": one(*IN_UNITS, rows=9), "labels": logits(91)}),
+    "ONNX with boxes and logits": bare({"logits": logits(80), "pred_boxes": one(*IN_UNITS, rows=9)}),
+    "Ultralytics OpenVINO folder": openvino_folder,
 }
 FILES: dict[str, Callable[[Path], Path]] = {
     "our pair, `.safetensors` and `.yaml`": lambda folder: DEFAULT_WEIGHTS,
@@ -114,20 +150,18 @@ FILES: dict[str, Callable[[Path], Path]] = {
     "`.pt` of YOLOv6": naming("yolov6.models.yolo.Model"),
     "`.pth` of YOLO-NAS": naming("super_gradients.training.models.YoloNAS"),
     "YOLOX `.pth`": yolox_pth,
-    "YOLOX `.onnx`": bare({"output": zeros(1, 126, 85)}),
-    "Ultralytics ONNX": ultralytics({"output0": zeros(1, 6, 126)}),
-    "… with `nms=True`, or of an end-to-end head": ultralytics(
-        {"output0": zeros(1, 300, 6)}, args={"nms": True}
-    ),
-    "… segmentation, pose, oriented boxes": ultralytics({"output0": zeros(1, 7, 126)}, task="obb"),
+    "YOLOX `.onnx`": CONSTANT["YOLOX `.onnx`"],
+    "Ultralytics ONNX": CONSTANT["Ultralytics ONNX"],
+    "… with `nms=True`, or of an end-to-end head": CONSTANT["… with `nms=True`, or of an end-to-end head"],
+    "… segmentation, pose, oriented boxes": CONSTANT["… segmentation, pose, oriented boxes"],
     "… classification (ONNX)": ultralytics({"output0": zeros(1, 2)}, task="classify"),
-    "… RT-DETR (ONNX)": ultralytics({"output0": zeros(1, 300, 6)}, head="RTDETRDecoder"),
-    "YOLOv5 ONNX": ultralytics({"output": zeros(1, 126, 7)}),
-    "RT-DETR, D-FINE ONNX of their authors": bare(SCORED, takes_size=True),
-    "RF-DETR ONNX": bare({"dets": zeros(1, 9, 4), "labels": zeros(1, 9, 91)}),
-    "ONNX with boxes and logits": bare({"logits": zeros(1, 9, 80), "pred_boxes": zeros(1, 9, 4)}),
+    "… RT-DETR (ONNX)": CONSTANT["… RT-DETR (ONNX)"],
+    "YOLOv5 ONNX": CONSTANT["YOLOv5 ONNX"],
+    "RT-DETR, D-FINE ONNX of their authors": CONSTANT["RT-DETR, D-FINE ONNX of their authors"],
+    "RF-DETR ONNX": CONSTANT["RF-DETR ONNX"],
+    "ONNX with boxes and logits": CONSTANT["ONNX with boxes and logits"],
     "other ONNX, also of YOLO-NAS": bare({"out": zeros(1, 5)}),
-    "Ultralytics OpenVINO folder": openvino_folder,
+    "Ultralytics OpenVINO folder": CONSTANT["Ultralytics OpenVINO folder"],
     "Ultralytics TorchScript": lambda folder: ultralytics_torchscript(
         folder / "net.torchscript", lively_model(), SIZE
     ),
@@ -148,8 +182,15 @@ def test_file_of_each_kind_does_what_the_table_says(tmp_path: Path, kind: str) -
     path, result = FILES[kind](tmp_path), rows()[kind]
     if result.startswith("works"):
         runner = read_source(path).runners()[0]
-        found = Detector(path, runtime=runner, image_size=96, threads=1).detect(make_image(64, 96))
-        assert found.xyxy.shape == (len(found), 4)
+        confidence = 0.5 if kind in CONSTANT else 0
+        detector = Detector(path, runtime=runner, image_size=96, threads=1, confidence=confidence)
+        found = detector.detect(make_image(64, 96))
+        if kind in CONSTANT:
+            np.testing.assert_allclose(found.xyxy, [BOX], rtol=1e-2)
+            np.testing.assert_allclose(found.confidence, [0.9], rtol=1e-2)
+            assert found.class_id.tolist() == [1]
+        else:
+            assert len(found) > 0
         return
     with pytest.raises(ValueError, match=re.escape(result.strip("`"))) as caught:
         read_source(path)
