@@ -84,6 +84,13 @@ _OTHER_PACKAGES = {
     "super_gradients.": "YOLO-NAS is not supported",
 }
 
+# Parts that only these networks have.
+_YOLOV9_BLOCKS = "ADown AConv CBFuse CBLinear ELAN1 RepCSP RepNCSPELAN4 SPPELAN Silence"
+_UNSUPPORTED_PARTS = {
+    **{f"ultralytics.nn.modules.block.{name}": "YOLOv9" for name in _YOLOV9_BLOCKS.split()},
+    "torch.nn.modules.padding.ZeroPad2d": "YOLOv3-tiny",
+}
+
 
 def unsupported(name: str) -> str | None:
     """Why a genuine checkpoint that names this class is not supported; None for any other name."""
@@ -93,6 +100,8 @@ def unsupported(name: str) -> str | None:
     for package, reason in _OTHER_PACKAGES.items():
         if name.startswith(package) and kind[:1].isupper():
             return reason
+    if (family := _UNSUPPORTED_PARTS.get(name)) is not None:
+        return f"{family} is not supported as a .pt; its ONNX export is"
     # A class, not a function: those are refused as calls.
     if name.startswith(_GENUINE) and (kind[:1].isupper() or kind.startswith("v8")):
         return f"it has the part {name!r:.100}, which is not supported; its ONNX export may be"
