@@ -24,6 +24,7 @@ from tests.vision.test_yolox import save_yolox
 from vision.detector import Detector
 from vision.runtimes.source import read_source
 from vision.weights import DEFAULT_WEIGHTS
+from vision.yolo.safe_pickle import _HANDLERS
 
 for package in ("onnx", "onnxruntime", "openvino"):
     pytest.importorskip(package, reason=f"{package} is an optional extra")
@@ -211,3 +212,8 @@ def test_segmentation_has_the_boxes_of_its_detector(tmp_path: Path) -> None:
     assert len(boxes) == len(expected) > 0
     np.testing.assert_array_equal(boxes.xyxy, expected.xyxy)
     assert segmentation.metadata["task"].startswith("segment")
+
+
+def test_number_of_opcodes_in_the_text_is_that_of_the_reader() -> None:
+    (number,) = re.findall(r"the (\d+) opcodes", TABLE.read_text())
+    assert int(number) == len(_HANDLERS) + 1  # STOP ends the loop and has no handler.
