@@ -128,7 +128,9 @@ def send_command(
         # Sent once: a command without an answer may be in progress.
         deadline_s = time.monotonic() + timeout_s
         replies = zenoh.handlers.Callback(received.put, lambda: received.put(None))
-        session.get(command_key(vehicle), replies, payload=text, timeout=timeout_s)
+        # The service limits the rate of each sender.
+        sender = str(session.zid())
+        session.get(command_key(vehicle), replies, payload=text, attachment=sender, timeout=timeout_s)
         return _answer(received, vehicle, text, timeout_s, deadline_s)
     finally:
         watching.undeclare()  # type: ignore[no-untyped-call]

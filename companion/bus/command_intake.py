@@ -7,12 +7,23 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import OrderedDict
 from collections.abc import Callable
 
 LARGEST_COMMAND_BYTES = 160 * 1024
 """A line, and for a mission its file."""
 COMMANDS_PER_S, BURST = 20.0, 40
-"""Of all senders together; zenoh does not identify them. `stop` has a separate allowance of the same size."""
+"""Of each sender. `stop` has a separate allowance of the same size.
+
+zenoh does not identify the sender of a query. It states itself in the query's attachment, as
+`companion.bus.client` does; all without one count as one sender. Identifiers may be invented, so all senders
+together have `ALL_SENDERS` times as much.
+"""
+ALL_SENDERS = 5
+MAX_SENDERS = 32
+"""Senders that are counted; of more, the one that was silent for the longest time is forgotten."""
+MAX_SENDER_BYTES = 64
+"""Longer identifiers count as none."""
 SEPARATE_ALLOWANCE = b"stop"
 
 
@@ -27,22 +38,23 @@ class CommandIntake:
     """
 
     def __init__(self, clock_s: Callable[[], float] = time.monotonic) -> None:
-        self._others, self._stops = Allowance(clock_s=clock_s), Allowance(clock_s=clock_s)
+        self._others, self._stops = _Senders(clock_s), _Senders(clock_s)
         self._lock = threading.Lock()
         self.refused = 0
 
-    def read(self, size: int, payload: Callable[[], bytes]) -> tuple[str | None, str]:
+    def read(self, size: int, payload: Callable[[], bytes], sender: bytes = b"") -> tuple[str | None, str]:
         """Return the command's text, or None and the reason of the refusal.
 
         Args:
             size: of the payload, bytes. payload: called only if the size is allowed.
+            sender: as it states itself; empty if it does not.
         """
         if size > LARGEST_COMMAND_BYTES:
             return self._refuse(f"{size} bytes, at most {LARGEST_COMMAND_BYTES} are accepted")
         data = payload()
         with self._lock:
             allowance = self._stops if data.strip().lower() == SEPARATE_ALLOWANCE else self._others
-            accepted = allowance.take()
+            accepted = allowance.take(sender)
         if not accepted:
             return self._refuse(f"more than {COMMANDS_PER_S:g} commands a second; send it again later")
         try:
@@ -54,6 +66,23 @@ class CommandIntake:
         with self._lock:
             self.refused += 1
         return None, f"command refused: {reason}"
+
+
+class _Senders:
+    """The allowance of each sender, and of all together."""
+
+    def __init__(self, clock_s: Callable[[], float]) -> None:
+        self._clock_s = clock_s
+        self._all = Allowance(ALL_SENDERS * COMMANDS_PER_S, ALL_SENDERS * BURST, clock_s)
+        self._each: OrderedDict[bytes, Allowance] = OrderedDict()
+
+    def take(self, sender: bytes) -> bool:
+        """Whether one more of this sender is allowed now."""
+        allowance = self._each.setdefault(sender, Allowance(clock_s=self._clock_s))
+        self._each.move_to_end(sender)
+        if len(self._each) > MAX_SENDERS:
+            self._each.popitem(last=False)
+        return allowance.take() and self._all.take()
 
 
 class Allowance:

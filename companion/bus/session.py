@@ -24,7 +24,7 @@ from pydantic_core import to_json
 from zenoh import ext
 
 from companion.bus.bodies import CloudBody, ImageBody
-from companion.bus.command_intake import COMMANDS_PER_S, Allowance, CommandIntake
+from companion.bus.command_intake import COMMANDS_PER_S, MAX_SENDER_BYTES, Allowance, CommandIntake
 from companion.bus.config import BusError, first_line, zenoh_config
 from companion.bus.topics import (
     RECORDER_TOPICS,
@@ -337,7 +337,9 @@ class Bus:
             self._loop.call_soon_threadsafe(listener, sample.payload.to_bytes(), received_ns)
 
     def _from_zenoh_thread(self, query: zenoh.Query) -> None:
-        text, why = self.intake.read(*_payload(query))
+        sender = query.attachment
+        known = sender is not None and len(sender) <= MAX_SENDER_BYTES
+        text, why = self.intake.read(*_payload(query), sender.to_bytes() if known and sender else b"")
         loop = self._loop
         if text is not None and loop is not None and not loop.is_closed():
             loop.call_soon_threadsafe(lambda: self._spawn(self._answer(query, text)))

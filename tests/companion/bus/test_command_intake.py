@@ -5,7 +5,13 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.bus.command_intake import BURST, COMMANDS_PER_S, LARGEST_COMMAND_BYTES, CommandIntake
+from companion.bus.command_intake import (
+    ALL_SENDERS,
+    BURST,
+    COMMANDS_PER_S,
+    LARGEST_COMMAND_BYTES,
+    CommandIntake,
+)
 
 
 class Clock:
@@ -16,8 +22,8 @@ class Clock:
         return self.now_s
 
 
-def read(intake: CommandIntake, data: bytes) -> tuple[str | None, str]:
-    return intake.read(len(data), lambda: data)
+def read(intake: CommandIntake, data: bytes, sender: bytes = b"") -> tuple[str | None, str]:
+    return intake.read(len(data), lambda: data, sender)
 
 
 def test_burst_then_limited_rate() -> None:
@@ -38,6 +44,21 @@ def test_stop_has_a_separate_allowance() -> None:
     for _ in range(2 * BURST):
         read(intake, b"dance")
     assert read(intake, b"STOP ")[0] == "STOP "
+
+
+def test_a_flood_of_one_sender_leaves_the_others_their_rate() -> None:
+    intake = CommandIntake(Clock())
+    flood = [read(intake, b"dance", b"one")[0] for _ in range(1000)]
+    assert flood.count("dance") == BURST
+    assert read(intake, b"hold", b"other")[0] == "hold"
+    assert read(intake, b"hold")[0] == "hold"
+
+
+def test_invented_senders_share_a_limit_and_are_forgotten() -> None:
+    intake = CommandIntake(Clock())
+    accepted = [read(intake, b"dance", str(number).encode())[0] for number in range(5000)]
+    assert accepted.count("dance") == ALL_SENDERS * BURST
+    assert read(intake, b"stop", b"other")[0] == "stop"
 
 
 def test_too_large_payload_is_not_read() -> None:

@@ -130,12 +130,16 @@ async def test_bad_queries_are_answered_and_stop_passes_a_flood() -> None:
                     "raises": ask(b"break"),
                     "flood": [reason for _ in range(150) for reason in ask(b"dance")],
                     "stop": ask(b" Stop\n"),
+                    "other sender": [
+                        str(send_command(session, "alpha", "hold", timeout_s=WAIT_S)["success"])
+                    ],
                 }
 
         answers = await asyncio.to_thread(other_side)
     finally:
         await bus.close()
     (refused_bytes,), (refused_size,) = answers["bytes"], answers["large"]
+    assert answers["other sender"] == ["True"]
     assert "0xff" in refused_bytes
     assert f"10000000 bytes, at most {LARGEST_COMMAND_BYTES}" in refused_size
     assert answers["empty"] == [""]
