@@ -129,10 +129,10 @@ async def test_bad_queries_are_answered_and_stop_passes_a_flood() -> None:
                     "empty": ask(b""),
                     "raises": ask(b"break"),
                     "flood": [reason for _ in range(150) for reason in ask(b"dance")],
-                    "stop": ask(b" Stop\n"),
                     "other sender": [
                         str(send_command(session, "alpha", "hold", timeout_s=WAIT_S)["success"])
                     ],
+                    "stop": ask(b" Stop\n"),
                 }
 
         answers = await asyncio.to_thread(other_side)
