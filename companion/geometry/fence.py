@@ -8,7 +8,7 @@ edge or away from it is not limited. Point in polygon is tested by the crossing 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -20,8 +20,8 @@ Constraint = tuple[float, float, float]  # unit direction (north, east), and the
 # Distance kept to an edge: covers the position estimate's error and the vehicle's delay.
 MARGIN_M = 0.5
 ON_EDGE_M = 1e-6
-# Correcting for one edge may violate another: maximum number of projections.
-_ROUNDS = 20
+# Of the speed that constraints below zero ask for: the largest share that the other constraints allow.
+_SHARES = (1.0, 0.75, 0.5, 0.25, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,25 +68,22 @@ class Fence:
             also: further constraints.
 
         Returns:
-            The limited velocity, never faster than the input. Outside the fence: no component further out.
+            The nearest velocity that satisfies every constraint, never faster than the input unless one of
+            `also` is below zero. Outside the fence: no component further out. Constraints below zero (back
+            away) may contradict the others; they are reduced until all can be satisfied.
         """
         top = math.hypot(*velocity)
-        constraints = [one for one in (*also, *self._constraints_at(position, speed_towards)) if one[2] < top]
-        for _ in range(_ROUNDS):
-            before = velocity
-            for north, east, allowed in constraints:
-                excess = velocity[0] * north + velocity[1] * east - allowed
-                if excess > 0.0:
-                    velocity = (velocity[0] - excess * north, velocity[1] - excess * east)
-            if velocity == before:
-                return velocity
-        # Zero velocity satisfies every constraint: scale down what still violates one.
-        fraction = 1.0
-        for north, east, allowed in constraints:
-            towards = velocity[0] * north + velocity[1] * east
-            if towards > allowed + 1e-6:
-                fraction = min(fraction, allowed / towards)
-        return (velocity[0] * fraction, velocity[1] * fraction)
+        constraints = [*also, *self._constraints_at(position, speed_towards)]
+        most = math.hypot(top, min((0.0, *(allowed for _, _, allowed in constraints))))
+        for share in _SHARES:
+            shared = [
+                (north, east, allowed * (share if allowed < 0.0 else 1.0))
+                for north, east, allowed in constraints
+            ]
+            nearest = _nearest_velocity(velocity, shared)
+            if nearest is not None and math.hypot(*nearest) <= most + 1e-6:
+                return nearest
+        return (0.0, 0.0)
 
     def clip(self, start: Point, goal: Point) -> Point:
         """The last allowed point on the straight line to `goal`, `MARGIN_M` before the first edge crossed.
@@ -134,6 +131,34 @@ class Fence:
                 if not _breached(area, (position[0] + 1e-3 * north, position[1] + 1e-3 * east)):
                     north, east = -north, -east
                 yield (north, east, 0.0)
+
+
+def _nearest_velocity(wanted: Point, constraints: Sequence[Constraint]) -> Point | None:
+    """The velocity nearest to `wanted` that satisfies all; None: they contradict each other.
+
+    One constraint after the other: where it is violated, the nearest velocity lies on its line, between the
+    crossings with the earlier ones (Seidel 1991, "Small-dimensional linear programming made easy").
+    """
+    velocity = wanted
+    for index, (north, east, allowed) in enumerate(constraints):
+        if velocity[0] * north + velocity[1] * east <= allowed:
+            continue
+        low, high = -math.inf, math.inf
+        for other_north, other_east, other_allowed in constraints[:index]:
+            slope = north * other_east - east * other_north
+            left = other_allowed - allowed * (north * other_north + east * other_east)
+            if abs(slope) < 1e-9:
+                if left < -1e-6:
+                    return None
+            elif slope > 0.0:
+                high = min(high, left / slope)
+            else:
+                low = max(low, left / slope)
+        if low > high + 1e-6:
+            return None
+        along = max(low, min(high, wanted[1] * north - wanted[0] * east))
+        velocity = (allowed * north - along * east, allowed * east + along * north)
+    return velocity
 
 
 def _breached(area: Area, position: Point) -> bool:

@@ -19,6 +19,7 @@ BAY = ((-20.0, -20.0), (20.0, -20.0), (0.0, 0.0), (20.0, 20.0), (-20.0, 20.0))
 coordinate = st.floats(-30, 30)
 point = st.tuples(coordinate, coordinate)
 speed = st.tuples(st.floats(-10, 10), st.floats(-10, 10))
+directions = st.floats(-math.pi, math.pi)
 
 
 def braking(left_m: float) -> float:
@@ -182,3 +183,30 @@ def test_settings_become_the_fence() -> None:
     assert fence.contains((0.0, 0.0))
     assert not fence.contains((1.8, 1.2))
     assert not fence.contains((6.0, 0.0))
+
+
+@given(
+    speed,
+    st.lists(st.tuples(directions, st.floats(0.0, 1.0)), max_size=12),
+    st.tuples(directions, st.floats(-2.0, 0.0)),
+)
+def test_further_constraints_hold_while_one_backs_away(
+    wanted: Point, bounds: list[tuple[float, float]], retreat: tuple[float, float]
+) -> None:
+    also = [(math.cos(angle), math.sin(angle), allowed) for angle, allowed in (retreat, *bounds)]
+    limited = Fence().limit_velocity(wanted, (0.0, 0.0), braking, also)
+    assert math.hypot(*limited) <= math.hypot(*wanted, retreat[1]) + 1e-5
+    for north, east, allowed in also:
+        assert limited[0] * north + limited[1] * east <= max(allowed, 0.0) + 1e-5
+
+
+def test_backing_away_gives_way_to_what_is_behind() -> None:
+    # Too near to an obstacle over 60 degrees in the east, drifting there; another one 1.6 m away, behind.
+    towards = [(angle, 0.0) for angle in range(60, 121, 5)]
+    bounds = [(85, -1.28), *towards, (-100, 0.76), (-80, 0.68), (-75, 0.63), (-70, 0.22)]
+    also = [(math.cos(math.radians(a)), math.sin(math.radians(a)), allowed) for a, allowed in bounds]
+    north, east = Fence().limit_velocity((0.0, -1.0), (0.0, 0.0), braking, also)
+    assert -0.7 < east < -0.25
+    assert north * also[-1][0] + east * also[-1][1] == pytest.approx(0.22, abs=1e-6)
+    # Without the one behind, as fast as asked for.
+    assert Fence().limit_velocity((0.0, -1.0), (0.0, 0.0), braking, also[:-4])[1] < -1.2
