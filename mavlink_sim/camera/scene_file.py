@@ -344,9 +344,9 @@ class _Builder:
                 noise_sigma=effects.noise,
             ),
             None if depth is None else DepthSensor(**depth.model_dump()),
-            table.loss,
-            table.latency_ms / 1e3,
-            table.seed,
+            loss=table.loss,
+            latency_s=table.latency_ms / 1e3,
+            seed=table.seed,
         )
 
 
