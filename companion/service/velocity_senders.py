@@ -55,7 +55,7 @@ class VelocitySenders:
             self._warn(f"{source}: at most {MAX_SENDERS} senders are accepted", receipt_ns)
             return
         older_ns = self._stamps_ns.get(source, body["stamp_ns"]) - body["stamp_ns"]
-        if older_ns > 0:  # overtaken by a newer one, or the sender's clock was set back
+        if older_ns > 0:  # a newer one arrived before it, or the sender's clock was set back
             self._warn(
                 f"{source}: stamp_ns is {older_ns / 1e9:.3f} s older than the newest; "
                 f"a restarted sender needs a new source, or {FORGET_S:g} s",
