@@ -15,7 +15,8 @@ import struct
 import threading
 import time
 from bisect import bisect_left, bisect_right
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -73,6 +74,7 @@ class AutopilotLink:
         modes: (time_s, custom_mode) of every change.
         poses, setpoints_s: everything since the start; when each setpoint of the service came.
         commands: time and number of each COMMAND_LONG of the service.
+        visions: capture time, north and east of each VISION_POSITION_ESTIMATE of the service.
         texts: STATUSTEXT of the autopilot. results: the newest MAV_RESULT of each command, whoever gave it.
         home_ned_m: of its newest HOME_POSITION. global_deg: latitude and longitude of its newest position.
         boots: how often its clock has begun again.
@@ -90,6 +92,7 @@ class AutopilotLink:
         self.poses: list[Pose] = []
         self.setpoints_s: list[float] = []
         self.commands: list[tuple[float, int]] = []
+        self.visions: list[tuple[float, float, float]] = []
         self.texts: list[str] = []
         self.results: dict[int, int] = {}
         self.armed = self.ready = False
@@ -246,6 +249,11 @@ class AutopilotLink:
                     self.commands += [
                         (now_s, message.command) for message in sent if message.get_type() == "COMMAND_LONG"
                     ]
+                    self.visions += [
+                        (message.usec / 1e6, message.x, message.y)
+                        for message in sent
+                        if message.get_type() == "VISION_POSITION_ESTIMATE"
+                    ]
                     if not self.cut:
                         self._to_autopilot(data)
                     continue
@@ -388,6 +396,24 @@ def bring_down(link: AutopilotLink) -> None:
         link.set_mode(LAND[link.autopilot or 0])
         link.until(lambda: link.grounded, GROUNDED_S, "landed and disarmed")
     link.set_mode(PARKED[link.autopilot or 0])
+
+
+@contextmanager
+def repeated(period_s: float, act: Iterator[None]) -> Iterator[None]:
+    """Advance an iterator again and again, in a thread."""
+    ended = threading.Event()
+
+    def run() -> None:
+        while not ended.wait(period_s):
+            next(act)
+
+    thread = threading.Thread(target=run, name="repeated", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join(5.0)
 
 
 def set_for_test(link: AutopilotLink, values: dict[str, float]) -> dict[str, float]:

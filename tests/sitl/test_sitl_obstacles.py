@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 import secrets
-import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +25,7 @@ from tests.sitl.sitl_harness import (
     AutopilotLink,
     Flight,
     bring_down,
+    repeated,
     set_for_test,
 )
 from vision.camera_model import CameraModel, CameraMount
@@ -38,24 +37,6 @@ POSITION_MODE = 3 << 16
 CAMERA, MOUNT = CameraModel.from_horizontal_fov(160, 120, math.radians(80.0)), CameraMount()
 WALL_M, THICKNESS_M, KEEP_M = 14.0, 0.4, 3.0
 FULL, NEUTRAL = 1000, 0
-
-
-@contextmanager
-def repeated(period_s: float, act: Iterator[None]) -> Iterator[None]:
-    """Advance an iterator again and again, in a thread."""
-    ended = threading.Event()
-
-    def run() -> None:
-        while not ended.wait(period_s):
-            next(act)
-
-    thread = threading.Thread(target=run, name="repeated", daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        thread.join(5.0)
 
 
 def wall_ahead(link: AutopilotLink) -> WorldObject:
