@@ -44,11 +44,12 @@ def ask(
     from companion.bus.client import NoAnswerError
     from companion.bus.session import BusError
     from companion.language.endpoints import LanguageError
+    from companion.language.tools import check_words
     from companion.plugins import PluginError, load_plugins
 
     with plain_errors(NoAnswerError, BusError, PluginError, LanguageError, ValueError):
         load_plugins(settings.plugins.modules)
-        _check_may(settings)
+        check_words("language.may", settings.language.may)
         endpoint = _endpoint(settings)
         try:
             done = asyncio.run(_converse(settings, endpoint, sentence, connect, serve=serve))
@@ -56,15 +57,6 @@ def ask(
             done = serve
     if not done:
         raise typer.Exit(EXIT_FAILED)
-
-
-def _check_may(settings: Settings) -> None:
-    """Raise ValueError for a command that does not exist."""
-    from companion.guidance.command import COMMANDS, nearest
-
-    for word in settings.language.may:
-        if word not in COMMANDS:
-            raise ValueError(f"language.may: unknown command {word!r}; {nearest(word, list(COMMANDS))}")
 
 
 def _endpoint(settings: Settings) -> Endpoint | None:

@@ -29,6 +29,7 @@ from companion.cli.dashboard import dashboard
 from companion.cli.evaluate import evaluate
 from companion.cli.flags import EXIT_BAD_INPUT, plain_errors, settings_command
 from companion.cli.markers import MARKER_SETTINGS, markers
+from companion.cli.mcp import MCP_SETTINGS, mcp
 from companion.cli.mission import mission
 from companion.cli.models import models
 from companion.cli.play import play
@@ -53,6 +54,7 @@ ORDER = (
     "send",
     "echo",
     "ask",
+    "mcp",
     "cameras",
     "preview",
     "depth",
@@ -88,6 +90,7 @@ settings_command(app, "source", "camera", "detector", "tracker", "vehicle.name",
 settings_command(app, *CLIENT_SETTINGS, "plugins", "detector")(mission)
 settings_command(app, *CLOUD_SETTINGS)(cloud)
 settings_command(app, *ASK_SETTINGS)(ask)
+settings_command(app, *MCP_SETTINGS)(mcp)
 settings_command(app)(play)
 settings_command(app, *MARKER_SETTINGS)(markers)
 settings_command(app, *CLIENT_SETTINGS, "dashboard")(dashboard)

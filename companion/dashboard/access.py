@@ -45,8 +45,11 @@ def is_loopback(host: str) -> bool:
     return address is not None and address.is_loopback
 
 
-def read_token(path: str | Path) -> str:
+def read_token(path: str | Path, name: str = "dashboard.token_file") -> str:
     """Read the token: one line of at least 16 printable characters, in a file readable by its owner only.
+
+    Args:
+        name: of the setting or option, for errors.
 
     Raises:
         DashboardError: the file or its content is not acceptable. The message never contains the token.
@@ -57,18 +60,16 @@ def read_token(path: str | Path) -> str:
             status = os.fstat(file.fileno())
             content = file.read(_LONGEST_FILE_BYTES + 1) if stat.S_ISREG(status.st_mode) else b""
     except OSError as error:
-        raise DashboardError(f"dashboard.token_file {path}: cannot be read: {error.strerror}") from error
+        raise DashboardError(f"{name} {path}: cannot be read: {error.strerror}") from error
     if status.st_mode & 0o077:
         mode = stat.S_IMODE(status.st_mode)
-        raise DashboardError(
-            f"dashboard.token_file {path}: others can read it (mode {mode:o}): chmod 600 {path}"
-        )
+        raise DashboardError(f"{name} {path}: others can read it (mode {mode:o}): chmod 600 {path}")
     token = content.decode("ascii", "replace").strip()
     if len(content) > _LONGEST_FILE_BYTES or not token.isprintable() or " " in token or "\ufffd" in token:
-        raise DashboardError(f"dashboard.token_file {path}: expected one line of ASCII without spaces")
+        raise DashboardError(f"{name} {path}: expected one line of ASCII without spaces")
     if len(token) < SHORTEST_TOKEN:
         raise DashboardError(
-            f"dashboard.token_file {path}: expected at least {SHORTEST_TOKEN} characters, got {len(token)}; "
+            f"{name} {path}: expected at least {SHORTEST_TOKEN} characters, got {len(token)}; "
             f"for example: openssl rand -hex 16 > {path}"
         )
     return token
@@ -80,6 +81,7 @@ class Access:
 
     Attributes:
         host: the address that it listens on. token: None: none is needed.
+        page: it serves a page to browsers; without one, a program's POST needs no `HEADER`.
 
     Raises:
         DashboardError: other computers can reach `host`, and there is no token.
@@ -87,6 +89,7 @@ class Access:
 
     host: str
     token: str | None = None
+    page: bool = True
 
     def __post_init__(self) -> None:
         if self.token is None and not is_loopback(self.host):
@@ -119,7 +122,7 @@ class Access:
         followed_link = method == "GET" and path == "/" and headers.get("sec-fetch-mode") == "navigate"
         if not followed_link and headers.get("sec-fetch-site", "none") not in ("same-origin", "none"):
             return Refusal(403, "requested by another page")
-        if method not in ("GET", "HEAD") and HEADER not in headers:
+        if self.page and method not in ("GET", "HEAD") and HEADER not in headers:
             return Refusal(403, f"the header {HEADER} is missing")
         return None
 

@@ -105,20 +105,7 @@ async def serve(options: DashboardOptions, on_ready: Callable[[str], None]) -> N
     access = Access(host, token)
     with listening_socket(host, port) as listener:
         fleet = Fleet(options.zenoh, options.vehicle)
-        application = create_app(fleet, access)
-        server = uvicorn.Server(
-            uvicorn.Config(
-                application,
-                http=_Connection,
-                ws="none",
-                lifespan="off",
-                access_log=False,
-                log_level="critical",
-                server_header=False,
-                limit_concurrency=MAX_CONNECTIONS,
-                timeout_graceful_shutdown=1,
-            )
-        )
+        server = http_server(create_app(fleet, access))
         bridging = asyncio.create_task(fleet.run())
         bridging.add_done_callback(lambda _: setattr(server, "should_exit", True))
         try:
@@ -131,21 +118,38 @@ async def serve(options: DashboardOptions, on_ready: Callable[[str], None]) -> N
             await asyncio.gather(bridging, return_exceptions=True)
 
 
-def split_listen(listen: str) -> tuple[str, int]:
-    """Split HOST:PORT. Raises DashboardError for a port above 65535."""
+def http_server(application: ASGIApp) -> uvicorn.Server:
+    """A server without a log of requests, whose connections are bounded."""
+    return uvicorn.Server(
+        uvicorn.Config(
+            application,
+            http=_Connection,
+            ws="none",
+            lifespan="off",
+            access_log=False,
+            log_level="critical",
+            server_header=False,
+            limit_concurrency=MAX_CONNECTIONS,
+            timeout_graceful_shutdown=1,
+        )
+    )
+
+
+def split_listen(listen: str, name: str = "dashboard.listen") -> tuple[str, int]:
+    """Split HOST:PORT. `name`: of the setting, for errors. Raises DashboardError."""
     host, _, port = listen.rpartition(":")
     if not host or not port.isdecimal() or int(port) > 65535:
-        raise DashboardError(f"dashboard.listen {listen}: expected HOST:PORT such as 127.0.0.1:8088")
+        raise DashboardError(f"{name} {listen}: expected HOST:PORT such as 127.0.0.1:8088")
     return host, int(port)
 
 
-def listening_socket(host: str, port: int) -> socket.socket:
-    """Open the server's socket. Raises DashboardError."""
+def listening_socket(host: str, port: int, flag: str = "--dashboard-listen") -> socket.socket:
+    """Open the server's socket. `flag`: what sets its address, for errors. Raises DashboardError."""
     try:
         listener = socket.create_server((host, port))
     except OSError as error:
         raise DashboardError(
-            f"no page on {host}:{port}: {error.strerror or error}; --dashboard-listen sets another address"
+            f"cannot listen on {host}:{port}: {error.strerror or error}; {flag} sets another address"
         ) from error
     # Accepted connections inherit these.
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES)
@@ -276,7 +280,7 @@ def create_app(fleet: Fleet, access: Access) -> ASGIApp:
         Route("/command", command, methods=["POST"]),
         Route("/velocity", velocity, methods=["POST"]),
     ]
-    return _Guard(Starlette(routes=routes), access)
+    return Guard(Starlette(routes=routes), access)
 
 
 class StreamTable:
@@ -341,7 +345,7 @@ def _text_of(fleet: Fleet, bridge: Bridge, news: News, replies: list[dict[str, A
     return f'{json.dumps(head)[:-1]}, "topics": {{{topics}}}}}'
 
 
-class _Guard:
+class Guard:
     """Applies the access rules to every request, and adds the security headers to every response."""
 
     def __init__(self, application: ASGIApp, access: Access) -> None:
@@ -373,7 +377,8 @@ class _Guard:
             return None if self._access.token_is(given) else Refusal(401, "wrong token")
         if self._access.admits(headers):
             return None
-        return Refusal(401, "a token is needed: open /?token=… once, or send it as Authorization: Bearer …")
+        once = "open /?token=… once, or " if self._access.page else ""
+        return Refusal(401, f"a token is needed: {once}send it as Authorization: Bearer …")
 
 
 def _joined(headers: Headers) -> dict[str, str]:

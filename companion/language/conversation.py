@@ -228,19 +228,22 @@ class Conversation:
         return reply
 
     async def _answer(self, question: Question) -> dict[str, Any]:
-        """A question's answer as data."""
-        if question.name == "seen":
-            scene = await self._vehicle.scene()
-            objects = [each for each in scene.objects if question.about in ("", each.class_name)]
-            return {"objects": [asdict(each) for each in objects]}
-        state = await self._vehicle.state()
-        warnings = state.pop("warnings", [])
-        if question.name == "battery":
-            return {"battery_percent": state.get("battery_percent")}
-        if question.name == "why_not":
-            newest = None if self._reply is None else self._reply.get("reason")
-            return {"newest_command": newest, "warnings": warnings}
-        return state
+        return await answer_to(question, self._vehicle, self._reply)
+
+
+async def answer_to(question: Question, vehicle: Vehicle, newest: Reply | None) -> dict[str, Any]:
+    """A question's answer as data. `newest`: the reply to the newest command, for `why_not`."""
+    if question.name == "seen":
+        scene = await vehicle.scene()
+        objects = [each for each in scene.objects if question.about in ("", each.class_name)]
+        return {"objects": [asdict(each) for each in objects]}
+    state = await vehicle.state()
+    warnings = state.pop("warnings", [])
+    if question.name == "battery":
+        return {"battery_percent": state.get("battery_percent")}
+    if question.name == "why_not":
+        return {"newest_command": None if newest is None else newest.get("reason"), "warnings": warnings}
+    return state
 
 
 async def send_stop(vehicle: Vehicle, show: Callable[[str], None]) -> bool:

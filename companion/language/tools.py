@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from companion.guidance.command import Command, GrammarError
+from companion.guidance.command import COMMANDS, Command, GrammarError, nearest
 from companion.guidance.grammar import parse
 from companion.language.clauses import QUESTIONS, Question
 
@@ -55,6 +55,19 @@ def tools_of(schema: Mapping[str, Any]) -> list[dict[str, Any]]:
         parameters = {"type": "object", "properties": seen if name == "seen" else {}, "required": []}
         tools.append(_tool(name, _QUESTION_HELP[name], parameters))
     return tools
+
+
+def check_words(name: str, words: Sequence[str], *, for_models: bool = False) -> None:
+    """Check a list of commands. `name`: of the setting or flag, for errors.
+
+    Raises:
+        ValueError: a command does not exist, or is not for models.
+    """
+    for word in words:
+        if word not in COMMANDS:
+            raise ValueError(f"{name}: unknown command {word!r}; {nearest(word, list(COMMANDS))}")
+        if for_models and word in _NOT_FOR_MODELS:
+            raise ValueError(f"{name}: {word} is not for a model: the call does not show what is flown")
 
 
 def class_names_of(schema: Mapping[str, Any]) -> tuple[str, ...] | None:

@@ -1,0 +1,101 @@
+"""The command line of `companion mcp`."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from companion.cli.flags import EXIT_BAD_INPUT, plain_errors
+from companion.settings import Settings
+
+if TYPE_CHECKING:
+    from companion.dashboard.access import Access
+
+MCP_SETTINGS = ("zenoh", "vehicle.name", "plugins")
+
+
+def mcp(
+    settings: Settings,
+    allow: Annotated[
+        str, typer.Option(help="Commands that may be flown, such as takeoff,land. Default: only stop.")
+    ] = "",
+    listen: Annotated[
+        str | None,
+        typer.Option(help="HOST:PORT of this computer, for HTTP. Default: standard input and output."),
+    ] = None,
+    token_file: Annotated[
+        Path | None, typer.Option(help="File with the token of the clients; required with --listen.")
+    ] = None,
+    connect: Annotated[str | None, typer.Option(help="Zenoh endpoint of the service or its router.")] = None,
+) -> None:
+    """Serve the vehicle's commands and state to language models by the Model Context Protocol.
+
+    Nobody confirms: only the commands of --allow are flown, and `stop`.
+    """
+    try:
+        import mcp.server  # noqa: F401
+    except ImportError as error:
+        typer.echo(f"companion: mcp needs the extra `mcp`: pip install '.[mcp]' ({error})", err=True)
+        raise typer.Exit(EXIT_BAD_INPUT) from error
+    from companion.bus.client import NoAnswerError
+    from companion.bus.session import BusError
+    from companion.dashboard.access import DashboardError
+    from companion.language.tools import check_words
+    from companion.plugins import PluginError, load_plugins
+
+    with plain_errors(NoAnswerError, BusError, DashboardError, PluginError, ValueError):
+        load_plugins(settings.plugins.modules)
+        allowed = [word.strip() for word in allow.split(",") if word.strip()]
+        check_words("--allow", allowed, for_models=True)
+        access = None if listen is None else _access(listen, token_file)
+        try:
+            asyncio.run(_serve(settings, allowed, listen, access, connect))
+        except KeyboardInterrupt:
+            return
+
+
+def _access(listen: str, token_file: Path | None) -> Access:
+    """Who may use HTTP. Raises DashboardError."""
+    from companion.dashboard.access import Access, DashboardError, is_loopback, read_token
+    from companion.dashboard.server import split_listen
+
+    host, _ = split_listen(listen, "--listen")
+    if not is_loopback(host):
+        raise DashboardError(
+            f"--listen {listen}: expected an address of this computer, such as 127.0.0.1:8089"
+        )
+    if token_file is None:
+        raise DashboardError(
+            "--listen needs --token-file FILE; make one: (umask 77; openssl rand -hex 16 > FILE)"
+        )
+    return Access(host, read_token(token_file, "--token-file"), page=False)
+
+
+async def _serve(
+    settings: Settings, allowed: list[str], listen: str | None, access: Access | None, connect: str | None
+) -> None:
+    from companion.bus.client import client_settings
+    from companion.client import connect as connect_to
+    from companion.dashboard.server import Guard, http_server, listening_socket, split_listen
+    from companion.language.live import LiveVehicle
+    from companion.language.mcp_server import PATH, FlightTools, http_app, serve_stdio, server_of
+
+    where = client_settings(settings.zenoh, (connect,) if connect else ()).connect[0]
+    async with connect_to(where, settings.vehicle.name, config_file=settings.zenoh.config_file) as drone:
+        camera = (await drone.query("config"))["guidance"]["camera"]
+        tools = FlightTools(LiveVehicle(drone, (), camera), lambda: drone.query("commands"), allowed)
+        server = server_of(tools)
+        try:
+            if listen is None or access is None:
+                await serve_stdio(server)
+                return
+            host, port = split_listen(listen)
+            with listening_socket(host, port, "--listen") as listener:
+                async with http_app(server) as application:
+                    print(f"mcp: http://{host}:{port}{PATH}", flush=True)
+                    await http_server(Guard(application, access)).serve(sockets=[listener])
+        finally:
+            await tools.close()
