@@ -40,12 +40,8 @@ def test_extrinsics_of_every_seed(seed: int) -> None:
     assert error.rotation_deg < 0.1
 
 
-# A wide lens that is fitted as a fisheye, which has no tangential coefficients (docs/how-to/calibrate.md).
-FISHEYE = pytest.mark.xfail(strict=True, reason="the centre of a wide lens is 1.14 px off")
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [pytest.param(38, marks=FISHEYE) if seed == 38 else seed for seed in SEEDS])
+@pytest.mark.parametrize("seed", SEEDS)
 def test_lens_of_every_seed(seed: int) -> None:
     check_lens(seed)
 

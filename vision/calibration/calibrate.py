@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vision.calibration.boards import BoardView
-from vision.calibration.fit import Fit, fit, held_out_residuals
+from vision.calibration.fit import Fit, fit, held_out_rms_px
 from vision.camera_model import EQUIDISTANT, PLUMB_BOB, CameraModel, DistortionModel
 
 LEAST_VIEWS = 6
@@ -36,7 +36,8 @@ class CalibrationResult:
         views: those that it was fitted to.
         fit: of these views, with their errors.
         rejected: outliers, and their RMS errors in pixels.
-        held_out_px: RMS error of each distortion model on views it was not fitted to; missing: it fits none.
+        held_out_px: of each distortion model, the median RMS error of a view that it was not fitted to;
+            missing: it fits none.
     """
 
     model: CameraModel
@@ -131,14 +132,16 @@ def covers_image(model: CameraModel) -> bool:
 
 
 def _held_out_px(found: Fit, views: Sequence[BoardView]) -> float:
-    """RMS error on views that the lens was not fitted to; infinite where it does not fit them."""
+    """Median RMS error of views that the lens was not fitted to; infinite where it does not fit them.
+
+    The median, since a view at the edge of what the others cover says more of them than of the model.
+    """
     errors = []
     for fold in range(_FOLDS):
         others = [view for index, view in enumerate(views) if index % _FOLDS != fold]
         try:
             model = fit(found.model.distortion_model, others, found.model).model
-            errors.append(held_out_residuals(model, views[fold::_FOLDS]))
+            errors.append(held_out_rms_px(model, views[fold::_FOLDS]))
         except ValueError:
             return float("inf")
-    squares = np.concatenate(errors) ** 2
-    return float(np.sqrt(squares.sum() / len(squares)))
+    return float(np.median(np.concatenate(errors)))

@@ -94,11 +94,13 @@ def fit(kind: DistortionModel, views: Sequence[BoardView], start: CameraModel | 
     return problem.result(start, rotations, positions)
 
 
-def held_out_residuals(model: CameraModel, views: Sequence[BoardView]) -> Array:
-    """(N, 2) residuals of views that the lens was not fitted to; only the board's poses are."""
+def held_out_rms_px(model: CameraModel, views: Sequence[BoardView]) -> Array:
+    """(V,) RMS errors, pixels, of views that the lens was not fitted to; only the board's poses are."""
     problem = _Problem(views)
     _, rotations, positions = problem.solve(model, *problem.first_poses(model), 0)
-    return problem.residuals(model, rotations, positions)
+    squares = (problem.residuals(model, rotations, positions) ** 2).sum(axis=1)
+    counts = [len(view.points_m) for view in views]
+    return np.asarray(np.sqrt(np.add.reduceat(squares, problem.starts) / counts), np.float64)
 
 
 def _start(kind: DistortionModel, views: Sequence[BoardView]) -> CameraModel:

@@ -153,4 +153,6 @@ async def test_simulated_vehicle_takes_off_and_is_stopped(tmp_path: Path) -> Non
                     await asyncio.sleep(0.1)
             assert (await call("stop"))["success"] is True
             assert (await going)["success"] is False
-            assert (await call("state"))["in_command"] is False
+            async with asyncio.timeout(20):
+                while (await call("state"))["in_command"]:
+                    await asyncio.sleep(0.1)
