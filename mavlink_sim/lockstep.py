@@ -204,12 +204,15 @@ class LockstepVehicle:
             self._wires[name] = LockstepWire(self.vehicle, self.vehicle.links[name])
         self._main_link = next(iter(self._waiting), "")
 
-    def copy(self) -> LockstepVehicle:
+    def copy(self, seed: int | None = None) -> LockstepVehicle:
         """An independent copy in the current state.
 
         With the same inputs both fly alike, bit for bit. It takes a few milliseconds: use it to try several
         continuations of one state, or to begin every episode of a training in the air. `stop` of what
         `repeat` returned stops the first one's messages only.
+
+        Args:
+            seed: of the copy's gusts and estimation errors from now on; None: as the first one's.
 
         Raises:
             ValueError: a fault is active, which may refer to objects outside.
@@ -220,6 +223,9 @@ class LockstepVehicle:
                 f"copy: fault {names} is active; end it first, and begin it again on each vehicle"
             )
         twin: LockstepVehicle = pickle.loads(pickle.dumps(self))
+        if seed is not None:
+            twin.vehicle.airframe.reseed(seed)
+            twin.vehicle.estimate.reseed(seed)
         return twin
 
     # ---- time -------------------------------------------------------------------------------------------

@@ -90,6 +90,7 @@ SIMULATOR_LAYERS = {
     "realtime": 7,
     "__init__": 8,
     "cli": 8,
+    "environments": 8,
     "__main__": 9,
 }
 MAX_SIMULATOR_LAYERS = 10

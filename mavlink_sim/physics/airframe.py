@@ -229,6 +229,10 @@ class Multirotor:
         self._gust_left_s = 0.0
         self._random = random.Random(seed)
 
+    def reseed(self, seed: int) -> None:
+        """Draw the random numbers from now on with another seed."""
+        self._random.seed(seed)
+
     # ---- other representations of the attitude ----------------------------------------------------------
 
     @property

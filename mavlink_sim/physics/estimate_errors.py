@@ -121,6 +121,11 @@ class Estimate(Multirotor):
         self.accelerometer_noise: Vector = _ZERO
         self.update(0.0)
 
+    def reseed(self, seed: int) -> None:
+        """Draw the errors from now on with another seed; the current ones fade."""
+        self._noise_source.seed(f"estimator {seed}")
+        self._index = seed % _TABLE_LENGTH
+
     # ---- time -------------------------------------------------------------------------------------------
 
     def update(self, dt_s: float) -> None:

@@ -1,0 +1,59 @@
+"""Approach an object and hold a distance from it, by sight."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mavlink_sim.environments.flight_task import FlightTask
+from mavlink_sim.environments.spaces import APPROACH_OBSERVATION, Array
+
+START_M = (6.0, 30.0)
+START_BEARING_RAD = math.radians(30.0)
+WANTED_M = (4.5, 10.0)
+TARGET_HEIGHT_M = (0.3, 1.0)
+FARTHEST_M = 40.0
+NEAREST_M = 1.0
+SCALE_M = 30.0
+
+
+class Approach(FlightTask):
+    """Fly to a wanted horizontal distance from an object, face it and hold there.
+
+    Reward of a step, with the error of the true distance e (m), the bearing b of the object (rad, 0 ahead):
+    max(0, 1 - e / 30) + exp(-2 e) - 0.3 |b| - 0.1 |climb rate, m/s| - 0.05 times the squared change of the
+    action (each entry by its range), and -10 at an early end. End: the object is lost for 5 s, nearer than
+    1 m or farther than 40 m, or the vehicle is below 0.5 m. Truncated after 30 s.
+    """
+
+    observation = APPROACH_OBSERVATION
+
+    def __init__(self, count: int, model: str = "fast", **conditions: object) -> None:
+        super().__init__(count, model, **conditions)
+        self._wanted_m = np.zeros(count)
+
+    def place(self, which: NDArray[np.intp], yaw_rad: Array, rng: np.random.Generator) -> None:
+        size = len(which)
+        distance = rng.uniform(*START_M, size)
+        bearing = yaw_rad + rng.uniform(-START_BEARING_RAD, START_BEARING_RAD, size)
+        place = [distance * np.cos(bearing), distance * np.sin(bearing), -rng.uniform(*TARGET_HEIGHT_M, size)]
+        self.target[:, which] = np.stack(place)
+        self._wanted_m[which] = rng.uniform(*WANTED_M, size)
+
+    def observe(self) -> Array:
+        return np.stack([*self.sight(), self._wanted_m])
+
+    def judge(self) -> tuple[Array, NDArray[np.bool_]]:
+        forward, right, _ = self.level(self.target - self.model.position)
+        distance = np.hypot(forward, right)
+        error = np.abs(distance - self._wanted_m)
+        ended = self.lost | (distance < NEAREST_M) | (distance > FARTHEST_M)
+        reward = np.maximum(0.0, 1.0 - error / SCALE_M) + np.exp(-2.0 * error)
+        reward -= 0.3 * np.abs(np.arctan2(right, forward)) + 0.1 * np.abs(self.model.velocity[2])
+        return reward - 0.05 * self.change - 10.0 * ended, ended
+
+    def measures(self) -> dict[str, Array]:
+        line = self.target - self.model.position
+        return {"range_error_m": np.hypot(line[0], line[1]) - self._wanted_m}
