@@ -81,7 +81,7 @@ class _Camera:
 
     frames: deque[dict[str, Any]] = field(default_factory=lambda: deque(maxlen=_KEPT_FRAMES))
     picture: Picture | None = None
-    received_s: float = 0.0
+    due_s: float = 0.0
     lease_s: float = 0.0
     subscriber: Any = None
     arrived: asyncio.Event = field(default_factory=asyncio.Event)
@@ -249,7 +249,7 @@ class Bridge:
     def _on_image(self, camera: _Camera, sample: zenoh.Sample) -> None:
         now_s = time.monotonic()
         # A camera's interval varies by some milliseconds.
-        too_soon = now_s - camera.received_s < 0.8 / MAX_RATE_HZ
+        too_soon = now_s < camera.due_s - 0.2 / MAX_RATE_HZ
         if too_soon or len(sample.payload) > LARGEST_PICTURE_BYTES:
             return
         try:
@@ -259,7 +259,8 @@ class Bridge:
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
             logger.debug("an image without usable attachment", exc_info=True)
             return
-        camera.picture, camera.received_s = Picture(sample.payload.to_bytes(), about), now_s
+        camera.picture = Picture(sample.payload.to_bytes(), about)
+        camera.due_s = max(camera.due_s + 1 / MAX_RATE_HZ, now_s)
         loop = self._link.loop
         if loop is not None and not loop.is_closed():
             loop.call_soon_threadsafe(camera.arrived.set)

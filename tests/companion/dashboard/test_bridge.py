@@ -194,6 +194,30 @@ async def test_picture_has_the_boxes_of_its_frame() -> None:
                 assert (picture.about["sequence"], picture.about["boxes_sequence"]) == (7, 6)
 
 
+async def test_at_most_fifteen_pictures_a_second() -> None:
+    with publishing() as (service, endpoint):
+        async with bridging(endpoint) as fleet:
+            await until(lambda: not fleet.problem)
+            asked = asyncio.create_task(fleet.first.picture("", -1, 20.0))
+            await until(lambda: service.image_is_watched)
+            shown: set[int] = set()
+
+            async def show() -> None:
+                picture = await asked
+                while picture is not None:
+                    shown.add(picture.about["sequence"])
+                    picture = await fleet.first.picture("", picture.about["sequence"], 1.0)
+
+            showing = asyncio.create_task(show())
+            begun_s = time.monotonic()
+            for number in range(36):  # at 18 Hz
+                await asyncio.sleep(max(0.0, begun_s + number / 18 - time.monotonic()))
+                service.image(number)
+            lasted_s = time.monotonic() - begun_s
+            await showing
+            assert 8 < len(shown) <= 15 * lasted_s + 2
+
+
 async def test_nothing_is_subscribed_without_a_browser() -> None:
     with publishing() as (service, endpoint):
         vehicle = service.session.declare_publisher(VEHICLE.key(NAME))
