@@ -23,7 +23,7 @@ from companion.dashboard.merge import SeenObject, merged
 from companion.geometry.geodesy import north_east
 from companion.settings import ZenohSection
 
-MAX_VEHICLES = 16
+MAX_VEHICLES = 32
 MAX_COMMANDS = 32
 """Commands of one vehicle that wait for their outcome; `stop` has a separate allowance of the same size."""
 _PERIOD_S = 0.5
