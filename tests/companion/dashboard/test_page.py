@@ -85,20 +85,19 @@ def rectangle(tab: Tab, selector: str) -> tuple[float, float, float, float]:
     return box["left"], box["top"], box["width"], box["height"]
 
 
-def centre_of_a_track(tab: Tab) -> tuple[int, float, float]:
-    """The id of the largest box with a track, and its centre in the window."""
-    tab.until(f"{BOXES}.some((box) => box[6] != null)", 60.0)
-    boxes = [box for box in tab.value(BOXES) if box[6] is not None]
+def click_track(tab: Tab, class_name: str = "") -> int:
+    """Click the largest box with a track, of a class if one is given, and wait for its menu; returns its id."""
+    boxes = tab.until(f"{BOXES}.filter((box) => box[6] != null && box[4].includes('{class_name}'))", 60.0)
     largest = max(boxes, key=lambda box: (box[2] - box[0]) * (box[3] - box[1]))
     x, y, width, height = rectangle(tab, "figure canvas")
     left, top, right, bottom = largest[:4]
-    return largest[6], x + (left + right) / 2 * width, y + (top + bottom) / 2 * height
+    tab.click(x + (left + right) / 2 * width, y + (top + bottom) / 2 * height)
+    assert tab.until("!document.querySelector('#menu').hidden")
+    return int(largest[6])
 
 
 def test_box_is_clicked_and_its_command_arrives(service: ServiceProcess, tab: Tab) -> None:
-    number, x, y = centre_of_a_track(tab)
-    tab.click(x, y)
-    assert tab.until("!document.querySelector('#menu').hidden")
+    number = click_track(tab)
     title, *items = tab.value("[...document.querySelector('#menu').children].map((item) => item.textContent)")
     assert title.startswith(f"track {number}, ")
     assert items[:3] == ["Follow", "Approach", "Orbit"]
@@ -141,6 +140,25 @@ def test_takeoff_button_and_space_bar(service: ServiceProcess, tab: Tab) -> None
     tab.until(f"{REPLY}.startsWith('hold 1: ')")
 
 
+def in_the_air(service: ServiceProcess, tab: Tab) -> None:
+    tab.until("state.topics.vehicle && state.topics.status")
+    if tab.value("state.topics.vehicle.altitude_m < 1"):
+        service.take_off(3.0)
+
+
+def test_clicked_car_is_followed(service: ServiceProcess, tab: Tab) -> None:
+    in_the_air(service, tab)
+    tab.value("document.querySelector('#class').value = 'car'")
+    tab.value("document.querySelector('[data-command^=seek]').click()")
+    tab.until(f"{REPLY}.startsWith('seek car: done')", 60.0)
+    number = click_track(tab, "car")
+    tab.value("document.querySelector('#menu button').click()")
+    tab.until(f"{REPLY}.startsWith('follow track={number}: done')")
+    # From some 20 m to the 8 m that it keeps, whatever id the car gets meanwhile.
+    distance = f"Number(state.topics.status.pilot.behaviour.match(/^following track {number}, ([0-9.]+) m/)?.[1])"
+    tab.until(f"Math.abs({distance} - 8) < 0.5", 60.0)
+
+
 SPEED = "Math.hypot(...state.topics.vehicle.velocity_ned_mps.slice(0, 2))"
 STEERING = "document.querySelector('#steer').getAttribute('aria-pressed') === 'true'"
 PAD = "navigator.getGamepads = () => [null, {mapping: 'standard', axes: [0, 0, 0, AXIS]}]"
@@ -154,9 +172,7 @@ def test_keys_and_gamepad_steer_and_a_lost_page_brakes(
     browser: Browser, service: ServiceProcess, tab: Tab
 ) -> None:
     other = open_page(browser, service.url)
-    tab.until("state.topics.vehicle && state.topics.status")
-    if tab.value("state.topics.vehicle.altitude_m < 1"):
-        service.take_off(3.0)
+    in_the_air(service, tab)
     tab.send("Emulation.setFocusEmulationEnabled", enabled=True)
     tab.value("document.querySelector('#steer').click()")
     tab.until(STEERING)
@@ -178,9 +194,7 @@ def test_keys_and_gamepad_steer_and_a_lost_page_brakes(
 
 
 def test_another_command_ends_steering(service: ServiceProcess, tab: Tab) -> None:
-    tab.until("state.topics.vehicle && state.topics.status")
-    if tab.value("state.topics.vehicle.altitude_m < 1"):
-        service.take_off(3.0)
+    in_the_air(service, tab)
     tab.value("document.querySelector('#steer').click()")
     tab.until(STEERING)
     tab.press(" ", " ")
@@ -196,6 +210,8 @@ def test_page_shows_a_stop_button_and_names_on_a_phone(tab: Tab) -> None:
     assert left + width <= 390
     assert top + height <= 844
     assert tab.value("document.documentElement.scrollWidth") <= 390
+    steer, turn = rectangle(tab, "#steer"), rectangle(tab, "#steer-turn")
+    assert steer[1] < turn[1] + turn[3] / 2 < steer[1] + steer[3]  # in one row
     named = "control.ariaLabel || control.textContent.trim() || (control.labels && control.labels.length)"
     controls = "[...document.querySelectorAll('button, input, select, canvas')]"
     assert tab.value(f"{controls}.filter((control) => !({named})).map((control) => control.outerHTML)") == []
