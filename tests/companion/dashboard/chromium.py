@@ -104,7 +104,7 @@ class Tab:
 
     def press(self, key: str, text: str = "") -> None:
         """Press and release a key."""
-        code = {" ": 32, "Enter": 13, "Escape": 27, "Tab": 9}.get(key, 0)
+        code = {" ": 32, "Enter": 13, "Escape": 27, "Tab": 9, "ArrowDown": 40}.get(key, 0)
         common = {"key": key, "windowsVirtualKeyCode": code}
         down = {"type": "keyDown", "text": text} if text else {"type": "rawKeyDown"}
         self.send("Input.dispatchKeyEvent", **down, **common)

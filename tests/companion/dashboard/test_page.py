@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from companion.bus.topics import DETECTIONS, IMAGE, VEHICLE
+from companion.bus.topics import DETECTIONS, EVENTS, IMAGE, SETPOINT, STATUS, VEHICLE
 from mavlink_sim.testing import free_port
 from tests.companion.dashboard.chromium import PROGRAM, Browser, Tab, chromium, wait_for
 from tests.companion.dashboard.serving import dashboard_command
@@ -86,7 +86,7 @@ def rectangle(tab: Tab, selector: str) -> tuple[float, float, float, float]:
 
 
 def click_track(tab: Tab, class_name: str = "") -> int:
-    """Click the largest box with a track, of a class if one is given, and wait for its menu; returns its id."""
+    """Click the largest box with a track (of a class, if given) and wait for its menu; returns its id."""
     boxes = tab.until(f"{BOXES}.filter((box) => box[6] != null && box[4].includes('{class_name}'))", 60.0)
     largest = max(boxes, key=lambda box: (box[2] - box[0]) * (box[3] - box[1]))
     x, y, width, height = rectangle(tab, "figure canvas")
@@ -155,7 +155,9 @@ def test_clicked_car_is_followed(service: ServiceProcess, tab: Tab) -> None:
     tab.value("document.querySelector('#menu button').click()")
     tab.until(f"{REPLY}.startsWith('follow track={number}: done')")
     # From some 20 m to the 8 m that it keeps, whatever id the car gets meanwhile.
-    distance = f"Number(state.topics.status.pilot.behaviour.match(/^following track {number}, ([0-9.]+) m/)?.[1])"
+    distance = (
+        f"Number(state.topics.status.pilot.behaviour.match(/^following track {number}, ([0-9.]+) m/)?.[1])"
+    )
     tab.until(f"Math.abs({distance} - 8) < 0.5", 60.0)
 
 
@@ -318,6 +320,87 @@ def test_page_says_when_no_service_answers_and_how_old_its_state_is(browser: Bro
 
             wait_for(shown)
         tab.until(f"/Shown is its state of [0-9]+ s ago/.test({LINK})")
+        tab.close()
+
+
+# Pixels of the fence's colour in the map.
+FENCE = """
+(() => {
+  const map = document.querySelector('#map');
+  const { data } = map.getContext('2d').getImageData(0, 0, map.width, map.height);
+  const is = (i) => data[i] === 0x0d && data[i + 1] === 0x7a && data[i + 2] === 0x3e;
+  return data.filter((_, i) => i % 4 === 0 && is(i)).length;
+})()
+"""
+MISSION = {
+    "name": "demo",
+    "steps": ["takeoff altitude=4", "find", "home"],
+    "current": 1,
+    "ended": [{"title": "takeoff altitude=4", "success": True, "reason": "took off"}],
+}
+
+
+def test_page_shows_the_state_and_its_menu_opens_by_key(browser: Browser) -> None:
+    limits = {"fence_include": [[-20, -20], [-20, 20], [20, 20], [20, -20]], "fence_exclude": []}
+    vehicle = {
+        "mode": "offboard",
+        "armed": True,
+        "altitude_m": 4.0,
+        "battery_fraction": 0.731,
+        "attitude_wxyz": [0.9659, 0.2588, 0.0, 0.0],
+        "yaw_rad": 1.5708,
+        "velocity_ned_mps": [1.0, 0.0, 0.0],
+        "position_ned_m": [3.0, 4.0, -4.0],
+    }
+    asked, sent = {"velocity_ned_mps": [2.0, 0.0, 0.0]}, {"velocity_ned_mps": [1.5, 0.0, 0.0]}
+    messages = {
+        STATUS.key(NAME): {"healthy": True, "vehicle": {}, "limits": limits, "pilot": {"mission": MISSION}},
+        VEHICLE.key(NAME): vehicle,
+        SETPOINT.key(NAME): {"asked": asked, "sent": sent, "limited_by": ["speed"]},
+        DETECTIONS.key(NAME): frame(1, captured_ns=10_000_000, published_ns=35_000_000),
+        EVENTS.key(NAME): {"stamp_ns": 1, "level": "error", "text": "battery low"},
+    }
+    with publishing() as (service, endpoint), dashboard_command(endpoint) as url:
+        tab = open_page(browser, url)
+        tab.resize(1280, 900)
+
+        def shown() -> bool:
+            for key, body in messages.items():
+                service.publish(key, body)
+            return bool(tab.value("state.topics.status && document.querySelector('#log li') !== null"))
+
+        def text(selector: str) -> list[str]:
+            found = f"[...document.querySelectorAll('{selector}')]"
+            texts: list[str] = tab.value(f"{found}.map((item) => item.ariaLabel ?? item.textContent)")
+            return texts
+
+        wait_for(shown)
+        tab.until("document.querySelector('#mode').textContent === 'offboard'")
+        summary = text("#mode, #armed, #height, #speed, #battery")
+        assert summary == ["offboard", "yes", "4.0 m", "1.0 m/s", "73 %"]
+        assert text("#attitude") == ["Roll 30°, pitch 0°, heading 90°"]
+        assert text("#setpoint tr:first-child td")[-3:] == ["1.00", "2.00", "1.50"]
+        assert text("#limited") == ["Limited by: speed"]
+        assert text("#latency") == ["Latency of the last minute: capture to result 25 ms"]
+        assert text("#steps .good, #steps .now") == ["takeoff altitude=4", "find"]
+        assert text("#log .error")[0].endswith("error: battery low")
+        assert text("#map")[0].startswith("Map, north up: vehicle 3 m north and 4 m east of home")
+        assert tab.value(FENCE) > 100
+        ground = "getComputedStyle(document.documentElement).backgroundColor"
+        light = tab.value(ground)
+        tab.resize(1280, 900, dark=True)
+        assert tab.value(ground) != light
+        wait_for(shown)
+        tab.until("document.querySelector('#detections button') !== null")
+        tab.value("document.querySelector('#detections button').focus()")
+        tab.press("Enter", "\r")
+        focus = "document.activeElement.textContent"
+        tab.until(f"{focus} === 'Follow'")
+        tab.press("ArrowDown")
+        assert tab.value(focus) == "Approach"
+        tab.press("Escape")
+        assert tab.value("document.querySelector('#menu').hidden")
+        assert tab.value(focus) == "#7"
         tab.close()
 
 
