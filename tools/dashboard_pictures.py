@@ -73,9 +73,9 @@ def _one_vehicle(tab: Tab, folder: Path) -> None:
 
 
 def _fleet(tab: Tab, folder: Path) -> None:
-    tab.until(f"state.vehicles.length === {FLEET}")
+    tab.until(f"document.querySelectorAll('#fleet button').length === {FLEET}")
     for text in ("takeoff 5", "goto 8 0", "goto 12 4"):
-        for number in range(FLEET):
+        for number in reversed(range(FLEET)):  # those in front first, since they keep apart
             tab.value(f"document.querySelectorAll('#fleet button')[{number}].click()")
             tab.until("state.topics.vehicle && state.topics.vehicle.connected")
             _command(tab, text)

@@ -147,7 +147,7 @@ function reserve({ xy, taken }, at, radius) {
   taken.push({ left: x - radius, right: x + radius, top: y - radius, bottom: y + radius });
 }
 
-// Draws the first of some texts that has room beside, above or below a symbol; none without room.
+// Draws the first of some texts that has room around a symbol, beside it first; none without room.
 function drawLabel({ g, width, height, xy, taken }, at, radius, ...texts) {
   const [x, y] = xy(at);
   for (const text of texts) {
@@ -156,6 +156,7 @@ function drawLabel({ g, width, height, xy, taken }, at, radius, ...texts) {
     const places = [
       [x + gap, y - LINE_PX / 2], [x - gap - size, y - LINE_PX / 2],
       [x - size / 2, y - radius - LINE_PX], [x - size / 2, y + radius],
+      ...[y - radius - LINE_PX, y + radius].flatMap((top) => [[x + radius, top], [x - radius - size, top]]),
     ];
     const boxes = places.map(([left, top]) => ({ left, right: left + size, top, bottom: top + LINE_PX }));
     const isFree = (box) => box.left >= 0 && box.right <= width && box.top >= 0 && box.bottom <= height
