@@ -58,12 +58,14 @@ def _page(*flags: str) -> Iterator[Tab]:
 def _one_vehicle(tab: Tab, folder: Path) -> None:
     _command(tab, "takeoff 4")
     _command(tab, "seek car")
-    click_track(tab, "car")
+    click_track(tab)
     time.sleep(1.0)  # until the menu's box is drawn as the chosen one
     tab.screenshot(folder / "dashboard.jpg")
     tab.value("document.querySelector('#menu button').click()")
     _succeeded(tab, "follow")
     time.sleep(_CHARTS_S)
+    if not (behaviour := tab.value("state.topics.status.pilot.behaviour")).startswith("following"):
+        raise SystemExit(f"the vehicle does not follow: {behaviour}")
     tab.resize(*WIDE, dark=True)
     time.sleep(1.0)
     tab.screenshot(folder / "dashboard-dark.jpg")

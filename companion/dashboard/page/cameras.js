@@ -186,7 +186,7 @@ export class Camera {
     else if (ageS > 1.5) words.push(`picture ${ageS.toFixed(0)} s old`);
     else {
       words.push(`${(this.times.length / 2).toFixed(0)} pictures/s`);
-      if (this.latencyMs != null) words.push(`${this.latencyMs.toFixed(0)} ms from capture to screen`);
+      if (this.latencyMs != null) words.push(`${this.latencyMs.toFixed(0)} ms to screen`);
     }
     if (this.status.rate_hz != null) words.push(`${this.status.rate_hz.toFixed(1)} results/s`);
     if (this.status.problem) words.push(this.status.problem);
@@ -235,8 +235,9 @@ export class Camera {
     const isInside = ([l, t, r, b]) => drag.x >= l && drag.x <= r && drag.y >= t && drag.y <= b;
     const size = ([l, t, r, b]) => (r - l) * (b - t);
     const inside = this.about.boxes.filter((box) => box[6] != null && isInside(box));
-    const [smallest] = inside.sort((one, other) => size(one) - size(other));
-    if (smallest) openMenu({ id: smallest[6], name: smallest[4] }, clientX, clientY);
+    const unsure = (box) => box[7] !== "confirmed"; // may be another class's track of the same object
+    const [best] = inside.sort((one, other) => unsure(one) - unsure(other) || size(one) - size(other));
+    if (best) openMenu({ id: best[6], name: best[4] }, clientX, clientY);
   }
 
   select([l, t, r, b], then) {

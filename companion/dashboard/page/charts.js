@@ -93,8 +93,9 @@ export function drawChart(canvas, title, label, series, names, unit) {
   const words = shown.map((key) => `${names[key]} ${newest[key].toFixed(digits)} ${unit}`);
   const text = words.join(", ");
   canvas.setAttribute("aria-label", `${title} of the last minute: ${text || "no values yet"}`);
-  if (label.dataset.text === text) return;
-  label.dataset.text = text;
+  const drawn = text + colours; // they change with the colour scheme
+  if (label.dataset.drawn === drawn) return;
+  label.dataset.drawn = drawn;
   label.replaceChildren(...shown.flatMap((key, index) => {
     const mark = document.createElement("b");
     mark.textContent = " — ";
