@@ -117,6 +117,13 @@ def export(
     image_size: Annotated[
         int, typer.Option(min=32, help="Image size for tuning and checking, pixels.")
     ] = 640,
+    precision: Annotated[
+        str, typer.Option(help="Precision: float32, or int8 with --calibrate (onnx and openvino).")
+    ] = "float32",
+    calibrate: Annotated[
+        Path | None,
+        typer.Option(help="Folder of images, as the camera sees them, from which int8 gets its ranges."),
+    ] = None,
 ) -> None:
     """Export a model for another runtime. The file is compared with the model before it is kept."""
     from vision.runtimes.base import RuntimeUnusableError
@@ -126,8 +133,19 @@ def export(
 
     path = _path(file)
     with plain_errors(CheckpointError, RuntimeUnusableError, ValueError, OSError):
+        if precision not in ("float32", "int8"):
+            raise ValueError(f"--precision must be float32 or int8; got {precision!r}")
+        if (precision == "int8") != (calibrate is not None):
+            raise ValueError("--precision int8 and --calibrate FOLDER go together; give both")
         model_family = model_family_of(load_checkpoint(path).model)
-        written = export(path, to, output, image_size, model_family=model_family)  # type: ignore[arg-type]
+        written = export(
+            path,
+            to,  # type: ignore[arg-type]  # checked there
+            output,
+            image_size,
+            model_family=model_family,
+            calibrate=calibrate,
+        )
     reader = {"onnx": "onnxruntime", "torchscript": "torch"}.get(to, to)
     typer.echo(f"{written} ({written.stat().st_size} bytes), for --model with --runtime {reader}")
 

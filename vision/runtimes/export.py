@@ -13,10 +13,12 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from vision.runtimes.base import RuntimeMissingError, RuntimeName, RuntimeUnusableError, required
 from vision.runtimes.exported import INPUT, KEY, SUFFIXES, ExportedFacts, ExportKind, with_facts
 from vision.runtimes.network import Network
+from vision.runtimes.quantize import calibration_images, mean_probability_difference, quantize_onnx
 from vision.runtimes.source import runtime_of_file
 from vision.runtimes.torch_runtime import traced
 from vision.yolo.checkpoint import load_checkpoint
@@ -28,6 +30,9 @@ logger = logging.getLogger(__name__)
 _OPSET = 17
 # Largest difference of the exported file's outputs from torch's, in logits; rounding is far less.
 _TOLERANCE = 0.02
+# Largest mean difference of the probabilities of an int8 file's best cells; YOLOv8n has 0.02.
+_INT8_TOLERANCE = 0.1
+_INT8_CHECKED_IMAGES = 8
 # Logits of trained networks stay within this; the tolerance scales with larger ones.
 _USUAL_LARGEST = 20.0
 _READER: dict[ExportKind, RuntimeName] = {
@@ -45,6 +50,7 @@ def export(
     image_size: int = 640,
     *,
     model_family: str = "",
+    calibrate: Path | None = None,
 ) -> Path:
     """Export a checkpoint's network for another runtime.
 
@@ -55,14 +61,19 @@ def export(
         output: file to write; None: beside the checkpoint, with the kind's suffix (`SUFFIXES`).
         image_size: size for tuning and verification; for a TensorRT plan the largest side.
         model_family: of the network, stored in the facts.
+        calibrate: a folder of images; the file is then quantised to int8 (`onnx` and `openvino`).
 
     Raises:
         CheckpointError: the checkpoint cannot be read.
-        RuntimeMissingError: the target runtime is not installed.
-        RuntimeUnusableError: the network cannot be exported, or the file's outputs differ from the network's.
+        RuntimeMissingError: the target runtime or the quantiser is not installed.
+        RuntimeUnusableError: the network cannot be exported, the file's outputs differ from the network's, or
+            the calibration folder has too few images.
+        DatasetError: an image of it cannot be read.
     """
     if to not in SUFFIXES:
         raise RuntimeUnusableError(f"can export to {', '.join(SUFFIXES)}, not to {to!r:.50}")
+    if calibrate is not None and to not in ("onnx", "openvino"):
+        raise RuntimeUnusableError(f"int8 can be exported to onnx and openvino, not to {to}")
     required(_READER[to])
     loaded = load_checkpoint(model_path)
     model = loaded.model
@@ -73,6 +84,7 @@ def export(
         end_to_end=model.end_to_end,
         image_size=image_size,
         source_sha256=weights_sha256(model_path),
+        precision="float32" if calibrate is None else "int8",
         model_family=model_family,
         metadata=loaded.metadata,
     )
@@ -81,15 +93,28 @@ def export(
     path = model_path.with_suffix(SUFFIXES[to]) if output is None else output
     if path.suffix != SUFFIXES[to]:
         raise RuntimeUnusableError(f"{path}: a file for {to} must end in {SUFFIXES[to]}")
-    return export_network(Network(model), facts, to, path)
+    calibration = calibration_images(calibrate, image_size, max(facts.strides)) if calibrate else ()
+    return export_network(Network(model), facts, to, path, calibration)
 
 
-def export_network(network: Network, facts: ExportedFacts, to: ExportKind, path: Path) -> Path:
-    """Export a network. The file appears complete or not at all (OpenVINO's `.xml` last)."""
+def export_network(
+    network: Network,
+    facts: ExportedFacts,
+    to: ExportKind,
+    path: Path,
+    calibration: Sequence[NDArray[np.uint8]] = (),
+) -> Path:
+    """Export a network. The file appears complete or not at all (OpenVINO's `.xml` last).
+
+    Args:
+        calibration: inputs of the network; if there are any, the file is quantised to int8.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
         partial = Path(folder) / path.name
-        if to == "onnx":
+        if calibration:
+            _write_int8(network, facts, to, partial, calibration)
+        elif to == "onnx":
             _write_onnx(network, facts, partial)
         elif to == "openvino":
             _write_openvino(network, facts, partial)
@@ -97,7 +122,10 @@ def export_network(network: Network, facts: ExportedFacts, to: ExportKind, path:
             _write_torchscript(network, facts, partial)
         else:
             _write_tensorrt(network, facts, partial)
-        _check(network, facts, to, partial)
+        if calibration:
+            _check_int8(network, to, partial, calibration[:_INT8_CHECKED_IMAGES])
+        else:
+            _check(network, facts, to, partial)
         for exported in sorted(Path(folder).iterdir(), key=lambda exported: exported.name == path.name):
             os.replace(exported, path.with_name(exported.name))
     logger.info("%s: written for %s", path, to)
@@ -165,6 +193,26 @@ def _write_openvino(network: Network, facts: ExportedFacts, path: Path) -> None:
     openvino.save_model(exported, str(path), compress_to_fp16=False)
 
 
+def _write_int8(
+    network: Network,
+    facts: ExportedFacts,
+    to: ExportKind,
+    path: Path,
+    calibration: Sequence[NDArray[np.uint8]],
+) -> None:
+    with tempfile.TemporaryDirectory(prefix="companion-int8-") as folder:
+        plain, quantised = Path(folder) / "float32.onnx", Path(folder) / "int8.onnx"
+        _write_onnx(network, facts, plain)
+        if to == "onnx":
+            quantize_onnx(plain, path, calibration, to)
+            return
+        quantize_onnx(plain, quantised, calibration, to)
+        openvino = required("openvino")
+        exported = openvino.convert_model(str(quantised))
+    exported.set_rt_info(facts.to_json(), [KEY])
+    openvino.save_model(exported, str(path), compress_to_fp16=False)
+
+
 def _write_torchscript(network: Network, facts: ExportedFacts, path: Path) -> None:
     with _without_warnings():
         trace: Any = torch.jit.trace
@@ -202,6 +250,30 @@ def _check(network: Network, facts: ExportedFacts, to: ExportKind, path: Path) -
         # Half precision rounds every layer; `companion models verify` compares the boxes.
         if not worst <= (_TOLERANCE if runtime.precision == "float32" else 50 * _TOLERANCE):
             raise _mismatch(to, image.shape, f"largest difference {worst:.3g}")
+
+
+def _check_int8(network: Network, to: ExportKind, path: Path, images: Sequence[NDArray[np.uint8]]) -> None:
+    """Compare the probabilities of the best cells with torch's."""
+    runtime = runtime_of_file(_READER[to], path, network.head)
+    differences = []
+    for image in images:
+        with torch.inference_mode():
+            levels = network.head.levels(
+                [output[0].numpy() for output in network(torch.from_numpy(image[None]))]
+            )
+        found = runtime.infer(image)
+        differences.append(
+            mean_probability_difference(
+                [level.classes for level in levels], [level.classes for level in found]
+            )
+        )
+    worst = float(np.mean(differences))
+    if not worst <= _INT8_TOLERANCE:
+        raise RuntimeUnusableError(
+            f"the network cannot be quantised: the probabilities of its best cells differ by {worst:.3f} "
+            f"on average, at most {_INT8_TOLERANCE} is accepted; calibrate with images of the kind it detects"
+        )
+    logger.info("%s: int8, the probabilities of the best cells differ by %.3f on average", path.name, worst)
 
 
 def _largest_difference(expected: Sequence[Any], found: Sequence[Any]) -> float:

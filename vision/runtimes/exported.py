@@ -41,6 +41,7 @@ class ExportedFacts:
         fixed_size: (height, width) of the only accepted input; None: any multiples of the largest stride.
         model_family: of the network, from the export; may be empty.
         source_sha256: of the checkpoint.
+        precision: of the file, `float32` or `int8`; a TensorRT plan computes in float16.
         metadata: of the checkpoint: licence, origin, score.
     """
 
@@ -50,6 +51,7 @@ class ExportedFacts:
     end_to_end: bool
     image_size: int
     source_sha256: str
+    precision: str = "float32"
     fixed_size: tuple[int, int] | None = None
     model_family: str = ""
     metadata: dict[str, Any] = field(default_factory=dict)
@@ -92,6 +94,7 @@ class ExportedFacts:
             strides=strides,
             fixed_size=None if fixed is None else (fixed[0], fixed[1]),
             source_sha256=str(facts.source_sha256),
+            precision=str(facts.precision),
             model_family=str(facts.model_family),
         )
 

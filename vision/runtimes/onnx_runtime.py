@@ -25,7 +25,7 @@ class OnnxRuntime:
     Args:
         path: the file.
         head: layout of its outputs; None: from the file's metadata.
-        precision: `float32`, the file's precision.
+        precision: `auto`, or `float32` for a file that is not int8.
         threads: of the processor; None: ONNX Runtime's default.
     """
 
@@ -40,13 +40,15 @@ class OnnxRuntime:
         precision: Precision = "auto",
         threads: int | None = None,
     ) -> None:
-        if precision not in ("auto", "float32"):
-            raise RuntimeUnusableError(
-                f"onnxruntime computes in float32, the precision of its files; not in {precision}"
-            )
         self._session, provider = open_session(path, threads)
-        self.head = head if head is not None else own_facts(onnx_facts(path, self._session), path).head()
-        self.precision, self.precision_reason = "float32", f"precision of the file ({provider})"
+        facts = own_facts(onnx_facts(path, self._session), path)
+        if precision not in ("auto", facts.precision):
+            raise RuntimeUnusableError(
+                f"{path}: onnxruntime computes in {facts.precision}, the precision of the file; "
+                f"not in {precision}"
+            )
+        self.head = head if head is not None else facts.head()
+        self.precision, self.precision_reason = facts.precision, f"precision of the file ({provider})"
         self._threads = threads
 
     @property

@@ -26,7 +26,8 @@ class OpenVinoNetwork:
 
     Args:
         path: the `.xml` (its `.bin` beside it) or `.onnx`.
-        precision: `auto`: bfloat16 if the processor supports it, else float32.
+        precision: `auto`: bfloat16 if the processor supports it, else float32; the only one for an int8 file,
+            whose other layers compute so.
         threads: of the processor; None: OpenVINO's default.
     """
 
@@ -38,18 +39,25 @@ class OpenVinoNetwork:
         self._model = _read(self._core, path)
         native = base.bfloat16_instructions()
         self._automatic = precision == "auto"
-        if precision == "auto":
-            self.precision = "bfloat16" if native else "float32"
+        int8 = any(node.get_type_name() == "FakeQuantize" for node in self._model.get_ops())
+        if int8 and precision != "auto":
+            raise RuntimeUnusableError(f"{path}: is an int8 file; its precision is auto, not {precision}")
+        self._computes = ("bfloat16" if native else "float32") if precision == "auto" else precision
+        self.precision: str = self._computes
+        if int8:
+            self.precision = "int8"
+            self.precision_reason = f"precision of the file; its other layers in {self._computes}"
+        elif precision == "auto":
             self.precision_reason = (
                 f"the processor computes in it ({native})"
                 if native
                 else "this processor does not compute in bfloat16"
             )
         else:
-            self.precision, self.precision_reason = precision, "as requested"
+            self.precision_reason = "as requested"
         self._settings: dict[str, Any] = {
             "PERFORMANCE_HINT": "LATENCY",
-            "INFERENCE_PRECISION_HINT": _HINTS[self.precision],
+            "INFERENCE_PRECISION_HINT": _HINTS[self._computes],
         }
         if threads is not None:
             self._settings["INFERENCE_NUM_THREADS"] = threads
@@ -85,14 +93,16 @@ class OpenVinoNetwork:
                 f"openvino cannot compile the network for {size}: {' '.join(str(error).split())}"
             ) from error
         used = str(compiled.get_property("INFERENCE_PRECISION_HINT"))
-        if _HINTS[self.precision] not in used.replace("float", "f"):
+        if _HINTS[self._computes] not in used.replace("float", "f"):
             if self._automatic and _HINTS["float32"] in used.replace("float", "f"):
-                self.precision = "float32"
+                self._computes = "float32"
                 self.precision_reason = "openvino does not use this processor's bfloat16"
+                if self.precision != "int8":
+                    self.precision = "float32"
                 self._settings["INFERENCE_PRECISION_HINT"] = _HINTS["float32"]
                 return self._compiled(size)
             raise RuntimeUnusableError(
-                f"openvino computes in {used} on this processor, not in {self.precision}"
+                f"openvino computes in {used} on this processor, not in {self._computes}"
             )
         self._threads = int(compiled.get_property("INFERENCE_NUM_THREADS")) or self._threads
         request = self._requests[size] = compiled.create_infer_request()
