@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from vision.detections import Detections
-from vision.evaluation.datasets import Dataset, DatasetError, read_image
+from vision.evaluation.datasets import Dataset, DatasetError, fold_name, read_image
 from vision.evaluation.misses import WorstMisses
 from vision.pipeline import FrameDetector
 from vision.yolo.metrics import ImageResult, Score, score_detections
@@ -98,12 +98,12 @@ def map_classes(model_names: Sequence[str], dataset: Dataset) -> ClassMapping:
         return ClassMapping(tuple(model_names), same, same, ())
     known: dict[str, int] = {}
     for index, name in enumerate(model_names):
-        known.setdefault(_folded(name), index)
+        known.setdefault(fold_name(name), index)
     of_model = np.full(len(model_names), -1)
     of_dataset = np.full(len(dataset.class_names), -1)
     names: list[str] = []
     for index, name in enumerate(dataset.class_names):
-        model_index = known.get(_folded(name))
+        model_index = known.get(fold_name(name))
         if model_index is None:
             continue
         if of_model[model_index] < 0:
@@ -184,10 +184,6 @@ def _evaluated(found: Detections, mapping: ClassMapping) -> Detections:
     ids = mapping.of_model[found.class_id]
     kept = ids >= 0
     return Detections(found.xyxy[kept], found.confidence[kept], ids[kept], mapping.names)
-
-
-def _folded(name: str) -> str:
-    return "".join(name.casefold().replace("_", " ").replace("-", " ").split())
 
 
 def _few(names: Sequence[str], most: int = 8) -> str:

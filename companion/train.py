@@ -1,30 +1,42 @@
-"""`companion train`: train the bundled detector from this repository.
+"""`companion train`: train the bundled detector from this repository, or any one on labelled images.
 
-The recipe (`vision.yolo.recipe`) and the scenes (`mavlink_sim.datasets.training_scenes`) determine the
-weights; nothing is downloaded.
+For the bundled one the recipe (`vision.yolo.recipe`) and the scenes (`mavlink_sim.datasets.training_scenes`)
+determine the weights; nothing is downloaded. On labelled images a trained model is refined
+(`vision.yolo.fine_tuning`).
 """
 
 from __future__ import annotations
 
 import json
+import logging
+import math
 import sys
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+from companion.evaluate import JUDGED_CONFIDENCE, evaluate_dataset, map_classes
 from mavlink_sim.datasets.training_scenes import random_scene, training_scene
 from mavlink_sim.world.shapes import CLASS_NAMES
+from vision.detector import DEFAULT_MODEL, Detector
+from vision.evaluation.datasets import Dataset, DatasetError, fold_name, open_dataset
+from vision.model_files import find_model
+from vision.runtimes.base import bfloat16_instructions
+from vision.weights import DEFAULT_WEIGHTS
 from vision.yolo.checkpoint import load_checkpoint, save_checkpoint
 from vision.yolo.checkpoint_pair import WEIGHTS_SUFFIX
+from vision.yolo.fine_tuning import DOUBTED_SCORE, LabelledScenes, extend_classes, training_images
 from vision.yolo.metrics import Score
 from vision.yolo.recipe import DEFAULT_RECIPE, HELD_OUT_SEED, HELD_OUT_SIZE, REFINEMENT, evaluate
 from vision.yolo.training import Progress as TrainingProgress
-from vision.yolo.training import TrainedModel, TrainingSettings, train
+from vision.yolo.training import Stage, TrainedModel, TrainingSettings, train
 
+logger = logging.getLogger(__name__)
 LICENCE = "Apache-2.0"
+USUAL_EPOCHS = 40
 
 
 def train_default(
@@ -110,6 +122,154 @@ def evaluate_and_save(
     }
     save_checkpoint(output.with_suffix(WEIGHTS_SUFFIX), trained.model, metadata=metadata)
     return score
+
+
+@dataclass(frozen=True, slots=True)
+class FineTuning:
+    """Result of `train_on_data`.
+
+    Attributes:
+        before: score of the starting model on the validation images; None if it knows none of the classes.
+        after: that of the result.
+        held_out: whether none of these images was trained on.
+    """
+
+    before: Score | None
+    after: Score
+    held_out: bool
+
+
+def train_on_data(
+    data: Path,
+    output: Path,
+    *,
+    start: str = DEFAULT_MODEL,
+    validation: Path | None = None,
+    steps: int | None = None,
+    time_limit_s: float | None = None,
+    image_size: int = 640,
+    batch_size: int = 8,
+    learning_rate: float = 1e-3,
+    seed: int = 0,
+    workers: int = 1,
+    threads: int = 1,
+    resume: bool = False,
+) -> FineTuning:
+    """Train a model on a labelled data set, score it before and after, and write it as a pair.
+
+    The model keeps its classes; those of the data set that it does not know are added. The state is stored
+    beside the output as `<output>.training`, for `resume`.
+
+    Args:
+        data: as for `companion evaluate`; the split `train` if it has splits.
+        start: the model to train: `default`, a file, or a name in the models folder.
+        validation: a data set to score on; None: the split `val` of `data`, or all of it without splits.
+        steps: None for about 40 passes over the images, at least 200 steps.
+        image_size: side of the training images, and longer side in the evaluation; pixels, a multiple of 32.
+
+    Raises:
+        DatasetError: the data set cannot be used. CheckpointError: `start` cannot be read.
+        FileNotFoundError: `resume` without a state. ValueError: it belongs to another network, or the
+            network cannot be trained.
+    """
+    path = DEFAULT_WEIGHTS if start == DEFAULT_MODEL else find_model(start)
+    loaded = load_checkpoint(path)
+    train_set = open_dataset(data, split="train", class_names=loaded.class_names)
+    judged_set = open_dataset(
+        validation or data, split=None if validation else "val", class_names=loaded.class_names
+    )
+    if not any(len(sample.class_ids) for sample in train_set.samples):
+        raise DatasetError(f"{data}: no object is labelled in its {len(train_set.samples)} images")
+    model = extend_classes(loaded.model, train_set.class_names or ())
+    map_classes(model.class_names, judged_set)  # Raises now, not after the training.
+    steps = steps or max(200, math.ceil(USUAL_EPOCHS * len(train_set.samples) / batch_size))
+    settings = TrainingSettings(
+        class_names=model.class_names,
+        stages=(Stage(image_size, image_size, batch_size, steps, decay_steps=steps),),
+        learning_rate=learning_rate,
+        warmup_steps=max(1, min(100, steps // 10)),
+        fixed_normalisation=True,
+        average_decay=min(0.998, max(0.9, 1 - 10 / steps)),
+        seed=seed,
+        threads=threads,
+        workers=workers,
+        bfloat16=bool(bfloat16_instructions()),
+        time_limit_s=time_limit_s,
+    )
+    output.parent.mkdir(parents=True, exist_ok=True)
+    finder = Detector(
+        path, confidence=DOUBTED_SCORE, image_size=image_size, precision="float32", threads=threads
+    )
+    images = list(training_images(train_set, model.class_names, finder.detect))
+    labels = sum(len(sample.class_ids) for sample in train_set.samples)
+    logger.info(
+        "%d images, %d labels, and %d objects that %s finds of its classes without labels",
+        len(images),
+        labels,
+        sum(len(image.class_ids) for image in images) - labels,
+        path.name,
+    )
+    with _ProgressDisplay() as display:
+        trained = train(
+            settings,
+            LabelledScenes(images),
+            display,
+            checkpoint=output.with_suffix(f"{output.suffix}.training"),
+            resume=resume,
+            start=model,
+            network=model.description,
+        )
+    weights = output.with_suffix(WEIGHTS_SUFFIX)
+    metadata: dict[str, Any] = {
+        **{key: value for key, value in loaded.metadata.items() if key == "licence"},
+        "trained_on": f"{len(images)} images of {data.resolve().name}",
+        "started_from": path.name,
+        "steps_done": trained.steps_done,
+        "settings": {
+            key: value
+            for key, value in json.loads(json.dumps(asdict(settings))).items()
+            if key not in ("depth_multiple", "width_multiple", "max_channels")  # not of this network
+        },
+    }
+    save_checkpoint(weights, trained.model, metadata=metadata)
+    judged = {fold_name(name) for name in judged_set.class_names or ()}
+    knows_any = not judged.isdisjoint(fold_name(name) for name in loaded.class_names)
+    after = _score(weights, judged_set, image_size, threads)
+    result = FineTuning(
+        _score(path, judged_set, image_size, threads) if knows_any else None,
+        after,
+        {s.image for s in judged_set.samples}.isdisjoint(s.image for s in train_set.samples),
+    )
+    metadata["score"] = {
+        "map50": round(after.map50, 4),
+        "map50_95": round(after.map50_95, 4),
+        "images": after.images,
+        "held_out": result.held_out,
+    }
+    save_checkpoint(weights, trained.model, metadata=metadata)
+    return result
+
+
+def score_lines(result: FineTuning) -> list[str]:
+    """A table of the classes that occur in the validation images, before and after the training."""
+    names = [name for name, one in result.after.per_class.items() if one.objects]
+    width = max([len("class"), *map(len, names)])
+    lines = [f"{'class':<{width}}  objects  mAP50: before  after  mAP50-95: before  after"]
+    for name in names:
+        new = result.after.per_class[name]
+        old = None if result.before is None else result.before.per_class.get(name)
+        old50, old95 = ("-", "-") if old is None else (f"{old.ap50:.3f}", f"{old.ap50_95:.3f}")
+        lines.append(
+            f"{name:<{width}}  {new.objects:7d}  {old50:>13}  {new.ap50:.3f}  {old95:>16}  {new.ap50_95:.3f}"
+        )
+    return lines
+
+
+def _score(model: Path, dataset: Dataset, image_size: int, threads: int) -> Score:
+    detector = Detector(
+        model, confidence=JUDGED_CONFIDENCE, image_size=image_size, precision="float32", threads=threads
+    )
+    return evaluate_dataset(dataset, detector, map_classes(detector.class_names, dataset)).score
 
 
 class _ProgressDisplay:

@@ -35,6 +35,7 @@ from companion.cli.models import models
 from companion.cli.play import play
 from companion.cli.recordings import RECORD_SETTINGS, log, record, replay, sightings
 from companion.cli.topics import topics
+from companion.cli.train import train
 from companion.settings import Settings
 from companion.settings.perception import DEFAULT_MODEL, NO_SOURCE
 from vision.gc_pause import gc_paused
@@ -83,6 +84,7 @@ app = typer.Typer(
 app.add_typer(models, name="models")
 app.add_typer(calibrate, name="calibrate")
 app.command()(evaluate)
+app.command()(train)
 app.command()(topics)
 app.command()(cameras)
 settings_command(app, "source", "camera", "vehicle", "plugins")(preview)
@@ -427,49 +429,6 @@ def parse_classes(text: str | None) -> tuple[str | int, ...] | None:
     if text is None or not text.strip():
         return None
     return tuple(int(word) if word.isdigit() else word for word in parse_words(text))
-
-
-@app.command()
-def train(
-    output: Annotated[Path, typer.Option(help="Output: NAME.safetensors and NAME.yaml.")] = Path(
-        "runs/model.safetensors"
-    ),
-    seed: Annotated[
-        int | None, typer.Option(min=0, help="Random seed of weights and scenes. Default: the recipe's.")
-    ] = None,
-    steps: Annotated[int | None, typer.Option(min=1, help="Number of training steps.")] = None,
-    hours: Annotated[float | None, typer.Option(min=0.001, help="Time limit, hours.")] = None,
-    workers: Annotated[
-        int | None, typer.Option(min=0, help="Number of processes that render scenes.")
-    ] = None,
-    threads: Annotated[int | None, typer.Option(min=1, help="CPU threads of torch.")] = None,
-    resume: Annotated[bool, typer.Option(help="Continue from OUTPUT's training state.")] = False,
-    start: Annotated[
-        Path | None, typer.Option(help="Weights to refine, instead of the first training.")
-    ] = None,
-    held_out: Annotated[int, typer.Option(min=1, help="Number of scenes for the evaluation.")] = 400,
-) -> None:
-    """Train the default detector. Trains on rendered scenes and evaluates on held-out ones."""
-    from companion.train import train_default
-    from vision.yolo.safe_pickle import CheckpointError
-
-    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
-    with plain_errors(CheckpointError, FileNotFoundError, ValueError, OSError):
-        score = train_default(
-            output,
-            seed=seed,
-            steps=steps,
-            time_limit_s=None if hours is None else hours * 3600,
-            workers=workers,
-            threads=threads,
-            resume=resume,
-            start=start,
-            held_out=held_out,
-        )
-    typer.echo(
-        f"{output.with_suffix('.safetensors')}: mAP50 {score.map50:.3f}, mAP50-95 {score.map50_95:.3f} "
-        f"on {held_out} held-out scenes"
-    )
 
 
 @settings_command(app)

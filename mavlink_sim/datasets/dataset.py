@@ -169,8 +169,9 @@ def _counts(item: VisibleObject, options: DatasetOptions) -> bool:
 
 def _random_frames(options: DatasetOptions) -> Iterator[Captured]:
     width, height = options.size
+    more = tuple(name for name in options.classes if name not in CLASS_NAMES)
     for index in range(options.frames):
-        rendered = training_frame(np.random.default_rng((options.seed, index)), width, height)
+        rendered = training_frame(np.random.default_rng((options.seed, index)), width, height, more)
         frame = Frame(np.ascontiguousarray(rendered.image), index, index, rendered.depth_m)
         yield Captured(frame, rendered, 0.0, index)
 

@@ -63,7 +63,8 @@ DISTRACTOR_NAMES = (
 ALIKE = (("car", "truck", "boat"), ("person", "bicycle", "dog", "chair"), ("tree", "bush", "autumn_tree"))
 NARROW_SIDE_M = np.array([0.5, 0.5, 1.5, 2.2, 1.7, 0.4, 0.5])
 """Least apparent width of each class, from most sides. Smaller than MIN_SIDE_PX is not attempted."""
-
+OTHER_NARROW_SIDE_M = 0.5
+"""The same of other kinds of objects."""
 
 FAR_WEIGHTS = np.array([1.3, 1.2, 1.4, 1.2, 1.8, 1.2, 1.2])
 """Weights of the classes where all distances are equally likely; most boats, which were detected as cars."""
@@ -119,17 +120,20 @@ def training_scene(rng: np.random.Generator, width: int, height: int) -> tuple[I
     return rendered.image, np.array(boxes, np.float32).reshape(-1, 4), np.array(ids, np.int64)
 
 
-def training_frame(rng: np.random.Generator, width: int, height: int) -> Rendered:
-    """One frame of the mixture that the bundled model is trained on."""
+def training_frame(rng: np.random.Generator, width: int, height: int, more: tuple[str, ...] = ()) -> Rendered:
+    """One frame of the mixture that the bundled model is trained on.
+
+    `more`: other kinds of objects to place as often as those of its classes.
+    """
     kind = float(rng.random())
     if kind < FLIGHT_SHARE:
-        return flight_frame(rng, width, height)
+        return flight_frame(rng, width, height, more)
     if kind < FLIGHT_SHARE + WORLD_SHARE:
         return world_frame(rng, width, height)
-    return random_frame(rng, width, height)
+    return random_frame(rng, width, height, more=more)
 
 
-def flight_frame(rng: np.random.Generator, width: int, height: int) -> Rendered:
+def flight_frame(rng: np.random.Generator, width: int, height: int, more: tuple[str, ...] = ()) -> Rendered:
     """The view ahead from a low vehicle: objects 3 to 70 m away, many distractors, ground, shadows."""
     low = rng.random() < 0.85
     altitude = float(math.exp(rng.uniform(math.log(1.5), math.log(10.0)) + (0.0 if low else math.log(5.0))))
@@ -149,7 +153,7 @@ def flight_frame(rng: np.random.Generator, width: int, height: int) -> Rendered:
     position = (float(viewpoint[0]), float(viewpoint[1]), -altitude)
     light, sky, buffers = _random_light(rng), _random_sky(rng), _buffers(width, height)
     renderer = Renderer(World((), ground, light, sky), camera, CameraMount(), None, buffers)
-    objects = _random_objects(rng, renderer, position, attitude, ground, far=True)
+    objects = _random_objects(rng, renderer, position, attitude, ground, far=True, more=more)
     if light.shadow > 0.2 and rng.random() < 0.5:
         objects += _shadow_casters(rng, renderer.view(position, attitude), light, objects)
     effects = _random_effects(rng) if rng.random() < 0.6 else MILD_EFFECTS
@@ -232,7 +236,11 @@ def _gaze(
 
 
 def random_frame(
-    rng: np.random.Generator, width: int, height: int, focal_px: tuple[float, float] | None = None
+    rng: np.random.Generator,
+    width: int,
+    height: int,
+    focal_px: tuple[float, float] | None = None,
+    more: tuple[str, ...] = (),
 ) -> Rendered:
     """The frame of `random_scene`, with depth and all visible objects; the same draws, the same image."""
     least, greatest = focal_px or (0.6 * width, 1.7 * width)
@@ -250,7 +258,7 @@ def random_frame(
     sky = _random_sky(rng)
     buffers = _buffers(width, height)
     renderer = Renderer(World((), ground, light, sky), camera, CameraMount(), None, buffers)
-    objects = _random_objects(rng, renderer, position, attitude, ground)
+    objects = _random_objects(rng, renderer, position, attitude, ground, more=more)
     effects = _random_effects(rng)
     renderer = Renderer(World(objects, ground, light, sky), camera, CameraMount(), effects, buffers, rng)
     return renderer.render(position, attitude)
@@ -387,17 +395,23 @@ def _random_objects(
     attitude: NDArray[np.float64],
     ground: Ground,
     far: bool = False,
+    more: tuple[str, ...] = (),
 ) -> tuple[WorldObject, ...]:
     """Objects placed where they are large enough in the image and not much hidden by each other.
 
-    `far`: equally many at each distance, small ones too, and every kind of distractor.
+    `far`: equally many at each distance, small ones too, and every kind of distractor. `more`: kinds of
+    objects besides the bundled model's classes.
     """
     view = renderer.view(position, attitude)
     empty = rng.random() < EMPTY_SHARE
     wanted = 0 if empty else 1 + int(rng.integers(MAX_OBJECTS))
     clutter = int(rng.integers(2, 16) if far else rng.integers(0, 9))
     water = ground.kinds[0] == "water"
-    weights = np.array(list(CLASS_WEIGHTS.values()))
+    wanted_names = CLASS_NAMES + more
+    of_more = np.ones(len(more))
+    weights = np.concatenate([list(CLASS_WEIGHTS.values()), of_more])
+    far_weights = np.concatenate([FAR_WEIGHTS, of_more])
+    narrow_m = np.concatenate([NARROW_SIDE_M, OTHER_NARROW_SIDE_M * of_more])
     if water:
         weights[CLASS_NAMES.index("boat")] *= 6.0
     placed: list[WorldObject] = []
@@ -420,12 +434,12 @@ def _random_objects(
             ahead = ray[:2] / math.hypot(*ray[:2])
             ray = np.array([*ahead, -view.eye[2] / depth])
         if real and far:
-            class_name = CLASS_NAMES[int(rng.choice(len(CLASS_NAMES), p=FAR_WEIGHTS / FAR_WEIGHTS.sum()))]
+            class_name = wanted_names[int(rng.choice(len(wanted_names), p=far_weights / far_weights.sum()))]
         elif real:
-            fitting = weights * (NARROW_SIDE_M * view.focal_px / depth > MIN_SIDE_PX)
+            fitting = weights * (narrow_m * view.focal_px / depth > MIN_SIDE_PX)
             if not fitting.any():
                 continue
-            class_name = CLASS_NAMES[int(rng.choice(len(CLASS_NAMES), p=fitting / fitting.sum()))]
+            class_name = wanted_names[int(rng.choice(len(wanted_names), p=fitting / fitting.sum()))]
         else:
             names = DISTRACTOR_NAMES if far else CLUTTER_NAMES
             class_name = names[int(rng.integers(len(names)))]

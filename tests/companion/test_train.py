@@ -1,17 +1,21 @@
-"""A few training steps as by `companion train`: the written model can be used."""
+"""A few training steps as by `companion train`, on scenes and on labelled images: the model can be used."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import yaml
+from typer.testing import CliRunner, Result
 
 import companion.train
-from companion.train import train_default
+from companion.cli import app
+from companion.train import train_default, train_on_data
 from vision.detector import Detector
+from vision.yolo.checkpoint import load_checkpoint
 from vision.yolo.recipe import DEFAULT_RECIPE, REFINEMENT
 from vision.yolo.training import Stage
 
@@ -49,3 +53,104 @@ def test_training_writes_model_with_licence_and_score(
 def test_resume_without_state_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         train_default(tmp_path / "model.pt", resume=True)
+
+
+@pytest.fixture
+def labelled(tmp_path: Path) -> Path:
+    """A YOLO set of six grey images with a bright square each, class `Drone`; two are for validation."""
+    folder = tmp_path / "set"
+    for index in range(6):
+        split = "val" if index > 3 else "train"
+        image = np.full((60, 80, 3), 90, np.uint8)
+        image[20:40, 5 * index : 5 * index + 20] = 250
+        for kind in ("images", "labels"):
+            (folder / kind / split).mkdir(parents=True, exist_ok=True)
+        assert cv2.imwrite(str(folder / "images" / split / f"{index}.png"), image)
+        line = f"1 {(5 * index + 10) / 80} 0.5 0.25 0.3333\n"
+        (folder / "labels" / split / f"{index}.txt").write_text(line)
+    (folder / "data.yaml").write_text("train: images/train\nval: images/val\nnames: [Person, Drone]\n")
+    return folder
+
+
+SHORT = ("--image-size", "64", "--batch-size", "2", "--workers", "0")
+
+
+def train_command(data: Path, model: Path | str, output: Path, *options: str) -> Result:
+    arguments = ["train", "--data", str(data), "--from", str(model), "--output", str(output)]
+    return CliRunner().invoke(app, [*arguments, *SHORT, *options])
+
+
+def test_class_of_own_images_is_added_and_scored(labelled: Path, small_model: Path, tmp_path: Path) -> None:
+    output = tmp_path / "out" / "mine.safetensors"
+    result = train_command(labelled, small_model, output, "--steps", "3")
+    assert result.exit_code == 0, result.stderr
+    header, row, last = result.stdout.splitlines()
+    assert header.split()[2:] == ["mAP50:", "before", "after", "mAP50-95:", "before", "after"]
+    assert row.split()[:3] == ["Drone", "2", "-"]
+    assert "on 2 images, none of them trained on" in last
+    written = load_checkpoint(output)
+    assert written.class_names == ("person", "car", "boat", "Drone")
+    assert written.metadata["licence"] == "Apache-2.0"
+    assert written.metadata["started_from"] == "small.pt"
+    assert (written.metadata["steps_done"], written.metadata["score"]["images"]) == (3, 2)
+    assert "width_multiple" not in written.metadata["settings"]
+    # The result can be trained again.
+    again = train_command(labelled, output, tmp_path / "again.safetensors", "--steps", "1")
+    assert again.exit_code == 0, again.stderr
+    assert load_checkpoint(tmp_path / "again.safetensors").class_names == written.class_names
+
+
+def test_interrupted_training_on_images_resumes(labelled: Path, small_model: Path, tmp_path: Path) -> None:
+    whole, cut = tmp_path / "whole.safetensors", tmp_path / "cut.safetensors"
+    options = {"start": str(small_model), "image_size": 64, "batch_size": 2, "workers": 0, "steps": 4}
+    train_on_data(labelled, whole, **options)  # type: ignore[arg-type]
+    train_on_data(labelled, cut, time_limit_s=0.0, **options)  # type: ignore[arg-type]
+    assert load_checkpoint(cut).metadata["steps_done"] == 1
+    assert train_command(labelled, small_model, cut, "--steps", "4", "--resume").exit_code == 0
+    assert cut.read_bytes() == whole.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "message"),
+    [
+        ("labels/train/2.txt", "0 0.5 0.5 0.2 0.2\n2 0.5 0.5 0.2 0.2\n", "2.txt, line 2: the class must be"),
+        ("labels/train/2.txt", "0 40 30 20 20\n", "2.txt, line 1: coordinates are fractions"),
+        ("labels/train/9.txt", "0 0.5 0.5 0.2 0.2\n", "labels/train/9.txt: its image "),
+        ("images/train/2.png", "", "images/train/2.png: cannot be read as an image"),
+        ("data.yaml", "train: images/train\nnames: [Person, Drone]\n", "has no split 'val'"),
+        ("data.yaml", "train: images/gone\nval: images/val\n", "images/gone, which does not exist"),
+    ],
+)
+def test_labels_that_do_not_fit_are_one_line(
+    labelled: Path, small_model: Path, tmp_path: Path, file: str, content: str, message: str
+) -> None:
+    (labelled / file).write_text(content)
+    result = train_command(labelled, small_model, tmp_path / "mine.safetensors", "--steps", "1")
+    assert (result.exit_code, result.stdout) == (2, "")
+    error = [line for line in result.stderr.splitlines() if line.startswith("companion:")]
+    assert len(error) == 1
+    assert message in error[0]
+
+
+def test_class_beyond_the_names_of_the_model_is_named(
+    labelled: Path, small_model: Path, tmp_path: Path
+) -> None:
+    (labelled / "data.yaml").unlink()
+    (labelled / "labels" / "train" / "2.txt").write_text("3 0.5 0.5 0.2 0.2\n")
+    result = train_command(labelled, small_model, tmp_path / "mine.safetensors")
+    assert result.exit_code == 2
+    assert "2.txt, line 1: the class must be a whole number, 0..2, got 3" in result.stderr
+
+
+def test_set_without_objects_is_refused(labelled: Path, small_model: Path, tmp_path: Path) -> None:
+    for path in (labelled / "labels" / "train").iterdir():
+        path.write_text("")
+    result = train_command(labelled, small_model, tmp_path / "mine.safetensors")
+    assert result.exit_code == 2
+    assert "no object is labelled in its 4 images" in result.stderr
+
+
+def test_option_for_own_data_without_data_is_refused(tmp_path: Path) -> None:
+    result = CliRunner().invoke(app, ["train", "--output", str(tmp_path / "m"), "--batch-size", "4"])
+    assert result.exit_code == 2
+    assert "--batch-size is an option of --data" in result.stderr

@@ -278,3 +278,11 @@ def test_flights_have_every_kind_of_distractor_and_far_objects() -> None:
     assert {"autumn_tree", "building", "plate"} < names
     assert max(ranges) > 40.0
     assert min(ranges) < 6.0
+
+
+def test_more_kinds_of_objects_are_placed_as_often_as_the_classes() -> None:
+    def drones(more: tuple[str, ...]) -> int:
+        frames = (flight_frame(np.random.default_rng((5, n)), 160, 128, more) for n in range(12))
+        return sum(item.world_object.class_name == "drone" for frame in frames for item in frame.objects)
+
+    assert drones(("drone",)) >= drones(()) + 5

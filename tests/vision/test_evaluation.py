@@ -52,6 +52,14 @@ def test_images_and_labels_in_separate_folders(yolo: Path) -> None:
     assert len(dataset.samples[2].boxes) == 0
 
 
+def test_labels_without_their_image_are_rejected(yolo: Path) -> None:
+    text(yolo / "labels" / "val" / "classes.txt", "car\n")  # the names, of a labelling program
+    assert len(open_dataset(yolo, class_names=("car", "dog")).samples) == 3
+    lost = text(yolo / "labels" / "val" / "d.txt", "0 0.5 0.5 0.2 0.4\n")
+    with pytest.raises(DatasetError, match=rf"{lost}: its image .*d\.jpg"):
+        open_dataset(yolo)
+
+
 def test_images_with_labels_beside_them(tmp_path: Path) -> None:
     make_image(tmp_path / "x.png")
     text(tmp_path / "x.txt", "0 0.5 0.5 1 1")
@@ -167,6 +175,7 @@ def test_invalid_json_and_ambiguous_files_are_rejected(tmp_path: Path) -> None:
     text(path.with_name("instances_train2017.json"), "{}")
     with pytest.raises(DatasetError, match="several annotation files"):
         open_dataset(tmp_path)
+    assert open_dataset(tmp_path, split="val").root == path
     with pytest.raises(DatasetError, match="is not JSON"):
         open_dataset(text(tmp_path / "x.json", "{"))
 

@@ -32,14 +32,22 @@ _ROUNDING = 1e-4
 _LARGEST_LABELS_BYTES = 16 << 20
 
 
-def open_dataset(path: Path, *, split: str | None = None, images: Path | None = None) -> Dataset:
+def open_dataset(
+    path: Path,
+    *,
+    split: str | None = None,
+    images: Path | None = None,
+    class_names: tuple[str, ...] | None = None,
+) -> Dataset:
     """Detect the format of the data set at `path` and read its labels.
 
     Args:
         path: a folder with `images/` and `labels/`, or with both side by side; one with a `data.yaml`, or
             that file; a COCO annotation file (JSON), or a folder with one.
-        split: `train`, `val` or `test` of a `data.yaml`; None: `val`, or the first other one.
+        split: `train`, `val` or `test` of a `data.yaml` (None: `val`, or the first other one), or in the name
+            of one of several annotation files.
         images: folder of a COCO file's images; None: searched near the file.
+        class_names: of a data set without names.
 
     Raises:
         DatasetError: no data set found, or an invalid label.
@@ -48,10 +56,10 @@ def open_dataset(path: Path, *, split: str | None = None, images: Path | None = 
         raise DatasetError(
             f"{path}: no such file or folder; give a data set's folder, data.yaml or COCO JSON"
         )
-    annotations = path if path.suffix.lower() == ".json" else find_annotations(path)
+    annotations = path if path.suffix.lower() == ".json" else find_annotations(path, split)
     if annotations is not None:
         return read_coco(annotations, images)
-    return read_yolo(path, split)
+    return read_yolo(path, split, class_names)
 
 
 class DatasetError(ValueError):
@@ -104,6 +112,11 @@ class Dataset:
     samples: tuple[Sample, ...]
 
 
+def fold_name(name: str) -> str:
+    """A class name without case, spaces, `_` and `-`: equal for names of the same class."""
+    return "".join(name.casefold().replace("_", " ").replace("-", " ").split())
+
+
 def image_files(folder: Path) -> list[Path]:
     """Every image below `folder`, by name."""
     return sorted(_images_below(folder))
@@ -123,15 +136,17 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     return image.astype(np.uint8, copy=False)
 
 
-def find_annotations(folder: Path) -> Path | None:
-    """Find the annotation file of a folder: the only JSON with `images` and `annotations`; None if there is
-    none.
+def find_annotations(folder: Path, split: str | None = None) -> Path | None:
+    """Find the annotation file of a folder: the only JSON with `images` and `annotations`, or the one with
+    the split in its name; None if there is none.
     """
     if not folder.is_dir():
         return None
     found = sorted({*folder.glob("annotations/*.json"), *folder.glob("*.json")})
     fitting = [path for path in found if path.name.startswith(("instances", "_annotations", "annotations"))]
     candidates = fitting or [path for path in found if _looks_like_coco(path)]
+    if split is not None and len(candidates) > 1:
+        candidates = [path for path in candidates if split in path.stem] or candidates
     if len(candidates) > 1:
         names = ", ".join(str(path.relative_to(folder)) for path in candidates)
         raise DatasetError(f"{folder}: has several annotation files, give one: {names}")
@@ -255,18 +270,18 @@ class _ImageFinder:
         raise DatasetError(f"{where}: {file_name} is in none of {searched}; give the folder with --images")
 
 
-def read_yolo(path: Path, split: str | None = None) -> Dataset:
-    """Read the data set at `path`: a `data.yaml`, a folder with one, or a folder of images. Raises
-    `DatasetError`.
+def read_yolo(path: Path, split: str | None = None, class_names: tuple[str, ...] | None = None) -> Dataset:
+    """Read the data set at `path`: a `data.yaml`, a folder with one, or a folder of images. `class_names`
+    are used if it has none. Raises `DatasetError`.
     """
     table_path = (
         path if path.is_file() else next((path / n for n in _TABLE_NAMES if (path / n).is_file()), None)
     )
     if table_path is None:
-        names, images = None, image_files(path / "images" if (path / "images").is_dir() else path)
+        names, images = class_names, image_files(path / "images" if (path / "images").is_dir() else path)
     else:
         table = _read_table(table_path)
-        names, images = _names(table, table_path), _images_of(table, table_path, split)
+        names, images = _names(table, table_path) or class_names, _images_of(table, table_path, split)
     if not images:
         raise DatasetError(
             f"{path}: has no images; expected images/ and labels/, or images with label files beside them"
@@ -277,7 +292,22 @@ def read_yolo(path: Path, split: str | None = None) -> Dataset:
             f"{path}: none of its {len(images)} images has labels; for {images[0]} "
             f"{_labels_path(images[0], path)} was expected"
         )
+    _check_labels_have_images(images, path)
     return Dataset(path, "YOLO", names, samples)
+
+
+def _check_labels_have_images(images: list[Path], root: Path) -> None:
+    """Raise `DatasetError` for a file under `labels/` without an image: the image was lost or renamed."""
+    for labels, folder in {(_labels_path(image, root).parent, image.parent) for image in images}:
+        if labels == folder or not labels.is_dir():
+            continue
+        shown = {image.stem for image in folder.iterdir() if image.suffix.lower() in IMAGE_SUFFIXES}
+        for path in sorted(labels.glob("*.txt")):
+            if path.stem not in shown and path.name != "classes.txt":  # labelling programs list the names
+                raise DatasetError(
+                    f"{path}: its image {folder / path.stem}.jpg (or of another kind) does not exist; "
+                    "add the image or remove the labels"
+                )
 
 
 def _read_table(path: Path) -> dict[Any, Any]:
@@ -306,11 +336,11 @@ def _names(table: dict[Any, Any], path: Path) -> tuple[str, ...] | None:
 def _images_of(table: dict[Any, Any], path: Path, split: str | None) -> list[Path]:
     available = [name for name in _SPLITS if table.get(name)]
     chosen = split or (available[0] if available else None)
-    if chosen is None and split is None:
+    if not available:
         root = path.parent
         return image_files(root / "images" if (root / "images").is_dir() else root)
     if chosen not in available:
-        raise DatasetError(f"{path}: has no split {chosen!r}; it has {', '.join(available) or 'none'}")
+        raise DatasetError(f"{path}: has no split {chosen!r}; it has {', '.join(available)}")
     base = path.parent / str(table["path"]) if table.get("path") else path.parent
     if not base.is_dir():
         base = path.parent  # `path` is often the author's local path.

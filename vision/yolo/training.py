@@ -18,8 +18,9 @@ import torch
 from torch import Tensor, nn
 
 from vision.yolo.architecture import YoloModel, build
+from vision.yolo.description import ModelDescription
 from vision.yolo.losses import DetectionLoss, detection_loss
-from vision.yolo.published import yolov8_description
+from vision.yolo.published import model_family_of, yolov8_description
 from vision.yolo.scene_batches import Augmentation, SceneKey, SceneSource, network_input, scene_batches
 
 logger = logging.getLogger(__name__)
@@ -82,6 +83,7 @@ class TrainingSettings:
         warmup_steps: the rate rises linearly over these.
         decay: shape of the rate's fall within a stage.
         final_rate: its end value, as a share of `learning_rate`.
+        fixed_normalisation: keep the running statistics of the start; its few images have others.
         normalisation_momentum: share of a batch in the running statistics; YOLOv8's own 0.03 lags behind the
             weights in a short training.
         gradient_limit: largest norm of the gradient (clipping).
@@ -107,6 +109,7 @@ class TrainingSettings:
     warmup_steps: int = 100
     decay: Literal["linear", "cosine"] = "linear"
     final_rate: float = 0.01
+    fixed_normalisation: bool = False
     normalisation_momentum: float = 0.1
     gradient_limit: float = 10.0
     average_decay: float = 0.998
@@ -193,6 +196,7 @@ def train(
     checkpoint: Path | None = None,
     resume: bool = False,
     start: YoloModel | None = None,
+    network: ModelDescription | None = None,
 ) -> TrainedModel:
     """Train from the initial weights, or resume from a checkpoint, to the last step or the time limit.
 
@@ -203,6 +207,7 @@ def train(
         checkpoint: file for the state, written periodically and at the end; None for none.
         resume: resume from `checkpoint`. The result is that of an uninterrupted run.
         start: a trained network of the same scale and classes to start from; None: random weights.
+        network: the network to train, with the settings' classes; None: YOLOv8 of the settings' scale.
 
     Raises:
         FileNotFoundError: `resume` without such a file.
@@ -213,7 +218,7 @@ def train(
     torch.set_num_threads(settings.threads)
     torch.manual_seed(settings.seed)
     scale = (settings.depth_multiple, settings.width_multiple, settings.max_channels)
-    model = build(yolov8_description(scale, settings.class_names)).train()
+    model = build(network or yolov8_description(scale, settings.class_names)).train()
     if start is None:
         _start_boxes_small(model)
     else:
@@ -221,6 +226,7 @@ def train(
     for module in model.modules():
         if isinstance(module, nn.BatchNorm2d):
             module.momentum = settings.normalisation_momentum
+            module.train(not settings.fixed_normalisation)
     model = model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     average = copy.deepcopy(model).eval()
     optimiser = _optimiser(model, settings)
@@ -394,9 +400,11 @@ def _pixels_until(stages: Sequence[Stage], step: int) -> int:
 _CHECKPOINT_KIND = "yolo training state 1"
 
 
-def _network(settings: TrainingSettings) -> dict[str, Any]:
+def _network(model: YoloModel, settings: TrainingSettings) -> dict[str, Any]:
+    description = model.description
     return {
-        "scale": [settings.depth_multiple, settings.width_multiple, settings.max_channels],
+        "family": model_family_of(model),
+        "scale": [description.depth_multiple, description.width_multiple, description.max_channels],
         "class_names": list(settings.class_names),
         "optimiser": settings.optimiser,
     }
@@ -406,14 +414,14 @@ def _save(
     path: Path,
     settings: TrainingSettings,
     step: int,
-    model: nn.Module,
+    model: YoloModel,
     average: nn.Module,
     optimiser: torch.optim.Optimizer,
 ) -> None:
     """Write a temporary file, then rename it: a reader sees the old state or the new one, never a part."""
     state = {
         "kind": _CHECKPOINT_KIND,
-        "network": _network(settings),
+        "network": _network(model, settings),
         "settings": asdict(settings),
         "step": step,
         "model": model.state_dict(),
@@ -430,7 +438,7 @@ def _save(
 def _restore(
     path: Path,
     settings: TrainingSettings,
-    model: nn.Module,
+    model: YoloModel,
     average: nn.Module,
     optimiser: torch.optim.Optimizer,
 ) -> int:
@@ -439,9 +447,9 @@ def _restore(
     state = torch.load(path, map_location="cpu", weights_only=True)
     if not isinstance(state, dict) or state.get("kind") != _CHECKPOINT_KIND:
         raise ValueError(f"{path} is not a training checkpoint of this program ({_CHECKPOINT_KIND!r})")
-    if state["network"] != _network(settings):
+    if state["network"] != _network(model, settings):
         raise ValueError(
-            f"{path} is of the network {state['network']}, the settings require {_network(settings)}"
+            f"{path} is of the network {state['network']}, the settings require {_network(model, settings)}"
         )
     model.load_state_dict(state["model"])
     average.load_state_dict(state["average"])
