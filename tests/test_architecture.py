@@ -41,6 +41,7 @@ FLOORS = {
     "replay": 9,
     "replay_detections": 9,
     "train": 9,
+    "train_policy": 9,
     "bench": 9,
     "cli": 10,
 }
@@ -50,6 +51,7 @@ GUIDANCE_FLOORS = {
     "search_pattern": 0,
     "targets": 0,
     "path": 1,
+    "policy_file": 1,
     "formation": 2,
     "behaviour": 3,
     "command": 4,
@@ -106,7 +108,7 @@ SIMULATOR_MAY_IMPORT = {
     "vision.rotation",
     "vision.shared_frame",
 }
-MAY_IMPORT_SIMULATOR = {"sim_session", "demo", "play", "train", "bench", "models"}
+MAY_IMPORT_SIMULATOR = {"sim_session", "demo", "play", "train", "train_policy", "bench", "models"}
 
 
 @cache

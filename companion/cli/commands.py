@@ -36,6 +36,7 @@ from companion.cli.play import play
 from companion.cli.recordings import RECORD_SETTINGS, log, record, replay, sightings
 from companion.cli.topics import topics
 from companion.cli.train import train
+from companion.cli.train_policy import train_policy
 from companion.settings import Settings
 from companion.settings.perception import DEFAULT_MODEL, NO_SOURCE
 from vision.gc_pause import gc_paused
@@ -71,6 +72,7 @@ ORDER = (
     "markers",
     "evaluate",
     "train",
+    "train-policy",
 )
 
 app = typer.Typer(
@@ -85,6 +87,7 @@ app.add_typer(models, name="models")
 app.add_typer(calibrate, name="calibrate")
 app.command()(evaluate)
 app.command()(train)
+app.command()(train_policy)
 app.command()(topics)
 app.command()(cameras)
 settings_command(app, "source", "camera", "vehicle", "plugins")(preview)

@@ -298,6 +298,27 @@ class Commands(ABC):
             marker=marker,
         )
 
+    async def policy(
+        self,
+        file: str,
+        class_: str | None = None,
+        distance: float | None = None,
+        limit: float | None = None,
+        track: int | None = None,
+    ) -> Reply:
+        """Fly to an object by a trained policy and stop before it.
+
+        Args:
+            file: an ONNX file on the service's computer, or a bundled policy
+            class_: what to fly to
+            distance: where to stop, to its surface (1 to 100 m; default 5)
+            limit: give up after this long (1 to 3600 s; default 120)
+            track: fly to this track, instead of a class
+        """
+        return await self._run(
+            "policy", file=file, class_=class_, distance=distance, limit=limit, track=track
+        )
+
     async def patrol(
         self,
         points: str,

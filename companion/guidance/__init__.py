@@ -17,6 +17,7 @@ from companion.guidance.behaviours.orbit import Orbit
 from companion.guidance.behaviours.search import Seek
 from companion.guidance.behaviours.approach_with_retry import Approach
 from companion.guidance.behaviours.follow import Follow
+from companion.guidance.behaviours.policy import Policy
 from companion.guidance.behaviours.patrol import Patrol
 from companion.guidance.missions.mission_file import Mission
 from companion.guidance.behaviours.formation import Formation
@@ -38,6 +39,7 @@ __all__ = [
     "Mission",
     "Orbit",
     "Patrol",
+    "Policy",
     "Rtl",
     "Seek",
     "Select",

@@ -17,7 +17,7 @@ _QUESTION_HELP = {
     "why_not": "why the newest command was refused or ended, and the newest warnings",
 }
 # What they fly is not in the call, so nobody could confirm it.
-_NOT_FOR_MODELS = frozenset({"mission", "velocity"})
+_NOT_FOR_MODELS = frozenset({"mission", "policy", "velocity"})
 
 
 @dataclass(frozen=True, slots=True)

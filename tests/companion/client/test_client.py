@@ -126,6 +126,7 @@ async def test_texts_of_methods_are_valid_commands(kind: Any) -> None:
         "follow": {"class_": 'a "quoted\\ name'},
         "patrol": {"points": "0,0 1,1 2,0", "classes": "person,car"},
         "mission": {"file": "my mission.toml"},
+        "policy": {"file": "my policy.onnx", "class_": "car"},
         "formation": {"shape": "wedge", "leader": "beta"},
         "land-on-marker": {"id": 7},
         "velocity": {"source": "a-1"},

@@ -13,6 +13,7 @@ from companion.guidance import (
     Mission,
     Orbit,
     Patrol,
+    Policy,
     Rtl,
     Seek,
     Stop,
@@ -170,6 +171,7 @@ several_names = st.lists(
 )
 without_class_name = st.one_of(
     st.builds(Mission, class_names),
+    st.builds(Policy, class_names, class_names, number(1, 100), number(1, 3600)),
     st.builds(
         Patrol,
         st.sampled_from(["0,0 10,0", "0,0,5 9,9,8 -3,2"]),

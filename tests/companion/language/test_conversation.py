@@ -87,7 +87,7 @@ def test_tools_have_units_ranges_and_classes() -> None:
     assert tools["seek"]["properties"]["class"]["enum"] == list(CLASSES)
     assert tools["seek"]["required"] == ["class"]
     assert {"seen", "battery", "state", "why_not", "stop", "takeoff"} <= set(tools)
-    assert not {"mission", "velocity"} & set(tools)
+    assert not {"mission", "policy", "velocity"} & set(tools)
     assert class_names_of(SCHEMA) == CLASSES
     assert class_names_of(json_schema(None)) is None
 
@@ -113,6 +113,7 @@ def test_tools_have_units_ranges_and_classes() -> None:
         ("approach", {"track": 1.5}),
         ("mission", {"file": "demo\n[[step]]"}),
         ("mission", {"file": "demo"}),
+        ("policy", {"file": "a.onnx", "class": "car"}),
         ("Mission", {"file": "demo"}),
         ("velocity", {}),
     ],

@@ -1,0 +1,30 @@
+"""The command line of `companion train-policy`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from companion.cli.flags import EXIT_BAD_INPUT, plain_errors
+
+
+def train_policy(
+    environment: Annotated[str, typer.Argument(help="Environment, for example companion/Approach-v0.")],
+    algorithm: Annotated[str, typer.Option(help="Algorithm: ppo or sac.")] = "ppo",
+    steps: Annotated[int, typer.Option(min=1, help="Steps of the environment, in all.")] = 1_000_000,
+    seed: Annotated[int, typer.Option(min=0, max=2**31, help="Random seed of weights and episodes.")] = 0,
+    resume: Annotated[bool, typer.Option(help="Continue from the state in OUTPUT.training.")] = False,
+    output: Annotated[Path, typer.Option(help="Policy file to write.")] = Path("runs/policy.onnx"),
+) -> None:
+    """Train a policy in a simulated environment. Writes an ONNX file for the flight command `policy`."""
+    try:
+        from companion.train_policy import PolicyTrainingError, Training, train_policy
+    except ModuleNotFoundError as error:
+        typer.echo(f"companion: train-policy: {error}: pip install 'mavlink-companion[rl]'", err=True)
+        raise typer.Exit(EXIT_BAD_INPUT) from error
+    with plain_errors(PolicyTrainingError, OSError):
+        figures = train_policy(Training(environment, algorithm, seed), steps, output, resume=resume)
+    written = ", ".join(f"{name} {value:.3g}" for name, value in figures.items())
+    typer.echo(f"{output}: over 100 episodes on average {written}")

@@ -1,0 +1,226 @@
+"""Policy: fly to an object by a trained network, see `companion.guidance.policy_file`."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, ClassVar
+
+from companion.guidance.behaviour import (
+    Behaviour,
+    BehaviourContext,
+    BehaviourOutput,
+    Outcome,
+    Requirement,
+    needs_to_see,
+)
+from companion.guidance.behaviours.hold import HoldBehaviour
+from companion.guidance.command import (
+    BuildContext,
+    ClassName,
+    Command,
+    FileName,
+    GrammarError,
+    Number,
+    TrackId,
+    behaviour,
+)
+from companion.guidance.motion import Arrival, position_and_yaw, speed_of
+from companion.guidance.policy_file import LoadedPolicy, PolicyError, Quantity, find_policy, load_policy
+from companion.guidance.targets.choosing import TargetSelector
+from companion.guidance.targets.chosen import Wanted
+from companion.guidance.targets.track import ObjectTrack
+from companion.vehicle.setpoint import Setpoint
+from companion.vehicle.state import Vector3
+from vision.runtimes.base import RuntimeMissingError
+
+# What a policy can observe and command, with units. `forward` and `right` are horizontal, by the yaw; the
+# target is the filtered point on the object's surface, `target_age_s` the age of its newest detection.
+OBSERVATIONS = {
+    "target_forward_m": "m",
+    "target_right_m": "m",
+    "target_up_m": "m",
+    "velocity_forward_m_s": "m/s",
+    "velocity_right_m_s": "m/s",
+    "velocity_up_m_s": "m/s",
+    "target_age_s": "s",
+    "distance_wanted_m": "m",
+}
+ACTIONS = {"forward_m_s": "m/s", "right_m_s": "m/s", "up_m_s": "m/s", "turn_rad_s": "rad/s"}
+# Without these a policy does not know what it flies to.
+NEEDED = ("target_forward_m", "target_right_m", "target_age_s", "distance_wanted_m")
+# An observation may be outside its range by this fraction of it. The age of the target may not.
+MARGIN = 0.05
+CONFIDENCE = 0.3
+# How long to wait for an object with a known range.
+LOOK_S = 10.0
+
+
+@behaviour("policy", "fly to an object by a trained policy and stop before it")
+class Policy(Command):
+    either: ClassVar[tuple[str, ...]] = ("class", "track")
+    file: Annotated[str, FileName("file", "an ONNX file on the service's computer, or a bundled policy")]
+    class_name: Annotated[str, ClassName("class", "what to fly to")] = ""
+    distance_m: Annotated[float, Number("distance", "m", 1.0, 100.0, "where to stop, to its surface")] = 5.0
+    limit_s: Annotated[float, Number("limit", "s", 1.0, 3600.0, "give up after this long")] = 120.0
+    track_id: Annotated[int | None, TrackId("track", "fly to this track, instead of a class")] = None
+
+    def build(self, context: BuildContext) -> Behaviour:
+        try:
+            loaded = load_policy(find_policy(self.file))
+            check_quantities(loaded)
+            wanted = Wanted(self.class_name, self.track_id)
+            return PolicyBehaviour(loaded, wanted, distance_m=self.distance_m, limit_s=self.limit_s)
+        except (PolicyError, RuntimeMissingError) as error:
+            raise GrammarError(f"policy: {error}") from error
+
+
+def check_quantities(policy: LoadedPolicy) -> None:
+    """Raises PolicyError for a quantity that is not known, has another unit, or is missing."""
+    described = policy.description
+    for what, known, quantities in (
+        ("observation", OBSERVATIONS, described.observation),
+        ("action", ACTIONS, described.action),
+    ):
+        for quantity in quantities:
+            if quantity.name not in known:
+                raise PolicyError(
+                    f"{policy.name} ({described.environment}): unknown {what} {quantity.name!r}; "
+                    f"known: {', '.join(known)}"
+                )
+            if quantity.unit != known[quantity.name]:
+                raise PolicyError(
+                    f"{policy.name}: {what} {quantity.name} must be in {known[quantity.name]}, "
+                    f"got {quantity.unit!r}"
+                )
+    missing = [name for name in NEEDED if name not in {each.name for each in described.observation}]
+    if missing:
+        raise PolicyError(f"{policy.name}: does not observe {', '.join(missing)}")
+
+
+class PolicyBehaviour(Behaviour):
+    """Flies the actions of a policy, each clipped to its trained range, until it stands before the object.
+
+    It holds until the object's range is known. An observation outside its trained range, a target that is
+    too old, or an action that is no number end it.
+
+    Args:
+        policy: checked by `check_quantities`.
+        wanted: the object. distance_m: where to stop, to its surface. limit_s: longest duration.
+
+    Raises:
+        PolicyError: it was not trained for this distance.
+    """
+
+    name = "policy"
+
+    def __init__(self, policy: LoadedPolicy, wanted: Wanted, *, distance_m: float, limit_s: float) -> None:
+        self._policy, self._wanted = policy, wanted
+        self._distance_m, self._limit_s = distance_m, limit_s
+        self.requirements = frozenset({Requirement.POSITION, Requirement.IN_AIR}) | needs_to_see(wanted)
+        self.class_names, self.track_id = wanted.class_names, wanted.track_id
+        trained = next(q for q in policy.description.observation if q.name == "distance_wanted_m")
+        if not trained.low <= distance_m <= trained.high:
+            raise PolicyError(
+                f"{policy.name} was trained for a distance of {trained.allowed}, not {distance_m:g} m"
+            )
+        self._selector, self._arrival = TargetSelector(), Arrival()
+        self._track: ObjectTrack | None = None
+        self._hold: HoldBehaviour | None = None
+        self._action = dict.fromkeys(ACTIONS, 0.0)
+        self._begun_ns = self._due_ns = 0
+        self._range_m = math.nan
+
+    def on_activate(self, context: BehaviourContext) -> None:
+        self._selector, self._arrival = TargetSelector(), Arrival()
+        self._track = None
+        self._hold = HoldBehaviour()
+        self._hold.on_activate(context)
+        self._begun_ns = self._due_ns = context.now_ns
+
+    def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
+        position, yaw_rad = position_and_yaw(context.state)
+        elapsed_s = (context.now_ns - self._begun_ns) / 1e9
+        track = self._observed(context, position, yaw_rad)
+        if track is None:
+            if elapsed_s > LOOK_S:
+                why = "range never known" if context.perception_fresh else "no detections received"
+                why = context.perception_fault(why)
+                return Outcome(False, f"no {self._wanted.name} to fly to in {elapsed_s:.0f} s: {why}")
+            assert self._hold is not None
+            return self._hold.update(dt_s, context)
+        values = self._observation(track, context, position, yaw_rad)
+        self._range_m = math.hypot(values["target_forward_m"], values["target_right_m"])
+        at_m = abs(self._range_m - self._distance_m)
+        if self._arrival.update(at_m, speed_of(context.state), context.now_ns):
+            return Outcome(True, f"reached {self._wanted.name} at {self._range_m:.1f} m")
+        if elapsed_s > self._limit_s:
+            return Outcome(False, f"not there after {elapsed_s:.0f} s: {self._range_m:.1f} m away")
+        if (fault := self._untrained(values)) is not None:
+            return Outcome(False, f"{self._policy.name} ended: {fault}")
+        # A little early rather than a whole update late.
+        if context.now_ns >= self._due_ns - 5_000_000:
+            period_ns = round(1e9 / self._policy.description.rate_hz)
+            self._due_ns = max(self._due_ns, context.now_ns - period_ns) + period_ns
+            if (fault := self._act(values)) is not None:
+                return Outcome(False, f"{self._policy.name} ended: {fault}")
+        north, east = _rotated(self._action["forward_m_s"], self._action["right_m_s"], yaw_rad)
+        velocity = (north, east, -self._action["up_m_s"])
+        return Setpoint.velocity(velocity, context.now_ns, yaw_rate_radps=self._action["turn_rad_s"])
+
+    def _observed(self, context: BehaviourContext, position: Vector3, yaw_rad: float) -> ObjectTrack | None:
+        """The object with its newest detection; None: none with a known range yet."""
+        if self._track is not None:
+            same = self._wanted.same(context.targets, self._track.newest, CONFIDENCE)
+            self._track.update(same, position)
+            return self._track
+        fitting = self._wanted.of(context.targets, CONFIDENCE)
+        chosen = self._selector.update(fitting, yaw_rad, context.now_ns)
+        if chosen is not None and chosen.position_ned_m is not None:
+            self._track = ObjectTrack(chosen, position)
+        return self._track
+
+    def _observation(
+        self, track: ObjectTrack, context: BehaviourContext, position: Vector3, yaw_rad: float
+    ) -> dict[str, float]:
+        north, east, down = (there - here for there, here in zip(track.position_ned_m, position, strict=True))
+        target_forward, target_right = _rotated(north, east, -yaw_rad)
+        north_mps, east_mps, down_mps = context.state.velocity_ned_mps or (math.nan,) * 3
+        forward_mps, right_mps = _rotated(north_mps, east_mps, -yaw_rad)
+        age_s = (context.now_ns - track.captured_ns) / 1e9
+        values = (target_forward, target_right, -down, forward_mps, right_mps, -down_mps, age_s)
+        return dict(zip(OBSERVATIONS, (*values, self._distance_m), strict=True))
+
+    def _untrained(self, values: dict[str, float]) -> str | None:
+        """Which value the policy was not trained for; None: none."""
+        for quantity in self._policy.description.observation:
+            value = values[quantity.name]
+            margin = 0.0 if quantity.name == "target_age_s" else MARGIN * (quantity.high - quantity.low)
+            if not quantity.low - margin <= value <= quantity.high + margin:
+                return f"{quantity.name} is {value:.2f}, trained for {quantity.allowed}"
+        return None
+
+    def _act(self, values: dict[str, float]) -> str | None:
+        """Step the policy. Returns what is wrong with its action; None: nothing."""
+        described = self._policy.description
+        action = self._policy.act([_clipped(each, values[each.name]) for each in described.observation])
+        for quantity, value in zip(described.action, action, strict=True):
+            if not math.isfinite(value):
+                return f"its action {quantity.name} is {value}"
+            self._action[quantity.name] = _clipped(quantity, value)
+        return None
+
+    @property
+    def status(self) -> str:
+        if self._track is None:
+            return f"policy {self._policy.name}, looking for {self._wanted.phrase}"
+        return f"policy {self._policy.name}, {self._wanted.name} {self._range_m:.1f} m away"
+
+
+def _clipped(quantity: Quantity, value: float) -> float:
+    return max(quantity.low, min(quantity.high, value))
+
+
+def _rotated(first: float, second: float, angle_rad: float) -> tuple[float, float]:
+    """A horizontal vector turned clockwise: by the yaw, forward and right become north and east."""
+    cos, sin = math.cos(angle_rad), math.sin(angle_rad)
+    return (first * cos - second * sin, first * sin + second * cos)

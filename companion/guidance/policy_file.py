@@ -1,0 +1,206 @@
+"""Policy files: an ONNX network from an observation to an action, with a description of both.
+
+The network has one input, (1, observations) float32, and one output, (1, actions) float32, both in the units
+of the description, which is JSON in the file's metadata under `KEY`. `companion train-policy` writes them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from vision.runtimes.base import required
+
+_Format = Literal["mavlink-companion.policy.v1"]
+FORMAT: _Format = "mavlink-companion.policy.v1"
+KEY = "mavlink_companion_policy"
+Activation = Literal["", "Tanh", "Relu"]
+_OPSET, _IR_VERSION = 17, 8
+POLICIES_FOLDER = Path(__file__).parent / "policies"
+# A network of this size still takes less than 1 ms a step.
+LARGEST_BYTES = 4_000_000
+
+_Finite = Annotated[float, Field(allow_inf_nan=False)]
+_Text = Annotated[str, Field(min_length=1, max_length=60)]
+
+
+class PolicyError(ValueError):
+    """A policy file cannot be used. The message is one line with the file's name."""
+
+
+class Quantity(BaseModel):
+    """One number of the observation or the action, with the range that was trained."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    name: _Text
+    unit: Annotated[str, Field(max_length=20)]
+    low: _Finite
+    high: _Finite
+
+    @model_validator(mode="after")
+    def _check(self) -> Quantity:
+        if self.low >= self.high:
+            raise ValueError(f"low must be less than high, got {self.low:g} and {self.high:g}")
+        return self
+
+    @property
+    def allowed(self) -> str:
+        """The range in words."""
+        return f"{self.low:g} to {self.high:g}{' ' + self.unit if self.unit else ''}"
+
+
+class PolicyDescription(BaseModel):
+    """What a policy observes and commands, in the order of its input and its output.
+
+    Attributes:
+        environment: id of the environment it was trained in.
+        rate_hz: steps a second.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    format: _Format = FORMAT
+    environment: _Text
+    rate_hz: Annotated[float, Field(ge=1.0, le=100.0)]
+    observation: Annotated[tuple[Quantity, ...], Field(min_length=1, max_length=100)]
+    action: Annotated[tuple[Quantity, ...], Field(min_length=1, max_length=20)]
+
+    @model_validator(mode="after")
+    def _check(self) -> PolicyDescription:
+        for names in ([each.name for each in self.observation], [each.name for each in self.action]):
+            if len(set(names)) != len(names):
+                raise ValueError(f"a name occurs twice: {', '.join(names)}")
+        return self
+
+
+class LoadedPolicy:
+    """A policy that is ready to be stepped, on one processor thread.
+
+    Attributes:
+        name: of the file, without suffix.
+    """
+
+    def __init__(self, name: str, description: PolicyDescription, session: Any) -> None:
+        self.name, self.description, self._session = name, description, session
+        self._input = session.get_inputs()[0].name
+
+    def act(self, observation: Sequence[float]) -> list[float]:
+        """The action for an observation, both in the order and the units of the description; not clipped."""
+        (action,) = self._session.run(None, {self._input: np.array([observation], np.float32)})
+        return [float(value) for value in action[0]]
+
+
+def find_policy(name: str) -> Path:
+    """Resolve a policy's name: a path, or the name of one bundled with this package.
+
+    Raises:
+        PolicyError: not found.
+    """
+    path = Path(name)
+    bundled = {file.stem: file for file in sorted(POLICIES_FOLDER.glob("*.onnx"))}
+    try:
+        if path.is_file():
+            return path
+    except (OSError, ValueError) as error:
+        raise PolicyError(f"invalid policy name {name[:80]!r}: {error}") from error
+    if name in bundled:
+        return bundled[name]
+    raise PolicyError(
+        f"policy {name[:80]!r} not found: no such file in {Path.cwd()}; "
+        f"bundled policies: {', '.join(bundled) or 'none'}"
+    )
+
+
+def load_policy(path: Path) -> LoadedPolicy:
+    """Load and check a policy file.
+
+    Raises:
+        PolicyError: it cannot be read, has no description or another layout than described.
+        RuntimeMissingError: ONNX Runtime is not installed; the message names the extra.
+    """
+    onnxruntime = required("onnxruntime")
+    try:
+        size = path.stat().st_size
+        if size > LARGEST_BYTES:
+            raise PolicyError(f"{path}: a policy has at most {LARGEST_BYTES} bytes, this file has {size}")
+        content = path.read_bytes()
+    except OSError as error:
+        raise PolicyError(f"{path}: cannot be read: {error}") from error
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 4
+    # ONNX Runtime's errors have no common base class but Exception.
+    try:
+        session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    except Exception as error:
+        raise PolicyError(f"{path}: no usable ONNX file: {' '.join(str(error).split())[:200]}") from error
+    text = session.get_modelmeta().custom_metadata_map.get(KEY)
+    if text is None:
+        raise PolicyError(
+            f"{path}: has no description of its observation and action (metadata {KEY}); "
+            "train it with `companion train-policy`"
+        )
+    try:
+        description = PolicyDescription.model_validate_json(text)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"])) or "it"
+        raise PolicyError(f"{path}: its description cannot be used: {where}: {first['msg']}") from error
+    for what, ports, quantities in (
+        ("input", session.get_inputs(), description.observation),
+        ("output", session.get_outputs(), description.action),
+    ):
+        found = ", ".join(f"{port.type}{list(port.shape)}" for port in ports)
+        wanted = f"one {what} tensor(float)[1, {len(quantities)}]"
+        if len(ports) != 1 or ports[0].type != "tensor(float)" or ports[0].shape != [1, len(quantities)]:
+            raise PolicyError(f"{path}: expected {wanted}, as it is described, got {found}")
+    policy = LoadedPolicy(path.stem, description, session)
+    try:
+        action = policy.act([(each.low + each.high) / 2 for each in description.observation])
+    except Exception as error:
+        raise PolicyError(f"{path}: it cannot be computed: {' '.join(str(error).split())[:200]}") from error
+    if not all(map(math.isfinite, action)):
+        raise PolicyError(f"{path}: its action is no number ({action}); train it again")
+    return policy
+
+
+@dataclass(frozen=True, slots=True)
+class Layer:
+    """One fully connected layer: `activation(weight @ x + bias)`, weight (outputs, inputs)."""
+
+    weight: NDArray[np.float64]
+    bias: NDArray[np.float64]
+    activation: Activation = ""
+
+
+def write_policy(path: Path, description: PolicyDescription, layers: Sequence[Layer]) -> None:
+    """Write a policy file. The layers take and give the units of the description."""
+    from onnx import TensorProto, helper, numpy_helper, save
+
+    nodes, tensors, value = [], [], "observation"
+    for index, layer in enumerate(layers):
+        names = [f"weight{index}", f"bias{index}"]
+        for name, array in zip(names, (layer.weight, layer.bias), strict=True):
+            tensors.append(numpy_helper.from_array(np.asarray(array, np.float32), name))
+        result = "action" if index == len(layers) - 1 and not layer.activation else f"sum{index}"
+        nodes.append(helper.make_node("Gemm", [value, *names], [result], transB=1))
+        value = result
+        if layer.activation:
+            value = "action" if index == len(layers) - 1 else f"value{index}"
+            nodes.append(helper.make_node(layer.activation, [result], [value]))
+    ports = [
+        helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, len(quantities)])
+        for name, quantities in (("observation", description.observation), ("action", description.action))
+    ]
+    graph = helper.make_graph(nodes, "policy", ports[:1], ports[1:], tensors)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", _OPSET)], ir_version=_IR_VERSION)
+    helper.set_model_props(model, {KEY: description.model_dump_json()})
+    save(model, str(path))

@@ -1,0 +1,362 @@
+"""`companion train-policy`: train a policy in an environment of `mavlink_sim.environments`, and write it.
+
+The algorithms are those of Stable-Baselines3 (extra `rl`). The network sees the observation normalized by
+its running mean and deviation, and acts in -1..1; both scalings become part of the written file. The same
+seed gives the same weights on one machine.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import gymnasium
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
+
+from companion.guidance.policy_file import (
+    Layer,
+    LoadedPolicy,
+    PolicyDescription,
+    Quantity,
+    load_policy,
+    write_policy,
+)
+from mavlink_sim.environments import TASKS, TaskVectorEnv
+from mavlink_sim.environments.task import STEP_S
+
+ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"ppo": PPO, "sac": SAC}
+# Episodes side by side. SAC learns once for each four of its steps.
+EPISODES = {"ppo": 128, "sac": 16}
+_LAYERS = {"net_arch": [64, 64]}
+PARAMETERS: dict[str, dict[str, Any]] = {
+    "ppo": {
+        "n_steps": 64,
+        "batch_size": 1024,
+        "n_epochs": 6,
+        "learning_rate": 3e-4,
+        "policy_kwargs": {**_LAYERS, "log_std_init": -1.0},
+    },
+    "sac": {"train_freq": 1, "gradient_steps": 4, "buffer_size": 300_000, "policy_kwargs": _LAYERS},
+}
+CHECKPOINT_STEPS = 100_000
+JUDGED_EPISODES = 100
+# Seeds of the judged episodes, far from those of trainings.
+JUDGED_SEED = 1_000_000
+_STATE = "training.json"
+# Largest difference of the written file from the trained network, as a fraction of an action's range.
+_TOLERANCE = 1e-4
+
+
+class PolicyTrainingError(ValueError):
+    """The training cannot begin or go on. The message is one line."""
+
+
+@dataclass(frozen=True, slots=True)
+class Training:
+    """What is trained. It is stored with the state, and a training is resumed with the same."""
+
+    environment: str
+    algorithm: str
+    seed: int
+
+
+def train_policy(training: Training, steps: int, output: Path, *, resume: bool = False) -> dict[str, float]:
+    """Train, write the policy, and judge the written file.
+
+    The state is kept in the folder `<output>.training`, with TensorBoard's files.
+
+    Args:
+        steps: of the environment, in all; rounded up to whole rollouts.
+        resume: go on from the state.
+
+    Returns:
+        means over `JUDGED_EPISODES` unseen episodes: `return`, `steps`, and the task's measures at the end.
+
+    Raises:
+        PolicyTrainingError: unknown environment or algorithm; a state that is missing, of another training,
+            or in the way.
+    """
+    folder = output.with_name(f"{output.name}.training")
+    torch.set_num_threads(1)
+    kind = ALGORITHMS.get(training.algorithm)
+    if kind is None:
+        raise PolicyTrainingError(
+            f"unknown algorithm {training.algorithm!r}; there are: {', '.join(ALGORITHMS)}"
+        )
+    monitored = VecMonitor(ScaledEnv(make_environment(training.environment, EPISODES[training.algorithm])))
+    if resume:
+        model = _restored(training, kind, folder, monitored)
+    elif (folder / _STATE).exists():
+        raise PolicyTrainingError(
+            f"{folder} holds the state of a training: continue it with --resume, or give another --output"
+        )
+    else:
+        folder.mkdir(parents=True, exist_ok=True)
+        model = kind(
+            "MlpPolicy",
+            VecNormalize(monitored),
+            seed=training.seed,
+            device="cpu",
+            tensorboard_log=str(folder / "tensorboard"),
+            **PARAMETERS[training.algorithm],
+        )
+    # The random numbers of a resumed training depend on its seed and its step alone.
+    model.set_random_seed(training.seed + model.num_timesteps)
+    if model.num_timesteps < steps:
+        with _Display(steps) as display:
+            model.learn(
+                steps - model.num_timesteps,
+                _Checkpoints(training, folder, display),
+                tb_log_name="run",
+                reset_num_timesteps=False,
+            )
+        _store(model, training, folder)
+    description = description_of(training.environment)
+    write_policy(output, description, layers_of(model, description))
+    policy = load_policy(output)
+    _compare(model, policy)
+    return judge(policy, JUDGED_EPISODES)
+
+
+def make_environment(name: str, count: int) -> TaskVectorEnv:
+    """`count` episodes side by side. Raises PolicyTrainingError for an unknown environment."""
+    known = [f"companion/{task}-v0" for task in TASKS]
+    if name not in known:
+        raise PolicyTrainingError(f"unknown environment {name!r}; there are: {', '.join(known)}")
+    env = gymnasium.make_vec(name, num_envs=count)
+    assert isinstance(env, TaskVectorEnv)
+    return env
+
+
+def description_of(environment: str) -> PolicyDescription:
+    """What a policy of this environment observes and commands."""
+    task = make_environment(environment, 1).task
+    observation, action = (
+        tuple(Quantity(**asdict(entry)) for entry in entries) for entries in (task.observation, task.action)
+    )
+    return PolicyDescription(
+        environment=environment, rate_hz=1.0 / STEP_S, observation=observation, action=action
+    )
+
+
+class ScaledEnv(VecEnv):
+    """Episodes side by side as Stable-Baselines3 takes them, with actions scaled to -1..1."""
+
+    def __init__(self, env: TaskVectorEnv) -> None:
+        self._env, self._actions = env, np.zeros(0)
+        actions = gymnasium.spaces.Box(-1.0, 1.0, (len(env.task.action),), np.float32)
+        super().__init__(env.num_envs, env.single_observation_space, actions)
+
+    def reset(self) -> NDArray[np.float32]:
+        seed = self._seeds[0]
+        observed, _ = self._env.reset(seed=seed)
+        self._reset_seeds()
+        return observed
+
+    def step_async(self, actions: NDArray[Any]) -> None:
+        centre, half = _centre_and_half(self._env.task.action)
+        self._actions = centre + half * actions
+
+    def step_wait(self) -> tuple[NDArray[np.float32], NDArray[Any], NDArray[Any], list[dict[str, Any]]]:
+        observed, rewards, ended, truncated, infos = self._env.step(self._actions.astype(np.float32))
+        over = ended | truncated
+        each: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        if over.any():
+            for index in np.flatnonzero(over):
+                each[index] = {
+                    "terminal_observation": infos["final_obs"][index],
+                    "TimeLimit.truncated": bool(truncated[index]),
+                }
+        return observed, rewards.astype(np.float32), over, each
+
+    def close(self) -> None:
+        self._env.close()
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        return [getattr(self._env, attr_name)] * len(list(self._get_indices(indices)))
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        setattr(self._env, attr_name, value)
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+        return [getattr(self._env, method_name)(*args, **kwargs)]
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+        return [False] * len(list(self._get_indices(indices)))
+
+
+def _centre_and_half(entries: Sequence[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    low, high = np.array([each.low for each in entries]), np.array([each.high for each in entries])
+    return (low + high) / 2, (high - low) / 2
+
+
+def layers_of(model: BaseAlgorithm, description: PolicyDescription) -> list[Layer]:
+    """The deterministic policy of a trained model, between the units of the description."""
+    policy: Any = model.policy
+    if isinstance(model, SAC):
+        modules = [*policy.actor.latent_pi, policy.actor.mu, torch.nn.Tanh()]
+    else:
+        modules = [*policy.mlp_extractor.policy_net, policy.action_net]
+    normal = model.get_vec_normalize_env()
+    assert normal is not None
+    assert isinstance(normal.obs_rms, RunningMeanStd)
+    deviation = np.sqrt(normal.obs_rms.var + normal.epsilon)
+    layers = [Layer(np.diag(1.0 / deviation), -normal.obs_rms.mean / deviation)]
+    for module in modules:
+        if isinstance(module, torch.nn.Linear):
+            weight, bias = (
+                values.detach().numpy().astype(np.float64) for values in (module.weight, module.bias)
+            )
+            layers.append(Layer(weight, bias))
+        else:
+            activation: Literal["Tanh", "Relu"] = "Tanh" if isinstance(module, torch.nn.Tanh) else "Relu"
+            layers[-1] = Layer(layers[-1].weight, layers[-1].bias, activation)
+    centre, half = _centre_and_half(description.action)
+    return [*layers, Layer(np.diag(half), centre)]
+
+
+def _compare(model: BaseAlgorithm, policy: LoadedPolicy) -> None:
+    """Raises PolicyTrainingError if the written file is not the trained network."""
+    normal = model.get_vec_normalize_env()
+    assert normal is not None
+    assert isinstance(normal.obs_rms, RunningMeanStd)
+    rng = np.random.default_rng(0)
+    centre, half = _centre_and_half(policy.description.action)
+    # Within two deviations: it is trained there, and nothing is clipped.
+    spread = 2.0 * np.sqrt(normal.obs_rms.var)
+    for part in rng.uniform(-1.0, 1.0, (20, len(spread))):
+        observation = (normal.obs_rms.mean + part * spread).astype(np.float32)
+        action, _ = model.predict(normal.normalize_obs(observation), deterministic=True)
+        written = (np.array(policy.act(observation.tolist())) - centre) / half
+        off = float(np.abs(np.clip(written, -1.0, 1.0) - action).max())
+        if off > _TOLERANCE:
+            raise PolicyTrainingError(f"the written policy differs from the trained one by {off:.2g}")
+
+
+def judge(policy: LoadedPolicy, episodes: int, seed: int = JUDGED_SEED) -> dict[str, float]:
+    """Means over unseen episodes of its environment: `return`, `steps`, and the measures at the end."""
+    env = make_environment(policy.description.environment, episodes)
+    observed, _ = env.reset(seed=seed)
+    running = np.ones(episodes, bool)
+    total, steps, measures = np.zeros(episodes), np.zeros(episodes), dict[str, NDArray[np.float64]]()
+    while running.any():
+        actions = np.array([policy.act(observation) for observation in observed], np.float32)
+        observed, rewards, ended, truncated, infos = env.step(actions)
+        total += rewards * running
+        steps += running
+        over = running & (ended | truncated)
+        for name, values in infos.items():
+            if not name.endswith("final_obs"):
+                measures.setdefault(name, np.zeros(episodes))[over] = np.abs(np.asarray(values)[over])
+        running &= ~over
+    return {
+        key: float(values.mean()) for key, values in {"return": total, "steps": steps, **measures}.items()
+    }
+
+
+# --- state -----------------------------------------------------------------------------------------------
+
+
+def _store(model: BaseAlgorithm, training: Training, folder: Path) -> None:
+    """Store the state; each file appears complete, the description of the training last."""
+    normal = model.get_vec_normalize_env()
+    assert normal is not None
+    parts: dict[str, Callable[[str], None]] = {"model.zip": model.save, "normal.pkl": normal.save}
+    if isinstance(model, SAC):
+        parts["replay.pkl"] = model.save_replay_buffer
+    for name, save in parts.items():
+        save(str(folder / f"next.{name}"))
+        os.replace(folder / f"next.{name}", folder / name)
+    (folder / _STATE).write_text(json.dumps({**asdict(training), "steps": model.num_timesteps}))
+
+
+def _restored(training: Training, kind: type[BaseAlgorithm], folder: Path, env: VecEnv) -> BaseAlgorithm:
+    try:
+        stored: Mapping[str, Any] = json.loads((folder / _STATE).read_text())
+    except (OSError, ValueError) as error:
+        raise PolicyTrainingError(f"--resume: no state of a training in {folder} ({error})") from error
+    for key, value in asdict(training).items():
+        if stored.get(key) != value:
+            raise PolicyTrainingError(
+                f"--resume: {folder} is a training with {key} {stored.get(key)}, not {value}"
+            )
+    normal = VecNormalize.load(str(folder / "normal.pkl"), env)
+    model = kind.load(folder / "model.zip", normal, device="cpu")
+    if isinstance(model, SAC):
+        model.load_replay_buffer(folder / "replay.pkl")
+    return model
+
+
+class _Checkpoints(BaseCallback):
+    """Shows the progress and stores the state every `CHECKPOINT_STEPS`."""
+
+    def __init__(self, training: Training, folder: Path, display: _Display) -> None:
+        super().__init__()
+        self._training, self._folder, self._display = training, folder, display
+        self._stored = 0
+
+    def _on_training_start(self) -> None:
+        self._stored = self.num_timesteps
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_start(self) -> None:
+        if self.num_timesteps - self._stored >= CHECKPOINT_STEPS:
+            self._stored = self.num_timesteps
+            _store(self.model, self._training, self._folder)
+        episodes: Sequence[dict[str, float]] = tuple(self.model.ep_info_buffer or ())
+        mean = float(np.mean([each["r"] for each in episodes])) if episodes else float("nan")
+        self._display.show(self.num_timesteps, mean)
+
+
+class _Display:
+    """Progress on standard error: a bar on a terminal, else a line every 10 s."""
+
+    _EVERY_S = 10.0
+
+    def __init__(self, steps: int) -> None:
+        self._steps = steps
+        self._begun: tuple[int, float] | None = None
+        self._shown_s = time.monotonic()
+        self._bar: Progress | None = None
+        if sys.stderr.isatty():
+            columns = (BarColumn(), TextColumn("{task.description}"), TimeRemainingColumn())
+            self._bar = Progress(*columns, console=Console(stderr=True))
+            self._task = self._bar.add_task("training", total=steps)
+
+    def show(self, steps: int, mean_return: float) -> None:
+        now_s = time.monotonic()
+        if self._begun is None:
+            self._begun = (steps, now_s)
+        rate = (steps - self._begun[0]) / max(now_s - self._begun[1], 1e-9)
+        text = f"step {steps}/{self._steps} return {mean_return:.1f} {rate:.0f} steps/s"
+        if self._bar is not None:
+            self._bar.update(self._task, completed=steps, description=text)
+        elif now_s - self._shown_s >= self._EVERY_S:
+            self._shown_s = now_s
+            print(text, file=sys.stderr, flush=True)
+
+    def __enter__(self) -> _Display:
+        if self._bar is not None:
+            self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.stop()
