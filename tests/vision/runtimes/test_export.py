@@ -206,7 +206,14 @@ def test_onnx_export_does_not_need_onnxruntime(
 
 PATH = Path("net.engine")
 FACTS = ExportedFacts(
-    ("person", "car"), (8, 16, 32), 16, False, 640, "ab" * 32, None, "YOLOv8", {"licence": "é"}
+    ("person", "car"),
+    (8, 16, 32),
+    16,
+    False,
+    640,
+    "ab" * 32,
+    model_family="YOLOv8",
+    metadata={"licence": "é"},
 )
 
 names = st.text(min_size=1, max_size=20)

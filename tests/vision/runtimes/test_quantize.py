@@ -52,8 +52,10 @@ def test_int8_file_gives_nearly_the_probabilities_of_torch(quantised: tuple[Path
     found, reference = runtime_of_file(name, path), TorchRuntime(lively_model(), precision="float32")
     for size in ((96, 96), (64, 160)):  # any size, as of a float file
         image = make_image(*size, seed=99)
-        classes = [[level.classes.copy() for level in runtime.infer(image)] for runtime in (reference, found)]
-        difference = mean_probability_difference(*classes)
+        wanted, got = (
+            [level.classes.copy() for level in runtime.infer(image)] for runtime in (reference, found)
+        )
+        difference = mean_probability_difference(wanted, got)
         assert 0 < difference < 0.1
 
 
