@@ -13,6 +13,7 @@ from typing import Any
 
 from companion.dashboard.process import dashboard_process
 from companion.guidance import grammar
+from companion.language.process import AskProcess
 from companion.operator.console import run_console, terminal_is_free
 from companion.service import Event, Service
 from companion.settings import Settings
@@ -136,7 +137,11 @@ async def _until_stopped(
             async with dashboard_process(services[0].settings, say):
                 if terminal_is_free(settings.source.uri):
                     await run_console(
-                        _commands_of(services), stop.set, grammar.describe(), lambda level, text: say(text)
+                        _commands_of(services),
+                        stop.set,
+                        grammar.describe(),
+                        lambda level, text: say(text),
+                        AskProcess(services[0].settings),
                     )
                 await stop.wait()
 

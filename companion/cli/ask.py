@@ -7,7 +7,6 @@ import math
 import sys
 import threading
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -18,13 +17,12 @@ from companion.settings import Settings
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-    from companion.language.conversation import Conversation
+    from companion.language.conversation import Conversation, Operator
     from companion.language.endpoints import Endpoint
 
 ASK_SETTINGS = ("zenoh", "vehicle.name", "language", "plugins")
 EXIT_FAILED = 1
-_DETECTOR_S = 15.0
-_BANNER = "ask, or say what to fly; `stop` stops at once, `quit` ends"
+_BANNER = "ask, or say what to fly; `stop` stops at once, `cancel` ends an answer, `quit` the chat"
 
 
 def ask(
@@ -43,36 +41,20 @@ def ask(
     """
     from companion.bus.client import NoAnswerError
     from companion.bus.session import BusError
-    from companion.language.endpoints import LanguageError
+    from companion.language.endpoints import LanguageError, endpoint_from
     from companion.language.tools import check_words
     from companion.plugins import PluginError, load_plugins
 
     with plain_errors(NoAnswerError, BusError, PluginError, LanguageError, ValueError):
         load_plugins(settings.plugins.modules)
         check_words("language.may", settings.language.may)
-        endpoint = _endpoint(settings)
+        endpoint = endpoint_from(settings.language)
         try:
             done = asyncio.run(_converse(settings, endpoint, sentence, connect, serve=serve))
         except KeyboardInterrupt:
             done = serve
     if not done:
         raise typer.Exit(EXIT_FAILED)
-
-
-def _endpoint(settings: Settings) -> Endpoint | None:
-    """The language model of the settings; None: by patterns. Raises LanguageError."""
-    from companion.language.endpoints import LanguageError, endpoint_of
-
-    language = settings.language
-    if not language.model:
-        return None
-    key = None
-    if language.key_file is not None:
-        try:
-            key = Path(language.key_file).read_text(encoding="utf-8").strip()
-        except (OSError, UnicodeDecodeError) as error:
-            raise LanguageError(f"language.key_file {language.key_file}: cannot be read: {error}") from None
-    return endpoint_of(language.url, language.model, key=key, timeout_s=language.timeout_s)
 
 
 async def _converse(
@@ -86,12 +68,11 @@ async def _converse(
     from companion.bus import topics
     from companion.bus.client import client_settings
     from companion.client import connect as connect_to
-    from companion.language.conversation import Conversation, Operator, send_stop
-    from companion.language.live import LiveVehicle
+    from companion.language.conversation import Operator, send_stop
+    from companion.language.live import LiveVehicle, conversations
     from companion.language.sentences import is_stop
     from companion.language.serve import ASK
     from companion.language.serve import serve as serve_queries
-    from companion.language.tools import class_names_of
 
     where = client_settings(settings.zenoh, (connect,) if connect else ()).connect[0]
     terminal = Terminal()
@@ -104,20 +85,7 @@ async def _converse(
             return await stop()
 
         async def prepare() -> Callable[[Operator], Conversation]:
-            config = await drone.query("config")
-            until_s = time.monotonic() + (_DETECTOR_S if config["detector"]["enabled"] else 0.0)
-            # The classes are known when the detector has started.
-            while (class_names := class_names_of(schema := await drone.query("commands"))) is None:
-                if time.monotonic() >= until_s:
-                    break
-                await asyncio.sleep(0.5)
-            vehicle = LiveVehicle(drone, class_names or (), config["guidance"]["camera"])
-            may = settings.language.may
-
-            def converse(operator: Operator) -> Conversation:
-                return Conversation(vehicle, operator, schema, class_names, endpoint=endpoint, may=may)
-
-            return converse
+            return await conversations(drone, endpoint, settings.language.may)
 
         if serve:
             converse = await prepare()
@@ -180,7 +148,7 @@ class Terminal:
 
         self._read_in_thread()
         chat = sentence is None
-        if chat:
+        if chat and sys.stdin.isatty():
             self.show(_BANNER)
         beginning = asyncio.ensure_future(begin())
 
@@ -222,6 +190,9 @@ class Terminal:
                     running = None
                     if not chat:
                         return False
+                elif line is not None and chat and line.strip() == "cancel":
+                    await _cancelled(running)
+                    running = None
                 elif line is None or (chat and self._asked is None and line.strip() in ("quit", "exit")):
                     self._ended = True
                     if self._asked is not None:

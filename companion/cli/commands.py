@@ -98,7 +98,7 @@ settings_command(app, *ASK_SETTINGS)(ask)
 settings_command(app, *MCP_SETTINGS)(mcp)
 settings_command(app)(play)
 settings_command(app, *MARKER_SETTINGS)(markers)
-settings_command(app, *CLIENT_SETTINGS, "dashboard")(dashboard)
+settings_command(app, *CLIENT_SETTINGS, "dashboard", "language", "plugins")(dashboard)
 app.add_typer(bench, name="bench")
 settings_command(app, *CLIENT_SETTINGS, *RECORD_SETTINGS)(record)
 settings_command(app, "plugins")(replay)
@@ -132,6 +132,7 @@ def run(settings: Settings) -> None:
     """Run the service. Ends on Ctrl-C or SIGTERM."""
     with gc_paused():
         from companion.bus.session import BusError
+        from companion.language.process import AskProcess
         from companion.operator.line_output import use_for_standard_error
         from companion.operator.metrics import MetricsError
         from companion.perception.supervisor import PerceptionStartError
@@ -146,7 +147,10 @@ def run(settings: Settings) -> None:
     )
     with plain_errors(LinkError, PerceptionStartError, BusError, MetricsError, PluginError):
         service = Service(
-            settings, console=True, dropped_lines=lambda: 0 if output is None else output.dropped
+            settings,
+            console=True,
+            ask=AskProcess(settings),
+            dropped_lines=lambda: 0 if output is None else output.dropped,
         )
         asyncio.run(_run_until_signal(settings, service))
 

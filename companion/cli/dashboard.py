@@ -31,7 +31,14 @@ def dashboard(
         raise typer.Exit(EXIT_BAD_INPUT)
     with plain_errors(NoAnswerError, DashboardError, BusError):
         zenoh = client_settings(settings.zenoh, (connect,) if connect else ())
-        options = DashboardOptions(address, settings.dashboard.token_file, zenoh, settings.vehicle.name)
+        options = DashboardOptions(
+            address,
+            settings.dashboard.token_file,
+            zenoh,
+            settings.vehicle.name,
+            settings.language,
+            settings.plugins.modules,
+        )
         os.nice(NICENESS)
         try:
             asyncio.run(serve(options, lambda url: print(f"dashboard: {url}", flush=True)))

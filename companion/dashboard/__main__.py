@@ -15,6 +15,7 @@ from companion.bus.config import BusError
 from companion.child_process import EXIT_REFUSED, on_parent_end
 from companion.dashboard.access import DashboardError
 from companion.dashboard.server import NICENESS, DashboardOptions, serve
+from companion.settings import LanguageSection
 
 
 def main(argument: str) -> int:
@@ -22,9 +23,12 @@ def main(argument: str) -> int:
     os.nice(NICENESS)
     values = json.loads(argument)
     zenoh = settings_in_child(values.pop("zenoh"))
+    language = LanguageSection.model_validate_json(json.dumps(values.pop("language")))
+    plugins = tuple(values.pop("plugins"))
     on_parent_end(lambda: os._exit(0))  # zenoh's threads and open streams need no shutdown
     try:
-        asyncio.run(serve(DashboardOptions(zenoh=zenoh, **values), lambda url: print(url, flush=True)))
+        options = DashboardOptions(zenoh=zenoh, language=language, plugins=plugins, **values)
+        asyncio.run(serve(options, lambda url: print(url, flush=True)))
     except (DashboardError, BusError) as error:
         print(error, flush=True)
         return EXIT_REFUSED

@@ -58,6 +58,11 @@ class Fleet:
         """Why there is no connection to zenoh; empty if there is one."""
         return self._link.problem
 
+    @property
+    def session(self) -> zenoh.Session | None:
+        """The connection to zenoh; None while there is none."""
+        return self._link.session
+
     async def run(self) -> None:
         """Connect, merge what the vehicles see, end what nobody watches any more; until cancelled."""
         self._link.loop = asyncio.get_running_loop()

@@ -33,6 +33,8 @@ async def dashboard_process(settings: Settings, say: Callable[[str], None]) -> A
         "token_file": settings.dashboard.token_file,
         "zenoh": zenoh,
         "vehicle": settings.vehicle.name,
+        "language": settings.language.model_dump(mode="json"),
+        "plugins": settings.plugins.modules,
     }
     async with child_process("dashboard", "companion.dashboard", json.dumps(options), say):
         yield

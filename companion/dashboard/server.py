@@ -14,7 +14,7 @@ import socket
 import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -32,8 +32,9 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from companion.bus.bodies import VelocityBody
 from companion.dashboard.access import COOKIE, Access, DashboardError, Refusal, read_token
 from companion.dashboard.bridge import Bridge, News
+from companion.dashboard.chat import MAX_SENTENCE_CHARACTERS, Chats
 from companion.dashboard.fleet import MAX_VEHICLES, Fleet
-from companion.settings import ZenohSection
+from companion.settings import LanguageSection, ZenohSection
 
 NICENESS = 5
 """Of the server's process: the loop that steers has priority."""
@@ -71,12 +72,15 @@ class DashboardOptions:
         listen: HOST:PORT. token_file: required beyond loopback.
         zenoh: settings of a client (`companion.bus.client.client_settings`).
         vehicle: name of the vehicle that is shown first.
+        language, plugins: of the chat; modules.
     """
 
     listen: str
     token_file: str | None
     zenoh: ZenohSection
     vehicle: str
+    language: LanguageSection = field(default_factory=LanguageSection)
+    plugins: tuple[str, ...] = ()
 
 
 class _Connection(H11Protocol):
@@ -105,7 +109,8 @@ async def serve(options: DashboardOptions, on_ready: Callable[[str], None]) -> N
     access = Access(host, token)
     with listening_socket(host, port) as listener:
         fleet = Fleet(options.zenoh, options.vehicle)
-        server = http_server(create_app(fleet, access))
+        chats = Chats(fleet, options.language, options.plugins)
+        server = http_server(create_app(fleet, chats, access))
         bridging = asyncio.create_task(fleet.run())
         bridging.add_done_callback(lambda _: setattr(server, "should_exit", True))
         try:
@@ -114,6 +119,7 @@ async def serve(options: DashboardOptions, on_ready: Callable[[str], None]) -> N
             if bridging.done():
                 bridging.result()  # raises why it ended
         finally:
+            chats.end()
             bridging.cancel()
             await asyncio.gather(bridging, return_exceptions=True)
 
@@ -158,7 +164,7 @@ def listening_socket(host: str, port: int, flag: str = "--dashboard-listen") -> 
     return listener
 
 
-def create_app(fleet: Fleet, access: Access) -> ASGIApp:
+def create_app(fleet: Fleet, chats: Chats, access: Access) -> ASGIApp:
     """Create the ASGI application."""
     folder = resources.files("companion.dashboard") / "page"
     files = {file.name: file.read_bytes() for file in folder.iterdir()}
@@ -189,8 +195,9 @@ def create_app(fleet: Fleet, access: Access) -> ASGIApp:
         browser = (
             f"{request.client.host if request.client else ''} {request.query_params.get('browser', '')[:64]}"
         )
+        window = request.query_params.get("window", "")
         return StreamingResponse(
-            _stream(fleet, bridge, streams, browser),
+            _stream(fleet, bridge, streams, browser, lambda: chats.state(window, bridge.vehicle)),
             media_type="text/event-stream",
         )
 
@@ -255,10 +262,13 @@ def create_app(fleet: Fleet, access: Access) -> ASGIApp:
         if vehicle == ALL:
             if text.strip().lower() != "stop":
                 return PlainTextResponse("only stop can be sent to all vehicles", 400)
+            chats.end()
             return JSONResponse(await fleet.stop_all(identifier))
         bridge = bridge_of(vehicle)
         if isinstance(bridge, Response):
             return bridge
+        if text.strip().lower() == "stop":
+            chats.end(bridge.vehicle)  # first: they send nothing after the stop
         outcome = fleet.command(bridge.vehicle, text, identifier)
         if outcome is None:
             return PlainTextResponse("too many commands are waiting for their outcome", 429)
@@ -267,6 +277,27 @@ def create_app(fleet: Fleet, access: Access) -> ASGIApp:
                 return JSONResponse(await asyncio.shield(outcome))
         except TimeoutError:
             return JSONResponse({"id": identifier, "command": text[:200], "vehicle": bridge.vehicle}, 202)
+
+    async def ask(request: Request) -> Response:
+        body = await read_body(request)
+        if isinstance(body, Response):
+            return body
+        try:
+            sent = json.loads(body)
+            window, text, plan = str(sent["window"])[:64], sent.get("text"), sent.get("plan")
+            fly, vehicle = sent.get("fly"), sent.get("vehicle", "")
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+            return PlainTextResponse('expected JSON such as {"window": "1", "text": "what do you see?"}', 400)
+        bridge = bridge_of(vehicle)
+        if isinstance(bridge, Response):
+            return bridge
+        if isinstance(plan, int) and isinstance(fly, bool):
+            waited = chats.answer_plan(window, bridge.vehicle, plan, fly=fly)
+            return Response(status_code=204) if waited else PlainTextResponse("this plan has ended", 409)
+        if not isinstance(text, str) or not 0 < len(text.strip()) <= MAX_SENTENCE_CHARACTERS:
+            return PlainTextResponse(f"text: expected 1 to {MAX_SENTENCE_CHARACTERS} characters", 400)
+        refusal = await chats.ask(window, bridge.vehicle, text)
+        return PlainTextResponse(refusal, 429) if refusal else Response(status_code=204)
 
     async def clock(_request: Request) -> Response:
         return JSONResponse({"now_ns": time.monotonic_ns()})
@@ -279,6 +310,7 @@ def create_app(fleet: Fleet, access: Access) -> ASGIApp:
         Route("/clock", clock),
         Route("/command", command, methods=["POST"]),
         Route("/velocity", velocity, methods=["POST"]),
+        Route("/ask", ask, methods=["POST"]),
     ]
     return Guard(Starlette(routes=routes), access)
 
@@ -308,10 +340,13 @@ class StreamTable:
             del self._open[browser]
 
 
-async def _stream(fleet: Fleet, bridge: Bridge, streams: StreamTable, browser: str) -> AsyncIterator[str]:
+async def _stream(
+    fleet: Fleet, bridge: Bridge, streams: StreamTable, browser: str, chat_of: Callable[[], dict[str, Any]]
+) -> AsyncIterator[str]:
     """Yield server-sent events with what is new since the one before, at most ten a second."""
     ended = streams.add(browser)
     seen = answered = 0
+    sent_chat: dict[str, Any] | None = None
     try:
         with fleet.watching(bridge):
             yield "retry: 1000\n\n"
@@ -319,7 +354,11 @@ async def _stream(fleet: Fleet, bridge: Bridge, streams: StreamTable, browser: s
                 news = bridge.news(seen)
                 seen = news.number
                 answered, replies = fleet.replies(answered)
-                yield f"data: {_text_of(fleet, bridge, news, replies, streams.count(browser))}\n\n"
+                chat = chat_of()
+                new_chat = chat if chat != sent_chat else None
+                sent_chat = chat
+                text = _text_of(fleet, bridge, news, replies, streams.count(browser), new_chat)
+                yield f"data: {text}\n\n"
                 with suppress(TimeoutError):
                     await asyncio.wait_for(ended.wait(), STREAM_PERIOD_S)
             yield "event: replaced\ndata: {}\n\n"
@@ -327,7 +366,14 @@ async def _stream(fleet: Fleet, bridge: Bridge, streams: StreamTable, browser: s
         streams.remove(browser, ended)
 
 
-def _text_of(fleet: Fleet, bridge: Bridge, news: News, replies: list[dict[str, Any]], windows: int) -> str:
+def _text_of(
+    fleet: Fleet,
+    bridge: Bridge,
+    news: News,
+    replies: list[dict[str, Any]],
+    windows: int,
+    chat: dict[str, Any] | None,
+) -> str:
     """Format what is new as JSON."""
     head = {
         "now_ns": time.monotonic_ns(),
@@ -338,6 +384,7 @@ def _text_of(fleet: Fleet, bridge: Bridge, news: News, replies: list[dict[str, A
         "events": news.events,
         "replies": replies,
         "windows": windows,
+        "chat": chat,
         "vehicles": (vehicles := fleet.vehicles(bridge)),
         "objects": fleet.objects(bridge) if len(vehicles) > 1 else [],
     }

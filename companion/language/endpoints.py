@@ -7,9 +7,11 @@ import json
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Protocol
 
 from companion.language.tools import ToolCall
+from companion.settings import LanguageSection
 
 MAX_ANSWER_CHARACTERS = 20_000
 MAX_CALLS = 50
@@ -57,6 +59,19 @@ def endpoint_of(url: str, model: str, *, key: str | None = None, timeout_s: floa
         ) from None
     kind = OpenAIEndpoint if url.rstrip("/").endswith("/v1") else OllamaEndpoint
     return kind(url.rstrip("/"), model, key, timeout_s)
+
+
+def endpoint_from(language: LanguageSection) -> Endpoint | None:
+    """The language model of the settings; None: sentences are read by patterns. Raises LanguageError."""
+    if not language.model:
+        return None
+    key = None
+    if language.key_file is not None:
+        try:
+            key = Path(language.key_file).read_text(encoding="utf-8").strip()
+        except (OSError, UnicodeDecodeError) as error:
+            raise LanguageError(f"language.key_file {language.key_file}: cannot be read: {error}") from None
+    return endpoint_of(language.url, language.model, key=key, timeout_s=language.timeout_s)
 
 
 @dataclass(frozen=True, slots=True)

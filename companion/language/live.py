@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import json
 import math
+import time
+from collections.abc import Callable, Collection
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any, TypeVar
@@ -15,15 +17,42 @@ from companion.bus import topics
 from companion.bus.bodies import DetectionBody, DetectionsBody
 from companion.client import CommandFailedError, Drone, Stream
 from companion.client.commands import Reply
+from companion.language.conversation import Conversation, Operator
+from companion.language.endpoints import Endpoint
 from companion.language.scene import Scene, SceneObject
+from companion.language.tools import class_names_of
 
 T = TypeVar("T")
 
+_DETECTOR_S = 15.0
 _STATE_S = 4.0
 # The kept events arrive within this.
 _EVENTS_S = 0.3
 # An image and the detections of the same frame: so many frames may lie between their messages.
 _FRAMES = 30
+
+
+async def conversations(
+    drone: Drone, endpoint: Endpoint | None, may: Collection[str]
+) -> Callable[[Operator], Conversation]:
+    """What makes conversations with the vehicle of a service. Waits until its detector has started.
+
+    Raises:
+        NoAnswerError: no service answers.
+    """
+    config = await drone.query("config")
+    until_s = time.monotonic() + (_DETECTOR_S if config["detector"]["enabled"] else 0.0)
+    # The classes are known when the detector has started.
+    while (class_names := class_names_of(schema := await drone.query("commands"))) is None:
+        if time.monotonic() >= until_s:
+            break
+        await asyncio.sleep(0.5)
+    vehicle = LiveVehicle(drone, class_names or (), config["guidance"]["camera"])
+
+    def converse(operator: Operator) -> Conversation:
+        return Conversation(vehicle, operator, schema, class_names, endpoint=endpoint, may=may)
+
+    return converse
 
 
 class LiveVehicle:

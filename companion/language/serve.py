@@ -25,7 +25,7 @@ MAX_SENTENCE_BYTES = 2000
 logger = logging.getLogger(__name__)
 
 
-class _Lines:
+class Lines:
     """Collects what an operator would read."""
 
     def __init__(self) -> None:
@@ -51,7 +51,7 @@ async def serve(session: zenoh.Session, vehicle: str, converse: Callable[[Operat
     Args:
         converse: makes the conversation, whose history all queries share.
     """
-    lines = _Lines()
+    lines = Lines()
     operator = Operator(
         lambda piece: lines.write(piece), lambda line: lines.show(line), lambda: lines.confirm()
     )
@@ -69,14 +69,14 @@ async def serve(session: zenoh.Session, vehicle: str, converse: Callable[[Operat
         if is_stop(text):
             if running is not None:
                 running.cancel()  # first: it sends nothing after the stop
-            own = _Lines()
+            own = Lines()
             stopping = converse(Operator(own.write, own.show, own.confirm))
             await reply(query, await _attempt(stopping, text), "stop")
             return
         if running is not None:
             await reply(query, "busy with another sentence; `stop` ends it", "")
             return
-        lines = _Lines()
+        lines = Lines()
         running = loop.create_task(_attempt(conversation, text))
         try:
             await asyncio.wait((running,))

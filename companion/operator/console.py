@@ -7,13 +7,30 @@ import logging
 import os
 import sys
 from collections.abc import Awaitable, Callable
-from typing import Any
+from typing import Any, Protocol
 
 from aioconsole.stream import StandardStreamReader, StandardStreamReaderProtocol
 
 logger = logging.getLogger(__name__)
 
 _BANNER = "type a command (help, quit): takeoff 5, seek car, approach car distance=5, hold, land, rtl, stop"
+_ASK_BANNER = "or ask in plain words: ask find a car and circle it"
+_CANCEL = "cancel"
+_ANSWERS = ("y", "yes", "n", "no")
+
+
+class Ask(Protocol):
+    """Answers plain sentences, in a process of its own."""
+
+    @property
+    def running(self) -> bool:
+        """Whether a sentence was passed on, and the process goes on."""
+
+    async def send(self, line: str, write: Callable[[str], None]) -> None:
+        """Pass on a sentence, the answer to a question, or `cancel`. `write`: gets what is printed."""
+
+    async def close(self) -> None:
+        """End the process."""
 
 
 async def run_console(
@@ -21,6 +38,7 @@ async def run_console(
     quit_service: Callable[[], None],
     help_text: str,
     on_event: Callable[[str, str], None],
+    ask: Ask | None = None,
 ) -> None:
     """Read commands until end of file or `quit`. A command runs while the next is typed.
 
@@ -28,16 +46,21 @@ async def run_console(
     Never raises: an error of the console must not affect the flight.
     """
     try:
-        await _read_commands(command, quit_service, help_text)
+        await _read_commands(command, quit_service, help_text, ask)
     except Exception as error:
         logger.exception("the console failed")
         on_event("warning", f"console ended: {type(error).__name__}: {error}")
 
 
 async def _read_commands(
-    command: Callable[[str], Awaitable[dict[str, Any]]], quit_service: Callable[[], None], help_text: str
+    command: Callable[[str], Awaitable[dict[str, Any]]],
+    quit_service: Callable[[], None],
+    help_text: str,
+    ask: Ask | None,
 ) -> None:
     _print(_BANNER)
+    if ask is not None:
+        _print(_ASK_BANNER)
     running: set[asyncio.Task[None]] = set()
 
     async def answer(text: str) -> None:
@@ -61,14 +84,23 @@ async def _read_commands(
             if text in ("quit", "exit"):
                 quit_service()
                 return
+            word, _, sentence = text.partition(" ")
             if text == "help":
                 _print(help_text)
+            elif ask is not None and word == "ask" and sentence:
+                await ask.send(sentence.strip(), _write)
+            elif ask is not None and ask.running and text.lower() in _ANSWERS:
+                await ask.send(text, _write)
             elif text:
+                if ask is not None and ask.running and text.split()[-1].lower() == "stop":
+                    await ask.send(_CANCEL, _write)  # it sends nothing after the stop
                 task = asyncio.create_task(answer(text))
                 running.add(task)
                 task.add_done_callback(running.discard)
     finally:
         transport.close()
+        if ask is not None:
+            await ask.close()
 
 
 async def _line_of(reader: asyncio.StreamReader) -> bytes:
@@ -80,7 +112,11 @@ async def _line_of(reader: asyncio.StreamReader) -> bytes:
 
 
 def _print(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
+    _write(f"{text}\n")
+
+
+def _write(text: str) -> None:
+    print(text, end="", file=sys.stderr, flush=True)
 
 
 def terminal_is_free(source_uri: str) -> bool:

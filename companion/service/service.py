@@ -17,7 +17,7 @@ from companion.bus.session import Bus
 from companion.bus.status_message import status_message
 from companion.guidance import grammar
 from companion.guidance.core import Guidance
-from companion.operator.console import run_console, terminal_is_free
+from companion.operator.console import Ask, run_console, terminal_is_free
 from companion.operator.metrics import MetricsServer
 from companion.perception.cameras import WorkerCamera, open_cameras
 from companion.perception.supervisor import PerceptionSupervisor
@@ -50,7 +50,7 @@ class Service:
     Args:
         settings: all of them.
         on_event: called in the loop with every event, besides the log and the bus.
-        console: also accept commands from the terminal.
+        console: also accept commands from the terminal. ask: answers plain sentences there.
         dropped_lines: returns the number of dropped log lines, for `status`.
     """
 
@@ -60,10 +60,11 @@ class Service:
         *,
         on_event: Callable[[Event], None] | None = None,
         console: bool = False,
+        ask: Ask | None = None,
         dropped_lines: Callable[[], int] = lambda: 0,
     ) -> None:
         self.settings = settings
-        self._console, self._dropped_lines = console, dropped_lines
+        self._console, self._ask, self._dropped_lines = console, ask, dropped_lines
         log = EventLog(lambda event: self.bus.publish(topics.EVENTS, event), on_event)
         self.events, self._event = log.newest, log.add
         self.driver: Driver = driver_of(settings, lambda sent, data: self._tap.on_bytes(sent, data))
@@ -142,7 +143,8 @@ class Service:
             loops = [self._loop.run(), self.streamer.run(), self._publish_status(), self._health.check()]
             loops.append(self._publisher.publish_vehicle(self.guidance, self.streamer, self.cameras))
             if self._console and all(terminal_is_free(camera.settings.source.uri) for camera in self.cameras):
-                loops.append(run_console(self.command, self.stop, grammar.describe(), self._event))
+                console = run_console(self.command, self.stop, grammar.describe(), self._event, self._ask)
+                loops.append(console)
             tasks = [asyncio.create_task(loop) for loop in loops]
             self._notifier.ready("flying" if self.driver.state.armed else "ready")
             self._event("info", f"ready: commands on {topics.command_key(self.settings.vehicle.name)}")

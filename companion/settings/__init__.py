@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from companion.settings.bus import ZenohSection
+    from companion.settings.language import LanguageSection
     from companion.settings.perception import CameraSection, DetectorSection, PreviewSection, SourceSection
     from companion.settings.section import Section
     from companion.settings.settings import Settings
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 _MODULES = {
     "CameraSection": "perception",
     "DetectorSection": "perception",
+    "LanguageSection": "language",
     "PreviewSection": "perception",
     "Section": "section",
     "Settings": "settings",
@@ -32,6 +34,7 @@ _MODULES = {
 __all__ = [
     "CameraSection",
     "DetectorSection",
+    "LanguageSection",
     "PreviewSection",
     "Section",
     "Settings",

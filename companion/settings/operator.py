@@ -1,4 +1,4 @@
-"""The settings of dashboard, language model, recordings, Foxglove, metrics, log and plug-ins."""
+"""The settings of dashboard, recordings, Foxglove, metrics, log and plug-ins."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pydantic import Field
 
 from companion.settings.perception import VideoSection
 from companion.settings.section import Section
-from companion.settings.texts import HOST_AND_PORT, HOST_AND_PORT_OR_EMPTY, HTTP_URL
+from companion.settings.texts import HOST_AND_PORT, HOST_AND_PORT_OR_EMPTY
 
 
 class DashboardSection(Section):
@@ -18,21 +18,6 @@ class DashboardSection(Section):
     """HOST:PORT of the page; empty: none"""
     token_file: str | None = None
     """file with the token, readable by its owner only; required if other computers can reach `listen`"""
-
-
-class LanguageSection(Section):
-    """The language model of `companion ask`."""
-
-    url: Annotated[str, HTTP_URL] = "http://127.0.0.1:11434"
-    """address of Ollama, or of an OpenAI-compatible endpoint, which ends with /v1 (extra `llm`)"""
-    model: str = ""
-    """name of the model; empty: plain sentences are read by patterns, without a model"""
-    key_file: str | None = None
-    """file with the endpoint's API key"""
-    may: tuple[str, ...] = ()
-    """flight commands that need no confirmation by the operator"""
-    timeout_s: Annotated[float, Field(ge=1, le=3600)] = 120.0
-    """maximum duration of one answer of the model, seconds"""
 
 
 class RecordingSection(VideoSection):

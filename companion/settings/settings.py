@@ -8,10 +8,10 @@ from pydantic import Field, ModelWrapValidatorHandler, model_validator
 
 from companion.settings.bus import ZenohSection
 from companion.settings.guidance import GuidanceSection
+from companion.settings.language import LanguageSection
 from companion.settings.operator import (
     DashboardSection,
     FoxgloveSection,
-    LanguageSection,
     LogSection,
     MetricsSection,
     PluginsSection,

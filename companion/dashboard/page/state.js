@@ -58,15 +58,21 @@ export function showAddress(vehicle) {
 }
 if (address.has("token")) showAddress(state.vehicle); // the cookie is set now
 
-export function browserId() {
+const newId = () => Math.random().toString(36).slice(2);
+
+function keptId(storage, name, without) {
   try {
-    const id = localStorage.getItem("browser") || Math.random().toString(36).slice(2);
-    localStorage.setItem("browser", id);
+    const id = window[storage].getItem(name) || newId();
+    window[storage].setItem(name, id);
     return id;
   } catch {
-    return ""; // storage is off
+    return without; // storage is off
   }
 }
+
+const ownId = newId();
+export const browserId = () => keptId("localStorage", "browser", "");
+export const windowId = () => keptId("sessionStorage", "window", ownId); // the same after a reload
 
 export async function measureClock() {
   // The fastest of five requests has the smallest error.

@@ -1,8 +1,9 @@
 // The stream of server-sent events (`/events`): what is new of the shown vehicle, and the map of all vehicles.
 
 import { camera, endCameras } from "./cameras.js";
+import { clearChat, showChat } from "./chat.js";
 import { closeMenu, onReply } from "./commands.js";
-import { $, browserId, ofOneVehicle, record, showAddress, state } from "./state.js";
+import { $, browserId, ofOneVehicle, record, showAddress, state, windowId } from "./state.js";
 
 const TRAIL_M = 0.3; // between two points of a trail
 const TRAIL_POINTS = 500;
@@ -13,7 +14,7 @@ const MAX_PICTURES = 2; // in flight; with the stream and those of a second wind
 
 export function connect() {
   if (state.stream || document.hidden || state.replaced) return;
-  const query = new URLSearchParams({ browser: browserId(), vehicle: state.vehicle });
+  const query = new URLSearchParams({ browser: browserId(), window: windowId(), vehicle: state.vehicle });
   const stream = state.stream = new EventSource(`/events?${query}`);
   stream.onopen = () => $("log").replaceChildren(); // a new stream begins with all kept events
   stream.onmessage = (event) => onNews(JSON.parse(event.data));
@@ -51,6 +52,7 @@ export function select(vehicle) {
   disconnect();
   Object.assign(state, ofOneVehicle(), { vehicle, at: 0, alive: null, objects: [] });
   endCameras();
+  clearChat();
   $("log").replaceChildren();
   $("class").replaceChildren();
   $("vehicle").textContent = document.title = vehicle;
@@ -76,6 +78,7 @@ function onNews(news) {
   if (news.topics.status) onStatus(news.topics.status);
   for (const event of news.events) log(event.level, event.text, (news.now_ns - event.stamp_ns) / 1e9);
   news.replies.forEach(onReply);
+  if (news.chat) showChat(news.chat);
 }
 
 export function extendTrails(vehicles) {

@@ -16,7 +16,7 @@ from typing import Any
 
 from companion.dashboard.access import HEADER
 from companion.dashboard.server import DashboardOptions, serve
-from companion.settings import ZenohSection
+from companion.settings import LanguageSection, ZenohSection
 from mavlink_sim.testing import free_port
 from tests.companion.service_process import ServiceProcess
 
@@ -31,13 +31,13 @@ async def serving(
     listen: str = "127.0.0.1",
     port: int | None = None,
     token_file: Path | None = None,
+    language: LanguageSection | None = None,
 ) -> AsyncIterator[int]:
     """Serve the page of the service at a zenoh endpoint; yields the port."""
     port = free_port(socket.SOCK_STREAM) if port is None else port
     zenoh = ZenohSection(mode="client", connect=(endpoint,), listen=())
-    options = DashboardOptions(
-        f"{listen}:{port}", None if token_file is None else str(token_file), zenoh, NAME
-    )
+    token = None if token_file is None else str(token_file)
+    options = DashboardOptions(f"{listen}:{port}", token, zenoh, NAME, language or LanguageSection())
     ready = asyncio.Event()
     running = asyncio.create_task(serve(options, lambda _url: ready.set()))
     starting = asyncio.create_task(ready.wait())

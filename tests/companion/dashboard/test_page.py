@@ -14,8 +14,10 @@ from urllib.parse import parse_qs, urlsplit
 import cv2
 import numpy as np
 import pytest
+import zenoh
 
-from companion.bus.topics import DETECTIONS, EVENTS, IMAGE, SETPOINT, STATUS, VEHICLE
+from companion.bus.topics import DETECTIONS, EVENTS, IMAGE, ROOT, SETPOINT, STATUS, VEHICLE
+from companion.guidance.grammar import json_schema
 from mavlink_sim.testing import free_port
 from tests.companion.dashboard.chromium import PROGRAM, Browser, Tab, chromium, wait_for
 from tests.companion.dashboard.serving import dashboard_command
@@ -491,3 +493,72 @@ def test_page_says_when_the_dashboard_is_gone(service: ServiceProcess, tab: Tab)
     tab.until("state.topics.status")
     service.process.kill()  # the last test with this service
     tab.until(f"/does not answer; everything here is [0-9]+ s old/.test({LINK})")
+
+
+LABEL = '<img src="x" onerror="document.body.remove()">'
+
+
+def test_chat_shows_a_plan_and_flies_what_is_confirmed(browser: Browser) -> None:
+    jpeg = cv2.imencode(".jpg", np.zeros((48, 64, 3), np.uint8))[1].tobytes()
+    found = {**FOUND, "class_name": LABEL, "bearing_rad": 0.1, "ground_range_m": 9.0}
+    answers = {
+        "config": {"guidance": {"camera": None}, "detector": {"enabled": True}},
+        "commands": json_schema(["car", LABEL]),
+    }
+
+    def declare(path: str, answer: Any) -> None:
+        def reply(query: zenoh.Query) -> None:
+            with query:
+                query.reply(query.key_expr, json.dumps(answer))
+
+        service.session.declare_queryable(f"{ROOT}/{NAME}/{path}", reply)
+
+    with publishing() as (service, endpoint), dashboard_command(endpoint) as url:
+        for path, answer in answers.items():
+            declare(path, answer)
+        received = answering({NAME: service})
+        tab = open_page(browser, url)
+        sequence = itertools.count()
+
+        def until(expression: str) -> None:
+            def shown() -> bool:
+                number = next(sequence)
+                service.publish(VEHICLE.key(NAME), {"yaw_rad": 0.0, "altitude_m": 5.0})
+                service.publish(DETECTIONS.key(NAME), frame(number, detections=[found]))
+                service.image(number, jpeg)
+                return bool(tab.value(expression))
+
+            wait_for(shown)
+
+        def ask(sentence: str) -> None:
+            tab.value("document.querySelector('#sentence').focus()")
+            tab.send("Input.insertText", text=sentence)
+            tab.press("Enter", "\r")
+
+        answer = "(document.querySelector('#chat li:last-child p:last-child')?.textContent ?? '')"
+        waiting = "!document.querySelector('#plan').hidden"
+        until("document.querySelector('#reader').textContent.includes('patterns')")
+        # A label is text, never markup.
+        ask("what do you see?")
+        until(f"{answer}.startsWith('seen: <img ') && {answer}.includes('9 m away')")
+        ask("take off to three metres")
+        until(f"{answer} === 'takeoff altitude=3' && {waiting}")
+        tab.value("document.querySelector('#decline').click()")
+        until(f"{answer}.endsWith('not flown')")
+        # The space bar stops, and ends the plan that waits.
+        ask("take off to four metres")
+        until(waiting)
+        tab.press(" ", " ")
+        until(f"{answer}.endsWith('ended by stop') && !({waiting})")
+        assert received == [(NAME, "stop")]
+        ask("take off to five metres")
+        until(waiting)
+        tab.value("document.querySelector('#confirm').click()")
+        until(f"{answer}.endsWith('done: holding')")
+        assert received[1:] == [(NAME, "takeoff altitude=5")]
+        # The same after a reload.
+        tab.send("Page.reload")
+        until(f"{OPENED} && true")
+        until(f"{answer}.endsWith('done: holding')")
+        assert tab.value("document.querySelectorAll('#chat li').length") == 4
+        tab.close()

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from typing import Any
 
 import pytest
 
-from companion.operator.console import run_console, terminal_is_free
+from companion.operator.console import Ask, run_console, terminal_is_free
 
 
 @pytest.fixture
@@ -41,9 +41,25 @@ class Service:
     def stop(self) -> None:
         self.stopped = True
 
-    async def run(self) -> None:
+    async def run(self, ask: Ask | None = None) -> None:
         async with asyncio.timeout(20.0):
-            await run_console(self.command, self.stop, "HELP", lambda *event: self.events.append(event))
+            await run_console(self.command, self.stop, "HELP", lambda *event: self.events.append(event), ask)
+
+
+class Sentences:
+    """Records what is passed on, and answers with a question."""
+
+    def __init__(self) -> None:
+        self.passed: list[str] = []
+        self.running = self.closed = False
+
+    async def send(self, line: str, write: Callable[[str], None]) -> None:
+        self.passed.append(line)
+        self.running = True
+        write("fly this? ")
+
+    async def close(self) -> None:
+        self.closed = True
 
 
 async def test_commands_are_answered_until_quit(terminal: int, capsys: pytest.CaptureFixture[str]) -> None:
@@ -76,3 +92,15 @@ async def test_closed_terminal_ends_only_the_console(terminal: int) -> None:
     await running
     assert not service.stopped
     assert service.events == []
+
+
+async def test_sentences_and_their_answers_are_passed_on(
+    terminal: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    service, sentences = Service(), Sentences()
+    os.write(terminal, b"y\nask  find a car\ny\nhold\nvehicle2 stop\nask\nquit\n")
+    await service.run(sentences)
+    assert sentences.passed == ["find a car", "y", "cancel"]
+    assert service.asked == ["y", "hold", "vehicle2 stop", "ask"]
+    assert sentences.closed
+    assert "fly this? fly this? " in capsys.readouterr().err

@@ -1,0 +1,84 @@
+"""The chat of a console: `companion ask` as a real process, at a stand-in of the service."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+import pytest
+
+from companion.bench.lockstep_flight import plain_settings
+from companion.language.process import NICENESS, AskProcess
+from tests.companion.cli.test_ask import Service, service
+from tests.companion.test_play import descendants
+
+pytestmark = pytest.mark.realtime
+
+
+class Talk:
+    """The console's side."""
+
+    def __init__(self, there: Service, **changes: str) -> None:
+        given = {key.replace("__", "."): value for key, value in changes.items()}
+        self.process = AskProcess(
+            plain_settings({"vehicle.name": "vehicle", "zenoh.listen": there.endpoint, **given})
+        )
+        self._printed = ""
+
+    async def send(self, line: str) -> None:
+        await self.process.send(line, self._write)
+
+    async def shown(self, text: str) -> str:
+        """Wait until a text is printed; returns everything printed until then."""
+        async with asyncio.timeout(60):
+            while text not in self._printed:
+                await asyncio.sleep(0.01)
+        printed, self._printed = self._printed, ""
+        return printed
+
+    def _write(self, piece: str) -> None:
+        self._printed += piece
+
+
+@asynccontextmanager
+async def talking(**changes: str) -> AsyncIterator[tuple[Service, Talk]]:
+    async with service() as there:
+        talk = Talk(there, **changes)
+        try:
+            yield there, talk
+        finally:
+            await talk.process.close()
+            assert not talk.process.running
+
+
+async def test_plan_is_confirmed_history_is_used_and_cancel_ends_it() -> None:
+    async with talking() as (there, talk):
+        there.stopped.set()
+        await talk.send("circle the red car at ten metres")
+        assert "orbit track=3" in await talk.shown("[y/N]")
+        (child,) = descendants(os.getpid())
+        own = os.getpriority(os.PRIO_PROCESS, 0)
+        assert os.getpriority(os.PRIO_PROCESS, child) == min(own + NICENESS, 19)
+        await talk.send("y")
+        await talk.shown("done: orbit: ended")
+        await talk.send("twice as far")
+        assert "orbit radius=20 track=3" in await talk.shown("[y/N]")
+        await talk.send("cancel")
+        await talk.send("y")  # the plan has ended
+        await talk.shown("not understood")
+        assert there.commands == ["orbit track=3"]
+
+
+async def test_settings_of_the_service_are_used_and_the_next_sentence_starts_it_again() -> None:
+    async with talking(language__may="orbit") as (there, talk):
+        there.stopped.set()
+        for _ in range(2):
+            await talk.send("circle the red car")
+            await talk.shown("done: orbit: ended")
+            await talk.send("quit")
+            async with asyncio.timeout(30):
+                while talk.process.running:
+                    await asyncio.sleep(0.01)
+        assert there.commands == ["orbit track=3"] * 2
