@@ -133,6 +133,7 @@ def http_server(application: ASGIApp) -> uvicorn.Server:
             ws="none",
             lifespan="off",
             access_log=False,
+            log_config=None,  # its own would close the handlers of the whole process
             log_level="critical",
             server_header=False,
             limit_concurrency=MAX_CONNECTIONS,
