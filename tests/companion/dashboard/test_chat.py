@@ -29,6 +29,11 @@ class Window:
         self._port, self._name, self._stream = port, name, stream
         self.chat: dict[str, Any] = {}
 
+    async def until_connected(self) -> None:
+        async with asyncio.timeout(20):
+            while (news := await self._stream.next()) is None or news["problem"]:
+                pass
+
     async def post(self, **sent: Any) -> int:
         body = {"window": self._name, "vehicle": VEHICLE, **sent}
         return (await request(self._port, "POST", "/ask", POST, body))[0]
@@ -81,6 +86,8 @@ async def windows(
             for name in names
         ]
         try:
+            for each in opened:
+                await each.until_connected()
             yield there, opened
         finally:
             for each in opened:

@@ -540,7 +540,7 @@ def test_chat_shows_a_plan_and_flies_what_is_confirmed(browser: Browser) -> None
         until("document.querySelector('#reader').textContent.includes('patterns')")
         # A label is text, never markup.
         ask("what do you see?")
-        until(f"{answer}.startsWith('seen: <img ') && {answer}.includes('9 m away')")
+        until(f"{answer}.startsWith('seen: black <img src=') && {answer}.includes('9 m away')")
         ask("take off to three metres")
         until(f"{answer} === 'takeoff altitude=3' && {waiting}")
         tab.value("document.querySelector('#decline').click()")
