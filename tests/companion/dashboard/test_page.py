@@ -21,7 +21,7 @@ from companion.guidance.grammar import json_schema
 from mavlink_sim.testing import free_port
 from tests.companion.dashboard.chromium import PROGRAM, Browser, Tab, chromium, wait_for
 from tests.companion.dashboard.serving import dashboard_command
-from tests.companion.dashboard.test_bridge import FOUND, NAME, frame, publishing
+from tests.companion.dashboard.test_bridge import FOUND, NAME, Publisher, frame, publishing
 from tests.companion.dashboard.test_dashboard_fleet import (
     OTHER,
     answering,
@@ -498,24 +498,21 @@ def test_page_says_when_the_dashboard_is_gone(service: ServiceProcess, tab: Tab)
 LABEL = '<img src="x" onerror="document.body.remove()">'
 
 
+def declare_query(service: Publisher, path: str, answer: Any) -> None:
+    def reply(query: zenoh.Query) -> None:
+        with query:
+            query.reply(query.key_expr, json.dumps(answer))
+
+    service.session.declare_queryable(f"{ROOT}/{NAME}/{path}", reply)
+
+
 def test_chat_shows_a_plan_and_flies_what_is_confirmed(browser: Browser) -> None:
     jpeg = cv2.imencode(".jpg", np.zeros((48, 64, 3), np.uint8))[1].tobytes()
     found = {**FOUND, "class_name": LABEL, "bearing_rad": 0.1, "ground_range_m": 9.0}
-    answers = {
-        "config": {"guidance": {"camera": None}, "detector": {"enabled": True}},
-        "commands": json_schema(["car", LABEL]),
-    }
-
-    def declare(path: str, answer: Any) -> None:
-        def reply(query: zenoh.Query) -> None:
-            with query:
-                query.reply(query.key_expr, json.dumps(answer))
-
-        service.session.declare_queryable(f"{ROOT}/{NAME}/{path}", reply)
-
     with publishing() as (service, endpoint), dashboard_command(endpoint) as url:
-        for path, answer in answers.items():
-            declare(path, answer)
+        config = {"guidance": {"camera": None}, "detector": {"enabled": True}}
+        declare_query(service, "config", config)
+        declare_query(service, "commands", json_schema(["car", LABEL]))
         received = answering({NAME: service})
         tab = open_page(browser, url)
         sequence = itertools.count()
@@ -535,30 +532,30 @@ def test_chat_shows_a_plan_and_flies_what_is_confirmed(browser: Browser) -> None
             tab.send("Input.insertText", text=sentence)
             tab.press("Enter", "\r")
 
-        answer = "(document.querySelector('#chat li:last-child p:last-child')?.textContent ?? '')"
+        newest = "(document.querySelector('#chat li:last-child p:last-child')?.textContent ?? '')"
         waiting = "!document.querySelector('#plan').hidden"
         until("document.querySelector('#reader').textContent.includes('patterns')")
         # A label is text, never markup.
         ask("what do you see?")
-        until(f"{answer}.startsWith('seen: black <img src=') && {answer}.includes('9 m away')")
+        until(f"{newest}.startsWith('seen: black <img src=') && {newest}.includes('9 m away')")
         ask("take off to three metres")
-        until(f"{answer} === 'takeoff altitude=3' && {waiting}")
+        until(f"{newest} === 'takeoff altitude=3' && {waiting}")
         tab.value("document.querySelector('#decline').click()")
-        until(f"{answer}.endsWith('not flown')")
+        until(f"{newest}.endsWith('not flown')")
         # The space bar stops, and ends the plan that waits.
         ask("take off to four metres")
         until(waiting)
         tab.press(" ", " ")
-        until(f"{answer}.endsWith('ended by stop') && !({waiting})")
-        assert received == [(NAME, "stop")]
+        until(f"{newest}.endsWith('ended by stop') && !({waiting})")
+        wait_for(lambda: received == [(NAME, "stop")])
         ask("take off to five metres")
         until(waiting)
         tab.value("document.querySelector('#confirm').click()")
-        until(f"{answer}.endsWith('done: holding')")
+        until(f"{newest}.endsWith('done: holding')")
         assert received[1:] == [(NAME, "takeoff altitude=5")]
         # The same after a reload.
         tab.send("Page.reload")
         until(f"{OPENED} && true")
-        until(f"{answer}.endsWith('done: holding')")
+        until(f"{newest}.endsWith('done: holding')")
         assert tab.value("document.querySelectorAll('#chat li').length") == 4
         tab.close()
