@@ -16,6 +16,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from companion.bus.client import NoAnswerError
+from companion.client import Drone
+from companion.client.commands import Reply
 from companion.dashboard.fleet import Fleet
 from companion.plugins import PluginError, load_plugins
 from companion.settings import LanguageSection
@@ -32,6 +34,7 @@ _KEPT_EXCHANGES, _KEPT_CHARACTERS = 20, 40_000
 _BEGINNING = 2
 # Unique over all chats: a late click cannot confirm another plan.
 _plan_numbers = itertools.count(1)
+_STOPPED_WITHIN_S = 1.0
 _BUSY = "busy with another sentence; STOP ends it"
 
 
@@ -222,7 +225,6 @@ class Chats:
         Raises:
             NoAnswerError: no service. LanguageError, PluginError, ValueError: of the settings.
         """
-        from companion.client import Drone
         from companion.language.conversation import Operator
         from companion.language.endpoints import endpoint_from
         from companion.language.live import conversations
@@ -235,8 +237,23 @@ class Chats:
         check_words("language.may", self._language.may)
         endpoint = await asyncio.to_thread(endpoint_from, self._language)
         async with self._beginning:
-            converse = await conversations(Drone(session, chat.vehicle), endpoint, self._language.may)
+            converse = await conversations(_ChatDrone(session, chat.vehicle), endpoint, self._language.may)
         operator = Operator(
             lambda piece: chat.current.write(piece), lambda line: chat.current.show(line), chat.confirm
         )
         return converse(operator)
+
+
+class _ChatDrone(Drone):
+    """A chat's vehicle."""
+
+    async def command(self, text: str) -> Reply:
+        """As the client's. Cancelled by a stop, it sends one of its own only if that stop does not end it."""
+        flown = asyncio.ensure_future(super().command(text))
+        try:
+            return await asyncio.shield(flown)
+        except asyncio.CancelledError:
+            await asyncio.wait({flown}, timeout=_STOPPED_WITHIN_S)
+            flown.cancel()
+            await asyncio.gather(flown, return_exceptions=True)
+            raise

@@ -510,9 +510,11 @@ class Guidance:
             self._out.event(EventKind.NOTED, behaviour.name, text, warning=not outcome.success)
         self._end(outcome)
         self._goal_ned_m = outcome.goal_ned_m
+        # The requested mode may show before the answer to the request.
+        handed_over = self._requested is not None and context.state.mode is self._requested.mode
         if self.phase is Phase.REQUESTING:
             self._drop_request()
-        if not self._streaming:
+        if not self._streaming or handed_over:
             self._release()
             return
         hold = HoldBehaviour()

@@ -18,6 +18,7 @@ from companion.guidance.behaviour import (
 from companion.guidance.behaviours.approach import ApproachBehaviour
 from companion.guidance.behaviours.follow_path import FollowPathBehaviour
 from companion.guidance.behaviours.hold import HoldBehaviour
+from companion.guidance.behaviours.stop import StopBehaviour
 from companion.guidance.behaviours.takeoff import TakeoffBehaviour
 from companion.guidance.core import Phase
 from companion.guidance.interface import Answer, CommandInput, EventKind, FindGimbal, GuidanceInput, Request
@@ -79,6 +80,21 @@ def test_failing_check_is_refused_and_the_flight_goes_on() -> None:
     assert kinds(harness)[-1] is EventKind.REFUSED
     harness.run(0.5)
     assert harness.guidance.phase is Phase.OFFBOARD
+
+
+def test_stop_whose_mode_shows_before_its_answer_gives_up_command() -> None:
+    silent = False
+    harness = GuidanceHarness(
+        flying(), inputs=lambda inputs: replace(inputs, answers=() if silent else inputs.answers)
+    )
+    engaged(harness)
+    silent = True
+    stopped = harness.command(StopBehaviour())
+    assert harness.outcome(stopped, 5.0).success
+    silent = False
+    harness.run(2.0)
+    assert harness.vehicle.mode is FlightMode.HOLD
+    assert harness.guidance.phase is Phase.IDLE
 
 
 def test_takeoff_request_needs_an_altitude() -> None:
