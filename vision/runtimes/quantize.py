@@ -83,7 +83,9 @@ def quantize_onnx(source: Path, output: Path, images: Iterable[NDArray[np.uint8]
         def get_next(self) -> dict[str, Any] | None:
             return next(self._inputs, None)
 
-    graph = onnx.load(str(source)).graph
+    model = onnx.load(str(source))
+    graph = model.graph
+    _name_constants(graph)
     options: dict[str, Any] = {"ActivationSymmetric": False, "WeightSymmetric": True}
     if to == "openvino":
         operators = ["Conv"]
@@ -99,7 +101,7 @@ def quantize_onnx(source: Path, output: Path, images: Iterable[NDArray[np.uint8]
     root.setLevel(logging.ERROR)
     try:
         quantization.quantize_static(
-            str(source),
+            model,
             str(output),
             Reader(),
             quant_format=quantization.QuantFormat.QDQ,
@@ -113,6 +115,16 @@ def quantize_onnx(source: Path, output: Path, images: Iterable[NDArray[np.uint8]
         )
     finally:
         root.setLevel(level)
+
+
+def _name_constants(graph: Any) -> None:
+    """Turn constant nodes into initialisers: only those are quantised as weights, per channel."""
+    for node in [node for node in graph.node if node.op_type == "Constant"]:
+        value = next((attribute.t for attribute in node.attribute if attribute.name == "value"), None)
+        if value is not None:
+            value.name = node.output[0]
+            graph.initializer.append(value)
+            graph.node.remove(node)
 
 
 def _last_convolutions(graph: Any) -> list[str]:
