@@ -1,12 +1,13 @@
-"""Ultralytics and ours on the same pictures in the same run, in turn; for development only.
+"""Ultralytics and this detector on the same pictures in the same run, in turn; for development only.
 
 Each contestant is a process of its own (`companion.bench.detector`), and they take turns, so that whatever
 else the machine does falls on all alike. Ultralytics is measured as anybody calls it, `predict` on a picture:
 as installed (it chooses its threads), with the threads forced, and on its own OpenVINO export.
 
-    PYTHONPATH=. OTHER_VENV/bin/python tools/bench_ultralytics.py --model yolov8n.pt --threads 2
+    python -m tools.bench_ultralytics --model yolov8n.pt --python OTHER_VENV/bin/python --threads 2
 
-`OTHER_VENV` holds `ultralytics` and what this project needs. Figures, never verdicts: see the ratios.
+Ultralytics (AGPL-3.0) runs in its own environment, `OTHER_VENV`, which needs nothing of this project but
+numpy. At the end are ratios of wall time and of processor time; a busy machine changes the latter less.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import argparse
 import json
 import os
 import shutil
+import subprocess
 import sys
 import tempfile
 import time
@@ -32,6 +34,7 @@ OURS = ("torch", "onnxruntime", "openvino")
 
 def contestant() -> int:
     """The process that is measured; see `companion.bench.detector`."""
+    sys.path.insert(0, str(Path(__file__).parents[1]))
     from companion.bench.detector import memory_mb
 
     order = json.loads(sys.stdin.readline())
@@ -59,8 +62,10 @@ def contestant() -> int:
     threads = "own" if order["name"] == "own-openvino" else torch.get_num_threads()
     _say({"runtime": name, "precision": "float32", "threads": threads, "memory_mb": memory_mb()})
     for line in sys.stdin:
+        before = time.process_time()
         times = [predict(pictures[number % len(pictures)]) for number in range(int(line))]
-        _say({"times_ms": times, "memory_mb": memory_mb()})
+        spent = {"processor_s": time.process_time() - before, "memory_mb": memory_mb()}
+        _say({"times_ms": times, **spent})
     return 0
 
 
@@ -69,24 +74,47 @@ def _say(what: dict[str, Any]) -> None:
     sys.__stdout__.flush()  # type: ignore[union-attr]
 
 
-def export_openvino(model: Path, folder: Path, size: tuple[int, int]) -> Path:
-    """Their export of a copy of the checkpoint, for one size (height, width)."""
-    from ultralytics import YOLO
+_EXPORT = """
+import sys
+from ultralytics import YOLO
+size = [int(number) for number in sys.argv[2:]]
+YOLO(sys.argv[1]).export(format="openvino", imgsz=size, half=False, verbose=False)
+"""
 
+
+def export_openvino(python: Path, model: Path, folder: Path, size: tuple[int, int]) -> Path:
+    """Their export of a copy of the checkpoint, for one size (height, width)."""
     copy = folder / model.name
     shutil.copyfile(model, copy)
-    return Path(YOLO(copy).export(format="openvino", imgsz=list(size), half=False, verbose=False))
+    command = [str(python), "-c", _EXPORT, str(copy), *map(str, size)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    exported = copy.with_name(f"{copy.stem}_openvino_model")
+    if done.returncode or not exported.is_dir():
+        raise RuntimeError(f"{python}: cannot export {model}: {done.stderr.strip()[-300:]}")
+    return exported
+
+
+def ratios(rows: list[dict[str, Any]]) -> list[str]:
+    """Each of ours against each of theirs: the share of the time and of the processor time."""
+    theirs = [row for row in rows if row["runtime"].startswith("ultralytics")]
+    return [
+        f"{ours['runtime']}: {ours['p50_ms'] / other['p50_ms']:.2f} of the time (p50), "
+        f"{ours['processor_ms'] / other['processor_ms']:.2f} of the processor time of {other['runtime']}"
+        for other in theirs
+        for ours in rows
+        if ours not in theirs
+    ]
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description="Ultralytics and ours, measured in turn.")
     parser.add_argument("--model", type=Path, required=True)
+    parser.add_argument("--python", type=Path, default=Path(sys.executable), help="has ultralytics")
     parser.add_argument("--threads", type=int, default=2, help="ours, and theirs where forced")
     parser.add_argument("--frames", type=int, default=50)
     parser.add_argument("--frame", default="640x480")
     parser.add_argument("--only", default="", help="of " + ", ".join((*CONTESTANTS, *OURS)))
     parser.add_argument("--json", action="store_true")
-    parser.add_argument("--contestant", action="store_true", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     from companion.bench.detector import Measured, draw_pictures, in_turn, machine, table
 
@@ -108,10 +136,12 @@ def main() -> int:
                     command = [sys.executable, "-m", "companion.bench.detector"]
                     asked = {"runtime": one, "threads": arguments.threads}
                 else:
-                    command = [sys.executable, __file__, "--model", "-", "--contestant"]
+                    command = [str(arguments.python), __file__, "--contestant"]
                     asked = {"name": one, "threads": arguments.threads if one == "forced-threads" else None}
                     if one == "own-openvino":
-                        asked["model"] = str(export_openvino(arguments.model, folder, (height, width)))
+                        asked["model"] = str(
+                            export_openvino(arguments.python, arguments.model, folder, (height, width))
+                        )
                 measured.append(Measured(one, command, order | asked))
             in_turn(measured, arguments.frames)
             rows = [one.figures() for one in measured]
@@ -124,10 +154,8 @@ def main() -> int:
         return 0
     for line in table(result):
         print(line)
-    rates = {row["runtime"]: row["frames_per_s"] for row in rows}
-    for theirs in (name for name in rates if name.startswith("ultralytics")):
-        for ours in (name for name in rates if not name.startswith("ultralytics")):
-            print(f"{ours}: {rates[ours] / rates[theirs]:.2f} times the frames per second of {theirs}")
+    for line in ratios(rows):
+        print(line)
     return 0
 
 

@@ -29,6 +29,7 @@ def bench_detector(
     frames: Annotated[int, typer.Option(min=5, help="Number of frames after a warm-up.")] = 100,
     threads: Annotated[int | None, typer.Option(min=1, help="CPU threads. Default: the runtime's.")] = None,
     precision: Annotated[str, typer.Option(help="Precision: auto, float32, bfloat16 or float16.")] = "auto",
+    device: Annotated[str, typer.Option(help="Device of torch: cpu or cuda.")] = "cpu",
     classes: Annotated[
         str | None, typer.Option(help="Classes to detect: names or ids, comma separated. Default: all.")
     ] = None,
@@ -54,6 +55,7 @@ def bench_detector(
             frames=frames,
             threads=threads,
             precision=precision,
+            device=device,
             classes=named,
             width=width,
             height=height,

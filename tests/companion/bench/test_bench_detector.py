@@ -42,13 +42,14 @@ def test_measurement_has_all_figures_and_can_be_compared(small_model: Path, tmp_
     assert 0 < row["p50_ms"] <= row["p99_ms"] <= row["max_ms"]
     assert 0 < row["around_p50_ms"] < row["p50_ms"] + row["max_ms"]
     assert row["frames_per_s"] > 0
+    assert row["processor_ms"] > 0
     assert row["memory_mb"] > 10
     assert row["first_detection_s"] > 0
     (tmp_path / "earlier.json").write_text(json.dumps(earlier))
     heading, line = bench(small_model, "--against", str(tmp_path / "earlier.json")).splitlines()
     assert heading.split() == [
-        "runtime", "precision", "threads", "fastest_ms", "p50_ms", "p99_ms", "around_p50_ms", "frames_per_s",
-        "memory_mb", "first_detection_s",
+        "runtime", "precision", "threads", "fastest_ms", "p50_ms", "p99_ms", "around_p50_ms", "processor_ms",
+        "frames_per_s", "memory_mb", "first_detection_s",
     ]  # fmt: skip
     assert f"p50 was {row['p50_ms']} ms" in line
 
@@ -62,6 +63,7 @@ def test_what_was_not_measured_before_says_so() -> None:
         "p50_ms",
         "p99_ms",
         "around_p50_ms",
+        "processor_ms",
         "frames_per_s",
     )
     row = dict.fromkeys([*names, "memory_mb", "first_detection_s"], 1)
