@@ -27,7 +27,7 @@ from vision.object_detector import (
     detector,
     resolve_classes,
 )
-from vision.runtimes.base import PRECISIONS, Precision
+from vision.runtimes.base import PRECISIONS, Device, Precision
 from vision.runtimes.selection import RuntimeChoice, check_runtime, start_runtime
 from vision.runtimes.source import read_source
 from vision.runtimes.stored_choice import forget_choices
@@ -77,6 +77,7 @@ class Detector(ObjectDetector):
         threads: int | None = None,
         square: bool = False,
         runtime: RuntimeChoice = "torch",
+        device: Device = "cpu",
     ) -> None:
         """Load the model.
 
@@ -93,6 +94,7 @@ class Detector(ObjectDetector):
             precision: `auto` selects bfloat16 only where the processor supports it (a fifth less time).
             threads: processor threads of the runtime (torch: of the whole process); None: its default.
             square: pad the input to a square rather than to the next multiple of the stride.
+            device: `cpu`, or `cuda` for a checkpoint on torch.
             runtime: by name, or `auto` for the fastest installed one (measured once, cached).
 
         Raises:
@@ -132,6 +134,7 @@ class Detector(ObjectDetector):
             threads=threads,
             image_size=image_size,
             sparse_boxes=confidence >= _SPARSE_FROM,
+            device=device,
         )
         self._runtime = started.runtime
         self.foreign: ForeignFacts | None = None
@@ -240,6 +243,7 @@ def _open_yolo(settings: DetectorSettings) -> ObjectDetector:
         precision=settings.precision,
         threads=settings.threads,
         runtime=settings.runtime,
+        device=settings.device,
     )
 
 

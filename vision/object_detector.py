@@ -15,7 +15,7 @@ from vision.detections import Detections
 from vision.registry import Registry
 
 if TYPE_CHECKING:
-    from vision.runtimes.base import Precision
+    from vision.runtimes.base import Device, Precision
     from vision.runtimes.selection import RuntimeChoice
 
 YOLO = "yolo"
@@ -35,6 +35,7 @@ class DetectorSettings:
         precision: of the network, or `auto`.
         threads: processor threads; None: the detector's default.
         runtime: of the network, or `auto`.
+        device: of torch, `cpu` or `cuda`.
     """
 
     model: str = "default"
@@ -45,6 +46,7 @@ class DetectorSettings:
     precision: Precision = "auto"
     threads: int | None = None
     runtime: RuntimeChoice = "torch"
+    device: Device = "cpu"
 
 
 @dataclass(frozen=True, slots=True)

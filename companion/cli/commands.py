@@ -337,6 +337,7 @@ def detect(
         str, typer.Option(help="Runtime: torch, onnxruntime, openvino, tensorrt or auto.")
     ] = "torch",
     precision: Annotated[str, typer.Option(help="Precision: auto, float32, bfloat16 or float16.")] = "auto",
+    device: Annotated[str, typer.Option(help="Device of torch: cpu or cuda.")] = "cpu",
     threads: Annotated[int | None, typer.Option(min=1, help="CPU threads of the network.")] = None,
     retune: Annotated[
         bool, typer.Option("--retune", help="Measure this model's runtimes and precisions again.")
@@ -392,6 +393,7 @@ def detect(
             iou=iou,
             image_size=image_size,
             precision=precision,  # type: ignore[arg-type]
+            device=device,  # type: ignore[arg-type]
             threads=threads,
             runtime=runtime,  # type: ignore[arg-type]
         )

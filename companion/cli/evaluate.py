@@ -31,6 +31,7 @@ def evaluate(
     precision: Annotated[
         str, typer.Option(help="Precision: auto, float32, bfloat16 or float16.")
     ] = "float32",
+    device: Annotated[str, typer.Option(help="Device of torch: cpu or cuda.")] = "cpu",
     threads: Annotated[int | None, typer.Option(min=1, help="CPU threads of the network.")] = None,
     tiles: Annotated[
         bool, typer.Option("--tiles", help="Process images in tiles too, as `detect --tiles`.")
@@ -68,6 +69,7 @@ def evaluate(
             iou=iou,
             image_size=image_size,
             precision=precision,  # type: ignore[arg-type]
+            device=device,  # type: ignore[arg-type]
             threads=threads,
             runtime=runtime,  # type: ignore[arg-type]
         )

@@ -269,6 +269,8 @@ class DetectorSection(Section):
     """inference runtime; auto uses the fastest installed, measured once on this board"""
     precision: Literal["auto", "float32", "bfloat16", "float16"] = "auto"
     """arithmetic of the network; auto uses bfloat16 if the processor supports it well"""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """where torch computes a checkpoint; cuda: an NVIDIA GPU"""
     threads: Annotated[int | None, Field(ge=1, le=256)] = None
     """CPU threads of the network; unset: all processors but one, divided among the cameras"""
     every: Annotated[int, Field(ge=1, le=1000)] = 1
@@ -306,6 +308,7 @@ class DetectorSection(Section):
             iou=self.iou,
             image_size=self.image_size,
             precision=self.precision,
+            device=self.device,
             threads=self.threads,
             runtime=self.runtime,
         )

@@ -17,6 +17,8 @@ from vision.yolo.level_outputs import Head, LevelOutput, Product
 RuntimeName = Literal["torch", "onnxruntime", "openvino", "tensorrt"]
 RUNTIMES: tuple[RuntimeName, ...] = ("torch", "onnxruntime", "openvino", "tensorrt")
 Precision = Literal["auto", "float32", "bfloat16", "float16"]
+Device = Literal["cpu", "cuda"]
+DEVICES: tuple[Device, ...] = ("cpu", "cuda")
 PRECISIONS: tuple[Precision, ...] = ("auto", "float32", "bfloat16", "float16")
 
 

@@ -8,7 +8,16 @@ from typing import Literal
 
 from vision.foreign.engines import ForeignRuntime
 from vision.runtimes.autotune import fastest_runtime
-from vision.runtimes.base import RUNTIMES, Precision, Runtime, installed, required
+from vision.runtimes.base import (
+    DEVICES,
+    RUNTIMES,
+    Device,
+    Precision,
+    Runtime,
+    RuntimeUnusableError,
+    installed,
+    required,
+)
 from vision.runtimes.source import ModelSource, cannot_run
 from vision.runtimes.start import start_named
 
@@ -36,6 +45,7 @@ def start_runtime(
     threads: int | None = None,
     image_size: int = 640,
     sparse_boxes: bool = False,
+    device: Device = "cpu",
 ) -> SelectedRuntime:
     """Load a model on the requested runtime.
 
@@ -44,6 +54,7 @@ def start_runtime(
             filtered afterwards.
         sparse_boxes: compute a checkpoint's boxes only at candidate cells; for thresholds that few cells
             reach. An exported file computes all.
+        device: `cuda` for a checkpoint on torch; the other runtimes choose theirs.
 
     Raises:
         RuntimeMissingError: the named runtime is not installed. There is no fallback.
@@ -51,9 +62,16 @@ def start_runtime(
     """
     if choice != "auto" and choice not in RUNTIMES:
         raise ValueError(f"runtime must be auto, {', '.join(RUNTIMES)}; got {choice!r}")
+    if device not in DEVICES:
+        raise ValueError(f"device must be {' or '.join(DEVICES)}; got {device!r}")
     check_runtime(source, choice)
+    if device != "cpu" and (choice != "torch" or source.kind is not None or source.foreign is not None):
+        raise RuntimeUnusableError(
+            f"{source.path}: the device {device} is for a checkpoint with the runtime torch, not for this "
+            f"file with {choice}; onnxruntime uses an NVIDIA GPU with the package onnxruntime-gpu"
+        )
     if choice != "auto":
-        runtime = start_named(source, choice, class_ids, precision, threads, image_size, sparse_boxes)
+        runtime = start_named(source, choice, class_ids, precision, threads, image_size, sparse_boxes, device)
         return SelectedRuntime(runtime, "as requested")
     candidates = [name for name in source.runners() if installed(name)]
     if len(candidates) == 1:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vision.foreign.engines import ForeignRuntime, start_foreign
-from vision.runtimes.base import Precision, Runtime, RuntimeName, RuntimeUnusableError, version
+from vision.runtimes.base import Device, Precision, Runtime, RuntimeName, RuntimeUnusableError, version
 from vision.runtimes.exported import FORMAT, SUFFIXES, ExportedFacts, ExportKind
 from vision.runtimes.source import ModelSource, runtime_of_file
 from vision.runtimes.stored_choice import cache_folder
@@ -37,6 +37,7 @@ def start_named(
     threads: int | None,
     image_size: int,
     sparse_boxes: bool,
+    device: Device = "cpu",
 ) -> Runtime | ForeignRuntime:
     """Load a model on this runtime, which is installed. Arguments and errors as of `start_runtime`."""
     if source.foreign is not None:
@@ -54,6 +55,7 @@ def start_named(
             threads=threads,
             sparse_boxes=sparse_boxes,
             model_sha256=weights_sha256(source.weights_path),
+            device=device,
         )
     from vision.runtimes.network import Network
 

@@ -1,4 +1,4 @@
-"""torch, the default runtime, on the processor: a checkpoint's network as a traced graph, or TorchScript."""
+"""torch, the default runtime: a checkpoint's network as a traced graph, or TorchScript; on CPU or CUDA."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from torch import Tensor
 
 from vision.foreign.layouts import ForeignFacts, recognise_by_metadata
 from vision.runtimes import base
-from vision.runtimes.base import Precision, RuntimeName, RuntimeUnusableError
+from vision.runtimes.base import Device, Precision, RuntimeName, RuntimeUnusableError
 from vision.runtimes.exported import KEY, ExportedFacts, not_ours, own_facts
 from vision.runtimes.network import Network
 from vision.runtimes.stored_choice import StoredChoice
@@ -31,6 +31,7 @@ logger = logging.getLogger(__name__)
 
 Graph = Callable[[Tensor], tuple[Tensor, ...]]
 _DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
+_CUDA_DTYPES = {**_DTYPES, "float16": torch.float16}
 # For graphs valid for one size only. A camera has one size; a folder of photographs a few.
 _MOST_GRAPHS = 4
 # Input sizes for tracing and for checking the graph, in strides: height and width.
@@ -61,6 +62,7 @@ class TorchRuntime:
         threads: processor threads, of torch in the whole process; None: unchanged.
         sparse_boxes: see `Network`.
         model_sha256: of the weights; with it, a measured precision is stored for later starts.
+        device: `cuda`: torch's current CUDA device; there `auto` is float32.
     """
 
     product: Product = staticmethod(torch_product)
@@ -75,17 +77,23 @@ class TorchRuntime:
         threads: int | None = None,
         sparse_boxes: bool = False,
         model_sha256: str | None = None,
+        device: Device = "cpu",
     ) -> None:
-        if precision not in ("auto", *_DTYPES):
+        check_device(device)
+        dtypes = _DTYPES if device == "cpu" else _CUDA_DTYPES
+        if precision not in ("auto", *dtypes):
             raise RuntimeUnusableError(
-                f"torch computes in float32 or bfloat16 on the processor, not {precision}"
+                f"torch computes in {' or '.join(dtypes)} on {device}, not in {precision}"
             )
+        self.device = torch.device(device)
         if threads is not None:
             torch.set_num_threads(threads)
+        # On a GPU the boxes of all cells cost less than copying the neck's features from it.
+        sparse_boxes = sparse_boxes and device == "cpu"
         self._network = Network(model, class_ids, sparse_boxes=sparse_boxes).channels_last()
         self.head: Head = self._network.head
         self.precision, self.precision_reason = self._choose_precision(precision, model_sha256)
-        self._network.in_precision(_DTYPES[self.precision])
+        self._network.in_precision(dtypes[self.precision]).to(self.device)
         self._graphs: collections.OrderedDict[tuple[int, int], Graph] = collections.OrderedDict()
         self._graph = self._any_size()
 
@@ -100,10 +108,10 @@ class TorchRuntime:
             self.infer(blank)
 
     def infer(self, image_bgr: NDArray[np.uint8]) -> list[LevelOutput]:
-        pixels = torch.from_numpy(image_bgr).unsqueeze(0)
+        pixels = torch.from_numpy(image_bgr).unsqueeze(0).to(self.device)
         with torch.inference_mode():
             graph = self._graph or self._graph_of_size(pixels)
-            outputs = [level[0].numpy() for level in graph(pixels)]
+            outputs = [level[0].cpu().numpy() for level in graph(pixels)]
         return self.head.levels(outputs)
 
     def _any_size(self) -> Graph | None:
@@ -112,7 +120,9 @@ class TorchRuntime:
         # Noise, so that outputs that were split and concatenated wrongly differ.
         noise = torch.Generator().manual_seed(0)
         shown, checked = (
-            torch.randint(256, (1, high * stride, wide * stride, 3), generator=noise, dtype=torch.uint8)
+            torch.randint(256, (1, high * stride, wide * stride, 3), generator=noise, dtype=torch.uint8).to(
+                self.device
+            )
             for high, wide in (_TRACED, _TRIED)
         )
         graph = traced(self._network, shown)
@@ -142,10 +152,12 @@ class TorchRuntime:
 
     def _choose_precision(self, requested: Precision, model_sha256: str | None) -> tuple[str, str]:
         native = base.bfloat16_instructions()
-        if requested == "bfloat16" and not native:
+        if requested == "bfloat16" and not native and self.device.type == "cpu":
             logger.warning("this processor does not support bfloat16; it is emulated and slow")
         if requested != "auto":
             return requested, "as requested"
+        if self.device.type != "cpu":
+            return "float32", f"the default on {self.device}"
         if not native:
             return "float32", "this processor does not support bfloat16"
         stored = None
@@ -183,6 +195,15 @@ class TorchRuntime:
                     graph(pixels)
                     spent.append((time.process_time() - started) * 1e3)
         return [min(spent) for spent in times]
+
+
+def check_device(device: Device) -> None:
+    """Raise `RuntimeUnusableError` if torch cannot compute on it."""
+    if device == "cuda" and not torch.cuda.is_available():
+        raise RuntimeUnusableError(
+            f"device cuda: torch {torch.__version__} finds no CUDA device; use the device cpu, or install a "
+            "torch built for CUDA and the driver"
+        )
 
 
 def traced(network: Network, pixels: Tensor) -> Graph:

@@ -9,12 +9,15 @@ import pytest
 import torch
 
 from tests.vision.runtimes.conftest import lively_model, make_image
-from vision.runtimes import base
+from vision.detector import Detector
+from vision.runtimes import base, selection
 from vision.runtimes import torch_runtime as torch_runtime_module
 from vision.runtimes.base import RuntimeUnusableError
 from vision.runtimes.network import Network
+from vision.runtimes.source import read_source
 from vision.runtimes.stored_choice import forget_choices
 from vision.runtimes.torch_runtime import TorchRuntime, torch_product
+from vision.yolo.architecture import YoloModel
 
 
 @pytest.fixture
@@ -132,3 +135,31 @@ def test_threads_are_set_and_reported() -> None:
 def test_torch_product_matches_numpy() -> None:
     a, b = np.random.default_rng(0).random((2, 5, 5), np.float32)
     np.testing.assert_allclose(torch_product(a, b), a @ b, rtol=1e-5)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="a CUDA device is here")
+def test_cuda_without_a_device_is_refused(checkpoint: Path) -> None:
+    with pytest.raises(RuntimeUnusableError, match=r"device cuda: torch .* finds no CUDA device"):
+        Detector(checkpoint, device="cuda")
+
+
+def test_cuda_is_refused_for_other_runtimes_and_unknown_devices(checkpoint: Path) -> None:
+    source = read_source(checkpoint)
+    for runtime in ("openvino", "auto"):
+        with pytest.raises(RuntimeUnusableError, match=r"the device cuda is for a checkpoint"):
+            selection.start_runtime(source, runtime, device="cuda")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="cpu or cuda"):
+        Detector(checkpoint, device="tpu")  # type: ignore[arg-type]
+
+
+def test_network_and_pixels_are_moved_to_the_device(
+    model: YoloModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch_runtime_module, "check_device", lambda device: None)
+    # The meta device computes shapes only: whatever stays on the processor fails there.
+    monkeypatch.setattr(torch.Tensor, "cpu", lambda tensor: torch.zeros(tensor.shape, dtype=tensor.dtype))
+    monkeypatch.setattr(TorchRuntime, "_any_size", lambda runtime: runtime._network)
+    runtime = TorchRuntime(model, device="meta", sparse_boxes=True)  # type: ignore[arg-type]
+    assert (runtime.precision, runtime.head.boxes) == ("float32", None)
+    levels = runtime.infer(make_image(64, 96))
+    assert [level.classes.shape[1:] for level in levels] == [(8, 12), (4, 6), (2, 3)]
