@@ -7,21 +7,19 @@ guidance.
 
 from __future__ import annotations
 
-import base64
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.bus.topics import DETECTIONS
 from companion.recording import RecordingError
 from companion.recording.convert import RUN_CHANNEL
 from companion.recording.files import RecordingReader
+from companion.recording.frames import recorded_frames
 from companion.settings import Settings
 from vision.detections import TRACK_CONFIRMED
 from vision.detector import open_detector
@@ -73,11 +71,6 @@ def replay_detections(paths: Sequence[Path], model: str) -> DetectionReplay:
     """
     settings = _settings_of(paths)
     steering = settings.guidance.camera
-    prefix = "" if steering is None else f"cameras/{steering}/"
-    if settings.preview.annotate:
-        raise RecordingError(
-            f"{paths[0]}: detections are drawn into its images: record with preview.annotate = false"
-        )
     steering_settings = settings.of_camera(steering)
     confidence = steering_settings.detector.confidence
     following = steering_settings.tracker.following(confidence) if steering_settings.tracker.enabled else None
@@ -90,7 +83,7 @@ def replay_detections(paths: Sequence[Path], model: str) -> DetectionReplay:
     found = DetectionReplay(model)
     overlap: list[float] = []
     tracks: tuple[set[int], set[int]] = (set(), set())
-    for captured_ns, image, message in _frames(paths, f"/{prefix}image", f"{prefix}{DETECTIONS.name}"):
+    for captured_ns, image, message in recorded_frames(paths, steering):
         replayed = detector.detect(image)
         if tracker is not None:
             replayed = tracker.update(replayed, captured_ns, image=image).detections
@@ -139,29 +132,6 @@ def _settings_of(paths: Sequence[Path]) -> Settings:
         except (ValueError, KeyError) as error:
             raise RecordingError(f"{paths[0]}: its settings cannot be read: {error}") from error
     raise RecordingError(f"{paths[0]}: not a recording of the service: it has no message on 'run'")
-
-
-def _frames(
-    paths: Sequence[Path], images: str, detections: str
-) -> Iterator[tuple[int, NDArray[np.uint8], dict[str, Any]]]:
-    """Capture stamp, image (BGR) and detection message of each recorded image that has both, in order."""
-    for path in paths:
-        reader = RecordingReader(path)
-        # An image arrives up to a second after the message about its frame; both have the capture's time.
-        waiting: dict[int, Any] = {}
-        run = next(iter(reader.messages(RUN_CHANNEL)))
-        offset_ns = json.loads(run.data)["unix_offset_ns"]
-        for message in reader.messages(images, detections):
-            body = json.loads(message.data)
-            if message.channel.topic == detections:
-                waiting[body["captured_ns"]] = body
-                continue
-            captured_ns = body["timestamp"]["sec"] * 10**9 + body["timestamp"]["nsec"] - offset_ns
-            found = waiting.get(captured_ns)
-            waiting = {stamp_ns: each for stamp_ns, each in waiting.items() if stamp_ns > captured_ns}
-            image = cv2.imdecode(np.frombuffer(base64.b64decode(body["data"]), np.uint8), cv2.IMREAD_COLOR)
-            if found is not None and image is not None:
-                yield captured_ns, image.astype(np.uint8, copy=False), found
 
 
 def _boxes(boxes: list[list[float]]) -> NDArray[np.float64]:

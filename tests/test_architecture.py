@@ -33,6 +33,7 @@ FLOORS = {
     "preview": 9,
     "detect": 9,
     "calibrate": 9,
+    "collect": 9,
     "evaluate": 8,
     "flight_log": 9,
     "markers": 9,

@@ -33,7 +33,7 @@ from companion.cli.mcp import MCP_SETTINGS, mcp
 from companion.cli.mission import mission
 from companion.cli.models import models
 from companion.cli.play import play
-from companion.cli.recordings import RECORD_SETTINGS, log, record, replay, sightings
+from companion.cli.recordings import RECORD_SETTINGS, collect, log, record, replay, sightings
 from companion.cli.topics import topics
 from companion.cli.train import train
 from companion.cli.train_policy import train_policy
@@ -70,6 +70,7 @@ ORDER = (
     "sightings",
     "config",
     "markers",
+    "collect",
     "evaluate",
     "train",
     "train-policy",
@@ -103,6 +104,7 @@ app.add_typer(bench, name="bench")
 settings_command(app, *CLIENT_SETTINGS, *RECORD_SETTINGS)(record)
 settings_command(app, "plugins")(replay)
 app.command()(sightings)
+settings_command(app, *CLIENT_SETTINGS)(collect)
 app.add_typer(log, name="log")
 
 EXIT_FAILED = 1

@@ -6,6 +6,7 @@ import itertools
 import json
 import signal
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -112,6 +113,49 @@ def replay(
             typer.echo(line)
     if found.first is not None or (detections is not None and detections.differing_images):
         raise typer.Exit(EXIT_DIFFERENT)
+
+
+def collect(
+    settings: Settings,
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="Folder of the data set, new or to be continued.")
+    ],
+    files: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="[FILE…]", help="Recordings of one run, in order. None: a running service."),
+    ] = None,
+    connect: Annotated[str | None, typer.Option(help="Zenoh endpoint of the service or its router.")] = None,
+    camera: Annotated[str | None, typer.Option(help="Name of the camera. Default: the first.")] = None,
+    interval: Annotated[float, typer.Option(min=0, help="Least time between two images, seconds.")] = 1.0,
+    most: Annotated[int, typer.Option(min=1, help="Number of images.")] = 200,
+) -> None:
+    """Collect frames to label: those with tracks that were doubted, lost, or changed class.
+
+    From recordings, or from a running service until Ctrl-C. The labels are the model's own boxes; correct
+    them, then train with `companion train --data FOLDER`.
+    """
+    from companion.bus.client import NoAnswerError, client_settings
+    from companion.bus.config import BusError
+
+    with _with_library():
+        from companion import collect as collecting
+        from companion.recording import RecordingError
+        from companion.recording.frames import recorded_frames
+    ending = threading.Event()
+    kept = 0
+    with plain_errors(RecordingError, NoAnswerError, BusError, ValueError, OSError):
+        if files:
+            frames, source = recorded_frames(files, camera), files[0].stem
+        else:
+            for number in (signal.SIGINT, signal.SIGTERM):
+                signal.signal(number, lambda *_: ending.set())
+            zenoh = client_settings(settings.zenoh, (connect,) if connect else ())
+            source = f"{settings.vehicle.name}_{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}"
+            frames = collecting.live_frames(zenoh, settings.vehicle.name, camera, ending)
+        for path, reasons in collecting.collect(frames, folder, source, interval_s=interval, most=most):
+            kept += 1
+            typer.echo(f"{path}: {', '.join(reasons)}")
+    typer.echo(f"{folder}: {kept} images", err=True)
 
 
 def _key_and_value(text: str) -> tuple[str, str]:

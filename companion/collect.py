@@ -1,0 +1,183 @@
+"""`companion collect`: frames in which the detector was in doubt, as a data set to label.
+
+Such frames teach a detector most. Each is labelled with the model's own boxes, to be corrected by hand.
+"""
+
+from __future__ import annotations
+
+import json
+import queue
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+import cv2
+import numpy as np
+
+from companion.bus.client import open_client
+from companion.bus.topics import DETECTIONS, IMAGE
+from companion.recording import RecordingError
+from companion.recording.frames import DetectedFrame
+from companion.settings import ZenohSection
+from vision.detections import TRACK_CONFIRMED, TRACK_TENTATIVE
+from vision.plain_yaml import load_plain_yaml
+
+DOUBTED, LOST, CHANGED = "doubted", "lost", "changed class"
+# Of every this many images one is for validation.
+VALIDATION_EVERY = 5
+# A lost track whose box was this near to the image's edge has left the image: share of its width.
+EDGE = 0.02
+# Messages that wait for their image: about two seconds of a fast camera.
+_MOST_WAITING = 100
+_POLL_S = 0.1
+
+
+class DoubtFinder:
+    """Compares each frame's tracks with those of the frame before."""
+
+    def __init__(self) -> None:
+        self._confirmed: dict[int, dict[str, Any]] = {}
+        self._class_of: dict[int, str] = {}
+
+    def update(self, message: dict[str, Any]) -> list[str]:
+        """The reasons to keep a frame, such as `doubted car 12`; empty for none.
+
+        Doubted is a track that is not confirmed: a few detections only, low scores, or two classes. Lost is a
+        confirmed one that the frame before had, and that was not at the edge. `message`: on `detections`.
+        """
+        tracks = {one["track_id"]: one for one in message["detections"] if one["track_id"] is not None}
+        reasons = []
+        for number, one in tracks.items():
+            before = self._class_of.get(number, one["class_name"])
+            if before != one["class_name"]:
+                reasons.append(f"{CHANGED} {before} {number} to {one['class_name']}")
+            elif one["track_state"] == TRACK_TENTATIVE:
+                reasons.append(f"{DOUBTED} {one['class_name']} {number}")
+        for number, one in self._confirmed.items():
+            if number not in tracks and not _at_edge(one["xyxy"], message["width"], message["height"]):
+                reasons.append(f"{LOST} {one['class_name']} {number}")
+        self._class_of |= {number: one["class_name"] for number, one in tracks.items()}
+        self._confirmed = {n: one for n, one in tracks.items() if one["track_state"] == TRACK_CONFIRMED}
+        return reasons
+
+
+def _at_edge(xyxy: list[float], width: int, height: int) -> bool:
+    margin = EDGE * width
+    left, top, right, bottom = xyxy
+    return min(left, top, width - right, height - bottom) < margin
+
+
+class LabelFolder:
+    """A YOLO data set that grows: images, labels and `data.yaml`. An existing one is continued.
+
+    Raises:
+        OSError: it cannot be written. ValueError: its `data.yaml` has no list of names.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._table = folder, folder / "data.yaml"
+        self._names: list[str] = []
+        if self._table.is_file():
+            table = load_plain_yaml(self._table.read_text("utf-8"))
+            names = table.get("names") if isinstance(table, dict) else None
+            if not isinstance(names, list):
+                raise ValueError(f"{self._table}: expected a list `names`, as `companion collect` writes it")
+            self._names = [str(name) for name in names]
+        self._count = sum(1 for _ in folder.glob("images/*/*.jpg"))
+
+    def add(self, name: str, frame: DetectedFrame) -> Path:
+        """Write an image and its labels; returns the image's file. One of the same name is replaced."""
+        known = next(self._folder.glob(f"images/*/{name}.jpg"), None)
+        split = "val" if self._count % VALIDATION_EVERY == VALIDATION_EVERY - 1 else "train"
+        image = known or self._folder / "images" / split / f"{name}.jpg"
+        labels = self._folder / "labels" / image.parent.name / f"{name}.txt"
+        for path in (image, labels):
+            path.parent.mkdir(parents=True, exist_ok=True)
+        done, jpeg = cv2.imencode(".jpg", frame.image, (cv2.IMWRITE_JPEG_QUALITY, 95))
+        if not done:
+            raise OSError(f"cannot encode {image}")
+        image.write_bytes(jpeg.tobytes())
+        labels.write_text("".join(self._lines(frame.message)), "utf-8")
+        self._count += known is None
+        validation = "images/val" if self._count >= VALIDATION_EVERY else "images/train"
+        names = json.dumps(self._names)
+        self._table.write_text(f"train: images/train\nval: {validation}\nnames: {names}\n", "utf-8")
+        return image
+
+    def _lines(self, message: dict[str, Any]) -> Iterator[str]:
+        """`class x y width height` of each detection: centre and size as fractions of the image."""
+        for one in message["detections"]:
+            if one["class_name"] not in self._names:
+                self._names.append(one["class_name"])
+            sides = np.array([message["width"], message["height"]])
+            box = np.clip(np.array(one["xyxy"]).reshape(2, 2) / sides, 0.0, 1.0)
+            x, y, width, height = *box.mean(axis=0), *(box[1] - box[0])
+            if min(width, height) > 0:
+                class_id = self._names.index(one["class_name"])
+                yield f"{class_id} {x:.6f} {y:.6f} {width:.6f} {height:.6f}\n"
+
+
+def live_frames(
+    zenoh: ZenohSection, vehicle: str, camera: str | None, ending: Event
+) -> Iterator[DetectedFrame]:
+    """The preview images of a running service with their detections, until `ending` is set.
+
+    Raises:
+        NoAnswerError: no service at the endpoint. RecordingError: detections are drawn into the images.
+    """
+    received: queue.Queue[tuple[bytes, bytes | None]] = queue.Queue()
+    waiting: dict[int, Any] = {}
+
+    def receive(sample: Any) -> None:
+        attachment = sample.attachment
+        received.put((sample.payload.to_bytes(), None if attachment is None else attachment.to_bytes()))
+
+    with open_client(zenoh) as session:
+        subscribers = [
+            session.declare_subscriber(topic.key(vehicle, camera), receive) for topic in (DETECTIONS, IMAGE)
+        ]
+        while not ending.is_set():
+            try:
+                payload, attachment = received.get(timeout=_POLL_S)
+            except queue.Empty:
+                continue
+            if attachment is None:
+                message = json.loads(payload)
+                waiting[message["captured_ns"]] = message
+                waiting = dict(list(waiting.items())[-_MOST_WAITING:])
+                continue
+            about = json.loads(attachment)
+            if about["annotated"]:
+                raise RecordingError(
+                    f"{vehicle}: detections are drawn into its images: set preview.annotate = false"
+                )
+            found = waiting.get(about["captured_ns"])
+            image = cv2.imdecode(np.frombuffer(payload, np.uint8), cv2.IMREAD_COLOR)
+            if found is not None and image is not None:
+                yield DetectedFrame(about["captured_ns"], image.astype(np.uint8, copy=False), found)
+        for subscriber in subscribers:
+            subscriber.undeclare()  # type: ignore[no-untyped-call]
+
+
+def collect(
+    frames: Iterable[DetectedFrame], folder: Path, source: str, *, interval_s: float = 1.0, most: int = 200
+) -> Iterator[tuple[Path, list[str]]]:
+    """Add the frames with a doubt to a folder, and return each image's file with the reasons.
+
+    Args:
+        source: first part of the files' names; the rest is the frame's number.
+        interval_s: least time between two of them; what follows at once looks the same.
+        most: number of images.
+    """
+    labelled, doubts = LabelFolder(folder), DoubtFinder()
+    due_ns = kept = 0
+    for frame in frames:
+        reasons = doubts.update(frame.message)
+        if not reasons or frame.captured_ns < due_ns:
+            continue
+        yield labelled.add(f"{source}_{frame.message['sequence']:07d}", frame), reasons
+        due_ns = frame.captured_ns + round(interval_s * 1e9)
+        kept += 1
+        if kept >= most:
+            return

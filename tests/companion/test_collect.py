@@ -1,0 +1,166 @@
+"""Collecting frames to label: doubts about tracks, the data set, a recording and a running service."""
+
+from __future__ import annotations
+
+import json
+import threading
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import zenoh
+from typer.testing import CliRunner
+
+from companion.bench.lockstep_flight import plain_settings
+from companion.bus.session import zenoh_config
+from companion.bus.topics import DETECTIONS, IMAGE
+from companion.cli import app
+from companion.collect import DoubtFinder, collect, live_frames
+from companion.guidance.core import GuidanceOptions
+from companion.recording.convert import Converter
+from companion.recording.encoding import dumps
+from companion.recording.frames import DetectedFrame
+from companion.recording.tap import run_record
+from companion.settings import ZenohSection
+from mavlink_sim.testing import free_port
+from tests.companion.recording.lockstep_recording import new_writer
+from vision.evaluation.datasets import open_dataset
+
+MIDDLE = (40.0, 30.0, 80.0, 60.0)
+
+
+def track(
+    number: int | None, name: str, state: str = "confirmed", xyxy: tuple[float, ...] = MIDDLE
+) -> dict[str, Any]:
+    return {"track_id": number, "class_name": name, "track_state": state, "xyxy": list(xyxy)}
+
+
+def message(sequence: int, *tracks: dict[str, Any]) -> dict[str, Any]:
+    """Of a frame of 160x120, ten a second."""
+    captured_ns = 10**9 + sequence * 10**8
+    about = {"sequence": sequence, "captured_ns": captured_ns, "width": 160, "height": 120}
+    return {**about, "detections": list(tracks)}
+
+
+def test_sure_tracks_give_no_reason() -> None:
+    finder = DoubtFinder()
+    for sequence in range(3):
+        assert finder.update(message(sequence, track(1, "car"), track(None, "boat", "none"))) == []
+
+
+def test_doubted_lost_and_changed_tracks_are_reasons() -> None:
+    finder = DoubtFinder()
+    assert finder.update(message(0, track(1, "car"), track(2, "dog", "tentative"))) == ["doubted dog 2"]
+    assert finder.update(message(1, track(1, "truck"))) == ["changed class car 1 to truck"]
+    assert finder.update(message(2)) == ["lost truck 1"]
+    assert finder.update(message(3)) == []
+
+
+@pytest.mark.parametrize("xyxy", [(0, 30, 40, 60), (40, 0, 80, 30), (130, 30, 159, 60), (40, 100, 60, 119)])
+def test_track_that_leaves_the_image_is_not_lost(xyxy: tuple[float, ...]) -> None:
+    finder = DoubtFinder()
+    finder.update(message(0, track(1, "car", xyxy=xyxy)))
+    assert finder.update(message(1)) == []
+
+
+def image() -> np.ndarray:
+    return np.full((60, 80, 3), 90, np.uint8)  # half as wide as the frame
+
+
+def doubtful(count: int) -> list[DetectedFrame]:
+    """Frames with one certain car and one doubted dog each, ten a second."""
+    frames = []
+    for sequence in range(count):
+        found = message(sequence, track(1, "car"), track(2, "dog", "tentative", (0, 0, 20, 30)))
+        frames.append(DetectedFrame(found["captured_ns"], image(), found))
+    return frames
+
+
+def test_collected_frames_are_a_data_set_to_train_on(tmp_path: Path) -> None:
+    kept = list(collect(doubtful(60), tmp_path, "flight", interval_s=0.5, most=10))
+    assert [path.name for path, _ in kept[:2]] == ["flight_0000000.jpg", "flight_0000005.jpg"]
+    assert len(kept) == 10
+    train, val = (open_dataset(tmp_path, split=split) for split in ("train", "val"))
+    assert (len(train.samples), len(val.samples)) == (8, 2)
+    assert train.class_names == ("car", "dog")
+    assert train.samples[0].class_ids.tolist() == [0, 1]
+    assert train.samples[0].boxes_in(160, 120) == pytest.approx(np.array([MIDDLE, (0, 0, 20, 30)]), abs=0.01)
+    # The same frames again replace, others are added and numbered by the same names.
+    list(collect(doubtful(60), tmp_path, "flight", interval_s=0.5, most=10))
+    found = message(0, track(1, "boat", "tentative"))
+    list(collect([DetectedFrame(0, image(), found)], tmp_path, "other"))
+    again = open_dataset(tmp_path, split="train")
+    assert len(again.samples) == 9
+    assert again.class_names == ("car", "dog", "boat")
+
+
+def recorded(folder: Path, **changes: str) -> Path:
+    settings = plain_settings({"preview.annotate": "false", **changes})
+    writer, converter = new_writer(folder), Converter("vehicle1")
+
+    def write(path: str, payload: bytes, attachment: bytes | None = None) -> None:
+        for one in converter.convert(path, payload, attachment):
+            writer.write(*one)
+
+    write("@record/run", dumps(run_record(settings, GuidanceOptions(), (1, 191), "service1")))
+    for frame in doubtful(12):
+        about = {"captured_ns": frame.captured_ns, "sequence": frame.message["sequence"]}
+        tracks = [{**one, "confidence": 0.5} for one in frame.message["detections"]]
+        write("detections", dumps({**frame.message, "detections": tracks}))
+        write("image", cv2.imencode(".jpg", frame.image)[1].tobytes(), json.dumps(about).encode())
+    writer.close()
+    return writer.path
+
+
+def test_command_collects_from_a_recording(tmp_path: Path) -> None:
+    path = recorded(tmp_path / "recordings")
+    result = CliRunner().invoke(app, ["collect", str(tmp_path / "set"), str(path)])
+    assert result.exit_code == 0, result.stderr
+    assert [line.partition(": ")[2] for line in result.stdout.splitlines()] == ["doubted dog 2"] * 2
+    assert len(open_dataset(tmp_path / "set").samples) == 2
+
+
+@pytest.mark.parametrize("case", ["annotated", "no recording", "another table"])
+def test_unusable_input_is_one_line(tmp_path: Path, case: str) -> None:
+    path = recorded(tmp_path / "recordings", **({"preview.annotate": "true"} if case == "annotated" else {}))
+    if case == "no recording":
+        path.write_bytes(b"text")
+    if case == "another table":
+        (tmp_path / "set").mkdir()
+        (tmp_path / "set" / "data.yaml").write_text("names: {0: car}\n")
+    result = CliRunner().invoke(app, ["collect", str(tmp_path / "set"), str(path)])
+    assert result.exit_code == 2
+    assert len([line for line in result.stderr.splitlines() if line.startswith("companion:")]) == 1
+
+
+def test_live_images_are_joined_with_their_detections() -> None:
+    endpoint, ending = f"tcp/127.0.0.1:{free_port()}", threading.Event()
+    service = zenoh.open(zenoh_config(ZenohSection(mode="peer", listen=(endpoint,))))
+
+    def publish() -> None:
+        for sequence in range(10_000):
+            if ending.wait(0.02):
+                return
+            found = message(sequence, track(1, "car"))
+            about = {"sequence": sequence, "captured_ns": found["captured_ns"], "annotated": False}
+            service.put(DETECTIONS.key("vehicle1"), json.dumps(found))
+            jpeg = cv2.imencode(".jpg", image())[1].tobytes()
+            service.put(IMAGE.key("vehicle1"), jpeg, attachment=json.dumps(about))
+
+    publishing = threading.Thread(target=publish)
+    publishing.start()
+    try:
+        client = ZenohSection(mode="client", connect=(endpoint,), listen=())
+        frames = live_frames(client, "vehicle1", None, ending)
+        for _ in range(3):
+            frame = next(frames)
+            assert frame.captured_ns == frame.message["captured_ns"]
+            assert frame.image.shape == (60, 80, 3)
+        ending.set()
+        assert list(frames) == []
+    finally:
+        ending.set()
+        publishing.join()
+        service.close()  # type: ignore[no-untyped-call]
