@@ -110,12 +110,12 @@ class LabelFolder:
         for one in message["detections"]:
             if one["class_name"] not in self._names:
                 self._names.append(one["class_name"])
-            sides = np.array([message["width"], message["height"]])
-            box = np.clip(np.array(one["xyxy"]).reshape(2, 2) / sides, 0.0, 1.0)
-            x, y, width, height = *box.mean(axis=0), *(box[1] - box[0])
-            if min(width, height) > 0:
+            sides = (message["width"], message["height"])
+            left, top, right, bottom = np.clip(np.divide(one["xyxy"], sides * 2), 0.0, 1.0).tolist()
+            if left < right and top < bottom:
+                numbers = ((left + right) / 2, (top + bottom) / 2, right - left, bottom - top)
                 class_id = self._names.index(one["class_name"])
-                yield f"{class_id} {x:.6f} {y:.6f} {width:.6f} {height:.6f}\n"
+                yield f"{class_id} " + " ".join(f"{number:.6f}" for number in numbers) + "\n"
 
 
 def live_frames(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +20,8 @@ from vision.detector import Detector
 from vision.yolo.checkpoint import load_checkpoint
 from vision.yolo.recipe import DEFAULT_RECIPE, REFINEMENT
 from vision.yolo.training import Stage
+
+DATA = Path(os.environ.get("COMPANION_TEST_DATA", Path(__file__).parents[3] / "shared" / "data"))
 
 
 def test_training_writes_model_with_licence_and_score(
@@ -154,3 +158,21 @@ def test_option_for_own_data_without_data_is_refused(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, ["train", "--output", str(tmp_path / "m"), "--batch-size", "4"])
     assert result.exit_code == 2
     assert "--batch-size is an option of --data" in result.stderr
+
+
+@pytest.mark.slow
+def test_sixteen_photographs_are_learned(tmp_path: Path) -> None:
+    checkpoint, photographs = DATA / "models" / "yolov8n_coco.pt", tmp_path / "set"
+    if not checkpoint.is_file():
+        pytest.skip(f"{checkpoint}: test data not found; see COMPANION_TEST_DATA")
+    for labels in sorted((DATA / "coco" / "labels").iterdir())[:16]:
+        for path in (labels, DATA / "coco" / "images" / f"{labels.stem}.jpg"):
+            (photographs / path.parent.name).mkdir(parents=True, exist_ok=True)
+            shutil.copy(path, photographs / path.parent.name)
+    result = train_on_data(
+        photographs, tmp_path / "mine.safetensors", start=str(checkpoint), steps=60, seed=7
+    )
+    assert result.before is not None
+    assert result.before.map50 < 0.9
+    assert result.after.map50 >= 0.95
+    assert not result.held_out

@@ -148,6 +148,6 @@ def _scaled(item: TrainingImage, width: int, height: int) -> LabelledImage:
     image = read_image(item.path)
     box = fit_into(image.shape[1], image.shape[0], width, height)
     size = (box.resized_width, box.resized_height)
-    scale = np.array(size * 2, np.float32) / np.array(image.shape[1::-1] * 2, np.float32)
-    boxes = (item.boxes * scale).astype(np.float32, copy=False)
+    scale = np.array(size * 2) / np.array([image.shape[1], image.shape[0]] * 2)
+    boxes = (item.boxes * scale).astype(np.float32)
     return cv2.resize(image, size).astype(np.uint8, copy=False), boxes, item.class_ids
