@@ -86,12 +86,18 @@ class LabelFolder:
             self._names = [str(name) for name in names]
         self._count = sum(1 for _ in folder.glob("images/*/*.jpg"))
 
-    def add(self, name: str, frame: DetectedFrame) -> Path:
-        """Write an image and its labels; returns the image's file. One of the same name is replaced."""
-        known = next(self._folder.glob(f"images/*/{name}.jpg"), None)
+    def add(self, name: str, frame: DetectedFrame) -> Path | None:
+        """Write an image and its labels; returns the image's file.
+
+        None: there is an image of that name. Its labels may have been corrected; they are kept.
+        """
+        if any(self._folder.glob(f"images/*/{name}.jpg")):
+            return None
         split = "val" if self._count % VALIDATION_EVERY == VALIDATION_EVERY - 1 else "train"
-        image = known or self._folder / "images" / split / f"{name}.jpg"
-        labels = self._folder / "labels" / image.parent.name / f"{name}.txt"
+        image, labels = (
+            self._folder / kind / split / f"{name}{suffix}"
+            for kind, suffix in (("images", ".jpg"), ("labels", ".txt"))
+        )
         for path in (image, labels):
             path.parent.mkdir(parents=True, exist_ok=True)
         done, jpeg = cv2.imencode(".jpg", frame.image, (cv2.IMWRITE_JPEG_QUALITY, 95))
@@ -99,7 +105,7 @@ class LabelFolder:
             raise OSError(f"cannot encode {image}")
         image.write_bytes(jpeg.tobytes())
         labels.write_text("".join(self._lines(frame.message)), "utf-8")
-        self._count += known is None
+        self._count += 1
         validation = "images/val" if self._count >= VALIDATION_EVERY else "images/train"
         names = json.dumps(self._names)
         self._table.write_text(f"train: images/train\nval: {validation}\nnames: {names}\n", "utf-8")
@@ -176,8 +182,10 @@ def collect(
         reasons = doubts.update(frame.message)
         if not reasons or frame.captured_ns < due_ns:
             continue
-        yield labelled.add(f"{source}_{frame.message['sequence']:07d}", frame), reasons
         due_ns = frame.captured_ns + round(interval_s * 1e9)
-        kept += 1
+        path = labelled.add(f"{source}_{frame.message['sequence']:07d}", frame)
+        if path is not None:
+            yield path, reasons
+            kept += 1
         if kept >= most:
             return

@@ -87,8 +87,11 @@ def test_collected_frames_are_a_data_set_to_train_on(tmp_path: Path) -> None:
     assert train.class_names == ("car", "dog")
     assert train.samples[0].class_ids.tolist() == [0, 1]
     assert train.samples[0].boxes_in(160, 120) == pytest.approx(np.array([MIDDLE, (0, 0, 20, 30)]), abs=0.01)
-    # The same frames again replace, others are added and numbered by the same names.
-    list(collect(doubtful(60), tmp_path, "flight", interval_s=0.5, most=10))
+    # The same frames again are left as they are, corrected labels too; others are added.
+    corrected = tmp_path / "labels" / "train" / "flight_0000000.txt"
+    corrected.write_text("1 0.5 0.5 0.1 0.1\n")
+    assert list(collect(doubtful(50), tmp_path, "flight", interval_s=0.5)) == []
+    assert corrected.read_text() == "1 0.5 0.5 0.1 0.1\n"
     found = message(0, track(1, "boat", "tentative"))
     list(collect([DetectedFrame(0, image(), found)], tmp_path, "other"))
     again = open_dataset(tmp_path, split="train")
