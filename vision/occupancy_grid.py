@@ -11,6 +11,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from vision.obstacle_sectors import ABOVE_M, BELOW_M
+
 CELL_M = 0.2
 # Cells on a side: 40 m.
 SIZE = 200
@@ -24,8 +26,10 @@ HIT, FAR_HIT, NEAR_M = 0.9, 0.45, 5.0
 MISS = 0.4
 LOWEST, HIGHEST = -2.0, 3.0
 OCCUPIED, FREE = 0.6, -0.6
-# At another height the band shows other obstacles: the grid starts again.
-HEIGHT_M = 0.5
+# At another height the band shows other obstacles. A free cell is unknown at a height that differs by more than
+# FREE_HEIGHT_M, where the vehicle would leave the band that was observed; in gusts it moves by half a metre. An
+# occupied one is unknown where the bands do not overlap.
+FREE_HEIGHT_M, OCCUPIED_HEIGHT_M = 0.6, ABOVE_M + BELOW_M
 
 Point = tuple[float, float]
 
@@ -43,17 +47,18 @@ class OccupancyGrid:
         self.log_odds: NDArray[np.float32] = np.zeros((SIZE, SIZE), np.float32)
         self.corner = (0, 0)
         self.captured_ns = 0
-        self._down_m = math.nan
+        self._down_m = 0.0
+        self._seen_down_m: NDArray[np.float32] = np.zeros((SIZE, SIZE), np.float32)
 
     @property
     def occupied(self) -> NDArray[np.bool_]:
-        """(SIZE, SIZE): cells with an obstacle."""
-        return self.log_odds > OCCUPIED
+        """(SIZE, SIZE): cells with an obstacle at the vehicle's height."""
+        return (self.log_odds > OCCUPIED) & (self._other_height_m() <= OCCUPIED_HEIGHT_M)
 
     @property
     def free(self) -> NDArray[np.bool_]:
-        """(SIZE, SIZE): cells that were observed to be free."""
-        return self.log_odds < FREE
+        """(SIZE, SIZE): cells that were observed to be free at the vehicle's height."""
+        return (self.log_odds < FREE) & (self._other_height_m() <= FREE_HEIGHT_M)
 
     def update(
         self, ranges_m: NDArray[np.float64], position_ned_m: tuple[float, float, float], captured_ns: int
@@ -64,10 +69,7 @@ class OccupancyGrid:
             ranges_m: (DIRECTIONS,) from `nearest_ranges`, clockwise from north.
             position_ned_m: of the vehicle at the capture.
         """
-        north_m, east_m, down_m = position_ned_m
-        if not abs(down_m - self._down_m) <= HEIGHT_M:
-            self.log_odds[:] = 0.0
-            self._down_m = down_m
+        north_m, east_m, self._down_m = position_ned_m
         self._centre(north_m, east_m)
         self.captured_ns = captured_ns
 
@@ -82,15 +84,20 @@ class OccupancyGrid:
         seen_m = ranges_m[np.rint(bearing).astype(np.int64) % DIRECTIONS]
         with np.errstate(invalid="ignore"):  # unobserved directions are NaN
             before = away_m < np.minimum(seen_m - BEFORE_M, RANGE_M)
-        self.log_odds[window] -= np.float32(MISS) * before
+        change = np.float32(-MISS) * before
 
         hit = np.flatnonzero(ranges_m < RANGE_M)
         angle, range_m = hit * (math.tau / DIRECTIONS), ranges_m[hit]
         points = np.column_stack((north_m + range_m * np.cos(angle), east_m + range_m * np.sin(angle)))
-        cells = self.cells(points)
+        rows, columns = (self.cells(points) - (row - reach, column - reach)).T
         # Twice in one image counts once: near obstacles fill many directions.
-        self.log_odds[cells[:, 0], cells[:, 1]] += np.where(range_m < NEAR_M, HIT, FAR_HIT)
-        np.clip(self.log_odds, LOWEST, HIGHEST, out=self.log_odds)
+        change[rows, columns] += np.where(range_m < NEAR_M, HIT, FAR_HIT)
+
+        observed, log_odds, down = change != 0.0, self.log_odds[window], self._seen_down_m[window]
+        valid_m = np.where(log_odds < 0.0, FREE_HEIGHT_M, OCCUPIED_HEIGHT_M)
+        log_odds[observed & (np.abs(down - self._down_m) > valid_m)] = 0.0
+        down[observed] = self._down_m
+        np.clip(log_odds + change, LOWEST, HIGHEST, out=log_odds)
 
     def cells(self, points: NDArray[np.float64]) -> NDArray[np.int64]:
         """(N, 2) indices of (N, 2) points north, east in metres; outside 0..SIZE-1: not in the grid."""
@@ -110,7 +117,12 @@ class OccupancyGrid:
         if max(map(abs, moved)) >= SIZE:
             self.log_odds[:] = 0.0
         elif moved != (0, 0):
-            self.log_odds = np.roll(self.log_odds, (-moved[0], -moved[1]), (0, 1))
+            for grid in (self.log_odds, self._seen_down_m):
+                grid[:] = np.roll(grid, (-moved[0], -moved[1]), (0, 1))
             for axis, by in enumerate(moved):
                 entered = slice(SIZE - by, SIZE) if by > 0 else slice(0, -by)
                 self.log_odds[(entered, slice(None)) if axis == 0 else (slice(None), entered)] = 0.0
+
+    def _other_height_m(self) -> NDArray[np.float32]:
+        """(SIZE, SIZE): difference of the vehicle's height from that at which a cell was observed."""
+        return np.abs(self._seen_down_m - np.float32(self._down_m))

@@ -92,11 +92,32 @@ def test_obstacle_keeps_its_position_while_the_grid_rolls(north: float, east: fl
     assert (row, column) == (SIZE // 2, SIZE // 2)
 
 
-def test_far_jump_and_another_height_clear_the_grid() -> None:
-    for position in ((100.0, 0.0, -3.0), (0.0, 0.0, -3.6)):
-        grid = grid_with(((5.0, 0.0), 0.5))
-        grid.update(np.full(DIRECTIONS, np.nan), position, 10)
-        assert not grid.log_odds.any()
+def test_far_jump_clears_the_grid() -> None:
+    grid = grid_with(((5.0, 0.0), 0.5))
+    grid.update(np.full(DIRECTIONS, np.nan), (100.0, 0.0, -3.0), 10)
+    assert not grid.log_odds.any()
+
+
+@pytest.mark.parametrize(
+    ("down_m", "free", "occupied"),
+    [(-3.55, True, True), (-3.7, False, True), (-2.3, False, True), (-4.6, False, False)],
+)
+def test_map_is_kept_at_heights_of_which_it_was_observed(down_m: float, free: bool, occupied: bool) -> None:
+    grid = grid_with(((5.0, 0.0), 0.5))
+    known = (grid.free.copy(), grid.occupied.copy())
+    grid.update(np.full(DIRECTIONS, np.nan), (0.0, 0.0, down_m), 10)
+    assert (bool(grid.free.any()), bool(grid.occupied.any())) == (free, occupied)
+    grid.update(np.full(DIRECTIONS, np.nan), (0.0, 0.0, -3.0), 11)
+    assert (grid.free == known[0]).all()
+    assert (grid.occupied == known[1]).all()
+
+
+def test_what_is_seen_at_another_height_replaces_what_was_seen() -> None:
+    grid = grid_with()
+    for number in range(2):
+        grid.update(scan((0.0, 0.0), [((5.0, 0.0), 0.5)]), (0.0, 0.0, -6.0), 10 + number)
+    assert at(grid, (4.5, 0.0)) > 0.6
+    assert grid.free.any()
 
 
 def test_free_reference_is_flown_straight() -> None:
