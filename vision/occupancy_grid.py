@@ -16,6 +16,8 @@ from vision.obstacle_sectors import ABOVE_M, BELOW_M
 CELL_M = 0.2
 # Cells on a side: 40 m.
 SIZE = 200
+# The grid moves by so many cells, so that blocks of them, the nodes of a path search, keep their positions.
+BLOCK = 2
 DIRECTIONS = 360
 # Farther than this a small stereo camera's error (1 m at 10 m) is larger than the obstacles.
 RANGE_M = 10.0
@@ -39,7 +41,7 @@ class OccupancyGrid:
 
     Attributes:
         log_odds: (SIZE, SIZE) float32, axes north and east; 0: never observed.
-        corner: (north, east) of the first cell, in whole cells from the local origin.
+        corner: (north, east) of the first cell, in whole cells from the local origin; multiples of `BLOCK`.
         captured_ns: stamp of the newest image; 0 before the first.
     """
 
@@ -110,8 +112,10 @@ class OccupancyGrid:
         return points
 
     def _centre(self, north_m: float, east_m: float) -> None:
-        """Move the grid by whole cells so that the vehicle is in its middle."""
-        corner = tuple(math.floor(value / CELL_M) - SIZE // 2 for value in (north_m, east_m))
+        """Move the grid by whole blocks so that the vehicle is in its middle."""
+        corner = tuple(
+            BLOCK * math.floor(value / (BLOCK * CELL_M)) - SIZE // 2 for value in (north_m, east_m)
+        )
         moved = (corner[0] - self.corner[0], corner[1] - self.corner[1])
         self.corner = (corner[0], corner[1])
         if max(map(abs, moved)) >= SIZE:

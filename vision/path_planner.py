@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vision.obstacle_sectors import SECTOR_RAD, SECTORS
-from vision.occupancy_grid import CELL_M, SIZE, OccupancyGrid, Point
+from vision.occupancy_grid import BLOCK, CELL_M, SIZE, OccupancyGrid, Point
 
 # Cost per metre: 1, plus these.
 UNKNOWN_COST = 1.0
@@ -28,8 +28,6 @@ NEAR_COST, NEAR_M = 1.0, 0.6
 AWAY_COST_PER_M, AWAY_LIMIT_M = 0.7, 2.0
 # Away from the newest path: of two ways of about the same cost the vehicle stays on the one it has begun.
 SWITCH_COST, SWITCH_M = 0.4, 1.0
-# The search uses every second cell in each direction.
-STRIDE = 2
 # A vehicle inside the clearance first flies out of it, to a cell within this distance.
 ESCAPE_M = 2.0
 INSIDE_M = 0.3
@@ -106,8 +104,8 @@ def plan_path(
         end = field.end(start, position)
     except _NoWayError as why:
         return PlannedPath(grid.captured_ns, (), reason=str(why), number=request.number, near=near)
-    cells = field.search(start, field.cell(end))
-    points = np.vstack((position, grid.points(np.array(cells[1:-1] or [start])), end))
+    nodes = field.search(start, field.node(end))
+    points = np.vstack((position, field.positions(nodes[1:-1] or [start]), end))
     points = field.rounded(field.shortened(points))
     free_m = field.free_length(points)
     path = tuple((float(north), float(east)) for north, east in points)
@@ -133,8 +131,9 @@ class _Field:
         self.cost = 1.0 + UNKNOWN_COST * unknown + NEAR_COST * near + AWAY_COST_PER_M * away
         if newest:
             self.cost += SWITCH_COST * np.minimum(self._away_m(np.array(newest)) / SWITCH_M, 1.0)
-        coarse = np.ascontiguousarray(self.passable[::STRIDE, ::STRIDE]).astype(np.uint8)
-        _, self._region = cv2.connectedComponents(coarse, connectivity=8)
+        self._cells = _freest_cells(self._gap_m)
+        nodes = self.passable[self._cells[..., 0], self._cells[..., 1]].astype(np.uint8)
+        _, self._region = cv2.connectedComponents(nodes, connectivity=8)
 
     def inside(self, position: Point) -> bool:
         """Whether the vehicle is inside the clearance by more than the deviation from a path."""
@@ -142,16 +141,16 @@ class _Field:
         return bool(self._gap_m[row, column] < self._clearance_m - INSIDE_M)
 
     def start(self, position: Point) -> tuple[int, int]:
-        """The passable cell (of the search) nearest to the vehicle. Raises _NoWayError."""
-        cells = np.argwhere(self.passable[::STRIDE, ::STRIDE]) * STRIDE
-        away_m = np.hypot(*(self._grid.points(cells) - position).T)
-        if not len(cells) or away_m.min() > ESCAPE_M:
-            row, column = self.cell(np.array(position))
+        """The passable node nearest to the vehicle. Raises _NoWayError."""
+        nodes = np.argwhere(self._region)
+        away_m = np.hypot(*(self.positions(nodes) - position).T)
+        if not len(nodes) or away_m.min() > ESCAPE_M:
+            row, column = self._grid.cells(np.array([position]))[0]
             raise _NoWayError(
                 f"obstacles on all sides, the nearest {self._gap_m[row, column]:.1f} m away; "
                 f"{self._clearance_m:g} m are needed"
             )
-        row, column = cells[int(np.argmin(away_m))]
+        row, column = nodes[int(np.argmin(away_m))]
         return int(row), int(column)
 
     def end(self, start: tuple[int, int], position: Point) -> NDArray[np.float64]:
@@ -166,14 +165,12 @@ class _Field:
         if not len(points):
             raise _NoWayError("the path to follow is outside the map around the vehicle")
         passable = self.passable[cells[:, 0], cells[:, 1]]
-        here = self._region[start[0] // STRIDE, start[1] // STRIDE]
-        reached = np.flatnonzero(
-            passable & (self._region[cells[:, 0] // STRIDE, cells[:, 1] // STRIDE] == here)
-        )
+        here = self._region[start]
+        reached = np.flatnonzero(passable & (self._region[*(cells // BLOCK).T] == here))
         if len(reached):
             end: NDArray[np.float64] = points[reached[-1]]
             return end
-        part = self._grid.points(np.argwhere(self._region == here) * STRIDE)
+        part = self._grid.points(self._cells[self._region == here])
         left_m = np.hypot(*(part - self.reference[-1]).T)
         if left_m.min() < math.dist(position, self.reference[-1]) - LEAST_M:
             nearest: NDArray[np.float64] = part[np.argmin(left_m)]
@@ -183,21 +180,27 @@ class _Field:
         gap_m = self._gap_m[cells[-1][0], cells[-1][1]]
         raise _NoWayError(f"an obstacle is {gap_m:.1f} m from the goal; {self._clearance_m:g} m are needed")
 
-    def cell(self, point: NDArray[np.float64]) -> tuple[int, int]:
-        """The search's cell at a point."""
-        row, column = self._grid.cells(point[None, :])[0] // STRIDE * STRIDE
+    def node(self, point: NDArray[np.float64]) -> tuple[int, int]:
+        """The node at a point."""
+        row, column = self._grid.cells(point[None, :])[0] // BLOCK
         return int(row), int(column)
 
+    def positions(self, nodes: NDArray[np.int64] | Sequence[tuple[int, int]]) -> NDArray[np.float64]:
+        """(N, 2) metres north, east of (N, 2) nodes."""
+        rows, columns = np.asarray(nodes).T
+        return self._grid.points(self._cells[rows, columns])
+
     def search(self, start: tuple[int, int], end: tuple[int, int]) -> list[tuple[int, int]]:
-        """A*: the cells of the cheapest path, both ends included; they must be connected."""
+        """A*: the nodes of the cheapest path, both ends included; they must be connected."""
         # Plain lists with a blocked border: element access is several times faster than in an array.
-        half = np.pad(np.where(self._region == 0, math.inf, self.cost[::STRIDE, ::STRIDE]) / 2.0, 1)
+        cost = self.cost[self._cells[..., 0], self._cells[..., 1]]
+        half = np.pad(np.where(self._region == 0, math.inf, cost) / 2.0, 1)
         half[[0, -1], :] = half[:, [0, -1]] = math.inf
         side = len(half)
         rows, columns = np.indices(half.shape)
-        left = np.hypot(rows - end[0] // STRIDE - 1, columns - end[1] // STRIDE - 1).ravel().tolist()
+        left = np.hypot(rows - end[0] - 1, columns - end[1] - 1).ravel().tolist()
         costs: list[float] = half.ravel().tolist()
-        first, goal = ((row // STRIDE + 1) * side + column // STRIDE + 1 for row, column in (start, end))
+        first, goal = ((row + 1) * side + column + 1 for row, column in (start, end))
         moves = [(down * side + right, math.hypot(down, right)) for down, right in _NEIGHBOURS]
         best, before = [math.inf] * len(costs), [first] * len(costs)
         best[first] = 0.0
@@ -220,7 +223,7 @@ class _Field:
         path = [goal]
         while path[-1] != first:
             path.append(before[path[-1]])
-        return [((at // side - 1) * STRIDE, (at % side - 1) * STRIDE) for at in reversed(path)]
+        return [(at // side - 1, at % side - 1) for at in reversed(path)]
 
     def shortened(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """The same path with straight lines wherever these are passable and cost no more."""
@@ -275,6 +278,18 @@ class _Field:
         cv2.polylines(line, [cells.astype(np.int32)], False, 0)
         away: NDArray[np.float32] = cv2.distanceTransform(line, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * CELL_M
         return away
+
+
+def _freest_cells(gap_m: NDArray[np.float32]) -> NDArray[np.int64]:
+    """(N, N, 2): of every block the cell farthest from obstacles.
+
+    It is the search's node: with a fixed cell of each block, a gap of one cell would be open or closed.
+    """
+    count = SIZE // BLOCK
+    blocks = gap_m.reshape(count, BLOCK, count, BLOCK).swapaxes(1, 2).reshape(count, count, BLOCK * BLOCK)
+    within = np.stack(np.divmod(blocks.argmax(axis=2), BLOCK), axis=-1)
+    corners: NDArray[np.int64] = np.moveaxis(np.indices((count, count)), 0, -1) * BLOCK
+    return corners + within
 
 
 def _nearby(grid: OccupancyGrid, position: Point) -> tuple[Point, ...]:
