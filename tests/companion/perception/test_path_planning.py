@@ -88,6 +88,18 @@ def test_nothing_is_planned_without_a_recent_request_or_pose() -> None:
     assert nowhere.update(pillar(1), TENTH_NS) is None
 
 
+@pytest.mark.parametrize(("rate_hz", "least", "most"), [(6.0, 11, 13), (10.0, 19, 21), (30.0, 19, 21)])
+def test_path_is_replanned_with_the_images_up_to_ten_times_a_second(
+    rate_hz: float, least: int, most: int
+) -> None:
+    planning, plans = planning_at(), 0
+    for step in range(round(2.0 * rate_hz)):
+        now_ns = round((step + 1) / rate_hz * 1e9)
+        planning.request(REQUEST, now_ns)
+        plans += planning.update(pillar(1 + step), now_ns) is not None
+    assert least <= plans <= most
+
+
 @pytest.mark.realtime
 async def test_worker_process_plans_and_sends_the_path() -> None:
     name = f"avoid-{secrets.token_hex(4)}"
