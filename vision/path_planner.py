@@ -30,7 +30,8 @@ AWAY_COST_PER_M, AWAY_LIMIT_M = 0.7, 2.0
 SWITCH_COST, SWITCH_M = 0.4, 1.0
 # A vehicle inside the clearance first flies out of it, to a cell within this distance.
 ESCAPE_M = 2.0
-INSIDE_M = 0.3
+# Inside by more: deviations from a path are smaller, and the obstacle limits' margin begins here.
+INSIDE_M = 0.2
 NEARBY_M = 3.0
 # The path ends at the last point of the reference that can be reached, at least this far from the vehicle.
 LEAST_M = 2.0

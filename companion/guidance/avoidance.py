@@ -151,8 +151,9 @@ class Avoidance:
             nose_rad = asked.yaw_rad + max(-FACING_RAD, min(FACING_RAD, off))
         left_m = max(0.0, planned.free_m - follower.along_m - UNSEEN_GAP_M)
         most_mps = min(_level_speed(asked), math.sqrt(2.0 * ACCELERATION_MPS2 * left_m))
-        if planned.inside:
-            most_mps = min(_level_speed(asked), ESCAPE_MPS)
+        gain = VELOCITY_GAIN
+        if planned.inside:  # a gust pushes; turned away, the camera would lose the obstacle
+            most_mps, gain, nose_rad = min(_level_speed(asked), ESCAPE_MPS), HOLD_VELOCITY_GAIN, yaw_rad
         else:  # slower while the camera does not look there yet
             most_mps *= max(0.0, math.cos(wrap_angle(bearing_rad - yaw_rad))) ** 2
         if most_mps < (HOLD_MPS if self._stop_at is None else LEAVE_MPS):
@@ -163,7 +164,7 @@ class Avoidance:
             direction = (north / speed, east / speed)
             allowed_mps = max(SLOW_MPS, BENT_FACTOR * _allowed_mps(direction, constraints))
             along_mps = min(most_mps, allowed_mps, speed)
-            level = _corrected(direction, along_mps, SPEED_MARGIN * _level_speed(asked), state)
+            level = _corrected(direction, along_mps, SPEED_MARGIN * _level_speed(asked), state, gain)
         return Setpoint.velocity((*level, _down_mps(asked)), context.now_ns, yaw_rad=wrap_angle(nose_rad))
 
     def _hold(self, context: BehaviourContext) -> Vector3:
@@ -210,13 +211,17 @@ def _allowed_mps(direction: tuple[float, float], constraints: Sequence[Constrain
 
 
 def _corrected(
-    direction: tuple[float, float], along_mps: float, top_mps: float, state: VehicleState
+    direction: tuple[float, float], along_mps: float, top_mps: float, state: VehicleState, gain: float
 ) -> tuple[float, float]:
-    """The velocity command for a speed in a direction, at most `top_mps`, against the velocity beside it."""
+    """The velocity command for a speed in a direction, at most `top_mps`, against the velocity beside it.
+
+    Args:
+        gain: of the error of the velocity in the direction.
+    """
     flown = (along_mps * direction[0], along_mps * direction[1])
     north, east, _ = state.velocity_ned_mps or (*flown, 0.0)
     is_mps = north * direction[0] + east * direction[1]
-    wanted_mps = min(top_mps, along_mps + VELOCITY_GAIN * (along_mps - is_mps))
+    wanted_mps = min(top_mps, along_mps + gain * (along_mps - is_mps))
     beside = (north - is_mps * direction[0], east - is_mps * direction[1])
     return (
         wanted_mps * direction[0] - HOLD_VELOCITY_GAIN * beside[0],
