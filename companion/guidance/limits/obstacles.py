@@ -33,6 +33,8 @@ GAIN_PER_S = 0.4
 # A few seconds: a person moves out of the way in less.
 REMEMBERED_S = 8.0
 REMEMBERED_WITHIN_M = 8.0
+# Of the depth inside the margin, for an obstacle of the map: the nearest of them stays the nearest.
+MAP_SHARE = 0.001
 Constraint = tuple[float, float, float]
 
 DIRECTIONS = tuple((math.cos(i * SECTOR_RAD), math.sin(i * SECTOR_RAD)) for i in range(SECTORS))
@@ -141,7 +143,9 @@ class ObstacleMemory:
             sector = round(math.atan2(away[1], away[0]) / SECTOR_RAD) % SECTORS
             if not math.isnan(seen.distance_m[sector]):
                 return False
-            known, away_m = distances[sector], max(least_m, math.hypot(*away))
+            known, away_m = distances[sector], math.hypot(*away)
+            if away_m < least_m:
+                away_m = least_m - MAP_SHARE * (least_m - away_m)
             distances[sector] = away_m if math.isnan(known) else min(known, away_m)
             return True
 

@@ -214,9 +214,18 @@ def test_obstacle_of_the_map_stops_the_vehicle_but_does_not_push_it() -> None:
         filled = ObstacleMemory().filled(replace(seen, planned=planned), rules.margin_m)
         return min(rules.constraints(filled), key=lambda one: one[2])
 
-    assert slowest(0.0, {}) == pytest.approx((-1.0, 0.0, 0.0))
+    assert slowest(0.0, {}) == pytest.approx((-1.0, 0.0, 0.0), abs=0.01)
     assert slowest(1.0, {})[2] < 0.0, "it brakes while it flies there"
     assert slowest(0.0, {18: 1.8}) == pytest.approx((0.0, 1.0, -0.5)), "it backs out of what it sees"
+
+
+def test_vehicle_brakes_towards_the_nearest_obstacle_of_the_map() -> None:
+    vehicle, rules = KinematicVehicle(), ObstacleRules("auto", 2.0)
+    vehicle.velocity[1] = -1.0
+    planned = PlannedPath(vehicle.now_ns, (), near=((1.5, 0.0), (0.0, -0.8), (-1.5, 0.0)))
+    seen = context(sectors(vehicle.now_ns, {18: math.inf}, rest=NAN), vehicle=vehicle)
+    filled = ObstacleMemory().filled(replace(seen, planned=planned), rules.margin_m)
+    assert rules.constraints(filled)[0] == pytest.approx((0.0, -1.0, -1.5), abs=0.01)
 
 
 def test_message_distinguishes_unknown_from_free() -> None:
