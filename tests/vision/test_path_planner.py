@@ -75,11 +75,18 @@ def test_unobserved_directions_stay_unknown() -> None:
     assert not grid.log_odds.any()
 
 
-def test_obstacle_that_has_gone_is_cleared() -> None:
+def test_obstacle_stays_until_the_camera_looks_through_its_position() -> None:
     grid = grid_with(((5.0, 0.0), 0.5))
-    for number in range(12):
-        grid.update(scan((0.0, 0.0), []), (0.0, 0.0, -3.0), 10 + number)
+    behind = np.full(DIRECTIONS, np.nan)
+    behind[135:226] = np.inf
+    for number in range(600):  # a minute, looking south
+        grid.update(behind, (0.0, 0.0, -3.0), 10 + number)
+    assert at(grid, (4.5, 0.0)) > 0.6
+    assert max(abs(east) for _, east in planned(grid).points) > 1.0
+    for number in range(10):
+        grid.update(scan((0.0, 0.0), []), (0.0, 0.0, -3.0), 1000 + number)
     assert at(grid, (4.5, 0.0)) < -0.6
+    assert max(abs(east) for _, east in planned(grid).points) < 0.3
 
 
 @given(north=st.floats(-15.0, 15.0), east=st.floats(-15.0, 15.0))
