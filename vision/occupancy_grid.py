@@ -28,9 +28,9 @@ HIT, FAR_HIT, NEAR_M = 0.9, 0.45, 5.0
 MISS = 0.4
 LOWEST, HIGHEST = -2.0, 3.0
 OCCUPIED, FREE = 0.6, -0.6
-# At another height the band shows other obstacles. A free cell is unknown at a height that differs by more than
-# FREE_HEIGHT_M, where the vehicle would leave the band that was observed; in gusts it moves by half a metre. An
-# occupied one is unknown where the bands do not overlap.
+# At another height the band shows other obstacles. A free cell is unknown where the vehicle would leave the
+# band that was observed; in gusts it moves by half a metre. An occupied one is unknown where the bands do not
+# overlap.
 FREE_HEIGHT_M, OCCUPIED_HEIGHT_M = 0.6, ABOVE_M + BELOW_M
 
 Point = tuple[float, float]
