@@ -129,4 +129,5 @@ class OccupancyGrid:
 
     def _other_height_m(self) -> NDArray[np.float32]:
         """(SIZE, SIZE): difference of the vehicle's height from that at which a cell was observed."""
-        return np.abs(self._seen_down_m - np.float32(self._down_m))
+        other_m: NDArray[np.float32] = np.abs(self._seen_down_m - np.float32(self._down_m))
+        return other_m

@@ -66,12 +66,12 @@ class PlannedPath:
 
     Attributes:
         captured_ns: stamp of the newest depth image that it uses.
-        points: (north, east) metres, from the vehicle on; empty: no way.
+        points: (north, east) metres, two or more from the vehicle on; empty: no way.
         free_m: length of its beginning that was observed to be free.
         reason: why there is no way; empty if there is one.
         number: of the request.
-        inside: the vehicle is nearer to an obstacle than the clearance by more than `INSIDE_M`; the path
-            first leads away from it.
+        inside: the vehicle is nearer to an obstacle than the clearance by more than `INSIDE_M`; the path's
+            first leg leads away from it.
         near: (north, east) metres, the nearest occupied cell within `NEARBY_M` of the vehicle in each of 72
             directions.
     """
@@ -289,8 +289,9 @@ def _freest_cells(gap_m: NDArray[np.float32]) -> NDArray[np.int64]:
     count = SIZE // BLOCK
     blocks = gap_m.reshape(count, BLOCK, count, BLOCK).swapaxes(1, 2).reshape(count, count, BLOCK * BLOCK)
     within = np.stack(np.divmod(blocks.argmax(axis=2), BLOCK), axis=-1)
-    corners: NDArray[np.int64] = np.moveaxis(np.indices((count, count)), 0, -1) * BLOCK
-    return corners + within
+    corners = np.moveaxis(np.indices((count, count)), 0, -1) * BLOCK
+    cells: NDArray[np.int64] = corners + within
+    return cells
 
 
 def _nearby(grid: OccupancyGrid, position: Point) -> tuple[Point, ...]:

@@ -152,8 +152,9 @@ class Avoidance:
         left_m = max(0.0, planned.free_m - follower.along_m - UNSEEN_GAP_M)
         most_mps = min(_level_speed(asked), math.sqrt(2.0 * ACCELERATION_MPS2 * left_m))
         gain = VELOCITY_GAIN
-        if planned.inside:  # a gust pushes; turned away, the camera would lose the obstacle
-            most_mps, gain, nose_rad = min(_level_speed(asked), ESCAPE_MPS), HOLD_VELOCITY_GAIN, yaw_rad
+        if planned.inside:  # a gust pushes: straight out, and the camera stays on the obstacle
+            most_mps, gain, nose_rad = _level_speed(asked), HOLD_VELOCITY_GAIN, yaw_rad
+            north, east = (b - a for a, b in zip(*planned.points[:2], strict=True))
         else:  # slower while the camera does not look there yet
             most_mps *= max(0.0, math.cos(wrap_angle(bearing_rad - yaw_rad))) ** 2
         if most_mps < (HOLD_MPS if self._stop_at is None else LEAVE_MPS):
@@ -162,6 +163,8 @@ class Avoidance:
             self._stop_at = None
             speed = max(math.hypot(north, east), 1e-6)
             direction = (north / speed, east / speed)
+            if planned.inside:
+                speed = ESCAPE_MPS
             allowed_mps = max(SLOW_MPS, BENT_FACTOR * _allowed_mps(direction, constraints))
             along_mps = min(most_mps, allowed_mps, speed)
             level = _corrected(direction, along_mps, SPEED_MARGIN * _level_speed(asked), state, gain)
