@@ -11,12 +11,17 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from mavlink_sim.environments.approach import Approach
+from mavlink_sim.environments.approach import Approach, Orbit
 from mavlink_sim.environments.cart_pole import CartPole
+from mavlink_sim.environments.landing import Landing
+from mavlink_sim.environments.obstacles import Obstacles
+from mavlink_sim.environments.rotors import Rotors
 from mavlink_sim.environments.spaces import Array, Entry, high, low
 from mavlink_sim.environments.task import STEP_S, Task
 
-TASKS: dict[str, Callable[..., Task]] = {"CartPole": CartPole, "Approach": Approach}
+TASKS: dict[str, Callable[..., Task]] = {
+    task.__name__: task for task in (CartPole, Approach, Orbit, Landing, Obstacles, Rotors)
+}
 """By the name in `companion/NAME-v0`."""
 
 Numbers = NDArray[np.float32]

@@ -41,12 +41,33 @@ MAX_AGE_S = 5.0
 VELOCITY_ACTION = (*_vector("", "m/s", (2.0, 2.0, 1.0)), Entry("turn_rad_s", "rad/s", -1.0, 1.0))
 
 # target_*: the last known position, from where the vehicle is now. target_age_s: since that was captured.
-APPROACH_OBSERVATION = (
-    *_vector("target_", "m", (40.0, 40.0, 20.0)),
+TARGET = _vector("target_", "m", (40.0, 40.0, 20.0))
+LANDING_OBSERVATION = (*TARGET, *VELOCITY, Entry("target_age_s", "s", 0.0, MAX_AGE_S))
+APPROACH_OBSERVATION = (*LANDING_OBSERVATION, Entry("distance_wanted_m", "m", 3.0, 10.0))
+# Along the circle, clockwise seen from above.
+ORBIT_OBSERVATION = (*APPROACH_OBSERVATION, Entry("speed_wanted_m_s", "m/s", -1.5, 1.5))
+
+# Distance to the nearest obstacle in each sector of 30 degrees, clockwise from the heading.
+MAX_RANGE_M = 12.0
+SECTORS_DEG = tuple(range(0, 360, 30))
+OBSTACLES_OBSERVATION = (
+    *TARGET,
     *VELOCITY,
-    Entry("target_age_s", "s", 0.0, MAX_AGE_S),
-    Entry("distance_wanted_m", "m", 3.0, 10.0),
+    *(Entry(f"range_at_{angle}_deg_m", "m", 0.0, MAX_RANGE_M) for angle in SECTORS_DEG),
+    Entry("range_age_s", "s", 0.0, MAX_AGE_S),
 )
+
+# down_*: the direction of gravity in body FRD. Commands: shares of a rotor's thrust.
+ROTORS = ("front_right", "rear_left", "front_left", "rear_right")
+ROTORS_OBSERVATION = (
+    *_vector("target_", "m", (10.0, 10.0, 10.0)),
+    *_vector("velocity_", "m/s", (10.0, 10.0, 10.0)),
+    *(Entry(f"down_{axis}", "1", -1.0, 1.0) for axis in ("x", "y", "z")),
+    *(Entry(f"{axis}_rate_rad_s", "rad/s", -10.0, 10.0) for axis in ("roll", "pitch", "yaw")),
+    *(Entry(f"thrust_{rotor}_m_s2", "m/s2", 0.0, 10.0) for rotor in ROTORS),
+    Entry("state_age_s", "s", 0.0, MAX_AGE_S),
+)
+ROTORS_ACTION = tuple(Entry(f"rotor_{rotor}", "1", 0.0, 1.0) for rotor in ROTORS)
 
 CART_POLE_OBSERVATION = (
     Entry("cart_position_m", "m", -4.8, 4.8),
