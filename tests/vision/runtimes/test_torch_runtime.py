@@ -147,7 +147,7 @@ def test_cuda_is_refused_for_other_runtimes_and_unknown_devices(checkpoint: Path
     source = read_source(checkpoint)
     for runtime in ("openvino", "auto"):
         with pytest.raises(RuntimeUnusableError, match=r"the device cuda is for a checkpoint"):
-            selection.start_runtime(source, runtime, device="cuda")  # type: ignore[arg-type]
+            selection.start_runtime(source, runtime, device="cuda")
     with pytest.raises(ValueError, match="cpu or cuda"):
         Detector(checkpoint, device="tpu")  # type: ignore[arg-type]
 
