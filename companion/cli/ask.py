@@ -125,7 +125,8 @@ class Terminal:
         if self._ended:
             self.show("not flown: nobody confirms it; language.may lists what needs no confirmation")
             return False
-        self.write("fly this? [y/N] ")
+        # A console of the service prints whole lines only.
+        (self.write if sys.stdin.isatty() else self.show)("fly this? [y/N] ")
         self._asked = asyncio.get_running_loop().create_future()
         try:
             return await self._asked

@@ -57,14 +57,14 @@ async def test_plan_is_confirmed_history_is_used_and_cancel_ends_it() -> None:
     async with talking() as (there, talk):
         there.stopped.set()
         await talk.send("circle the red car at ten metres")
-        assert "orbit track=3" in await talk.shown("[y/N]")
+        assert "orbit track=3" in await talk.shown("[y/N] \n")
         (child,) = descendants(os.getpid())
         own = os.getpriority(os.PRIO_PROCESS, 0)
         assert os.getpriority(os.PRIO_PROCESS, child) == min(own + NICENESS, 19)
         await talk.send("y")
         await talk.shown("done: orbit: ended")
         await talk.send("twice as far")
-        assert "orbit radius=20 track=3" in await talk.shown("[y/N]")
+        assert "orbit radius=20 track=3" in await talk.shown("[y/N] \n")
         await talk.send("cancel")
         await talk.send("y")  # the plan has ended
         await talk.shown("not understood")
