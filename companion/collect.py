@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import queue
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from threading import Event
@@ -26,6 +27,10 @@ from vision.plain_yaml import load_plain_yaml
 DOUBTED, LOST, CHANGED = "doubted", "lost", "changed class"
 # Of every this many images one is for validation.
 VALIDATION_EVERY = 5
+# A track is confirmed after `tracker.min_hits` detections, 3 by default, if its scores and class allow it.
+DOUBTED_FRAMES = 5
+# The same doubt about the same track again counts as new after this.
+REPEAT_S = 10.0
 # A lost track whose box was this near to the image's edge has left the image: share of its width.
 EDGE = 0.02
 # Messages that wait for their image: about two seconds of a fast camera.
@@ -39,11 +44,12 @@ class DoubtFinder:
     def __init__(self) -> None:
         self._confirmed: dict[int, dict[str, Any]] = {}
         self._class_of: dict[int, str] = {}
+        self._tentative: Counter[int] = Counter()
 
     def update(self, message: dict[str, Any]) -> list[str]:
         """The reasons to keep a frame, such as `doubted car 12`; empty for none.
 
-        Doubted is a track that is not confirmed: a few detections only, low scores, or two classes. Lost is a
+        Doubted is a track that is not confirmed by its fifth detection: low scores, or two classes. Lost is a
         confirmed one that the frame before had, and that was not at the edge. `message`: on `detections`.
         """
         tracks = {one["track_id"]: one for one in message["detections"] if one["track_id"] is not None}
@@ -52,7 +58,8 @@ class DoubtFinder:
             before = self._class_of.get(number, one["class_name"])
             if before != one["class_name"]:
                 reasons.append(f"{CHANGED} {before} {number} to {one['class_name']}")
-            elif one["track_state"] == TRACK_TENTATIVE:
+            self._tentative[number] += one["track_state"] == TRACK_TENTATIVE
+            if self._tentative[number] >= DOUBTED_FRAMES and one["track_state"] == TRACK_TENTATIVE:
                 reasons.append(f"{DOUBTED} {one['class_name']} {number}")
         for number, one in self._confirmed.items():
             if number not in tracks and not _at_edge(one["xyxy"], message["width"], message["height"]):
@@ -178,11 +185,14 @@ def collect(
     """
     labelled, doubts = LabelFolder(folder), DoubtFinder()
     due_ns = kept = 0
+    repeated_ns: dict[str, int] = {}
     for frame in frames:
-        reasons = doubts.update(frame.message)
-        if not reasons or frame.captured_ns < due_ns:
+        now_ns = frame.captured_ns
+        reasons = [one for one in doubts.update(frame.message) if now_ns >= repeated_ns.get(one, 0)]
+        if not reasons or now_ns < due_ns:
             continue
-        due_ns = frame.captured_ns + round(interval_s * 1e9)
+        due_ns = now_ns + round(interval_s * 1e9)
+        repeated_ns |= dict.fromkeys(reasons, now_ns + round(REPEAT_S * 1e9))
         path = labelled.add(f"{source}_{frame.message['sequence']:07d}", frame)
         if path is not None:
             yield path, reasons

@@ -52,10 +52,12 @@ def test_sure_tracks_give_no_reason() -> None:
 
 def test_doubted_lost_and_changed_tracks_are_reasons() -> None:
     finder = DoubtFinder()
-    assert finder.update(message(0, track(1, "car"), track(2, "dog", "tentative"))) == ["doubted dog 2"]
-    assert finder.update(message(1, track(1, "truck"))) == ["changed class car 1 to truck"]
-    assert finder.update(message(2)) == ["lost truck 1"]
-    assert finder.update(message(3)) == []
+    for sequence in range(4):
+        assert finder.update(message(sequence, track(1, "car"), track(2, "dog", "tentative"))) == []
+    assert finder.update(message(4, track(1, "car"), track(2, "dog", "tentative"))) == ["doubted dog 2"]
+    assert finder.update(message(5, track(1, "truck"))) == ["changed class car 1 to truck"]
+    assert finder.update(message(6)) == ["lost truck 1"]
+    assert finder.update(message(7)) == []
 
 
 @pytest.mark.parametrize("xyxy", [(0, 30, 40, 60), (40, 0, 80, 30), (130, 30, 159, 60), (40, 100, 60, 119)])
@@ -70,17 +72,19 @@ def image() -> np.ndarray:
 
 
 def doubtful(count: int) -> list[DetectedFrame]:
-    """Frames with one certain car and one doubted dog each, ten a second."""
+    """Frames with one certain car and one doubted dog each, ten a second; another dog every ten frames."""
     frames = []
     for sequence in range(count):
-        found = message(sequence, track(1, "car"), track(2, "dog", "tentative", (0, 0, 20, 30)))
+        dog = track(2 + sequence // 10, "dog", "tentative", (0, 0, 20, 30))
+        found = message(sequence, track(1, "car"), dog)
         frames.append(DetectedFrame(found["captured_ns"], image(), found))
     return frames
 
 
 def test_collected_frames_are_a_data_set_to_train_on(tmp_path: Path) -> None:
-    kept = list(collect(doubtful(60), tmp_path, "flight", interval_s=0.5, most=10))
-    assert [path.name for path, _ in kept[:2]] == ["flight_0000000.jpg", "flight_0000005.jpg"]
+    kept = list(collect(doubtful(200), tmp_path, "flight", interval_s=0.5, most=10))
+    assert [path.name for path, _ in kept[:2]] == ["flight_0000004.jpg", "flight_0000014.jpg"]
+    assert [reasons for _, reasons in kept[:2]] == [["doubted dog 2"], ["doubted dog 3"]]
     assert len(kept) == 10
     train, val = (open_dataset(tmp_path, split=split) for split in ("train", "val"))
     assert (len(train.samples), len(val.samples)) == (8, 2)
@@ -88,12 +92,14 @@ def test_collected_frames_are_a_data_set_to_train_on(tmp_path: Path) -> None:
     assert train.samples[0].class_ids.tolist() == [0, 1]
     assert train.samples[0].boxes_in(160, 120) == pytest.approx(np.array([MIDDLE, (0, 0, 20, 30)]), abs=0.01)
     # The same frames again are left as they are, corrected labels too; others are added.
-    corrected = tmp_path / "labels" / "train" / "flight_0000000.txt"
+    corrected = tmp_path / "labels" / "train" / "flight_0000004.txt"
     corrected.write_text("1 0.5 0.5 0.1 0.1\n")
-    assert list(collect(doubtful(50), tmp_path, "flight", interval_s=0.5)) == []
+    assert list(collect(doubtful(100), tmp_path, "flight", interval_s=0.5)) == []
     assert corrected.read_text() == "1 0.5 0.5 0.1 0.1\n"
-    found = message(0, track(1, "boat", "tentative"))
-    list(collect([DetectedFrame(0, image(), found)], tmp_path, "other"))
+    found = [message(sequence, track(1, "boat", "tentative")) for sequence in range(30)]
+    others = [DetectedFrame(one["captured_ns"], image(), one) for one in found]
+    # One doubt is one image, however long it lasts (up to ten seconds).
+    assert len(list(collect(others, tmp_path, "other"))) == 1
     again = open_dataset(tmp_path, split="train")
     assert len(again.samples) == 9
     assert again.class_names == ("car", "dog", "boat")
@@ -108,7 +114,7 @@ def recorded(folder: Path, **changes: str) -> Path:
             writer.write(*one)
 
     write("@record/run", dumps(run_record(settings, GuidanceOptions(), (1, 191), "service1")))
-    for frame in doubtful(12):
+    for frame in doubtful(20):
         about = {"captured_ns": frame.captured_ns, "sequence": frame.message["sequence"]}
         tracks = [{**one, "confidence": 0.5} for one in frame.message["detections"]]
         write("detections", dumps({**frame.message, "detections": tracks}))
@@ -121,7 +127,10 @@ def test_command_collects_from_a_recording(tmp_path: Path) -> None:
     path = recorded(tmp_path / "recordings")
     result = CliRunner().invoke(app, ["collect", str(tmp_path / "set"), str(path)])
     assert result.exit_code == 0, result.stderr
-    assert [line.partition(": ")[2] for line in result.stdout.splitlines()] == ["doubted dog 2"] * 2
+    assert [line.partition(": ")[2] for line in result.stdout.splitlines()] == [
+        "doubted dog 2",
+        "doubted dog 3",
+    ]
     assert len(open_dataset(tmp_path / "set").samples) == 2
 
 
