@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from dataclasses import fields as fields_of
 from typing import Any
 
 from companion.guidance.command import COMMANDS, Command
@@ -107,8 +108,11 @@ class Clause:
             if self._missing is not None:
                 raise NotSeenError(self._missing)
             return intent
+        raise self._not_understood()
+
+    def _not_understood(self) -> UnclearError:
         known = "take off, land, come home, stop, hold, go, turn, find, approach, follow, circle, look"
-        raise UnclearError(
+        return UnclearError(
             f"{self._whole!r} is not understood. Begin with a verb: {known}; or ask a question"
         )
 
@@ -390,11 +394,40 @@ class Clause:
     # --- changes of the newest command
 
     def scaled(self, found: re.Match[str]) -> Command:
-        """ "twice as far": a factor on the distance or the speed."""
-        factor = {"twice": 2.0, "half": 0.5, "2 x": 2.0}[found[1]]
-        if found[2] == "close":
+        """ "twice as far", "three times as high": a factor on the distance, the speed or the height."""
+        word, what = found["factor"], found["what"]
+        factor = {"twice": 2.0, "half": 0.5}.get(word) or float(word.split()[0])
+        if factor == 0:
+            raise self._not_understood()
+        if what in ("close", "slow"):
             factor = 1 / factor
-        return self._changed(found[2] in ("fast", "speed"), lambda value: value * factor)
+        if what not in ("high", "height", "altitude"):
+            return self._changed(what in ("fast", "slow", "speed"), lambda value: value * factor)
+        if self._scene.altitude_m is None:
+            raise UnclearError(f"{self._whole!r}: the height is not known. Say 'climb to N metres'")
+        return self._to_height(round(self._scene.altitude_m * factor, 1), {})
+
+    def higher(self, found: re.Match[str]) -> Command:
+        """ "two metres higher"."""
+        self._rest = self._whole
+        return self.go(found)
+
+    def faster(self, _: re.Match[str]) -> Command:
+        """ "slower"."""
+        raise UnclearError(f"{self._whole!r}: how fast? Say for example 'twice as fast', 'half as fast'")
+
+    def same_with(self, found: re.Match[str]) -> Command:
+        """ "the same with the car", or only "the car": the newest command with another object."""
+        if found[1] is None:
+            self._rest = self._whole
+        last, target = self._scene.last, self.target()
+        if last is None or not target:
+            raise self._not_understood()
+        keys = ("class_name", "track_id", "marker_id")
+        named = {each.name: each.default for each in fields_of(last) if each.name in keys}
+        if not target.keys() <= named.keys():
+            raise self._not_understood()
+        return replace(last, **(named | target))
 
     def shifted(self, found: re.Match[str]) -> Command:
         """ "five metres closer"."""
@@ -455,9 +488,12 @@ def _chosen(word: str, seen: Sequence[SceneObject]) -> SceneObject:
 _Handler = Callable[[Clause, re.Match[str]], Command | Question]
 _HANDLERS: tuple[tuple[str, _Handler], ...] = (
     (
-        r"(?:go |stay |be )?(twice|half|2 x) (?:as )?(?:the )?(far|close|distance|radius|fast|speed)",
+        r"(?:go |stay |be |fly )?(?P<factor>twice|half|\d+(?:\.\d+)? x) (?:as )?(?:the )?"
+        r"(?P<what>far|close|distance|radius|fast|slow|speed|high|height|altitude)",
         Clause.scaled,
     ),
+    (rf"(?:{_N} m )?(?:higher|lower)$", Clause.higher),
+    (r"(?:go |fly )?(?:faster|slower)$", Clause.faster),
     (
         rf"(?:go |come |move |get |stay )?(?:{_N} m )?(closer|nearer|farther|further)(?: away)?$",
         Clause.shifted,
@@ -489,4 +525,5 @@ _HANDLERS: tuple[tuple[str, _Handler], ...] = (
     (r"turn|face|rotate|yaw", Clause.turn),
     (r"(?:go |move )?back (?:up|off|away)", Clause.back),
     (r"(?:go|fly|move|come) over(?= to)|go|fly|move|climb|rise|ascend|descend|come|back", Clause.go),
+    (r"((?:do )?the same (?:with|for|to|on|around))|the|an?|track|marker", Clause.same_with),
 )

@@ -127,6 +127,13 @@ SENTENCES: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("go three metres further away", ("orbit boat radius=13",)),
     ("keep fifteen metres", ("orbit boat radius=15",)),
     ("twice as fast", ("orbit boat speed=4",)),
+    ("half as slow", ("orbit boat speed=4",)),
+    ("three times as far", ("orbit boat radius=30",)),
+    ("twice as high", ("goto forward=0 right=0 altitude=10",)),
+    ("two metres lower", ("goto forward=0 right=0 altitude=3",)),
+    ("and now the person", ("orbit person radius=10",)),
+    ("the same with the blue car", ("orbit track=5 radius=10",)),
+    ("now marker 3", ("orbit marker=3 radius=10",)),
     ("the other way round", ("orbit boat direction=counterclockwise",)),
     ("do it again", ("orbit boat",)),
     # camera
@@ -170,6 +177,10 @@ SENTENCES: tuple[tuple[str, tuple[str, ...]], ...] = (
 
 # Sentences that are ambiguous, or that no command expresses; and a word of the question back.
 UNCLEAR: tuple[tuple[str, str], ...] = (
+    ("faster", "how fast"),
+    ("zero times as far", "not understood"),
+    ("the same with the unicorn", "not understood"),
+    ("the person, but not too near", "not understood"),
     ("follow the car", "which car"),
     ("approach", "which object"),
     ("find the unicorn", "unicorn"),
