@@ -15,6 +15,8 @@ from companion.settings import LanguageSection
 
 MAX_ANSWER_CHARACTERS = 20_000
 MAX_CALLS = 50
+OLLAMA_CONTEXT_TOKENS = 8192
+"""The functions alone take some 5600 tokens, more than Ollama keeps by default (4096)."""
 
 
 class LanguageError(RuntimeError):
@@ -92,7 +94,9 @@ class OllamaEndpoint:
         written = [_for_ollama(message) for message in messages]
         answer = _Answer(on_text)
         async with _readable(self, f"`ollama pull {self.model}`"):
-            async for part in await client.chat(self.model, written, tools=tools, stream=True):
+            async for part in await client.chat(
+                self.model, written, tools=tools, stream=True, options={"num_ctx": OLLAMA_CONTEXT_TOKENS}
+            ):
                 answer.add_text(part.message.content or "")
                 for call in part.message.tool_calls or ():
                     answer.add_call(ToolCall(call.function.name, dict(call.function.arguments)))
