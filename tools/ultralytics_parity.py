@@ -259,7 +259,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as temporary:
         for name in arguments.names:
             maps, folded, theirs, boxes, count = compare(
-                name, arguments.keep or Path(temporary), arguments.classes, arguments.apply_message
+                name, arguments.keep or Path(temporary), arguments.classes, arguments.fold
             )
             bad = maps > LARGEST_MAP_DIFFERENCE or boxes > LARGEST_BOX_DIFFERENCE
             wrong |= bad

@@ -82,11 +82,12 @@ def as_foreign(model: YoloModel, classes: Classes, **attributes: Any) -> Any:
     whole: Any = classes["DetectionModel"]()
     whole.model = nn.Sequential(*[relabelled(layer) for layer in model.model])
     head = whole.model[-1]
-    head.stride, head.reg_max = torch.tensor([8.0, 16.0, 32.0]), model.reg_max
+    strides = torch.tensor([float(stride) for stride in model.strides])
+    head.stride, head.reg_max = strides, model.reg_max
     whole.yaml = {key: table[key] for key in ("nc", "backbone", "head", "depth_multiple", "width_multiple")}
     whole.yaml |= {"max_channels": table["max_channels"], "yaml_file": "yolov8.yaml", "ch": 3}
     whole.names = dict(enumerate(model.class_names))
-    whole.stride = torch.tensor([8.0, 16.0, 32.0])
+    whole.stride = strides
     for name, value in attributes.items():
         setattr(whole, name, value)
     return whole.half()

@@ -12,7 +12,7 @@ import pytest
 from torch import nn
 
 from tests.vision.checkpoint_bombs import named, pickled
-from tests.vision.foreign_checkpoints import FOREIGN, as_foreign, foreign_classes, save_foreign, trained_model
+from tests.vision.foreign_checkpoints import as_foreign, foreign_classes, save_foreign, trained_model
 from tests.vision.foreign_files import (
     constant_onnx,
     stated,
@@ -20,6 +20,7 @@ from tests.vision.foreign_files import (
     ultralytics_torchscript,
 )
 from tests.vision.runtimes.conftest import lively_model, make_image
+from tests.vision.test_yolov9 import FOREIGN_YOLOV9, described
 from tests.vision.test_yolox import save_yolox
 from vision.detector import Detector
 from vision.runtimes.source import read_source
@@ -42,12 +43,15 @@ def rows() -> dict[str, str]:
     return {kind: result for kind, result in found if kind != "File"}
 
 
-def checkpoint(folder: Path, model: str = "DetectionModel", head: str = "Detect") -> Path:
-    """As Ultralytics saves one; other heads have further branches."""
+def checkpoint(
+    folder: Path, model: str = "DetectionModel", head: str = "Detect", rows: str | None = None
+) -> Path:
+    """As Ultralytics saves one; other heads have further branches. `rows`: a network of `test_yolov9`."""
+    trained = trained_model(None if rows is None else described(rows))
     with pytest.MonkeyPatch.context() as patch:
         tasks = dict.fromkeys(("SegmentationModel", "PoseModel"), "ultralytics.nn.tasks")
-        classes = foreign_classes(patch, FOREIGN | tasks | HEADS)
-        whole = as_foreign(trained_model(), classes | {"DetectionModel": classes[model]})
+        classes = foreign_classes(patch, FOREIGN_YOLOV9 | tasks | HEADS)
+        whole = as_foreign(trained, classes | {"DetectionModel": classes[model]})
         if head != "Detect":
             last = whole.model[-1]
             other = nn.Module.__new__(classes[head])
@@ -145,8 +149,8 @@ FILES: dict[str, Callable[[Path], Path]] = {
     "… YOLO-World": naming("ultralytics.nn.tasks.WorldModel"),
     "… YOLOE": naming("ultralytics.nn.tasks.YOLOEModel"),
     "… RT-DETR": naming("ultralytics.nn.tasks.RTDETRDetectionModel"),
-    "… YOLOv9": naming("ultralytics.nn.modules.block.ELAN1"),
-    "… YOLOv3-tiny": naming("torch.nn.modules.padding.ZeroPad2d"),
+    "… YOLOv9": lambda folder: checkpoint(folder, rows="YOLOv9, t to m"),
+    "… YOLOv3-tiny": lambda folder: checkpoint(folder, rows="YOLOv3-tiny"),
     "`.pt` of the repositories YOLOv5 and YOLOv7": naming("models.yolo.Model"),
     "`.pt` of YOLOv6": naming("yolov6.models.yolo.Model"),
     "`.pth` of YOLO-NAS": naming("super_gradients.training.models.YoloNAS"),

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from vision.yolo.description import ArchitectureError, LayerSpec, ModelDescription
+from vision.yolo.gelan import CBFuse, RepConv
 from vision.yolo.heads import Detect
 from vision.yolo.layer_config import HEADS, LAYERS, build_layer
 from vision.yolo.layers import ACTIVATIONS, Concat, Conv, LargeKernelDWConv
@@ -34,7 +35,7 @@ class YoloModel(nn.Module):
         layers, self._sources, self.strides = _build_layers(description)
         self.model = nn.ModuleList(layers)
         for module in self.modules():
-            if isinstance(module, Conv) and isinstance(module.act, nn.SiLU):
+            if isinstance(module, Conv | RepConv) and isinstance(module.act, nn.SiLU):
                 module.act = ACTIVATIONS[description.activation](inplace=True)
         self._last_use = {source: index for index, sources in enumerate(self._sources) for source in sources}
         self.detect.initialise_biases(self.strides)
@@ -72,7 +73,7 @@ class YoloModel(nn.Module):
             for source in set(sources):
                 if self._last_use[source] == index:
                     del outputs[source]
-            outputs[index] = layer(inputs if isinstance(layer, Concat | Detect) else inputs[0])
+            outputs[index] = layer(inputs if isinstance(layer, Concat | CBFuse | Detect) else inputs[0])
         levels: list[Tensor] = list(outputs[len(self.model) - 1])
         return levels
 
@@ -83,7 +84,7 @@ class YoloModel(nn.Module):
         """
         self.eval()
         for module in list(self.modules()):
-            if isinstance(module, Conv | LargeKernelDWConv | Detect):
+            if isinstance(module, Conv | LargeKernelDWConv | RepConv | Detect):
                 module.fuse()
         return self
 
@@ -107,6 +108,7 @@ def _build_layers(
     sources: list[tuple[int, ...]] = []
     channels = {_IMAGE: description.channels}
     reduction = {_IMAGE: 1}
+    parts: dict[int, tuple[int, ...]] = {}
     last = len(description.rows) - 1
     if sum(row.repeats for row in description.rows if row.repeats > 1) * description.depth_multiple > (
         _MAX_TOTAL_REPEATS
@@ -120,23 +122,32 @@ def _build_layers(
             raise ArchitectureError(
                 f"row {index} is {shown(row.layer)}: the last row, and no other, must be 'Detect'"
             )
-        if len({reduction[source] for source in reads}) > 1 and row.layer not in HEADS:
+        if len({reduction[source] for source in reads}) > 1 and row.layer not in (*HEADS, "CBFuse"):
             raise ArchitectureError(f"row {index} ({row.layer}) joins inputs of different sizes")
         if row.layer not in LAYERS:
             raise ArchitectureError(
                 f"row {index}: unknown layer {shown(row.layer)}; known: {', '.join(LAYERS)}"
             )
         try:
-            built = build_layer(row, [channels[source] for source in reads], description)
+            _check_padding(row, [description.rows[source].layer for source in reads if source >= 0])
+            widths = [channels[source] for source in reads]
+            built = build_layer(row, widths, description, [parts.get(source, ()) for source in reads])
         except ArchitectureError as error:
             raise ArchitectureError(f"row {index} ({row.layer}): {error}") from None
         layers.append(built.module)
         sources.append(reads)
         channels[index] = built.channels
-        reduction[index] = reduction[reads[0]] * built.reduction // built.enlargement
+        parts[index] = built.parts
+        reduction[index] = reduction[reads[-1]] * built.reduction // built.enlargement
     strides = tuple(reduction[source] for source in sources[-1])
     if strides[0] < 2 or strides[-1] > _LARGEST_STRIDE or list(strides) != sorted(set(strides)):
         raise ArchitectureError(
             f"row {last}: Detect must read inputs each smaller than the one before, got strides {strides}"
         )
     return layers, sources, strides
+
+
+def _check_padding(row: LayerSpec, read: list[str]) -> None:
+    """YOLOv3-tiny's only padding keeps the size in a pooling at stride 1: neither may stand alone."""
+    if (row.layer == "nn.MaxPool2d" and tuple(row.arguments) == (2, 1, 0)) != ("nn.ZeroPad2d" in read):
+        raise ArchitectureError("a pooling at stride 1 must read a padding by one, and nothing else may")

@@ -119,7 +119,7 @@ def save_checkpoint(path: str | Path, model: YoloModel, *, metadata: Mapping[str
 def load_checkpoint(path: str | Path) -> LoadedModel:
     """Read our own checkpoint (either file of a pair, or a `.pt`) or an Ultralytics detection checkpoint.
 
-    Of Ultralytics': YOLOv5u, v8, v10, 11, 12, 26.
+    Of Ultralytics': YOLOv3-tiny, v5u, v8, v9, v10, 11, 12, 26.
 
     Raises:
         UnsafeCheckpointError: the file requests a function call, named in the message.

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from torch import nn
 
 from vision.yolo.description import ArchitectureError, LayerSpec, ModelDescription
+from vision.yolo.gelan import ELAN1, SPPELAN, AConv, ADown, CBFuse, CBLinear, RepNCSPELAN4
 from vision.yolo.heads import Detect
 from vision.yolo.layers import (
     C2,
@@ -33,6 +34,9 @@ from vision.yolo.safe_pickle import shown
 LARGEST_KERNEL = 31
 _LARGEST_CHANNELS = 1 << 14
 _MOST_REPEATS = 64
+# Published: 1 to 3. Each is a dozen modules, in two stages of a row.
+_MOST_STAGE_REPEATS = 4
+_MOST_MAPS = 8
 HEADS = ("Detect", "v10Detect")
 
 
@@ -42,11 +46,13 @@ class LayerArguments:
 
     Attributes:
         inputs: channels of the rows it reads.
+        parts: of each of those rows the channels of its maps; empty for a single map.
     """
 
     row: LayerSpec
     inputs: tuple[int, ...]
     description: ModelDescription
+    parts: tuple[tuple[int, ...], ...] = ()
 
     def single(self) -> int:
         """The channels of the one row it reads."""
@@ -82,6 +88,14 @@ class LayerArguments:
         if self._argument(position, 1) != 1:
             raise ArchitectureError(f"does not support groups, got {shown(self._argument(position, 1))}")
 
+    def numbers(self, position: int, name: str, smallest: int) -> tuple[int, ...]:
+        value = self._argument(position, None)
+        if not isinstance(value, list | tuple) or not 1 <= len(value) <= _MOST_MAPS:
+            raise ArchitectureError(f"{name} must be a list of 1..{_MOST_MAPS} numbers, got {shown(value)}")
+        if not all(type(item) is int and smallest <= item <= _LARGEST_CHANNELS for item in value):
+            raise ArchitectureError(f"{name} must be whole numbers from {smallest}, got {shown(value)}")
+        return tuple(value)
+
     def _argument(self, position: int, default: object) -> object:
         return self.row.arguments[position] if position < len(self.row.arguments) else default
 
@@ -105,20 +119,29 @@ class LayerArguments:
 
 @dataclass(frozen=True, slots=True)
 class BuiltLayer:
-    """A row's module, its output channels, and the factors by which it reduces and enlarges the size."""
+    """A row's module, its output channels, and the factors by which it reduces and enlarges the size.
+
+    `parts` has the channels of each map if they are several.
+    """
 
     module: nn.Module
     channels: int
     reduction: int = 1
     enlargement: int = 1
+    parts: tuple[int, ...] = ()
 
 
 _Builder = Callable[["LayerArguments"], BuiltLayer]
 _BUILDERS: dict[str, tuple[_Builder, int | None, bool]] = {}
 
 
-def build_layer(row: LayerSpec, inputs: Sequence[int], description: ModelDescription) -> BuiltLayer:
-    """Build the module of `row`, one of `LAYERS`, for inputs with `inputs` channels.
+def build_layer(
+    row: LayerSpec,
+    inputs: Sequence[int],
+    description: ModelDescription,
+    parts: Sequence[tuple[int, ...]] = (),
+) -> BuiltLayer:
+    """Build the module of `row`, one of `LAYERS`, for inputs with `inputs` channels, in these `parts`.
 
     Raises `ArchitectureError`.
     """
@@ -127,7 +150,7 @@ def build_layer(row: LayerSpec, inputs: Sequence[int], description: ModelDescrip
         raise ArchitectureError(f"takes at most {most_arguments} arguments, got {shown(list(row.arguments))}")
     if row.repeats != 1 and not repeats:
         raise ArchitectureError(f"cannot repeat, got repeats {row.repeats}")
-    return builder(LayerArguments(row, tuple(inputs), description))
+    return builder(LayerArguments(row, tuple(inputs), description, tuple(parts)))
 
 
 def _builds(
@@ -325,6 +348,73 @@ def _detect(row: LayerArguments) -> BuiltLayer:
         class_width=description.class_width,
     )
     return BuiltLayer(module, 0)
+
+
+@_builds("RepNCSPELAN4", "ELAN1", most_arguments=4)
+def _elan(row: LayerArguments) -> BuiltLayer:
+    channels = row.channels()
+    hidden = row.number(1, "hidden channels", _LARGEST_CHANNELS)
+    width = row.number(2, "width of the stages", _LARGEST_CHANNELS)
+    repeats = row.number(3, "repeats", _MOST_STAGE_REPEATS, 1)
+    if hidden % 2 or width % 2:
+        raise ArchitectureError(f"needs even channels, got {hidden} and {width}")
+    if row.row.layer == "ELAN1":
+        return BuiltLayer(ELAN1(row.single(), channels, hidden, width), channels)
+    return BuiltLayer(RepNCSPELAN4(row.single(), channels, hidden, width, repeats), channels)
+
+
+@_builds("AConv", "ADown", most_arguments=1)
+def _averaging_down(row: LayerArguments) -> BuiltLayer:
+    channels, inputs = row.channels(), row.single()
+    if inputs % 2 or channels % 2:
+        raise ArchitectureError(f"needs even channels, got {inputs} and {channels}")
+    block = AConv if row.row.layer == "AConv" else ADown
+    return BuiltLayer(block(inputs, channels), channels, reduction=2)
+
+
+@_builds("SPPELAN", most_arguments=3)
+def _sppelan(row: LayerArguments) -> BuiltLayer:
+    channels, hidden = row.channels(), row.number(1, "hidden channels", _LARGEST_CHANNELS)
+    return BuiltLayer(SPPELAN(row.single(), channels, hidden, row.odd(2, "kernel", 5)), channels)
+
+
+@_builds("CBLinear", most_arguments=1)
+def _cblinear(row: LayerArguments) -> BuiltLayer:
+    widths = row.numbers(0, "channels of the maps", 1)
+    return BuiltLayer(CBLinear(row.single(), widths), sum(widths), parts=widths)
+
+
+@_builds("CBFuse", most_arguments=1)
+def _cbfuse(row: LayerArguments) -> BuiltLayer:
+    *others, channels = row.inputs
+    chosen = row.numbers(0, "maps of the inputs", 0)
+    if len(chosen) != len(others) or any(
+        index >= len(parts) or parts[index] != channels
+        for index, parts in zip(chosen, row.parts, strict=False)
+    ):
+        raise ArchitectureError(f"needs a map of {channels} channels of each input, got {list(chosen)}")
+    starts = [sum(parts[:index]) for index, parts in zip(chosen, row.parts, strict=False)]
+    return BuiltLayer(CBFuse(starts), channels)
+
+
+@_builds("nn.Identity", most_arguments=0)
+def _identity(row: LayerArguments) -> BuiltLayer:
+    return BuiltLayer(nn.Identity(), row.single())
+
+
+@_builds("nn.ZeroPad2d", most_arguments=1)
+def _zero_pad(row: LayerArguments) -> BuiltLayer:
+    if row.numbers(0, "padding", 0) != (0, 1, 0, 1):
+        raise ArchitectureError(f"pads right and bottom by one, got {shown(list(row.row.arguments))}")
+    return BuiltLayer(nn.ZeroPad2d((0, 1, 0, 1)), row.single())
+
+
+@_builds("nn.MaxPool2d", most_arguments=3)
+def _max_pool(row: LayerArguments) -> BuiltLayer:
+    if tuple(row.row.arguments) not in ((2, 2, 0), (2, 1, 0)):
+        raise ArchitectureError(f"pools 2×2 at stride 2 or 1, got {shown(list(row.row.arguments))}")
+    stride = row.number(1, "stride", 2)
+    return BuiltLayer(nn.MaxPool2d(2, stride), row.single(), reduction=stride)
 
 
 LAYERS = tuple(sorted(_BUILDERS))

@@ -459,15 +459,20 @@ class LargeKernelDWConv(nn.Module):
         large, small = self.conv, self.conv1
         if not isinstance(large, Conv) or not isinstance(small, Conv):
             return
-        large.fuse()
-        small.fuse()
-        margin = (large.conv.kernel_size[0] - small.conv.kernel_size[0]) // 2
-        with torch.no_grad():
-            large.conv.weight += nn.functional.pad(small.conv.weight, [margin] * 4)
-            assert large.conv.bias is not None
-            assert small.conv.bias is not None
-            large.conv.bias += small.conv.bias
-        self.conv, self.conv1 = large.conv, None
+        self.conv, self.conv1 = merged_convolution(large, small), None
+
+
+def merged_convolution(large: Conv, small: Conv) -> nn.Conv2d:
+    """One convolution with the sum of two parallel ones without activation, normalisation folded."""
+    large.fuse()
+    small.fuse()
+    margin = (large.conv.kernel_size[0] - small.conv.kernel_size[0]) // 2
+    with torch.no_grad():
+        large.conv.weight += nn.functional.pad(small.conv.weight, [margin] * 4)
+        assert large.conv.bias is not None
+        assert small.conv.bias is not None
+        large.conv.bias += small.conv.bias
+    return large.conv
 
 
 class CIB(nn.Module):

@@ -286,6 +286,10 @@ def model_family_of(model: YoloModel) -> str:
         model_family = "YOLO12"
     elif "C3k2" in layers:
         model_family = "YOLO26" if description.reg_max == 1 else "YOLO11"
+    elif layers & {"RepNCSPELAN4", "ELAN1"}:
+        model_family = "YOLOv9"
+    elif "nn.ZeroPad2d" in layers:
+        return "YOLOv3-tiny"
     elif "C2f" in layers:
         model_family = "YOLOv8"
     elif "C3" in layers:
