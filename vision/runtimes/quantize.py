@@ -88,10 +88,8 @@ def quantize_onnx(source: Path, output: Path, images: Iterable[NDArray[np.uint8]
     _name_constants(graph)
     options: dict[str, Any] = {"ActivationSymmetric": False, "WeightSymmetric": True}
     if to == "openvino":
-        operators = ["Conv"]
-        options["OpTypesToExcludeOutputQuantization"] = operators
+        options["OpTypesToExcludeOutputQuantization"] = ["Conv"]
     else:
-        operators = ["Conv", "Sigmoid", "Mul", "Add", "Concat", "MaxPool", "Resize", "Split", "Slice"]
         options["TensorQuantOverrides"] = {
             name: [{"rmin": np.float32(_SILU_FROM)}] for name in _before_silu(graph)
         }
@@ -105,7 +103,7 @@ def quantize_onnx(source: Path, output: Path, images: Iterable[NDArray[np.uint8]
             str(output),
             Reader(),
             quant_format=quantization.QuantFormat.QDQ,
-            op_types_to_quantize=operators,
+            op_types_to_quantize=["Conv"],
             nodes_to_exclude=_last_convolutions(graph),
             per_channel=True,
             weight_type=quantization.QuantType.QInt8,
