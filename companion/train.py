@@ -212,7 +212,7 @@ def train_on_data(
     with _ProgressDisplay() as display:
         trained = train(
             settings,
-            LabelledScenes(images),
+            LabelledScenes(images, len(loaded.class_names)),
             display,
             checkpoint=output.with_suffix(f"{output.suffix}.training"),
             resume=resume,

@@ -142,7 +142,7 @@ def make_dataset(
                 lines = "".join(_yolo_line(item, options.classes, size) for item in seen)
                 (folder / "labels" / split / f"{name}.txt").write_text(lines, "utf-8")
             else:
-                coco[split].add(index, f"{name}.jpg", size, seen)
+                coco[split].add(index, f"{name}.jpg", size, captured.rendered.objects, seen)
             entry = {"image": f"images/{split}/{name}.jpg", **frame_truth(captured)}
             truth.write(json.dumps(entry) + "\n")
             on_frame(index + 1)
@@ -282,9 +282,21 @@ class _Coco:
         self._images: list[dict[str, Any]] = []
         self._annotations: list[dict[str, Any]] = []
 
-    def add(self, index: int, file_name: str, size: tuple[int, int], seen: Sequence[VisibleObject]) -> None:
+    def add(
+        self,
+        index: int,
+        file_name: str,
+        size: tuple[int, int],
+        objects: Sequence[VisibleObject],
+        seen: Sequence[VisibleObject],
+    ) -> None:
+        """Add an image. Objects of the classes that are not in `seen` are neither these nor background:
+        `iscrowd`, which YOLO's format cannot say.
+        """
         self._images.append({"id": index, "file_name": file_name, "width": size[0], "height": size[1]})
-        for item in seen:
+        for item in objects:
+            if item.world_object.class_name not in self._classes:
+                continue
             left, top, right, bottom = item.xyxy
             self._annotations.append(
                 {
@@ -293,7 +305,7 @@ class _Coco:
                     "category_id": self._classes.index(item.world_object.class_name) + 1,
                     "bbox": [left, top, right - left, bottom - top],
                     "area": item.pixel_count,
-                    "iscrowd": 0,
+                    "iscrowd": int(not any(item is one for one in seen)),
                     "object": item.world_object.identifier,
                     "visible_fraction": round(item.visible_fraction, 4),
                     "range_m": round(item.range_m, 3),

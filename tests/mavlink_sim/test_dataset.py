@@ -103,7 +103,7 @@ def test_coco_files_read_by_pycocotools(tmp_path: Path) -> None:
     coco = pytest.importorskip("pycocotools.coco", reason="COCO's own reader is not installed")
     folder = tmp_path / "set"
     labels = make_dataset(folder, None, DatasetOptions(6, layout="coco", size=(160, 128), validation=0.5))
-    found = 0
+    found = ignored = 0
     for split in ("train", "val"):
         book = coco.COCO(str(folder / "annotations" / f"instances_{split}.json"))
         assert len(book.getImgIds()) == 3
@@ -117,9 +117,13 @@ def test_coco_files_read_by_pycocotools(tmp_path: Path) -> None:
             assert left + width <= 160
             assert top + height <= 128
             assert 0 < item["area"] <= width * height
-            found += 1
+            found += item["iscrowd"] == 0
+            if item["iscrowd"]:  # too small or too much hidden to be labelled, and no background
+                ignored += 1
+                assert min(width, height) < 6 or item["visible_fraction"] < 0.3
         assert [item["name"] for item in book.loadCats(book.getCatIds())] == list(CLASS_NAMES)
     assert found == labels > 0
+    assert ignored > 0
 
 
 @pytest.mark.parametrize("scene", [SCENE, None])

@@ -99,7 +99,7 @@ def shown(image: NDArray[np.uint8], colour: tuple[int, int, int], box: NDArray[n
 
 def test_boxes_fit_their_objects_in_single_images_and_mosaics(tmp_path: Path) -> None:
     item = TrainingImage(picture(tmp_path / "a.png"), BOXES, np.array([0, 1]))
-    scenes = LabelledScenes([item, item])
+    scenes = LabelledScenes([item, item], known=2)
     counts = []
     for seed in range(30):
         image, boxes, ids = scenes(np.random.default_rng(seed), 160, 128)
@@ -113,3 +113,16 @@ def test_boxes_fit_their_objects_in_single_images_and_mosaics(tmp_path: Path) ->
         assert np.array_equal(image, again[0])
     assert counts.count(2) >= 8
     assert max(counts) > 3
+
+
+def test_half_of_the_images_show_a_new_class(tmp_path: Path) -> None:
+    path = picture(tmp_path / "a.png")
+    images = [TrainingImage(path, BOXES[:1], np.array([number == 0])) for number in range(20)]
+    rng = np.random.default_rng(0)
+
+    def share(known: int) -> float:
+        scenes = LabelledScenes(images, known)
+        return float(np.mean(np.concatenate([scenes(rng, 64, 64)[2] == 1 for _ in range(60)])))
+
+    assert share(known=1) > 0.4
+    assert share(known=2) < 0.2

@@ -25,6 +25,8 @@ object nor background from the second."""
 SAME_OBJECT_IOU = 0.5
 MOSAIC_SHARE = 0.5
 """Share of the images that are composed of four."""
+NEW_SHARE = 0.5
+"""Share of the images and tiles that show a new class, if any does: the others are known already."""
 _TILE = replace(NO_AUGMENTATION, zoom_probability=1.0, min_side_px=4.0)
 
 
@@ -110,10 +112,15 @@ def _with_found(
 
 
 class LabelledScenes:
-    """A `SceneSource` of labelled images: one letterboxed, or a mosaic of parts of four."""
+    """A `SceneSource` of labelled images: one letterboxed, or a mosaic of parts of four.
 
-    def __init__(self, images: Sequence[TrainingImage]) -> None:
+    Args:
+        known: number of classes that the starting model knows; the ids from there on are new.
+    """
+
+    def __init__(self, images: Sequence[TrainingImage], known: int) -> None:
         self._images = tuple(images)
+        self._with_new = [i for i, item in enumerate(self._images) if (item.class_ids >= known).any()]
         self._read: dict[tuple[int, int, int], LabelledImage] = {}
         self._margin = KEPT_BYTES
 
@@ -135,6 +142,8 @@ class LabelledScenes:
     def _random(self, rng: np.random.Generator, width: int, height: int) -> LabelledImage:
         """One of the images, enlarged or reduced to fit into the size, without padding."""
         index = int(rng.integers(len(self._images)))
+        if self._with_new and rng.random() < NEW_SHARE:
+            index = self._with_new[int(rng.integers(len(self._with_new)))]
         scene = self._read.get((index, width, height))
         if scene is None:
             scene = _scaled(self._images[index], width, height)
