@@ -207,7 +207,7 @@ class LockstepVehicle:
     def copy(self, seed: int | None = None) -> LockstepVehicle:
         """An independent copy in the current state.
 
-        With the same inputs both fly alike, bit for bit. It takes a few milliseconds: use it to try several
+        With the same inputs both fly alike, bit for bit. It takes about 2 ms: use it to try several
         continuations of one state, or to begin every episode of a training in the air. `stop` of what
         `repeat` returned stops the first one's messages only.
 

@@ -14,6 +14,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib import resources
+from typing import Any
 
 INT32 = 6  # MAV_PARAM_TYPE_INT32
 REAL32 = 9  # MAV_PARAM_TYPE_REAL32
@@ -86,6 +87,11 @@ def default_parameters(gimbal: bool = False) -> list[Parameter]:
 
 
 @cache
+def _defaults(gimbal: bool) -> Mapping[str, Parameter]:
+    return {parameter.name: parameter for parameter in default_parameters(gimbal)}
+
+
+@cache
 def _read(file_name: str) -> tuple[Parameter, ...]:
     text = resources.files(__package__).joinpath(file_name).read_text(encoding="utf-8")
     found = []
@@ -108,13 +114,30 @@ class Parameters:
 
         Raises UnknownParameterError or ValueError for an unknown name or an invalid value in `values`.
         """
-        self._defaults = {parameter.name: parameter for parameter in default_parameters(gimbal)}
+        self._gimbal = gimbal
+        self._defaults = self._default_set()
         self._parameters = dict(self._defaults)
         self._unused = {parameter.name for parameter in _read(_MISSION_FILE)}
         self._number_listed()
         self.revision = 0
         for name, value in (values or {}).items():
             self.set(name, value)
+
+    def _default_set(self) -> Mapping[str, Parameter]:
+        """The defaults by name, shared by all vehicles with the same ones."""
+        return _defaults(self._gimbal)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Only what differs from the defaults: a copy of a vehicle shares them."""
+        state = {**vars(self), "_parameters": self.customised()}
+        del state["_defaults"], state["_names"], state["_index"]
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._defaults = self._default_set()
+        self._parameters = {**self._defaults, **{item.name: item for item in state["_parameters"]}}
+        self._number_listed()
 
     def _number_listed(self) -> None:
         self._names = [name for name in self._parameters if name not in self._unused]

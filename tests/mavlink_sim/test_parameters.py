@@ -1,5 +1,6 @@
 """The parameter set and MAVLink's parameter protocol."""
 
+import pickle
 import struct
 from typing import Any
 
@@ -15,6 +16,7 @@ from mavlink_sim.px4.parameters import (
     UnknownParameterError,
     decode_wire_value,
 )
+from mavlink_sim.vehicles.ardupilot.parameters import CopterParameters
 from mavlink_sim.wire.messages import dialect
 from tests.mavlink_sim.conftest import SimHarness
 
@@ -80,3 +82,22 @@ def test_unknown_name_raises() -> None:
 def test_a_value_that_the_type_cannot_hold_is_refused(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=r"INT32|32-bit float"):
         Parameters({name: value})
+
+
+@pytest.mark.parametrize(("kind", "name"), [(Parameters, "MPC_XY_P"), (CopterParameters, "WPNAV_SPEED")])
+def test_copy_has_values_and_shares_the_defaults(kind: type[Parameters], name: str) -> None:
+    first = kind(gimbal=True)
+    first.use("MIS_DIST_1WP")
+    default = first.number(name)
+    first.set(name, 2.0)
+    stored = pickle.dumps(first)
+    assert len(stored) < 10_000
+    second = pickle.loads(stored)
+    assert list(second) == list(first)
+    assert [second.index(item.name) for item in second] == list(range(len(first)))
+    assert (second.revision, second.hash()) == (first.revision, first.hash())
+    assert second.customised() == first.customised()
+    first.set(name, 3.0)
+    assert second.number(name) == 2.0
+    second.reset()
+    assert second.number(name) == default

@@ -13,6 +13,7 @@ import math
 import struct
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 
 from mavlink_sim.px4.parameters import REAL32, Parameter, Parameters
 
@@ -131,16 +132,21 @@ _LOOPS: dict[str, Callable[[Parameters], float]] = {
 _ALIASES = {"MAV_SYS_ID": "SYSID_THISMAV"}
 
 
+@cache
+def _copter_defaults() -> Mapping[str, Parameter]:
+    return {
+        name: CopterParameter(name, kind, value if kind == REAL32 else int(value))
+        for name, kind, value in _DEFAULTS
+    }
+
+
 class CopterParameters(Parameters):
     """Copter's set as clients see it; `number` also finds the hidden parameters of the loops."""
 
     def __init__(self, values: Mapping[str, float] | None = None, gimbal: bool = False) -> None:
         """Raises UnknownParameterError or ValueError for an unknown name or an invalid value in `values`."""
         self._loops = Parameters()
-        self._defaults = {
-            name: CopterParameter(name, kind, value if kind == REAL32 else int(value))
-            for name, kind, value in _DEFAULTS
-        }
+        self._defaults = self._default_set()
         self._parameters = dict(self._defaults)
         self._unused = set()
         self._number_listed()
@@ -148,6 +154,9 @@ class CopterParameters(Parameters):
         for name, value in (values or {}).items():
             self._set_own(name, value)
         self._follow()
+
+    def _default_set(self) -> Mapping[str, Parameter]:
+        return _copter_defaults()
 
     def number(self, name: str) -> float:
         own = self._parameters.get(name)
