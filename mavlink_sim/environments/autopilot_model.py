@@ -42,10 +42,13 @@ class AutopilotModel:
     def __init__(self, count: int, *, noise: bool = True) -> None:
         self._noise = noise
         self.vehicles = [hovering(noise)] * count
-        self.position, self.velocity, self.wind = (np.zeros((3, count)) for _ in range(3))
-        self.estimated_position, self.estimated_velocity = np.zeros((3, count)), np.zeros((3, count))
-        self.rotation = np.zeros((3, 3, count))
-        self.yaw_rad, self.gusts_m_s, self.mass = np.zeros(count), np.zeros(count), np.ones(count)
+        # views of one array, so that `_read` writes the values of all vehicles at once
+        self._state = np.zeros((22, count))
+        self.position, self.velocity = self._state[0:3], self._state[3:6]
+        self.estimated_position, self.estimated_velocity = self._state[6:9], self._state[9:12]
+        self.rotation = self._state[12:21].reshape(3, 3, count)
+        self.yaw_rad = self._state[21]
+        self.wind, self.gusts_m_s, self.mass = np.zeros((3, count)), np.zeros(count), np.ones(count)
         self.failed = np.zeros(count, bool)
 
     def begin(
@@ -68,7 +71,7 @@ class AutopilotModel:
             airframe.rotor_effectiveness = (share, share, share, share)
             vehicle.vehicle.estimate.refresh()
             autopilot.controller.reset(vehicle.vehicle.estimate.yaw_rad)
-            self._read(int(index))
+        self._read(which)
 
     def fly(self, velocity: Array, turn_rad_s: Array, rng: np.random.Generator) -> None:
         """As `FastModel.fly`; `rng` is not used: each vehicle has its own."""
@@ -79,15 +82,22 @@ class AutopilotModel:
             setpoint = TrajectorySetpoint(NOTHING, (north, east, down), NOTHING, NAN, turn)
             vehicle.autopilot.offboard_setpoint(setpoint)
             vehicle.step(STEP_S)
-            self._read(index)
+        self._read(np.arange(len(self.vehicles)))
 
-    def _read(self, index: int) -> None:
-        vehicle = self.vehicles[index].vehicle
-        airframe, estimate = vehicle.airframe, vehicle.estimate
-        self.position[:, index] = airframe.position
-        self.velocity[:, index] = airframe.velocity
-        self.rotation[:, :, index] = np.reshape(airframe.matrix, (3, 3))
-        self.estimated_position[:, index] = estimate.position
-        self.estimated_velocity[:, index] = estimate.velocity
-        self.yaw_rad[index] = estimate.yaw_rad
-        self.failed[index] = airframe.crashed or vehicle.autopilot.mode is not Mode.OFFBOARD
+    def _read(self, which: NDArray[np.intp]) -> None:
+        vehicles = [self.vehicles[index].vehicle for index in which]
+        rows = [
+            (
+                *one.airframe.position,
+                *one.airframe.velocity,
+                *one.estimate.position,
+                *one.estimate.velocity,
+                *one.airframe.matrix,
+                one.estimate.yaw_rad,
+            )
+            for one in vehicles
+        ]
+        self._state[:, which] = np.array(rows).T
+        self.failed[which] = [
+            one.airframe.crashed or one.autopilot.mode is not Mode.OFFBOARD for one in vehicles
+        ]
