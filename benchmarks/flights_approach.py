@@ -8,6 +8,7 @@ and the true distance to the object's nearest surface is off by 1.5 m at most, w
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from companion.bench.lockstep_flight import Camera, LockstepFlight, camera_setti
 from companion.bench.rendered_camera import RenderedCamera, rendered_scene
 from companion.bench.synthetic_camera import SyntheticCamera
 from companion.bench.synthetic_detector import SceneObject, ScenePose, SyntheticDetector
+from companion.guidance.behaviour import Behaviour
 from companion.guidance.behaviours.approach import ApproachBehaviour
 from mavlink_sim.lockstep import LockstepVehicle
 from vision.camera_model import CameraModel, CameraMount
@@ -39,11 +41,19 @@ def run(seed: int, *, rendered: bool = False) -> FlightResult:
     return fly(seed, with_depth=False, tolerance_m=WITHOUT_DEPTH_M, rendered=rendered)
 
 
-def fly(seed: int, *, with_depth: bool, tolerance_m: float, rendered: bool = False) -> FlightResult:
+def fly(
+    seed: int,
+    *,
+    with_depth: bool,
+    tolerance_m: float,
+    rendered: bool = False,
+    command: Callable[[str], str | Behaviour] = lambda name: ApproachBehaviour(name, distance_m=DISTANCE_M),
+) -> FlightResult:
     """One flight; its success allows an error of the final range of `tolerance_m`.
 
     Args:
         rendered: the camera is drawn and looked at by the real detector, tracker and ranging.
+        command: what is flown to an object of a class, to `DISTANCE_M`.
     """
     rng = np.random.default_rng((seed, 81))
     class_name = ("car", "person", "truck")[seed % 3]
@@ -77,7 +87,7 @@ def fly(seed: int, *, with_depth: bool, tolerance_m: float, rendered: bool = Fal
     flight.turn_to(
         math.atan2(goal.pose(0.0).east_m, goal.pose(0.0).north_m) + float(rng.uniform(-0.15, 0.15))
     )
-    log = flight.fly(ApproachBehaviour(class_name, distance_m=DISTANCE_M), LIMIT_S)
+    log = flight.fly(command(class_name), LIMIT_S)
     range_m = goal.range_m(flight.vehicle.truth.position_ned_m, flight.seconds)
     error_m = abs(range_m - DISTANCE_M)
     reason = log.outcome.reason if log.outcome is not None else f"not there after {LIMIT_S:g} s"

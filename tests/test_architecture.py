@@ -52,6 +52,7 @@ GUIDANCE_FLOORS = {
     "search_pattern": 0,
     "targets": 0,
     "path": 1,
+    "policy_network": 0,
     "policy_file": 1,
     "formation": 2,
     "behaviour": 3,

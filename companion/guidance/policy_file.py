@@ -10,13 +10,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from vision.runtimes.base import required
+from companion.guidance.policy_network import Network, NetworkError, read_network
 
 _Format = Literal["mavlink-companion.policy.v1"]
 FORMAT: _Format = "mavlink-companion.policy.v1"
@@ -82,20 +82,18 @@ class PolicyDescription(BaseModel):
 
 
 class LoadedPolicy:
-    """A policy that is ready to be stepped, on one processor thread.
+    """A policy that is ready to be stepped.
 
     Attributes:
         name: of the file, without suffix.
     """
 
-    def __init__(self, name: str, description: PolicyDescription, session: Any) -> None:
-        self.name, self.description, self._session = name, description, session
-        self._input = session.get_inputs()[0].name
+    def __init__(self, name: str, description: PolicyDescription, network: Network) -> None:
+        self.name, self.description, self._network = name, description, network
 
     def act(self, observation: Sequence[float]) -> list[float]:
         """The action for an observation, both in the order and the units of the description; not clipped."""
-        (action,) = self._session.run(None, {self._input: np.array([observation], np.float32)})
-        return [float(value) for value in action[0]]
+        return [float(value) for value in self._network.compute(np.array([observation], np.float32))[0]]
 
 
 def find_policy(name: str) -> Path:
@@ -124,9 +122,7 @@ def load_policy(path: Path) -> LoadedPolicy:
 
     Raises:
         PolicyError: it cannot be read, has no description or another layout than described.
-        RuntimeMissingError: ONNX Runtime is not installed; the message names the extra.
     """
-    onnxruntime = required("onnxruntime")
     try:
         size = path.stat().st_size
         if size > LARGEST_BYTES:
@@ -134,15 +130,11 @@ def load_policy(path: Path) -> LoadedPolicy:
         content = path.read_bytes()
     except OSError as error:
         raise PolicyError(f"{path}: cannot be read: {error}") from error
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.log_severity_level = 4
-    # ONNX Runtime's errors have no common base class but Exception.
     try:
-        session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-    except Exception as error:
-        raise PolicyError(f"{path}: no usable ONNX file: {' '.join(str(error).split())[:200]}") from error
-    text = session.get_modelmeta().custom_metadata_map.get(KEY)
+        network = read_network(content)
+    except NetworkError as error:
+        raise PolicyError(f"{path}: no usable ONNX file: {error}") from error
+    text = network.metadata.get(KEY)
     if text is None:
         raise PolicyError(
             f"{path}: has no description of its observation and action (metadata {KEY}); "
@@ -155,18 +147,18 @@ def load_policy(path: Path) -> LoadedPolicy:
         where = ".".join(map(str, first["loc"])) or "it"
         raise PolicyError(f"{path}: its description cannot be used: {where}: {first['msg']}") from error
     for what, ports, quantities in (
-        ("input", session.get_inputs(), description.observation),
-        ("output", session.get_outputs(), description.action),
+        ("input", network.inputs, description.observation),
+        ("output", network.outputs, description.action),
     ):
-        found = ", ".join(f"{port.type}{list(port.shape)}" for port in ports)
-        wanted = f"one {what} tensor(float)[1, {len(quantities)}]"
-        if len(ports) != 1 or ports[0].type != "tensor(float)" or ports[0].shape != [1, len(quantities)]:
-            raise PolicyError(f"{path}: expected {wanted}, as it is described, got {found}")
-    policy = LoadedPolicy(path.stem, description, session)
+        found = ", ".join(f"{'float32' if port.is_float32 else 'other'}{port.shape}" for port in ports)
+        shape = [1, len(quantities)]
+        if [(port.is_float32, port.shape) for port in ports] != [(True, shape)]:
+            raise PolicyError(f"{path}: expected one {what} float32{shape}, as it is described, got {found}")
+    policy = LoadedPolicy(path.stem, description, network)
     try:
         action = policy.act([(each.low + each.high) / 2 for each in description.observation])
-    except Exception as error:
-        raise PolicyError(f"{path}: it cannot be computed: {' '.join(str(error).split())[:200]}") from error
+    except NetworkError as error:
+        raise PolicyError(f"{path}: {error}") from error
     if not all(map(math.isfinite, action)):
         raise PolicyError(f"{path}: its action is no number ({action}); train it again")
     return policy

@@ -31,7 +31,6 @@ from companion.guidance.targets.chosen import Wanted
 from companion.guidance.targets.track import ObjectTrack
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
-from vision.runtimes.base import RuntimeMissingError
 
 # What a policy can observe and command, with units. `forward` and `right` are horizontal, by the yaw; the
 # target is the filtered point on the object's surface, `target_age_s` the age of its newest detection.
@@ -70,7 +69,7 @@ class Policy(Command):
             check_quantities(loaded)
             wanted = Wanted(self.class_name, self.track_id)
             return PolicyBehaviour(loaded, wanted, distance_m=self.distance_m, limit_s=self.limit_s)
-        except (PolicyError, RuntimeMissingError) as error:
+        except PolicyError as error:
             raise GrammarError(f"policy: {error}") from error
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.flights_policy_depth import run
 from companion.guidance.behaviour import Behaviour
 from companion.guidance.behaviours.policy import ACTIONS, OBSERVATIONS
 from companion.guidance.command import NO_CONTEXT, GrammarError
@@ -23,16 +25,17 @@ from companion.guidance.policy_file import (
     KEY,
     Layer,
     PolicyDescription,
+    PolicyError,
     Quantity,
     find_policy,
     load_policy,
     write_policy,
 )
+from companion.guidance.policy_network import read_network
 from companion.vehicle.setpoint import Setpoint
 from tests.companion.guidance.guidance_harness import Flight, GuidanceHarness, assert_failed, engaged, flying
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
 
-pytest.importorskip("onnxruntime", reason="onnxruntime is an optional extra")
 onnx = pytest.importorskip("onnx", reason="onnx is an optional extra")
 
 RANGES = {
@@ -274,11 +277,76 @@ def test_policy_needs_a_class_or_a_track() -> None:
     assert parse("policy a.onnx track=7").build is not None
 
 
-def test_missing_runtime_is_named_with_its_extra(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = write()
-    monkeypatch.setattr("importlib.util.find_spec", lambda name, package=None: None)
-    with pytest.raises(GrammarError, match=r"mavlink-companion\[onnxruntime\]"):
+def test_bundled_policy_flies_an_approach_without_onnx(monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in ("onnx", "onnxruntime"):
+        monkeypatch.setitem(sys.modules, module, None)
+    flown = run(2)
+    assert flown.success, flown.reason
+    assert flown.values["range_error_m"] < 0.5
+    assert flown.values["envelope_violations"] == 0.0
+
+
+def test_bundled_policy_is_computed_as_by_onnx_runtime() -> None:
+    onnxruntime = pytest.importorskip("onnxruntime", reason="onnxruntime is an optional extra")
+    policy = load_policy(find_policy("approach"))
+    session = onnxruntime.InferenceSession(str(find_policy("approach")))
+    described, rng = policy.description.observation, np.random.default_rng(1)
+    for part in rng.uniform(0.0, 1.0, (50, len(described))):
+        values = [each.low + at * (each.high - each.low) for at, each in zip(part, described, strict=True)]
+        (expected,) = session.run(None, {"observation": np.array([values], np.float32)})
+        assert policy.act(values) == pytest.approx(expected[0].tolist(), abs=1e-5)
+
+
+def test_every_operator_is_computed_as_by_onnx_runtime() -> None:
+    onnxruntime = pytest.importorskip("onnxruntime", reason="onnxruntime is an optional extra")
+    make, floats = onnx.helper, onnx.TensorProto.FLOAT
+    rng = np.random.default_rng(2)
+    weights = {name: rng.normal(size=shape) for name, shape in (("square", (3, 3)), ("row", (3,)))}
+    # Operators in their order, with their inputs beside the value before.
+    steps = [("Gemm", ["square", "row"]), ("Tanh", []), ("MatMul", ["square"]), ("Add", ["row"])]
+    steps += [("Relu", []), ("Mul", ["row"]), ("Sub", ["row"]), ("Sigmoid", []), ("Div", ["row"])]
+    steps += [("Gemm", ["square"])]
+    nodes = []
+    for index, (kind, more) in enumerate(steps):
+        given = {"alpha": 0.5} if kind == "Gemm" else {}
+        nodes.append(make.make_node(kind, [f"v{index}", *more], [f"v{index + 1}"], **given))
+    ports = [make.make_tensor_value_info(name, floats, [1, 3]) for name in ("v0", f"v{len(steps)}")]
+    tensors = [
+        make.make_tensor(name, floats, array.shape, array.astype(np.float32).flatten())
+        for name, array in weights.items()
+    ]
+    graph = make.make_graph(nodes, "all", ports[:1], ports[1:], tensors)
+    content = make.make_model(
+        graph, opset_imports=[make.make_opsetid("", 17)], ir_version=8
+    ).SerializeToString()
+    value = rng.normal(size=(1, 3)).astype(np.float32)
+    (expected,) = onnxruntime.InferenceSession(content).run(None, {"v0": value})
+    assert read_network(content).compute(value) == pytest.approx(expected, rel=1e-5)
+
+
+def test_unknown_operator_is_named(write: Write) -> None:
+    model = onnx.load(str(path := write()))
+    model.graph.node[0].op_type = "LSTM"
+    onnx.save(model, str(path))
+    with pytest.raises(
+        GrammarError, match=r"tried.onnx: .*operator LSTM with transB is not computed; known: Gemm"
+    ):
         built(path)
+
+
+def test_damaged_files_are_refused_or_computed(write: Write) -> None:
+    path = write()
+    whole, rng, refused = path.read_bytes(), np.random.default_rng(3), []
+    for index in range(400):
+        damaged = bytearray(whole)
+        damaged[int(rng.integers(len(whole)))] = int(rng.integers(256))
+        path.write_bytes(damaged[: int(rng.integers(len(whole)))] if index % 4 == 0 else damaged)
+        try:
+            load_policy(path)
+        except PolicyError as error:
+            refused.append(str(error))
+    assert len(refused) > 100
+    assert [text for text in refused if "\n" in text] == []
 
 
 def test_step_of_a_large_policy_takes_less_than_a_millisecond(tmp_path: Path) -> None:
