@@ -119,9 +119,9 @@ def _node(node: _Fields) -> tuple[Callable[..., _Floats], list[str], str]:
     given = f" with {', '.join(attributes)}" if attributes else ""
     computed, inputs = OPERATORS.get(kind, (None, 0))
     if kind == "Gemm" and attributes.keys() <= {"alpha", "beta", "transB"}:
-        factors = [_number(attributes[key], 2) if key in attributes else 1.0 for key in ("alpha", "beta")]
+        alpha, beta = (_number(attributes[key], 2) if key in attributes else 1.0 for key in ("alpha", "beta"))
         transposed = "transB" in attributes and _number(attributes["transB"], 3) != 0
-        computed, inputs, attributes = _gemm(*factors, transposed), min(max(len(names), 2), 3), {}
+        computed, inputs, attributes = _gemm(alpha, beta, transposed), min(max(len(names), 2), 3), {}
     if computed is None or attributes or node[7]:
         raise NetworkError(f"operator {kind}{given} is not computed; known: Gemm, {', '.join(OPERATORS)}")
     if len(names) != inputs:
