@@ -142,16 +142,28 @@ class _Field:
         return bool(self._gap_m[row, column] < self._clearance_m - INSIDE_M)
 
     def start(self, position: Point) -> tuple[int, int]:
-        """The passable node nearest to the vehicle. Raises _NoWayError."""
+        """The passable node nearest to the vehicle, of those to which a straight line leads out.
+
+        The line enters no occupied cell, and until the clearance is reached the gap does not shrink by more
+        than a cell. Raises _NoWayError.
+        """
         nodes = np.argwhere(self._region)
         away_m = np.hypot(*(self.positions(nodes) - position).T)
-        if not len(nodes) or away_m.min() > ESCAPE_M:
+        order = np.argsort(away_m)[: np.count_nonzero(away_m <= ESCAPE_M)]
+        spans = self.positions(nodes[order]) - position
+        share = np.linspace(0.0, 1.0, math.ceil(ESCAPE_M / SPACING_M) + 1)
+        rows, columns = self._grid.cells((position + share[:, None, None] * spans).reshape(-1, 2)).T
+        gap_m = self._gap_m[rows, columns].reshape(len(share), -1)
+        most_m = np.maximum.accumulate(gap_m, axis=0)
+        out = (gap_m >= np.minimum(most_m, self._clearance_m) - CELL_M) & ((gap_m > 0.0) | (most_m == 0.0))
+        leads_out = np.flatnonzero(out.all(axis=0))
+        if not len(leads_out):
             row, column = self._grid.cells(np.array([position]))[0]
             raise _NoWayError(
                 f"obstacles on all sides, the nearest {self._gap_m[row, column]:.1f} m away; "
                 f"{self._clearance_m:g} m are needed"
             )
-        row, column = nodes[int(np.argmin(away_m))]
+        row, column = nodes[order[leads_out[0]]]
         return int(row), int(column)
 
     def end(self, start: tuple[int, int], position: Point) -> NDArray[np.float64]:

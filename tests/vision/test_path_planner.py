@@ -180,10 +180,19 @@ def test_of_two_ways_the_one_begun_is_kept() -> None:
 
 @pytest.mark.parametrize("east", [0.1, 0.3, 0.5, 0.7])
 def test_gap_is_open_from_every_cell(east: float) -> None:
-    row = [((6.0, side * (1.75 + 0.8 * number)), 0.4) for side in (-1, 1) for number in range(12)]
+    """The gap's middle is in no fixed place of the search's blocks of cells."""
+    row = [((6.0, 0.3 + side * (1.75 + 0.8 * number)), 0.4) for side in (-1, 1) for number in range(12)]
     path = planned(grid_with(*row, position=(0.0, east)), ((0.0, 0.0), (12.0, 0.0)), (0.0, east))
     assert path.points[-1] == pytest.approx((12.0, 0.0))
     assert max(abs(point[1]) for point in path.points) < 1.0
+
+
+def test_way_out_of_the_clearance_leads_through_no_obstacle() -> None:
+    """Beyond both walls there is room, 2 m away; between them there is none."""
+    walls = [((north, east), 0.1) for north in (0.4, -1.3) for east in np.arange(-4.0, 4.01, 0.1)]
+    path = planned(grid_with(*walls))
+    assert path.points == ()
+    assert "all sides" in path.reason
 
 
 def test_enclosed_vehicle_has_no_way() -> None:
@@ -201,7 +210,8 @@ def test_vehicle_inside_the_clearance_flies_out_of_it() -> None:
     assert path.points
     assert path.points[-1][0] == pytest.approx(15.0)
     assert path.inside
-    assert not planned(grid_with()).inside
+    assert planned(grid_with(((1.5, 0.0), 0.4))).inside  # by 0.3 m, the grid's cells are 0.2 m
+    assert not planned(grid_with(((1.6, 0.0), 0.4))).inside  # by 0.1 m
     crowded = [((1.2 * math.cos(a), 1.2 * math.sin(a)), 0.4) for a in np.arange(0.0, math.tau, 0.5)]
     assert "all sides" in planned(grid_with(*crowded)).reason
 

@@ -1,7 +1,9 @@
 """Flight envelope: the limits every setpoint passes before it is sent.
 
 The envelope only reduces. A limited velocity is never faster than the input, neither horizontally nor
-vertically; braking is never delayed. A setpoint inside every limit passes unchanged.
+vertically; braking is never delayed. The one exception: before an obstacle or inside its margin the sent
+velocity may lead away from it, against a drift too, at most as fast as the horizontal limit. A setpoint
+inside every limit passes unchanged.
 
 The feed-forward acceleration may turn the velocity and compensate drag. It never makes the vehicle faster
 than the sent velocity, nor brings it nearer to a fence.
@@ -209,7 +211,8 @@ class Envelope:
         north, east, down = (value * scale for value in asked) if scale < 1.0 else asked
         velocity = self._slew((north, east, down), state, dt_s, reasons)
         # Last, so that the acceleration limit does not delay braking at a fence.
-        return self._slow_at_fences(velocity, state, reasons)
+        north, east, down = self._slow_at_fences(velocity, state, reasons)
+        return (*_shorten((north, east, 0.0), limits.max_horizontal_speed_mps)[:2], down)
 
     def _limit_feed_forward(
         self, asked: Vector3, sent: Vector3, state: VehicleState, reasons: list[str]

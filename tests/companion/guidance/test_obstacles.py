@@ -14,7 +14,7 @@ from companion.guidance.behaviours.goto import GotoBehaviour
 from companion.guidance.behaviours.land import LandBehaviour
 from companion.guidance.core import Guidance, GuidanceOptions
 from companion.guidance.interface import EventKind, GuidanceInput
-from companion.guidance.limits.envelope import Envelope
+from companion.guidance.limits.envelope import Envelope, Limits
 from companion.guidance.limits.obstacles import (
     Constraint,
     ObstacleMemory,
@@ -88,6 +88,17 @@ def test_wall_limits_velocity_into_it_only() -> None:
     away = envelope.apply(Setpoint.velocity((-0.1, 0.0, 0.0), now_ns), vehicle.state, now_ns, 0.05)
     assert away.sent.velocity_ned_mps is not None
     assert away.sent.velocity_ned_mps[0] < 0.0
+
+
+def test_retreat_is_no_faster_than_the_horizontal_limit() -> None:
+    """A drift of 1.5 m/s towards an obstacle inside the margin is countered as fast as is allowed."""
+    vehicle = KinematicVehicle(velocity=[1.5, 0.0, 0.0])
+    envelope = Envelope(Limits(max_horizontal_speed_mps=1.0))
+    near = sectors(vehicle.now_ns, {0: 1.0})
+    envelope.obstacle_constraints = ObstacleRules("auto", 2.0).constraints(context(near, vehicle=vehicle))
+    still = Setpoint.velocity((0.0, 0.0, 0.0), vehicle.now_ns)
+    sent = envelope.apply(still, vehicle.state, vehicle.now_ns, 0.05).sent
+    assert sent.velocity_ned_mps == pytest.approx((-1.0, 0.0, 0.0))
 
 
 def test_position_behind_an_obstacle_is_not_reached() -> None:
