@@ -10,7 +10,7 @@ import sys
 import torch
 from ultralytics.nn.tasks import DetectionModel, yaml_model_load
 
-from tests.vision.test_model_families import FEW, GOLDEN, facts, fill, picture
+from tests.vision.test_model_families import FEW, GOLDEN, facts, fill, make_image
 from tools.ultralytics_parity import oracle_maps
 
 
@@ -25,7 +25,7 @@ def main() -> int:
         model.load_state_dict(state)
         end_to_end = model_family in ("YOLOv10", "YOLO26")
         with torch.inference_mode():
-            output = model(picture())
+            output = model(make_image())
         got = facts([oracle_maps(output, end_to_end)[..., None]])
         different = max(abs(a - b) for a, b in zip(got, recorded, strict=True)) > 1e-4 * got[1]
         wrong |= different
