@@ -82,6 +82,8 @@ def read_call(call: ToolCall, class_names: Sequence[str] | None) -> Command | Qu
     Raises:
         GrammarError: an unknown tool or argument, a wrong type, a value out of its range.
     """
+    if not isinstance(call.name, str):
+        raise GrammarError(f"unknown tool {str(call.name)[:80]!r}")
     arguments = {} if call.arguments is None else call.arguments
     if not isinstance(arguments, Mapping):
         raise GrammarError(f"{call.name}: the arguments must be an object, got {str(call.arguments)[:80]!r}")
@@ -89,11 +91,20 @@ def read_call(call: ToolCall, class_names: Sequence[str] | None) -> Command | Qu
     if call.name in QUESTIONS:
         about = given.get("class", "")
         return Question(call.name, about if isinstance(about, str) else "")
-    if not isinstance(call.name, str) or len(call.name.split()) != 1:
-        raise GrammarError(f"unknown tool {str(call.name)[:80]!r}")
-    if call.name.lower() in _NOT_FOR_MODELS:
-        raise GrammarError(f"{call.name} is not for a model: the call does not show what is flown")
-    return parse(" ".join([call.name, *(_written(call.name, *item) for item in given.items())]), class_names)
+    if call.name not in COMMANDS:
+        known = [word for word in COMMANDS if word not in _NOT_FOR_MODELS]
+        raise GrammarError(f"unknown command {call.name[:80]!r}; {nearest(call.name[:80], known)}")
+    _check_offered(call.name)
+    command = parse(
+        " ".join([call.name, *(_written(call.name, *item) for item in given.items())]), class_names
+    )
+    _check_offered(command.word)
+    return command
+
+
+def _check_offered(word: str) -> None:
+    if word in _NOT_FOR_MODELS:
+        raise GrammarError(f"{word} is not for a model: the call does not show what is flown")
 
 
 def _written(name: str, key: Any, value: Any) -> str:

@@ -116,6 +116,14 @@ def test_tools_have_units_ranges_and_classes() -> None:
         ("policy", {"file": "a.onnx", "class": "car"}),
         ("Mission", {"file": "demo"}),
         ("velocity", {}),
+        ('"mission"', {"file": "/tmp/other.toml"}),
+        ('"policy"', {"file": "a.onnx", "class": "car"}),
+        ('"velocity"', {}),
+        ('"takeoff"', {}),
+        ("Takeoff", {}),
+        (" takeoff", {}),
+        (None, {}),
+        (["seen"], {}),
     ],
 )
 def test_invalid_call_is_refused_by_the_grammar(name: str, arguments: Any) -> None:

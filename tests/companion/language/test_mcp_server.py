@@ -79,7 +79,7 @@ async def test_listed_tools_are_those_of_ask_and_say_what_is_not_allowed() -> No
     async with calling("takeoff") as caller:
         tools = {tool.name: tool for tool in (await caller.client.list_tools()).tools}
     assert tools.keys() >= {*QUESTIONS, "takeoff", "land", "seek", "stop", "hold"}
-    assert not tools.keys() & {"mission", "velocity"}
+    assert not tools.keys() & {"mission", "policy", "velocity"}
     assert tools["seek"].input_schema["properties"]["class"]["enum"] == list(CLASSES)
     refused = {name for name, tool in tools.items() if "Not allowed" in (tool.description or "")}
     assert refused == tools.keys() - {*QUESTIONS, "takeoff", "stop"}
@@ -134,6 +134,7 @@ async def test_allowed_command_is_flown_with_the_service_s_reply() -> None:
         ("explode", {}, "explode"),
         ("mission", {"file": "demo"}, "mission"),
         ("Velocity", {}, "Velocity"),
+        ('"mission"', {"file": "/tmp/other.toml"}, "mission"),
     ],
 )
 async def test_invalid_call_is_refused_by_the_grammar(
