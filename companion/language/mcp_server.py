@@ -31,6 +31,8 @@ PATH = "/mcp"
 WAIT_S = 20.0
 """A command that takes longer is answered with `running`: clients give up after a minute."""
 MAX_SESSIONS = 16
+SESSION_IDLE_S = 60.0
+"""A session without a request for so long ends: many clients do not end theirs. Longer than `WAIT_S`."""
 LARGEST_BODY_BYTES = 64 * 1024
 # These may end a command that is being flown.
 _ENDING = frozenset({"stop", "hold", "land", "rtl"})
@@ -176,7 +178,10 @@ async def serve_stdio(server: Server[Any]) -> None:
 async def http_app(server: Server[Any]) -> AsyncIterator[Starlette]:
     """The server as an ASGI application at `PATH`; who may use it is checked outside."""
     manager = StreamableHTTPSessionManager(
-        server, max_sessions=MAX_SESSIONS, max_request_body_size=LARGEST_BODY_BYTES
+        server,
+        max_sessions=MAX_SESSIONS,
+        max_request_body_size=LARGEST_BODY_BYTES,
+        session_idle_timeout=SESSION_IDLE_S,
     )
     async with manager.run():
         yield Starlette(routes=[Route(PATH, StreamableHTTPASGIApp(manager))])

@@ -8,6 +8,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any
 
+import httpx2
 import pytest
 from mcp.client import Client
 
@@ -198,3 +199,34 @@ async def test_service_that_has_gone_is_an_error_in_a_line() -> None:
     assert await FlightTools(FlyingVehicle(), schema).call("state", {}) == {
         "error": "commands: no answer from vehicle 'vehicle1' within 10 s"
     }
+
+
+async def test_sessions_that_were_not_deleted_leave_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mcp_server, "SESSION_IDLE_S", 0.02)
+    monkeypatch.setattr(mcp_server, "MAX_SESSIONS", 1)
+    begin = {
+        "jsonrpc": "2.0",
+        "id": 1,
+        "method": "initialize",
+        "params": {
+            "protocolVersion": "2025-06-18",
+            "capabilities": {},
+            "clientInfo": {"name": "test", "version": "1"},
+        },
+    }
+    headers = {"accept": "application/json, text/event-stream"}
+
+    async def schema() -> dict[str, Any]:
+        return SCHEMA
+
+    async with (
+        mcp_server.http_app(server_of(FlightTools(FlyingVehicle(), schema))) as application,
+        httpx2.AsyncClient(
+            transport=httpx2.ASGITransport(application), base_url="http://127.0.0.1:8089"
+        ) as http,
+    ):
+        for _ in range(3):
+            async with asyncio.timeout(10):
+                while (reply := await http.post("/mcp", json=begin, headers=headers)).status_code == 503:
+                    await asyncio.sleep(0.01)
+            assert reply.status_code == 200
