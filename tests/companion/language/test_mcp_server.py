@@ -30,6 +30,7 @@ class FlyingVehicle(FakeVehicle):
     def __init__(self, *, in_command: bool = True, scene: Scene | None = None) -> None:
         super().__init__(*(() if scene is None else (scene,)))
         self.flying, self.replaced, self.cancelled = asyncio.Event(), asyncio.Event(), False
+        self.failure: Exception | None = None
         self._in_command = in_command
 
     async def command(self, text: str) -> dict[str, Any]:
@@ -44,6 +45,8 @@ class FlyingVehicle(FakeVehicle):
         except asyncio.CancelledError:
             self.cancelled = True
             raise
+        if self.failure is not None:
+            raise self.failure
         return {"command": text, "success": False, "reason": f"replaced by {self.commands[-1]}"}
 
     async def state(self) -> dict[str, Any]:
@@ -180,6 +183,51 @@ async def test_long_command_is_answered_before_its_end(monkeypatch: pytest.Monke
         assert (error, reply["running"], caller.vehicle.cancelled) == (False, True, False)
         assert "still flown" in (await caller.call("goto", forward=9, right=0))[1]["reason"]
     assert caller.vehicle.cancelled  # at the end of the server
+
+
+async def why_not(caller: Caller, words: str) -> None:
+    """Wait until `why_not` gives this reason."""
+    async with asyncio.timeout(10):
+        while words not in (await caller.call("why_not"))[1]["newest_command"]:
+            await asyncio.sleep(0.01)
+
+
+async def test_why_not_is_about_the_command_that_is_flown_then_its_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(mcp_server, "WAIT_S", 0.02)
+    async with calling("goto", "takeoff") as caller:
+        await caller.call("takeoff")
+        _, running = await caller.call("goto", forward=9, right=0)
+        newest = (await caller.call("why_not"))[1]["newest_command"]
+        assert newest not in ("done", None)
+        assert running["running"] is True
+        caller.vehicle.commands.append("land")
+        caller.vehicle.replaced.set()
+        await why_not(caller, "replaced by land")
+
+
+@pytest.mark.parametrize("failure", [NoAnswerError("the service has gone"), KeyError("the service has gone")])
+async def test_why_not_reports_a_service_that_has_gone(
+    failure: Exception, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mcp_server, "WAIT_S", 0.02)
+    async with calling("goto") as caller:
+        assert (await caller.call("goto", forward=9, right=0))[1]["running"] is True
+        caller.vehicle.failure = failure
+        caller.vehicle.replaced.set()
+        await why_not(caller, "the service has gone")
+
+
+async def test_other_error_is_a_result() -> None:
+    class Broken(FlyingVehicle):
+        async def scene(self) -> Scene:
+            raise KeyError("ground_range_m")
+
+    async with calling(vehicle=Broken()) as caller:
+        error, reply = await caller.call("seen")
+    assert error
+    assert "KeyError" in reply["error"]
 
 
 async def test_cancelled_call_cancels_the_command() -> None:
