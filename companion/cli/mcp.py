@@ -20,7 +20,11 @@ MCP_SETTINGS = ("zenoh", "vehicle.name", "plugins")
 def mcp(
     settings: Settings,
     allow: Annotated[
-        str, typer.Option(help="Commands that may be flown, such as takeoff,land. Default: only stop.")
+        str,
+        typer.Option(
+            help="Commands that may be flown, such as takeoff,land. Default: none; stop and hold only end a "
+            "command that this server started."
+        ),
     ] = "",
     listen: Annotated[
         str | None,
@@ -33,7 +37,9 @@ def mcp(
 ) -> None:
     """Serve the vehicle's commands and state to language models by the Model Context Protocol.
 
-    Nobody confirms: only the commands of --allow are flown, and `stop`.
+    Nobody confirms: only the commands of --allow are flown. Without it, `stop` and `hold` are sent only while
+    a command that this server started is being flown; they end it. After a pilot took over, nothing is flown
+    until an operator has commanded in another way, or this server is restarted.
     """
     try:
         import mcp.server  # noqa: F401
@@ -86,7 +92,9 @@ async def _serve(
     where = client_settings(settings.zenoh, (connect,) if connect else ()).connect[0]
     async with connect_to(where, settings.vehicle.name, config_file=settings.zenoh.config_file) as drone:
         camera = (await drone.query("config"))["guidance"]["camera"]
-        tools = FlightTools(LiveVehicle(drone, (), camera), lambda: drone.query("commands"), allowed)
+        vehicle = LiveVehicle(drone, (), camera)
+        await vehicle.forget_loss()  # an operator starts this program
+        tools = FlightTools(vehicle, lambda: drone.query("commands"), allowed)
         server = server_of(tools)
         try:
             if listen is None or access is None:

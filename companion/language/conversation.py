@@ -17,6 +17,7 @@ from companion.client.commands import NOT_FLOWN, Reply
 from companion.guidance.command import Command, GrammarError
 from companion.guidance.missions.mission_file import Mission, describe, plan_from
 from companion.language.clauses import Question, UnclearError
+from companion.language.control import Control
 from companion.language.endpoints import Endpoint, Message
 from companion.language.scene import Scene, SceneObject
 from companion.language.sentences import is_stop, understand
@@ -49,6 +50,9 @@ class Vehicle(Protocol):
     async def state(self) -> dict[str, Any]:
         """Facts for the question `state`; `battery_percent` and `warnings` for the others."""
 
+    async def control(self) -> Control:
+        """Who controls the vehicle."""
+
 
 @dataclass(frozen=True, slots=True)
 class Operator:
@@ -71,7 +75,8 @@ class Conversation:
         schema: the commands, as the queryable `commands` answers.
         class_names: the detector's; None: not known.
         endpoint: the language model; None: sentences are read by patterns.
-        may: commands that are flown without a confirmation, besides a single one that does not fly.
+        may: commands that are flown without a confirmation, besides a single one that does not fly; not
+            after a loss of command, nor while someone else flies.
     """
 
     def __init__(
@@ -220,6 +225,9 @@ class Conversation:
         else:
             # Several are a mission, which takes offboard control, also if none of them flies.
             free = words <= self._may and not words <= NOT_FLOWN
+        if free and not words <= NOT_FLOWN and (why := (await self._vehicle.control()).taken()) is not None:
+            self._operator.show(f"{why}: to be confirmed")
+            free = False
         if not free and not await self._operator.confirm():
             return {"success": False, "reason": "the operator declined", "declined": True}
         self._last = commands[-1]

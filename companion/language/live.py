@@ -6,6 +6,7 @@ import asyncio
 import json
 import math
 import time
+from collections import deque
 from collections.abc import Callable, Collection
 from contextlib import suppress
 from dataclasses import replace
@@ -14,9 +15,10 @@ from typing import Any, TypeVar
 import zenoh
 
 from companion.bus import topics
-from companion.bus.bodies import DetectionBody, DetectionsBody
+from companion.bus.bodies import DetectionBody, DetectionsBody, EventBody
 from companion.client import CommandFailedError, Drone, Stream
 from companion.client.commands import Reply
+from companion.language.control import CommandEvents, Control
 from companion.language.conversation import Conversation, Operator
 from companion.language.endpoints import Endpoint
 from companion.language.scene import Scene, SceneObject
@@ -28,6 +30,8 @@ _DETECTOR_S = 15.0
 _STATE_S = 4.0
 # The kept events arrive within this.
 _EVENTS_S = 0.3
+# Events that may wait until they are read.
+_WAITING_EVENTS = 1000
 # An image and the detections of the same frame: so many frames may lie between their messages.
 _FRAMES = 30
 
@@ -60,9 +64,13 @@ class LiveVehicle:
 
     def __init__(self, drone: Drone, class_names: tuple[str, ...], camera: str | None) -> None:
         self._drone, self._class_names, self._camera = drone, class_names, camera
+        self._commands, self._warnings = CommandEvents(), deque[str](maxlen=5)
+        self._events: Stream[EventBody] | None = None
+        self._missed = 0
 
     async def command(self, text: str) -> Reply:
         """Send a command and wait for its reply; a refused one is a reply too."""
+        self._commands.send(text)
         try:
             return await self._drone.command(text)
         except CommandFailedError as error:
@@ -82,7 +90,8 @@ class LiveVehicle:
 
     async def state(self) -> dict[str, Any]:
         """Facts in plain words and numbers; null where unknown."""
-        warnings = await self._warnings()
+        await self._read_events()
+        warnings = list(self._warnings)
         vehicle = await _next(self._drone.vehicle(), _STATE_S)
         status = await _next(self._drone.status(), _STATE_S)
         if vehicle is None or status is None:
@@ -105,19 +114,33 @@ class LiveVehicle:
             "warnings": warnings,
         }
 
-    async def _warnings(self) -> list[str]:
-        texts: list[str] = []
-        stream = self._drone.events()
-        try:
+    async def control(self) -> Control:
+        """Who controls the vehicle now."""
+        await self._read_events()
+        vehicle = await _next(self._drone.vehicle(), _STATE_S)
+        if vehicle is None:
+            return Control("no state received from the service", flown=self._commands.flown)
+        mode = vehicle["mode"] if vehicle["armed"] else ""
+        return Control(self._commands.lost, mode, self._commands.flown)
+
+    async def forget_loss(self) -> None:
+        """A loss of command until now does not count."""
+        await self._read_events()
+        self._commands.lost = None
+
+    async def _read_events(self) -> None:
+        """Read the events that have arrived, at first the kept ones."""
+        if self._events is None:
+            self._events = self._drone.events(size=_WAITING_EVENTS)
+        with suppress(TimeoutError):
             async with asyncio.timeout(_EVENTS_S):
-                async for event in stream:
+                async for event in self._events:
+                    if self._events.dropped != self._missed:
+                        self._missed = self._events.dropped
+                        self._commands.lost = "events were missed"
+                    self._commands.take(event["level"], event["text"])
                     if event["level"] != "info":
-                        texts.append(event["text"])
-        except TimeoutError:
-            return texts[-5:]
-        finally:
-            stream.close()
-        return texts[-5:]
+                        self._warnings.append(event["text"])
 
     async def _detections(self) -> tuple[list[DetectionBody], list[str | None]]:
         """The detections of a frame and their colours by its image; without an image, None for each."""

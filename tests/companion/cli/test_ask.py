@@ -40,6 +40,7 @@ class Service:
         self.endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
         self.commands: list[str] = []
         self.ready = True
+        self.vehicle = {"yaw_rad": 1.5, "altitude_m": 5.0, "mode": "hold", "armed": True}
         self.flying, self.stopped = asyncio.Event(), asyncio.Event()
         self.bus = Bus(
             ZenohSection(listen=(self.endpoint,)),
@@ -74,7 +75,7 @@ class Service:
             objects = [{**common, "track_id": track, "xyxy": box} for track, box in BOXES.items()]
             frame = {"sequence": sequence, "width": 320, "height": 240, "detections": objects}
             self.bus.publish(topics.DETECTIONS, frame)
-            self.bus.publish(topics.VEHICLE, {"yaw_rad": 1.5, "altitude_m": 5.0})
+            self.bus.publish(topics.VEHICLE, self.vehicle)
             self.bus.publish_large(
                 topics.IMAGE,
                 jpeg,

@@ -127,12 +127,12 @@ def test_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.realtime
-async def test_simulated_vehicle_takes_off_and_is_stopped(tmp_path: Path) -> None:
+async def test_simulated_vehicle_is_left_to_its_pilot(tmp_path: Path) -> None:
     with (
         running_simulator(parameters=QUICK_FLIGHT) as simulator,
         running_service(simulator.onboard_port, ["--source", "none"], cwd=tmp_path) as flown,
     ):
-        allowed = ("--allow", "takeoff,goto")
+        allowed = ("--allow", "takeoff,goto,orbit")
         async with Client(process(flown.endpoint, "vehicle1", *allowed)) as client:
 
             async def call(name: str, **arguments: Any) -> dict[str, Any]:
@@ -156,3 +156,19 @@ async def test_simulated_vehicle_takes_off_and_is_stopped(tmp_path: Path) -> Non
             async with asyncio.timeout(20):
                 while (await call("state"))["in_command"]:
                     await asyncio.sleep(0.1)
+            assert "--allow stop" in (await call("stop"))["reason"]
+            for _ in range(2):  # an endless one is answered when it is flown
+                assert (await call("orbit"))["success"] is True
+                assert (await call("stop"))["success"] is True
+            assert (await call("orbit"))["success"] is True
+            simulator.fault("pilot_takeover mode=POSCTL")
+            async with asyncio.timeout(20):
+                while (await call("state"))["mode"] != "position":
+                    await asyncio.sleep(0.1)
+            assert "the pilot took over" in (await call("orbit"))["reason"]
+            assert (await call("stop"))["success"] is False
+            assert (await call("state"))["mode"] == "position"
+            operator = asyncio.to_thread(flown.command, "hold")
+            assert (await operator)["success"] is True
+            assert (await call("stop"))["success"] is False
+            assert (await call("orbit"))["success"] is True

@@ -12,6 +12,7 @@ import pytest
 
 from companion.bench.lockstep_flight import LockstepFlight
 from companion.guidance.grammar import json_schema, parse
+from companion.language.control import CommandEvents, Control
 from companion.language.conversation import MAX_TURNS, Conversation, Operator, plan_of
 from companion.language.endpoints import LanguageError, endpoint_of
 from companion.language.scene import Scene, SceneObject
@@ -29,6 +30,7 @@ class FakeVehicle:
     def __init__(self, scene: Scene = SCENE, refused: str = "") -> None:
         self.commands: list[str] = []
         self.seen, self._refused = scene, refused
+        self.controlled = Control()
 
     async def command(self, text: str) -> dict[str, Any]:
         self.commands.append(text)
@@ -37,6 +39,9 @@ class FakeVehicle:
 
     async def scene(self) -> Scene:
         return replace(self.seen, last=None)
+
+    async def control(self) -> Control:
+        return self.controlled
 
     async def state(self) -> dict[str, Any]:
         return {"mode": "HOLD", "armed": True, "battery_percent": 81, "warnings": ["wind is strong"]}
@@ -275,6 +280,67 @@ async def test_models_mission_and_stop_are_confirmed(
         talk = Talk(script.url, yes=False, may=may)
         assert await talk.ask("model: do it") is (asked == 0)
     assert (talk.asked, len(talk.vehicle.commands)) == (asked, 1 - asked)
+
+
+@pytest.mark.parametrize(
+    ("control", "asked"),
+    [
+        (Control(), 0),
+        (Control(mode="hold"), 0),
+        (Control("the pilot took over: hold mode", "hold"), 1),
+        (Control(mode="position"), 1),
+        (Control(mode="land"), 1),
+    ],
+)
+async def test_listed_command_is_confirmed_after_a_take_over(control: Control, asked: int) -> None:
+    calls: list[Call] = [("seek", {"class": "boat"})]
+    async with serving(ollama(calls=calls), ollama("ok")) as script:
+        talk = Talk(script.url, yes=False, may=("seek",))
+        talk.vehicle.controlled = control
+        assert await talk.ask("model: do it") is (asked == 0)
+    assert (talk.asked, len(talk.vehicle.commands)) == (asked, 1 - asked)
+
+
+# --- who controls the vehicle
+
+ORBIT, GOTO = "orbit track=3", "goto forward=9 right=0"
+FLOWN = [("info", f"command: {ORBIT}"), ("info", f"{ORBIT}: in progress")]
+LOST = ("warning", "command lost: the pilot took over: hold mode")
+
+
+@pytest.mark.parametrize(
+    ("sent", "events", "lost", "flown"),
+    [
+        ((ORBIT,), FLOWN, False, ORBIT),
+        ((), FLOWN, False, None),
+        ((ORBIT,), [*FLOWN, LOST], True, None),
+        ((ORBIT,), [*FLOWN, LOST, ("info", "command: gimbal pitch=-30")], True, None),
+        ((ORBIT,), [*FLOWN, LOST, ("info", "command: stop")], True, None),
+        ((ORBIT,), [*FLOWN, LOST, ("info", "command: hold (3 before it not logged)")], False, None),
+        ((ORBIT,), [*FLOWN, ("info", "command: gimbal pitch=-30")], False, ORBIT),
+        ((ORBIT,), [*FLOWN, ("info", "command: follow car")], False, None),
+        ((ORBIT,), [*FLOWN, ("info", "command: stop")], False, None),
+        ((ORBIT,), [*FLOWN, ("warning", "orbit ended: lost track 3")], False, None),
+        ((ORBIT,), [*FLOWN, ("warning", "battery at 12 %: orbit ends, rtl follows")], False, None),
+        (
+            (ORBIT, GOTO),
+            [*FLOWN, ("info", f"command: {GOTO}"), ("warning", f"{GOTO}: too far")],
+            False,
+            ORBIT,
+        ),
+        ((ORBIT, GOTO), [*FLOWN, ("info", f"command: {GOTO}"), ("info", f"{GOTO}: arrived")], False, None),
+        ((ORBIT, "stop"), [*FLOWN, ("info", "command: stop"), ("info", "stop: stopped")], False, None),
+    ],
+)
+def test_events_say_who_commands(
+    sent: tuple[str, ...], events: list[tuple[str, str]], lost: bool, flown: str | None
+) -> None:
+    commands = CommandEvents()
+    for text in sent:
+        commands.send(text)
+    for event in events:
+        commands.take(*event)
+    assert (commands.lost is not None, commands.flown) == (lost, flown)
 
 
 @pytest.mark.parametrize(("text", "asked"), [("look down", 0), ("stop", 0), ("look down and look left", 1)])

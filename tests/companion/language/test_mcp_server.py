@@ -16,6 +16,7 @@ from companion.client import NoAnswerError
 from companion.guidance.grammar import json_schema
 from companion.language import mcp_server
 from companion.language.clauses import QUESTIONS
+from companion.language.control import Control
 from companion.language.mcp_server import FlightTools, server_of
 from companion.language.scene import Scene, SceneObject
 from tests.companion.language.sentence_table import CLASSES
@@ -27,11 +28,11 @@ SCHEMA = json_schema(CLASSES)
 class FlyingVehicle(FakeVehicle):
     """A `goto` is flown until another command comes, or until it is cancelled."""
 
-    def __init__(self, *, in_command: bool = True, scene: Scene | None = None) -> None:
+    def __init__(self, *, control: Control | None = None, scene: Scene | None = None) -> None:
         super().__init__(*(() if scene is None else (scene,)))
         self.flying, self.replaced, self.cancelled = asyncio.Event(), asyncio.Event(), False
         self.failure: Exception | None = None
-        self._in_command = in_command
+        self.controlled = control or Control()
 
     async def command(self, text: str) -> dict[str, Any]:
         self.replaced.set()
@@ -48,9 +49,6 @@ class FlyingVehicle(FakeVehicle):
         if self.failure is not None:
             raise self.failure
         return {"command": text, "success": False, "reason": f"replaced by {self.commands[-1]}"}
-
-    async def state(self) -> dict[str, Any]:
-        return {**await super().state(), "in_command": self._in_command}
 
 
 class Caller:
@@ -86,7 +84,7 @@ async def test_listed_tools_are_those_of_ask_and_say_what_is_not_allowed() -> No
     assert not tools.keys() & {"mission", "policy", "velocity"}
     assert tools["seek"].input_schema["properties"]["class"]["enum"] == list(CLASSES)
     refused = {name for name, tool in tools.items() if "Not allowed" in (tool.description or "")}
-    assert refused == tools.keys() - {*QUESTIONS, "takeoff", "stop"}
+    assert refused == tools.keys() - {*QUESTIONS, "takeoff"}
     read_only = {name for name, tool in tools.items() if tool.annotations and tool.annotations.read_only_hint}
     assert read_only == set(QUESTIONS)
 
@@ -165,15 +163,58 @@ async def test_stop_and_hold_end_what_is_flown() -> None:
         assert caller.vehicle.commands == ["goto forward=9 right=0", "hold", "goto forward=9 right=0", "stop"]
 
 
-async def test_hold_takes_no_vehicle_from_its_pilot_but_stop_is_sent() -> None:
-    async with calling(vehicle=FlyingVehicle(in_command=False)) as caller:
-        error, reply = await caller.call("hold")
+@pytest.mark.parametrize("word", ["stop", "hold"])
+@pytest.mark.parametrize("mode", ["position", "land", "return", "hold", "offboard"])
+async def test_stop_and_hold_end_only_a_command_of_this_server(word: str, mode: str) -> None:
+    vehicle = FlyingVehicle(control=Control(mode=mode))
+    async with calling("goto", vehicle=vehicle) as caller:
+        error, reply = await caller.call(word)
         assert error
-        assert "--allow hold" in reply["reason"]
+        for named in (f"`companion send {word}`", "the page", f"--allow {word}"):
+            assert named in reply["reason"]
+        assert vehicle.commands == []
+    vehicle.controlled = Control(mode="offboard", flown="orbit track=3")
+    async with calling("orbit", vehicle=vehicle) as caller:
+        assert (await caller.call(word))[0] is False
+    assert vehicle.commands == [word]
+
+
+async def test_listed_stop_is_sent_while_a_pilot_flies() -> None:
+    pilot = Control("the pilot took over: position mode", "position")
+    async with calling("stop", "hold", vehicle=FlyingVehicle(control=pilot)) as caller:
         assert (await caller.call("stop"))[0] is False
+        assert (await caller.call("hold"))[0] is True
         assert caller.vehicle.commands == ["stop"]
-    async with calling("hold", vehicle=FlyingVehicle(in_command=False)) as caller:
-        assert (await caller.call("hold"))[0] is False
+
+
+@pytest.mark.parametrize(
+    ("control", "named"),
+    [
+        (Control("the pilot took over: hold mode", "hold"), "the pilot took over"),
+        (Control(mode="position"), "position mode"),
+        (Control(mode="return"), "return mode"),
+    ],
+)
+async def test_no_command_takes_the_vehicle_back_from_a_pilot(control: Control, named: str) -> None:
+    async with calling("takeoff", "land", "gimbal", vehicle=FlyingVehicle(control=control)) as caller:
+        for word in ("takeoff", "land"):
+            error, reply = await caller.call(word)
+            assert error
+            assert named in reply["reason"]
+            assert "companion send" in reply["reason"]
+        assert (await caller.call("gimbal"))[0] is False
+        assert caller.vehicle.commands == ["gimbal"]
+        caller.vehicle.controlled = Control(mode="hold")
+        assert (await caller.call("land"))[0] is False
+
+
+async def test_landing_of_this_server_may_become_a_return() -> None:
+    async with calling("goto", "rtl") as caller:
+        going = asyncio.create_task(caller.call("goto", forward=9, right=0))
+        await asyncio.wait_for(caller.vehicle.flying.wait(), 10)
+        caller.vehicle.controlled = Control(mode="land")
+        assert (await caller.call("rtl"))[0] is False
+        await asyncio.wait_for(going, 10)
 
 
 async def test_long_command_is_answered_before_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
