@@ -35,7 +35,11 @@ class AskProcess:
         return self._process is not None and self._process.returncode is None
 
     async def send(self, line: str, write: Callable[[str], None]) -> None:
-        """Pass a line on. `write`: gets pieces of what the process prints."""
+        """Pass a line on. `write`: gets pieces of what the process prints.
+
+        Raises:
+            OSError: the process cannot be started, or has just ended.
+        """
         if not self.running:
             self._process = await asyncio.create_subprocess_exec(
                 *self._words,
@@ -51,6 +55,8 @@ class AskProcess:
         assert self._process is not None
         assert self._process.stdin is not None
         self._process.stdin.write(f"{line}\n".encode())
+        if self._process.stdin.is_closing():
+            raise BrokenPipeError(f"the process has ended before {line!r} was passed on: ask again")
 
     async def close(self) -> None:
         """End the process."""

@@ -27,7 +27,11 @@ class Ask(Protocol):
         """Whether a sentence was passed on, and the process goes on."""
 
     async def send(self, line: str, write: Callable[[str], None]) -> None:
-        """Pass on a sentence, the answer to a question, or `cancel`. `write`: gets what is printed."""
+        """Pass on a sentence, the answer to a question, or `cancel`. `write`: gets what is printed.
+
+        Raises:
+            OSError: the process cannot be started, or has just ended.
+        """
 
     async def close(self) -> None:
         """End the process."""
@@ -72,6 +76,13 @@ async def _read_commands(
         result = "done" if reply["success"] else "failed"
         _print(f"{text}: {result}: {reply['reason']}")
 
+    async def pass_on(line: str) -> None:
+        assert ask is not None
+        try:
+            await ask.send(line, _write)
+        except OSError as error:
+            _print(f"ask: {error}")
+
     reader = StandardStreamReader()
     loop = asyncio.get_running_loop()
     # The terminal is opened again: the reader makes it non-blocking, which must not affect standard error and
@@ -88,12 +99,12 @@ async def _read_commands(
             if text == "help":
                 _print(help_text)
             elif ask is not None and word == "ask" and sentence:
-                await ask.send(sentence.strip(), _write)
+                await pass_on(sentence.strip())
             elif ask is not None and ask.running and text.lower() in _ANSWERS:
-                await ask.send(text, _write)
+                await pass_on(text)
             elif text:
                 if ask is not None and ask.running and text.split()[-1].lower() == "stop":
-                    await ask.send(_CANCEL, _write)  # it sends nothing after the stop
+                    await pass_on(_CANCEL)  # it sends nothing after the stop
                 task = asyncio.create_task(answer(text))
                 running.add(task)
                 task.add_done_callback(running.discard)

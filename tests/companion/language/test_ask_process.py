@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import os
+import signal
+import sys
+import time
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
+from pathlib import Path
 
 import pytest
 
@@ -82,3 +86,28 @@ async def test_settings_of_the_service_are_used_and_the_next_sentence_starts_it_
                 while talk.process.running:
                     await asyncio.sleep(0.01)
         assert there.commands == ["orbit track=3"] * 2
+
+
+def kill(pid: int) -> None:
+    """Kill a process and wait for its end, without letting the loop notice it."""
+    os.kill(pid, signal.SIGKILL)
+    with suppress(OSError):  # reaped by a thread
+        while "State:\tZ" not in Path(f"/proc/{pid}/status").read_text():
+            time.sleep(0.001)
+
+
+async def test_line_to_an_ended_process_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    echo = tmp_path / "echo"
+    echo.write_text("#!/bin/sh\nexec cat\n")
+    echo.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(echo))
+    process, printed = AskProcess(plain_settings({})), asyncio.Event()
+    try:
+        await process.send("hold", lambda _: printed.set())
+        await asyncio.wait_for(printed.wait(), 20)
+        (child,) = descendants(os.getpid())
+        kill(child)
+        with pytest.raises(BrokenPipeError, match="'y'"):
+            await process.send("y", lambda _: None)
+    finally:
+        await process.close()

@@ -54,6 +54,8 @@ class Sentences:
         self.running = self.closed = False
 
     async def send(self, line: str, write: Callable[[str], None]) -> None:
+        if line == "break":
+            raise OSError("no process")
         self.passed.append(line)
         self.running = True
         write("fly this? ")
@@ -104,3 +106,14 @@ async def test_sentences_and_their_answers_are_passed_on(
     assert service.asked == ["y", "hold", "vehicle2 stop", "ask"]
     assert sentences.closed
     assert "fly this? fly this? " in capsys.readouterr().err
+
+
+async def test_sentence_that_fails_leaves_the_console(
+    terminal: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    service = Service()
+    os.write(terminal, b"ask break\nstop\nquit\n")
+    await service.run(Sentences())
+    assert service.asked == ["stop"]
+    assert service.events == []
+    assert "ask: no process" in capsys.readouterr().err.splitlines()
