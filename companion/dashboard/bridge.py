@@ -14,6 +14,7 @@ import math
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -89,11 +90,15 @@ class _Camera:
 
 @dataclass(slots=True)
 class Link:
-    """The connection to zenoh. `session` is None while there is none, and `problem` then says why."""
+    """The connection to zenoh. `session` is None while there is none, and `problem` then says why.
+
+    `on_command`: called in the loop with the vehicle of a command that was seen in its events.
+    """
 
     session: zenoh.Session | None = None
     loop: asyncio.AbstractEventLoop | None = None
     problem: str = "connecting"
+    on_command: Callable[[str], None] = lambda _vehicle: None
 
 
 class Bridge:
@@ -245,6 +250,9 @@ class Bridge:
                 return  # kept by the service, and received before
             self._number += 1
             self._events.append((self._number, value))
+        loop = self._link.loop
+        if str(value.get("text")).startswith("command: ") and loop is not None and not loop.is_closed():
+            loop.call_soon_threadsafe(self._link.on_command, self.vehicle)
 
     def _on_image(self, camera: _Camera, sample: zenoh.Sample) -> None:
         now_s = time.monotonic()

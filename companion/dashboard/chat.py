@@ -1,8 +1,8 @@
 """The chats of the page: plain sentences to a vehicle, by the same code as `companion ask`.
 
 A window has one chat for each vehicle. Its state is small and sent whole. What moves the vehicle is flown
-after the window has confirmed it. A stop of the vehicle ends what its chats do. The code that reads sentences
-loads OpenCV, so it is imported with the first one.
+after the window has confirmed it. A stop of the vehicle ends what its chats do, another command the plans
+that wait. The code that reads sentences loads OpenCV, so it is imported in a thread, from the server's start.
 """
 
 from __future__ import annotations
@@ -10,8 +10,9 @@ from __future__ import annotations
 import asyncio
 import itertools
 import logging
-from collections import deque
-from collections.abc import Awaitable, Callable
+from collections import Counter, deque
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +24,8 @@ from companion.plugins import PluginError, load_plugins
 from companion.settings import LanguageSection
 
 if TYPE_CHECKING:
+    import zenoh
+
     from companion.language.conversation import Conversation
 
 logger = logging.getLogger(__name__)
@@ -35,6 +38,11 @@ _BEGINNING = 2
 # Unique over all chats: a late click cannot confirm another plan.
 _plan_numbers = itertools.count(1)
 _STOPPED_WITHIN_S = 1.0
+PLAN_S = 60.0
+"""How long a plan waits for its confirmation."""
+_ENDED = "ended by stop"
+_OTHER_COMMAND = "another command was sent"
+_NOT_WATCHED = "the window was closed or hidden"
 _BUSY = "busy with another sentence; STOP ends it"
 
 
@@ -59,20 +67,26 @@ class Chat:
 
     Attributes:
         current: the newest exchange that a conversation answers.
+        stops: number of the vehicle's stops before the newest sentence.
 
     Args:
-        converse: makes the conversation.
+        converse: makes the conversation. watched: whether the window has an open stream.
     """
 
-    def __init__(self, vehicle: str, converse: Callable[[Chat], Awaitable[Conversation]]) -> None:
-        self.vehicle = vehicle
-        self._converse = converse
+    def __init__(
+        self,
+        vehicle: str,
+        converse: Callable[[Chat], Awaitable[Conversation]],
+        watched: Callable[[], bool] = lambda: True,
+    ) -> None:
+        self.vehicle, self.stops = vehicle, 0
+        self._converse, self._watched = converse, watched
         self._conversation: Conversation | None = None
         self._exchanges: deque[Exchange] = deque(maxlen=_KEPT_EXCHANGES)
         self.current = Exchange("")
         self._running: asyncio.Task[None] | None = None
         # The plan that waits for its confirmation.
-        self._plan: tuple[int, asyncio.Future[bool]] | None = None
+        self._plan: tuple[int, asyncio.Future[str]] | None = None
 
     @property
     def busy(self) -> bool:
@@ -87,8 +101,9 @@ class Chat:
             "exchanges": [{"asked": each.asked, "answer": each.answer} for each in self._exchanges],
         }
 
-    def begin(self, text: str) -> None:
+    def begin(self, text: str, stops: int) -> None:
         """Answer a sentence; none is being answered."""
+        self.stops = stops
         self._running = asyncio.create_task(self._run(self.add(text), text))
 
     def end(self) -> None:
@@ -107,18 +122,28 @@ class Chat:
         """Confirm or decline a plan; False: it does not wait any more."""
         if self._plan is None or self._plan[0] != number or self._plan[1].done():
             return False
-        self._plan[1].set_result(fly)
+        self._plan[1].set_result("confirmed" if fly else "not flown")
         return True
 
+    def end_plan(self, reason: str) -> None:
+        """Decline the plan that waits, if there is one."""
+        if self._plan is not None and not self._plan[1].done():
+            self._plan[1].set_result(f"not flown: {reason}")
+
     async def confirm(self) -> bool:
-        """Wait for the window's answer to the plan that was shown."""
-        self._plan = next(_plan_numbers), asyncio.get_running_loop().create_future()
+        """Wait for the window's answer to the plan that was shown, at most `PLAN_S`."""
+        loop = asyncio.get_running_loop()
+        self._plan = next(_plan_numbers), loop.create_future()
+        expiry = loop.call_later(PLAN_S, self.end_plan, f"not confirmed within {PLAN_S:g} s")
+        if not self._watched():
+            self.end_plan(_NOT_WATCHED)
         try:
-            fly = await self._plan[1]
+            outcome = await self._plan[1]
         finally:
+            expiry.cancel()
             self._plan = None
-        self.current.show("confirmed" if fly else "not flown")
-        return fly
+        self.current.show(outcome)
+        return outcome == "confirmed"
 
     async def _run(self, exchange: Exchange, text: str) -> None:
         from companion.language.endpoints import LanguageError
@@ -129,7 +154,7 @@ class Chat:
                 self._conversation = await self._converse(self)
             await self._conversation.ask(text)
         except asyncio.CancelledError:
-            exchange.show("ended by stop")
+            exchange.show(_ENDED)
             raise
         except (NoAnswerError, LanguageError, PluginError, ValueError) as error:
             exchange.show(str(error))
@@ -149,7 +174,11 @@ class Chats:
 
     def __init__(self, fleet: Fleet, language: LanguageSection, plugins: tuple[str, ...]) -> None:
         self._fleet, self._language, self._plugins = fleet, language, plugins
+        # The least recently used first.
         self._chats: dict[tuple[str, str], Chat] = {}
+        self._stops: Counter[str | None] = Counter()
+        self._streams: Counter[tuple[str, str]] = Counter()
+        fleet.on_command(self.end_plans)
         self._beginning = asyncio.Semaphore(_BEGINNING)
         self._noting: set[asyncio.Task[None]] = set()
 
@@ -161,15 +190,19 @@ class Chats:
 
     async def ask(self, window: str, vehicle: str, text: str) -> str:
         """Begin to answer a sentence. Returns why it is not; empty: it is."""
+        stops = self._stops_of(vehicle)
+        stop = text.strip().lower() == "stop" or await self._is_stop(text)
         chat = self._chat(window, vehicle)
-        if chat is None:
+        if stop:
+            self._stop(chat or Chat(vehicle, self._converse), text)
+        elif chat is None:
             return f"at most {MAX_CHATS} chats"
-        if text.strip().lower() == "stop" or await self._is_stop(text):
-            self._stop(chat, text)
+        elif stops != self._stops_of(vehicle):
+            chat.add(text).show(_ENDED)
         elif chat.busy:
             return _BUSY
         else:
-            chat.begin(text)
+            chat.begin(text, stops)
         return ""
 
     def answer_plan(self, window: str, vehicle: str, number: int, *, fly: bool) -> bool:
@@ -178,10 +211,35 @@ class Chats:
         return chat is not None and chat.answer_plan(number, fly=fly)
 
     def end(self, vehicle: str | None = None) -> None:
-        """End what the chats of a vehicle do; None: of all."""
+        """End what the chats of a vehicle do; None: of all. They send nothing after it."""
+        self._stops[vehicle] += 1
         for chat in self._chats.values():
             if vehicle in (None, chat.vehicle):
                 chat.end()
+
+    def end_plans(self, vehicle: str) -> None:
+        """End the plans that wait: another command was sent to the vehicle."""
+        for chat in self._chats.values():
+            if chat.vehicle == vehicle:
+                chat.end_plan(_OTHER_COMMAND)
+
+    @contextmanager
+    def watching(self, window: str, vehicle: str) -> Iterator[None]:
+        """A window has an open stream meanwhile; its plan ends with the last one."""
+        key = window, vehicle
+        self._streams[key] += 1
+        try:
+            yield
+        finally:
+            self._streams[key] -= 1
+            if not self._streams[key]:
+                del self._streams[key]
+                if (chat := self._chats.get(key)) is not None:
+                    chat.end_plan(_NOT_WATCHED)
+
+    async def load(self) -> None:
+        """Import what reads sentences; it takes long."""
+        await self._is_stop("")
 
     async def _is_stop(self, text: str) -> bool:
         def is_stop_() -> bool:
@@ -191,6 +249,9 @@ class Chats:
             return is_stop(text)
 
         return await asyncio.to_thread(is_stop_)
+
+    def _stops_of(self, vehicle: str) -> int:
+        return self._stops[vehicle] + self._stops[None]
 
     def _stop(self, chat: Chat, text: str) -> None:
         self.end(chat.vehicle)  # first: they send nothing after the stop
@@ -210,14 +271,16 @@ class Chats:
     def _chat(self, window: str, vehicle: str) -> Chat | None:
         """Return the chat of a window; None: too many are busy."""
         key = window, vehicle
-        if key not in self._chats:
+        chat = self._chats.pop(key, None)
+        if chat is None:
             if len(self._chats) >= MAX_CHATS:
-                idle = next((other for other, chat in self._chats.items() if not chat.busy), None)
+                idle = next((other for other, each in self._chats.items() if not each.busy), None)
                 if idle is None:
                     return None
                 del self._chats[idle]
-            self._chats[key] = Chat(vehicle, self._converse)
-        return self._chats[key]
+            chat = Chat(vehicle, self._converse, lambda: key in self._streams)
+        self._chats[key] = chat
+        return chat
 
     async def _converse(self, chat: Chat) -> Conversation:
         """A conversation with a vehicle whose operator is a window.
@@ -237,18 +300,29 @@ class Chats:
         check_words("language.may", self._language.may)
         endpoint = await asyncio.to_thread(endpoint_from, self._language)
         async with self._beginning:
-            converse = await conversations(_ChatDrone(session, chat.vehicle), endpoint, self._language.may)
+            drone = _ChatDrone(session, chat.vehicle, lambda: self._before_command(chat))
+            converse = await conversations(drone, endpoint, self._language.may)
         operator = Operator(
             lambda piece: chat.current.write(piece), lambda line: chat.current.show(line), chat.confirm
         )
         return converse(operator)
 
+    def _before_command(self, chat: Chat) -> None:
+        if chat.stops != self._stops_of(chat.vehicle):
+            raise asyncio.CancelledError
+        self.end_plans(chat.vehicle)
+
 
 class _ChatDrone(Drone):
-    """A chat's vehicle."""
+    """A chat's vehicle. `before_command`: called before each; raises CancelledError after a stop."""
+
+    def __init__(self, session: zenoh.Session, name: str, before_command: Callable[[], None]) -> None:
+        super().__init__(session, name)
+        self._before_command = before_command
 
     async def command(self, text: str) -> Reply:
         """As the client's. Cancelled by a stop, it sends one of its own only if that stop does not end it."""
+        self._before_command()
         flown = asyncio.ensure_future(super().command(text))
         try:
             return await asyncio.shield(flown)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections import Counter, deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -62,6 +62,10 @@ class Fleet:
     def session(self) -> zenoh.Session | None:
         """The connection to zenoh; None while there is none."""
         return self._link.session
+
+    def on_command(self, call: Callable[[str], None]) -> None:
+        """Set what is called with a vehicle's name when its events, while subscribed, show a command."""
+        self._link.on_command = call
 
     async def run(self) -> None:
         """Connect, merge what the vehicles see, end what nobody watches any more; until cancelled."""

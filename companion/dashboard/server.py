@@ -113,6 +113,7 @@ async def serve(options: DashboardOptions, on_ready: Callable[[str], None]) -> N
         server = http_server(create_app(fleet, chats, access))
         bridging = asyncio.create_task(fleet.run())
         bridging.add_done_callback(lambda _: setattr(server, "should_exit", True))
+        loading = asyncio.create_task(chats.load())
         try:
             on_ready(f"http://{host}:{port}/")
             await server.serve(sockets=[listener])
@@ -121,7 +122,8 @@ async def serve(options: DashboardOptions, on_ready: Callable[[str], None]) -> N
         finally:
             chats.end()
             bridging.cancel()
-            await asyncio.gather(bridging, return_exceptions=True)
+            loading.cancel()
+            await asyncio.gather(bridging, loading, return_exceptions=True)
 
 
 def http_server(application: ASGIApp) -> uvicorn.Server:
@@ -196,10 +198,9 @@ def create_app(fleet: Fleet, chats: Chats, access: Access) -> ASGIApp:
         browser = (
             f"{request.client.host if request.client else ''} {request.query_params.get('browser', '')[:64]}"
         )
-        window = request.query_params.get("window", "")
+        window = request.query_params.get("window", "")[:64]
         return StreamingResponse(
-            _stream(fleet, bridge, streams, browser, lambda: chats.state(window, bridge.vehicle)),
-            media_type="text/event-stream",
+            _stream(fleet, bridge, streams, browser, chats, window), media_type="text/event-stream"
         )
 
     async def picture(request: Request) -> Response:
@@ -270,6 +271,8 @@ def create_app(fleet: Fleet, chats: Chats, access: Access) -> ASGIApp:
             return bridge
         if text.strip().lower() == "stop":
             chats.end(bridge.vehicle)  # first: they send nothing after the stop
+        else:
+            chats.end_plans(bridge.vehicle)
         outcome = fleet.command(bridge.vehicle, text, identifier)
         if outcome is None:
             return PlainTextResponse("too many commands are waiting for their outcome", 429)
@@ -342,20 +345,20 @@ class StreamTable:
 
 
 async def _stream(
-    fleet: Fleet, bridge: Bridge, streams: StreamTable, browser: str, chat_of: Callable[[], dict[str, Any]]
+    fleet: Fleet, bridge: Bridge, streams: StreamTable, browser: str, chats: Chats, window: str
 ) -> AsyncIterator[str]:
     """Yield server-sent events with what is new since the one before, at most ten a second."""
     ended = streams.add(browser)
     seen = answered = 0
     sent_chat: dict[str, Any] | None = None
     try:
-        with fleet.watching(bridge):
+        with fleet.watching(bridge), chats.watching(window, bridge.vehicle):
             yield "retry: 1000\n\n"
             while not ended.is_set():
                 news = bridge.news(seen)
                 seen = news.number
                 answered, replies = fleet.replies(answered)
-                chat = chat_of()
+                chat = chats.state(window, bridge.vehicle)
                 new_chat = chat if chat != sent_chat else None
                 sent_chat = chat
                 text = _text_of(fleet, bridge, news, replies, streams.count(browser), new_chat)

@@ -34,7 +34,7 @@ BOXES = {3: (20.0, 40.0, 120.0, 100.0), 5: (180.0, 40.0, 280.0, 100.0)}
 
 
 class Service:
-    """The bus of a service that sees a red and a blue car. `orbit` flies until `stop`."""
+    """The bus of a service that sees a red and a blue car. `goto` and `orbit` fly until `stop`."""
 
     def __init__(self) -> None:
         self.endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
@@ -60,7 +60,7 @@ class Service:
         self.commands.append(text)
         if text == "stop":
             self.stopped.set()
-        if text.startswith("orbit"):
+        if text.startswith(("goto", "orbit")):
             self.flying.set()
             await self.stopped.wait()
         return {"command": text, "success": True, "reason": f"{text.split()[0]}: ended"}

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from typing import Any
 
 import pytest
 
-from companion.dashboard.chat import Chat
-from companion.settings import LanguageSection
+import companion.dashboard.chat
+from companion.bus import topics
+from companion.dashboard.chat import Chat, Chats
+from companion.dashboard.fleet import Fleet
+from companion.language.sentences import is_stop
+from companion.settings import LanguageSection, ZenohSection
 from tests.companion.cli.test_ask import Service, service
 from tests.companion.dashboard.serving import POST, EventStream, request, serving
 from tests.companion.dashboard.test_bridge import until
@@ -72,8 +77,18 @@ class Window:
         answer: str = self.chat["exchanges"][-1]["answer"]
         return answer
 
+    async def until_alone(self) -> None:
+        """Wait until the server has noticed that the other window was closed."""
+        async with asyncio.timeout(20):
+            while (news := await self._stream.next()) is None or news["windows"] > 1:
+                pass
+
     def close(self) -> None:
         self._stream.close()
+
+
+async def no_conversation(_chat: Chat) -> Any:
+    raise AssertionError
 
 
 @asynccontextmanager
@@ -139,12 +154,125 @@ async def test_stop_is_sent_and_ends_the_plan_that_waits(way: str) -> None:
 
 
 async def test_stop_ends_what_the_chat_flies() -> None:
-    async with windows(LanguageSection(may=("orbit",))) as (there, (window,)):
-        assert await window.post(text="circle the red car") == 204
+    async with windows(LanguageSection(may=("goto",))) as (there, (window,)):
+        assert await window.post(text="go ten metres forward") == 204
         await asyncio.wait_for(there.flying.wait(), 20)
         await window.command("stop")
         await window.until(busy=False)
-        assert there.commands == ["orbit track=3", "stop"]
+        assert there.commands == ["goto forward=10 right=0", "stop"]
+
+
+async def test_reader_of_sentences_is_loaded_with_the_server(monkeypatch: pytest.MonkeyPatch) -> None:
+    loaded = asyncio.Event()
+
+    async def load(_: Chats) -> None:
+        loaded.set()
+
+    monkeypatch.setattr(Chats, "load", load)
+    async with serving():
+        await asyncio.wait_for(loaded.wait(), 20)
+
+
+async def test_stop_while_a_sentence_is_read_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    reading, read = asyncio.Event(), threading.Event()
+    loop = asyncio.get_running_loop()
+
+    def slow_is_stop(text: str) -> bool:
+        if text:
+            loop.call_soon_threadsafe(reading.set)
+            assert read.wait(20)
+        return is_stop(text)
+
+    monkeypatch.setattr("companion.language.sentences.is_stop", slow_is_stop)
+    async with windows(LanguageSection(may=("goto",))) as (there, (window,)):
+        asked = asyncio.create_task(window.post(text="go ten metres forward"))
+        await asyncio.wait_for(reading.wait(), 20)
+        assert await window.command("stop") == 200
+        read.set()
+        assert await asked == 204
+        assert await window.until_answered() == "ended by stop"
+        assert there.commands == ["stop"]
+
+
+async def test_sentence_that_survives_its_end_sends_no_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    waiting = asyncio.Event()
+
+    async def stubborn(drone: Any, *_: Any) -> Any:
+        class Stubborn:
+            async def ask(self, _: str) -> None:
+                waiting.set()
+                with suppress(asyncio.CancelledError):
+                    await asyncio.Event().wait()
+                await drone.command("land")
+
+        return lambda _operator: Stubborn()
+
+    monkeypatch.setattr("companion.language.live.conversations", stubborn)
+    async with windows() as (there, (window,)):
+        assert await window.post(text="land") == 204
+        await asyncio.wait_for(waiting.wait(), 20)
+        await window.command("stop")
+        assert await window.until_answered() == "ended by stop"
+        assert there.commands == ["stop"]
+
+
+@pytest.mark.parametrize("by", ["page", "other window", "elsewhere"])
+async def test_plan_ends_with_another_command(by: str) -> None:
+    async with windows(LanguageSection(may=("land",)), names=("one", "two")) as (there, (window, other)):
+        assert await window.post(text="circle the red car") == 204
+        plan = await window.until_plan()
+        if by == "page":
+            await window.command("land")
+        elif by == "other window":
+            assert await other.post(text="land") == 204
+        else:
+            there.bus.publish(topics.EVENTS, {"stamp_ns": 1, "level": "info", "text": "command: land"})
+        assert "not flown: " in await window.until_answered()
+        assert window.chat["plan"] is None
+        assert await window.post(plan=plan, fly=True) == 409
+        await until(lambda: there.commands == ([] if by == "elsewhere" else ["land"]))
+
+
+@pytest.mark.parametrize("watched", [True, False])
+async def test_plan_ends_in_time_and_at_once_without_a_stream(
+    watched: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(companion.dashboard.chat, "PLAN_S", 0.0 if watched else 60.0)
+    chat = Chat(VEHICLE, no_conversation, lambda: watched)
+    assert not await asyncio.wait_for(chat.confirm(), 20)
+    assert chat.state()["plan"] is None
+    assert "not flown: " in chat.current.answer
+
+
+async def test_plan_ends_with_the_last_stream_of_its_window() -> None:
+    async with windows(names=("one", "two")) as (there, (window, other)):
+        assert await window.post(text="circle the red car") == 204
+        plan = await window.until_plan()
+        window.close()
+        await other.until_alone()
+        assert await window.post(plan=plan, fly=True) == 409
+        assert there.commands == []
+
+
+async def test_stop_is_sent_if_all_chats_are_busy(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(companion.dashboard.chat, "MAX_CHATS", 1)
+    async with windows(names=("one", "two")) as (there, (window, other)):
+        assert await window.post(text="circle the red car") == 204
+        await window.until_plan()
+        assert await other.post(text="land") == 429
+        assert await other.post(text="Halt!") == 204
+        await window.until(busy=False)
+        await until(lambda: there.commands == ["stop"])
+
+
+async def test_least_recently_used_idle_chat_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(companion.dashboard.chat, "MAX_CHATS", 2)
+    chats = Chats(Fleet(ZenohSection(), VEHICLE), LanguageSection(), ())
+    for window in ("one", "two", "one", "three"):
+        assert await chats.ask(window, VEHICLE, "hold") == ""
+        await until(lambda: not chats.state(window, VEHICLE)["busy"])  # noqa: B023
+    lengths = [len(chats.state(window, VEHICLE)["exchanges"]) for window in ("one", "two", "three")]
+    assert lengths == [2, 0, 1]
 
 
 async def test_question_is_answered_by_a_model_that_streams() -> None:
@@ -189,10 +317,7 @@ async def test_bad_request_is_refused(sent: dict[str, Any]) -> None:
 
 
 async def test_chat_is_bounded() -> None:
-    async def converse(_chat: Chat) -> Any:
-        raise AssertionError
-
-    chat = Chat(VEHICLE, converse)
+    chat = Chat(VEHICLE, no_conversation)
     for number in range(200):
         chat.add(f"{number}").write("x" * 5000)
     exchanges = chat.state()["exchanges"]
