@@ -19,9 +19,14 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from vision.detections import Detections
+from vision.detector import DEFAULT_MODEL
 from vision.evaluation.datasets import Dataset, DatasetError, fold_name, read_image
 from vision.evaluation.misses import WorstMisses
+from vision.model_files import find_model
 from vision.pipeline import FrameDetector
+from vision.runtimes.base import Precision
+from vision.runtimes.exported import kind_of
+from vision.runtimes.source import read_source
 from vision.yolo.metrics import ImageResult, Score, score_detections
 
 logger = logging.getLogger(__name__)
@@ -78,6 +83,14 @@ class Evaluation:
             "imagined_at_0.25": self.misses.counts["imagined"],
             "seconds": round(self.seconds, 2),
         }
+
+
+def usual_precision(model: str) -> Precision:
+    """float32, so that figures can be compared; `auto` for an exported file of a fixed precision."""
+    path = find_model(model)
+    if model == DEFAULT_MODEL or kind_of(path) is None:
+        return "float32"
+    return "auto" if read_source(path).fixed_precision else "float32"
 
 
 def map_classes(model_names: Sequence[str], dataset: Dataset) -> ClassMapping:

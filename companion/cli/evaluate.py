@@ -29,8 +29,11 @@ def evaluate(
         str, typer.Option(help="Runtime: torch, onnxruntime, openvino, tensorrt or auto.")
     ] = "torch",
     precision: Annotated[
-        str, typer.Option(help="Precision: auto, float32, bfloat16 or float16.")
-    ] = "float32",
+        str | None,
+        typer.Option(
+            help="Precision: auto, float32, bfloat16 or float16. Default: float32, or auto for an int8 file."
+        ),
+    ] = None,
     device: Annotated[str, typer.Option(help="Device of torch: cpu or cuda.")] = "cpu",
     threads: Annotated[int | None, typer.Option(min=1, help="CPU threads of the network.")] = None,
     tiles: Annotated[
@@ -50,6 +53,7 @@ def evaluate(
         evaluate_dataset,
         map_classes,
         report_lines,
+        usual_precision,
         write_sheet,
     )
     from vision.detector import Detector
@@ -68,7 +72,7 @@ def evaluate(
             confidence=JUDGED_CONFIDENCE,
             iou=iou,
             image_size=image_size,
-            precision=precision,  # type: ignore[arg-type]
+            precision=precision or usual_precision(model),  # type: ignore[arg-type]
             device=device,  # type: ignore[arg-type]
             threads=threads,
             runtime=runtime,  # type: ignore[arg-type]

@@ -109,9 +109,7 @@ def verify(
         start_runtime(source, "torch", precision="float32", threads=threads, image_size=image_size).runtime
     )
     runner = exported.runners()[0]
-    # The precision of a plan and of an int8 file is fixed.
-    fixed = exported.kind == "tensorrt" or exported.facts.precision == "int8"
-    precision: Precision = "auto" if fixed else "float32"
+    precision: Precision = "auto" if exported.fixed_precision else "float32"
     other = _levels(
         start_runtime(exported, runner, precision=precision, threads=threads, image_size=image_size).runtime
     )

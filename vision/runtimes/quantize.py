@@ -73,7 +73,7 @@ def quantize_onnx(source: Path, output: Path, images: Iterable[NDArray[np.uint8]
     except ImportError as error:
         raise RuntimeMissingError(
             f"exporting to int8 needs the packages onnx and onnxruntime ({error}): "
-            "pip install 'mavlink-companion[int8]'"
+            "pip install 'mavlink-companion[onnxruntime]'"
         ) from error
 
     class Reader(quantization.CalibrationDataReader):  # type: ignore[misc]

@@ -63,6 +63,11 @@ class ModelSource:
         """The file that identifies the model: OpenVINO's `.xml` of another exporter has no weights."""
         return self.path.with_suffix(".bin") if self.kind == "openvino" and self.foreign else self.path
 
+    @property
+    def fixed_precision(self) -> bool:
+        """Whether the precision is the file's, and `auto` the only one to request for every runtime."""
+        return self.kind == "tensorrt" or (self.facts is not None and self.facts.precision == "int8")
+
     def runners(self) -> tuple[RuntimeName, ...]:
         """The runtimes that can run this kind of file."""
         if self.kind is None:

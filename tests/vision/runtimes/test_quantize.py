@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import cv2
@@ -68,6 +69,21 @@ def test_int8_file_states_its_precision(quantised: tuple[Path, RuntimeName]) -> 
     assert detector.precision == "int8"
     with pytest.raises(RuntimeUnusableError, match=r"net\..*int8.*float32"):
         Detector(path, runtime=name, image_size=SIDE, precision="float32")
+
+
+def test_evaluation_of_int8_file_needs_no_precision(
+    quantised: tuple[Path, RuntimeName], tmp_path: Path
+) -> None:
+    path, name = quantised
+    assert cv2.imwrite(str(tmp_path / "a.png"), make_image(72, SIDE))
+    (tmp_path / "a.txt").write_text("0 0.5 0.5 0.5 0.5\n")
+    options = ["--model", str(path), "--runtime", name, "--image-size", str(SIDE), "--json"]
+    arguments = ["evaluate", str(tmp_path), *options, "--misses", str(tmp_path / "misses.png")]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.stderr
+    assert json.loads(result.stdout)["precision"] == "int8"
+    result = CliRunner().invoke(app, [*arguments, "--precision", "float32"])
+    assert result.exit_code == 2
 
 
 @pytest.mark.parametrize("count", [0, 15])
