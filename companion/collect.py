@@ -15,6 +15,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import yaml
 
 from companion.bus.client import open_client
 from companion.bus.topics import DETECTIONS, IMAGE
@@ -22,11 +23,13 @@ from companion.recording import RecordingError
 from companion.recording.frames import DetectedFrame
 from companion.settings import ZenohSection
 from vision.detections import TRACK_CONFIRMED, TRACK_TENTATIVE
+from vision.evaluation.datasets import fold_name
 from vision.plain_yaml import load_plain_yaml
 
 DOUBTED, LOST, CHANGED = "doubted", "lost", "changed class"
-# Of every this many images one is for validation.
-VALIDATION_EVERY = 5
+# The last of every five parts of a flight is for validation. At its ends nothing is kept: these images would
+# look like those to train on.
+PART_S, PARTS, GAP_S = 30.0, 5, 5.0
 # A track is confirmed after `tracker.min_hits` detections, 3 by default, if its scores and class allow it.
 DOUBTED_FRAMES = 5
 # The same doubt about the same track again counts as new after this.
@@ -75,32 +78,54 @@ def _at_edge(xyxy: list[float], width: int, height: int) -> bool:
     return min(left, top, width - right, height - bottom) < margin
 
 
+def split_at(elapsed_s: float) -> str | None:
+    """`train` or `val`, by the time since a flight's first frame; None between the two."""
+    into_s = elapsed_s % (PART_S * PARTS) - PART_S * (PARTS - 1)
+    if into_s < 0:
+        return "train"
+    return "val" if GAP_S <= into_s < PART_S - GAP_S else None
+
+
 class LabelFolder:
-    """A YOLO data set that grows: images, labels and `data.yaml`. An existing one is continued.
+    """A YOLO data set that grows: images, labels and `data.yaml`.
+
+    An existing one is continued. Of its `data.yaml` only `names` is extended, and a missing `val` is added.
 
     Raises:
-        OSError: it cannot be written. ValueError: its `data.yaml` has no list of names.
+        OSError: it cannot be written. ValueError: its `data.yaml` has no list of names, or its splits do not
+            have the folders of images.
     """
 
     def __init__(self, folder: Path) -> None:
-        self._folder, self._table = folder, folder / "data.yaml"
-        self._names: list[str] = []
-        if self._table.is_file():
-            table = load_plain_yaml(self._table.read_text("utf-8"))
+        self._folder, self._file = folder, folder / "data.yaml"
+        self._text, self._names = "train: images/train\nnames: []\n", list[str]()
+        self._splits: dict[str, Any] = {"train": "images/train"}
+        if self._file.is_file():
+            self._text = self._file.read_bytes().decode("utf-8")
+            table = load_plain_yaml(self._text)
             names = table.get("names") if isinstance(table, dict) else None
             if not isinstance(names, list):
-                raise ValueError(f"{self._table}: expected a list `names`, as `companion collect` writes it")
+                raise ValueError(f"{self._file}: expected a list `names`, as `companion collect` writes it")
             self._names = [str(name) for name in names]
-        self._count = sum(1 for _ in folder.glob("images/*/*.jpg"))
+            self._splits = {split: table[split] for split in ("train", "val") if table.get(split)}
+            self._check_splits(folder / str(table.get("path") or ""))
+        self._index_of = {fold_name(name): index for index, name in reversed([*enumerate(self._names)])}
 
-    def add(self, name: str, frame: DetectedFrame) -> Path | None:
+    def _check_splits(self, base: Path) -> None:
+        base = base if base.is_dir() else self._folder  # as `open_dataset`
+        for split, value in self._splits.items():
+            images = self._folder / "images" / split
+            entries = [base / str(one) for one in (value if isinstance(value, list) else [value])]
+            if not any(images.resolve().is_relative_to(entry.resolve()) for entry in entries):
+                raise ValueError(f"{self._file}: `{split}` does not have {images}, where images are added")
+
+    def add(self, name: str, split: str, frame: DetectedFrame) -> Path | None:
         """Write an image and its labels; returns the image's file.
 
         None: there is an image of that name. Its labels may have been corrected; they are kept.
         """
         if any(self._folder.glob(f"images/*/{name}.jpg")):
             return None
-        split = "val" if self._count % VALIDATION_EVERY == VALIDATION_EVERY - 1 else "train"
         image, labels = (
             self._folder / kind / split / f"{name}{suffix}"
             for kind, suffix in (("images", ".jpg"), ("labels", ".txt"))
@@ -110,25 +135,48 @@ class LabelFolder:
         done, jpeg = cv2.imencode(".jpg", frame.image, (cv2.IMWRITE_JPEG_QUALITY, 95))
         if not done:
             raise OSError(f"cannot encode {image}")
+        known = len(self._names)
+        lines = "".join(self._lines(frame.message))
+        text = _with_names(self._text, self._names[known:])
+        if split == "val" and "train" in self._splits and "val" not in self._splits:
+            text += ("" if text.endswith("\n") else "\n") + "val: images/val\n"
+            self._splits["val"] = "images/val"
+        if text != self._text or not self._file.is_file():
+            if [str(one) for one in load_plain_yaml(text)["names"]] != self._names:
+                raise ValueError(f"{self._file}: write its `names` as a list in one line, to add to it")
+            self._file.write_bytes(text.encode("utf-8"))
+            self._text = text
         image.write_bytes(jpeg.tobytes())
-        labels.write_text("".join(self._lines(frame.message)), "utf-8")
-        self._count += 1
-        validation = "images/val" if self._count >= VALIDATION_EVERY else "images/train"
-        names = json.dumps(self._names)
-        self._table.write_text(f"train: images/train\nval: {validation}\nnames: {names}\n", "utf-8")
+        labels.write_text(lines, "utf-8")
         return image
 
     def _lines(self, message: dict[str, Any]) -> Iterator[str]:
         """`class x y width height` of each detection: centre and size as fractions of the image."""
         for one in message["detections"]:
-            if one["class_name"] not in self._names:
+            class_id = self._index_of.setdefault(fold_name(one["class_name"]), len(self._names))
+            if class_id == len(self._names):
                 self._names.append(one["class_name"])
             sides = (message["width"], message["height"])
             left, top, right, bottom = np.clip(np.divide(one["xyxy"], sides * 2), 0.0, 1.0).tolist()
             if left < right and top < bottom:
                 numbers = ((left + right) / 2, (top + bottom) / 2, right - left, bottom - top)
-                class_id = self._names.index(one["class_name"])
                 yield f"{class_id} " + " ".join(f"{number:.6f}" for number in numbers) + "\n"
+
+
+def _with_names(text: str, added: list[str]) -> str:
+    """Add to the list `names` of a YAML table, and leave all else as it is."""
+    if not added:
+        return text
+    table: Any = yaml.compose(text, Loader=yaml.SafeLoader)
+    node = next(value for key, value in table.value if key.value == "names")
+    words = [json.dumps(name, ensure_ascii=False) for name in added]
+    if not node.flow_style:  # one entry a line
+        before, after = text[: node.value[-1].end_mark.index], text[node.value[-1].end_mark.index :]
+        rest, newline, after = after.partition("\n")
+        lines = "\n".join(" " * node.start_mark.column + f"- {word}" for word in words)
+        return f"{before}{rest}\n{lines}{newline}{after}"
+    at = node.value[-1].end_mark.index if node.value else node.start_mark.index + 1
+    return text[:at] + (", " if node.value else "") + ", ".join(words) + text[at:]
 
 
 def live_frames(
@@ -185,15 +233,18 @@ def collect(
     """
     labelled, doubts = LabelFolder(folder), DoubtFinder()
     due_ns = kept = 0
+    first_ns: int | None = None
     repeated_ns: dict[str, int] = {}
     for frame in frames:
         now_ns = frame.captured_ns
+        first_ns = now_ns if first_ns is None else first_ns
+        split = split_at((now_ns - first_ns) / 1e9)
         reasons = [one for one in doubts.update(frame.message) if now_ns >= repeated_ns.get(one, 0)]
-        if not reasons or now_ns < due_ns:
+        if not reasons or now_ns < due_ns or split is None:
             continue
         due_ns = now_ns + round(interval_s * 1e9)
         repeated_ns |= dict.fromkeys(reasons, now_ns + round(REPEAT_S * 1e9))
-        path = labelled.add(f"{source}_{frame.message['sequence']:07d}", frame)
+        path = labelled.add(f"{source}_{frame.message['sequence']:07d}", split, frame)
         if path is not None:
             yield path, reasons
             kept += 1

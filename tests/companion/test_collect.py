@@ -86,8 +86,8 @@ def test_collected_frames_are_a_data_set_to_train_on(tmp_path: Path) -> None:
     assert [path.name for path, _ in kept[:2]] == ["flight_0000004.jpg", "flight_0000014.jpg"]
     assert [reasons for _, reasons in kept[:2]] == [["doubted dog 2"], ["doubted dog 3"]]
     assert len(kept) == 10
-    train, val = (open_dataset(tmp_path, split=split) for split in ("train", "val"))
-    assert (len(train.samples), len(val.samples)) == (8, 2)
+    train = open_dataset(tmp_path, split="train")
+    assert len(train.samples) == 10
     assert train.class_names == ("car", "dog")
     assert train.samples[0].class_ids.tolist() == [0, 1]
     assert train.samples[0].boxes_in(160, 120) == pytest.approx(np.array([MIDDLE, (0, 0, 20, 30)]), abs=0.01)
@@ -101,8 +101,59 @@ def test_collected_frames_are_a_data_set_to_train_on(tmp_path: Path) -> None:
     # One doubt is one image, however long it lasts (up to ten seconds).
     assert len(list(collect(others, tmp_path, "other"))) == 1
     again = open_dataset(tmp_path, split="train")
-    assert len(again.samples) == 9
+    assert len(again.samples) == 11
     assert again.class_names == ("car", "dog", "boat")
+
+
+def test_images_for_validation_are_apart_in_time(tmp_path: Path) -> None:
+    # Every dog is doubted from its fifth frame on.
+    for _ in collect(doubtful(3000), tmp_path, "flight", interval_s=0.5, most=1000):
+        pass
+    seconds = {
+        split: [
+            int(one.image.stem.rpartition("_")[2]) / 10 for one in open_dataset(tmp_path, split=split).samples
+        ]
+        for split in ("train", "val")
+    }
+    assert len(seconds["val"]) > 30
+    assert len(seconds["train"]) > 200
+    assert all(125 <= one % 150 < 145 for one in seconds["val"])
+    assert all(one % 150 < 120 for one in seconds["train"])
+
+
+TABLE = """# of my cameras
+path: .
+train: [images/train, more]  # two folders
+test: images/test
+"""
+
+
+@pytest.mark.parametrize(
+    ("names", "extended"),
+    [
+        ("names: [Car, 'ca t']  # mine\n", "names: [Car, 'ca t', \"dog\"]  # mine\n"),
+        ("names:\n  - Car  # cars\n  - cat\nnc: 3\n", 'names:\n  - Car  # cars\n  - cat\n  - "dog"\nnc: 3\n'),
+        ("names:\n- Car\n- cat", 'names:\n- Car\n- cat\n- "dog"'),
+        ("names: []\r\n", 'names: ["car", "dog"]\r\n'),
+        ("names: [Car, Dog]\n", "names: [Car, Dog]\n"),
+    ],
+)
+def test_of_an_own_table_only_names_are_extended(tmp_path: Path, names: str, extended: str) -> None:
+    (tmp_path / "data.yaml").write_bytes((TABLE + names).encode())
+    assert len(list(collect(doubtful(20), tmp_path, "flight"))) == 2
+    assert (tmp_path / "data.yaml").read_bytes().decode() == TABLE + extended
+    (tmp_path / "more").mkdir()
+    found = open_dataset(tmp_path, split="train")
+    assert found.class_names is not None
+    assert [found.class_names[one].casefold() for one in found.samples[0].class_ids] == ["car", "dog"]
+
+
+def test_validation_folder_is_added_to_an_own_table(tmp_path: Path) -> None:
+    (tmp_path / "data.yaml").write_text("names: [car, dog]\ntrain: images/train # mine")
+    assert len(list(collect(doubtful(1400), tmp_path, "flight", interval_s=10))) > 10
+    table = (tmp_path / "data.yaml").read_text()
+    assert table == "names: [car, dog]\ntrain: images/train # mine\nval: images/val\n"
+    assert open_dataset(tmp_path, split="val").samples
 
 
 def recorded(folder: Path, **changes: str) -> Path:
@@ -134,14 +185,15 @@ def test_command_collects_from_a_recording(tmp_path: Path) -> None:
     assert len(open_dataset(tmp_path / "set").samples) == 2
 
 
-@pytest.mark.parametrize("case", ["annotated", "no recording", "another table"])
+@pytest.mark.parametrize("case", ["annotated", "no recording", "another table", "other folders"])
 def test_unusable_input_is_one_line(tmp_path: Path, case: str) -> None:
     path = recorded(tmp_path / "recordings", **({"preview.annotate": "true"} if case == "annotated" else {}))
     if case == "no recording":
         path.write_bytes(b"text")
-    if case == "another table":
+    tables = {"another table": "names: {0: car}\n", "other folders": "train: photos\nnames: [car]\n"}
+    if case in tables:
         (tmp_path / "set").mkdir()
-        (tmp_path / "set" / "data.yaml").write_text("names: {0: car}\n")
+        (tmp_path / "set" / "data.yaml").write_text(tables[case])
     result = CliRunner().invoke(app, ["collect", str(tmp_path / "set"), str(path)])
     assert result.exit_code == 2
     assert len([line for line in result.stderr.splitlines() if line.startswith("companion:")]) == 1
