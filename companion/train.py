@@ -7,10 +7,13 @@ determine the weights; nothing is downloaded. On labelled images a trained model
 
 from __future__ import annotations
 
+import hashlib
 import json
 import logging
 import math
+import os
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,12 +25,12 @@ from companion.evaluate import JUDGED_CONFIDENCE, evaluate_dataset, map_classes
 from mavlink_sim.datasets.training_scenes import random_scene, training_scene
 from mavlink_sim.world.shapes import CLASS_NAMES
 from vision.detector import DEFAULT_MODEL, Detector
-from vision.evaluation.datasets import Dataset, DatasetError, fold_name, open_dataset
+from vision.evaluation.datasets import Dataset, DatasetError, MissingSplitError, fold_name, open_dataset
 from vision.model_files import find_model
 from vision.runtimes.base import bfloat16_instructions
 from vision.weights import DEFAULT_WEIGHTS
 from vision.yolo.checkpoint import load_checkpoint, save_checkpoint
-from vision.yolo.checkpoint_pair import WEIGHTS_SUFFIX
+from vision.yolo.checkpoint_pair import WEIGHTS_SUFFIX, pair_paths, weights_sha256
 from vision.yolo.fine_tuning import DOUBTED_SCORE, LabelledScenes, extend_classes, training_images
 from vision.yolo.metrics import Score
 from vision.yolo.recipe import DEFAULT_RECIPE, HELD_OUT_SEED, HELD_OUT_SIZE, REFINEMENT, evaluate
@@ -62,8 +65,11 @@ def train_default(
 
     Raises:
         FileNotFoundError: `resume` without a state. CheckpointError: `start` cannot be read.
-        ValueError: the state or `start` belongs to another recipe.
+        FileExistsError: a state or the output exists, without `resume`.
+        ValueError: the state or `start` belongs to another recipe, or the output is `start`.
     """
+    states = [output.with_suffix(f"{output.suffix}.{name}") for name in ("training", "refining")]
+    _check_output(output, states, start, resume=resume)
     output.parent.mkdir(parents=True, exist_ok=True)
     changes: dict[str, Any] = {
         key: value for key, value in (("workers", workers), ("threads", threads)) if value is not None
@@ -80,7 +86,6 @@ def train_default(
     if time_limit_s is not None:
         first = replace(first, time_limit_s=time_limit_s * share)
         second = replace(second, time_limit_s=time_limit_s * (1 - share))
-    states = [output.with_suffix(f"{output.suffix}.{name}") for name in ("training", "refining")]
     with _ProgressDisplay() as display:
         if start is not None:
             initial = load_checkpoint(start).model
@@ -93,6 +98,7 @@ def train_default(
             checkpoint=states[1],
             resume=resume and (start is not None or states[1].is_file()),
             start=initial,
+            origin={"start": "the first stage" if start is None else _digest_of(start)},
         )
     return evaluate_and_save(output, refined, second, held_out)
 
@@ -163,21 +169,28 @@ def train_on_data(
     Args:
         data: as for `companion evaluate`; the split `train` if it has splits.
         start: the model to train: `default`, a file, or a name in the models folder.
-        validation: a data set to score on; None: the split `val` of `data`, or all of it without splits.
+        validation: a data set to score on; None: the split `val` of `data`, or without one the training
+            images.
         steps: None for about 40 passes over the images, at least 200 steps.
         image_size: side of the training images, and longer side in the evaluation; pixels, a multiple of 32.
 
     Raises:
         DatasetError: the data set cannot be used. CheckpointError: `start` cannot be read.
-        FileNotFoundError: `resume` without a state. ValueError: it belongs to another network, or the
-            network cannot be trained.
+        FileNotFoundError: `resume` without a state. FileExistsError: a state or the output exists, without
+            `resume`. ValueError: the state belongs to another training, the network cannot be trained, or the
+            output is `start`.
     """
     path = DEFAULT_WEIGHTS if start == DEFAULT_MODEL else find_model(start)
+    state = output.with_suffix(f"{output.suffix}.training")
+    _check_output(output, [state], path, resume=resume)
     loaded = load_checkpoint(path)
     train_set = open_dataset(data, split="train", class_names=loaded.class_names)
-    judged_set = open_dataset(
-        validation or data, split=None if validation else "val", class_names=loaded.class_names
-    )
+    try:
+        judged_set = open_dataset(
+            validation or data, split=None if validation else "val", class_names=loaded.class_names
+        )
+    except MissingSplitError:
+        judged_set = train_set
     if not any(len(sample.class_ids) for sample in train_set.samples):
         raise DatasetError(f"{data}: no object is labelled in its {len(train_set.samples)} images")
     model = extend_classes(loaded.model, train_set.class_names or ())
@@ -214,10 +227,11 @@ def train_on_data(
             settings,
             LabelledScenes(images, len(loaded.class_names)),
             display,
-            checkpoint=output.with_suffix(f"{output.suffix}.training"),
+            checkpoint=state,
             resume=resume,
             start=model,
             network=model.description,
+            origin={"data": _data_digest(train_set), "start": _digest_of(path)},
         )
     weights = output.with_suffix(WEIGHTS_SUFFIX)
     metadata: dict[str, Any] = {
@@ -263,6 +277,34 @@ def score_lines(result: FineTuning) -> list[str]:
             f"{name:<{width}}  {new.objects:7d}  {old50:>13}  {new.ap50:.3f}  {old95:>16}  {new.ap50_95:.3f}"
         )
     return lines
+
+
+def _check_output(output: Path, states: Sequence[Path], start: Path | None, *, resume: bool) -> None:
+    """Raise before the training if its files would replace the model to start from, or others."""
+    pair = pair_paths(output.with_suffix(WEIGHTS_SUFFIX))
+    if start is not None and start.resolve() in [path.resolve() for path in pair]:
+        raise ValueError(f"{start} is the model to start from and the output; give another --output")
+    if resume:
+        return
+    if state := next((path for path in states if path.exists()), None):
+        raise FileExistsError(f"{state} exists: continue it with --resume, or give another --output")
+    if existing := next((path for path in pair if path.exists()), None):
+        raise FileExistsError(f"{existing} exists: give another --output")
+
+
+def _data_digest(dataset: Dataset) -> str:
+    """Identifies the images (path below the root, bytes) and labels, wherever the data set is."""
+    root = dataset.root if dataset.root.is_dir() else dataset.root.parent
+    digest = hashlib.sha256(json.dumps(dataset.class_names).encode())
+    for sample in dataset.samples:
+        digest.update(f"{os.path.relpath(sample.image, root)} {sample.image.stat().st_size}\n".encode())
+        for array in (sample.boxes, sample.class_ids, sample.ignored):
+            digest.update(array.tobytes())
+    return f"{len(dataset.samples)} images, SHA-256 {digest.hexdigest()[:16]}"
+
+
+def _digest_of(model: Path) -> str:
+    return f"SHA-256 {weights_sha256(model)[:16]}"
 
 
 def _score(model: Path, dataset: Dataset, image_size: int, threads: int) -> Score:

@@ -51,7 +51,8 @@ def train(
     validation: Annotated[
         Path | None,
         typer.Option(
-            help="Data set to evaluate on. Default: the split `val` of DATA.", rich_help_panel=_DATA
+            help="Data set to evaluate on. Default: the split `val` of DATA, or its training images.",
+            rich_help_panel=_DATA,
         ),
     ] = None,
     image_size: Annotated[

@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 import yaml
 from typer.testing import CliRunner, Result
 
@@ -17,7 +18,7 @@ import companion.train
 from companion.cli import app
 from companion.train import train_default, train_on_data
 from vision.detector import Detector
-from vision.yolo.checkpoint import load_checkpoint
+from vision.yolo.checkpoint import load_checkpoint, save_checkpoint
 from vision.yolo.recipe import DEFAULT_RECIPE, REFINEMENT
 from vision.yolo.training import Stage
 
@@ -114,6 +115,80 @@ def test_interrupted_training_on_images_resumes(labelled: Path, small_model: Pat
     assert cut.read_bytes() == whole.read_bytes()
 
 
+def test_resume_of_another_training_is_refused(labelled: Path, small_model: Path, tmp_path: Path) -> None:
+    output, other = tmp_path / "mine.safetensors", tmp_path / "other.pt"
+    assert train_command(labelled, small_model, output, "--steps", "1").exit_code == 0
+    before = output.read_bytes()
+    loaded = load_checkpoint(small_model)
+    torch.nn.init.zeros_(next(loaded.model.parameters()))
+    save_checkpoint(other, loaded.model, metadata={})
+
+    def differing(start: Path, *options: str) -> set[str]:
+        result = train_command(labelled, start, output, "--steps", "2", "--resume", *options)
+        assert result.exit_code == 2
+        (error,) = [line for line in result.stderr.splitlines() if line.startswith("companion:")]
+        return {key for key in ("data", "start", "seed", "batches") if f" {key}: " in error}
+
+    assert differing(small_model, "--seed", "9", "--image-size", "96") == {"seed", "batches"}
+    assert differing(other) == {"start"}
+    labels = labelled / "labels" / "train" / "0.txt"
+    corrected = labels.read_text()
+    labels.write_text("1 0.5 0.5 0.25 0.3333\n")
+    assert differing(small_model) == {"data"}
+    labels.write_text(corrected)
+    shutil.copy(labelled / "images" / "val" / "5.png", labelled / "images" / "train")
+    assert differing(small_model) == {"data"}
+    assert output.read_bytes() == before
+
+
+@pytest.mark.parametrize("existing", ["mine.safetensors.training", "mine.safetensors", "mine.yaml"])
+@pytest.mark.parametrize("own_data", [True, False])
+def test_existing_state_or_output_is_kept(
+    labelled: Path, small_model: Path, tmp_path: Path, existing: str, own_data: bool
+) -> None:
+    output = tmp_path / "mine.safetensors"
+    (tmp_path / existing).write_text("kept")
+    if own_data:
+        result = train_command(labelled, small_model, output, "--steps", "1")
+    else:
+        result = CliRunner().invoke(app, ["train", "--output", str(output), "--steps", "1"])
+    assert result.exit_code == 2
+    assert len(result.stderr.splitlines()) == 1
+    assert existing in result.stderr
+    assert "another --output" in result.stderr
+    assert ("--resume" in result.stderr) == existing.endswith(".training")
+    assert (tmp_path / existing).read_text() == "kept"
+
+
+@pytest.mark.parametrize("own_data", [True, False])
+def test_output_that_is_the_start_is_refused(
+    labelled: Path, small_model: Path, tmp_path: Path, own_data: bool
+) -> None:
+    start, link = tmp_path / "mine.safetensors", tmp_path / "link"
+    save_checkpoint(start, load_checkpoint(small_model).model, metadata={})
+    link.symlink_to(tmp_path, target_is_directory=True)
+    before = start.read_bytes()
+    if own_data:
+        result = train_command(labelled, start, link / "mine", "--steps", "1", "--resume")
+    else:
+        arguments = ["train", "--from", str(start), "--output", str(link / "mine"), "--resume"]
+        result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 2
+    assert len(result.stderr.splitlines()) == 1
+    assert "mine.safetensors is the model to start from" in result.stderr
+    assert start.read_bytes() == before
+
+
+def test_without_validation_images_training_images_are_judged(
+    labelled: Path, small_model: Path, tmp_path: Path
+) -> None:
+    (labelled / "data.yaml").write_text("train: images/train\nnames: [Person, Drone]\n")
+    result = train_command(labelled, small_model, tmp_path / "mine.safetensors", "--steps", "1")
+    assert result.exit_code == 0, result.stderr
+    assert result.stdout.splitlines()[-1].endswith("on 4 images, the training images")
+    assert load_checkpoint(tmp_path / "mine.safetensors").metadata["score"]["held_out"] is False
+
+
 @pytest.mark.parametrize(
     ("file", "content", "message"),
     [
@@ -121,7 +196,7 @@ def test_interrupted_training_on_images_resumes(labelled: Path, small_model: Pat
         ("labels/train/2.txt", "0 40 30 20 20\n", "2.txt, line 1: coordinates are fractions"),
         ("labels/train/9.txt", "0 0.5 0.5 0.2 0.2\n", "labels/train/9.txt: its image "),
         ("images/train/2.png", "", "images/train/2.png: cannot be read as an image"),
-        ("data.yaml", "train: images/train\nnames: [Person, Drone]\n", "has no split 'val'"),
+        ("data.yaml", "val: images/val\nnames: [Person, Drone]\n", "has no split 'train'"),
         ("data.yaml", "train: images/gone\nval: images/val\n", "images/gone, which does not exist"),
     ],
 )

@@ -50,6 +50,7 @@ def open_dataset(
         class_names: of a data set without names.
 
     Raises:
+        MissingSplitError: it has splits, but not `split`.
         DatasetError: no data set found, or an invalid label.
     """
     if not path.exists():
@@ -64,6 +65,10 @@ def open_dataset(
 
 class DatasetError(ValueError):
     """A data set that cannot be used; the message names the file, the line or entry, and the problem."""
+
+
+class MissingSplitError(DatasetError):
+    """A data set that has splits, but not the requested one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -149,7 +154,9 @@ def find_annotations(folder: Path, split: str | None = None) -> Path | None:
         candidates = [path for path in candidates if split in path.stem] or candidates
     if len(candidates) > 1:
         names = ", ".join(str(path.relative_to(folder)) for path in candidates)
-        raise DatasetError(f"{folder}: has several annotation files, give one: {names}")
+        absent = split is not None and split not in candidates[0].stem
+        error = MissingSplitError if absent else DatasetError
+        raise error(f"{folder}: has several annotation files, give one: {names}")
     return candidates[0] if candidates else None
 
 
@@ -340,7 +347,7 @@ def _images_of(table: dict[Any, Any], path: Path, split: str | None) -> list[Pat
         root = path.parent
         return image_files(root / "images" if (root / "images").is_dir() else root)
     if chosen not in available:
-        raise DatasetError(f"{path}: has no split {chosen!r}; it has {', '.join(available)}")
+        raise MissingSplitError(f"{path}: has no split {chosen!r}; it has {', '.join(available)}")
     base = path.parent / str(table["path"]) if table.get("path") else path.parent
     if not base.is_dir():
         base = path.parent  # `path` is often the author's local path.

@@ -8,7 +8,7 @@ import logging
 import math
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -197,6 +197,7 @@ def train(
     resume: bool = False,
     start: YoloModel | None = None,
     network: ModelDescription | None = None,
+    origin: Mapping[str, str] | None = None,
 ) -> TrainedModel:
     """Train from the initial weights, or resume from a checkpoint, to the last step or the time limit.
 
@@ -208,10 +209,13 @@ def train(
         resume: resume from `checkpoint`. The result is that of an uninterrupted run.
         start: a trained network of the same scale and classes to start from; None: random weights.
         network: the network to train, with the settings' classes; None: YOLOv8 of the settings' scale.
+        origin: what identifies `scenes` and `start`. It is stored in the checkpoint with the seed and the
+            sizes of the images; `resume` requires the same.
 
     Raises:
         FileNotFoundError: `resume` without such a file.
-        ValueError: the checkpoint or `start` is of another network, or `scenes` returns an invalid scene.
+        ValueError: the checkpoint is of another network, seed, size or `origin`; `start` is of another
+            network; or `scenes` returns an invalid scene.
         FloatingPointError: the loss is not finite.
     """
     started = time.monotonic()
@@ -230,11 +234,11 @@ def train(
     model = model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     average = copy.deepcopy(model).eval()
     optimiser = _optimiser(model, settings)
-    first = 0
+    first, identity = 0, _identity(settings, origin or {})
     if resume:
         if checkpoint is None:
             raise ValueError("resume needs a checkpoint")
-        first = _restore(checkpoint, settings, model, average, optimiser)
+        first = _restore(checkpoint, settings, identity, model, average, optimiser)
         logger.info("training resumes from %s at step %d of %d", checkpoint, first, settings.steps)
 
     plan = _plan(settings)[first:]
@@ -274,13 +278,13 @@ def train(
             )
         )
         if checkpoint is not None and now - saved_s >= settings.checkpoint_every_s:
-            _save(checkpoint, settings, step, model, average, optimiser)
+            _save(checkpoint, settings, identity, step, model, average, optimiser)
             saved_s = now
         if settings.time_limit_s is not None and now - started >= settings.time_limit_s:
             logger.warning("training stops at its time limit after %d of %d steps", step, settings.steps)
             break
     if checkpoint is not None:
-        _save(checkpoint, settings, step, model, average, optimiser)
+        _save(checkpoint, settings, identity, step, model, average, optimiser)
     return TrainedModel(average.eval(), settings, step, time.monotonic() - started)
 
 
@@ -397,7 +401,7 @@ def _pixels_until(stages: Sequence[Stage], step: int) -> int:
     return pixels
 
 
-_CHECKPOINT_KIND = "yolo training state 1"
+_CHECKPOINT_KIND = "yolo training state 2"
 
 
 def _network(model: YoloModel, settings: TrainingSettings) -> dict[str, Any]:
@@ -410,9 +414,16 @@ def _network(model: YoloModel, settings: TrainingSettings) -> dict[str, Any]:
     }
 
 
+def _identity(settings: TrainingSettings, origin: Mapping[str, str]) -> dict[str, str]:
+    """What a resumed training has in common with its beginning. The number of steps may differ."""
+    sizes = (f"{stage.batch_size} of {stage.width}x{stage.height}" for stage in settings.stages)
+    return {**origin, "seed": str(settings.seed), "batches": ", ".join(sizes)}
+
+
 def _save(
     path: Path,
     settings: TrainingSettings,
+    identity: dict[str, str],
     step: int,
     model: YoloModel,
     average: nn.Module,
@@ -423,6 +434,7 @@ def _save(
         "kind": _CHECKPOINT_KIND,
         "network": _network(model, settings),
         "settings": asdict(settings),
+        "identity": identity,
         "step": step,
         "model": model.state_dict(),
         "average": average.state_dict(),
@@ -438,6 +450,7 @@ def _save(
 def _restore(
     path: Path,
     settings: TrainingSettings,
+    identity: dict[str, str],
     model: YoloModel,
     average: nn.Module,
     optimiser: torch.optim.Optimizer,
@@ -450,6 +463,17 @@ def _restore(
     if state["network"] != _network(model, settings):
         raise ValueError(
             f"{path} is of the network {state['network']}, the settings require {_network(model, settings)}"
+        )
+    kept: dict[str, str] = state["identity"]
+    if kept != identity:
+        differences = (
+            f"{key}: {kept.get(key, 'none')} (now {identity.get(key, 'none')})"
+            for key in {**kept, **identity}
+            if kept.get(key) != identity.get(key)
+        )
+        raise ValueError(
+            f"{path} is of another training, {'; '.join(differences)}; repeat its options, "
+            "or train to another output"
         )
     model.load_state_dict(state["model"])
     average.load_state_dict(state["average"])
