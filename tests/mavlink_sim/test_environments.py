@@ -6,9 +6,12 @@ import warnings
 from collections.abc import Callable
 from typing import Any
 
-import gymnasium
 import numpy as np
 import pytest
+
+pytest.importorskip("gymnasium", reason="gymnasium is of the optional extra rl")
+
+import gymnasium
 from gymnasium.utils.env_checker import check_env
 
 from benchmarks.environments import model_errors
