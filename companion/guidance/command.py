@@ -210,12 +210,14 @@ class BuildContext:
         class_names: the detector's classes; None: not known.
         attachment: lines sent along with the command (a mission's text).
         check_requirements: `Guidance.check_requirements`; a mission calls it at each step.
+        loop_rate_hz: updates of a behaviour a second; None: not known.
     """
 
     footprint: Footprint | None = None
     class_names: tuple[str, ...] | None = None
     attachment: str = ""
     check_requirements: Callable[[Behaviour], str | None] = lambda behaviour: None
+    loop_rate_hz: float | None = None
 
 
 NO_CONTEXT = BuildContext()

@@ -24,7 +24,7 @@ KEY = "mavlink_companion_policy"
 Activation = Literal["", "Tanh", "Relu"]
 _OPSET, _IR_VERSION = 17, 8
 POLICIES_FOLDER = Path(__file__).parent / "policies"
-# A network of this size still takes less than 1 ms a step.
+# How long a step takes is limited by `Network.check`.
 LARGEST_BYTES = 4_000_000
 
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -36,7 +36,7 @@ class PolicyError(ValueError):
 
 
 class Quantity(BaseModel):
-    """One number of the observation or the action, with the range that was trained."""
+    """One number: of the observation with the range visited in training, of the action with its limits."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -154,11 +154,12 @@ def load_policy(path: Path) -> LoadedPolicy:
         shape = [1, len(quantities)]
         if [(port.is_float32, port.shape) for port in ports] != [(True, shape)]:
             raise PolicyError(f"{path}: expected one {what} float32{shape}, as it is described, got {found}")
-    policy = LoadedPolicy(path.stem, description, network)
     try:
-        action = policy.act([(each.low + each.high) / 2 for each in description.observation])
+        network.check()
     except NetworkError as error:
         raise PolicyError(f"{path}: {error}") from error
+    policy = LoadedPolicy(path.stem, description, network)
+    action = policy.act([(each.low + each.high) / 2 for each in description.observation])
     if not all(map(math.isfinite, action)):
         raise PolicyError(f"{path}: its action is no number ({action}); train it again")
     return policy

@@ -6,6 +6,7 @@ onnx.proto (https://onnx.ai/onnx/repo-docs/IR.html), the encoding that of Protoc
 
 from __future__ import annotations
 
+import math
 import struct
 from collections import defaultdict
 from collections.abc import Callable, Sequence
@@ -15,9 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 _Floats = NDArray[np.float32]
+_Shape = tuple[int, ...]
 _Fields = defaultdict[int, list[int | bytes]]
 _FLOAT32 = 1
 _EXTERNAL = 14
+# One step of guidance waits for the network: all of it together takes at most some 2 ms.
+LARGEST_WIDTH = 1024
+LARGEST_NODES = 100
+LARGEST_MULTIPLICATIONS = 1_000_000
+_LARGEST_FIELDS = 1000
 
 
 class NetworkError(ValueError):
@@ -51,6 +58,32 @@ class _Port:
 
 
 @dataclass(frozen=True, slots=True)
+class _Node:
+    """One operation: its function, the names of its inputs and of its output.
+
+    `transposed`: of the second factor of a matrix product; None: computed number by number.
+    """
+
+    function: Callable[..., _Floats]
+    inputs: list[str]
+    output: str
+    transposed: bool | None
+
+    def shape(self, shapes: list[_Shape]) -> tuple[_Shape, int]:
+        """The shape that it computes from these, and the multiplications. Raises ValueError."""
+        if self.transposed is None:
+            computed = np.broadcast_shapes(*shapes)
+            return computed, math.prod(computed)
+        first, second, *bias = shapes
+        if len(first) != 2 or len(second) != 2:
+            raise ValueError(f"a product of {list(first)} and {list(second)}")
+        second = second[::-1] if self.transposed else second
+        if first[1] != second[0]:
+            raise ValueError(f"a product of {list(first)} and {list(second)}")
+        return np.broadcast_shapes((first[0], second[1]), *bias), first[0] * first[1] * second[1]
+
+
+@dataclass(frozen=True, slots=True)
 class Network:
     """A network with its weights.
 
@@ -58,35 +91,56 @@ class Network:
         metadata: texts of the file, by key.
         inputs, outputs: without the weights.
         weights: by name.
-        nodes: in the order of computation: function, names of its inputs, name of its output.
+        nodes: in the order of computation.
     """
 
     metadata: dict[str, str]
     inputs: list[_Port]
     outputs: list[_Port]
     weights: dict[str, _Floats]
-    nodes: list[tuple[Callable[..., _Floats], list[str], str]]
+    nodes: list[_Node]
 
-    def compute(self, value: _Floats) -> _Floats:
-        """The first output for the first input, both (1, numbers).
+    def check(self) -> None:
+        """Find the shape of every value, without computing it.
 
         Raises:
-            NetworkError: the file's weights, nodes and ports do not fit each other.
+            NetworkError: weights, nodes and ports do not fit each other, a value is not of shape (1, n), or
+                the network is too large to be computed in a step of guidance.
         """
+        shapes: dict[str, _Shape] = {name: weight.shape for name, weight in self.weights.items()}
+        shapes[self.inputs[0].name] = tuple(size or 0 for size in self.inputs[0].shape)
+        if len(self.nodes) > LARGEST_NODES:
+            raise NetworkError(f"it has {len(self.nodes)} operators, at most {LARGEST_NODES} are computed")
+        total = 0
+        for node in self.nodes:
+            try:
+                shape, multiplications = node.shape([shapes[name] for name in node.inputs])
+            except KeyError as error:
+                raise NetworkError(f"nothing computes {error}") from error
+            except ValueError as error:
+                raise NetworkError(f"{node.output} cannot be computed: {error}") from error
+            if len(shape) != 2 or shape[0] != 1 or not 1 <= shape[1] <= LARGEST_WIDTH:
+                raise NetworkError(
+                    f"{node.output} is of shape {list(shape)}, expected [1, n] with n up to {LARGEST_WIDTH}"
+                )
+            shapes[node.output] = shape
+            total += multiplications
+        if total > LARGEST_MULTIPLICATIONS:
+            raise NetworkError(f"a step takes {total} multiplications, at most {LARGEST_MULTIPLICATIONS} fit")
+        last = self.outputs[0]
+        if last.name not in shapes:
+            raise NetworkError(f"nothing computes {last.name!r}")
+        if list(shapes[last.name]) != last.shape:
+            raise NetworkError(f"it computes {list(shapes[last.name])}, its output is {last.shape}")
+
+    def compute(self, value: _Floats) -> _Floats:
+        """The first output for the first input, both (1, numbers), of a network that was checked."""
         values = {**self.weights, self.inputs[0].name: value}
         # Infinite and undefined results are found by the caller.
         with np.errstate(all="ignore"):
-            try:
-                for operator, names, result in self.nodes:
-                    values[result] = operator(*[values[name] for name in names])
-                last = values[self.outputs[0].name]
-            except KeyError as error:
-                raise NetworkError(f"nothing computes {error}") from error
-            except (TypeError, ValueError) as error:
-                raise NetworkError(f"{result} cannot be computed: {error}") from error
-        if last.shape != (1, self.outputs[0].shape[1]):
-            raise NetworkError(f"it computes {list(last.shape)}, its output is {self.outputs[0].shape}")
-        return last
+            for node in self.nodes:
+                values[node.output] = node.function(*[values[name] for name in node.inputs])
+        return values[self.outputs[0].name]
 
 
 def read_network(content: bytes) -> Network:
@@ -108,16 +162,16 @@ def read_network(content: bytes) -> Network:
         )
     except NetworkError:
         raise
-    except (IndexError, ValueError, struct.error) as error:
+    except (IndexError, OverflowError, ValueError, struct.error) as error:
         raise NetworkError(f"it is damaged: {error}") from error
 
 
-def _node(node: _Fields) -> tuple[Callable[..., _Floats], list[str], str]:
-    """The function of a node, and the names of its inputs and its output."""
+def _node(node: _Fields) -> _Node:
     kind, names = _text(node, 4), [_bytes(name).decode() for name in node[1]]
     attributes = {_text(each, 1): each for each in (_fields(_bytes(attribute)) for attribute in node[5])}
     given = f" with {', '.join(attributes)}" if attributes else ""
     computed, inputs = OPERATORS.get(kind, (None, 0))
+    transposed = False if kind == "MatMul" else None
     if kind == "Gemm" and attributes.keys() <= {"alpha", "beta", "transB"}:
         alpha, beta = (_number(attributes[key], 2) if key in attributes else 1.0 for key in ("alpha", "beta"))
         transposed = "transB" in attributes and _number(attributes["transB"], 3) != 0
@@ -126,7 +180,7 @@ def _node(node: _Fields) -> tuple[Callable[..., _Floats], list[str], str]:
         raise NetworkError(f"operator {kind}{given} is not computed; known: Gemm, {', '.join(OPERATORS)}")
     if len(names) != inputs:
         raise NetworkError(f"operator {kind} has {len(names)} inputs, expected {inputs}")
-    return computed, names, _text(node, 2)
+    return _Node(computed, names, _text(node, 2), transposed)
 
 
 def _gemm(alpha: float, beta: float, transposed: bool) -> Callable[..., _Floats]:
@@ -158,7 +212,7 @@ def _port(content: bytes) -> _Port:
 
 
 def _numbers(values: Sequence[int | bytes]) -> list[int]:
-    """Repeated integers, each alone or many packed."""
+    """The integers of a shape, each alone or many packed."""
     numbers: list[int] = []
     for value in values:
         if isinstance(value, int):
@@ -168,6 +222,10 @@ def _numbers(values: Sequence[int | bytes]) -> list[int]:
         while at < len(value):
             number, at = _varint(value, at)
             numbers.append(number)
+            if len(numbers) > 2:
+                break
+    if len(numbers) > 2:
+        raise NetworkError("weights must have at most 2 dimensions")
     return numbers
 
 
@@ -190,10 +248,12 @@ def _bytes(value: int | bytes) -> bytes:
 def _fields(content: bytes) -> _Fields:
     """The fields of one message, by number. Fixed-size numbers stay bytes."""
     fields: _Fields = defaultdict(list)
-    at = 0
+    at = count = 0
     while at < len(content):
         key, at = _varint(content, at)
-        kind = key & 7
+        kind, count = key & 7, count + 1
+        if count > _LARGEST_FIELDS:
+            raise NetworkError(f"a message of it has more than {_LARGEST_FIELDS} fields")
         if kind == 0:
             number, at = _varint(content, at)
             fields[key >> 3].append(number)

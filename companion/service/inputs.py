@@ -174,7 +174,8 @@ class InputAssembler:
             return CommandInput(identifier, str(command), aim=aim, mode_changes=self._mode_changes)
         footprint = Footprint(self.steering.settings.camera.field_rad, -self.camera_pitch_rad(state))
         source = CommandSource(enclosed if enclosed.strip() else command.read_attachment(), footprint, names)
-        context = BuildContext(footprint, names, source.attachment, check_requirements)
+        rate_hz = self._settings.guidance.rate_hz
+        context = BuildContext(footprint, names, source.attachment, check_requirements, rate_hz)
         return CommandInput(
             identifier,
             str(command),

@@ -67,6 +67,12 @@ class Policy(Command):
         try:
             loaded = load_policy(find_policy(self.file))
             check_quantities(loaded)
+            rate_hz, loop_hz = loaded.description.rate_hz, context.loop_rate_hz
+            if loop_hz is not None and rate_hz > loop_hz:
+                raise PolicyError(
+                    f"{loaded.name} steps at {rate_hz:g} Hz, guidance only at {loop_hz:g} Hz: "
+                    "set guidance.rate_hz to at least that of the policy"
+                )
             wanted = Wanted(self.class_name, self.track_id)
             return PolicyBehaviour(loaded, wanted, distance_m=self.distance_m, limit_s=self.limit_s)
         except PolicyError as error:

@@ -79,7 +79,7 @@ class Mission(Command):
             raise MissionError(f"{self.file}: a mission has at most {LARGEST_BYTES} bytes")
         if not text.strip():
             text = self.read_attachment()
-        plan = plan_from(text, self.file, context.class_names, context.footprint)
+        plan = plan_from(text, self.file, context.class_names, context.footprint, context.loop_rate_hz)
         return SequenceBehaviour(plan, context.check_requirements)
 
     def read_attachment(self) -> str:
@@ -158,13 +158,14 @@ def plan_from(
     source: str,
     class_names: Sequence[str] | None = None,
     footprint: Footprint | None = None,
+    loop_rate_hz: float | None = None,
 ) -> Plan:
     """Parse and validate a mission.
 
     Args:
         text: of the file. source: its name, for messages.
         class_names: the detector's classes; None: not known, any is accepted.
-        footprint: of the steering camera; None: not known.
+        footprint, loop_rate_hz: as of `BuildContext`.
 
     Raises:
         MissionError: with every problem found: invalid TOML, an unknown key, an invalid command, an unknown
@@ -189,7 +190,7 @@ def plan_from(
         raise MissionError(*problems)
     return Plan(
         name=table.name or Path(source).stem,
-        steps=tuple(_planned(step, footprint) for step in read),
+        steps=tuple(_planned(step, BuildContext(footprint, loop_rate_hz=loop_rate_hz)) for step in read),
         way_down=lambda word: parse(word).build(NO_CONTEXT),
         timeout_s=table.timeout_s,
     )
@@ -219,12 +220,12 @@ def _shown(plan: Plan, follows: int | str) -> str:
     return follows if isinstance(follows, str) else f"{plan.steps[follows].title}"
 
 
-def _planned(step: _Read, footprint: Footprint | None) -> PlannedStep:
+def _planned(step: _Read, context: BuildContext) -> PlannedStep:
     table = step.table
     return PlannedStep(
         title=table.name or str(step.command),
         command=str(step.command),
-        make=lambda: step.command.build(BuildContext(footprint)),
+        make=lambda: step.command.build(context),
         endless=step.command.endless,
         timeout_s=table.timeout_s,
         repeat=table.repeat,

@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 
 from benchmarks.flights_policy_depth import run
+from companion.bench.lockstep_flight import plain_settings
 from companion.guidance.behaviour import Behaviour
 from companion.guidance.behaviours.policy import ACTIONS, OBSERVATIONS
-from companion.guidance.command import NO_CONTEXT, GrammarError
+from companion.guidance.command import NO_CONTEXT, BuildContext, GrammarError
 from companion.guidance.grammar import parse
 from companion.guidance.interface import EventKind
 from companion.guidance.limits.envelope import Limits
@@ -32,6 +33,8 @@ from companion.guidance.policy_file import (
     write_policy,
 )
 from companion.guidance.policy_network import read_network
+from companion.perception.cameras import PerceptionCamera
+from companion.service.inputs import InputAssembler
 from companion.vehicle.setpoint import Setpoint
 from tests.companion.guidance.guidance_harness import Flight, GuidanceHarness, assert_failed, engaged, flying
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
@@ -156,6 +159,18 @@ def test_observation_outside_its_range_ends_the_policy(
     assert_failed(outcome, "tried", name, "trained for")
 
 
+@pytest.mark.parametrize("height_m", [12.0, 15.0, 19.0])
+def test_bundled_policy_hands_back_at_heights_it_was_not_trained_at(height_m: float) -> None:
+    vehicle = KinematicVehicle(position=[0.0, 0.0, -height_m])
+    flight = Flight(
+        parse("policy approach class=car distance=6").build(NO_CONTEXT),
+        vehicle,
+        [SeenObject("car", 18.0, 0.0)],
+    )
+    assert_failed(flight.run(10.0), "approach ended: target_up_m is -", "trained for -4.1 to 0.1 m")
+    assert math.hypot(*vehicle.position[:2]) < 0.5
+
+
 def test_observation_within_the_margin_is_flown(write: Write) -> None:
     outcome = Flight(built(write()), KinematicVehicle(), [SeenObject("car", 31.4, 0.0)]).run(60.0)
     assert outcome is not None
@@ -240,6 +255,21 @@ def test_unusable_description_is_refused_in_one_line(
     assert [word for word in words if word not in text] == [], text
 
 
+def test_policy_faster_than_the_loop_is_refused(write: Write, tmp_path: Path) -> None:
+    command = parse(f'policy "{write()}" class=car')
+    command.build(BuildContext(loop_rate_hz=20.0))
+    with pytest.raises(GrammarError, match=r"tried steps at 20 Hz, guidance only at 10 Hz: .*rate_hz"):
+        command.build(BuildContext(loop_rate_hz=10.0))
+    settings = plain_settings({"guidance.rate_hz": "10", "detector.enabled": "false"})
+    inputs = InputAssembler(settings, [PerceptionCamera(settings.of_camera(None))], lambda *event: None)
+    with pytest.raises(GrammarError, match="guidance only at 10 Hz"):
+        inputs.read_command(1, str(command), flying().state, lambda behaviour: None)
+    mission = parse("mission one.toml")
+    text = f"[[step]]\ndo = '{command}'"
+    with pytest.raises(GrammarError, match="guidance only at 10 Hz"):
+        mission.build(BuildContext(attachment=text, loop_rate_hz=10.0))
+
+
 def test_policy_must_observe_what_it_flies_to(tmp_path: Path) -> None:
     quantities = tuple(each for each in DESCRIPTION.observation if each.name != "target_age_s")
     path = tmp_path / "old.onnx"
@@ -280,7 +310,7 @@ def test_policy_needs_a_class_or_a_track() -> None:
 def test_bundled_policy_flies_an_approach_without_onnx(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in ("onnx", "onnxruntime"):
         monkeypatch.setitem(sys.modules, module, None)
-    flown = run(2)
+    flown = run(1)
     assert flown.success, flown.reason
     assert flown.values["range_error_m"] < 0.5
     assert flown.values["envelope_violations"] == 0.0
@@ -331,6 +361,52 @@ def test_unknown_operator_is_named(write: Write) -> None:
     with pytest.raises(
         GrammarError, match=r"tried.onnx: .*operator LSTM with transB is not computed; known: Gemm"
     ):
+        built(path)
+
+
+@pytest.mark.parametrize(
+    ("weight", "nodes", "words"),
+    [
+        # 1.6 MB of weights whose sum would take 149 GiB.
+        (
+            (200_000, 1),
+            [("Add", "w", "row")],
+            "[200000, 200000]",
+        ),
+        ((10_000, 1), [("Add", "observation", "w")], "[10000, 8]"),
+        ((8, 1025), [("MatMul", "observation", "w")], "[1, 1025]"),
+        ((900, 900), [("MatMul", "w", "w")], "[900, 900]"),
+        ((8, 4), [("MatMul", "w", "observation")], "a product of [8, 4] and [1, 8]"),
+        ((7, 4), [("MatMul", "observation", "w")], "a product of [1, 8] and [7, 4]"),
+        ((1, 8), [("Relu", "nothing")], "nothing computes 'nothing'"),
+        ((1, 8), [("Add", "observation", "w")], "it computes [1, 8], its output is [1, 4]"),
+        ((1, 8), [("Relu", "observation")] * 101, "101 operators"),
+        ((1, 2, 2), [("Relu", "w")], "at most 2 dimensions"),
+        ((600, 600), [("MatMul", "wide", "w")] * 3, "1080000 multiplications"),
+    ],
+)
+def test_network_too_large_for_a_step_is_refused(
+    write: Write, weight: tuple[int, ...], nodes: list[tuple[str, ...]], words: str
+) -> None:
+    model = onnx.load(str(path := write()))
+    del model.graph.node[:], model.graph.initializer[:]
+    shapes = {"w": weight, "wide": (1, 600), "row": (1, 200_000)}
+    for name in {name for _, *names in nodes for name in names} & shapes.keys():
+        model.graph.initializer.append(onnx.numpy_helper.from_array(np.ones(shapes[name], np.float32), name))
+    for kind, *names in nodes:
+        model.graph.node.append(onnx.helper.make_node(kind, names, ["action"]))
+    onnx.save(model, str(path))
+    with pytest.raises(GrammarError) as caught:
+        built(path)
+    assert "tried.onnx: " in str(caught.value)
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_file_of_countless_parts_is_refused(write: Write) -> None:
+    path = write()
+    path.write_bytes(bytes([8, 1]) * 100_000)
+    with pytest.raises(GrammarError, match=r"tried.onnx: .*more than 1000 fields"):
         built(path)
 
 
