@@ -7,11 +7,11 @@ seed gives the same weights on one machine.
 
 from __future__ import annotations
 
-import json
+import math
 import os
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -57,7 +57,8 @@ CHECKPOINT_STEPS = 100_000
 JUDGED_EPISODES = 100
 # Seeds of the judged episodes, far from those of trainings.
 JUDGED_SEED = 1_000_000
-_STATE = "training.json"
+_STATE = "state.pt"
+_REPLAY = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 # Largest difference of the written file from the trained network, as a fraction of an action's range.
 _TOLERANCE = 1e-4
 
@@ -99,22 +100,22 @@ def train_policy(training: Training, steps: int, output: Path, *, resume: bool =
             f"unknown algorithm {training.algorithm!r}; there are: {', '.join(ALGORITHMS)}"
         )
     monitored = VecMonitor(ScaledEnv(make_environment(training.environment, EPISODES[training.algorithm])))
-    if resume:
-        model = _restored(training, kind, folder, monitored)
-    elif (folder / _STATE).exists():
-        raise PolicyTrainingError(
-            f"{folder} holds the state of a training: continue it with --resume, or give another --output"
-        )
-    else:
+    if not resume:
+        if (folder / _STATE).exists():
+            raise PolicyTrainingError(
+                f"{folder} holds the state of a training: continue it with --resume, or give another --output"
+            )
         folder.mkdir(parents=True, exist_ok=True)
-        model = kind(
-            "MlpPolicy",
-            VecNormalize(monitored),
-            seed=training.seed,
-            device="cpu",
-            tensorboard_log=str(folder / "tensorboard"),
-            **PARAMETERS[training.algorithm],
-        )
+    model = kind(
+        "MlpPolicy",
+        VecNormalize(monitored),
+        seed=training.seed,
+        device="cpu",
+        tensorboard_log=str(folder / "tensorboard"),
+        **PARAMETERS[training.algorithm],
+    )
+    if resume:
+        _restore(model, training, folder)
     # The random numbers of a resumed training depend on its seed and its step alone.
     model.set_random_seed(training.seed + model.num_timesteps)
     if model.num_timesteps < steps:
@@ -127,10 +128,15 @@ def train_policy(training: Training, steps: int, output: Path, *, resume: bool =
             )
         _store(model, training, folder)
     description = description_of(training.environment)
-    write_policy(output, description, layers_of(model, description))
-    policy = load_policy(output)
+    layers, draft = layers_of(model, description), folder / f"draft{output.suffix}"
+    write_policy(draft, description, layers)
+    policy = load_policy(draft)
     _compare(model, policy)
-    return judge(policy, JUDGED_EPISODES)
+    figures, visited = judge(policy, JUDGED_EPISODES)
+    write_policy(draft, description.model_copy(update={"observation": visited}), layers)
+    load_policy(draft)
+    os.replace(draft, output)
+    return figures
 
 
 def make_environment(name: str, count: int) -> TaskVectorEnv:
@@ -144,7 +150,7 @@ def make_environment(name: str, count: int) -> TaskVectorEnv:
 
 
 def description_of(environment: str) -> PolicyDescription:
-    """What a policy of this environment observes and commands."""
+    """What a policy of this environment observes and commands, with the limits of its spaces."""
     task = make_environment(environment, 1).task
     observation, action = (
         tuple(Quantity(**asdict(entry)) for entry in entries) for entries in (task.observation, task.action)
@@ -248,13 +254,22 @@ def _compare(model: BaseAlgorithm, policy: LoadedPolicy) -> None:
             raise PolicyTrainingError(f"the written policy differs from the trained one by {off:.2g}")
 
 
-def judge(policy: LoadedPolicy, episodes: int, seed: int = JUDGED_SEED) -> dict[str, float]:
-    """Means over unseen episodes of its environment: `return`, `steps`, and the measures at the end."""
+def judge(
+    policy: LoadedPolicy, episodes: int, seed: int = JUDGED_SEED
+) -> tuple[dict[str, float], tuple[Quantity, ...]]:
+    """Fly unseen episodes of its environment.
+
+    Returns:
+        means: `return`, `steps`, and the measures at the end; and the observation with its visited range.
+    """
     env = make_environment(policy.description.environment, episodes)
     observed, _ = env.reset(seed=seed)
     running = np.ones(episodes, bool)
     total, steps, measures = np.zeros(episodes), np.zeros(episodes), dict[str, NDArray[np.float64]]()
+    least, most = observed.min(0), observed.max(0)
     while running.any():
+        least = np.minimum(least, observed[running].min(0))
+        most = np.maximum(most, observed[running].max(0))
         actions = np.array([policy.act(observation) for observation in observed], np.float32)
         observed, rewards, ended, truncated, infos = env.step(actions)
         total += rewards * running
@@ -264,42 +279,124 @@ def judge(policy: LoadedPolicy, episodes: int, seed: int = JUDGED_SEED) -> dict[
             if not name.endswith("final_obs"):
                 measures.setdefault(name, np.zeros(episodes))[over] = np.abs(np.asarray(values)[over])
         running &= ~over
-    return {
-        key: float(values.mean()) for key, values in {"return": total, "steps": steps, **measures}.items()
-    }
+    figures = {"return": total, "steps": steps, **measures}
+    return {key: float(values.mean()) for key, values in figures.items()}, tuple(
+        _visited(quantity, float(low), float(high))
+        for quantity, low, high in zip(policy.description.observation, least, most, strict=True)
+    )
+
+
+def _visited(quantity: Quantity, low: float, high: float) -> Quantity:
+    """The range from low to high, rounded outward to two digits."""
+    step = 10.0 ** (math.floor(math.log10(max(abs(low), abs(high), 1e-3))) - 1)
+    first, last = math.floor(low / step), math.ceil(high / step)
+    update = {"low": round(first * step, 9), "high": round(max(last, first + 1) * step, 9)}
+    return quantity.model_copy(update=update)
 
 
 # --- state -----------------------------------------------------------------------------------------------
 
 
 def _store(model: BaseAlgorithm, training: Training, folder: Path) -> None:
-    """Store the state; each file appears complete, the description of the training last."""
+    """Store the state: one file of tensors and plain values, which appears complete."""
+    state: dict[str, Any] = {
+        "training": _conditions(training),
+        "steps": model.num_timesteps,
+        "parameters": model.get_parameters(),
+        "arrays": {name: torch.as_tensor(values) for name, values in _arrays(model).items()},
+    }
+    if isinstance(model, SAC):
+        buffer = model.replay_buffer
+        assert buffer is not None
+        used = buffer.size()
+        state["replay"] = {name: torch.as_tensor(getattr(buffer, name)[:used]) for name in _REPLAY}
+        state["next"] = buffer.pos
+    torch.save(state, folder / f"next.{_STATE}")
+    os.replace(folder / f"next.{_STATE}", folder / _STATE)
+
+
+def _conditions(training: Training) -> dict[str, Any]:
+    """All that a training must share with its state."""
+    name = training.algorithm
+    return {**asdict(training), "episodes": EPISODES[name], "parameters": PARAMETERS[name]}
+
+
+def _arrays(model: BaseAlgorithm) -> dict[str, NDArray[Any]]:
+    """The numbers beside the networks and their optimizers, as views where they are arrays."""
     normal = model.get_vec_normalize_env()
     assert normal is not None
-    parts: dict[str, Callable[[str], None]] = {"model.zip": model.save, "normal.pkl": normal.save}
+    assert isinstance(normal.obs_rms, RunningMeanStd)
+    arrays = {}
+    for name, measured in (("observation", normal.obs_rms), ("return", normal.ret_rms)):
+        arrays |= {f"{name}.mean": measured.mean, f"{name}.var": measured.var}
+        arrays[f"{name}.count"] = np.asarray(measured.count)
     if isinstance(model, SAC):
-        parts["replay.pkl"] = model.save_replay_buffer
-    for name, save in parts.items():
-        save(str(folder / f"next.{name}"))
-        os.replace(folder / f"next.{name}", folder / name)
-    (folder / _STATE).write_text(json.dumps({**asdict(training), "steps": model.num_timesteps}))
+        assert model.log_ent_coef is not None
+        arrays["log_ent_coef"] = model.log_ent_coef.detach().numpy()
+    return {name: np.asarray(values) for name, values in arrays.items()}
 
 
-def _restored(training: Training, kind: type[BaseAlgorithm], folder: Path, env: VecEnv) -> BaseAlgorithm:
+def _restore(model: BaseAlgorithm, training: Training, folder: Path) -> None:
+    """Give a new model the stored state. Nothing in the file can run code: it holds no other objects.
+
+    Raises:
+        PolicyTrainingError: no state, a damaged one, or one of another training.
+    """
+    file = folder / _STATE
+    if not file.is_file():
+        raise PolicyTrainingError(f"--resume: no state of a training in {folder}: {_STATE} is missing")
     try:
-        stored: Mapping[str, Any] = json.loads((folder / _STATE).read_text())
-    except (OSError, ValueError) as error:
-        raise PolicyTrainingError(f"--resume: no state of a training in {folder} ({error})") from error
-    for key, value in asdict(training).items():
+        state = torch.load(file, weights_only=True)
+        stored = dict(state["training"])
+    except Exception as error:
+        raise _damaged(file, error) from error
+    for key, value in _conditions(training).items():
         if stored.get(key) != value:
             raise PolicyTrainingError(
                 f"--resume: {folder} is a training with {key} {stored.get(key)}, not {value}"
             )
-    normal = VecNormalize.load(str(folder / "normal.pkl"), env)
-    model = kind.load(folder / "model.zip", normal, device="cpu")
+    try:
+        _apply(model, state)
+    except Exception as error:
+        raise _damaged(file, error) from error
+
+
+def _damaged(file: Path, error: Exception) -> PolicyTrainingError:
+    why = (str(error).splitlines() or [""])[0][:120]
+    return PolicyTrainingError(
+        f"--resume: {file} is no state of a training ({type(error).__name__}: {why}): "
+        "train again with another --output"
+    )
+
+
+def _apply(model: BaseAlgorithm, state: dict[str, Any]) -> None:
+    """Raises any error if the state does not fit the model."""
+    if state["parameters"].keys() != model.get_parameters().keys():
+        raise ValueError(f"parameters of {', '.join(state['parameters'])}")
+    model.set_parameters(state["parameters"])
+    arrays = {}
+    for name, current in _arrays(model).items():
+        arrays[name] = state["arrays"][name].numpy()
+        if arrays[name].shape != current.shape or not np.isfinite(arrays[name]).all():
+            raise ValueError(f"{name} of shape {list(arrays[name].shape)}")
+    normal = model.get_vec_normalize_env()
+    assert normal is not None
+    assert isinstance(normal.obs_rms, RunningMeanStd)
+    for name, measured in (("observation", normal.obs_rms), ("return", normal.ret_rms)):
+        measured.mean, measured.var = arrays[f"{name}.mean"], arrays[f"{name}.var"]
+        measured.count = float(arrays[f"{name}.count"])
     if isinstance(model, SAC):
-        model.load_replay_buffer(folder / "replay.pkl")
-    return model
+        assert model.log_ent_coef is not None
+        model.log_ent_coef.data.copy_(state["arrays"]["log_ent_coef"])
+        buffer = model.replay_buffer
+        assert buffer is not None
+        used = len(state["replay"]["rewards"])
+        for name in _REPLAY:
+            getattr(buffer, name)[:used] = state["replay"][name].reshape(
+                (used, *getattr(buffer, name).shape[1:])
+            )
+        buffer.full, buffer.pos = used == buffer.buffer_size, range(buffer.buffer_size)[state["next"]]
+    model.num_timesteps = range(10**12)[state["steps"]]
 
 
 class _Checkpoints(BaseCallback):

@@ -20,11 +20,12 @@ def train_policy(
 ) -> None:
     """Train a policy in a simulated environment. Writes an ONNX file for the flight command `policy`."""
     try:
+        from companion.guidance.policy_file import PolicyError
         from companion.train_policy import PolicyTrainingError, Training, train_policy
     except ModuleNotFoundError as error:
         typer.echo(f"companion: train-policy: {error}: pip install 'mavlink-companion[rl]'", err=True)
         raise typer.Exit(EXIT_BAD_INPUT) from error
-    with plain_errors(PolicyTrainingError, OSError):
+    with plain_errors(PolicyTrainingError, PolicyError, OSError):
         figures = train_policy(Training(environment, algorithm, seed), steps, output, resume=resume)
     written = ", ".join(f"{name} {value:.3g}" for name, value in figures.items())
     typer.echo(f"{output}: over 100 episodes on average {written}")

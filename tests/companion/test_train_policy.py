@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import pickle
 import subprocess
 import sys
 from dataclasses import replace
@@ -12,6 +12,8 @@ import pytest
 from typer.testing import CliRunner
 
 pytest.importorskip("stable_baselines3", reason="stable_baselines3 is of the optional extra rl")
+
+import torch
 
 from companion import train_policy as trainer
 from companion.cli import app
@@ -55,7 +57,7 @@ def test_training_resumes_with_its_state(tmp_path: Path) -> None:
     train_policy(CART_POLE, 256, file)
     first = file.read_bytes()
     train_policy(CART_POLE, 512, file, resume=True)
-    assert json.loads((folder / "training.json").read_text())["steps"] == 512
+    assert torch.load(folder / "state.pt", weights_only=True)["steps"] == 512
     second = file.read_bytes()
     assert second != first
     # A finished training has nothing left to do.
@@ -65,6 +67,72 @@ def test_training_resumes_with_its_state(tmp_path: Path) -> None:
         train_policy(replace(CART_POLE, seed=1), 1024, file, resume=True)
     with pytest.raises(PolicyTrainingError, match="holds the state of a training: continue it with --resume"):
         train_policy(CART_POLE, 512, file)
+
+
+class _Runs:
+    """Unpickled, it makes a file."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return Path.touch, (self._path,)
+
+
+def test_state_that_is_no_training_is_refused_and_runs_nothing(tmp_path: Path) -> None:
+    file, state = tmp_path / "policy.onnx", tmp_path / "policy.onnx.training" / "state.pt"
+    command = ["train-policy", "companion/CartPole-v0", "--steps", "512", "--resume", "--output", str(file)]
+    train_policy(CART_POLE, 256, file)
+    whole, run = torch.load(state, weights_only=True), tmp_path / "run"
+
+    def refused() -> str:
+        result = CliRunner().invoke(app, command)
+        assert result.exit_code == 2
+        assert "--resume" in result.stderr
+        assert "state.pt is no state" in result.stderr
+        assert len(result.stderr.splitlines()) == 1
+        return result.stderr
+
+    content = state.read_bytes()
+    for bad in (content[: len(content) // 2], b"", b"[]", pickle.dumps(_Runs(run), 2)):
+        state.write_bytes(bad)
+        refused()
+    mean = whole["arrays"]["observation.mean"]
+    bad_states: tuple[object, ...] = (
+        [],
+        {},
+        _Runs(run),
+        whole | {"extra": _Runs(run)},
+        whole | {"steps": -(10**13)},
+        whole | {"parameters": {}},
+        whole | {"parameters": whole["parameters"] | {"policy": {"x": mean}}},
+        whole | {"arrays": whole["arrays"] | {"observation.mean": mean[:1]}},
+        whole | {"arrays": whole["arrays"] | {"observation.mean": mean * float("nan")}},
+    )
+    for bad_state in bad_states:
+        torch.save(bad_state, state)
+        refused()
+    assert not run.exists()
+
+
+def test_resume_with_other_sizes_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    train_policy(CART_POLE, 256, tmp_path / "policy.onnx")
+    monkeypatch.setitem(trainer.EPISODES, "ppo", 8)
+    with pytest.raises(PolicyTrainingError, match="episodes 16, not 8"):
+        train_policy(CART_POLE, 512, tmp_path / "policy.onnx", resume=True)
+
+
+def test_described_range_is_what_the_episodes_visited(tmp_path: Path) -> None:
+    train_policy(APPROACH, 256, tmp_path / "policy.onnx")
+    described = load_policy(tmp_path / "policy.onnx").description
+    limits = {each.name: each for each in description_of("companion/Approach-v0").observation}
+    found = {each.name: each for each in described.observation}
+    for name, each in found.items():
+        assert limits[name].low <= each.low < each.high <= limits[name].high
+    # Episodes begin at heights of 1.5 to 3.5 m, 6 to 30 m away.
+    assert -10.0 < found["target_up_m"].low < -1.5
+    assert found["target_forward_m"].high < 35.0
+    assert 4.4 <= found["distance_wanted_m"].low
 
 
 def test_sac_writes_its_policy_and_resumes(tmp_path: Path) -> None:
