@@ -20,11 +20,12 @@ _Shape = tuple[int, ...]
 _Fields = defaultdict[int, list[int | bytes]]
 _FLOAT32 = 1
 _EXTERNAL = 14
-# One step of guidance waits for the network: all of it together takes at most some 2 ms.
+# One step of guidance waits for the network: within these limits about 1 ms of a core.
 LARGEST_WIDTH = 1024
 LARGEST_NODES = 100
 LARGEST_MULTIPLICATIONS = 1_000_000
-_LARGEST_FIELDS = 1000
+# Reading it takes at most some 50 ms: fields of a message and of weights, bytes of all else.
+_LARGEST_FIELDS, _WEIGHTS_FIELDS, _LARGEST_REST_BYTES = 1000, 20, 200_000
 
 
 class NetworkError(ValueError):
@@ -150,6 +151,11 @@ def read_network(content: bytes) -> Network:
         if not model[7]:
             raise NetworkError("it holds no graph")
         graph = _fields(_bytes(model[7][-1]))
+        rest = sum(len(_bytes(each)) for each in (*graph[1], *graph[11], *graph[12], *model[14]))
+        if rest > _LARGEST_REST_BYTES:
+            raise NetworkError(
+                f"it has {rest} bytes beside its weights, at most {_LARGEST_REST_BYTES} are read"
+            )
         weights = dict(_tensor(_bytes(each)) for each in graph[5])
         ports = [[_port(_bytes(each)) for each in graph[key]] for key in (11, 12)]
         pairs = [_fields(_bytes(each)) for each in model[14]]
@@ -192,7 +198,7 @@ def _gemm(alpha: float, beta: float, transposed: bool) -> Callable[..., _Floats]
 
 
 def _tensor(content: bytes) -> tuple[str, _Floats]:
-    tensor = _fields(content)
+    tensor = _fields(content, _WEIGHTS_FIELDS)
     name = _text(tensor, 8)
     if _number(tensor, 2) != _FLOAT32 or _number(tensor, _EXTERNAL):
         raise NetworkError(f"weights {name!r} must be float32 and in the file")
@@ -245,15 +251,15 @@ def _bytes(value: int | bytes) -> bytes:
     return value
 
 
-def _fields(content: bytes) -> _Fields:
+def _fields(content: bytes, limit: int = _LARGEST_FIELDS) -> _Fields:
     """The fields of one message, by number. Fixed-size numbers stay bytes."""
     fields: _Fields = defaultdict(list)
     at = count = 0
     while at < len(content):
         key, at = _varint(content, at)
         kind, count = key & 7, count + 1
-        if count > _LARGEST_FIELDS:
-            raise NetworkError(f"a message of it has more than {_LARGEST_FIELDS} fields")
+        if count > limit:
+            raise NetworkError(f"a message of it has more than {limit} fields")
         if kind == 0:
             number, at = _varint(content, at)
             fields[key >> 3].append(number)

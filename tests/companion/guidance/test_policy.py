@@ -404,7 +404,11 @@ def test_network_too_large_for_a_step_is_refused(
 
 
 def test_file_of_countless_parts_is_refused(write: Write) -> None:
-    path = write()
+    model = onnx.load(str(path := write()))
+    onnx.helper.set_model_props(model, {str(index): "x" * 1000 for index in range(200)})
+    onnx.save(model, str(path))
+    with pytest.raises(GrammarError, match=r"tried.onnx: .*bytes beside its weights, at most 200000"):
+        built(path)
     path.write_bytes(bytes([8, 1]) * 100_000)
     with pytest.raises(GrammarError, match=r"tried.onnx: .*more than 1000 fields"):
         built(path)
