@@ -188,7 +188,7 @@ def test_gap_is_open_from_every_cell(east: float) -> None:
 
 
 def test_way_out_of_the_clearance_leads_through_no_obstacle() -> None:
-    """Beyond both walls there is room, 2 m away; between them there is none."""
+    """The nearest cells with enough clearance are behind the walls."""
     walls = [((north, east), 0.1) for north in (0.4, -1.3) for east in np.arange(-4.0, 4.01, 0.1)]
     path = planned(grid_with(*walls))
     assert path.points == ()
