@@ -193,7 +193,7 @@ def train_on_data(
         judged_set = train_set
     if not any(len(sample.class_ids) for sample in train_set.samples):
         raise DatasetError(f"{data}: no object is labelled in its {len(train_set.samples)} images")
-    model = extend_classes(loaded.model, train_set.class_names or ())
+    model = extend_classes(loaded.model, train_set.class_names or (), seed=seed)
     map_classes(model.class_names, judged_set)  # Raises now, not after the training.
     steps = steps or max(200, math.ceil(USUAL_EPOCHS * len(train_set.samples) / batch_size))
     settings = TrainingSettings(

@@ -19,6 +19,7 @@ from companion.cli import app
 from companion.train import train_default, train_on_data
 from vision.detector import Detector
 from vision.yolo.checkpoint import load_checkpoint, save_checkpoint
+from vision.yolo.checkpoint_pair import weights_sha256
 from vision.yolo.recipe import DEFAULT_RECIPE, REFINEMENT
 from vision.yolo.training import Stage
 
@@ -108,11 +109,14 @@ def test_class_of_own_images_is_added_and_scored(labelled: Path, small_model: Pa
 def test_interrupted_training_on_images_resumes(labelled: Path, small_model: Path, tmp_path: Path) -> None:
     whole, cut = tmp_path / "whole.safetensors", tmp_path / "cut.safetensors"
     options = {"start": str(small_model), "image_size": 64, "batch_size": 2, "workers": 0, "steps": 4}
+    torch.manual_seed(0)
     train_on_data(labelled, whole, **options)  # type: ignore[arg-type]
+    torch.manual_seed(1)  # Nothing depends on the process's generator.
     train_on_data(labelled, cut, time_limit_s=0.0, **options)  # type: ignore[arg-type]
     assert load_checkpoint(cut).metadata["steps_done"] == 1
     assert train_command(labelled, small_model, cut, "--steps", "4", "--resume").exit_code == 0
-    assert cut.read_bytes() == whole.read_bytes()
+    assert weights_sha256(cut) == weights_sha256(whole)
+    assert load_checkpoint(cut).metadata == load_checkpoint(whole).metadata
 
 
 def test_resume_of_another_training_is_refused(labelled: Path, small_model: Path, tmp_path: Path) -> None:
@@ -236,6 +240,7 @@ def test_option_for_own_data_without_data_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)
 def test_sixteen_photographs_are_learned(tmp_path: Path) -> None:
     checkpoint, photographs = DATA / "models" / "yolov8n_coco.pt", tmp_path / "set"
     if not checkpoint.is_file():

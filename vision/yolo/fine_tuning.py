@@ -8,6 +8,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from vision.detections import Detections
@@ -40,11 +41,11 @@ class TrainingImage:
     class_ids: NDArray[np.int64]
 
 
-def extend_classes(model: YoloModel, names: Sequence[str]) -> YoloModel:
+def extend_classes(model: YoloModel, names: Sequence[str], *, seed: int = 0) -> YoloModel:
     """A copy of a network that also knows the classes `names`; those that it knows are not added.
 
-    Names are compared by `fold_name`. All weights are kept. A new class has random weights in the last
-    convolution of the class branches, and the prior probability of an untrained network.
+    Names are compared by `fold_name`. All weights are kept. A new class has random weights, of `seed`, in
+    the last convolution of the class branches, and the prior probability of an untrained network.
 
     Raises:
         ValueError: the network has an end-to-end head, or one without distributions of the sides.
@@ -59,15 +60,16 @@ def extend_classes(model: YoloModel, names: Sequence[str]) -> YoloModel:
     added = tuple(name for key, name in folded.items() if key not in known)
     rows = model.description.head
     last_convolution = model.detect.cv3[0][-1]  # type: ignore[index]
-    extended = build(
-        replace(
-            model.description,
-            class_names=model.class_names + added,
-            # By default it depends on the number of classes, as may the argument of the last row.
-            class_width=last_convolution.in_channels,
-            head=(*rows[:-1], replace(rows[-1], arguments=("nc",))),
-        )
+    description = replace(
+        model.description,
+        class_names=model.class_names + added,
+        # By default it depends on the number of classes, as may the argument of the last row.
+        class_width=last_convolution.in_channels,
+        head=(*rows[:-1], replace(rows[-1], arguments=("nc",))),
     )
+    with torch.random.fork_rng(devices=()):
+        torch.manual_seed(seed)
+        extended = build(description)
     weights = extended.state_dict()
     for name, old in model.state_dict().items():
         # The last convolutions' new rows are behind the old ones. (A counter of batches has no rows.)
