@@ -13,6 +13,7 @@ from companion.guidance.behaviour import (
     Requirement,
     needs_to_see,
 )
+from companion.guidance.behaviours.approach import LOST_AFTER_S
 from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.command import (
     BuildContext,
@@ -105,8 +106,9 @@ def check_quantities(policy: LoadedPolicy) -> None:
 class PolicyBehaviour(Behaviour):
     """Flies the actions of a policy, each clipped to its trained range, until it stands before the object.
 
-    It holds until the object's range is known. An observation outside its trained range, a target that is
-    too old, or an action that is no number end it.
+    It holds until the object's range is known, and brakes and holds while the object has not been detected
+    for `LOST_AFTER_S`. An observation outside its trained range, a target that is too old, or an action that
+    is no number end it.
 
     Args:
         policy: checked by `check_quantities`.
@@ -137,9 +139,7 @@ class PolicyBehaviour(Behaviour):
 
     def on_activate(self, context: BehaviourContext) -> None:
         self._selector, self._arrival = TargetSelector(), Arrival()
-        self._track = None
-        self._hold = HoldBehaviour()
-        self._hold.on_activate(context)
+        self._track = self._hold = None
         self._begun_ns = self._due_ns = context.now_ns
 
     def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
@@ -151,17 +151,20 @@ class PolicyBehaviour(Behaviour):
                 why = "range never known" if context.perception_fresh else "no detections received"
                 why = context.perception_fault(why)
                 return Outcome(False, f"no {self._wanted.name} to fly to in {elapsed_s:.0f} s: {why}")
-            assert self._hold is not None
-            return self._hold.update(dt_s, context)
+            return self._wait(dt_s, context)
         values = self._observation(track, context, position, yaw_rad)
         self._range_m = math.hypot(values["target_forward_m"], values["target_right_m"])
         at_m = abs(self._range_m - self._distance_m)
-        if self._arrival.update(at_m, speed_of(context.state), context.now_ns):
+        lost = values["target_age_s"] > LOST_AFTER_S
+        if not lost and self._arrival.update(at_m, speed_of(context.state), context.now_ns):
             return Outcome(True, f"reached {self._wanted.name} at {self._range_m:.1f} m")
         if elapsed_s > self._limit_s:
             return Outcome(False, f"not there after {elapsed_s:.0f} s: {self._range_m:.1f} m away")
         if (fault := self._untrained(values)) is not None:
             return Outcome(False, f"{self._policy.name} ended: {fault}")
+        if lost:
+            return self._wait(dt_s, context)
+        self._hold = None
         # A little early rather than a whole update late.
         if context.now_ns >= self._due_ns - 5_000_000:
             period_ns = round(1e9 / self._policy.description.rate_hz)
@@ -171,6 +174,13 @@ class PolicyBehaviour(Behaviour):
         north, east = _rotated(self._action["forward_m_s"], self._action["right_m_s"], yaw_rad)
         velocity = (north, east, -self._action["up_m_s"])
         return Setpoint.velocity(velocity, context.now_ns, yaw_rate_radps=self._action["turn_rad_s"])
+
+    def _wait(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
+        """Brake, and hold where the vehicle comes to rest."""
+        if self._hold is None:
+            self._hold, self._arrival = HoldBehaviour(), Arrival()
+            self._hold.on_activate(context)
+        return self._hold.update(dt_s, context)
 
     def _observed(self, context: BehaviourContext, position: Vector3, yaw_rad: float) -> ObjectTrack | None:
         """The object with its newest detection; None: none with a known range yet."""
@@ -218,6 +228,8 @@ class PolicyBehaviour(Behaviour):
     def status(self) -> str:
         if self._track is None:
             return f"policy {self._policy.name}, looking for {self._wanted.phrase}"
+        if self._hold is not None:
+            return f"policy {self._policy.name}, lost {self._wanted.phrase}, waiting"
         return f"policy {self._policy.name}, {self._wanted.name} {self._range_m:.1f} m away"
 
 

@@ -189,6 +189,40 @@ def test_old_target_hands_back_to_hold_and_an_event_says_so(write: Write) -> Non
     assert vehicle.now_ns - KinematicVehicle().now_ns == pytest.approx(4.1e9, abs=0.2e9)
 
 
+def test_bundled_policy_brakes_a_second_after_losing_its_object() -> None:
+    car, vehicle = SeenObject("car", 25.0, 0.0), KinematicVehicle(position=[0.0, 0.0, -3.0])
+    speeds: dict[float, float] = {}
+
+    def each(seconds: float, vehicle: KinematicVehicle) -> None:
+        car.visible = seconds < 3.0
+        speeds[round(seconds, 1)] = math.hypot(*vehicle.velocity)
+
+    flight = Flight(parse("policy approach class=car distance=6").build(NO_CONTEXT), vehicle, [car])
+    assert_failed(flight.run(20.0, each), "target_age_s is 4.6")
+    assert speeds[3.9] > 1.5
+    assert max(speed for seconds, speed in speeds.items() if seconds > 5.5) < 0.1
+
+
+def test_policy_goes_on_when_its_object_is_seen_again(write: Write) -> None:
+    observation = tuple(
+        each.model_copy(update={"high": 5.0}) if each.name == "target_age_s" else each
+        for each in DESCRIPTION.observation
+    )
+    wide = DESCRIPTION.model_copy(update={"observation": observation}).model_dump(mode="json")
+    car, vehicle, statuses = SeenObject("car", 18.0, 0.0), KinematicVehicle(), []
+    flown = built(write(description=wide), "distance=6")
+
+    def each(seconds: float, vehicle: KinematicVehicle) -> None:
+        car.visible = not 2.0 < seconds < 5.0
+        statuses.append(flown.status)
+
+    outcome = Flight(flown, vehicle, [car]).run(40.0, each)
+    assert outcome is not None
+    assert outcome.success, outcome.reason
+    assert vehicle.position[0] == pytest.approx(12.0, abs=0.35)
+    assert "policy tried, lost the car, waiting" in statuses
+
+
 def test_policy_without_an_object_holds_then_ends_in_hold(write: Write) -> None:
     harness = GuidanceHarness(flying())
     outcome = harness.outcome(engaged(harness, built(write())), 15.0)
