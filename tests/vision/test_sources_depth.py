@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -68,15 +69,39 @@ def test_floats_are_metres_and_holes_are_nan(tmp_path: Path, name: str) -> None:
         np.testing.assert_allclose(frame.depth_m, [[expected, np.nan], [np.nan, np.nan]], rtol=1e-6)
 
 
-def test_openexr_is_read_or_refused_with_a_way_out(tmp_path: Path) -> None:
-    path = tmp_path / "a.exr"
-    if "OpenEXR:                     NO" in cv2.getBuildInformation():
-        with pytest.raises(SourceError, match="convert it to 32-bit TIFF or NPY"):
-            decode_depth(path, b"\x76\x2f\x31\x01")
-    else:
-        picture = decode_depth(path, saved(path, METRES).read_bytes())
-        assert picture is not None
-        np.testing.assert_array_equal(picture, METRES)
+def saved_exr(path: Path, channels: dict[str, NDArray[Any]]) -> Path:
+    OpenEXR = pytest.importorskip("OpenEXR")  # noqa: N806
+    OpenEXR.File({"type": OpenEXR.scanlineimage}, channels).write(str(path))
+    return path
+
+
+@pytest.mark.parametrize("names", [["V"], ["B", "G", "R", "Z"]])
+@pytest.mark.parametrize("dtype", [np.float32, np.float16])
+def test_openexr_depth_is_its_channel_or_z(tmp_path: Path, names: list[str], dtype: type) -> None:
+    channels = {name: np.full((2, 2), 9.0, dtype) for name in names}
+    channels[names[-1]] = METRES.astype(dtype)
+    path = saved_exr(tmp_path / "a.exr", channels)
+    with open_source(str(path), SourceSettings(as_depth=True)) as source:
+        frame = source.read()
+    assert frame is not None
+    assert frame.depth_m is not None
+    np.testing.assert_array_equal(frame.depth_m, [[1.5, np.nan], [np.nan, np.nan]])
+
+
+def test_openexr_without_a_depth_channel_is_refused(tmp_path: Path) -> None:
+    colour = saved_exr(tmp_path / "a.exr", dict.fromkeys("RGB", METRES))
+    with pytest.raises(SourceError, match="only channel or 'Z', got B, G, R"):
+        decode_depth(colour, b"")
+    whole = colour.read_bytes()
+    for data in (whole[: len(whole) // 2], whole[:-4], b"\x76\x2f\x31\x01", b"picture"):
+        colour.write_bytes(data)
+        assert decode_depth(colour, data) is None
+
+
+def test_openexr_without_its_extra_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "OpenEXR", None)
+    with pytest.raises(SourceError, match=r"mavlink-companion\[exr\].*32-bit TIFF or NPY"):
+        decode_depth(tmp_path / "a.exr", b"")
 
 
 def test_floats_in_millimetres_are_refused_with_the_key() -> None:

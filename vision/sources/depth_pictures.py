@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import os
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +17,8 @@ INTEGER_SCALE_M, FLOAT_SCALE_M = 0.001, 1.0
 """Metres per unit without `depth_scale`: 16-bit integers are millimetres, floats metres."""
 # Floats in millimetres are common, and depth cameras for vehicles do not see this far.
 IMPLAUSIBLE_MEDIAN_M = 200.0
-
-# OpenCV 4 has an OpenEXR reader that this enables; OpenCV 5.0 on PyPI is built without it.
-os.environ.setdefault("OPENCV_IO_ENABLE_OPENEXR", "1")
+# The channel of depth in an OpenEXR file with several, as renderers name it.
+_EXR_CHANNEL = "Z"
 
 
 def is_depth_picture(path: Path) -> bool:
@@ -32,11 +30,13 @@ def decode_depth(path: Path, data: bytes) -> NDArray[Any] | None:
     """(height, width) uint16 or float of a file's bytes, in the file's units; None if it cannot be read.
 
     Raises:
-        SourceError: it holds something else than one channel of 16-bit integers or floats, or OpenCV has no
-            OpenEXR reader.
+        SourceError: it holds something else than one channel of 16-bit integers or floats; or it is OpenEXR
+            and the extra is missing, or none of several channels is `Z`.
     """
     picture: Any = None
-    if path.suffix.lower() == ".npy":
+    if path.suffix.lower() == ".exr":
+        picture = _decode_exr(path)
+    elif path.suffix.lower() == ".npy":
         try:
             picture = np.load(io.BytesIO(data), allow_pickle=False)
         except (ValueError, EOFError, OSError):
@@ -46,11 +46,6 @@ def decode_depth(path: Path, data: bytes) -> NDArray[Any] | None:
             picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         except cv2.error:
             picture = None
-        if picture is None and path.suffix.lower() == ".exr":
-            raise SourceError(
-                f"{path}: this OpenCV ({cv2.__version__}) cannot read OpenEXR or this file; convert it to "
-                f"32-bit TIFF or NPY"
-            )
     if picture is None:
         return None
     if picture.ndim == 3 and picture.shape[2] == 1:
@@ -61,6 +56,27 @@ def decode_depth(path: Path, data: bytes) -> NDArray[Any] | None:
             f"{picture.dtype}"
         )
     return np.asarray(picture)
+
+
+def _decode_exr(path: Path) -> NDArray[Any] | None:
+    """The only channel of an OpenEXR file's first part, or `Z`; None if it cannot be read."""
+    try:
+        import OpenEXR
+    except ImportError as error:
+        raise SourceError(
+            f"{path}: OpenEXR needs pip install 'mavlink-companion[exr]' ({error}); or convert it to 32-bit "
+            f"TIFF or NPY"
+        ) from error
+    try:
+        channels = OpenEXR.File(str(path), separate_channels=True).channels()
+    except (RuntimeError, ValueError):
+        return None
+    name = next(iter(channels)) if len(channels) == 1 else _EXR_CHANNEL
+    if name not in channels:
+        raise SourceError(
+            f"{path}: depth must be the only channel or {_EXR_CHANNEL!r}, got {', '.join(sorted(channels))}"
+        )
+    return np.asarray(channels[name].pixels)
 
 
 def to_metres(picture: NDArray[Any], scale_m: float | None) -> NDArray[np.float32]:

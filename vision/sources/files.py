@@ -122,7 +122,7 @@ class ImagesCapture(Capture):
             started_ns = time.monotonic_ns()
             try:
                 image = self._decode(path, path.read_bytes())
-                reason = "not an image that OpenCV can read; it may be truncated or damaged"
+                reason = "not an image that can be read; it may be truncated or damaged"
             except OSError as error:
                 image, reason = None, error.strerror or str(error)
             if image is not None:
