@@ -1,7 +1,8 @@
 """Depth images: their summary, and the nearest surface point of a detected object in its box.
 
 The point is in the optical frame, so that the attitude at the capture can rotate it into NED.
-"Nearest" is horizontal: of a car seen from above, the bumper and not the roof.
+"Nearest" is horizontal: of a car seen from above, the bumper and not the roof. Noise makes some part of a
+surface seem nearest, so the point is where the surface begins without the noise.
 """
 
 from __future__ import annotations
@@ -29,6 +30,12 @@ _STRIP, _STRIP_MIN_PX = 0.15, 3
 # This share of the remaining cells may be wrong. Less than a tenth of them, nearer than the others by half a
 # metre, is another object in front of this one.
 _NEAR_FRACTION, _OTHER_FRACTION, _OTHER_GAP_M = 0.01, 0.1, 0.5
+# The front of an object: its nearest cells, to so many sigma of their noise behind the nearest one. It holds
+# all cells of an upright surface.
+_FRONT_SIGMAS = 5.0
+# The noise is measured by the smaller differences of neighbours, this share of them, the others may be edges;
+# and the root mean square of that share of normal differences, in sigma.
+_SMOOTH_SHARE, _SMOOTH_RMS, _SMOOTH_MIN = 0.8, 0.6616, 8
 
 # The depth at the centre is the median of a square: its side as a share of the image's shorter one, and its
 # least pixels.
@@ -79,7 +86,8 @@ def nearest_points(
     """The point of each object's visible surface that is horizontally nearest to the camera.
 
     The box is averaged into cells of inverse depth, in which a stereo camera's noise is uniform. Ground and
-    sky are excluded, and the remaining cells are sorted by horizontal range.
+    sky are excluded, and the remaining cells are sorted by horizontal range. The range of the nearest ones is
+    their mean, less as much of their spread as their noise does not explain.
 
     Args:
         depth_m: (height, width) float32, metres along the optical axis; NaN, infinite or not above zero where
@@ -116,7 +124,8 @@ def _nearest_point(
     share = cv2.mean(known)[0]
     if not share or share < MIN_KNOWN_FRACTION:
         return nothing
-    side = _cell_side(inverse)
+    sigma = _pixel_sigma(inverse)
+    side = _cell_side(inverse, sigma)
     shape = (_cells(inverse.shape[0], side), _cells(inverse.shape[1], side))
     rays, along_m = _averaged(inverse, known, shape, edges, camera)
     if not len(along_m):
@@ -135,9 +144,21 @@ def _nearest_point(
     ranges_m = level * along_m
     order = np.argsort(ranges_m)
     first = _first_of_object(ranges_m[order])
-    index = order[first + int(_NEAR_FRACTION * (len(order) - first))]
-    point: NDArray[np.float64] = rays[index] * along_m[index]
+    first += int(_NEAR_FRACTION * (len(order) - first))
+    index = order[first]
+    noise_m = level[index] * along_m[index] ** 2 * sigma * math.sqrt(shape[0] * shape[1] / inverse.size)
+    range_m = _front(ranges_m[order[first:]], noise_m)
+    point: NDArray[np.float64] = rays[index] * (range_m / level[index] if level[index] else along_m[index])
     return point
+
+
+def _front(sorted_m: NDArray[np.float64], noise_m: float) -> float:
+    """Where a surface begins whose cells have these ranges, nearest first, with this noise (one sigma)."""
+    end = np.searchsorted(sorted_m, sorted_m[0] + _FRONT_SIGMAS * noise_m, side="right")
+    front_m = sorted_m[:end]
+    mean_m, variance = float(front_m.mean()), float(front_m.var())
+    own_share = math.sqrt(max(0.0, 1.0 - noise_m * noise_m / variance)) if variance else 0.0
+    return mean_m - own_share * (mean_m - float(sorted_m[0]))
 
 
 def _pixels(first: float, last: float, size: int) -> tuple[int, int]:
@@ -163,19 +184,26 @@ def _inverse_depth(
     return inverse, known
 
 
-def _cell_side(inverse: NDArray[np.float32]) -> float:
-    """Side of a cell in pixels for its noise to be small, at the depth of the box's centre.
+def _pixel_sigma(inverse: NDArray[np.float32]) -> float:
+    """Noise of one pixel of inverse depth, from neighbours, which differ by little else on a surface.
 
-    The noise is estimated from neighbouring pixels, which differ by little else on a surface; the median
-    absolute difference ignores edges.
+    Returns 0 where too few pixels are known.
     """
     rows, columns = (max(1, size // 32) for size in inverse.shape)
-    high, wide = inverse.shape
     first, second = inverse[::rows, :-1:columns], inverse[::rows, 1::columns]
     both = np.minimum(first, second) > 0.0
-    if np.count_nonzero(both) < 10:
-        return 1.0
-    sigma = _quantile(np.abs(first - second)[both], 0.5) / (0.6745 * math.sqrt(2.0))
+    differences = np.abs(first - second)[both]
+    count = int(_SMOOTH_SHARE * differences.size)
+    if count < _SMOOTH_MIN:
+        return 0.0
+    smallest = np.partition(differences, count)[:count]
+    return math.sqrt(float(np.square(smallest).mean()) / 2.0) / _SMOOTH_RMS
+
+
+def _cell_side(inverse: NDArray[np.float32], sigma: float) -> float:
+    """Side of a cell in pixels for its noise to be small, at the depth of the box's centre."""
+    high, wide = inverse.shape
+    rows, columns = (max(1, size // 32) for size in inverse.shape)
     middle = inverse[high // 4 : high - high // 4 : rows, wide // 4 : wide - wide // 4 : columns]
     middle = middle[middle > 0.0]
     if not middle.size:

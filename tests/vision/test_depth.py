@@ -220,6 +220,17 @@ def test_noise_of_a_stereo_camera_does_not_make_it_nearer(yaw_rad: float) -> Non
     assert max(map(abs, errors_m)) < 0.6
 
 
+@pytest.mark.parametrize("size_m", [(0.5, 0.5, 1.75), (4.4, 1.8, 1.5)], ids=["person", "car"])
+def test_noise_does_not_bias_far_ranges(size_m: tuple[float, float, float]) -> None:
+    scene = cuboid_scene(north_m=18.0, yaw_rad=0.6, size_m=size_m, height_m=5.0)
+    rng, errors = np.random.default_rng(2), []
+    for _ in range(20):
+        measured = measured_depth(scene.depth_m, CAMERA.fx, DepthSensor(baseline_m=0.1), rng)
+        errors.append(ground_range_m(scene, measured, scene.box) / scene.true_m - 1.0)
+    assert abs(float(np.mean(errors))) < 0.015
+    assert float(np.std(errors)) < 0.015
+
+
 def test_small_object_in_front_is_ignored() -> None:
     scene = cuboid_scene(north_m=10.0)
     left, top, *_ = map(int, scene.box)
