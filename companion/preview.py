@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.bus.bodies import DepthBody
+from companion.bus.bodies.frames import DepthBody
 from companion.bus.messages import depth_message
 from companion.perception.assembly import CameraTelemetry
 from companion.settings import Settings

@@ -17,7 +17,7 @@ import zenoh
 
 from companion.bench.setpoints import busy
 from companion.bus import topics
-from companion.bus.bodies import DetectionBody, DetectionsBody
+from companion.bus.bodies.frames import DetectionBody, DetectionsBody
 from companion.bus.client import client_settings, open_client, subscribe_kept
 from companion.bus.session import Bus
 from companion.settings import ZenohSection

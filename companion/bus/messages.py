@@ -1,4 +1,4 @@
-"""Builds the bodies of the messages about frames and cameras (`bodies.py`)."""
+"""Builds the bodies of the messages about frames and cameras (`bodies/frames.py`)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from companion.bus.bodies import (
+from companion.bus.bodies.frames import (
     BoardBody,
     CameraInfoBody,
     CloudBody,
@@ -20,13 +20,13 @@ from companion.bus.bodies import (
     ImageBody,
     MarkerBody,
     MarkersBody,
-    ObstaclesBody,
     PositionBody,
     TrackEventBody,
     TracksBody,
     TransformBody,
     TransformsBody,
 )
+from companion.bus.bodies.vehicle import ObstaclesBody
 from companion.bus.topics import NO_OBJECTS
 from companion.geometry.geodesy import GeodeticOrigin
 from companion.guidance.targets.from_detections import StateHistory, mount_at

@@ -11,12 +11,13 @@ from pydantic import TypeAdapter
 from pydantic.json_schema import GenerateJsonSchema
 from typing_extensions import get_original_bases
 
-from companion.bus import bodies
+from companion.bus.bodies import frames, service, vehicle
 from companion.bus.topics import INPUT_TOPICS, TOPICS, Topic
 from companion.settings.section import texts_below_keys
 
 DIALECT = GenerateJsonSchema.schema_dialect
 ALL_TOPICS = (*TOPICS, *INPUT_TOPICS)
+_MODULES = (frames, vehicle, service)
 
 
 class _WithoutTitles(GenerateJsonSchema):
@@ -37,8 +38,11 @@ def schema_of(body: Any) -> dict[str, Any]:
 
 def _texts_of(name: str) -> dict[str, str]:
     """Return field → the string below it, of a body and its bases."""
-    texts = texts_below_keys(bodies.__name__)
-    bases = [base.__name__ for base in get_original_bases(getattr(bodies, name))] if name in texts else []
+    texts = {owner: below for m in _MODULES for owner, below in texts_below_keys(m.__name__).items()}
+    if name not in texts:
+        return {}
+    body = next(getattr(module, name) for module in _MODULES if hasattr(module, name))
+    bases = [base.__name__ for base in get_original_bases(body)]
     return {key: text for owner in (*bases, name) for key, text in texts.get(owner, {}).items()}
 
 

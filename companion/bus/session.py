@@ -23,7 +23,7 @@ import zenoh
 from pydantic_core import to_json
 from zenoh import ext
 
-from companion.bus.bodies import CloudBody, ImageBody
+from companion.bus.bodies.frames import CloudBody, ImageBody
 from companion.bus.command_intake import COMMANDS_PER_S, MAX_SENDER_BYTES, Allowance, CommandIntake
 from companion.bus.config import BusError, first_line, zenoh_config
 from companion.bus.topics import (

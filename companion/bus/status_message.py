@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from companion.bus.bodies import (
+from companion.bus.bodies.service import (
     OtherCommanderBody,
     StatusBody,
     StatusCameraBody,

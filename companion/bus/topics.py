@@ -11,7 +11,18 @@ from typing import Any, Final
 
 import zenoh
 
-from companion.bus import bodies
+from companion.bus.bodies.frames import (
+    CameraInfoBody,
+    CloudBody,
+    DepthBody,
+    DetectionsBody,
+    ImageBody,
+    MarkersBody,
+    TracksBody,
+    TransformsBody,
+)
+from companion.bus.bodies.service import EventBody, StatusBody
+from companion.bus.bodies.vehicle import ObstaclesBody, PoseBody, SetpointsBody, VehicleBody, VelocityBody
 
 ROOT = "companion"
 
@@ -63,7 +74,7 @@ class Topic:
 
 DETECTIONS: Final = Topic(
     "detections",
-    bodies.DetectionsBody,
+    DetectionsBody,
     "the detections of one frame, with tracks and positions",
     "per processed frame",
     max_age_s=0.5,
@@ -82,7 +93,7 @@ LABELS: Final = Topic(
 )
 TRACKS: Final = Topic(
     "tracks",
-    bodies.TracksBody,
+    TracksBody,
     "track events: new, update, lost, end",
     "per frame with track events",
     of_camera=True,
@@ -90,7 +101,7 @@ TRACKS: Final = Topic(
 )
 MARKERS: Final = Topic(
     "markers",
-    bodies.MarkersBody,
+    MarkersBody,
     "the markers in a frame and their positions",
     "per processed frame, if marker detection is on",
     max_age_s=0.5,
@@ -100,7 +111,7 @@ MARKERS: Final = Topic(
 )
 DEPTH: Final = Topic(
     "depth",
-    bodies.DepthBody,
+    DepthBody,
     "distance at the centre of the image and of each detection, share of pixels with depth",
     "per processed frame with depth",
     max_age_s=0.5,
@@ -108,7 +119,7 @@ DEPTH: Final = Topic(
 )
 TRANSFORMS: Final = Topic(
     "transforms",
-    bodies.TransformsBody,
+    TransformsBody,
     "NED, body, gimbal and camera at the capture",
     "per processed frame with a known attitude",
     max_age_s=0.5,
@@ -118,7 +129,7 @@ TRANSFORMS: Final = Topic(
 )
 CAMERA_INFO: Final = Topic(
     "camera_info",
-    bodies.CameraInfoBody,
+    CameraInfoBody,
     "lens and mount of the camera",
     "1 Hz after the first frame",
     rate_hz=1.0,
@@ -127,7 +138,7 @@ CAMERA_INFO: Final = Topic(
 )
 IMAGE: Final = Topic(
     "image",
-    bodies.ImageBody,
+    ImageBody,
     "a frame, with `preview.annotate` with its detections drawn; the attachment has its number",
     "at most `preview.rate_hz`, only with subscribers",
     rate_hz=15.0,
@@ -138,7 +149,7 @@ IMAGE: Final = Topic(
 )
 CLOUD: Final = Topic(
     "cloud",
-    bodies.CloudBody,
+    CloudBody,
     "the points of a depth image with their colours; the attachment has their number and frame",
     "at most `preview.cloud_rate_hz`, only with subscribers, of cameras with depth",
     rate_hz=2.0,
@@ -149,7 +160,7 @@ CLOUD: Final = Topic(
 )
 VEHICLE: Final = Topic(
     "vehicle",
-    bodies.VehicleBody,
+    VehicleBody,
     "state of the vehicle",
     "10 Hz",
     rate_hz=10.0,
@@ -158,7 +169,7 @@ VEHICLE: Final = Topic(
 )
 SETPOINT: Final = Topic(
     "setpoint",
-    bodies.SetpointsBody,
+    SetpointsBody,
     "the requested setpoint and the one sent",
     "10 Hz while in command",
     rate_hz=10.0,
@@ -167,7 +178,7 @@ SETPOINT: Final = Topic(
 )
 POSE: Final = Topic(
     "pose",
-    bodies.PoseBody,
+    PoseBody,
     "global pose, for other vehicles",
     "10 Hz while known",
     rate_hz=10.0,
@@ -177,7 +188,7 @@ POSE: Final = Topic(
 )
 OBSTACLES: Final = Topic(
     "obstacles",
-    bodies.ObstaclesBody,
+    ObstaclesBody,
     "distance of the nearest obstacle in 72 horizontal directions, from north",
     "per depth image of the steering camera",
     max_age_s=0.5,
@@ -186,7 +197,7 @@ OBSTACLES: Final = Topic(
 )
 STATUS: Final = Topic(
     "status",
-    bodies.StatusBody,
+    StatusBody,
     "state of every part of the service",
     "1 Hz",
     rate_hz=1.0,
@@ -195,7 +206,7 @@ STATUS: Final = Topic(
 )
 EVENTS: Final = Topic(
     "events",
-    bodies.EventBody,
+    EventBody,
     "modes, behaviours, losses and recoveries",
     "on occurrence",
     cached=100,
@@ -204,7 +215,7 @@ EVENTS: Final = Topic(
 # Received by the service.
 VELOCITY: Final = Topic(
     "velocity",
-    bodies.VelocityBody,
+    VelocityBody,
     "a velocity to fly, for the command `velocity`",
     "by the program that steers, at least twice a second",
     max_age_s=0.5,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from companion.bus.bodies import (
+from companion.bus.bodies.vehicle import (
     FormationBody,
     GimbalBody,
     PoseBody,

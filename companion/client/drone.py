@@ -15,7 +15,10 @@ from typing import Any
 import zenoh
 from pydantic import TypeAdapter, ValidationError
 
-from companion.bus import bodies, topics
+from companion.bus import topics
+from companion.bus.bodies.frames import DepthBody, DetectionsBody, MarkersBody, TracksBody
+from companion.bus.bodies.service import EventBody, StatusBody
+from companion.bus.bodies.vehicle import ObstaclesBody, VehicleBody, VelocityBody
 from companion.bus.client import NoAnswerError, client_settings, open_client, send_command
 from companion.client.commands import NOT_FLOWN, Commands, Reply
 from companion.client.stream import Stream
@@ -64,7 +67,7 @@ class Steering:
         Raises:
             ValueError: a value is not finite or out of range.
         """
-        body: bodies.VelocityBody = {
+        body: VelocityBody = {
             "source": self.source,
             "stamp_ns": time.monotonic_ns(),
             "forward_mps": float(forward),
@@ -83,8 +86,8 @@ class Steering:
 
 
 @cache
-def _velocity_body() -> TypeAdapter[bodies.VelocityBody]:
-    return TypeAdapter(bodies.VelocityBody)
+def _velocity_body() -> TypeAdapter[VelocityBody]:
+    return TypeAdapter(VelocityBody)
 
 
 class Drone(Commands):
@@ -207,35 +210,35 @@ class Drone(Commands):
 
     # --- messages: the bodies of docs/messages.md
 
-    def detections(self, camera: str | None = None, *, size: int = 1) -> Stream[bodies.DetectionsBody]:
+    def detections(self, camera: str | None = None, *, size: int = 1) -> Stream[DetectionsBody]:
         """Detections of each frame. `camera`: one of the settings' table; None: the first."""
         return self._stream(topics.DETECTIONS, camera, size)
 
-    def tracks(self, camera: str | None = None, *, size: int = 100) -> Stream[bodies.TracksBody]:
+    def tracks(self, camera: str | None = None, *, size: int = 100) -> Stream[TracksBody]:
         """Events of tracks, the kept ones first."""
         return self._stream(topics.TRACKS, camera, size)
 
-    def markers(self, camera: str | None = None, *, size: int = 1) -> Stream[bodies.MarkersBody]:
+    def markers(self, camera: str | None = None, *, size: int = 1) -> Stream[MarkersBody]:
         """Markers of each frame."""
         return self._stream(topics.MARKERS, camera, size)
 
-    def depth(self, camera: str | None = None, *, size: int = 1) -> Stream[bodies.DepthBody]:
+    def depth(self, camera: str | None = None, *, size: int = 1) -> Stream[DepthBody]:
         """Distances of each frame with depth."""
         return self._stream(topics.DEPTH, camera, size)
 
-    def vehicle(self, *, size: int = 1) -> Stream[bodies.VehicleBody]:
+    def vehicle(self, *, size: int = 1) -> Stream[VehicleBody]:
         """State of the vehicle, 10 times a second."""
         return self._stream(topics.VEHICLE, None, size)
 
-    def obstacles(self, *, size: int = 1) -> Stream[bodies.ObstaclesBody]:
+    def obstacles(self, *, size: int = 1) -> Stream[ObstaclesBody]:
         """The nearest obstacle in 72 directions, per depth image."""
         return self._stream(topics.OBSTACLES, None, size)
 
-    def status(self, *, size: int = 1) -> Stream[bodies.StatusBody]:
+    def status(self, *, size: int = 1) -> Stream[StatusBody]:
         """State of the service, once a second, the kept one first."""
         return self._stream(topics.STATUS, None, size)
 
-    def events(self, *, size: int = 100) -> Stream[bodies.EventBody]:
+    def events(self, *, size: int = 100) -> Stream[EventBody]:
         """Events of the service, the kept ones first."""
         return self._stream(topics.EVENTS, None, size)
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import zenoh
 
-from companion.bus.bodies import VelocityBody
+from companion.bus.bodies.vehicle import VelocityBody
 from companion.bus.client import NoAnswerError, send_command
 from companion.bus.session import encode, zenoh_config
 from companion.bus.topics import VELOCITY, alive_key

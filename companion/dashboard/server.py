@@ -29,7 +29,7 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from companion.bus.bodies import VelocityBody
+from companion.bus.bodies.vehicle import VelocityBody
 from companion.dashboard.access import COOKIE, Access, DashboardError, Refusal, read_token
 from companion.dashboard.bridge import Bridge, News
 from companion.dashboard.chat import MAX_SENTENCE_CHARACTERS, Chats

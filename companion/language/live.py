@@ -15,7 +15,8 @@ from typing import Any, TypeVar
 import zenoh
 
 from companion.bus import topics
-from companion.bus.bodies import DetectionBody, DetectionsBody, EventBody
+from companion.bus.bodies.frames import DetectionBody, DetectionsBody
+from companion.bus.bodies.service import EventBody
 from companion.client import CommandFailedError, Drone, Stream
 from companion.client.commands import Reply
 from companion.language.control import CommandEvents, Control

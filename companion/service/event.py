@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from companion.bus.bodies import EventBody
+from companion.bus.bodies.service import EventBody
 
 logger = logging.getLogger(__package__)
 

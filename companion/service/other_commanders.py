@@ -11,7 +11,7 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from companion.bus.bodies import OtherCommanderBody
+from companion.bus.bodies.service import OtherCommanderBody
 from companion.guidance.interface import CommandInput
 from companion.guidance.limits.battery import needs_charge
 from companion.settings.vehicle import VehicleSection

@@ -10,7 +10,7 @@ from dataclasses import replace
 from urllib.parse import quote
 
 from companion.bus import topics
-from companion.bus.bodies import TransformsBody
+from companion.bus.bodies.frames import TransformsBody
 from companion.bus.messages import (
     Localization,
     ModelIdentity,

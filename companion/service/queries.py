@@ -8,7 +8,7 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from companion.bus.bodies import ModelBody, ModelsBody, StatusBody
+from companion.bus.bodies.service import ModelBody, ModelsBody, StatusBody
 from companion.bus.session import QueryHandler
 from companion.bus.topics import IMAGE
 from companion.guidance.grammar import json_schema

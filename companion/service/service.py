@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 from companion.bus import topics
-from companion.bus.bodies import StatusBody
+from companion.bus.bodies.service import StatusBody
 from companion.bus.messages import Localization
 from companion.bus.session import Bus
 from companion.bus.status_message import status_message

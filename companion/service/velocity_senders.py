@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from pydantic import TypeAdapter, ValidationError
 
-from companion.bus.bodies import VelocityBody
+from companion.bus.bodies.vehicle import VelocityBody
 from companion.guidance.behaviour import VelocityInput
 from companion.vehicle.clock_sync import SenderDelay
 

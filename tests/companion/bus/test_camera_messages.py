@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from companion.bus.bodies import TransformsBody
+from companion.bus.bodies.frames import TransformsBody
 from companion.bus.messages import (
     Localization,
     ModelIdentity,

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from jsonschema import Draft202012Validator, ValidationError
 
-from companion.bus.bodies import CommandReplyBody, EventBody
+from companion.bus.bodies.service import CommandReplyBody, EventBody
 from companion.bus.schema import ALL_TOPICS, schema_of, topic_table, topics_markdown, write_schemas
 from companion.guidance.formation.pose import ROLES
 from companion.guidance.targets.target import RangeSource

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import zenoh
 
-from companion.bus.bodies import CommandReplyBody
+from companion.bus.bodies.service import CommandReplyBody
 from companion.bus.schema import schema_of
 from companion.bus.topics import LARGE_TOPICS, TOPICS
 from mavlink_sim.testing import QUICK_FLIGHT, running_simulator

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from jsonschema import Draft202012Validator
 
-from companion.bus.bodies import ModelsBody
+from companion.bus.bodies.service import ModelsBody
 from companion.bus.schema import schema_of
 from companion.guidance.command import COMMANDS
 from companion.perception.messages import Preview, Ready

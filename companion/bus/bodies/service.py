@@ -1,0 +1,316 @@
+"""Bodies of the messages about the service: status, events, and the replies to commands and queries."""
+
+from __future__ import annotations
+
+from typing import Annotated, NotRequired
+
+from typing_extensions import TypedDict
+
+from companion.bus.bodies import Sha256, Two, one_of
+
+LevelWord = Annotated[str, one_of("info", "warning", "error")]
+Corners = list[Two]
+
+
+class OtherCommanderBody(TypedDict):
+    """Another service that commands this vehicle."""
+
+    via: str
+    """mavlink or zenoh"""
+    identity: str
+    """its MAVLink address, or service of its status"""
+    uptime_s: float
+    """since its start"""
+    in_command: bool
+    """whether it is in command"""
+
+
+class StatusVehicleBody(TypedDict):
+    """The link to the vehicle."""
+
+    name: str
+    """its name"""
+    connected: bool
+    """a heartbeat was received within 3 s"""
+    autopilot: str | None
+    """PX4 or ArduPilot; null until known"""
+    driver: str
+    """MAVLink library: mavsdk or pymavlink"""
+    mode: str
+    """flight mode"""
+    armed: bool
+    """motors are armed"""
+    failsafe: bool
+    """MAV_STATE_CRITICAL or EMERGENCY"""
+    missing_streams: list[str]
+    """required messages that arrive at less than half their rate"""
+    status_texts: list[str]
+    """the autopilot's last 20 texts, newest last"""
+    other_commanders: list[OtherCommanderBody]
+    """other services seen within 3.5 s"""
+
+
+class StatusStepBody(TypedDict):
+    """A step of a mission that has ended."""
+
+    title: str
+    """its title in the mission"""
+    command: str
+    """its command"""
+    success: bool
+    """it reached its goal"""
+    reason: str
+    """how it ended"""
+    started_ns: int
+    """its start"""
+    ended_ns: int
+    """its end"""
+
+
+class StatusMissionBody(TypedDict):
+    """The mission being flown."""
+
+    name: str
+    """its name"""
+    steps: list[str]
+    """titles"""
+    current: int
+    """index of the active step"""
+    failure: str
+    """why its failure handling is flown; empty: it is not"""
+    ended: list[StatusStepBody]
+    """the last 20 steps"""
+
+
+class StatusLimitsBody(TypedDict):
+    """Where the vehicle may fly, from home."""
+
+    max_distance_m: float
+    """horizontally"""
+    max_altitude_m: float
+    """above home"""
+    fence_include: Corners
+    """corners north, east; empty: no fence"""
+    fence_exclude: list[Corners]
+    """areas not to enter"""
+
+
+class StatusPilotBody(TypedDict):
+    """Guidance."""
+
+    in_command: bool
+    """the vehicle follows our setpoints"""
+    behaviour: str
+    """the active one"""
+    stream: str
+    """state of the streamer"""
+    setpoints_sent: int
+    """so far"""
+    mission: StatusMissionBody | None
+    """null: no mission is flown"""
+
+
+class StatusCameraBody(TypedDict):
+    """One camera with its worker process."""
+
+    state: str
+    """stopped, starting, running, restarting, finished or failed"""
+    pid: int | None
+    """of the process"""
+    restarts: int
+    """so far"""
+    frames: int
+    """read so far"""
+    results: int
+    """received so far"""
+    rate_hz: float
+    """results a second"""
+    sequence: int | None
+    """of the newest result"""
+    age_s: float | None
+    """of the newest result"""
+    timing_ms: dict[str, float]
+    """stage: newest duration"""
+    timing_p50_ms: dict[str, float]
+    """stage: median of the newest 200"""
+    timing_p99_ms: dict[str, float]
+    """stage: 99th percentile of the newest 200"""
+    dropped: int
+    """frames lost unintentionally"""
+    frames_skipped: dict[str, int]
+    """reason: frames without a message"""
+    stuck_after_s: float | None
+    """silence after which the process is restarted"""
+    class_names: list[str]
+    """classes of the model"""
+    tracks: int
+    """confirmed tracks that have not ended"""
+    model: str | None
+    """name of the model"""
+    model_sha256: Sha256 | None
+    """of its file"""
+    runtime: str | None
+    """of the network"""
+    runtime_reason: str
+    """why this runtime and precision"""
+    problem: str
+    """the last error; empty: none"""
+
+
+class StatusTargetsBody(TypedDict):
+    """The objects that guidance may use."""
+
+    camera: str | None
+    """the steering camera; null: the first"""
+    count: int
+    """number of objects in its newest frame"""
+    localization_error: str
+    """why detections have no direction; empty if they have"""
+
+
+class StatusGimbalBody(TypedDict):
+    """The gimbal in `status`."""
+
+    answers: bool
+    """a gimbal was received"""
+    pitch_deg: float | None
+    """above the horizon"""
+    primary_control: str | None
+    """MAVLink address with primary control"""
+    ours: bool
+    """whether the service has primary control"""
+    problem: str | None
+    """why its attitude is unknown, or why it is not moved"""
+
+
+class StatusNeighboursBody(TypedDict):
+    """The other vehicles."""
+
+    ages_s: dict[str, float]
+    """vehicle: age of its pose"""
+    unread: int
+    """invalid messages"""
+    out_of_order: int
+    """messages older than the newest"""
+
+
+class StatusBusBody(TypedDict):
+    """The network."""
+
+    connected: bool
+    """a node is connected, or none is expected"""
+    published: dict[str, int]
+    """topic: messages so far, with or without a subscriber"""
+    publish_failed: int
+    """messages without a session, or refused by zenoh"""
+    refused_commands: int
+    """commands refused by the rate limit"""
+
+
+class StatusLogBody(TypedDict):
+    """The log."""
+
+    dropped_lines: int
+    """lines not written because the reader stalled"""
+
+
+class StatusBody(TypedDict):
+    """The state of every part of the service."""
+
+    stamp_ns: int
+    """of this message"""
+    service: str
+    """changes at each start; source in pose"""
+    uptime_s: float
+    """since the start of the service"""
+    healthy: bool
+    """every camera delivers results and the autopilot is connected"""
+    vehicle: StatusVehicleBody
+    """the link to the vehicle"""
+    pilot: StatusPilotBody
+    """guidance"""
+    limits: StatusLimitsBody
+    """where the vehicle may fly"""
+    perception: StatusCameraBody
+    """the first camera"""
+    cameras: dict[str, StatusCameraBody]
+    """name: each further camera"""
+    targets: StatusTargetsBody
+    """objects that guidance may use"""
+    gimbal: StatusGimbalBody | None
+    """null without a gimbal and a camera on one"""
+    neighbours: StatusNeighboursBody
+    """other vehicles"""
+    bus: StatusBusBody
+    """the network"""
+    log: StatusLogBody
+    """the log"""
+
+
+class EventBody(TypedDict):
+    """One event of the service."""
+
+    stamp_ns: int
+    """when"""
+    level: LevelWord
+    """severity"""
+    text: str
+    """for the operator"""
+
+
+class StepBody(TypedDict):
+    """One ended step of a mission."""
+
+    title: str
+    """name of the step"""
+    command: str
+    """its command"""
+    success: bool
+    """result"""
+    reason: str
+    """reason of the result"""
+    started_ns: int
+    """begin"""
+    ended_ns: int
+    """end"""
+
+
+class CommandReplyBody(TypedDict):
+    """The reply to a command."""
+
+    command: str
+    """the command as understood"""
+    success: bool
+    """result"""
+    reason: str
+    """reason of the result"""
+    steps: NotRequired[list[StepBody]]
+    """of a mission: its ended steps"""
+
+
+class ModelBody(TypedDict):
+    """One loaded model, in the reply of `models`."""
+
+    camera: str | None
+    """name of the camera; null: the first"""
+    running: bool
+    """whether its process runs"""
+    model: str
+    """its name"""
+    model_sha256: Sha256 | None
+    """of its file; null for a detector without one"""
+    class_names: list[str]
+    """its classes"""
+    runtime: str | None
+    """of the network"""
+    precision: str | None
+    """of the network"""
+
+
+class ModelsBody(TypedDict):
+    """The reply of `models`."""
+
+    loaded: list[ModelBody]
+    """the models in use"""
+    files: list[str]
+    """file names in the models folder"""
