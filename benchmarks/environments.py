@@ -6,12 +6,12 @@
 from __future__ import annotations
 
 import time
-from concurrent.futures import ProcessPoolExecutor
-from typing import Any
+from functools import partial
 
 import gymnasium
 import numpy as np
 
+from companion.campaign import map_seeds
 from mavlink_sim.environments import TASKS
 from mavlink_sim.environments.autopilot_model import AutopilotModel
 from mavlink_sim.environments.fast_model import FastModel
@@ -46,25 +46,19 @@ def model_errors(wind_m_s: float, mass: float, *, noise: bool, flights: int = FL
     return sorted(np.linalg.norm(whole.position - fast.position, axis=0).tolist())
 
 
-def steps_per_second(name: str, count: int, **options: Any) -> float:
+def steps_per_second(name: str, model: str, seed: int) -> float:
     """Of processor time, in one process: with the beginning of episodes, observations and rewards."""
     assert name in TASKS
-    env = gymnasium.make_vec(f"companion/{name}-v0", num_envs=count, **options)
-    env.reset(seed=1)
-    env.action_space.seed(1)
+    count = {"fast": 1024, "autopilot": 32}[model]
+    env = gymnasium.make_vec(f"companion/{name}-v0", num_envs=count, model=model)
+    env.reset(seed=seed)
+    env.action_space.seed(seed)
     actions = env.action_space.sample() * 0.3
     done, started_s = 0, time.process_time()
     while (took_s := time.process_time() - started_s) < TIMED_S:
         env.step(actions)
         done += count
     return done / took_s
-
-
-def _timed(name: str, model: str) -> float:
-    count = {"fast": 1024, "autopilot": 32}[model]
-    with ProcessPoolExecutor(WORKERS) as pool:
-        runs = [pool.submit(steps_per_second, name, count, model=model) for _ in range(WORKERS)]
-        return sum(run.result() for run in runs)
 
 
 def main() -> None:
@@ -75,7 +69,8 @@ def main() -> None:
         print(f"| {wind_m_s} | {mass} | {'yes' if noise else 'no'} | {middle:.3f} | {errors[-1]:.3f} |")
     print(f"\nsteps of 20 Hz per second of processor time, sum of {WORKERS} processes at once:")
     for model in ("fast", "autopilot"):
-        print(f"Approach, {model}: {_timed('Approach', model):.0f}")
+        timed = map_seeds(partial(steps_per_second, "Approach", model), range(WORKERS), processes=WORKERS)
+        print(f"Approach, {model}: {sum(timed):.0f}")
 
 
 if __name__ == "__main__":

@@ -14,18 +14,18 @@ import argparse
 import importlib
 import inspect
 import json
-import os
 import pkgutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
-from multiprocessing import get_context
+from functools import partial
 from typing import Any
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
+
+from companion.campaign import ClusterError, map_seeds
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,32 +73,22 @@ def flight_named(name: str) -> Flight:
 
 
 def fly(
-    name: str, seeds: Sequence[int], processes: int = 1, *, rendered: bool = False
+    name: str, seeds: Sequence[int], processes: int = 1, *, ray: str | None = None, rendered: bool = False
 ) -> Iterator[FlightResult]:
-    """Fly it once with each seed, the results in the seeds' order.
+    """Fly it once with each seed, the results in the seeds' order; see `map_seeds`.
 
     Args:
-        processes: at once; 1 flies in this one.
         rendered: with the rendered camera and the real perception.
 
     Raises:
-        UnknownFlightError: before the first flight, also of one that has no rendered camera.
+        UnknownFlightError: also of one that has no rendered camera.
     """
-    if rendered and "rendered" not in inspect.signature(flight_named(name)).parameters:
-        raise UnknownFlightError(f"{name} has no flights with a rendered camera")
-    flight_named(name)
-    if processes <= 1 or len(seeds) <= 1:
-        yield from (_fly_one(name, seed, rendered) for seed in seeds)
-        return
-    with ProcessPoolExecutor(min(processes, len(seeds)), get_context("spawn")) as pool:
-        yield from pool.map(_fly_one, [name] * len(seeds), seeds, [rendered] * len(seeds))
-
-
-def _fly_one(name: str, seed: int, rendered: bool) -> FlightResult:
-    # A network's thread pool in every process would have them wait for each other.
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
     flight = flight_named(name)
-    return flight(seed, rendered=True) if rendered else flight(seed)
+    if rendered and "rendered" not in inspect.signature(flight).parameters:
+        raise UnknownFlightError(f"{name} has no flights with a rendered camera")
+    return map_seeds(
+        partial(flight, rendered=True) if rendered else flight, seeds, processes=processes, ray=ray
+    )
 
 
 def summary(name: str, results: Sequence[FlightResult]) -> dict[str, Any]:
@@ -145,21 +135,28 @@ def flights_table(figures: dict[str, Any]) -> Table:
     return table
 
 
+def add_workers(parser: argparse.ArgumentParser) -> None:
+    """The options of `map_seeds`."""
+    parser.add_argument("--processes", type=int, default=1, help="flights at once")
+    parser.add_argument("--ray", metavar="HOST:PORT", help="fly on this Ray cluster (extra cluster)")
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line. Returns the exit code: 2 for a flight that does not exist."""
+    """The command line. Returns the exit code: 2 for a flight or a cluster that does not exist."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.flights", description=__doc__)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("name", help=f"one of: {', '.join(flights())}")
     parser.add_argument("--runs", type=int, default=100, help="flights, one per seed")
     parser.add_argument("--seed", type=int, default=0, help="the first seed")
-    parser.add_argument("--processes", type=int, default=1, help="flights at once")
+    add_workers(parser)
     parser.add_argument("--rendered", action="store_true", help="the rendered camera with the real detector")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     given = parser.parse_args(arguments)
     seeds = range(given.seed, given.seed + given.runs)
     try:
-        figures = summary(given.name, list(fly(given.name, seeds, given.processes, rendered=given.rendered)))
-    except UnknownFlightError as error:
+        flown = fly(given.name, seeds, given.processes, ray=given.ray, rendered=given.rendered)
+        figures = summary(given.name, list(flown))
+    except (UnknownFlightError, ClusterError) as error:
         print(error, file=sys.stderr)
         return 2
     if given.json:

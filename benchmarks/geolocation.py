@@ -1,6 +1,6 @@
 """Error of the positions of tracks: rendered flights, the bundled detector, the functions that fly.
 
-    python -m benchmarks.geolocation --seeds 1..10 [--depth] [--json]
+    python -m benchmarks.geolocation --seeds 1..10 [--processes 2] [--depth] [--json]
 
 Each flight shows four standing objects 12 to 40 m ahead, on level ground. The vehicle flies 10 to 15 m
 forward and up to 8 m to the side at 3 m/s, 3 to 8 m above the ground, nose forward, in wind of 2 m/s. Camera:
@@ -23,13 +23,16 @@ import json
 import math
 from collections import Counter
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.flights import add_workers
 from companion.bench.lockstep_flight import LockstepFlight, camera_settings
 from companion.bench.rendered_camera import RenderedCamera, rendered_scene
 from companion.bench.synthetic_detector import SceneObject, ScenePose
+from companion.campaign import map_seeds, seeds_of
 from companion.guidance.targets.fused import FusedPosition
 from companion.guidance.targets.target import Target
 from companion.vehicle.state import Vector3
@@ -208,11 +211,14 @@ def main() -> None:
     parser.add_argument(
         "--json", action="store_true", help="print one JSON object per flight, then the summary"
     )
+    add_workers(parser)
     arguments = parser.parse_args()
-    first, _, last = arguments.seeds.partition("..")
+    seeds = seeds_of(arguments.seeds)
+    flights = map_seeds(
+        partial(flight_of, depth=arguments.depth), seeds, processes=arguments.processes, ray=arguments.ray
+    )
     found = []
-    for seed in range(int(first), int(last or first) + 1):
-        of_flight = flight_of(seed, depth=arguments.depth)
+    for seed, of_flight in zip(seeds, flights, strict=True):
         found += of_flight
         for each in of_flight:
             print(

@@ -7,13 +7,17 @@ seed gives the same weights on one machine.
 
 from __future__ import annotations
 
+import io
 import math
 import os
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import redirect_stderr
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 import gymnasium
@@ -28,6 +32,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
 
+from companion.campaign import map_seeds
 from companion.guidance.policy_file import (
     Layer,
     LoadedPolicy,
@@ -92,19 +97,12 @@ def train_policy(training: Training, steps: int, output: Path, *, resume: bool =
         PolicyTrainingError: unknown environment or algorithm; a state that is missing, of another training,
             or in the way.
     """
-    folder = output.with_name(f"{output.name}.training")
+    folder = _folder_of(output)
     torch.set_num_threads(1)
-    kind = ALGORITHMS.get(training.algorithm)
-    if kind is None:
-        raise PolicyTrainingError(
-            f"unknown algorithm {training.algorithm!r}; there are: {', '.join(ALGORITHMS)}"
-        )
+    kind = _algorithm(training.algorithm)
     monitored = VecMonitor(ScaledEnv(make_environment(training.environment, EPISODES[training.algorithm])))
     if not resume:
-        if (folder / _STATE).exists():
-            raise PolicyTrainingError(
-                f"{folder} holds the state of a training: continue it with --resume, or give another --output"
-            )
+        _check_no_state(folder)
         folder.mkdir(parents=True, exist_ok=True)
     model = kind(
         "MlpPolicy",
@@ -137,6 +135,73 @@ def train_policy(training: Training, steps: int, output: Path, *, resume: bool =
     load_policy(draft)
     os.replace(draft, output)
     return figures
+
+
+def train_policies(
+    environment: str,
+    algorithm: str,
+    seeds: Sequence[int],
+    steps: int,
+    output: Path,
+    *,
+    processes: int = 1,
+    ray: str | None = None,
+) -> Iterator[tuple[Path, dict[str, float]]]:
+    """Train and judge a policy for each seed, as `train_policy` does, several at once; see `map_seeds`.
+
+    A training runs in one worker, from the first step: one that dies takes no half of a training with it.
+
+    Yields:
+        for each seed the file, `<stem of output>-<seed>`, and its figures.
+
+    Raises:
+        PolicyTrainingError: as `train_policy`, before the first training.
+    """
+    _algorithm(algorithm)
+    make_environment(environment, 1)
+    files = [_of_seed(output, seed) for seed in seeds]
+    for file in files:
+        _check_no_state(_folder_of(file))
+    train = partial(_train_in_worker, environment, algorithm, steps, output.name)
+    trained = map_seeds(train, seeds, processes=processes, ray=ray)
+    for file, (figures, written) in zip(files, trained, strict=True):
+        for name, content in written.items():
+            path = output.parent / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(content)
+        yield file, figures
+
+
+def _train_in_worker(
+    environment: str, algorithm: str, steps: int, name: str, seed: int
+) -> tuple[dict[str, float], dict[str, bytes]]:
+    """The figures, and the files with their contents: the cluster's machines may share no folder."""
+    with TemporaryDirectory() as folder, redirect_stderr(io.StringIO()):
+        output = _of_seed(Path(folder, name), seed)
+        figures = train_policy(Training(environment, algorithm, seed), steps, output)
+        files = [file for file in Path(folder).rglob("*") if file.is_file()]
+        return figures, {str(file.relative_to(folder)): file.read_bytes() for file in files}
+
+
+def _of_seed(output: Path, seed: int) -> Path:
+    return output.with_stem(f"{output.stem}-{seed}")
+
+
+def _folder_of(output: Path) -> Path:
+    return output.with_name(f"{output.name}.training")
+
+
+def _check_no_state(folder: Path) -> None:
+    if (folder / _STATE).exists():
+        raise PolicyTrainingError(
+            f"{folder} holds the state of a training: continue it with --resume, or give another --output"
+        )
+
+
+def _algorithm(name: str) -> type[BaseAlgorithm]:
+    if name not in ALGORITHMS:
+        raise PolicyTrainingError(f"unknown algorithm {name!r}; there are: {', '.join(ALGORITHMS)}")
+    return ALGORITHMS[name]
 
 
 def make_environment(name: str, count: int) -> TaskVectorEnv:

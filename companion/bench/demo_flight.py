@@ -7,11 +7,9 @@ simulator's truth.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
-from multiprocessing import get_context
+from functools import partial
 from typing import Any
 
 from rich.table import Table
@@ -21,6 +19,7 @@ from companion.bench.rendered_camera import RenderedCamera
 from companion.bench.simulated_driver import RATES_HZ, SimulatedDriver
 from companion.bench.synthetic_camera import SyntheticCamera
 from companion.bench.synthetic_detector import SceneObject, ScenePose, SyntheticDetector
+from companion.campaign import map_seeds
 from companion.guidance.missions.sequence import SequenceBehaviour
 from companion.settings import Settings
 from companion.sim_session import (
@@ -128,15 +127,11 @@ def fly_demo(seed: int, *, synthetic: bool = False) -> DemoFlight:
     )
 
 
-def fly_demos(seeds: Sequence[int], *, processes: int = 1, synthetic: bool = False) -> Iterator[DemoFlight]:
-    """One for each seed, in the seeds' order, some at once."""
-    if processes <= 1 or len(seeds) <= 1:
-        yield from (fly_demo(seed, synthetic=synthetic) for seed in seeds)
-        return
-    with ProcessPoolExecutor(
-        min(processes, len(seeds)), get_context("spawn"), initializer=_one_thread
-    ) as pool:
-        yield from pool.map(_fly, [(seed, synthetic) for seed in seeds])
+def fly_demos(
+    seeds: Sequence[int], *, processes: int = 1, ray: str | None = None, synthetic: bool = False
+) -> Iterator[DemoFlight]:
+    """One for each seed, in the seeds' order; see `map_seeds`."""
+    return map_seeds(partial(fly_demo, synthetic=synthetic), seeds, processes=processes, ray=ray)
 
 
 def demos_summary(flights: Sequence[DemoFlight]) -> dict[str, Any]:
@@ -181,31 +176,6 @@ def demos_table(flights: Sequence[DemoFlight]) -> Table:
             flight.failure or "",
         )
     return table
-
-
-def seeds_of(text: str) -> list[int]:
-    """`1..50` or `1,5,9..12` as numbers. Raises ValueError for what is none."""
-    seeds: list[int] = []
-    for part in text.split(","):
-        first, dots, last = part.strip().partition("..")
-        try:
-            low = int(first)
-            high = int(last) if dots else low
-        except ValueError:
-            raise ValueError(f"seeds {text!r}: expected numbers and ranges such as 1..50 or 3,7") from None
-        if low < 0 or high < low:
-            raise ValueError(f"seeds {text!r}: {part.strip()} is no range of seeds from 0 up")
-        seeds.extend(range(low, high + 1))
-    return seeds
-
-
-def _one_thread() -> None:
-    # A network's thread pool in every process would have them wait for each other.
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-
-
-def _fly(task: tuple[int, bool]) -> DemoFlight:
-    return fly_demo(task[0], synthetic=task[1])
 
 
 def _range_to_target(world: World, vehicle: LockstepVehicle) -> tuple[float, float]:

@@ -27,7 +27,14 @@ from companion.cli.cameras import cameras, depth, preview
 from companion.cli.cloud import CLOUD_SETTINGS, cloud
 from companion.cli.dashboard import dashboard
 from companion.cli.evaluate import evaluate
-from companion.cli.flags import EXIT_BAD_INPUT, plain_errors, settings_command
+from companion.cli.flags import (
+    EXIT_BAD_INPUT,
+    Processes,
+    RayAddress,
+    check_seeds_given,
+    plain_errors,
+    settings_command,
+)
 from companion.cli.markers import MARKER_SETTINGS, markers
 from companion.cli.mcp import MCP_SETTINGS, mcp
 from companion.cli.mission import mission
@@ -240,7 +247,8 @@ def demo(
     seeds: Annotated[
         str | None, typer.Option(help="Fly these seeds in lockstep, without a video: 1..50, or 3,7,9..12.")
     ] = None,
-    processes: Annotated[int, typer.Option(min=1, help="Number of parallel flights with --seeds.")] = 1,
+    processes: Processes = 1,
+    ray: RayAddress = None,
     synthetic: Annotated[
         bool, typer.Option("--synthetic", help="With --seeds: detections from ground truth, no network.")
     ] = False,
@@ -257,8 +265,9 @@ def demo(
         typer.echo("companion: --seeds flies the simulated vehicle; remove --vehicle-url", err=True)
         raise typer.Exit(EXIT_BAD_INPUT)
     if seeds is not None:
-        _fly_seeds(seeds, processes, synthetic=synthetic, as_json=as_json)
+        _fly_seeds(seeds, processes, ray, synthetic=synthetic, as_json=as_json)
         return
+    check_seeds_given(ray)
     from companion.bus.session import BusError
     from companion.demo import run_demo
     from companion.operator.line_output import LineOutput, use_for_standard_error
@@ -297,19 +306,21 @@ def demo(
     )
 
 
-def _fly_seeds(text: str, processes: int, *, synthetic: bool, as_json: bool) -> None:
+def _fly_seeds(text: str, processes: int, ray: str | None, *, synthetic: bool, as_json: bool) -> None:
     from rich.console import Console
 
-    from companion.bench.demo_flight import demos_summary, demos_table, fly_demos, seeds_of
+    from companion.bench.demo_flight import demos_summary, demos_table, fly_demos
+    from companion.campaign import ClusterError, seeds_of
 
     logging.basicConfig(level=logging.ERROR, format="companion: %(message)s", stream=sys.stderr)
     with plain_errors(ValueError):
         seeds = seeds_of(text)
     flights = []
-    for flight in fly_demos(seeds, processes=processes, synthetic=synthetic):
-        flights.append(flight)
-        outcome = "success" if flight.success else f"failed: {flight.failure}"
-        typer.echo(f"seed {flight.seed}: {outcome}", err=True)
+    with plain_errors(ClusterError):
+        for flight in fly_demos(seeds, processes=processes, ray=ray, synthetic=synthetic):
+            flights.append(flight)
+            outcome = "success" if flight.success else f"failed: {flight.failure}"
+            typer.echo(f"seed {flight.seed}: {outcome}", err=True)
     if as_json:
         typer.echo(json.dumps(demos_summary(flights)))
     else:

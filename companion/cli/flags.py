@@ -33,6 +33,14 @@ SHORT_NAMES = {
     "log.level": "--log-level",
 }
 
+Processes = Annotated[int, typer.Option(min=1, help="With --seeds: number of seeds at once.")]
+RayAddress = Annotated[
+    str | None,
+    typer.Option(
+        "--ray", metavar="HOST:PORT", help="With --seeds: run them on this Ray cluster (extra cluster)."
+    ),
+]
+
 
 @contextmanager
 def plain_errors(*expected: type[Exception]) -> Iterator[None]:
@@ -49,6 +57,13 @@ def check_finite(flag: str, *values: float) -> None:
     """Raise ValueError, which names the flag, if a value is no finite number."""
     if not all(map(math.isfinite, values)):
         raise ValueError(f"{flag} must be finite, got {' '.join(f'{value:g}' for value in values)}")
+
+
+def check_seeds_given(ray: str | None) -> None:
+    """Exit with code 2 if --ray is given. To be called without --seeds."""
+    if ray is not None:
+        typer.echo("companion: --ray runs many seeds: add --seeds, such as --seeds 1..8", err=True)
+        raise typer.Exit(EXIT_BAD_INPUT)
 
 
 def check_folder(path: Path) -> None:

@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from companion.cli.flags import EXIT_BAD_INPUT, plain_errors
+from companion.campaign import ClusterError, seeds_of
+from companion.cli.flags import EXIT_BAD_INPUT, Processes, RayAddress, check_seeds_given, plain_errors
 
 
 def train_policy(
@@ -15,17 +16,38 @@ def train_policy(
     algorithm: Annotated[str, typer.Option(help="Algorithm: ppo or sac.")] = "ppo",
     steps: Annotated[int, typer.Option(min=1, help="Steps of the environment, in all.")] = 1_000_000,
     seed: Annotated[int, typer.Option(min=0, max=2**31, help="Random seed of weights and episodes.")] = 0,
+    seeds: Annotated[
+        str | None, typer.Option(help="Train a policy for each seed, OUTPUT-SEED: 1..8, or 3,7,9..12.")
+    ] = None,
+    processes: Processes = 1,
+    ray: RayAddress = None,
     resume: Annotated[bool, typer.Option(help="Continue from the state in OUTPUT.training.")] = False,
     output: Annotated[Path, typer.Option(help="Policy file to write.")] = Path("runs/policy.onnx"),
 ) -> None:
     """Train a policy in a simulated environment. Writes an ONNX file for the flight command `policy`."""
     try:
         from companion.guidance.policy_file import PolicyError
-        from companion.train_policy import PolicyTrainingError, Training, train_policy
+        from companion.train_policy import PolicyTrainingError, Training, train_policies, train_policy
     except ModuleNotFoundError as error:
         typer.echo(f"companion: train-policy: {error}: pip install 'mavlink-companion[rl]'", err=True)
         raise typer.Exit(EXIT_BAD_INPUT) from error
-    with plain_errors(PolicyTrainingError, PolicyError, OSError):
-        figures = train_policy(Training(environment, algorithm, seed), steps, output, resume=resume)
+    with plain_errors(PolicyTrainingError, PolicyError, ClusterError, ValueError, OSError):
+        if seeds is None:
+            check_seeds_given(ray)
+            _report(
+                output, train_policy(Training(environment, algorithm, seed), steps, output, resume=resume)
+            )
+            return
+        if resume:
+            raise PolicyTrainingError(
+                "--resume continues one training: give its --seed and --output, not --seeds"
+            )
+        for trained in train_policies(
+            environment, algorithm, seeds_of(seeds), steps, output, processes=processes, ray=ray
+        ):
+            _report(*trained)
+
+
+def _report(output: Path, figures: dict[str, float]) -> None:
     written = ", ".join(f"{name} {value:.3g}" for name, value in figures.items())
     typer.echo(f"{output}: over 100 episodes on average {written}")

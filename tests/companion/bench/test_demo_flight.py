@@ -7,7 +7,8 @@ import json
 import pytest
 from typer.testing import CliRunner
 
-from companion.bench.demo_flight import demos_summary, fly_demo, seeds_of
+from companion.bench.demo_flight import demos_summary, fly_demo
+from companion.campaign import seeds_of
 from companion.cli.commands import app
 
 

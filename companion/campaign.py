@@ -1,0 +1,152 @@
+"""One function over many seeds: in this process, in several, or on a Ray cluster (extra `cluster`).
+
+The results come in the seeds' order and depend on the seeds alone. A seed whose worker dies is run again.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, TypeVar
+
+Result = TypeVar("Result")
+
+# Of workers that died, for one seed on a cluster, for all seeds in processes of this machine.
+MAX_RETRIES = 3
+# Ray itself tries an address where no cluster answers for many minutes.
+ANSWER_S = 20.0
+# Sent to the workers, so that a cluster runs the code of this process.
+_PACKAGES = ("benchmarks", "companion", "mavlink_sim", "vision")
+
+
+class ClusterError(RuntimeError):
+    """The Ray cluster cannot be used. The message is one line."""
+
+
+class SeedError(RuntimeError):
+    """The function failed for a seed, or every worker that ran it died. The message names the seed."""
+
+
+def map_seeds(
+    function: Callable[[int], Result], seeds: Sequence[int], *, processes: int = 1, ray: str | None = None
+) -> Iterator[Result]:
+    """The function's result for each seed, in the seeds' order.
+
+    Args:
+        function: to be pickled; its result must depend on the seed alone.
+        processes: at once; 1 runs in this one. A cluster decides itself.
+        ray: HOST:PORT of a Ray cluster of which this machine is a node.
+
+    Raises:
+        ClusterError: Ray is not installed, or no cluster answers there.
+        SeedError: the function raised, or `MAX_RETRIES` more workers died.
+    """
+    call = partial(_named, function)
+    if ray is not None:
+        return _on_cluster(call, seeds, ray)
+    if processes <= 1 or len(seeds) <= 1:
+        return map(call, seeds)
+    return _in_processes(call, seeds, processes)
+
+
+def seeds_of(text: str) -> list[int]:
+    """`1..50` or `1,5,9..12` as numbers. Raises ValueError for what is none."""
+    seeds: list[int] = []
+    for part in text.split(","):
+        first, dots, last = part.strip().partition("..")
+        try:
+            low = int(first)
+            high = int(last) if dots else low
+        except ValueError:
+            raise ValueError(f"seeds {text!r}: expected numbers and ranges such as 1..50 or 3,7") from None
+        if low < 0 or high < low:
+            raise ValueError(f"seeds {text!r}: {part.strip()} is no range of seeds from 0 up")
+        seeds.extend(range(low, high + 1))
+    return seeds
+
+
+def _named(function: Callable[[int], Result], seed: int) -> Result:
+    try:
+        return function(seed)
+    except Exception as error:
+        raise SeedError(f"seed {seed}: {type(error).__name__}: {error}") from error
+
+
+def _one_thread() -> None:
+    # A thread pool of a network in every process would have them wait for each other.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+
+def _in_processes(call: Callable[[int], Result], seeds: Sequence[int], processes: int) -> Iterator[Result]:
+    done = 0
+    for _ in range(1 + MAX_RETRIES):
+        left = seeds[done:]
+        try:
+            with ProcessPoolExecutor(
+                min(processes, len(left)), get_context("spawn"), initializer=_one_thread
+            ) as pool:
+                for result in pool.map(call, left):
+                    done += 1
+                    yield result
+            return
+        except BrokenProcessPool:
+            continue
+    raise SeedError(f"seed {seeds[done]}: no result, {1 + MAX_RETRIES} times a worker process died")
+
+
+def _on_cluster(call: Callable[[int], Result], seeds: Sequence[int], address: str) -> Iterator[Result]:
+    ray = _connected(address)
+    try:
+        task = ray.remote(call.func).options(num_cpus=1, max_retries=MAX_RETRIES)
+        pending = [task.remote(*call.args, seed) for seed in seeds]
+        for seed, result in zip(seeds, pending, strict=True):
+            try:
+                yield ray.get(result)
+            except ray.exceptions.RayTaskError as error:
+                raise error.cause from error
+            except ray.exceptions.RayError as error:
+                raise SeedError(f"seed {seed}: no result from {address}: {_first_line(error)}") from error
+    finally:
+        ray.shutdown()
+
+
+def _connected(address: str) -> Any:
+    """The module `ray`, connected. Raises ClusterError."""
+    try:
+        import ray
+    except ModuleNotFoundError as error:
+        raise ClusterError(f"--ray: {error}: pip install 'mavlink-companion[cluster]'") from error
+    host, _, port = address.rpartition(":")
+    if not host or not port.isdecimal() or "/" in host:
+        raise ClusterError(f"--ray {address}: expected HOST:PORT, as `ray start --head --port PORT` opens it")
+    try:
+        socket.create_connection((host, int(port)), ANSWER_S).close()
+        # In another process, because no call of Ray's takes a time limit for this.
+        command = (sys.executable, "-m", "ray.scripts.scripts", "status", "--address", address)
+        subprocess.run(command, capture_output=True, check=True, timeout=ANSWER_S)
+    except (OSError, OverflowError, subprocess.SubprocessError) as error:
+        raise ClusterError(
+            f"--ray {address}: no Ray cluster answers ({error}): start one with `ray start`"
+        ) from error
+    root = Path(__file__).parents[1]
+    modules = [str(root / name) for name in _PACKAGES if (root / name).is_dir()]
+    try:
+        ray.init(address, runtime_env={"py_modules": modules}, log_to_driver=False, logging_level="ERROR")
+    except (RuntimeError, OSError, ValueError) as error:
+        raise ClusterError(f"--ray {address}: {_first_line(error)}") from error
+    if ray.cluster_resources().get("CPU", 0.0) < 1.0:
+        ray.shutdown()
+        raise ClusterError(f"--ray {address}: the cluster has no processors: `ray start --num-cpus`")
+    return ray
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]

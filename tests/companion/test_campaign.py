@@ -1,0 +1,141 @@
+"""The same seeds give the same results in one process, in two, and on a Ray cluster."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from benchmarks import flights
+from companion.bench.demo_flight import fly_demo
+from companion.campaign import MAX_RETRIES, ClusterError, SeedError, map_seeds, seeds_of
+from companion.cli import app
+from tests.companion.seed_functions import killed, killed_once, squared
+
+SEEDS = range(6)
+SQUARES = [0, 1, 4, 9, 16, 25]
+
+
+def test_seeds_are_numbers_and_ranges() -> None:
+    assert seeds_of("1..3, 7,9..9") == [1, 2, 3, 7, 9]
+    for wrong in ("", "a", "3..1", "-1", "1..b"):
+        with pytest.raises(ValueError, match="seeds"):
+            seeds_of(wrong)
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+def test_results_come_in_order_and_an_error_names_its_seed(processes: int) -> None:
+    results = map_seeds(squared, [3, 1, 2, 7, 4], processes=processes)
+    assert [next(results), next(results), next(results)] == [9, 1, 4]
+    with pytest.raises(SeedError, match="seed 7: ValueError: no square"):
+        next(results)
+
+
+def test_a_killed_process_loses_no_seed(tmp_path: Path) -> None:
+    assert list(map_seeds(partial(killed_once, tmp_path), SEEDS, processes=2)) == SQUARES
+    assert (tmp_path / "tried").exists()
+
+
+def test_a_seed_that_kills_every_process_is_named() -> None:
+    results = map_seeds(killed, [1, 3], processes=2)
+    with pytest.raises(SeedError, match=f"seed [13]: no result, {1 + MAX_RETRIES} times"):
+        list(results)
+
+
+def test_missing_ray_is_one_line_that_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    for command in (
+        ["demo", "--seeds", "1..2"],
+        ["train-policy", "companion/CartPole-v0", "--seeds", "1..2"],
+    ):
+        result = CliRunner().invoke(app, [*command, "--ray", "127.0.0.1:6379"])
+        assert result.exit_code == 2
+        assert "mavlink-companion[cluster]" in result.stderr
+        assert len(result.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize("command", [["demo"], ["train-policy", "companion/CartPole-v0"]])
+def test_a_cluster_without_seeds_is_refused(command: list[str]) -> None:
+    result = CliRunner().invoke(app, [*command, "--ray", "127.0.0.1:6379"])
+    assert result.exit_code == 2
+    assert "--seeds" in result.stderr
+
+
+def test_address_without_a_cluster_is_refused_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("ray", reason="ray is of the optional extra cluster")
+    with socket.socket() as bound:  # not listening: a connection is refused
+        bound.bind(("127.0.0.1", 0))
+        unused = f"127.0.0.1:{bound.getsockname()[1]}"
+        for address in (unused, "ray://127.0.0.1:10001", "127.0.0.1", "127.0.0.1:x", "127.0.0.1:99999"):
+            with pytest.raises(ClusterError) as refused:
+                list(map_seeds(squared, SEEDS, ray=address))
+            assert address in str(refused.value)
+            assert len(str(refused.value).splitlines()) == 1
+        assert flights.main(["approach", "--runs", "1", "--ray", unused]) == 2
+    assert unused in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[str]:
+    """The address of a Ray cluster of two processors on this machine, with a token of its own."""
+    pytest.importorskip("ray", reason="ray is of the optional extra cluster")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    with pytest.MonkeyPatch.context() as patch, tempfile.TemporaryDirectory(prefix="ray") as folder:
+        # Ray listens on every address of the machine.
+        patch.setenv("RAY_AUTH_MODE", "token")
+        patch.setenv("RAY_AUTH_TOKEN", secrets.token_hex(32))
+        command = f"start --head --block --port {port} --num-cpus 2 --temp-dir {folder} --disable-usage-stats"
+        started = subprocess.Popen(
+            [sys.executable, "-m", "ray.scripts.scripts", *command.split(), "--include-dashboard=false"],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+            start_new_session=True,
+        )
+        assert started.stdout is not None
+        try:
+            assert any("runtime started" in line for line in started.stdout)
+            yield f"127.0.0.1:{port}"
+        finally:
+            os.killpg(started.pid, signal.SIGTERM)
+            started.wait(30.0)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_cluster_gives_the_flights_of_one_and_of_two_processes(cluster: str) -> None:
+    fly, seeds = partial(fly_demo, synthetic=True), range(40, 43)
+    one = list(map_seeds(fly, seeds))
+    assert [flight.seed for flight in one] == list(seeds)
+    assert list(map_seeds(fly, seeds, processes=2)) == one
+    assert list(map_seeds(fly, seeds, ray=cluster)) == one
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_a_killed_worker_of_a_cluster_loses_no_seed(cluster: str, tmp_path: Path) -> None:
+    assert list(map_seeds(partial(killed_once, tmp_path), SEEDS, ray=cluster)) == SQUARES
+    assert (tmp_path / "tried").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_an_error_on_a_cluster_names_its_seed(cluster: str) -> None:
+    results = map_seeds(squared, [2, 7, 4], ray=cluster)
+    assert next(results) == 4
+    with pytest.raises(SeedError, match="seed 7: ValueError: no square"):
+        next(results)
+    with pytest.raises(SeedError, match="seed 3: no result"):
+        list(map_seeds(killed, [3], ray=cluster))
