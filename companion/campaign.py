@@ -113,7 +113,7 @@ def _on_cluster(call: Callable[[int], Result], seeds: Sequence[int], address: st
             except ray.exceptions.RayTaskError as error:
                 raise error.cause from error
             except ray.exceptions.RayError as error:
-                raise SeedError(f"seed {seed}: no result from {address}: {_first_line(error)}") from error
+                raise SeedError(f"seed {seed}: no result from {address}: {_one_line(error)}") from error
     finally:
         ray.shutdown()
 
@@ -131,22 +131,25 @@ def _connected(address: str) -> Any:
         socket.create_connection((host, int(port)), ANSWER_S).close()
         # In another process, because no call of Ray's takes a time limit for this.
         command = (sys.executable, "-m", "ray.scripts.scripts", "status", "--address", address)
-        subprocess.run(command, capture_output=True, check=True, timeout=ANSWER_S)
-    except (OSError, OverflowError, subprocess.SubprocessError) as error:
+        asked = subprocess.run(command, capture_output=True, text=True, timeout=ANSWER_S)
+    except (OSError, OverflowError, subprocess.TimeoutExpired) as error:
+        why = f"nothing in {ANSWER_S:g} s" if isinstance(error, subprocess.TimeoutExpired) else error
         raise ClusterError(
-            f"--ray {address}: no Ray cluster answers ({error}): start one with `ray start`"
+            f"--ray {address}: no Ray cluster answers ({why}): `ray start` starts one"
         ) from error
+    if asked.returncode != 0:
+        raise ClusterError(f"--ray {address}: {_one_line(asked.stderr[-300:])}")
     root = Path(__file__).parents[1]
     modules = [str(root / name) for name in _PACKAGES if (root / name).is_dir()]
     try:
         ray.init(address, runtime_env={"py_modules": modules}, log_to_driver=False, logging_level="ERROR")
     except (RuntimeError, OSError, ValueError) as error:
-        raise ClusterError(f"--ray {address}: {_first_line(error)}") from error
+        raise ClusterError(f"--ray {address}: {_one_line(error)}") from error
     if ray.cluster_resources().get("CPU", 0.0) < 1.0:
         ray.shutdown()
         raise ClusterError(f"--ray {address}: the cluster has no processors: `ray start --num-cpus`")
     return ray
 
 
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]
+def _one_line(text: object) -> str:
+    return " ".join(str(text).split())[:300]

@@ -102,7 +102,7 @@ def cluster() -> Iterator[str]:
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             text=True,
-            start_new_session=True,
+            process_group=0,
         )
         assert started.stdout is not None
         try:
@@ -121,6 +121,20 @@ def test_cluster_gives_the_flights_of_one_and_of_two_processes(cluster: str) -> 
     assert [flight.seed for flight in one] == list(seeds)
     assert list(map_seeds(fly, seeds, processes=2)) == one
     assert list(map_seeds(fly, seeds, ray=cluster)) == one
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_cluster_trains_the_policies_of_one_and_of_two_processes(cluster: str, tmp_path: Path) -> None:
+    trainer = pytest.importorskip(
+        "companion.train_policy", reason="companion.train_policy needs the extra rl"
+    )
+    trained = {}
+    for name, options in (("one", {}), ("two", {"processes": 2}), ("ray", {"ray": cluster})):
+        output = tmp_path / name / "policy.onnx"
+        made = list(trainer.train_policies("companion/CartPole-v0", "ppo", [1, 2], 1, output, **options))
+        trained[name] = [(file.name, figures, file.read_bytes()) for file, figures in made]
+    assert trained["one"] == trained["two"] == trained["ray"]
 
 
 @pytest.mark.slow

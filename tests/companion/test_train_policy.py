@@ -50,6 +50,27 @@ def test_same_seed_gives_the_same_file_and_another_does_not(tmp_path: Path) -> N
     assert list((tmp_path / "a.onnx.training" / "tensorboard").rglob("events.out.tfevents.*"))
 
 
+def test_policies_of_many_seeds_are_those_of_each_seed(tmp_path: Path) -> None:
+    command = ["train-policy", "companion/CartPole-v0", "--steps", "256"]
+    output, alone = tmp_path / "policy.onnx", tmp_path / "alone.onnx"
+    several = [*command, "--seeds", "3,5", "--output", str(output)]
+    result = CliRunner().invoke(app, several)
+    assert result.exit_code == 0, result.output
+    assert [line.split(":")[0] for line in result.stdout.splitlines()] == [
+        str(tmp_path / "policy-3.onnx"),
+        str(tmp_path / "policy-5.onnx"),
+    ]
+    train_policy(replace(CART_POLE, seed=5), 256, alone)
+    assert (tmp_path / "policy-5.onnx").read_bytes() == alone.read_bytes()
+    assert (tmp_path / "policy-3.onnx").read_bytes() != alone.read_bytes()
+    assert list((tmp_path / "policy-5.onnx.training" / "tensorboard").rglob("events.out.tfevents.*"))
+    train_policy(replace(CART_POLE, seed=5), 512, tmp_path / "policy-5.onnx", resume=True)
+    for refused in (several, [*several, "--resume"], [*command, "--seeds", "5..3"]):
+        result = CliRunner().invoke(app, refused)
+        assert result.exit_code == 2
+        assert len(result.stderr.splitlines()) == 1
+
+
 def test_training_resumes_with_its_state(tmp_path: Path) -> None:
     file, folder = tmp_path / "policy.onnx", tmp_path / "policy.onnx.training"
     with pytest.raises(PolicyTrainingError, match=r"no state of a training in .*policy.onnx.training"):
