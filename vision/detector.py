@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from vision.detections import Detections
 from vision.foreign.engines import ForeignRuntime
+from vision.foreign.layouts import TASKS, ForeignFacts
 from vision.letterbox import Letterbox, fit
 from vision.model_files import find_model
 from vision.object_detector import (
@@ -37,7 +38,6 @@ from vision.yolo.postprocess import Boxes, boxes_from, candidates_of, decode_ltr
 from vision.yolo.safe_pickle import CheckpointError
 
 if TYPE_CHECKING:
-    from vision.foreign.layouts import ForeignFacts
     from vision.yolo.description import ModelDescription
 
 logger = logging.getLogger(__name__)
@@ -147,11 +147,11 @@ class Detector(ObjectDetector):
         self.precision: str = self._runtime.precision
         self.precision_reason = self._runtime.precision_reason
         self.reason = f"{self.runtime_reason}; {self.precision}: {self.precision_reason}"
-        task = self.foreign.task if self.foreign else str(self.metadata.get("task", "detect"))
-        if task.partition(";")[0] != "detect":
-            logger.warning(
-                "%s is a network for %s; only its boxes are used", source.path, task.partition(";")[0]
-            )
+        task, _, note = str(self.metadata.get("task", "detect")).partition("; ")
+        if self.foreign:
+            task, note = self.foreign.task, TASKS[self.foreign.task]
+        if task != "detect":
+            logger.warning("%s is a network for %s; %s", source.path, task, note)
         logger.info(
             "model %s: %d classes, on %s (%s), in %s (%s)",
             source.path,

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from vision.detector import Detector
-from vision.foreign.layouts import LAYOUTS
+from vision.foreign.layouts import LAYOUTS, TASKS
 from vision.runtimes.base import installed
 from vision.runtimes.selection import RuntimeChoice
 from vision.runtimes.source import ModelSource
@@ -22,7 +22,7 @@ class ExportInfo:
         sha256: of the file that has the weights.
         kind: `onnx`, `openvino`, `tensorrt`, `torchscript`, or `checkpoint` (YOLOX).
         written_by: the exporting program, as far as known.
-        task: of the network; of all tasks only the boxes are used.
+        task: of the network, see `TASKS`; only the boxes are used.
         layout, layout_text: of its outputs, by name and in words.
         stride: the sides of the input are multiples of it, pixels.
         input_size: (height, width) of the only accepted input; None: any.
@@ -91,12 +91,12 @@ def export_lines(info: ExportInfo) -> list[str]:
     """Return the description as text lines."""
     shown = ", ".join(info.classes[:12]) + (", …" if len(info.classes) > 12 else "")
     size = "any" if info.input_size is None else f"{info.input_size[1]}x{info.input_size[0]}"
-    note = "" if info.task == "detect" else "; only its boxes are used"
+    note = TASKS[info.task]
     rows = {
         "file": info.file,
         "sha256": info.sha256,
         "written by": f"{info.written_by}, as {info.kind}",
-        "task": f"{info.task}{note}",
+        "task": f"{info.task}; {note}" if note else info.task,
         "outputs": f"{info.layout}: {info.layout_text}",
         "input": f"{size}, stride {info.stride}",
         "classes": f"{len(info.classes)} (from {info.names_from}): {shown}",

@@ -8,6 +8,7 @@ import pickle
 import sys
 import types
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +48,12 @@ def trained_model(description: ModelDescription | None = None, seed: int = 0) ->
     return model.eval()
 
 
+def rotated(description: ModelDescription) -> ModelDescription:
+    """The same network with a head of rotated boxes."""
+    *rows, last = description.head
+    return replace(description, head=(*rows, replace(last, layer="OBB", arguments=("nc", 1))))
+
+
 def foreign_classes(monkeypatch: pytest.MonkeyPatch, modules: dict[str, str]) -> Classes:
     classes = {}
     for name, module_name in modules.items():
@@ -83,7 +90,7 @@ def as_foreign(model: YoloModel, classes: Classes, **attributes: Any) -> Any:
     whole.model = nn.Sequential(*[relabelled(layer) for layer in model.model])
     head = whole.model[-1]
     strides = torch.tensor([float(stride) for stride in model.strides])
-    head.stride, head.reg_max = strides, model.reg_max
+    head.stride, head.reg_max = strides, model.description.reg_max
     whole.yaml = {key: table[key] for key in ("nc", "backbone", "head", "depth_multiple", "width_multiple")}
     whole.yaml |= {"max_channels": table["max_channels"], "yaml_file": "yolov8.yaml", "ch": 3}
     whole.names = dict(enumerate(model.class_names))

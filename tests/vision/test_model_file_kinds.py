@@ -12,7 +12,14 @@ import pytest
 from torch import nn
 
 from tests.vision.checkpoint_bombs import named, pickled
-from tests.vision.foreign_checkpoints import as_foreign, foreign_classes, save_foreign, trained_model
+from tests.vision.foreign_checkpoints import (
+    SMALL,
+    as_foreign,
+    foreign_classes,
+    rotated,
+    save_foreign,
+    trained_model,
+)
 from tests.vision.foreign_files import (
     constant_onnx,
     stated,
@@ -25,6 +32,7 @@ from tests.vision.test_yolox import save_yolox
 from vision.detector import Detector
 from vision.runtimes.source import read_source
 from vision.weights import DEFAULT_WEIGHTS
+from vision.yolo.published import yolov8_description
 from vision.yolo.safe_pickle import _HANDLERS
 
 for package in ("onnx", "onnxruntime", "openvino"):
@@ -33,7 +41,7 @@ for package in ("onnx", "onnxruntime", "openvino"):
 SIZE = (64, 96)
 TWO = ("car", "dog")
 TABLE = Path(__file__).parent.parent.parent / "docs" / "models.md"
-HEADS = {"Segment": "ultralytics.nn.modules.head", "Pose": "ultralytics.nn.modules.head"}
+HEADS = dict.fromkeys(("Segment", "Pose", "OBB"), "ultralytics.nn.modules.head")
 
 
 def rows() -> dict[str, str]:
@@ -47,12 +55,15 @@ def checkpoint(
     folder: Path, model: str = "DetectionModel", head: str = "Detect", rows: str | None = None
 ) -> Path:
     """As Ultralytics saves one; other heads have further branches. `rows`: a network of `test_yolov9`."""
-    trained = trained_model(None if rows is None else described(rows))
+    if head == "OBB":
+        trained = trained_model(rotated(yolov8_description(SMALL, TWO)))
+    else:
+        trained = trained_model(None if rows is None else described(rows))
     with pytest.MonkeyPatch.context() as patch:
-        tasks = dict.fromkeys(("SegmentationModel", "PoseModel"), "ultralytics.nn.tasks")
+        tasks = dict.fromkeys(("SegmentationModel", "PoseModel", "OBBModel"), "ultralytics.nn.tasks")
         classes = foreign_classes(patch, FOREIGN_YOLOV9 | tasks | HEADS)
         whole = as_foreign(trained, classes | {"DetectionModel": classes[model]})
-        if head != "Detect":
+        if head in ("Segment", "Pose"):
             last = whole.model[-1]
             other = nn.Module.__new__(classes[head])
             other.__dict__ = dict(last.__dict__)
@@ -144,7 +155,7 @@ FILES: dict[str, Callable[[Path], Path]] = {
     "Ultralytics `.pt`: YOLOv5u, v8, v10, 11, 12, 26": checkpoint,
     "… segmentation, v8 and 11": lambda folder: checkpoint(folder, "SegmentationModel", "Segment"),
     "… pose, v8 and 11": lambda folder: checkpoint(folder, "PoseModel", "Pose"),
-    "… oriented boxes": naming("ultralytics.nn.tasks.OBBModel"),
+    "… oriented boxes, v8 and 11": lambda folder: checkpoint(folder, "OBBModel", "OBB"),
     "… classification": naming("ultralytics.nn.tasks.ClassificationModel"),
     "… YOLO-World": naming("ultralytics.nn.tasks.WorldModel"),
     "… YOLOE": naming("ultralytics.nn.tasks.YOLOEModel"),

@@ -27,11 +27,18 @@ LAYOUTS: dict[Layout, str] = {
     "logits": "boxes and class logits of queries, without NMS",
     "scored": "labels, boxes and scores, without NMS",
 }
+_ONLY_BOXES = "only its boxes are used"
+TASKS = {
+    "detect": "",
+    "segment": _ONLY_BOXES,
+    "pose": _ONLY_BOXES,
+    "obb": "boxes enclose rotated boxes",
+}
+"""Ultralytics' tasks that have boxes, each with a note."""
 YOLOX_STRIDES = (8, 16, 32)
 YOLOX_SUFFIX = ".pth"
 # 1200 names of 40 characters; to parse one of 1 MiB takes seconds and 200 MB.
 _LONGEST_TEXT = 1 << 16
-_TASKS = ("detect", "segment", "pose", "obb")
 _IMAGENET = ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
 
 
@@ -164,8 +171,8 @@ def _ultralytics(
     stated: Mapping[str, Any], image: Port, fixed: tuple[int, int] | None, outputs: Sequence[Port]
 ) -> ForeignFacts:
     task = str(stated.get("task", "detect"))
-    if task not in _TASKS:
-        raise ValueError(f"is an export for {task!r:.40}; boxes come of {', '.join(_TASKS)}")
+    if task not in TASKS:
+        raise ValueError(f"is an export for {task!r:.40}; boxes come of {', '.join(TASKS)}")
     names, stride = _class_names(stated["names"]), _literal(stated["stride"])
     if type(stride) is not int or not 1 <= stride <= 256:
         raise ValueError(f"states the stride {stride!r:.40}, expected a whole number of pixels")

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from vision.runtimes.base import RuntimeUnusableError
 from vision.yolo.architecture import YoloModel
-from vision.yolo.heads import Detect
+from vision.yolo.heads import OBB, Detect
 from vision.yolo.level_outputs import BoxBranch, ClassRows, Head
 from vision.yolo.postprocess import head_of
 
@@ -91,16 +91,18 @@ class _SplitHead(Detect):
 
     def __init__(self, head: Detect, kinds: tuple[str, ...]) -> None:
         nn.Module.__init__(self)
-        self.__dict__.update({name: value for name, value in head.__dict__.items() if name != "_modules"})
-        self._modules = dict(head._modules)
-        self.kinds = kinds
+        self.whole, self.kinds = head, kinds
+
+    @property
+    def class_branches(self) -> nn.ModuleList:
+        return self.whole.class_branches
 
     def forward(self, neck: Sequence[Tensor]) -> list[Tensor]:
         outputs: list[Tensor] = []
-        branches = zip(_branches(self.box_branches), _branches(self.class_branches), strict=True)
-        for x, (boxes, classes) in zip(neck, branches, strict=True):
+        for level, (x, classes) in enumerate(zip(neck, _branches(self.class_branches), strict=True)):
             features = classes[:-1](x).float()
-            outputs += [(x if "neck" in self.kinds else boxes(x)).float(), classes[-1](features)]
+            boxes = x if "neck" in self.kinds else self.whole.sides(level, x)
+            outputs += [boxes.float(), classes[-1](features)]
             if "features" in self.kinds:
                 outputs.append(features)
         return outputs
@@ -131,6 +133,8 @@ def _sliced(head: Head, detect: Detect, class_ids: Sequence[int] | None) -> Head
 
 def _box_branches(detect: Detect, activation: str) -> tuple[BoxBranch, ...] | None:
     """The box branches' weights in `BoxBranch`'s layout; None for branches of another structure."""
+    if isinstance(detect, OBB):
+        return None
     result = []
     for branch in _branches(detect.box_branches):
         layers = [cast(nn.Conv2d, getattr(layer, "conv", layer)) for layer in branch]

@@ -53,7 +53,8 @@ class YoloModel(nn.Module):
 
     @property
     def reg_max(self) -> int:
-        return self.description.reg_max
+        """Bins of a box side in the outputs; 1: distances in cells."""
+        return self.detect.reg_max
 
     @property
     def end_to_end(self) -> bool:

@@ -21,6 +21,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from vision.foreign.layouts import TASKS
 from vision.plain_yaml import numbered
 from vision.yolo.architecture import ArchitectureError, YoloModel, build_shapes
 from vision.yolo.checkpoint_pair import WEIGHTS_SUFFIX, is_pair, read_pair, write_pair
@@ -51,6 +52,7 @@ _MODELS = {
     "ultralytics.nn.tasks.YOLOv10DetectionModel": "detect",  # As the authors of YOLOv10 published it.
     "ultralytics.nn.tasks.SegmentationModel": "segment",
     "ultralytics.nn.tasks.PoseModel": "pose",
+    "ultralytics.nn.tasks.OBBModel": "obb",
 }
 _TASK_HEADS = ("Segment", "Pose")
 # Branches of such a head that are read past: masks, their prototypes, key points.
@@ -170,7 +172,7 @@ def _interpret_ultralytics(record: Stub, content: dict[Any, Any]) -> LoadedModel
         raise CheckpointError(f"holds a {record.name.rpartition('.')[2]}; only detection models can be used")
     table = _plain_dictionary(record.state, "yaml")
     modules = dict(_modules(record))
-    if task != "detect":
+    if task in ("segment", "pose"):
         table, modules = _boxes_only(table, modules)
     description = ModelDescription.from_plain(table, _class_names(record, table))
     description = as_trained(description, modules)
@@ -188,7 +190,7 @@ def _interpret_ultralytics(record: Stub, content: dict[Any, Any]) -> LoadedModel
             module.eps = epsilon
     metadata = {"origin": f"Ultralytics {_text(content, 'version')}".strip()}
     if task != "detect":
-        metadata["task"] = f"{task}; only its boxes are used"
+        metadata["task"] = f"{task}; {TASKS[task]}"
     for key, source in (("licence", "license"), ("date", "date")):
         if _text(content, source):
             metadata[key] = _text(content, source)

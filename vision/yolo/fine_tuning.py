@@ -52,8 +52,8 @@ def extend_classes(model: YoloModel, names: Sequence[str], *, seed: int = 0) -> 
     """
     if model.end_to_end or model.reg_max != BINS:
         raise ValueError(
-            f"a {model_family_of(model)} network cannot be trained, its head has another loss; "
-            "expected YOLOv8 or YOLO11"
+            f"a {model_family_of(model)} network with the head {model.description.rows[-1].layer} cannot be "
+            "trained, its head has another loss; expected YOLOv8 or YOLO11 with Detect"
         )
     folded = {fold_name(name): name for name in names}
     known = {fold_name(name) for name in model.class_names}

@@ -1,4 +1,4 @@
-"""The anchor-free heads: with and without distributions over the box sides, with and without NMS.
+"""The anchor-free heads: with and without distributions over the box sides, NMS and rotated boxes.
 
 Attribute names (`cv2`, `cv3`, `one2one_cv2`, `dfl` …) are those of published checkpoints.
 
@@ -12,6 +12,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -46,6 +47,9 @@ class Detect(nn.Module):
     An end-to-end head has every branch twice. The one-to-many branches learn from many cells per object, need
     NMS, and are used in training. The one-to-one branches predict each object once and are used in
     evaluation; `fuse` drops the others.
+
+    Attributes:
+        reg_max: of the outputs.
 
     Args:
         light: class branches of depthwise and 1×1 convolutions (YOLOv10, YOLO11 and later).
@@ -88,13 +92,17 @@ class Detect(nn.Module):
         return self.one2one_cv3 if self.end_to_end else self.cv3
 
     def forward(self, maps: Sequence[Tensor]) -> list[Tensor]:
-        if self.training and not self._fused:
-            boxes, classes = self.cv2, self.cv3
-        else:
-            boxes, classes = self.box_branches, self.class_branches
+        classes = self.cv3 if self.training and not self._fused else self.class_branches
         return [
-            torch.cat((box(x), kind(x)), dim=1) for x, box, kind in zip(maps, boxes, classes, strict=True)
+            torch.cat((self.sides(level, x), kind(x)), dim=1)
+            for level, (x, kind) in enumerate(zip(maps, classes, strict=True))
         ]
+
+    def sides(self, level: int, x: Tensor) -> Tensor:
+        """(B, C, H, W) input of one level → (B, 4 · reg_max, H, W) box sides."""
+        boxes = self.cv2 if self.training and not self._fused else self.box_branches
+        sides: Tensor = boxes[level](x)
+        return sides
 
     def fuse(self) -> None:
         """Drop the branches that are not used in evaluation."""
@@ -114,6 +122,39 @@ class Detect(nn.Module):
             for box, kind, stride in zip(boxes, classes, strides, strict=True):
                 _last_bias(box).data.fill_(1.0)
                 _last_bias(kind).data.fill_(math.log(5 / self.nc / (image_size / stride) ** 2))
+
+
+class OBB(Detect):
+    """A head of rotated boxes, whose outputs are the axis-aligned boxes that enclose them.
+
+    The distances left, top, right and bottom of the box branch are along the rotated box's axes; a further
+    branch, `cv4`, has the logit of the angle, -π/4 to 3π/4. The conversion takes place in the network, so
+    that decoding, every runtime and every export treat it as a detector of distances (`reg_max` 1).
+    """
+
+    def __init__(self, classes: int, inputs: Sequence[int], reg_max: int = 16, **options: Any) -> None:
+        super().__init__(classes, inputs, reg_max, **options)
+        self.cv4 = nn.ModuleList(_branch(channels, max(inputs[0] // 4, 1), 1) for channels in inputs)
+        self.reg_max = 1
+
+    def sides(self, level: int, x: Tensor) -> Tensor:
+        # In float32 whatever the network's precision: a distance has more digits than a logit needs.
+        logits = super().sides(level, x).float().permute(0, 2, 3, 1)
+        left, top, right, bottom = self.dfl(logits).unbind(dim=-1)
+        angle = (self.cv4[level](x).float().squeeze(1).sigmoid() - 0.25) * math.pi
+        cos, sin = angle.cos(), angle.sin()
+        across, along = (right - left) / 2, (bottom - top) / 2
+        centre_x, centre_y = across * cos - along * sin, across * sin + along * cos
+        width, height = left + right, top + bottom
+        half_width = (width * cos.abs() + height * sin.abs()) / 2
+        half_height = (width * sin.abs() + height * cos.abs()) / 2
+        enclosing = (
+            half_width - centre_x,
+            half_height - centre_y,
+            half_width + centre_x,
+            half_height + centre_y,
+        )
+        return torch.stack(enclosing, dim=1)
 
 
 def _branch(channels: int, width: int, outputs: int) -> nn.Sequential:

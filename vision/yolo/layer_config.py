@@ -10,7 +10,7 @@ from torch import nn
 
 from vision.yolo.description import ArchitectureError, LayerSpec, ModelDescription
 from vision.yolo.gelan import ELAN1, SPPELAN, AConv, ADown, CBFuse, CBLinear, RepNCSPELAN4
-from vision.yolo.heads import Detect
+from vision.yolo.heads import OBB, Detect
 from vision.yolo.layers import (
     C2,
     C2PSA,
@@ -37,7 +37,7 @@ _MOST_REPEATS = 64
 # Published: 1 to 3. Each is a dozen modules, in two stages of a row.
 _MOST_STAGE_REPEATS = 4
 _MOST_MAPS = 8
-HEADS = ("Detect", "v10Detect")
+HEADS = ("Detect", "v10Detect", "OBB")
 
 
 @dataclass(frozen=True, slots=True)
@@ -335,11 +335,17 @@ def _concat(row: LayerArguments) -> BuiltLayer:
 def _detect(row: LayerArguments) -> BuiltLayer:
     description = row.description
     classes = len(description.class_names)
-    if tuple(row.row.arguments) not in (("nc",), (classes,)):
+    rotated = row.row.layer == "OBB"
+    # An angle is the one further number of a rotated box.
+    further = (1,) if rotated else ()
+    if tuple(row.row.arguments) not in (("nc", *further), (classes, *further)):
         raise ArchitectureError(
-            f"takes the number of classes, {classes}, got {shown(list(row.row.arguments))}"
+            f"takes the number of classes, {classes}{', and 1' if rotated else ''}, "
+            f"got {shown(list(row.row.arguments))}"
         )
-    module = Detect(
+    if rotated and description.end_to_end:
+        raise ArchitectureError("an end-to-end head of rotated boxes is not supported")
+    module = (OBB if rotated else Detect)(
         classes,
         row.inputs,
         description.reg_max,

@@ -36,13 +36,14 @@ _BLOCKS = """A2C2f AAttn ABlock AConv ADown Attention Bottleneck C2 C2PSA C2f C2
     CBLinear CIB DFL ELAN1 PSA PSABlock Proto RepBottleneck RepCSP RepNCSPELAN4 RepVGGDW SCDown SPPELAN
     SPPF"""
 _CONVOLUTIONS = "Concat Conv DWConv RepConv"
-_HEADS = "Detect Pose Segment v10Detect"
+_HEADS = "Detect OBB Pose Segment v10Detect"
 _LAYERS = f"{_BLOCKS} {_CONVOLUTIONS} {_HEADS}"
-_MODELS = "DetectionModel PoseModel SegmentationModel YOLOv10DetectionModel"
+_MODELS = "DetectionModel OBBModel PoseModel SegmentationModel YOLOv10DetectionModel"
 # A model saved during training contains its loss; it is ignored.
 _LOSSES = """utils.loss.BboxLoss utils.loss.DFLoss utils.loss.E2EDetectLoss utils.loss.E2ELoss
     utils.loss.v8DetectionLoss utils.tal.TaskAlignedAssigner utils.loss.v8SegmentationLoss
     utils.loss.v8PoseLoss utils.loss.KeypointLoss utils.loss.BCEDiceLoss utils.loss.MultiChannelDiceLoss
+    utils.loss.v8OBBLoss utils.loss.RotatedBboxLoss utils.tal.RotatedTaskAlignedAssigner
     yolo.utils.loss.v8SegmentationLoss yolo.utils.loss.v8PoseLoss yolo.utils.loss.BboxLoss
     yolo.utils.loss.v8DetectionLoss yolo.utils.tal.TaskAlignedAssigner yolo.v8.detect.train.Loss"""
 # Until 8.0.6 the training settings were omegaconf objects, stored with the model.
@@ -67,7 +68,6 @@ _STUB_NAMES: tuple[str, ...] = (
 
 # Genuine names of networks that are not supported, by their class of model.
 _UNSUPPORTED_MODELS = {
-    "OBBModel": "checkpoints of oriented boxes are not supported; export it to ONNX, which is",
     "ClassificationModel": "a classification model has no boxes",
     "WorldModel": "YOLO-World is not supported",
     "YOLOEModel": "YOLOE is not supported",

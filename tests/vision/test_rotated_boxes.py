@@ -1,0 +1,103 @@
+"""Checkpoints of rotated boxes: the network gives the boxes that enclose them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tests.vision.foreign_checkpoints import (
+    FOREIGN,
+    NAMES,
+    SMALL,
+    as_foreign,
+    foreign_classes,
+    rotated,
+    save_foreign,
+    trained_model,
+)
+from tests.vision.runtimes.conftest import make_image
+from vision.detector import Detector
+from vision.runtimes.export import export
+from vision.runtimes.network import Network
+from vision.yolo.architecture import ArchitectureError, build
+from vision.yolo.fine_tuning import extend_classes
+from vision.yolo.heads import OBB
+from vision.yolo.published import published_description
+
+OBB_FOREIGN = FOREIGN | {"OBB": "ultralytics.nn.modules.head", "OBBModel": "ultralytics.nn.tasks"}
+
+
+def checkpoint(folder: Path, family: str) -> Path:
+    model = trained_model(rotated(published_description(family, SMALL, NAMES)))
+    with pytest.MonkeyPatch.context() as patch:
+        classes = foreign_classes(patch, OBB_FOREIGN)
+        whole = as_foreign(model, classes | {"DetectionModel": classes["OBBModel"]})
+        return save_foreign(folder / "rotated.pt", whole)
+
+
+@pytest.mark.parametrize("degrees", [-44, -20, 0, 30, 45, 90, 134])
+def test_head_gives_the_box_around_the_rotated_one(degrees: float) -> None:
+    head = OBB(2, (8,)).eval()
+    left, top, right, bottom = 1, 4, 2, 7
+    bins = torch.full((4, 16), -50.0)
+    bins[range(4), (left, top, right, bottom)] = 50.0
+    share = 0.25 + degrees / 180
+    angle = torch.tensor([math.log(share / (1 - share))])
+    for branch, bias in ((head.cv2, bins.flatten()), (head.cv4, angle)):
+        *_, last = next(branch.children()).children()
+        last.get_parameter("weight").data.zero_()
+        last.get_parameter("bias").data.copy_(bias)
+    (level,) = head([torch.rand(1, 8, 3, 5)])
+    assert level.shape == (1, 4 + 2, 3, 5)
+    # The corners, turned about the centre of the cell, clockwise in an image.
+    x, y = np.array([-left, right, right, -left]), np.array([-top, -top, bottom, bottom])
+    cos, sin = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    turned_x, turned_y = x * cos - y * sin, x * sin + y * cos
+    expected = [-turned_x.min(), -turned_y.min(), turned_x.max(), turned_y.max()]
+    for cell in level[0, :4].detach().flatten(1).T:
+        np.testing.assert_allclose(cell, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("family", ["YOLOv8", "YOLO11"])
+def test_checkpoint_and_its_export_find_the_same_boxes(
+    tmp_path: Path, family: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    for package in ("onnx", "onnxruntime"):
+        pytest.importorskip(package, reason=f"{package} is an optional extra")
+    path = checkpoint(tmp_path, family)
+    image = make_image(64, 96)
+    detector = Detector(path, image_size=96, confidence=0, precision="float32", threads=1)
+    found = detector.detect(image)
+    assert len(found) > 0
+    assert detector.metadata["task"] == "obb; boxes enclose rotated boxes"
+    assert "boxes enclose rotated boxes" in caplog.text
+    exported = export(path, "onnx", image_size=96)
+    again = Detector(exported, image_size=96, confidence=0, runtime="onnxruntime", threads=1).detect(image)
+    np.testing.assert_allclose(again.xyxy, found.xyxy, atol=0.05)
+    np.testing.assert_array_equal(again.class_id, found.class_id)
+
+
+def test_network_gives_distances_of_all_cells() -> None:
+    model = build(rotated(published_description("YOLOv8", SMALL, NAMES)))
+    head = Network(model, sparse_boxes=True).head
+    assert (head.reg_max, head.boxes, head.kinds) == (1, None, ("sides", "classes"))
+
+
+def test_other_heads_of_rotated_boxes_are_refused() -> None:
+    description = rotated(published_description("YOLO11", SMALL, NAMES))
+    with pytest.raises(ArchitectureError, match="end-to-end"):
+        build(replace(description, end_to_end=True))
+    last = replace(description.head[-1], arguments=("nc", 2))
+    with pytest.raises(ArchitectureError, match="and 1, got"):
+        build(replace(description, head=(*description.head[:-1], last)))
+
+
+def test_network_of_rotated_boxes_is_not_trained() -> None:
+    model = build(rotated(published_description("YOLO11", SMALL, NAMES)))
+    with pytest.raises(ValueError, match="OBB cannot be trained"):
+        extend_classes(model, ("boat",))
