@@ -1,20 +1,22 @@
 """`companion replay`: step guidance again over recorded inputs, compare its outputs with the recorded ones.
 
 `Guidance.step` is a function of its inputs: without a change every output is equal, bit for bit, on the same
-processor, Python and library versions. A replay is open-loop: with a changed setting the vehicle of the
-recording does not react, so the first differences say what the setting does, not how the flight would go on.
+processor, Python and library versions. With a model its targets are made again from the recorded images
+(`replay_perception`). A replay is open-loop: the vehicle of the recording does not react to a changed output,
+so the first differences say what a change does, not how the flight would go on.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
+from companion import replay_perception
 from companion.guidance.command import GrammarError
 from companion.guidance.core import Guidance, GuidanceOptions
 from companion.recording import RecordingError
@@ -22,11 +24,13 @@ from companion.recording.convert import INPUT_CHANNEL, OUTPUT_CHANNEL, RUN_CHANN
 from companion.recording.encoding import DecodeError, decode, dumps
 from companion.recording.files import RecordingReader
 from companion.recording.guidance_record import LAYOUT, inputs_of, output_record, read_step
+from companion.replay_perception import DetectionReplay, PerceptionReplay
+from companion.replay_timeline import TOLERANCES_TEXT, Change, Timeline, setpoint_difference
 from companion.service.factory import guidance_options
 from companion.settings import Settings
 from companion.settings.reading import ConfigurationError, changed
 
-MAX_LISTED = 10
+MAX_LISTED, MAX_LISTED_CHANGES = 10, 25
 WINDOW = 1000
 """Steps that an input and its output may be apart in a file."""
 
@@ -61,6 +65,8 @@ class Replay:
         first: the first difference; None: all outputs are equal.
         differing_fields: field of an output → steps in which it differs.
         events_recorded, events_replayed: texts of events that only one side has, the first ten.
+        timeline: what differs, by time: targets, events, and setpoints beyond `replay_timeline`'s tolerances.
+        detections: how the detections differ; None without a model.
     """
 
     vehicle: str
@@ -76,22 +82,26 @@ class Replay:
     differing_fields: dict[str, int] = field(default_factory=dict)
     events_recorded: list[str] = field(default_factory=list)
     events_replayed: list[str] = field(default_factory=list)
+    timeline: list[Change] = field(default_factory=list)
+    detections: DetectionReplay | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Return it as JSON-able data."""
         return {"identical": not self.differing_steps, **asdict(self)}
 
 
-def replay(paths: Sequence[Path], changes: Mapping[str, str]) -> Replay:
+def replay(paths: Sequence[Path], changes: Mapping[str, str], model: str | None = None) -> Replay:
     """Replay one run of a service.
 
     Args:
         paths: its files, in order.
         changes: key of `[guidance]` → text, for the replay.
+        model: detect and track again with it; None: guidance gets the recorded targets.
 
     Raises:
-        RecordingError: not a recording of this version, or without steps of guidance.
+        RecordingError: not a recording of this version, without steps of guidance, or without usable images.
         ConfigurationError: an invalid change, or one that guidance does not depend on.
+        ValueError: the model cannot be loaded.
     """
     run = _run_of(paths)
     if run["layout"] != LAYOUT:
@@ -106,7 +116,12 @@ def replay(paths: Sequence[Path], changes: Mapping[str, str]) -> Replay:
         raise RecordingError(f"{paths[0]}: its settings cannot be read: {_first_line(error)}") from error
     options, changed_settings = _changed_options(options, recorded_settings, run["own_address"], changes)
     found = Replay(run["vehicle"], run["version"], changed_settings)
-    _step_all(paths, Guidance(options), found)
+    timeline = Timeline()
+    perception = None if model is None else PerceptionReplay(paths, recorded_settings, model, timeline)
+    _step_all(paths, Guidance(options), perception, timeline, found)
+    if perception is not None:
+        found.detections, reasons = perception.result()
+        found.inexact += reasons
     if not found.steps:
         raise RecordingError(f"{paths[0]}: has no steps of guidance")
     return found
@@ -152,7 +167,13 @@ def _changed_options(
     return replace(options, **different), listed
 
 
-def _step_all(paths: Sequence[Path], guidance: Guidance, found: Replay) -> None:
+def _step_all(
+    paths: Sequence[Path],
+    guidance: Guidance,
+    perception: PerceptionReplay | None,
+    timeline: Timeline,
+    found: Replay,
+) -> None:
     digest = hashlib.sha256()
     # By step: replayed outputs and recorded ones that wait for each other; either may come first.
     replayed: dict[int, bytes] = {}
@@ -160,6 +181,7 @@ def _step_all(paths: Sequence[Path], guidance: Guidance, found: Replay) -> None:
     unrecorded: list[int] = []
     next_step = first_ns = 0
     events: tuple[Counter[str], Counter[str]] = (Counter(), Counter())
+    times: tuple[dict[str, list[float]], dict[str, list[float]]] = (defaultdict(list), defaultdict(list))
     differing: Counter[str] = Counter()
     for path, topic, data in _messages(paths, found.inexact):
         record = _json(path, data)
@@ -169,11 +191,14 @@ def _step_all(paths: Sequence[Path], guidance: Guidance, found: Replay) -> None:
                 found.inexact.append(_gap(next_step, recorded.step, started=found.steps > 0))
             next_step = recorded.step + 1
             first_ns = first_ns or recorded.now_ns
-            guidance.gimbal.mounting = recorded.mounting
+            guidance.gimbal.mounting = recorded.context.mounting
             try:
                 inputs = inputs_of(recorded, guidance.check_requirements)
             except GrammarError as error:
                 raise RecordingError(f"{path}: step {recorded.step}: {_first_line(error)}") from error
+            if perception is not None:
+                seconds = round((recorded.now_ns - first_ns) / 1e9, 3)
+                inputs = replace(inputs, **perception.update(recorded, seconds))
             output = guidance.step(recorded.now_ns, inputs)
             text = dumps(output_record(recorded.step, recorded.now_ns, output))
             digest.update(text)
@@ -196,11 +221,15 @@ def _step_all(paths: Sequence[Path], guidance: Guidance, found: Replay) -> None:
             was, again = json.loads(old), json.loads(new)
             differences = list(_differences(was, again))
             differing.update({name.partition(".")[0].partition("[")[0] for name, _, _ in differences})
+            seconds = round((was["now_ns"] - first_ns) / 1e9, 3)
             if found.first is None and differences:
-                seconds = round((was["now_ns"] - first_ns) / 1e9, 3)
                 found.first = Difference(step, seconds, *differences[0])
-            for counter, side in zip(events, (was, again), strict=True):
-                counter.update(event["message"] for event in side["events"])
+            for counter, side, times_s in zip(events, (was, again), times, strict=True):
+                for event in side["events"]:
+                    counter[event["message"]] += 1
+                    times_s[event["message"]].append(seconds)
+            if (apart := setpoint_difference(was["setpoint"], again["setpoint"])) is not None:
+                timeline.add("setpoint", seconds, apart[1], apart[0])
     unrecorded += [step for step in sorted(replayed) if step != next_step - 1]  # the last may be cut
     if unrecorded:
         found.inexact.append(
@@ -210,6 +239,12 @@ def _step_all(paths: Sequence[Path], guidance: Guidance, found: Replay) -> None:
     found.differing_fields = dict(differing.most_common())
     found.events_recorded = list((events[0] - events[1]).elements())[:MAX_LISTED]
     found.events_replayed = list((events[1] - events[0]).elements())[:MAX_LISTED]
+    for name, texts, times_s in zip(
+        ("recording", "replay"), (found.events_recorded, found.events_replayed), times, strict=True
+    ):
+        for text in texts:
+            timeline.add((name, text), times_s[text].pop(), f"event only in the {name}: {text}")
+    found.timeline = timeline.sorted()
 
 
 def _messages(paths: Sequence[Path], problems: list[str]) -> Iterator[tuple[Path, str, bytes]]:
@@ -268,6 +303,8 @@ def report(found: Replay) -> Iterator[str]:
     yield from (f"not exact: {reason}" for reason in found.inexact)
     for setting in found.changed:
         yield f"changed: {setting.key}: recorded {setting.recorded}, replayed {setting.replayed}"
+    if found.detections is not None:
+        yield from replay_perception.report(found.detections)
     if not found.differing_steps or found.first is None:
         yield f"all outputs are identical (SHA-256 {found.digest})"
         return
@@ -277,6 +314,13 @@ def report(found: Replay) -> Iterator[str]:
         f"recorded {first.recorded}, replayed {first.replayed}"
     )
     listed = ", ".join(f"{name} in {count}" for name, count in found.differing_fields.items())
-    yield f"{found.differing_steps} of {found.steps} steps differ: {listed}"
-    yield from (f"event only in the recording: {text}" for text in found.events_recorded)
-    yield from (f"event only in the replay: {text}" for text in found.events_replayed)
+    yield f"{found.differing_steps} of {found.steps} steps differ: {listed} (SHA-256 {found.digest})"
+    yield (
+        "open loop: the recorded vehicle does not react to what differs. In order of time (setpoints that "
+        f"differ by more than {TOLERANCES_TEXT}):"
+    )
+    for change in found.timeline[:MAX_LISTED_CHANGES]:
+        until = f" to {change.until_s:g}" if change.until_s > change.seconds else ""
+        yield f"{change.seconds:g}{until} s: {change.text}"
+    if (more := len(found.timeline) - MAX_LISTED_CHANGES) > 0:
+        yield f"{more} more differences: all with --json"

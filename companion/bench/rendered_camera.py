@@ -41,7 +41,7 @@ class RenderedCamera:
 
     Attributes:
         shown: the truth of the newest frame; None before the first.
-        planning: as of `RenderedPerception`.
+        perception: of the camera. planning: as of `RenderedPerception`.
     """
 
     def __init__(
@@ -55,9 +55,9 @@ class RenderedCamera:
         by_flight: bool = False,
         depth: bool = True,
     ) -> None:
-        self._perception = RenderedPerception(settings, vehicle, scene)
-        self.planning = self._perception.planning
-        self.perceived = PerceptionCamera(settings, None, self._perception.class_names or None)
+        self.perception = RenderedPerception(settings, vehicle, scene)
+        self.planning = self.perception.planning
+        self.perceived = PerceptionCamera(settings, None, self.perception.class_names or None)
         self.rate_hz, self.latency_s = rate_hz, latency_s
         self._by_flight, self._depth = by_flight, depth
         self.shown: Rendered | None = None
@@ -66,26 +66,26 @@ class RenderedCamera:
         """As `WorkerCamera.send_state` sends it to the worker."""
         if state.attitude is not None:
             position = None if state.position_ned_m is None else (state.position_ns, state.position_ned_m)
-            self._perception.add_attitude(state.attitude_ns, state.attitude, state.height_m, position)
+            self.perception.add_attitude(state.attitude_ns, state.attitude, state.height_m, position)
         gimbal = state.gimbal
         if gimbal is not None and gimbal.attitude is not None and self.perceived.settings.camera.on_gimbal:
             with contextlib.suppress(HistoryError):
-                self._perception.add_gimbal(gimbal.attitude_ns, history.gimbal_at(gimbal.attitude_ns))
+                self.perception.add_gimbal(gimbal.attitude_ns, history.gimbal_at(gimbal.attitude_ns))
 
     def select(self, request: SelectRequest) -> None:
         """Select an object with the next frame."""
-        self._perception.select(request)
+        self.perception.select(request)
 
     def capture(self, flight: LockstepFlight) -> Callable[[], PerceptionResult | None]:
         time_s = flight.seconds if self._by_flight else None
-        taken = self._perception.capture(flight.now_ns, time_s=time_s)
+        taken = self.perception.capture(flight.now_ns, time_s=time_s)
         self.shown = self.shown if taken is None else taken.rendered
 
         def finish() -> PerceptionResult | None:
             if taken is None:
                 return None
             frame = taken.frame if self._depth else replace(taken.frame, depth_m=None)
-            result = self._perception.process(frame, flight.now_ns)
+            result = self.perception.process(frame, flight.now_ns)
             if (planning := self.planning) is not None:
                 if (request := self.perceived.path_request) is not None:
                     planning.request(request, flight.now_ns)

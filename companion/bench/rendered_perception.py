@@ -33,7 +33,7 @@ from vision.frame import Frame
 from vision.object_detector import ObjectDetector
 from vision.pipeline import PerceptionResult
 from vision.rotation import matrix_from_quaternion
-from vision.sources import EndOfStream, Source, SourceStatistics
+from vision.sources.source import OneFrame
 from vision.tracking import SelectRequest
 
 
@@ -88,7 +88,7 @@ class RenderedPerception:
         self._camera = SimulatedCamera(scene)
         self._telemetry = CameraTelemetry()
         self._now_ns = 0
-        self._source = _OneFrame()
+        self._source = OneFrame()
         self._pipeline = build_pipeline(
             settings, self._source, detector, self._telemetry, clock_ns=lambda: self._now_ns
         )
@@ -160,28 +160,6 @@ class RenderedPerception:
         """`capture` and `process` at one moment."""
         captured = self.capture(now_ns)
         return None if captured is None else self.process(captured.frame, now_ns)
-
-
-class _OneFrame(Source):
-    """Gives the frame that was put in, once."""
-
-    uri, live = "rendered", True
-
-    def __init__(self) -> None:
-        self.frame: Frame | None = None
-
-    def read(self, timeout_s: float = 1.0) -> Frame | None:
-        if self.frame is None:
-            raise EndOfStream("no frame was put in")
-        frame, self.frame = self.frame, None
-        return frame
-
-    @property
-    def statistics(self) -> SourceStatistics:
-        return SourceStatistics()
-
-    def close(self) -> None:
-        self.frame = None
 
 
 @lru_cache(maxsize=4)

@@ -152,6 +152,7 @@ def _camera(supervisor: PerceptionSupervisor) -> StatusCameraBody:
         "model": None if ready is None else ready.model,
         "model_sha256": None if ready is None else ready.model_sha256,
         "runtime": status.runtime,
+        "precision": None if ready is None else ready.precision,
         "runtime_reason": status.runtime_reason,
         "problem": status.problem,
     }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import signal
 import threading
@@ -79,14 +78,14 @@ def replay(
         typer.Option("--set", metavar="KEY=VALUE", help="Change a setting, such as guidance.brake_s=1."),
     ] = None,
     model: Annotated[
-        str | None, typer.Option(help="Also detect in the recorded images, with this model.")
+        str | None, typer.Option(help="Detect and track again in the recorded images, with this model.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Run guidance again over a recording.
 
-    Compares each output with the recorded one. The exit code is 1 if any differs. With --model also compares
-    detections; they do not go to guidance.
+    Compares each output with the recorded one. The exit code is 1 if any differs. With --model guidance gets
+    the targets that this model finds in the recorded images.
     """
     from companion.plugins import PluginError, load_plugins
     from companion.settings.reading import ConfigurationError
@@ -95,23 +94,15 @@ def replay(
         from companion.recording import RecordingError
         from companion.replay import replay as replay_files
         from companion.replay import report
-    with plain_errors(RecordingError, ConfigurationError, PluginError):
+    with plain_errors(RecordingError, ConfigurationError, PluginError, ValueError):  # of a model
         load_plugins(settings.plugins.modules)
-        found = replay_files(files, dict(map(_key_and_value, changes or ())))
-    detections, lines = None, report(found)
-    if model is not None:
-        from companion import replay_detections
-
-        with plain_errors(RecordingError, ValueError):  # CheckpointError is a ValueError
-            detections = replay_detections.replay_detections(files, model)
-        lines = itertools.chain(lines, replay_detections.report(detections))
+        found = replay_files(files, dict(map(_key_and_value, changes or ())), model)
     if as_json:
-        more = {} if detections is None else {"detections": detections.as_dict()}
-        typer.echo(json.dumps(found.as_dict() | more))
+        typer.echo(json.dumps(found.as_dict()))
     else:
-        for line in lines:
+        for line in report(found):
             typer.echo(line)
-    if found.first is not None or (detections is not None and detections.differing_images):
+    if found.first is not None or (found.detections is not None and found.detections.differing_images):
         raise typer.Exit(EXIT_DIFFERENT)
 
 

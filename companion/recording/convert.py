@@ -62,6 +62,7 @@ _NO_POSE = {
     "position": {"x": 0.0, "y": 0.0, "z": 0.0},
     "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
 }
+_PNG = b"\x89PNG"
 _LINE_LOOP = 2  # foxglove.PointsAnnotationType
 _COLORS = {"confirmed": (0.2, 1.0, 0.3), "tentative": (1.0, 0.8, 0.1)}
 _OTHER_COLOR = (0.4, 0.7, 1.0)
@@ -179,13 +180,13 @@ class Converter:
             channel = Channel(SENT_CHANNEL if piece.sent else RECEIVED_CHANNEL, encoding="mavlink")
             yield Recorded(channel, piece.stamp_ns + self._offset_ns, piece.data)
 
-    def _image(self, camera: str, jpeg: bytes, stamps: dict[str, Any]) -> Recorded:
+    def _image(self, camera: str, encoded: bytes, stamps: dict[str, Any]) -> Recorded:
         captured_ns = stamps["captured_ns"]
         body = {
             "timestamp": self._time(captured_ns),
             "frame_id": self._camera_frame(camera),
-            "data": base64.b64encode(jpeg).decode(),
-            "format": "jpeg",
+            "data": base64.b64encode(encoded).decode(),
+            "format": "png" if encoded.startswith(_PNG) else "jpeg",
         }
         text = json.dumps(body, separators=(",", ":")).encode()
         return Recorded(large_channels(camera)[0], captured_ns + self._offset_ns, text)

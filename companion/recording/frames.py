@@ -17,13 +17,20 @@ from companion.recording import RecordingError
 from companion.recording.convert import RUN_CHANNEL
 from companion.recording.files import RecordingReader
 
+# Some seconds of frames.
+MAX_WAITING = 100
+
 
 class DetectedFrame(NamedTuple):
-    """An image (height, width, 3) uint8 BGR, at most `preview.width` wide, with its detection message."""
+    """An image (height, width, 3) uint8 BGR with its detection message.
+
+    `image_format`: `png`: the frame as it was processed; `jpeg`: at most `preview.width` wide.
+    """
 
     captured_ns: int
     image: NDArray[np.uint8]
     message: dict[str, Any]
+    image_format: str = "jpeg"
 
 
 def recorded_frames(paths: Sequence[Path], camera: str | None = None) -> Iterator[DetectedFrame]:
@@ -39,25 +46,36 @@ def recorded_frames(paths: Sequence[Path], camera: str | None = None) -> Iterato
     images, detections = f"/{prefix}{IMAGE.name}", f"{prefix}{DETECTIONS.name}"
     for path in paths:
         reader = RecordingReader(path)
-        # An image arrives up to a second after the message about its frame; both have the capture's time.
-        waiting: dict[int, Any] = {}
         run = next(iter(reader.messages(RUN_CHANNEL)), None)
         if run is None:
             raise RecordingError(f"{path}: not a recording of the service: it has no message on 'run'")
         about = json.loads(run.data)
-        if about["settings"]["preview"]["annotate"]:
-            raise RecordingError(
-                f"{path}: detections are drawn into its images: record with preview.annotate = false"
-            )
+        # Either comes first, an image up to a second after the message; both have the capture's time.
+        waiting: dict[str, dict[int, Any]] = {images: {}, detections: {}}
         for message in reader.messages(images, detections):
-            body = json.loads(message.data)
-            if message.channel.topic == detections:
-                waiting[body["captured_ns"]] = body
-                continue
-            stamp = body["timestamp"]
-            captured_ns = stamp["sec"] * 10**9 + stamp["nsec"] - about["unix_offset_ns"]
-            found = waiting.get(captured_ns)
-            waiting = {stamp_ns: each for stamp_ns, each in waiting.items() if stamp_ns > captured_ns}
-            image = cv2.imdecode(np.frombuffer(base64.b64decode(body["data"]), np.uint8), cv2.IMREAD_COLOR)
-            if found is not None and image is not None:
-                yield DetectedFrame(captured_ns, image.astype(np.uint8, copy=False), found)
+            body, topic = json.loads(message.data), message.channel.topic
+            if topic == detections:
+                captured_ns = body["captured_ns"]
+            else:
+                stamp = body["timestamp"]
+                captured_ns = stamp["sec"] * 10**9 + stamp["nsec"] - about["unix_offset_ns"]
+                if about["settings"]["preview"]["annotate"] and body["format"] == "jpeg":
+                    raise RecordingError(
+                        f"{path}: detections are drawn into its images: record with preview.annotate = false"
+                    )
+            waiting[topic][captured_ns] = body
+            if all(captured_ns in bodies for bodies in waiting.values()):
+                image, found = waiting[images][captured_ns], waiting[detections][captured_ns]
+                waiting = {
+                    topic: {stamp_ns: each for stamp_ns, each in bodies.items() if stamp_ns > captured_ns}
+                    for topic, bodies in waiting.items()
+                }
+                decoded = cv2.imdecode(
+                    np.frombuffer(base64.b64decode(image["data"]), np.uint8), cv2.IMREAD_COLOR
+                )
+                if decoded is not None:
+                    yield DetectedFrame(
+                        captured_ns, decoded.astype(np.uint8, copy=False), found, image["format"]
+                    )
+            elif len(waiting[topic]) > MAX_WAITING:
+                del waiting[topic][next(iter(waiting[topic]))]

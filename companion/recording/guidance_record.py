@@ -1,7 +1,8 @@
 """The inputs and outputs of guidance as they are recorded, one of each per step.
 
 Together with guidance's options, a `RecordedStep` is everything that `Guidance.step` depends on. A behaviour
-has no encoding: recorded is what it was built from, its command's text and `CommandSource`.
+has no encoding: recorded is what it was built from, its command's text and `CommandSource`. With the recorded
+images it is also what the steering camera's targets depend on.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from companion.guidance.gimbal.controller import GimbalMounting
 from companion.guidance.grammar import parse
 from companion.guidance.interface import CommandInput, CommandSource, GuidanceInput, GuidanceOutput
 from companion.guidance.targets.chosen import GimbalGoal
+from companion.guidance.targets.from_detections import HistorySamples
 from companion.recording.encoding import decode, encode, layout_of
 
 
@@ -37,18 +39,32 @@ class RecordedCommand:
 
 
 @dataclass(frozen=True, slots=True)
+class StepContext:
+    """What is recorded of a step besides its input.
+
+    Attributes:
+        mounting: which cameras the gimbal carries; a camera's calibration may arrive during a flight.
+        camera: the steering camera's section `camera` as JSON, with the camera's own calibration.
+        samples: of the vehicle's pose since the previous step.
+    """
+
+    mounting: GimbalMounting
+    camera: str
+    samples: HistorySamples
+
+
+@dataclass(frozen=True, slots=True)
 class RecordedStep:
     """The input of one step.
 
     Attributes:
         step: counted from the start of the service; a gap means lost steps.
-        mounting: which cameras the gimbal carries; a camera's calibration may arrive during a flight.
         inputs: without commands.
     """
 
     step: int
     now_ns: int
-    mounting: GimbalMounting
+    context: StepContext
     commands: tuple[RecordedCommand, ...]
     inputs: GuidanceInput
 
@@ -57,7 +73,7 @@ class RecordedStep:
 LAYOUT = layout_of(RecordedStep, GuidanceOutput, GuidanceOptions)
 
 
-def input_record(step: int, now_ns: int, mounting: GimbalMounting, inputs: GuidanceInput) -> dict[str, Any]:
+def input_record(step: int, now_ns: int, context: StepContext, inputs: GuidanceInput) -> dict[str, Any]:
     """Encode the input of one step, as JSON-able data."""
     commands = tuple(
         RecordedCommand(
@@ -70,7 +86,7 @@ def input_record(step: int, now_ns: int, mounting: GimbalMounting, inputs: Guida
         )
         for command in inputs.commands
     )
-    data: dict[str, Any] = encode(RecordedStep, RecordedStep(step, now_ns, mounting, commands, inputs))
+    data: dict[str, Any] = encode(RecordedStep, RecordedStep(step, now_ns, context, commands, inputs))
     return data
 
 

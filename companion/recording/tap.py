@@ -17,10 +17,9 @@ from typing import Any
 from companion.bus.session import Bus
 from companion.bus.topics import GUIDANCE_INPUT, GUIDANCE_OUTPUT, MAVLINK, RUN
 from companion.guidance.core import GuidanceOptions
-from companion.guidance.gimbal.controller import GimbalMounting
 from companion.guidance.interface import GuidanceInput, GuidanceOutput
 from companion.recording.encoding import dumps, encode
-from companion.recording.guidance_record import LAYOUT, input_record, output_record
+from companion.recording.guidance_record import LAYOUT, StepContext, input_record, output_record
 from companion.recording.link_bytes import LinkBytes, pack_link_bytes
 from companion.settings import Settings
 from companion.settings.perception import NO_SOURCE
@@ -72,7 +71,7 @@ class FlightTap:
 
     def __init__(self, bus: Bus, run: dict[str, Any], *, expected: bool) -> None:
         self._bus, self._run = bus, dumps(run)
-        self._steps: deque[tuple[int, int, GimbalMounting, GuidanceInput, GuidanceOutput]] = deque(
+        self._steps: deque[tuple[int, int, StepContext, GuidanceInput, GuidanceOutput]] = deque(
             maxlen=MAX_STEPS
         )
         self._pieces: deque[tuple[int, LinkBytes]] = deque(maxlen=MAX_PIECES)
@@ -95,10 +94,10 @@ class FlightTap:
             self._thread.join(2.0)
 
     def on_step(
-        self, now_ns: int, mounting: GimbalMounting, inputs: GuidanceInput, output: GuidanceOutput
+        self, now_ns: int, context: StepContext, inputs: GuidanceInput, output: GuidanceOutput
     ) -> None:
         """Queue one step of guidance."""
-        self._steps.append((self._step, now_ns, mounting, inputs, output))
+        self._steps.append((self._step, now_ns, context, inputs, output))
         self._step += 1
 
     def on_bytes(self, sent: bool, data: bytes) -> None:
@@ -133,10 +132,10 @@ class FlightTap:
             self._bus.publish(MAVLINK, pack_link_bytes(pieces[begin][0], batch))
 
     def _publish_step(
-        self, step: int, now_ns: int, mounting: GimbalMounting, inputs: GuidanceInput, output: GuidanceOutput
+        self, step: int, now_ns: int, context: StepContext, inputs: GuidanceInput, output: GuidanceOutput
     ) -> None:
         try:
-            taken = dumps(input_record(step, now_ns, mounting, inputs))
+            taken = dumps(input_record(step, now_ns, context, inputs))
             given = dumps(output_record(step, now_ns, output))
         except Exception:
             # Such as a value of another type in a plug-in's outcome. The missing step shows in the recording.

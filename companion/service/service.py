@@ -17,10 +17,12 @@ from companion.bus.session import Bus
 from companion.bus.status_message import status_message
 from companion.guidance import grammar
 from companion.guidance.core import Guidance
+from companion.guidance.interface import GuidanceInput, GuidanceOutput
 from companion.operator.console import Ask, run_console, terminal_is_free
 from companion.operator.metrics import MetricsServer
 from companion.perception.cameras import WorkerCamera, open_cameras
 from companion.perception.supervisor import PerceptionSupervisor
+from companion.recording.guidance_record import StepContext
 from companion.recording.tap import FlightTap, run_record
 from companion.service.event import Event, EventLog
 from companion.service.factory import clients_of, driver_of, gimbal_mounting, guidance_options, streamer_of
@@ -99,6 +101,7 @@ class Service:
             run_record(settings, self.guidance.options, self.driver.own_address, self.inputs.poses.source),
             expected=bool(settings.recording.directory),
         )
+        self._steering_section = self.inputs.steering.settings.camera.model_dump_json()
         self._publisher = Publisher(settings.vehicle.name, self.bus, self.driver, self.inputs, self._queries)
         self._loop = GuidanceLoop(
             *(self.guidance, self.inputs, self.driver, self.streamer),
@@ -106,9 +109,7 @@ class Service:
             on_event=self._event,
             on_step=lambda now_ns: self._health.after_step(now_ns, self.guidance),
             others=self.others,
-            record=lambda now_ns, inputs, output: self._tap.on_step(
-                now_ns, self.guidance.gimbal.mounting, inputs, output
-            ),
+            record=self._record,
         )
         self._notifier = SystemdNotifier()
         self._health = Health(self.driver, self.cameras, self._notifier, self.others, self._event)
@@ -237,7 +238,15 @@ class Service:
 
     def _on_calibration(self) -> None:
         sections = [camera.settings.camera for camera in self.cameras]
-        self.guidance.gimbal.mounting = gimbal_mounting(sections, self.inputs.steering.settings.camera)
+        steering = self.inputs.steering.settings.camera
+        self.guidance.gimbal.mounting = gimbal_mounting(sections, steering)
+        self._steering_section = steering.model_dump_json()
+
+    def _record(self, now_ns: int, inputs: GuidanceInput, output: GuidanceOutput) -> None:
+        context = StepContext(
+            self.guidance.gimbal.mounting, self._steering_section, self.inputs.history.take_new()
+        )
+        self._tap.on_step(now_ns, context, inputs, output)
 
     def _on_result(self, camera: WorkerCamera, result: PerceptionResult) -> None:
         """Localize a camera's result, let guidance use it, then publish it."""

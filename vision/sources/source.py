@@ -196,3 +196,25 @@ class Source(ABC):
                 return
             if frame is not None:
                 yield frame
+
+
+class OneFrame(Source):
+    """Gives the frame that was put in, once: for a pipeline that is stepped by hand."""
+
+    uri, live = "one frame", True
+
+    def __init__(self) -> None:
+        self.frame: Frame | None = None
+
+    def read(self, timeout_s: float = 1.0) -> Frame | None:
+        if self.frame is None:
+            raise EndOfStream("no frame was put in")
+        frame, self.frame = self.frame, None
+        return frame
+
+    @property
+    def statistics(self) -> SourceStatistics:
+        return SourceStatistics()
+
+    def close(self) -> None:
+        self.frame = None

@@ -151,6 +151,8 @@ class StatusCameraBody(TypedDict):
     """of its file"""
     runtime: str | None
     """of the network"""
+    precision: str | None
+    """of the network"""
     runtime_reason: str
     """why this runtime and precision"""
     problem: str

@@ -6,10 +6,12 @@ attitude and position of the capture time are used, interpolated from a short hi
 
 from __future__ import annotations
 
+import itertools
 import math
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import NamedTuple, TypeVar
 
@@ -84,6 +86,19 @@ class Pose(NamedTuple):
     error: PoseError
 
 
+@dataclass(frozen=True, slots=True)
+class HistorySamples:
+    """Samples of a `StateHistory`, oldest first, each after its stamp (CLOCK_MONOTONIC ns).
+
+    Attributes:
+        positions: local NED, height, and one sigma of height and of the horizontal position; metres.
+    """
+
+    attitudes: tuple[tuple[int, Quaternion], ...] = ()
+    positions: tuple[tuple[int, tuple[float, ...]], ...] = ()
+    gimbal: tuple[tuple[int, tuple[Quaternion, YawFrame]], ...] = ()
+
+
 class StateHistory:
     """Attitudes and positions of the last few seconds, each with its own stamp (CLOCK_MONOTONIC ns).
 
@@ -92,6 +107,7 @@ class StateHistory:
 
     def __init__(self, duration_s: float = HISTORY_S) -> None:
         self._duration_ns = round(duration_s * 1e9)
+        self._taken_ns = (0, 0, 0)
         self._attitudes: deque[tuple[int, Quaternion]] = deque()
         self._positions: deque[tuple[int, tuple[float, ...]]] = deque()
         self._gimbal: deque[tuple[int, tuple[Quaternion, YawFrame]]] = deque()
@@ -112,6 +128,27 @@ class StateHistory:
         if gimbal is not None and gimbal.attitude is not None and _newer(self._gimbal, gimbal.attitude_ns):
             self._gimbal.append((gimbal.attitude_ns, (gimbal.attitude, gimbal.yaw_frame)))
             self._forget(self._gimbal)
+
+    def take_new(self) -> HistorySamples:
+        """Return the samples added since the last call, for one caller: a recording."""
+        kinds = (self._attitudes, self._positions, self._gimbal)
+        new = HistorySamples(
+            _after(self._attitudes, self._taken_ns[0]),
+            _after(self._positions, self._taken_ns[1]),
+            _after(self._gimbal, self._taken_ns[2]),
+        )
+        attitude_ns, position_ns, gimbal_ns = (kind[-1][0] if kind else 0 for kind in kinds)
+        self._taken_ns = (attitude_ns, position_ns, gimbal_ns)
+        return new
+
+    def extend(self, samples: HistorySamples) -> None:
+        """Add samples of another history, newer than those here."""
+        self._attitudes.extend(samples.attitudes)
+        self._positions.extend(samples.positions)
+        self._gimbal.extend(samples.gimbal)
+        for kind in (self._attitudes, self._positions, self._gimbal):
+            if kind:
+                self._forget(kind)
 
     def at(self, stamp_ns: int) -> Pose:
         """The pose at a time: attitude by slerp, position by linear interpolation.
@@ -378,6 +415,12 @@ def _nearer(lens: list[float], direction: list[float], foot: list[float], by_m: 
 def _measurable(camera: CameraModel, top: float, bottom: float) -> bool:
     """Whether a box is tall enough and not cut off by the image's upper or lower edge."""
     return top > EDGE_PX and bottom < camera.height - 1 - EDGE_PX and bottom - top >= LEAST_HEIGHT_PX
+
+
+def _after(samples: deque[tuple[int, _Sample]], stamp_ns: int) -> tuple[tuple[int, _Sample], ...]:
+    """The samples newer than a time, which are few."""
+    newer = itertools.takewhile(lambda sample: sample[0] > stamp_ns, reversed(samples))
+    return tuple(newer)[::-1]
 
 
 def _newer(samples: deque[tuple[int, _Sample]], stamp_ns: int) -> bool:

@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import cv2
+
 from companion.bench.lockstep_flight import LockstepFlight
+from companion.bench.rendered_camera import RenderedCamera
+from companion.bus.messages import ModelIdentity, detections_message
+from companion.bus.topics import DETECTIONS, IMAGE, RUN, Topic
 from companion.guidance.interface import GuidanceInput, GuidanceOutput
-from companion.recording.convert import ANY_OBJECT, INPUT_CHANNEL, OUTPUT_CHANNEL, RUN_CHANNEL
+from companion.recording.convert import ANY_OBJECT, INPUT_CHANNEL, OUTPUT_CHANNEL, RUN_CHANNEL, Converter
 from companion.recording.encoding import dumps
 from companion.recording.files import Channel, Recorded, RecordingReader, RecordingWriter
-from companion.recording.guidance_record import input_record, output_record
+from companion.recording.guidance_record import StepContext, input_record, output_record
 from companion.recording.tap import run_record
+from vision.frame import Frame
+from vision.pipeline import PerceptionResult
 
 GIGABYTE = 10**9
 
@@ -23,17 +31,52 @@ def new_writer(folder: Path, **limits: float) -> RecordingWriter:
     return RecordingWriter(folder, "vehicle1", **chosen)  # type: ignore[arg-type]
 
 
+def step_context(flight: LockstepFlight) -> StepContext:
+    """What the service records of a step besides its input."""
+    section = flight.inputs.steering.settings.camera
+    return StepContext(
+        flight.guidance.gimbal.mounting, section.model_dump_json(), flight.inputs.history.take_new()
+    )
+
+
 @contextmanager
-def recording(flight: LockstepFlight, folder: Path) -> Iterator[Path]:
-    """Record every step of guidance meanwhile; yields the file, which is complete afterwards."""
+def recording(
+    flight: LockstepFlight, folder: Path, *, images: str = "", model: ModelIdentity | None = None
+) -> Iterator[Path]:
+    """Record every step of guidance meanwhile; yields the file, which is complete afterwards.
+
+    Args:
+        images: `.png` or `.jpg`: also the rendered camera's images and detections. model: its model.
+    """
     writer, original = new_writer(folder), flight.guidance.step
     run = run_record(flight.settings, flight.guidance.options, (1, 191), "service1")
     writer.write(Channel(RUN_CHANNEL, "companion.run", ANY_OBJECT), flight.now_ns, dumps(run))
+    converter = Converter("vehicle1")
+    list(converter.convert(RUN.name, dumps(run)))
     number = 0
+
+    def write(topic: Topic, payload: bytes, attachment: bytes | None = None) -> None:
+        for message in converter.convert(topic.name, payload, attachment):
+            writer.write(*message)
+
+    def process(frame: Frame, now_ns: int) -> PerceptionResult | None:
+        result = detect(frame, now_ns)
+        assert result is not None
+        _, encoded = cv2.imencode(images, frame.image)
+        stamps = {"captured_ns": frame.captured_ns}
+        write(IMAGE, encoded.tobytes(), json.dumps(stamps).encode())
+        write(DETECTIONS, dumps(detections_message(result, "vehicle1", now_ns, model=model)))
+        return result
+
+    if images:
+        (camera,) = flight.cameras
+        assert isinstance(camera, RenderedCamera)
+        detect = camera.perception.process
+        camera.perception.process = process  # type: ignore[method-assign]
 
     def step(now_ns: int, inputs: GuidanceInput) -> GuidanceOutput:
         nonlocal number
-        taken = input_record(number, now_ns, flight.guidance.gimbal.mounting, inputs)
+        taken = input_record(number, now_ns, step_context(flight), inputs)
         output = original(now_ns, inputs)
         given = output_record(number, now_ns, output)
         writer.write(Channel(INPUT_CHANNEL, "companion.guidance_input", ANY_OBJECT), now_ns, dumps(taken))
@@ -46,6 +89,8 @@ def recording(flight: LockstepFlight, folder: Path) -> Iterator[Path]:
         yield writer.path
     finally:
         flight.guidance.step = original  # type: ignore[method-assign]
+        if images:
+            camera.perception.process = detect  # type: ignore[method-assign]
         writer.close()
 
 

@@ -13,6 +13,8 @@ from companion.guidance.behaviour import Outcome
 from companion.guidance.core import GuidanceOptions
 from companion.guidance.gimbal.controller import GimbalMounting
 from companion.guidance.interface import CommandResult, GuidanceInput, GuidanceOutput
+from companion.guidance.targets.from_detections import HistorySamples
+from companion.recording.guidance_record import StepContext
 from companion.recording.link_bytes import unpack_link_bytes
 from companion.recording.tap import MAX_PIECES, MAX_STEPS, FlightTap, run_record
 from companion.settings import Settings
@@ -44,7 +46,7 @@ def tap_on(bus: BusOfTest, *, expected: bool = False) -> FlightTap:
 
 
 def step(tap: FlightTap, output: GuidanceOutput = NOTHING) -> None:
-    tap.on_step(1, GimbalMounting(), INPUT, output)
+    tap.on_step(1, StepContext(GimbalMounting(), "{}", HistorySamples()), INPUT, output)
 
 
 def test_steps_and_bytes_are_published_in_order() -> None:
