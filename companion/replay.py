@@ -315,10 +315,11 @@ def report(found: Replay) -> Iterator[str]:
     )
     listed = ", ".join(f"{name} in {count}" for name, count in found.differing_fields.items())
     yield f"{found.differing_steps} of {found.steps} steps differ: {listed} (SHA-256 {found.digest})"
-    yield (
-        "open loop: the recorded vehicle does not react to what differs. In order of time (setpoints that "
-        f"differ by more than {TOLERANCES_TEXT}):"
-    )
+    yield "open loop: the recorded vehicle does not react to what differs"
+    if not found.timeline:
+        yield f"no target or event differs, and no setpoint by more than {TOLERANCES_TEXT}"
+        return
+    yield f"in order of time, setpoints that differ by more than {TOLERANCES_TEXT}:"
     for change in found.timeline[:MAX_LISTED_CHANGES]:
         until = f" to {change.until_s:g}" if change.until_s > change.seconds else ""
         yield f"{change.seconds:g}{until} s: {change.text}"

@@ -38,6 +38,7 @@ from companion.settings.perception import CameraSection, DetectorSection
 from vision.detections import TRACK_CONFIRMED, DetectionRecord
 from vision.frame import Frame
 from vision.pipeline import PerceptionResult, Pipeline
+from vision.runtimes.exported import kind_of
 from vision.sources.source import OneFrame
 from vision.tracking import TARGET_CLASS
 from vision.tracking.association import match, overlaps
@@ -101,8 +102,8 @@ class PerceptionReplay:
         name = settings.guidance.camera
         own = settings.of_camera(name)
         detectors = [settings.of_camera(each).detector for each in (None, *settings.cameras)]
-        detector = _as_in_flight(own.detector, threads_each(detectors), _status(paths, name))
-        self._settings = own.model_copy(update={"detector": detector.model_copy(update={"model": model})})
+        detector = _as_in_flight(own.detector, threads_each(detectors), _status(paths, name), model)
+        self._settings = own.model_copy(update={"detector": detector})
         self._frames = recorded_frames(paths, name)
         self._next = next(self._frames, None)
         if self._next is None:
@@ -304,16 +305,21 @@ def report(found: DetectionReplay) -> Iterator[str]:
     yield from found.listed
 
 
-def _as_in_flight(section: DetectorSection, threads: int, status: dict[str, Any]) -> DetectorSection:
+def _as_in_flight(
+    section: DetectorSection, threads: int, status: dict[str, Any], model: str
+) -> DetectorSection:
     """Every image is processed, with the runtime and precision that `auto` selected in the flight.
 
-    Selecting again may come out otherwise, and two replays would differ.
+    Selecting again may come out otherwise, and two replays would differ. An exported file needs another
+    runtime than the checkpoint of the flight.
     """
-    changes: dict[str, Any] = {"every": 1, "rate_hz": None, "max_age_s": None}
+    changes: dict[str, Any] = {"model": model, "every": 1, "rate_hz": None, "max_age_s": None}
     changes["threads"] = section.threads or threads
-    for key in ("runtime", "precision"):
-        if getattr(section, key) == "auto" and status.get(key) is not None:
-            changes[key] = status[key]
+    if section.runtime == "torch" and kind_of(Path(model)) not in (None, "torchscript"):
+        return section.model_copy(update=changes | {"runtime": "auto"})
+    changes["runtime"] = section.runtime if section.runtime != "auto" else status.get("runtime", "torch")
+    if section.precision == "auto":
+        changes["precision"] = status.get("precision") or "float32"
     return section.model_copy(update=changes)
 
 

@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import base64
+import json
 import math
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from companion.bench.lockstep_flight import LockstepFlight, camera_settings
 from companion.bench.rendered_camera import RenderedCamera, rendered_scene
 from companion.bench.synthetic_detector import SceneObject, ScenePose
 from companion.bus.messages import ModelIdentity
-from companion.replay import replay
+from companion.recording import RecordingError
+from companion.recording.convert import RUN_CHANNEL
+from companion.recording.files import Recorded
+from companion.replay import replay, report
 from companion.settings.perception import DEFAULT_MODEL
 from mavlink_sim.lockstep import LockstepVehicle
-from tests.companion.recording.lockstep_recording import recording
+from tests.companion.command_line import companion
+from tests.companion.recording.lockstep_recording import recording, rewritten
 from vision.attitude import euler_from_quaternion
 from vision.camera_model import CameraModel, CameraMount
 from vision.detector import open_detector
@@ -25,11 +33,13 @@ MOUNT = CameraMount(forward_m=0.1, pitch_rad=math.radians(-10.0))
 SETTINGS = {"detector.image_size": "256", "detector.threads": "1", "preview.annotate": "false"}
 
 
-def flown(folder: Path, images: str) -> Path:
-    """A recorded approach to a car, with images."""
+@pytest.fixture(scope="module")
+def lossless(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recorded approach to a car, with PNG images."""
     flight = LockstepFlight.airborne(seed=11, height_m=3.0, wind_mps=1.0, camera=_camera)
     detector = open_detector("yolo", DetectorSettings(DEFAULT_MODEL, image_size=256, threads=1))
-    with recording(flight, folder, images=images, model=ModelIdentity("own", detector.model_sha256)) as path:
+    folder = tmp_path_factory.mktemp("lossless")
+    with recording(flight, folder, images=".png", model=ModelIdentity("own", detector.model_sha256)) as path:
         assert flight.fly("approach car distance=8", 7.0).moments
     return path
 
@@ -43,11 +53,6 @@ def _camera(vehicle: LockstepVehicle) -> RenderedCamera:
     return RenderedCamera(camera_settings(CAMERA, MOUNT, SETTINGS), scene, vehicle, depth=False)
 
 
-@pytest.fixture(scope="module")
-def lossless(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return flown(tmp_path_factory.mktemp("lossless"), ".png")
-
-
 def test_lossless_images_and_the_same_model_give_the_flight(lossless: Path) -> None:
     found = replay([lossless], {}, DEFAULT_MODEL)
     detections = found.detections
@@ -56,3 +61,98 @@ def test_lossless_images_and_the_same_model_give_the_flight(lossless: Path) -> N
     assert detections.images == detections.frames == detections.identical_images > 50
     assert detections.recorded == detections.replayed > 50
     assert (found.first, found.differing_steps, found.timeline, found.inexact) == (None, 0, [], [])
+
+
+@pytest.fixture(scope="module")
+def jpeg(lossless: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same flight with JPEG images."""
+
+    def change(message: Recorded) -> Recorded:
+        if message.channel.topic != "/image":
+            return message
+        body = json.loads(message.data)
+        png = cv2.imdecode(np.frombuffer(base64.b64decode(body["data"]), np.uint8), cv2.IMREAD_COLOR)
+        assert png is not None
+        _, encoded = cv2.imencode(".jpg", png, [cv2.IMWRITE_JPEG_QUALITY, 80])
+        body |= {"data": base64.b64encode(encoded.tobytes()).decode(), "format": "jpeg"}
+        return message._replace(data=json.dumps(body).encode())
+
+    return rewritten(lossless, tmp_path_factory.mktemp("jpeg"), change)
+
+
+def test_two_replays_of_jpeg_images_are_equal_and_say_what_the_images_change(jpeg: Path) -> None:
+    found, again = replay([jpeg], {}, DEFAULT_MODEL), replay([jpeg], {}, DEFAULT_MODEL)
+    assert found == again
+    detections = found.detections
+    assert detections is not None
+    assert (detections.same_model, detections.image_formats) == (True, ["jpeg"])
+    assert detections.matched == detections.recorded
+    assert detections.identical_images < detections.images
+    assert detections.range_difference_m is not None
+    assert 0.0 < detections.range_difference_m[1] < 0.5
+    assert found.first is not None
+    assert any("JPEG" in reason for reason in found.inexact)
+    assert "setpoint" in found.differing_fields
+
+
+def test_model_that_finds_nothing_is_the_reason_of_other_setpoints(
+    lossless: Path, small_model: Path, tmp_path: Path
+) -> None:
+    done = companion("replay", lossless, "--model", small_model, "--json", cwd=tmp_path)
+    assert done.returncode == 1, done.stderr
+    found = json.loads(done.stdout)
+    assert found["detections"]["same_model"] is False
+    assert (found["detections"]["replayed"], found["detections"]["matched"]) == (0, 0)
+    first, *later = found["timeline"]
+    assert "car (track 1)" in first["text"]
+    assert "not detected" in first["text"]
+    setpoint = next(change for change in later if change["text"].startswith("setpoint"))
+    assert first["seconds"] <= found["first"]["seconds"] <= setpoint["seconds"] < setpoint["until_s"]
+    assert any("event only in the recording: reached car" in change["text"] for change in later)
+    lines = list(report(replay([lossless], {}, str(small_model))))
+    assert any("open loop" in line for line in lines)
+    assert any(line.startswith(f"{setpoint['seconds']:g} to {setpoint['until_s']:g} s: ") for line in lines)
+
+
+def test_exported_file_of_the_model_is_another_model(lossless: Path, exported_model: Path) -> None:
+    found = replay([lossless], {}, str(exported_model)).detections
+    assert found is not None
+    assert found.same_model is False
+    assert found.images == found.frames
+
+
+def test_frames_without_an_image_are_counted(lossless: Path, tmp_path: Path) -> None:
+    seen = 0
+
+    def change(message: Recorded) -> Recorded | None:
+        nonlocal seen
+        seen += message.channel.topic == "/image"
+        return None if message.channel.topic == "/image" and seen % 3 == 0 else message
+
+    found = replay([rewritten(lossless, tmp_path, change)], {}, DEFAULT_MODEL)
+    assert found.detections is not None
+    missing = found.detections.frames - found.detections.images
+    assert missing == seen // 3
+    assert found.inexact == [
+        f"{missing} of {found.detections.frames} processed frames have no recorded image"
+    ]
+
+
+@pytest.mark.parametrize("what", ["annotated", "no images"])
+def test_unusable_images_are_refused(jpeg: Path, tmp_path: Path, what: str) -> None:
+    def change(message: Recorded) -> Recorded | None:
+        if what == "no images":
+            return None if message.channel.topic == "/image" else message
+        if message.channel.topic != RUN_CHANNEL:
+            return message
+        return message._replace(data=message.data.replace(b'"annotate":false', b'"annotate":true'))
+
+    with pytest.raises(RecordingError, match="annotate" if what == "annotated" else "images"):
+        replay([rewritten(jpeg, tmp_path, change)], {}, DEFAULT_MODEL)
+
+
+def test_unknown_model_is_one_line(lossless: Path, tmp_path: Path) -> None:
+    done = companion("replay", lossless, "--model", "none.pt", cwd=tmp_path)
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert "none.pt" in done.stderr
