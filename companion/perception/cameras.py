@@ -41,6 +41,18 @@ logger = logging.getLogger(__name__)
 _SEEING_S = 1.0
 
 
+def recorded_frames_names(settings: Settings) -> dict[str | None, str]:
+    """Return camera → name of the shared memory in which its worker gives a recorder every processed frame.
+
+    Empty if images are not recorded, or as JPEG.
+    """
+    recording = settings.recording
+    if not (recording.directory and recording.images and recording.image_format == "png"):
+        return {}
+    prefix = f"companion-{os.getpid()}-{settings.vehicle.name}"
+    return {name: f"{prefix}-{name or 'camera'}-recorded" for name in (None, *settings.cameras)}
+
+
 class PerceptionCamera:
     """One camera with its model, and its newest result.
 
@@ -150,6 +162,7 @@ class WorkerCamera(PerceptionCamera):
         on_preview: Callable[[WorkerCamera, Preview | CloudPreview], None],
         on_event: Callable[[str, str], None],
         on_calibration: Callable[[], None],
+        record_as: str | None = None,
     ) -> None:
         super().__init__(settings, name)
         self._given = settings.camera
@@ -165,6 +178,7 @@ class WorkerCamera(PerceptionCamera):
             on_preview=lambda preview: on_preview(self, preview),
             on_calibration=self._adopt,
             on_path=self._on_path,
+            record_as=record_as,
         )
 
     @property
@@ -266,6 +280,7 @@ def open_cameras(
     own_settings = {name: settings.of_camera(name) for name in (None, *settings.cameras)}
     threads = threads_each([own.detector for own in own_settings.values()])
     shared = {f"shm://{source.share}" for source in settings.sources().values() if source.share}
+    record_as = recorded_frames_names(settings)
     cameras = []
     for name, own in own_settings.items():
         changes: dict[str, Section] = {}
@@ -286,6 +301,7 @@ def open_cameras(
                 on_preview=on_preview,
                 on_event=on_event,
                 on_calibration=on_calibration,
+                record_as=record_as.get(name),
             )
         )
     return tuple(cameras)

@@ -36,10 +36,16 @@ LARGEST_BYTES = 1 << 24
 
 @dataclass(frozen=True, slots=True)
 class Begin:
-    """The first message. Tracks are numbered from `first_track_id` on."""
+    """The first message.
+
+    Attributes:
+        first_track_id: of its first track; further ones follow.
+        record_as: name of the shared memory for processed frames, for a recorder; None: none.
+    """
 
     settings: Settings
     first_track_id: int = 1
+    record_as: str | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -66,12 +66,14 @@ class PerceptionProcess:
         self._printing.start()
 
     @classmethod
-    async def spawn(cls, settings: Settings, standard_input: int, first_track_id: int = 1) -> Self:
+    async def spawn(
+        cls, settings: Settings, standard_input: int, first_track_id: int = 1, record_as: str | None = None
+    ) -> Self:
         """Start a new interpreter with this one's module search path.
 
         Args:
             standard_input: descriptor of the worker's standard input, or `subprocess.DEVNULL`.
-            first_track_id: the id of its first track.
+            first_track_id, record_as: as in `Begin`.
 
         Raises:
             OSError: no more processes or descriptors.
@@ -113,7 +115,7 @@ class PerceptionProcess:
             )
             failing.pop_all()
         worker = cls(process, reports, control, printed)
-        worker._put(Begin(settings, first_track_id))
+        worker._put(Begin(settings, first_track_id, record_as))
         return worker
 
     @property

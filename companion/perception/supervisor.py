@@ -93,6 +93,7 @@ class PerceptionSupervisor:
         on_preview: called with preview images and point clouds, while `watch` wants them.
         on_calibration: called when a worker is ready, with its camera's calibration or None.
         on_path: called with every planned path.
+        record_as: name of the shared memory for processed frames, for a recorder; None: none.
     """
 
     def __init__(
@@ -104,8 +105,9 @@ class PerceptionSupervisor:
         on_preview: Callable[[Preview | CloudPreview], None] = lambda _: None,
         on_calibration: Callable[[CameraCalibration | None], None] = lambda _: None,
         on_path: Callable[[PlannedPath], None] = lambda _: None,
+        record_as: str | None = None,
     ) -> None:
-        self._settings = settings
+        self._settings, self._record_as = settings, record_as
         self._on_path = on_path
         self._on_calibration = on_calibration
         self._on_preview = on_preview
@@ -393,14 +395,14 @@ class PerceptionSupervisor:
             self._first_sequence = 0 if self._newest is None else self._newest.sequence + 1
 
     async def _spawn(self) -> PerceptionProcess:
-        settings = self._worker_settings()
+        settings, begin = self._worker_settings(), (self._tracks.next_id, self._record_as)
         if settings.source.uri != STANDARD_INPUT:
-            return await PerceptionProcess.spawn(settings, asyncio.subprocess.DEVNULL, self._tracks.next_id)
+            return await PerceptionProcess.spawn(settings, asyncio.subprocess.DEVNULL, *begin)
         if self._input is None:
             self._input = StandardInput(settings.source)
         descriptor = self._input.for_worker()
         try:
-            return await PerceptionProcess.spawn(settings, descriptor, self._tracks.next_id)
+            return await PerceptionProcess.spawn(settings, descriptor, *begin)
         finally:
             # The worker's copy must be the only one, else its death is not detected.
             os.close(descriptor)

@@ -128,6 +128,36 @@ class ControlChannel:
             os._exit(1)
 
 
+class ProcessedFrames:
+    """Gives a recorder the processed frames in shared memory, numbered without gaps.
+
+    Attributes:
+        newest_ns: capture of the frame that was processed last; set by the owner.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.newest_ns = -1
+        self._sharing: FrameSharing | None = FrameSharing(name)
+        self._count = 0
+
+    def write(self, frame: Frame) -> None:
+        """Give a frame, if it was processed; a failure ends the recording of images only."""
+        if self._sharing is None or frame.captured_ns != self.newest_ns:
+            return
+        try:
+            self._sharing.write(replace(frame, depth_m=None, sequence=self._count))
+            self._count += 1
+        except SourceError as error:
+            logger.warning("images are not recorded: %s", error)
+            self.close()
+
+    def close(self) -> None:
+        """Remove the shared memory."""
+        if self._sharing is not None:
+            self._sharing.close()
+        self._sharing = None
+
+
 @dataclass(frozen=True, slots=True)
 class Perception:
     """The opened parts of the worker."""
@@ -137,11 +167,14 @@ class Perception:
     recording: Recording | None
     preview: PreviewEncoder
     clouds: CloudEncoder
+    processed: ProcessedFrames | None = None
     plan: Callable[[Frame], None] = lambda frame: None
 
     def write(self, frame: Frame, detections: Detections) -> None:
         """Pass a frame, after its result was sent, to path planning, recording and previews."""
         self.plan(frame)
+        if self.processed is not None:
+            self.processed.write(frame)
         if self.recording is not None:
             self.recording.write(frame, detections)
         self.preview.write(frame, detections)
@@ -186,7 +219,7 @@ def _work(begin: Begin, control: ControlChannel, sender: ResultSender) -> Ended 
     with contextlib.ExitStack() as stack:
         try:
             with _heartbeat_while_loading(settings, sender):
-                perception = _open(settings, stack, sender)
+                perception = _open(begin, stack, sender)
         except (
             PluginError,
             SourceError,
@@ -251,7 +284,8 @@ def _heartbeat_while_loading(settings: Settings, sender: ResultSender) -> Iterat
         loaded.set()
 
 
-def _open(settings: Settings, stack: contextlib.ExitStack, sender: ResultSender) -> Perception:
+def _open(begin: Begin, stack: contextlib.ExitStack, sender: ResultSender) -> Perception:
+    settings = begin.settings
     load_plugins(settings.plugins.modules)
     recording = None
     if settings.recording.video is not None:
@@ -278,7 +312,11 @@ def _open(settings: Settings, stack: contextlib.ExitStack, sender: ResultSender)
     stack.callback(preview.close)
     clouds = CloudEncoder(settings.preview, settings.camera, sender.put_preview)
     stack.callback(clouds.close)
-    return Perception(source, detector, recording, preview, clouds)
+    processed = None
+    if begin.record_as is not None:
+        processed = ProcessedFrames(begin.record_as)
+        stack.callback(processed.close)
+    return Perception(source, detector, recording, preview, clouds, processed)
 
 
 def _planner(settings: Settings, control: ControlChannel, sender: ResultSender) -> Callable[[Frame], None]:
@@ -318,6 +356,8 @@ def _run(pipeline: Pipeline, perception: Perception, control: ControlChannel, se
 
     def deliver(result: PerceptionResult) -> None:
         nonlocal sent_s
+        if perception.processed is not None:
+            perception.processed.newest_ns = result.captured_ns
         sender.put_newest(Report(result, pipeline.frames, replaced=0))
         for answer in () if selection is None else selection.take_answers():
             sender.put(answer)

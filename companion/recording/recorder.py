@@ -6,8 +6,8 @@ import json
 import os
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -36,6 +36,7 @@ class LossesBody(TypedDict):
     lost_steps: int
     lost_link_pieces: int
     dropped_messages: int
+    dropped_images: int
     unread_messages: int
 
 
@@ -49,6 +50,8 @@ class RecorderOptions:
     Attributes:
         zenoh: settings of a client. vehicle: its name in the keys.
         images, clouds: record the preview images, the point clouds too.
+        frames: path of a camera's topic `image` → shared memory with its processed frames, which are recorded
+            as PNG instead of the preview images; empty: none.
     """
 
     zenoh: ZenohSection
@@ -59,10 +62,15 @@ class RecorderOptions:
     max_file_mb: int
     max_file_minutes: int
     max_total_mb: int
+    frames: Mapping[str, str] = field(default_factory=dict)
 
 
 class Recorder:
-    """Converts and writes messages. Messages may be added from any thread."""
+    """Converts and writes messages. Messages may be added from any thread.
+
+    Attributes:
+        dropped_images: PNG images that were not encoded, because encoding or writing was late.
+    """
 
     def __init__(self, options: RecorderOptions) -> None:
         self._writer = RecordingWriter(
@@ -75,6 +83,7 @@ class Recorder:
         self._converter = Converter(options.vehicle)
         self._waiting: deque[tuple[str, bytes, bytes | None]] = deque(maxlen=MAX_WAITING)
         self._added = self._taken = self._unread = 0
+        self.dropped_images = 0
         self._noted: LossesBody | None = None
         self._flush_due_s = 0.0
 
@@ -82,6 +91,11 @@ class Recorder:
     def path(self) -> Path:
         """The current file."""
         return self._writer.path
+
+    @property
+    def late(self) -> bool:
+        """Whether so much waits that images are left out."""
+        return len(self._waiting) > MAX_WAITING // 10
 
     def add(self, path: str, payload: bytes, attachment: bytes | None) -> None:
         """Queue a message; if the writer is late, the oldest is dropped."""
@@ -131,6 +145,7 @@ class Recorder:
             "lost_steps": self._converter.lost_steps,
             "lost_link_pieces": self._converter.lost_pieces,
             "dropped_messages": self._added - self._taken - len(self._waiting),
+            "dropped_images": self.dropped_images,
             "unread_messages": self._unread,
         }
         if note != self._noted:
@@ -140,7 +155,8 @@ class Recorder:
 
 def topics_of(options: RecorderOptions) -> list[Topic]:
     """Return the topics to subscribe to; the one that says that a recorder listens is the last."""
-    unwanted = [topic for topic, wanted in ((IMAGE, options.images), (CLOUD, options.clouds)) if not wanted]
+    images = options.images and not options.frames
+    unwanted = [topic for topic, wanted in ((IMAGE, images), (CLOUD, options.clouds)) if not wanted]
     topics = [topic for topic in TOPICS if topic not in unwanted]
     return [*topics, *(topic for topic in RECORDER_TOPICS if topic is not MAVLINK), MAVLINK]
 
@@ -181,9 +197,18 @@ def record(options: RecorderOptions, ending: Event, say: Callable[[str], None]) 
             )
 
         subscribers = subscribe_all(session, options.vehicle, topics_of(options), receive)
+        encoding = None
+        if options.frames:
+            from companion.recording.lossless import FrameEncoder  # OpenCV is not loaded without
+
+            encoding = FrameEncoder(options.frames, recorder)
         say(f"recording to {recorder.path}")
-        while not ending.wait(_POLL_S):
-            recorder.write()
+        try:
+            while not ending.wait(_POLL_S):
+                recorder.write()
+        finally:
+            if encoding is not None:
+                encoding.close()
         time.sleep(_LAST_S)
         for subscriber in subscribers:
             subscriber.undeclare()

@@ -10,12 +10,14 @@ from typing import Any
 
 from companion.bus.client import NoAnswerError, settings_for_child
 from companion.bus.config import BusError
+from companion.bus.topics import IMAGE
 from companion.child_process import child_process
 from companion.guidance.core import GuidanceOptions
 from companion.guidance.gimbal.controller import GimbalMounting
 from companion.guidance.limits.battery import BatteryMinimum
 from companion.guidance.limits.envelope import Limits
 from companion.guidance.limits.obstacles import ObstacleRules
+from companion.perception.cameras import recorded_frames_names
 from companion.settings import CameraSection, Settings
 from companion.vehicle.driver import Driver, OnBytes
 from companion.vehicle.drivers import open_driver
@@ -107,6 +109,9 @@ async def clients_of(settings: Settings, on_event: Callable[[str, str], None]) -
     if settings.recording.directory:
         keys = {"directory", "images", "clouds", "max_file_mb", "max_file_minutes", "max_total_mb"}
         programs["recorder"] = settings.recording.model_dump(include=keys)
+        programs["recorder"]["frames"] = {
+            IMAGE.path(camera): name for camera, name in recorded_frames_names(settings).items()
+        }
     if settings.foxglove.listen is not None:
         programs["foxglove"] = settings.foxglove.model_dump()
 

@@ -26,7 +26,9 @@ class RecordingSection(VideoSection):
     directory: str = ""
     """folder of the MCAP recordings, one per run (extra `recording`); empty: none"""
     images: bool = True
-    """record the preview images too"""
+    """record images too"""
+    image_format: Literal["jpeg", "png"] = "jpeg"
+    """jpeg: the preview images; png: each processed frame without losses, by the service's own recorder"""
     clouds: bool = False
     """record the point clouds of cameras with depth too; some 0.2 MB/s"""
     max_file_mb: Annotated[int, Field(ge=1, le=1_000_000)] = 1000

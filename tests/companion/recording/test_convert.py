@@ -7,6 +7,7 @@ import json
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+import cv2
 import jsonschema
 import numpy as np
 import pytest
@@ -252,6 +253,19 @@ def test_lost_steps_are_counted(converter: Converter) -> None:
     for step in (3, 4, 8):
         list(converter.convert("@record/guidance_input", dumps({"step": step, "now_ns": step})))
     assert (converter.first_step, converter.lost_steps) == (3, 3)
+
+
+def test_recorder_of_lossless_images_does_not_subscribe_to_the_preview() -> None:
+    options = RecorderOptions(ZenohSection(), "vehicle1", "", True, True, 1, 1, 1, {"image": "frames"})
+    names = [topic.name for topic in topics_of(options)]
+    assert ("image" in names, "cloud" in names) == (False, True)
+
+
+@pytest.mark.parametrize(("encoding", "kind"), [(".png", "png"), (".jpg", "jpeg")])
+def test_format_of_an_image_is_named(converter: Converter, encoding: str, kind: str) -> None:
+    _, encoded = cv2.imencode(encoding, np.zeros((4, 6, 3), np.uint8))
+    (message,) = converter.convert("image", encoded.tobytes(), b'{"captured_ns": 7}')
+    assert (message.channel.topic, json.loads(message.data)["format"]) == ("/image", kind)
 
 
 @pytest.mark.parametrize(("images", "clouds"), [(True, False), (False, True)])

@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import re
+import resource
 import signal
 import subprocess
 import sys
@@ -72,13 +73,18 @@ def layout_topics() -> set[str]:
     return {*re.findall(r'"(/\w+)"', text), *plotted}
 
 
-def test_flight_is_recorded_and_replays(filming: list[str], tmp_path: Path) -> None:
+def test_flight_is_recorded_and_replays(pictures: Path, exported_model: Path, tmp_path: Path) -> None:
+    """With lossless images: the model of the flight finds the same again, bit for bit."""
     folder = tmp_path / "recordings"
+    flags = [
+        *("--source", str(pictures), "--source-loop", "true", "--source-rate-hz", "5"),
+        *("--detector-model", str(exported_model), "--detector-runtime", "onnxruntime"),
+        *("--detector-image-size", "160", "--detector-confidence", "0", "--tracker-enabled", "false"),
+        *("--recording-directory", str(folder), "--recording-image-format", "png"),
+    ]
     with (
         running_simulator(parameters=QUICK_FLIGHT) as simulator,
-        running_service(
-            simulator.onboard_port, [*filming, "--recording-directory", str(folder)], cwd=tmp_path
-        ) as service,
+        running_service(simulator.onboard_port, flags, cwd=tmp_path) as service,
     ):
         service.take_off(2.5)
         assert service.command("hold")["success"]
@@ -101,6 +107,11 @@ def test_flight_is_recorded_and_replays(filming: list[str], tmp_path: Path) -> N
     result = replay([path], {})
     assert (result.first, result.inexact) == (None, [])
     assert result.steps == found["guidance_input"]
+    again = replay([path], {}, str(exported_model)).detections
+    assert again is not None
+    assert (again.image_formats, again.same_model) == (["png"], True)
+    assert again.images == again.identical_images > 20
+    assert again.recorded == again.replayed > again.images
     sent = mavutil.mavlink.MAVLink(None)
     names = Counter(
         message.get_type()
@@ -112,6 +123,32 @@ def test_flight_is_recorded_and_replays(filming: list[str], tmp_path: Path) -> N
         0 < names["SET_POSITION_TARGET_LOCAL_NED"] <= json.loads(last.data)["inputs"]["stream"]["sent_count"]
     )
     assert names["HEARTBEAT"]
+
+
+def test_full_disk_is_one_event_and_the_flight_goes_on(filming: list[str], tmp_path: Path) -> None:
+    """The limit of a file's size stands for a full disk: the same write fails, with EFBIG for ENOSPC."""
+    folder = tmp_path / "recordings"
+    with (
+        running_simulator(parameters=QUICK_FLIGHT) as simulator,
+        running_service(
+            simulator.onboard_port, [*filming, "--recording-directory", str(folder)], cwd=tmp_path
+        ) as service,
+    ):
+        service.take_off(2.5)
+        wait_for(lambda: files(folder))
+        recorder = recorder_of(service)
+        _, hard = resource.prlimit(recorder, resource.RLIMIT_FSIZE)
+        resource.prlimit(recorder, resource.RLIMIT_FSIZE, (files(folder)[0].stat().st_size, hard))
+        line = service.wait_for_line("cannot be written")
+        assert str(files(folder)[0]) in line
+        assert service.command("hold")["success"]
+        assert service.stop() == 0
+    assert [each for each in service.last_lines() if "recorder" in each].count(line) == 1
+    assert not [each for each in service.lines if "started again" in each]
+    (path,) = files(folder)
+    reader = RecordingReader(path)
+    assert len(list(reader.messages())) > 100
+    assert len(reader.problems) == 1  # it has no end
 
 
 def test_killed_recorder_leaves_a_file_and_is_started_again(filming: list[str], tmp_path: Path) -> None:
@@ -188,4 +225,5 @@ def test_recorder_joins_a_running_service(filming: list[str], tmp_path: Path) ->
         assert len(printed.splitlines()) == 2
     (path,) = files(folder)
     assert RecordingReader(path).problems == []
+    assert messages_of(path)["/image"]
     assert replay([path], {}).inexact
