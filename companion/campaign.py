@@ -12,6 +12,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import redirect_stdout
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -109,11 +110,13 @@ def _on_cluster(call: Callable[[int], Result], seeds: Sequence[int], address: st
         pending = [task.remote(*call.args, seed) for seed in seeds]
         for seed, result in zip(seeds, pending, strict=True):
             try:
-                yield ray.get(result)
+                with redirect_stdout(sys.stderr):  # Ray prints of workers that died
+                    value = ray.get(result)
             except ray.exceptions.RayTaskError as error:
                 raise error.cause from error
             except ray.exceptions.RayError as error:
                 raise SeedError(f"seed {seed}: no result from {address}: {_one_line(error)}") from error
+            yield value
     finally:
         ray.shutdown()
 
