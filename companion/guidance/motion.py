@@ -31,6 +31,9 @@ HOLD_INTEGRAL_GAIN = 0.4
 HOLD_INTEGRAL_MPS = 0.5
 # Farther away than this the error is remaining distance, not a disturbance to integrate.
 HOLD_INTEGRAL_M = 1.0
+# `VelocityBias`: natural frequency and damping of the observer, and the limits of its result and its error.
+BIAS_FREQUENCY_RADPS, BIAS_DAMPING = 1.2, 0.8
+MAX_BIAS_MPS, MAX_BIAS_ERROR_M = 0.5, 1.0
 # Arrived: within this distance of the goal and slower than this...
 ARRIVED_M = 0.3
 ARRIVED_MPS = 0.3
@@ -186,6 +189,43 @@ class PositionController:
         self._down_integral_mps = max(-HOLD_INTEGRAL_MPS, min(HOLD_INTEGRAL_MPS, integral)) if near else 0.0
         asked = wanted + HOLD_DOWN_VELOCITY_GAIN * (wanted - down_mps) + self._down_integral_mps
         return max(-top_speed_mps, min(top_speed_mps, asked))
+
+
+class VelocityBias:
+    """Difference between the rate of change of the estimated position and the estimated velocity.
+
+    PX4's estimates disagree by 0.2 m/s for tens of seconds (1.17, SIH). The vehicle flies its velocity
+    estimate to the setpoint, so its position drifts by the difference. A second-order observer, which gusts do
+    not disturb.
+    """
+
+    def __init__(self) -> None:
+        self._predicted_m: tuple[float, float] | None = None
+        self._bias_mps = (0.0, 0.0)
+
+    def update(self, state: VehicleState, dt_s: float) -> tuple[float, float]:
+        """North and east, local NED m/s, at most `MAX_BIAS_MPS`; 0 while position or velocity is unknown.
+
+        To be called in every step. dt_s: since the last call.
+        """
+        position, velocity = state.position_ned_m, state.velocity_ned_mps
+        if position is None or velocity is None:
+            self._predicted_m, self._bias_mps = None, (0.0, 0.0)
+            return self._bias_mps
+        predicted = self._predicted_m or position[:2]
+        error = (position[0] - predicted[0], position[1] - predicted[1])
+        if math.hypot(*error) > MAX_BIAS_ERROR_M:
+            predicted, error, self._bias_mps = position[:2], (0.0, 0.0), (0.0, 0.0)
+        gain = 2.0 * BIAS_DAMPING * BIAS_FREQUENCY_RADPS
+        north, east = (
+            p + (v + b + gain * e) * dt_s
+            for p, v, b, e in zip(predicted, velocity, self._bias_mps, error, strict=False)
+        )
+        self._predicted_m = (north, east)
+        bias = [b + BIAS_FREQUENCY_RADPS**2 * e * dt_s for b, e in zip(self._bias_mps, error, strict=True)]
+        shorten = min(1.0, MAX_BIAS_MPS / max(math.hypot(*bias), 1e-6))
+        self._bias_mps = (bias[0] * shorten, bias[1] * shorten)
+        return self._bias_mps
 
 
 class Arrival:

@@ -27,6 +27,7 @@ from companion.guidance.command import (
 )
 from companion.guidance.motion import (
     STOPPING_MPS2,
+    VelocityBias,
     correction,
     in_degrees,
     laps_text,
@@ -159,6 +160,7 @@ class OrbitBehaviour(Behaviour):
         self._flown_rad = 0.0
         self._out_mps = self._drag_mps2 = self._lead_rad = self._pace_mps = self._turning_mps2 = 0.0
         self._asked_mps = (0.0, 0.0)
+        self._bias = VelocityBias()
         self._until_ns: float = 0
 
     def on_activate(self, context: BehaviourContext) -> None:
@@ -167,6 +169,7 @@ class OrbitBehaviour(Behaviour):
         self._angle_rad, self._flown_rad = None, 0.0
         self._out_mps = self._drag_mps2 = self._lead_rad = self._pace_mps = self._turning_mps2 = 0.0
         self._asked_mps = (0.0, 0.0)
+        self._bias = VelocityBias()
         self._centre = None
         if self._subject is None:
             self._centre = (
@@ -205,16 +208,18 @@ class OrbitBehaviour(Behaviour):
                 (self._speed_mps, 0.0, correction(self._down_m - position[2])), context.now_ns
             )
         outward = (north / distance, east / distance)
-        velocity = context.state.velocity_ned_mps or (0.0, 0.0, 0.0)
-        out_mps = outward[0] * velocity[0] + outward[1] * velocity[1]
-        along_mps = self._turn * (outward[0] * velocity[1] - outward[1] * velocity[0])
+        bias = self._bias.update(context.state, dt_s)
+        measured = context.state.velocity_ned_mps or (0.0, 0.0, 0.0)
+        north_mps, east_mps = measured[0] + bias[0], measured[1] + bias[1]
+        out_mps = outward[0] * north_mps + outward[1] * east_mps
+        along_mps = self._turn * (outward[0] * east_mps - outward[1] * north_mps)
         self._adapt_pace(along_mps, distance, context.max_acceleration_mps2, dt_s)
         asked_out_mps, asked_along_mps = self._asked(self._radius_m - distance, out_mps, along_mps, dt_s)
         self._asked_mps = (asked_out_mps, asked_along_mps)
         around_mps = self._turn * asked_along_mps
         velocity = (
-            outward[0] * asked_out_mps - outward[1] * around_mps,
-            outward[1] * asked_out_mps + outward[0] * around_mps,
+            outward[0] * asked_out_mps - outward[1] * around_mps - bias[0],
+            outward[1] * asked_out_mps + outward[0] * around_mps - bias[1],
             correction(self._down_m - position[2]),
         )
         bearing = math.atan2(-east, -north)
