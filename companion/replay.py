@@ -242,8 +242,8 @@ def _step_all(
     for name, texts, times_s in zip(
         ("recording", "replay"), (found.events_recorded, found.events_replayed), times, strict=True
     ):
-        for text in texts:
-            timeline.add((name, text), times_s[text].pop(), f"event only in the {name}: {text}")
+        for message in texts:
+            timeline.add((name, message), times_s[message].pop(), f"event only in the {name}: {message}")
     found.timeline = timeline.sorted()
 
 

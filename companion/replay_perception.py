@@ -112,7 +112,8 @@ class PerceptionReplay:
         self._camera = PerceptionCamera(self._settings, name, self._detector.class_names)
         self._telemetry, self._history = CameraTelemetry(), StateHistory()
         self._limiters = RateLimiter(), RateLimiter()
-        self._source, self._pipeline, self._section = OneFrame(), None, ""
+        self._source, self._section = OneFrame(), ""
+        self._pipeline: Pipeline | None = None
         self._timeline = timeline
         self._seen_ns: int | None = None
         self._clock_ns = self._tracks = 0

@@ -144,11 +144,11 @@ class StateHistory:
     def extend(self, samples: HistorySamples) -> None:
         """Add samples of another history, newer than those here."""
         self._attitudes.extend(samples.attitudes)
+        self._forget(self._attitudes)
         self._positions.extend(samples.positions)
+        self._forget(self._positions)
         self._gimbal.extend(samples.gimbal)
-        for kind in (self._attitudes, self._positions, self._gimbal):
-            if kind:
-                self._forget(kind)
+        self._forget(self._gimbal)
 
     def at(self, stamp_ns: int) -> Pose:
         """The pose at a time: attitude by slerp, position by linear interpolation.
@@ -186,8 +186,7 @@ class StateHistory:
         return matrix_from_quaternion(slerp(first, second, fraction))
 
     def _forget(self, samples: deque[tuple[int, _Sample]]) -> None:
-        oldest_ns = samples[-1][0] - self._duration_ns
-        while samples[0][0] < oldest_ns:
+        while samples and samples[0][0] < samples[-1][0] - self._duration_ns:
             samples.popleft()
 
 

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from companion.perception.messages import Begin
 from companion.perception.worker import _open
 from companion.settings.reading import load_settings
 from vision.calibration.camera_info import write_camera_info
@@ -36,7 +37,7 @@ def test_frames_of_another_aspect_than_the_calibration_end_the_source(
         environment={},
     )
     with contextlib.ExitStack() as stack:
-        source = _open(settings, stack, Mock()).source
+        source = _open(Begin(settings), stack, Mock()).source
         if accepted:
             assert (frame := source.read()) is not None
             assert (frame.width, frame.height) == size

@@ -68,9 +68,8 @@ def recording(
         write(DETECTIONS, dumps(detections_message(result, "vehicle1", now_ns, model=model)))
         return result
 
-    if images:
-        (camera,) = flight.cameras
-        assert isinstance(camera, RenderedCamera)
+    camera = flight.cameras[0] if images else None
+    if isinstance(camera, RenderedCamera):
         detect = camera.perception.process
         camera.perception.process = process  # type: ignore[method-assign]
 
@@ -89,7 +88,7 @@ def recording(
         yield writer.path
     finally:
         flight.guidance.step = original  # type: ignore[method-assign]
-        if images:
+        if isinstance(camera, RenderedCamera):
             camera.perception.process = detect  # type: ignore[method-assign]
         writer.close()
 
