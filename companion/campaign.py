@@ -50,9 +50,9 @@ def map_seeds(
         ClusterError: Ray is not installed, or no cluster answers there.
         SeedError: the function raised, or `MAX_RETRIES` more workers died.
     """
-    call = partial(_named, function)
     if ray is not None:
-        return _on_cluster(call, seeds, ray)
+        return _on_cluster(function, seeds, ray)
+    call = partial(_named, function)
     if processes <= 1 or len(seeds) <= 1:
         return map(call, seeds)
     return _in_processes(call, seeds, processes)
@@ -103,11 +103,11 @@ def _in_processes(call: Callable[[int], Result], seeds: Sequence[int], processes
     raise SeedError(f"seed {seeds[done]}: no result, {1 + MAX_RETRIES} times a worker process died")
 
 
-def _on_cluster(call: Callable[[int], Result], seeds: Sequence[int], address: str) -> Iterator[Result]:
+def _on_cluster(function: Callable[[int], Result], seeds: Sequence[int], address: str) -> Iterator[Result]:
     ray = _connected(address)
     try:
-        task = ray.remote(call.func).options(num_cpus=1, max_retries=MAX_RETRIES)
-        pending = [task.remote(*call.args, seed) for seed in seeds]
+        task = ray.remote(_named).options(num_cpus=1, max_retries=MAX_RETRIES)
+        pending = [task.remote(function, seed) for seed in seeds]
         for seed, result in zip(seeds, pending, strict=True):
             try:
                 with redirect_stdout(sys.stderr):  # Ray prints of workers that died

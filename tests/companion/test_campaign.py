@@ -17,7 +17,6 @@ import pytest
 from typer.testing import CliRunner
 
 from benchmarks import flights
-from companion.bench.demo_flight import fly_demo
 from companion.campaign import MAX_RETRIES, ClusterError, SeedError, map_seeds, seeds_of
 from companion.cli import app
 from tests.companion.seed_functions import killed, killed_once, squared
@@ -116,11 +115,11 @@ def cluster() -> Iterator[str]:
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_cluster_gives_the_flights_of_one_and_of_two_processes(cluster: str) -> None:
-    fly, seeds = partial(fly_demo, synthetic=True), range(40, 43)
-    one = list(map_seeds(fly, seeds))
+    seeds = range(40, 43)
+    one = list(flights.fly("approach", seeds))
     assert [flight.seed for flight in one] == list(seeds)
-    assert list(map_seeds(fly, seeds, processes=2)) == one
-    assert list(map_seeds(fly, seeds, ray=cluster)) == one
+    assert list(flights.fly("approach", seeds, 2)) == one
+    assert list(flights.fly("approach", seeds, ray=cluster)) == one
 
 
 @pytest.mark.slow
