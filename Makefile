@@ -9,6 +9,8 @@ TORCH := --constraint constraints.txt $(if $(TORCH_INDEX),--index-url $(TORCH_IN
 # Tests at once: of those that compute, and of those that fly in real time and mostly wait.
 WORKERS ?= auto
 REALTIME_WORKERS ?= 6
+# The files with real-time tests: each of the workers imports what it is given.
+REALTIME = $(sort $(shell grep -rl mark.realtime tests --include='test_*.py'))
 BIN := $(VENV)/bin
 READY := $(VENV)/.installed
 
@@ -26,7 +28,7 @@ test test-slow: export PYTHONDONTWRITEBYTECODE =
 test: $(READY)
 	$(BIN)/python -m pytest tests/alone -m "not slow"
 	$(BIN)/python -m pytest --ignore tests/alone -n $(WORKERS) --dist worksteal -m "not realtime and not slow"
-	$(BIN)/python -m pytest --ignore tests/alone -n $(REALTIME_WORKERS) --dist worksteal -m "realtime and not slow" --reruns 1
+	$(BIN)/python -m pytest $(REALTIME) -n $(REALTIME_WORKERS) --dist worksteal -m "realtime and not slow" --reruns 1
 
 test-slow: $(READY)
 	$(BIN)/python -m pytest tests/alone -m slow

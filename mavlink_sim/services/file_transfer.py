@@ -459,9 +459,7 @@ class Server:
             raise RequestRefusedError(Failure.END_OF_FILE)
         return request.session, data
 
-    def _open(
-        self, request: Packet, content: bytes | bytearray, size: int, writable: bool
-    ) -> tuple[int, bytes]:
+    def _open(self, content: bytes | bytearray, size: int, writable: bool) -> tuple[int, bytes]:
         self._session = _Session(content, size, not writable, writable)
         self._burst = None
         return 0, struct.pack("<I", size)
@@ -469,17 +467,17 @@ class Server:
     def _open_read(self, request: Packet) -> tuple[int, bytes]:
         self._check_free()
         content = self._files.read(request.text)
-        return self._open(request, content, len(content), False)
+        return self._open(content, len(content), False)
 
     def _open_write(self, request: Packet) -> tuple[int, bytes]:
         self._check_free()
         content = self._files.create(request.text, truncate=False)
-        return self._open(request, content, len(content), True)
+        return self._open(content, len(content), True)
 
     def _create(self, request: Packet) -> tuple[int, bytes]:
         self._check_free()
         content = self._files.create(request.text, truncate=True)
-        return self._open(request, content, 0, True)
+        return self._open(content, 0, True)
 
     def _check_free(self) -> None:
         if self._session is not None:

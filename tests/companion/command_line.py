@@ -1,11 +1,16 @@
-"""Runs `companion` as a separate process, with its output and exit code."""
+"""Runs `companion` with its output and exit code: as a separate process, or in this one."""
 
 from __future__ import annotations
 
 import os
 import subprocess
 import sys
+from contextlib import chdir
 from pathlib import Path
+
+from typer.testing import CliRunner
+
+from companion.cli.commands import app
 
 COLUMNS = {"COLUMNS": "200", "NO_COLOR": "1"}
 
@@ -24,3 +29,18 @@ def companion(*arguments: str | Path, cwd: Path, timeout_s: float = 60.0) -> sub
         timeout=timeout_s,
         check=False,
     )
+
+
+def companion_here(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
+    """The same in this process, which saves half a second of imports.
+
+    Not for commands that keep running (`run`, `play`, `record`…): they set signal handlers and replace
+    standard error of the process.
+    """
+    command = [str(argument) for argument in arguments]
+    ours = {key: None for key in os.environ if key.startswith("COMPANION_")}
+    with chdir(cwd):
+        done = CliRunner().invoke(app, command, env=ours | COLUMNS)
+    if done.exception is not None and not isinstance(done.exception, SystemExit):
+        raise done.exception
+    return subprocess.CompletedProcess(command, done.exit_code, done.stdout, done.stderr)

@@ -2,25 +2,45 @@
 
 from __future__ import annotations
 
+import fcntl
+import os
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from vision.runtimes.export import export
-from vision.yolo.architecture import build
-from vision.yolo.checkpoint import save_checkpoint
-from vision.yolo.published import yolov8_description
+# torch is imported by the fixtures that need it: it takes longer than the collection of all tests.
+
+
+def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
+    """The file of that name, which the first of the parallel workers makes for all."""
+    base = factory.getbasetemp()
+    path = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / name
+    with path.with_suffix(".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not path.exists():
+            make(path)
+    return path
 
 
 @pytest.fixture(scope="session")
 def small_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A network with random weights."""
-    path = tmp_path_factory.mktemp("model") / "small.pt"
-    model = build(yolov8_description((1 / 3, 0.0625, 256), ("person", "car", "boat"))).eval()
-    save_checkpoint(path, model, metadata={"licence": "Apache-2.0"})
-    return path
+
+    def make(path: Path) -> None:
+        import torch
+
+        from vision.yolo.architecture import build
+        from vision.yolo.checkpoint import save_checkpoint
+        from vision.yolo.published import yolov8_description
+
+        torch.manual_seed(1)
+        model = build(yolov8_description((1 / 3, 0.0625, 256), ("person", "car", "boat"))).eval()
+        save_checkpoint(path, model, metadata={"licence": "Apache-2.0"})
+
+    return made_once(tmp_path_factory, "small.pt", make)
 
 
 @pytest.fixture(scope="session")
@@ -28,8 +48,13 @@ def exported_model(small_model: Path, tmp_path_factory: pytest.TempPathFactory) 
     """The same for ONNX Runtime: loading torch takes half of a worker's start."""
     for package in ("onnx", "onnxruntime"):
         pytest.importorskip(package, reason=f"{package} is an optional extra")
-    path = tmp_path_factory.mktemp("exported") / "small.onnx"
-    return export(small_model, "onnx", path, 160, model_family="YOLOv8")
+
+    def make(path: Path) -> None:
+        from vision.runtimes.export import export
+
+        export(small_model, "onnx", path, 160, model_family="YOLOv8")
+
+    return made_once(tmp_path_factory, "small.onnx", make)
 
 
 @pytest.fixture(scope="session")

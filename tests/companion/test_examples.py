@@ -165,6 +165,7 @@ def test_service_publishes_detections_of_plugins(
     assert all(pattern.match(line) for line in lines)
 
 
+@pytest.mark.vehicle(parameters=QUICK_FLIGHT)
 @pytest.mark.timeout(200)
 def test_square_is_flown_by_velocities(vehicle: RunningSimulator, filming: list[str], tmp_path: Path) -> None:
     with running_service(vehicle.onboard_port, filming, cwd=tmp_path) as service:

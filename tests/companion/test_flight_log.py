@@ -17,7 +17,7 @@ from companion.recording.encoding import dumps
 from companion.recording.files import RecordingReader
 from companion.recording.tap import run_record
 from companion.vehicle.state import FlightMode, VehicleState
-from tests.companion.command_line import companion
+from tests.companion.command_line import companion, companion_here
 from tests.companion.recording.lockstep_recording import new_writer
 
 SECOND_NS = 10**9
@@ -55,7 +55,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_show_lists_what_happened_in_order(path: Path, tmp_path: Path) -> None:
-    done = companion("log", "show", path, "--json", cwd=tmp_path)
+    done = companion_here("log", "show", path, "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     assert [(line["kind"], line["text"]) for line in found["lines"]] == [
@@ -69,7 +69,7 @@ def test_show_lists_what_happened_in_order(path: Path, tmp_path: Path) -> None:
     ]
     assert [flight["duration_s"] for flight in found["flights"]] == [4.0]
     assert (found["vehicle"], found["problems"]) == ("vehicle1", [])
-    text = companion("log", "show", path, cwd=tmp_path).stdout
+    text = companion_here("log", "show", path, cwd=tmp_path).stdout
     assert len(text.splitlines()) == 1 + len(found["lines"])
 
 
@@ -77,7 +77,7 @@ def test_list_has_a_line_for_each_file_and_one_for_a_bad_one(path: Path, tmp_pat
     (tmp_path / "a.mcap").write_bytes(path.read_bytes())
     (tmp_path / "b.mcap").write_bytes(path.read_bytes()[:1000])
     (tmp_path / "c.mcap").touch()
-    done = companion("log", "list", tmp_path, "--json", cwd=tmp_path)
+    done = companion_here("log", "list", tmp_path, "--json", cwd=tmp_path)
     assert done.returncode == 0
     found = [json.loads(line) for line in done.stdout.splitlines()]
     assert [Path(each["path"]).name for each in found] == ["a.mcap", "b.mcap"]
@@ -88,7 +88,7 @@ def test_list_has_a_line_for_each_file_and_one_for_a_bad_one(path: Path, tmp_pat
 
 def test_recover_writes_a_complete_file(path: Path, tmp_path: Path) -> None:
     (tmp_path / "cut.mcap").write_bytes(path.read_bytes()[:-400])  # in the summary: no message is lost
-    done = companion("log", "recover", "cut.mcap", "whole.mcap", cwd=tmp_path)
+    done = companion_here("log", "recover", "cut.mcap", "whole.mcap", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     with (tmp_path / "whole.mcap").open("rb") as whole:
         found = list(make_reader(whole).iter_messages())
@@ -97,7 +97,7 @@ def test_recover_writes_a_complete_file(path: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("command", [("list", "none"), ("show", "none"), ("recover", "none", "x.mcap")])
 def test_missing_path_is_one_line(command: tuple[str, ...], tmp_path: Path) -> None:
-    done = companion("log", *command, cwd=tmp_path)
+    done = companion_here("log", *command, cwd=tmp_path)
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
     assert done.stderr.startswith("companion: none: ")

@@ -12,7 +12,7 @@ import pytest
 from companion.preview import PreviewOptions, RateMeter, preview_source
 from mavlink_sim.testing import free_udp_ports, running_simulator
 from tests.companion.bus.message_check import check_message
-from tests.companion.command_line import companion
+from tests.companion.command_line import companion, companion_here
 from vision.sources import open_source
 
 pytestmark = pytest.mark.realtime
@@ -76,7 +76,7 @@ def test_every_frame_is_saved_with_its_lines(
 
 
 def test_preview_of_a_rotated_source(pictures: Path, tmp_path: Path) -> None:
-    done = companion(
+    done = companion_here(
         "preview", pictures, "--limit", "2", "--period", "0", "--source-rotate-deg", "90",
         "--source-name", "front", "--vehicle-name", "alpha", cwd=tmp_path,
     )  # fmt: skip
@@ -87,7 +87,7 @@ def test_preview_of_a_rotated_source(pictures: Path, tmp_path: Path) -> None:
 
 
 def test_bad_source_of_preview_is_one_line(tmp_path: Path) -> None:
-    done = companion("preview", "/dev/video98765", cwd=tmp_path)
+    done = companion_here("preview", "/dev/video98765", cwd=tmp_path)
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()
     assert line.startswith("companion: /dev/video98765: no such camera")
@@ -121,7 +121,7 @@ def test_preview_that_cannot_be_levelled_is_one_line(
     pictures: Path, tmp_path: Path, options: tuple[str, ...], part: str
 ) -> None:
     url = f"udpin://127.0.0.1:{free_udp_ports(1)[0]}"
-    done = companion("preview", pictures, *options, "--vehicle-url", url, cwd=tmp_path)
+    done = companion_here("preview", pictures, *options, "--vehicle-url", url, cwd=tmp_path)
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()
     assert part in line
@@ -168,10 +168,11 @@ def test_depth_prints_the_messages_of_its_topic(pictures: Path, depth: Path, tmp
     assert max(blue, green) < 90
 
 
-def test_depth_of_detections(pictures: Path, depth: Path, tmp_path: Path, small_model: Path) -> None:
+def test_depth_of_detections(pictures: Path, depth: Path, tmp_path: Path, exported_model: Path) -> None:
     done = companion(
         "depth", pictures, "--source-depth", depth, "--source-depth-scale", "0.002", "--limit", "1", "--json",
-        "--detect", "--detector-model", small_model, "--detector-confidence", "0",
+        "--detect", "--detector-model", exported_model, "--detector-runtime", "onnxruntime",
+        "--detector-confidence", "0",
         "--detector-image-size", "160", "--tracker-enabled", "false", cwd=tmp_path,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -196,7 +197,7 @@ def test_source_without_usable_depth_is_one_line(pictures: Path, depth: Path, tm
         (["--source-depth", tmp_path / "nothing"], "no such file"),
     )
     for options, words in cases:
-        done = companion("depth", pictures, *options, cwd=tmp_path)
+        done = companion_here("depth", pictures, *options, cwd=tmp_path)
         assert done.returncode == 2, done.stdout
         (line,) = done.stderr.splitlines()
         assert words in line

@@ -15,7 +15,7 @@ from companion.recording.convert import INPUT_CHANNEL, OUTPUT_CHANNEL, RUN_CHANN
 from companion.recording.files import Recorded
 from companion.replay import replay
 from companion.settings.reading import ConfigurationError
-from tests.companion.command_line import companion
+from tests.companion.command_line import companion_here
 from tests.companion.guidance.gimbal_flight import gimbal_flight, person
 from tests.companion.recording.lockstep_recording import recording, rewritten
 
@@ -83,7 +83,7 @@ def test_replay_equals_in_another_process(flown: Path, tmp_path: Path) -> None:
 
 
 def test_changed_setting_is_named_with_the_first_difference(flown: Path, tmp_path: Path) -> None:
-    done = companion(
+    done = companion_here(
         "replay", flown, "--set", "guidance.max_horizontal_speed_mps=0.5", "--json", cwd=tmp_path
     )
     assert done.returncode == 1, done.stderr
@@ -94,7 +94,7 @@ def test_changed_setting_is_named_with_the_first_difference(flown: Path, tmp_pat
     assert found["first"]["field"].startswith("setpoint.")
     assert found["first"]["recorded"] != found["first"]["replayed"]
     assert 0 < found["differing_steps"] <= found["steps"]
-    lines = companion("replay", flown, "--set", "guidance.max_horizontal_speed_mps=0.5", cwd=tmp_path)
+    lines = companion_here("replay", flown, "--set", "guidance.max_horizontal_speed_mps=0.5", cwd=tmp_path)
     assert f"step {found['first']['step']}," in lines.stdout
 
 
@@ -187,7 +187,7 @@ def test_parts_are_replayed_together(flown: Path, tmp_path: Path) -> None:
 
 def test_recording_of_another_version_is_one_line(flown: Path, tmp_path: Path) -> None:
     other = changed_run(flown, tmp_path, layout="0" * 12, version="9.9.9")
-    done = companion("replay", other, cwd=tmp_path)
+    done = companion_here("replay", other, cwd=tmp_path)
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
     assert "9.9.9" in done.stderr
@@ -198,7 +198,7 @@ def test_unknown_command_is_one_line(flown: Path, tmp_path: Path) -> None:
         text = message.data.replace(b'"text":"goto forward=900 right=0"', b'"text":"circle"')
         return message._replace(data=text)
 
-    done = companion("replay", rewritten(flown, tmp_path, change), cwd=tmp_path)
+    done = companion_here("replay", rewritten(flown, tmp_path, change), cwd=tmp_path)
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
     assert "circle" in done.stderr
@@ -207,7 +207,7 @@ def test_unknown_command_is_one_line(flown: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("content", [b"", b"text", b"\x89MCAP0\r\n"])
 def test_file_without_recording_is_one_line(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "file.mcap").write_bytes(content)
-    done = companion("replay", "file.mcap", cwd=tmp_path)
+    done = companion_here("replay", "file.mcap", cwd=tmp_path)
     assert done.returncode == 2
     assert done.stderr.startswith("companion: file.mcap: ")
     assert len(done.stderr.splitlines()) == 1

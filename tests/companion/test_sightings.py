@@ -17,7 +17,7 @@ from companion.guidance.core import GuidanceOptions
 from companion.recording.convert import Converter
 from companion.recording.encoding import dumps
 from companion.recording.tap import run_record
-from tests.companion.command_line import companion
+from tests.companion.command_line import companion_here
 from tests.companion.recording.lockstep_recording import new_writer
 
 SECOND_NS = 10**9
@@ -78,7 +78,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_geojson_has_each_track_once(path: Path, tmp_path: Path) -> None:
-    done = companion("sightings", path, "--geojson", cwd=tmp_path)
+    done = companion_here("sightings", path, "--geojson", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     assert found["type"] == "FeatureCollection"
@@ -111,7 +111,7 @@ def test_geojson_has_each_track_once(path: Path, tmp_path: Path) -> None:
 
 
 def test_ellipse_is_a_closed_counterclockwise_ring(path: Path, tmp_path: Path) -> None:
-    done = companion("sightings", path, "--geojson", cwd=tmp_path)
+    done = companion_here("sightings", path, "--geojson", cwd=tmp_path)
     (first, *_) = [f for f in json.loads(done.stdout)["features"] if f["properties"].get("error_ellipse")]
     assert first["properties"] == {"track_id": 1, "error_ellipse": 0.95}
     (ring,) = first["geometry"]["coordinates"]
@@ -126,7 +126,7 @@ def test_ellipse_is_a_closed_counterclockwise_ring(path: Path, tmp_path: Path) -
 
 
 def test_kml_has_points_times_and_ellipses(path: Path, tmp_path: Path) -> None:
-    done = companion("sightings", path, "--kml", cwd=tmp_path)
+    done = companion_here("sightings", path, "--kml", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     root = ElementTree.fromstring(done.stdout)
     assert root.tag == f"{KML}kml"
@@ -160,7 +160,7 @@ def test_bad_input_is_one_line_and_exit_code_two(path: Path, tmp_path: Path) -> 
         ((other, "--geojson"), "not an MCAP file"),
         ((writer.path, "--geojson"), "class_name"),
     ):
-        done = companion("sightings", *arguments, cwd=tmp_path)
+        done = companion_here("sightings", *arguments, cwd=tmp_path)
         assert done.returncode == 2
         assert done.stdout == ""
         assert len(done.stderr.splitlines()) == 1
@@ -170,5 +170,5 @@ def test_bad_input_is_one_line_and_exit_code_two(path: Path, tmp_path: Path) -> 
 def test_recording_without_tracks_gives_an_empty_collection(tmp_path: Path) -> None:
     writer = new_writer(tmp_path / "empty")
     writer.close()
-    done = companion("sightings", writer.path, "--geojson", cwd=tmp_path)
+    done = companion_here("sightings", writer.path, "--geojson", cwd=tmp_path)
     assert (done.returncode, json.loads(done.stdout)["features"]) == (0, [])

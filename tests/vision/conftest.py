@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
 from urllib.request import getproxies
 
 import pytest
 
-from tests.vision.foreign_checkpoints import FOREIGN, Classes, foreign_classes
+if TYPE_CHECKING:  # it imports torch, which tests of sources and tracking do without
+    from tests.vision.foreign_checkpoints import Classes
 
 
 @pytest.fixture
 def foreign(monkeypatch: pytest.MonkeyPatch) -> Classes:
     """Classes with the foreign library's names, importable only during a test."""
+    from tests.vision.foreign_checkpoints import FOREIGN, foreign_classes
+
     return foreign_classes(monkeypatch, FOREIGN)
 
 
 @pytest.fixture
 def early_foreign(monkeypatch: pytest.MonkeyPatch) -> Classes:
     """As in the first releases: all layers in one module."""
+    from tests.vision.foreign_checkpoints import FOREIGN, foreign_classes
+
     modules = {
         name: "ultralytics.nn.modules" if module.startswith("ultralytics.nn.modules") else module
         for name, module in FOREIGN.items()

@@ -222,7 +222,7 @@ class FollowBehaviour(Behaviour):
         closing = GAIN_PER_S * (self._range_m - self._distance_m)
         closing = max(-MOST_CLOSING_MPS, min(MOST_CLOSING_MPS, closing))
         circling = 0.0
-        goal_rad = self._goal_rad(track, towards_rad, dt_s)
+        goal_rad = self._goal_rad(track, dt_s)
         if goal_rad is not None:
             from_object_rad = wrap_angle(towards_rad + math.pi)
             missing_m = wrap_angle(goal_rad - from_object_rad) * max(self._range_m, 1.0)
@@ -231,7 +231,7 @@ class FollowBehaviour(Behaviour):
         c, s = math.cos(towards_rad), math.sin(towards_rad)
         return (north + closing * c + circling * s, east + closing * s - circling * c)
 
-    def _goal_rad(self, track: MovingTrack, towards_rad: float, dt_s: float) -> float | None:
+    def _goal_rad(self, track: MovingTrack, dt_s: float) -> float | None:
         """Goal bearing, seen from the object; None: anywhere on the circle."""
         if self._bearing == "here":
             return None

@@ -14,7 +14,7 @@ from companion.bus.schema import ALL_TOPICS, schema_of, topic_table, topics_mark
 from companion.guidance.formation.pose import ROLES
 from companion.guidance.targets.target import RangeSource
 from tests.companion.bus.message_check import check_message, closed, validator
-from tests.companion.command_line import companion
+from tests.companion.command_line import companion_here
 from vision.detections import TRACK_CONFIRMED, TRACK_NONE, TRACK_TENTATIVE
 from vision.tracking import TrackEventKind
 
@@ -90,10 +90,10 @@ def test_schema_files(tmp_path: Path) -> None:
 
 
 def test_topics_on_the_command_line(tmp_path: Path) -> None:
-    printed = companion("topics", "--json", cwd=tmp_path)
+    printed = companion_here("topics", "--json", cwd=tmp_path)
     assert [json.loads(line) for line in printed.stdout.splitlines()] == topic_table()
-    assert companion("topics", "--markdown", cwd=tmp_path).stdout == topics_markdown()
-    listed = companion("topics", "--schema", tmp_path / "schemas", cwd=tmp_path)
+    assert companion_here("topics", "--markdown", cwd=tmp_path).stdout == topics_markdown()
+    listed = companion_here("topics", "--schema", tmp_path / "schemas", cwd=tmp_path)
     assert len(listed.stdout.splitlines()) == len(ALL_TOPICS)
-    plain = companion("topics", cwd=tmp_path).stdout
+    plain = companion_here("topics", cwd=tmp_path).stdout
     assert all(topic.name in plain for topic in ALL_TOPICS)

@@ -24,7 +24,7 @@ from companion.cli import commands as companion_commands
 from companion.cli.commands import app
 from companion.guidance.command import COMMANDS
 from mavlink_sim.testing import free_port
-from tests.companion.command_line import companion
+from tests.companion.command_line import companion, companion_here
 
 pytestmark = pytest.mark.realtime
 
@@ -41,11 +41,12 @@ def one_line_of_bad_input(done: subprocess.CompletedProcess[str]) -> str:
     return lines[0]
 
 
-def test_detect_writes_one_json_object_per_frame(small_model: Path, pictures: Path, tmp_path: Path) -> None:
+def test_detect_writes_one_json_object_per_frame(
+    exported_model: Path, pictures: Path, tmp_path: Path
+) -> None:
     done = companion(
-        "detect", pictures, "--model", small_model, "--precision", "float32", "--image-size", "160",
-        "--confidence", "0", "--json", "--every", "3", "--limit", "4", "--save", tmp_path / "saved",
-        cwd=tmp_path,
+        "detect", pictures, "--model", exported_model, *ONNX, "--image-size", "160", "--confidence", "0",
+        "--json", "--every", "3", "--limit", "4", "--save", tmp_path / "saved", cwd=tmp_path,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     messages = [json.loads(line) for line in done.stdout.splitlines()]
@@ -72,7 +73,7 @@ def test_detect_writes_one_json_object_per_frame(small_model: Path, pictures: Pa
 def test_detect_reports_tracks_with_track_option(
     exported_model: Path, pictures: Path, tmp_path: Path
 ) -> None:
-    done = companion(
+    done = companion_here(
         "detect", pictures, "--model", exported_model, *ONNX, "--image-size", "160", "--confidence", "0",
         "--json", "--limit", "2", "--track", cwd=tmp_path,
     )  # fmt: skip
@@ -87,7 +88,7 @@ def test_detect_reports_tracks_with_track_option(
 def test_detect_without_json_writes_one_line_per_frame(
     exported_model: Path, pictures: Path, tmp_path: Path
 ) -> None:
-    done = companion(
+    done = companion_here(
         "detect",
         pictures,
         "--model",
@@ -120,7 +121,7 @@ def test_detect_reports_only_requested_classes(exported_model: Path, pictures: P
     common += ["--json", "--limit", "3"]
 
     def names(*more: str) -> set[str]:
-        lines = companion(*common, *more, cwd=tmp_path).stdout.splitlines()
+        lines = companion_here(*common, *more, cwd=tmp_path).stdout.splitlines()
         return {found["class_name"] for line in lines for found in json.loads(line)["detections"]}
 
     everything = names()
@@ -137,7 +138,7 @@ def test_truncated_checkpoint_is_one_line(small_model: Path, pictures: Path, tmp
     broken = tmp_path / "broken.pt"
     content = small_model.read_bytes()
     broken.write_bytes(content[: len(content) // 2])
-    line = one_line_of_bad_input(companion("detect", pictures, "--model", broken, cwd=tmp_path))
+    line = one_line_of_bad_input(companion_here("detect", pictures, "--model", broken, cwd=tmp_path))
     assert "broken.pt" in line
 
 
@@ -163,7 +164,7 @@ def test_unknown_class_is_one_line_with_nearest_names(
     exported_model: Path, pictures: Path, tmp_path: Path
 ) -> None:
     arguments: list[str | Path] = ["detect", pictures, "--model", exported_model, *ONNX, "--classes", "persn"]
-    line = one_line_of_bad_input(companion(*arguments, cwd=tmp_path))
+    line = one_line_of_bad_input(companion_here(*arguments, cwd=tmp_path))
     assert "'persn'" in line
     assert "person" in line
 
@@ -171,7 +172,9 @@ def test_unknown_class_is_one_line_with_nearest_names(
 def test_unreadable_video_is_one_line(exported_model: Path, tmp_path: Path) -> None:
     video = tmp_path / "broken.mp4"
     video.write_bytes(b"\0\0\0\x18ftypmp42" + bytes(1000))
-    line = one_line_of_bad_input(companion("detect", video, "--model", exported_model, *ONNX, cwd=tmp_path))
+    line = one_line_of_bad_input(
+        companion_here("detect", video, "--model", exported_model, *ONNX, cwd=tmp_path)
+    )
     assert "broken.mp4" in line
 
 
@@ -212,7 +215,7 @@ def test_send_without_a_service_is_one_line(tmp_path: Path) -> None:
 
 def test_config_merges_file_environment_and_flags(tmp_path: Path) -> None:
     (tmp_path / "companion.toml").write_text('[vehicle]\nname = "alpha"\n')
-    done = companion("config", "--detector-image-size", "320", "--source", "-", cwd=tmp_path)
+    done = companion_here("config", "--detector-image-size", "320", "--source", "-", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert 'name = "alpha"' in done.stdout
     assert "image_size = 320" in done.stdout
@@ -298,7 +301,7 @@ def test_help_of_send_has_flight_commands_and_few_settings() -> None:
 
 
 def test_echo_of_unknown_topic_lists_topics(tmp_path: Path) -> None:
-    line = one_line_of_bad_input(companion("echo", "bogus", cwd=tmp_path))
+    line = one_line_of_bad_input(companion_here("echo", "bogus", cwd=tmp_path))
     assert {topic.name for topic in TOPICS} <= set(re.findall(r"[a-z_]+", line))
 
 

@@ -19,7 +19,7 @@ from companion.guidance.missions.mission_file import (
 )
 from companion.guidance.missions.sequence import ABORT, END, LAND, RTL
 from mavlink_sim.testing import QUICK_FLIGHT, running_simulator
-from tests.companion.command_line import companion
+from tests.companion.command_line import companion, companion_here
 from tests.companion.service_process import running_service
 
 pytestmark = pytest.mark.realtime
@@ -196,20 +196,20 @@ def test_unreadable_file_is_reported(tmp_path: Path) -> None:
 
 def test_cli_checks_a_mission_and_prints_its_plan(exported_model: Path, tmp_path: Path) -> None:
     options = ("--check", "--model", exported_model, "--detector-runtime", "onnxruntime")
-    done = companion("mission", "demo", *options, cwd=tmp_path)
+    done = companion_here("mission", "demo", *options, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[:2] == [
         "mission demo: 5 steps",
         "1. takeoff altitude=4 → find; on failure → rtl",
     ]
     (tmp_path / "bad.toml").write_text("[[step]]\nname = 'look'\ndo = 'seek zebra'\n")
-    done = companion("mission", "bad.toml", *options, cwd=tmp_path)
+    done = companion_here("mission", "bad.toml", *options, cwd=tmp_path)
     assert done.returncode == 2
     assert done.stdout == ""
     assert done.stderr.startswith("companion: bad.toml: step 1 (look)")
     assert "'zebra'" in done.stderr
     assert done.stderr.count("\n") == 1
-    done = companion("mission", "demo", *options[:3], cwd=tmp_path)
+    done = companion_here("mission", "demo", *options[:3], cwd=tmp_path)
     assert done.returncode == 2
     assert "cannot run .onnx files" in done.stderr
 

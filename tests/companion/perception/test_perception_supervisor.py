@@ -212,9 +212,11 @@ def patterned(tmp_path: Path) -> Path:
     return folder
 
 
-async def test_selected_object_is_a_track_until_its_worker_ends(patterned: Path, tiny_model: Path) -> None:
+async def test_selected_object_is_a_track_until_its_worker_ends(
+    patterned: Path, exported_model: Path
+) -> None:
     # An untrained network has low confidences: nothing is detected.
-    settings = settings_of(patterned, tiny_model, **{"detector.confidence": "0.9"})
+    settings = settings_of(patterned, exported_model, **{"detector.confidence": "0.9"})
     async with supervised(settings) as (supervisor, recorder):
         await until(lambda: recorder.results)
         answer = await supervisor.select(SelectRequest((0.25, 0.25, 0.25, 0.25)))

@@ -138,22 +138,8 @@ def test_worker_receives_attitudes() -> None:
 # --- with real workers
 
 
-@pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    import torch
-
-    from vision.yolo.architecture import build
-    from vision.yolo.checkpoint import save_checkpoint
-    from vision.yolo.published import yolov8_description
-
-    torch.manual_seed(1)
-    path = tmp_path_factory.mktemp("model") / "tiny.pt"
-    save_checkpoint(path, build(yolov8_description((0.33, 0.125, 128), ("car", "person"))), metadata={})
-    return path
-
-
 @pytest.fixture
-def settings(tmp_path: Path, model: Path) -> Settings:
+def settings(tmp_path: Path, exported_model: Path) -> Settings:
     """A still image, in which an untrained network gives the same detections in every frame."""
     folder = tmp_path / "photos"
     folder.mkdir()
@@ -162,7 +148,8 @@ def settings(tmp_path: Path, model: Path) -> Settings:
         "source.uri": str(folder),
         "source.loop": "true",
         "source.rate_hz": "20",
-        "detector.model": str(model),
+        "detector.model": str(exported_model),
+        "detector.runtime": "onnxruntime",
         "detector.image_size": "64",
         "detector.threads": "1",
         "detector.precision": "float32",

@@ -19,7 +19,7 @@ from companion.recording import RecordingError
 from companion.recording.boot_clock import Boot, BootClock, align
 from companion.recording.files import RecordingReader
 from companion.recording.ulog import merge_ulog
-from tests.companion.command_line import companion
+from tests.companion.command_line import companion_here
 from tests.companion.recording.ulog_flight import (
     Flight,
     link_pieces,
@@ -163,7 +163,7 @@ def test_merged_file_has_the_recording_the_log_and_the_clock(tmp_path: Path) -> 
     flight = Flight(6)
     path, _ = write_recording(tmp_path, link_pieces(flight))
     write_ulog(tmp_path / "a.ulg", flight, 10.0, 50.0)
-    done = companion("log", "ulog", path, "a.ulg", "-o", "out.mcap", cwd=tmp_path)
+    done = companion_here("log", "ulog", path, "a.ulg", "-o", "out.mcap", cwd=tmp_path)
     assert (done.returncode, done.stderr, len(done.stdout.splitlines())) == (0, "", 3)
     with (tmp_path / "out.mcap").open("rb") as file:
         reader = make_reader(file)
@@ -179,10 +179,10 @@ def test_merged_file_has_the_recording_the_log_and_the_clock(tmp_path: Path) -> 
     assert copied == original
     ((_, entry),) = bodies(tmp_path / "out.mcap", "/log")
     assert (entry["level"], entry["message"], entry["name"]) == (3, "high wind", "ulog")
-    shown = json.loads(companion("log", "show", "out.mcap", "--json", cwd=tmp_path).stdout)
+    shown = json.loads(companion_here("log", "show", "out.mcap", "--json", cwd=tmp_path).stdout)
     assert [(line["kind"], line["text"]) for line in shown["lines"]] == [("ulog", "high wind")]
     assert shown["metadata"] == {metadata.name: metadata.metadata}
-    companion("log", "recover", "out.mcap", "again.mcap", cwd=tmp_path)
+    companion_here("log", "recover", "out.mcap", "again.mcap", cwd=tmp_path)
     assert (tmp_path / "again.mcap").read_bytes() == (tmp_path / "out.mcap").read_bytes()
 
 
@@ -192,7 +192,7 @@ def test_log_of_another_boot_or_time_is_refused(tmp_path: Path) -> None:
     write_ulog(tmp_path / "other.ulg", replace(flight, seed=8), 10.0, 50.0)
     write_ulog(tmp_path / "later.ulg", replace(flight, seconds=400.0), 300.0, 390.0)
     for name, word in (("other.ulg", "0 samples"), ("later.ulg", "boot time 340.0 to 430.0 s")):
-        done = companion("log", "ulog", path, name, "-o", "out.mcap", cwd=tmp_path)
+        done = companion_here("log", "ulog", path, name, "-o", "out.mcap", cwd=tmp_path)
         assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
         assert f"{name}: another flight" in done.stderr
         assert word in done.stderr

@@ -105,18 +105,17 @@ def iter_queue(messages: queue.Queue[dict[str, Any]]) -> list[dict[str, Any]]:
     return found
 
 
-def test_land_on_marker_needs_markers_and_a_camera_down(tmp_path: Path) -> None:
-    scene = tmp_path / "pad.toml"
-    scene.write_text(SCENE)
-    camera = f"pad-{uuid.uuid4().hex[:8]}"
-    with running_simulator(scene=scene, camera=camera) as simulator:
-        with running_service(simulator.onboard_port, flags(camera), cwd=tmp_path) as service:
-            refused = service.command("land-on-marker 7")
-            assert not refused["success"]
-            assert "markers.dictionary" in refused["reason"]
-        ahead = flags(camera, "--markers-dictionary", "4X4_50", "--camera-mount-pitch-deg", "-20")
-        with running_service(simulator.onboard_port, ahead, cwd=tmp_path) as service:
-            deadline_s = time.monotonic() + 20.0
-            while "mount_pitch_deg is -20" not in (refused := service.command("land-on-marker 7"))["reason"]:
-                assert time.monotonic() < deadline_s, refused
-            assert not refused["success"]
+def test_land_on_marker_needs_a_camera_down(filming: list[str], tmp_path: Path) -> None:
+    """Without markers at all it is refused in `test_land_on_marker`."""
+    ahead = [
+        *filming, "--markers-dictionary", "4X4_50", "--markers-size-m", "0.5",
+        "--camera-horizontal-fov-deg", "80", "--camera-mount-pitch-deg", "-20",
+    ]  # fmt: skip
+    with (
+        running_simulator() as simulator,
+        running_service(simulator.onboard_port, ahead, cwd=tmp_path) as service,
+    ):
+        deadline_s = time.monotonic() + 20.0
+        while "mount_pitch_deg is -20" not in (refused := service.command("land-on-marker 7"))["reason"]:
+            assert time.monotonic() < deadline_s, refused
+        assert not refused["success"]

@@ -35,8 +35,8 @@ place_m = [{north_m}, 0.2]
 yaw_deg = 180
 size_m = {size_m}
 [camera]
-width = 320
-height = 240
+width = 240
+height = 180
 horizontal_fov_deg = 80
 rate_hz = 10
 [camera.mount]

@@ -154,7 +154,7 @@ def test_killed_perception_worker_is_replaced_in_flight(seeing: list[str], tmp_p
         assert_ends_in_hold(service, simulator, signal.SIGINT)
 
 
-def test_lost_vehicle_is_reported_and_reconnected(filming: list[str], tmp_path: Path) -> None:
+def test_lost_vehicle_is_reconnected_and_held_at_shutdown(filming: list[str], tmp_path: Path) -> None:
     with (
         running_simulator(parameters=QUICK_FLIGHT) as first,
         running_service(first.onboard_port, filming, cwd=tmp_path) as service,
@@ -167,17 +167,9 @@ def test_lost_vehicle_is_reported_and_reconnected(filming: list[str], tmp_path: 
             onboard_port=first.onboard_port, onboard_bind=first.onboard_bind, parameters=QUICK_FLIGHT
         ) as second:
             service.wait_for_line("autopilot heartbeat received", after=count)
-            service.take_off(2.5)
+            fly(service)
             second.wait_for_event("takeoff")
-
-
-def test_shutdown_in_flight_switches_to_hold(filming: list[str], tmp_path: Path) -> None:
-    with (
-        running_simulator(parameters=QUICK_FLIGHT) as simulator,
-        running_service(simulator.onboard_port, filming, cwd=tmp_path) as service,
-    ):
-        fly(service)
-        assert_ends_in_hold(service, simulator, signal.SIGTERM)
+            assert_ends_in_hold(service, second, signal.SIGTERM)
 
 
 def test_frames_from_ffmpeg_on_standard_input(exported_model: Path, tmp_path: Path) -> None:
