@@ -8,6 +8,7 @@ surface seem nearest, so the point is where the surface begins without the noise
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vision.camera_model import MIN_COSINE, CameraModel
+from vision.tracking.association import overlaps
 
 # With a smaller share of pixels with known depth, these may belong to something else.
 MIN_KNOWN_FRACTION = 0.1
@@ -36,6 +38,9 @@ _FRONT_SIGMAS = 5.0
 # The noise is measured by the smaller differences of neighbours, this share of them, the others may be edges;
 # and the root mean square of that share of normal differences, in sigma.
 _SMOOTH_SHARE, _SMOOTH_RMS, _SMOOTH_MIN = 0.8, 0.6616, 8
+
+# Boxes that overlap by this IoU are of one object.
+SAME_OBJECT_IOU = 0.7
 
 # The depth at the centre is the median of a square: its side as a share of the image's shorter one, and its
 # least pixels.
@@ -89,6 +94,9 @@ def nearest_points(
     sky are excluded, and the remaining cells are sorted by horizontal range. The range of the nearest ones is
     their mean, less as much of their spread as their noise does not explain.
 
+    Where boxes overlap, a point of the object in front, whose box ends lower in the image, is not one of the
+    object behind: that one is measured where it is not hidden.
+
     Args:
         depth_m: (height, width) float32, metres along the optical axis; NaN, infinite or not above zero where
             unknown.
@@ -102,8 +110,33 @@ def nearest_points(
         (N, 3) float32 metres, optical frame (right, down, forward); NaN where too little of the box has known
         depth.
     """
-    points = [_nearest_point(depth_m, box, camera, down, lens_height_m) for box in np.asarray(xyxy).tolist()]
-    return np.array(points, np.float32).reshape(-1, 3)
+    boxes = np.asarray(xyxy, np.float64).reshape(-1, 4)
+    points = np.empty((len(boxes), 3))
+    for index, box in enumerate(boxes.tolist()):
+        points[index] = _nearest_point(depth_m, box, camera, down, lens_height_m)
+    for index, hiding in _hidden(points, boxes, camera):
+        visible_m = depth_m.copy()
+        for left, top, right, bottom in boxes[hiding].tolist():
+            columns, rows = _pixels(left, right, camera.width), _pixels(top, bottom, camera.height)
+            visible_m[slice(*rows), slice(*columns)] = np.nan
+        behind = _nearest_point(visible_m, boxes[index].tolist(), camera, down, lens_height_m)
+        if not np.isnan(behind).any():
+            points[index] = behind
+    return points.astype(np.float32)
+
+
+def _hidden(
+    points: NDArray[np.float64], boxes: NDArray[np.float64], camera: CameraModel
+) -> Iterator[tuple[int, NDArray[np.bool_]]]:
+    """Of the points that are in another object's box, of an object in front: index, (N,) the boxes in front."""
+    if len(boxes) < 2:
+        return
+    same = overlaps(boxes, boxes) >= SAME_OBJECT_IOU
+    pixels = camera.project(points) + 0.5  # to edges
+    inside = (pixels[:, None] >= boxes[:, :2]).all(axis=2) & (pixels[:, None] <= boxes[:, 2:]).all(axis=2)
+    in_front = (boxes[:, 3] > boxes[:, 3, None]) & ~same
+    for index in np.flatnonzero((inside & in_front).any(axis=1)).tolist():
+        yield index, in_front[index]
 
 
 def _nearest_point(
