@@ -203,6 +203,7 @@ def train_on_data(
         warmup_steps=max(1, min(100, steps // 10)),
         fixed_normalisation=True,
         average_decay=min(0.998, max(0.9, 1 - 10 / steps)),
+        new_classes=len(model.class_names) - len(loaded.class_names),
         seed=seed,
         threads=threads,
         workers=workers,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -101,6 +102,25 @@ def test_another_seed_gives_other_weights() -> None:
     assert not torch.equal(
         weights(train(SMALL, rectangles, silent)), weights(train(replace(SMALL, seed=1), rectangles, silent))
     )
+
+
+def test_weights_of_new_classes_learn_faster_by_the_rate() -> None:
+    one = replace(SMALL, stages=(Stage(96, 96, 8, 1),), average_decay=0.0)
+    start = train(one, rectangles, silent).model
+
+    def change(**settings: Any) -> dict[str, torch.Tensor]:
+        trained = train(replace(one, seed=1, **settings), rectangles, silent, start=start)
+        before, after = start.state_dict(), trained.model.state_dict()
+        return {name: (after[name] - before[name]).float() for name in before}
+
+    usual, faster = change(), change(new_classes=1, new_class_rate=10.0)
+    last = [name for name in usual if re.search(r"\.cv3\.\d\.2\.(weight|bias)$", name)]
+    assert len(last) == 6
+    for name in last:
+        assert usual[name][1].any()
+        usual[name][1] *= 10.0
+    for name, value in faster.items():
+        torch.testing.assert_close(value, usual[name], rtol=1e-3, atol=1e-6)
 
 
 def test_resumed_training_gives_uninterrupted_weights(tmp_path: Path) -> None:
