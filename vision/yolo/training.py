@@ -117,7 +117,7 @@ class TrainingSettings:
     gradient_limit: float = 10.0
     average_decay: float = 0.998
     new_classes: int = 0
-    new_class_rate: float = 10.0
+    new_class_rate: float = 30.0
     seed: int = 0
     augmentation: Augmentation = field(default_factory=Augmentation)
     threads: int = 1
