@@ -128,7 +128,7 @@ def nearest_points(
 def _hidden(
     points: NDArray[np.float64], boxes: NDArray[np.float64], camera: CameraModel
 ) -> Iterator[tuple[int, NDArray[np.bool_]]]:
-    """Of the points that are in another object's box, of an object in front: index, (N,) the boxes in front."""
+    """Indices of objects whose point lies in the box of one in front; with each, (N,) the boxes in front."""
     if len(boxes) < 2:
         return
     same = overlaps(boxes, boxes) >= SAME_OBJECT_IOU

@@ -195,8 +195,8 @@ class VelocityBias:
     """Difference between the rate of change of the estimated position and the estimated velocity.
 
     PX4's estimates disagree by 0.2 m/s for tens of seconds (1.17, SIH). The vehicle flies its velocity
-    estimate to the setpoint, so its position drifts by the difference. A second-order observer, which gusts do
-    not disturb.
+    estimate to the setpoint, so its position drifts by the difference. A second-order observer; gusts do not
+    disturb it.
     """
 
     def __init__(self) -> None:

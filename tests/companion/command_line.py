@@ -38,7 +38,7 @@ def companion_here(*arguments: str | Path, cwd: Path) -> subprocess.CompletedPro
     standard error of the process.
     """
     command = [str(argument) for argument in arguments]
-    ours = {key: None for key in os.environ if key.startswith("COMPANION_")}
+    ours: dict[str, str | None] = {key: None for key in os.environ if key.startswith("COMPANION_")}
     with chdir(cwd):
         done = CliRunner().invoke(app, command, env=ours | COLUMNS)
     if done.exception is not None and not isinstance(done.exception, SystemExit):

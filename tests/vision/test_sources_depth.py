@@ -78,7 +78,7 @@ def saved_exr(path: Path, channels: dict[str, NDArray[Any]]) -> Path:
 @pytest.mark.parametrize("names", [["V"], ["B", "G", "R", "Z"]])
 @pytest.mark.parametrize("dtype", [np.float32, np.float16])
 def test_openexr_depth_is_its_channel_or_z(tmp_path: Path, names: list[str], dtype: type) -> None:
-    channels = {name: np.full((2, 2), 9.0, dtype) for name in names}
+    channels: dict[str, NDArray[Any]] = {name: np.full((2, 2), 9.0, dtype) for name in names}
     channels[names[-1]] = METRES.astype(dtype)
     path = saved_exr(tmp_path / "a.exr", channels)
     with open_source(str(path), SourceSettings(as_depth=True)) as source:
