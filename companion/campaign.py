@@ -141,7 +141,8 @@ def _connected(address: str) -> Any:
             f"--ray {address}: no Ray cluster answers ({why}): `ray start` starts one"
         ) from error
     if asked.returncode != 0:
-        raise ClusterError(f"--ray {address}: {_one_line(asked.stderr[-300:])}")
+        message = asked.stderr.rpartition("Error: ")[2]
+        raise ClusterError(f"--ray {address}: {_one_line(message)}")
     root = Path(__file__).parents[1]
     modules = [str(root / name) for name in _PACKAGES if (root / name).is_dir()]
     try:
