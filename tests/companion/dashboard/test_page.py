@@ -48,6 +48,13 @@ class = "car"
 appearance = 4
 place_m = [14.0, 0.5]
 yaw_deg = 90
+[camera]
+width = 320
+height = 240
+horizontal_fov_deg = 70
+rate_hz = 10
+[camera.mount]
+pitch_deg = -20
 """
 BOXES = "[...cameras.values()].flatMap((camera) => camera.about ? camera.about.boxes : [])"
 REPLY = "document.querySelector('#reply').textContent"
@@ -80,6 +87,7 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServiceProcess
     folder = tmp_path_factory.mktemp("play")
     (folder / "car.toml").write_text(SCENE)
     flags = ("--scene", "car.toml", "--dashboard-listen", listen, "--detector-rate-hz", "8")
+    flags += ("--detector-image-size", "320")
     with playing(folder, *flags) as running:
         running.wait_for_line(f"dashboard: http://{listen}/", 60.0)
         running.url = f"http://{listen}/"
