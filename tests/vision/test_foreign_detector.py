@@ -424,6 +424,24 @@ def test_torchscript_that_calls_nms_says_how_to_export(
 REAL = Path(os.environ.get("COMPANION_TEST_EXPORTS", "/nonexistent"))
 
 
+@pytest.mark.parametrize(
+    ("marked", "precision"),
+    [
+        ({}, "float32"),
+        ({"args": {"half": True}}, "float16"),
+        ({"args": {"quantize": 8}}, "int8"),
+        ({"onnx.infer": "onnxruntime.quant"}, "int8"),
+    ],
+)
+def test_precision_of_a_file_is_its_own(tmp_path: Path, marked: dict[str, Any], precision: str) -> None:
+    metadata = stated(NAMES, (64, 96), **marked)
+    cells = np.zeros((1, 4 + len(NAMES), 126), np.float32)
+    source = read_source(constant_onnx(tmp_path / "net.onnx", {"output0": cells}, metadata=metadata))
+    assert source.foreign is not None
+    assert source.foreign.precision == precision
+    assert source.fixed_precision == (precision != "float32")
+
+
 @pytest.mark.skipif(not REAL.is_dir(), reason="COMPANION_TEST_EXPORTS names no folder of real exports")
 def test_real_exports_are_recognised() -> None:
     for path in sorted(REAL.iterdir()):

@@ -179,7 +179,13 @@ def _ultralytics(
     arguments = _literal(stated.get("args", {}))
     arguments = arguments if isinstance(arguments, dict) else {}
     selected = str(stated.get("end2end", "")) == "True" or bool(arguments.get("nms"))
-    half = image.dtype == "float16" or arguments.get("half") is True or arguments.get("quantize") == 16
+    precision = "float32"
+    if image.dtype == "float16" or arguments.get("half") is True or arguments.get("quantize") == 16:
+        precision = "float16"
+    # ONNX Runtime's quantiser keeps the exporter's metadata and adds a key.
+    quantised = stated.get("onnx.infer") == "onnxruntime.quant"
+    if quantised or arguments.get("int8") is True or arguments.get("quantize") == 8:
+        precision = "int8"
     layout = _cell_layout(outputs, len(names), task, stated, selected=selected)
     known = {"licence": "license", "version": "version", "date": "date", "about": "description"}
     return ForeignFacts(
@@ -191,7 +197,7 @@ def _ultralytics(
         fixed,
         Pixels(placement="stretch") if layout == "queries" else Pixels(),
         image.dtype,
-        "float16" if half else "float32",
+        precision,
         metadata={key: str(stated[name])[:200] for key, name in known.items() if name in stated},
     )
 

@@ -66,6 +66,10 @@ class ModelSource:
     @property
     def fixed_precision(self) -> bool:
         """Whether the precision is the file's, and `auto` the only one to request for every runtime."""
+        if self.foreign is not None:
+            # OpenVINO computes a file of float16 weights in any precision.
+            free = ("float32", "float16") if self.kind == "openvino" else ("float32",)
+            return self.foreign.precision not in free
         return self.kind == "tensorrt" or (self.facts is not None and self.facts.precision == "int8")
 
     def runners(self) -> tuple[RuntimeName, ...]:
