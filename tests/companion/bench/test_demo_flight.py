@@ -8,15 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from companion.bench.demo_flight import demos_summary, fly_demo
-from companion.campaign import seeds_of
 from companion.cli.commands import app
-
-
-def test_seeds_are_numbers_and_ranges() -> None:
-    assert seeds_of("1..3, 7,9..9") == [1, 2, 3, 7, 9]
-    for wrong in ("", "a", "3..1", "-1", "1..b"):
-        with pytest.raises(ValueError, match="seeds"):
-            seeds_of(wrong)
 
 
 def test_the_same_seed_gives_the_same_flight_on_the_command_line() -> None:
