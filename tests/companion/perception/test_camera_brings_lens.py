@@ -22,12 +22,16 @@ from vision.shared_frame import segment_path
 pytestmark = pytest.mark.realtime
 
 HEIGHT_M = 3.0
+# A ground that is made quickly.
+BARE = '[ground]\nkinds = ["concrete"]\ntile_texels = 256\ntexel_m = 0.05\n'
 
 
 @pytest.fixture(scope="module")
-def front() -> Iterator[str]:
+def front(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    scene = tmp_path_factory.mktemp("scene") / "bare.toml"
+    scene.write_text(BARE)
     name = f"test-lens-{os.getpid()}-{secrets.token_hex(4)}"
-    with running_simulator(camera=name):
+    with running_simulator(scene=scene, camera=name, camera_rate=5.0):
         yield name
     segment_path(name).unlink(missing_ok=True)
 

@@ -25,14 +25,14 @@ pytestmark = pytest.mark.realtime
 
 
 def test_two_models_on_one_camera_are_independent(
-    seeing: list[str], small_model: Path, tmp_path: Path
+    seeing: list[str], exported_model: Path, tmp_path: Path
 ) -> None:
     shared = f"companion-test-{secrets.token_hex(4)}"
     (tmp_path / "companion.toml").write_text(
         f'[source]\nshare = "{shared}"\n'
         f'[cameras.down.source]\nuri = "shm://{shared}"\n'
-        f"[cameras.down.detector]\nmodel = {str(small_model)!r}\nprecision = 'float32'\nimage_size = 96\n"
-        "classes = ['boat']\n"
+        f"[cameras.down.detector]\nmodel = {str(exported_model)!r}\nruntime = 'onnxruntime'\n"
+        "image_size = 96\nclasses = ['boat']\n"
     )
     received: queue.SimpleQueue[tuple[str, dict[str, Any]]] = queue.SimpleQueue()
 

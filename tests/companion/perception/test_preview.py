@@ -111,6 +111,8 @@ def test_clouds_are_rate_limited_and_on_demand() -> None:
 
 def test_clouds_only_with_a_subscriber(tmp_path: Path) -> None:
     camera = f"cloud-{uuid.uuid4().hex[:8]}"
+    scene = tmp_path / "bare.toml"
+    scene.write_text('[ground]\nkinds = ["concrete"]\ntile_texels = 256\ntexel_m = 0.05\n')
     flags = [
         *("--source", f"shm://{camera}", "--detector-enabled", "false"),
         *("--guidance-perception-max-age-s", "3"),
@@ -118,7 +120,7 @@ def test_clouds_only_with_a_subscriber(tmp_path: Path) -> None:
     samples: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
     statuses: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
     with (
-        running_simulator(camera=camera, seed=5) as simulator,
+        running_simulator(scene=scene, camera=camera, camera_rate=5.0, seed=5) as simulator,
         running_service(simulator.onboard_port, flags, cwd=tmp_path) as service,
         service.client() as session,
     ):
