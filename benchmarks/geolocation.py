@@ -10,10 +10,10 @@ of 5 cm. Errors: those of the simulated autopilot's estimate (those of PX4, see
 over a flight.
 
 The truth of a detection is a point in the direction of the object's middle, at the range of the nearest point
-of its surface; the object is the one whose true box agrees best. Of a track it is the mean of those, weighted
-as the track's position is. A part of a long object, where the image's edge or another object hides the rest,
-has its middle elsewhere: so the distance to the object's footprint is printed too, 0 on it. The range is the
-mean of the ranges.
+of its surface; the object is the one whose true box agrees best. Of a track it is these points fused as the
+track's positions are. Seen from elsewhere it is another point of a long object, and where something hides a
+part of the object the middle of the rest is elsewhere: so the distance to the object's footprint is printed
+too, 0 on it. The range is the mean of the ranges.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from companion.bench.lockstep_flight import LockstepFlight, camera_settings
 from companion.bench.rendered_camera import RenderedCamera, rendered_scene
 from companion.bench.synthetic_detector import SceneObject, ScenePose
 from companion.campaign import map_seeds, seeds_of
-from companion.guidance.targets.fused import FusedPosition
+from companion.guidance.targets.fused import FusedPosition, FusedTracks
 from companion.guidance.targets.target import Target
 from companion.vehicle.state import Vector3
 from mavlink_sim.camera.renderer import Rendered
@@ -58,7 +58,7 @@ MIN_FRAMES = 10
 
 @dataclass(frozen=True, slots=True)
 class Located:
-    """One track against the truth.
+    """One track against the truth. Detections that the image's edge may cut off are not fused, nor counted.
 
     Attributes:
         error_m: of the fused position. off_m: its distance to the object's footprint.
@@ -78,7 +78,7 @@ class Located:
 
 
 def flight_of(seed: int, *, depth: bool) -> list[Located]:
-    """The tracks of one flight that were seen in at least ten frames; the same seed gives the same."""
+    """The tracks of one flight that were seen whole in at least ten frames; the same seed gives the same."""
     rng = np.random.default_rng((seed, 57))
     placed = [_object(name, number, rng) for number, name in enumerate(SIZES_M)]
     scene, _ = rendered_scene(placed, CAMERA, MOUNT, seed, depth=depth)
@@ -127,28 +127,25 @@ def _object(name: str, number: int, rng: np.random.Generator) -> SceneObject:
 
 
 def _located(fused: FusedPosition, seen: list[tuple[Target, Vector3, Rendered]]) -> Located | None:
-    """The track against the object that most of its boxes show; None: fewer than ten show it."""
+    """The track against the object that most of its boxes show; None: fewer than ten show all of it."""
     truths = [_object_of(target, rendered) for target, _, rendered in seen]
     shown = [item for item in truths if item is not None]
     if not shown:
         return None
     identifier = Counter(item.identifier for item in shown).most_common(1)[0][0]
     of_object = [
-        (target, _truth(item, vehicle))
+        (target, _truth(item, vehicle), vehicle)
         for (target, vehicle, _), item in zip(seen, truths, strict=True)
-        if item is not None and item.identifier == identifier
+        if item is not None and item.identifier == identifier and not target.cut
     ]
     if len(of_object) < MIN_FRAMES:
         return None
     singles = [
         math.dist(target.position_ned_m[:2], truth)
-        for target, truth in of_object
+        for target, truth, _ in of_object
         if target.position_ned_m is not None
     ]
-    covariances = [target.position_covariance for target, _ in of_object]
-    weights = [np.linalg.inv(each) for each in covariances if each is not None]
-    weighted = sum(weight @ truth for weight, (_, truth) in zip(weights, of_object, strict=True))
-    truth = of_object[-1][1] if fused.moving else np.linalg.solve(sum(weights), weighted)
+    truth = of_object[-1][1] if fused.moving else _fused(of_object)
     error = np.array(fused.position_ned_m[:2]) - truth
     major_m, minor_m, orientation = fused.ellipse
     axis = np.array((math.cos(orientation), math.sin(orientation)))
@@ -157,13 +154,24 @@ def _located(fused: FusedPosition, seen: list[tuple[Target, Vector3, Rendered]])
     return Located(
         item.class_name,
         len(of_object),
-        round(float(np.mean([target.ground_range_m for target, _ in of_object])), 2),
+        round(float(np.mean([target.ground_range_m for target, _, _ in of_object])), 2),
         round(math.hypot(*error), 3),
         round(range_to(item, fused.position_ned_m), 3),
         round(float(np.median(singles)), 3),
         fused.moving,
         bool((along / major_m) ** 2 + (across / minor_m) ** 2 <= CHI_SQUARED_95),
     )
+
+
+def _fused(of_object: list[tuple[Target, NDArray[np.float64], Vector3]]) -> NDArray[np.float64]:
+    """(2,) the true points of a track's detections, fused as the track is."""
+    tracks, position = FusedTracks(), None
+    for target, (north, east), vehicle in of_object:
+        exact = replace(target, position_ned_m=(float(north), float(east), 0.0), track_id=0)
+        tracks.update([exact], vehicle, target.captured_ns)
+        position = tracks.position(0)
+    assert position is not None
+    return np.array(position.position_ned_m[:2])
 
 
 def _object_of(target: Target, rendered: Rendered) -> WorldObject | None:

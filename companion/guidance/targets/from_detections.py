@@ -24,6 +24,7 @@ from companion.guidance.targets.range_error import (
     PoseError,
     across_sigma_m,
     depth_sigma_m,
+    edge_sigma_px,
     ground_sigma_m,
     height_sigma_m,
     size_sigma_m,
@@ -44,8 +45,9 @@ _Sample = TypeVar("_Sample")
 HISTORY_S = 3.0
 # The nearest sample is used up to this far beyond the history; a quadrotor turns 10° in this time.
 MAX_OUTSIDE_S = 0.2
-# Within this many pixels a box touches the image edge; at the lower edge its ground contact is hidden.
-EDGE_PX = 2.0
+# Within this many pixels a box touches the image edge; at the lower edge its ground contact is hidden. Within
+# so many sigma of a detected edge the object may be cut off.
+EDGE_PX, CUT_SIGMAS = 2.0, 3.0
 # One degree of attitude error at this depression is half the range.
 MIN_DEPRESSION_RAD = math.radians(2.0)
 # Below this height the ground plane gives no range.
@@ -253,6 +255,7 @@ class _Sight(NamedTuple):
         on_ground: to the intersection of the middle of its lower edge with the ground.
         lens: to the optical centre.
         pixel_rad: depression of one row at the lower edge, radians.
+        column_slope: how much the range of the ground changes from column to column there, per metre of drop.
     """
 
     direction: list[float]
@@ -260,6 +263,7 @@ class _Sight(NamedTuple):
     on_ground: list[float]
     lens: list[float]
     pixel_rad: float
+    column_slope: float
 
 
 def _sights(
@@ -271,21 +275,30 @@ def _sights(
     left, top, right, bottom = np.array([detection["xyxy"] for detection in detections]).T - 0.5
     unknown = [math.nan] * 3
     nearest = np.array([detection["nearest_camera_m"] or unknown for detection in detections], np.float64)
-    pixels = np.empty((3 * count, 2))
+    pixels = np.empty((4 * count, 2))
     middle = (left + right) / 2
     contact = middle + _contact_px(right - left, bottom - top, _roll_rad(mount, pose))
-    pixels[:, 0] = np.concatenate([middle, contact, contact])
-    pixels[:, 1] = np.concatenate([(top + bottom) / 2, bottom, bottom + 1.0])
+    pixels[:, 0] = np.concatenate([middle, contact, contact, contact + 1.0])
+    pixels[:, 1] = np.concatenate([(top + bottom) / 2, bottom, bottom + 1.0, bottom])
     lines = PixelRays.of(camera, mount, pose.ned_from_body, pixels)
-    centres, feet, below = lines[:count], lines[count : 2 * count], lines[2 * count :]
+    centres, feet, below = lines[:count], lines[count : 2 * count], lines[2 * count : 3 * count]
     on_ground = feet.on_ground(pose.height_m, MIN_DEPRESSION_RAD)
     # Between two rays one row apart; the angle is too small for the arc cosine of their product.
     pixel_rad = np.linalg.norm(below.directions - feet.directions, axis=1)
     pixel_rad = np.where(np.isfinite(pixel_rad), pixel_rad, 1.0 / camera.fy)  # the lower edge has no rays
+    column_slope = np.abs(np.subtract(*(_cotangents(each) for each in (feet, lines[3 * count :]))))
     offsets = lines.camera_ned_m + nearest @ mount.ned_from_optical(pose.ned_from_body).T
-    of_each, lens = (centres.directions, offsets, on_ground, pixel_rad), lines.camera_ned_m.tolist()
+    lens = lines.camera_ned_m.tolist()
+    of_each = (centres.directions, offsets, on_ground, pixel_rad, column_slope)
     geometry = zip(*(values.tolist() for values in of_each), strict=True)
-    return [_Sight(direction, at, foot, lens, row_rad) for direction, at, foot, row_rad in geometry]
+    return [_Sight(*directions, lens, row_rad, slope) for *directions, row_rad, slope in geometry]
+
+
+def _cotangents(lines: PixelRays) -> NDArray[np.float64]:
+    """(N,) horizontal range of each ray for each metre that it goes down; NaN: it does not."""
+    north, east, down = lines.directions.T
+    ranges: NDArray[np.float64] = np.hypot(north, east) / np.where(down > 0.0, down, np.nan)
+    return ranges
 
 
 def _contact_px(
@@ -346,9 +359,14 @@ def _target(
     direction = sight.direction
     source, offset, sigma_m = RangeSource.NONE, [math.nan] * 3, math.nan
     whole_below = bottom < camera.height - 1 - EDGE_PX
-    inside = left > EDGE_PX and right < camera.width - EDGE_PX and whole_below
     box = BoxError(
-        sight.pixel_rad, right - left, bottom - top, camera.width, _roll_rad(mount, pose), not inside
+        sight.pixel_rad,
+        sight.column_slope,
+        right - left,
+        bottom - top,
+        camera.width,
+        _roll_rad(mount, pose),
+        _cut(detection["xyxy"], camera),
     )
     if all(map(math.isfinite, sight.nearest)):
         source = RangeSource.DEPTH
@@ -388,6 +406,13 @@ def _target(
         across_sigma_m=across_sigma_m(*_range_and_drop(offset, sight.lens), box, pose.error),
         vehicle_sigma_m=pose.error.horizontal_m,
     )
+
+
+def _cut(xyxy: Sequence[float], camera: CameraModel) -> bool:
+    """Whether the left, right or lower edge of the image may cut an object off, by its box."""
+    left, top, right, bottom = xyxy
+    margin_px = max(EDGE_PX, CUT_SIGMAS * edge_sigma_px(bottom - top, camera.width))
+    return min(left, camera.width - right, camera.height - bottom) <= margin_px
 
 
 def _range_and_drop(offset: list[float], lens: list[float]) -> tuple[float, float]:

@@ -21,6 +21,9 @@ MOVING_MPS, MOVING_SIGMA = 1.0, 3.0
 MEMORY_S = 5.0
 # A detection this many sigma from the fused position shows that the object has moved: the fusion restarts.
 RESTART_SIGMA = 3.0
+# A detection this many sigma from where the object was expected is left out: it may have the range of another
+# object in front. So many in a row show that the object was moved.
+OUTLIER_SIGMA, OUTLIERS = 5.0, 3
 # A track that was not seen for this long has ended (`tracker.max_age_s` is less by default).
 FORGET_S = 60.0
 
@@ -52,13 +55,23 @@ class _Track:
     """
 
     def __init__(self, target: Target, vehicle: Vector3, covariance: NDArray[np.float64]) -> None:
+        self._begin(target, vehicle, covariance)
+
+    def _begin(self, target: Target, vehicle: Vector3, covariance: NDArray[np.float64]) -> None:
         self._motion = Estimate.initialize(target, vehicle)
+        self._outliers = 0
         self._restart()
         self._add(target, covariance)
 
     def update(self, target: Target, vehicle: Vector3, covariance: NDArray[np.float64]) -> None:
         expected = self._motion.at(target.captured_ns)
-        self._motion = expected.update(expected.fit(target, vehicle))
+        fit = expected.fit(target, vehicle)
+        self._outliers = self._outliers + 1 if fit.squared > OUTLIER_SIGMA**2 else 0
+        if self._outliers:
+            if self._outliers == OUTLIERS:
+                self._begin(target, vehicle, covariance)
+            return
+        self._motion = expected.update(fit)
         if self.moving or self._disagrees(target, covariance):
             self._restart()
         self._forget((target.captured_ns - self._newest.captured_ns) / 1e9)
@@ -91,6 +104,10 @@ class _Track:
     @property
     def captured_ns(self) -> int:
         return self._newest.captured_ns
+
+    @property
+    def cut(self) -> bool:
+        return self._newest.cut
 
     def _fused(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Position and covariance of the mean information."""
@@ -135,7 +152,8 @@ class FusedTracks:
     def update(self, targets: Sequence[Target], vehicle: Vector3, now_ns: int) -> None:
         """Add the targets of one frame.
 
-        Where the image's edge cuts a box off, an object seems to move: such a target only begins a track.
+        Where the image's edge cuts a box off, an object seems to move: the position of such a target is only
+        used until the object is seen whole.
 
         Args:
             vehicle: its position at the capture, local NED.
@@ -146,7 +164,7 @@ class FusedTracks:
             if covariance is None or target.track_id is None or not target.trusted:
                 continue
             track = self._tracks.get(target.track_id)
-            if track is None:
+            if track is None or (track.cut and not target.cut):
                 self._tracks[target.track_id] = _Track(target, vehicle, covariance)
             elif target.captured_ns > track.captured_ns and not target.cut:
                 track.update(target, vehicle, covariance)

@@ -40,7 +40,7 @@ INSET_SIGMA_M = 0.2
 SIZE_SIGMA_SHARE = 0.1
 # The nearest point of a box cut off by the image's edge may be outside: by depth, by the ground.
 CUT_DEPTH_SIGMA_M, CUT_GROUND_SIGMA_M = 0.12, 0.4
-# Assumed: where an object touches the lower edge of its box in a rolled image, a share of the box's width;
+# Assumed: where an object touches the lower edge of its box, a share of the box's width;
 # depth of an object along the line of sight, as a share of its width.
 CONTACT_SIGMA, DEPTH_OF_WIDTH_SIGMA = 0.25, 0.4
 
@@ -64,12 +64,15 @@ class BoxError(NamedTuple):
 
     Attributes:
         pixel_rad: depression of one row, at the box's lower edge.
+        column_slope: by how much the range of the ground changes from column to column there, for each metre
+            that the ground is below the lens: the image is rolled, or the object is not in its middle.
         width_px, height_px: its size. image_width_px: of the whole image.
         roll_rad: between the image's rows and the horizontal.
         cut: the image's edge cuts it off.
     """
 
     pixel_rad: float
+    column_slope: float
     width_px: float
     height_px: float
     image_width_px: int
@@ -125,7 +128,8 @@ def ground_sigma_m(range_m: float, drop_m: float, box: BoxError, pose: PoseError
     # range = drop / tan(depression)
     per_rad = range_m**2 / drop_m + drop_m
     return math.hypot(
-        per_rad * math.hypot(box.contact_rad, pose.tilt_rad),
+        per_rad * math.hypot(box.edge_rad, pose.tilt_rad),
+        drop_m * box.column_slope * CONTACT_SIGMA * box.width_px,
         pose.height_m * range_m / drop_m,
         INSET_SIGMA_M,
         CUT_GROUND_SIGMA_M if box.cut else 0.0,

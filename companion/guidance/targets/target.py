@@ -49,7 +49,7 @@ class Target:
             not ambiguous, neither in this frame nor over its track.
         depth_m: along the camera's optical axis to the nearest surface; NaN without a depth image.
         distance_m: from the vehicle to the nearest surface; NaN when the range is unknown.
-        cut: the image's edge cuts the box off, so its centre is not the object's.
+        cut: the image's edge may cut the object off, so the box's centre is not the object's.
         range_sigma_m: one sigma of `ground_range_m`; NaN: not stated.
         across_sigma_m: the same across the line of sight, horizontal.
         vehicle_sigma_m: one sigma of the vehicle's own horizontal position, on each axis, common to all of

@@ -176,6 +176,26 @@ def test_object_that_leaves_the_image_keeps_its_position() -> None:
     assert not position_of(tracks).moving
 
 
+def test_cut_off_box_counts_until_the_object_is_seen_whole() -> None:
+    tracks, vehicle = FusedTracks(), (0.0, 0.0, -5.0)
+    for frame in range(3):
+        target = replace(seen(vehicle, (12.0, 3.0 if frame < 2 else 1.5), frame), cut=frame < 2)
+        tracks.update([target], vehicle, target.captured_ns)
+        assert position_of(tracks).position_ned_m[1] == pytest.approx(3.0 if frame < 2 else 1.5)
+
+
+def test_ranges_of_an_object_in_front_are_left_out() -> None:
+    tracks = FusedTracks()
+    for frame in range(40):
+        vehicle = (0.1 * frame, 0.0, -5.0)
+        hidden = frame in (10, 11, 25, 39)
+        target = seen(vehicle, (20.0, 0.0), frame, sigma_m=0.4, along_error_m=-5.0 if hidden else 0.0)
+        tracks.update([target], vehicle, target.captured_ns)
+        fused = position_of(tracks)
+        assert not fused.moving
+        assert fused.position_ned_m[:2] == pytest.approx((20.0, 0.0), abs=0.01)
+
+
 def test_only_trusted_tracks_with_a_range_are_fused() -> None:
     tracks, vehicle = FusedTracks(), (0.0, 0.0, -5.0)
     target = seen(vehicle, (10.0, 0.0), 0)
