@@ -231,6 +231,20 @@ def test_noise_does_not_bias_far_ranges(size_m: tuple[float, float, float]) -> N
     assert float(np.std(errors)) < 0.015
 
 
+def test_object_in_front_is_not_the_one_behind_it() -> None:
+    depth_m = depth_of(30.0)
+    depth_m[5:25, 10:50] = 18.0
+    depth_m[15:35, 20:40] = 14.0
+    behind, front = (10, 5, 50, 25), (20, 15, 40, 35)
+    both = nearest_points(depth_m, np.array([behind, front]), SMALL, LEVEL)[:, 2]
+    assert both.tolist() == pytest.approx([18.0, 14.0])
+    assert depth_at(depth_m, *behind) == pytest.approx(14.0)  # not detected
+    # Two boxes of one object hide nothing from each other, nor does a box that hides all of another.
+    for box in ((10, 5, 50, 27), (5, 5, 55, 40)):
+        found = nearest_points(depth_m, np.array([behind, box]), SMALL, LEVEL)[:, 2]
+        assert found.tolist() == pytest.approx([14.0, 14.0])
+
+
 def test_small_object_in_front_is_ignored() -> None:
     scene = cuboid_scene(north_m=10.0)
     left, top, *_ = map(int, scene.box)

@@ -245,6 +245,25 @@ def test_box_cut_by_the_edge_has_a_larger_sigma() -> None:
     assert (whole.cut, cut.cut) == (False, True)
 
 
+def test_box_within_the_error_of_its_edges_may_be_cut() -> None:
+    history = history_of(quaternion_from_euler(0.0, 0.0, 0.0))
+    boxes = [(left, 300, left + 60, 400) for left in (4, CAMERA.width - 64, 10, CAMERA.width - 70)]
+    found = targets_from_detections(list(map(detection, boxes)), T0, CAMERA, MOUNT, history)
+    assert [target.cut for target in found] == [True, True, False, False]
+
+
+def test_contact_of_a_wide_box_is_less_known_beside_the_middle() -> None:
+    history = history_of(quaternion_from_euler(0.0, 0.0, 0.0))
+    boxes = [(CAMERA.width / 2 - half, 300, CAMERA.width / 2 + half, 400) for half in (10, 80)]
+    boxes += [(left + 220, top, right + 220, bottom) for left, top, right, bottom in boxes]
+    found = targets_from_detections(list(map(detection, boxes)), T0, CAMERA, MOUNT, history)
+    narrow, wide, narrow_beside, wide_beside = [
+        target.range_sigma_m / target.ground_range_m**2 for target in found
+    ]
+    assert wide == pytest.approx(narrow, rel=0.02)
+    assert wide_beside > narrow_beside * 1.3
+
+
 @given(scene=scenes, tall_m=st.floats(0.8, 4.0))
 def test_foot_is_recovered_from_the_known_height(scene: Scene, tall_m: float) -> None:
     _, pitch, yaw, distance, _, height, (north, east) = scene
