@@ -291,7 +291,10 @@ def _sights(
     lens = lines.camera_ned_m.tolist()
     of_each = (centres.directions, offsets, on_ground, pixel_rad, column_slope)
     geometry = zip(*(values.tolist() for values in of_each), strict=True)
-    return [_Sight(*directions, lens, row_rad, slope) for *directions, row_rad, slope in geometry]
+    return [
+        _Sight(towards, nearest_ned_m, ground_ned_m, lens, row_rad, slope)
+        for towards, nearest_ned_m, ground_ned_m, row_rad, slope in geometry
+    ]
 
 
 def _cotangents(lines: PixelRays) -> NDArray[np.float64]:

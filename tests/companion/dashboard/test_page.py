@@ -86,9 +86,8 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServiceProcess
     listen = f"127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     folder = tmp_path_factory.mktemp("play")
     (folder / "car.toml").write_text(SCENE)
-    flags = ("--scene", "car.toml", "--dashboard-listen", listen, "--detector-rate-hz", "8")
-    flags += ("--detector-image-size", "320")
-    with playing(folder, *flags) as running:
+    detector = ("--detector-rate-hz", "8", "--detector-image-size", "320")
+    with playing(folder, "--scene", "car.toml", "--dashboard-listen", listen, *detector) as running:
         running.wait_for_line(f"dashboard: http://{listen}/", 60.0)
         running.url = f"http://{listen}/"
         yield running
