@@ -32,7 +32,7 @@ HOLD_INTEGRAL_MPS = 0.5
 # Farther away than this the error is remaining distance, not a disturbance to integrate.
 HOLD_INTEGRAL_M = 1.0
 # `VelocityBias`: natural frequency and damping of the observer, and the limits of its result and its error.
-BIAS_FREQUENCY_RADPS, BIAS_DAMPING = 1.2, 0.8
+BIAS_FREQUENCY_RADPS, BIAS_DAMPING = 0.8, 0.8
 MAX_BIAS_MPS, MAX_BIAS_ERROR_M = 0.5, 1.0
 # Arrived: within this distance of the goal and slower than this...
 ARRIVED_M = 0.3

@@ -78,9 +78,12 @@ def test_goto_arrives_and_stays(flight: Flight) -> None:
     flight.note("goto 15 m", time_s=took_s, error_after_2_s_m=error_m)
 
 
-def test_an_orbit_keeps_radius_speed_and_nose(flight: Flight) -> None:
+# 8 m at 4 m/s needs all the acceleration that the envelope allows: 3.7 m/s are flown.
+@pytest.mark.parametrize(("radius_m", "speed_mps", "laps"), [(10.0, 2.0, 1.2), (8.0, 4.0, 4.0)])
+def test_an_orbit_keeps_radius_speed_and_nose(
+    flight: Flight, radius_m: float, speed_mps: float, laps: float
+) -> None:
     link = flight.link
-    radius_m, speed_mps = 10.0, 2.0
     flight.take_off(HEIGHT_M)
     start = link.poses[-1]
     centre = (
@@ -88,7 +91,7 @@ def test_an_orbit_keeps_radius_speed_and_nose(flight: Flight) -> None:
         start.position_ned_m[1] + radius_m * math.sin(start.yaw_rad),
     )
     begun_s = time.monotonic()
-    flight.fly(f"orbit radius={radius_m:g} speed={speed_mps:g} laps=1.2")
+    flight.fly(f"orbit radius={radius_m:g} speed={speed_mps:g} laps={laps:g}")
     poses = link.flown(begun_s + 5.0)
     radius_errors = [abs(horizontal_m(pose, *centre) - radius_m) for pose in poses]
     nose_errors = [
@@ -102,12 +105,12 @@ def test_an_orbit_keeps_radius_speed_and_nose(flight: Flight) -> None:
     p50, p95 = np.percentile(radius_errors, [50, 95])
     speed = float(np.mean([pose.speed_mps for pose in poses]))
     nose_deg = math.degrees(float(np.percentile(nose_errors, 95)))
-    assert p50 < 0.8
-    assert p95 < 1.5
+    assert p50 < 0.4
+    assert p95 < 0.6
     assert speed == pytest.approx(speed_mps, rel=0.25)
     assert nose_deg < 20.0
     flight.note(
-        "orbit R 10 m at 2 m/s",
+        f"orbit R {radius_m:g} m at {speed_mps:g} m/s",
         radius_error_p50_m=float(p50),
         radius_error_p95_m=float(p95),
         speed_mps=speed,
