@@ -6,7 +6,6 @@ attitude and position of the capture time are used, interpolated from a short hi
 
 from __future__ import annotations
 
-import itertools
 import math
 from bisect import bisect_right
 from collections import deque
@@ -133,14 +132,17 @@ class StateHistory:
 
     def take_new(self) -> HistorySamples:
         """Return the samples added since the last call, for one caller: a recording."""
-        kinds = (self._attitudes, self._positions, self._gimbal)
+        attitude_ns, position_ns, gimbal_ns = self._taken_ns
         new = HistorySamples(
-            _after(self._attitudes, self._taken_ns[0]),
-            _after(self._positions, self._taken_ns[1]),
-            _after(self._gimbal, self._taken_ns[2]),
+            _after(self._attitudes, attitude_ns),
+            _after(self._positions, position_ns),
+            _after(self._gimbal, gimbal_ns),
         )
-        attitude_ns, position_ns, gimbal_ns = (kind[-1][0] if kind else 0 for kind in kinds)
-        self._taken_ns = (attitude_ns, position_ns, gimbal_ns)
+        self._taken_ns = (
+            _newest_ns(new.attitudes, attitude_ns),
+            _newest_ns(new.positions, position_ns),
+            _newest_ns(new.gimbal, gimbal_ns),
+        )
         return new
 
     def extend(self, samples: HistorySamples) -> None:
@@ -446,8 +448,16 @@ def _measurable(camera: CameraModel, top: float, bottom: float) -> bool:
 
 def _after(samples: deque[tuple[int, _Sample]], stamp_ns: int) -> tuple[tuple[int, _Sample], ...]:
     """The samples newer than a time, which are few."""
-    newer = itertools.takewhile(lambda sample: sample[0] > stamp_ns, reversed(samples))
-    return tuple(newer)[::-1]
+    newer: list[tuple[int, _Sample]] = []
+    for sample in reversed(samples):
+        if sample[0] <= stamp_ns:
+            break
+        newer.append(sample)
+    return tuple(reversed(newer))
+
+
+def _newest_ns(samples: tuple[tuple[int, _Sample], ...], before_ns: int) -> int:
+    return samples[-1][0] if samples else before_ns
 
 
 def _newer(samples: deque[tuple[int, _Sample]], stamp_ns: int) -> bool:
