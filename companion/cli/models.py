@@ -88,8 +88,8 @@ def pull(
     """Download an official model. Verifies its SHA-256 and resumes an interrupted download."""
     import difflib
 
-    from companion.models.catalog import KNOWN, LICENCE_NOTES
     from companion.models.pull import PullError, at_address, pull
+    from vision.catalog import KNOWN, LICENCE_NOTES
     from vision.model_files import models_folder
 
     known = KNOWN.get(name.removesuffix(".pt").removesuffix(".onnx"))

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from companion.models.catalog import KNOWN, known_by_digest
+from vision.catalog import KNOWN, known_by_digest
 from vision.detector import Detector
 from vision.model_files import kept_models
 from vision.runtimes.selection import RuntimeChoice

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from companion.models.catalog import KnownModel
+from vision.catalog import KnownModel
 from vision.yolo.checkpoint_pair import file_sha256
 
 _CHUNK_BYTES = 1 << 16

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vision.catalog import KNOWN
 from vision.foreign.layouts import YOLOX_SUFFIX, ForeignFacts
 from vision.model_files import models_folder
 from vision.runtimes.base import Precision, Runtime, RuntimeName, RuntimeUnusableError, installed
@@ -113,7 +114,7 @@ def read_source(path: Path) -> ModelSource:
             _model=loaded.model,
         )
     if not path.is_file():
-        raise RuntimeUnusableError(f"{path}: no such file")
+        raise RuntimeUnusableError(f"{path}: no such file; {_what_to_do(path)}")
     found = _facts(path, kind)
     if isinstance(found, ForeignFacts):
         strides = (found.stride,)
@@ -140,12 +141,12 @@ def _facts(path: Path, kind: ExportKind) -> ExportedFacts | ForeignFacts:
 
 
 def _what_to_do(path: Path) -> str:
+    absent = f"nor is it in the models folder {models_folder()}; `companion models"
+    if any(str(path) in (known.name, known.file) for known in KNOWN.values()):
+        return f"{absent} pull {path.stem}` downloads it"
     if path.suffix or path.name != str(path):
-        return "give the path of a .pt checkpoint, or of NAME.safetensors beside its NAME.yaml"
-    return (
-        f"nor is it in the models folder {models_folder()}; `companion models pull {path.name}` downloads "
-        "an official one, `companion models list` shows them"
-    )
+        return "give the path of a .pt checkpoint, of NAME.safetensors beside its NAME.yaml, or of an export"
+    return f"{absent} list` shows the models"
 
 
 def _file_in(folder: Path) -> Path:

@@ -49,10 +49,19 @@ def test_list_has_permissive_licences_first(folder: Path) -> None:
     assert run("list").splitlines()[1].startswith("Apache-2.0")
 
 
-def test_missing_name_says_how_to_pull_it(folder: Path) -> None:
-    result = CliRunner().invoke(app, ["detect", "photo.jpg", "--model", "yolov8n"])
+@pytest.mark.parametrize(
+    ("name", "command"),
+    [
+        ("yolov8n", "companion models pull yolov8n"),
+        ("yolov8n.pt", "companion models pull yolov8n"),
+        ("yolox_s.onnx", "companion models pull yolox_s"),
+        ("other", "companion models list"),
+    ],
+)
+def test_missing_name_says_how_to_get_a_model(folder: Path, name: str, command: str) -> None:
+    result = CliRunner().invoke(app, ["detect", "photo.jpg", "--model", name])
     assert result.exit_code == 2
-    assert "`companion models pull yolov8n`" in result.stderr
+    assert re.findall(r"`(companion .*?)`", result.stderr) == [command]
     assert str(folder) in result.stderr
 
 

@@ -13,8 +13,8 @@ import pytest
 from typer.testing import CliRunner
 
 from companion.cli import app
-from companion.models.catalog import KNOWN, KnownModel, known_by_digest
 from companion.models.pull import PullError, at_address, pull
+from vision.catalog import KNOWN, KnownModel, known_by_digest
 
 CONTENT = bytes(range(256)) * 2000
 DIGEST = hashlib.sha256(CONTENT).hexdigest()
