@@ -28,7 +28,7 @@ def play(
     vehicles: Annotated[
         int,
         typer.Option(
-            min=1, max=8, help="Number of simulated vehicles, one service each; up to 4 have a camera each."
+            min=1, max=20, help="Number of simulated vehicles, one service each; up to 4 have a camera each."
         ),
     ] = 1,
     seed: Annotated[int, typer.Option(min=0, help="Random seed of the world and the wind.")] = 1,
