@@ -38,9 +38,9 @@ def companion_here(*arguments: str | Path, cwd: Path) -> subprocess.CompletedPro
     standard error of the process.
     """
     command = [str(argument) for argument in arguments]
-    ours: dict[str, str | None] = {key: None for key in os.environ if key.startswith("COMPANION_")}
+    unset = {key: None for key in os.environ if key.startswith("COMPANION_")}
     with chdir(cwd):
-        done = CliRunner().invoke(app, command, env=ours | COLUMNS)
+        done = CliRunner().invoke(app, command, env={**unset, **COLUMNS})
     if done.exception is not None and not isinstance(done.exception, SystemExit):
         raise done.exception
     return subprocess.CompletedProcess(command, done.exit_code, done.stdout, done.stderr)

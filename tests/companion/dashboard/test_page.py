@@ -87,7 +87,8 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServiceProcess
     folder = tmp_path_factory.mktemp("play")
     (folder / "car.toml").write_text(SCENE)
     detector = ("--detector-rate-hz", "8", "--detector-image-size", "320")
-    with playing(folder, "--scene", "car.toml", "--dashboard-listen", listen, *detector) as running:
+    flags = ("--scene", "car.toml", "--dashboard-listen", listen, *detector)
+    with playing(folder, *flags) as running:
         running.wait_for_line(f"dashboard: http://{listen}/", 60.0)
         running.url = f"http://{listen}/"
         yield running
