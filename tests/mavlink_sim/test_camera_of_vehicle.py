@@ -32,6 +32,15 @@ pytestmark = [
 DEADLINE_S = 120.0
 LOWEST_EYE_M = -0.05
 """The renderer's least height of the camera (NED)."""
+SMALL = """
+[ground]
+kinds = ["concrete"]
+tile_texels = 256
+texel_m = 0.05
+[camera]
+width = 160
+height = 120
+"""
 
 
 @pytest.fixture
@@ -121,9 +130,17 @@ def test_a_port_in_use_is_refused(name: str) -> None:
     assert "in use" in line
 
 
-def test_no_autopilot_is_refused_after_ten_seconds(name: str) -> None:
+@pytest.fixture
+def small(tmp_path: Path) -> str:
+    """A scene that is made and rendered quickly."""
+    path = tmp_path / "small.toml"
+    path.write_text(SMALL)
+    return str(path)
+
+
+def test_no_autopilot_is_refused_after_ten_seconds(name: str, small: str) -> None:
     port = free_port()
-    finished = run("--vehicle-url", f"udpin://127.0.0.1:{port}", "--camera", name)
+    finished = run("--vehicle-url", f"udpin://127.0.0.1:{port}", "--camera", name, "--scene", small)
     assert finished.returncode == 2
     (line,) = finished.stderr.splitlines()
     assert "HEARTBEAT" in line
@@ -198,13 +215,16 @@ def test_listen_only_sends_nothing() -> None:
 
 
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
-def test_frames_are_drawn_from_another_autopilots_pose(name: str, tmp_path: Path, autopilot: str) -> None:
+def test_frames_are_drawn_from_another_autopilots_pose(
+    name: str, small: str, tmp_path: Path, autopilot: str
+) -> None:
     """Where each frame's eye is, against the simulator's own truth at the frame's stamp; then a lost pose."""
     seen, flight = tmp_path / "seen.jsonl", tmp_path / "flown.jsonl"
     with running_simulator(
         truth=tmp_path / "truth.jsonl", autopilot=autopilot, noise="off", gusts=0.0
     ) as sim:
         command = [sys.executable, "-m", "mavlink_sim", "camera", "--camera", name, "--camera-rate", "10"]
+        command += ["--scene", small]
         command += ["--vehicle-url", f"udpin://127.0.0.1:{sim.gcs_port}", "--origin", "0,0,0"]
         command += ["--camera-truth", str(seen), "--truth", str(flight)]
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
