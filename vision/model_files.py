@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from vision.catalog import KNOWN
+
 # Suffixes of model files, in the order in which a bare name is looked up.
 MODEL_SUFFIXES = (".safetensors", ".pt", ".onnx", ".pth")
 
@@ -41,3 +43,13 @@ def find_model(name: str | Path) -> Path:
         except OSError:  # an unreadable folder holds no model for us
             return path
     return path
+
+
+def missing_model_advice(path: Path) -> str:
+    """What to do about a model that `find_model` did not find."""
+    absent = f"nor is it in the models folder {models_folder()}; `companion models"
+    if any(str(path) in (known.name, known.file) for known in KNOWN.values()):
+        return f"{absent} pull {path.stem}` downloads it"
+    if path.suffix or path.name != str(path):
+        return "give the path of a .pt checkpoint, of NAME.safetensors beside its NAME.yaml, or of an export"
+    return f"{absent} list` shows the models"

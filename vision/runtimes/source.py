@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vision.catalog import KNOWN
 from vision.foreign.layouts import YOLOX_SUFFIX, ForeignFacts
-from vision.model_files import models_folder
+from vision.model_files import missing_model_advice
 from vision.runtimes.base import Precision, Runtime, RuntimeName, RuntimeUnusableError, installed
 from vision.runtimes.exported import SUFFIXES, ExportedFacts, ExportKind, kind_of
 from vision.yolo.level_outputs import Head
@@ -93,7 +92,7 @@ def read_source(path: Path) -> ModelSource:
     kind = kind_of(path)
     if kind is None:
         if not path.exists():  # checked before torch is imported
-            raise CheckpointError(f"{path}: no such file; {_what_to_do(path)}")
+            raise CheckpointError(f"{path}: no such file; {missing_model_advice(path)}")
         if path.suffix == YOLOX_SUFFIX:
             from vision.foreign.yolox import load_yolox
 
@@ -114,7 +113,7 @@ def read_source(path: Path) -> ModelSource:
             _model=loaded.model,
         )
     if not path.is_file():
-        raise RuntimeUnusableError(f"{path}: no such file; {_what_to_do(path)}")
+        raise RuntimeUnusableError(f"{path}: no such file; {missing_model_advice(path)}")
     found = _facts(path, kind)
     if isinstance(found, ForeignFacts):
         strides = (found.stride,)
@@ -138,15 +137,6 @@ def _facts(path: Path, kind: ExportKind) -> ExportedFacts | ForeignFacts:
     from vision.runtimes.openvino_runtime import openvino_facts
 
     return openvino_facts(path)
-
-
-def _what_to_do(path: Path) -> str:
-    absent = f"nor is it in the models folder {models_folder()}; `companion models"
-    if any(str(path) in (known.name, known.file) for known in KNOWN.values()):
-        return f"{absent} pull {path.stem}` downloads it"
-    if path.suffix or path.name != str(path):
-        return "give the path of a .pt checkpoint, of NAME.safetensors beside its NAME.yaml, or of an export"
-    return f"{absent} list` shows the models"
 
 
 def _file_in(folder: Path) -> Path:

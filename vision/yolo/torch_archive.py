@@ -15,6 +15,7 @@ from typing import Any, BinaryIO
 import torch
 from torch import Tensor
 
+from vision.model_files import missing_model_advice
 from vision.yolo.safe_pickle import (
     AllowedGlobal,
     CheckpointError,
@@ -141,7 +142,7 @@ def read_archive(path: str | Path) -> Any:
     except CheckpointError as error:
         raise type(error)(one_line(f"{path}: {error}")) from None
     except FileNotFoundError:
-        raise CheckpointError(f"{path}: no such file; give the path of a .pt checkpoint") from None
+        raise CheckpointError(f"{path}: no such file; {missing_model_advice(path)}") from None
     except IsADirectoryError:
         raise CheckpointError(f"{path}: is a folder; give the path of a .pt checkpoint") from None
     except OSError as error:

@@ -50,16 +50,17 @@ def test_list_has_permissive_licences_first(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "command"),
+    ("arguments", "command"),
     [
-        ("yolov8n", "companion models pull yolov8n"),
-        ("yolov8n.pt", "companion models pull yolov8n"),
-        ("yolox_s.onnx", "companion models pull yolox_s"),
-        ("other", "companion models list"),
+        (["detect", "photo.jpg", "--model", "yolov8n"], "companion models pull yolov8n"),
+        (["detect", "photo.jpg", "--model", "yolov8n.pt"], "companion models pull yolov8n"),
+        (["detect", "photo.jpg", "--model", "yolox_s.onnx"], "companion models pull yolox_s"),
+        (["detect", "photo.jpg", "--model", "other"], "companion models list"),
+        (["models", "verify", "yolo11n", "yolo11n.onnx"], "companion models pull yolo11n"),
     ],
 )
-def test_missing_name_says_how_to_get_a_model(folder: Path, name: str, command: str) -> None:
-    result = CliRunner().invoke(app, ["detect", "photo.jpg", "--model", name])
+def test_missing_name_says_how_to_get_a_model(folder: Path, arguments: list[str], command: str) -> None:
+    result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 2
     assert re.findall(r"`(companion .*?)`", result.stderr) == [command]
     assert str(folder) in result.stderr
