@@ -12,7 +12,7 @@ from mavlink_sim.environments.spaces import APPROACH_OBSERVATION, ORBIT_OBSERVAT
 
 START_BEARING_RAD = math.radians(30.0)
 WANTED_M = (4.5, 10.0)
-TARGET_HEIGHT_M = (0.3, 1.0)
+TARGET_HEIGHT_M = (0.3, 3.0)
 FARTHEST_M = 40.0
 NEAREST_M = 1.0
 SCALE_M = 30.0
@@ -29,6 +29,7 @@ class Approach(FlightTask):
 
     observation = APPROACH_OBSERVATION
     start_m: Range = (6.0, 30.0)
+    height_m = (1.5, 4.5)
 
     def __init__(self, count: int, model: str = "fast", **conditions: object) -> None:
         super().__init__(count, model, **conditions)

@@ -167,7 +167,7 @@ def test_bundled_policy_hands_back_at_heights_it_was_not_trained_at(height_m: fl
         vehicle,
         [SeenObject("car", 18.0, 0.0)],
     )
-    assert_failed(flight.run(10.0), "approach ended: target_up_m is -", "trained for -4.1 to 0.1 m")
+    assert_failed(flight.run(10.0), "approach ended: target_up_m is -", "trained for -4.4 to 2 m")
     assert math.hypot(*vehicle.position[:2]) < 0.5
 
 
@@ -198,7 +198,7 @@ def test_bundled_policy_brakes_a_second_after_losing_its_object() -> None:
         speeds[round(seconds, 1)] = math.hypot(*vehicle.velocity)
 
     flight = Flight(parse("policy approach class=car distance=6").build(NO_CONTEXT), vehicle, [car])
-    assert_failed(flight.run(20.0, each), "target_age_s is 4.6")
+    assert_failed(flight.run(20.0, each), "target_age_s is 5.0")
     assert speeds[3.9] > 1.5
     assert max(speed for seconds, speed in speeds.items() if seconds > 5.5) < 0.1
 
