@@ -33,7 +33,8 @@ HOLD_INTEGRAL_MPS = 0.5
 HOLD_INTEGRAL_M = 1.0
 # `VelocityBias`: natural frequency and damping of the observer, and the limits of its result and its error.
 BIAS_FREQUENCY_RADPS, BIAS_DAMPING = 0.8, 0.8
-MAX_BIAS_MPS, MAX_BIAS_ERROR_M = 0.5, 1.0
+# A larger error is a jump of the estimate: the observer begins anew.
+MAX_BIAS_MPS, MAX_BIAS_ERROR_M = 0.5, 0.5
 # Arrived: within this distance of the goal and slower than this...
 ARRIVED_M = 0.3
 ARRIVED_MPS = 0.3
@@ -196,7 +197,8 @@ class VelocityBias:
 
     PX4's estimates disagree by 0.2 m/s for tens of seconds (1.17, SIH). The vehicle flies its velocity
     estimate to the setpoint, so its position drifts by the difference. A second-order observer; gusts do not
-    disturb it.
+    disturb it. For circles, where a constant error turns in the circle's frame; elsewhere an integral of the
+    position error corrects it.
     """
 
     def __init__(self) -> None:

@@ -203,12 +203,12 @@ class OrbitBehaviour(Behaviour):
                 False, f"orbit timed out after {self._flown_rad / math.tau:.1f} of {self._laps:g} laps"
             )
 
+        bias = self._bias.update(context.state, dt_s)
         if distance < MIN_RADIUS_M:
             return Setpoint.velocity(
                 (self._speed_mps, 0.0, correction(self._down_m - position[2])), context.now_ns
             )
         outward = (north / distance, east / distance)
-        bias = self._bias.update(context.state, dt_s)
         measured = context.state.velocity_ned_mps or (0.0, 0.0, 0.0)
         north_mps, east_mps = measured[0] + bias[0], measured[1] + bias[1]
         out_mps = outward[0] * north_mps + outward[1] * east_mps
