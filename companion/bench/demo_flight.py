@@ -76,7 +76,9 @@ def fly_demo(seed: int, *, synthetic: bool = False) -> DemoFlight:
         synthetic: detections are made of the truth instead of drawn and looked for.
     """
     scene = scene_or_demo(None, seed)
-    settings = with_lens(session_settings(14540, "lockstep"), scene.camera)
+    # The precision `auto` is measured, and may be another one on another machine.
+    chosen = Settings.model_validate({"detector": {"precision": "float32"}})
+    settings = with_lens(session_settings(14540, "lockstep", chosen=chosen), scene.camera)
     vehicle = LockstepVehicle({"onboard": RATES_HZ}, seed=seed, parameters=dict(SIMULATOR_PARAMETERS))
     camera: Camera
     if synthetic:

@@ -387,8 +387,12 @@ def plain_settings(changes: Mapping[str, str] | None = None) -> Settings:
 def camera_settings(
     camera: CameraModel, mount: CameraMount, changes: Mapping[str, str] | None = None
 ) -> Settings:
-    """The same for a calibrated camera that is mounted so."""
+    """The same for a calibrated camera that is mounted so.
+
+    The network computes in float32: `auto` measures, and would select another precision on another machine.
+    """
     values = {
+        "detector.precision": "float32",
         "camera.fx_px": camera.fx,
         "camera.fy_px": camera.fy,
         "camera.cx_px": camera.cx,

@@ -16,9 +16,12 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from benchmarks import flights
+from benchmarks import flights, geolocation
+from companion.bench import demo_flight
+from companion.bench.lockstep_flight import camera_settings
 from companion.campaign import MAX_RETRIES, ClusterError, SeedError, map_seeds, seeds_of
 from companion.cli import app
+from companion.settings import Settings
 from tests.companion.seed_functions import killed, killed_once, squared
 
 SEEDS = range(6)
@@ -49,6 +52,21 @@ def test_a_seed_that_kills_every_process_is_named() -> None:
     results = map_seeds(killed, [1, 3], processes=2)
     with pytest.raises(SeedError, match=f"seed [13]: no result, {1 + MAX_RETRIES} times"):
         list(results)
+
+
+def test_detectors_of_campaigns_take_no_measured_choice(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What `auto` selects is measured, and differs between machines."""
+    taken: list[Settings] = [camera_settings(geolocation.CAMERA, geolocation.MOUNT)]
+
+    def camera(settings: Settings, *_: object, **__: object) -> None:
+        taken.append(settings)
+        raise InterruptedError
+
+    monkeypatch.setattr(demo_flight, "RenderedCamera", camera)
+    with pytest.raises(InterruptedError):
+        demo_flight.fly_demo(3)
+    assert [(each.detector.runtime, each.detector.precision) for each in taken] == [("torch", "float32")] * 2
+    assert taken[1].detector.threads == 1
 
 
 def test_missing_ray_is_one_line_that_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
