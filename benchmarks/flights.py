@@ -25,7 +25,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from companion.campaign import ClusterError, map_seeds
+from companion.campaign import ClusterError, SeedError, map_seeds, seeds_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,12 +137,32 @@ def flights_table(figures: dict[str, Any]) -> Table:
 
 def add_workers(parser: argparse.ArgumentParser) -> None:
     """The options of `map_seeds`."""
-    parser.add_argument("--processes", type=int, default=1, help="flights at once")
-    parser.add_argument("--ray", metavar="HOST:PORT", help="fly on this Ray cluster (extra cluster)")
+    workers = parser.add_mutually_exclusive_group()
+    workers.add_argument("--processes", type=_count, default=1, help="seeds at once")
+    workers.add_argument("--ray", metavar="HOST:PORT", help="run on this Ray cluster (extra cluster)")
+
+
+def add_seeds(parser: argparse.ArgumentParser, default: str) -> None:
+    """The option `--seeds`, and those of `map_seeds`."""
+    parser.add_argument("--seeds", type=_seeds, default=default, help="as 1..10, or 3,7,9..12")
+    add_workers(parser)
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"expected a number from 1, got {text!r}")
+    return int(text)
+
+
+def _seeds(text: str) -> list[int]:
+    try:
+        return seeds_of(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line. Returns the exit code: 2 for a flight or a cluster that does not exist."""
+    """The command line. Returns the exit code: 2 for no such flight or cluster, or a seed that fails."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.flights", description=__doc__)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("name", help=f"one of: {', '.join(flights())}")
@@ -156,7 +176,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         flown = fly(given.name, seeds, given.processes, ray=given.ray, rendered=given.rendered)
         figures = summary(given.name, list(flown))
-    except (UnknownFlightError, ClusterError) as error:
+    except (UnknownFlightError, ClusterError, SeedError) as error:
         print(error, file=sys.stderr)
         return 2
     if given.json:

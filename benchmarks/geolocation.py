@@ -21,18 +21,20 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import sys
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.flights import add_workers
+from benchmarks.flights import add_seeds
 from companion.bench.lockstep_flight import LockstepFlight, camera_settings
 from companion.bench.rendered_camera import RenderedCamera, rendered_scene
 from companion.bench.synthetic_detector import SceneObject, ScenePose
-from companion.campaign import map_seeds, seeds_of
+from companion.campaign import ClusterError, SeedError, map_seeds
 from companion.guidance.targets.fused import FusedPosition, FusedTracks
 from companion.guidance.targets.target import Target
 from companion.vehicle.state import Vector3
@@ -212,29 +214,33 @@ def summary(found: list[Located]) -> dict[str, float]:
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="Error of the positions of tracks")
-    parser.add_argument("--seeds", default="1..3", help="as 1..10")
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line. Returns the exit code: 2 for a cluster that does not exist, or a seed that fails."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.geolocation", description="Error of the positions of tracks"
+    )
+    add_seeds(parser, "1..3")
     parser.add_argument("--depth", action="store_true", help="a camera with depth")
     parser.add_argument(
         "--json", action="store_true", help="print one JSON object per flight, then the summary"
     )
-    add_workers(parser)
-    arguments = parser.parse_args()
-    seeds = seeds_of(arguments.seeds)
-    flights = map_seeds(
-        partial(flight_of, depth=arguments.depth), seeds, processes=arguments.processes, ray=arguments.ray
-    )
+    given = parser.parse_args(arguments)
     found = []
-    for seed, of_flight in zip(seeds, flights, strict=True):
-        found += of_flight
-        for each in of_flight:
-            print(
-                json.dumps({"seed": seed, **asdict(each)}) if arguments.json else f"{seed:3d} {each}",
-                flush=True,
-            )
+    try:
+        flights = map_seeds(
+            partial(flight_of, depth=given.depth), given.seeds, processes=given.processes, ray=given.ray
+        )
+        for seed, of_flight in zip(given.seeds, flights, strict=True):
+            found += of_flight
+            for each in of_flight:
+                row = json.dumps({"seed": seed, **asdict(each)}) if given.json else f"{seed:3d} {each}"
+                print(row, flush=True)
+    except (ClusterError, SeedError) as error:
+        print(error, file=sys.stderr)
+        return 2
     print(json.dumps(summary(found)))
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -9,6 +9,7 @@ import os
 import socket
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -24,6 +25,8 @@ Result = TypeVar("Result")
 MAX_RETRIES = 3
 # Ray itself tries an address where no cluster answers for many minutes.
 ANSWER_S = 20.0
+# Of a seed: the largest that numpy, torch and a training's steps added to it allow, rounded.
+MAX_SEED = 2**31
 # Sent to the workers, so that a cluster runs the code of this process.
 _PACKAGES = ("benchmarks", "companion", "mavlink_sim", "vision")
 
@@ -59,7 +62,7 @@ def map_seeds(
 
 
 def seeds_of(text: str) -> list[int]:
-    """`1..50` or `1,5,9..12` as numbers. Raises ValueError for what is none."""
+    """`1..50` or `1,5,9..12` as numbers. Raises ValueError for what is none, and for a seed given twice."""
     seeds: list[int] = []
     for part in text.split(","):
         first, dots, last = part.strip().partition("..")
@@ -68,9 +71,12 @@ def seeds_of(text: str) -> list[int]:
             high = int(last) if dots else low
         except ValueError:
             raise ValueError(f"seeds {text!r}: expected numbers and ranges such as 1..50 or 3,7") from None
-        if low < 0 or high < low:
-            raise ValueError(f"seeds {text!r}: {part.strip()} is no range of seeds from 0 up")
+        if not 0 <= low <= high <= MAX_SEED:
+            raise ValueError(f"seeds {text!r}: {part.strip()} is no range of seeds from 0 to {MAX_SEED}")
         seeds.extend(range(low, high + 1))
+    twice = next((seed for seed, count in Counter(seeds).items() if count > 1), None)
+    if twice is not None:
+        raise ValueError(f"seeds {text!r}: {twice} is given twice")
     return seeds
 
 

@@ -31,7 +31,7 @@ from companion.cli.flags import (
     EXIT_BAD_INPUT,
     Processes,
     RayAddress,
-    check_seeds_given,
+    check_seed_options,
     plain_errors,
     settings_command,
 )
@@ -232,6 +232,7 @@ async def _run_dashboard(settings: Settings, ready: asyncio.Event) -> None:
 
 @app.command()
 def demo(
+    context: typer.Context,
     duration: Annotated[
         float | None,
         typer.Option(min=20, help="Time limit, seconds. Default: 150, with --vehicle-url 300."),
@@ -261,13 +262,13 @@ def demo(
     The vehicle is the simulated one. With --vehicle-url it is another autopilot, disarmed on the ground, and
     the camera is rendered from the position it reports; its parameters are not changed.
     """
+    check_seed_options(context)
     if seeds is not None and vehicle_url is not None:
         typer.echo("companion: --seeds flies the simulated vehicle; remove --vehicle-url", err=True)
         raise typer.Exit(EXIT_BAD_INPUT)
     if seeds is not None:
         _fly_seeds(seeds, processes, ray, synthetic=synthetic, as_json=as_json)
         return
-    check_seeds_given(ray)
     from companion.bus.session import BusError
     from companion.demo import run_demo
     from companion.operator.line_output import LineOutput, use_for_standard_error
@@ -310,13 +311,13 @@ def _fly_seeds(text: str, processes: int, ray: str | None, *, synthetic: bool, a
     from rich.console import Console
 
     from companion.bench.demo_flight import demos_summary, demos_table, fly_demos
-    from companion.campaign import ClusterError, seeds_of
+    from companion.campaign import ClusterError, SeedError, seeds_of
 
     logging.basicConfig(level=logging.ERROR, format="companion: %(message)s", stream=sys.stderr)
     with plain_errors(ValueError):
         seeds = seeds_of(text)
     flights = []
-    with plain_errors(ClusterError):
+    with plain_errors(ClusterError, SeedError):
         for flight in fly_demos(seeds, processes=processes, ray=ray, synthetic=synthetic):
             flights.append(flight)
             outcome = "success" if flight.success else f"failed: {flight.failure}"

@@ -59,10 +59,22 @@ def check_finite(flag: str, *values: float) -> None:
         raise ValueError(f"{flag} must be finite, got {' '.join(f'{value:g}' for value in values)}")
 
 
-def check_seeds_given(ray: str | None) -> None:
-    """Exit with code 2 if --ray is given. To be called without --seeds."""
-    if ray is not None:
-        typer.echo("companion: --ray runs many seeds: add --seeds, such as --seeds 1..8", err=True)
+def check_seed_options(context: typer.Context) -> None:
+    """Exit with code 2 if --seed, --seeds, --processes and --ray of a command do not fit together."""
+    given = {
+        name
+        for name in ("seed", "seeds", "processes", "ray")
+        if (source := context.get_parameter_source(name)) is not None and source.name == "COMMANDLINE"
+    }
+    refused = None
+    if "seeds" not in given and (alone := given & {"processes", "ray"}):
+        refused = f"--{min(alone)} is for many seeds: add --seeds, such as --seeds 1..8"
+    elif {"seed", "seeds"} <= given:
+        refused = "--seed and --seeds were given: give one of them"
+    elif {"processes", "ray"} <= given:
+        refused = "--processes and --ray were given: a cluster decides how many seeds run at once"
+    if refused is not None:
+        typer.echo(f"companion: {refused}", err=True)
         raise typer.Exit(EXIT_BAD_INPUT)
 
 

@@ -7,15 +7,16 @@ from typing import Annotated
 
 import typer
 
-from companion.campaign import ClusterError, seeds_of
-from companion.cli.flags import EXIT_BAD_INPUT, Processes, RayAddress, check_seeds_given, plain_errors
+from companion.campaign import MAX_SEED, ClusterError, SeedError, seeds_of
+from companion.cli.flags import EXIT_BAD_INPUT, Processes, RayAddress, check_seed_options, plain_errors
 
 
 def train_policy(
+    context: typer.Context,
     environment: Annotated[str, typer.Argument(help="Environment, for example companion/Approach-v0.")],
     algorithm: Annotated[str, typer.Option(help="Algorithm: ppo or sac.")] = "ppo",
     steps: Annotated[int, typer.Option(min=1, help="Steps of the environment, in all.")] = 1_000_000,
-    seed: Annotated[int, typer.Option(min=0, max=2**31, help="Random seed of weights and episodes.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=MAX_SEED, help="Random seed of weights and episodes.")] = 0,
     seeds: Annotated[
         str | None, typer.Option(help="Train a policy for each seed, OUTPUT-SEED: 1..8, or 3,7,9..12.")
     ] = None,
@@ -25,15 +26,15 @@ def train_policy(
     output: Annotated[Path, typer.Option(help="Policy file to write.")] = Path("runs/policy.onnx"),
 ) -> None:
     """Train a policy in a simulated environment. Writes an ONNX file for the flight command `policy`."""
+    check_seed_options(context)
     try:
         from companion.guidance.policy_file import PolicyError
         from companion.train_policy import PolicyTrainingError, Training, train_policies, train_policy
     except ModuleNotFoundError as error:
         typer.echo(f"companion: train-policy: {error}: pip install 'mavlink-companion[rl]'", err=True)
         raise typer.Exit(EXIT_BAD_INPUT) from error
-    with plain_errors(PolicyTrainingError, PolicyError, ClusterError, ValueError, OSError):
+    with plain_errors(PolicyTrainingError, PolicyError, ClusterError, SeedError, ValueError, OSError):
         if seeds is None:
-            check_seeds_given(ray)
             _report(
                 output, train_policy(Training(environment, algorithm, seed), steps, output, resume=resume)
             )

@@ -9,7 +9,7 @@ import socket
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
@@ -30,7 +30,7 @@ SQUARES = [0, 1, 4, 9, 16, 25]
 
 def test_seeds_are_numbers_and_ranges() -> None:
     assert seeds_of("1..3, 7,9..9") == [1, 2, 3, 7, 9]
-    for wrong in ("", "a", "3..1", "-1", "1..b"):
+    for wrong in ("", "a", "3..1", "-1", "1..b", "1,1", "3,1..4", "99999999999", "0..99999999999"):
         with pytest.raises(ValueError, match="seeds"):
             seeds_of(wrong)
 
@@ -82,10 +82,52 @@ def test_missing_ray_is_one_line_that_names_the_extra(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize("command", [["demo"], ["train-policy", "companion/CartPole-v0"]])
-def test_a_cluster_without_seeds_is_refused(command: list[str]) -> None:
-    result = CliRunner().invoke(app, [*command, "--ray", "127.0.0.1:6379"])
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        ("--ray 127.0.0.1:6379", "--seeds"),
+        ("--processes 2", "--seeds"),
+        ("--seed 9 --seeds 1,2", "--seed and --seeds"),
+        ("--seeds 1,2 --processes 2 --ray 127.0.0.1:6379", "--processes and --ray"),
+        ("--seeds 1,1", "1 is given twice"),
+        ("--seeds 99999999999", "99999999999"),
+    ],
+)
+def test_contradicting_options_are_refused(command: list[str], options: str, named: str) -> None:
+    result = CliRunner().invoke(app, [*command, *options.split()])
     assert result.exit_code == 2
-    assert "--seeds" in result.stderr
+    assert named in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("main", "options"),
+    [
+        (geolocation.main, "--seeds a"),
+        (geolocation.main, "--seeds 2,2"),
+        (geolocation.main, "--processes 0"),
+        (flights.main, "approach --processes 2 --ray 127.0.0.1:6379"),
+    ],
+)
+def test_wrong_options_of_benchmarks_are_exit_code_2(
+    main: Callable[[list[str]], int], options: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as refused:
+        main(options.split())
+    assert refused.value.code == 2
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_failed_seed_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(flights, "flight_named", lambda _: squared)
+    assert flights.main(["approach", "--runs", "1", "--seed", "7"]) == 2
+    monkeypatch.setattr(geolocation, "flight_of", lambda seed, **_: squared(seed))
+    assert geolocation.main(["--seeds", "7"]) == 2
+    assert capsys.readouterr().err.splitlines() == ["seed 7: ValueError: no square of 7"] * 2
+    monkeypatch.setattr(demo_flight, "fly_demo", lambda seed, **_: squared(seed))
+    result = CliRunner().invoke(app, ["demo", "--seeds", "7"])
+    assert result.exit_code == 2
+    assert result.stderr.splitlines() == ["companion: seed 7: ValueError: no square of 7"]
 
 
 def test_address_without_a_cluster_is_refused_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
@@ -99,6 +141,7 @@ def test_address_without_a_cluster_is_refused_in_one_line(capsys: pytest.Capture
             assert address in str(refused.value)
             assert len(str(refused.value).splitlines()) == 1
         assert flights.main(["approach", "--runs", "1", "--ray", unused]) == 2
+        assert geolocation.main(["--seeds", "1", "--ray", unused]) == 2
     assert unused in capsys.readouterr().err
 
 

@@ -71,6 +71,17 @@ def test_policies_of_many_seeds_are_those_of_each_seed(tmp_path: Path) -> None:
         assert len(result.stderr.splitlines()) == 1
 
 
+def test_failed_training_of_a_seed_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: object) -> None:
+        raise RuntimeError("no policy")
+
+    monkeypatch.setattr(trainer, "judge", fails)
+    command = ["train-policy", "companion/CartPole-v0", "--steps", "256", "--seeds", "3"]
+    result = CliRunner().invoke(app, [*command, "--output", str(tmp_path / "policy.onnx")])
+    assert result.exit_code == 2
+    assert result.stderr.splitlines() == ["companion: seed 3: RuntimeError: no policy"]
+
+
 def test_training_resumes_with_its_state(tmp_path: Path) -> None:
     file, folder = tmp_path / "policy.onnx", tmp_path / "policy.onnx.training"
     with pytest.raises(PolicyTrainingError, match=r"no state of a training in .*policy.onnx.training"):
