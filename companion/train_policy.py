@@ -7,13 +7,11 @@ seed gives the same weights on one machine.
 
 from __future__ import annotations
 
-import io
 import math
 import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import redirect_stderr
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -81,7 +79,9 @@ class Training:
     seed: int
 
 
-def train_policy(training: Training, steps: int, output: Path, *, resume: bool = False) -> dict[str, float]:
+def train_policy(
+    training: Training, steps: int, output: Path, *, resume: bool = False, progress: str = ""
+) -> dict[str, float]:
     """Train, write the policy, and judge the written file.
 
     The state is kept in the folder `<output>.training`, with TensorBoard's files.
@@ -89,6 +89,7 @@ def train_policy(training: Training, steps: int, output: Path, *, resume: bool =
     Args:
         steps: of the environment, in all; rounded up to whole rollouts.
         resume: go on from the state.
+        progress: begins every line of the progress, which is then no bar.
 
     Returns:
         means over `JUDGED_EPISODES` unseen episodes: `return`, `steps`, and the task's measures at the end.
@@ -117,7 +118,7 @@ def train_policy(training: Training, steps: int, output: Path, *, resume: bool =
     # The random numbers of a resumed training depend on its seed and its step alone.
     model.set_random_seed(training.seed + model.num_timesteps)
     if model.num_timesteps < steps:
-        with _Display(steps) as display:
+        with _Display(steps, progress) as display:
             model.learn(
                 steps - model.num_timesteps,
                 _Checkpoints(training, folder, display),
@@ -144,26 +145,39 @@ def train_policies(
     steps: int,
     output: Path,
     *,
+    resume: bool = False,
     processes: int = 1,
     ray: str | None = None,
 ) -> Iterator[tuple[Path, dict[str, float]]]:
     """Train and judge a policy for each seed, as `train_policy` does, several at once; see `map_seeds`.
 
-    A training runs in one worker, from the first step: one that dies takes no half of a training with it.
+    On this machine each training keeps its state beside its output, and one whose process dies goes on from
+    it. A machine of a cluster keeps none.
+
+    Args:
+        resume: go on from the states that there are; seeds without one begin.
 
     Yields:
         for each seed the file, `<stem of output>-<seed>`, and its figures.
 
     Raises:
-        PolicyTrainingError: as `train_policy`, before the first training.
+        PolicyTrainingError: as `train_policy`, before the first training; to resume on a cluster.
     """
     _algorithm(algorithm)
     make_environment(environment, 1)
     files = [_of_seed(output, seed) for seed in seeds]
-    for file in files:
-        _check_no_state(_folder_of(file))
-    train = partial(_train_in_worker, environment, algorithm, steps, output.name)
-    trained = map_seeds(train, seeds, processes=processes, ray=ray)
+    if not resume:
+        for file in files:
+            _check_no_state(_folder_of(file))
+    elif ray is not None:
+        raise PolicyTrainingError("--resume goes on from states on this machine: remove --ray")
+    elif not any((_folder_of(file) / _STATE).exists() for file in files):
+        raise PolicyTrainingError(f"--resume: no state of a training of these seeds beside {output}")
+    if ray is None:
+        train = partial(_train_beside, environment, algorithm, steps, output)
+        yield from zip(files, map_seeds(train, seeds, processes=processes), strict=True)
+        return
+    trained = map_seeds(partial(_train_away, environment, algorithm, steps, output.name), seeds, ray=ray)
     for file, (figures, written) in zip(files, trained, strict=True):
         for name, content in written.items():
             path = output.parent / name
@@ -172,13 +186,20 @@ def train_policies(
         yield file, figures
 
 
-def _train_in_worker(
+def _train_beside(environment: str, algorithm: str, steps: int, output: Path, seed: int) -> dict[str, float]:
+    file = _of_seed(output, seed)
+    # There is a state if one is resumed, or the process that wrote it died.
+    resume = (_folder_of(file) / _STATE).exists()
+    training = Training(environment, algorithm, seed)
+    return train_policy(training, steps, file, resume=resume, progress=f"seed {seed}: ")
+
+
+def _train_away(
     environment: str, algorithm: str, steps: int, name: str, seed: int
 ) -> tuple[dict[str, float], dict[str, bytes]]:
     """The figures, and the files with their contents: the cluster's machines may share no folder."""
-    with TemporaryDirectory() as folder, redirect_stderr(io.StringIO()):
-        output = _of_seed(Path(folder, name), seed)
-        figures = train_policy(Training(environment, algorithm, seed), steps, output)
+    with TemporaryDirectory() as folder:
+        figures = _train_beside(environment, algorithm, steps, Path(folder, name), seed)
         files = [file for file in Path(folder).rglob("*") if file.is_file()]
         return figures, {str(file.relative_to(folder)): file.read_bytes() for file in files}
 
@@ -488,16 +509,16 @@ class _Checkpoints(BaseCallback):
 
 
 class _Display:
-    """Progress on standard error: a bar on a terminal, else a line every 10 s."""
+    """Progress on standard error: a bar on a terminal, else, and with a prefix, a line every 10 s."""
 
     _EVERY_S = 10.0
 
-    def __init__(self, steps: int) -> None:
-        self._steps = steps
+    def __init__(self, steps: int, prefix: str) -> None:
+        self._steps, self._prefix = steps, prefix
         self._begun: tuple[int, float] | None = None
         self._shown_s = time.monotonic()
         self._bar: Progress | None = None
-        if sys.stderr.isatty():
+        if sys.stderr.isatty() and not prefix:
             columns = (BarColumn(), TextColumn("{task.description}"), TimeRemainingColumn())
             self._bar = Progress(*columns, console=Console(stderr=True))
             self._task = self._bar.add_task("training", total=steps)
@@ -507,7 +528,7 @@ class _Display:
         if self._begun is None:
             self._begun = (steps, now_s)
         rate = (steps - self._begun[0]) / max(now_s - self._begun[1], 1e-9)
-        text = f"step {steps}/{self._steps} return {mean_return:.1f} {rate:.0f} steps/s"
+        text = f"{self._prefix}step {steps}/{self._steps} return {mean_return:.1f} {rate:.0f} steps/s"
         if self._bar is not None:
             self._bar.update(self._task, completed=steps, description=text)
         elif now_s - self._shown_s >= self._EVERY_S:

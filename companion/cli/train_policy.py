@@ -39,12 +39,15 @@ def train_policy(
                 output, train_policy(Training(environment, algorithm, seed), steps, output, resume=resume)
             )
             return
-        if resume:
-            raise PolicyTrainingError(
-                "--resume continues one training: give its --seed and --output, not --seeds"
-            )
         for trained in train_policies(
-            environment, algorithm, seeds_of(seeds), steps, output, processes=processes, ray=ray
+            environment,
+            algorithm,
+            seeds_of(seeds),
+            steps,
+            output,
+            resume=resume,
+            processes=processes,
+            ray=ray,
         ):
             _report(*trained)
 

@@ -6,6 +6,7 @@ import pickle
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -65,7 +66,13 @@ def test_policies_of_many_seeds_are_those_of_each_seed(tmp_path: Path) -> None:
     assert (tmp_path / "policy-3.onnx").read_bytes() != alone.read_bytes()
     assert list((tmp_path / "policy-5.onnx.training" / "tensorboard").rglob("events.out.tfevents.*"))
     train_policy(replace(CART_POLE, seed=5), 512, tmp_path / "policy-5.onnx", resume=True)
-    for refused in (several, [*several, "--resume"], [*command, "--seeds", "5..3"]):
+    elsewhere = ["--output", str(tmp_path / "other.onnx"), "--resume"]
+    for refused in (
+        several,
+        [*several, *elsewhere],
+        [*several, "--resume", "--ray", "127.0.0.1:1"],
+        [*command, "--seeds", "5..3"],
+    ):
         result = CliRunner().invoke(app, refused)
         assert result.exit_code == 2
         assert len(result.stderr.splitlines()) == 1
@@ -80,6 +87,33 @@ def test_failed_training_of_a_seed_is_one_line(tmp_path: Path, monkeypatch: pyte
     result = CliRunner().invoke(app, [*command, "--output", str(tmp_path / "policy.onnx")])
     assert result.exit_code == 2
     assert result.stderr.splitlines() == ["companion: seed 3: RuntimeError: no policy"]
+
+
+def test_interrupted_trainings_of_many_seeds_resume(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The first stores a state and is interrupted; the second was not begun."""
+    monkeypatch.setattr(trainer, "CHECKPOINT_STEPS", 256)
+    monkeypatch.setattr(trainer._Display, "_EVERY_S", 0.0)
+    several = partial(trainer.train_policies, "companion/CartPole-v0", "ppo", [3, 5])
+    with monkeypatch.context() as patch:
+
+        def interrupt(*_: object) -> None:
+            raise KeyboardInterrupt
+
+        patch.setattr(trainer, "judge", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            list(several(768, tmp_path / "policy.onnx"))
+    assert "seed 3: step 512/768 return" in capsys.readouterr().err
+    state = tmp_path / "policy-3.onnx.training" / "state.pt"
+    assert torch.load(state, weights_only=True)["steps"] == 768
+    resumed = list(several(1024, tmp_path / "policy.onnx", resume=True))
+    shown = capsys.readouterr().err
+    assert "seed 3: step 256/" not in shown
+    assert "seed 3: step 768/1024" in shown
+    assert "seed 5: step 256/1024" in shown
+    assert [file for file, _ in resumed] == [tmp_path / "policy-3.onnx", tmp_path / "policy-5.onnx"]
+    assert torch.load(state, weights_only=True)["steps"] == 1024
 
 
 def test_training_resumes_with_its_state(tmp_path: Path) -> None:
