@@ -1,6 +1,6 @@
 """Error of a calibration: rendered views of a board, and of a marker for the mount.
 
-    python -m benchmarks.calibration --seeds 1-50 [--mount | --extrinsics] [--json]
+    python -m benchmarks.calibration --seeds 1..50 [--mount | --extrinsics] [--processes 2] [--json]
 
 Lens: each seed takes one of the lenses of `mavlink-sim board` (plain, webcam, wide, fisheye) with other
 numbers (focal length +-20 %, centre +-2 %, coefficients +-20 %; none that folds the image), and a chessboard
@@ -20,13 +20,17 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from itertools import islice
 
 import cv2
 import numpy as np
 
+from benchmarks.flights import add_seeds
+from companion.campaign import ClusterError, SeedError, map_seeds
 from mavlink_sim.camera.image_effects import ImageEffects
 from mavlink_sim.camera.renderer import Renderer
 from mavlink_sim.datasets.board_views import LENSES, BoardCamera, board_pairs, board_poses, random_rig
@@ -84,6 +88,9 @@ class ExtrinsicsError:
     position_mm: float
     rotation_deg: float
     rms_px: float
+
+
+Error = LensError | MountError | ExtrinsicsError
 
 
 def random_lens(seed: int) -> tuple[str, CameraModel]:
@@ -188,36 +195,46 @@ def mount_error(seed: int) -> MountError:
     return MountError(seed, result.views, float(np.degrees(np.abs(measured - angles).max())))
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--seeds", default="1-50", help="first-last")
+def _in_one_thread(measure: Callable[[int], Error], seed: int) -> Error:
+    cv2.setNumThreads(1)
+    return measure(seed)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line. Returns the exit code: 2 for a cluster that does not exist, or a seed that fails."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.calibration", description=(__doc__ or "").partition("\n")[0]
+    )
+    add_seeds(parser, "1..50")
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--mount", action="store_true", help="the mount instead of the lens")
     what.add_argument("--extrinsics", action="store_true", help="a depth camera's place on the colour camera")
     parser.add_argument("--json", action="store_true", help="one JSON object per seed")
-    arguments = parser.parse_args()
-    cv2.setNumThreads(1)
-    first, _, last = arguments.seeds.partition("-")
-    seeds = range(int(first), int(last or first) + 1)
-    measure: Callable[[int], LensError | MountError | ExtrinsicsError] = lens_error
-    if arguments.mount or arguments.extrinsics:
-        measure = mount_error if arguments.mount else extrinsics_error
+    given = parser.parse_args(arguments)
+    measure: Callable[[int], Error] = lens_error
+    if given.mount or given.extrinsics:
+        measure = mount_error if given.mount else extrinsics_error
     results = []
-    for seed in seeds:
-        result = measure(seed)
-        results.append(result)
-        row = asdict(result)
-        values = (f"{value:.3f}" if isinstance(value, float) else str(value) for value in row.values())
-        print(json.dumps(row) if arguments.json else "  ".join(values), flush=True)
+    try:
+        measured = partial(_in_one_thread, measure)
+        for result in map_seeds(measured, given.seeds, processes=given.processes, ray=given.ray):
+            results.append(result)
+            row = asdict(result)
+            values = (f"{value:.3f}" if isinstance(value, float) else str(value) for value in row.values())
+            print(json.dumps(row) if given.json else "  ".join(values), flush=True)
+    except (ClusterError, SeedError) as error:
+        print(error, file=sys.stderr)
+        return 2
     for key in (
         *("focal_percent", "centre_px", "rms_px", "ray_px", "angle_deg"),
         *("position_mm", "rotation_deg"),
     ):
-        if hasattr(results[0], key) and not arguments.json:
+        if hasattr(results[0], key) and not given.json:
             numbers = np.array([getattr(result, key) for result in results])
             median, p95, worst = np.quantile(numbers, (0.5, 0.95, 1.0))
             print(f"{key}: median {median:.3f}, p95 {p95:.3f}, worst {worst:.3f} of {len(numbers)}")
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

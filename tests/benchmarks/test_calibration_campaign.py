@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import asdict
+
 import pytest
 
-from benchmarks.calibration import extrinsics_error, lens_error, mount_error, random_lens
+from benchmarks.calibration import extrinsics_error, lens_error, main, mount_error, random_lens
 from mavlink_sim.datasets.board_views import LENSES
 
 SEEDS = range(1, 51)
@@ -30,6 +33,15 @@ def test_mount_is_measured_from_rendered_images() -> None:
     error = mount_error(1)
     assert error.angle_deg < 0.3
     assert error.views == 10
+
+
+def test_seeds_are_measured_by_two_processes_in_their_order(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--mount", "--seeds", "2,1", "--processes", "2", "--json"]) == 0
+    rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert rows == [asdict(mount_error(seed)) for seed in (2, 1)]
+    with pytest.raises(SystemExit) as refused:
+        main(["--seeds", "1-2"])
+    assert refused.value.code == 2
 
 
 @pytest.mark.slow
