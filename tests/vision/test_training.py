@@ -140,6 +140,18 @@ def test_resuming_another_network_is_rejected(tmp_path: Path) -> None:
         train(replace(SMALL, width_multiple=0.125), rectangles, silent, checkpoint=kept, resume=True)
 
 
+def test_resuming_at_another_rate_of_new_classes_is_rejected(tmp_path: Path) -> None:
+    kept = tmp_path / "state.pt"
+    one_new = replace(SMALL, new_classes=1, new_class_rate=10.0)
+    train(replace(one_new, time_limit_s=0.0), rectangles, silent, checkpoint=kept)
+    for changed in ({"new_class_rate": 30.0}, {"new_classes": 2}, {"new_classes": 0}):
+        with pytest.raises(ValueError, match=r"another training, new classes: 1, learning 10 times"):
+            train(replace(one_new, **changed), rectangles, silent, checkpoint=kept, resume=True)
+    # Without new classes their rate has no effect.
+    train(replace(SMALL, time_limit_s=0.0), rectangles, silent, checkpoint=kept)
+    assert train(replace(SMALL, new_class_rate=10.0), rectangles, silent, checkpoint=kept, resume=True)
+
+
 def test_resuming_without_a_checkpoint_names_the_file(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"missing\.pt"):
         train(SMALL, rectangles, silent, checkpoint=tmp_path / "missing.pt", resume=True)

@@ -437,7 +437,10 @@ def _network(model: YoloModel, settings: TrainingSettings) -> dict[str, Any]:
 def _identity(settings: TrainingSettings, origin: Mapping[str, str]) -> dict[str, str]:
     """What a resumed training has in common with its beginning. The number of steps may differ."""
     sizes = (f"{stage.batch_size} of {stage.width}x{stage.height}" for stage in settings.stages)
-    return {**origin, "seed": str(settings.seed), "batches": ", ".join(sizes)}
+    identity = {**origin, "seed": str(settings.seed), "batches": ", ".join(sizes)}
+    if settings.new_classes:
+        identity["new classes"] = f"{settings.new_classes}, learning {settings.new_class_rate:g} times faster"
+    return identity
 
 
 def _save(
