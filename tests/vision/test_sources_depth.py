@@ -75,7 +75,7 @@ def saved_exr(path: Path, channels: dict[str, NDArray[Any]]) -> Path:
     return path
 
 
-@pytest.mark.parametrize("names", [["V"], ["B", "G", "R", "Z"]])
+@pytest.mark.parametrize("names", [["V"], ["B", "G", "R", "Z"], ["L.Combined.B", "L.Mist.V", "L.Depth.Z"]])
 @pytest.mark.parametrize("dtype", [np.float32, np.float16])
 def test_openexr_depth_is_its_channel_or_z(tmp_path: Path, names: list[str], dtype: type) -> None:
     channels: dict[str, NDArray[Any]] = {name: np.full((2, 2), 9.0, dtype) for name in names}
@@ -89,13 +89,12 @@ def test_openexr_depth_is_its_channel_or_z(tmp_path: Path, names: list[str], dty
 
 
 def test_openexr_without_a_depth_channel_is_refused(tmp_path: Path) -> None:
-    colour = saved_exr(tmp_path / "a.exr", dict.fromkeys("RGB", METRES))
-    with pytest.raises(SourceError, match="only channel or 'Z', got B, G, R"):
-        decode_depth(colour, b"")
-    whole = colour.read_bytes()
-    for data in (whole[: len(whole) // 2], whole[:-4], b"\x76\x2f\x31\x01", b"picture"):
-        colour.write_bytes(data)
-        assert decode_depth(colour, data) is None
+    for names in (("B", "G", "R"), ("A.Z", "B.Z")):
+        whole = saved_exr(tmp_path / "a.exr", dict.fromkeys(names, METRES)).read_bytes()
+        with pytest.raises(SourceError, match=f"the only 'Z', got {', '.join(names)}"):
+            decode_depth(Path("of-bytes.exr"), whole)
+    for data in (whole[: len(whole) // 2], whole[:-4], b"\x76\x2f\x31\x01", b"picture", b""):
+        assert decode_depth(Path("of-bytes.exr"), data) is None
 
 
 def test_openexr_without_its_extra_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,7 +17,8 @@ INTEGER_SCALE_M, FLOAT_SCALE_M = 0.001, 1.0
 """Metres per unit without `depth_scale`: 16-bit integers are millimetres, floats metres."""
 # Floats in millimetres are common, and depth cameras for vehicles do not see this far.
 IMPLAUSIBLE_MEDIAN_M = 200.0
-# The channel of depth in an OpenEXR file with several, as renderers name it.
+# The channel of depth in an OpenEXR file with several, as renderers name it. Files with layers have the
+# layer's name and a dot before it.
 _EXR_CHANNEL = "Z"
 
 
@@ -31,11 +32,11 @@ def decode_depth(path: Path, data: bytes) -> NDArray[Any] | None:
 
     Raises:
         SourceError: it holds something else than one channel of 16-bit integers or floats; or it is OpenEXR
-            and the extra is missing, or none of several channels is `Z`.
+            and the extra is missing, or not exactly one of several channels is `Z` or `LAYER.Z`.
     """
     picture: Any = None
     if path.suffix.lower() == ".exr":
-        picture = _decode_exr(path)
+        picture = _decode_exr(path, data)
     elif path.suffix.lower() == ".npy":
         try:
             picture = np.load(io.BytesIO(data), allow_pickle=False)
@@ -58,8 +59,11 @@ def decode_depth(path: Path, data: bytes) -> NDArray[Any] | None:
     return np.asarray(picture)
 
 
-def _decode_exr(path: Path) -> NDArray[Any] | None:
-    """The only channel of an OpenEXR file's first part, or `Z`; None if it cannot be read."""
+def _decode_exr(path: Path, data: bytes) -> NDArray[Any] | None:
+    """The only channel of an OpenEXR file's first part, or `Z`; None if it cannot be read.
+
+    OpenEXR prints about damaged pixels itself; its Python interface has no setting against it.
+    """
     try:
         import OpenEXR
     except ImportError as error:
@@ -68,15 +72,16 @@ def _decode_exr(path: Path) -> NDArray[Any] | None:
             f"TIFF or NPY"
         ) from error
     try:
-        channels = OpenEXR.File(str(path), separate_channels=True).channels()
+        channels = OpenEXR.File(io.BytesIO(data), separate_channels=True).channels()
     except (RuntimeError, ValueError):
         return None
-    name = next(iter(channels)) if len(channels) == 1 else _EXR_CHANNEL
-    if name not in channels:
+    found = [name for name in channels if len(channels) == 1 or name.rpartition(".")[2] == _EXR_CHANNEL]
+    if len(found) != 1:
         raise SourceError(
-            f"{path}: depth must be the only channel or {_EXR_CHANNEL!r}, got {', '.join(sorted(channels))}"
+            f"{path}: depth must be the only channel or the only {_EXR_CHANNEL!r}, got "
+            f"{', '.join(sorted(channels))}"
         )
-    return np.asarray(channels[name].pixels)
+    return np.asarray(channels[found[0]].pixels)
 
 
 def to_metres(picture: NDArray[Any], scale_m: float | None) -> NDArray[np.float32]:
