@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import subprocess
 import sys
@@ -39,8 +40,17 @@ def companion_here(*arguments: str | Path, cwd: Path) -> subprocess.CompletedPro
     """
     command = [str(argument) for argument in arguments]
     unset = {key: None for key in os.environ if key.startswith("COMPANION_")}
-    with chdir(cwd):
-        done = CliRunner().invoke(app, command, env={**unset, **COLUMNS})
+    # pytest's handlers would make the command's `logging.basicConfig` do nothing.
+    root = logging.getLogger()
+    handlers, level = root.handlers, root.level
+    root.handlers = []
+    root.setLevel(logging.WARNING)
+    try:
+        with chdir(cwd):
+            done = CliRunner().invoke(app, command, env={**unset, **COLUMNS})
+    finally:
+        root.handlers = handlers
+        root.setLevel(level)
     if done.exception is not None and not isinstance(done.exception, SystemExit):
         raise done.exception
     return subprocess.CompletedProcess(command, done.exit_code, done.stdout, done.stderr)
