@@ -39,8 +39,9 @@ _FRONT_SIGMAS = 5.0
 # and the root mean square of that share of normal differences, in sigma.
 _SMOOTH_SHARE, _SMOOTH_RMS, _SMOOTH_MIN = 0.8, 0.6616, 8
 
-# Boxes that overlap by this IoU are of one object.
-SAME_OBJECT_IOU = 0.7
+# A box may hide the object of another one if their IoU is less: NMS leaves several boxes of one object, up to
+# an IoU of 0.7. What remains visible of the object needs this share of its box.
+_HIDING_IOU, _VISIBLE_SHARE = 0.3, 0.25
 
 # The depth at the centre is the median of a square: its side as a share of the image's shorter one, and its
 # least pixels.
@@ -95,7 +96,9 @@ def nearest_points(
     their mean, less as much of their spread as their noise does not explain.
 
     Where boxes overlap, a point of the object in front, whose box ends lower in the image, is not one of the
-    object behind: that one is measured where it is not hidden.
+    object behind: that one is measured where it is not hidden. A box that may be a second one of the same
+    object, with an IoU from 0.3 or over the other box's centre, hides nothing. If less than a quarter of the
+    box has known depth and is not hidden, the nearer point counts.
 
     Args:
         depth_m: (height, width) float32, metres along the optical axis; NaN, infinite or not above zero where
@@ -119,6 +122,11 @@ def nearest_points(
         for left, top, right, bottom in boxes[hiding].tolist():
             columns, rows = _pixels(left, right, camera.width), _pixels(top, bottom, camera.height)
             visible_m[slice(*rows), slice(*columns)] = np.nan
+        left, top, right, bottom = boxes[index].tolist()
+        columns, rows = _pixels(left, right, camera.width), _pixels(top, bottom, camera.height)
+        visible = visible_m[slice(*rows), slice(*columns)]
+        if np.count_nonzero((visible > 0.0) & (visible < np.inf)) < _VISIBLE_SHARE * visible.size:
+            continue
         behind = _nearest_point(visible_m, boxes[index].tolist(), camera, down, lens_height_m)
         if not np.isnan(behind).any():
             points[index] = behind
@@ -131,7 +139,9 @@ def _hidden(
     """Indices of objects whose point lies in the box of one in front; with each, (N,) the boxes in front."""
     if len(boxes) < 2:
         return
-    same = overlaps(boxes, boxes) >= SAME_OBJECT_IOU
+    centres = ((boxes[:, :2] + boxes[:, 2:]) / 2.0)[:, None]
+    over_centre = ((centres > boxes[:, :2]) & (centres < boxes[:, 2:])).all(axis=2)
+    same = over_centre | (overlaps(boxes, boxes) >= _HIDING_IOU)
     pixels = camera.project(points) + 0.5  # to edges
     inside = (pixels[:, None] >= boxes[:, :2]).all(axis=2) & (pixels[:, None] <= boxes[:, 2:]).all(axis=2)
     in_front = (boxes[:, 3] > boxes[:, 3, None]) & ~same

@@ -245,6 +245,32 @@ def test_object_in_front_is_not_the_one_behind_it() -> None:
         assert found.tolist() == pytest.approx([14.0, 14.0])
 
 
+def test_second_box_of_an_object_does_not_hide_it() -> None:
+    """A car at 6 m with trees at 30 m: a loose box, and a tight one whose lower edge is a pixel lower."""
+    camera = CameraModel(640, 480, 500.0, 500.0, 320.0, 240.0)
+    ground_m = 1.5 * 500.0 / np.maximum(np.arange(480) - 240, 1.0)
+    depth_m = np.repeat(np.minimum(30.0, ground_m)[:, None], 640, axis=1)
+    left, top, right, bottom = 170, 249, 470, 365
+    depth_m[top:bottom, left:right] = 6.0
+    noise = np.random.default_rng(1).normal(0.0, 0.01, depth_m.shape)
+    depth_m = (1.0 / (1.0 / depth_m + noise)).astype(np.float32)
+    tight = (left - 3, top, right + 3, bottom + 1)
+    for loose_px in (30, 50, 64, 200):  # IoU 0.79, 0.69, 0.64, 0.37
+        loose = (left - 3, top - loose_px, right + 3, bottom)
+        points = nearest_points(depth_m, np.array([loose, tight]), camera, LEVEL)
+        assert points[:, 2].tolist() == pytest.approx([6.0, 6.0], abs=0.2)
+
+
+@pytest.mark.parametrize(("columns", "expected_m"), [(12, 14.0), (24, 18.0)])
+def test_mostly_hidden_object_keeps_the_nearer_range(columns: int, expected_m: float) -> None:
+    behind, front = (10, 5, 50, 25), (20, 15, 40, 35)
+    depth_m = np.full((HEIGHT, WIDTH), np.nan, np.float32)
+    depth_m[5:15, 20 : 20 + columns] = 18.0  # 15 or 30 % of the box
+    depth_m[15:35, 20:40] = 14.0
+    points = nearest_points(depth_m, np.array([behind, front]), SMALL, LEVEL)
+    assert points[0, 2] == pytest.approx(expected_m)
+
+
 def test_small_object_in_front_is_ignored() -> None:
     scene = cuboid_scene(north_m=10.0)
     left, top, *_ = map(int, scene.box)
