@@ -22,7 +22,7 @@ MEMORY_S = 5.0
 # A detection this many sigma from the fused position shows that the object has moved: the fusion restarts.
 RESTART_SIGMA = 3.0
 # A detection this many sigma from where the object was expected is left out: it may have the range of another
-# object in front. So many in a row show that the object was moved.
+# object in front. So many in a row that fit each other as well show that the object was moved.
 OUTLIER_SIGMA, OUTLIERS = 5.0, 3
 # A track that was not seen for this long has ended (`tracker.max_age_s` is less by default).
 FORGET_S = 60.0
@@ -59,23 +59,36 @@ class _Track:
 
     def _begin(self, target: Target, vehicle: Vector3, covariance: NDArray[np.float64]) -> None:
         self._motion = Estimate.initialize(target, vehicle)
-        self._outliers = 0
+        self._outliers: list[tuple[Target, Vector3]] = []
         self._restart()
         self._add(target, covariance)
 
     def update(self, target: Target, vehicle: Vector3, covariance: NDArray[np.float64]) -> None:
         expected = self._motion.at(target.captured_ns)
         fit = expected.fit(target, vehicle)
-        self._outliers = self._outliers + 1 if fit.squared > OUTLIER_SIGMA**2 else 0
-        if self._outliers:
-            if self._outliers == OUTLIERS:
-                self._begin(target, vehicle, covariance)
+        if fit.squared > OUTLIER_SIGMA**2:
+            self._leave_out(target, vehicle, covariance)
             return
+        self._outliers = []
         self._motion = expected.update(fit)
         if self.moving or self._disagrees(target, covariance):
             self._restart()
         self._forget((target.captured_ns - self._newest.captured_ns) / 1e9)
         self._add(target, covariance)
+
+    def _leave_out(self, target: Target, vehicle: Vector3, covariance: NDArray[np.float64]) -> None:
+        """Restart at the last of enough outliers that fit each other, with their spread as an error."""
+        for other, from_ned_m in self._outliers:
+            expected = Estimate.initialize(other, from_ned_m).at(target.captured_ns)
+            if expected.fit(target, vehicle).squared > OUTLIER_SIGMA**2:
+                self._outliers = []
+                break
+        self._outliers.append((target, vehicle))
+        if len(self._outliers) == OUTLIERS:
+            places = [other.position_ned_m[:2] for other, _ in self._outliers if other.position_ned_m]
+            spread = np.cov(places, rowvar=False)
+            self._begin(target, vehicle, covariance + spread)
+            self._motion.covariance[:2, :2] += spread
 
     @property
     def moving(self) -> bool:

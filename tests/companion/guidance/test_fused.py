@@ -166,6 +166,29 @@ def test_object_that_was_moved_is_located_again() -> None:
     assert position_of(tracks).position_ned_m[:2] == pytest.approx((12.0, 4.0), abs=0.01)
 
 
+def test_outliers_that_do_not_fit_each_other_are_left_out() -> None:
+    tracks, vehicle = FusedTracks(), (0.0, 0.0, -5.0)
+    norths = (*[10.0] * 50, 30.0, 4.0, 22.0, 10.0)
+    for frame, north in enumerate(norths):
+        target = seen(vehicle, (north, 0.0), frame, sigma_m=0.3)
+        tracks.update([target], vehicle, target.captured_ns)
+        fused = position_of(tracks)
+        assert fused.position_ned_m[:2] == pytest.approx((10.0, 0.0), abs=0.01)
+        assert not fused.moving
+    assert fused.captured_ns == T0 + 53 * PERIOD_NS
+
+
+def test_spread_of_fitting_outliers_is_part_of_the_error() -> None:
+    tracks, vehicle = FusedTracks(), (0.0, 0.0, -5.0)
+    for frame, north in enumerate((*[10.0] * 20, 30.0, 30.6, 29.7)):
+        target = seen(vehicle, (north, 0.0), frame, sigma_m=0.3, across_m=0.2)
+        tracks.update([target], vehicle, target.captured_ns)
+    fused = position_of(tracks)
+    assert fused.position_ned_m[:2] == pytest.approx((29.7, 0.0))
+    spread_m = math.sqrt(0.21)  # of the three
+    assert fused.ellipse.semi_major_m == pytest.approx(math.hypot(0.3, spread_m, VEHICLE_SIGMA_M), abs=0.01)
+
+
 def test_object_that_leaves_the_image_keeps_its_position() -> None:
     tracks, vehicle = FusedTracks(), (0.0, 0.0, -5.0)
     for frame in range(40):
