@@ -117,7 +117,7 @@ def flight_of(seed: int, *, depth: bool) -> list[Located]:
     tracks = [
         _located(position, [(target, *shown[ns]) for ns, target in of_track.items() if ns in shown])
         for track_id, of_track in seen.items()
-        if (position := fused.position(track_id)) is not None
+        if (position := fused.position(track_id, 0)) is not None  # its newest
     ]
     return [track for track in tracks if track is not None]
 
@@ -171,7 +171,7 @@ def _fused(of_object: list[tuple[Target, NDArray[np.float64], Vector3]]) -> NDAr
     for target, (north, east), vehicle in of_object:
         exact = replace(target, position_ned_m=(float(north), float(east), 0.0), track_id=0)
         tracks.update([exact], vehicle, target.captured_ns)
-        position = tracks.position(0)
+        position = tracks.position(0, target.captured_ns)
     assert position is not None
     return np.array(position.position_ned_m[:2])
 

@@ -129,6 +129,14 @@ def _sighting(event: dict[str, Any], camera: str, offset_ns: int, before: Sighti
                 float(ellipse["semi_minor_m"]),
                 float(ellipse["orientation_rad"]),
             )
+            if (
+                before is not None
+                and before.ellipse is not None
+                and before.position == position
+                and not moving
+            ):
+                # The error of a position grows while no detection counts; here it is that of when one did.
+                axes = min(axes, before.ellipse)
     elif before is not None:
         # The vehicle's own position may be unknown for a while.
         position, axes = before.position, before.ellipse

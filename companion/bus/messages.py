@@ -178,7 +178,11 @@ def tracks_message(
     return {
         **_of_frame(result, vehicle, published_ns, view),
         "events": [
-            _track_event(event, None if fused is None else fused.position(event.track.track_id), origin)
+            _track_event(
+                event,
+                None if fused is None else fused.position(event.track.track_id, event.track.last_ns),
+                origin,
+            )
             for event in result.track_events
         ],
     }

@@ -63,6 +63,14 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 "events": [event(1, 2, 8, CAR), event(4, 1, 8, None, class_name="person")],
             },
         ),
+        # The image's edge cuts the car off: the same position, its error grows.
+        (
+            "tracks",
+            {
+                "published_ns": 10 * SECOND_NS,
+                "events": [event(1, 2, 9, CAR, error_ellipse=ELLIPSE | {"semi_major_m": 5.0})],
+            },
+        ),
         # The vehicle's own position has become unknown.
         ("tracks", {"published_ns": 11 * SECOND_NS, "events": [event(1, 2, 10, None, event="end")]}),
         (

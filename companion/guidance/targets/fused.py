@@ -24,6 +24,8 @@ RESTART_SIGMA = 3.0
 # A detection this many sigma from where the object was expected is left out: it may have the range of another
 # object in front. So many in a row that fit each other as well show that the object was moved.
 OUTLIER_SIGMA, OUTLIERS = 5.0, 3
+# Without a position for this long an object may be anywhere, although its boxes are still detected.
+STALE_S = MEMORY_S / 2.0
 # A track that was not seen for this long has ended (`tracker.max_age_s` is less by default).
 FORGET_S = 60.0
 
@@ -35,7 +37,7 @@ class FusedPosition:
     Attributes:
         position_ned_m: local NED.
         ellipse: its horizontal error, the vehicle's own position error included.
-        moving: whether the object moves; then the position is that of the newest detection's time.
+        moving: whether the object moves; then the position is that of the requested time.
         captured_ns: capture of the newest detection with a position.
     """
 
@@ -95,12 +97,14 @@ class _Track:
         speed_sigma_mps = math.sqrt(float(np.trace(self._motion.covariance[2:, 2:])))
         return math.hypot(*self._motion.velocity) > max(MOVING_MPS, MOVING_SIGMA * speed_sigma_mps)
 
-    @property
-    def position(self) -> FusedPosition:
+    def position(self, at_ns: int) -> FusedPosition:
+        """The position at this time; its error grows since the newest detection as the filter's does."""
         moving, newest = self.moving, self._newest
         place, covariance = self._fused()
+        motion = self._motion.at(at_ns)
+        covariance += (motion.covariance - self._motion.covariance)[:2, :2]
         if moving:
-            place = self._motion.state[:2]
+            place = motion.state[:2]
         else:
             # How far the newest detections are from the fused position is part of its error.
             behind = self._motion.state[:2] - place
@@ -185,7 +189,14 @@ class FusedTracks:
         for key in ended:
             del self._tracks[key]
 
-    def position(self, track_id: int) -> FusedPosition | None:
-        """The position of a track; None: it never had one."""
+    def position(self, track_id: int, seen_ns: int) -> FusedPosition | None:
+        """The position of a track when it was last detected, with or without a position then.
+
+        Returns:
+            None: it never had a position, or the newest one is older than that by more than `STALE_S`.
+        """
         track = self._tracks.get(track_id)
-        return None if track is None else track.position
+        if track is None:
+            return None
+        at_ns = max(seen_ns, track.captured_ns)
+        return track.position(at_ns) if at_ns - track.captured_ns <= STALE_S * 1e9 else None

@@ -49,7 +49,7 @@ def seen(
 
 
 def position_of(tracks: FusedTracks) -> FusedPosition:
-    fused = tracks.position(7)
+    fused = tracks.position(7, T0)  # its newest
     assert fused is not None
     return fused
 
@@ -189,6 +189,33 @@ def test_spread_of_fitting_outliers_is_part_of_the_error() -> None:
     assert fused.ellipse.semi_major_m == pytest.approx(math.hypot(0.3, spread_m, VEHICLE_SIGMA_M), abs=0.01)
 
 
+def test_object_that_is_cut_off_for_long_has_no_position() -> None:
+    """It was seen whole, then drives away, 2 m/s² up to 3 m/s, cut off by the image's edge."""
+    tracks, vehicle = FusedTracks(), (0.0, 0.0, -5.0)
+    for frame in range(5):
+        tracks.update([seen(vehicle, (10.0, 0.0), frame, sigma_m=0.3)], vehicle, T0 + frame * PERIOD_NS)
+    whole_m = position_of(tracks).ellipse.semi_major_m
+    for frame in range(5, 305):
+        elapsed_s = 0.1 * (frame - 4)
+        at = (10.0 + (elapsed_s**2 if elapsed_s < 1.5 else 3.0 * elapsed_s - 2.25), 0.0)
+        target = replace(seen((at[0] - 10.0, 0.0, -5.0), at, frame), cut=True)
+        tracks.update([target], (at[0] - 10.0, 0.0, -5.0), target.captured_ns)
+        fused = tracks.position(7, target.captured_ns)
+        if frame - 4 > 25:
+            assert fused is None
+        else:
+            assert fused is not None
+            grown_m = fused.ellipse.semi_major_m
+            assert grown_m > whole_m
+            assert not fused.moving
+            assert at[0] - fused.position_ned_m[0] < 2.45 * grown_m
+    whole = seen((90.0, 0.0, -5.0), (100.0, 0.0), 305, sigma_m=0.3)
+    tracks.update([whole], (90.0, 0.0, -5.0), whole.captured_ns)
+    again = tracks.position(7, whole.captured_ns)
+    assert again is not None
+    assert again.position_ned_m[0] == pytest.approx(100.0, abs=1.0)
+
+
 def test_object_that_leaves_the_image_keeps_its_position() -> None:
     tracks, vehicle = FusedTracks(), (0.0, 0.0, -5.0)
     for frame in range(40):
@@ -227,13 +254,13 @@ def test_only_trusted_tracks_with_a_range_are_fused() -> None:
     )
     targets = [no_range, replace(target, trusted=False, track_id=4), replace(target, track_id=None)]
     tracks.update(targets, vehicle, T0)
-    assert [tracks.position(track_id) for track_id in (3, 4, 7)] == [None] * 3
+    assert [tracks.position(track_id, T0) for track_id in (3, 4, 7)] == [None] * 3
 
 
 def test_track_is_forgotten_after_a_minute() -> None:
     tracks, vehicle = FusedTracks(), (0.0, 0.0, -5.0)
     tracks.update([seen(vehicle, (10.0, 0.0), 0)], vehicle, T0)
     tracks.update([], vehicle, T0 + 59_000_000_000)
-    assert tracks.position(7) is not None
+    assert tracks.position(7, T0) is not None
     tracks.update([], vehicle, T0 + 61_000_000_000)
-    assert tracks.position(7) is None
+    assert tracks.position(7, T0) is None
