@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 
 Pairs = list[tuple[int, int]]
 
+# Boxes of two classes that overlap by this IoU belong to one object; a rider and the bicycle overlap less.
+SAME_OBJECT_IOU = 0.7
+
 
 def overlaps(first: NDArray[np.floating], second: NDArray[np.floating]) -> NDArray[np.float64]:
     """Intersection over union of (N, 4) and (M, 4) boxes xyxy → (N, M); 0 where both are empty."""

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from vision.detections import NO_TRACK, Detections
 from vision.tracking import kalman
 from vision.tracking.appearance import appearances
-from vision.tracking.association import enlarge, match, overlaps
+from vision.tracking.association import SAME_OBJECT_IOU, enlarge, match, overlaps
 from vision.tracking.camera_motion import CameraView, rotate_boxes
 from vision.tracking.kalman import BoxStates
 from vision.tracking.tracks import (
@@ -47,8 +47,6 @@ Looks = dict[int, NDArray[np.float32]]
 # How far boxes are enlarged for the second pass, in their own sizes. On rendered sequences 0.3 to 1.0 work
 # equally well with the vehicle's attitude; without it, 0.6 has the fewest switches.
 REACH = 0.6
-# Boxes of two classes that overlap this much belong to one object; a rider and the bicycle overlap less.
-SAME_OBJECT_IOU = 0.7
 # A track's class is in doubt while the summed confidences of another class on its object reach this share of
 # its own. Of confirmed rendered tracks, 0.25, 0.5, 0.75 and 1.0 leave 142, 160, 169 and 172 of 174 of the
 # right class, 77, 85, 90 and 94 of 114 of a wrong one. Sums decay as if only `SCORES_KEPT` frames counted.

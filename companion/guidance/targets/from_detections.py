@@ -37,7 +37,7 @@ from vision.detections import TRACK_CONFIRMED, DetectionRecord
 from vision.geolocation import PixelRays, range_from_known_height
 from vision.rotation import matrix_from_quaternion
 from vision.tracking import TARGET_CLASS
-from vision.tracking.association import overlaps
+from vision.tracking.association import SAME_OBJECT_IOU, overlaps
 
 _Sample = TypeVar("_Sample")
 
@@ -62,9 +62,8 @@ CONTACT_INSET_M = 0.2
 CONTACT_SHARE = 0.25
 # Beyond this roll it is not corrected.
 MAX_CONTACT_ROLL_RAD = math.radians(30.0)
-# Boxes with at least this IoU belong to one object (those of a rider and the bicycle do not). A class is
-# unambiguous if its score exceeds that of every other class of the object by this.
-SAME_OBJECT_IOU, CLEAR_MARGIN = 0.7, 0.1
+# A class is unambiguous if its score exceeds that of every other class of the object by this.
+CLEAR_MARGIN = 0.1
 
 
 class HistoryError(LookupError):
