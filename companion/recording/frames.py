@@ -44,14 +44,15 @@ def recorded_frames(paths: Sequence[Path], camera: str | None = None) -> Iterato
     """
     prefix = "" if camera is None else f"cameras/{camera}/"
     images, detections = f"/{prefix}{IMAGE.name}", f"{prefix}{DETECTIONS.name}"
+    # Either comes first, an image up to a second after the message, also in the next file; both have the
+    # capture's time.
+    waiting: dict[str, dict[int, Any]] = {images: {}, detections: {}}
     for path in paths:
         reader = RecordingReader(path)
         run = next(iter(reader.messages(RUN_CHANNEL)), None)
         if run is None:
             raise RecordingError(f"{path}: not a recording of the service: it has no message on 'run'")
         about = json.loads(run.data)
-        # Either comes first, an image up to a second after the message; both have the capture's time.
-        waiting: dict[str, dict[int, Any]] = {images: {}, detections: {}}
         for message in reader.messages(images, detections):
             body, topic = json.loads(message.data), message.channel.topic
             if topic == detections:
