@@ -49,8 +49,8 @@ def recorded_frames_names(settings: Settings) -> dict[str | None, str]:
     recording = settings.recording
     if not (recording.directory and recording.images and recording.image_format == "png"):
         return {}
-    prefix = f"companion-{os.getpid()}-{settings.vehicle.name}"
-    return {name: f"{prefix}-{name or 'camera'}-recorded" for name in (None, *settings.cameras)}
+    first = f"companion-{os.getpid()}-{settings.vehicle.name}-recorded"
+    return {None: first} | {name: f"{first}-{name}" for name in settings.cameras}
 
 
 class PerceptionCamera:

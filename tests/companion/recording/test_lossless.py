@@ -115,3 +115,15 @@ def test_only_png_images_of_a_recording_are_shared(tmp_path: Path) -> None:
 
     assert list(names()) == [None]
     assert names(image_format="jpeg") == names(images="false") == names(directory="") == {}
+
+
+def test_each_camera_has_its_own_shared_memory(tmp_path: Path) -> None:
+    settings = {
+        "recording.directory": str(tmp_path),
+        "recording.image_format": "png",
+        "cameras.camera.source.uri": "none",
+        "cameras.recorded.source.uri": "none",
+    }
+    names = recorded_frames_names(load_settings(os.devnull, settings, {}))
+    assert list(names) == [None, "camera", "recorded"]
+    assert len(set(names.values())) == 3
