@@ -3,7 +3,8 @@
 The same functions as in the service make targets of the images; `Guidance.step` gets them in the step in
 which it got those of the flight. JPEG images are those of the preview: at most `preview.rate_hz`, and scaled
 down where they are wider than `preview.width`, so even the flight's own model finds slightly different boxes.
-PNG images are the processed frames.
+PNG images are the processed frames. Which samples of the vehicle's pose the service had when it processed an
+image is not recorded: here it has all until the step of guidance.
 """
 
 from __future__ import annotations
@@ -46,6 +47,9 @@ from vision.tracking.association import match, overlaps
 # The usual limit of evaluations.
 LEAST_IOU = 0.5
 MAX_LISTED = 10
+SAMPLES_INEXACT = (
+    "tracks and ranges: the flight had fewer samples of the vehicle's pose when it processed an image"
+)
 _COMPARED = ("class_name", "confidence", "xyxy", "track_id", "track_score", "track_state")
 
 
@@ -102,7 +106,8 @@ class PerceptionReplay:
         name = settings.guidance.camera
         own = settings.of_camera(name)
         detectors = [settings.of_camera(each).detector for each in (None, *settings.cameras)]
-        detector = _as_in_flight(own.detector, threads_each(detectors), _status(paths, name), model)
+        status, restarts = _status(paths, name)
+        detector = _as_in_flight(own.detector, threads_each(detectors), status, model)
         self._settings = own.model_copy(update={"detector": detector})
         self._frames = recorded_frames(paths, name)
         self._next = next(self._frames, None)
@@ -122,6 +127,12 @@ class PerceptionReplay:
         self._ranges_m: list[float] = []
         self._digest = hashlib.sha256()
         self._inexact: dict[str, None] = {}
+        if restarts is not None:
+            self._inexact[SAMPLES_INEXACT] = None
+        if restarts:
+            self._inexact[
+                f"the perception process was restarted {restarts} times: its tracker began again, not here"
+            ] = None
 
     def update(self, recorded: RecordedStep, seconds: float) -> dict[str, Any]:
         """Process the images that this step knew; returns the fields of its input that are replaced."""
@@ -295,13 +306,13 @@ def report(found: DetectionReplay) -> Iterator[str]:
         yield f"ranges to targets of both differ by {median_m:g} m (median), {largest_m:g} m at most"
     if found.same_model:
         yield (
-            "the model is that of the flight: what differs comes from the images, or from another runtime or "
-            "processor"
+            "the model is that of the flight: what differs comes from the images, from what is not exact, or "
+            "from another runtime or processor"
         )
     else:
         yield (
-            "the model is not that of the flight. How much comes from the images alone, a replay with the "
-            f"flight's model shows: {found.recorded_model}"
+            "the model is not that of the flight. How much differs without a change of the model, a replay "
+            f"with the flight's model shows: {found.recorded_model}"
         )
     yield from found.listed
 
@@ -324,15 +335,21 @@ def _as_in_flight(
     return section.model_copy(update=changes)
 
 
-def _status(paths: Sequence[Path], camera: str | None) -> dict[str, Any]:
-    """Return the first recorded status of a camera with a loaded model; empty without one."""
+def _status(paths: Sequence[Path], camera: str | None) -> tuple[dict[str, Any], int | None]:
+    """Return a camera's first recorded status with a loaded model, and how often its process was restarted.
+
+    The status is empty without one; the number is None if no service published a status.
+    """
+    loaded: dict[str, Any] = {}
+    restarts: list[int] = []
     for path in paths:
         for message in RecordingReader(path).messages(STATUS.name):
             body = json.loads(message.data)
             found: dict[str, Any] = body["perception"] if camera is None else body["cameras"].get(camera, {})
-            if found.get("runtime") is not None:
-                return found
-    return {}
+            if not loaded and found.get("runtime") is not None:
+                loaded = found
+            restarts.append(found.get("restarts", 0))
+    return loaded, restarts[-1] - restarts[0] if restarts else None
 
 
 def _boxes(boxes: list[list[float]]) -> NDArray[np.float64]:

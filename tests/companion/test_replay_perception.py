@@ -15,10 +15,12 @@ from companion.bench.lockstep_flight import LockstepFlight, camera_settings
 from companion.bench.rendered_camera import RenderedCamera, rendered_scene
 from companion.bench.synthetic_detector import SceneObject, ScenePose
 from companion.bus.messages import ModelIdentity
+from companion.bus.topics import STATUS
 from companion.recording import RecordingError
-from companion.recording.convert import RUN_CHANNEL
-from companion.recording.files import Recorded
+from companion.recording.convert import ANY_OBJECT, RUN_CHANNEL
+from companion.recording.files import Channel, Recorded
 from companion.replay import replay, report
+from companion.replay_perception import SAMPLES_INEXACT
 from companion.settings.perception import DEFAULT_MODEL
 from mavlink_sim.lockstep import LockstepVehicle
 from tests.companion.command_line import companion
@@ -136,6 +138,26 @@ def test_frames_without_an_image_are_counted(lossless: Path, tmp_path: Path) -> 
     assert found.inexact == [
         f"{missing} of {found.detections.frames} processed frames have no recorded image"
     ]
+
+
+@pytest.mark.parametrize("restarts", [0, 2])
+def test_what_a_flight_of_the_service_does_not_record_is_said(
+    lossless: Path, tmp_path: Path, restarts: int
+) -> None:
+    """Only the service has a process for perception, and publishes its status."""
+    statuses = iter([{"runtime": runtime, "restarts": 1} for runtime in (None, "torch")])
+    last = {"runtime": "torch", "restarts": 1 + restarts}
+
+    def change(message: Recorded) -> Recorded:
+        if message.channel.topic != "/annotations":
+            return message
+        body = json.dumps({"perception": next(statuses, last)}).encode()
+        return Recorded(Channel(STATUS.name, "companion.status", ANY_OBJECT), message.log_time_ns, body)
+
+    found = replay([rewritten(lossless, tmp_path, change)], {}, DEFAULT_MODEL)
+    again = f"the perception process was restarted {restarts} times: its tracker began again, not here"
+    assert found.inexact == [SAMPLES_INEXACT, again][: 1 + bool(restarts)]
+    assert [line for line in report(found) if line.startswith("not exact: tracks and ranges")]
 
 
 @pytest.mark.parametrize("what", ["annotated", "no images"])
