@@ -85,7 +85,8 @@ def replay(
     """Run guidance again over a recording.
 
     Compares each output with the recorded one. The exit code is 1 if any differs. With --model guidance gets
-    the targets that this model finds in the recorded images.
+    the targets that this model finds in the recorded images, without depth and without an operator's
+    selection.
     """
     from companion.plugins import PluginError, load_plugins
     from companion.settings.reading import ConfigurationError
