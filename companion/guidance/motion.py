@@ -33,7 +33,7 @@ HOLD_INTEGRAL_MPS = 0.5
 HOLD_INTEGRAL_M = 1.0
 # `VelocityBias`: natural frequency and damping of the observer, and the limits of its result and its error.
 BIAS_FREQUENCY_RADPS, BIAS_DAMPING = 0.8, 0.8
-# A larger error is a jump of the estimate: the observer begins anew.
+# A larger error is a jump of the estimate: the observer starts again.
 MAX_BIAS_MPS, MAX_BIAS_ERROR_M = 0.5, 0.5
 # Arrived: within this distance of the goal and slower than this...
 ARRIVED_M = 0.3

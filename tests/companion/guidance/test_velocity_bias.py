@@ -41,7 +41,7 @@ def test_jump_of_the_position_is_no_velocity(jump_m: float) -> None:
     assert max(abs(north_mps) for north_mps, _ in observed(VELOCITY_MPS[:2], 8.0, jump_m)) < 0.01
 
 
-def test_unknown_state_begins_anew() -> None:
+def test_unknown_state_starts_again() -> None:
     bias = VelocityBias()
     for index in range(100):
         bias.update(state(3.2 * index * STEP_S, 0.0), STEP_S)

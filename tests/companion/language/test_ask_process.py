@@ -58,11 +58,12 @@ async def talking(**changes: str) -> AsyncIterator[tuple[Service, Talk]]:
 
 
 async def test_plan_is_confirmed_history_is_used_and_cancel_ends_it() -> None:
+    before = set(descendants(os.getpid()))  # multiprocessing's resource tracker
     async with talking() as (there, talk):
         there.stopped.set()
         await talk.send("circle the red car at ten metres")
         assert "orbit track=3" in await talk.shown("[y/N] \n")
-        (child,) = descendants(os.getpid())
+        (child,) = set(descendants(os.getpid())) - before
         own = os.getpriority(os.PRIO_PROCESS, 0)
         assert os.getpriority(os.PRIO_PROCESS, child) == min(own + NICENESS, 19)
         await talk.send("y")
@@ -102,10 +103,11 @@ async def test_line_to_an_ended_process_is_an_error(tmp_path: Path, monkeypatch:
     echo.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(echo))
     process, printed = AskProcess(plain_settings({})), asyncio.Event()
+    before = set(descendants(os.getpid()))
     try:
         await process.send("hold", lambda _: printed.set())
         await asyncio.wait_for(printed.wait(), 20)
-        (child,) = descendants(os.getpid())
+        (child,) = set(descendants(os.getpid())) - before
         kill(child)
         with pytest.raises(BrokenPipeError, match="'y'"):
             await process.send("y", lambda _: None)
