@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -80,6 +81,21 @@ def test_checkpoint_and_its_export_find_the_same_boxes(
     again = Detector(exported, image_size=96, confidence=0, runtime="onnxruntime", threads=1).detect(image)
     np.testing.assert_allclose(again.xyxy, found.xyxy, atol=0.05)
     np.testing.assert_array_equal(again.class_id, found.class_id)
+
+
+def test_int8_export_keeps_sides_angles_and_classes_in_float(tmp_path: Path) -> None:
+    onnx = pytest.importorskip("onnx", reason="onnx is an optional extra")
+    pytest.importorskip("onnxruntime", reason="onnxruntime is an optional extra")
+    photographs = tmp_path / "photographs"
+    photographs.mkdir()
+    for number in range(16):
+        assert cv2.imwrite(str(photographs / f"{number:02}.png"), make_image(64, 64, seed=number))
+    exported = export(checkpoint(tmp_path, "YOLO11"), "onnx", image_size=64, calibrate=photographs)
+    nodes = onnx.load(str(exported)).graph.node
+    int8 = {name for node in nodes if node.op_type == "DequantizeLinear" for name in node.output}
+    convolutions = [node for node in nodes if node.op_type == "Conv"]
+    in_float = [node for node in convolutions if node.input[1] not in int8]
+    assert len(in_float) == 3 * 3 < len(convolutions)  # of sides, angles and classes, at three levels
 
 
 def test_network_gives_distances_of_all_cells() -> None:

@@ -126,14 +126,16 @@ def _name_constants(graph: Any) -> None:
 
 
 def _last_convolutions(graph: Any) -> list[str]:
-    """Names of the convolutions that give the outputs."""
+    """Names of the convolutions that give the outputs; a rotated box comes from those of sides and angle."""
     producers = {name: node for node in graph.node for name in node.output}
     found = []
-    for output in graph.output:
-        node = producers[output.name]
-        while node.op_type != "Conv":
-            node = producers[node.input[0]]
-        found.append(node.name)
+    names = {output.name for output in graph.output}
+    seen: set[str] = set()
+    while names:
+        seen |= names
+        nodes = [producers[name] for name in names if name in producers]
+        found += [node.name for node in nodes if node.op_type == "Conv"]
+        names = {name for node in nodes if node.op_type != "Conv" for name in node.input} - seen
     return found
 
 
