@@ -13,7 +13,7 @@ import pytest
 from companion.recording import RecordingError
 from companion.recording.convert import INPUT_CHANNEL, OUTPUT_CHANNEL, RUN_CHANNEL
 from companion.recording.files import Recorded
-from companion.replay import replay
+from companion.replay import Replay, replay
 from companion.settings.reading import ConfigurationError
 from tests.companion.command_line import companion_here
 from tests.companion.guidance.gimbal_flight import gimbal_flight, person
@@ -48,6 +48,11 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.fixture(scope="module")
+def replayed(flown: Path) -> Replay:
+    return replay([flown], {})
+
+
 def changed_run(flown: Path, folder: Path, **values: object) -> Path:
     def change(message: Recorded) -> Recorded:
         if message.channel.topic != RUN_CHANNEL:
@@ -57,15 +62,14 @@ def changed_run(flown: Path, folder: Path, **values: object) -> Path:
     return rewritten(flown, folder, change)
 
 
-def test_replay_equals_the_flight(flown: Path) -> None:
-    found = replay([flown], {})
-    assert (found.first, found.inexact, found.differing_steps) == (None, [], 0)
-    assert found.steps > 500
-    assert found.commands == 4
-    assert found.digest == replay([flown], {}).digest
+def test_replay_equals_the_flight(flown: Path, replayed: Replay) -> None:
+    assert (replayed.first, replayed.inexact, replayed.differing_steps) == (None, [], 0)
+    assert replayed.steps > 500
+    assert replayed.commands == 4
+    assert replayed.digest == replay([flown], {}).digest
 
 
-def test_replay_equals_in_another_process(flown: Path, tmp_path: Path) -> None:
+def test_replay_equals_in_another_process(flown: Path, replayed: Replay, tmp_path: Path) -> None:
     """Sets of texts have another order there."""
     digests = set()
     for seed in ("1", "2"):
@@ -79,7 +83,7 @@ def test_replay_equals_in_another_process(flown: Path, tmp_path: Path) -> None:
         found = json.loads(done.stdout)
         assert found["identical"] is True
         digests.add(found["digest"])
-    assert digests == {replay([flown], {}).digest}
+    assert digests == {replayed.digest}
 
 
 def test_changed_setting_is_named_with_the_first_difference(flown: Path, tmp_path: Path) -> None:
@@ -167,7 +171,7 @@ def test_outputs_before_their_inputs_are_compared(flown: Path, tmp_path: Path) -
     assert (found.differing_steps, found.inexact) == (found.steps, [])
 
 
-def test_parts_are_replayed_together(flown: Path, tmp_path: Path) -> None:
+def test_parts_are_replayed_together(flown: Path, replayed: Replay, tmp_path: Path) -> None:
     def half(second: bool) -> Path:
         def change(message: Recorded) -> Recorded | None:
             step = json.loads(message.data).get("step", -1)
@@ -178,7 +182,7 @@ def test_parts_are_replayed_together(flown: Path, tmp_path: Path) -> None:
     parts = [half(False), half(True)]
     found = replay(parts, {})
     assert (found.first, found.inexact) == (None, [])
-    assert found.digest == replay([flown], {}).digest
+    assert found.digest == replayed.digest
     assert replay(parts[::-1], {}).inexact
     other = changed_run(flown, tmp_path / "other", service="service2")
     with pytest.raises(RecordingError, match="2 runs"):

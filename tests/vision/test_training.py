@@ -78,6 +78,11 @@ def silent(_progress: Progress) -> None:
     pass
 
 
+@pytest.fixture(scope="module")
+def trained() -> TrainedModel:
+    return train(SMALL, rectangles, silent)
+
+
 def test_tiny_model_overfits_eight_images() -> None:
     settings = replace(
         SMALL, stages=(Stage(96, 96, 8, 110),), warmup_steps=10, learning_rate=6e-3, average_decay=0.95
@@ -91,17 +96,14 @@ def test_tiny_model_overfits_eight_images() -> None:
     assert seen[-1].remaining_s == 0
 
 
-def test_same_seed_gives_same_weights_for_any_workers() -> None:
-    assert torch.equal(
-        weights(train(SMALL, rectangles, silent)),
-        weights(train(replace(SMALL, workers=2), rectangles, silent)),
-    )
+def test_same_seed_gives_same_weights_for_any_workers(trained: TrainedModel) -> None:
+    again = train(replace(SMALL, workers=2), rectangles, silent)
+    assert torch.equal(weights(trained), weights(again))
 
 
-def test_another_seed_gives_other_weights() -> None:
-    assert not torch.equal(
-        weights(train(SMALL, rectangles, silent)), weights(train(replace(SMALL, seed=1), rectangles, silent))
-    )
+def test_another_seed_gives_other_weights(trained: TrainedModel) -> None:
+    other = train(replace(SMALL, seed=1), rectangles, silent)
+    assert not torch.equal(weights(trained), weights(other))
 
 
 def test_weights_of_new_classes_learn_faster_by_the_rate() -> None:
@@ -123,14 +125,13 @@ def test_weights_of_new_classes_learn_faster_by_the_rate() -> None:
         torch.testing.assert_close(value, usual[name], rtol=1e-3, atol=1e-6)
 
 
-def test_resumed_training_gives_uninterrupted_weights(tmp_path: Path) -> None:
-    whole = train(SMALL, rectangles, silent)
+def test_resumed_training_gives_uninterrupted_weights(trained: TrainedModel, tmp_path: Path) -> None:
     kept = tmp_path / "state.pt"
     cut = train(replace(SMALL, time_limit_s=0.0), rectangles, silent, checkpoint=kept)
     assert cut.steps_done == 1
     resumed = train(SMALL, rectangles, silent, checkpoint=kept, resume=True)
     assert resumed.steps_done == 4
-    assert torch.equal(weights(whole), weights(resumed))
+    assert torch.equal(weights(trained), weights(resumed))
 
 
 def test_resuming_another_network_is_rejected(tmp_path: Path) -> None:
@@ -312,14 +313,12 @@ def test_an_object_that_became_too_small_is_ignored() -> None:
     assert truth.classes.tolist() == [[1, 0]]
 
 
-def test_training_can_start_from_another_model() -> None:
-    first = train(SMALL, rectangles, silent)
+def test_training_can_start_from_another_model(trained: TrainedModel) -> None:
     gentle = replace(SMALL, learning_rate=1e-9, average_decay=0.0)
-    assert torch.allclose(
-        weights(train(gentle, rectangles, silent, start=first.model))[:100], weights(first)[:100], atol=1e-5
-    )
+    again = train(gentle, rectangles, silent, start=trained.model)
+    assert torch.allclose(weights(again)[:100], weights(trained)[:100], atol=1e-5)
     with pytest.raises(ValueError, match="another scale"):
-        train(replace(SMALL, width_multiple=0.125), rectangles, silent, start=first.model)
+        train(replace(SMALL, width_multiple=0.125), rectangles, silent, start=trained.model)
 
 
 def test_same_key_draws_the_same_image() -> None:
