@@ -199,7 +199,9 @@ def test_file_of_each_kind_does_what_the_table_says(tmp_path: Path, kind: str) -
     if result.startswith("works"):
         runner = read_source(path).runners()[0]
         confidence = 0.5 if kind in CONSTANT else 0
-        detector = Detector(path, runtime=runner, image_size=96, threads=1, confidence=confidence)
+        detector = Detector(
+            path, runtime=runner, image_size=96, threads=1, confidence=confidence, precision="float32"
+        )
         found = detector.detect(make_image(64, 96))
         if kind in CONSTANT:
             np.testing.assert_allclose(found.xyxy, [BOX], rtol=1e-2)
