@@ -83,6 +83,7 @@ def test_what_cannot_be_measured_is_exit_code_2(
     small_model: Path, arguments: list[str], expected: str
 ) -> None:
     common = ["bench", "detector", "--model", str(small_model), "--runtime", "torch", "--frames", "5"]
+    common += ["--frame", "64x48"]
     result = CliRunner().invoke(app, [*common, *arguments])
     assert result.exit_code == 2
     assert expected in result.output
