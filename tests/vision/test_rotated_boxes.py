@@ -23,8 +23,10 @@ from tests.vision.foreign_checkpoints import (
 )
 from tests.vision.runtimes.conftest import make_image
 from vision.detector import Detector
+from vision.runtimes.base import RuntimeUnusableError
 from vision.runtimes.export import export
 from vision.runtimes.network import Network
+from vision.runtimes.source import runtime_of_file
 from vision.yolo.architecture import ArchitectureError, build
 from vision.yolo.fine_tuning import extend_classes
 from vision.yolo.heads import OBB
@@ -81,6 +83,22 @@ def test_checkpoint_and_its_export_find_the_same_boxes(
     again = Detector(exported, image_size=96, confidence=0, runtime="onnxruntime", threads=1).detect(image)
     np.testing.assert_allclose(again.xyxy, found.xyxy, atol=0.05)
     np.testing.assert_array_equal(again.class_id, found.class_id)
+
+
+def test_openvino_in_bfloat16_gives_nearly_the_sides(tmp_path: Path) -> None:
+    pytest.importorskip("openvino", reason="openvino is an optional extra")
+    exported = export(checkpoint(tmp_path, "YOLO11"), "openvino", image_size=96)
+    image = make_image(64, 96)
+    try:
+        rounded = runtime_of_file("openvino", exported, precision="bfloat16").infer(image)
+    except RuntimeUnusableError as error:
+        pytest.skip(str(error))
+    exact = runtime_of_file("openvino", exported, precision="float32").infer(image)
+    for found, expected in zip(rounded, exact, strict=True):
+        assert found.sides is not None
+        assert expected.sides is not None
+        # In cells, of sides of about 10; a single rounding to bfloat16 would be up to 0.03.
+        np.testing.assert_allclose(found.sides, expected.sides, atol=0.03)
 
 
 def test_int8_export_keeps_sides_angles_and_classes_in_float(tmp_path: Path) -> None:

@@ -138,7 +138,8 @@ class OBB(Detect):
         self.reg_max = 1
 
     def sides(self, level: int, x: Tensor) -> Tensor:
-        # In float32 whatever the network's precision: a distance has more digits than a logit needs.
+        # torch computes this in float32 whatever the network's precision: a distance needs more digits than a
+        # logit. OpenVINO in bfloat16 does not keep all of it in float32 (figures: docs/models.md).
         logits = super().sides(level, x).float().permute(0, 2, 3, 1)
         left, top, right, bottom = self.dfl(logits).unbind(dim=-1)
         angle = (self.cv4[level](x).float().squeeze(1).sigmoid() - 0.25) * math.pi
