@@ -9,6 +9,7 @@ import os
 import socket
 import subprocess
 import sys
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -137,10 +138,12 @@ def _connected(address: str) -> Any:
     if not host or not port.isdecimal() or "/" in host:
         raise ClusterError(f"--ray {address}: expected HOST:PORT, as `ray start --head --port PORT` opens it")
     try:
-        socket.create_connection((host, int(port)), ANSWER_S).close()
+        until_s = time.monotonic() + ANSWER_S
+        _connect(host, int(port), until_s)
         # In another process, because no call of Ray's takes a time limit for this.
         command = (sys.executable, "-m", "ray.scripts.scripts", "status", "--address", address)
-        asked = subprocess.run(command, capture_output=True, text=True, timeout=ANSWER_S)
+        left_s = until_s - time.monotonic()
+        asked = subprocess.run(command, capture_output=True, text=True, timeout=left_s)
     except (OSError, OverflowError, subprocess.TimeoutExpired) as error:
         why = f"nothing in {ANSWER_S:g} s" if isinstance(error, subprocess.TimeoutExpired) else error
         raise ClusterError(
@@ -159,6 +162,20 @@ def _connected(address: str) -> Any:
         ray.shutdown()
         raise ClusterError(f"--ray {address}: the cluster has no processors: `ray start --num-cpus`")
     return ray
+
+
+def _connect(host: str, port: int, until_s: float) -> None:
+    """Connect to the first address of the host that answers until then. Raises OSError."""
+    refused: OSError = TimeoutError()
+    for family, kind, protocol, _, place in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM):
+        with socket.socket(family, kind, protocol) as connection:
+            try:
+                connection.settimeout(max(until_s - time.monotonic(), 0.01))
+                connection.connect(place)
+                return
+            except OSError as error:
+                refused = error
+    raise refused
 
 
 def _one_line(text: object) -> str:
