@@ -16,7 +16,7 @@ from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import redirect_stdout
 from functools import partial
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -101,9 +101,15 @@ def _in_processes(call: Callable[[int], Result], seeds: Sequence[int], processes
             with ProcessPoolExecutor(
                 min(processes, len(left)), get_context("spawn"), initializer=_one_thread
             ) as pool:
-                for result in pool.map(call, left):
-                    done += 1
-                    yield result
+                try:
+                    for result in pool.map(call, left):
+                        done += 1
+                        yield result
+                except (KeyboardInterrupt, GeneratorExit):
+                    pool.shutdown(wait=False, cancel_futures=True)
+                    for worker in active_children():  # else their seeds would be waited for
+                        worker.terminate()
+                    raise
             return
         except BrokenProcessPool:
             continue

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 from pathlib import Path
 
 
@@ -27,4 +28,11 @@ def killed(seed: int) -> int:
     """Every process that is given seed 3 is killed."""
     if seed == 3:
         os.kill(os.getpid(), signal.SIGKILL)
+    return squared(seed)
+
+
+def endless(seed: int) -> int:
+    """The seed squared; any but 1 never ends."""
+    if seed != 1:
+        threading.Event().wait()
     return squared(seed)

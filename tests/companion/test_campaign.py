@@ -9,7 +9,7 @@ import socket
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from functools import partial
 from pathlib import Path
 
@@ -22,7 +22,7 @@ from companion.bench.lockstep_flight import camera_settings
 from companion.campaign import MAX_RETRIES, ClusterError, SeedError, map_seeds, seeds_of
 from companion.cli import app
 from companion.settings import Settings
-from tests.companion.seed_functions import killed, killed_once, squared
+from tests.companion.seed_functions import endless, killed, killed_once, squared
 
 SEEDS = range(6)
 SQUARES = [0, 1, 4, 9, 16, 25]
@@ -52,6 +52,13 @@ def test_a_seed_that_kills_every_process_is_named() -> None:
     results = map_seeds(killed, [1, 3], processes=2)
     with pytest.raises(SeedError, match=f"seed [13]: no result, {1 + MAX_RETRIES} times"):
         list(results)
+
+
+def test_an_interrupted_campaign_does_not_wait_for_its_workers() -> None:
+    results = map_seeds(endless, [1, 2, 3, 4], processes=2)
+    assert next(results) == 1
+    assert isinstance(results, Generator)
+    results.close()  # as a KeyboardInterrupt in the loop
 
 
 def test_detectors_of_campaigns_take_no_measured_choice(monkeypatch: pytest.MonkeyPatch) -> None:
