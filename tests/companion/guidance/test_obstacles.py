@@ -245,7 +245,7 @@ def test_message_distinguishes_unknown_from_free() -> None:
     assert message["known"][:3] == [True, False, True]
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_goto_stops_before_an_obstacle(seed: int) -> None:
     result = run(seed)
     assert result.success, result.reason
