@@ -66,6 +66,10 @@ def schema_errors(path: Path) -> list[str]:
     return found
 
 
+def images(path: Path) -> int:
+    return sum(1 for _ in RecordingReader(path).messages("/image"))
+
+
 def layout_topics() -> set[str]:
     """The topics that the layout for Foxglove shows."""
     text = LAYOUT.read_text()
@@ -89,7 +93,8 @@ def test_flight_is_recorded_and_replays(pictures: Path, exported_model: Path, tm
         service.take_off(2.5)
         assert service.command("hold")["success"]
         assert not service.command("goto forward=900 right=0")["success"]
-        wait_for(lambda: files(folder))
+        # A busy machine takes longer for as many images.
+        wait_for(lambda: [*map(images, files(folder))] > [25])
         assert service.stop() == 0
     (path,) = files(folder)
     reader = RecordingReader(path)
@@ -110,7 +115,7 @@ def test_flight_is_recorded_and_replays(pictures: Path, exported_model: Path, tm
     again = replay([path], {}, str(exported_model)).detections
     assert again is not None
     assert (again.image_formats, again.same_model) == (["png"], True)
-    assert again.images == again.identical_images > 4
+    assert again.images == again.identical_images > 20
     assert again.recorded == again.replayed > again.images
     sent = mavutil.mavlink.MAVLink(None)
     names = Counter(
