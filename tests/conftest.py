@@ -8,8 +8,8 @@ import pytest
 from hypothesis import settings
 
 # How long an example takes says more of the machine than of the code. The same examples every time, so that a
-# failure is of the change; `--hypothesis-profile=explore` tries new ones, and more of them.
-settings.register_profile("steady", deadline=None, derandomize=True, max_examples=50)
+# failure is of the change; `--hypothesis-profile=explore` tries new ones.
+settings.register_profile("steady", deadline=None, derandomize=True)
 settings.register_profile("explore", deadline=None)
 settings.load_profile("steady")
 
