@@ -137,7 +137,7 @@ def test_without_gnss_above_a_map_the_vehicle_keeps_its_place(
             flight.take_off(HEIGHT_M)
             before |= set_for_test(link, {"SIM_GPS_USED": 0.0})
             link.after(SETTLED_S)
-            errors, sent = [], []
+            errors, away, sent = [], [], []
             for north, east in itertools.islice(itertools.cycle([(2.0, 1.0), (0.5, -1.0)]), 4):
                 goal = (north + origin[0], east + origin[1])
                 ahead, aside = goal[0] - link.home_ned_m[0], goal[1] - link.home_ned_m[1]
@@ -145,12 +145,16 @@ def test_without_gnss_above_a_map_the_vehicle_keeps_its_place(
                 for _ in range(40):
                     link.after(0.1)
                     errors.append(math.dist(link.poses[-1].position_ned_m[:2], place(link.poses[-1].time_s)))
+                    away.append(math.dist(place(link.poses[-1].time_s), goal))
                     captured_s, *vision = link.visions[-1]
                     sent.append(math.dist(vision, place(captured_s)))
-            estimate_m = float(np.percentile(errors, 95))
-            flight.note("a map without GNSS", sent_max_m=max(sent), estimate_p95_m=estimate_m)
+            estimate_m, away_m = (float(np.percentile(values, 95)) for values in (errors, away))
+            flight.note(
+                "a map without GNSS", sent_max_m=max(sent), estimate_p95_m=estimate_m, goal_p95_m=away_m
+            )
             assert max(sent) < 0.1
             assert estimate_m < 0.5
+            assert away_m < 0.3 + 0.5  # the arrival's tolerance, and the estimate's
     finally:
         for parameter, value in before.items():
             link.set_parameter(parameter, value)
