@@ -389,6 +389,7 @@ def detect(
         from vision.detector import forget_measurements, open_detector
         from vision.object_detector import DetectorSettings
         from vision.pipeline import FrameDetector
+        from vision.runtimes.base import RuntimeUnusableError
         from vision.sources import SourceError, SourceSettings, open_source
         from vision.tiling import TiledDetector
         from vision.tracking import Tracker, TrackerSettings
@@ -423,7 +424,8 @@ def detect(
             width=width, height=height, rate_hz=rate, pixel_format=pixel_format, every_frame=True
         )
     write = functools.partial(print, flush=True)
-    with plain_errors(SourceError, OSError), open_source(source, settings) as frames:
+    unusable = (SourceError, OSError, RuntimeUnusableError)
+    with plain_errors(*unusable), open_source(source, settings) as frames:
         if detector_kind == YOLO:
             _warn_synthetic_model([(source, model)])
         summary = detect_source(

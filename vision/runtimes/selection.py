@@ -63,7 +63,10 @@ def start_runtime(
     if choice != "auto" and choice not in RUNTIMES:
         raise ValueError(f"runtime must be auto, {', '.join(RUNTIMES)}; got {choice!r}")
     if device not in DEVICES:
-        raise ValueError(f"device must be {' or '.join(DEVICES)}; got {device!r}")
+        raise ValueError(
+            f"device must be {' or '.join(DEVICES)}, got {device!r}; CUDA_VISIBLE_DEVICES selects one of "
+            "several GPUs"
+        )
     check_runtime(source, choice)
     if device != "cpu" and (choice != "torch" or source.kind is not None or source.foreign is not None):
         raise RuntimeUnusableError(

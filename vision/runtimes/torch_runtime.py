@@ -9,7 +9,8 @@ import logging
 import time
 import warnings
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,8 @@ _TRACED, _TRIED = (2, 4), (4, 6)
 _TRIAL_PAIRS = range(5, 40)
 _TRIAL_S = 0.5
 _TRIAL_SIDE = 320
+# Of the calls before the first frame: the second of a GPU's also compiles, for each size.
+_WARM_UP_RUNS = {"cpu": 2, "cuda": 4}
 # bfloat16 must save at least a fifth; for less it is not worth its rounding.
 _WORTH = 0.8
 
@@ -62,7 +65,11 @@ class TorchRuntime:
         threads: processor threads, of torch in the whole process; None: unchanged.
         sparse_boxes: see `Network`.
         model_sha256: of the weights; with it, a measured precision is stored for later starts.
-        device: `cuda`: torch's current CUDA device; there `auto` is float32.
+        device: `cuda`: torch's current CUDA device; there `auto` is float32, without TF32 (in the whole
+            process), so that boxes equal the processor's.
+
+    Raises:
+        RuntimeUnusableError: no such device or precision, or the GPU's memory is full (`infer` too).
     """
 
     product: Product = staticmethod(torch_product)
@@ -93,9 +100,14 @@ class TorchRuntime:
         self._network = Network(model, class_ids, sparse_boxes=sparse_boxes).channels_last()
         self.head: Head = self._network.head
         self.precision, self.precision_reason = self._choose_precision(precision, model_sha256)
-        self._network.in_precision(dtypes[self.precision]).to(self.device)
         self._graphs: collections.OrderedDict[tuple[int, int], Graph] = collections.OrderedDict()
-        self._graph = self._any_size()
+        with gpu_errors():
+            if device == "cuda":
+                # Its 10 bits of mantissa are those of float16, which can be asked for by its name.
+                torch.backends.cudnn.allow_tf32 = False
+                self.precision_reason += f", on {torch.cuda.get_device_name()}"
+            self._network.in_precision(dtypes[self.precision]).to(self.device)
+            self._graph = self._any_size()
 
     @property
     def threads(self) -> int:
@@ -104,12 +116,12 @@ class TorchRuntime:
     def prepare(self, height: int, width: int) -> None:
         # The graph's first runs allocate its memory; later ones only compute.
         blank = np.zeros((height, width, 3), np.uint8)
-        for _ in range(2):
+        for _ in range(_WARM_UP_RUNS.get(self.device.type, 2)):
             self.infer(blank)
 
     def infer(self, image_bgr: NDArray[np.uint8]) -> list[LevelOutput]:
-        pixels = torch.from_numpy(image_bgr).unsqueeze(0).to(self.device)
-        with torch.inference_mode():
+        with torch.inference_mode(), gpu_errors():
+            pixels = torch.from_numpy(image_bgr).unsqueeze(0).to(self.device)
             graph = self._graph or self._graph_of_size(pixels)
             outputs = [level[0].cpu().numpy() for level in graph(pixels)]
         return self.head.levels(outputs)
@@ -151,9 +163,13 @@ class TorchRuntime:
         return graph
 
     def _choose_precision(self, requested: Precision, model_sha256: str | None) -> tuple[str, str]:
+        on_cuda = self.device.type == "cuda"
         native = base.bfloat16_instructions()
-        if requested == "bfloat16" and not native and self.device.type == "cpu":
-            logger.warning("this processor does not support bfloat16; it is emulated and slow")
+        if requested == "bfloat16":
+            supported = torch.cuda.is_bf16_supported(including_emulation=False) if on_cuda else native
+            if not supported:
+                which = "GPU" if on_cuda else "processor"
+                logger.warning("this %s does not support bfloat16; it is emulated and slow", which)
         if requested != "auto":
             return requested, "as requested"
         if self.device.type != "cpu":
@@ -199,11 +215,38 @@ class TorchRuntime:
 
 def check_device(device: Device) -> None:
     """Raise `RuntimeUnusableError` if torch cannot compute on it."""
-    if device == "cuda" and not torch.cuda.is_available():
-        raise RuntimeUnusableError(
-            f"device cuda: torch {torch.__version__} finds no CUDA device; use the device cpu, or install a "
-            "torch built for CUDA and the driver"
-        )
+    if device != "cuda":
+        return
+    with warnings.catch_warnings(record=True) as said:  # torch warns of a driver that it cannot use
+        warnings.simplefilter("always")
+        available = torch.cuda.is_available()
+    if available:
+        return
+    built = torch.version.cuda
+    if built is None:
+        reason, do = "it is built without CUDA", "install a torch built for CUDA"
+    else:
+        reason = "; ".join(" ".join(str(warning.message).split())[:200] for warning in said)
+        reason = reason or f"it is built for CUDA {built}"
+        do = "check the driver (nvidia-smi) and CUDA_VISIBLE_DEVICES"
+    raise RuntimeUnusableError(
+        f"device cuda: torch {torch.__version__} finds no CUDA device ({reason}); use the device cpu, or {do}"
+    )
+
+
+@contextmanager
+def gpu_errors() -> Iterator[None]:
+    """Raise what torch reports of a GPU as a `RuntimeUnusableError` of one line."""
+    try:
+        yield
+    except RuntimeError as error:
+        # From a traced graph it is a plain RuntimeError that quotes the operation's.
+        line = next((line for line in str(error).splitlines() if "CUDA" in line or "cuDNN" in line), None)
+        if line is None:
+            raise
+        if "out of memory" in line:
+            line = "out of memory; use a smaller image_size or model, or end other programs on the GPU"
+        raise RuntimeUnusableError(f"device cuda: {line.strip()[:300]}") from error
 
 
 def traced(network: Network, pixels: Tensor) -> Graph:

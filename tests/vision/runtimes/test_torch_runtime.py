@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from vision.runtimes.base import RuntimeUnusableError
 from vision.runtimes.network import Network
 from vision.runtimes.source import read_source
 from vision.runtimes.stored_choice import forget_choices
-from vision.runtimes.torch_runtime import TorchRuntime, torch_product
+from vision.runtimes.torch_runtime import TorchRuntime, gpu_errors, torch_product
 from vision.yolo.architecture import YoloModel
 
 
@@ -143,13 +144,45 @@ def test_cuda_without_a_device_is_refused(checkpoint: Path) -> None:
         Detector(checkpoint, device="cuda")
 
 
+def test_cuda_names_the_driver_problem_that_torch_warns_of(
+    checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_driver() -> bool:
+        warnings.warn("the driver is too old\n(found version 1)", stacklevel=1)
+        return False
+
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    monkeypatch.setattr(torch.cuda, "is_available", no_driver)
+    with pytest.raises(RuntimeUnusableError, match=r"\(the driver is too old \(found version 1\)\); [^\n]*$"):
+        Detector(checkpoint, device="cuda")
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("The following failed:\nRuntimeError: CUDA out of memory. Tried 2 GiB", "out of memory; [^\n]*$"),
+        ("CUDA error: no kernel image\nFor debugging pass …", "CUDA error: no kernel image$"),
+    ],
+)
+def test_errors_of_the_gpu_are_one_line(text: str, expected: str) -> None:
+    with pytest.raises(RuntimeUnusableError, match=f"^device cuda: {expected}"), gpu_errors():
+        raise RuntimeError(text)
+
+
+def test_other_errors_keep_their_type() -> None:
+    with pytest.raises(RuntimeError, match="shapes") as caught, gpu_errors():
+        raise RuntimeError("shapes differ")
+    assert not isinstance(caught.value, ValueError)
+
+
 def test_cuda_is_refused_for_other_runtimes_and_unknown_devices(checkpoint: Path) -> None:
     source = read_source(checkpoint)
     for runtime in ("openvino", "auto"):
         with pytest.raises(RuntimeUnusableError, match=r"the device cuda is for a checkpoint"):
             selection.start_runtime(source, runtime, device="cuda")
-    with pytest.raises(ValueError, match="cpu or cuda"):
-        Detector(checkpoint, device="tpu")  # type: ignore[arg-type]
+    for device in ("tpu", "cuda:7"):
+        with pytest.raises(ValueError, match=f"^device must be cpu or cuda, got '{device}'[^\n]*$"):
+            Detector(checkpoint, device=device)  # type: ignore[arg-type]
 
 
 def test_network_and_pixels_are_moved_to_the_device(
