@@ -49,7 +49,7 @@ CLASS_WEIGHTS = {
     "dog": 1.0,
     "chair": 1.0,
 }
-FLIGHT_SHARE, WORLD_SHARE = 0.42, 0.28
+FLIGHT_SHARE, WORLD_SHARE = 0.36, 0.3
 """Shares of `flight_frame` and `world_frame` in training; the rest is `random_frame`."""
 TRAINING_WORLDS = tuple(range(1_000_000, 1_000_008))
 """Seeds of the default worlds in training. Flights and held-out frames use small seeds."""

@@ -285,15 +285,15 @@ def detection_loss(outputs: Sequence[Tensor], strides: Sequence[float], truth: T
 
 def _class_mask(truth: Truth, centres: Tensor, cell_sizes: Tensor, class_scores: Tensor) -> Tensor:
     """(B, A, classes) weights: 0 inside an ignored object of the class, 1 elsewhere."""
-    mask = torch.ones_like(class_scores)
-    if truth.ignored is None:
-        return mask
-    for image, item in truth.ignored.nonzero().tolist():
-        left, top, right, bottom = truth.boxes[image, item].tolist()
-        x, y, reach = centres[:, 0], centres[:, 1], cell_sizes / 2
-        inside = (x > left - reach) & (x < right + reach) & (y > top - reach) & (y < bottom + reach)
-        mask[image, inside, int(truth.classes[image, item])] = 0.0
-    return torch.where(class_scores > 0, 1.0, mask)
+    if truth.ignored is None or not truth.boxes.shape[1]:
+        return torch.ones_like(class_scores)
+    reach = cell_sizes[:, None] / 2
+    low, high = centres - reach, centres + reach
+    boxes = truth.boxes[:, :, None]
+    inside = (high > boxes[..., :2]).all(-1) & (low < boxes[..., 2:]).all(-1) & truth.ignored[..., None]
+    of_class = F.one_hot(truth.classes, class_scores.shape[-1]).to(class_scores.dtype)
+    hidden = torch.einsum("bma,bmc->bac", inside.to(class_scores.dtype), of_class) > 0
+    return torch.where(hidden & (class_scores <= 0), 0.0, 1.0)
 
 
 def _boxes_from_bins(bin_logits: Tensor, centres: Tensor, cell_sizes: Tensor) -> Tensor:

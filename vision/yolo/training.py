@@ -229,7 +229,7 @@ def train(
     scale = (settings.depth_multiple, settings.width_multiple, settings.max_channels)
     model = build(network or yolov8_description(scale, settings.class_names)).train()
     if start is None:
-        _start_boxes_small(model)
+        prepare_start(model)
     else:
         _copy_weights(start, model)
     for module in model.modules():
@@ -305,7 +305,7 @@ def _floats(module: nn.Module) -> list[Tensor]:
     return [tensor for tensor in module.state_dict().values() if tensor.is_floating_point()]
 
 
-def _start_boxes_small(model: YoloModel) -> None:
+def prepare_start(model: YoloModel) -> None:
     """Let every side's distribution fall off by bin, so that the initial boxes are about four cells wide.
 
     A flat distribution gives boxes of 15 cells; their IoU with a small object is near zero, and with

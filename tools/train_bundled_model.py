@@ -1,0 +1,352 @@
+"""Train the bundled detector on a GPU within a given time, from scenes drawn while it runs.
+
+    python -m tools.train_bundled_model runs/default.safetensors --minutes 9
+
+`companion train` does the same on a processor, in hours. Here processes draw the scenes of
+`mavlink_sim.datasets.training_scenes` into a pool in shared memory and replace the oldest ones without end.
+The trainer keeps a copy of the pool on the GPU and makes its batches there, as `vision.yolo.scene_batches`
+does on the processor: a whole scene, reduced, or a part of it, mirrored and recoloured. Images of both sizes
+of `SIZES` alternate. The learning rate falls with the time, to almost zero at its end. The result is the
+average of the weights. It is not repeatable to the bit: how many scenes are drawn depends on the machine.
+
+Several `--width` train as many networks at the same time, on the same scenes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import logging
+import math
+import mmap
+import multiprocessing
+import os
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from mavlink_sim.datasets.training_scenes import training_scene
+from mavlink_sim.world.shapes import CLASS_NAMES
+from vision.yolo.architecture import YoloModel, build
+from vision.yolo.checkpoint import load_checkpoint, save_checkpoint
+from vision.yolo.losses import Truth, detection_loss
+from vision.yolo.published import yolov8_description
+from vision.yolo.recipe import REFINEMENT
+from vision.yolo.scene_batches import PADDING_GREY
+from vision.yolo.training import prepare_start, update_average
+
+WIDTH, HEIGHT = 640, 480
+"""Pixels of a drawn scene."""
+SIZES = ((320, 256, 256), (320, 256, 256), (640, 480, 96))
+"""Width, height and batch size of the images of one step after another."""
+MOST_OBJECTS = 32
+WARMUP_STEPS = 300
+FIRST_SCENES = 2048
+"""Training starts when so many are drawn."""
+AVERAGE_DECAY = 0.9995
+LOGGED_STEPS = 100
+SCENE_SEED = 40_000_000
+"""Of the drawn scenes: far from the seeds of evaluations and flights."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pool:
+    """Scenes in memory that the processes share. Renderer r draws into the places r, r + R, r + 2R …
+
+    Attributes:
+        images: (N, HEIGHT, WIDTH, 3) uint8 RGB.
+        boxes: (N, MOST_OBJECTS, 4) float32, pixels xyxy.
+        ids: (N, MOST_OBJECTS) int64, of `LabelledImage`; LACKING where there is no object.
+        drawn: (R,) int64, how many each renderer has drawn.
+    """
+
+    images: NDArray[np.uint8]
+    boxes: NDArray[np.float32]
+    ids: NDArray[np.int64]
+    drawn: NDArray[np.int64]
+
+    @classmethod
+    def of_size(cls, scenes: int, renderers: int) -> Pool:
+        """An empty pool of about `scenes` places, a multiple of `renderers`."""
+        count = max(1, scenes // renderers) * renderers
+        return cls(
+            _shared((count, HEIGHT, WIDTH, 3), np.uint8),
+            _shared((count, MOST_OBJECTS, 4), np.float32),
+            _shared((count, MOST_OBJECTS), np.int64),
+            _shared((renderers,), np.int64),
+        )
+
+
+LACKING = -1000
+
+
+def _shared(shape: tuple[int, ...], dtype: type) -> NDArray[Any]:
+    size = math.prod(shape) * np.dtype(dtype).itemsize
+    return np.frombuffer(mmap.mmap(-1, size), dtype).reshape(shape)
+
+
+def draw(pool: Pool, renderer: int, seed: int) -> None:
+    """Draw scenes without end, the oldest places again."""
+    os.nice(5)
+    cv2.setNumThreads(1)
+    renderers, rounds = len(pool.drawn), len(pool.images) // len(pool.drawn)
+    while True:
+        number = int(pool.drawn[renderer])
+        place = renderer + renderers * (number % rounds)
+        rng = np.random.default_rng([seed, renderer, number])
+        image, boxes, ids = training_scene(rng, WIDTH, HEIGHT)
+        count = min(len(ids), MOST_OBJECTS)
+        pool.images[place] = image[:, :, ::-1]
+        pool.boxes[place, :count] = boxes[:count]
+        pool.ids[place] = LACKING
+        pool.ids[place, :count] = ids[:count]
+        pool.drawn[renderer] = number + 1
+
+
+class PoolCopy:
+    """The pool on the trainer's device, updated by a thread."""
+
+    def __init__(self, pool: Pool, device: torch.device) -> None:
+        self._pool, self._device = pool, device
+        self.images = torch.zeros(pool.images.shape, dtype=torch.uint8, device=device)
+        self.boxes = torch.zeros(pool.boxes.shape, device=device)
+        self.ids = torch.full(pool.ids.shape, LACKING, dtype=torch.int64, device=device)
+        self._copied = np.zeros_like(pool.drawn)
+
+    @property
+    def available(self) -> int:
+        """The first so many places have a scene."""
+        return min(int(self._copied.min()) * len(self._copied), len(self.images))
+
+    @property
+    def scenes(self) -> int:
+        """How many different scenes were copied."""
+        return int(self._copied.sum())
+
+    def update(self) -> None:
+        """Copy what was drawn since the last call."""
+        renderers, rounds = len(self._copied), len(self.images) // len(self._copied)
+        for renderer, drawn in enumerate(self._pool.drawn.tolist()):
+            first = max(int(self._copied[renderer]), drawn - rounds)
+            places = [renderer + renderers * (number % rounds) for number in range(first, drawn)]
+            for start in range(0, len(places), 64):
+                some = places[start : start + 64]
+                for mine, theirs in (
+                    (self.images, self._pool.images),
+                    (self.boxes, self._pool.boxes),
+                    (self.ids, self._pool.ids),
+                ):
+                    mine[some] = torch.from_numpy(theirs[some]).to(self._device)
+            self._copied[renderer] = drawn
+
+    def follow(self, ended: threading.Event) -> None:
+        """Update until `ended`."""
+        while not ended.wait(0.5):
+            self.update()
+
+
+def batch(pool: PoolCopy, width: int, height: int, count: int, rng: torch.Generator) -> tuple[Tensor, Truth]:
+    """Augmented images (count, 3, height, width) float32 in 0..1 and their objects."""
+    limits, device = REFINEMENT.augmentation, pool.images.device
+
+    def uniform(low: float, high: float, *shape: int) -> Tensor:
+        return low + (high - low) * torch.rand(shape or (count,), device=device, generator=rng)
+
+    chosen = torch.randint(pool.available, (count,), device=device, generator=rng)
+    boxes, ids = pool.boxes[chosen], pool.ids[chosen]
+    window = torch.tensor([width, height], device=device, dtype=torch.float32)
+    whole = torch.tensor([WIDTH, HEIGHT], device=device, dtype=torch.float32)
+    least = float((window / whole).min())
+    zoomed = uniform(0, 1) < limits.zoom_probability
+    zoom = torch.exp(uniform(math.log(least * limits.zoom_min), math.log(limits.zoom_max)))
+    zoom = torch.where(zoomed, zoom, torch.full_like(zoom, least))[:, None]
+    margin = window - zoom * whole
+    shift = uniform(0, 1, count, 2) * margin
+    # Most of a large scene is empty: prefer a part with an object.
+    target = torch.multinomial((ids != LACKING).float() + 1e-6, 1, generator=rng)[:, :, None].expand(-1, 1, 4)
+    centre = boxes.gather(1, target)[:, 0].reshape(count, 2, 2).mean(1) * zoom
+    aimed = uniform(0.1, 0.9, count, 2) * window - centre
+    aimed = torch.minimum(torch.maximum(aimed, margin.clamp(max=0)), margin.clamp(min=0))
+    aims = (uniform(0, 1) < 0.7) & (ids != LACKING).any(1)
+    shift = torch.where(aims[:, None], aimed, shift)
+    shift = torch.where(zoomed[:, None], shift, margin / 2)
+
+    moved = boxes * zoom[:, None] + shift.repeat(1, 2)[:, None]
+    mirrored = uniform(0, 1) < limits.mirror
+    flipped = torch.stack([width - moved[..., 2], moved[..., 1], width - moved[..., 0], moved[..., 3]], -1)
+    moved = torch.where(mirrored[:, None, None], flipped, moved)
+    clipped = torch.minimum(moved.clamp(min=0), window.repeat(2))
+    sides = (clipped[..., 2:] - clipped[..., :2]).clamp(min=0)
+    area, visible = (moved[..., 2:] - moved[..., :2]).prod(-1), sides.prod(-1)
+    hidden = visible < limits.visible_fraction * area.clamp(min=1e-9)
+    small = (sides.amin(-1) < limits.min_side_px) | (visible < limits.min_area_px)
+    exists = (ids != LACKING) & (visible > 0)
+    learned = exists & (ids >= 0) & ~hidden & ~small
+    classes = torch.where(ids < 0, -1 - ids, ids).clamp(0, len(CLASS_NAMES) - 1)
+
+    # Pixel x of the image shows the scene's (x - shift) / zoom, mirrored: of the image's other side.
+    sign = torch.where(mirrored, -1.0, 1.0)
+    across, down = window[0] / (zoom[:, 0] * whole[0]), window[1] / (zoom[:, 0] * whole[1])
+    matrix = torch.zeros(count, 2, 3, device=device)
+    matrix[:, 0, 0], matrix[:, 1, 1] = sign * across, down
+    matrix[:, 0, 2] = across - 2 * shift[:, 0] / (zoom[:, 0] * whole[0]) - 1
+    matrix[:, 1, 2] = down - 2 * shift[:, 1] / (zoom[:, 0] * whole[1]) - 1
+    grid = F.affine_grid(matrix, [count, 3, height, width], align_corners=False)
+    scenes = pool.images[chosen].permute(0, 3, 1, 2).float() - PADDING_GREY
+    images = (F.grid_sample(scenes, grid, align_corners=False) + PADDING_GREY) / 255.0
+    # Saturation and brightness of HSV; small gains of each channel stand for the hue.
+    value = images.amax(1, keepdim=True)
+    saturation = 1 + uniform(-limits.saturation, limits.saturation)[:, None, None, None]
+    gain = 1 + uniform(-limits.brightness, limits.brightness)[:, None, None, None]
+    tint = uniform(0.96, 1.04, count, 3)[:, :, None, None]
+    images = ((value - (value - images) * saturation) * gain * tint).clamp(0, 1)
+    return images, Truth(clipped, classes, learned, exists & ~learned)
+
+
+def train(pool: Pool, width_multiple: float, output: Path, given: argparse.Namespace) -> None:
+    """Train one network until the time is over; its average is written every minute and at the end."""
+    device = torch.device(given.device)
+    torch.set_num_threads(1)
+    torch.manual_seed(given.seed)
+    torch.backends.cudnn.benchmark = True
+    torch.set_float32_matmul_precision("high")
+    rng = torch.Generator(device).manual_seed(given.seed)
+    copied, ended = PoolCopy(pool, device), threading.Event()
+    while copied.available < min(FIRST_SCENES, len(copied.images)):
+        time.sleep(0.2)
+        copied.update()
+    threading.Thread(target=copied.follow, args=(ended,), daemon=True).start()
+
+    scale = (REFINEMENT.depth_multiple, width_multiple, REFINEMENT.max_channels)
+    model = build(yolov8_description(scale, CLASS_NAMES)).train()
+    prepare_start(model)
+    if given.start is not None:
+        start = load_checkpoint(given.start)
+        if start.description.width_multiple == width_multiple:
+            model.load_state_dict(start.model.state_dict())
+    model = model.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+    average = copy.deepcopy(model).eval()
+    decayed = [
+        parameter for parameter in model.parameters() if parameter.requires_grad and parameter.ndim > 1
+    ]
+    others = [
+        parameter for parameter in model.parameters() if parameter.requires_grad and parameter.ndim <= 1
+    ]
+    optimiser = torch.optim.AdamW(
+        [
+            {"params": decayed, "weight_decay": REFINEMENT.weight_decay},
+            {"params": others, "weight_decay": 0.0},
+        ],
+        given.rate,
+        betas=(0.9, 0.99),
+        fused=device.type == "cuda",
+    )
+    started, written, step, images_done = time.monotonic(), time.monotonic(), 0, 0
+    end = given.end
+    while (now := time.monotonic()) < end:
+        width, height, count = SIZES[step % len(SIZES)]
+        count = max(1, int(count * given.batch_share))
+        share = (now - started) / (end - started)
+        rate = given.rate * min(1.0, (step + 1) / WARMUP_STEPS) * (0.5 + 0.5 * math.cos(math.pi * share))
+        for group in optimiser.param_groups:
+            group["lr"] = rate
+        images, truth = batch(copied, width, height, count, rng)
+        with torch.autocast(device.type, torch.bfloat16):
+            outputs = model(images.to(memory_format=torch.channels_last))
+        loss = detection_loss([level.float() for level in outputs], model.strides, truth)
+        optimiser.zero_grad(set_to_none=True)
+        loss.total.backward()  # type: ignore[no-untyped-call]
+        nn.utils.clip_grad_norm_(model.parameters(), REFINEMENT.gradient_limit)
+        optimiser.step()
+        step, images_done = step + 1, images_done + count
+        update_average(average, model, min(AVERAGE_DECAY, step / (step + 10)))
+        if step % LOGGED_STEPS == 0:
+            logging.info(
+                "%s %.0f s: step %d, %d images, %d scenes, losses %.3f %.3f %.3f, rate %.2g",
+                output.name,
+                now - started,
+                step,
+                images_done,
+                copied.scenes,
+                loss.box,
+                loss.classes,
+                loss.distribution,
+                rate,
+            )
+            if not math.isfinite(float(loss.total)):
+                raise FloatingPointError(f"the loss of step {step} is {float(loss.total)}: lower --rate")
+        if now - written > 60:
+            _write(output, average, given, step, images_done, copied.scenes)
+            written = now
+    ended.set()
+    _write(output, average, given, step, images_done, copied.scenes)
+
+
+def _write(
+    output: Path, average: YoloModel, given: argparse.Namespace, steps: int, images: int, scenes: int
+) -> None:
+    metadata = {
+        "licence": "Apache-2.0",
+        "trained_on": "scenes drawn by mavlink_sim.datasets.training_scenes",
+        "trained_by": "tools.train_bundled_model",
+        "seed": given.seed,
+        "minutes": given.minutes,
+        "steps_done": steps,
+        "images": images,
+        "scenes": scenes,
+    }
+    output.parent.mkdir(parents=True, exist_ok=True)
+    save_checkpoint(output, copy.deepcopy(average).cpu(), metadata=metadata)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Read the command line, start the renderers and a trainer for each width."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument(
+        "output", type=Path, help="NAME.safetensors; of several widths NAME-WIDTH.safetensors"
+    )
+    parser.add_argument("--width", type=float, action="append", help="width multiple of YOLOv8; repeatable")
+    parser.add_argument(
+        "--minutes", type=float, default=9.0, help="in all, with the drawing of the first scenes"
+    )
+    parser.add_argument("--device", default="cuda")
+    parser.add_argument("--renderers", type=int, default=max(1, (os.cpu_count() or 2) - 2))
+    parser.add_argument("--scenes", type=int, default=24_000, help="places of the pool, 0.9 MB each")
+    parser.add_argument("--rate", type=float, default=3e-3, help="highest learning rate")
+    parser.add_argument("--batch-share", type=float, default=1.0, help="smaller batches, for a small GPU")
+    parser.add_argument("--start", type=Path, help="weights for the network of their width to start from")
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args(arguments)
+    given.end = time.monotonic() + 60 * given.minutes
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    widths = given.width or [REFINEMENT.width_multiple]
+    # Forked, so that they share the pool's memory; before CUDA and torch's threads start.
+    processes = multiprocessing.get_context("fork")
+    pool = Pool.of_size(given.scenes, given.renderers)
+    for number in range(given.renderers):
+        processes.Process(target=draw, args=(pool, number, SCENE_SEED + given.seed), daemon=True).start()
+    trainers = []
+    for width in widths:
+        output = given.output
+        if len(widths) > 1:
+            output = output.with_name(f"{output.stem}-{width:g}{output.suffix}")
+        trainers.append(processes.Process(target=train, args=(pool, width, output, given)))
+        trainers[-1].start()
+    for trainer in trainers:
+        trainer.join()
+    if any(trainer.exitcode for trainer in trainers):
+        raise SystemExit(1)
+
+
+if __name__ == "__main__":
+    main()
