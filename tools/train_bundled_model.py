@@ -9,7 +9,7 @@ does on the processor: a whole scene, reduced, or a part of it, mirrored and rec
 of `SIZES` alternate. The learning rate falls with the time, to almost zero at its end. The result is the
 average of the weights. It is not repeatable to the bit: how many scenes are drawn depends on the machine.
 
-Several `--width` train as many networks at the same time, on the same scenes.
+Several `--rate` train as many networks at the same time, on the same scenes.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import os
 import threading
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +41,7 @@ from vision.yolo.architecture import YoloModel, build
 from vision.yolo.checkpoint import load_checkpoint, save_checkpoint
 from vision.yolo.losses import Truth, detection_loss
 from vision.yolo.published import yolov8_description
-from vision.yolo.recipe import REFINEMENT
+from vision.yolo.recipe import HELD_OUT_SEED, HELD_OUT_SIZE, REFINEMENT, evaluate
 from vision.yolo.scene_batches import PADDING_GREY
 from vision.yolo.training import prepare_start, update_average
 
@@ -51,10 +51,11 @@ SIZES = ((320, 256, 256), (320, 256, 256), (640, 480, 96))
 """Width, height and batch size of the images of one step after another."""
 MOST_OBJECTS = 32
 WARMUP_STEPS = 300
-FIRST_SCENES = 2048
+FIRST_SCENES = 512
 """Training starts when so many are drawn."""
 AVERAGE_DECAY = 0.9995
 LOGGED_STEPS = 100
+HELD_OUT_SCENES = 100
 SCENE_SEED = 40_000_000
 """Of the drawn scenes: far from the seeds of evaluations and flights."""
 
@@ -213,12 +214,11 @@ def batch(pool: PoolCopy, width: int, height: int, count: int, rng: torch.Genera
     return images, Truth(clipped, classes, learned, exists & ~learned)
 
 
-def train(pool: Pool, width_multiple: float, output: Path, given: argparse.Namespace) -> None:
+def train(pool: Pool, highest_rate: float, output: Path, given: argparse.Namespace) -> None:
     """Train one network until the time is over; its average is written every minute and at the end."""
     device = torch.device(given.device)
     torch.set_num_threads(1)
     torch.manual_seed(given.seed)
-    torch.backends.cudnn.benchmark = True
     torch.set_float32_matmul_precision("high")
     rng = torch.Generator(device).manual_seed(given.seed)
     copied, ended = PoolCopy(pool, device), threading.Event()
@@ -227,13 +227,11 @@ def train(pool: Pool, width_multiple: float, output: Path, given: argparse.Names
         copied.update()
     threading.Thread(target=copied.follow, args=(ended,), daemon=True).start()
 
-    scale = (REFINEMENT.depth_multiple, width_multiple, REFINEMENT.max_channels)
+    scale = (REFINEMENT.depth_multiple, given.width, REFINEMENT.max_channels)
     model = build(yolov8_description(scale, CLASS_NAMES)).train()
     prepare_start(model)
     if given.start is not None:
-        start = load_checkpoint(given.start)
-        if start.description.width_multiple == width_multiple:
-            model.load_state_dict(start.model.state_dict())
+        model.load_state_dict(load_checkpoint(given.start).model.state_dict())
     model = model.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     average = copy.deepcopy(model).eval()
     decayed = [
@@ -247,7 +245,7 @@ def train(pool: Pool, width_multiple: float, output: Path, given: argparse.Names
             {"params": decayed, "weight_decay": REFINEMENT.weight_decay},
             {"params": others, "weight_decay": 0.0},
         ],
-        given.rate,
+        highest_rate,
         betas=(0.9, 0.99),
         fused=device.type == "cuda",
     )
@@ -257,7 +255,7 @@ def train(pool: Pool, width_multiple: float, output: Path, given: argparse.Names
         width, height, count = SIZES[step % len(SIZES)]
         count = max(1, int(count * given.batch_share))
         share = (now - started) / (end - started)
-        rate = given.rate * min(1.0, (step + 1) / WARMUP_STEPS) * (0.5 + 0.5 * math.cos(math.pi * share))
+        rate = highest_rate * min(1.0, (step + 1) / WARMUP_STEPS) * (0.5 + 0.5 * math.cos(math.pi * share))
         for group in optimiser.param_groups:
             group["lr"] = rate
         images, truth = batch(copied, width, height, count, rng)
@@ -286,14 +284,20 @@ def train(pool: Pool, width_multiple: float, output: Path, given: argparse.Names
             if not math.isfinite(float(loss.total)):
                 raise FloatingPointError(f"the loss of step {step} is {float(loss.total)}: lower --rate")
         if now - written > 60:
-            _write(output, average, given, step, images_done, copied.scenes)
+            _write(output, average, given, highest_rate, step, images_done, copied.scenes)
             written = now
     ended.set()
-    _write(output, average, given, step, images_done, copied.scenes)
+    _write(output, average, given, highest_rate, step, images_done, copied.scenes)
 
 
 def _write(
-    output: Path, average: YoloModel, given: argparse.Namespace, steps: int, images: int, scenes: int
+    output: Path,
+    average: YoloModel,
+    given: argparse.Namespace,
+    rate: float,
+    steps: int,
+    images: int,
+    scenes: int,
 ) -> None:
     metadata = {
         "licence": "Apache-2.0",
@@ -301,6 +305,7 @@ def _write(
         "trained_by": "tools.train_bundled_model",
         "seed": given.seed,
         "minutes": given.minutes,
+        "learning_rate": rate,
         "steps_done": steps,
         "images": images,
         "scenes": scenes,
@@ -309,43 +314,64 @@ def _write(
     save_checkpoint(output, copy.deepcopy(average).cpu(), metadata=metadata)
 
 
+def _write_score(output: Path) -> None:
+    trained = load_checkpoint(output)
+    width, height = HELD_OUT_SIZE
+    score = evaluate(trained.model, training_scene, HELD_OUT_SEED, HELD_OUT_SCENES, width, height)
+    per_class = {name: asdict(of_class) for name, of_class in score.per_class.items()}
+    metadata = trained.metadata | {
+        "score": {
+            "map50": round(score.map50, 4),
+            "map50_95": round(score.map50_95, 4),
+            "per_class": per_class,
+            "held_out_scenes": HELD_OUT_SCENES,
+            "held_out_seed": HELD_OUT_SEED,
+            "held_out_size": [width, height],
+        }
+    }
+    save_checkpoint(output, trained.model, metadata=metadata)
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Read the command line, start the renderers and a trainer for each width."""
+    """Read the command line, start the renderers and a trainer for each rate."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("output", type=Path, help="NAME.safetensors; of several rates NAME-RATE.safetensors")
     parser.add_argument(
-        "output", type=Path, help="NAME.safetensors; of several widths NAME-WIDTH.safetensors"
+        "--rate", type=float, action="append", help="highest learning rate, default 0.003; repeatable"
     )
-    parser.add_argument("--width", type=float, action="append", help="width multiple of YOLOv8; repeatable")
+    parser.add_argument("--width", type=float, default=REFINEMENT.width_multiple, help="multiple of YOLOv8")
     parser.add_argument(
         "--minutes", type=float, default=9.0, help="in all, with the drawing of the first scenes"
     )
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--renderers", type=int, default=max(1, (os.cpu_count() or 2) - 2))
     parser.add_argument("--scenes", type=int, default=24_000, help="places of the pool, 0.9 MB each")
-    parser.add_argument("--rate", type=float, default=3e-3, help="highest learning rate")
     parser.add_argument("--batch-share", type=float, default=1.0, help="smaller batches, for a small GPU")
-    parser.add_argument("--start", type=Path, help="weights for the network of their width to start from")
+    parser.add_argument("--start", type=Path, help="weights of the same width to start from")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args(arguments)
     given.end = time.monotonic() + 60 * given.minutes
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    widths = given.width or [REFINEMENT.width_multiple]
+    rates = given.rate or [3e-3]
     # Forked, so that they share the pool's memory; before CUDA and torch's threads start.
     processes = multiprocessing.get_context("fork")
     pool = Pool.of_size(given.scenes, given.renderers)
     for number in range(given.renderers):
         processes.Process(target=draw, args=(pool, number, SCENE_SEED + given.seed), daemon=True).start()
-    trainers = []
-    for width in widths:
+    trainers, outputs = [], []
+    for rate in rates:
         output = given.output
-        if len(widths) > 1:
-            output = output.with_name(f"{output.stem}-{width:g}{output.suffix}")
-        trainers.append(processes.Process(target=train, args=(pool, width, output, given)))
+        if len(rates) > 1:
+            output = output.with_name(f"{output.stem}-{rate:g}{output.suffix}")
+        outputs.append(output)
+        trainers.append(processes.Process(target=train, args=(pool, rate, output, given)))
         trainers[-1].start()
     for trainer in trainers:
         trainer.join()
     if any(trainer.exitcode for trainer in trainers):
         raise SystemExit(1)
+    for output in outputs:
+        _write_score(output)
 
 
 if __name__ == "__main__":

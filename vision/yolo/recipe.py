@@ -22,7 +22,7 @@ HELD_OUT_SIZE = (640, 480)
 DEFAULT_RECIPE = TrainingSettings(
     class_names=("person", "bicycle", "car", "truck", "boat", "dog", "chair"),
     depth_multiple=1 / 3,
-    width_multiple=0.125,
+    width_multiple=0.1875,
     max_channels=1024,
     # Small images have the same field of view: as many objects for a quarter of the work, at half the
     # pixels. Then the frames' full size; and, because small objects were missed, both again. Scenes
