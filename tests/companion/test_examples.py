@@ -174,9 +174,9 @@ def test_square_is_flown_by_velocities(vehicle: RunningSimulator, filming: list[
     assert done.returncode == 0, done.stderr
     corners = [ast.literal_eval(line.removeprefix("corner at ")) for line in done.stdout.splitlines()]
     sides_m = [math.dist(one[:2], other[:2]) for one, other in pairwise(corners)]
-    assert sides_m == pytest.approx([3.0] * 3, abs=1.2)
-    assert math.hypot(*corners[-1][:2]) < 1.5  # where it began
-    assert math.dist(corners[0][:2], corners[2][:2]) > 3.0
+    assert sides_m == pytest.approx([3.0] * 3, abs=0.6)
+    assert math.hypot(*corners[-1][:2]) < 0.6  # where it began
+    assert math.dist(corners[0][:2], corners[2][:2]) == pytest.approx(3.0 * math.sqrt(2), abs=0.6)
 
 
 def test_video_is_detected_and_tracked(tmp_path: Path) -> None:
