@@ -58,14 +58,17 @@ class Seen:
     range_m: float
 
 
-def draw(folder: Path, frames: int) -> dict[str, list[Path]]:
-    """Draw the held-out frames; scene name → the data sets' folders."""
+def draw(folder: Path, frames: int, seed: int = HELD_OUT_SEED, first_world: int = 1) -> dict[str, list[Path]]:
+    """Draw frames, by default the held-out ones; scene name → the data sets' folders.
+
+    `first_world` is the first seed of the default world.
+    """
     groups: dict[str, list[tuple[Scene | None, int]]] = {"random": [(None, frames * 2 // 5)]}
     examples = {name: load_scene(name) for name in example_scenes()}
     worlds = min(DEFAULT_WORLDS, max(1, frames // 10))
     shares = _shares(frames * 3 // 10, worlds)
     groups["default world"] = [
-        (scene_or_demo(None, seed), share) for seed, share in enumerate(shares, 1) if share
+        (scene_or_demo(None, world), share) for world, share in enumerate(shares, first_world) if share
     ]
     rest = _shares(frames - frames * 2 // 5 - frames * 3 // 10, len(examples))
     for (name, scene), share in zip(examples.items(), rest, strict=True):
@@ -77,9 +80,9 @@ def draw(folder: Path, frames: int) -> dict[str, list[Path]]:
                 share = _shares(count, len(ALTITUDES_M))[half]
                 if not share:
                     continue
-                seed = HELD_OUT_SEED + 1000 * number + len(ALTITUDES_M) * index + half
+                of_part = seed + 1000 * number + len(ALTITUDES_M) * index + half
                 target = folder / f"{number}_{index}_{half}"
-                options = DatasetOptions(share, seed, validation=0.0, altitude_m=heights)
+                options = DatasetOptions(share, of_part, validation=0.0, altitude_m=heights)
                 make_dataset(target, chosen, options)
                 drawn.setdefault(name, []).append(target)
                 logging.info("%s: %d frames", name, share)
@@ -167,10 +170,17 @@ def _rounded(value: float) -> float | None:
     return None if math.isnan(value) else round(value, 4)
 
 
-def evaluate(
-    drawn: Mapping[str, Sequence[Path]], model: str, image_size: int, confidence: float
-) -> dict[str, Any]:
-    """Evaluate one model on rendered frames: all of them, and each scene's."""
+@dataclass(frozen=True, slots=True)
+class Found:
+    """The detections of one model and everything seen, by scene and frame; the names of the classes."""
+
+    results: dict[str, list[ImageResult]]
+    seen: dict[str, list[list[Seen]]]
+    names: tuple[str, ...]
+
+
+def detect(drawn: Mapping[str, Sequence[Path]], model: str, image_size: int) -> Found:
+    """Run one model on drawn frames."""
     detector = Detector(
         model, confidence=JUDGED_CONFIDENCE, image_size=image_size, precision="float32", threads=1
     )
@@ -184,6 +194,15 @@ def evaluate(
             names = mapping.names
             results.setdefault(scene, []).extend(evaluate_dataset(dataset, detector, mapping).results)
             seen.setdefault(scene, []).extend(things)
+    return Found(results, seen, names)
+
+
+def evaluate(
+    drawn: Mapping[str, Sequence[Path]], model: str, image_size: int, confidence: float
+) -> dict[str, Any]:
+    """Evaluate one model on drawn frames: all of them, and each scene's."""
+    found = detect(drawn, model, image_size)
+    results, seen, names = found.results, found.seen, found.names
     everything = [result for of_scene in results.values() for result in of_scene]
     all_seen = [things for of_scene in seen.values() for things in of_scene]
     return {

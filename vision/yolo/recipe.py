@@ -65,6 +65,7 @@ REFINEMENT = replace(
 (`training_scene`)."""
 
 
+@torch.inference_mode()
 def evaluate(
     model: YoloModel,
     scenes: SceneSource,
@@ -88,23 +89,6 @@ def evaluate(
     Raises:
         ValueError: the size is not a multiple of 32, or the source returns an invalid scene.
     """
-    found = detect_scenes(model, scenes, seed, count, width, height, confidence=confidence, iou=iou)
-    return score_detections(found, model.class_names)
-
-
-@torch.inference_mode()
-def detect_scenes(
-    model: YoloModel,
-    scenes: SceneSource,
-    seed: int,
-    count: int,
-    width: int,
-    height: int,
-    *,
-    confidence: float = 0.001,
-    iou: float = 0.7,
-) -> list[ImageResult]:
-    """The detections and the true objects of each scene; arguments and errors as `evaluate`."""
     if width % 32 or height % 32:
         raise ValueError(f"evaluation scenes must be multiples of 32 pixels, got {width}x{height}")
     model.eval()
@@ -124,4 +108,4 @@ def detect_scenes(
                 true_ids < 0,
             )
         )
-    return results
+    return score_detections(results, model.class_names)
