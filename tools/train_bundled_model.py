@@ -260,10 +260,10 @@ def train(pool: Pool, highest_rate: float, output: Path, given: argparse.Namespa
     )
     started, written, step, images_done = time.monotonic(), time.monotonic(), 0, 0
     end = given.end
-    while (now := time.monotonic()) < end:
+    while (now := time.monotonic()) < end or step == 0:
         width, height, count = SIZES[step % len(SIZES)]
         count = max(1, int(count * given.batch_share))
-        share = (now - started) / (end - started)
+        share = min(1.0, (now - started) / max(end - started, 1e-9))
         rate = highest_rate * min(1.0, (step + 1) / WARMUP_STEPS) * (0.5 + 0.5 * math.cos(math.pi * share))
         for group in optimiser.param_groups:
             group["lr"] = rate
