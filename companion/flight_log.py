@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from companion.bus.topics import EVENTS, VEHICLE
+from companion.bus.topics import EVENTS, LARGE_TOPICS, VEHICLE
 from companion.recording import RecordingError
 from companion.recording.convert import (
     LOG_CHANNEL,
@@ -20,6 +21,7 @@ from companion.recording.convert import (
 )
 from companion.recording.files import RecordingReader
 
+_LARGE = {topic.name: topic.name.replace("_", " ") + "s" for topic in LARGE_TOPICS}
 _READ = (RUN_CHANNEL, EVENTS.name, VEHICLE.name, OUTPUT_CHANNEL, RECORDER_CHANNEL, LOG_CHANNEL)
 
 
@@ -38,6 +40,7 @@ class RecordingSummary:
     Attributes:
         began_ns, ended_ns: Unix time of its first and last message; 0 without one.
         lines: (Unix time, kind, text) of events, modes and refusals, in order.
+        large: topic of images, depth images and point clouds → how many are recorded.
         losses: the recorder's last note about losses.
         metadata: of the file, such as the clock of a ULog in it.
         problems: damage of the file.
@@ -51,6 +54,7 @@ class RecordingSummary:
     ended_ns: int = 0
     flights: list[Flight] = field(default_factory=list)
     lines: list[tuple[int, str, str]] = field(default_factory=list)
+    large: Counter[str] = field(default_factory=Counter)
     losses: dict[str, Any] = field(default_factory=dict)
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
@@ -71,6 +75,7 @@ class RecordingSummary:
             "lines": [
                 {"time": _shown(stamp_ns), "kind": kind, "text": text} for stamp_ns, kind, text in self.lines
             ],
+            "large": dict(self.large),
             "losses": self.losses,
             "metadata": self.metadata,
             "problems": self.problems,
@@ -92,6 +97,8 @@ def summarize(path: Path) -> RecordingSummary:
         found.began_ns = min(found.began_ns or log_time_ns, log_time_ns)
         found.ended_ns = max(found.ended_ns, log_time_ns)
         if channel.topic not in _READ:
+            if channel.topic.startswith("/") and channel.topic.rpartition("/")[2] in _LARGE:
+                found.large[channel.topic] += 1
             continue
         try:
             message = json.loads(data)
@@ -173,6 +180,8 @@ def shown(found: RecordingSummary) -> Iterator[str]:
     yield listed(found)
     for stamp_ns, kind, text in found.lines:
         yield f"{(stamp_ns - found.began_ns) / 1e9:9.2f} s  {kind:8}  {text}".rstrip()
+    for topic, count in sorted(found.large.items()):
+        yield f"{topic}: {count} {_LARGE[topic.rpartition('/')[2]]}"
     lost = {name: count for name, count in found.losses.items() if count and name != "first_step"}
     yield from (f"{name.replace('_', ' ')}: {count}" for name, count in lost.items())
     for name, entries in found.metadata.items():

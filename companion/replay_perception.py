@@ -1,10 +1,11 @@
-"""`companion replay --model`: detector, tracker and ranging again over the recorded images, without depth.
+"""`companion replay --model`: detector, tracker and ranging again over the recorded images and their depth.
 
 The same functions as in the service make targets of the images; `Guidance.step` gets them in the step in
 which it got those of the flight. JPEG images are those of the preview: at most `preview.rate_hz`, and scaled
 down where they are wider than `preview.width`, so even the flight's own model finds slightly different boxes.
-PNG images are the processed frames. Which samples of the vehicle's pose the service had when it processed an
-image is not recorded: here it has all until the step of guidance.
+PNG images are the processed frames. Depth is that of the processed frames, in whole millimetres. Which
+samples of the vehicle's pose the service had when it processed an image is not recorded: here it has all
+until the step of guidance.
 """
 
 from __future__ import annotations
@@ -47,6 +48,7 @@ from vision.tracking.association import match, overlaps
 # The usual limit of evaluations.
 LEAST_IOU = 0.5
 MAX_LISTED = 10
+DEPTH_INEXACT = "recorded depth is in whole millimetres, up to 65.535 m: ranges can differ by as much"
 SAMPLES_INEXACT = (
     "tracks and ranges: the flight had fewer samples of the vehicle's pose when it processed an image"
 )
@@ -61,6 +63,7 @@ class DetectionReplay:
         same_model: whether the model's file is the flight's, by its SHA-256. recorded_model: its name.
         image_formats: `jpeg`, `png`. scaled: images are smaller than the frames.
         frames: whose detections guidance got in the flight. images: of those with a recorded image.
+        depth_images: images with recorded depth.
         identical_images: all detections and tracks are equal, as published.
         recorded, replayed, matched: detections; a pair has one class and an IoU of at least `LEAST_IOU`.
         mean_iou: of the pairs; None without one.
@@ -78,6 +81,7 @@ class DetectionReplay:
     scaled: bool = False
     frames: int = 0
     images: int = 0
+    depth_images: int = 0
     identical_images: int = 0
     recorded: int = 0
     replayed: int = 0
@@ -109,7 +113,7 @@ class PerceptionReplay:
         status, restarts = _status(paths, name)
         detector = _as_in_flight(own.detector, threads_each(detectors), status, model)
         self._settings = own.model_copy(update={"detector": detector})
-        self._frames = recorded_frames(paths, name)
+        self._frames = recorded_frames(paths, name, depth=True)
         self._next = next(self._frames, None)
         if self._next is None:
             raise RecordingError(f"{paths[0]}: has no images with detections")
@@ -125,6 +129,8 @@ class PerceptionReplay:
         self._found, self._overlap = DetectionReplay(model), list[float]()
         self._ids: tuple[set[int], set[int]] = (set(), set())
         self._ranges_m: list[float] = []
+        self._depth_ns: int | None = None
+        self._without_depth: set[int | None] = set()
         self._digest = hashlib.sha256()
         self._inexact: dict[str, None] = {}
         if restarts is not None:
@@ -154,10 +160,8 @@ class PerceptionReplay:
             if self._camera.newest is not newest and self._newest_ns == inputs.seen_ns:
                 self._compare_targets(inputs.targets, seconds)
         for target in inputs.targets:
-            if target.range_source is RangeSource.DEPTH:
-                self._inexact[
-                    "depth images are not recorded: ranges come from the ground or known heights"
-                ] = None
+            if target.range_source is RangeSource.DEPTH and inputs.seen_ns != self._depth_ns:
+                self._without_depth.add(inputs.seen_ns)
             if target.class_name == TARGET_CLASS:
                 self._inexact["an operator's selection in the images is not replayed"] = None
         return {
@@ -180,6 +184,13 @@ class PerceptionReplay:
         missing = found.frames - found.images
         if missing > 0:
             self._inexact[f"{missing} of {found.frames} processed frames have no recorded image"] = None
+        if found.depth_images:
+            self._inexact[DEPTH_INEXACT] = None
+        if missing := len(self._without_depth):
+            self._inexact[
+                f"{missing} frames with ranges from depth have no recorded depth image: here they come from "
+                f"the ground or known heights"
+            ] = None
         if "jpeg" in found.image_formats:
             scaled = " and scaled down" if found.scaled else ""
             self._inexact[f"the images are compressed with losses (JPEG){scaled}"] = None
@@ -223,7 +234,10 @@ class PerceptionReplay:
             self._found.image_formats.append(frame.image_format)
         self._found.recorded_model = message["model"]
         self._found.same_model = message["model_sha256"] == self._detector.model_sha256 is not None
-        self._source.frame = Frame(image, frame.captured_ns, message["sequence"])
+        if frame.depth_m is not None:
+            self._found.depth_images += 1
+            self._depth_ns = frame.captured_ns
+        self._source.frame = Frame(image, frame.captured_ns, message["sequence"], frame.depth_m)
         results: list[PerceptionResult] = []
         assert self._pipeline is not None
         self._pipeline.step(0.0, results.append)
@@ -298,7 +312,8 @@ def report(found: DetectionReplay) -> Iterator[str]:
     yield (
         f"{found.model}: {found.images} images: recorded {found.recorded} detections, replayed "
         f"{found.replayed}, matched {found.matched}{overlap}; differing images: {found.differing_images}; "
-        f"identical: {found.identical_images} (SHA-256 of the detections {found.digest})"
+        f"identical: {found.identical_images}; with depth: {found.depth_images} "
+        f"(SHA-256 of the detections {found.digest})"
     )
     yield f"confirmed tracks: recorded {found.recorded_tracks}, replayed {found.replayed_tracks}"
     if found.range_difference_m is not None:

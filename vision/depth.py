@@ -46,6 +46,8 @@ _HIDING_IOU, _VISIBLE_SHARE = 0.3, 0.25
 # The depth at the centre is the median of a square: its side as a share of the image's shorter one, and its
 # least pixels.
 _CENTRE, _CENTRE_MIN_PX = 0.02, 5
+# What rounds to 65,536 mm does not fit into 16 bits.
+_END_M = 65.5355
 
 _Edges = tuple[int, int, int, int]  # left, top, right, bottom
 
@@ -70,6 +72,17 @@ def depth_summary(depth_m: NDArray[np.float32]) -> DepthSummary:
     """Summarize a depth image (height, width), float32 metres, NaN, infinite or not above zero if unknown."""
     known = np.count_nonzero((depth_m > 0.0) & (depth_m < np.inf))
     return DepthSummary(centre_depth(depth_m), known / depth_m.size)
+
+
+def depth_millimetres(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
+    """Depth (height, width) as little-endian integers, as depth cameras deliver it and ROS has it (REP 118).
+
+    0: unknown, or nearer than half a millimetre or farther than 65.535 m. `to_metres` of
+    `vision.sources.depth_pictures` is the inverse: exact for depth that came in whole millimetres.
+    """
+    with np.errstate(invalid="ignore"):
+        known = (depth_m > 0.0) & (depth_m < _END_M)
+    return np.rint(np.where(known, depth_m, np.float32(0.0)) * np.float32(1000.0)).astype("<u2")
 
 
 def centre_depth(depth_m: NDArray[np.float32]) -> float:

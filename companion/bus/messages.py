@@ -13,6 +13,7 @@ from companion.bus.bodies.frames import (
     CameraInfoBody,
     CloudBody,
     DepthBody,
+    DepthImageBody,
     DetectionBody,
     DetectionsBody,
     ErrorEllipseBody,
@@ -231,6 +232,19 @@ def labels_message(result: PerceptionResult) -> str:
 def image_attachment(sequence: int, captured_ns: int, view: str | None, *, annotated: bool) -> ImageBody:
     """Create the attachment of one image."""
     return {"camera": view, "sequence": sequence, "captured_ns": captured_ns, "annotated": annotated}
+
+
+def depth_image_attachment(
+    sequence: int, captured_ns: int, view: str | None, width: int, height: int
+) -> DepthImageBody:
+    """Create the attachment of one depth image."""
+    return {
+        "camera": view,
+        "sequence": sequence,
+        "captured_ns": captured_ns,
+        "width": width,
+        "height": height,
+    }
 
 
 def cloud_attachment(

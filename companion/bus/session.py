@@ -23,7 +23,7 @@ import zenoh
 from pydantic_core import to_json
 from zenoh import ext
 
-from companion.bus.bodies.frames import CloudBody, ImageBody
+from companion.bus.bodies.frames import CloudBody, DepthImageBody, ImageBody
 from companion.bus.command_intake import COMMANDS_PER_S, MAX_SENDER_BYTES, Allowance, CommandIntake
 from companion.bus.config import BusError, first_line, zenoh_config
 from companion.bus.topics import (
@@ -203,7 +203,11 @@ class Bus:
             self._tokens[part] = session.liveliness().declare_token(key)
 
     def publish_large(
-        self, topic: Topic, data: bytes, attachment: ImageBody | CloudBody, view: str | None = None
+        self,
+        topic: Topic,
+        data: bytes,
+        attachment: ImageBody | DepthImageBody | CloudBody,
+        view: str | None = None,
     ) -> None:
         """Publish bytes that are too large for one packet, with an attachment as JSON.
 

@@ -15,6 +15,7 @@ from companion.bus.bodies.frames import (
     CameraInfoBody,
     CloudBody,
     DepthBody,
+    DepthImageBody,
     DetectionsBody,
     ImageBody,
     MarkersBody,
@@ -147,6 +148,17 @@ IMAGE: Final = Topic(
     encoding=zenoh.Encoding.IMAGE_JPEG,
     priority=zenoh.Priority.BACKGROUND,
 )
+DEPTH_IMAGE: Final = Topic(
+    "depth_image",
+    DepthImageBody,
+    "the depth image of the same frame as `image`; the attachment has its size",
+    "at most `preview.rate_hz`, only with subscribers, of cameras with depth",
+    rate_hz=15.0,
+    max_age_s=1.0,
+    of_camera=True,
+    encoding=zenoh.Encoding.APPLICATION_OCTET_STREAM,
+    priority=zenoh.Priority.BACKGROUND,
+)
 CLOUD: Final = Topic(
     "cloud",
     CloudBody,
@@ -264,6 +276,7 @@ TOPICS: Final = (
     TRANSFORMS,
     CAMERA_INFO,
     IMAGE,
+    DEPTH_IMAGE,
     CLOUD,
     VEHICLE,
     SETPOINT,
@@ -277,7 +290,7 @@ TOPICS: Final = (
 INPUT_TOPICS: Final = (VELOCITY,)
 
 # Large ones, of which a reader chooses whether it wants them; their body is that of the attachment.
-LARGE_TOPICS: Final = (IMAGE, CLOUD)
+LARGE_TOPICS: Final = (IMAGE, DEPTH_IMAGE, CLOUD)
 
 # Topics published by every view.
 VIEW_TOPICS: Final = tuple(topic for topic in TOPICS if topic.of_camera)

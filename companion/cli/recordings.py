@@ -18,7 +18,8 @@ from companion.settings import Settings
 
 EXIT_DIFFERENT = 1
 RECORD_SETTINGS = tuple(
-    f"recording.{key}" for key in ("images", "clouds", "max_file_mb", "max_file_minutes", "max_total_mb")
+    f"recording.{key}"
+    for key in ("images", "depth", "clouds", "max_file_mb", "max_file_minutes", "max_total_mb")
 )
 
 log = typer.Typer(
@@ -62,6 +63,7 @@ def record(
             vehicle=settings.vehicle.name,
             directory=str(directory),
             images=recording.images,
+            depth=recording.depth,
             clouds=recording.clouds,
             max_file_mb=recording.max_file_mb,
             max_file_minutes=recording.max_file_minutes,
@@ -85,8 +87,8 @@ def replay(
     """Run guidance again over a recording.
 
     Compares each output with the recorded one. The exit code is 1 if any differs. With --model guidance gets
-    the targets that this model finds in the recorded images, without depth and without an operator's
-    selection.
+    the targets that this model finds in the recorded images, with ranges from the recorded depth where it is
+    there, without an operator's selection.
     """
     from companion.plugins import PluginError, load_plugins
     from companion.settings.reading import ConfigurationError
@@ -198,7 +200,7 @@ def show_recording(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="A recording.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """Show a recording: events, modes, arming, refusals, losses and damage."""
+    """Show a recording: events, modes, arming, refusals, images, depth, losses and damage."""
     with _with_library():
         from companion.flight_log import shown, summarize
         from companion.recording import RecordingError

@@ -23,7 +23,7 @@ from companion.guidance.targets.from_detections import (
 from companion.guidance.targets.fused import FusedTracks
 from companion.guidance.targets.ranging import ALL_MEANS, RangeMeans, sees_ground
 from companion.guidance.targets.target import Target
-from companion.perception.messages import CloudPreview, Preview
+from companion.perception.messages import AnyPreview
 from companion.perception.process import START_S
 from companion.perception.supervisor import PerceptionStartError, PerceptionState, PerceptionSupervisor
 from companion.settings import DetectorSection, Section, Settings
@@ -159,7 +159,7 @@ class WorkerCamera(PerceptionCamera):
         name: str | None,
         *,
         on_result: Callable[[WorkerCamera, PerceptionResult], None],
-        on_preview: Callable[[WorkerCamera, Preview | CloudPreview], None],
+        on_preview: Callable[[WorkerCamera, AnyPreview], None],
         on_event: Callable[[str, str], None],
         on_calibration: Callable[[], None],
         record_as: str | None = None,
@@ -269,7 +269,7 @@ def open_cameras(
     settings: Settings,
     *,
     on_result: Callable[[WorkerCamera, PerceptionResult], None],
-    on_preview: Callable[[WorkerCamera, Preview | CloudPreview], None],
+    on_preview: Callable[[WorkerCamera, AnyPreview], None],
     on_event: Callable[[str, str], None],
     on_calibration: Callable[[], None],
 ) -> tuple[WorkerCamera, ...]:

@@ -82,10 +82,11 @@ class GimbalAttitude:
 
 @dataclass(frozen=True, slots=True)
 class Watched:
-    """Whether preview images and point clouds are wanted."""
+    """Whether preview images, point clouds and depth images are wanted."""
 
     watched: bool
     clouds: bool = False
+    depth: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,6 +146,17 @@ class Preview:
 
 
 @dataclass(frozen=True, slots=True)
+class DepthPreview:
+    """The depth image of one frame; `data` is the payload of `companion.bus.topics.DEPTH_IMAGE`."""
+
+    sequence: int
+    captured_ns: int
+    width: int
+    height: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
 class CloudPreview:
     """The point cloud of one frame, in the camera's optical frame; `data` is of `PointCloud.packed`."""
 
@@ -181,6 +193,9 @@ class Ended:
     frames: int
 
 
+AnyPreview = Preview | DepthPreview | CloudPreview
+"""What previews are made of a frame."""
+
 Message = (
     Begin
     | Hud
@@ -195,8 +210,7 @@ Message = (
     | Report
     | Selected
     | PlannedPath
-    | Preview
-    | CloudPreview
+    | AnyPreview
     | Heartbeat
     | LogLine
     | Ended
@@ -288,7 +302,7 @@ class ResultSender:
         self._changed = threading.Condition()
         self._queue: deque[Message] = deque(maxlen=_QUEUED_LINES)
         self._newest: Report | Heartbeat | None = None
-        self._previews: dict[type, Preview | CloudPreview] = {}
+        self._previews: dict[type, AnyPreview] = {}
         self._replaced = 0
         self._last: Message | None = None
         self._busy = False
@@ -317,7 +331,7 @@ class ResultSender:
             if not self._send_newest():
                 self._changed.notify()
 
-    def put_preview(self, preview: Preview | CloudPreview) -> None:
+    def put_preview(self, preview: AnyPreview) -> None:
         """Send a preview when nothing else waits, unless a newer one of its kind replaces it."""
         with self._changed:
             self._previews[type(preview)] = preview

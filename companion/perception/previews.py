@@ -1,4 +1,4 @@
-"""Preview images and point clouds for readers of the bus, encoded in threads of the perception worker."""
+"""Images, depth images and point clouds for readers of the bus, encoded in threads of the worker."""
 
 from __future__ import annotations
 
@@ -6,18 +6,19 @@ import logging
 import math
 import os
 import threading
+import zlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Generic, TypeVar
 
 import cv2
 import numpy as np
 
-from companion.perception.messages import CloudPreview, Preview
+from companion.perception.messages import CloudPreview, DepthPreview, Preview
 from companion.settings import PreviewSection
 from companion.settings.perception import CameraSection
 from vision.annotate import annotate
-from vision.depth import centre_depth
+from vision.depth import centre_depth, depth_millimetres
 from vision.detections import Detections
 from vision.frame import Frame
 from vision.point_cloud import cloud_from_depth, voxel_grid
@@ -55,7 +56,7 @@ class _Encoder(ABC, Generic[_Encoded]):
 
     def write(self, frame: Frame, detections: Detections) -> None:
         """Queue a frame with the newest detections. Never waits."""
-        if not self.watched or frame.captured_ns < self._due_ns:
+        if not self._wanted(frame) or frame.captured_ns < self._due_ns:
             return
         self._due_ns = frame.captured_ns + round(1e9 / self._rate_hz)
         with self._changed:
@@ -79,23 +80,42 @@ class _Encoder(ABC, Generic[_Encoded]):
                     return
                 (frame, detections), self._waiting = self._waiting, None
             try:
-                self._deliver(self._encoded(frame, detections))
+                for encoded in self._encoded(frame, detections):
+                    self._deliver(encoded)
             except Exception:  # a failed preview must not end the thread
                 logger.exception("%s of %dx%d failed", self._thread.name, frame.width, frame.height)
 
+    def _wanted(self, frame: Frame) -> bool:
+        return self.watched
+
     @abstractmethod
-    def _encoded(self, frame: Frame, detections: Detections) -> _Encoded:
+    def _encoded(self, frame: Frame, detections: Detections) -> Iterator[_Encoded]:
         """Encode one frame."""
 
 
-class PreviewEncoder(_Encoder[Preview]):
-    """Encodes preview images."""
+class PreviewEncoder(_Encoder[Preview | DepthPreview]):
+    """Encodes preview images, and the depth images of the same frames: a replay needs both of a frame.
 
-    def __init__(self, settings: PreviewSection, deliver: Callable[[Preview], None]) -> None:
+    Attributes:
+        watched: whether images are wanted. depth: whether depth images are.
+    """
+
+    def __init__(self, settings: PreviewSection, deliver: Callable[[Preview | DepthPreview], None]) -> None:
+        self.depth = False
         self._settings = settings
         super().__init__("preview", settings.rate_hz, deliver)
 
-    def _encoded(self, frame: Frame, detections: Detections) -> Preview:
+    def _wanted(self, frame: Frame) -> bool:
+        return self.watched or (self.depth and frame.depth_m is not None)
+
+    def _encoded(self, frame: Frame, detections: Detections) -> Iterator[Preview | DepthPreview]:
+        if self.watched:
+            yield self._image(frame, detections)
+        if self.depth and frame.depth_m is not None:
+            data = zlib.compress(depth_millimetres(frame.depth_m).tobytes(), 1)
+            yield DepthPreview(frame.sequence, frame.captured_ns, frame.width, frame.height, data)
+
+    def _image(self, frame: Frame, detections: Detections) -> Preview:
         image = frame.image
         if self._settings.annotate:
             centre_m = None if frame.depth_m is None else centre_depth(frame.depth_m)
@@ -122,11 +142,10 @@ class CloudEncoder(_Encoder[CloudPreview]):
         self._settings = settings
         super().__init__("cloud", settings.cloud_rate_hz, deliver)
 
-    def write(self, frame: Frame, detections: Detections) -> None:
-        if frame.depth_m is not None:
-            super().write(frame, detections)
+    def _wanted(self, frame: Frame) -> bool:
+        return self.watched and frame.depth_m is not None
 
-    def _encoded(self, frame: Frame, detections: Detections) -> CloudPreview:
+    def _encoded(self, frame: Frame, detections: Detections) -> Iterator[CloudPreview]:
         assert frame.depth_m is not None
         cloud = cloud_from_depth(
             frame.depth_m,
@@ -136,4 +155,4 @@ class CloudEncoder(_Encoder[CloudPreview]):
             average=math.ceil(math.sqrt(frame.width * frame.height / MAX_CLOUD_POINTS)),
         )
         reduced = voxel_grid(cloud, self._settings.cloud_voxel_m)
-        return CloudPreview(frame.sequence, frame.captured_ns, len(reduced), reduced.packed())
+        yield CloudPreview(frame.sequence, frame.captured_ns, len(reduced), reduced.packed())

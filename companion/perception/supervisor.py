@@ -17,8 +17,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from companion.perception.messages import (
+    AnyPreview,
     Attitude,
     CloudPreview,
+    DepthPreview,
     Ended,
     GimbalAttitude,
     Heartbeat,
@@ -90,7 +92,7 @@ class PerceptionSupervisor:
         settings: the sections source, detector, recording and log are used by the worker.
         on_result: called with every result. Sequence numbers continue when a worker is replaced.
         on_event: called with a level (`info`, `warning`, `error`) and a line of text.
-        on_preview: called with preview images and point clouds, while `watch` wants them.
+        on_preview: called with preview images, depth images and point clouds, while `watch` wants them.
         on_calibration: called when a worker is ready, with its camera's calibration or None.
         on_path: called with every planned path.
         record_as: name of the shared memory for processed frames, for a recorder; None: none.
@@ -102,7 +104,7 @@ class PerceptionSupervisor:
         *,
         on_result: Callable[[PerceptionResult], None],
         on_event: Callable[[str, str], None],
-        on_preview: Callable[[Preview | CloudPreview], None] = lambda _: None,
+        on_preview: Callable[[AnyPreview], None] = lambda _: None,
         on_calibration: Callable[[CameraCalibration | None], None] = lambda _: None,
         on_path: Callable[[PlannedPath], None] = lambda _: None,
         record_as: str | None = None,
@@ -197,9 +199,9 @@ class PerceptionSupervisor:
         """Record the publication of a result: the duration of its last stage, since the inference."""
         self._times.add({"publish": (time.monotonic_ns() - result.inferred_ns) / 1e6})
 
-    def watch(self, watched: bool, clouds: bool | None = None) -> None:
-        """Set whether preview images and point clouds (None: as before) are wanted; initially not."""
-        wanted = Watched(watched, self._watched.clouds if clouds is None else clouds)
+    def watch(self, watched: bool, **others: bool) -> None:
+        """Set whether preview images are wanted, and others of `Watched`; initially none."""
+        wanted = replace(self._watched, watched=watched, **others)
         if wanted != self._watched:
             self._watched = wanted
             if self._process is not None:
@@ -459,7 +461,7 @@ class PerceptionSupervisor:
                         started.set_result(None)
                 case PlannedPath():
                     self._on_path(message)
-                case Preview() | CloudPreview():
+                case Preview() | DepthPreview() | CloudPreview():
                     self._on_preview(replace(message, sequence=message.sequence + self._first_sequence))
                 case StartFailed():
                     return _End(False, message.text)

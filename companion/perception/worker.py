@@ -131,12 +131,16 @@ class ControlChannel:
 class ProcessedFrames:
     """Gives a recorder the processed frames in shared memory, numbered without gaps.
 
+    Args:
+        depth: with their depth.
+
     Attributes:
         newest_ns: capture of the frame that was processed last; set by the owner.
     """
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, *, depth: bool) -> None:
         self.newest_ns = -1
+        self._depth = depth
         self._sharing: FrameSharing | None = FrameSharing(name)
         self._count = 0
 
@@ -145,7 +149,8 @@ class ProcessedFrames:
         if self._sharing is None or frame.captured_ns != self.newest_ns:
             return
         try:
-            self._sharing.write(replace(frame, depth_m=None, sequence=self._count))
+            depth_m = frame.depth_m if self._depth else None
+            self._sharing.write(replace(frame, depth_m=depth_m, sequence=self._count))
             self._count += 1
         except SourceError as error:
             logger.warning("images are not recorded: %s", error)
@@ -314,7 +319,7 @@ def _open(begin: Begin, stack: contextlib.ExitStack, sender: ResultSender) -> Pe
     stack.callback(clouds.close)
     processed = None
     if begin.record_as is not None:
-        processed = ProcessedFrames(begin.record_as)
+        processed = ProcessedFrames(begin.record_as, depth=settings.recording.depth)
         stack.callback(processed.close)
     return Perception(source, detector, recording, preview, clouds, processed)
 
@@ -369,6 +374,7 @@ def _run(pipeline: Pipeline, perception: Perception, control: ControlChannel, se
             perception.recording.highlight = control.hud.highlight
         watched = control.watched
         perception.preview.watched, perception.clouds.watched = watched.watched, watched.clouds
+        perception.preview.depth = watched.depth
         while control.selections:
             request = control.selections.popleft()
             if selection is None:

@@ -68,6 +68,16 @@ SCHEMAS = {
             format=_TEXT,
         ),
         _object(
+            "foxglove.RawImage",
+            timestamp=_TIME,
+            frame_id=_TEXT,
+            width=_COUNT,
+            height=_COUNT,
+            encoding=_TEXT,
+            step=_COUNT,
+            data={"type": "string", "contentEncoding": "base64"},
+        ),
+        _object(
             "foxglove.ImageAnnotations",
             timestamp=_TIME,
             circles=_list({"type": "object"}),

@@ -1,9 +1,10 @@
-"""The recorded images with the detection messages of their frames."""
+"""The recorded images with the detection messages of their frames, and with their depth."""
 
 from __future__ import annotations
 
 import base64
 import json
+from collections import deque
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,71 +13,104 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.bus.topics import DETECTIONS, IMAGE
+from companion.bus.topics import DEPTH_IMAGE, DETECTIONS, IMAGE
 from companion.recording import RecordingError
-from companion.recording.convert import RUN_CHANNEL
+from companion.recording.convert import DEPTH_ENCODING, RUN_CHANNEL
 from companion.recording.files import RecordingReader
+from vision.sources.depth_pictures import to_metres
 
 # Some seconds of frames.
 MAX_WAITING = 100
+# Images that wait for their depth, which may come after them, or not at all.
+MAX_WAITING_FOR_DEPTH = 10
 
 
 class DetectedFrame(NamedTuple):
     """An image (height, width, 3) uint8 BGR with its detection message.
 
     `image_format`: `png`: the frame as it was processed; `jpeg`: at most `preview.width` wide.
+    `depth_m`: (height, width) float32 of the whole frame, metres along the optical axis, NaN where unknown;
+    None: not recorded.
     """
 
     captured_ns: int
     image: NDArray[np.uint8]
     message: dict[str, Any]
     image_format: str = "jpeg"
+    depth_m: NDArray[np.float32] | None = None
 
 
-def recorded_frames(paths: Sequence[Path], camera: str | None = None) -> Iterator[DetectedFrame]:
+def recorded_frames(
+    paths: Sequence[Path], camera: str | None = None, *, depth: bool = False
+) -> Iterator[DetectedFrame]:
     """Read each recorded image that has a detection message, in order.
 
     Args:
-        paths: files of one run, in order. camera: None: the first.
+        paths: files of one run, in order. camera: None: the first. depth: with the depth of the frames.
 
     Raises:
-        RecordingError: a file cannot be read, is not a recording of the service, or its images are drawn on.
+        RecordingError: a file cannot be read, is not a recording of the service, its images are drawn on, or
+            a depth image has another size or encoding.
     """
     prefix = "" if camera is None else f"cameras/{camera}/"
-    images, detections = f"/{prefix}{IMAGE.name}", f"{prefix}{DETECTIONS.name}"
-    # Either comes first, an image up to a second after the message, also in the next file; both have the
+    images, detections, depths = (
+        f"/{prefix}{IMAGE.name}",
+        f"{prefix}{DETECTIONS.name}",
+        f"/{prefix}{DEPTH_IMAGE.name}",
+    )
+    # Either comes first, an image up to a second after the message, also in the next file; all have the
     # capture's time.
-    waiting: dict[str, dict[int, Any]] = {images: {}, detections: {}}
+    waiting: dict[str, dict[int, Any]] = {images: {}, detections: {}} | ({depths: {}} if depth else {})
+    pairs: deque[tuple[int, Any, Any]] = deque()
     for path in paths:
         reader = RecordingReader(path)
         run = next(iter(reader.messages(RUN_CHANNEL)), None)
         if run is None:
             raise RecordingError(f"{path}: not a recording of the service: it has no message on 'run'")
         about = json.loads(run.data)
-        for message in reader.messages(images, detections):
+        for message in reader.messages(*waiting):
             body, topic = json.loads(message.data), message.channel.topic
             if topic == detections:
                 captured_ns = body["captured_ns"]
             else:
                 stamp = body["timestamp"]
                 captured_ns = stamp["sec"] * 10**9 + stamp["nsec"] - about["unix_offset_ns"]
-                if about["settings"]["preview"]["annotate"] and body["format"] == "jpeg":
-                    raise RecordingError(
-                        f"{path}: detections are drawn into its images: record with preview.annotate = false"
-                    )
-            waiting[topic][captured_ns] = body
-            if all(captured_ns in bodies for bodies in waiting.values()):
-                image, found = waiting[images][captured_ns], waiting[detections][captured_ns]
-                waiting = {
-                    topic: {stamp_ns: each for stamp_ns, each in bodies.items() if stamp_ns > captured_ns}
-                    for topic, bodies in waiting.items()
-                }
-                decoded = cv2.imdecode(
-                    np.frombuffer(base64.b64decode(image["data"]), np.uint8), cv2.IMREAD_COLOR
+            if topic == images and about["settings"]["preview"]["annotate"] and body["format"] == "jpeg":
+                raise RecordingError(
+                    f"{path}: detections are drawn into its images: record with preview.annotate = false"
                 )
-                if decoded is not None:
-                    yield DetectedFrame(
-                        captured_ns, decoded.astype(np.uint8, copy=False), found, image["format"]
-                    )
-            elif len(waiting[topic]) > MAX_WAITING:
+            waiting[topic][captured_ns] = body
+            if captured_ns in waiting[images] and captured_ns in waiting[detections]:
+                pairs.append((captured_ns, waiting[images][captured_ns], waiting[detections][captured_ns]))
+                for each in (images, detections):
+                    waiting[each] = _newer(waiting[each], captured_ns)
+            elif len(waiting[topic]) > (MAX_WAITING_FOR_DEPTH if topic == depths else MAX_WAITING):
                 del waiting[topic][next(iter(waiting[topic]))]
+            # Depth images come in order: after a newer one, an older one does not come any more.
+            newest_ns = max(waiting[depths], default=-1) if depth else captured_ns
+            while pairs and (len(pairs) > MAX_WAITING_FOR_DEPTH or pairs[0][0] <= newest_ns):
+                yield from _decoded(path, *pairs.popleft(), waiting.get(depths, {}))
+    for pair in pairs:
+        yield from _decoded(paths[-1], *pair, waiting.get(depths, {}))
+
+
+def _decoded(
+    path: Path, captured_ns: int, image: Any, message: Any, depths: dict[int, Any]
+) -> Iterator[DetectedFrame]:
+    """Decode one frame; a damaged image is left out."""
+    pixels = cv2.imdecode(np.frombuffer(base64.b64decode(image["data"]), np.uint8), cv2.IMREAD_COLOR)
+    if pixels is None:
+        return
+    depth = depths.pop(captured_ns, None)
+    depth_m = None
+    if depth is not None:
+        expected = (message["width"], message["height"], DEPTH_ENCODING)
+        if (found := (depth["width"], depth["height"], depth["encoding"])) != expected:
+            raise RecordingError(f"{path}: a depth image is {found}, expected {expected}")
+        millimetres = np.frombuffer(base64.b64decode(depth["data"]), "<u2")
+        depth_m = to_metres(millimetres.reshape(expected[1::-1]), None)
+    yield DetectedFrame(captured_ns, pixels.astype(np.uint8, copy=False), message, image["format"], depth_m)
+
+
+def _newer(bodies: dict[int, Any], captured_ns: int) -> dict[int, Any]:
+    return {stamp_ns: each for stamp_ns, each in bodies.items() if stamp_ns > captured_ns}

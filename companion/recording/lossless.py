@@ -1,4 +1,4 @@
-"""Images without losses: the processed frames of the cameras from shared memory, as PNG."""
+"""Images without losses: the processed frames of the cameras from shared memory, as PNG, with their depth."""
 
 from __future__ import annotations
 
@@ -6,11 +6,14 @@ import contextlib
 import json
 import threading
 import time
+import zlib
 from collections.abc import Mapping
 from typing import Protocol
 
 import cv2
 
+from companion.bus.topics import DEPTH_IMAGE, IMAGE
+from vision.depth import depth_millimetres
 from vision.shared_frame import SharedFrameReader
 
 # Shared memory does not notify; a poll of one camera takes some microseconds.
@@ -79,10 +82,15 @@ class _Camera:
         if recorder.late:
             recorder.dropped_images += 1
             return
+        about = {"captured_ns": frame.captured_ns, "width": frame.width, "height": frame.height}
+        attachment = json.dumps(about).encode()
+        if frame.depth_m is not None:
+            data = zlib.compress(depth_millimetres(frame.depth_m).tobytes(), 0)  # the file is compressed
+            recorder.add(self._path.removesuffix(IMAGE.name) + DEPTH_IMAGE.name, data, attachment)
         # OpenCV chooses zlib's fastest level with run lengths: half the time of the level 1 that can be
         # named, and smaller.
         _, png = cv2.imencode(".png", frame.image)
-        recorder.add(self._path, png.tobytes(), json.dumps({"captured_ns": frame.captured_ns}).encode())
+        recorder.add(self._path, png.tobytes(), attachment)
 
     def close(self) -> None:
         """Release the shared memory."""

@@ -16,7 +16,7 @@ import zenoh
 from typing_extensions import TypedDict
 
 from companion.bus.client import open_client, subscribe_kept
-from companion.bus.topics import CLOUD, IMAGE, MAVLINK, RECORDER_TOPICS, ROOT, TOPICS, Topic
+from companion.bus.topics import CLOUD, DEPTH_IMAGE, IMAGE, MAVLINK, RECORDER_TOPICS, ROOT, TOPICS, Topic
 from companion.recording.convert import RECORDER_CHANNEL, RUN_CHANNEL, Converter, stored_schema
 from companion.recording.files import FLUSH_S, Channel, Recorded, RecordingWriter
 from companion.settings import ZenohSection
@@ -49,15 +49,16 @@ class RecorderOptions:
 
     Attributes:
         zenoh: settings of a client. vehicle: its name in the keys.
-        images, clouds: record the preview images, the point clouds too.
+        images, depth, clouds: record the preview images, the depth images, the point clouds too.
         frames: path of a camera's topic `image` → shared memory with its processed frames, which are recorded
-            as PNG instead of the preview images; empty: none.
+            as PNG, and with their depth, instead of those of the preview; empty: none.
     """
 
     zenoh: ZenohSection
     vehicle: str
     directory: str
     images: bool
+    depth: bool
     clouds: bool
     max_file_mb: int
     max_file_minutes: int
@@ -155,9 +156,12 @@ class Recorder:
 
 def topics_of(options: RecorderOptions) -> list[Topic]:
     """Return the topics to subscribe to; the one that says that a recorder listens is the last."""
-    images = options.images and not options.frames
-    unwanted = [topic for topic, wanted in ((IMAGE, images), (CLOUD, options.clouds)) if not wanted]
-    topics = [topic for topic in TOPICS if topic not in unwanted]
+    wanted = {
+        IMAGE.name: options.images and not options.frames,
+        DEPTH_IMAGE.name: options.depth and not options.frames,
+        CLOUD.name: options.clouds,
+    }
+    topics = [topic for topic in TOPICS if wanted.get(topic.name, True)]
     return [*topics, *(topic for topic in RECORDER_TOPICS if topic is not MAVLINK), MAVLINK]
 
 

@@ -107,7 +107,8 @@ async def clients_of(settings: Settings, on_event: Callable[[str, str], None]) -
     """Run meanwhile the clients that are set: the recorder, and Foxglove live."""
     programs: dict[str, dict[str, Any]] = {}
     if settings.recording.directory:
-        keys = {"directory", "images", "clouds", "max_file_mb", "max_file_minutes", "max_total_mb"}
+        limits = {"max_file_mb", "max_file_minutes", "max_total_mb"}
+        keys = {"directory", "images", "depth", "clouds", *limits}
         programs["recorder"] = settings.recording.model_dump(include=keys)
         programs["recorder"]["frames"] = {
             IMAGE.path(camera): name for camera, name in recorded_frames_names(settings).items()

@@ -16,6 +16,7 @@ from companion.bus.messages import (
     ModelIdentity,
     camera_info_message,
     cloud_attachment,
+    depth_image_attachment,
     depth_message,
     detections_message,
     image_attachment,
@@ -36,7 +37,7 @@ from companion.guidance.core import Guidance
 from companion.guidance.targets.from_detections import HistoryError
 from companion.guidance.targets.from_markers import LocalizedMarkers
 from companion.perception.cameras import WorkerCamera
-from companion.perception.messages import CloudPreview, Preview
+from companion.perception.messages import AnyPreview, CloudPreview, DepthPreview
 from companion.perception.supervisor import PerceptionState
 from companion.service.inputs import InputAssembler
 from companion.service.queries import Queries
@@ -145,13 +146,19 @@ class Publisher:
             )
             self._bus.publish(topics.CAMERA_INFO, message, camera.name)
 
-    def publish_preview(self, camera: WorkerCamera, preview: Preview | CloudPreview) -> None:
-        """Publish a point cloud, or a preview image, which also answers the queries for one."""
+    def publish_preview(self, camera: WorkerCamera, preview: AnyPreview) -> None:
+        """Publish a point cloud, a depth image, or an image, which also answers the queries for one."""
         if isinstance(preview, CloudPreview):
             about = cloud_attachment(
                 preview.sequence, preview.captured_ns, self._vehicle, camera.name, preview.points
             )
             self._bus.publish_large(topics.CLOUD, preview.data, about, camera.name)
+            return
+        if isinstance(preview, DepthPreview):
+            size = depth_image_attachment(
+                preview.sequence, preview.captured_ns, camera.name, preview.width, preview.height
+            )
+            self._bus.publish_large(topics.DEPTH_IMAGE, preview.data, size, camera.name)
             return
         self._queries.on_image(camera, preview.jpeg)
         attachment = image_attachment(
@@ -167,9 +174,11 @@ class Publisher:
         while True:
             self._publish_vehicle(guidance, streamer, time.monotonic_ns())
             for camera in cameras:
-                watched = self._bus.watched(topics.IMAGE, camera.name)
-                clouds = self._bus.watched(topics.CLOUD, camera.name)
-                camera.supervisor.watch(watched or self._queries.image_wanted(camera), clouds)
+                image, depth, clouds = (
+                    self._bus.watched(topic, camera.name) for topic in topics.LARGE_TOPICS
+                )
+                image = image or self._queries.image_wanted(camera)
+                camera.supervisor.watch(image, depth=depth, clouds=clouds)
             self._bus.set_alive(_alive(cameras))
             await asyncio.sleep(period_s)
 

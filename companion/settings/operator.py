@@ -29,6 +29,8 @@ class RecordingSection(VideoSection):
     """record images too"""
     image_format: Literal["jpeg", "png"] = "jpeg"
     """jpeg: the preview images; png: each processed frame without losses, by the service's own recorder"""
+    depth: bool = True
+    """record the depth images of cameras with depth too, of the same frames as the images"""
     clouds: bool = False
     """record the point clouds of cameras with depth too; some 0.2 MB/s"""
     max_file_mb: Annotated[int, Field(ge=1, le=1_000_000)] = 1000

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pytest
 from mcap.reader import make_reader
 
 from companion.bench.lockstep_flight import plain_settings
+from companion.bus.messages import depth_image_attachment
 from companion.bus.vehicle_messages import vehicle_message
 from companion.guidance.core import GuidanceOptions
 from companion.recording.convert import Converter
@@ -36,8 +38,9 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Ten seconds with a flight of four, in two modes, with an event and a refusal."""
     writer, converter = new_writer(tmp_path_factory.mktemp("log")), Converter("vehicle1")
 
-    def write(path: str, message: object) -> None:
-        for converted in converter.convert(path, dumps(message)):
+    def write(path: str, message: object, attachment: bytes | None = None) -> None:
+        payload = message if isinstance(message, bytes) else dumps(message)
+        for converted in converter.convert(path, payload, attachment):
             writer.write(*converted)
 
     write("@record/run", run_record(plain_settings(), GuidanceOptions(), (1, 191), "service1"))
@@ -50,6 +53,9 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
             write("events", {"stamp_ns": second * SECOND_NS + 1, "level": "warning", "text": "low battery"})
             output = {"step": 1, "now_ns": second * SECOND_NS + 2, "events": [REFUSED]}
             write("@record/guidance_output", output)
+        if second > 5:
+            about = depth_image_attachment(second, second * SECOND_NS, "down", 2, 1)
+            write("cameras/down/depth_image", zlib.compress(b"\1\0\2\0"), dumps(about))
     writer.close()
     return writer.path
 
@@ -69,8 +75,10 @@ def test_show_lists_what_happened_in_order(path: Path, tmp_path: Path) -> None:
     ]
     assert [flight["duration_s"] for flight in found["flights"]] == [4.0]
     assert (found["vehicle"], found["problems"]) == ("vehicle1", [])
+    assert found["large"] == {"/cameras/down/depth_image": 5}
     text = companion_here("log", "show", path, cwd=tmp_path).stdout
-    assert len(text.splitlines()) == 1 + len(found["lines"])
+    assert len(text.splitlines()) == 1 + len(found["lines"]) + len(found["large"])
+    assert text.splitlines()[-1] == "/cameras/down/depth_image: 5 depth images"
 
 
 def test_list_has_a_line_for_each_file_and_one_for_a_bad_one(path: Path, tmp_path: Path) -> None:

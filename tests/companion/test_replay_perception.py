@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -20,15 +21,19 @@ from companion.recording import RecordingError
 from companion.recording.convert import ANY_OBJECT, RUN_CHANNEL
 from companion.recording.files import Channel, Recorded
 from companion.replay import replay, report
-from companion.replay_perception import SAMPLES_INEXACT
+from companion.replay_perception import DEPTH_INEXACT, SAMPLES_INEXACT
 from companion.settings.perception import DEFAULT_MODEL
 from mavlink_sim.lockstep import LockstepVehicle
 from tests.companion.command_line import companion
 from tests.companion.recording.lockstep_recording import recording, rewritten
 from vision.attitude import euler_from_quaternion
 from vision.camera_model import CameraModel, CameraMount
+from vision.depth import depth_millimetres
 from vision.detector import open_detector
+from vision.frame import Frame
 from vision.object_detector import DetectorSettings
+from vision.pipeline import PerceptionResult
+from vision.sources.depth_pictures import to_metres
 
 CAMERA = CameraModel.from_horizontal_fov(480, 360, math.radians(80.0))
 MOUNT = CameraMount(forward_m=0.1, pitch_rad=math.radians(-10.0))
@@ -37,7 +42,7 @@ SETTINGS = {"detector.image_size": "256", "detector.threads": "1", "preview.anno
 
 @pytest.fixture(scope="module")
 def lossless(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recorded approach to a car, with PNG images."""
+    """A recorded approach to a car, with PNG images and the depth of a camera that delivers millimetres."""
     flight = LockstepFlight.airborne(seed=11, height_m=3.0, wind_mps=1.0, camera=_camera)
     detector = open_detector("yolo", DetectorSettings(DEFAULT_MODEL, image_size=256, threads=1))
     folder = tmp_path_factory.mktemp("lossless")
@@ -47,12 +52,20 @@ def lossless(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _camera(vehicle: LockstepVehicle) -> RenderedCamera:
-    """It sees a car 14 m ahead."""
+    """It sees a car 14 m ahead, with depth in whole millimetres."""
     yaw_rad = euler_from_quaternion(vehicle.truth.quaternion)[2]
     pose = ScenePose(14.0 * math.cos(yaw_rad), 14.0 * math.sin(yaw_rad), 1.2)
     car = SceneObject("car", (4.2, 1.8, 1.5), lambda _: pose)
-    scene, _ = rendered_scene([car], CAMERA, MOUNT, 11)
-    return RenderedCamera(camera_settings(CAMERA, MOUNT, SETTINGS), scene, vehicle, depth=False)
+    scene, _ = rendered_scene([car], CAMERA, MOUNT, 11, depth=True)
+    camera = RenderedCamera(camera_settings(CAMERA, MOUNT, SETTINGS), scene, vehicle)
+    process = camera.perception.process
+
+    def process_millimetres(frame: Frame, now_ns: int) -> PerceptionResult | None:
+        assert frame.depth_m is not None
+        return process(replace(frame, depth_m=to_metres(depth_millimetres(frame.depth_m), None)), now_ns)
+
+    camera.perception.process = process_millimetres  # type: ignore[method-assign]
+    return camera
 
 
 def test_lossless_images_and_the_same_model_give_the_flight(lossless: Path) -> None:
@@ -62,7 +75,24 @@ def test_lossless_images_and_the_same_model_give_the_flight(lossless: Path) -> N
     assert (detections.same_model, detections.image_formats) == (True, ["png"])
     assert detections.images == detections.frames == detections.identical_images > 50
     assert detections.recorded == detections.replayed > 50
-    assert (found.first, found.differing_steps, found.timeline, found.inexact) == (None, 0, [], [])
+    assert detections.depth_images == detections.images
+    assert (found.first, found.differing_steps, found.timeline) == (None, 0, [])
+    assert found.inexact == [DEPTH_INEXACT]
+
+
+def test_flight_with_ranges_from_depth_replays_without_it_as_inexact(lossless: Path, tmp_path: Path) -> None:
+    without = rewritten(
+        lossless, tmp_path, lambda message: None if message.channel.topic == "/depth_image" else message
+    )
+    found = replay([without], {}, DEFAULT_MODEL)
+    detections = found.detections
+    assert detections is not None
+    assert (detections.depth_images, detections.identical_images) == (0, detections.images)
+    assert detections.range_difference_m is not None
+    assert detections.range_difference_m[1] > 0.02
+    (reason,) = found.inexact
+    assert "no recorded depth image" in reason
+    assert found.differing_steps > 20
 
 
 @pytest.fixture(scope="module")
@@ -135,9 +165,7 @@ def test_frames_without_an_image_are_counted(lossless: Path, tmp_path: Path) -> 
     assert found.detections is not None
     missing = found.detections.frames - found.detections.images
     assert missing == seen // 3
-    assert found.inexact == [
-        f"{missing} of {found.detections.frames} processed frames have no recorded image"
-    ]
+    assert f"{missing} of {found.detections.frames} processed frames have no recorded image" in found.inexact
 
 
 @pytest.mark.parametrize("restarts", [0, 2])
@@ -156,7 +184,7 @@ def test_what_a_flight_of_the_service_does_not_record_is_said(
 
     found = replay([rewritten(lossless, tmp_path, change)], {}, DEFAULT_MODEL)
     again = f"the perception process was restarted {restarts} times: its tracker began again, not here"
-    assert found.inexact == [SAMPLES_INEXACT, again][: 1 + bool(restarts)]
+    assert found.inexact == [SAMPLES_INEXACT, *[again] * bool(restarts), DEPTH_INEXACT]
     assert [line for line in report(found) if line.startswith("not exact: tracks and ranges")]
 
 

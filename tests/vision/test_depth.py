@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 
 from mavlink_sim.camera.depth_camera import DepthSensor, measured_depth
 from vision.camera_model import CameraModel, CameraMount
-from vision.depth import depth_summary, nearest_points
+from vision.depth import depth_millimetres, depth_summary, nearest_points
 from vision.rotation import matrix_from_euler
+from vision.sources.depth_pictures import to_metres
 
 HEIGHT, WIDTH = 48, 64
 SMALL = CameraModel.from_horizontal_fov(WIDTH, HEIGHT, math.radians(70.0))
@@ -291,3 +292,19 @@ def test_summary_of_a_depth_image() -> None:
     depth_m[:, :321] = 0.0  # more than half of the centre is unknown
     assert math.isnan(depth_summary(depth_m).centre_m)
     assert depth_summary(np.zeros((1, 1), np.float32)).valid_share == 0.0
+
+
+def test_every_whole_millimetre_is_exact() -> None:
+    millimetres = np.arange(2**16, dtype=np.uint16).reshape(256, 256)
+    depth_m = to_metres(millimetres, None)
+    np.testing.assert_array_equal(depth_millimetres(depth_m), millimetres)
+    assert math.isnan(depth_m[0, 0])
+
+
+def test_other_depth_is_rounded_and_unknown_stays_unknown() -> None:
+    unknown = [0.0, -0.0, -1.0, math.nan, math.inf, -math.inf, 0.0004, 65.536, 1e30]
+    depth_m = np.array([[1.2344, 1.2346, 65.5351, *unknown]], np.float32)
+    millimetres = depth_millimetres(depth_m)
+    assert millimetres.dtype == np.dtype("<u2")
+    assert millimetres.tolist() == [[1234, 1235, 65535, *[0] * len(unknown)]]
+    assert np.isnan(to_metres(millimetres, None)[0, 3:]).all()

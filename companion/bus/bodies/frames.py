@@ -284,6 +284,25 @@ class ImageBody(TypedDict):
     """the detections are drawn in it"""
 
 
+class DepthImageBody(TypedDict):
+    """The attachment of a depth image.
+
+    The payload is zlib data (RFC 1950): little-endian uint16, row by row, millimetres along the optical axis
+    of the pixels of the whole frame; 0: unknown, or above 65.535 m.
+    """
+
+    camera: str | None
+    """name of the camera; null: the first"""
+    sequence: int
+    """number of the frame, as in detections"""
+    captured_ns: int
+    """capture of the frame"""
+    width: int
+    """pixels of a row"""
+    height: int
+    """number of rows"""
+
+
 class CloudBody(TypedDict):
     """The attachment of a point cloud.
 

@@ -6,6 +6,7 @@ import json
 import queue
 import threading
 import uuid
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ import pytest
 import zenoh
 
 from companion.bus.client import listen
-from companion.perception.messages import CloudPreview, Preview
+from companion.perception.messages import CloudPreview, DepthPreview, Preview
 from companion.perception.previews import MAX_CLOUD_POINTS, CloudEncoder, PreviewEncoder
 from companion.settings import PreviewSection
 from companion.settings.perception import CameraSection
@@ -36,7 +37,8 @@ def previews_of(settings: PreviewSection, stamps_ns: list[int], *, watched: bool
     made: list[Preview] = []
     delivered = threading.Semaphore(0)
 
-    def deliver(preview: Preview) -> None:
+    def deliver(preview: Preview | DepthPreview) -> None:
+        assert isinstance(preview, Preview)
         made.append(preview)
         delivered.release()
 
@@ -87,6 +89,25 @@ def wall(width: int, height: int, stamp_ns: int = 0) -> Frame:
     return Frame(np.full((height, width, 3), (1, 2, 3), np.uint8), stamp_ns, stamp_ns // 100_000_000, depth_m)
 
 
+@pytest.mark.parametrize("images", [True, False])
+def test_depth_images_are_of_the_frames_of_the_images(images: bool) -> None:
+    made: queue.SimpleQueue[Preview | DepthPreview] = queue.SimpleQueue()
+    encoder = PreviewEncoder(PreviewSection(rate_hz=5.0), made.put)
+    encoder.watched, encoder.depth = images, True
+    found = []
+    for frame in [wall(64, 48, number * 100_000_000) for number in range(4)] + [Frame(IMAGE, 10**9, 9)]:
+        before = encoder._due_ns
+        encoder.write(frame, CAR)
+        if encoder._due_ns != before:
+            found += [made.get(timeout=10) for _ in range(images + (frame.depth_m is not None))]
+    encoder.close()
+    depths = [each for each in found if isinstance(each, DepthPreview)]
+    assert [each.sequence for each in depths] == [0, 2]
+    assert [each.sequence for each in found if isinstance(each, Preview)] == [0, 2, 9] * images
+    assert (depths[0].width, depths[0].height) == (64, 48)
+    assert zlib.decompress(depths[0].data) == np.full(64 * 48, 4000, "<u2").tobytes()
+
+
 def test_cloud_has_points_and_colours_of_the_frame() -> None:
     (cloud,) = clouds_of(PreviewSection(cloud_voxel_m=0.5), [wall(160, 120, 500_000_000)])
     assert (cloud.sequence, cloud.captured_ns) == (5, 500_000_000)
@@ -109,7 +130,7 @@ def test_clouds_are_rate_limited_and_on_demand() -> None:
     assert clouds_of(PreviewSection(), [Frame(IMAGE, 0, 0)]) == []
 
 
-def test_clouds_only_with_a_subscriber(tmp_path: Path) -> None:
+def test_clouds_and_depth_images_only_with_a_subscriber(tmp_path: Path) -> None:
     camera = f"cloud-{uuid.uuid4().hex[:8]}"
     scene = tmp_path / "bare.toml"
     scene.write_text('[ground]\nkinds = ["concrete"]\ntile_texels = 256\ntexel_m = 0.05\n')
@@ -125,15 +146,23 @@ def test_clouds_only_with_a_subscriber(tmp_path: Path) -> None:
         service.client() as session,
     ):
         listen(session, "status", lambda _key, text: statuses.put(json.loads(text)))
-        assert statuses.get(timeout=10)["bus"]["published"]["cloud"] == 0
+        published = statuses.get(timeout=10)["bus"]["published"]
+        assert (published["cloud"], published["depth_image"]) == (0, 0)
         with session.declare_subscriber("companion/*/cloud", samples.put):
             sample = samples.get(timeout=30)
+        with session.declare_subscriber("companion/*/depth_image", samples.put):
+            image = samples.get(timeout=30)
     assert sample.attachment is not None
     about = json.loads(sample.attachment.to_string())
     assert about["frame_id"] == "vehicle1/camera"
     points = np.frombuffer(sample.payload.to_bytes(), [("xyz", "<f4", 3), ("rgba", "u1", 4)])
     assert len(points) == about["points"] > 100
     assert 0.0 < points["xyz"][:, 2].min() < points["xyz"][:, 2].max() < 20.5
+    assert image.attachment is not None
+    size = json.loads(image.attachment.to_string())
+    millimetres = np.frombuffer(zlib.decompress(image.payload.to_bytes()), "<u2")
+    assert len(millimetres) == size["width"] * size["height"]
+    assert np.count_nonzero(millimetres) > 1000
 
 
 def test_previews_only_with_a_subscriber(seeing: list[str], tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,14 +12,15 @@ import cv2
 
 from companion.bench.lockstep_flight import LockstepFlight
 from companion.bench.rendered_camera import RenderedCamera
-from companion.bus.messages import ModelIdentity, detections_message
-from companion.bus.topics import DETECTIONS, IMAGE, RUN, Topic
+from companion.bus.messages import ModelIdentity, depth_image_attachment, detections_message
+from companion.bus.topics import DEPTH_IMAGE, DETECTIONS, IMAGE, RUN, Topic
 from companion.guidance.interface import GuidanceInput, GuidanceOutput
 from companion.recording.convert import ANY_OBJECT, INPUT_CHANNEL, OUTPUT_CHANNEL, RUN_CHANNEL, Converter
 from companion.recording.encoding import dumps
 from companion.recording.files import Channel, Recorded, RecordingReader, RecordingWriter
 from companion.recording.guidance_record import StepContext, input_record, output_record
 from companion.recording.tap import run_record
+from vision.depth import depth_millimetres
 from vision.frame import Frame
 from vision.pipeline import PerceptionResult
 
@@ -46,7 +48,7 @@ def recording(
     """Record every step of guidance meanwhile; yields the file, which is complete afterwards.
 
     Args:
-        images: `.png` or `.jpg`: also the rendered camera's images and detections. model: its model.
+        images: `.png` or `.jpg`: also the rendered camera's images, depth and detections. model: its model.
     """
     writer, original = new_writer(folder), flight.guidance.step
     run = run_record(flight.settings, flight.guidance.options, (1, 191), "service1")
@@ -65,6 +67,9 @@ def recording(
         _, encoded = cv2.imencode(images, frame.image)
         stamps = {"captured_ns": frame.captured_ns}
         write(IMAGE, encoded.tobytes(), json.dumps(stamps).encode())
+        if frame.depth_m is not None:
+            about = depth_image_attachment(frame.sequence, frame.captured_ns, None, frame.width, frame.height)
+            write(DEPTH_IMAGE, zlib.compress(depth_millimetres(frame.depth_m).tobytes()), dumps(about))
         write(DETECTIONS, dumps(detections_message(result, "vehicle1", now_ns, model=model)))
         return result
 

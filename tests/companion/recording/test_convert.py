@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import zlib
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -13,8 +14,8 @@ import numpy as np
 import pytest
 
 from companion.bench.lockstep_flight import plain_settings
-from companion.bus.messages import cloud_attachment, detections_message
-from companion.bus.topics import RECORDER_TOPICS, TOPICS
+from companion.bus.messages import cloud_attachment, depth_image_attachment, detections_message
+from companion.bus.topics import LARGE_TOPICS, RECORDER_TOPICS, TOPICS
 from companion.bus.vehicle_messages import vehicle_message
 from companion.guidance.core import GuidanceOptions
 from companion.recording.convert import Converter
@@ -146,6 +147,31 @@ def test_cloud_of_another_length_is_refused(converter: Converter) -> None:
         list(converter.convert("cloud", bytes(31), about))
 
 
+DEPTH = np.arange(12, dtype="<u2").reshape(3, 4)
+
+
+def test_depth_image_becomes_foxgloves_raw_image(converter: Converter) -> None:
+    about = dumps(depth_image_attachment(7, CAPTURED_NS, "down", 4, 3))
+    (message,) = converter.convert("cameras/down/depth_image", zlib.compress(DEPTH.tobytes()), about)
+    body = foxglove(iter([message]))["/cameras/down/depth_image"]
+    info = foxglove(converter.convert("cameras/down/camera_info", dumps(CAMERA_INFO)))
+    stamps = dumps({"camera": "down", "sequence": 7, "captured_ns": CAPTURED_NS})
+    image = foxglove(converter.convert("cameras/down/image", b"\xff\xd8", stamps))["/cameras/down/image"]
+    assert (body["encoding"], body["width"], body["height"], body["step"]) == ("16UC1", 4, 3, 8)
+    assert base64.b64decode(body["data"]) == DEPTH.tobytes()
+    assert (body["timestamp"], body["frame_id"]) == (image["timestamp"], image["frame_id"])
+    assert "/cameras/down/camera_info" in info
+
+
+@pytest.mark.parametrize(
+    "packed", [DEPTH.tobytes(), zlib.compress(DEPTH.tobytes()[:-1]), zlib.compress(bytes(10**6)), b""]
+)
+def test_depth_image_of_another_size_is_refused(converter: Converter, packed: bytes) -> None:
+    about = dumps(depth_image_attachment(7, CAPTURED_NS, None, 4, 3))
+    with pytest.raises(ValueError, match="depth image"):
+        list(converter.convert("depth_image", packed, about))
+
+
 def test_annotations_are_scaled_to_the_preview(converter: Converter) -> None:
     annotations = foxglove(converter.convert("cameras/down/detections", detections()))
     (box,) = annotations["/cameras/down/annotations"]["points"]
@@ -256,9 +282,10 @@ def test_lost_steps_are_counted(converter: Converter) -> None:
 
 
 def test_recorder_of_lossless_images_does_not_subscribe_to_the_preview() -> None:
-    options = RecorderOptions(ZenohSection(), "vehicle1", "", True, True, 1, 1, 1, {"image": "frames"})
+    frames = {"image": "frames"}
+    options = RecorderOptions(ZenohSection(), "vehicle1", "", True, True, True, 1, 1, 1, frames)
     names = [topic.name for topic in topics_of(options)]
-    assert ("image" in names, "cloud" in names) == (False, True)
+    assert ("image" in names, "depth_image" in names, "cloud" in names) == (False, False, True)
 
 
 @pytest.mark.parametrize(("encoding", "kind"), [(".png", "png"), (".jpg", "jpeg")])
@@ -268,10 +295,10 @@ def test_format_of_an_image_is_named(converter: Converter, encoding: str, kind: 
     assert (message.channel.topic, json.loads(message.data)["format"]) == ("/image", kind)
 
 
-@pytest.mark.parametrize(("images", "clouds"), [(True, False), (False, True)])
-def test_recorder_subscribes_to_the_chosen_large_topics(images: bool, clouds: bool) -> None:
-    options = RecorderOptions(ZenohSection(), "vehicle1", "", images, clouds, 1, 1, 1)
+@pytest.mark.parametrize("chosen", [(True, False, False), (False, True, False), (False, False, True)])
+def test_recorder_subscribes_to_the_chosen_large_topics(chosen: tuple[bool, bool, bool]) -> None:
+    options = RecorderOptions(ZenohSection(), "vehicle1", "", *chosen, 1, 1, 1)
     names = [topic.name for topic in topics_of(options)]
-    assert ("image" in names, "cloud" in names) == (images, clouds)
+    assert tuple(topic.name in names for topic in LARGE_TOPICS) == chosen
     assert names[-1] == "@record/mavlink"
-    assert len(names) == len(TOPICS) - 1 + len(RECORDER_TOPICS)
+    assert len(names) == len(TOPICS) - 2 + len(RECORDER_TOPICS)

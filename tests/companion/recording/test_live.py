@@ -90,6 +90,7 @@ def test_viewer_gets_messages_and_images(filming: list[str], tmp_path: Path) -> 
             image, transforms = viewer.wait_for_channel("/image"), viewer.wait_for_channel("/tf")
             assert image["schemaName"] == "foxglove.CompressedImage"
             assert viewer.wait_for_channel("/cloud")["schemaName"] == "foxglove.PointCloud"
+            assert viewer.wait_for_channel("/depth_image")["schemaName"] == "foxglove.RawImage"
             assert json.loads(transforms["schema"])["title"] == "foxglove.FrameTransforms"
             chosen = [{"id": 1, "channelId": transforms["id"]}, {"id": 2, "channelId": image["id"]}]
             viewer.send({"op": "subscribe", "subscriptions": chosen})

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import os
 import time
+import zlib
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -57,7 +59,7 @@ def give(shared: ProcessedFrames, given: Frame, *, processed: bool = True) -> No
 
 
 def test_processed_frames_are_encoded_bit_for_bit(name: str) -> None:
-    recorder, shared = RecorderOfTest(), ProcessedFrames(name)
+    recorder, shared = RecorderOfTest(), ProcessedFrames(name, depth=False)
     encoder = FrameEncoder({"cameras/down/image": name}, recorder)
     for number in range(1, 5):
         give(shared, frame(number), processed=number != 3)
@@ -68,12 +70,28 @@ def test_processed_frames_are_encoded_bit_for_bit(name: str) -> None:
     for (_, png, attachment), number in zip(recorder.added, (1, 2, 4), strict=True):
         image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
         np.testing.assert_array_equal(image, frame(number).image)
-        assert json.loads(attachment or b"") == {"captured_ns": 1000 * number}
+        assert json.loads(attachment or b"")["captured_ns"] == 1000 * number
     assert recorder.dropped_images == 0
 
 
+@pytest.mark.parametrize("depth", [True, False])
+def test_depth_of_a_frame_is_recorded_before_its_image_if_chosen(name: str, depth: bool) -> None:
+    recorder, shared = RecorderOfTest(), ProcessedFrames(name, depth=depth)
+    encoder = FrameEncoder({"cameras/down/image": name}, recorder)
+    give(shared, replace(frame(1), depth_m=np.full((48, 64), 1.5, np.float32)))
+    wait_for(lambda: len(recorder.added) == 1 + depth)
+    encoder.close()
+    shared.close()
+    paths = [path for path, _, _ in recorder.added]
+    assert paths == ["cameras/down/depth_image"] * depth + ["cameras/down/image"]
+    if depth:
+        _, packed, attachment = recorder.added[0]
+        assert zlib.decompress(packed) == np.full(48 * 64, 1500, "<u2").tobytes()
+        assert json.loads(attachment or b"") == {"captured_ns": 1000, "width": 64, "height": 48}
+
+
 def test_frames_that_are_replaced_or_would_wait_are_counted(name: str) -> None:
-    recorder, shared = RecorderOfTest(), ProcessedFrames(name)
+    recorder, shared = RecorderOfTest(), ProcessedFrames(name, depth=False)
     give(shared, frame(1))
     encoder = FrameEncoder({"image": name}, recorder)
     wait_for(lambda: len(recorder.added) == 1)
@@ -90,7 +108,7 @@ def test_frames_of_a_restarted_worker_follow(name: str) -> None:
     recorder = RecorderOfTest()
     encoder = FrameEncoder({"image": name}, recorder)
     for number in (1, 2):
-        shared = ProcessedFrames(name)
+        shared = ProcessedFrames(name, depth=False)
         give(shared, frame(number))
         wait_for(lambda expected=number: len(recorder.added) == expected)  # type: ignore[misc]
         shared.close()
@@ -99,7 +117,7 @@ def test_frames_of_a_restarted_worker_follow(name: str) -> None:
 
 
 def test_memory_that_cannot_be_made_ends_only_the_images(caplog: pytest.LogCaptureFixture) -> None:
-    shared = ProcessedFrames("no/plain/name")
+    shared = ProcessedFrames("no/plain/name", depth=False)
     for number in (1, 2):
         give(shared, frame(number))
     assert len(caplog.records) == 1

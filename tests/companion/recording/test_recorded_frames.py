@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import base64
+import itertools
 import json
 from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 
 from companion.bus.topics import DETECTIONS
+from companion.recording import RecordingError
 from companion.recording.convert import ANY_OBJECT, RUN_CHANNEL, large_channels
 from companion.recording.files import Channel
-from companion.recording.frames import recorded_frames
+from companion.recording.frames import MAX_WAITING_FOR_DEPTH, recorded_frames
 from tests.companion.recording.lockstep_recording import new_writer
 
 SECOND_NS = 10**9
 
 
-def part(folder: Path, *messages: tuple[str, int]) -> Path:
-    """A file of one run with an `image` or the `detections` of these seconds."""
+def part(folder: Path, *messages: tuple[str, int], depth_height: int = 8) -> Path:
+    """A file of one run with an `image`, the `depth` or the `detections` of these seconds."""
     folder.mkdir()
     writer = new_writer(folder)
     about = {"unix_offset_ns": 0, "settings": {"preview": {"annotate": False}}}
@@ -31,8 +34,13 @@ def part(folder: Path, *messages: tuple[str, int]) -> Path:
             data = base64.b64encode(png.tobytes()).decode()
             body = {"timestamp": {"sec": second, "nsec": 0}, "data": data, "format": "png"}
             channel = large_channels("")[0]
+        elif kind == "depth":
+            data = base64.b64encode(np.full(64, 1000 * second, "<u2").tobytes()).decode()
+            body = {"timestamp": {"sec": second, "nsec": 0}, "data": data, "encoding": "16UC1"}
+            body |= {"width": 8, "height": depth_height}
+            channel = large_channels("")[1]
         else:
-            body = {"captured_ns": second * SECOND_NS, "detections": []}
+            body = {"captured_ns": second * SECOND_NS, "detections": [], "width": 8, "height": 8}
             channel = Channel(DETECTIONS.name, "companion.detections", ANY_OBJECT)
         writer.write(channel, second * SECOND_NS, json.dumps(body).encode())
     writer.close()
@@ -48,3 +56,31 @@ def test_image_after_its_detections_in_the_next_part_is_kept(tmp_path: Path) -> 
         (2, 2),
         (3, 3),
     ]
+
+
+ALL = [("detections", 1), ("image", 1), ("depth", 1)]
+
+
+@pytest.mark.parametrize("order", list(itertools.permutations(range(3))))
+def test_depth_is_joined_in_any_order_and_may_be_missing(tmp_path: Path, order: tuple[int, ...]) -> None:
+    """The second frame has no depth, and neither has the last one."""
+    messages = [(ALL[index][0], second) for second in range(1, 5) for index in order]
+    path = part(tmp_path / "0", *(each for each in messages if each not in {("depth", 2), ("depth", 4)}))
+    frames = list(recorded_frames([path], depth=True))
+    assert [frame.captured_ns // SECOND_NS for frame in frames] == [1, 2, 3, 4]
+    depths = [None if frame.depth_m is None else round(float(frame.depth_m[7, 7]), 3) for frame in frames]
+    assert depths == [1.0, None, 3.0, None]
+    assert [frame.depth_m for frame in recorded_frames([path])] == [None] * 4
+
+
+def test_frames_of_a_recording_without_depth_are_all_read(tmp_path: Path) -> None:
+    seconds = range(1, MAX_WAITING_FOR_DEPTH + 5)
+    path = part(tmp_path / "0", *((kind, second) for second in seconds for kind in ("detections", "image")))
+    frames = [frame.captured_ns // SECOND_NS for frame in recorded_frames([path], depth=True)]
+    assert frames == list(seconds)
+
+
+def test_depth_of_another_size_is_refused(tmp_path: Path) -> None:
+    path = part(tmp_path / "0", *ALL, depth_height=7)
+    with pytest.raises(RecordingError, match="8, 7"):
+        list(recorded_frames([path], depth=True))
