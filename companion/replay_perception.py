@@ -160,7 +160,10 @@ class PerceptionReplay:
             if self._camera.newest is not newest and self._newest_ns == inputs.seen_ns:
                 self._compare_targets(inputs.targets, seconds)
         for target in inputs.targets:
-            if target.range_source is RangeSource.DEPTH and inputs.seen_ns != self._depth_ns:
+            if (
+                target.range_source is RangeSource.DEPTH
+                and self._depth_ns != inputs.seen_ns == self._newest_ns
+            ):
                 self._without_depth.add(inputs.seen_ns)
             if target.class_name == TARGET_CLASS:
                 self._inexact["an operator's selection in the images is not replayed"] = None
@@ -186,10 +189,10 @@ class PerceptionReplay:
             self._inexact[f"{missing} of {found.frames} processed frames have no recorded image"] = None
         if found.depth_images:
             self._inexact[DEPTH_INEXACT] = None
-        if missing := len(self._without_depth):
+        if count := len(self._without_depth):
             self._inexact[
-                f"{missing} frames with ranges from depth have no recorded depth image: here they come from "
-                f"the ground or known heights"
+                f"{count} images of frames with ranges from depth have no recorded depth image: these ranges "
+                f"come from the ground or known heights"
             ] = None
         if "jpeg" in found.image_formats:
             scaled = " and scaled down" if found.scaled else ""

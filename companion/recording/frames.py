@@ -60,7 +60,8 @@ def recorded_frames(
     )
     # Either comes first, an image up to a second after the message, also in the next file; all have the
     # capture's time.
-    waiting: dict[str, dict[int, Any]] = {images: {}, detections: {}} | ({depths: {}} if depth else {})
+    topics = [images, detections, *([depths] if depth else [])]
+    waiting: dict[str, dict[int, Any]] = {topic: {} for topic in topics}
     pairs: deque[tuple[int, Any, Any]] = deque()
     for path in paths:
         reader = RecordingReader(path)
