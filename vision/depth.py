@@ -35,6 +35,9 @@ _NEAR_FRACTION, _OTHER_FRACTION, _OTHER_GAP_M = 0.01, 0.1, 0.5
 # The front of an object: its nearest cells, to so many sigma of their noise behind the nearest one. It holds
 # all cells of an upright surface.
 _FRONT_SIGMAS = 5.0
+# A surface begins before its first cell, because a cell is a mean and the wrong ones are left out: by the
+# range that this share of the cells spans, at most so many metres and this share of the range.
+_SPAN_FRACTION, _SPAN_MAX_M, _SPAN_MAX_SHARE = 0.05, 0.2, 0.1
 # The noise is measured by the smaller differences of neighbours, this share of them, the others may be edges;
 # and the root mean square of that share of normal differences, in sigma.
 _SMOOTH_SHARE, _SMOOTH_RMS, _SMOOTH_MIN = 0.8, 0.6616, 8
@@ -106,7 +109,7 @@ def nearest_points(
 
     The box is averaged into cells of inverse depth, in which a stereo camera's noise is uniform. Ground and
     sky are excluded, and the remaining cells are sorted by horizontal range. The range of the nearest ones is
-    their mean, less as much of their spread as their noise does not explain.
+    their mean, less as much of their distance from the surface's beginning as their noise does not explain.
 
     Where boxes overlap, a point of the object in front, whose box ends lower in the image, is not one of the
     object behind: that one is measured where it is not hidden. A box that may be a second one of the same
@@ -203,18 +206,25 @@ def _nearest_point(
     first += int(_NEAR_FRACTION * (len(order) - first))
     index = order[first]
     noise_m = level[index] * along_m[index] ** 2 * sigma * math.sqrt(shape[0] * shape[1] / inverse.size)
-    range_m = _front(ranges_m[order[first:]], noise_m)
+    range_m = _front(ranges_m[order[first:]], along_m[order[first:]], noise_m)
     point: NDArray[np.float64] = rays[index] * (range_m / level[index] if level[index] else along_m[index])
     return point
 
 
-def _front(sorted_m: NDArray[np.float64], noise_m: float) -> float:
-    """Where a surface begins whose cells have these ranges, nearest first, with this noise (one sigma)."""
+def _front(sorted_m: NDArray[np.float64], along_m: NDArray[np.float64], noise_m: float) -> float:
+    """Where a surface begins whose cells have these ranges, nearest first, with this noise (one sigma).
+
+    Args:
+        along_m: depth of the same cells. Where it is the same, nothing is nearer than the nearest cell.
+    """
     end = np.searchsorted(sorted_m, sorted_m[0] + _FRONT_SIGMAS * noise_m, side="right")
     front_m = sorted_m[:end]
-    mean_m, variance = float(front_m.mean()), float(front_m.var())
-    own_share = math.sqrt(max(0.0, 1.0 - noise_m * noise_m / variance)) if variance else 0.0
-    return mean_m - own_share * (mean_m - float(sorted_m[0]))
+    mean_m, variance, nearest_m = float(front_m.mean()), float(front_m.var()), float(sorted_m[0])
+    first = slice(int(_SPAN_FRACTION * len(sorted_m)) + 1)
+    span_m = min(float(np.ptp(sorted_m[first])), float(np.ptp(along_m[first])))
+    begin_m = nearest_m - min(span_m, _SPAN_MAX_M, _SPAN_MAX_SHARE * nearest_m)
+    explained = min(1.0, noise_m * noise_m / variance) if variance else float(noise_m > 0.0)
+    return mean_m - math.sqrt(1.0 - explained) * (mean_m - begin_m)
 
 
 def _pixels(first: float, last: float, size: int) -> tuple[int, int]:
