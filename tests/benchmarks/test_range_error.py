@@ -35,6 +35,8 @@ def test_ranges_of_the_detector_are_near_the_truth(seen: list[View]) -> None:
     table = {(row.source, row.group): row for row in rows(measured)}
     depth, exact = table["depth", "3-15 m"], table["depth_exact", "3-15 m"]
     assert depth.count >= 10
-    assert depth.median_abs_m < 0.2
-    assert exact.median_abs_m < 0.2
+    assert depth.median_abs_m < 0.1
+    assert exact.median_abs_m < 0.05
+    assert abs(depth.median_m) < 0.05
+    assert abs(exact.median_m) < 0.03
     assert table["ground_plane", "5-25 m"].median_abs_m < 0.6
