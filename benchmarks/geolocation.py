@@ -26,6 +26,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,7 +64,8 @@ class Located:
     """One track against the truth. Detections that the image's edge may cut off are not fused, nor counted.
 
     Attributes:
-        error_m: of the fused position. off_m: its distance to the object's footprint.
+        error_m: of the fused position. relative_m: the same without the vehicle's own position error.
+        off_m: its distance to the object's footprint.
         single_m: median error of its detections. range_m: mean of them.
         moving: it was taken for moving.
         within_95: the truth is in the 95 % ellipse.
@@ -73,10 +75,19 @@ class Located:
     count: int
     range_m: float
     error_m: float
+    relative_m: float
     off_m: float
     single_m: float
     moving: bool
     within_95: bool
+
+
+class _Shown(NamedTuple):
+    """A frame, with the vehicle's true position at its capture and the error of its estimate."""
+
+    vehicle: Vector3
+    drift: NDArray[np.float64]
+    rendered: Rendered
 
 
 def flight_of(seed: int, *, depth: bool) -> list[Located]:
@@ -98,15 +109,15 @@ def flight_of(seed: int, *, depth: bool) -> list[Located]:
     flight = LockstepFlight.airborne(seed=seed, height_m=height_m, wind_mps=2.0, camera=camera)
     flight.turn_to(0.0)
     seen: dict[int, dict[int, Target]] = {}
-    shown: dict[int, tuple[Vector3, Rendered]] = {}
-    before = flight.now_ns, flight.vehicle.truth.position_ned_m
+    shown: dict[int, _Shown] = {}
+    before = flight.now_ns, *_positions(flight)
 
     def collect() -> None:
         nonlocal before
         newest = cameras[0].shown
-        if newest is not None and (not shown or shown[max(shown)][1] is not newest):
-            shown[before[0]] = before[1], newest  # captured at the beginning of the tick
-        before = flight.now_ns, flight.vehicle.truth.position_ned_m
+        if newest is not None and (not shown or shown[max(shown)].rendered is not newest):
+            shown[before[0]] = _Shown(*before[1:], newest)  # captured at the beginning of the tick
+        before = flight.now_ns, *_positions(flight)
         for target in flight.inputs.steering.targets:
             if target.track_id is not None and target.trusted and target.position_covariance is not None:
                 seen.setdefault(target.track_id, {})[target.captured_ns] = target
@@ -115,11 +126,17 @@ def flight_of(seed: int, *, depth: bool) -> list[Located]:
     flight.fly(f"goto north={forward_m:.1f} east={right_m:.1f} heading=0 speed=3", 30.0, on_tick=collect)
     fused = flight.inputs.steering.fused
     tracks = [
-        _located(position, [(target, *shown[ns]) for ns, target in of_track.items() if ns in shown])
+        _located(position, [(target, shown[ns]) for ns, target in of_track.items() if ns in shown])
         for track_id, of_track in seen.items()
         if (position := fused.position(track_id, 0)) is not None  # its newest
     ]
     return [track for track in tracks if track is not None]
+
+
+def _positions(flight: LockstepFlight) -> tuple[Vector3, NDArray[np.float64]]:
+    """The vehicle's true position, and (2,) metres north and east by which its estimate is off."""
+    true, estimated = flight.vehicle.truth.position_ned_m, flight.vehicle.vehicle.estimate.position
+    return true, np.array(estimated[:2]) - true[:2]
 
 
 def _object(name: str, number: int, rng: np.random.Generator) -> SceneObject:
@@ -128,16 +145,16 @@ def _object(name: str, number: int, rng: np.random.Generator) -> SceneObject:
     return SceneObject(name, SIZES_M[name], lambda _: ScenePose(float(north), float(east), float(yaw)))
 
 
-def _located(fused: FusedPosition, seen: list[tuple[Target, Vector3, Rendered]]) -> Located | None:
+def _located(fused: FusedPosition, seen: list[tuple[Target, _Shown]]) -> Located | None:
     """The track against the object that most of its boxes show; None: fewer than ten show all of it."""
-    truths = [_object_of(target, rendered) for target, _, rendered in seen]
+    truths = [_object_of(target, frame.rendered) for target, frame in seen]
     shown = [item for item in truths if item is not None]
     if not shown:
         return None
     identifier = Counter(item.identifier for item in shown).most_common(1)[0][0]
     of_object = [
-        (target, _truth(item, vehicle), vehicle)
-        for (target, vehicle, _), item in zip(seen, truths, strict=True)
+        (target, _truth(item, frame.vehicle), frame)
+        for (target, frame), item in zip(seen, truths, strict=True)
         if item is not None and item.identifier == identifier and not target.cut
     ]
     if len(of_object) < MIN_FRAMES:
@@ -147,8 +164,10 @@ def _located(fused: FusedPosition, seen: list[tuple[Target, Vector3, Rendered]])
         for target, truth, _ in of_object
         if target.position_ned_m is not None
     ]
-    truth = of_object[-1][1] if fused.moving else _fused(of_object)
-    error = np.array(fused.position_ned_m[:2]) - truth
+    shifted = [(target, truth + frame.drift, frame) for target, truth, frame in of_object]
+    truth, relative = (points[-1][1] if fused.moving else _fused(points) for points in (of_object, shifted))
+    position = np.array(fused.position_ned_m[:2])
+    error = position - truth
     major_m, minor_m, orientation = fused.ellipse
     axis = np.array((math.cos(orientation), math.sin(orientation)))
     along, across = error @ axis, error @ (-axis[1], axis[0])
@@ -158,6 +177,7 @@ def _located(fused: FusedPosition, seen: list[tuple[Target, Vector3, Rendered]])
         len(of_object),
         round(float(np.mean([target.ground_range_m for target, _, _ in of_object])), 2),
         round(math.hypot(*error), 3),
+        round(math.hypot(*(position - relative)), 3),
         round(range_to(item, fused.position_ned_m), 3),
         round(float(np.median(singles)), 3),
         fused.moving,
@@ -165,12 +185,12 @@ def _located(fused: FusedPosition, seen: list[tuple[Target, Vector3, Rendered]])
     )
 
 
-def _fused(of_object: list[tuple[Target, NDArray[np.float64], Vector3]]) -> NDArray[np.float64]:
+def _fused(of_object: list[tuple[Target, NDArray[np.float64], _Shown]]) -> NDArray[np.float64]:
     """(2,) the true points of a track's detections, fused as the track is."""
     tracks, position = FusedTracks(), None
-    for target, (north, east), vehicle in of_object:
+    for target, (north, east), frame in of_object:
         exact = replace(target, position_ned_m=(float(north), float(east), 0.0), track_id=0)
-        tracks.update([exact], vehicle, target.captured_ns)
+        tracks.update([exact], frame.vehicle, target.captured_ns)
         position = tracks.position(0, target.captured_ns)
     assert position is not None
     return np.array(position.position_ned_m[:2])
@@ -197,6 +217,7 @@ def summary(found: list[Located]) -> dict[str, float]:
     """Medians and 95th percentiles."""
     share = np.array([each.error_m / each.range_m for each in found])
     errors = np.array([each.error_m for each in found])
+    relative = np.array([each.relative_m / each.range_m for each in found])
     off = np.array([each.off_m / each.range_m for each in found])
     singles = np.array([each.single_m / each.range_m for each in found])
     return {
@@ -206,6 +227,9 @@ def summary(found: list[Located]) -> dict[str, float]:
         "median_of_range": round(float(np.median(share)), 4),
         "p95_of_range": round(float(np.percentile(share, 95)), 4),
         "within_3_percent": round(float(np.mean(share <= 0.03)), 3),
+        "relative_median_of_range": round(float(np.median(relative)), 4),
+        "relative_p95_of_range": round(float(np.percentile(relative, 95)), 4),
+        "relative_within_3_percent": round(float(np.mean(relative <= 0.03)), 3),
         "off_median_of_range": round(float(np.median(off)), 4),
         "off_p95_of_range": round(float(np.percentile(off, 95)), 4),
         "off_within_3_percent": round(float(np.mean(off <= 0.03)), 3),
