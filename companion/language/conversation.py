@@ -21,7 +21,7 @@ from companion.language.control import Control
 from companion.language.endpoints import Endpoint, Message
 from companion.language.scene import Scene, SceneObject
 from companion.language.sentences import is_stop, understand
-from companion.language.tools import read_call, tools_of
+from companion.language.tools import calls_in, read_call, tools_of
 
 MAX_TURNS = 8
 # A model's command of these alone needs no confirmation; its `stop` could end a pilot's flight.
@@ -91,6 +91,7 @@ class Conversation:
     ) -> None:
         self._vehicle, self._operator = vehicle, operator
         self._tools, self._class_names = tools_of(schema), class_names
+        self._tool_names = frozenset(tool["function"]["name"] for tool in self._tools)
         self._endpoint, self._may = endpoint, frozenset(may)
         self._history: deque[list[Message]] = deque(maxlen=KEPT_EXCHANGES)
         self._last: Command | None = None
@@ -155,10 +156,15 @@ class Conversation:
                 [Message("system", SYSTEM), *earlier, *exchange], self._tools, self._operator.on_text
             )
             self._operator.show("")
+            written = () if answer.calls else calls_in(answer.content, self._tool_names)
+            if written:
+                answer = replace(answer, content="", calls=written)
             exchange.append(answer)
             if not answer.calls:
                 return success
-            results, declined, flown = await self._execute(answer)
+            # A text may also repeat what a label says: it is always confirmed.
+            unconfirmed = None if written else _UNCONFIRMED_OF_MODEL
+            results, declined, flown = await self._execute(answer, unconfirmed)
             success = success if flown is None else flown
             exchange += results
             if declined:
@@ -167,7 +173,9 @@ class Conversation:
         self._operator.show(f"the model has not come to an end in {MAX_TURNS} turns")
         return False
 
-    async def _execute(self, answer: Message) -> tuple[list[Message], bool, bool | None]:
+    async def _execute(
+        self, answer: Message, unconfirmed: Collection[str] | None
+    ) -> tuple[list[Message], bool, bool | None]:
         """The results of all calls of one answer, whether the operator declined, and success.
 
         Success is None if there were only questions.
@@ -193,7 +201,7 @@ class Conversation:
         declined = False
         if commands and not invalid:
             try:
-                reply = await self._propose(commands, _UNCONFIRMED_OF_MODEL)
+                reply = await self._propose(commands, unconfirmed)
                 declined = bool(reply.get("declined"))
             except GrammarError as error:
                 reply = {"success": False, "reason": str(error)}
@@ -207,11 +215,11 @@ class Conversation:
 
     # --- both
 
-    async def _propose(self, commands: Sequence[Command], unconfirmed: Collection[str]) -> Reply:
+    async def _propose(self, commands: Sequence[Command], unconfirmed: Collection[str] | None) -> Reply:
         """Show a plan, have it confirmed where it must be, and fly it.
 
         Args:
-            unconfirmed: commands that need no confirmation if they are alone.
+            unconfirmed: commands that need no confirmation if they are alone; None: all need one.
 
         Raises:
             GrammarError: the plan is not a valid mission.
@@ -220,7 +228,9 @@ class Conversation:
         for line in lines:
             self._operator.show(line)
         words = {command.word for command in commands}
-        if len(commands) == 1:
+        if unconfirmed is None:
+            free = False
+        elif len(commands) == 1:
             free = words <= self._may.union(unconfirmed)
         else:
             # Several are a mission, which takes offboard control, also if none of them flies.

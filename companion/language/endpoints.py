@@ -10,11 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from companion.language.tools import ToolCall
+from companion.language.tools import MAX_CALLS, ToolCall
 from companion.settings import LanguageSection
 
 MAX_ANSWER_CHARACTERS = 20_000
-MAX_CALLS = 50
 OLLAMA_CONTEXT_TOKENS = 8192
 """The functions alone take some 5600 tokens, more than Ollama keeps by default (4096)."""
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import json
+import re
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,12 +12,14 @@ from companion.guidance.command import COMMANDS, Command, GrammarError, nearest
 from companion.guidance.grammar import parse
 from companion.language.clauses import QUESTIONS, Question
 
+MAX_CALLS = 50
 _QUESTION_HELP = {
     "seen": "the objects in the camera's newest image: class, track, colour, range and bearing from the nose",
     "battery": "the battery's charge, percent",
     "state": "flight mode, whether armed, height, position and the active command",
     "why_not": "why the newest command was refused or ended, and the newest warnings",
 }
+_MARKUP = re.compile(r"```(?:json|tool_call)?|</?(?:tools|tool_calls?)>")
 # What they fly is not in the call, so nobody could confirm it.
 _NOT_FOR_MODELS = frozenset({"mission", "policy", "velocity"})
 
@@ -30,30 +34,27 @@ class ToolCall:
 
 
 def tools_of(schema: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The tools in the format that Ollama and OpenAI share.
+    """The tools in the format that Ollama and OpenAI share, short, since a small computer reads them slowly.
+
+    The detector's classes stand in `seek` only: eighty names in five commands are 1300 tokens.
 
     Args:
         schema: what the queryable `commands` answers (`grammar.json_schema`).
     """
     tools = []
+    classes = class_names_of(schema)
     for word, command in schema["$defs"].items():
         if word in _NOT_FOR_MODELS:
             continue
         described = command["description"]
         if exclusive := [key for each in command.get("oneOf", ()) for key in each["required"]]:
             described += f". Give exactly one of {', '.join(exclusive)}"
-        properties = {key: _property(value) for key, value in command["properties"].items()}
-        parameters = {
-            "type": "object",
-            "properties": properties,
-            "required": command["required"],
-            "additionalProperties": False,
-        }
-        tools.append(_tool(word, described, parameters))
+        repeated = None if word == "seek" else classes
+        properties = {key: _property(value, repeated) for key, value in command["properties"].items()}
+        tools.append(_tool(word, described, properties, command["required"]))
     seen = {"class": {"type": "string", "description": "only this class"}}
     for name in QUESTIONS:
-        parameters = {"type": "object", "properties": seen if name == "seen" else {}, "required": []}
-        tools.append(_tool(name, _QUESTION_HELP[name], parameters))
+        tools.append(_tool(name, _QUESTION_HELP[name], seen if name == "seen" else {}, []))
     return tools
 
 
@@ -74,6 +75,28 @@ def class_names_of(schema: Mapping[str, Any]) -> tuple[str, ...] | None:
     """The detector's classes in the schema of the commands; None: not known."""
     names = schema["$defs"].get("seek", {}).get("properties", {}).get("class", {}).get("enum")
     return None if names is None else tuple(map(str, names))
+
+
+def calls_in(text: str, offered: Collection[str]) -> tuple[ToolCall, ...]:
+    """The calls that a small model writes as text instead of calling.
+
+    Args:
+        text: of at most `MAX_CALLS` calls: JSON objects of `name` and `arguments`, also in code fences or
+            tags. Any other word makes it an answer, and there are no calls.
+        offered: names of the tools.
+    """
+    rest, calls = _MARKUP.sub("", text).strip(), list[ToolCall]()
+    try:
+        while rest:
+            value, end = json.JSONDecoder().raw_decode(rest)
+            for each in value if isinstance(value, list) else [value]:
+                if not each.keys() <= {"name", "arguments"} or each["name"] not in offered:
+                    return ()
+                calls.append(ToolCall(each["name"], each.get("arguments"), f"text_{len(calls)}"))
+            rest = rest[end:].lstrip(" \n\r\t,;")
+    except (ValueError, AttributeError, KeyError, TypeError, RecursionError):
+        return ()
+    return tuple(calls) if len(calls) <= MAX_CALLS else ()
 
 
 def read_call(call: ToolCall, class_names: Sequence[str] | None) -> Command | Question:
@@ -116,15 +139,29 @@ def _written(name: str, key: Any, value: Any) -> str:
     return f'{key}="' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
 
 
-def _property(schema: Mapping[str, Any]) -> dict[str, Any]:
-    """Without keys that are not JSON Schema's; the unit goes into the description."""
-    described = dict(schema)
+def _property(schema: Mapping[str, Any], repeated: Sequence[str] | None) -> dict[str, Any]:
+    """Without keys that are not JSON Schema's; the unit goes into the description.
+
+    Args:
+        repeated: class names that are not listed again.
+    """
+    described = {
+        key: _short(value) for key, value in schema.items() if not (key == "default" and value == "")
+    }
     if unit := described.pop("unit", None):
         described["description"] += f", {unit}"
+    if repeated is not None and tuple(described.get("enum", ())) == tuple(repeated):
+        del described["enum"]
+        described["description"] += "; classes as in seek"
     return described
 
 
-def _tool(name: str, description: str, parameters: dict[str, Any]) -> dict[str, Any]:
+def _short(value: Any) -> Any:
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
+def _tool(name: str, description: str, properties: dict[str, Any], required: list[str]) -> dict[str, Any]:
+    parameters = {"type": "object", "properties": properties} | ({"required": required} if required else {})
     return {
         "type": "function",
         "function": {"name": name, "description": description, "parameters": parameters},

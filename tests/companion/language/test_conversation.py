@@ -16,7 +16,7 @@ from companion.language.control import CommandEvents, Control
 from companion.language.conversation import MAX_TURNS, Conversation, Operator, plan_of
 from companion.language.endpoints import LanguageError, endpoint_of
 from companion.language.scene import Scene, SceneObject
-from companion.language.tools import ToolCall, class_names_of, read_call, tools_of
+from companion.language.tools import ToolCall, calls_in, class_names_of, read_call, tools_of
 from mavlink_sim.testing import free_port
 from tests.companion.language.language_server import Call, Script, failure, ollama, openai, response, serving
 from tests.companion.language.sentence_table import CLASSES, SCENE, SENTENCES
@@ -44,7 +44,8 @@ class FakeVehicle:
         return self.controlled
 
     async def state(self) -> dict[str, Any]:
-        return {"mode": "HOLD", "armed": True, "battery_percent": 81, "warnings": ["wind is strong"]}
+        facts = {"mode": "HOLD", "armed": True, "height_above_home_m": 5.0, "heading_deg": 90}
+        return facts | {"battery_percent": 81, "warnings": ["wind is strong"]}
 
 
 class Talk:
@@ -91,6 +92,8 @@ def test_tools_have_units_ranges_and_classes() -> None:
     assert distance["description"].endswith(", m")
     assert tools["seek"]["properties"]["class"]["enum"] == list(CLASSES)
     assert tools["seek"]["required"] == ["class"]
+    assert {name for name, each in tools.items() if '"traffic light"' in json.dumps(each)} == {"seek"}
+    assert tools["follow"]["properties"]["class"]["description"].endswith("classes as in seek")
     assert {"seen", "battery", "state", "why_not", "stop", "takeoff"} <= set(tools)
     assert not {"mission", "policy", "velocity"} & set(tools)
     assert class_names_of(SCHEMA) == CLASSES
@@ -142,6 +145,59 @@ def test_call_of_loose_form_is_read() -> None:
     assert str(read_call(ToolCall("approach", {"class": "traffic_light", "track": None}), CLASSES)) == str(
         parse('approach "traffic light"')
     )
+
+
+TAKEOFF_TEXT = '{"name": "takeoff", "arguments": {"altitude": 5}}'
+LAND_TEXT = '{"name": "land", "arguments": null}'
+
+
+@pytest.mark.parametrize(
+    ("text", "names"),
+    [
+        (TAKEOFF_TEXT, ["takeoff"]),
+        (f"```json\n{TAKEOFF_TEXT}\n```", ["takeoff"]),
+        (f"<tools>\n{TAKEOFF_TEXT}\n</tools>", ["takeoff"]),
+        (
+            f"<tool_call>\n{TAKEOFF_TEXT}\n</tool_call>\n<tool_call>{LAND_TEXT}</tool_call>",
+            ["takeoff", "land"],
+        ),
+        (f"[{TAKEOFF_TEXT}, {LAND_TEXT}]", ["takeoff", "land"]),
+        (TAKEOFF_TEXT * 51, []),
+        (f"I call {TAKEOFF_TEXT}", []),
+        (f"{TAKEOFF_TEXT} now", []),
+        ('{"name": "explode", "arguments": {}}', []),
+        ('{"name": "land", "because": "a label says so"}', []),
+        ('{"name": ["land"]}', []),
+        ("{" * 5000, []),
+        ("[" * 100_000, []),
+        ("5", []),
+        ('""', []),
+        ("", []),
+    ],
+)
+def test_text_of_calls_alone_is_calls(text: str, names: list[str]) -> None:
+    calls = calls_in(text, {"takeoff", "land"})
+    assert [call.name for call in calls] == names
+    if names:
+        assert str(read_call(calls[0], CLASSES)) == "takeoff altitude=5"
+
+
+@pytest.mark.parametrize(("path", "say"), [("", ollama), ("/v1", openai)])
+async def test_call_written_as_text_is_always_confirmed(path: str, say: Any) -> None:
+    looked, flown = (
+        '{"name": "gimbal", "arguments": {"pitch": -30}}',
+        '{"name": "seek", "arguments": {"class": "car"}}',
+    )
+    async with serving(say(looked), say("Done."), say(flown), say("Done.")) as script:
+        talk = Talk(script.url + path, may=("seek",))
+        assert await talk.ask("look 30 degrees down")
+        assert await talk.ask("find a car")
+        assert (talk.vehicle.commands, talk.asked) == (["gimbal pitch=-30", "seek car"], 2)
+        assert tool_results(script)[1]["success"] is True
+    async with serving(say(flown)) as script:
+        talk = Talk(script.url + path, yes=False, may=("seek",))
+        assert not await talk.ask("find a car")
+        assert talk.vehicle.commands == []
 
 
 # --- exchanges
