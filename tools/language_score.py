@@ -3,7 +3,8 @@
     python -m tools.language_score --url http://127.0.0.1:8080/v1 --model NAME
 
 Each sentence is a conversation of its own, as `companion ask` has it. Before those that refer to an earlier
-command ("twice as far") there is an exchange about a circle. Every plan is confirmed, and only recorded.
+command ("twice as far") there is an exchange about a circle. Every plan is confirmed, and only recorded; the
+model is not asked again after as many commands as are expected.
 """
 
 from __future__ import annotations
@@ -37,9 +38,9 @@ TOOL_NAMES = {tool["function"]["name"] for tool in tools_of(SCHEMA)}
 class Recorder(FakeVehicle):
     """The vehicle and the model of one conversation, of which all calls are noted."""
 
-    def __init__(self, model: Endpoint) -> None:
+    def __init__(self, model: Endpoint, commands: int) -> None:
         super().__init__()
-        self.model, self.said, self.refused = model, "", 0
+        self.model, self.expected, self.said, self.refused = model, max(commands, 1), "", 0
         self.earlier, self.flown, self.questions = list[Message](), list[str](), list[str]()
 
     async def answer(
@@ -47,6 +48,8 @@ class Recorder(FakeVehicle):
     ) -> Message:
         if self.earlier:
             return self.earlier.pop(0)
+        if len(self.flown) >= self.expected:
+            return Message("assistant", "")
         answer = await self.model.answer(messages, tools, on_text)
         self.said += answer.content
         for call in answer.calls or calls_in(answer.content, TOOL_NAMES):
@@ -75,7 +78,8 @@ def refers_to_earlier(text: str) -> bool:
 
 async def verdict(text: str, expected: Sequence[str], model: Endpoint) -> tuple[str, Recorder]:
     """`expected`: as in the table; empty: nothing may be flown. Questions before a command are allowed."""
-    recorder = Recorder(model)
+    wanted = [str(parse(each)) for each in expected if not each.startswith("?")]
+    recorder = Recorder(model, len(wanted))
     operator = Operator(lambda _: None, lambda _: None, recorder.confirm)
     conversation = Conversation(recorder, operator, SCHEMA, CLASSES, endpoint=recorder)
     if refers_to_earlier(text):
@@ -87,7 +91,6 @@ async def verdict(text: str, expected: Sequence[str], model: Endpoint) -> tuple[
     except LanguageError as error:
         recorder.said = str(error)
         return "error", recorder
-    wanted = [str(parse(each)) for each in expected if not each.startswith("?")]
     asked = [{each, each.split()[0]} for each in expected if each.startswith("?")]
     if recorder.flown == wanted and all(each & set(recorder.questions) for each in asked):
         return "right", recorder

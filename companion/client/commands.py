@@ -72,7 +72,8 @@ class Commands(ABC):
         speed: float | None = None,
         heading: float | None = None,
     ) -> Reply:
-        """Fly straight to a point, given by one pair of arguments.
+        """Fly straight to a point, given by one pair: forward and right, north and east, latitude and
+        longitude.
 
         Args:
             north: distance north of home; needs east (-5000 to 5000 m)

@@ -19,7 +19,8 @@ _QUESTION_HELP = {
     "state": "flight mode, whether armed, height, position and the active command",
     "why_not": "why the newest command was refused or ended, and the newest warnings",
 }
-_MARKUP = re.compile(r"```(?:json|tool_call)?|</?(?:tools|tool_calls?)>")
+# Before, between and after calls that are written as text.
+_MARKUP = re.compile(r"(?:[\s,;]|```\w*|</?\w+>)*")
 # What they fly is not in the call, so nobody could confirm it.
 _NOT_FOR_MODELS = frozenset({"mission", "policy", "velocity"})
 
@@ -83,20 +84,24 @@ def calls_in(text: str, offered: Collection[str]) -> tuple[ToolCall, ...]:
     Args:
         text: of at most `MAX_CALLS` calls: JSON objects of `name` and `arguments`, also in code fences or
             tags. Any other word makes it an answer, and there are no calls.
-        offered: names of the tools.
+        offered: names of the tools, which are calls without arguments too.
     """
-    rest, calls = _MARKUP.sub("", text).strip(), list[ToolCall]()
+    calls, end, keys = list[ToolCall](), 0, {"name", "arguments"}
     try:
-        while rest:
-            value, end = json.JSONDecoder().raw_decode(rest)
+        while (begin := _end_of_markup(text, end)) < len(text):
+            value, end = json.JSONDecoder().raw_decode(text, begin)
             for each in value if isinstance(value, list) else [value]:
-                if not each.keys() <= {"name", "arguments"} or each["name"] not in offered:
+                if not each.keys() <= keys or (each["name"] not in offered and each.keys() != keys):
                     return ()
                 calls.append(ToolCall(each["name"], each.get("arguments"), f"text_{len(calls)}"))
-            rest = rest[end:].lstrip(" \n\r\t,;")
     except (ValueError, AttributeError, KeyError, TypeError, RecursionError):
         return ()
     return tuple(calls) if len(calls) <= MAX_CALLS else ()
+
+
+def _end_of_markup(text: str, begin: int) -> int:
+    found = _MARKUP.match(text, begin)
+    return begin if found is None else found.end()
 
 
 def read_call(call: ToolCall, class_names: Sequence[str] | None) -> Command | Question:

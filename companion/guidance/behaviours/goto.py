@@ -15,7 +15,10 @@ from companion.vehicle.state import Vector3
 NEAREST_M = 0.05
 
 
-@behaviour("goto", "fly straight to a point, given by one pair of arguments")
+@behaviour(
+    "goto",
+    "fly straight to a point, given by one pair: forward and right, north and east, latitude and longitude",
+)
 class Goto(Command):
     north_m: Annotated[
         float | None, Number("north", "m", -5000.0, 5000.0, "distance north of home; needs east")
