@@ -26,7 +26,7 @@ from companion.vehicle.landing_target import LandingTarget, landing_target_field
 from companion.vehicle.mav_result import ACCEPTED, IN_PROGRESS, result_name
 from companion.vehicle.obstacle_distance import obstacle_distance_fields
 from companion.vehicle.report_reader import Event, EventCatalogue
-from companion.vehicle.setpoint import Setpoint
+from companion.vehicle.setpoint import Setpoint, setpoint_fields
 from companion.vehicle.state import VehicleState
 from companion.vehicle.telemetry import TELEMETRY_MESSAGES, apply_message
 from companion.vehicle.telemetry_state import REPORTS_KEPT
@@ -136,10 +136,8 @@ class SimulatedDriver:
 
     def send_setpoint(self, setpoint: Setpoint) -> None:
         moved = setpoint.moved(self._state.reset_offset_ned_m)
-        message = setpoint_message(moved, self.vehicle.vehicle.system_id)
-        fields = message.to_dict()
-        del fields["mavpackettype"]
-        self.vehicle.send(type(message)(**self._profile.setpoint_fields(fields)))
+        fields = self._profile.setpoint_fields(setpoint_fields(moved, self.vehicle.vehicle.system_id))
+        self.vehicle.send(dialect.MAVLink_set_position_target_local_ned_message(**fields))
 
     def send_landing_target(self, target: LandingTarget) -> None:
         fields = landing_target_fields(target, self._kind, self._state.reset_offset_ned_m)
@@ -275,20 +273,3 @@ class SimulatedDriver:
 def _events_of_px4() -> EventCatalogue:
     """The events that the drivers read from the vehicle's file."""
     return EventCatalogue(event_metadata())
-
-
-def setpoint_message(setpoint: Setpoint, system_id: int = 1) -> Any:
-    """SET_POSITION_TARGET_LOCAL_NED as the drivers send it."""
-    zero = (0.0, 0.0, 0.0)  # the type mask says what counts
-    return dialect.MAVLink_set_position_target_local_ned_message(
-        0,
-        system_id,
-        1,
-        dialect.MAV_FRAME_LOCAL_NED,
-        setpoint.type_mask,
-        *(setpoint.position_ned_m or zero),
-        *(setpoint.velocity_ned_mps or zero),
-        *(setpoint.acceleration_ned_mps2 or zero),
-        setpoint.yaw_rad or 0.0,
-        setpoint.yaw_rate_radps or 0.0,
-    )

@@ -31,7 +31,7 @@ from companion.vehicle.landing_target import LandingTarget, landing_target_field
 from companion.vehicle.link_url import LinkScheme, LinkUrl
 from companion.vehicle.obstacle_distance import obstacle_distance_fields
 from companion.vehicle.report_reader import ReportReader
-from companion.vehicle.setpoint import LEAVES_WITHIN_S, Setpoint
+from companion.vehicle.setpoint import LEAVES_WITHIN_S, Setpoint, setpoint_fields
 from companion.vehicle.signing import FrameSigner
 from companion.vehicle.state import HEARTBEAT_MAX_AGE_S, FlightMode, VehicleState
 from companion.vehicle.stream_requests import StreamRequests
@@ -52,7 +52,6 @@ _HEARTBEAT = struct.Struct(
 _CURRENT_MODE = struct.Struct("<II")  # custom_mode, intended_custom_mode; standard_mode is not read
 _NAMED_VALUE_INT_ID = 252
 _NAMED_VALUE_INT = struct.Struct("<II10s")  # time_boot_ms, value, name
-_FRAME_LOCAL_NED = 1
 _TIMESYNC_ID = 111
 _SYSTEM_TIME_ID = 2
 _SYSTEM_TIME = struct.Struct("<QI")  # time_unix_usec, time_boot_ms
@@ -414,29 +413,8 @@ class AutopilotDriver(ABC):
             self._warn_stale_setpoint()
             return
         setpoint = setpoint.moved(self._telemetry.state.reset_offset_ned_m)
-        zero = (0.0, 0.0, 0.0)  # ignored by the type mask
-        kinematics = (
-            *(setpoint.position_ned_m or zero),
-            *(setpoint.velocity_ned_mps or zero),
-            *(setpoint.acceleration_ned_mps2 or zero),
-        )
-        self._send_message(
-            "SET_POSITION_TARGET_LOCAL_NED",
-            self._telemetry.profile.setpoint_fields(
-                {
-                    "time_boot_ms": stamp_ms,
-                    "target_system": self._system_id,
-                    "target_component": AUTOPILOT_COMPONENT,
-                    "coordinate_frame": _FRAME_LOCAL_NED,
-                    "type_mask": setpoint.type_mask,
-                    **dict(
-                        zip(("x", "y", "z", "vx", "vy", "vz", "afx", "afy", "afz"), kinematics, strict=True)
-                    ),
-                    "yaw": setpoint.yaw_rad or 0.0,
-                    "yaw_rate": setpoint.yaw_rate_radps or 0.0,
-                }
-            ),
-        )
+        fields = setpoint_fields(setpoint, self._system_id, stamp_ms)
+        self._send_message("SET_POSITION_TARGET_LOCAL_NED", self._telemetry.profile.setpoint_fields(fields))
 
     def send_landing_target(self, target: LandingTarget) -> None:
         """See Driver."""

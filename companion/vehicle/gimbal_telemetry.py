@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import Any
 
 from companion.vehicle.gimbal import LAST_ATTACHED_DEVICE, GimbalState, Quaternion, YawFrame
-from companion.vehicle.state import VehicleState
+from companion.vehicle.state import VehicleState, with_fields
 
 Fields = Mapping[str, Any]
 
@@ -30,7 +30,7 @@ def apply_information(state: VehicleState, fields: Fields, now_ns: int) -> Vehic
     if gimbal is None:
         return state
     low, high = _number(fields["pitch_min"]), _number(fields["pitch_max"])
-    return replace(
+    return with_fields(
         state,
         gimbal=replace(
             gimbal,
@@ -47,7 +47,7 @@ def apply_status(state: VehicleState, fields: Fields, now_ns: int) -> VehicleSta
     if gimbal is None:
         return state
     primary = (int(fields["primary_control_sysid"]), int(fields["primary_control_compid"]))
-    return replace(state, gimbal=replace(gimbal, status_ns=now_ns, primary_control=primary))
+    return with_fields(state, gimbal=replace(gimbal, status_ns=now_ns, primary_control=primary))
 
 
 def apply_attitude(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:
@@ -57,11 +57,11 @@ def apply_attitude(state: VehicleState, fields: Fields, now_ns: int) -> VehicleS
         return state
     frame = _yaw_frame(int(fields["flags"]))
     if frame is None:
-        return replace(state, gimbal=replace(gimbal, attitude=None, attitude_problem=_UNKNOWN_YAW))
+        return with_fields(state, gimbal=replace(gimbal, attitude=None, attitude_problem=_UNKNOWN_YAW))
     attitude = _unit(fields["q"])
     if attitude is None:
-        return state if gimbal is state.gimbal else replace(state, gimbal=gimbal)
-    return replace(
+        return state if gimbal is state.gimbal else with_fields(state, gimbal=gimbal)
+    return with_fields(
         state,
         gimbal=replace(gimbal, attitude_ns=now_ns, attitude=attitude, yaw_frame=frame, attitude_problem=""),
     )

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 from companion.vehicle.state import Vector3
 
@@ -18,6 +19,10 @@ IGNORE_VELOCITY = 0b0000_0011_1000
 IGNORE_ACCELERATION = 0b0001_1100_0000
 IGNORE_YAW = 0b0100_0000_0000
 IGNORE_YAW_RATE = 0b1000_0000_0000
+
+_FRAME_LOCAL_NED = 1
+_AUTOPILOT_COMPONENT = 1  # MAV_COMP_ID_AUTOPILOT1
+_ZERO = (0.0, 0.0, 0.0)  # ignored by the type mask
 
 # Default lifetime of a setpoint: below PX4's default COM_OF_LOSS_T (1 s).
 DEFAULT_LIFETIME_S = 0.3
@@ -126,3 +131,28 @@ class Setpoint:
             return self
         north, east, down = (p + d for p, d in zip(self.position_ned_m, by_ned_m, strict=True))
         return replace(self, position_ned_m=(north, east, down))
+
+
+def setpoint_fields(setpoint: Setpoint, system_id: int, time_boot_ms: int = 0) -> dict[str, Any]:
+    """Return the fields of SET_POSITION_TARGET_LOCAL_NED to this system's autopilot."""
+    x, y, z = setpoint.position_ned_m or _ZERO
+    vx, vy, vz = setpoint.velocity_ned_mps or _ZERO
+    afx, afy, afz = setpoint.acceleration_ned_mps2 or _ZERO
+    return {
+        "time_boot_ms": time_boot_ms,
+        "target_system": system_id,
+        "target_component": _AUTOPILOT_COMPONENT,
+        "coordinate_frame": _FRAME_LOCAL_NED,
+        "type_mask": setpoint.type_mask,
+        "x": x,
+        "y": y,
+        "z": z,
+        "vx": vx,
+        "vy": vy,
+        "vz": vz,
+        "afx": afx,
+        "afy": afy,
+        "afz": afz,
+        "yaw": setpoint.yaw_rad or 0.0,
+        "yaw_rate": setpoint.yaw_rate_radps or 0.0,
+    }

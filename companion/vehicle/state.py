@@ -12,12 +12,26 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import TYPE_CHECKING, Any
 
 from companion.vehicle.clock_sync import ClockOffset
 from companion.vehicle.commander import Commander
 from companion.vehicle.gimbal import GimbalState
 from companion.vehicle.ground import GROUND_MAX_AGE_S, GroundLevel
 from companion.vehicle.report import WARNING, Report
+
+__all__ = [
+    "HEARTBEAT_MAX_AGE_S",
+    "TELEMETRY_MAX_AGE_S",
+    "FlightMode",
+    "HeightSource",
+    "LandedState",
+    "Odometry",
+    "Quaternion",
+    "Vector3",
+    "VehicleState",
+    "with_fields",
+]
 
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
@@ -85,7 +99,7 @@ class Odometry:
     velocity_ned_mps: Vector3
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class VehicleState:
     """A snapshot. Every group of values has the stamp of its newest message (CLOCK_MONOTONIC ns, 0: never).
 
@@ -250,3 +264,15 @@ class VehicleState:
     def warnings_since(self, stamp_ns: int) -> list[Report]:
         """Return the reports of level warning or worse since a time (CLOCK_MONOTONIC)."""
         return [report for report in self.reports if report.stamp_ns >= stamp_ns and report.level <= WARNING]
+
+
+if TYPE_CHECKING:
+    from dataclasses import replace as with_fields
+else:
+
+    def with_fields(state: VehicleState, /, **changes: Any) -> VehicleState:
+        """`dataclasses.replace` in a tenth of its time: each of a hundred messages a second makes a state."""
+        new = object.__new__(VehicleState)
+        new.__dict__.update(state.__dict__)
+        new.__dict__.update(changes)
+        return new

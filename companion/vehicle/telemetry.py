@@ -10,7 +10,7 @@ from typing import Any
 from companion.vehicle.gimbal_telemetry import GIMBAL_STEPS
 from companion.vehicle.ground import GroundLevel, may_measure, range_below_m
 from companion.vehicle.px4_modes import mode_of_custom_mode
-from companion.vehicle.state import FlightMode, LandedState, Odometry, Vector3, VehicleState
+from companion.vehicle.state import FlightMode, LandedState, Odometry, Vector3, VehicleState, with_fields
 
 Fields = Mapping[str, Any]
 
@@ -53,7 +53,7 @@ def apply_message(state: VehicleState, name: str, fields: Fields, now_ns: int) -
 
 
 def _heartbeat(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:
-    return replace(
+    return with_fields(
         state,
         heartbeat_ns=now_ns,
         armed=bool(fields["base_mode"] & _SAFETY_ARMED),
@@ -71,12 +71,12 @@ def _current_mode(state: VehicleState, fields: Fields, _now_ns: int) -> VehicleS
         intended, beside = mode_of_custom_mode(fields["intended_custom_mode"]), mode
     if (mode, intended, beside) == (state.mode, state.intended_mode, state.intended_beside):
         return state
-    return replace(state, mode=mode, intended_mode=intended, intended_beside=beside)
+    return with_fields(state, mode=mode, intended_mode=intended, intended_beside=beside)
 
 
 def _extended_sys_state(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:
     landed = _LANDED.get(fields["landed_state"], LandedState.UNKNOWN)
-    return replace(state, landed=landed)
+    return with_fields(state, landed=landed)
 
 
 def _attitude_quaternion(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:
@@ -86,7 +86,7 @@ def _attitude_quaternion(state: VehicleState, fields: Fields, now_ns: int) -> Ve
     if not 0.5 < norm < 2.0 or rates is None:  # NaN also fails the comparison
         return state
     attitude = (w / norm, x / norm, y / norm, z / norm)
-    return replace(state, attitude_ns=now_ns, attitude=attitude, angular_velocity_frd_radps=rates)
+    return with_fields(state, attitude_ns=now_ns, attitude=attitude, angular_velocity_frd_radps=rates)
 
 
 def _local_position_ned(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:
@@ -100,7 +100,7 @@ def _local_position_ned(state: VehicleState, fields: Fields, now_ns: int) -> Veh
         jump = _jump(state.position_ned_m, state.velocity_ned_mps, position_ned_m, velocity, dt_s)
         if jump is not None and math.hypot(*jump) > _JUMP_M + _JUMP_MPS2 * dt_s * dt_s:
             state, position_ned_m = _reset_by(state, jump), _subtract(position_ned_m, jump)
-    return replace(
+    return with_fields(
         state,
         position_ns=now_ns,
         position_boot_ms=boot_ms,
@@ -119,7 +119,7 @@ def _odometry(state: VehicleState, fields: Fields, _now_ns: int) -> VehicleState
         return state
     position_ned_m = _subtract(position, state.reset_offset_ned_m)
     seen = Odometry(fields["time_usec"], fields["reset_counter"], position_ned_m, velocity)
-    last, state = state.odometry, replace(state, odometry=seen)
+    last, state = state.odometry, with_fields(state, odometry=seen)
     if last is None or last.reset_counter == seen.reset_counter:
         return state
     dt_s = (seen.time_us - last.time_us) * 1e-6
@@ -127,7 +127,7 @@ def _odometry(state: VehicleState, fields: Fields, _now_ns: int) -> VehicleState
     if jump is None or math.hypot(*jump) < _MIN_RESET_M:
         return state
     return _reset_by(
-        replace(state, odometry=replace(seen, position_ned_m=_subtract(position_ned_m, jump))), jump
+        with_fields(state, odometry=replace(seen, position_ned_m=_subtract(position_ned_m, jump))), jump
     )
 
 
@@ -148,7 +148,7 @@ def _reset_by(state: VehicleState, jump: Vector3) -> VehicleState:
     """Add a reset to the offset; home keeps its autopilot coordinates, so it moves here."""
     north, east, down = (o + j for o, j in zip(state.reset_offset_ned_m, jump, strict=True))
     home = state.home_position_ned_m
-    return replace(
+    return with_fields(
         state,
         reset_count=state.reset_count + 1,
         reset_offset_ned_m=(north, east, down),
@@ -170,7 +170,7 @@ def _estimator_status(state: VehicleState, fields: Fields, _now_ns: int) -> Vehi
     new = (valid, horizontal, vertical)
     if new == (state.position_valid, state.horizontal_sigma_m, state.vertical_sigma_m):
         return state
-    return replace(state, position_valid=valid, horizontal_sigma_m=horizontal, vertical_sigma_m=vertical)
+    return with_fields(state, position_valid=valid, horizontal_sigma_m=horizontal, vertical_sigma_m=vertical)
 
 
 def _distance_sensor(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:
@@ -183,11 +183,11 @@ def _distance_sensor(state: VehicleState, fields: Fields, now_ns: int) -> Vehicl
         return state
     home_down = state.home_position_ned_m[2] if state.home_position_ned_m else 0.0
     ground = state.ground or GroundLevel()
-    return replace(state, ground=ground.measure(now_ns, slant_m, position, cosine, home_down))
+    return with_fields(state, ground=ground.measure(now_ns, slant_m, position, cosine, home_down))
 
 
 def _global_position_int(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:
-    return replace(
+    return with_fields(
         state,
         global_ns=now_ns,
         latitude_deg=fields["lat"] * 1e-7,
@@ -197,16 +197,16 @@ def _global_position_int(state: VehicleState, fields: Fields, now_ns: int) -> Ve
 
 
 def _home_position(state: VehicleState, fields: Fields, _now_ns: int) -> VehicleState:
-    home = replace(state, home_altitude_amsl_m=fields["altitude"] * 1e-3)
+    home = with_fields(state, home_altitude_amsl_m=fields["altitude"] * 1e-3)
     local = _vector(fields, "x", "y", "z")
     if local is not None:
-        home = replace(home, home_position_ned_m=_subtract(local, state.reset_offset_ned_m))
+        home = with_fields(home, home_position_ned_m=_subtract(local, state.reset_offset_ned_m))
     return state if home == state else home
 
 
 def _sys_status(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:
     ready = bool(fields["onboard_control_sensors_health"] & _PREARM_CHECK)
-    return _battery_status(replace(state, ready_to_arm=ready), fields, now_ns)
+    return _battery_status(with_fields(state, ready_to_arm=ready), fields, now_ns)
 
 
 def _battery_status(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:
@@ -214,7 +214,7 @@ def _battery_status(state: VehicleState, fields: Fields, now_ns: int) -> Vehicle
     if fields.get("id", 0) != 0 or fields["battery_remaining"] < 0:
         return state
     fraction = min(fields["battery_remaining"] / 100.0, 1.0)
-    return replace(state, battery_ns=now_ns, battery_fraction=fraction)
+    return with_fields(state, battery_ns=now_ns, battery_fraction=fraction)
 
 
 def _mode(fields: Fields) -> FlightMode:

@@ -47,6 +47,10 @@ class Packed:
         """The pymavlink message, a new one at every call."""
         return self._form.unpacked(self.payload)
 
+    def to_dict(self) -> dict[str, Any]:
+        """As pymavlink's, without its message."""
+        return {"mavpackettype": self._form.name, **self._form.fields(self.payload)}
+
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
             raise AttributeError(name)
@@ -75,10 +79,11 @@ class Packed:
 class Form:
     """The layout of one kind of message."""
 
-    __slots__ = ("_class", "crc_extra", "high", "identifier", "low", "name")
+    __slots__ = ("_class", "_has_arrays", "crc_extra", "high", "identifier", "low", "name")
 
     def __init__(self, message_class: Any) -> None:
         self._class = message_class
+        self._has_arrays = any(message_class.array_lengths)
         self.name: str = message_class.msgname
         self.identifier: int = message_class.id
         self.low, self.high = self.identifier & 0xFF, self.identifier >> 8
@@ -87,16 +92,22 @@ class Form:
     def __reduce__(self) -> tuple[type[Form], tuple[Any]]:
         return Form, (self._class,)
 
-    def unpacked(self, payload: bytes) -> Any:
-        """The pymavlink message of a payload."""
-        values = list(self._class.unpacker.unpack(payload))
-        fields: dict[str, Any] = {}
+    def fields(self, payload: bytes) -> dict[str, Any]:
+        """The fields of a payload by name."""
+        values = self._class.unpacker.unpack(payload)
+        if not self._has_arrays:
+            return dict(zip(self._class.ordered_fieldnames, values, strict=True))
+        rest, fields = list(values), {}
         for name, length in zip(self._class.ordered_fieldnames, self._class.array_lengths, strict=True):
             if length:
-                fields[name], values = values[:length], values[length:]
+                fields[name], rest = rest[:length], rest[length:]
             else:
-                fields[name] = values.pop(0)
-        return self._class(**fields)
+                fields[name] = rest.pop(0)
+        return fields
+
+    def unpacked(self, payload: bytes) -> Any:
+        """The pymavlink message of a payload."""
+        return self._class(**self.fields(payload))
 
 
 def packer(message_class: Any) -> Callable[..., Packed]:

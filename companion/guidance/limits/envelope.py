@@ -26,7 +26,7 @@ from companion.guidance.formation.separation import (
     level_constraints,
 )
 from companion.vehicle.setpoint import Setpoint
-from companion.vehicle.state import Vector3, VehicleState
+from companion.vehicle.state import Vector3, VehicleState, with_fields
 from vision.attitude import wrap_angle
 
 # PX4 flies towards a position setpoint with about this speed per metre of distance (MPC_XY_P 0.95, MPC_Z_P
@@ -170,7 +170,7 @@ class Envelope:
             self._home = state.home_position_ned_m
         elif self._home is not None:
             # An autopilot may send it again only later; until then the last one is used.
-            state = replace(state, home_position_ned_m=self._home)
+            state = with_fields(state, home_position_ned_m=self._home)
         elif self.limits.fence != NO_FENCE:
             self.reset()
             return Limited(Setpoint.brake(now_ns), ("home position not received: no fence without it",))
