@@ -423,8 +423,7 @@ def test_page_shows_the_state_and_the_menu_of_a_track(browser: Browser) -> None:
         light = tab.value(ground)
         tab.resize(1280, 900, dark=True)
         assert tab.value(ground) != light
-        wait_for(shown)
-        tab.until(f"{BOXES}.length === 2")
+        wait_for(lambda: shown() and tab.value(f"{BOXES}.length === 2"))
         assert click_track(tab) == 7
         assert text("#menu p") == ["track 7, car"]
         tab.value("document.querySelector('#detections button').focus()")
