@@ -125,7 +125,7 @@ class CameraModel:
         if ahead.any():
             plane = points[ahead, :2] / points[ahead, 2:]
             if self.distortion:
-                plane = _distorted(self.distortion, plane)[0]
+                plane = _distorted(self.distortion, plane)
             pixels[ahead] = plane * (self.fx, self.fy) + (self.cx, self.cy)
         return pixels
 
@@ -167,26 +167,32 @@ def check_distortion(model: str, coefficients: tuple[float, ...]) -> None:
         raise ValueError(f"distortion of {model} must have {counts} coefficients, got {len(coefficients)}")
 
 
-def _distorted(
+def _distorted(coefficients: tuple[float, ...], plane: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N, 2) points at unit depth → (N, 2) distorted."""
+    k1, k2, p1, p2, k3, k4, k5, k6 = (*coefficients, 0.0, 0.0, 0.0, 0.0)[:8]
+    x, y = plane[:, 0], plane[:, 1]
+    r2 = x * x + y * y
+    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    points = np.empty((len(plane), 2))
+    points[:, 0] = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    points[:, 1] = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    return points
+
+
+def _slopes(
     coefficients: tuple[float, ...], plane: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(N, 2) points at unit depth → (N, 2) distorted, and (N, 3) their derivatives: xx, xy = yx, yy."""
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """The derivatives of `_distorted`, (N,) each: xx, xy = yx, yy."""
     k1, k2, p1, p2, k3, k4, k5, k6 = (*coefficients, 0.0, 0.0, 0.0, 0.0)[:8]
     x, y = plane[:, 0], plane[:, 1]
     r2 = x * x + y * y
     over, under = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
     radial = over / under
     slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3) - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / under
-    points = np.column_stack(
-        [
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-        ]
-    )
     mixed = x * y * slope + 2 * p1 * x + 2 * p2 * y
     across = radial + x * x * slope + 2 * p1 * y + 6 * p2 * x
     along = radial + y * y * slope + 6 * p1 * y + 2 * p2 * x
-    return points, np.column_stack([across, mixed, along])
+    return across, mixed, along
 
 
 def _undistorted(
@@ -195,9 +201,8 @@ def _undistorted(
     """Newton's method from `plane`; NaN where it does not converge, and where the image is folded."""
     with np.errstate(all="ignore"):
         for _ in range(_MAX_STEPS):
-            points, slope = _distorted(coefficients, plane)
-            error = points - wanted
-            xx, xy, yy = slope.T
+            error = _distorted(coefficients, plane) - wanted
+            xx, xy, yy = _slopes(coefficients, plane)
             determinant = xx * yy - xy * xy
             found = (np.abs(error) < _INVERTED).all(axis=1) & (determinant > 0.0) & (xx > 0.0)
             if found.all():

@@ -14,7 +14,7 @@ from mavlink_sim.lockstep import LockstepVehicle
 from vision.camera_model import CameraModel, CameraMount
 from vision.tracking import SelectRequest
 
-CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(80.0))
+CAMERA = CameraModel.from_horizontal_fov(480, 360, math.radians(80.0))
 MOUNT = CameraMount(forward_m=0.1, pitch_rad=math.radians(-10.0))
 
 
