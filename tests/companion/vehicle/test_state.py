@@ -1,13 +1,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.vehicle.state import HEARTBEAT_MAX_AGE_S, TELEMETRY_MAX_AGE_S, VehicleState
+from companion.vehicle.state import HEARTBEAT_MAX_AGE_S, TELEMETRY_MAX_AGE_S, VehicleState, with_fields
 
 S = 1_000_000_000
 
@@ -65,3 +66,23 @@ def test_without_setpoints_names_the_autopilots_failsafe() -> None:
     assert "GUID_TIMEOUT" in of_ardupilot
     assert "COM_" not in of_ardupilot
     assert "COM_" not in VehicleState().without_setpoints
+
+
+CHANGES = {
+    "battery_fraction": st.floats(0, 1),
+    "armed": st.booleans(),
+    "position_ned_m": st.tuples(*[st.floats(-9, 9)] * 3),
+}
+
+
+@given(st.fixed_dictionaries({}, optional=CHANGES))
+def test_state_with_fields_equals_a_replaced_one(changes: dict[str, Any]) -> None:
+    before = VehicleState(armed=True, battery_fraction=0.5)
+    assert with_fields(before, **changes) == replace(before, **changes)
+    assert before == VehicleState(armed=True, battery_fraction=0.5)
+
+
+def test_state_with_an_unknown_field_is_refused() -> None:
+    misspelt: Any = {"batery_fraction": 0.1}
+    with pytest.raises(TypeError, match="no field batery_fraction"):
+        with_fields(VehicleState(), **misspelt)
