@@ -7,9 +7,9 @@
 The trainer keeps a copy of the pool on the GPU and makes its batches there, as `vision.yolo.scene_batches`
 does on the processor: a whole scene, reduced, or a part of it, mirrored and recoloured. Images of both sizes
 of `SIZES` alternate. The learning rate falls with the time, to almost zero at its end. The result is the
-average of the weights, with the biases of the classes lowered until the precision of each is 0.95 at the
-confidence that confirms a track. It is not repeatable to the bit: how many scenes are drawn depends on the
-machine.
+average of the weights. The biases of the classes are then lowered until the precision of each is `PRECISION`
+at the confidence that confirms a track, on images of 640 pixels, the size of the camera; other sizes are not
+calibrated. It is not repeatable to the bit: how many scenes are drawn depends on the machine.
 
 Several `--rate` train as many networks at the same time, on the same scenes.
 """
@@ -22,12 +22,14 @@ import logging
 import math
 import mmap
 import multiprocessing
+import multiprocessing.connection
 import os
 import tempfile
 import threading
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +61,12 @@ WARMUP_STEPS = 300
 FIRST_SCENES = 512
 """Training starts when so many are drawn."""
 AVERAGE_DECAY = 0.9995
+BETAS = (0.9, 0.99)
+TINT = 0.04
+"""Largest relative change of each channel; stands for the hue of `Augmentation`."""
+AIMED = 0.7
+"""Of the parts of a scene, so many show one of its objects."""
+COPIED_AT_ONCE = 64
 LOGGED_STEPS = 100
 HELD_OUT_SCENES = 100
 CALIBRATION_SEED, CALIBRATION_FRAMES, CALIBRATION_WORLD = 20_000_000, 2000, 101
@@ -78,12 +86,14 @@ class Pool:
         boxes: (N, MOST_OBJECTS, 4) float32, pixels xyxy.
         ids: (N, MOST_OBJECTS) int64, of `LabelledImage`; LACKING where there is no object.
         drawn: (R,) int64, how many each renderer has drawn.
+        begun: (R,) int64, how many it has begun to write.
     """
 
     images: NDArray[np.uint8]
     boxes: NDArray[np.float32]
     ids: NDArray[np.int64]
     drawn: NDArray[np.int64]
+    begun: NDArray[np.int64]
 
     @classmethod
     def of_size(cls, scenes: int, renderers: int) -> Pool:
@@ -93,6 +103,7 @@ class Pool:
             _shared((count, HEIGHT, WIDTH, 3), np.uint8),
             _shared((count, MOST_OBJECTS, 4), np.float32),
             _shared((count, MOST_OBJECTS), np.int64),
+            _shared((renderers,), np.int64),
             _shared((renderers,), np.int64),
         )
 
@@ -116,6 +127,7 @@ def render(pool: Pool, renderer: int, seed: int) -> None:
         rng = np.random.default_rng([seed, renderer, number])
         image, boxes, ids = training_scene(rng, WIDTH, HEIGHT)
         count = min(len(ids), MOST_OBJECTS)
+        pool.begun[renderer] = number + 1
         pool.images[place] = image[:, :, ::-1]
         pool.boxes[place, :count] = boxes[:count]
         pool.ids[place] = LACKING
@@ -132,37 +144,55 @@ class PoolCopy:
         self.boxes = torch.zeros(pool.boxes.shape, device=device)
         self.ids = torch.full(pool.ids.shape, LACKING, dtype=torch.int64, device=device)
         self._copied = np.zeros_like(pool.drawn)
+        self._filled = np.zeros(len(pool.images), np.bool_)
+        self._lock = threading.Lock()
+        self._failure: Exception | None = None
 
     @property
     def available(self) -> int:
         """The first so many places have a scene."""
-        return min(int(self._copied.min()) * len(self._copied), len(self.images))
+        return len(self._filled) if self._filled.all() else int(self._filled.argmin())
 
     @property
     def scenes(self) -> int:
         """How many different scenes were copied."""
         return int(self._copied.sum())
 
+    def take(self, places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Images, boxes and ids of the same scenes, also while another thread updates."""
+        with self._lock:
+            return self.images[places], self.boxes[places], self.ids[places]
+
     def update(self) -> None:
-        """Copy what was drawn since the last call."""
+        """Copy what was drawn since the last call, except what its renderer draws over meanwhile."""
         renderers, rounds = len(self._copied), len(self.images) // len(self._copied)
         for renderer, drawn in enumerate(self._pool.drawn.tolist()):
             first = max(int(self._copied[renderer]), drawn - rounds)
-            places = [renderer + renderers * (number % rounds) for number in range(first, drawn)]
-            for start in range(0, len(places), 64):
-                some = places[start : start + 64]
-                for mine, theirs in (
-                    (self.images, self._pool.images),
-                    (self.boxes, self._pool.boxes),
-                    (self.ids, self._pool.ids),
-                ):
-                    mine[some] = torch.from_numpy(theirs[some]).to(self._device)
+            for start in range(first, drawn, COPIED_AT_ONCE):
+                numbers = np.arange(start, min(start + COPIED_AT_ONCE, drawn))
+                places = renderer + renderers * (numbers % rounds)
+                copies = [of[places] for of in (self._pool.images, self._pool.boxes, self._pool.ids)]
+                torn = max(0, int(self._pool.begun[renderer]) - rounds - start)
+                places = places[torn:]
+                to = torch.from_numpy(places).to(self._device)
+                images, boxes, ids = (torch.from_numpy(one[torn:]).to(self._device) for one in copies)
+                with self._lock:
+                    self.images[to], self.boxes[to], self.ids[to] = images, boxes, ids
+                self._filled[places] = True
             self._copied[renderer] = drawn
 
     def follow(self, ended: threading.Event) -> None:
-        """Update until `ended`."""
-        while not ended.wait(0.5):
-            self.update()
+        """Update until `ended`, or until an error, which `check` raises."""
+        try:
+            while not ended.wait(0.5):
+                self.update()
+        except Exception as error:
+            self._failure = error
+
+    def check(self) -> None:
+        """Raise RuntimeError if `follow` has failed."""
+        if self._failure is not None:
+            raise RuntimeError(f"the drawn scenes could not be copied: {self._failure}") from self._failure
 
 
 def batch(pool: PoolCopy, width: int, height: int, count: int, rng: torch.Generator) -> tuple[Tensor, Truth]:
@@ -173,7 +203,7 @@ def batch(pool: PoolCopy, width: int, height: int, count: int, rng: torch.Genera
         return low + (high - low) * torch.rand(shape or (count,), device=device, generator=rng)
 
     chosen = torch.randint(pool.available, (count,), device=device, generator=rng)
-    boxes, ids = pool.boxes[chosen], pool.ids[chosen]
+    scenes, boxes, ids = pool.take(chosen)
     window = torch.tensor([width, height], device=device, dtype=torch.float32)
     whole = torch.tensor([WIDTH, HEIGHT], device=device, dtype=torch.float32)
     least = float((window / whole).min())
@@ -187,7 +217,7 @@ def batch(pool: PoolCopy, width: int, height: int, count: int, rng: torch.Genera
     centre = boxes.gather(1, target)[:, 0].reshape(count, 2, 2).mean(1) * zoom
     aimed = uniform(0.1, 0.9, count, 2) * window - centre
     aimed = torch.minimum(torch.maximum(aimed, margin.clamp(max=0)), margin.clamp(min=0))
-    aims = (uniform(0, 1) < 0.7) & (ids != LACKING).any(1)
+    aims = (uniform(0, 1) < AIMED) & (ids != LACKING).any(1)
     shift = torch.where(aims[:, None], aimed, shift)
     shift = torch.where(zoomed[:, None], shift, margin / 2)
 
@@ -212,26 +242,39 @@ def batch(pool: PoolCopy, width: int, height: int, count: int, rng: torch.Genera
     matrix[:, 0, 2] = across - 2 * shift[:, 0] / (zoom[:, 0] * whole[0]) - 1
     matrix[:, 1, 2] = down - 2 * shift[:, 1] / (zoom[:, 0] * whole[1]) - 1
     grid = F.affine_grid(matrix, [count, 3, height, width], align_corners=False)
-    scenes = pool.images[chosen].permute(0, 3, 1, 2).float() - PADDING_GREY
-    images = (F.grid_sample(scenes, grid, align_corners=False) + PADDING_GREY) / 255.0
+    centred = scenes.permute(0, 3, 1, 2).float() - PADDING_GREY
+    images = (F.grid_sample(centred, grid, align_corners=False) + PADDING_GREY) / 255.0
     # Saturation and brightness of HSV; small gains of each channel stand for the hue.
     value = images.amax(1, keepdim=True)
     saturation = 1 + uniform(-limits.saturation, limits.saturation)[:, None, None, None]
     gain = 1 + uniform(-limits.brightness, limits.brightness)[:, None, None, None]
-    tint = uniform(0.96, 1.04, count, 3)[:, :, None, None]
+    tint = uniform(1 - TINT, 1 + TINT, count, 3)[:, :, None, None]
     images = ((value - (value - images) * saturation) * gain * tint).clamp(0, 1)
     return images, Truth(clipped, classes, learned, exists & ~learned)
 
 
 def train(pool: Pool, highest_rate: float, output: Path, given: argparse.Namespace) -> None:
-    """Train one network until the time is over; its average is written every minute and at the end."""
+    """Train one network until the time is over; its average is written every minute and at the end.
+
+    Raises:
+        TimeoutError: the time was over before the first scenes were drawn.
+        RuntimeError: scenes could not be copied.
+        FloatingPointError: the loss is not finite.
+    """
     device = torch.device(given.device)
     torch.set_num_threads(1)
     torch.manual_seed(given.seed)
     torch.set_float32_matmul_precision("high")
     rng = torch.Generator(device).manual_seed(given.seed)
     copied, ended = PoolCopy(pool, device), threading.Event()
-    while copied.available < min(FIRST_SCENES, len(copied.images)):
+    needed = min(FIRST_SCENES, len(copied.images))
+    copied.update()
+    while copied.available < needed:
+        if time.monotonic() >= given.end:
+            raise TimeoutError(
+                f"the time was over when {copied.available} of the first {needed} places had a scene; "
+                "training starts with all: give more --minutes or --renderers"
+            )
         time.sleep(0.2)
         copied.update()
     threading.Thread(target=copied.follow, args=(ended,), daemon=True).start()
@@ -255,14 +298,14 @@ def train(pool: Pool, highest_rate: float, output: Path, given: argparse.Namespa
             {"params": others, "weight_decay": 0.0},
         ],
         highest_rate,
-        betas=(0.9, 0.99),
+        betas=BETAS,
         fused=device.type == "cuda",
     )
     started, written, step, images_done = time.monotonic(), time.monotonic(), 0, 0
-    end = given.end
+    end, sizes = given.end, _sizes(given.batch_share)
     while (now := time.monotonic()) < end or step == 0:
-        width, height, count = SIZES[step % len(SIZES)]
-        count = max(1, int(count * given.batch_share))
+        copied.check()
+        width, height, count = sizes[step % len(sizes)]
         share = min(1.0, (now - started) / max(end - started, 1e-9))
         rate = highest_rate * min(1.0, (step + 1) / WARMUP_STEPS) * (0.5 + 0.5 * math.cos(math.pi * share))
         for group in optimiser.param_groups:
@@ -296,7 +339,12 @@ def train(pool: Pool, highest_rate: float, output: Path, given: argparse.Namespa
             _write(output, average, given, highest_rate, step, images_done, copied.scenes)
             written = now
     ended.set()
+    copied.check()
     _write(output, average, given, highest_rate, step, images_done, copied.scenes)
+
+
+def _sizes(batch_share: float) -> list[tuple[int, int, int]]:
+    return [(width, height, max(1, int(count * batch_share))) for width, height, count in SIZES]
 
 
 def _write(
@@ -318,6 +366,20 @@ def _write(
         "steps_done": steps,
         "images": images,
         "scenes": scenes,
+        "renderers": given.renderers,
+        "pool_scenes": given.scenes,
+        "steps_of_width_height_batch": [list(size) for size in _sizes(given.batch_share)],
+        "warmup_steps": WARMUP_STEPS,
+        "average_decay": AVERAGE_DECAY,
+        "optimiser": "AdamW",
+        "betas": list(BETAS),
+        "weight_decay": REFINEMENT.weight_decay,
+        "gradient_limit": REFINEMENT.gradient_limit,
+        "augmentation": {
+            **{name: value for name, value in asdict(REFINEMENT.augmentation).items() if name != "hue"},
+            "tint": TINT,
+            "aimed": AIMED,
+        },
     }
     output.parent.mkdir(parents=True, exist_ok=True)
     save_checkpoint(output, copy.deepcopy(average).cpu(), metadata=metadata)
@@ -328,7 +390,8 @@ def lower_confidence(output: Path) -> tuple[YoloModel, dict[str, float]]:
     """The written network with lower class biases, and class name → by how much.
 
     The precision at CONFIRMED becomes PRECISION, on frames like those of `benchmarks.bundled_model`, of other
-    seeds. A class that is more precise stays as it is.
+    seeds, at 640 pixels. A class that is more precise stays as it is. One that is never so precise gets the
+    last threshold, and a warning names it.
     """
     with tempfile.TemporaryDirectory() as folder:
         drawn = draw(Path(folder), CALIBRATION_FRAMES, CALIBRATION_SEED, CALIBRATION_WORLD)
@@ -340,6 +403,14 @@ def lower_confidence(output: Path) -> tuple[YoloModel, dict[str, float]]:
     for name in found.names:
         precise = [t for t, at in zip(thresholds, points, strict=True) if at[name].precision >= PRECISION]
         threshold = precise[0] if precise else thresholds[-1]
+        if not precise:
+            logging.warning(
+                "%s: the precision of %s is below %g up to confidence %g; its bias is lowered as for that",
+                output.name,
+                name,
+                PRECISION,
+                threshold,
+            )
         lowered[name] = round(_logit(threshold) - _logit(CONFIRMED), 3)
         for branch in model.detect.cv3:
             branch[-1].bias[model.class_names.index(name)] -= lowered[name]  # type: ignore[index]
@@ -358,6 +429,14 @@ def _finish(output: Path) -> None:
     per_class = {name: asdict(of_class) for name, of_class in score.per_class.items()}
     metadata = load_checkpoint(output).metadata | {
         "class_biases_lowered_by": lowered,
+        "calibration": {
+            "precision": PRECISION,
+            "confidence": CONFIRMED,
+            "seed": CALIBRATION_SEED,
+            "first_world": CALIBRATION_WORLD,
+            "frames": CALIBRATION_FRAMES,
+            "image_size": max(HELD_OUT_SIZE),
+        },
         "score": {
             "map50": round(score.map50, 4),
             "map50_95": round(score.map50_95, 4),
@@ -370,6 +449,30 @@ def _finish(output: Path) -> None:
     save_checkpoint(output, model, metadata=metadata)
 
 
+def join(trainers: Sequence[BaseProcess], renderers: Sequence[BaseProcess]) -> None:
+    """Wait until all trainers have ended; none of the processes is left.
+
+    Raises:
+        SystemExit: a renderer ended before them, or a trainer failed.
+    """
+    try:
+        while any(trainer.is_alive() for trainer in trainers):
+            running = [trainer for trainer in trainers if trainer.is_alive()]
+            multiprocessing.connection.wait([process.sentinel for process in (*running, *renderers)])
+            for number, renderer in enumerate(renderers):
+                if not renderer.is_alive():
+                    raise SystemExit(
+                        f"renderer {number} ended with exit code {renderer.exitcode}; training was stopped: "
+                        "see its error above; without one, it may have been killed for memory (--scenes)"
+                    )
+    finally:
+        for process in (*trainers, *renderers):
+            process.terminate()
+            process.join()
+    if any(trainer.exitcode for trainer in trainers):
+        raise SystemExit(1)
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Read the command line, start the renderers and a trainer for each rate."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
@@ -379,11 +482,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--width", type=float, default=REFINEMENT.width_multiple, help="multiple of YOLOv8")
     parser.add_argument(
-        "--minutes", type=float, default=9.0, help="in all, with the drawing of the first scenes"
+        "--minutes",
+        type=float,
+        default=9.0,
+        help="of drawing the first scenes and training; calibration and evaluation follow",
     )
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--renderers", type=int, default=max(1, (os.cpu_count() or 2) - 2))
-    parser.add_argument("--scenes", type=int, default=24_000, help="places of the pool, 0.9 MB each")
+    parser.add_argument(
+        "--scenes",
+        type=int,
+        default=24_000,
+        help="places of the pool, 0.92 MB of shared memory each, and as much on the GPU for each --rate",
+    )
     parser.add_argument("--batch-share", type=float, default=1.0, help="smaller batches, for a small GPU")
     parser.add_argument("--start", type=Path, help="weights of the same width to start from")
     parser.add_argument("--seed", type=int, default=0)
@@ -394,9 +505,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     # Forked, so that they share the pool's memory; before CUDA and torch's threads start.
     processes = multiprocessing.get_context("fork")
     pool = Pool.of_size(given.scenes, given.renderers)
+    renderers, trainers, outputs = [], [], []
     for number in range(given.renderers):
-        processes.Process(target=render, args=(pool, number, SCENE_SEED + given.seed), daemon=True).start()
-    trainers, outputs = [], []
+        seed = SCENE_SEED + given.seed
+        renderers.append(processes.Process(target=render, args=(pool, number, seed), daemon=True))
+        renderers[-1].start()
     for rate in rates:
         output = given.output
         if len(rates) > 1:
@@ -404,10 +517,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         outputs.append(output)
         trainers.append(processes.Process(target=train, args=(pool, rate, output, given)))
         trainers[-1].start()
-    for trainer in trainers:
-        trainer.join()
-    if any(trainer.exitcode for trainer in trainers):
-        raise SystemExit(1)
+    join(trainers, renderers)
     for output in outputs:
         _finish(output)
 

@@ -13,6 +13,7 @@ from vision.yolo.losses import (
     BINS,
     Assignment,
     Truth,
+    _class_mask,
     assign_task_aligned,
     cell_grid,
     ciou,
@@ -295,3 +296,32 @@ def test_ignored_object_masks_only_its_class() -> None:
     other = detection_loss(maps, strides, Truth(corners, torch.tensor([[2]]), absent, present)).classes
     assert same < 0.1 * wrong
     assert other == pytest.approx(wrong, rel=0.01)
+
+
+@settings(max_examples=25)
+@given(seed=st.integers(0, 2**32 - 1), count=st.integers(0, 5))
+def test_mask_is_that_of_a_loop_over_ignored_objects(seed: int, count: int) -> None:
+    rng = torch.Generator().manual_seed(seed)
+    centres, sizes = cell_grid([(8, 8), (4, 4)], [8, 16])
+    # Whole multiples of 4 pixels: some edges touch those of cells.
+    corners = torch.randint(-2, 18, (2, count, 2, 2), generator=rng).sort(2).values.float() * 4
+    truth = Truth(
+        corners.reshape(2, count, 4),
+        torch.randint(3, (2, count), generator=rng),
+        torch.zeros(2, count).bool(),
+        torch.rand(2, count, generator=rng) < 0.7,
+    )
+    assert truth.ignored is not None
+    scores = torch.rand(2, len(centres), 3, generator=rng) * (torch.rand(2, 80, 3, generator=rng) < 0.3)
+    expected = torch.ones(2, len(centres), 3)
+    for image in range(2):
+        for item in range(count):
+            left, top, right, bottom = truth.boxes[image, item].tolist()
+            of_class = int(truth.classes[image, item])
+            for cell, ((x, y), size) in enumerate(zip(centres.tolist(), sizes.tolist(), strict=True)):
+                across = x + size / 2 > left and x - size / 2 < right
+                down = y + size / 2 > top and y - size / 2 < bottom
+                learned = float(scores[image, cell, of_class]) > 0
+                if truth.ignored[image, item] and across and down and not learned:
+                    expected[image, cell, of_class] = 0
+    assert torch.equal(_class_mask(truth, centres, sizes, scores), expected)
