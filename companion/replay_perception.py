@@ -48,7 +48,7 @@ from vision.tracking.association import match, overlaps
 # The usual limit of evaluations.
 LEAST_IOU = 0.5
 MAX_LISTED = 10
-DEPTH_INEXACT = "recorded depth is in whole millimetres, up to 65.535 m: ranges can differ by as much"
+DEPTH_INEXACT = "depth was rounded to 1 mm unless the camera delivers whole millimetres"
 SAMPLES_INEXACT = (
     "tracks and ranges: the flight had fewer samples of the vehicle's pose when it processed an image"
 )

@@ -27,12 +27,12 @@ from companion.bus.topics import (
     GUIDANCE_OUTPUT,
     IMAGE,
     LABELS,
-    LARGE_TOPICS,
     MAVLINK,
     RUN,
     SETPOINT,
     TOPICS,
     VEHICLE,
+    Topic,
 )
 from companion.recording.files import Channel, Recorded
 from companion.recording.foxglove_schemas import SCHEMAS
@@ -68,6 +68,11 @@ _NO_POSE = {
 _PNG = b"\x89PNG"
 DEPTH_ENCODING = "16UC1"
 """Of a foxglove.RawImage with depth: little-endian uint16, millimetres, 0 where unknown."""
+_LARGE_TYPES = {
+    IMAGE.name: "foxglove.CompressedImage",
+    DEPTH_IMAGE.name: "foxglove.RawImage",
+    CLOUD.name: "foxglove.PointCloud",
+}
 _LINE_LOOP = 2  # foxglove.PointsAnnotationType
 _COLORS = {"confirmed": (0.2, 1.0, 0.3), "tentative": (1.0, 0.8, 0.1)}
 _OTHER_COLOR = (0.4, 0.7, 1.0)
@@ -195,7 +200,7 @@ class Converter:
             "frame_id": self._camera_frame(camera),
             "format": "png" if encoded.startswith(_PNG) else "jpeg",
         }
-        channel = large_channels(camera)[0]
+        channel = large_channel(IMAGE, camera)
         return Recorded(channel, captured_ns + self._offset_ns, _with_data(body, encoded))
 
     def _depth_image(self, camera: str, packed: bytes, about: dict[str, Any]) -> Recorded:
@@ -215,7 +220,7 @@ class Converter:
             "encoding": DEPTH_ENCODING,
             "step": 2 * width,
         }
-        channel = large_channels(camera)[1]
+        channel = large_channel(DEPTH_IMAGE, camera)
         return Recorded(channel, captured_ns + self._offset_ns, _with_data(body, data))
 
     def _cloud(self, camera: str, packed: bytes, about: dict[str, Any]) -> Recorded:
@@ -231,7 +236,7 @@ class Converter:
                 {"name": name, "offset": offset, "type": kind} for name, offset, kind in _POINT_FIELDS
             ],
         }
-        channel = large_channels(camera)[2]
+        channel = large_channel(CLOUD, camera)
         return Recorded(channel, captured_ns + self._offset_ns, _with_data(body, packed))
 
     def _annotations(self, camera: str, message: dict[str, Any]) -> Iterator[tuple[str, str, Any]]:
@@ -366,13 +371,10 @@ def _unix_time(unix_ns: int) -> dict[str, int]:
     return {"sec": seconds, "nsec": rest}
 
 
-def large_channels(camera: str) -> tuple[Channel, ...]:
-    """Return the channels of a camera's `LARGE_TOPICS`, in that order. `camera`: empty, or `cameras/NAME`."""
-    kinds = ("foxglove.CompressedImage", "foxglove.RawImage", "foxglove.PointCloud")
-    return tuple(
-        Channel(_joined("", camera, topic.name), kind, SCHEMAS[kind])
-        for topic, kind in zip(LARGE_TOPICS, kinds, strict=True)
-    )
+def large_channel(topic: Topic, camera: str = "") -> Channel:
+    """Return the channel of one of `LARGE_TOPICS`. `camera`: empty, or `cameras/NAME`."""
+    kind = _LARGE_TYPES[topic.name]
+    return Channel(_joined("", camera, topic.name), kind, SCHEMAS[kind])
 
 
 def _with_data(body: dict[str, Any], data: bytes) -> bytes:

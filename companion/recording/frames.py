@@ -50,7 +50,7 @@ def recorded_frames(
 
     Raises:
         RecordingError: a file cannot be read, is not a recording of the service, its images are drawn on, or
-            a depth image has another size or encoding.
+            a depth image has another size or encoding, or cannot be decoded.
     """
     prefix = "" if camera is None else f"cameras/{camera}/"
     images, detections, depths = (
@@ -61,7 +61,7 @@ def recorded_frames(
     # Either comes first, an image up to a second after the message, also in the next file; all have the
     # capture's time.
     topics = [images, detections, *([depths] if depth else [])]
-    waiting: dict[str, dict[int, Any]] = {topic: {} for topic in topics}
+    waiting: dict[str, dict[int, Any]] = {images: {}, detections: {}, depths: {}}
     pairs: deque[tuple[int, Any, Any]] = deque()
     for path in paths:
         reader = RecordingReader(path)
@@ -69,7 +69,7 @@ def recorded_frames(
         if run is None:
             raise RecordingError(f"{path}: not a recording of the service: it has no message on 'run'")
         about = json.loads(run.data)
-        for message in reader.messages(*waiting):
+        for message in reader.messages(*topics):
             body, topic = json.loads(message.data), message.channel.topic
             if topic == detections:
                 captured_ns = body["captured_ns"]
@@ -80,37 +80,49 @@ def recorded_frames(
                 raise RecordingError(
                     f"{path}: detections are drawn into its images: record with preview.annotate = false"
                 )
-            waiting[topic][captured_ns] = body
+            waiting[topic][captured_ns] = (path, body) if topic == depths else body
             if captured_ns in waiting[images] and captured_ns in waiting[detections]:
                 pairs.append((captured_ns, waiting[images][captured_ns], waiting[detections][captured_ns]))
                 for each in (images, detections):
                     waiting[each] = _newer(waiting[each], captured_ns)
-            elif len(waiting[topic]) > (MAX_WAITING_FOR_DEPTH if topic == depths else MAX_WAITING):
+            elif len(waiting[topic]) > MAX_WAITING:
                 del waiting[topic][next(iter(waiting[topic]))]
             # Depth images come in order: after a newer one, an older one does not come any more.
             newest_ns = max(waiting[depths], default=-1) if depth else captured_ns
             while pairs and (len(pairs) > MAX_WAITING_FOR_DEPTH or pairs[0][0] <= newest_ns):
-                yield from _decoded(path, *pairs.popleft(), waiting.get(depths, {}))
+                pair = pairs.popleft()
+                yield from _decoded(*pair, depths, waiting[depths].get(pair[0]))
+                waiting[depths] = _newer(waiting[depths], pair[0])
     for pair in pairs:
-        yield from _decoded(paths[-1], *pair, waiting.get(depths, {}))
+        yield from _decoded(*pair, depths, waiting[depths].get(pair[0]))
 
 
 def _decoded(
-    path: Path, captured_ns: int, image: Any, message: Any, depths: dict[int, Any]
+    captured_ns: int, image: Any, message: Any, topic: str, depth: tuple[Path, Any] | None
 ) -> Iterator[DetectedFrame]:
-    """Decode one frame; a damaged image is left out."""
+    """Decode one frame; a damaged image is left out. `topic`, `depth`: of its depth image, with its file."""
     pixels = cv2.imdecode(np.frombuffer(base64.b64decode(image["data"]), np.uint8), cv2.IMREAD_COLOR)
     if pixels is None:
         return
-    depth = depths.pop(captured_ns, None)
-    depth_m = None
-    if depth is not None:
-        expected = (message["width"], message["height"], DEPTH_ENCODING)
-        if (found := (depth["width"], depth["height"], depth["encoding"])) != expected:
-            raise RecordingError(f"{path}: a depth image is {found}, expected {expected}")
-        millimetres = np.frombuffer(base64.b64decode(depth["data"]), "<u2")
-        depth_m = to_metres(millimetres.reshape(expected[1::-1]), None)
+    depth_m = None if depth is None else _depth_m(*depth, topic, message["width"], message["height"])
     yield DetectedFrame(captured_ns, pixels.astype(np.uint8, copy=False), message, image["format"], depth_m)
+
+
+def _depth_m(path: Path, body: Any, topic: str, width: int, height: int) -> NDArray[np.float32]:
+    """Decode a depth image of a frame of this size. Raises RecordingError."""
+    expected = (width, height, DEPTH_ENCODING)
+    if (found := tuple(body.get(key) for key in ("width", "height", "encoding"))) != expected:
+        raise RecordingError(f"{path}: {topic}: a depth image is {found}, expected {expected}")
+    try:
+        data = base64.b64decode(body["data"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise RecordingError(f"{path}: {topic}: data of a depth image is not base64: {error}") from error
+    if len(data) != 2 * width * height:
+        raise RecordingError(
+            f"{path}: {topic}: a depth image of {width}x{height} has {len(data)} bytes, "
+            f"expected {2 * width * height}"
+        )
+    return to_metres(np.frombuffer(data, "<u2").reshape(height, width), None)
 
 
 def _newer(bodies: dict[int, Any], captured_ns: int) -> dict[int, Any]:

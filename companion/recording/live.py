@@ -16,7 +16,7 @@ from foxglove.websocket import ChannelView, Client, ServerListener
 from companion.bus.client import open_client
 from companion.bus.topics import LARGE_TOPICS, ROOT, RUN, TOPICS
 from companion.recording import RecordingError
-from companion.recording.convert import Converter, large_channels
+from companion.recording.convert import Converter, large_channel
 from companion.recording.files import Channel
 from companion.recording.recorder import subscribe_all
 from companion.settings import ZenohSection
@@ -42,8 +42,8 @@ class Live(ServerListener):
         self._large: dict[str, zenoh.Subscriber[None]] = {}
         self._lock = Lock()  # zenoh's threads, and the server's
         host, _, port = options.listen.rpartition(":")
-        for large in large_channels(""):
-            self._channel(large)
+        for topic in LARGE_TOPICS:
+            self._channel(large_channel(topic))
         try:
             self._server = foxglove.start_server(
                 name=f"companion {options.vehicle}", host=host, port=int(port), server_listener=self
@@ -93,8 +93,8 @@ class Live(ServerListener):
                 )
                 if path == RUN.name:
                     for camera in json.loads(messages[0].data)["settings"]["cameras"]:
-                        for large in large_channels(f"cameras/{camera}"):
-                            self._channel(large)
+                        for topic in LARGE_TOPICS:
+                            self._channel(large_channel(topic, f"cameras/{camera}"))
                 channels = [self._channel(message.channel) for message in messages]
         except (ValueError, KeyError, TypeError):
             return  # of another version, or another program's

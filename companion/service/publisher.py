@@ -175,7 +175,8 @@ class Publisher:
             self._publish_vehicle(guidance, streamer, time.monotonic_ns())
             for camera in cameras:
                 image, depth, clouds = (
-                    self._bus.watched(topic, camera.name) for topic in topics.LARGE_TOPICS
+                    self._bus.watched(topic, camera.name)
+                    for topic in (topics.IMAGE, topics.DEPTH_IMAGE, topics.CLOUD)
                 )
                 image = image or self._queries.image_wanted(camera)
                 camera.supervisor.watch(image, depth=depth, clouds=clouds)

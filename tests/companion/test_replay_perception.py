@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -43,21 +44,29 @@ SETTINGS = {"detector.image_size": "256", "detector.threads": "1", "preview.anno
 @pytest.fixture(scope="module")
 def lossless(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A recorded approach to a car, with PNG images and the depth of a camera that delivers millimetres."""
-    flight = LockstepFlight.airborne(seed=11, height_m=3.0, wind_mps=1.0, camera=_camera)
+    return _approach(tmp_path_factory.mktemp("lossless"), _depth_camera, 7.0)
+
+
+def _approach(folder: Path, camera: Callable[[LockstepVehicle], RenderedCamera], seconds: float) -> Path:
+    flight = LockstepFlight.airborne(seed=11, height_m=3.0, wind_mps=1.0, camera=camera)
     detector = open_detector("yolo", DetectorSettings(DEFAULT_MODEL, image_size=256, threads=1))
-    folder = tmp_path_factory.mktemp("lossless")
     with recording(flight, folder, images=".png", model=ModelIdentity("own", detector.model_sha256)) as path:
-        assert flight.fly("approach car distance=8", 7.0).moments
+        assert flight.fly("approach car distance=8", seconds).moments
     return path
 
 
-def _camera(vehicle: LockstepVehicle) -> RenderedCamera:
-    """It sees a car 14 m ahead, with depth in whole millimetres."""
+def _camera(vehicle: LockstepVehicle, *, depth: bool = False) -> RenderedCamera:
+    """It sees a car 14 m ahead."""
     yaw_rad = euler_from_quaternion(vehicle.truth.quaternion)[2]
     pose = ScenePose(14.0 * math.cos(yaw_rad), 14.0 * math.sin(yaw_rad), 1.2)
     car = SceneObject("car", (4.2, 1.8, 1.5), lambda _: pose)
-    scene, _ = rendered_scene([car], CAMERA, MOUNT, 11, depth=True)
-    camera = RenderedCamera(camera_settings(CAMERA, MOUNT, SETTINGS), scene, vehicle)
+    scene, _ = rendered_scene([car], CAMERA, MOUNT, 11, depth=depth)
+    return RenderedCamera(camera_settings(CAMERA, MOUNT, SETTINGS), scene, vehicle, depth=depth)
+
+
+def _depth_camera(vehicle: LockstepVehicle) -> RenderedCamera:
+    """The same with depth in whole millimetres."""
+    camera = _camera(vehicle, depth=True)
     process = camera.perception.process
 
     def process_millimetres(frame: Frame, now_ns: int) -> PerceptionResult | None:
@@ -78,6 +87,16 @@ def test_lossless_images_and_the_same_model_give_the_flight(lossless: Path) -> N
     assert detections.depth_images == detections.images
     assert (found.first, found.differing_steps, found.timeline) == (None, 0, [])
     assert found.inexact == [DEPTH_INEXACT]
+
+
+def test_lossless_replay_without_depth_has_no_reservations(tmp_path: Path) -> None:
+    found = replay([_approach(tmp_path, _camera, 3.0)], {}, DEFAULT_MODEL)
+    detections = found.detections
+    assert detections is not None
+    assert detections.images == detections.frames == detections.identical_images > 20
+    assert detections.recorded == detections.replayed > 20
+    assert detections.depth_images == 0
+    assert (found.first, found.differing_steps, found.timeline, found.inexact) == (None, 0, [], [])
 
 
 def test_flight_with_ranges_from_depth_replays_without_it_as_inexact(lossless: Path, tmp_path: Path) -> None:
@@ -165,7 +184,10 @@ def test_frames_without_an_image_are_counted(lossless: Path, tmp_path: Path) -> 
     assert found.detections is not None
     missing = found.detections.frames - found.detections.images
     assert missing == seen // 3
-    assert f"{missing} of {found.detections.frames} processed frames have no recorded image" in found.inexact
+    assert found.inexact == [
+        f"{missing} of {found.detections.frames} processed frames have no recorded image",
+        DEPTH_INEXACT,
+    ]
 
 
 @pytest.mark.parametrize("restarts", [0, 2])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import os
 import zlib
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -15,7 +16,7 @@ import pytest
 
 from companion.bench.lockstep_flight import plain_settings
 from companion.bus.messages import cloud_attachment, depth_image_attachment, detections_message
-from companion.bus.topics import LARGE_TOPICS, RECORDER_TOPICS, TOPICS
+from companion.bus.topics import RECORDER_TOPICS, TOPICS
 from companion.bus.vehicle_messages import vehicle_message
 from companion.guidance.core import GuidanceOptions
 from companion.recording.convert import Converter
@@ -26,6 +27,7 @@ from companion.recording.link_bytes import LinkBytes, pack_link_bytes, unpack_li
 from companion.recording.recorder import RecorderOptions, topics_of
 from companion.recording.tap import run_record
 from companion.settings import ZenohSection
+from companion.settings.reading import load_settings
 from companion.vehicle.state import VehicleState
 from vision.detections import Detections
 from vision.pipeline import PerceptionResult
@@ -299,6 +301,12 @@ def test_format_of_an_image_is_named(converter: Converter, encoding: str, kind: 
 def test_recorder_subscribes_to_the_chosen_large_topics(chosen: tuple[bool, bool, bool]) -> None:
     options = RecorderOptions(ZenohSection(), "vehicle1", "", *chosen, 1, 1, 1)
     names = [topic.name for topic in topics_of(options)]
-    assert tuple(topic.name in names for topic in LARGE_TOPICS) == chosen
+    assert ("image" in names, "depth_image" in names, "cloud" in names) == chosen
     assert names[-1] == "@record/mavlink"
     assert len(names) == len(TOPICS) - 2 + len(RECORDER_TOPICS)
+
+
+@pytest.mark.parametrize("chosen", [{}, {"recording.depth": "true"}])
+def test_images_are_recorded_by_default_and_depth_if_chosen(chosen: dict[str, str]) -> None:
+    recording = load_settings(os.devnull, chosen, {}).recording
+    assert (recording.images, recording.depth, recording.clouds) == (True, bool(chosen), False)
