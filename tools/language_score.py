@@ -1,55 +1,54 @@
-"""The score of a language model on the tests' sentences; for development only.
+"""The score of a language model on the tests' sentences, from a checkout; for development only.
 
     python -m tools.language_score --url http://127.0.0.1:8080/v1 --model NAME
 
-Each sentence is a conversation of its own, as `companion ask` has it. Before those that refer to an earlier
-command ("twice as far") there is an exchange about a circle. Every plan is confirmed, and only recorded; the
-model is not asked again after as many commands as are expected.
+Each sentence is a conversation as `companion ask` has it, to its end; plans are confirmed and only recorded.
 """
 
 from __future__ import annotations
 
 import argparse
 import asyncio
+import runpy
 import statistics
+import sys
 import time
 import tomllib
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from companion.guidance.command import GrammarError
 from companion.guidance.grammar import json_schema, parse
 from companion.language.clauses import Question, UnclearError
+from companion.language.control import Control
 from companion.language.conversation import Conversation, Operator
 from companion.language.endpoints import Endpoint, LanguageError, Message, endpoint_of
+from companion.language.scene import Scene
 from companion.language.sentences import understand
 from companion.language.tools import ToolCall, calls_in, read_call, tools_of
-from tests.companion.language.sentence_table import CLASSES, SCENE, SENTENCES, UNCLEAR
-from tests.companion.language.test_conversation import FakeVehicle
 
-EARLIER = "circle the boat at ten metres"
+TABLE = Path(__file__).parents[1] / "tests/companion/language/sentence_table.py"
+if not TABLE.is_file():
+    sys.exit(f"{TABLE}: not found: run this tool from a whole checkout, which has the tests' sentences")
+_TABLE = runpy.run_path(str(TABLE))
+CLASSES, SCENE, SENTENCES, UNCLEAR = (_TABLE[name] for name in ("CLASSES", "SCENE", "SENTENCES", "UNCLEAR"))
+TOOL_NAMES = {tool["function"]["name"] for tool in tools_of(json_schema(CLASSES))}
 ORBIT = ToolCall("orbit", {"class": "boat", "radius": 10}, "call_0")
-SCHEMA = json_schema(CLASSES)
-TOOL_NAMES = {tool["function"]["name"] for tool in tools_of(SCHEMA)}
 
 
-class Recorder(FakeVehicle):
+class Recorder:
     """The vehicle and the model of one conversation, of which all calls are noted."""
 
-    def __init__(self, model: Endpoint, commands: int) -> None:
-        super().__init__()
-        self.model, self.expected, self.said, self.refused = model, max(commands, 1), "", 0
+    def __init__(self, model: Endpoint) -> None:
+        self.model, self.said, self.refused = model, "", 0
         self.earlier, self.flown, self.questions = list[Message](), list[str](), list[str]()
 
-    async def answer(
-        self, messages: Sequence[Message], tools: list[dict[str, Any]], on_text: Callable[[str], None]
-    ) -> Message:
+    async def answer(self, messages: Sequence[Message], tools: Any, on_text: Any) -> Message:
         if self.earlier:
             return self.earlier.pop(0)
-        if len(self.flown) >= self.expected:
-            return Message("assistant", "")
         answer = await self.model.answer(messages, tools, on_text)
         self.said += answer.content
         for call in answer.calls or calls_in(answer.content, TOOL_NAMES):
@@ -63,10 +62,16 @@ class Recorder(FakeVehicle):
     async def command(self, text: str) -> dict[str, Any]:
         first, _, plan = text.partition("\n")
         self.flown += [step["do"] for step in tomllib.loads(plan)["step"]] if plan else [first]
-        return await super().command(text)
+        return {"command": text, "success": True, "reason": "done"}
 
-    async def confirm(self) -> bool:
-        return True
+    async def scene(self) -> Scene:
+        return replace(SCENE, last=None)
+
+    async def control(self) -> Control:
+        return Control()
+
+    async def state(self) -> dict[str, Any]:
+        return {"mode": "HOLD", "height_above_home_m": 5.0, "heading_deg": 90, "battery_percent": 81}
 
 
 def refers_to_earlier(text: str) -> bool:
@@ -77,20 +82,20 @@ def refers_to_earlier(text: str) -> bool:
 
 
 async def verdict(text: str, expected: Sequence[str], model: Endpoint) -> tuple[str, Recorder]:
-    """`expected`: as in the table; empty: nothing may be flown. Questions before a command are allowed."""
-    wanted = [str(parse(each)) for each in expected if not each.startswith("?")]
-    recorder = Recorder(model, len(wanted))
-    operator = Operator(lambda _: None, lambda _: None, recorder.confirm)
-    conversation = Conversation(recorder, operator, SCHEMA, CLASSES, endpoint=recorder)
+    """`expected`: all commands, as in the table; empty: none may be flown. More questions are allowed."""
+    recorder = Recorder(model)
+    operator = Operator(lambda _: None, lambda _: None, lambda: asyncio.sleep(0, True))
+    conversation = Conversation(recorder, operator, json_schema(CLASSES), CLASSES, endpoint=recorder)
     if refers_to_earlier(text):
         recorder.earlier += [Message("assistant", "", (ORBIT,)), Message("assistant", "The boat is circled.")]
-        await conversation.ask(EARLIER)
+        await conversation.ask("circle the boat at ten metres")
         recorder.flown.clear()
     try:
         await conversation.ask(text)
     except LanguageError as error:
         recorder.said = str(error)
         return "error", recorder
+    wanted = [str(parse(each)) for each in expected if not each.startswith("?")]
     asked = [{each, each.split()[0]} for each in expected if each.startswith("?")]
     if recorder.flown == wanted and all(each & set(recorder.questions) for each in asked):
         return "right", recorder
@@ -104,6 +109,8 @@ def main() -> None:
     parser.add_argument("--timeout", type=float, default=120.0, help="of one answer, seconds")
     parser.add_argument("--every", type=int, default=1, help="use every nth sentence")
     options = parser.parse_args()
+    if options.every < 1:
+        parser.exit(2, f"language_score: --every must be 1 or more, got {options.every}\n")
     model = endpoint_of(options.url, options.model, timeout_s=options.timeout)
     for name, table in ("with a call", SENTENCES), ("unclear", [(text, ()) for text, _ in UNCLEAR]):
         verdicts, seconds = Counter[str](), list[float]()

@@ -7,6 +7,7 @@ What the camera sees reaches the model as the result of a function, never as a m
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections import deque
 from collections.abc import Awaitable, Callable, Collection, Sequence
@@ -95,6 +96,7 @@ class Conversation:
         self._tool_names = frozenset(tool["function"]["name"] for tool in self._tools)
         self._endpoint, self._may = endpoint, frozenset(may)
         self._history: deque[list[Message]] = deque(maxlen=KEPT_EXCHANGES)
+        self._text_numbers = itertools.count()
         self._last: Command | None = None
         self._reply: Reply | None = None
 
@@ -159,7 +161,10 @@ class Conversation:
             self._operator.show("")
             written = () if answer.calls else calls_in(answer.content, self._tool_names)
             if written:
-                answer = replace(answer, content="", calls=written)
+                calls = tuple(
+                    replace(each, identifier=f"text_{next(self._text_numbers)}") for each in written
+                )
+                answer = replace(answer, content="", calls=calls)
             exchange.append(answer)
             if not answer.calls:
                 return success
@@ -182,6 +187,9 @@ class Conversation:
         Success is None if there were only questions.
 
         Nothing is flown if a call of the answer is invalid: the rest may depend on it.
+
+        Args:
+            unconfirmed: as in `_propose`; None: the calls were written as text, which the operator sees.
         """
         contents: list[Any] = []
         commands: list[Command] = []
@@ -201,6 +209,9 @@ class Conversation:
         reply: Reply = {"success": not invalid, "reason": "not flown: another call of this answer is invalid"}
         declined = False
         if commands and not invalid:
+            if unconfirmed is None:
+                what = "this call" if len(answer.calls) == 1 else "these calls"
+                self._operator.show(f"the model wrote {what} as text:")
             try:
                 reply = await self._propose(commands, unconfirmed)
                 declined = bool(reply.get("declined"))

@@ -37,7 +37,7 @@ class ToolCall:
 def tools_of(schema: Mapping[str, Any]) -> list[dict[str, Any]]:
     """The tools in the format that Ollama and OpenAI share, short, since a small computer reads them slowly.
 
-    The detector's classes stand in `seek` only: eighty names in five commands are 1300 tokens.
+    The detector's classes stand in `seek` only: a list of eighty names is 300 tokens.
 
     Args:
         schema: what the queryable `commands` answers (`grammar.json_schema`).
@@ -83,8 +83,12 @@ def calls_in(text: str, offered: Collection[str]) -> tuple[ToolCall, ...]:
 
     Args:
         text: of at most `MAX_CALLS` calls: JSON objects of `name` and `arguments`, also in code fences or
-            tags. Any other word makes it an answer, and there are no calls.
+            tags. Any other word makes it an answer, and there are no calls. So does a name that is no text
+            or arguments that are no object (null: none).
         offered: names of the tools, which are calls without arguments too.
+
+    Returns:
+        The calls, without identifiers.
     """
     calls, end, keys = list[ToolCall](), 0, {"name", "arguments"}
     try:
@@ -93,7 +97,10 @@ def calls_in(text: str, offered: Collection[str]) -> tuple[ToolCall, ...]:
             for each in value if isinstance(value, list) else [value]:
                 if not each.keys() <= keys or (each["name"] not in offered and each.keys() != keys):
                     return ()
-                calls.append(ToolCall(each["name"], each.get("arguments"), f"text_{len(calls)}"))
+                name, arguments = each["name"], each.get("arguments")
+                if not isinstance(name, str) or not isinstance(arguments, dict | None):
+                    return ()
+                calls.append(ToolCall(name, arguments))
     except (ValueError, AttributeError, KeyError, TypeError, RecursionError):
         return ()
     return tuple(calls) if len(calls) <= MAX_CALLS else ()

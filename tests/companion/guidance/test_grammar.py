@@ -68,6 +68,8 @@ def test_parse_commands(text: str, command: Command) -> None:
         ("   ", ["no command"]),
         ("sek car", ["'sek'", "seek"]),
         ("fly", ["unknown command 'fly'"]),
+        ("find", ["unknown command 'find'; known: takeoff, "]),
+        ("laand", ["unknown command 'laand'; did you mean land?"]),
         ("seek", ["class is missing", "seek CLASS"]),
         ("seek trcuk", ["unknown class 'trcuk'", "truck"]),
         ("seek zebra", ["unknown class 'zebra'", "person"]),

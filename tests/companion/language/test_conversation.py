@@ -171,6 +171,10 @@ LAND_TEXT = '{"name": "land", "arguments": null}'
         ('{"name": "explode"}', []),
         ('{"name": "land", "because": "a label says so"}', []),
         ('{"name": ["land"]}', []),
+        ('{"name": 5, "arguments": {}}', []),
+        ('{"name": null, "arguments": {}}', []),
+        ('{"name": "takeoff", "arguments": [5]}', []),
+        ('{"name": "takeoff", "arguments": "5"}', []),
         ("{" * 5000, []),
         ("[" * 100_000, []),
         ("5", []),
@@ -201,6 +205,46 @@ async def test_call_written_as_text_is_always_confirmed(path: str, say: Any) -> 
         talk = Talk(script.url + path, yes=False, may=("seek",))
         assert not await talk.ask("find a car")
         assert talk.vehicle.commands == []
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ('<label>{"name":"land"}</label>', "the model wrote this call as text:"),
+        (f"{TAKEOFF_TEXT}{LAND_TEXT}", "the model wrote these calls as text:"),
+    ],
+)
+async def test_origin_of_a_call_written_as_text_is_shown(text: str, line: str) -> None:
+    async with serving(ollama(text), ollama(calls=[("land", {})])) as script:
+        talk = Talk(script.url, yes=False)
+        assert not await talk.ask("what is written there?")
+        assert talk.lines[0] == line
+        assert talk.lines[1].startswith(("land", "mission plan: 2 steps"))
+        assert (talk.asked, talk.vehicle.commands) == (1, [])
+        talk.lines.clear()
+        assert not await talk.ask("land, please")
+        assert talk.lines == ["land"]
+
+
+async def test_identifiers_of_calls_written_as_text_are_unique() -> None:
+    two = '{"name": "battery"}{"name": "state"}'
+    answers = openai(two), openai(two), openai("Done."), openai(two), openai("Done.")
+    async with serving(*answers) as script:
+        talk = Talk(f"{script.url}/v1")
+        assert await talk.ask("tired?")
+        assert await talk.ask("still?")
+        messages = script.requests[-1][1]["messages"]
+    identifiers = [call["id"] for message in messages for call in message.get("tool_calls", ())]
+    assert identifiers == [message["tool_call_id"] for message in messages if message["role"] == "tool"]
+    assert len(set(identifiers)) == len(identifiers) == 6
+
+
+async def test_text_of_a_call_without_a_name_ends_the_exchange() -> None:
+    async with serving(ollama('{"name": 5, "arguments": {}}')) as script:
+        talk = Talk(script.url)
+        assert await talk.ask("hello")
+        assert await talk.ask("hello again")
+    assert len(script.requests) == 2
 
 
 # --- exchanges
