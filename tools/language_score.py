@@ -18,7 +18,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from companion.guidance.command import GrammarError
 from companion.guidance.grammar import json_schema, parse
@@ -65,7 +65,7 @@ class Recorder:
         return {"command": text, "success": True, "reason": "done"}
 
     async def scene(self) -> Scene:
-        return replace(SCENE, last=None)
+        return cast(Scene, replace(SCENE, last=None))
 
     async def control(self) -> Control:
         return Control()

@@ -189,8 +189,9 @@ def range_of(argument: Number) -> str:
 
 def nearest(word: str, known: list[str]) -> str:
     """Suggest known words close to an unknown one, or list the known words."""
+    # At 0.6, `launch` is close to `land`.
     plain = {_plain(name): name for name in known}
-    near = [plain[match] for match in difflib.get_close_matches(_plain(word), list(plain), 3, 0.6)]
+    near = [plain[match] for match in difflib.get_close_matches(_plain(word), list(plain), 3, 0.65)]
     if near:
         return f"did you mean {' or '.join(near)}?"
     more = ", …" if len(known) > 12 else ""

@@ -69,6 +69,7 @@ def test_parse_commands(text: str, command: Command) -> None:
         ("sek car", ["'sek'", "seek"]),
         ("fly", ["unknown command 'fly'"]),
         ("find", ["unknown command 'find'; known: takeoff, "]),
+        ("launch", ["unknown command 'launch'; known: takeoff, "]),
         ("laand", ["unknown command 'laand'; did you mean land?"]),
         ("seek", ["class is missing", "seek CLASS"]),
         ("seek trcuk", ["unknown class 'trcuk'", "truck"]),
