@@ -141,8 +141,8 @@ def test_renderer_fills_its_places_in_order(monkeypatch: pytest.MonkeyPatch) -> 
         return image, np.full((number % 3, 4), number, np.float32), np.full(number % 3, number)
 
     monkeypatch.setattr(train_bundled_model, "training_scene", scene)
-    monkeypatch.setattr(train_bundled_model.os, "nice", lambda _: 0)
-    monkeypatch.setattr(train_bundled_model.cv2, "setNumThreads", lambda _: None)
+    monkeypatch.setattr("os.nice", lambda _: 0)
+    monkeypatch.setattr("cv2.setNumThreads", lambda _: None)
     with pytest.raises(KeyboardInterrupt):
         train_bundled_model.render(pool, 1, 9)
     assert pool.drawn.tolist() == [0, draws]
@@ -244,7 +244,7 @@ def test_network_is_trained_and_written(pool: Pool, tmp_path: Path) -> None:
 
 def class_biases(model: YoloModel) -> torch.Tensor:
     """(3, classes), of each level."""
-    return torch.stack([branch[-1].bias.detach() for branch in model.detect.cv3])  # type: ignore[index, union-attr, misc]
+    return torch.stack([branch[-1].bias.detach() for branch in model.detect.cv3])  # type: ignore[index]
 
 
 def judged(class_id: int, confidences: list[float], right: list[bool]) -> ImageResult:
