@@ -456,8 +456,7 @@ def join(trainers: Sequence[BaseProcess], renderers: Sequence[BaseProcess]) -> N
         SystemExit: a renderer ended before them, or a trainer failed.
     """
     try:
-        while any(trainer.is_alive() for trainer in trainers):
-            running = [trainer for trainer in trainers if trainer.is_alive()]
+        while running := [trainer for trainer in trainers if trainer.is_alive()]:
             multiprocessing.connection.wait([process.sentinel for process in (*running, *renderers)])
             for number, renderer in enumerate(renderers):
                 if not renderer.is_alive():

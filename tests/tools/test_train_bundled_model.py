@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import logging
 import multiprocessing
 import sys
 import threading
 import time
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -217,6 +219,16 @@ def test_renderers_end_after_the_trainers(status: int) -> None:
     else:
         join([trainer], [renderer])
     assert (trainer.exitcode, renderer.is_alive()) == (status, False)
+
+
+def test_trainer_that_ends_before_the_wait_is_still_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    trainer, renderer = Mock(sentinel=5, exitcode=0), Mock(sentinel=6)
+    trainer.is_alive.side_effect = itertools.chain([True], itertools.repeat(False))
+    waits: list[list[int]] = []
+    monkeypatch.setattr("multiprocessing.connection.wait", waits.append)
+    join([trainer], [renderer])
+    assert waits == [[5, 6]]
+    renderer.terminate.assert_called_once_with()
 
 
 def test_network_is_trained_and_written(pool: Pool, tmp_path: Path) -> None:
