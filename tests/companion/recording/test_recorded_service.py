@@ -37,7 +37,8 @@ def wait_for(condition: Callable[[], object], timeout_s: float = 60.0) -> None:
 
 
 def files(folder: Path) -> list[Path]:
-    return sorted(folder.glob("*.mcap"))
+    """The recordings whose writing has begun: a new file is empty for a moment."""
+    return sorted(path for path in folder.glob("*.mcap") if path.stat().st_size)
 
 
 def recorder_of(service: ServiceProcess) -> int:
