@@ -70,7 +70,12 @@ def test_processed_frames_are_encoded_bit_for_bit(name: str) -> None:
     for (_, png, attachment), number in zip(recorder.added, (1, 2, 4), strict=True):
         image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
         np.testing.assert_array_equal(image, frame(number).image)
-        assert json.loads(attachment or b"")["captured_ns"] == 1000 * number
+        height, width = frame(number).image.shape[:2]
+        assert json.loads(attachment or b"") == {
+            "captured_ns": 1000 * number,
+            "width": width,
+            "height": height,
+        }
     assert recorder.dropped_images == 0
 
 
