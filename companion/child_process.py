@@ -18,7 +18,8 @@ from contextlib import asynccontextmanager, suppress
 EXIT_REFUSED = 2
 MAX_RESTARTS = 5
 _RESTART_S = 1.0  # longer by this each time; the first time at once
-_END_S = 5.0
+# A recorder with low priority takes seconds on a busy machine to finish its file.
+_END_S = 20.0
 
 Say = Callable[[str], None]
 
@@ -65,7 +66,8 @@ async def _run_again(name: str, words: tuple[str, str], say: Say) -> None:
                 say(f"{name}: {line.decode(errors='replace').rstrip()}")
             code = await process.wait()
         finally:
-            await _end(process)
+            if not await _end(process):
+                say(f"{name}: did not end within {_END_S:g} s; killed")
         if code == EXIT_REFUSED:
             return
         if restarts < MAX_RESTARTS:
@@ -74,17 +76,19 @@ async def _run_again(name: str, words: tuple[str, str], say: Say) -> None:
     say(f"{name}: ended {MAX_RESTARTS + 1} times; not started again")
 
 
-async def _end(process: Process) -> None:
-    """Close the pipe, which ends the process; kill it if it does not end."""
+async def _end(process: Process) -> bool:
+    """Close the pipe, which ends the process; kill it if it does not end. Returns whether it ended itself."""
     assert process.stdin is not None
     process.stdin.close()
     try:
         async with asyncio.timeout(_END_S):
             await process.wait()
+        return True
     except TimeoutError:
         with suppress(ProcessLookupError):
             process.kill()
         await process.wait()
+        return False
 
 
 def on_parent_end(call: Callable[[], None]) -> None:

@@ -103,7 +103,7 @@ class ServiceProcess:
             self.signal(signal.SIGCONT)
             self.process.terminate()
         try:
-            return self.process.wait(20)
+            return self.process.wait(45)  # of which 20 for a recorder
         except subprocess.TimeoutExpired:
             self.process.kill()
             raise

@@ -1,0 +1,48 @@
+"""Programs beside the service: how they end."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+import pytest
+
+from companion import child_process
+
+WAITING = "print('ready', flush=True); import sys; sys.stdin.read(); open({path!r}, 'w').write('ended')"
+HANGING = "print('ready', flush=True); import time; time.sleep(600)"
+
+
+def run(module: str) -> list[str]:
+    """Run a program until it is ready, then end it; returns what was said."""
+    said: list[str] = []
+
+    async def until_ready() -> None:
+        ready = asyncio.Event()
+
+        def say(line: str) -> None:
+            said.append(line)
+            ready.set()
+
+        async with child_process.child_process("program", module, "{}", say), asyncio.timeout(30):
+            await ready.wait()
+
+    asyncio.run(until_ready())
+    return said
+
+
+def test_program_ends_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    ended = tmp_path / "ended"
+    (tmp_path / "waiting_program.py").write_text(WAITING.format(path=str(ended)))
+    assert run("waiting_program") == ["program: ready"]
+    assert ended.read_text() == "ended"
+
+
+def test_program_that_does_not_end_is_killed_and_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(child_process, "_END_S", 0.2)
+    (tmp_path / "hanging_program.py").write_text(HANGING)
+    assert run("hanging_program") == ["program: ready", "program: did not end within 0.2 s; killed"]
