@@ -207,7 +207,8 @@ export class Camera {
     if (event.button !== 0 || !this.bitmap) return;
     const [x, y] = this.pointOf(event);
     const selects = event.pointerType === "mouse" || this.figure.classList.contains("selecting");
-    this.drag = { x, y, px: event.clientX, py: event.clientY, moved: false, box: [x, y, x, y], selects };
+    const { boxes } = this.about; // a click means a box of this picture, although a newer one may come meanwhile
+    this.drag = { x, y, px: event.clientX, py: event.clientY, moved: false, box: [x, y, x, y], boxes, selects };
     if (selects) this.canvas.setPointerCapture(event.pointerId);
   }
 
@@ -234,7 +235,7 @@ export class Camera {
     }
     const isInside = ([l, t, r, b]) => drag.x >= l && drag.x <= r && drag.y >= t && drag.y <= b;
     const size = ([l, t, r, b]) => (r - l) * (b - t);
-    const inside = this.about.boxes.filter((box) => box[6] != null && isInside(box));
+    const inside = drag.boxes.filter((box) => box[6] != null && isInside(box));
     const unsure = (box) => box[7] !== "confirmed"; // may be another class's track of the same object
     const [best] = inside.sort((one, other) => unsure(one) - unsure(other) || size(one) - size(other));
     if (best) openMenu({ id: best[6], name: best[4] }, clientX, clientY);

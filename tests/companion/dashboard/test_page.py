@@ -110,15 +110,21 @@ def rectangle(tab: Tab, selector: str) -> tuple[float, float, float, float]:
 
 
 def click_track(tab: Tab) -> int:
-    """Click the largest box of a confirmed car and wait for its menu; returns the track's id."""
-    boxes = tab.until(f"{BOXES}.filter((box) => box[4] === 'car' && box[7] === 'confirmed')", 60.0)
-    largest = max(boxes, key=lambda box: (box[2] - box[0]) * (box[3] - box[1]))
-    x, y, width, height = rectangle(tab, "figure canvas")
-    left, top, right, bottom = largest[:4]
-    # In its lower right part: the menu opens from there, and does not cover it.
-    tab.click(x + (0.2 * left + 0.8 * right) * width, y + (0.2 * top + 0.8 * bottom) * height)
-    assert tab.until("!document.querySelector('#menu').hidden")
-    return int(largest[6])
+    """Click the largest box of a confirmed car until its menu opens; returns the track's id.
+
+    As a person does: the box may have moved in the picture that is clicked.
+    """
+    deadline_s = time.monotonic() + 60.0
+    while True:
+        boxes = tab.until(f"{BOXES}.filter((box) => box[4] === 'car' && box[7] === 'confirmed')", 60.0)
+        largest = max(boxes, key=lambda box: (box[2] - box[0]) * (box[3] - box[1]))
+        x, y, width, height = rectangle(tab, "figure canvas")
+        left, top, right, bottom = largest[:4]
+        # In its lower right part: the menu opens from there, and does not cover it.
+        tab.click(x + (0.2 * left + 0.8 * right) * width, y + (0.2 * top + 0.8 * bottom) * height)
+        if not tab.value("document.querySelector('#menu').hidden"):
+            return int(largest[6])
+        assert time.monotonic() < deadline_s, tab.value("document.body.innerText")
 
 
 def test_box_is_clicked_and_its_command_arrives(service: ServiceProcess, tab: Tab) -> None:
