@@ -280,15 +280,19 @@ def test_biases_of_imprecise_classes_are_lowered(
     save_checkpoint(output, build(yolov8_description(scale, CLASS_NAMES)), metadata={})
     # In another order than the network's, as of a data set.
     names = ("truck", "person", "boat")
-    results = [
-        judged(0, [0.45] * 20, [True] * 20),
-        # Of 0.4 two of three are right; above 0.57 all.
-        judged(1, [0.45, 0.57, 0.7], [True, False, True]),
-        judged(2, [0.5, 0.995], [True, False]),
-    ]
+    of_sizes = {
+        640: [
+            judged(0, [0.45] * 20, [True] * 20),
+            # Of 0.4 two of three are right; above 0.57 all.
+            judged(1, [0.45, 0.57, 0.7], [True, False, True]),
+            judged(2, [0.5, 0.995], [True, False]),
+        ],
+        # All are right from 0.47 on: fewer than at the other size.
+        320: [judged(0, [0.45], [True]), judged(1, [0.46, 0.7], [False, True]), judged(2, [0.5], [True])],
+    }
     monkeypatch.setattr(train_bundled_model, "draw", lambda folder, frames, seed, world: {})
     monkeypatch.setattr(
-        train_bundled_model, "detect", lambda drawn, model, size: Found({"a": results}, {}, names)
+        train_bundled_model, "detect", lambda drawn, model, size: Found({"a": of_sizes[size]}, {}, names)
     )
     before = class_biases(load_checkpoint(output).model)
     with caplog.at_level(logging.WARNING):
