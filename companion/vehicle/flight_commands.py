@@ -22,7 +22,8 @@ _NAV_TAKEOFF = 22
 _COMPONENT_ARM_DISARM = 400
 _REQUEST_MESSAGE = 512
 _RUN_PREARM_CHECKS = 401
-_REASONS_S = 0.5  # how long to wait for the reports of failing checks
+# How long to wait for the reports of failing checks: for all of them, and on a busy computer for the first.
+_REASONS_S, _FIRST_REASON_S = 0.5, 2.0
 _SHOWN_TIMEOUT_S = 3.0  # HEARTBEAT is sent once a second
 
 
@@ -79,7 +80,12 @@ class FlightCommands:
             with contextlib.suppress(CommandRefusedError):
                 await self._command(_RUN_PREARM_CHECKS)
         await telemetry.until(lambda: False, _REASONS_S)
-        state = telemetry.state
+        if not telemetry.state.ready_to_arm:
+            await telemetry.until(lambda: bool(self._checks_since(asked_ns)), _FIRST_REASON_S)
+        return self._checks_since(asked_ns)
+
+    def _checks_since(self, asked_ns: int) -> str:
+        state = self._telemetry.state
         reports = [
             report
             for report in state.reports
