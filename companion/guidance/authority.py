@@ -43,6 +43,7 @@ class Authority:
         self._takeoff_altitude_m = 0.0
         self._was_armed = False
         self._failsafe_before = False
+        self._changed_ns: int | None = None
 
     @property
     def mode(self) -> FlightMode | None:
@@ -52,6 +53,7 @@ class Authority:
     def acquire(self, state: VehicleState) -> None:
         """Take command of a vehicle in its current state."""
         self._mode = state.mode
+        self._changed_ns = None
         self._leaving = set()
         self._leaving_until_ns = 0
         self._dropped = {}
@@ -74,6 +76,7 @@ class Authority:
             # From the ground, disarmed after our own landing.
             self._was_armed = state.armed
         self._mode = mode
+        self._changed_ns = None
         self._leaving_until_ns = float("inf")
 
     def settled(self, now_ns: int) -> None:
@@ -167,14 +170,19 @@ class Authority:
             # While the request is in progress the old mode may flicker; afterwards it may not.
             if self._leaving_until_ns != float("inf"):
                 self._leaving = set()
+            self._changed_ns = None
             return True
         if state.mode in self._leaving and now_ns <= self._leaving_until_ns:
             return True
         if now_ns <= self._dropped.get(state.mode, 0):
             return True
-        if self._mode in GOING_DOWN and (not state.armed or state.landed is LandedState.ON_GROUND):
-            # Landed and disarmed, PX4 shows the mode selected before the landing.
-            return True
+        if self._mode in GOING_DOWN:
+            # Landed and disarmed, PX4 shows the mode selected before the landing: CURRENT_MODE at once, but
+            # only the next heartbeat shows `armed`.
+            if self._changed_ns is None:
+                self._changed_ns = now_ns
+            heard = state.heartbeat_ns > self._changed_ns
+            return not heard or not state.armed or state.landed is LandedState.ON_GROUND
         if FlightMode.TAKEOFF in (self._mode, *self._leaving) and state.mode is FlightMode.HOLD:
             short_m = self._takeoff_altitude_m - (state.altitude_m or 0.0)
             return short_m <= TAKEOFF_SHORT_M

@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 
+from companion.guidance.authority import Authority
 from companion.guidance.behaviour import BehaviourContext, ModeRequest, Outcome
 from companion.guidance.behaviours.land import LandBehaviour, ReturnBehaviour
 from companion.guidance.behaviours.stop import StopBehaviour
@@ -95,6 +96,28 @@ def test_land_and_rtl_end_when_disarmed(
     assert isinstance(outcome, Outcome)
     assert outcome.success
     assert outcome.reason.endswith("landed and disarmed")
+
+
+@pytest.mark.parametrize(
+    ("armed", "reason"),
+    [(False, None), (True, "the pilot took over: offboard mode")],
+    ids=["landed", "pilot"],
+)
+def test_mode_after_the_landing_comes_before_disarmed(armed: bool, reason: str | None) -> None:
+    """CURRENT_MODE shows it up to a second before HEARTBEAT; EXTENDED_SYS_STATE may be later still."""
+    now_ns = START_NS
+    landing = replace(
+        PARKED, armed=True, mode=FlightMode.LAND, landed=LandedState.IN_AIR, heartbeat_ns=now_ns
+    )
+    authority = Authority()
+    authority.acquire(landing)
+    assert authority.lost(landing, now_ns, flying_by_setpoint=False) is None
+    changed = replace(landing, mode=FlightMode.OFFBOARD)
+    for after_s in (0.1, 0.9):
+        now_ns = START_NS + round(after_s * 1e9)
+        assert authority.lost(changed, now_ns, flying_by_setpoint=False) is None
+    heard = replace(changed, armed=armed, heartbeat_ns=now_ns)
+    assert authority.lost(heard, now_ns, flying_by_setpoint=False) == reason
 
 
 @pytest.mark.parametrize("kind", [LandBehaviour, ReturnBehaviour])
