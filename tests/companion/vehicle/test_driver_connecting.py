@@ -241,11 +241,18 @@ def test_open_driver_refuses_bad_arguments() -> None:
         open_driver("pymavlink", "udpin://0.0.0.0:14540", own_component_id=256)
 
 
-async def test_no_answer_with_heartbeats_only_names_signing(driver: Driver, autopilot: FakeAutopilot) -> None:
+async def test_no_answer_with_heartbeats_only_names_signing(
+    kind: DriverKind, port: int, autopilot: FakeAutopilot
+) -> None:
     autopilot.answers.clear()
-    with pytest.raises(NoAnswerError, match=r"only heartbeats .*vehicle\.signing_key_file"):
-        await driver.arm()
-    autopilot.send(mavlink.MAVLink_local_position_ned_message(60_000, 0, 0, 0, 0, 0, 0))
-    await wait_until(lambda: driver.state.position_ned_m is not None, 5.0)
-    with pytest.raises(NoAnswerError, match=r"command 400 \([^;]*$"):
-        await driver.arm()
+    driver = open_driver(kind, f"udpin://127.0.0.1:{port}")
+    try:
+        await driver.connect(10.0)
+        with pytest.raises(NoAnswerError, match=r"only heartbeats .*vehicle\.signing_key_file"):
+            await driver.arm()
+        autopilot.send(mavlink.MAVLink_local_position_ned_message(60_000, 0, 0, 0, 0, 0, 0))
+        await wait_until(lambda: driver.state.position_ned_m is not None, 5.0)
+        with pytest.raises(NoAnswerError, match=r"command 400 \([^;]*$"):
+            await driver.arm()
+    finally:
+        await driver.close()
