@@ -16,11 +16,12 @@ from companion.child_process import EXIT_REFUSED, on_parent_end
 from companion.dashboard.access import DashboardError
 from companion.dashboard.server import NICENESS, DashboardOptions, serve
 from companion.settings import LanguageSection
+from companion.vehicle.precise_sleep import lower_priority
 
 
 def main(argument: str) -> int:
     """Serve; returns the exit code."""
-    os.nice(NICENESS)
+    lower_priority(NICENESS)
     values = json.loads(argument)
     zenoh = settings_in_child(values.pop("zenoh"))
     language = LanguageSection.model_validate_json(json.dumps(values.pop("language")))

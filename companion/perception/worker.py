@@ -48,6 +48,7 @@ from companion.perception.previews import CloudEncoder, PreviewEncoder
 from companion.plugins import PluginError, load_plugins
 from companion.settings import Settings
 from companion.settings.calibration import adopt_calibration
+from companion.vehicle.precise_sleep import lower_priority
 from vision.detections import Detections
 from vision.frame import Frame
 from vision.object_detector import YOLO, ObjectDetector
@@ -194,7 +195,7 @@ def main(arguments: list[str]) -> int:
     """
     reports, control_fd, service_pid = (int(argument) for argument in arguments)
     _end_with(service_pid)
-    os.nice(NICENESS)
+    lower_priority(NICENESS)
     connection = socket.socket(fileno=control_fd)
     begin = receive(connection)
     if not isinstance(begin, Begin):

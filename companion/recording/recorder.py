@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -20,6 +19,7 @@ from companion.bus.topics import CLOUD, DEPTH_IMAGE, IMAGE, MAVLINK, RECORDER_TO
 from companion.recording.convert import RECORDER_CHANNEL, RUN_CHANNEL, Converter, stored_schema
 from companion.recording.files import FLUSH_S, Channel, Recorded, RecordingWriter
 from companion.settings import ZenohSection
+from companion.vehicle.precise_sleep import lower_priority
 
 # The service and its perception have priority.
 _NICER = 10
@@ -187,7 +187,7 @@ def record(options: RecorderOptions, ending: Event, say: Callable[[str], None]) 
     Raises:
         RecordingError: the recording cannot be written (any more). NoAnswerError: no service at the endpoint.
     """
-    os.nice(_NICER)
+    lower_priority(_NICER)
     prefix = f"{ROOT}/{options.vehicle}/"
     with open_client(options.zenoh, timeout_s=10.0) as session:
         recorder = Recorder(options)

@@ -15,8 +15,10 @@ import pytest
 
 from companion.bench.lockstep_flight import plain_settings
 from companion.language.process import NICENESS, AskProcess
+from companion.vehicle.precise_sleep import DEFAULT_NS, SHORTEST_NS, set_scheduler_slice
 from tests.companion.cli.test_ask import Service, service
 from tests.companion.test_play import descendants
+from tests.companion.vehicle.thread_slice import slice_of
 
 pytestmark = pytest.mark.realtime
 
@@ -61,11 +63,14 @@ async def test_plan_is_confirmed_history_is_used_and_cancel_ends_it() -> None:
     before = set(descendants(os.getpid()))  # multiprocessing's resource tracker
     async with talking() as (there, talk):
         there.stopped.set()
+        set_scheduler_slice()  # as the service's loop
         await talk.send("circle the red car at ten metres")
         assert "orbit track=3" in await talk.shown("[y/N] \n")
         (child,) = set(descendants(os.getpid())) - before
         own = os.getpriority(os.PRIO_PROCESS, 0)
         assert os.getpriority(os.PRIO_PROCESS, child) == min(own + NICENESS, 19)
+        assert slice_of(child) != SHORTEST_NS
+        set_scheduler_slice(DEFAULT_NS)
         await talk.send("y")
         await talk.shown("done: orbit: ended")
         await talk.send("twice as far")

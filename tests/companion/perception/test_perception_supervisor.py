@@ -19,7 +19,10 @@ import numpy as np
 import pytest
 
 from companion.perception.supervisor import PerceptionStartError, PerceptionState, PerceptionSupervisor
+from companion.perception.worker import NICENESS
 from companion.settings.reading import Settings, load_settings
+from companion.vehicle.precise_sleep import DEFAULT_NS, SHORTEST_NS, set_scheduler_slice
+from tests.companion.vehicle.thread_slice import slice_of
 from vision.pipeline import PerceptionResult
 from vision.sources import SourceSettings, open_source
 from vision.tracking import Selected, SelectRequest
@@ -108,11 +111,13 @@ def alive(pid: int) -> bool:
 
 
 async def test_results_have_classes_stamps_and_timing(photos: Path, tiny_model: Path) -> None:
+    set_scheduler_slice()  # as the service's loop
     async with supervised(settings_of(photos, tiny_model, **{"detector.confidence": "0"})) as (
         supervisor,
         recorder,
     ):
         await until(lambda: len(recorder.results) >= 5)
+        set_scheduler_slice(DEFAULT_NS)
         status = supervisor.status
         first = recorder.results[0]
         assert supervisor.class_names == status.class_names == ("car", "person")
@@ -130,6 +135,9 @@ async def test_results_have_classes_stamps_and_timing(photos: Path, tiny_model: 
         assert sequences == sorted(set(sequences))
         pid = status.pid
         assert pid is not None
+        own = os.getpriority(os.PRIO_PROCESS, 0)
+        assert os.getpriority(os.PRIO_PROCESS, pid) == min(own + NICENESS, 19)
+        assert slice_of(pid) != SHORTEST_NS
     assert not alive(pid)
     assert supervisor.status.state is PerceptionState.STOPPED
     assert supervisor.status.pid is None

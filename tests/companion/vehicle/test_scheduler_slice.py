@@ -1,40 +1,38 @@
-"""The scheduler slice: set where the kernel supports it, unchanged otherwise."""
+"""The scheduler slice: set where the kernel supports it, unchanged otherwise; a program has its own."""
 
 from __future__ import annotations
 
 import os
-import re
+import subprocess
+import sys
 import threading
-from pathlib import Path
+from collections.abc import Callable
 from typing import NamedTuple
 
 import pytest
 
 from companion.vehicle.precise_sleep import SHORTEST_NS, set_scheduler_slice
+from tests.companion.vehicle.thread_slice import slice_of
+
+needs_slices = pytest.mark.skipif(slice_of(0) is None, reason="this system has no slices")
 
 
 class Scheduling(NamedTuple):
-    """A thread's niceness, and its slice as reported by the kernel (None: not reported)."""
-
     nice: int
     slice_ns: int | None
 
 
-def scheduling() -> Scheduling:
-    identity = threading.get_native_id()
-    file = Path(f"/proc/self/task/{identity}/sched")
-    found = re.search(r"^se\.slice\s*:\s*(\d+)", file.read_text(), re.MULTILINE) if file.is_file() else None
-    return Scheduling(os.getpriority(os.PRIO_PROCESS, identity), int(found[1]) if found else None)
+def scheduling(thread: int) -> Scheduling:
+    return Scheduling(os.getpriority(os.PRIO_PROCESS, thread), slice_of(thread))
 
 
-def in_a_thread() -> tuple[bool, Scheduling, Scheduling]:
-    """Set the slice in a new thread; returns the result and the scheduling before and after."""
+def in_a_thread(action: Callable[[], bool]) -> tuple[bool, Scheduling, Scheduling]:
+    """Act in a new thread; returns the result and the scheduling before and after."""
     results: list[tuple[bool, Scheduling, Scheduling]] = []
 
     def run() -> None:
-        before = scheduling()
-        supported = set_scheduler_slice()
-        results.append((supported, before, scheduling()))
+        before = scheduling(0)
+        results.append((action(), before, scheduling(0)))
 
     thread = threading.Thread(target=run)
     thread.start()
@@ -42,19 +40,16 @@ def in_a_thread() -> tuple[bool, Scheduling, Scheduling]:
     return results[0]
 
 
+@needs_slices
 def test_scheduler_slice_is_set_and_niceness_kept() -> None:
-    supported, before, after = in_a_thread()
-    if not supported or before.slice_ns is None:
-        pytest.skip("this kernel does not support slices, or does not report them")
-    assert after.nice == before.nice
-    # Before 6.12 the kernel accepts the request and ignores it.
-    release = tuple(int(number) for number in re.findall(r"\d+", os.uname().release)[:2])
-    assert after.slice_ns == (SHORTEST_NS if release >= (6, 12) else before.slice_ns)
+    supported, before, after = in_a_thread(set_scheduler_slice)
+    assert supported is True
+    assert after == (before.nice, SHORTEST_NS)
 
 
 def test_refused_slice_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("companion.vehicle.precise_sleep._SCHED_OTHER", 99)  # no such policy
-    supported, before, after = in_a_thread()
+    supported, before, after = in_a_thread(set_scheduler_slice)
     assert supported is False
     assert after == before
 
@@ -62,3 +57,34 @@ def test_refused_slice_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_unknown_machine_is_unsupported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("platform.machine", lambda: "abacus")
     assert set_scheduler_slice() is False
+
+
+PROGRAM = """
+from companion.vehicle.precise_sleep import lower_priority
+lower_priority(3)
+print(flush=True)
+input()
+"""
+
+
+@needs_slices
+def test_program_of_lower_priority_has_not_its_parents_slice() -> None:
+    programs: list[Scheduling] = []
+
+    def start() -> bool:
+        set_scheduler_slice()
+        process = subprocess.Popen(
+            [sys.executable, "-c", PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        )
+        assert process.stdout is not None
+        process.stdout.readline()
+        programs.append(scheduling(process.pid))
+        process.communicate(b"\n")
+        return process.returncode == 0
+
+    ended, before, _ = in_a_thread(start)
+    assert ended
+    (program,) = programs
+    assert program.nice == min(before.nice + 3, 19)
+    assert program.slice_ns is not None
+    assert program.slice_ns > SHORTEST_NS
