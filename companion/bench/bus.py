@@ -1,4 +1,4 @@
-"""The bus under load, measured on this machine: time from publication to a subscriber in another process."""
+"""The bus under load, measured on this machine: time from put to a subscriber in another process."""
 
 from __future__ import annotations
 
@@ -7,87 +7,142 @@ import json
 import multiprocessing
 import os
 import socket
+import tempfile
 import threading
 import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from multiprocessing.connection import Connection
+from pathlib import Path
+from subprocess import DEVNULL
 from typing import Any
 
+import cv2
 import numpy as np
 import zenoh
 
-from companion.bench.setpoints import busy
+from companion.bench.percentiles import percentiles
 from companion.bus import topics
 from companion.bus.bodies.frames import DetectionBody, DetectionsBody
 from companion.bus.client import client_settings, open_client, subscribe_kept
-from companion.bus.session import Bus
-from companion.settings import ZenohSection
-from companion.vehicle.precise_sleep import set_scheduler_slice
+from companion.bus.session import Bus, encode
+from companion.perception.messages import Report, StartFailed
+from companion.perception.process import PerceptionProcess
+from companion.settings import Settings, ZenohSection
+from companion.vehicle.precise_sleep import DEFAULT_NS, set_scheduler_slice
 from mavlink_sim.testing import free_port
 
 VEHICLE = "bench"
-# Ten detections with every field: about 5 kB of JSON.
+# Ten detections with every field: 6 kB of JSON.
 DETECTIONS = 10
 # A burst is half of what is kept, so that every message of it can be recovered.
 BURST = topics.EVENTS.cached // 2
 # A lost message at the end of a burst is noticed by the next heartbeat, one second later.
 RECOVERY_S = 10.0
 _START_S = 30.0
+# A worker that uses another runtime than torch may convert the model first.
+_LOADING_S = 120.0
+_WARM_UP_MESSAGES = 20
 _WARM_UP = -1
 
 
 def measure_bus(seconds: float, *, rate_hz: float, load: int) -> dict[str, Any]:
-    """Milliseconds from before a message of ten detections is built until another process has received it.
+    """Time messages of ten detections from this process to a subscriber with default priority in another one.
+
+    This process has the priority of the service. `put_to_subscriber` is from immediately before the message
+    is given to zenoh until the subscriber's callback has it; `build_and_encode` precedes it.
 
     Args:
-        load: number of busy processes beside the two.
+        load: number of perception workers beside it: the bundled model, one thread each, no pause.
 
     Raises:
-        RuntimeError: the subscriber's process does not start.
+        RuntimeError: the subscriber or a worker does not start.
     """
-    context = multiprocessing.get_context("spawn")
-    loaded = [context.Process(target=busy, daemon=True) for _ in range(load)]
-    for process in loaded:
-        process.start()
-    try:
-        built_us, received = asyncio.run(_publish_detections(seconds, rate_hz))
-    finally:
-        for process in loaded:
-            process.kill()
-            process.join()
-    delay_ms = np.array([delay_ns for _, delay_ns in received["delays"]]) / 1e6
+    return asyncio.run(_measure_bus(seconds, rate_hz, load))
+
+
+async def _measure_bus(seconds: float, rate_hz: float, load: int) -> dict[str, Any]:
+    build_ns: list[int] = []
+    put_ns: list[int] = []
+    async with _detecting(load) as frames, _Reader(_read_detections) as reader:
+        set_scheduler_slice()  # as the service
+        await _until_watched(reader.bus)
+        before, started_s = sum(frames), time.monotonic()
+        due_s = started_s
+        for sequence in range(-_WARM_UP_MESSAGES, round(seconds * rate_hz)):
+            due_s = max(due_s + 1 / rate_hz, time.monotonic())
+            await asyncio.sleep(max(0.0, due_s - time.monotonic()))
+            called_ns = time.monotonic_ns()
+            message = encode(_detections(sequence))
+            built_ns = time.monotonic_ns()
+            reader.bus.publish(topics.DETECTIONS, message)
+            if sequence >= 0:
+                build_ns.append(built_ns - called_ns)
+                put_ns.append(built_ns)
+        detected_hz = (sum(frames) - before) / (time.monotonic() - started_s)
+        await asyncio.sleep(0.5)
+        received = await reader.result()
+    delays_ms = [(received_ns - put_ns[sequence]) / 1e6 for sequence, received_ns in received["times"]]
+    if not delays_ms:
+        raise RuntimeError(f"none of {len(put_ns)} messages has reached the subscriber's process")
     return {
         "rate_hz": rate_hz,
-        "busy_processes": load,
         "cores": len(os.sched_getaffinity(0)),
-        "published": len(built_us),
-        "received": len(delay_ms),
-        "bytes": received["bytes"],
-        "publish_p50_ms": round(float(np.percentile(built_us, 50)) / 1e3, 3),
-        "publish_p99_ms": round(float(np.percentile(built_us, 99)) / 1e3, 3),
-        "delay_p50_ms": round(float(np.percentile(delay_ms, 50)), 3),
-        "delay_p99_ms": round(float(np.percentile(delay_ms, 99)), 3),
-        "delay_max_ms": round(float(delay_ms.max()), 3),
+        "detectors": load,
+        "detector_frames_per_s": round(detected_hz, 1),
+        "message_bytes": len(message),
+        "published": len(put_ns),
+        "received": len(delays_ms),
+        "build_and_encode_p50_ms": percentiles([value / 1e6 for value in build_ns])["p50_ms"],
+        **{f"put_to_subscriber_{name}": value for name, value in percentiles(delays_ms).items()},
     }
 
 
-async def _publish_detections(seconds: float, rate_hz: float) -> tuple[list[float], dict[str, Any]]:
-    set_scheduler_slice()  # as the service
-    async with _Reader(_read_detections) as reader:
-        reader.bus.publish(topics.DETECTIONS, lambda: _detections(0))
-        await _until_watched(reader.bus)
-        for number in range(20):  # a warm-up, of connections and of the interpreter
-            reader.bus.publish(topics.DETECTIONS, lambda number=number: _detections(-1 - number))
-            await asyncio.sleep(0.02)
-        taken_us = []
-        due_s = time.monotonic()
-        for number in range(round(seconds * rate_hz)):
-            due_s += 1 / rate_hz
-            await asyncio.sleep(max(0.0, due_s - time.monotonic()))
-            started = time.perf_counter()
-            reader.bus.publish(topics.DETECTIONS, lambda number=number: _detections(number + 1))
-            taken_us.append((time.perf_counter() - started) * 1e6)
-        await asyncio.sleep(0.5)
-        return taken_us, await reader.result()
+@asynccontextmanager
+async def _detecting(number: int) -> AsyncIterator[list[int]]:
+    """Run perception workers, each on one thread and without a pause; yields their numbers of frames."""
+    frames = [0] * number
+    with tempfile.TemporaryDirectory() as folder:
+        image = Path(folder, "frame.png")
+        cv2.imwrite(str(image), np.full((480, 640, 3), 128, np.uint8))
+        settings = Settings.model_validate(
+            {
+                "source": {"uri": str(image), "loop": True},
+                "detector": {"threads": 1, "image_size": 320},  # as in `companion play`
+            }
+        )
+        workers = [await PerceptionProcess.spawn(settings, DEVNULL) for _ in range(number)]
+
+        async def read(index: int) -> None:
+            reason = "its process has ended"
+            while (message := await workers[index].read()) is not None:
+                if isinstance(message, Report):
+                    frames[index] = message.frames
+                elif isinstance(message, StartFailed):
+                    reason = message.text
+            raise RuntimeError(f"no perception worker: {reason}")
+
+        reading = [asyncio.create_task(read(index)) for index in range(number)]
+        deadline_s = time.monotonic() + _LOADING_S
+
+        def check() -> None:
+            for task in reading:
+                if task.done():
+                    task.result()
+
+        try:
+            while not all(frames):
+                check()
+                if time.monotonic() > deadline_s:
+                    raise RuntimeError(f"no result of a perception worker within {_LOADING_S:g} s")
+                await asyncio.sleep(0.05)
+            yield frames
+            check()
+        finally:
+            for worker, task in zip(workers, reading, strict=True):
+                worker.kill()
+                await worker.wait()
+                await asyncio.gather(task, return_exceptions=True)
 
 
 async def _until_watched(bus: Bus) -> None:
@@ -177,22 +232,20 @@ class _Reader:
 
 
 def _read_detections(endpoint: str, connection: Connection) -> None:
-    delays: list[tuple[int, int]] = []
-    size = 0
+    set_scheduler_slice(DEFAULT_NS)  # of any program, not the service's
+    times: list[tuple[int, int]] = []
 
     def receive(sample: zenoh.Sample) -> None:
-        nonlocal size
-        now_ns = time.monotonic_ns()
-        body = json.loads(sample.payload.to_bytes())
-        if body["sequence"] > 0:
-            size = len(sample.payload)
-            delays.append((body["sequence"], now_ns - body["published_ns"]))
+        received_ns = time.monotonic_ns()
+        sequence = json.loads(sample.payload.to_bytes())["sequence"]
+        if sequence >= 0:
+            times.append((sequence, received_ns))
 
     with open_client(client_settings(ZenohSection(listen=(endpoint,)))) as session:
         subscriber = session.declare_subscriber(topics.DETECTIONS.key(VEHICLE), receive)
         connection.send("ready")
         connection.recv()
-        connection.send({"delays": delays, "bytes": size})
+        connection.send({"times": times})
         subscriber.undeclare()  # type: ignore[no-untyped-call]
 
 

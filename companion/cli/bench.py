@@ -105,7 +105,7 @@ def bench_bus(
     seconds: Annotated[float, typer.Option(min=1, help="Duration of the measurement.")] = 10.0,
     rate_hz: Annotated[float, typer.Option(min=1, max=1000, help="Messages a second.")] = 30.0,
     load: Annotated[
-        int | None, typer.Option(min=0, help="Number of CPU-bound processes. Default: one for each core.")
+        int | None, typer.Option(min=0, help="Number of detectors that run beside it. Default: one per core.")
     ] = None,
     recovered: Annotated[
         int | None,
@@ -113,7 +113,7 @@ def bench_bus(
     ] = None,
     as_json: _JSON = False,
 ) -> None:
-    """Measure the time from publication to a subscriber in another process. All cores are busy."""
+    """Measure the time from put to a subscriber in another process, while detectors use every core."""
     import os
 
     from companion.bench.bus import measure_bus, measure_recovery
@@ -123,8 +123,8 @@ def bench_bus(
         if recovered is not None:
             figures = measure_recovery(recovered)
         else:
-            busy = len(os.sched_getaffinity(0)) if load is None else load
-            figures = measure_bus(seconds, rate_hz=rate_hz, load=busy)
+            detectors = len(os.sched_getaffinity(0)) if load is None else load
+            figures = measure_bus(seconds, rate_hz=rate_hz, load=detectors)
     _print_figures(figures, as_json)
 
 
