@@ -12,16 +12,13 @@ import json
 import logging
 import math
 import os
-import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
 from companion.evaluate import JUDGED_CONFIDENCE, evaluate_dataset, map_classes
+from companion.training_display import TrainingDisplay
 from mavlink_sim.datasets.training_scenes import random_scene, training_scene
 from mavlink_sim.world.shapes import CLASS_NAMES
 from vision.detector import DEFAULT_MODEL, Detector
@@ -34,8 +31,7 @@ from vision.yolo.checkpoint_pair import WEIGHTS_SUFFIX, pair_paths, weights_sha2
 from vision.yolo.fine_tuning import DOUBTED_SCORE, LabelledScenes, extend_classes, training_images
 from vision.yolo.metrics import Score
 from vision.yolo.recipe import DEFAULT_RECIPE, HELD_OUT_SEED, HELD_OUT_SIZE, REFINEMENT, evaluate
-from vision.yolo.training import Progress as TrainingProgress
-from vision.yolo.training import Stage, TrainedModel, TrainingSettings, train
+from vision.yolo.training import Progress, Stage, TrainedModel, TrainingSettings, train
 
 logger = logging.getLogger(__name__)
 LICENCE = "Apache-2.0"
@@ -86,15 +82,16 @@ def train_default(
     if time_limit_s is not None:
         first = replace(first, time_limit_s=time_limit_s * share)
         second = replace(second, time_limit_s=time_limit_s * (1 - share))
-    with _ProgressDisplay() as display:
+    with TrainingDisplay() as display:
+        show = _shown_on(display)
         if start is not None:
             initial = load_checkpoint(start).model
         else:
-            initial = train(first, random_scene, display, checkpoint=states[0], resume=resume).model
+            initial = train(first, random_scene, show, checkpoint=states[0], resume=resume).model
         refined = train(
             second,
             training_scene,
-            display,
+            show,
             checkpoint=states[1],
             resume=resume and (start is not None or states[1].is_file()),
             start=initial,
@@ -223,11 +220,11 @@ def train_on_data(
         sum(len(image.class_ids) for image in images) - labels,
         path.name,
     )
-    with _ProgressDisplay() as display:
+    with TrainingDisplay() as display:
         trained = train(
             settings,
             LabelledScenes(images, len(loaded.class_names)),
-            display,
+            _shown_on(display),
             checkpoint=state,
             resume=resume,
             start=model,
@@ -315,39 +312,12 @@ def _score(model: Path, dataset: Dataset, image_size: int, threads: int) -> Scor
     return evaluate_dataset(dataset, detector, map_classes(detector.class_names, dataset)).score
 
 
-class _ProgressDisplay:
-    """Progress on standard error: a bar on a terminal, else a line per 100 steps."""
-
-    _LINE_EVERY = 100
-
-    def __init__(self) -> None:
-        self._bar: Progress | None = None
-        if sys.stderr.isatty():
-            self._bar = Progress(
-                TextColumn("training"),
-                BarColumn(),
-                TextColumn("{task.fields[losses]}"),
-                TimeRemainingColumn(),
-                console=Console(stderr=True),
-            )
-        self._task = self._bar.add_task("training", total=None, losses="") if self._bar else None
-
-    def __call__(self, progress: TrainingProgress) -> None:
-        losses = (
-            f"step {progress.step}/{progress.steps} box {progress.box_loss:.3f} "
-            f"class {progress.class_loss:.3f} distribution {progress.distribution_loss:.3f} "
-            f"{progress.images_per_s:.1f} images/s"
+def _shown_on(display: TrainingDisplay) -> Callable[[Progress], None]:
+    def show(progress: Progress) -> None:
+        figures = (
+            f"box {progress.box_loss:.3f} class {progress.class_loss:.3f} "
+            f"distribution {progress.distribution_loss:.3f} {progress.images_per_s:.1f} images/s"
         )
-        if self._bar is not None and self._task is not None:
-            self._bar.update(self._task, total=progress.steps, completed=progress.step, losses=losses)
-        elif progress.step % self._LINE_EVERY == 0 or progress.step == progress.steps:
-            print(f"{losses}, {progress.remaining_s / 60:.1f} min left", file=sys.stderr, flush=True)
+        display.show(progress.step, progress.steps, figures, progress.remaining_s)
 
-    def __enter__(self) -> _ProgressDisplay:
-        if self._bar is not None:
-            self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
-            self._bar.stop()
+    return show

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import os
-import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -22,8 +21,6 @@ import gymnasium
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
@@ -39,6 +36,7 @@ from companion.guidance.policy_file import (
     load_policy,
     write_policy,
 )
+from companion.training_display import TrainingDisplay
 from mavlink_sim.environments import TASKS, TaskVectorEnv
 from mavlink_sim.environments.task import STEP_S
 
@@ -118,10 +116,10 @@ def train_policy(
     # The random numbers of a resumed training depend on its seed and its step alone.
     model.set_random_seed(training.seed + model.num_timesteps)
     if model.num_timesteps < steps:
-        with _Display(steps, progress) as display:
+        with TrainingDisplay(progress) as display:
             model.learn(
                 steps - model.num_timesteps,
-                _Checkpoints(training, folder, display),
+                _Checkpoints(training, steps, folder, display),
                 tb_log_name="run",
                 reset_num_timesteps=False,
             )
@@ -488,13 +486,15 @@ def _apply(model: BaseAlgorithm, state: dict[str, Any]) -> None:
 class _Checkpoints(BaseCallback):
     """Shows the progress and stores the state every `CHECKPOINT_STEPS`."""
 
-    def __init__(self, training: Training, folder: Path, display: _Display) -> None:
+    def __init__(self, training: Training, steps: int, folder: Path, display: TrainingDisplay) -> None:
         super().__init__()
-        self._training, self._folder, self._display = training, folder, display
-        self._stored = 0
+        self._training, self._steps, self._folder, self._display = training, steps, folder, display
+        self._stored = self._begun = 0
+        self._begun_s = 0.0
 
     def _on_training_start(self) -> None:
-        self._stored = self.num_timesteps
+        self._stored = self._begun = self.num_timesteps
+        self._begun_s = time.monotonic()
 
     def _on_step(self) -> bool:
         return True
@@ -505,41 +505,7 @@ class _Checkpoints(BaseCallback):
             _store(self.model, self._training, self._folder)
         episodes: Sequence[dict[str, float]] = tuple(self.model.ep_info_buffer or ())
         mean = float(np.mean([each["r"] for each in episodes])) if episodes else float("nan")
-        self._display.show(self.num_timesteps, mean)
-
-
-class _Display:
-    """Progress on standard error: a bar on a terminal, else, and with a prefix, a line every 10 s."""
-
-    _EVERY_S = 10.0
-
-    def __init__(self, steps: int, prefix: str) -> None:
-        self._steps, self._prefix = steps, prefix
-        self._begun: tuple[int, float] | None = None
-        self._shown_s = time.monotonic()
-        self._bar: Progress | None = None
-        if sys.stderr.isatty() and not prefix:
-            columns = (BarColumn(), TextColumn("{task.description}"), TimeRemainingColumn())
-            self._bar = Progress(*columns, console=Console(stderr=True))
-            self._task = self._bar.add_task("training", total=steps)
-
-    def show(self, steps: int, mean_return: float) -> None:
-        now_s = time.monotonic()
-        if self._begun is None:
-            self._begun = (steps, now_s)
-        rate = (steps - self._begun[0]) / max(now_s - self._begun[1], 1e-9)
-        text = f"{self._prefix}step {steps}/{self._steps} return {mean_return:.1f} {rate:.0f} steps/s"
-        if self._bar is not None:
-            self._bar.update(self._task, completed=steps, description=text)
-        elif now_s - self._shown_s >= self._EVERY_S:
-            self._shown_s = now_s
-            print(text, file=sys.stderr, flush=True)
-
-    def __enter__(self) -> _Display:
-        if self._bar is not None:
-            self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
-            self._bar.stop()
+        rate = (self.num_timesteps - self._begun) / max(time.monotonic() - self._begun_s, 1e-9)
+        remaining_s = (self._steps - self.num_timesteps) / rate if rate else None
+        figures = f"return {mean:.1f} {rate:.0f} steps/s"
+        self._display.show(self.num_timesteps, self._steps, figures, remaining_s)

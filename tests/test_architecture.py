@@ -45,6 +45,7 @@ FLOORS = {
     "replay_timeline": 0,
     "train": 9,
     "train_policy": 9,
+    "training_display": 0,
     "bench": 9,
     "cli": 10,
 }

@@ -21,6 +21,7 @@ from companion.cli import app
 from companion.guidance.behaviours.policy import ACTIONS, OBSERVATIONS, check_quantities
 from companion.guidance.policy_file import PolicyError, load_policy
 from companion.train_policy import PolicyTrainingError, Training, description_of, train_policy
+from companion.training_display import TrainingDisplay
 
 APPROACH = Training("companion/Approach-v0", "ppo", 3)
 CART_POLE = Training("companion/CartPole-v0", "ppo", 0)
@@ -94,7 +95,7 @@ def test_interrupted_trainings_of_many_seeds_resume(
 ) -> None:
     """The first stores a state and is interrupted; the second was not begun."""
     monkeypatch.setattr(trainer, "CHECKPOINT_STEPS", 256)
-    monkeypatch.setattr(trainer._Display, "_EVERY_S", 0.0)
+    monkeypatch.setattr(TrainingDisplay, "EVERY_S", 0.0)
     several = partial(trainer.train_policies, "companion/CartPole-v0", "ppo", [3, 5])
     with monkeypatch.context() as patch:
 
