@@ -8,6 +8,8 @@ mode (`setpoint_monitor`).
 
 from __future__ import annotations
 
+import math
+
 from companion.guidance.limits.setpoint_monitor import SetpointMonitor
 from companion.vehicle.px4_modes import among_modes
 from companion.vehicle.report import Report, words_of
@@ -22,6 +24,8 @@ SHOW_DELAY_S = 2.0
 TAKEOFF_SHORT_M = 1.3
 # The autopilot reports a failsafe within this time of its change of mode.
 REPORT_WINDOW_S = 1.0
+# Of a vehicle that may have landed.
+STANDING_MPS, NEAR_GROUND_M = 0.3, 1.0
 _FAILSAFES = "commander_failsafe_enter"
 _LASTING_FAILSAFES = ("commander_failsafe_enter", "commander_failsafe_enter_generic")
 GOING_DOWN = (FlightMode.LAND, FlightMode.RETURN, FlightMode.PRECISION_LAND)
@@ -181,8 +185,8 @@ class Authority:
             # only the next heartbeat shows `armed`.
             if self._changed_ns is None:
                 self._changed_ns = now_ns
-            heard = state.heartbeat_ns > self._changed_ns
-            return not heard or not state.armed or state.landed is LandedState.ON_GROUND
+            unknown = _may_have_landed(state) and state.heartbeat_ns <= self._changed_ns
+            return unknown or not state.armed or state.landed is LandedState.ON_GROUND
         if FlightMode.TAKEOFF in (self._mode, *self._leaving) and state.mode is FlightMode.HOLD:
             short_m = self._takeoff_altitude_m - (state.altitude_m or 0.0)
             return short_m <= TAKEOFF_SHORT_M
@@ -199,6 +203,12 @@ def silence(stream: StreamState, state: VehicleState, paused_s: float) -> str | 
     if stream is StreamState.EXPIRED:
         return f"setpoint stream interrupted: {state.without_setpoints}"
     return None
+
+
+def _may_have_landed(state: VehicleState) -> bool:
+    """Whether it stands, or is near the height of home."""
+    stands = state.velocity_ned_mps is not None and math.hypot(*state.velocity_ned_mps) < STANDING_MPS
+    return stands or (state.altitude_m is not None and state.altitude_m < NEAR_GROUND_M)
 
 
 def _shown(mode: FlightMode) -> str:

@@ -98,26 +98,38 @@ def test_land_and_rtl_end_when_disarmed(
     assert outcome.reason.endswith("landed and disarmed")
 
 
-@pytest.mark.parametrize(
-    ("armed", "reason"),
-    [(False, None), (True, "the pilot took over: offboard mode")],
-    ids=["landed", "pilot"],
-)
-def test_mode_after_the_landing_comes_before_disarmed(armed: bool, reason: str | None) -> None:
+LANDING = replace(PARKED, armed=True, mode=FlightMode.LAND, landed=LandedState.IN_AIR, heartbeat_ns=START_NS)
+PILOT = "the pilot took over: offboard mode"
+
+
+@pytest.mark.parametrize("height_m", [0.5, 10.0])
+@pytest.mark.parametrize(("armed", "reason"), [(False, None), (True, PILOT)], ids=["landed", "pilot"])
+def test_mode_after_the_landing_comes_before_disarmed(
+    height_m: float, armed: bool, reason: str | None
+) -> None:
     """CURRENT_MODE shows it up to a second before HEARTBEAT; EXTENDED_SYS_STATE may be later still."""
-    now_ns = START_NS
-    landing = replace(
-        PARKED, armed=True, mode=FlightMode.LAND, landed=LandedState.IN_AIR, heartbeat_ns=now_ns
-    )
+    down_mps = 0.5 if height_m < 1.0 else 0.0  # at 10 m the ground is higher than home
+    landing = replace(LANDING, position_ned_m=(0.0, 0.0, -height_m), velocity_ned_mps=(0.0, 0.0, down_mps))
     authority = Authority()
     authority.acquire(landing)
-    assert authority.lost(landing, now_ns, flying_by_setpoint=False) is None
+    assert authority.lost(landing, START_NS, flying_by_setpoint=False) is None
     changed = replace(landing, mode=FlightMode.OFFBOARD)
+    now_ns = START_NS
     for after_s in (0.1, 0.9):
         now_ns = START_NS + round(after_s * 1e9)
         assert authority.lost(changed, now_ns, flying_by_setpoint=False) is None
     heard = replace(changed, armed=armed, heartbeat_ns=now_ns)
     assert authority.lost(heard, now_ns, flying_by_setpoint=False) == reason
+
+
+def test_pilot_ends_a_descent_at_once() -> None:
+    descending = replace(
+        LANDING, position_ned_m=(0.0, 0.0, -10.0), velocity_ned_mps=(0.0, 0.0, 0.7), heartbeat_ns=START_NS
+    )
+    authority = Authority()
+    authority.acquire(descending)
+    changed = replace(descending, mode=FlightMode.OFFBOARD)
+    assert authority.lost(changed, START_NS + 100_000_000, flying_by_setpoint=False) == PILOT
 
 
 @pytest.mark.parametrize("kind", [LandBehaviour, ReturnBehaviour])
