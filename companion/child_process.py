@@ -18,20 +18,23 @@ from contextlib import asynccontextmanager, suppress
 EXIT_REFUSED = 2
 MAX_RESTARTS = 5
 _RESTART_S = 1.0  # longer by this each time; the first time at once
-# A recorder with low priority takes seconds on a busy machine to finish its file.
-_END_S = 20.0
+_END_S = 5.0
+_UNSAID_S = 2.0  # a longer end is announced
 
 Say = Callable[[str], None]
 
 
 @asynccontextmanager
-async def child_process(name: str, module: str, argument: str, say: Say) -> AsyncIterator[None]:
+async def child_process(
+    name: str, module: str, argument: str, say: Say, *, end_s: float = _END_S
+) -> AsyncIterator[None]:
     """Run `python -m MODULE ARGUMENT` meanwhile; started again after a crash.
 
     Args:
         name: for people. say: called in the loop with each line that it prints, and with its end.
+        end_s: it is killed if it takes longer to end, seconds.
     """
-    running = asyncio.create_task(_supervise(name, (module, argument), say), name=name)
+    running = asyncio.create_task(_supervise(name, (module, argument), say, end_s), name=name)
     try:
         yield
     finally:
@@ -39,14 +42,14 @@ async def child_process(name: str, module: str, argument: str, say: Say) -> Asyn
         await asyncio.gather(running, return_exceptions=True)
 
 
-async def _supervise(name: str, words: tuple[str, str], say: Say) -> None:
+async def _supervise(name: str, words: tuple[str, str], say: Say, end_s: float) -> None:
     try:
-        await _run_again(name, words, say)
+        await _run_again(name, words, say, end_s)
     except (OSError, ValueError) as error:  # no process, or a line above 64 KiB
         say(f"{name}: not started again: {error}")
 
 
-async def _run_again(name: str, words: tuple[str, str], say: Say) -> None:
+async def _run_again(name: str, words: tuple[str, str], say: Say, end_s: float) -> None:
     for restarts in range(MAX_RESTARTS + 1):
         process = await asyncio.create_subprocess_exec(
             sys.executable,
@@ -66,8 +69,7 @@ async def _run_again(name: str, words: tuple[str, str], say: Say) -> None:
                 say(f"{name}: {line.decode(errors='replace').rstrip()}")
             code = await process.wait()
         finally:
-            if not await _end(process):
-                say(f"{name}: did not end within {_END_S:g} s; killed")
+            await _end(process, end_s, lambda text: say(f"{name}: {text}"))
         if code == EXIT_REFUSED:
             return
         if restarts < MAX_RESTARTS:
@@ -76,19 +78,27 @@ async def _run_again(name: str, words: tuple[str, str], say: Say) -> None:
     say(f"{name}: ended {MAX_RESTARTS + 1} times; not started again")
 
 
-async def _end(process: Process) -> bool:
-    """Close the pipe, which ends the process; kill it if it does not end. Returns whether it ended itself."""
+async def _end(process: Process, end_s: float, say: Say) -> None:
+    """Close the pipe, which ends the process; kill it if it does not end."""
     assert process.stdin is not None
     process.stdin.close()
-    try:
-        async with asyncio.timeout(_END_S):
-            await process.wait()
-        return True
-    except TimeoutError:
+    unsaid_s = min(_UNSAID_S, end_s)
+    if await _ended(process, unsaid_s):
+        return
+    if end_s > unsaid_s:
+        say(f"has not ended yet; killed after {end_s:g} s")
+    if not await _ended(process, end_s - unsaid_s):
         with suppress(ProcessLookupError):
             process.kill()
         await process.wait()
-        return False
+        say(f"did not end within {end_s:g} s; killed")
+
+
+async def _ended(process: Process, within_s: float) -> bool:
+    with suppress(TimeoutError):
+        async with asyncio.timeout(within_s):
+            await process.wait()
+    return process.returncode is not None
 
 
 def on_parent_end(call: Callable[[], None]) -> None:

@@ -28,6 +28,8 @@ from companion.vehicle.streamer import Streamer
 
 # Beginnings of the lines that its clients print when all is well.
 _ROUTINE = ("recorder: recording to ", "recorder: recorded ", "foxglove: open ")
+# With low priority on a busy computer the recorder takes seconds to finish its file.
+_END_S = {"recorder": 20.0, "foxglove": 5.0}
 
 
 def driver_of(settings: Settings, on_bytes: OnBytes | None = None) -> Driver:
@@ -127,5 +129,6 @@ async def clients_of(settings: Settings, on_event: Callable[[str, str], None]) -
                 on_event("warning", f"{name}: {error}")
                 continue
             argument = json.dumps({"zenoh": zenoh, "vehicle": settings.vehicle.name, **options})
-            await stack.enter_async_context(child_process(name, "companion.recording", argument, say))
+            program = child_process(name, "companion.recording", argument, say, end_s=_END_S[name])
+            await stack.enter_async_context(program)
         yield

@@ -9,11 +9,13 @@ import pytest
 
 from companion import child_process
 
+pytestmark = pytest.mark.realtime
+
 WAITING = "print('ready', flush=True); import sys; sys.stdin.read(); open({path!r}, 'w').write('ended')"
 HANGING = "print('ready', flush=True); import time; time.sleep(600)"
 
 
-def run(module: str) -> list[str]:
+def run(module: str, end_s: float = 30.0) -> list[str]:
     """Run a program until it is ready, then end it; returns what was said."""
     said: list[str] = []
 
@@ -24,7 +26,7 @@ def run(module: str) -> list[str]:
             said.append(line)
             ready.set()
 
-        async with child_process.child_process("program", module, "{}", say), asyncio.timeout(30):
+        async with child_process.child_process("program", module, "{}", say, end_s=end_s):
             await ready.wait()
 
     asyncio.run(until_ready())
@@ -43,6 +45,10 @@ def test_program_that_does_not_end_is_killed_and_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(child_process, "_END_S", 0.2)
+    monkeypatch.setattr(child_process, "_UNSAID_S", 0.1)
     (tmp_path / "hanging_program.py").write_text(HANGING)
-    assert run("hanging_program") == ["program: ready", "program: did not end within 0.2 s; killed"]
+    assert run("hanging_program", 0.2) == [
+        "program: ready",
+        "program: has not ended yet; killed after 0.2 s",
+        "program: did not end within 0.2 s; killed",
+    ]
