@@ -22,8 +22,9 @@ _NAV_TAKEOFF = 22
 _COMPONENT_ARM_DISARM = 400
 _REQUEST_MESSAGE = 512
 _RUN_PREARM_CHECKS = 401
-# How long to wait for the reports of failing checks: for all of them, and on a busy computer for the first.
-_REASONS_S, _FIRST_REASON_S = 0.5, 2.0
+# How long to wait for the first report of a failing check, which a busy computer gets late, and then for the
+# others.
+_FIRST_REASON_S, _REASONS_S = 2.0, 0.5
 _SHOWN_TIMEOUT_S = 3.0  # HEARTBEAT is sent once a second
 
 
@@ -79,9 +80,8 @@ class FlightCommands:
             # PX4 reports its checks when they change, and all of them after RUN_PREARM_CHECKS.
             with contextlib.suppress(CommandRefusedError):
                 await self._command(_RUN_PREARM_CHECKS)
-        await telemetry.until(lambda: False, _REASONS_S)
-        if not telemetry.state.ready_to_arm:
-            await telemetry.until(lambda: bool(self._checks_since(asked_ns)), _FIRST_REASON_S)
+        if await telemetry.until(lambda: bool(self._checks_since(asked_ns)), _FIRST_REASON_S):
+            await telemetry.until(lambda: False, _REASONS_S)
         return self._checks_since(asked_ns)
 
     def _checks_since(self, asked_ns: int) -> str:

@@ -1,14 +1,17 @@
 """Text reports of the built-in autopilots, received by both drivers."""
 
+import asyncio
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
+from pymavlink.dialects.v20 import common as mavlink
 
-from companion.vehicle.driver import CommandRefusedError
+from companion.vehicle.driver import CommandRefusedError, Driver
 from companion.vehicle.drivers import DriverKind, open_driver
 from mavlink_sim.testing import running_simulator
-from tests.companion.vehicle.fake_autopilot import wait_for_state
+from tests.companion.vehicle.fake_autopilot import FakeAutopilot, wait_for_state
 
 pytestmark = pytest.mark.realtime
 
@@ -33,6 +36,24 @@ async def test_px4_arming_refusal_has_its_reason(
             await driver.close()
     events = next((tmp_path / "companion" / "metadata").glob("events-*.json"))
     assert json.loads(events.read_bytes())["version"] == 2
+
+
+async def test_reasons_of_a_refusal_may_come_late(driver: Driver, autopilot: FakeAutopilot) -> None:
+    """On a busy computer; the second one after the first."""
+    loop = asyncio.get_running_loop()
+
+    def report(text: bytes) -> None:
+        autopilot.send(mavlink.MAVLink_statustext_message(2, text))
+
+    def refuse(message: Any) -> None:
+        autopilot.acknowledge(message.command, mavlink.MAV_RESULT_DENIED)
+        if message.command == mavlink.MAV_CMD_COMPONENT_ARM_DISARM:
+            loop.call_later(1.0, report, b"PreArm: Compass not healthy")
+            loop.call_later(1.2, report, b"PreArm: Logging failed")
+
+    autopilot.answers["COMMAND_LONG"] = refuse
+    with pytest.raises(CommandRefusedError, match=r": PreArm: Compass not healthy; PreArm: Logging failed$"):
+        await driver.arm()
 
 
 async def test_copter_arming_refusal_has_its_reason() -> None:
