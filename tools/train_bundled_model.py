@@ -407,7 +407,7 @@ def lower_confidence(output: Path) -> tuple[YoloModel, dict[str, float]]:
         precise = [
             threshold
             for threshold, of_sizes in zip(thresholds, points, strict=True)
-            if min(at[name].precision for at in of_sizes) >= PRECISION
+            if all(at[name].precision >= PRECISION for at in of_sizes)
         ]
         threshold = precise[0] if precise else thresholds[-1]
         if not precise:

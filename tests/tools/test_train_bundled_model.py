@@ -262,7 +262,7 @@ def class_biases(model: YoloModel) -> torch.Tensor:
 def judged(class_id: int, confidences: list[float], right: list[bool]) -> ImageResult:
     """One image with an object for each right detection; a wrong one is elsewhere."""
     corners = np.arange(len(right), dtype=np.float32)[:, None] * 20 + np.array([0, 0, 10, 10], np.float32)
-    true = corners[np.array(right)]
+    true = corners[np.array(right, bool)]
     return ImageResult(
         corners,
         np.array(confidences, np.float32),
@@ -288,7 +288,7 @@ def test_biases_of_imprecise_classes_are_lowered(
             judged(2, [0.5, 0.995], [True, False]),
         ],
         # All are right from 0.47 on: fewer than at the other size.
-        320: [judged(0, [0.45], [True]), judged(1, [0.46, 0.7], [False, True]), judged(2, [0.5], [True])],
+        320: [judged(0, [0.45], [True]), judged(1, [0.46, 0.7], [False, True]), judged(2, [], [])],
     }
     monkeypatch.setattr(train_bundled_model, "draw", lambda folder, frames, seed, world: {})
     monkeypatch.setattr(
