@@ -25,8 +25,9 @@ MIN_KNOWN_FRACTION = 0.1
 _MAX_PIXELS, _MAX_CELLS = 96, 24
 # Cells average enough pixels to reduce their noise to this, but a box keeps this many in each direction.
 _CELL_SIGMA_M, _MIN_CELLS = 0.15, 8
-# Points lower than this above the ground count as ground: boxes are a few pixels too large.
-GROUND_GAP_M = 0.12
+# Points lower than this above the ground count as ground: boxes are a few pixels too large. So do cells lower
+# than so many sigma of their own noise: one of a steep view that stayed would be the nearest of its box.
+GROUND_GAP_M, _GROUND_SIGMAS = 0.12, 3.0
 # The ground is measured in a strip below the box, this share of its height.
 _STRIP, _STRIP_MIN_PX = 0.15, 3
 # This share of the remaining cells may be wrong. Less than a tenth of them, nearer than the others by half a
@@ -189,15 +190,16 @@ def _nearest_point(
     rays, along_m = _averaged(inverse, known, shape, edges, camera)
     if not len(along_m):
         return nothing
+    noise_m = along_m * along_m * (sigma * math.sqrt(shape[0] * shape[1] / inverse.size))
     drop = rays @ down
-    drops_m = drop * along_m
     ground_m = _ground(depth_m, edges, camera, down)
     if ground_m is None:
         ground_m = lens_height_m
     if ground_m is not None:
-        above = drops_m < ground_m - GROUND_GAP_M
+        gap_m = np.maximum(GROUND_GAP_M, _GROUND_SIGMAS * np.abs(drop) * noise_m)
+        above = drop * along_m < ground_m - gap_m
         if np.count_nonzero(above) >= MIN_KNOWN_FRACTION * len(above):
-            rays, along_m, drop = rays[above], along_m[above], drop[above]
+            rays, along_m, drop, noise_m = rays[above], along_m[above], drop[above], noise_m[above]
     # Horizontal distance per metre along the optical axis.
     level = np.sqrt(np.maximum((rays * rays).sum(axis=1) - drop * drop, 0.0))
     ranges_m = level * along_m
@@ -205,8 +207,7 @@ def _nearest_point(
     first = _first_of_object(ranges_m[order])
     first += int(_NEAR_FRACTION * (len(order) - first))
     index = order[first]
-    noise_m = level[index] * along_m[index] ** 2 * sigma * math.sqrt(shape[0] * shape[1] / inverse.size)
-    range_m = _front(ranges_m[order[first:]], along_m[order[first:]], noise_m)
+    range_m = _front(ranges_m[order[first:]], along_m[order[first:]], level[index] * noise_m[index])
     point: NDArray[np.float64] = rays[index] * (range_m / level[index] if level[index] else along_m[index])
     return point
 

@@ -232,6 +232,20 @@ def test_noise_does_not_bias_far_ranges(size_m: tuple[float, float, float]) -> N
     assert float(np.std(errors)) < 0.015
 
 
+@pytest.mark.parametrize(("north_m", "yaw_rad"), [(8.5, 0.6), (8.5, 1.2), (10.0, 1.2)])
+def test_noise_of_the_ground_in_a_rolled_box_is_not_the_object(north_m: float, yaw_rad: float) -> None:
+    """The ground in its lower corners is nearer than the object."""
+    scene = cuboid_scene(
+        north_m=north_m, yaw_rad=yaw_rad, height_m=5.5, pitch_rad=math.radians(-25), roll_rad=math.radians(13)
+    )
+    left, top, right, bottom = scene.box
+    larger = (left - 4, top - 4, right + 4, bottom + 4)
+    rng = np.random.default_rng(3)
+    for _ in range(10):
+        measured = measured_depth(scene.depth_m, CAMERA.fx, DepthSensor(), rng)
+        assert abs(ground_range_m(scene, measured, larger) - scene.true_m) < 0.3
+
+
 def test_object_in_front_is_not_the_one_behind_it() -> None:
     depth_m = depth_of(30.0)
     depth_m[5:25, 10:50] = 18.0
