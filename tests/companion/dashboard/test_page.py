@@ -281,6 +281,12 @@ def test_stop_works_with_the_page_in_many_windows(browser: Browser, service: Ser
             opened.close()
 
 
+def test_page_says_when_the_dashboard_is_gone(service: ServiceProcess, tab: Tab) -> None:
+    tab.until("state.topics.status")
+    service.process.kill()  # the last test with this service: the next ones have the processor for themselves
+    tab.until(f"/does not answer; everything here is [0-9]+ s old/.test({LINK})")
+
+
 REQUESTS = "performance.getEntriesByType('resource').map((entry) => entry.toJSON())"
 
 
@@ -527,12 +533,6 @@ def test_page_of_a_fleet_switches_the_vehicle_and_stops_all(browser: Browser) ->
         assert stop_all[0] + stop_all[2] <= 390
         assert tab.value("document.documentElement.scrollWidth") <= 390
         tab.close()
-
-
-def test_page_says_when_the_dashboard_is_gone(service: ServiceProcess, tab: Tab) -> None:
-    tab.until("state.topics.status")
-    service.process.kill()  # the last test with this service
-    tab.until(f"/does not answer; everything here is [0-9]+ s old/.test({LINK})")
 
 
 LABEL = '<img src="x" onerror="document.body.remove()">'
