@@ -2,31 +2,69 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from companion.bench.bus import _detections, measure_recovery
+from companion.bench.bus import _LOADING_S, _START_S, _detections, measure_bus, measure_recovery
+from companion.perception.process import PerceptionProcess
+from companion.settings import Settings
+from companion.vehicle.precise_sleep import DEFAULT_NS, set_scheduler_slice
 from tests.companion.bus.message_check import check_message
-from tests.companion.command_line import companion
+from tests.companion.command_line import companion_here
 
 pytestmark = pytest.mark.realtime
 
 
-def test_delay_to_another_process_is_measured(tmp_path: Path) -> None:
-    command = ("bench", "bus", "--seconds", "1", "--load", "1", "--json")
-    printed = companion(*command, cwd=tmp_path, timeout_s=120.0)
+# More than the command's own limits: its workers, its subscriber's process, its subscription.
+@pytest.mark.timeout(_LOADING_S + 3 * _START_S)
+def test_delay_to_another_process_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    spawn = PerceptionProcess.spawn
+
+    async def spawn_with_one_hertz(settings: Settings, standard_input: int) -> PerceptionProcess:
+        """A paced source would give one frame a second, also on a busy machine."""
+        source = settings.source.model_copy(update={"rate_hz": 1.0})
+        return await spawn(settings.model_copy(update={"source": source}), standard_input)
+
+    monkeypatch.setattr(PerceptionProcess, "spawn", spawn_with_one_hertz)
+    command = ("bench", "bus", "--seconds", "1", "--rate-hz", "1000", "--load", "1", "--json")
+    try:
+        printed = companion_here(*command, cwd=tmp_path)
+    finally:
+        set_scheduler_slice(DEFAULT_NS)
     assert printed.returncode == 0, printed.stderr
     figures = json.loads(printed.stdout)
-    assert figures["published"] == 30
-    assert 0 < figures["received"] <= 30
+    assert figures["published"] == 1000
+    assert 0 < figures["received"] <= 1000
+    # Some messages are late, and the next ones with them.
+    assert 0.0 < figures["rate_hz"] < 1000.0
     assert figures["message_bytes"] > 4000
     assert figures["detectors"] == 1
-    assert figures["detector_frames_per_s"] > 0.0
+    assert figures["detector_frames_per_s"] > 2.0
     assert figures["build_and_encode_p50_ms"] > 0.0
     p50, p99, largest = (figures[f"put_to_subscriber_{name}_ms"] for name in ("p50", "p99", "max"))
     assert 0.0 < p50 <= p99 <= largest
+
+
+def test_worker_ends_if_the_next_one_cannot_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    spawn = PerceptionProcess.spawn
+    started: list[PerceptionProcess] = []
+
+    async def spawn_one(*arguments: Any) -> PerceptionProcess:
+        if started:
+            raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+        started.append(await spawn(*arguments))
+        return started[0]
+
+    monkeypatch.setattr(PerceptionProcess, "spawn", spawn_one)
+    with pytest.raises(BlockingIOError):
+        measure_bus(1.0, rate_hz=30.0, load=2)
+    with pytest.raises(ProcessLookupError):
+        os.kill(started[0].pid, 0)
 
 
 def test_benchmark_publishes_a_valid_message() -> None:
