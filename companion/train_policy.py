@@ -503,9 +503,16 @@ class _Checkpoints(BaseCallback):
         if self.num_timesteps - self._stored >= CHECKPOINT_STEPS:
             self._stored = self.num_timesteps
             _store(self.model, self._training, self._folder)
+        self._show()
+
+    def _on_training_end(self) -> None:
+        self._show()
+
+    def _show(self) -> None:
         episodes: Sequence[dict[str, float]] = tuple(self.model.ep_info_buffer or ())
         mean = float(np.mean([each["r"] for each in episodes])) if episodes else float("nan")
         rate = (self.num_timesteps - self._begun) / max(time.monotonic() - self._begun_s, 1e-9)
-        remaining_s = (self._steps - self.num_timesteps) / rate if rate else None
+        # The last rollout may end after the last step that was asked for.
+        remaining_s = max(0, self._steps - self.num_timesteps) / rate if rate else None
         figures = f"return {mean:.1f} {rate:.0f} steps/s"
         self._display.show(self.num_timesteps, self._steps, figures, remaining_s)

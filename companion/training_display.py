@@ -10,7 +10,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 
 class TrainingDisplay:
-    """A bar on a terminal; else, and with a prefix, a line every 10 s and at the last step.
+    """A bar on a terminal; else, and with a prefix, a line every 10 s and when all steps are done.
 
     Args:
         prefix: begins every line.
@@ -32,7 +32,7 @@ class TrainingDisplay:
         text, now_s = f"step {step}/{steps} {figures}", time.monotonic()
         if self._bar is not None:
             self._bar.update(self._task, total=steps, completed=step, description=text)
-        elif step == steps or now_s - self._shown_s >= self.EVERY_S:
+        elif step >= steps or now_s - self._shown_s >= self.EVERY_S:
             self._shown_s = now_s
             left = "" if remaining_s is None else f", {remaining_s / 60:.1f} min left"
             print(f"{self._prefix}{text}{left}", file=sys.stderr, flush=True)

@@ -87,7 +87,9 @@ def test_failed_training_of_a_seed_is_one_line(tmp_path: Path, monkeypatch: pyte
     command = ["train-policy", "companion/CartPole-v0", "--steps", "256", "--seeds", "3"]
     result = CliRunner().invoke(app, [*command, "--output", str(tmp_path / "policy.onnx")])
     assert result.exit_code == 2
-    assert result.stderr.splitlines() == ["companion: seed 3: RuntimeError: no policy"]
+    trained, failed = result.stderr.splitlines()
+    assert trained.startswith("seed 3: step 256/256 return ")
+    assert failed == "companion: seed 3: RuntimeError: no policy"
 
 
 def test_interrupted_trainings_of_many_seeds_resume(
@@ -117,13 +119,17 @@ def test_interrupted_trainings_of_many_seeds_resume(
     assert torch.load(state, weights_only=True)["steps"] == 1024
 
 
-def test_training_resumes_with_its_state(tmp_path: Path) -> None:
+def test_training_resumes_with_its_state(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file, folder = tmp_path / "policy.onnx", tmp_path / "policy.onnx.training"
     with pytest.raises(PolicyTrainingError, match=r"no state of a training in .*policy.onnx.training"):
         train_policy(CART_POLE, 256, file, resume=True)
     train_policy(CART_POLE, 256, file)
     first = file.read_bytes()
-    train_policy(CART_POLE, 512, file, resume=True)
+    capsys.readouterr()
+    train_policy(CART_POLE, 500, file, resume=True)
+    (last,) = capsys.readouterr().err.splitlines()
+    assert last.startswith("step 512/500 return ")
+    assert last.endswith(" steps/s, 0.0 min left")
     assert torch.load(folder / "state.pt", weights_only=True)["steps"] == 512
     second = file.read_bytes()
     assert second != first

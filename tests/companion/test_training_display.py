@@ -7,18 +7,18 @@ import pytest
 from companion.training_display import TrainingDisplay
 
 
-def test_line_is_shown_every_ten_seconds_and_at_the_last_step(
+def test_line_is_shown_every_ten_seconds_and_at_the_end(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     now_s = 100.0
     monkeypatch.setattr("time.monotonic", lambda: now_s)
     with TrainingDisplay("seed 3: ") as display:
-        for step in range(1, 6):
+        for step in range(2, 12, 2):
             now_s += 4.0
-            display.show(step, 5, f"return {step}.0", 90.0 if step < 5 else None)
+            display.show(step, 9, f"return {step}.0", 90.0 if step < 9 else None)
     assert capsys.readouterr().err.splitlines() == [
-        "seed 3: step 3/5 return 3.0, 1.5 min left",
-        "seed 3: step 5/5 return 5.0",
+        "seed 3: step 6/9 return 6.0, 1.5 min left",
+        "seed 3: step 10/9 return 10.0",
     ]
 
 
