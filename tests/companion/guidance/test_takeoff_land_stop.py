@@ -118,8 +118,8 @@ def test_mode_after_the_landing_comes_before_disarmed(
     for after_s in (0.1, 0.9):
         now_ns = START_NS + round(after_s * 1e9)
         assert authority.lost(changed, now_ns, flying_by_setpoint=False) is None
-    heard = replace(changed, armed=armed, heartbeat_ns=now_ns)
-    assert authority.lost(heard, now_ns, flying_by_setpoint=False) == reason
+    later = replace(changed, armed=armed, heartbeat_ns=now_ns)
+    assert authority.lost(later, now_ns, flying_by_setpoint=False) == reason
 
 
 def test_pilot_ends_a_descent_at_once() -> None:
