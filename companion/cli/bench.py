@@ -119,7 +119,7 @@ def bench_bus(
     from companion.bench.bus import measure_bus, measure_recovery
     from companion.bus.session import BusError
 
-    with plain_errors(BusError, RuntimeError):
+    with plain_errors(BusError, OSError, RuntimeError):
         if recovered is not None:
             figures = measure_recovery(recovered)
         else:
