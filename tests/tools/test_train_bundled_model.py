@@ -262,7 +262,7 @@ def class_biases(model: YoloModel) -> torch.Tensor:
 def judged(class_id: int, confidences: list[float], right: list[bool]) -> ImageResult:
     """One image with an object for each right detection; a wrong one is elsewhere."""
     corners = np.arange(len(right), dtype=np.float32)[:, None] * 20 + np.array([0, 0, 10, 10], np.float32)
-    true = corners[np.array(right, bool)]
+    true = corners[np.array(right)]
     return ImageResult(
         corners,
         np.array(confidences, np.float32),
@@ -280,19 +280,15 @@ def test_biases_of_imprecise_classes_are_lowered(
     save_checkpoint(output, build(yolov8_description(scale, CLASS_NAMES)), metadata={})
     # In another order than the network's, as of a data set.
     names = ("truck", "person", "boat")
-    of_sizes = {
-        640: [
-            judged(0, [0.45] * 20, [True] * 20),
-            # Of 0.4 two of three are right; above 0.57 all.
-            judged(1, [0.45, 0.57, 0.7], [True, False, True]),
-            judged(2, [0.5, 0.995], [True, False]),
-        ],
-        # All are right from 0.47 on: fewer than at the other size.
-        320: [judged(0, [0.45], [True]), judged(1, [0.46, 0.7], [False, True]), judged(2, [], [])],
-    }
+    results = [
+        judged(0, [0.45] * 20, [True] * 20),
+        # Of 0.4 two of three are right; above 0.57 all.
+        judged(1, [0.45, 0.57, 0.7], [True, False, True]),
+        judged(2, [0.5, 0.995], [True, False]),
+    ]
     monkeypatch.setattr(train_bundled_model, "draw", lambda folder, frames, seed, world: {})
     monkeypatch.setattr(
-        train_bundled_model, "detect", lambda drawn, model, size: Found({"a": of_sizes[size]}, {}, names)
+        train_bundled_model, "detect", lambda drawn, model, size: Found({"a": results}, {}, names)
     )
     before = class_biases(load_checkpoint(output).model)
     with caplog.at_level(logging.WARNING):
