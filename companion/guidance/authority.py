@@ -185,7 +185,8 @@ class Authority:
             # only the next heartbeat shows `armed`.
             if self._changed_ns is None:
                 self._changed_ns = now_ns
-            unknown = _may_have_landed(state) and state.heartbeat_ns <= self._changed_ns
+            asking = self._leaving_until_ns == float("inf")  # a pilot's mode must not be asked away
+            unknown = not asking and _may_have_landed(state) and state.heartbeat_ns <= self._changed_ns
             return unknown or not state.armed or state.landed is LandedState.ON_GROUND
         if FlightMode.TAKEOFF in (self._mode, *self._leaving) and state.mode is FlightMode.HOLD:
             short_m = self._takeoff_altitude_m - (state.altitude_m or 0.0)

@@ -132,6 +132,18 @@ def test_pilot_ends_a_descent_at_once() -> None:
     assert authority.lost(changed, START_NS + 100_000_000, flying_by_setpoint=False) == PILOT
 
 
+def test_pilot_ends_a_landing_that_is_being_requested_at_once() -> None:
+    """Also of a vehicle that stands: the request, which would take the mode away again, ends."""
+    hovering = replace(LANDING, mode=FlightMode.OFFBOARD, velocity_ned_mps=(0.0, 0.0, 0.0))
+    authority = Authority()
+    authority.acquire(hovering)
+    authority.request(FlightMode.LAND, hovering)
+    assert authority.lost(hovering, START_NS, flying_by_setpoint=False) is None
+    changed = replace(hovering, mode=FlightMode.POSITION)
+    reason = authority.lost(changed, START_NS + 100_000_000, flying_by_setpoint=False)
+    assert reason == "the pilot took over: position mode"
+
+
 @pytest.mark.parametrize("kind", [LandBehaviour, ReturnBehaviour])
 def test_landing_on_the_ground_succeeds_at_once(
     kind: type[LandBehaviour] | type[ReturnBehaviour],
