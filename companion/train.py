@@ -30,7 +30,7 @@ from vision.yolo.checkpoint import load_checkpoint, save_checkpoint
 from vision.yolo.checkpoint_pair import WEIGHTS_SUFFIX, pair_paths, weights_sha256
 from vision.yolo.fine_tuning import DOUBTED_SCORE, LabelledScenes, extend_classes, training_images
 from vision.yolo.metrics import Score
-from vision.yolo.recipe import DEFAULT_RECIPE, HELD_OUT_SEED, HELD_OUT_SIZE, REFINEMENT, evaluate
+from vision.yolo.recipe import DEFAULT_RECIPE, HELD_OUT_SEED, HELD_OUT_SIZE, NMS_IOU, REFINEMENT, evaluate
 from vision.yolo.training import Progress, Stage, TrainedModel, TrainingSettings, train
 
 logger = logging.getLogger(__name__)
@@ -111,6 +111,7 @@ def evaluate_and_save(
     score = evaluate(trained.model, training_scene, HELD_OUT_SEED, held_out, width, height)
     metadata = {
         "licence": LICENCE,
+        "nms_iou": NMS_IOU,
         "trained_on": "scenes drawn by mavlink_sim.datasets.training_scenes",
         "steps_done": trained.steps_done,
         "score": {
@@ -233,7 +234,7 @@ def train_on_data(
         )
     weights = output.with_suffix(WEIGHTS_SUFFIX)
     metadata: dict[str, Any] = {
-        **{key: value for key, value in loaded.metadata.items() if key == "licence"},
+        **{key: value for key, value in loaded.metadata.items() if key in ("licence", "nms_iou")},
         "trained_on": f"{len(images)} images of {data.resolve().name}",
         "started_from": path.name,
         "steps_done": trained.steps_done,

@@ -48,7 +48,7 @@ from vision.yolo.checkpoint import load_checkpoint, save_checkpoint
 from vision.yolo.losses import Truth, detection_loss
 from vision.yolo.metrics import operating_points
 from vision.yolo.published import yolov8_description
-from vision.yolo.recipe import HELD_OUT_SEED, HELD_OUT_SIZE, REFINEMENT, evaluate
+from vision.yolo.recipe import HELD_OUT_SEED, HELD_OUT_SIZE, NMS_IOU, REFINEMENT, evaluate
 from vision.yolo.scene_batches import PADDING_GREY
 from vision.yolo.training import prepare_start, update_average
 
@@ -358,6 +358,7 @@ def _write(
 ) -> None:
     metadata = {
         "licence": "Apache-2.0",
+        "nms_iou": NMS_IOU,
         "trained_on": "scenes drawn by mavlink_sim.datasets.training_scenes",
         "trained_by": "tools.train_bundled_model",
         "seed": given.seed,

@@ -30,7 +30,7 @@ from vision.object_detector import (
 )
 from vision.runtimes.base import PRECISIONS, Device, Precision
 from vision.runtimes.selection import RuntimeChoice, check_runtime, start_runtime
-from vision.runtimes.source import read_source
+from vision.runtimes.source import ModelSource, read_source
 from vision.runtimes.stored_choice import forget_choices
 from vision.weights import DEFAULT_WEIGHTS
 from vision.yolo.checkpoint_pair import weights_sha256
@@ -43,6 +43,8 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 DEFAULT_MODEL = "default"
+USUAL_IOU = 0.7
+"""NMS IoU threshold of a model whose metadata gives none; the reference predicts with it."""
 # From this confidence on, decoding the few remaining cells one by one is faster than decoding all cells.
 _SPARSE_FROM = 0.05
 
@@ -71,7 +73,7 @@ class Detector(ObjectDetector):
         *,
         classes: Sequence[str | int] | None = None,
         confidence: float = 0.25,
-        iou: float = 0.7,
+        iou: float | None = None,
         image_size: int = 640,
         precision: Precision = "auto",
         threads: int | None = None,
@@ -88,7 +90,7 @@ class Detector(ObjectDetector):
             classes: names or ids to report; None for all. The network does not compute the others.
             confidence: boxes not above this are dropped, 0..1.
             iou: NMS IoU threshold, 0..1: of two boxes of one class overlapping more, the less confident is
-                dropped.
+                dropped. None: `nms_iou` of the model's metadata, else 0.7.
             image_size: longer side of the network's input, pixels, a multiple of its largest stride (32). A
                 file of a fixed size keeps its own.
             precision: `auto` selects bfloat16 only where the processor supports it (a fifth less time).
@@ -104,7 +106,7 @@ class Detector(ObjectDetector):
             ValueError: an unknown class (the message names the nearest), or a number out of range.
         """
         for name, value in (("confidence", confidence), ("iou", iou)):
-            if not 0.0 <= value <= 1.0:
+            if value is not None and not 0.0 <= value <= 1.0:
                 raise ValueError(f"{name} must be in 0..1, got {value}")
         if precision not in PRECISIONS:
             raise ValueError(f"precision must be {', '.join(PRECISIONS)}; got {precision!r}")
@@ -121,7 +123,7 @@ class Detector(ObjectDetector):
         self.metadata: dict[str, Any] = source.metadata
         self.model_name, self.model_sha256 = str(model), weights_sha256(source.weights_path)
         self.confidence = confidence
-        self.iou = iou
+        self.iou = _own_iou(source) if iou is None else iou
         self.image_size = image_size
         self.square = square
         self._letterbox: Letterbox | None = None
@@ -230,6 +232,14 @@ class Detector(ObjectDetector):
                 box = fit(width, height, self.image_size, square=self.square, stride=self._stride)
             self._letterbox, self._boxed = box, box.blank()
         return box
+
+
+def _own_iou(source: ModelSource) -> float:
+    """The NMS threshold that a model's metadata gives, else USUAL_IOU. Raises CheckpointError."""
+    iou = source.metadata.get("nms_iou", USUAL_IOU)
+    if isinstance(iou, bool) or not isinstance(iou, int | float) or not 0.0 <= iou <= 1.0:
+        raise CheckpointError(f"{source.path}: nms_iou must be a number in 0..1, got {iou!r:.40}")
+    return float(iou)
 
 
 @detector(YOLO, "a YOLO network, by detector.model")

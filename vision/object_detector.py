@@ -30,7 +30,7 @@ class DetectorSettings:
         model: for `yolo` as in `vision.detector.Detector`; a plug-in may give it any meaning.
         classes: names or ids to report; None for all.
         confidence: boxes below this are dropped, 0..1.
-        iou: NMS IoU threshold, 0..1.
+        iou: NMS IoU threshold, 0..1; None: the model's own.
         image_size: longer side of a network's input, pixels.
         precision: of the network, or `auto`.
         threads: processor threads; None: the detector's default.
@@ -41,7 +41,7 @@ class DetectorSettings:
     model: str = "default"
     classes: tuple[str | int, ...] | None = None
     confidence: float = 0.25
-    iou: float = 0.7
+    iou: float | None = None
     image_size: int = 640
     precision: Precision = "auto"
     threads: int | None = None

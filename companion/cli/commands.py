@@ -343,7 +343,10 @@ def detect(
         str | None, typer.Option(help="Classes to detect: names or ids, comma separated. Default: all.")
     ] = None,
     confidence: Annotated[float, typer.Option(min=0, max=1, help="Confidence threshold.")] = 0.25,
-    iou: Annotated[float, typer.Option(min=0, max=1, help="NMS IoU threshold.")] = 0.7,
+    iou: Annotated[
+        float | None,
+        typer.Option(min=0, max=1, help="NMS IoU threshold. Default: that of the model, else 0.7."),
+    ] = None,
     image_size: Annotated[
         int, typer.Option(min=32, help="Longer side of the network's input, pixels.")
     ] = 640,

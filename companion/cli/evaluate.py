@@ -24,7 +24,10 @@ def evaluate(
     image_size: Annotated[
         int, typer.Option(min=32, help="Longer side of the network's input, pixels.")
     ] = 640,
-    iou: Annotated[float, typer.Option(min=0, max=1, help="NMS IoU threshold.")] = 0.7,
+    iou: Annotated[
+        float | None,
+        typer.Option(min=0, max=1, help="NMS IoU threshold. Default: that of the model, else 0.7."),
+    ] = None,
     runtime: Annotated[
         str, typer.Option(help="Runtime: torch, onnxruntime, openvino, tensorrt or auto.")
     ] = "torch",

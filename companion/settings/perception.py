@@ -261,8 +261,8 @@ class DetectorSection(Section):
     """only these classes, by name or id; empty: all classes of the model"""
     confidence: Annotated[float, Field(ge=0, le=1)] = 0.25
     """minimum confidence of detections"""
-    iou: Annotated[float, Field(ge=0, le=1)] = 0.7
-    """NMS IoU threshold"""
+    iou: Annotated[float | None, Field(ge=0, le=1)] = None
+    """NMS IoU threshold; unset: that of the model's description, else 0.7"""
     image_size: Annotated[int, Field(ge=32, le=4096, multiple_of=32)] = 640
     """longer side of the network's input, pixels"""
     runtime: Literal["auto", "torch", "onnxruntime", "openvino", "tensorrt"] = "torch"

@@ -137,6 +137,26 @@ def test_detector_exposes_its_model_metadata(model_path: Path) -> None:
     assert detector.description.class_names == NAMES
 
 
+@pytest.mark.parametrize("stated, given, used", [(None, None, 0.7), (0.0, None, 0.0), (0.0, 0.7, 0.7)])
+def test_nms_threshold_of_a_model_is_used_unless_another_is_given(
+    tmp_path: Path, frame: np.ndarray[Any, Any], stated: float | None, given: float | None, used: float
+) -> None:
+    metadata = {} if stated is None else {"nms_iou": stated}
+    save_checkpoint(tmp_path / "m.pt", eager_model(), metadata=metadata)
+    boxes = detector_of(tmp_path / "m.pt", iou=given).detect(frame).xyxy
+    expected = detector_of(tmp_path / "m.pt", iou=used).detect(frame).xyxy
+    other = detector_of(tmp_path / "m.pt", iou=0.0 if used else 0.7).detect(frame).xyxy
+    assert boxes.tolist() == expected.tolist()
+    assert len(boxes) != len(other)
+
+
+@pytest.mark.parametrize("stated", ["0.5", True, 1.5, float("nan"), [0.5]])
+def test_nms_threshold_of_a_model_is_a_number_from_0_to_1(tmp_path: Path, stated: Any) -> None:
+    save_checkpoint(tmp_path / "m.pt", eager_model(), metadata={"nms_iou": stated})
+    with pytest.raises(CheckpointError, match=r"m\.pt: nms_iou must be a number in 0\.\.1"):
+        detector_of(tmp_path / "m.pt")
+
+
 def test_bfloat16_detects_the_same(model_path: Path, frame: np.ndarray[Any, Any]) -> None:
     full = Detector(model_path, image_size=64, precision="float32")
     half = Detector(model_path, image_size=64, precision="bfloat16")
