@@ -8,13 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from companion.guidance.targets.estimate import BEARING_SIGMA_RAD, Estimate
 from companion.guidance.targets.target import Target
 from companion.vehicle.state import Vector3
 from vision.attitude import wrap_angle
+from vision.tracking.association import overlaps
 
 # χ² with two degrees of freedom, 99.9 %.
 GATE = 13.8
+# Two boxes of a frame that overlap by this IoU may be of one object: the detector finds some of them twice.
+ONE_OBJECT_IOU = 0.5
 
 
 class ObjectTrack:
@@ -87,12 +92,17 @@ class ObjectTrack:
         """Candidates: targets with the object's track id, else trusted ones with an unknown id."""
         own = [t for t in targets if t.track_id is not None and t.track_id == self._track_id]
         if own:
-            # A second box on the object itself is not another object.
             self._others |= {
                 t.track_id
                 for t in targets
-                if t.track_id not in (None, self._track_id)
-                and abs(wrap_angle(t.bearing_rad - own[0].bearing_rad)) > BEARING_SIGMA_RAD
+                if t.track_id not in (None, self._track_id) and _are_apart(t, own[0])
             }
             return own
         return [t for t in targets if t.trusted and not self.is_another(t)]
+
+
+def _are_apart(one: Target, other: Target) -> bool:
+    """Whether two targets of a frame are two objects, and not two boxes on the same."""
+    if abs(wrap_angle(one.bearing_rad - other.bearing_rad)) <= BEARING_SIGMA_RAD:
+        return False
+    return bool(overlaps(np.array([one.box_xyxy]), np.array([other.box_xyxy]))[0, 0] < ONE_OBJECT_IOU)

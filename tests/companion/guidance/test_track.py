@@ -106,3 +106,16 @@ def test_long_unseen_object_may_have_moved() -> None:
     moved = (10.0, 3.5)
     assert not near.update([seen(moved, frame=1, source=RangeSource.DEPTH)], vehicle)
     assert late.update([seen(moved, frame=30, source=RangeSource.DEPTH)], vehicle)
+
+
+@pytest.mark.parametrize("left, same", [(290.0, True), (340.0, False)])
+def test_second_box_on_the_object_may_replace_it_and_one_beside_it_may_not(left: float, same: bool) -> None:
+    vehicle = (0.0, 0.0, -5.0)
+    first = replace(seen((10.0, 0.0)), track_id=1, box_xyxy=(300.0, 100.0, 340.0, 200.0))
+    second = replace(seen((10.0, 0.4)), track_id=2, box_xyxy=(left, 100.0, left + 60.0, 200.0))
+    track = ObjectTrack(first, vehicle)
+    both = [replace(target, captured_ns=T0 + FRAME_NS) for target in (first, second)]
+    assert track.update(both, vehicle)
+    assert track.track_id == 1
+    assert track.update([replace(second, captured_ns=T0 + 2 * FRAME_NS)], vehicle) is same
+    assert track.track_id == (2 if same else 1)
