@@ -108,7 +108,7 @@ def test_long_unseen_object_may_have_moved() -> None:
     assert late.update([seen(moved, frame=30, source=RangeSource.DEPTH)], vehicle)
 
 
-@pytest.mark.parametrize("left, same", [(290.0, True), (340.0, False)])
+@pytest.mark.parametrize(("left", "same"), [(290.0, True), (340.0, False)])
 def test_second_box_on_the_object_may_replace_it_and_one_beside_it_may_not(left: float, same: bool) -> None:
     vehicle = (0.0, 0.0, -5.0)
     first = replace(seen((10.0, 0.0)), track_id=1, box_xyxy=(300.0, 100.0, 340.0, 200.0))
