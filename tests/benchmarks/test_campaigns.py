@@ -15,7 +15,16 @@ SEEDS = range(300, 308)
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize(
     ("name", "least"),
-    [("approach-depth", 8), ("approach", 7), ("obstacles", 8), ("bearing", 8), ("land", 7), ("follow", 6)],
+    [
+        ("approach-depth", 8),
+        ("approach", 7),
+        ("obstacles", 8),
+        ("bearing", 8),
+        ("land", 7),
+        ("follow", 6),
+        ("hold", 8),
+        ("orbit", 7),
+    ],
 )
 def test_most_flights_of_a_campaign_succeed(name: str, least: int) -> None:
     results = list(fly(name, SEEDS))

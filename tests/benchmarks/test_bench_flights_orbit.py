@@ -1,0 +1,26 @@
+"""Campaigns of orbits and of the hold after a `goto`: what their figures mean."""
+
+import pytest
+
+from benchmarks import flights_hold, flights_orbit, flights_orbit_calm
+
+
+def test_gusts_widen_an_orbit() -> None:
+    gusts, calm = flights_orbit.run(1), flights_orbit_calm.run(1)
+    assert gusts.success, gusts.reason
+    assert calm.success, calm.reason
+    for name in ("radius_error_max_m", "heading_error_p95_deg"):
+        assert gusts.values[name] > calm.values[name] > 0.0
+    assert 3.0 < calm.values["speed_p50_mps"] < 4.0
+
+
+def test_orbit_outside_of_its_tolerance_is_no_success(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(flights_orbit, "WITHIN_M", 0.05)
+    assert not flights_orbit.run(1).success
+
+
+def test_hold_is_judged_by_the_estimate_and_by_the_truth() -> None:
+    flight = flights_hold.run(3)
+    assert flight.success, flight.reason
+    assert 0.05 < flight.values["hold_error_max_m"] <= 0.3
+    assert flight.values["true_hold_error_max_m"] != flight.values["hold_error_max_m"]
