@@ -21,7 +21,7 @@ from companion.evaluate import JUDGED_CONFIDENCE, evaluate_dataset, map_classes
 from companion.training_display import TrainingDisplay
 from mavlink_sim.datasets.training_scenes import random_scene, training_scene
 from mavlink_sim.world.shapes import CLASS_NAMES
-from vision.detector import DEFAULT_MODEL, Detector
+from vision.detector import DEFAULT_MODEL, RENDERED_SCENES, Detector
 from vision.evaluation.datasets import Dataset, DatasetError, MissingSplitError, fold_name, open_dataset
 from vision.model_files import find_model
 from vision.runtimes.base import bfloat16_instructions
@@ -112,7 +112,7 @@ def evaluate_and_save(
     metadata = {
         "licence": LICENCE,
         "nms_iou": NMS_IOU,
-        "trained_on": "scenes drawn by mavlink_sim.datasets.training_scenes",
+        "trained_on": f"{RENDERED_SCENES}mavlink_sim.datasets.training_scenes",
         "steps_done": trained.steps_done,
         "score": {
             "map50": round(score.map50, 4),

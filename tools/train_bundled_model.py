@@ -43,6 +43,7 @@ from torch import Tensor, nn
 from benchmarks.bundled_model import CONFIRMED, detect, draw
 from mavlink_sim.datasets.training_scenes import training_scene
 from mavlink_sim.world.shapes import CLASS_NAMES
+from vision.detector import RENDERED_SCENES
 from vision.yolo.architecture import YoloModel, build
 from vision.yolo.checkpoint import load_checkpoint, save_checkpoint
 from vision.yolo.losses import Truth, detection_loss
@@ -359,7 +360,7 @@ def _write(
     metadata = {
         "licence": "Apache-2.0",
         "nms_iou": NMS_IOU,
-        "trained_on": "scenes drawn by mavlink_sim.datasets.training_scenes",
+        "trained_on": f"{RENDERED_SCENES}mavlink_sim.datasets.training_scenes",
         "trained_by": "tools.train_bundled_model",
         "seed": given.seed,
         "minutes": given.minutes,

@@ -45,6 +45,8 @@ logger = logging.getLogger(__name__)
 DEFAULT_MODEL = "default"
 USUAL_IOU = 0.7
 """NMS IoU threshold of a model whose metadata gives none; the reference predicts with it."""
+RENDERED_SCENES = "scenes drawn by "
+"""`trained_on` in the metadata of a model trained on rendered scenes only begins with this."""
 # From this confidence on, decoding the few remaining cells one by one is faster than decoding all cells.
 _SPARSE_FROM = 0.05
 
@@ -64,6 +66,7 @@ class Detector(ObjectDetector):
         description: what the network was built from; None for an exported file.
         foreign: the recognised network of another exporter's file; else None.
         metadata: of the file (licence, origin, score).
+        rendered_only: `trained_on` in the metadata begins with RENDERED_SCENES.
         last_timing: of the latest `detect`; None before the first.
     """
 
@@ -121,6 +124,7 @@ class Detector(ObjectDetector):
         self.class_ids = None if classes is None else resolve_classes(classes, source.class_names)
         self.description: ModelDescription | None = source.description
         self.metadata: dict[str, Any] = source.metadata
+        self.rendered_only = str(self.metadata.get("trained_on")).startswith(RENDERED_SCENES)
         self.model_name, self.model_sha256 = str(model), weights_sha256(source.weights_path)
         self.confidence = confidence
         self.iou = _own_iou(source) if iou is None else iou

@@ -75,6 +75,7 @@ class ObjectDetector(ABC):
         runtime: of its network; None where there is no choice.
         precision: `float32` for example; None where it does not apply.
         reason: why this runtime and precision, in words.
+        rendered_only: its network was trained on rendered scenes only, as far as its file says.
     """
 
     class_names: tuple[str, ...]
@@ -84,6 +85,7 @@ class ObjectDetector(ABC):
     runtime: str | None = None
     precision: str | None = None
     reason: str = ""
+    rendered_only: bool = False
 
     @abstractmethod
     def detect(self, image_bgr: NDArray[np.uint8], /) -> Detections:

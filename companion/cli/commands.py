@@ -45,7 +45,6 @@ from companion.cli.topics import topics
 from companion.cli.train import train
 from companion.cli.train_policy import train_policy
 from companion.settings import Settings
-from companion.settings.perception import DEFAULT_MODEL, NO_SOURCE
 from vision.gc_pause import gc_paused
 from vision.object_detector import YOLO
 
@@ -173,20 +172,23 @@ def _freeze_loaded_objects() -> None:
     gc.freeze()
 
 
-def _warn_synthetic_model(detectors: Iterable[tuple[str, str]]) -> None:
-    """Warn once if the bundled model processes real images.
+def _warn_rendered_only(models: Iterable[tuple[str, str | None]]) -> None:
+    """Warn once if a model of rendered scenes may process camera images.
 
     Args:
-        detectors: (source URI, model) of each detector. The simulated camera is read from shared memory; any
-            other source may have real images.
+        models: (source URI, name) of each model that was trained on rendered scenes only. The simulated
+            camera is read from shared memory. Any other source, the simulator's streams included, looks like
+            a camera.
     """
-    real = [model for uri, model in detectors if uri != NO_SOURCE and not uri.startswith("shm://")]
-    if DEFAULT_MODEL in real:
-        typer.echo(
-            f"companion: the bundled model '{DEFAULT_MODEL}' is trained on rendered scenes only and does not "
-            "work on real images; run `companion models pull yolo11n`, then use --model yolo11n",
-            err=True,
-        )
+    for uri, model in models:
+        if not uri.startswith("shm://"):
+            typer.echo(
+                f"companion: the model '{model}' is trained on rendered scenes only and does not work on "
+                "camera images; if these are camera images, run `companion models pull yolo11n`, "
+                "then use --model yolo11n",
+                err=True,
+            )
+            return
 
 
 async def _run_until_signal(settings: Settings, service: Service) -> None:
@@ -196,11 +198,13 @@ async def _run_until_signal(settings: Settings, service: Service) -> None:
     def on_ready() -> None:
         ready.set()
         _freeze_loaded_objects()
-        cameras = [settings.of_camera(name) for name in (None, *settings.cameras)]
-        _warn_synthetic_model(
-            (camera.source.uri, camera.detector.model)
-            for camera in cameras
-            if camera.detector.enabled and camera.detector.kind == YOLO
+        # Shared frames of one of our cameras are those of its source.
+        sources = [camera.settings.source for camera in service.cameras]
+        shared = {f"shm://{source.share}": source.uri for source in sources}
+        _warn_rendered_only(
+            (shared.get(source.uri, source.uri), loaded.model)
+            for camera, source in zip(service.cameras, sources, strict=True)
+            if (loaded := camera.supervisor.ready) is not None and loaded.rendered_only
         )
 
     running = asyncio.ensure_future(service.run(on_ready))
@@ -429,8 +433,8 @@ def detect(
     write = functools.partial(print, flush=True)
     unusable = (SourceError, OSError, RuntimeUnusableError)
     with plain_errors(*unusable), open_source(source, settings) as frames:
-        if detector_kind == YOLO:
-            _warn_synthetic_model([(source, model)])
+        if detector.rendered_only:
+            _warn_rendered_only([(source, detector.model_name)])
         summary = detect_source(
             frames,
             frame_detector,

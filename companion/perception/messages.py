@@ -103,7 +103,7 @@ class Ready:
 
     `model` is None without a detector; `precision` and `runtime` of the network are None without a network.
     `reason`: why these were selected, as text. `calibration`: from the camera, if it provides one.
-    `model_sha256`: of the model's file; None without one.
+    `model_sha256`: of the model's file; None without one. `rendered_only`: as of `ObjectDetector`.
     """
 
     source: str
@@ -114,6 +114,7 @@ class Ready:
     reason: str = ""
     calibration: CameraCalibration | None = None
     model_sha256: str | None = None
+    rendered_only: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -353,6 +353,7 @@ def _ready(perception: Perception) -> Ready:
         detector.reason,
         calibration,
         detector.model_sha256,
+        detector.rendered_only,
     )
 
 

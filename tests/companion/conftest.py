@@ -27,18 +27,20 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
 
 @pytest.fixture(scope="session")
 def small_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A network with random weights."""
+    """A network with random weights. Its metadata says that it knows rendered scenes only."""
 
     def make(path: Path) -> None:
         import torch
 
+        from vision.detector import RENDERED_SCENES
         from vision.yolo.architecture import build
         from vision.yolo.checkpoint import save_checkpoint
         from vision.yolo.published import yolov8_description
 
         torch.manual_seed(1)
         model = build(yolov8_description((1 / 3, 0.0625, 256), ("person", "car", "boat"))).eval()
-        save_checkpoint(path, model, metadata={"licence": "Apache-2.0"})
+        trained_on = f"{RENDERED_SCENES}nobody"
+        save_checkpoint(path, model, metadata={"licence": "Apache-2.0", "trained_on": trained_on})
 
     return made_once(tmp_path_factory, "small.pt", make)
 

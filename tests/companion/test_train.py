@@ -48,6 +48,7 @@ def test_training_writes_model_with_licence_and_score(
     assert written["steps_done"] == 2
     detector = Detector(output, image_size=96)
     assert detector.metadata["licence"] == "Apache-2.0"
+    assert detector.rendered_only
     detector.detect(np.zeros((96, 96, 3), np.uint8))
     # Resuming a finished training has nothing left to do.
     assert train_default(output, held_out=2, resume=True).map50 == pytest.approx(score.map50)
@@ -98,6 +99,7 @@ def test_class_of_own_images_is_added_and_scored(labelled: Path, small_model: Pa
     assert written.class_names == ("person", "car", "boat", "Drone")
     assert written.metadata["licence"] == "Apache-2.0"
     assert written.metadata["started_from"] == "small.pt"
+    assert not Detector(output, image_size=64).rendered_only
     assert (written.metadata["steps_done"], written.metadata["score"]["images"]) == (3, 2)
     assert "width_multiple" not in written.metadata["settings"]
     # The result can be trained again.

@@ -14,7 +14,6 @@ from importlib.metadata import version
 from pathlib import Path
 
 import cv2
-import numpy as np
 import pytest
 import typer
 from typer.testing import CliRunner
@@ -25,6 +24,8 @@ from companion.cli.commands import app
 from companion.guidance.command import COMMANDS
 from mavlink_sim.testing import free_port
 from tests.companion.command_line import companion, companion_here
+from vision.weights import DEFAULT_WEIGHTS
+from vision.yolo.checkpoint import load_checkpoint, save_checkpoint
 
 pytestmark = pytest.mark.realtime
 
@@ -267,18 +268,37 @@ def test_bench_setpoints_prints_json(tmp_path: Path) -> None:
     assert figures["setpoints"] > 10
 
 
-def test_bundled_model_warns_once_for_real_images(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    image = tmp_path / "photo.png"
-    cv2.imwrite(str(image), np.full((64, 96, 3), 90, np.uint8))
-    done = companion("detect", image, "--image-size", "96", cwd=tmp_path)
+@pytest.mark.parametrize("name", ["default", "path", "export"])
+def test_detect_warns_of_a_model_of_rendered_scenes(
+    name: str, exported_model: Path, pictures: Path, tmp_path: Path
+) -> None:
+    model, flags = {
+        "default": ("default", ("--image-size", "96")),
+        "path": (str(DEFAULT_WEIGHTS), ("--image-size", "96")),
+        "export": (str(exported_model), (*ONNX, "--image-size", "160")),
+    }[name]
+    done = companion_here("detect", pictures, "--limit", "2", "--model", model, *flags, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     (line,) = [line for line in done.stderr.splitlines() if "models pull" in line]
-    assert "'default'" in line
-    warn = companion_commands._warn_synthetic_model
-    warn([("shm://simulator", "default"), ("/dev/video0", "yolo11n")])
+    assert f"'{model}'" in line
+    assert "if these are camera images" in line
+
+
+def test_detect_is_silent_about_another_model(small_model: Path, pictures: Path, tmp_path: Path) -> None:
+    own = tmp_path / "own.safetensors"
+    save_checkpoint(own, load_checkpoint(small_model).model, metadata={"trained_on": "6 images of set"})
+    done = companion_here("detect", pictures, "--model", own, "--image-size", "96", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "models pull" not in done.stderr
+
+
+def test_no_warning_for_the_simulated_camera(capsys: pytest.CaptureFixture[str]) -> None:
+    warn = companion_commands._warn_rendered_only
+    warn([("shm://simulator", "default")])
     assert capsys.readouterr().err == ""
-    warn([("shm://simulator", "default"), ("/dev/video0", "default"), ("/dev/video1", "default")])
-    assert capsys.readouterr().err.count("models pull") == 1
+    warn([("shm://simulator", "default"), ("/dev/video0", "mine.onnx"), ("rtp://:5600", "default")])
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "'mine.onnx'" in line
 
 
 def test_help_lists_commands_in_order_of_use() -> None:

@@ -61,6 +61,9 @@ def test_two_models_on_one_camera_are_independent(
         os.kill(status["cameras"]["down"]["pid"], signal.SIGKILL)
         service.wait_for_line("camera down: perception lost")
         service.wait_for_line("camera down: perception restored")
+        # Both cameras have the model of rendered scenes.
+        (line,) = [line for line in service.lines if "models pull" in line]
+        assert "'small.onnx'" in line.replace(str(exported_model), "small.onnx")
         while not received.empty():
             received.get()
         next_of("down")
@@ -73,9 +76,10 @@ def test_two_models_on_one_camera_are_independent(
 def test_guidance_camera_selects_the_steering_camera(
     exported_model: Path, pictures: Path, tmp_path: Path
 ) -> None:
+    shared = f"companion-test-{secrets.token_hex(4)}"
     (tmp_path / "companion.toml").write_text(
         '[detector]\nenabled = false\n[guidance]\ncamera = "side"\n'
-        f"[cameras.side.source]\nuri = {str(pictures)!r}\nloop = true\n"
+        f'[source]\nshare = "{shared}"\n[cameras.side.source]\nuri = "shm://{shared}"\n'
         f"[cameras.side.detector]\nmodel = {str(exported_model)!r}\n"
         "runtime = 'onnxruntime'\nimage_size = 96\n"
     )
@@ -87,6 +91,8 @@ def test_guidance_camera_selects_the_steering_camera(
         # Only the classes of that camera's model can be sought.
         assert "unknown class 'bicycle'" in service.command("seek bicycle")["reason"]
         assert "in the air" in service.command("seek boat")["reason"]
+        # It reads the first camera's frames, which are not the simulator's.
+        service.wait_for_line("models pull")
 
 
 @pytest.mark.parametrize(
