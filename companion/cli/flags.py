@@ -60,15 +60,16 @@ def check_finite(flag: str, *values: float) -> None:
 
 
 def check_seed_options(context: typer.Context) -> None:
-    """Exit with code 2 if --seed, --seeds, --processes and --ray of a command do not fit together."""
+    """Exit with code 2 if a command's options do not fit together: --seed, --seeds and those for --seeds."""
+    for_seeds = {"as_json", "processes", "ray", "synthetic"}
     given = {
         name
-        for name in ("seed", "seeds", "processes", "ray")
+        for name in ("seed", "seeds", *for_seeds)
         if (source := context.get_parameter_source(name)) is not None and source.name == "COMMANDLINE"
     }
     refused = None
-    if "seeds" not in given and (alone := given & {"processes", "ray"}):
-        refused = f"--{min(alone)} is for many seeds: add --seeds, such as --seeds 1..8"
+    if "seeds" not in given and (alone := given & for_seeds):
+        refused = f"--{min(alone).removeprefix('as_')} is for many seeds: add --seeds, such as --seeds 1..8"
     elif {"seed", "seeds"} <= given:
         refused = "--seed and --seeds were given: give one of them"
     elif {"processes", "ray"} <= given:

@@ -125,6 +125,20 @@ def test_wrong_options_of_benchmarks_are_exit_code_2(
     assert "Traceback" not in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("option", ["--synthetic", "--json"])
+def test_options_of_seeds_start_no_demonstration(
+    option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("companion.demo.run_demo", None)
+    result = CliRunner().invoke(app, ["demo", option])
+    assert result.exit_code == 2
+    (line,) = result.stderr.splitlines()
+    assert option in line
+    assert "--seeds" in line
+    assert not list(tmp_path.iterdir())
+
+
 def test_failed_seed_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(flights, "flight_named", lambda _: squared)
     assert flights.main(["approach", "--runs", "1", "--seed", "7"]) == 2
