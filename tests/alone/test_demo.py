@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import pytest
 
+from companion.demo import _CAMERA_RATE_HZ
 from mavlink_sim.testing import QUICK_FLIGHT, running_simulator
 
 URL_LIMIT_S = 150
@@ -51,8 +52,8 @@ def test_the_demonstration_finds_the_car_stops_before_it_and_lands(tmp_path: Pat
     done = demo(output, "--duration", "150")
     assert done.returncode == 0, done.stdout + done.stderr
     # A warning of the service (a video with gaps, on a busy machine) is printed once, with its time.
-    lines = [line for line in done.stdout.splitlines() if "missing" in line]
-    assert not any(line.split("s  ", 1)[-1] in done.stderr for line in lines), done.stderr
+    gaps = [line for line in done.stdout.splitlines() if "missing" in line]
+    assert not any(line.split("s  ", 1)[-1] in done.stderr for line in gaps), done.stderr
     summary = json.loads((output / "summary.json").read_text())
     assert summary["success"]
     assert summary["found"]
@@ -75,7 +76,9 @@ def test_the_demonstration_finds_the_car_stops_before_it_and_lands(tmp_path: Pat
         pictures += 1
         filmed_s = video.get(cv2.CAP_PROP_POS_MSEC) / 1000.0
     # Whole, from the first frame to the end, and moving.
-    assert pictures > 3 * filmed_s
+    # A busy machine may miss some: the demonstration prints how many.
+    most = round(filmed_s * _CAMERA_RATE_HZ) + 1
+    assert pictures > 3 * filmed_s, f"{pictures} of {most} pictures in {filmed_s:.2f} s; {gaps}"
     events = [json.loads(line) for line in (output / "events.jsonl").read_text().splitlines()]
     (seen_ns,) = [event["stamp_ns"] for event in events if event["text"].startswith("perception running")]
     flown_ns = max(event["stamp_ns"] for event in events if event["text"].startswith(FLOWN))

@@ -1,24 +1,33 @@
-"""What the demonstration does when its mission fails, and its page."""
+"""What the demonstration does when its mission fails, its page, and its video."""
 
 from __future__ import annotations
 
 import asyncio
 import re
 import socket
+import threading
 import urllib.request
 from collections.abc import Callable
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
+import numpy as np
 import pytest
 import zenoh
+from numpy.typing import NDArray
 
 from companion import demo
 from companion.bus.config import zenoh_config
 from companion.service import Service
 from companion.settings import Settings, ZenohSection
+from companion.sim_session import session_settings
 from companion.vehicle.state import LandedState, VehicleState
 from mavlink_sim.testing import free_port
+from vision.detections import Detections
+from vision.frame import Frame
+from vision.recording import Recording
+from vision.video_writer import VideoWriter
 
 FLYING = VehicleState(armed=True, ready_to_arm=True, landed=LandedState.IN_AIR)
 LANDED = VehicleState(ready_to_arm=True, landed=LandedState.ON_GROUND)
@@ -56,6 +65,41 @@ async def test_a_failed_demo_returns_unless_the_pilot_flies(in_command: bool) ->
     assert flight.failure is not None
     assert flight.failure.startswith("the battery has 14%")
     assert flight.on_ground is flight.ended is in_command
+
+
+@pytest.mark.parametrize("video_rate_hz", [demo._CAMERA_RATE_HZ, demo._SLOW_VIDEO_RATE_HZ])
+def test_video_of_the_demo_misses_no_picture(
+    video_rate_hz: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Frames come at the camera's rate, and the writer keeps up: each waits for the one before."""
+    video = tmp_path / demo.VIDEO_NAME
+    section = session_settings(14540, "none", video=video, video_rate_hz=video_rate_hz).recording
+    assert section.video == str(video)
+    added, writers = threading.Semaphore(0), []
+
+    class Writer(VideoWriter):
+        def write(self, image: NDArray[np.uint8], captured_ns: int) -> int:
+            slots = super().write(image, captured_ns)
+            writers.append(self)
+            added.release()
+            return slots
+
+    monkeypatch.setattr("vision.recording.VideoWriter", Writer)
+    recording = Recording(section.video, section.rate_hz)
+    image, nothing = np.full((480, 640, 3), 90, np.uint8), Detections.empty(("car",))
+    rng = np.random.default_rng(1)
+    taken = 0
+    for sequence in range(54):
+        # A fifth of the period early or late.
+        at_s = (sequence + rng.uniform(-0.2, 0.2)) / demo._CAMERA_RATE_HZ
+        recording.write(Frame(image, 10**9 + round(at_s * 1e9), sequence), nothing)
+        if recording._next_slot > taken:
+            taken = recording._next_slot
+            assert added.acquire(timeout=30.0)
+    recording.close()
+    assert recording.skipped == 0
+    assert (writers[-1].repeated, writers[-1].frames) == (0, taken)
+    assert abs(taken - 54 * video_rate_hz / demo._CAMERA_RATE_HZ) <= 1
 
 
 async def test_demo_prints_the_address_of_its_page_which_answers(monkeypatch: pytest.MonkeyPatch) -> None:
