@@ -128,7 +128,7 @@ function renderDetections() {
   while (body.rows.length > shown.length) body.deleteRow(-1);
   shown.forEach(([found, name], index) => {
     const row = body.rows[index] || newRow(body, 5);
-    const range = found.range_m ?? found.ground_range_m ?? found.depth_m;
+    const range = found.ground_range_m;
     renderTrack(row.cells[0], found);
     row.className = found.track_id != null && found.track_id === state.chosen ? "chosen" : "";
     setText(row.cells[1], found.class_name + (found.track_state === "tentative" ? " (tentative)" : ""));

@@ -408,7 +408,8 @@ def test_page_shows_the_state_and_the_menu_of_a_track(browser: Browser) -> None:
     }
     # Of the same object, and smaller.
     unsure = {**FOUND, "class_name": "truck", "xyxy": [70.0, 60.0, 310.0, 230.0], "track_id": 8}
-    unsure["track_state"] = "tentative"
+    unsure.update(track_state="tentative", depth_m=5.4)
+    found = {**FOUND, "ground_range_m": 4.2, "distance_m": 6.0, "depth_m": 5.4}
     jpeg = cv2.imencode(".jpg", np.zeros((480, 640, 3), np.uint8))[1].tobytes()
     asked, sent = {"velocity_ned_mps": [2.0, 0.0, 0.0]}, {"velocity_ned_mps": [1.5, 0.0, 0.0]}
     messages = {
@@ -416,7 +417,7 @@ def test_page_shows_the_state_and_the_menu_of_a_track(browser: Browser) -> None:
         VEHICLE.key(NAME): vehicle,
         SETPOINT.key(NAME): {"asked": asked, "sent": sent, "limited_by": ["speed"]},
         DETECTIONS.key(NAME): frame(
-            1, captured_ns=10_000_000, published_ns=35_000_000, detections=[FOUND, unsure]
+            1, captured_ns=10_000_000, published_ns=35_000_000, detections=[found, unsure]
         ),
         EVENTS.key(NAME): {"stamp_ns": 1, "level": "error", "text": "battery low"},
     }
@@ -443,6 +444,8 @@ def test_page_shows_the_state_and_the_menu_of_a_track(browser: Browser) -> None:
 
         wait_for(shown)
         becomes("#mode, #armed, #height, #speed, #battery", ["offboard", "yes", "4.0 m", "1.0 m/s", "73 %"])
+        # Over ground, never along the camera's axis.
+        becomes("#detections td:nth-child(4)", ["4.2 m", "–"])
         becomes("#attitude", ["Roll 30°, pitch 0°, heading 90°"])
         becomes("#setpoint tr:first-child td", ["1.00", "2.00", "1.50"])
         becomes("#limited", ["Limited by: speed"])
