@@ -96,7 +96,7 @@ class DetectionBody(PositionBody):
     ground_range_m: float | None
     """horizontal distance from the vehicle to the nearest surface"""
     distance_m: float | None
-    """straight distance to the same point"""
+    """straight distance to the surface at that range (depth), to the ground there or the object's foot"""
     range_source: RangeWord | None
     """what the range was measured by; none: no range"""
     range_sigma_m: float | None

@@ -48,7 +48,10 @@ class Target:
         trusted: it may be selected as a goal: its track is confirmed, or tracking is off; and its class is
             not ambiguous, neither in this frame nor over its track.
         depth_m: along the camera's optical axis to the nearest surface; NaN without a depth image.
-        distance_m: from the vehicle to the nearest surface; NaN when the range is unknown.
+        distance_m: straight line from the vehicle to a point at `ground_range_m`; NaN when the range is
+            unknown. Which point: by depth, of the surface, at the height of the nearest one; by the ground
+            plane, of the ground below the nearest surface; by the class's height, the object's foot; the
+            marker's centre.
         cut: the image's edge may cut the object off, so the box's centre is not the object's.
         range_sigma_m: one sigma of `ground_range_m`; NaN: not stated.
         across_sigma_m: the same across the line of sight, horizontal.
