@@ -231,7 +231,7 @@ class Commands(ABC):
 
         Args:
             class_: what to fly to
-            distance: where to stop, to its surface (1 to 100 m; default 5)
+            distance: where to stop, over ground to its nearest surface (1 to 100 m; default 5)
             speed: maximum speed (0.2 to 10 m/s; default 2)
             confidence: minimum confidence (0.05 to 1; default 0.3)
             lost_timeout: wait for a lost object this long (0.5 to 60 s; default 5)
@@ -272,7 +272,7 @@ class Commands(ABC):
 
         Args:
             class_: what to follow
-            distance: to keep, to its surface (1.5 to 100 m; default 8)
+            distance: to keep, over ground to its nearest surface (1.5 to 100 m; default 8)
             bearing: where to stay: unchanged, or `angle` from north or course (default here)
             angle: seen from the object, clockwise; relative to its course 180 is behind (-360 to 360 deg;
                 default 180)
@@ -312,7 +312,7 @@ class Commands(ABC):
         Args:
             file: an ONNX file on the service's computer, or a bundled policy
             class_: what to fly to
-            distance: where to stop, to its surface (1 to 100 m; default 5)
+            distance: where to stop, over ground to its nearest surface (1 to 100 m; default 5)
             limit: give up after this long (1 to 3600 s; default 120)
             track: fly to this track, instead of a class
         """
@@ -339,7 +339,7 @@ class Commands(ABC):
             points: the path: north,east or north,east,height, metres from home
             classes: what to stop for, separated by commas
             on_detection: stop and face it, or fly up to `distance` (default hold)
-            distance: where an approach stops (1 to 100 m; default 5)
+            distance: where an approach stops, over ground to the nearest surface (1 to 100 m; default 5)
             dwell: time spent at an object (0 to 600 s; default 5)
             revisit: time within which the same object is ignored (0 to 3600 s; default 120)
             merge_radius: detections within this distance are one object (0.5 to 100 m; default 5)

@@ -65,7 +65,7 @@ BASE_TIMEOUT_S = 45.0
 
 
 class ApproachBehaviour(Behaviour):
-    """Keeps the height, yaws to the object and stops `distance_m` before its nearest surface.
+    """Keeps the height, yaws to the object and stops `distance_m` over ground before its surface.
 
     It selects the confirmed object of the class ahead (see `TargetSelector`), or the track or marker, and
     stays with it. After losing it, it brakes and waits for `lost_timeout_s` before it fails.

@@ -46,7 +46,9 @@ POINTED_RAD = math.radians(6.0)
 class Approach(Command):
     either: ClassVar[tuple[str, ...]] = ("class", "track", "marker")
     class_name: Annotated[str, ClassName("class", "what to fly to")] = ""
-    distance_m: Annotated[float, Number("distance", "m", 1.0, 100.0, "where to stop, to its surface")] = 5.0
+    distance_m: Annotated[
+        float, Number("distance", "m", 1.0, 100.0, "where to stop, over ground to its nearest surface")
+    ] = 5.0
     speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 10.0, "maximum speed")] = 2.0
     confidence: Annotated[float, Number("confidence", "", 0.05, 1.0, "minimum confidence")] = 0.3
     lost_timeout_s: Annotated[

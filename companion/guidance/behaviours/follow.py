@@ -54,7 +54,9 @@ UNSEEN_S = 0.6
 class Follow(Command):
     either: ClassVar[tuple[str, ...]] = ("class", "track", "marker")
     class_name: Annotated[str, ClassName("class", "what to follow")] = ""
-    distance_m: Annotated[float, Number("distance", "m", 1.5, 100.0, "to keep, to its surface")] = 8.0
+    distance_m: Annotated[
+        float, Number("distance", "m", 1.5, 100.0, "to keep, over ground to its nearest surface")
+    ] = 8.0
     bearing: Annotated[
         str,
         EnumArgument(
@@ -106,7 +108,7 @@ class Follow(Command):
 
 
 class FollowBehaviour(Behaviour):
-    """Keeps the height, yaws to the object and keeps `distance_m` from its nearest surface.
+    """Keeps the height, yaws to the object and keeps `distance_m` over ground from its surface.
 
     It selects the confirmed object of the class ahead (see `TargetSelector`), or the track or marker, and
     stays with it. Unseen, it follows the prediction for `occlusion_s`; then it fails.

@@ -57,7 +57,10 @@ class Patrol(Command):
     on_detection: Annotated[
         str, EnumArgument("on_detection", ("hold", "approach"), "stop and face it, or fly up to `distance`")
     ] = "hold"
-    distance_m: Annotated[float, Number("distance", "m", 1.0, 100.0, "where an approach stops")] = 5.0
+    distance_m: Annotated[
+        float,
+        Number("distance", "m", 1.0, 100.0, "where an approach stops, over ground to the nearest surface"),
+    ] = 5.0
     dwell_s: Annotated[float, Number("dwell", "s", 0.0, 600.0, "time spent at an object")] = 5.0
     revisit_s: Annotated[
         float, Number("revisit", "s", 0.0, 3600.0, "time within which the same object is ignored")

@@ -60,7 +60,9 @@ class Policy(Command):
     either: ClassVar[tuple[str, ...]] = ("class", "track")
     file: Annotated[str, FileName("file", "an ONNX file on the service's computer, or a bundled policy")]
     class_name: Annotated[str, ClassName("class", "what to fly to")] = ""
-    distance_m: Annotated[float, Number("distance", "m", 1.0, 100.0, "where to stop, to its surface")] = 5.0
+    distance_m: Annotated[
+        float, Number("distance", "m", 1.0, 100.0, "where to stop, over ground to its nearest surface")
+    ] = 5.0
     limit_s: Annotated[float, Number("limit", "s", 1.0, 3600.0, "give up after this long")] = 120.0
     track_id: Annotated[int | None, TrackId("track", "fly to this track, instead of a class")] = None
 
@@ -112,7 +114,7 @@ class PolicyBehaviour(Behaviour):
 
     Args:
         policy: checked by `check_quantities`.
-        wanted: the object. distance_m: where to stop, to its surface. limit_s: longest duration.
+        wanted: the object. distance_m: where to stop, over ground to its surface. limit_s: longest duration.
 
     Raises:
         PolicyError: it was not trained for this distance.

@@ -107,7 +107,7 @@ def test_schema_has_every_command_and_its_ranges() -> None:
     assert approach["properties"]["class"]["enum"] == ["car", "dog"]
     assert approach["properties"]["distance"] == {
         "type": "number",
-        "description": "where to stop, to its surface",
+        "description": "where to stop, over ground to its nearest surface",
         "minimum": 1.0,
         "maximum": 100.0,
         "unit": "m",
