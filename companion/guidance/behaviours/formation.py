@@ -54,6 +54,7 @@ CLEARANCE_M = 1.2
 FAR_M = 3.0
 # Virtual structure: slot tolerance and duration for completion; then how long completion is published.
 ARRIVED_M, ARRIVED_S, PUBLISH_S = 1.2, 1.0, 1.5
+OVER = f"the structure has flown its path, all within {ARRIVED_M:g} m of their slots"
 
 
 @dataclass(frozen=True, slots=True)
@@ -306,7 +307,7 @@ class FormationBehaviour(Behaviour):
             return None
         now_ns = context.now_ns
         if agreement.by != own:
-            return Outcome(True, "the structure has flown its path") if leader.over else None
+            return Outcome(True, OVER) if leader.over else None
         if not (self._structure.arrived and agreement.worst_error_m < ARRIVED_M):
             self._arrived_since_ns = None
         elif self._arrived_since_ns is None:
@@ -314,7 +315,7 @@ class FormationBehaviour(Behaviour):
         elif self._over_since_ns is None and now_ns - self._arrived_since_ns > ARRIVED_S * 1e9:
             self._over_since_ns = now_ns
         if self._over_since_ns is not None and now_ns - self._over_since_ns > PUBLISH_S * 1e9:
-            return Outcome(True, "the structure has flown its path")
+            return Outcome(True, OVER)
         return None
 
     def _turn(self, dt_s: float, hood: Neighbourhood, leader: _Leader, agreement: Agreement) -> None:

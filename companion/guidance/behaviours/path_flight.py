@@ -14,6 +14,7 @@ from companion.guidance.behaviour import (
     RoutedSetpoint,
 )
 from companion.guidance.motion import (
+    ARRIVED_M,
     Arrival,
     PositionController,
     add_velocity_error,
@@ -37,8 +38,9 @@ GAIN_M = 0.5
 AVOIDING_STUCK_S = 120.0
 # How far ahead a way around obstacles is planned.
 ROUTE_M = 15.0
-# A vehicle that stays for so long within this distance of the end has arrived, whatever speed its estimate
+# A vehicle that stays for so long within this distance of the end has succeeded, whatever speed its estimate
 # shows: PX4's, in its own simulation on a busy computer, showed 0.5 m/s for 8 s at a constant position.
+# Beyond ARRIVED_M the outcome states the distance.
 STAYS_M = 0.5
 SPEED_MARGIN = 1.25
 # Nearer than this to the end the yaw no longer follows the path.
@@ -109,7 +111,9 @@ class PathFlight(Behaviour):
         arrived = self._arrival.update(away_m, speed_of(state), now_ns)
         stuck = self._stuck(follower, now_ns, AVOIDING_STUCK_S if context.avoiding else STUCK_S)
         if aligned and (arrived or (stuck and away_m <= STAYS_M)):
-            return Outcome(True, self._success_text(), end)
+            near = away_m <= ARRIVED_M
+            text = self._success_text() if near else f"stopped {away_m:.2f} m from the goal"
+            return Outcome(True, text, end)
         if stuck:
             return Outcome(False, stuck)
         bearing = follower.bearing()

@@ -214,7 +214,7 @@ def test_virtual_structure_flies_its_path_and_ends() -> None:
     assert fleet.run_until(lambda: all(member.outcome is not None for member in members), 90.0)
     assert all(ended(fleet, name).success for name in fleet.members)
     for name in fleet.members:
-        assert "flown its path" in ended(fleet, name).reason
+        assert "1.2 m" in ended(fleet, name).reason
     assert separated(fleet)
     centre = [sum(member.airframe.place()[axis] for member in members) / 3 for axis in range(3)]
     # Three abreast: their centre is the structure's.

@@ -118,6 +118,21 @@ def test_goto_arrives_though_the_estimated_speed_is_wrong() -> None:
     assert math.dist(flight.vehicle.position, (15.0, 0.0, -5.0)) < 0.5
 
 
+@pytest.mark.parametrize(("off_m", "speed_mps"), [(0.42, 0.0), (0.42, 0.5), (0.25, 0.5)])
+def test_goto_that_stays_beside_its_goal_states_the_distance(off_m: float, speed_mps: float) -> None:
+    state = KinematicVehicle(velocity=[0.0, speed_mps, 0.0]).state
+    behaviour = GotoBehaviour(from_here_m=(off_m, 0.0))
+    behaviour.on_activate(BehaviourContext(state.position_ns, state))
+    for second in range(12):
+        now_ns = state.position_ns + second * 1_000_000_000
+        assert isinstance(behaviour.update(1.0, BehaviourContext(now_ns, state)), Setpoint)
+    outcome = behaviour.update(1.0, BehaviourContext(state.position_ns + 13_000_000_000, state))
+    assert isinstance(outcome, Outcome)
+    assert outcome.success
+    assert outcome.goal_ned_m == pytest.approx((off_m, 0.0, -5.0))
+    assert ("0.42 m" in outcome.reason, "reached" in outcome.reason) == (off_m > 0.3, off_m <= 0.3)
+
+
 def test_goal_beyond_a_limit_ends_without_progress() -> None:
     flight = Flight(GotoBehaviour(from_home_m=(60.0, 0.0)), limits=Limits(max_distance_m=30.0))
     outcome = flight.run(120.0)
