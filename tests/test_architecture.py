@@ -101,6 +101,7 @@ SIMULATOR_LAYERS = {
     "__main__": 9,
 }
 MAX_SIMULATOR_LAYERS = 10
+SERVICE, MAX_SERVICE_LINES = ROOT / "companion" / "service", 250
 SIMULATOR_MAY_IMPORT = {
     "vision.attitude",
     "vision.calibration.boards",
@@ -246,6 +247,13 @@ def test_one_file_calls_the_update_of_a_behaviour_besides_behaviours() -> None:
                 if isinstance(called, ast.Attribute) and called.attr in ("update", "on_activate"):
                     callers.add((name, ast.unparse(called)))
     assert not [caller for caller in callers if "behaviour" in caller[1]], callers
+
+
+def test_no_file_of_the_service_is_long() -> None:
+    """The service moves values between guidance, driver, perception and bus; its files stay small."""
+    lines = {path.name: len(path.read_text().splitlines()) for path in SERVICE.glob("*.py")}
+    assert len(lines) > 5
+    assert not {name: count for name, count in lines.items() if count > MAX_SERVICE_LINES}
 
 
 def test_simulator_imports_only_lower_layers() -> None:

@@ -13,12 +13,14 @@ from typing import Any
 from companion.guidance.core import Guidance
 from companion.guidance.gimbal.controller import ENDING
 from companion.guidance.interface import EventKind, GuidanceInput, GuidanceOutput, StreamStatus
+from companion.recording.guidance_record import StepContext
 from companion.service.command_handler import CommandHandler
 from companion.service.inputs import InputAssembler
 from companion.service.other_commanders import OtherCommanders
 from companion.service.requests import RequestRunner, apply_output
-from companion.vehicle.driver import Driver
-from companion.vehicle.streamer import Streamer
+from companion.vehicle.driver import CommandRefusedError, Driver
+from companion.vehicle.state import FlightMode
+from companion.vehicle.streamer import Streamer, StreamState
 
 # Reported with the command's own result.
 _ANSWERED = (EventKind.REFUSED, EventKind.ENDED, EventKind.STARTED)
@@ -38,7 +40,7 @@ class GuidanceLoop:
         rate_hz: of guidance.
         on_event: called with (level, text). on_step: called after every step with its time.
         others: other services that command the vehicle.
-        record: called with time, input and output of every step.
+        record: called with time, context, input and output of every step.
     """
 
     def __init__(
@@ -52,7 +54,7 @@ class GuidanceLoop:
         on_event: Callable[[str, str], None],
         on_step: Callable[[int], None],
         others: OtherCommanders,
-        record: Callable[[int, GuidanceInput, GuidanceOutput], None] = lambda now_ns, inputs, output: None,
+        record: Callable[[int, StepContext, GuidanceInput, GuidanceOutput], None] = lambda *step: None,
     ) -> None:
         self.guidance, self._inputs = guidance, inputs
         self._driver, self._streamer = driver, streamer
@@ -95,6 +97,21 @@ class GuidanceLoop:
             self._on_step(now_ns)
             await self._wait_for_input_until(now_ns / 1e9 + self._period_s)
 
+    async def shut_down(self) -> None:
+        """Accept no more commands; switch a vehicle that flies our setpoints to the autopilot's HOLD."""
+        flying = self._streamer.state is not StreamState.SILENT
+        try:
+            self.begin_shutdown()
+        finally:
+            self._streamer.stop()
+            try:
+                if flying and self._driver.state.connected(time.monotonic_ns()):
+                    await self._driver.set_mode(FlightMode.HOLD, timeout_s=2.0)
+            except CommandRefusedError as error:
+                self._on_event("error", f"shutdown: {error}; {self._driver.state.without_setpoints}")
+            finally:
+                await self.wait_released()
+
     def begin_shutdown(self) -> None:
         """Accept no more commands and stream nothing from now on. `run` continues."""
         self._ending = True
@@ -125,7 +142,8 @@ class GuidanceLoop:
         output = self.guidance.step(now_ns, inputs)
         self._warn_slow(name, time.thread_time_ns() - used_ns, time.monotonic_ns() - begun_ns, now_ns)
         self._apply(output)
-        self._record(now_ns, inputs, output)
+        context = self._inputs.step_context(self.guidance.gimbal.mounting)
+        self._record(now_ns, context, inputs, output)
         return output
 
     def _warn_slow(self, before: str, used_ns: int, passed_ns: int, now_ns: int) -> None:

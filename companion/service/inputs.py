@@ -13,6 +13,7 @@ from dataclasses import replace
 from companion.guidance.behaviour import Behaviour
 from companion.guidance.behaviours.select import FIRST_CAMERA, Select
 from companion.guidance.command import BuildContext, Command, GrammarError
+from companion.guidance.gimbal.controller import GimbalMounting
 from companion.guidance.grammar import parse
 from companion.guidance.interface import Answer, CommandInput, CommandSource, GuidanceInput, StreamStatus
 from companion.guidance.pose_sharing import PoseSharing
@@ -22,8 +23,9 @@ from companion.guidance.targets.from_markers import LocalizedMarkers
 from companion.perception.cameras import PerceptionCamera
 from companion.perception.marker_tracker import MarkerTracker
 from companion.plugins import load_plugins
+from companion.recording.guidance_record import StepContext
 from companion.service.velocity_senders import VelocitySenders
-from companion.settings import Settings
+from companion.settings import CameraSection, Settings
 from companion.vehicle.px4_modes import among_modes
 from companion.vehicle.report import Report
 from companion.vehicle.state import FlightMode, VehicleState
@@ -73,6 +75,8 @@ class InputAssembler:
         self._on_event = on_event
         self._reported: tuple[Report, ...] = ()
         self._logged_ns: dict[str, int] = {}
+        self._recorded_section: CameraSection | None = None
+        self._section_json = ""
 
     def on_state(self, state: VehicleState) -> None:
         """Process a new snapshot of the vehicle."""
@@ -138,6 +142,17 @@ class InputAssembler:
             self._markers.steering_sight(self.steering, now_ns, self._settings.guidance.perception_max_age_s),
             self.velocities.newest(now_ns),
         )
+
+    def step_context(self, mounting: GimbalMounting) -> StepContext:
+        """Return what is recorded of a step besides its input, for one caller.
+
+        Args:
+            mounting: of guidance's gimbal.
+        """
+        section = self.steering.settings.camera
+        if section is not self._recorded_section:  # replaced by the camera's calibration
+            self._recorded_section, self._section_json = section, section.model_dump_json()
+        return StepContext(mounting, self._section_json, self.history.take_new())
 
     def camera_pitch_rad(self, state: VehicleState) -> float:
         """Pitch of the steering camera above the horizon, with the vehicle level."""

@@ -17,12 +17,10 @@ from companion.bus.session import Bus
 from companion.bus.status_message import status_message
 from companion.guidance import grammar
 from companion.guidance.core import Guidance
-from companion.guidance.interface import GuidanceInput, GuidanceOutput
 from companion.operator.console import Ask, run_console, terminal_is_free
 from companion.operator.metrics import MetricsServer
 from companion.perception.cameras import WorkerCamera, open_cameras
 from companion.perception.supervisor import PerceptionSupervisor
-from companion.recording.guidance_record import StepContext
 from companion.recording.tap import FlightTap, run_record
 from companion.service.event import Event, EventLog
 from companion.service.factory import clients_of, driver_of, gimbal_mounting, guidance_options, streamer_of
@@ -35,9 +33,8 @@ from companion.service.queries import Queries
 from companion.service.systemd_notify import SystemdNotifier
 from companion.service.tasks import run_until, start_together
 from companion.settings import Settings
-from companion.vehicle.driver import CommandRefusedError, Driver
-from companion.vehicle.state import FlightMode, VehicleState
-from companion.vehicle.streamer import StreamState
+from companion.vehicle.driver import Driver
+from companion.vehicle.state import VehicleState
 from vision.pipeline import PerceptionResult
 
 
@@ -101,7 +98,6 @@ class Service:
             run_record(settings, self.guidance.options, self.driver.own_address, self.inputs.poses.source),
             expected=bool(settings.recording.directory),
         )
-        self._steering_section = self.inputs.steering.settings.camera.model_dump_json()
         self._publisher = Publisher(settings.vehicle.name, self.bus, self.driver, self.inputs, self._queries)
         self._loop = GuidanceLoop(
             *(self.guidance, self.inputs, self.driver, self.streamer),
@@ -109,7 +105,7 @@ class Service:
             on_event=self._event,
             on_step=lambda now_ns: self._health.after_step(now_ns, self.guidance),
             others=self.others,
-            record=self._record,
+            record=self._tap.on_step,
         )
         self._notifier = SystemdNotifier()
         self._health = Health(self.driver, self.cameras, self._notifier, self.others, self._event)
@@ -155,7 +151,8 @@ class Service:
             try:
                 await run_until(self._stop, tasks)
             finally:
-                await self._shut_down()
+                self._ending = True
+                await self._loop.shut_down()
         finally:
             self._notifier.stopping()
             unsubscribe()
@@ -207,22 +204,6 @@ class Service:
         """The supervisor of the steering camera."""
         return next(camera for camera in self.cameras if camera is self.inputs.steering).supervisor
 
-    async def _shut_down(self) -> None:
-        """Accept no more commands; switch a vehicle that flies our setpoints to the autopilot's HOLD."""
-        self._ending = True
-        flying = self.streamer.state is not StreamState.SILENT
-        try:
-            self._loop.begin_shutdown()
-        finally:
-            self.streamer.stop()
-            try:
-                if flying and self.driver.state.connected(time.monotonic_ns()):
-                    await self.driver.set_mode(FlightMode.HOLD, timeout_s=2.0)
-            except CommandRefusedError as error:
-                self._event("error", f"shutdown: {error}; {self.driver.state.without_setpoints}")
-            finally:
-                await self._loop.wait_released()
-
     async def _publish_status(self) -> None:
         while True:
             self._status = status = self.status()
@@ -240,13 +221,6 @@ class Service:
         sections = [camera.settings.camera for camera in self.cameras]
         steering = self.inputs.steering.settings.camera
         self.guidance.gimbal.mounting = gimbal_mounting(sections, steering)
-        self._steering_section = steering.model_dump_json()
-
-    def _record(self, now_ns: int, inputs: GuidanceInput, output: GuidanceOutput) -> None:
-        context = StepContext(
-            self.guidance.gimbal.mounting, self._steering_section, self.inputs.history.take_new()
-        )
-        self._tap.on_step(now_ns, context, inputs, output)
 
     def _on_result(self, camera: WorkerCamera, result: PerceptionResult) -> None:
         """Localize a camera's result, let guidance use it, then publish it."""

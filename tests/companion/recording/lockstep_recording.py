@@ -18,7 +18,7 @@ from companion.guidance.interface import GuidanceInput, GuidanceOutput
 from companion.recording.convert import ANY_OBJECT, INPUT_CHANNEL, OUTPUT_CHANNEL, RUN_CHANNEL, Converter
 from companion.recording.encoding import dumps
 from companion.recording.files import Channel, Recorded, RecordingReader, RecordingWriter
-from companion.recording.guidance_record import StepContext, input_record, output_record
+from companion.recording.guidance_record import input_record, output_record
 from companion.recording.tap import run_record
 from vision.depth import depth_millimetres
 from vision.frame import Frame
@@ -31,14 +31,6 @@ def new_writer(folder: Path, **limits: float) -> RecordingWriter:
     """A writer of large files, unless limited."""
     chosen = {"max_bytes": GIGABYTE, "max_duration_s": 3600.0, "max_total_bytes": GIGABYTE} | limits
     return RecordingWriter(folder, "vehicle1", **chosen)  # type: ignore[arg-type]
-
-
-def step_context(flight: LockstepFlight) -> StepContext:
-    """What the service records of a step besides its input."""
-    section = flight.inputs.steering.settings.camera
-    return StepContext(
-        flight.guidance.gimbal.mounting, section.model_dump_json(), flight.inputs.history.take_new()
-    )
 
 
 @contextmanager
@@ -80,7 +72,8 @@ def recording(
 
     def step(now_ns: int, inputs: GuidanceInput) -> GuidanceOutput:
         nonlocal number
-        taken = input_record(number, now_ns, step_context(flight), inputs)
+        context = flight.inputs.step_context(flight.guidance.gimbal.mounting)
+        taken = input_record(number, now_ns, context, inputs)
         output = original(now_ns, inputs)
         given = output_record(number, now_ns, output)
         writer.write(Channel(INPUT_CHANNEL, "companion.guidance_input", ANY_OBJECT), now_ns, dumps(taken))
