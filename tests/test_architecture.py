@@ -101,6 +101,15 @@ SIMULATOR_LAYERS = {
     "__main__": 9,
 }
 MAX_SIMULATOR_LAYERS = 10
+# Besides these, only behaviours made of others call a behaviour; and unit tests of single updates.
+STEPS_BEHAVIOURS = ("companion/guidance/core.py",)
+COMPOSED_BEHAVIOURS = ("companion/guidance/behaviours/", "companion/guidance/missions/sequence.py")
+SINGLE_STEP_TESTS = {
+    "tests/companion/guidance/test_hold_orbit.py",
+    "tests/companion/guidance/test_paths.py",
+    "tests/companion/guidance/test_seek_needs_a_gimbal.py",
+    "tests/companion/guidance/test_takeoff_land_stop.py",
+}
 SERVICE, MAX_SERVICE_LINES = ROOT / "companion" / "service", 250
 SIMULATOR_MAY_IMPORT = {
     "vision.attitude",
@@ -173,7 +182,7 @@ def circles(package: str) -> set[frozenset[str]]:
 
 
 def room(module: str) -> str:
-    """`companion.guidance.pilot` → guidance."""
+    """`companion.guidance.core` → guidance."""
     return module.split(".")[1]
 
 
@@ -221,6 +230,15 @@ def test_parts_of_guidance_import_downwards_only() -> None:
                 assert GUIDANCE_FLOORS[there[0]] < GUIDANCE_FLOORS[here], f"{name} imports upwards: {other}"
 
 
+def test_every_part_with_a_layer_exists() -> None:
+    tables = {"companion": FLOORS, "companion/guidance": GUIDANCE_FLOORS, "mavlink_sim": SIMULATOR_LAYERS}
+    for folder, table in tables.items():
+        parts = {path.stem for path in (ROOT / folder).iterdir() if path.suffix == ".py" or path.is_dir()}
+        assert not table.keys() - parts, folder
+    assert not (SIMULATOR_MAY_IMPORT | {"vision"}) - modules().keys()
+    assert MAY_IMPORT_SIMULATOR <= FLOORS.keys()
+
+
 def test_guidance_has_no_clock_and_no_input_or_output() -> None:
     """What it knows and when it is comes in as values; see `companion.guidance.interface`."""
     forbidden = {"asyncio", "time", "threading", "socket", "subprocess", "zenoh", "mavsdk", "pymavlink"}
@@ -237,16 +255,57 @@ def test_guidance_has_no_clock_and_no_input_or_output() -> None:
         assert "open" not in calls, name
 
 
-def test_one_file_calls_the_update_of_a_behaviour_besides_behaviours() -> None:
-    """Whoever flies one goes through `Guidance.step`; only behaviours made of others call `update` too."""
-    callers = set()
-    for name, path in modules().items():
-        if name.startswith("companion.") and not name.startswith("companion.guidance."):
-            for node in ast.walk(ast.parse(path.read_text())):
-                called = node.func if isinstance(node, ast.Call) else None
-                if isinstance(called, ast.Attribute) and called.attr in ("update", "on_activate"):
-                    callers.add((name, ast.unparse(called)))
-    assert not [caller for caller in callers if "behaviour" in caller[1]], callers
+def _behaviour_calls(tree: ast.AST) -> list[tuple[bool, str]]:
+    """(inside a loop, text) of each call of a behaviour's `on_activate` or `update`.
+
+    Many classes have an `update`. It is a behaviour's if its second argument names a context, or if the file
+    calls `on_activate`. Calls within a method of the same name, by a behaviour that is made of others, are
+    not listed.
+    """
+    loops = (ast.For, ast.AsyncFor, ast.While, ast.ListComp, ast.SetComp, ast.DictComp, ast.GeneratorExp)
+    activates = any(isinstance(node, ast.Attribute) and node.attr == "on_activate" for node in ast.walk(tree))
+    found = []
+
+    def visit(node: ast.AST, method: str, looping: bool) -> None:
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            method, looping = node.name, False
+        looping = looping or isinstance(node, loops)
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr != method:
+            arguments = [ast.unparse(each) for each in (*node.args, *(word.value for word in node.keywords))]
+            steps = len(arguments) == 2 and (activates or "context" in arguments[1].lower())
+            if node.func.attr == "on_activate" or (node.func.attr == "update" and steps):
+                found.append((looping, ast.unparse(node)))
+        for child in ast.iter_child_nodes(node):
+            visit(child, method, looping)
+
+    visit(tree, "", False)
+    return found
+
+
+def test_only_guidance_steps_a_behaviour() -> None:
+    """Whoever flies one goes through `Guidance.step`; unit tests of single updates do not loop."""
+    callers = {}
+    for folder in ("companion", "benchmarks", "examples", "tests", "tools"):
+        for path in (ROOT / folder).rglob("*.py"):
+            if calls := _behaviour_calls(ast.parse(path.read_text())):
+                callers[path.relative_to(ROOT).as_posix()] = calls
+    for name in STEPS_BEHAVIOURS:
+        assert callers.pop(name), name
+    callers = {name: calls for name, calls in callers.items() if not name.startswith(COMPOSED_BEHAVIOURS)}
+    assert callers.keys() == SINGLE_STEP_TESTS
+    assert not {name: calls for name, calls in callers.items() if any(looping for looping, _ in calls)}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "hold.on_activate(now)\nwhile True:\n    hold.update(dt_s=0.1, context=now)",
+        "hold.on_activate(now)\nfor _ in range(9):\n    hold.update(0.1, now)",
+        "steps = [hold.update(0.1, context) for _ in range(9)]",
+    ],
+)
+def test_a_loop_that_steps_a_behaviour_is_found(text: str) -> None:
+    assert any(looping for looping, _ in _behaviour_calls(ast.parse(text)))
 
 
 def test_no_file_of_the_service_is_long() -> None:

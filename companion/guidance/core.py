@@ -2,7 +2,8 @@
 
 One behaviour is active at a time. Guidance engages OFFBOARD for it, keeps its setpoints inside the envelope
 and yields to the pilot. There is no asyncio, no clock and no I/O here: the service, the campaigns and the
-tests call this one function, and nothing else steps a behaviour.
+tests call this one function. Only behaviours made of others, and unit tests of single updates, call a
+behaviour elsewhere.
 
 When the vehicle shows a mode that was not requested, or does not follow the setpoints, our command ends at
 once and nothing is streamed until the operator's next command, even if OFFBOARD comes back by itself.

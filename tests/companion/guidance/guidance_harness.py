@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
@@ -10,6 +11,7 @@ from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourO
 from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.core import Guidance, GuidanceOptions, Phase
 from companion.guidance.interface import (
+    Action,
     Answer,
     Arm,
     CommandInput,
@@ -17,18 +19,26 @@ from companion.guidance.interface import (
     GuidanceEvent,
     GuidanceInput,
     GuidanceOutput,
+    PointGimbal,
+    ReleaseGimbal,
     Request,
     SetMode,
     StreamStatus,
+    TakeGimbal,
     TakeOff,
 )
 from companion.guidance.limits.envelope import Limits
 from companion.guidance.targets.target import Target
-from companion.vehicle.gimbal import GimbalAim
+from companion.service.requests import apply_output
+from companion.vehicle.gimbal import NOBODY, Address, GimbalAim, GimbalState, YawFrame
+from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
 from companion.vehicle.streamer import Streamer
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject, look
+from vision.attitude import quaternion_from_euler
+from vision.obstacle_sectors import ObstacleSectors
+from vision.path_planner import PathRequest
 
 CLIMB_MPS = 1.5
 DISARM_AFTER_LANDING_S = 2.0
@@ -36,12 +46,65 @@ STEP_S = 0.02
 SHOWN_TIMEOUT_S = 3.0
 
 
+@dataclass
+class ScriptedGimbal:
+    """A gimbal whose manager reports its state in every step, and which reaches its aim at once.
+
+    Attributes:
+        primary: the component in control.
+        refuses: why pointing is denied; None: it is not.
+        follows: it moves. reports_attitude: else its newest attitude gets older.
+    """
+
+    primary: Address = NOBODY
+    refuses: str | None = None
+    follows: bool = True
+    reports_attitude: bool = True
+    pitch_rad: float = 0.0
+    _attitude_ns: int = 0
+
+    def answer(self, action: Action) -> str | None:
+        """Execute a request; returns why it is refused."""
+        match action:
+            case TakeGimbal():
+                self.primary = GuidanceOptions().own_address
+            case ReleaseGimbal():
+                self.primary = NOBODY
+            case PointGimbal(aim):
+                if self.follows and self.refuses is None:
+                    self.pitch_rad = aim.pitch_rad
+                return self.refuses
+        return None
+
+    def state(self, now_ns: int) -> GimbalState:
+        """The reported state now."""
+        if self.reports_attitude:
+            self._attitude_ns = now_ns
+        attitude = quaternion_from_euler(0.0, self.pitch_rad, 0.0)
+        return GimbalState(
+            1,
+            now_ns,
+            now_ns,
+            self._attitude_ns,
+            attitude,
+            YawFrame.NOSE,
+            lowest_pitch_rad=-math.pi / 2,
+            highest_pitch_rad=math.radians(30.0),
+            primary_control=self.primary,
+        )
+
+
 class ScriptedAutopilot:
-    """Answers guidance's requests. A mode shows `lag_s` after its change, as in a HEARTBEAT."""
+    """Answers guidance's requests. A mode shows `lag_s` after its change, as in a HEARTBEAT.
+
+    Attributes:
+        gimbal: None: there is none.
+    """
 
     def __init__(self, vehicle: KinematicVehicle, lag_s: float = 0.0) -> None:
         self.vehicle = vehicle
         self.lag_s = lag_s
+        self.gimbal: ScriptedGimbal | None = None
         self.refuse: dict[FlightMode, str] = {}
         self.refuse_arming: str | None = None
         self.linked = True
@@ -53,6 +116,8 @@ class ScriptedAutopilot:
         self.takeoff_short_m = 0.0
         self.requests: list[str] = []
         self.setpoints: list[Setpoint] = []
+        self.landing_targets: list[LandingTarget] = []
+        self.obstacle_distances: list[ObstacleSectors] = []
         self.mode_changes = 0
         self._shown = (vehicle.armed, vehicle.mode)
         self._changes: list[tuple[int, tuple[bool, FlightMode]]] = []
@@ -77,6 +142,7 @@ class ScriptedAutopilot:
             failsafe=self.failsafe,
             battery_fraction=self.battery_fraction,
             battery_ns=self._battery_ns,
+            gimbal=None if self.gimbal is None else self.gimbal.state(self.vehicle.now_ns),
         )
 
     def start(self, request: Request) -> None:
@@ -101,7 +167,8 @@ class ScriptedAutopilot:
                 self.change_mode(FlightMode.TAKEOFF)
                 self._answers.append(Answer(request.identifier))
             case _:
-                self._answers.append(Answer(request.identifier, "no gimbal"))
+                refused = "no gimbal" if self.gimbal is None else self.gimbal.answer(request.action)
+                self._answers.append(Answer(request.identifier, refused))
 
     def cancel(self, identifier: int) -> None:
         """Abandon a request."""
@@ -202,6 +269,7 @@ class GuidanceHarness:
         self.autopilot = ScriptedAutopilot(vehicle, lag_s)
         self.events: list[GuidanceEvent] = []
         self.outputs: list[GuidanceOutput] = []
+        self.path_requests: list[PathRequest] = []
         self.streamer = Streamer(self.autopilot.setpoints.append, clock_ns=lambda: vehicle.now_ns)
         self.guidance = Guidance(options)
         self.vehicle = vehicle
@@ -233,14 +301,15 @@ class GuidanceHarness:
             ending=ending,
         )
         output = self.guidance.step(now_ns, self._inputs(inputs))
-        if output.setpoint is None:
-            self.streamer.stop()
-        else:
-            self.streamer.submit(output.setpoint)
-        for identifier in output.cancelled:
-            self.autopilot.cancel(identifier)
-        for request in output.requests:
-            self.autopilot.start(request)
+        apply_output(
+            output,
+            self.streamer,
+            start=self.autopilot.start,
+            cancel=self.autopilot.cancel,
+            send_landing_target=self.autopilot.landing_targets.append,
+            send_obstacle_distance=self.autopilot.obstacle_distances.append,
+            request_path=self.path_requests.append,
+        )
         self.events += output.events
         self.outputs.append(output)
         self.results |= {result.identifier: result.outcome for result in output.results}

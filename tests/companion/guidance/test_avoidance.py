@@ -31,8 +31,7 @@ def harness_with(
     """Guidance whose perception worker plans by `plan`, for the newest request, and sees objects."""
 
     def add_plan(inputs: GuidanceInput) -> GuidanceInput:
-        requests = (output.path_request for output in reversed(harness.outputs))
-        request = next((request for request in requests if request is not None), None)
+        request = harness.path_requests[-1] if harness.path_requests else None
         planned = plan(inputs)
         inputs = replace(inputs, targets=look(harness.vehicle, objects, inputs.seen_ns or 0))
         if planned is None or request is None:
@@ -72,7 +71,7 @@ def test_goto_flies_the_planned_path() -> None:
     assert track[-1][:2] == pytest.approx((12.0, 0.0), abs=0.3)
     assert next(iter(harness.results.values())).success
     assert harness.guidance.path == ()  # arrived
-    request = next(output.path_request for output in harness.outputs if output.path_request)
+    request = harness.path_requests[0]
     assert request.clearance_m == pytest.approx(1.2)
     assert request.reference[-1] == pytest.approx((12.0, 0.0), abs=0.1)
 
@@ -95,7 +94,7 @@ def test_no_path_is_requested_without_avoid_or_by_hold() -> None:
     holding.run(0.1)
     holding.command(HoldBehaviour())
     holding.run(3.0)
-    assert not any(output.path_request for output in (*straight.outputs, *holding.outputs))
+    assert straight.path_requests == holding.path_requests == []
 
 
 def test_path_of_the_command_before_is_not_flown() -> None:
@@ -107,7 +106,7 @@ def test_path_of_the_command_before_is_not_flown() -> None:
         ),
     )
     assert max(math.hypot(north, east) for north, east, _ in flown(harness, 5.0)) < 0.3
-    numbers = {output.path_request.number for output in harness.outputs if output.path_request is not None}
+    numbers = {request.number for request in harness.path_requests}
     assert len(numbers) == 1
     assert 1 not in numbers
 

@@ -212,15 +212,15 @@ def test_slow_climb_keeps_its_speed() -> None:
     assert max(abs(b[2] - a[2]) for a, b in steps) < 0.25 / 50
 
 
-def test_point_relative_to_home_needs_home() -> None:
+@pytest.mark.parametrize("text", ["goto 1 2", "follow-path 1,2 3,4", "goto forward=1 right=1 altitude=5"])
+def test_point_relative_to_home_needs_home(text: str) -> None:
     vehicle = KinematicVehicle()
     state = replace(vehicle.state, home_position_ned_m=None)
-    for text in ("goto 1 2", "follow-path 1,2 3,4", "goto forward=1 right=1 altitude=5"):
-        behaviour = grammar.parse(text).build(NO_CONTEXT)
-        behaviour.on_activate(BehaviourContext(vehicle.now_ns, state))
-        step = behaviour.update(0.0, BehaviourContext(vehicle.now_ns, state))
-        assert isinstance(step, Outcome)
-        assert "home position" in step.reason
+    behaviour = grammar.parse(text).build(NO_CONTEXT)
+    behaviour.on_activate(BehaviourContext(vehicle.now_ns, state))
+    step = behaviour.update(0.0, BehaviourContext(vehicle.now_ns, state))
+    assert isinstance(step, Outcome)
+    assert "home position" in step.reason
 
 
 def test_figure_eight_stays_on_its_line() -> None:

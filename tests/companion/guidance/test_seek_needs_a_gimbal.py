@@ -11,12 +11,20 @@ import pytest
 from companion.guidance.behaviour import Behaviour, BehaviourContext, GimbalStatus, Outcome
 from companion.guidance.behaviours.approach import ApproachBehaviour
 from companion.guidance.behaviours.gimbal_pointing import PointGimbalBehaviour
+from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.behaviours.seek import SeekBehaviour
+from companion.guidance.core import GuidanceOptions
+from companion.guidance.gimbal.controller import GimbalMounting
 from companion.guidance.gimbal.pitch import GimbalSweep
 from companion.guidance.requirements import check_requirements
 from companion.vehicle.gimbal import CONTROL_MAX_AGE_S, NOBODY, GimbalAim, GimbalState
-from companion.vehicle.setpoint import Setpoint
-from tests.companion.guidance.guidance_harness import assert_failed
+from tests.companion.guidance.guidance_harness import (
+    GuidanceHarness,
+    ScriptedGimbal,
+    assert_failed,
+    engaged,
+    flying,
+)
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle
 from vision.attitude import quaternion_from_euler
 
@@ -39,11 +47,8 @@ def gimbal(now_ns: int, pitch_deg: float = 0.0, **changes: Any) -> GimbalState:
     return replace(replace(known, lowest_pitch_rad=low, highest_pitch_rad=high), **changes)
 
 
-def context(
-    gimbal_state: GimbalState | None, status: GimbalStatus = CARRIED, now_ns: int = 0
-) -> BehaviourContext:
+def context(gimbal_state: GimbalState | None, status: GimbalStatus = CARRIED) -> BehaviourContext:
     vehicle = KinematicVehicle()
-    vehicle.now_ns = now_ns or vehicle.now_ns
     state = replace(vehicle.state, gimbal=gimbal_state)
     return BehaviourContext(vehicle.now_ns, state, (), 0.05, not status.direction_fault, gimbal=status)
 
@@ -122,56 +127,57 @@ def test_unknown_camera_direction_is_refused(
     assert "direction (no gimbal)" in why
 
 
-def fly(
-    behaviour: Behaviour, statuses: list[GimbalStatus], follows: bool = True, limit_s: float = 60.0
-) -> Outcome | None:
-    """20 updates a second; the gimbal follows its aim or not; the last status is kept."""
-    now_ns, pitch_deg, yaw_rad = NOW_NS, 0.0, 0.0
-    for turn in range(round(limit_s * 20)):
-        status = statuses[min(turn, len(statuses) - 1)]
-        now = context(gimbal(now_ns, pitch_deg), status, now_ns)
-        now = replace(now, state=replace(now.state, attitude=quaternion_from_euler(0.0, 0.0, yaw_rad)))
-        if turn == 0:
-            behaviour.on_activate(now)
-        step = behaviour.update(0.05, now)
-        if isinstance(step, Outcome):
-            return step
-        assert isinstance(step, Setpoint)
-        aim = behaviour.gimbal_aim
-        if follows and aim is not None:
-            pitch_deg = math.degrees(aim.pitch_rad)
-        yaw_rad += 0.05 * (step.yaw_rate_radps or 0.0)
-        now_ns += 50_000_000
-    return None
+class KeepsAim(HoldBehaviour):
+    """Holds with a gimbal aim, whatever happens to the gimbal."""
+
+    gimbal_aim = GimbalAim(-0.7)
+
+
+def harness_with_gimbal(**changes: Any) -> GuidanceHarness:
+    """In flight, with the camera on a gimbal. `changes`: of the scripted gimbal."""
+    mounting = GimbalMounting(carries_camera=True, carries_steering=True)
+    harness = GuidanceHarness(flying(), options=GuidanceOptions(gimbal=mounting))
+    harness.autopilot.gimbal = ScriptedGimbal(**changes)
+    harness.run(0.1)
+    return harness
 
 
 def test_lost_gimbal_control_ends_seek_with_the_owner() -> None:
-    taken = replace(CARRIED, problem="taken by 245/190")
-    outcome = fly(seek(), [CARRIED] * 20 + [taken])
-    assert_failed(outcome, "lost the gimbal", "245/190")
+    harness = harness_with_gimbal()
+    command = engaged(harness, seek())
+    assert harness.autopilot.gimbal is not None
+    harness.autopilot.gimbal.primary = (245, 190)
+    assert_failed(harness.outcome(command, 1.0), "lost the gimbal", "245/190")
 
 
-def test_previous_gimbal_problem_does_not_end_seek() -> None:
-    """A step of a mission begins in the update in which the previous one ended."""
-    before = replace(CARRIED, problem="taken by 245/190")
-    for behaviour in (seek(), PointGimbalBehaviour(GimbalAim(-0.5))):
-        outcome = fly(behaviour, [before, CARRIED], limit_s=3.0)
-        assert outcome is None or outcome.success
+@pytest.mark.parametrize("behaviour", [seek(), PointGimbalBehaviour(GimbalAim(-0.5))])
+def test_previous_gimbal_problem_does_not_end_the_next(behaviour: Behaviour) -> None:
+    """A behaviour begins in the step in which the previous one is replaced."""
+    harness = harness_with_gimbal(refuses="denied")
+    engaged(harness, KeepsAim())
+    assert harness.autopilot.gimbal is not None
+    harness.autopilot.gimbal.refuses = None
+    assert harness.guidance.gimbal.problem(harness.vehicle.now_ns, harness.autopilot.state) == "denied"
+    command = harness.command(behaviour)
+    harness.run(3.0)
+    assert not command.done() or command.result().success
 
 
 def test_stuck_gimbal_ends_seek() -> None:
-    outcome = fly(seek(), [CARRIED], follows=False)
-    assert outcome is not None
-    assert not outcome.success
-    assert "does not follow" in outcome.reason
+    harness = harness_with_gimbal(follows=False)
+    outcome = harness.outcome(engaged(harness, seek()))
+    assert_failed(outcome, "does not follow")
     assert outcome.reason.endswith("measured 0°")
 
 
 def test_silent_gimbal_ends_seek_with_the_reason() -> None:
-    silent = replace(CARRIED, direction_fault="0.6 s old")
-    outcome = fly(seek(), [CARRIED] * 20 + [silent])
-    assert outcome is not None
-    assert outcome.reason.endswith("(0.6 s old) for 5 s")
+    harness = harness_with_gimbal()
+    command = engaged(harness, seek())
+    assert harness.autopilot.gimbal is not None
+    harness.autopilot.gimbal.reports_attitude = False
+    outcome = harness.outcome(command)
+    assert_failed(outcome, "camera direction unknown", "attitude 5.")
+    assert outcome.reason.endswith("s old) for 5 s")
 
 
 @pytest.mark.parametrize(
@@ -184,16 +190,18 @@ def test_silent_gimbal_ends_seek_with_the_reason() -> None:
 )
 @pytest.mark.parametrize("ended", [False, True])
 def test_cleared_gimbal_attitude_ends_the_sweep(left: GimbalState | None, ended: bool) -> None:
-    behaviour = SeekBehaviour("car", sweep=sweep())
-    now = context(gimbal(NOW_NS))
-    behaviour.on_activate(now)
-    assert isinstance(behaviour.update(0.05, now), Setpoint)
-    behaviour._failure = "no car found" if ended else ""  # the gimbal then returns
-    later = replace(now, now_ns=NOW_NS + 50_000_000, state=replace(now.state, gimbal=left))
+    behaviour = SeekBehaviour("car", sweep=sweep(), laps=0.1)
+    harness = harness_with_gimbal()
+    command = engaged(harness, behaviour)
+    harness.until(lambda: bool(behaviour._failure) is ended, 20.0)  # after a failure the gimbal returns
+    assert harness.autopilot.gimbal is not None
+    vars(harness.autopilot.gimbal)["state"] = lambda now_ns: left
     reason = "gimbal manager not responding"
     if left is not None:
-        reason = f"seek lost the gimbal: {left.why_not_looking(later.now_ns) or '?'}"
-    assert behaviour.update(0.05, later) == Outcome(False, reason)
+        reason = f"seek lost the gimbal: {left.why_not_looking(NOW_NS) or '?'}"
+    assert not command.done()
+    harness.run()
+    assert command.result() == Outcome(False, reason)
 
 
 def test_missing_gimbal_at_the_start_is_named() -> None:
@@ -204,12 +212,13 @@ def test_missing_gimbal_at_the_start_is_named() -> None:
 
 
 def test_mission_step_ends_when_the_gimbal_points_there() -> None:
-    outcome = fly(PointGimbalBehaviour(GimbalAim(-0.5)), [CARRIED])
-    assert outcome is not None
+    pointed = PointGimbalBehaviour(GimbalAim(-0.5))
+    harness = harness_with_gimbal()
+    outcome = harness.outcome(harness.command(pointed))
     assert outcome.success
     assert "29° down" in outcome.reason
-    outcome = fly(PointGimbalBehaviour(GimbalAim(-0.5)), [CARRIED], follows=False)
-    assert_failed(outcome, "29° down")
+    stuck = harness_with_gimbal(follows=False)
+    assert_failed(stuck.outcome(stuck.command(pointed)), "29° down")
 
 
 @pytest.mark.parametrize(("end_deg", "rate_dps"), [(-60.0, 20.0), (-90.0, 40.0), (30.0, 5.0)])

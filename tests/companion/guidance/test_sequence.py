@@ -323,7 +323,7 @@ def test_mission_forwards_notes_and_requirements() -> None:
     future = begun(harness, behaviour)
     harness.until(lambda: harness.guidance.phase == "offboard")
     assert behaviour.landing_target == TARGET
-    assert [output.landing_target for output in harness.outputs if output.landing_target] == [TARGET], "once"
+    assert harness.autopilot.landing_targets == [TARGET], "once"
     assert behaviour.active is noting
     assert behaviour.requirements == noting.requirements
     harness.outcome(future)
