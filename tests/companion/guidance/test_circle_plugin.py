@@ -16,8 +16,6 @@ from companion.guidance.command import COMMANDS
 from mavlink_sim.testing import QUICK_FLIGHT, RunningSimulator
 from tests.companion.service_process import running_service
 
-pytestmark = pytest.mark.realtime
-
 EXAMPLE = Path(__file__).parents[3] / "examples" / "circle"
 
 
@@ -65,6 +63,7 @@ def test_plugin_flies_its_circle(installed: Path, monkeypatch: pytest.MonkeyPatc
     assert np.ptp(np.hypot(*(points - (north, east)).T)) < 1.2
 
 
+@pytest.mark.realtime
 @pytest.mark.timeout(200)
 @pytest.mark.vehicle(parameters=QUICK_FLIGHT)
 def test_service_flies_an_installed_plugin(

@@ -22,8 +22,6 @@ from mavlink_sim.testing import QUICK_FLIGHT, running_simulator
 from tests.companion.command_line import companion, companion_here
 from tests.companion.service_process import running_service
 
-pytestmark = pytest.mark.realtime
-
 NAMES = ("person", "car", "traffic light")
 DOCUMENT = Path(__file__).parents[3] / "docs" / "flight.md"
 
@@ -236,6 +234,7 @@ do = "land"
 """
 
 
+@pytest.mark.realtime
 @pytest.mark.timeout(120)
 def test_service_flies_a_mission_and_logs_its_steps(seeing: list[str], tmp_path: Path) -> None:
     (tmp_path / "here").mkdir()

@@ -20,8 +20,6 @@ from companion.vehicle.state import FlightMode, VehicleState
 from mavlink_sim.testing import QUICK_FLIGHT, running_simulator
 from tests.companion.live_flight import LiveFlight
 
-pytestmark = pytest.mark.realtime
-
 S = 1_000_000_000
 NOW_NS = 1000 * S
 
@@ -128,6 +126,7 @@ def test_appearance_and_loss_are_reported_once() -> None:
     assert [level for level, _ in here.events] == ["error", "info"]
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize(("kind", "autopilot"), [("mavsdk", "px4"), ("pymavlink", "ardupilot")])
 async def test_two_services_on_two_links_of_one_vehicle(kind: str, autopilot: str) -> None:
     parameters = QUICK_FLIGHT if autopilot == "px4" else None

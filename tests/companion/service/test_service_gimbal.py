@@ -25,8 +25,6 @@ from vision.detections import Detections
 from vision.frame import Frame
 from vision.pipeline import PerceptionResult
 
-pytestmark = pytest.mark.realtime
-
 PITCH_RAD, HEADING_RAD = -0.9, 1.2
 
 
@@ -129,6 +127,7 @@ def test_camera_pitch_includes_the_gimbal() -> None:
     assert fixed.inputs.camera_pitch_rad(fixed.driver.state) == pytest.approx(-math.radians(10.0))
 
 
+@pytest.mark.realtime
 async def test_gimbal_command_without_a_gimbal_is_refused() -> None:
     service = service_of()
     service.ready = True
