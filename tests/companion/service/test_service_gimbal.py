@@ -127,6 +127,15 @@ def test_camera_pitch_includes_the_gimbal() -> None:
     assert fixed.inputs.camera_pitch_rad(fixed.driver.state) == pytest.approx(-math.radians(10.0))
 
 
+def test_recorded_camera_has_a_calibration_that_arrives_later() -> None:
+    service = service_of()
+    camera, mounting = service.cameras[0], service.guidance.gimbal.mounting
+    assert service.inputs.step_context(mounting).camera == camera.settings.camera.model_dump_json()
+    calibrated = camera.settings.camera.model_copy(update={"mount_pitch_deg": -10.0})
+    camera.settings = camera.settings.model_copy(update={"camera": calibrated})
+    assert service.inputs.step_context(mounting).camera == calibrated.model_dump_json()
+
+
 @pytest.mark.realtime
 async def test_gimbal_command_without_a_gimbal_is_refused() -> None:
     service = service_of()
