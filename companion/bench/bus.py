@@ -322,12 +322,14 @@ def _detections(sequence: int) -> DetectionsBody:
         "ground_range_m": 11.337,
         "distance_m": 11.34,
         "range_source": "depth",
-        "range_sigma_m": 0.272,
+        "range_sigma_m": 0.147,
+        "depth_sigma_m": 0.147,
+        "distance_sigma_m": 0.147,
         "position_ned_m": [11.323, 0.581, -2.41],
         "latitude_deg": 47.39781404,
         "longitude_deg": 8.54560773,
         "altitude_amsl_m": 490.41,
-        "error_ellipse": {"semi_major_m": 0.42, "semi_minor_m": 0.36, "orientation_rad": 0.0512},
+        "error_ellipse": {"semi_major_m": 0.38, "semi_minor_m": 0.352, "orientation_rad": 1.622},
     }
     now_ns = time.monotonic_ns()
     return {

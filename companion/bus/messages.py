@@ -142,6 +142,8 @@ def _detection(
         "distance_m": None if target is None else _number(target.distance_m),
         "range_source": None if target is None else target.range_source.value,
         "range_sigma_m": None if target is None else _number(target.range_sigma_m),
+        "depth_sigma_m": None if target is None else _number(target.depth_sigma_m),
+        "distance_sigma_m": None if target is None else _number(target.distance_sigma_m),
         **_position_fields(position, origin, ellipse),
     }
 

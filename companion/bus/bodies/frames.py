@@ -101,6 +101,10 @@ class DetectionBody(PositionBody):
     """what the range was measured by; none: no range"""
     range_sigma_m: float | None
     """one-sigma error of ground_range_m"""
+    depth_sigma_m: float | None
+    """one-sigma error of depth_m"""
+    distance_sigma_m: float | None
+    """one-sigma error of distance_m"""
 
 
 class DetectionsBody(FrameBody):
@@ -206,7 +210,7 @@ class MarkerBody(TypedDict):
     covariance_body: Covariance | None
     """upper right triangle, row by row, of position (m²) and rotation about the body's axes (rad²)"""
     range_sigma_m: float | None
-    """one sigma of the distance, from that"""
+    """one sigma of distance_m, not of ground_range_m, from that"""
     angle_sigma_rad: float | None
     """one sigma of the rotation about the least certain axis, from that"""
 
@@ -231,7 +235,7 @@ class BoardBody(TypedDict):
     covariance_body: Covariance
     """as of a marker"""
     range_sigma_m: float
-    """as of a marker"""
+    """one sigma of the straight distance of its origin, from that"""
     angle_sigma_rad: float
     """as of a marker"""
 

@@ -22,11 +22,15 @@ from companion.guidance.targets.range_error import (
     BoxError,
     PoseError,
     across_sigma_m,
+    depth_distance_sigma_m,
+    depth_range_sigma_m,
     depth_sigma_m,
     edge_sigma_px,
-    ground_sigma_m,
+    ground_distance_sigma_m,
+    ground_range_sigma_m,
     height_sigma_m,
-    size_sigma_m,
+    size_distance_sigma_m,
+    size_range_sigma_m,
 )
 from companion.guidance.targets.target import RangeSource, Target
 from companion.vehicle.gimbal import YawFrame
@@ -361,7 +365,7 @@ def _target(
 ) -> Target:
     left, top, right, bottom = detection["xyxy"]
     direction = sight.direction
-    source, offset, sigma_m = RangeSource.NONE, [math.nan] * 3, math.nan
+    source, offset, sigma_m, distance_sigma_m = RangeSource.NONE, [math.nan] * 3, math.nan, math.nan
     whole_below = bottom < camera.height - 1 - EDGE_PX
     box = BoxError(
         sight.pixel_rad,
@@ -376,18 +380,24 @@ def _target(
         source = RangeSource.DEPTH
         offset = _towards(sight.lens, direction, sight.nearest)
         depth_m = detection["nearest_camera_m"][2] if detection["nearest_camera_m"] else math.nan
-        sigma_m = depth_sigma_m(*_range_and_drop(offset, sight.lens), depth_m, box, pose.error)
+        range_and_drop = _range_and_drop(offset, sight.lens)
+        sigma_m = depth_range_sigma_m(*range_and_drop, depth_m, box, pose.error)
+        distance_sigma_m = depth_distance_sigma_m(*range_and_drop, depth_m, box)
     elif whole_below and pose.height_m > MIN_HEIGHT_M and math.isfinite(sight.on_ground[0]):
         source = RangeSource.GROUND_PLANE
         offset = _nearer(sight.lens, sight.direction, sight.on_ground, CONTACT_INSET_M)
-        sigma_m = ground_sigma_m(*_range_and_drop(sight.on_ground, sight.lens), box, pose.error)
+        range_and_drop = _range_and_drop(sight.on_ground, sight.lens)
+        sigma_m = ground_range_sigma_m(*range_and_drop, box, pose.error)
+        distance_sigma_m = ground_distance_sigma_m(sigma_m, *range_and_drop, pose.error)
     elif height_m is not None and _measurable(camera, top, bottom):
         offset = range_from_known_height(
             camera, mount, pose.ned_from_body, detection["xyxy"], height_m
         ).tolist()
         if all(map(math.isfinite, offset)):
             source = RangeSource.KNOWN_HEIGHT
-            sigma_m = size_sigma_m(*_range_and_drop(offset, sight.lens), height_m, box, pose.error)
+            range_and_drop = _range_and_drop(offset, sight.lens)
+            sigma_m = size_range_sigma_m(*range_and_drop, height_m, box, pose.error)
+            distance_sigma_m = size_distance_sigma_m(sigma_m, *range_and_drop, box, pose.error)
     known = source is not RangeSource.NONE
     north, east, down = (origin + away for origin, away in zip(pose.position_ned_m, offset, strict=True))
     return Target(
@@ -404,7 +414,9 @@ def _target(
         track_score=detection.get("track_score"),
         trusted=trusted and detection.get("track_state") in (None, TRACK_CONFIRMED),
         depth_m=math.nan if detection["depth_m"] is None else detection["depth_m"],
+        depth_sigma_m=math.nan if detection["depth_m"] is None else depth_sigma_m(detection["depth_m"], box),
         distance_m=math.hypot(*offset),
+        distance_sigma_m=distance_sigma_m,
         cut=box.cut,
         range_sigma_m=sigma_m,
         across_sigma_m=across_sigma_m(*_range_and_drop(offset, sight.lens), box, pose.error),

@@ -57,7 +57,7 @@ class BodyPose:
 
     @property
     def range_sigma_m(self) -> float:
-        """One sigma of the distance from the vehicle."""
+        """One sigma of the straight distance from the vehicle."""
         line = np.array(self.position_m) / max(float(np.linalg.norm(self.position_m)), 1e-9)
         return math.sqrt(float(line @ self.matrix[:3, :3] @ line))
 

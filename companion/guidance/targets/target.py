@@ -52,6 +52,8 @@ class Target:
             unknown. Which point: by depth, of the surface, at the height of the nearest one; by the ground
             plane, of the ground below the nearest surface; by the class's height, the object's foot; the
             marker's centre.
+        depth_sigma_m, distance_sigma_m: one sigma of `depth_m` and of `distance_m`; NaN: not stated, as for
+            a marker.
         cut: the image's edge may cut the object off, so the box's centre is not the object's.
         range_sigma_m: one sigma of `ground_range_m`; NaN: not stated.
         across_sigma_m: the same across the line of sight, horizontal.
@@ -77,6 +79,8 @@ class Target:
     range_sigma_m: float = math.nan
     across_sigma_m: float = math.nan
     vehicle_sigma_m: float = 0.0
+    depth_sigma_m: float = math.nan
+    distance_sigma_m: float = math.nan
 
     @property
     def position_covariance(self) -> NDArray[np.float64] | None:

@@ -190,6 +190,8 @@ def test_detections_of_the_steering_camera_have_their_targets() -> None:
     assert near["bearing_rad"] == pytest.approx(targets[0].bearing_rad, abs=1e-4)
     assert near["ground_range_m"] == pytest.approx(targets[0].ground_range_m, abs=1e-3)
     assert near["range_sigma_m"] == pytest.approx(targets[0].range_sigma_m, abs=1e-3)
+    assert near["distance_sigma_m"] == pytest.approx(targets[0].distance_sigma_m, abs=1e-3)
+    assert (near["depth_sigma_m"], far["distance_sigma_m"]) == (None, None)
     assert near["latitude_deg"] is not None
     assert near["longitude_deg"] is not None
     position = near["position_ned_m"]

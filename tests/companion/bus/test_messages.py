@@ -82,6 +82,8 @@ def test_detection_message() -> None:
                 "distance_m": None,
                 "range_source": None,
                 "range_sigma_m": None,
+                "depth_sigma_m": None,
+                "distance_sigma_m": None,
                 "position_ned_m": None,
                 "latitude_deg": None,
                 "longitude_deg": None,

@@ -53,10 +53,12 @@ class View(NamedTuple):
 
 
 class Ranged(NamedTuple):
-    """A box as detected, and the true horizontal range of the nearest surface."""
+    """A box as detected, and the truth: horizontal range and height below of the point, and its depth."""
 
     xyxy: tuple[float, float, float, float]
     true_m: float
+    drop_m: float
+    depth_m: float = math.nan
     nearest: Vector | None = None
     known_m: float | None = None
 
@@ -96,7 +98,9 @@ def by_ground(view: View, rng: np.random.Generator) -> Ranged:
     middle -= rng.normal(0.0, range_error.CONTACT_SIGMA * view.width_px)
     inset_m = rng.normal(CONTACT_INSET_M, range_error.INSET_SIGMA_M)
     true_m = math.hypot(*view.foot[:2]) - inset_m
-    return Ranged(box_about(middle, top, bottom + edge_px(rng, bottom - top), view.width_px), true_m)
+    return Ranged(
+        box_about(middle, top, bottom + edge_px(rng, bottom - top), view.width_px), true_m, view.foot[2]
+    )
 
 
 def by_depth(view: View, rng: np.random.Generator) -> Ranged:
@@ -106,7 +110,7 @@ def by_depth(view: View, rng: np.random.Generator) -> Ranged:
     x, y = CAMERA.project(optical)[0]
     box = box_about(x, y - 10.0, y + 10.0, view.width_px)
     measured = optical * (1.0 + rng.normal(0.0, sigma_m) / optical[2])
-    return Ranged(box, math.hypot(*point[:2]), measured)
+    return Ranged(box, math.hypot(*point[:2]), point[2], optical[2], measured)
 
 
 def by_size(view: View, rng: np.random.Generator) -> Ranged:
@@ -127,7 +131,7 @@ def by_size(view: View, rng: np.random.Generator) -> Ranged:
     height_px = bottom - top
     box = box_about(x, top + edge_px(rng, height_px), bottom + edge_px(rng, height_px), view.width_px)
     known_m = view.tall_m / (1.0 + rng.normal(0.0, range_error.SIZE_SIGMA_SHARE))
-    return Ranged(box, range_m, known_m=known_m)
+    return Ranged(box, range_m, view.foot[2], known_m=known_m)
 
 
 def slope_of(view: View, x: float, y: float) -> float:
@@ -168,9 +172,9 @@ def ranged_target(view: View, ranged: Ranged, rng: np.random.Generator) -> Targe
 def errors(
     source: RangeSource, measure: Callable[[View, np.random.Generator], Ranged], seed: int
 ) -> tuple[Vector, Vector]:
-    """(N,) true ranges and errors in sigma."""
+    """(N,) true ranges, and (N, 3) errors of range, distance and depth in sigma; NaN without a depth."""
     rng = np.random.default_rng(seed)
-    found: list[tuple[float, float]] = []
+    found: list[tuple[float, ...]] = []
     while len(found) < COUNT:
         view = random_view(rng)
         depression = math.atan2(view.foot[2], math.hypot(*view.foot[:2]))
@@ -184,9 +188,17 @@ def errors(
             continue
         target = ranged_target(view, ranged, rng)
         if target.range_source is source:
-            found.append((ranged.true_m, (target.ground_range_m - ranged.true_m) / target.range_sigma_m))
-    true_m, in_sigma = np.array(found).T
-    return true_m, in_sigma
+            distance_m = math.hypot(ranged.true_m, ranged.drop_m)
+            found.append(
+                (
+                    ranged.true_m,
+                    (target.ground_range_m - ranged.true_m) / target.range_sigma_m,
+                    (target.distance_m - distance_m) / target.distance_sigma_m,
+                    (target.depth_m - ranged.depth_m) / target.depth_sigma_m,
+                )
+            )
+    found_m = np.array(found)
+    return found_m[:, 0], found_m[:, 1:]
 
 
 @pytest.mark.parametrize(
@@ -202,11 +214,12 @@ def test_two_thirds_of_the_errors_are_within_one_sigma(
     source: RangeSource, measure: Callable[[View, np.random.Generator], Ranged]
 ) -> None:
     true_m, in_sigma = errors(source, measure, seed=23)
-    within = np.abs(in_sigma) <= 1.0
     near = true_m < np.median(true_m)
-    for share in (within.mean(), within[near].mean(), within[~near].mean()):
-        assert 0.63 <= share <= 0.73
-    assert abs(float(np.median(in_sigma))) < 0.15
+    for each in in_sigma.T[: 3 if source is RangeSource.DEPTH else 2]:
+        within = np.abs(each) <= 1.0
+        for share in (within.mean(), within[near].mean(), within[~near].mean()):
+            assert 0.63 <= share <= 0.73
+        assert abs(float(np.median(each))) < 0.15
     assert true_m.min() < 5.0
     assert true_m.max() > 50.0
 

@@ -245,6 +245,24 @@ def test_box_cut_by_the_edge_has_a_larger_sigma() -> None:
     assert (whole.cut, cut.cut) == (False, True)
 
 
+def test_depth_and_distance_have_their_own_sigmas() -> None:
+    history = history_of(quaternion_from_euler(0.0, 0.0, 0.0))
+    boxes = [detection((310, 200, 330, 300), (0.0, 3.0, 4.0)), detection((310, 300, 330, 400))]
+    boxes += [detection((300, 300, 339, 479))]
+    by_depth, by_ground, none = targets_from_detections(boxes, T0, CAMERA, CameraMount(), history)
+    # 0.07 m and 0.0003 * 4^2.5 m, and 5 m away at a depth of 4 m.
+    assert by_depth.depth_sigma_m == pytest.approx(math.hypot(0.07, 0.0096))
+    assert by_depth.distance_sigma_m == pytest.approx(1.25 * by_depth.depth_sigma_m)
+    assert by_depth.range_sigma_m < by_depth.depth_sigma_m + 0.01
+    # The height is 0.3 m off.
+    assert math.isnan(by_ground.depth_sigma_m)
+    level = by_ground.ground_range_m / by_ground.distance_m
+    expected_m = math.hypot(level * by_ground.range_sigma_m, 0.3 * math.hypot(1.0, level))
+    assert by_ground.distance_sigma_m == pytest.approx(expected_m, rel=0.02)
+    assert math.isnan(none.depth_sigma_m)
+    assert math.isnan(none.distance_sigma_m)
+
+
 def test_box_within_the_error_of_its_edges_may_be_cut() -> None:
     history = history_of(quaternion_from_euler(0.0, 0.0, 0.0))
     boxes = [(left, 300, left + 60, 400) for left in (4, CAMERA.width - 64, 10, CAMERA.width - 70)]

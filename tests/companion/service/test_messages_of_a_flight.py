@@ -99,6 +99,7 @@ def test_every_message_of_a_flight_is_valid(tmp_path: Path) -> None:
     assert 5.0 < middle["position_ned_m"][0] < 11.0
     assert middle["range_source"] == "depth"
     assert middle["range_sigma_m"] > 0.0
+    assert min(middle["depth_sigma_m"], middle["distance_sigma_m"]) > 0.0
     state = next(body for body in bodies["vehicle"] if body["latitude_deg"] is not None)
     assert 0.0 < middle["latitude_deg"] - state["latitude_deg"] < 2e-4
     assert max(car["track_age_s"] for _, car in cars) > 1.0
