@@ -46,6 +46,7 @@ class Steering:
 
     def __init__(self, publisher: zenoh.Publisher, source: str) -> None:
         self._publisher, self.source = publisher, source
+        self._statuses, self._flown_instead = 0, ""
 
     def send(
         self,
@@ -66,7 +67,13 @@ class Steering:
 
         Raises:
             ValueError: a value is not finite or out of range.
+            CommandFailedError: the command has ended, as far as `status` has shown it, within about 2 s.
         """
+        if self._flown_instead:
+            reason = f"ended, the vehicle flies something else: {self._flown_instead}"
+            raise CommandFailedError(
+                {"command": f"velocity source={self.source}", "success": False, "reason": reason}
+            )
         body: VelocityBody = {
             "source": self.source,
             "stamp_ns": time.monotonic_ns(),
@@ -83,6 +90,13 @@ class Steering:
             name = str(first["loc"][0]).partition("_")[0]
             raise ValueError(f"{name}: {first['msg']}, got {first['input']}") from None
         self._publisher.put(json.dumps(body))
+
+    def _on_status(self, sample: zenoh.Sample) -> None:
+        self._statuses += 1
+        behaviour: str = json.loads(sample.payload.to_string())["pilot"]["behaviour"]
+        # The first one may have been made before the command began.
+        if self._statuses > 1 and not behaviour.startswith(f"velocity of {self.source}"):
+            self._flown_instead = behaviour
 
 
 @cache
@@ -101,6 +115,8 @@ class Drone(Commands):
 
     def __init__(self, session: zenoh.Session, name: str) -> None:
         self._session, self.name = session, name
+        # One for all its steering: the last message of the one before is still valid at the next.
+        self._source = f"client-{uuid.uuid4().hex[:8]}"
 
     @property
     def session(self) -> zenoh.Session:
@@ -175,23 +191,25 @@ class Drone(Commands):
         """Begin the command `velocity` for this program's messages; afterwards the vehicle brakes and holds.
 
         Raises:
-            CommandFailedError, NoAnswerError: as `command`.
+            CommandFailedError: it is refused, for example while another sender steers.
+            NoAnswerError: as `command`.
         """
-        topic, source = topics.VELOCITY, f"client-{uuid.uuid4().hex[:8]}"
-        publisher = self._session.declare_publisher(
+        topic = topics.VELOCITY
+        with self._session.declare_publisher(
             topic.key(self.name),
             encoding=topic.encoding,
             congestion_control=zenoh.CongestionControl.DROP,
             priority=topic.priority,
             express=topic.express,
-        )
-        steering = Steering(publisher, source)
-        try:
-            await self.velocity(source=source)
-            yield steering
-        finally:
-            steering.send()
-            publisher.undeclare()  # type: ignore[no-untyped-call]
+        ) as publisher:
+            steering = Steering(publisher, self._source)
+            await self.velocity(source=self._source)
+            with self._session.declare_subscriber(topics.STATUS.key(self.name), steering._on_status):
+                try:
+                    yield steering
+                finally:
+                    with suppress(CommandFailedError):  # something else is flown
+                        steering.send()
 
     async def query(self, path: str) -> Any:
         """Ask one of the queryables status, config, models, commands.

@@ -219,6 +219,10 @@ class Behaviour(ABC):
         """Points it would fly to if it began now, local NED metres, as far as they are known."""
         return ()
 
+    def blocked_by(self, active: Behaviour, context: BehaviourContext) -> str | None:
+        """Why it must not replace the active behaviour now, in words; None: it may."""
+        return None
+
     def on_activate(self, context: BehaviourContext) -> None:  # noqa: B027  (an optional hook)
         """Called once, before the first update."""
 

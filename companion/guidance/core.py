@@ -304,6 +304,9 @@ class Guidance:
         assert behaviour is not None
         try:
             missing = self.check_requirements(behaviour)
+            active = self._active or self._behaviour  # one that has just begun is not known as active yet
+            if missing is None and active is not None:
+                missing = behaviour.blocked_by(active, context)
         except Exception as error:
             logger.exception("%s cannot be checked", behaviour.name)
             missing = f"{behaviour.name} cannot begin: {type(error).__name__}: {error}"

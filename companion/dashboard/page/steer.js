@@ -16,15 +16,17 @@ const KEYS = {
 // Axes of the Gamepad API's standard layout, as a remote control's in mode 2.
 const STICKS = { turn: [0, 1], up: [1, -1], right: [2, 1], forward: [3, -1] };
 
+// One of this page, also when it steers again: its last message is still valid then.
+const source = `page-${Math.random().toString(36).slice(2, 10)}`;
 const pressed = new Set();
-let steering = null; // { source, vehicle, since, timer, sending }
+let steering = null; // { vehicle, since, timer, sending }
 
-function begin(source) {
+function begin() {
   if (steering) clearInterval(steering.timer);
   pressed.clear();
   document.activeElement.blur();
   const timer = setInterval(tick, PERIOD_MS);
-  steering = { source, vehicle: state.vehicle, since: performance.now(), timer, sending: false };
+  steering = { vehicle: state.vehicle, since: performance.now(), timer, sending: false };
   show("Steering: W A S D fly, arrows climb and turn.");
 }
 
@@ -43,7 +45,7 @@ function show(text) {
 }
 
 function tick() {
-  const { source, vehicle, since, sending } = steering;
+  const { vehicle, since, sending } = steering;
   const { behaviour = "" } = (state.topics.status || {}).pilot || {};
   if (vehicle !== state.vehicle) {
     end("Another vehicle is shown.");
@@ -69,7 +71,7 @@ const stick = (value) => Math.sign(value) * Math.max(0, Math.abs(value) - DEAD_Z
 async function post(to, { forward, right, up, turn }) {
   const speed = Number($("steer-speed").value) || 0;
   const body = JSON.stringify({
-    vehicle: to.vehicle, source: to.source, stamp_ns: Math.round(performance.now() * 1e6), lifetime_s: LIFETIME_S,
+    vehicle: to.vehicle, source, stamp_ns: Math.round(performance.now() * 1e6), lifetime_s: LIFETIME_S,
     forward_mps: forward * speed, right_mps: right * speed, up_mps: up * speed,
     turn_radps: turn * (Number($("steer-turn").value) || 0) * Math.PI / 180,
   });
@@ -90,8 +92,7 @@ $("steer").addEventListener("click", () => {
   if (steering) {
     end("Ended: the vehicle holds.");
   } else {
-    const source = `page-${Math.random().toString(36).slice(2, 10)}`;
-    send(`velocity source=${source}`, () => begin(source));
+    send(`velocity source=${source}`, begin);
   }
 });
 document.addEventListener("keydown", (event) => {

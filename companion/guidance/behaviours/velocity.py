@@ -69,6 +69,15 @@ class VelocityBehaviour(Behaviour):
         self._received_ns: int | None = None
         self._silent = False
 
+    def blocked_by(self, active: Behaviour, context: BehaviourContext) -> str | None:
+        """See Behaviour: a sender whose message is being flown keeps the vehicle."""
+        if not isinstance(active, VelocityBehaviour):
+            return None
+        sources = [one.source for one in _valid(context)]
+        if active._source not in sources or (self._source or sources[0]) == active._source:
+            return None
+        return f"velocity: {active._source} steers; end that by stop or hold first"
+
     def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
         message = self._message(context)
         turn_radps = 0.0 if message is None else message.turn_radps
@@ -87,7 +96,7 @@ class VelocityBehaviour(Behaviour):
 
     def _message(self, context: BehaviourContext) -> VelocityInput | None:
         """The message to fly; None: there is no valid one."""
-        valid = [one for one in context.velocities if context.now_ns <= one.expires_ns]
+        valid = _valid(context)
         if self._source is None and valid:
             self._source = valid[0].source
         for other in valid:
@@ -142,6 +151,11 @@ class VelocityBehaviour(Behaviour):
 
     @property
     def status(self) -> str:
+        of = "" if self._source is None else f" of {self._source}"
         if self._received_ns is None:
-            return "velocity, no message yet"
-        return f"velocity of {self._source}" + (", silent" if self._silent else "")
+            return f"velocity{of}, no message yet"
+        return f"velocity{of}" + (", silent" if self._silent else "")
+
+
+def _valid(context: BehaviourContext) -> list[VelocityInput]:
+    return [one for one in context.velocities if context.now_ns <= one.expires_ns]

@@ -30,7 +30,7 @@ IMPORT_S = 0.3
 
 
 class Vehicle:
-    """The bus of a service. A command `hold …` waits for `stop`; `land` fails; others succeed.
+    """The bus of a service. A command `hold …` waits for `stop`; those in `refused` fail; others succeed.
 
     Attributes:
         commands: texts in the order of arrival. velocities: messages on `velocity`.
@@ -40,6 +40,7 @@ class Vehicle:
         self.name, self.endpoint = name, f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
         self.commands: list[str] = []
         self.velocities: list[dict[str, Any]] = []
+        self.refused = {"land"}
         self._stopped = asyncio.Event()
         settings = ZenohSection(listen=(self.endpoint,))
         if router is not None:
@@ -62,7 +63,7 @@ class Vehicle:
             self._stopped.clear()
             await self._stopped.wait()
             return {"command": text, "success": False, "reason": "replaced by stop"}
-        return {"command": text, "success": text != "land", "reason": "on the ground"}
+        return {"command": text, "success": text.split()[0] not in self.refused, "reason": "on the ground"}
 
 
 @asynccontextmanager
@@ -281,6 +282,40 @@ async def test_steering_sends_velocities_and_ends_with_zero() -> None:
     assert there.commands == [f'velocity source="{steering.source}"']
     assert (first["source"], first["forward_mps"], first["turn_radps"]) == (steering.source, 1.0, -0.5)
     assert {last[key] for key in ("forward_mps", "right_mps", "up_mps", "turn_radps")} == {0.0}
+
+
+@pytest.mark.realtime
+async def test_steering_raises_once_something_else_is_flown() -> None:
+    async with connected() as (there, drone):
+        async with drone.steer() as steering:
+            states, own = drone.status(size=10), f"velocity of {steering.source}"
+            await drone.takeoff(3)  # its answer comes after the subscriptions have arrived
+            for behaviour in ("hold", own):  # the first is from before the command
+                there.bus.publish(topics.STATUS, {"pilot": {"behaviour": behaviour}})
+            async with asyncio.timeout(20.0):
+                while (await anext(states))["pilot"]["behaviour"] != own:
+                    pass
+            steering.send(forward=1.0)
+            there.bus.publish(topics.STATUS, {"pilot": {"behaviour": "velocity of another"}})
+            with pytest.raises(CommandFailedError, match="velocity of another") as failed:
+                await until(lambda: steering.send(forward=2.0))
+        assert failed.value.reply["command"] == f"velocity source={steering.source}"
+
+
+@pytest.mark.realtime
+async def test_refused_steering_sends_nothing_and_source_stays() -> None:
+    async with connected() as (there, drone):
+        there.refused = {"velocity"}
+        with pytest.raises(CommandFailedError):
+            async with drone.steer():
+                pass
+        there.refused = set()
+        async with drone.steer() as steering:
+            pass
+        async with drone.steer() as again:  # the last message of the steering before is still valid
+            assert again.source == steering.source
+        await until(lambda: len(there.velocities) == 2)
+    assert {one["source"] for one in there.velocities} == {steering.source}
 
 
 @pytest.mark.realtime

@@ -250,6 +250,19 @@ def test_another_command_ends_steering(service: ServiceProcess, tab: Tab) -> Non
     tab.until(f"!({STEERING})")
 
 
+def test_steering_of_a_second_window_is_refused(browser: Browser, service: ServiceProcess, tab: Tab) -> None:
+    other = open_page(browser, service.url)
+    in_the_air(service, tab)
+    tab.value("document.querySelector('#steer').click()")
+    tab.until(STEERING)
+    other.until("/^velocity of page-[a-z0-9]+$/.test(state.topics.status?.pilot.behaviour)")
+    other.value("document.querySelector('#steer').click()")
+    other.until(f"/^velocity source=page-.*: failed: velocity: page-.* steers/.test({REPLY})")
+    assert not other.value(STEERING)
+    assert tab.value(STEERING)
+    other.close()
+
+
 def test_page_shows_a_stop_button_and_names_on_a_phone(tab: Tab) -> None:
     tab.resize(390, 844, phone=True)
     left, top, width, height = rectangle(tab, "#stop")

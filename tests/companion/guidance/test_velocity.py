@@ -11,13 +11,20 @@ import pytest
 
 from companion.bench.lockstep_flight import LockstepFlight
 from companion.guidance.behaviour import VelocityInput
+from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.behaviours.stop import StopBehaviour
 from companion.guidance.behaviours.velocity import VelocityBehaviour
 from companion.guidance.core import Phase
 from companion.guidance.interface import EventKind, GuidanceInput
 from companion.service.velocity_senders import FORGET_S, MAX_SENDERS, VelocitySenders
 from companion.vehicle.state import FlightMode
-from tests.companion.guidance.guidance_harness import GuidanceHarness, Pending, engaged, flying
+from tests.companion.guidance.guidance_harness import (
+    GuidanceHarness,
+    Pending,
+    assert_failed,
+    engaged,
+    flying,
+)
 
 S = 1_000_000_000
 
@@ -108,6 +115,35 @@ def test_named_sender_is_waited_for() -> None:
     harness.sending["page"] = {"forward_mps": 1.0}
     harness.run(2.0)
     assert harness.vehicle.velocity[0] == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize("source", [None, "first"])
+@pytest.mark.parametrize("other", [None, "second"])
+def test_another_sender_is_refused_while_the_first_is_flown(source: str | None, other: str | None) -> None:
+    harness = Steered(source)
+    harness.sending["first"] = {"forward_mps": 1.0}
+    harness.run(1.0)
+    harness.sending = {"second": {"forward_mps": -1.0}, **harness.sending}  # also as the first in the list
+    assert_failed(harness.outcome(harness.command(VelocityBehaviour(other), endless=True)), "first steers")
+    harness.run(1.0)
+    assert harness.vehicle.velocity[0] == pytest.approx(1.0, abs=0.1)
+    assert harness.guidance.status == "velocity of first"
+    assert harness.outcome(harness.command(VelocityBehaviour("first"), endless=True)).success
+    harness.command(HoldBehaviour(), endless=True)
+    assert harness.outcome(harness.command(VelocityBehaviour(other), endless=True)).success
+    harness.run(2.0)
+    assert harness.vehicle.velocity[0] == pytest.approx(-1.0, abs=0.1)
+
+
+def test_sender_whose_lifetime_is_over_is_replaced() -> None:
+    harness = Steered("first")
+    assert harness.guidance.status == "velocity of first, no message yet"
+    harness.sending["first"] = {}  # zero: it holds, and still steers
+    harness.run(1.0)
+    assert_failed(harness.outcome(harness.command(VelocityBehaviour("second"), endless=True)), "first")
+    del harness.sending["first"]
+    harness.run(0.1)
+    assert harness.outcome(harness.command(VelocityBehaviour("second"), endless=True)).success
 
 
 def test_command_is_answered_in_progress_and_ended_by_stop() -> None:
@@ -220,6 +256,33 @@ def test_senders_are_bounded_and_the_first_stay() -> None:
         received.on_message(message(source=f"s{number}"), 100 * S)
     assert [one.source for one in received.newest(100 * S)] == [f"s{number}" for number in range(MAX_SENDERS)]
     assert len(events) == 1
+
+
+def test_second_program_cannot_take_the_simulated_vehicle() -> None:
+    flight = LockstepFlight.airborne(seed=12, height_m=5.0)
+    first = flight.command("velocity source=a")
+    flight.run_until(lambda: flight.outcome(first), 5.0)
+
+    sending = {"a": 1.0}
+
+    def given(text: str) -> bool:
+        identifier = flight.command(text)
+        for _ in range(20):
+            for source, forward_mps in sending.items():
+                payload = message(source=source, stamp_ns=flight.now_ns, forward_mps=forward_mps)
+                flight.inputs.velocities.on_message(payload, flight.now_ns)
+            flight.run(0.1)
+        outcome = flight.outcome(identifier)
+        assert outcome is not None
+        return outcome.success
+
+    assert given("velocity source=a")
+    sending["b"] = -1.0
+    assert not given("velocity source=b")
+    assert flight.guidance.status == "velocity of a"
+    assert given("stop")
+    assert given("velocity source=b")
+    assert flight.guidance.status == "velocity of b"
 
 
 def test_simulated_vehicle_flies_messages_and_stops_in_a_gap() -> None:
