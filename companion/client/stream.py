@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import threading
 import time
 from collections import deque
@@ -74,7 +75,7 @@ class Stream(AsyncIterator[T], Generic[T]):
             raise ValueError(f"size must be at least 1, got {size}")
         self._decode, self._max_age_s = decode, max_age_s
         self._queue, self._too_old = _Queue(size), 0
-        self._arrived_s = 0.0
+        self._arrived_s = -math.inf
         # The callback refers to the queue alone, so that a stream that nobody reads any more is deleted.
         put = self._queue.put
         self._subscriber = (
@@ -93,7 +94,7 @@ class Stream(AsyncIterator[T], Generic[T]):
 
     @property
     def age_s(self) -> float:
-        """Seconds since the newest delivered message has arrived."""
+        """Seconds since the newest delivered message has arrived; infinite before the first."""
         return time.monotonic() - self._arrived_s
 
     @property

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import inspect
 import json
+import math
 import socket
 import subprocess
 import sys
@@ -224,6 +225,7 @@ async def test_timeout_stops_a_flight_but_not_for_the_gimbal() -> None:
 async def test_slow_reader_gets_the_newest_messages(size: int) -> None:
     async with connected() as (there, drone):
         stream = drone.vehicle(size=size)
+        assert stream.age_s == math.inf
         await watched(there, topics.VEHICLE)
         for number in range(50):  # one by one: the bus drops what comes too fast
             there.bus.publish(topics.VEHICLE, {"number": number})
