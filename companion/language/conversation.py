@@ -265,6 +265,8 @@ async def answer_to(question: Question, vehicle: Vehicle, newest: Reply | None) 
     """A question's answer as data. `newest`: the reply to the newest command, for `why_not`."""
     if question.name == "seen":
         scene = await vehicle.scene()
+        if scene.fault is not None:
+            return {"error": scene.fault}
         objects = [each for each in scene.objects if question.about in ("", each.class_name)]
         return {"objects": [asdict(each) for each in objects]}
     state = await vehicle.state()
@@ -313,7 +315,7 @@ def _outcome(reply: Reply) -> str:
 
 def _in_words(question: Question, answer: dict[str, Any]) -> str:
     """An answer for people."""
-    if question.name == "seen":
+    if question.name == "seen" and "objects" in answer:
         objects = [str(SceneObject(**each)) for each in answer["objects"]]
         return "seen: " + ("; ".join(objects) or f"no {question.about or 'object'}")
     if question.name == "why_not":

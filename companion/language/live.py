@@ -16,7 +16,7 @@ import zenoh
 
 from companion.bus import topics
 from companion.bus.bodies.frames import DetectionBody, DetectionsBody
-from companion.bus.bodies.service import EventBody
+from companion.bus.bodies.service import EventBody, StatusBody, StatusCameraBody
 from companion.client import CommandFailedError, Drone, Stream
 from companion.client.commands import Reply
 from companion.language.control import CommandEvents, Control
@@ -79,7 +79,9 @@ class LiveVehicle:
 
     async def scene(self) -> Scene:
         """The objects of the newest frame with an image, and the vehicle's pose."""
-        detections, colours = await self._detections()
+        seen = await self._detections()
+        fault = None if seen else await self._camera_fault()
+        detections, colours = seen or ([], [])
         vehicle = await _next(self._drone.vehicle(), _STATE_S)
         yaw_rad = None if vehicle is None else vehicle["yaw_rad"]
         objects = tuple(
@@ -87,7 +89,7 @@ class LiveVehicle:
             for each, colour in zip(detections, colours, strict=True)
         )
         height_m = None if vehicle is None else vehicle["altitude_m"]
-        return Scene(self._class_names, objects, yaw_rad, height_m)
+        return Scene(self._class_names, objects, yaw_rad, height_m, fault=fault)
 
     async def state(self) -> dict[str, Any]:
         """Facts in plain words and numbers; null where unknown."""
@@ -111,7 +113,7 @@ class LiveVehicle:
             "battery_percent": None if charge is None else round(100 * charge),
             "command": status["pilot"]["behaviour"],
             "in_command": status["pilot"]["in_command"],
-            "camera": status["perception"]["state"],
+            "camera": self._perception(status)["state"],
             "warnings": warnings,
         }
 
@@ -143,16 +145,37 @@ class LiveVehicle:
                     if event["level"] != "info":
                         self._warnings.append(event["text"])
 
-    async def _detections(self) -> tuple[list[DetectionBody], list[str | None]]:
-        """The detections of a frame and their colours by its image; without an image, None for each."""
+    def _perception(self, status: StatusBody) -> StatusCameraBody:
+        return status["perception"] if self._camera is None else status["cameras"][self._camera]
+
+    async def _camera_fault(self) -> str:
+        """That no detections come, and what `status` says about it."""
+        status = await _next(self._drone.status(), _STATE_S)
+        if status is None:
+            return "no detections received"
+        camera = self._perception(status)
+        facts = [f"perception is {camera['state']}"]
+        if camera["state"] == "running" and camera["model"] is None:
+            facts.append("no detector is enabled")
+        if camera["problem"]:
+            facts.append(camera["problem"])
+        return f"no detections received: {'; '.join(facts)}"
+
+    async def _detections(self) -> tuple[list[DetectionBody], list[str | None]] | None:
+        """The detections of a frame and their colours by its image; without an image, None for each.
+
+        None: no frame came that a detector has seen.
+        """
         frames = self._drone.detections(self._camera, size=_FRAMES)
         received: dict[int, DetectionsBody] = {}
         jpegs: dict[int, bytes] = {}
-        newest: list[DetectionBody] = []
+        newest: list[DetectionBody] | None = None
         subscriber = self._images(jpegs)
         try:
             async with asyncio.timeout(_STATE_S):
                 async for frame in frames:
+                    if frame["model"] is None:  # frames are read without a detector
+                        continue
                     received[frame["sequence"]] = frame
                     newest = frame["detections"]
                     if not newest:
@@ -162,11 +185,11 @@ class LiveVehicle:
                         colours = await asyncio.to_thread(_colours, jpegs[max(common)], both)
                         return both["detections"], colours
         except TimeoutError:
-            return newest, [None] * len(newest)
+            pass
         finally:
             frames.close()
             subscriber.undeclare()  # type: ignore[no-untyped-call]
-        return newest, [None] * len(newest)
+        return None if newest is None else (newest, [None] * len(newest))
 
     def _images(self, jpegs: dict[int, bytes]) -> zenoh.Subscriber[None]:
         """Collect preview images by the number of their frame."""

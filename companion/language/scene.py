@@ -43,6 +43,7 @@ class Scene:
     Attributes:
         class_names: the detector's.
         yaw_rad: heading, clockwise from north. altitude_m: above home. None: not known.
+        fault: why no detections were received, so that no objects are known; None: they were.
         last: the newest command of the conversation; "it" and "twice as far" refer to it.
     """
 
@@ -50,4 +51,5 @@ class Scene:
     objects: tuple[SceneObject, ...] = ()
     yaw_rad: float | None = None
     altitude_m: float | None = None
+    fault: str | None = None
     last: Command | None = None

@@ -85,7 +85,7 @@ def understand(text: str, scene: Scene, done: int | None = None) -> Reading:
         try:
             intent = clause.intent()
         except NotSeenError as missing:
-            if done is not None:
+            if done is not None or scene.fault is not None:
                 raise UnclearError(_not_seen(words, scene)) from None
             search = make_command("seek", class_name=missing.class_name)
             return Reading((*intents, search), done=len(intents))
@@ -112,6 +112,8 @@ def _plain(text: str) -> str:
 
 
 def _not_seen(words: str, scene: Scene) -> str:
+    if scene.fault is not None:
+        return f"{words!r}: {scene.fault}"
     seen = "; ".join(map(str, scene.objects)) or "nothing"
     return f"{words!r}: no such object is in view. Seen: {seen}. Which one?"
 

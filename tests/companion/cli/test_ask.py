@@ -40,6 +40,8 @@ class Service:
         self.endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
         self.commands: list[str] = []
         self.ready = True
+        self.frame: dict[str, Any] | None = {"model": "yolov8n"}  # None: the camera is dead
+        self.perception = {"state": "running", "model": "yolov8n", "problem": ""}
         self.vehicle = {"yaw_rad": 1.5, "altitude_m": 5.0, "mode": "hold", "armed": True}
         self.flying, self.stopped = asyncio.Event(), asyncio.Event()
         self.bus = Bus(
@@ -73,8 +75,10 @@ class Service:
         for sequence in range(10_000):
             common = {"class_name": "car", "bearing_rad": 1.6, "ground_range_m": 9.0}
             objects = [{**common, "track_id": track, "xyxy": box} for track, box in BOXES.items()]
-            frame = {"sequence": sequence, "width": 320, "height": 240, "detections": objects}
-            self.bus.publish(topics.DETECTIONS, frame)
+            if self.frame is not None:
+                frame = {"sequence": sequence, "width": 320, "height": 240, "detections": objects}
+                self.bus.publish(topics.DETECTIONS, frame | self.frame)
+            self.bus.publish(topics.STATUS, {"perception": self.perception})
             self.bus.publish(topics.VEHICLE, self.vehicle)
             self.bus.publish_large(
                 topics.IMAGE,
@@ -210,6 +214,36 @@ async def test_what_is_seen_has_colour_range_and_direction(
         assert await ask(there, "what do you see?")
     where = "9 m away 6 deg to the right"
     assert f"red car (track 3) {where}; blue car (track 5) {where}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("frame", "perception", "words"),
+    [
+        ({"model": "yolov8n", "detections": []}, {}, ("seen: no object",)),
+        (
+            None,
+            {"state": "failed", "problem": "source lost"},
+            ("no detections received", "failed", "source lost"),
+        ),
+        ({"model": None, "detections": []}, {"model": None}, ("no detections received", "no detector")),
+    ],
+)
+async def test_dead_camera_is_not_a_free_view(
+    frame: dict[str, Any] | None,
+    perception: dict[str, Any],
+    words: tuple[str, ...],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(sys, "stdin", io.StringIO(""))
+    monkeypatch.setattr("companion.language.live._STATE_S", 1.0)
+    async with service() as there:
+        there.frame = frame
+        there.perception |= perception
+        assert await ask(there, "what do you see?")
+    printed = capsys.readouterr().out
+    assert all(word in printed for word in words)
+    assert ("no object" in printed) is (words[0] == "seen: no object")
 
 
 async def test_questions_on_zenoh_are_answered_and_fly_only_what_may_be(

@@ -690,6 +690,23 @@ async def test_questions_and_failures_in_words() -> None:
     assert "which car" in talk.lines[-1]
 
 
+FAULT = "no detections received: perception is failed"
+
+
+async def test_model_gets_an_error_without_detections() -> None:
+    async with serving(ollama(calls=[("seen", {"class": "car"})]), ollama("I am blind.")) as script:
+        talk = Talk(script.url, vehicle=FakeVehicle(replace(SCENE, objects=(), fault=FAULT)))
+        assert await talk.ask("model: is the way free?")
+        assert tool_results(script) == [{"error": FAULT}]
+
+
+async def test_described_object_is_not_searched_for_without_detections() -> None:
+    talk = Talk(vehicle=FakeVehicle(replace(SCENE, objects=(), fault=FAULT)))
+    assert not await talk.ask("circle the red car")
+    assert FAULT in talk.lines[-1]
+    assert (talk.asked, talk.vehicle.commands) == (0, [])
+
+
 async def test_newest_command_is_what_it_refers_to() -> None:
     talk = Talk()
     for sentence in ("circle the boat at ten metres", "twice as far", "the other way round"):

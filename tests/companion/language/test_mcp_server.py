@@ -106,6 +106,13 @@ async def test_questions_are_answered_with_data() -> None:
         assert caller.vehicle.commands == []
 
 
+async def test_no_detections_is_an_error_not_an_empty_view() -> None:
+    async with calling(vehicle=FlyingVehicle(scene=Scene(CLASSES, fault="no detections received"))) as caller:
+        assert await caller.call("seen") == (True, {"error": "no detections received"})
+    async with calling(vehicle=FlyingVehicle(scene=Scene(CLASSES))) as caller:
+        assert await caller.call("seen") == (False, {"objects": []})
+
+
 @pytest.mark.parametrize("word", ["takeoff", "land", "rtl", "gimbal"])
 async def test_command_that_is_not_allowed_names_the_flag(word: str) -> None:
     async with calling("goto") as caller:
