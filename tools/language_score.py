@@ -96,8 +96,10 @@ async def verdict(text: str, expected: Sequence[str], model: Endpoint) -> tuple[
         recorder.said = str(error)
         return "error", recorder
     wanted = [str(parse(each)) for each in expected if not each.startswith("?")]
-    asked = [{each, each.split()[0]} for each in expected if each.startswith("?")]
-    if recorder.flown == wanted and all(each & set(recorder.questions) for each in asked):
+    asked = [each for each in expected if each.startswith("?")]
+    # A model cannot ask for a colour or a track.
+    answered = all(any(f"{each} ".startswith(f"{given} ") for given in recorder.questions) for each in asked)
+    if recorder.flown == wanted and answered:
         return "right", recorder
     return "wrong call" if recorder.flown else "refused" if recorder.refused else "no call", recorder
 

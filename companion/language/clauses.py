@@ -18,13 +18,39 @@ QUESTIONS = ("seen", "battery", "state", "why_not")
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """A question about the vehicle: one of QUESTIONS; `about`: a class, of "seen"."""
+    """A question about the vehicle.
+
+    Attributes:
+        name: one of QUESTIONS. The others restrict "seen".
+        classes: any of these. colour: of `vision.colour.COLOURS`. choice: a superlative or a side.
+    """
 
     name: str
-    about: str = ""
+    classes: tuple[str, ...] = ()
+    colour: str = ""
+    choice: str = ""
+    track_id: int | None = None
 
     def __str__(self) -> str:
-        return f"?{self.name} {self.about}".strip()
+        track = "" if self.track_id is None else f"track={self.track_id}"
+        words = (f"?{self.name}", *self.classes, self.colour, self.choice, track)
+        return " ".join(filter(None, words))
+
+    def select(self, objects: Sequence[SceneObject]) -> list[SceneObject]:
+        """Those that it asks for.
+
+        Raises:
+            UnclearError: colours or ranges are not known.
+        """
+        found = [
+            each
+            for each in objects
+            if (not self.classes or each.class_name in self.classes)
+            and self.track_id in (None, each.track_id)
+        ]
+        if self.colour:
+            found = _of_colour(self.colour, found)
+        return [_chosen(self.choice, found)] if self.choice and found else found
 
 
 class UnclearError(ValueError):
@@ -45,6 +71,8 @@ POLITE = re.compile(
 _FILLERS = frozenset(
     re.findall(r"\w+", "the a an that this of to at in on it me us there here please now with for")
 )
+COLOUR = "|".join(COLOUR_WORDS)
+CHOICE = "nearest|closest|farthest|furthest|left|leftmost|right|rightmost|biggest"
 # These refer to an object or a place; a command that took no object has not understood them.
 _REFERRING = frozenset(("that", "on", "it", "me", "us", "there"))
 _N = r"(-?\d+(?:\.\d+)?)"
@@ -136,9 +164,9 @@ class Clause:
             if found := self.take(pattern):
                 return {key: int(found[1])}
         nouns = noun_pattern(self._scene.class_names)
-        any_one = self.take(rf"(?:an?|any|some)(?= (?:(?:{'|'.join(COLOUR_WORDS)}) )?(?:{nouns})\b)")
-        which = self.take(r"(?:nearest|closest|farthest|furthest|left|leftmost|right|rightmost|biggest)")
-        colour = self.take(rf"(?:{'|'.join(COLOUR_WORDS)})")
+        any_one = self.take(rf"(?:an?|any|some)(?= (?:(?:{COLOUR}) )?(?:{nouns})\b)")
+        which = self.take(rf"(?:{CHOICE})")
+        colour = self.take(rf"(?:{COLOUR})")
         noun = self.take(rf"(?:{nouns})")
         side = self.take(r"on the (left|right)") if which is None else None
         word = which[0] if which is not None else side[1] if side is not None else None
@@ -191,15 +219,7 @@ class Clause:
             for each in self._scene.objects
             if each.track_id is not None and class_name in (None, each.class_name)
         ]
-        if colour is None:
-            return of_class
-        matching = [each for each in of_class if each.colour == COLOUR_WORDS[colour[0]]]
-        if not matching and (unknown := [each for each in of_class if each.colour is None]):
-            raise UnclearError(
-                f"{self._whole!r}: colours are not known: no preview image, or too small in it: "
-                f"{_options(unknown)}, or ask again"
-            )
-        return matching
+        return of_class if colour is None else _of_colour(COLOUR_WORDS[colour[0]], of_class)
 
     def _same_object(self) -> dict[str, Any]:
         if self.focus:
@@ -242,7 +262,7 @@ class Clause:
         if "track_id" in target:
             identifier = target["track_id"]
             names = [each.class_name for each in self._scene.objects if each.track_id == identifier]
-            return Question("seen", names[0] if names else "")
+            return Question("seen", tuple(names[:1]), track_id=identifier)
         if "class_name" not in target:
             raise UnclearError(
                 f"{self._whole!r}: find what? The classes: {', '.join(self._scene.class_names[:12])}"
@@ -468,6 +488,17 @@ def _signed(metres: str, side: str) -> float:
 
 def _options(seen: Sequence[SceneObject]) -> str:
     return f"{'; '.join(map(str, seen))}? Say for example 'track {seen[0].track_id}'"
+
+
+def _of_colour(colour: str, seen: Sequence[SceneObject]) -> list[SceneObject]:
+    """Raises UnclearError: none is known to have the colour, and that of some is unknown."""
+    matching = [each for each in seen if each.colour == colour]
+    if not matching and (unknown := [each for each in seen if each.colour is None]):
+        raise UnclearError(
+            "colours are not known: no preview image, or too small in it: "
+            f"{'; '.join(map(str, unknown))}. Name a track, or ask again"
+        )
+    return matching
 
 
 def _chosen(word: str, seen: Sequence[SceneObject]) -> SceneObject:

@@ -262,13 +262,19 @@ class Conversation:
 
 
 async def answer_to(question: Question, vehicle: Vehicle, newest: Reply | None) -> dict[str, Any]:
-    """A question's answer as data. `newest`: the reply to the newest command, for `why_not`."""
+    """A question's answer as data.
+
+    Args:
+        newest: the reply to the newest command, for `why_not`.
+
+    Raises:
+        UnclearError: colours or ranges that the question needs are not known; never for a model's question.
+    """
     if question.name == "seen":
         scene = await vehicle.scene()
         if scene.fault is not None:
             return {"error": scene.fault}
-        objects = [each for each in scene.objects if question.about in ("", each.class_name)]
-        return {"objects": [asdict(each) for each in objects]}
+        return {"objects": [asdict(each) for each in question.select(scene.objects)]}
     state = await vehicle.state()
     warnings = state.pop("warnings", [])
     if question.name == "battery":
@@ -317,7 +323,9 @@ def _in_words(question: Question, answer: dict[str, Any]) -> str:
     """An answer for people."""
     if question.name == "seen" and "objects" in answer:
         objects = [str(SceneObject(**each)) for each in answer["objects"]]
-        return "seen: " + ("; ".join(objects) or f"no {question.about or 'object'}")
+        track = "" if question.track_id is None else f"track {question.track_id}"
+        what = (question.colour, " or ".join(question.classes) or "object", track)
+        return "seen: " + ("; ".join(objects) or f"no {' '.join(filter(None, what))}")
     if question.name == "why_not":
         reasons = [answer["newest_command"], *answer["warnings"][-3:]]
         return (

@@ -14,8 +14,17 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from companion.guidance.command import Command
-from companion.language.clauses import POLITE, Clause, NotSeenError, Question, UnclearError, make_command
-from companion.language.nouns import classes_of, noun_pattern
+from companion.language.clauses import (
+    CHOICE,
+    COLOUR,
+    POLITE,
+    Clause,
+    NotSeenError,
+    Question,
+    UnclearError,
+    make_command,
+)
+from companion.language.nouns import COLOUR_WORDS, classes_of, noun_pattern
 from companion.language.numbers_in_words import with_numbers
 from companion.language.scene import Scene
 
@@ -42,6 +51,11 @@ _SPLIT = re.compile(
 )
 # Further words of a question.
 _REST = rf"(?: (?!.*\b(?:{_VERBS})\b).*)?"
+# Of a question about what is seen. Another word may restrict it, and must be understood.
+_SEEN_REST = (
+    r"(?: (?:right )?now| (?:(?:is|are) )?(?:there|here|nearby|around|visible|in (?:view|sight))"
+    r"| in front(?: of (?:you|us))?| from (?:here|you|us)| (?:do|can) you see)*"
+)
 _STOP_WORDS = "stop|halt|abort|freeze"
 _STOP = re.compile(rf"[,;. ]*(?:emergency )?(?:{_STOP_WORDS})\b")
 # After these a verb is a noun: "stop the search", "abort landing".
@@ -131,17 +145,19 @@ def _question(text: str, scene: Scene) -> Question | None:
         return Question("battery")
     if re.fullmatch(
         r"what (?:(?:do|can) you see|are you seeing|is visible)(?: right)?(?: now)?"
-        rf"|what is (?:in (?:front|view|sight)|there){_REST}|report what you see",
+        rf"|what is (?:in (?:front(?: of (?:you|us))?|view|sight)|there){_SEEN_REST}|report what you see",
         text,
     ):
         return Question("seen")
     if found := re.fullmatch(
         r"(?:(?:can|do) you see|is there|are there|where (?:is|are)|how far(?: away)? (?:is|are)|how many"
-        rf"|any)(?: any| a| an| the)? (?P<noun>{nouns}){_REST}",
+        rf"|any)(?: any| a| an| the)?(?: (?P<choice>{CHOICE}))?(?: (?P<colour>{COLOUR}))? (?P<noun>{nouns})"
+        rf"(?(choice)|(?: on the (?P<side>left|right))?){_SEEN_REST}",
         text,
     ):
         names = classes_of(found["noun"], scene.class_names)
-        return Question("seen", names[0] if len(names) == 1 else "")
+        colour = COLOUR_WORDS.get(found["colour"], "")
+        return Question("seen", names, colour, found["choice"] or found["side"] or "")
     if re.fullmatch(
         rf"(?:how high|how fast|where) are you{_REST}|what are you doing{_REST}"
         r"|(?:what is )?(?:the |your )?(?:state|status)"

@@ -125,7 +125,7 @@ def read_call(call: ToolCall, class_names: Sequence[str] | None) -> Command | Qu
     given = {key: value for key, value in arguments.items() if value is not None}
     if call.name in QUESTIONS:
         about = given.get("class", "")
-        return Question(call.name, about if isinstance(about, str) else "")
+        return Question(call.name, (about,) if about and isinstance(about, str) else ())
     if call.name not in COMMANDS:
         known = [word for word in COMMANDS if word not in _NOT_FOR_MODELS]
         raise GrammarError(f"unknown command {call.name[:80]!r}; {nearest(call.name[:80], known)}")

@@ -690,6 +690,37 @@ async def test_questions_and_failures_in_words() -> None:
     assert "which car" in talk.lines[-1]
 
 
+CAR_3, CAR_5 = (
+    "red car (track 3) 12 m away 20 deg to the left",
+    "blue car (track 5) 20 m away 10 deg to the right",
+)
+
+
+@pytest.mark.parametrize(
+    ("question", "answer"),
+    [
+        ("where is the red car?", f"seen: {CAR_3}"),
+        ("find the red car", f"seen: {CAR_3}"),
+        ("where is the farthest car", f"seen: {CAR_5}"),
+        ("do you see any vehicles", f"seen: {CAR_3}; {CAR_5}"),
+        ("where is the nearest dog", "seen: no dog"),
+        ("where is the green car", "seen: no green car"),
+        ("find track 12", "seen: no object track 12"),
+    ],
+)
+async def test_question_is_answered_with_the_objects_asked_for(question: str, answer: str) -> None:
+    talk = Talk()
+    assert await talk.ask(question)
+    assert talk.lines == [answer]
+
+
+@pytest.mark.parametrize("question", ["where is the red car", "where is the nearest car"])
+async def test_question_about_what_is_not_known_is_asked_back(question: str) -> None:
+    talk = Talk(vehicle=FakeVehicle(replace(SCENE, objects=(SceneObject("car", 3), SceneObject("car")))))
+    assert not await talk.ask(question)
+    assert "car (track 3)" in talk.lines[-1]
+
+
 FAULT = "no detections received: perception is failed"
 
 
