@@ -23,6 +23,7 @@ from torch import Tensor, nn
 
 from vision.foreign.layouts import TASKS
 from vision.plain_yaml import numbered
+from vision.runtimes.exported import kind_of
 from vision.yolo.architecture import ArchitectureError, YoloModel, build_shapes
 from vision.yolo.checkpoint_pair import WEIGHTS_SUFFIX, is_pair, read_pair, write_pair
 from vision.yolo.description import (
@@ -125,8 +126,12 @@ def load_checkpoint(path: str | Path) -> LoadedModel:
 
     Raises:
         UnsafeCheckpointError: the file requests a function call, named in the message.
-        CheckpointError: missing, damaged, of another kind, or weights that do not fit the description.
+        CheckpointError: missing, damaged, an export, of another kind, or its weights do not fit.
     """
+    if kind_of(Path(path)) is not None and Path(path).is_file():
+        raise CheckpointError(
+            one_line(f"{path}: is an exported file; a checkpoint is needed (.pt or .safetensors)")
+        )
     pair = is_pair(Path(path))
     content = read_pair(Path(path)) if pair else read_archive(path)
     try:

@@ -112,6 +112,17 @@ def test_missing_model_or_unknown_format_is_an_error(tmp_path: Path) -> None:
     assert "not to 'caffe'" in result.stderr
 
 
+@pytest.mark.parametrize("to", ["onnx", "openvino"])
+@pytest.mark.parametrize("name", ["foreign.onnx", "foreign.torchscript"])
+def test_export_of_exported_file_asks_for_checkpoint(tmp_path: Path, name: str, to: str) -> None:
+    (tmp_path / name).write_bytes(b"\x08\x08")
+    options = ["--to", to, "--precision", "int8", "--calibrate", str(tmp_path)]
+    result = CliRunner().invoke(app, ["models", "export", str(tmp_path / name), *options])
+    assert result.exit_code == 2
+    assert f"{tmp_path / name}: is an exported file; a checkpoint is needed" in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+
+
 def test_verify_compares_export_with_source(
     tmp_path: Path, small_model: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
