@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from companion.cli import app
 from tests.vision.foreign_files import (
     constant_onnx,
     stated,
@@ -399,6 +402,20 @@ def test_objectness_of_one_everywhere_is_not_yolox(tmp_path: Path) -> None:
 def test_folder_without_one_model_is_refused(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match=r"0 \.xml files"):
         read_source(tmp_path)
+
+
+@pytest.mark.parametrize("head", [b"", b"<?xml version='1.0'?>"])
+def test_damaged_openvino_file_is_refused_without_openvino(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, head: bytes
+) -> None:
+    monkeypatch.setitem(sys.modules, "openvino", None)  # It would print its own lines.
+    (tmp_path / "g.xml").write_bytes(head + np.random.default_rng(0).bytes(2000))
+    (tmp_path / "g.bin").write_bytes(bytes(64))
+    (tmp_path / "metadata.yaml").write_text("names: {0: car}\nstride: 32\n")
+    result = CliRunner().invoke(app, ["models", "info", str(tmp_path)])
+    assert result.exit_code == 2
+    assert f"{tmp_path / 'g.xml'}: is not an OpenVINO model" in result.stderr
+    assert len(result.stderr.splitlines()) == 1
 
 
 def test_torchscript_must_give_what_it_states(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import re
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,14 @@ from vision.foreign.layouts import ForeignFacts, Port, recognise
 from vision.plain_yaml import PlainYamlError, load_plain_yaml
 from vision.runtimes import base
 from vision.runtimes.base import Precision, RuntimeName, RuntimeUnusableError, required
-from vision.runtimes.exported import KEY, ExportedFacts, own_facts
+from vision.runtimes.exported import KEY, SUFFIXES, ExportedFacts, own_facts
 from vision.yolo.level_outputs import Head, LevelOutput, Product
 
 _HINTS = {"float32": "f32", "bfloat16": "bf16", "float16": "f16"}
 _MOST_SIZES = 2
 _LARGEST_METADATA_BYTES = 1 << 20
+# The beginning of an `.xml` that OpenVINO writes.
+_IR_HEAD = re.compile(rb"(\xef\xbb\xbf)?\s*(<\?xml[^>]*>\s*)?<net\b")
 
 
 class OpenVinoNetwork:
@@ -141,6 +144,7 @@ class OpenVinoRuntime(OpenVinoNetwork):
 def openvino_facts(path: Path, model: Any = None) -> ExportedFacts | ForeignFacts:
     """Read the metadata of an OpenVINO or ONNX file: of our own export, or of a recognised network."""
     if model is None:
+        _check_head(path)
         model = _read(required("openvino").Core(), path)
     # The metadata of an ONNX file is under its frontend's.
     for keys in ([KEY], ["framework", KEY]):
@@ -177,6 +181,22 @@ def _ports(nodes: Any) -> list[Port]:
         )
         for node in nodes
     ]
+
+
+def _check_head(path: Path) -> None:
+    """Refuse an `.xml` that is no IR: OpenVINO would try its other readers, which print to standard error."""
+    if path.suffix != SUFFIXES["openvino"]:
+        return
+    try:
+        with path.open("rb") as file:
+            head = file.read(1024)
+    except OSError as error:
+        raise RuntimeUnusableError(f"{path}: cannot be read ({error.strerror or error})") from None
+    if not _IR_HEAD.match(head):
+        raise RuntimeUnusableError(
+            f"{path}: is not an OpenVINO model: expected an XML document that begins with <net; "
+            "export or copy it again"
+        )
 
 
 def _read(core: Any, path: Path) -> Any:
