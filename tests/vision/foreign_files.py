@@ -136,10 +136,27 @@ def ultralytics_onnx(path: Path, model: YoloModel, size: tuple[int, int], *, dyn
     return path
 
 
-def ultralytics_torchscript(path: Path, model: YoloModel, size: tuple[int, int], **others: Any) -> Path:
+class Selected(nn.Module):
+    """With torchvision's NMS, as Ultralytics exports with `nms=True`."""
+
+    def __init__(self, model: YoloModel) -> None:
+        super().__init__()
+        self.decoded = Decoded(model)
+
+    def forward(self, image: Tensor) -> Tensor:
+        found = self.decoded(image)[0].T
+        scores, classes = found[:, 4:].max(1)
+        kept: Tensor = torch.ops.torchvision.nms(found[:, :4], scores, 0.7)
+        return torch.cat((found[:, :4], scores[:, None], classes[:, None].float()), 1)[kept][None]
+
+
+def ultralytics_torchscript(
+    path: Path, model: YoloModel, size: tuple[int, int], *, nms: bool = False, **others: Any
+) -> Path:
     trace: Any = torch.jit.trace
+    module = Selected(model) if nms else Decoded(model)
     with torch.no_grad():
-        module = trace(Decoded(model), torch.zeros(1, 3, *size), check_trace=False)
+        module = trace(module, torch.zeros(1, 3, *size), check_trace=False)
     text = json.dumps(stated(model.class_names, size, **others))
     torch.jit.save(module, str(path), _extra_files={"config.txt": text})
     return path
