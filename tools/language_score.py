@@ -95,11 +95,11 @@ async def verdict(text: str, expected: Sequence[str], model: Endpoint) -> tuple[
     except LanguageError as error:
         recorder.said = str(error)
         return "error", recorder
-    wanted = [str(parse(each)) for each in expected if not each.startswith("?")]
+    wanted = [parse(each) for each in expected if not each.startswith("?")]
     asked = [each for each in expected if each.startswith("?")]
     # A model cannot ask for a colour or a track.
     answered = all(any(f"{each} ".startswith(f"{given} ") for given in recorder.questions) for each in asked)
-    if recorder.flown == wanted and answered:
+    if [parse(each) for each in recorder.flown] == wanted and answered:
         return "right", recorder
     return "wrong call" if recorder.flown else "refused" if recorder.refused else "no call", recorder
 

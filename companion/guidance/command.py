@@ -19,8 +19,8 @@ from __future__ import annotations
 import difflib
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, Field, dataclass, fields
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import MISSING, Field, dataclass, fields, replace
 from typing import Any, ClassVar, TypeVar, dataclass_transform, get_args, get_type_hints
 
 from companion.geometry.points import points_from
@@ -233,6 +233,7 @@ class Command(ABC):
         takes_attachment: further lines may be sent along.
         renamed: former key of an argument → its current key, for the error message.
         either: keys of which exactly one must be given; the first may be written without its key.
+        stated: names of fields that were asked for: the text has them also where they equal their default.
     """
 
     word: ClassVar[str]
@@ -240,6 +241,7 @@ class Command(ABC):
     takes_attachment: ClassVar[bool] = False
     renamed: ClassVar[Mapping[str, str]] = {}
     either: ClassVar[tuple[str, ...]] = ()
+    stated: ClassVar[frozenset[str]] = frozenset()
 
     def __post_init__(self) -> None:
         given = []
@@ -277,13 +279,29 @@ class Command(ABC):
         words = [self.word]
         for index, (field, argument) in enumerate(arguments_of(type(self))):
             value = getattr(self, field.name)
-            if value == default_of(field):
+            if value in (None, "") or (value == default_of(field) and field.name not in self.stated):
                 continue
             written = _quoted(value) if isinstance(value, str) else _plain_number(value)
             # All words without a key may belong to the first argument.
             bare = index == 0 and (field.default is MISSING or isinstance(argument, ClassName))
             words.append(written if bare else f"{argument.key}={written}")
         return " ".join(words)
+
+
+def make_stated(kind: type[Command], values: Mapping[str, Any]) -> Command:
+    """A command of which these fields are stated. Raises GrammarError."""
+    return _stating(kind(**values), values)
+
+
+def changed(command: Command, **changes: Any) -> Command:
+    """The command with other values, which are stated too. Raises GrammarError."""
+    return _stating(replace(command, **changes), {*command.stated, *changes})
+
+
+def _stating(command: Command, names: Iterable[str]) -> Command:
+    # No field: it is neither an argument nor part of the equality.
+    object.__setattr__(command, "stated", frozenset(names))
+    return command
 
 
 def both_of(keys: Sequence[str]) -> str:

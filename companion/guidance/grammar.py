@@ -37,6 +37,7 @@ from companion.guidance.command import (
     arguments_of,
     default_of,
     known_class,
+    make_stated,
     names_in,
     nearest,
     range_of,
@@ -70,7 +71,7 @@ def parse(text: str, class_names: Sequence[str] | None = None) -> Command:
             raise GrammarError(f"{word}: {argument.key} is missing ({argument.meaning}): {usage(kind)}")
     if kind.either and not any(f.name in values for f, a in arguments_of(kind) if a.key in kind.either):
         raise GrammarError(f"{word}: {' or '.join(kind.either)} is missing: {usage(kind)}")
-    return kind(**values)
+    return make_stated(kind, values)
 
 
 def usage(kind: type[Command]) -> str:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from dataclasses import fields as fields_of
 from typing import Any
 
-from companion.guidance.command import COMMANDS, Command
+from companion.guidance.command import COMMANDS, Command, changed, make_stated
 from companion.language.nouns import COLOUR_WORDS, classes_of, noun_pattern
 from companion.language.scene import Scene, SceneObject
 
@@ -92,7 +92,7 @@ _RELATIVE = {
 
 def make_command(word: str, **values: Any) -> Command:
     """A command of the table; arguments that are None have their default. Raises GrammarError."""
-    return COMMANDS[word](**{key: value for key, value in values.items() if value is not None})
+    return make_stated(COMMANDS[word], {key: value for key, value in values.items() if value is not None})
 
 
 class Clause:
@@ -447,7 +447,7 @@ class Clause:
         named = {each.name: each.default for each in fields_of(last) if each.name in keys}
         if not target.keys() <= named.keys():
             raise self._not_understood()
-        return replace(last, **(named | target))
+        return changed(last, **(named | target))
 
     def shifted(self, found: re.Match[str]) -> Command:
         """ "five metres closer"."""
@@ -465,7 +465,7 @@ class Clause:
         if self._scene.last is None or direction is None:
             raise UnclearError(f"{self._whole!r}: nothing circles. Circle what?")
         other = "counterclockwise" if direction == "clockwise" else "clockwise"
-        return replace(self._scene.last, direction=other)  # type: ignore[call-arg]
+        return changed(self._scene.last, direction=other)
 
     def again(self, _: re.Match[str]) -> Command:
         if self._scene.last is None:
@@ -478,7 +478,7 @@ class Clause:
         for field in fields:
             value = getattr(last, field, None)
             if last is not None and value is not None:
-                return replace(last, **{field: round(change(value), 3)})
+                return changed(last, **{field: round(change(value), 3)})
         raise UnclearError(f"{self._whole!r}: of what? The newest command has no such value")
 
 

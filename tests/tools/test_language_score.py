@@ -49,6 +49,7 @@ def calling(*calls: ToolCall) -> Message:
         ("battery", ["?battery"], [calling(ToolCall("battery", {})), calling(LAND)], "wrong call"),
         ("land", ["land"], [calling(ToolCall("descend", {}))], "refused"),
         ("land", ["land"], [], "no call"),
+        ("take off", ["takeoff"], [calling(ToolCall("takeoff", {"altitude": 2.5}))], "right"),
         ("make me a sandwich", [], [], "right"),
         ("make me a sandwich", [], [calling(LAND)], "wrong call"),
     ],

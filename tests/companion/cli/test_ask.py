@@ -127,7 +127,7 @@ async def shown(text: str, capsys: pytest.CaptureFixture[str]) -> str:
     return printed
 
 
-@pytest.mark.parametrize(("answer", "commands"), [("y", ["orbit track=3"]), ("n", [])])
+@pytest.mark.parametrize(("answer", "commands"), [("y", ["orbit radius=10 track=3"]), ("n", [])])
 async def test_red_car_is_flown_to_if_confirmed(
     answer: str, commands: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -135,7 +135,7 @@ async def test_red_car_is_flown_to_if_confirmed(
         async with service() as there:
             there.stopped.set()
             asked = asyncio.create_task(ask(there, "find the red car and circle it at ten metres"))
-            assert "orbit track=3\n" in await shown("fly this?", capsys)
+            assert "orbit radius=10 track=3\n" in await shown("fly this?", capsys)
             typed.write(f"{answer}\n")
             assert await asyncio.wait_for(asked, 20) is bool(commands)
             assert there.commands == commands

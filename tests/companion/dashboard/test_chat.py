@@ -116,7 +116,7 @@ async def test_plan_is_flown_after_its_confirmation_and_history_is_used() -> Non
         plan = await window.until_plan()
         assert window.chat["model"] == ""
         assert window.chat["exchanges"] == [
-            {"asked": "circle the red car at ten metres", "answer": "orbit track=3"}
+            {"asked": "circle the red car at ten metres", "answer": "orbit radius=10 track=3"}
         ]
         assert there.commands == []
         # Neither another window nor an earlier plan's number confirms it.
@@ -125,14 +125,14 @@ async def test_plan_is_flown_after_its_confirmation_and_history_is_used() -> Non
         assert await window.post(text="land") == 429
         assert await window.post(plan=plan, fly=True) == 204
         answer = await window.until_answered()
-        assert answer.splitlines() == ["orbit track=3", "confirmed", "done: orbit: ended"]
-        assert there.commands == ["orbit track=3"]
+        assert answer.splitlines() == ["orbit radius=10 track=3", "confirmed", "done: orbit: ended"]
+        assert there.commands == ["orbit radius=10 track=3"]
         assert await window.post(text="twice as far") == 204
         later = await window.until_plan()
         assert window.chat["exchanges"][1]["answer"] == "orbit radius=20 track=3"
         assert await window.post(plan=later, fly=False) == 204
         assert (await window.until_answered()).splitlines()[-1] == "not flown"
-        assert there.commands == ["orbit track=3"]
+        assert there.commands == ["orbit radius=10 track=3"]
         assert await window.post(plan=later, fly=True) == 409
         assert other.chat.get("exchanges", []) == []
 

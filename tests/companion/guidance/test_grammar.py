@@ -188,6 +188,13 @@ without_class_name = st.one_of(
 @given(commands | without_class_name)
 def test_text_of_a_command_parses_back(command: Command) -> None:
     assert parse(str(command)) == command
+    assert str(parse(str(command))) == str(command)
+
+
+def test_text_has_stated_values_also_if_they_are_the_default() -> None:
+    assert str(parse("orbit car direction=clockwise radius=10m")) == "orbit car radius=10 direction=clockwise"
+    assert str(parse("orbit car")) == "orbit car"
+    assert parse("orbit car radius=10") == parse("orbit car")
 
 
 @given(commands)

@@ -26,7 +26,7 @@ SENTENCES: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("Take off.", ("takeoff",)),
     ("take off to five metres", ("takeoff altitude=5",)),
     ("Please take off and climb to 12 m", ("takeoff altitude=12",)),
-    ("launch to two and a half meters", ("takeoff",)),
+    ("launch to two and a half meters", ("takeoff altitude=2.5",)),
     ("could you take off to twenty feet please", ("takeoff altitude=6.096",)),
     ("take off to one point five metres", ("takeoff altitude=1.5",)),
     ("lift off", ("takeoff",)),
@@ -114,7 +114,7 @@ SENTENCES: tuple[tuple[str, tuple[str, ...]], ...] = (
     # orbit
     ("circle", ("orbit",)),
     ("circle it", ("orbit boat",)),
-    ("circle the red car at ten metres", ("orbit track=3",)),
+    ("circle the red car at ten metres", ("orbit radius=10 track=3",)),
     ("orbit the person twice at 6 m", ("orbit person radius=6 laps=2",)),
     ("fly around the boat counterclockwise", ("orbit boat direction=counterclockwise",)),
     (
@@ -129,16 +129,16 @@ SENTENCES: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("five metres closer", ("orbit boat radius=5",)),
     ("go three metres further away", ("orbit boat radius=13",)),
     ("keep fifteen metres", ("orbit boat radius=15",)),
-    ("twice as fast", ("orbit boat speed=4",)),
-    ("half as slow", ("orbit boat speed=4",)),
+    ("twice as fast", ("orbit boat radius=10 speed=4",)),
+    ("half as slow", ("orbit boat radius=10 speed=4",)),
     ("three times as far", ("orbit boat radius=30",)),
     ("twice as high", ("goto forward=0 right=0 altitude=10",)),
     ("two metres lower", ("goto forward=0 right=0 altitude=3",)),
     ("and now the person", ("orbit person radius=10",)),
     ("the same with the blue car", ("orbit track=5 radius=10",)),
     ("now marker 3", ("orbit marker=3 radius=10",)),
-    ("the other way round", ("orbit boat direction=counterclockwise",)),
-    ("do it again", ("orbit boat",)),
+    ("the other way round", ("orbit boat radius=10 direction=counterclockwise",)),
+    ("do it again", ("orbit boat radius=10",)),
     # camera
     ("look down", ("gimbal pitch=-90",)),
     ("look 30 degrees down", ("gimbal pitch=-30",)),
@@ -146,7 +146,7 @@ SENTENCES: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("look ahead", ("gimbal",)),
     ("turn the camera left 45 degrees", ("gimbal yaw=-45",)),
     # several
-    ("find the red car and circle it at ten metres", ("orbit track=3",)),
+    ("find the red car and circle it at ten metres", ("orbit radius=10 track=3",)),
     ("find a boat and circle it twice at twelve metres", ("seek boat", "orbit boat radius=12 laps=2")),
     (
         "take off to 5 m, look for a person, then approach it",

@@ -65,7 +65,7 @@ async def test_plan_is_confirmed_history_is_used_and_cancel_ends_it() -> None:
         there.stopped.set()
         set_scheduler_slice()  # as the service's loop
         await talk.send("circle the red car at ten metres")
-        assert "orbit track=3" in await talk.shown("[y/N] \n")
+        assert "orbit radius=10 track=3" in await talk.shown("[y/N] \n")
         (child,) = set(descendants(os.getpid())) - before
         own = os.getpriority(os.PRIO_PROCESS, 0)
         assert os.getpriority(os.PRIO_PROCESS, child) == min(own + NICENESS, 19)
@@ -78,7 +78,7 @@ async def test_plan_is_confirmed_history_is_used_and_cancel_ends_it() -> None:
         await talk.send("cancel")
         await talk.send("y")  # the plan has ended
         await talk.shown("not understood")
-        assert there.commands == ["orbit track=3"]
+        assert there.commands == ["orbit radius=10 track=3"]
 
 
 async def test_settings_of_the_service_are_used_and_the_next_sentence_starts_it_again() -> None:

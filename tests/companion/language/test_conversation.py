@@ -268,7 +268,7 @@ async def test_question_then_plan_then_answer(style: str) -> None:
     async with serving(*answers) as script:
         talk = Talk(script.url + ("/v1" if style == "openai" else ""))
         assert await talk.ask("circle the red car once at ten metres")
-    assert talk.vehicle.commands == [str(parse("orbit track=3 laps=1"))]
+    assert talk.vehicle.commands == talk.lines[:1] == ["orbit radius=10 laps=1 track=3"]
     assert talk.asked == 1
     assert "circle." in talk.text
     assert script.requests[0][0] == ("/v1/chat/completions" if style == "openai" else "/api/chat")
@@ -672,7 +672,7 @@ async def test_unseen_object_is_searched_for_then_flown_to() -> None:
 
     vehicle.command = found  # type: ignore[method-assign]
     assert await talk.ask("find the green truck and circle it twice at ten metres")
-    assert vehicle.commands == ["seek truck", str(parse("orbit track=9 laps=2"))]
+    assert vehicle.commands == ["seek truck", "orbit radius=10 laps=2 track=9"]
     assert talk.asked == 2
 
 
@@ -738,12 +738,38 @@ async def test_described_object_is_not_searched_for_without_detections() -> None
     assert (talk.asked, talk.vehicle.commands) == (0, [])
 
 
+@pytest.mark.parametrize(
+    ("sentences", "lines"),
+    [
+        (["circle track 3 at ten metres"], ["orbit radius=10 track=3"]),
+        (["circle track 3"], ["orbit track=3"]),
+        (["circle track 3 at five metres", "twice as far"], ["orbit radius=10 track=3"]),
+        (
+            ["find a boat and circle it once clockwise at ten metres"],
+            [
+                "mission plan: 2 steps",
+                "1. seek boat → orbit boat radius=10 laps=1 direction=clockwise; on failure → abort",
+                "2. orbit boat radius=10 laps=1 direction=clockwise → end; on failure → abort",
+            ],
+        ),
+    ],
+)
+async def test_plan_shows_stated_values_that_equal_the_default(
+    sentences: list[str], lines: list[str]
+) -> None:
+    talk = Talk(yes=True)
+    for sentence in sentences:
+        talk.lines.clear()
+        await talk.ask(sentence)
+    assert talk.lines[: len(lines)] == lines
+
+
 async def test_newest_command_is_what_it_refers_to() -> None:
     talk = Talk()
     for sentence in ("circle the boat at ten metres", "twice as far", "the other way round"):
         assert await talk.ask(sentence)
     assert talk.vehicle.commands == [
-        "orbit boat",
+        "orbit boat radius=10",
         "orbit boat radius=20",
         "orbit boat radius=20 direction=counterclockwise",
     ]
