@@ -209,9 +209,9 @@ async def _readable(endpoint: OllamaEndpoint | OpenAIEndpoint, advice: str) -> A
             "language.timeout_s"
         ) from None
     except (ConnectionError, httpx.ConnectError):
-        raise LanguageError(
-            f"no language model at {url}: start Ollama with `ollama serve`, or set language.url"
-        ) from None
+        is_ollama = isinstance(endpoint, OllamaEndpoint)
+        start = "start Ollama with `ollama serve`" if is_ollama else f"start the server at {url}"
+        raise LanguageError(f"no language model at {url}: {start}, or set language.url") from None
     except httpx.TransportError as error:
         raise LanguageError(f"{url}: the connection was lost during the answer: {error}") from None
     except httpx.InvalidURL as error:

@@ -609,9 +609,12 @@ async def test_silent_server_is_given_up(path: str) -> None:
 
 
 @pytest.mark.parametrize("path", ["", "/v1"])
-async def test_no_server_says_how_to_start_one(path: str) -> None:
-    with pytest.raises(LanguageError, match="ollama serve"):
-        await Talk(f"http://127.0.0.1:{free_port(socket.SOCK_STREAM)}{path}").ask("hello")
+async def test_no_server_says_which_one_to_start(path: str) -> None:
+    url = f"http://127.0.0.1:{free_port(socket.SOCK_STREAM)}{path}"
+    with pytest.raises(LanguageError) as caught:
+        await Talk(url).ask("hello")
+    assert ("ollama serve" in str(caught.value)) is (path == "")
+    assert (f"start the server at {url}," in str(caught.value)) is (path == "/v1")
 
 
 async def test_malformed_arguments_of_openai_are_refused() -> None:
