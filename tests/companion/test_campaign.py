@@ -166,17 +166,23 @@ def test_address_without_a_cluster_is_refused_in_one_line(capsys: pytest.Capture
     assert unused in capsys.readouterr().err
 
 
+@pytest.fixture(scope="module", autouse=True)
+def token() -> Iterator[None]:
+    """A token, because Ray listens on every address; set before any test imports Ray, which reads it then."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAY_AUTH_MODE", "token")
+        patch.setenv("RAY_AUTH_TOKEN", secrets.token_hex(32))
+        yield
+
+
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[str]:
-    """The address of a Ray cluster of two processors on this machine, with a token of its own."""
+    """The address of a Ray cluster of two processors on this machine."""
     pytest.importorskip("ray", reason="ray is of the optional extra cluster")
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    with pytest.MonkeyPatch.context() as patch, tempfile.TemporaryDirectory(prefix="ray") as folder:
-        # Ray listens on every address of the machine.
-        patch.setenv("RAY_AUTH_MODE", "token")
-        patch.setenv("RAY_AUTH_TOKEN", secrets.token_hex(32))
+    with tempfile.TemporaryDirectory(prefix="ray") as folder:
         command = f"start --head --block --port {port} --num-cpus 2 --temp-dir {folder} --disable-usage-stats"
         started = subprocess.Popen(
             [sys.executable, "-m", "ray.scripts.scripts", *command.split(), "--include-dashboard=false"],
