@@ -131,7 +131,8 @@ def _on_cluster(function: Callable[[int], Result], seeds: Sequence[int], address
                 raise SeedError(f"seed {seed}: no result from {address}: {_one_line(error)}") from error
             yield value
     finally:
-        ray.shutdown()
+        with redirect_stdout(sys.stderr):  # the rest of these lines
+            ray.shutdown()
 
 
 def _connected(address: str) -> Any:
