@@ -56,6 +56,8 @@ RIVAL_SHARE = 0.5
 # five other objects at the predicted place less. Boxes with a side below `MIN_LOOK_PX` are too few pixels for
 # that; rendered ones of 32 pixels lost tracks by it.
 SAME_LOOK, MIN_LOOK_PX, GAP_S = 0.935, 48.0, 0.1
+# Only so many of a frame's boxes, to limit the time: the largest, whose order changes least between frames.
+MOST_LOOKS = 24
 # Share of the newest detection in a track's appearance.
 LOOK_SHARE = 0.3
 _DECAY = 1.0 - 1.0 / SCORES_KEPT
@@ -396,7 +398,8 @@ class Tracker:
 
 
 def _looks(image: NDArray[np.uint8], detections: Detections) -> Looks:
-    """The appearances of those that are large enough."""
+    """The appearances of those that are large enough, at most `MOST_LOOKS`."""
     sides = (detections.xyxy[:, 2:] - detections.xyxy[:, :2]).min(axis=1)
-    large = np.flatnonzero(sides >= MIN_LOOK_PX)
+    largest = np.argsort(-sides, kind="stable")[:MOST_LOOKS]
+    large = largest[sides[largest] >= MIN_LOOK_PX]
     return dict(zip(large.tolist(), appearances(image, detections.xyxy[large]), strict=True))

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from vision.detections import Detections
 from vision.tracking import Tracker
 from vision.tracking.appearance import appearances
+from vision.tracking.byte_track import MIN_LOOK_PX, MOST_LOOKS, _looks
 
 RED, BLUE = (30, 30, 160), (160, 50, 25)
 FRAME_NS = 50_000_000
@@ -106,3 +107,14 @@ def test_small_boxes_are_matched_without_appearance() -> None:
         shown = tracker.update(found, frame * FRAME_NS + 1, image=image).detections
     assert shown.track_id is not None
     assert shown.track_id.tolist() == [1]
+
+
+def test_appearance_is_of_the_largest_boxes_of_a_crowd() -> None:
+    sides = MIN_LOOK_PX - 1 + np.random.default_rng(0).permutation(2 * MOST_LOOKS)
+    boxes = np.concatenate([box(side=int(side)) for side in sides])
+    looks = _looks(picture(RED), seen(boxes))
+    assert set(looks) == set(np.argsort(-sides)[:MOST_LOOKS].tolist())
+    for index, look in looks.items():
+        np.testing.assert_array_equal(look, appearances(picture(RED), boxes[[index]])[0])
+    few = _looks(picture(RED), seen(boxes[sides <= MIN_LOOK_PX + 1]))
+    assert len(few) == 2  # The third is too small.
