@@ -40,7 +40,10 @@ _LARGEST_METADATA_BYTES = 1 << 20
 _TRACED, _TRIED = (2, 4), (4, 6)
 # Enough to distinguish two precisions: as many pairs of runs as fit. Measured once, see `StoredChoice`.
 _TRIAL_PAIRS = range(5, 40)
-_TRIAL_S = 0.5
+_TRIAL_S = 0.5  # of processor time
+_TRIAL_WALL_S = 3.0
+# Least share of pairs that agree with the choice; of 20 measurements beside other load the least was 0.97.
+_AGREEING = 0.75
 _TRIAL_SIDE = 320
 # Of the calls before the first frame: the second of a GPU's also compiles, for each size.
 _WARM_UP_RUNS = {"cpu": 2, "cuda": 4}
@@ -178,39 +181,62 @@ class TorchRuntime:
             return "float32", "this processor does not support bfloat16"
         stored = None
         if model_sha256 is not None:
-            question = {"torch": torch.__version__, "threads": self.threads, "precisions": list(_DTYPES)}
-            stored = StoredChoice(model_sha256, question)
+            stored = StoredChoice(model_sha256, {"torch": torch.__version__, "precisions": list(_DTYPES)})
         times = stored.read(set(_DTYPES)) if stored is not None else None
-        when = "measured before"
+        when, agreeing, count = "measured before", 1, 1
         if times is None:
-            when = "measured now"
-            times = dict(zip(_DTYPES, self._measured_ms(*_DTYPES.values()), strict=True))
-            if stored is not None:
-                stored.write(times)
+            pairs = self._measured_ms(*_DTYPES.values())
+            times = dict(zip(_DTYPES, map(min, zip(*pairs, strict=True)), strict=True))
+            worth = times["bfloat16"] < _WORTH * times["float32"]
+            when, count = "measured now", len(pairs)
+            agreeing = sum((half < _WORTH * full) == worth for full, half in pairs)
         full, half = times["float32"], times["bfloat16"]
-        chosen = "bfloat16" if half < _WORTH * full else "float32"
-        return chosen, f"{when}: {full:.1f} ms in float32, {half:.1f} ms in bfloat16 ({native})"
+        text = f"{full:.1f} ms in float32, {half:.1f} ms in bfloat16 ({native})"
+        if agreeing < _AGREEING * count:
+            return "bfloat16", (
+                f"measured now, not clearly: {text}, but {agreeing} of {count} pairs agree; "
+                "the processor supports it"
+            )
+        if stored is not None and when == "measured now":
+            stored.write(times)
+        return "bfloat16" if half < _WORTH * full else "float32", f"{when}: {text}"
 
-    def _measured_ms(self, *dtypes: torch.dtype) -> list[float]:
-        """The minimum processor time, of all threads, of a small input in each dtype.
+    def _measured_ms(self, *dtypes: torch.dtype) -> list[tuple[float, ...]]:
+        """The processor times of a small input in each dtype, measured alternately.
 
-        Measured alternately. Other load changes the wall time far more than the processor time.
+        On one thread: beside other load, several wait for each other and spend processor time on it, which
+        made bfloat16 slower or faster by chance.
         """
         pixels = torch.zeros(1, _TRIAL_SIDE, _TRIAL_SIDE, 3, dtype=torch.uint8)
-        with torch.inference_mode():
-            graphs = [traced(copy.deepcopy(self._network).in_precision(dtype), pixels) for dtype in dtypes]
-            for graph in graphs * 2:
-                graph(pixels)  # its first runs allocate its memory
-            times: list[list[float]] = [[] for _ in dtypes]
-            began = time.perf_counter()
-            for count in range(_TRIAL_PAIRS.stop):
-                if count >= _TRIAL_PAIRS.start and time.perf_counter() - began > _TRIAL_S:
-                    break
-                for graph, spent in zip(graphs, times, strict=True):
-                    started = time.process_time()
-                    graph(pixels)
-                    spent.append((time.process_time() - started) * 1e3)
-        return [min(spent) for spent in times]
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)
+        try:
+            with torch.inference_mode():
+                graphs = [
+                    traced(copy.deepcopy(self._network).in_precision(dtype), pixels) for dtype in dtypes
+                ]
+                for graph in graphs * 2:
+                    graph(pixels)  # its first runs allocate its memory
+                pairs: list[tuple[float, ...]] = []
+                began, began_wall = time.thread_time(), time.perf_counter()
+                while len(pairs) < _TRIAL_PAIRS.stop and (
+                    len(pairs) < _TRIAL_PAIRS.start
+                    or (
+                        time.thread_time() - began < _TRIAL_S
+                        and time.perf_counter() - began_wall < _TRIAL_WALL_S
+                    )
+                ):
+                    pairs.append(tuple(_spent_ms(graph, pixels) for graph in graphs))
+        finally:
+            torch.set_num_threads(threads)
+        return pairs
+
+
+def _spent_ms(graph: Graph, pixels: Tensor) -> float:
+    """Processor time of this thread for one run."""
+    started = time.thread_time()
+    graph(pixels)
+    return (time.thread_time() - started) * 1e3
 
 
 def check_device(device: Device) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import warnings
 from pathlib import Path
 
@@ -88,7 +89,7 @@ def test_auto_uses_native_bfloat16_if_much_faster(
     monkeypatch: pytest.MonkeyPatch, half_ms: float, chosen: str
 ) -> None:
     times = {torch.float32: 5.0, torch.bfloat16: half_ms}
-    monkeypatch.setattr(TorchRuntime, "_measured_ms", lambda self, *dtypes: [times[d] for d in dtypes])
+    monkeypatch.setattr(TorchRuntime, "_measured_ms", lambda self, *dtypes: [tuple(times[d] for d in dtypes)])
     runtime = TorchRuntime(lively_model())
     assert runtime.precision == chosen
     assert "5.0 ms in float32" in runtime.precision_reason
@@ -99,7 +100,7 @@ def test_measured_precision_is_stored_for_later_starts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    measured = iter([[5.0, 2.0], [5.0, 9.0], [5.0, 9.0]])
+    measured = iter([[(5.0, 2.0)], [(5.0, 9.0)], [(5.0, 9.0)]])
     monkeypatch.setattr(TorchRuntime, "_measured_ms", lambda self, *dtypes: next(measured))
 
     def chosen(model_sha256: str) -> tuple[str, str]:
@@ -111,6 +112,50 @@ def test_measured_precision_is_stored_for_later_starts(
     assert chosen("b") == ("float32", "measured now")
     forget_choices("a")
     assert chosen("a") == ("float32", "measured now")
+
+
+@pytest.mark.usefixtures("with_bfloat16")
+@pytest.mark.parametrize("slow_pairs", [1, 2, 3])
+def test_measurement_whose_pairs_disagree_is_not_stored(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, slow_pairs: int
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    pairs = [(5.0, 9.0)] * slow_pairs + [(8.0, 4.5)] * (4 - slow_pairs)
+    monkeypatch.setattr(TorchRuntime, "_measured_ms", lambda self, *dtypes: pairs)
+    runtime = TorchRuntime(lively_model(), model_sha256="a")
+    # By the minima float32 is as good; 3 of 4 pairs must agree with that.
+    assert runtime.precision == ("float32" if slow_pairs == 3 else "bfloat16")
+    assert (f"{slow_pairs} of 4 pairs" in runtime.precision_reason) == (slow_pairs < 3)
+    assert bool(list(tmp_path.rglob("*.json"))) == (slow_pairs == 3)
+
+
+@pytest.mark.usefixtures("with_bfloat16")
+def test_precision_is_measured_on_one_thread_for_a_limited_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = torch.get_num_threads()
+    runtime = TorchRuntime(lively_model(), precision="float32", threads=2)
+    used: list[int] = []
+
+    def spent_ms(graph: object, pixels: object) -> float:
+        used.append(torch.get_num_threads())
+        return 1.0
+
+    monkeypatch.setattr(torch_runtime_module, "traced", lambda network, pixels: lambda pixels: ())
+    monkeypatch.setattr(torch_runtime_module, "_spent_ms", spent_ms)
+    try:
+        for name, pairs in (("thread_time", 5), ("perf_counter", 5), (None, 40)):
+            used.clear()
+            with monkeypatch.context() as patch:
+                clock = itertools.count(0.0, 10.0)
+                patch.setattr(torch_runtime_module, "_TRIAL_S", 1.0 if name == "thread_time" else 1e6)
+                patch.setattr(torch_runtime_module, "_TRIAL_WALL_S", 1.0 if name == "perf_counter" else 1e6)
+                if name is not None:
+                    patch.setattr(f"vision.runtimes.torch_runtime.time.{name}", clock.__next__)
+                found = runtime._measured_ms(torch.float32, torch.bfloat16)
+            assert found == [(1.0, 1.0)] * pairs
+            assert used == [1] * 2 * pairs
+            assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
 
 
 @pytest.mark.usefixtures("with_bfloat16")
