@@ -35,7 +35,14 @@ BOX = [0.1, 0.1, 0.5, 0.5, "car", 0.9, 7, "confirmed"]
 
 
 def frame(sequence: int, **more: Any) -> dict[str, Any]:
-    return {"sequence": sequence, "width": 640, "height": 480, "detections": [FOUND], **more}
+    return {
+        "sequence": sequence,
+        "width": 640,
+        "height": 480,
+        "model": "default",
+        "detections": [FOUND],
+        **more,
+    }
 
 
 class Publisher:

@@ -14,6 +14,7 @@ import companion.dashboard.chat
 from companion.bus import topics
 from companion.dashboard.chat import Chat, Chats
 from companion.dashboard.fleet import Fleet
+from companion.language import conversation, serve
 from companion.language.sentences import is_stop
 from companion.settings import LanguageSection, ZenohSection
 from tests.companion.cli.test_ask import Service, service
@@ -176,6 +177,8 @@ async def test_reader_of_sentences_is_loaded_with_the_server(monkeypatch: pytest
 async def test_stop_while_a_sentence_is_read_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
     reading, read = asyncio.Event(), threading.Event()
     loop = asyncio.get_running_loop()
+    # Both are imported now: with the replaced function they would keep it.
+    assert vars(conversation)["is_stop"] is vars(serve)["is_stop"] is is_stop
 
     def slow_is_stop(text: str) -> bool:
         if text:
