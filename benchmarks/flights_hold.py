@@ -22,8 +22,7 @@ def run(seed: int) -> FlightResult:
     chance = random.Random(seed)
     goal = (chance.uniform(-15.0, 15.0), chance.uniform(-15.0, 15.0))
     goto = GotoBehaviour(from_home_m=goal, altitude_m=chance.uniform(3.0, 8.0), speed_mps=4.0)
-    wind_mps = random.Random(seed).uniform(0.0, 3.0)
-    flight = LockstepFlight.airborne(seed=seed, wind_mps=wind_mps, gusts_mps=GUSTS_MPS)
+    flight = LockstepFlight.airborne(seed=seed, wind_mps=chance.uniform(0.0, 3.0), gusts_mps=GUSTS_MPS)
     log = flight.fly(goto, LIMIT_S)
     if log.outcome is None or not log.outcome.success or log.outcome.goal_ned_m is None:
         reason = f"not there after {LIMIT_S:g} s" if log.outcome is None else log.outcome.reason

@@ -33,6 +33,9 @@ def fly(seed: int, gusts_mps: float) -> FlightResult:
     flight = LockstepFlight.airborne(seed=seed, wind_mps=wind_mps, gusts_mps=gusts_mps)
     orbit = OrbitBehaviour(RADIUS_M, SPEED_MPS, LAPS, clockwise=bool(seed % 2))
     log = flight.fly(orbit, LIMIT_S)
+    if log.outcome is None or not log.outcome.success:
+        reason = f"not flown in {LIMIT_S:g} s" if log.outcome is None else log.outcome.reason
+        return FlightResult(seed, False, {}, reason)
     begin, yaw_rad = position_and_yaw(log.moments[0].context.state)
     centre = (begin[0] + RADIUS_M * math.cos(yaw_rad), begin[1] + RADIUS_M * math.sin(yaw_rad))
     radius_m, nose_deg, speed_mps = [], [], []
@@ -49,6 +52,4 @@ def fly(seed: int, gusts_mps: float) -> FlightResult:
         "speed_p50_mps": float(np.median(speed_mps)),
     }
     good = values["radius_error_p95_m"] <= WITHIN_M and values["heading_error_p95_deg"] <= WITHIN_DEG
-    flown = log.outcome is not None and log.outcome.success and not log.violations
-    reason = f"not flown in {LIMIT_S:g} s" if log.outcome is None else log.outcome.reason
-    return FlightResult(seed, good and flown, values, reason)
+    return FlightResult(seed, good and not log.violations, values, log.outcome.reason)

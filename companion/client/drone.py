@@ -74,6 +74,13 @@ class Steering:
             raise CommandFailedError(
                 {"command": f"velocity source={self.source}", "success": False, "reason": reason}
             )
+        self._put(forward, right, up, turn, lifetime)
+
+    def end(self) -> None:
+        """Replace the last velocity, which may still be valid, by zero."""
+        self._put(0.0, 0.0, 0.0, 0.0, 0.5)
+
+    def _put(self, forward: float, right: float, up: float, turn: float, lifetime: float) -> None:
         body: VelocityBody = {
             "source": self.source,
             "stamp_ns": time.monotonic_ns(),
@@ -95,8 +102,8 @@ class Steering:
         self._statuses += 1
         behaviour: str = json.loads(sample.payload.to_string())["pilot"]["behaviour"]
         # The first one may have been made before the command began.
-        if self._statuses > 1 and not behaviour.startswith(f"velocity of {self.source}"):
-            self._flown_instead = behaviour
+        own = self._statuses == 1 or behaviour.startswith(f"velocity of {self.source}")
+        self._flown_instead = "" if own else behaviour
 
 
 @cache
@@ -117,6 +124,7 @@ class Drone(Commands):
         self._session, self.name = session, name
         # One for all its steering: the last message of the one before is still valid at the next.
         self._source = f"client-{uuid.uuid4().hex[:8]}"
+        self._steering: Steering | None = None
 
     @property
     def session(self) -> zenoh.Session:
@@ -192,8 +200,10 @@ class Drone(Commands):
 
         Raises:
             CommandFailedError: it is refused, for example while another sender steers.
-            NoAnswerError: as `command`.
+            NoAnswerError: as `command`. RuntimeError: this Drone is being steered already.
         """
+        if self._steering is not None:
+            raise RuntimeError(f"{self.name} is being steered already: use one `steer()` at a time")
         topic = topics.VELOCITY
         with self._session.declare_publisher(
             topic.key(self.name),
@@ -202,14 +212,16 @@ class Drone(Commands):
             priority=topic.priority,
             express=topic.express,
         ) as publisher:
-            steering = Steering(publisher, self._source)
-            await self.velocity(source=self._source)
-            with self._session.declare_subscriber(topics.STATUS.key(self.name), steering._on_status):
-                try:
-                    yield steering
-                finally:
-                    with suppress(CommandFailedError):  # something else is flown
-                        steering.send()
+            self._steering = steering = Steering(publisher, self._source)
+            try:
+                await self.velocity(source=self._source)
+                with self._session.declare_subscriber(topics.STATUS.key(self.name), steering._on_status):
+                    try:
+                        yield steering
+                    finally:
+                        steering.end()
+            finally:
+                self._steering = None
 
     async def query(self, path: str) -> Any:
         """Ask one of the queryables status, config, models, commands.

@@ -22,18 +22,20 @@ class Question:
 
     Attributes:
         name: one of QUESTIONS. The others restrict "seen".
-        classes: any of these. colour: of `vision.colour.COLOURS`. choice: a superlative or a side.
+        classes: any of these. colour: of `vision.colour.COLOURS`. choice: of CHOICE. side: left or right.
     """
 
     name: str
     classes: tuple[str, ...] = ()
     colour: str = ""
     choice: str = ""
+    side: str = ""
     track_id: int | None = None
 
     def __str__(self) -> str:
         track = "" if self.track_id is None else f"track={self.track_id}"
-        words = (f"?{self.name}", *self.classes, self.colour, self.choice, track)
+        side = self.side and f"on the {self.side}"
+        words = (f"?{self.name}", *self.classes, self.colour, self.choice, side, track)
         return " ".join(filter(None, words))
 
     def select(self, objects: Sequence[SceneObject]) -> list[SceneObject]:
@@ -50,6 +52,8 @@ class Question:
         ]
         if self.colour:
             found = _of_colour(self.colour, found)
+        if self.side:
+            found = _on_side(self.side, found)
         return [_chosen(self.choice, found)] if self.choice and found else found
 
 
@@ -219,7 +223,10 @@ class Clause:
             for each in self._scene.objects
             if each.track_id is not None and class_name in (None, each.class_name)
         ]
-        return of_class if colour is None else _of_colour(COLOUR_WORDS[colour[0]], of_class)
+        try:
+            return of_class if colour is None else _of_colour(COLOUR_WORDS[colour[0]], of_class)
+        except UnclearError as error:
+            raise UnclearError(f"{self._whole!r}: {error}") from None
 
     def _same_object(self) -> dict[str, Any]:
         if self.focus:
@@ -499,6 +506,14 @@ def _of_colour(colour: str, seen: Sequence[SceneObject]) -> list[SceneObject]:
             f"{'; '.join(map(str, unknown))}. Name a track, or ask again"
         )
     return matching
+
+
+def _on_side(side: str, seen: Sequence[SceneObject]) -> list[SceneObject]:
+    """Those left or right of the nose. Raises UnclearError: a direction is unknown."""
+    if unknown := [each for each in seen if each.bearing_deg is None]:
+        raise UnclearError(f"directions are not known: {'; '.join(map(str, unknown))}")
+    sign = -1 if side == "left" else 1
+    return [each for each in seen if sign * (each.bearing_deg or 0.0) > 0.0]
 
 
 def _chosen(word: str, seen: Sequence[SceneObject]) -> SceneObject:

@@ -126,7 +126,11 @@ class Conversation:
             commands = [intent for intent in reading.intents if isinstance(intent, Command)]
             for intent in reading.intents:
                 if isinstance(intent, Question):
-                    self._operator.show(_in_words(intent, await self._answer(intent)))
+                    answer = await self._answer(intent)
+                    if "error" in answer:
+                        self._operator.show(str(answer["error"]))
+                        return False
+                    self._operator.show(_in_words(intent, answer))
             if reading.done is not None:
                 self._operator.show("not in view: search first")
             if commands and not (await self._propose(commands, NOT_FLOWN))["success"]:

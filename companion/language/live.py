@@ -175,7 +175,7 @@ class LiveVehicle:
             async with asyncio.timeout(_STATE_S):
                 async for frame in frames:
                     if frame["model"] is None:  # frames are read without a detector
-                        continue
+                        return None
                     received[frame["sequence"]] = frame
                     newest = frame["detections"]
                     if not newest:

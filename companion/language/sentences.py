@@ -152,12 +152,12 @@ def _question(text: str, scene: Scene) -> Question | None:
     if found := re.fullmatch(
         r"(?:(?:can|do) you see|is there|are there|where (?:is|are)|how far(?: away)? (?:is|are)|how many"
         rf"|any)(?: any| a| an| the)?(?: (?P<choice>{CHOICE}))?(?: (?P<colour>{COLOUR}))? (?P<noun>{nouns})"
-        rf"(?(choice)|(?: on the (?P<side>left|right))?){_SEEN_REST}",
+        rf"(?(choice)|(?: (?:(?:is|are) )?on the (?P<side>left|right))?){_SEEN_REST}",
         text,
     ):
         names = classes_of(found["noun"], scene.class_names)
         colour = COLOUR_WORDS.get(found["colour"], "")
-        return Question("seen", names, colour, found["choice"] or found["side"] or "")
+        return Question("seen", names, colour, found["choice"] or "", found["side"] or "")
     if re.fullmatch(
         rf"(?:how high|how fast|where) are you{_REST}|what are you doing{_REST}"
         r"|(?:what is )?(?:the |your )?(?:state|status)"

@@ -3,6 +3,7 @@
 import pytest
 
 from benchmarks import flights_hold, flights_orbit, flights_orbit_calm
+from benchmarks.flights import FlightResult
 
 
 def test_gusts_widen_an_orbit() -> None:
@@ -17,6 +18,11 @@ def test_gusts_widen_an_orbit() -> None:
 def test_orbit_outside_of_its_tolerance_is_no_success(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(flights_orbit, "WITHIN_M", 0.05)
     assert not flights_orbit.run(1).success
+
+
+def test_orbit_that_is_not_flown_is_no_success(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(flights_orbit, "LIMIT_S", 1.0)
+    assert flights_orbit.run(1) == FlightResult(1, False, {}, "not flown in 1 s")
 
 
 def test_hold_is_judged_by_the_estimate_and_by_the_truth() -> None:

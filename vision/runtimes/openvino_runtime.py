@@ -20,8 +20,8 @@ from vision.yolo.level_outputs import Head, LevelOutput, Product
 _HINTS = {"float32": "f32", "bfloat16": "bf16", "float16": "f16"}
 _MOST_SIZES = 2
 _LARGEST_METADATA_BYTES = 1 << 20
-# The beginning of an `.xml` that OpenVINO writes.
-_IR_HEAD = re.compile(rb"(\xef\xbb\xbf)?\s*(<\?xml[^>]*>\s*)?<net\b")
+# The beginning of an `.xml` that OpenVINO reads.
+_IR_HEAD = re.compile(rb"(\xef\xbb\xbf)?\s*(<\?xml[^>]*>\s*)?(<!--.*?-->\s*)*<net\b", re.DOTALL)
 
 
 class OpenVinoNetwork:

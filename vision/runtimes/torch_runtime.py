@@ -9,7 +9,7 @@ import logging
 import time
 import warnings
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -183,23 +183,20 @@ class TorchRuntime:
         if model_sha256 is not None:
             stored = StoredChoice(model_sha256, {"torch": torch.__version__, "precisions": list(_DTYPES)})
         times = stored.read(set(_DTYPES)) if stored is not None else None
-        when, agreeing, count = "measured before", 1, 1
-        if times is None:
-            pairs = self._measured_ms(*_DTYPES.values())
-            times = dict(zip(_DTYPES, map(min, zip(*pairs, strict=True)), strict=True))
-            worth = times["bfloat16"] < _WORTH * times["float32"]
-            when, count = "measured now", len(pairs)
-            agreeing = sum((half < _WORTH * full) == worth for full, half in pairs)
-        full, half = times["float32"], times["bfloat16"]
-        text = f"{full:.1f} ms in float32, {half:.1f} ms in bfloat16 ({native})"
-        if agreeing < _AGREEING * count:
+        if times is not None:
+            return _faster(times), f"measured before: {_in_words(times)} ({native})"
+        pairs = self._measured_ms(*_DTYPES.values())
+        times = dict(zip(_DTYPES, map(min, zip(*pairs, strict=True)), strict=True))
+        text, chosen = f"{_in_words(times)} ({native})", _faster(times)
+        agreeing = sum(_faster(dict(zip(_DTYPES, pair, strict=True))) == chosen for pair in pairs)
+        if agreeing < _AGREEING * len(pairs):
             return "bfloat16", (
-                f"measured now, not clearly: {text}, but {agreeing} of {count} pairs agree; "
+                f"measured now, not clearly: {text}, but {agreeing} of {len(pairs)} pairs agree; "
                 "the processor supports it"
             )
-        if stored is not None and when == "measured now":
+        if stored is not None:
             stored.write(times)
-        return "bfloat16" if half < _WORTH * full else "float32", f"{when}: {text}"
+        return chosen, f"measured now: {text}"
 
     def _measured_ms(self, *dtypes: torch.dtype) -> list[tuple[float, ...]]:
         """The processor times of a small input in each dtype, measured alternately.
@@ -230,6 +227,15 @@ class TorchRuntime:
         finally:
             torch.set_num_threads(threads)
         return pairs
+
+
+def _faster(times: Mapping[str, float]) -> str:
+    """The precision to use, by the times of both."""
+    return "bfloat16" if times["bfloat16"] < _WORTH * times["float32"] else "float32"
+
+
+def _in_words(times: Mapping[str, float]) -> str:
+    return f"{times['float32']:.1f} ms in float32, {times['bfloat16']:.1f} ms in bfloat16"
 
 
 def _spent_ms(graph: Graph, pixels: Tensor) -> float:

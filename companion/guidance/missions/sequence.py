@@ -119,6 +119,10 @@ class SequenceBehaviour(Behaviour):
             return frozenset()
         return self._first.requirements
 
+    def blocked_by(self, active: Behaviour, context: BehaviourContext) -> str | None:
+        """See Behaviour: as its first step."""
+        return None if self._first is None else self._first.blocked_by(active, context)
+
     @property
     def where(self) -> str:
         """The current step: `step 2 of 6 (find)`."""

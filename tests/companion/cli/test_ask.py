@@ -240,7 +240,8 @@ async def test_dead_camera_is_not_a_free_view(
     async with service() as there:
         there.frame = frame
         there.perception |= perception
-        assert await ask(there, "what do you see?")
+        answered = await ask(there, "what do you see?")
+        assert answered is (words[0] == "seen: no object")
     printed = capsys.readouterr().out
     assert all(word in printed for word in words)
     assert ("no object" in printed) is (words[0] == "seen: no object")

@@ -301,7 +301,10 @@ async def test_steering_raises_once_something_else_is_flown() -> None:
             there.bus.publish(topics.STATUS, {"pilot": {"behaviour": "velocity of another"}})
             with pytest.raises(CommandFailedError, match="velocity of another") as failed:
                 await until(lambda: steering.send(forward=2.0))
-        assert failed.value.reply["command"] == f"velocity source={steering.source}"
+            assert failed.value.reply["command"] == f"velocity source={steering.source}"
+        # The last velocity is not flown on by the next steering: zero replaces it.
+        await until(lambda: there.velocities[-1]["forward_mps"] == 0.0)
+        assert there.velocities[0]["forward_mps"] == 1.0
 
 
 @pytest.mark.realtime
@@ -313,7 +316,9 @@ async def test_refused_steering_sends_nothing_and_source_stays() -> None:
                 pass
         there.refused = set()
         async with drone.steer() as steering:
-            pass
+            with pytest.raises(RuntimeError, match="being steered already"):
+                async with drone.steer():
+                    pass
         async with drone.steer() as again:  # the last message of the steering before is still valid
             assert again.source == steering.source
         await until(lambda: len(there.velocities) == 2)

@@ -10,12 +10,13 @@ from typing import Any
 import pytest
 
 from companion.bench.lockstep_flight import LockstepFlight
-from companion.guidance.behaviour import VelocityInput
+from companion.guidance.behaviour import Behaviour, VelocityInput
 from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.behaviours.stop import StopBehaviour
 from companion.guidance.behaviours.velocity import VelocityBehaviour
 from companion.guidance.core import Phase
 from companion.guidance.interface import EventKind, GuidanceInput
+from companion.guidance.missions.sequence import Plan, PlannedStep, SequenceBehaviour
 from companion.service.velocity_senders import FORGET_S, MAX_SENDERS, VelocitySenders
 from companion.vehicle.state import FlightMode
 from tests.companion.guidance.guidance_harness import (
@@ -133,6 +134,24 @@ def test_another_sender_is_refused_while_the_first_is_flown(source: str | None, 
     assert harness.outcome(harness.command(VelocityBehaviour(other), endless=True)).success
     harness.run(2.0)
     assert harness.vehicle.velocity[0] == pytest.approx(-1.0, abs=0.1)
+
+
+def test_mission_that_begins_with_another_sender_is_refused() -> None:
+    harness = Steered("first")
+    harness.sending["first"] = {"forward_mps": 1.0}
+    harness.run(1.0)
+
+    def mission(behaviour: Behaviour) -> SequenceBehaviour:
+        step = PlannedStep("steer", "steer", lambda: behaviour, on_success=0)
+        return SequenceBehaviour(
+            Plan("other", (step,), lambda _: HoldBehaviour()), harness.guidance.check_requirements
+        )
+
+    assert_failed(harness.outcome(harness.command(mission(VelocityBehaviour("second")))), "first steers")
+    assert harness.guidance.status == "velocity of first"
+    harness.command(mission(HoldBehaviour()))
+    harness.run(0.1)
+    assert harness.guidance.status.startswith("mission other")
 
 
 def test_sender_whose_lifetime_is_over_is_replaced() -> None:

@@ -171,7 +171,7 @@ SENTENCES: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("is there a grey boat in view?", ("?seen boat grey",)),
     ("how many silver cars are there", ("?seen car grey",)),
     ("how far away is the farthest blue car from here?", ("?seen car blue farthest",)),
-    ("where is the car on the left", ("?seen car left",)),
+    ("where is the car on the left", ("?seen car on the left",)),
     ("do you see any vehicles right now?", ("?seen car truck bus",)),
     ("what is in front of you?", ("?seen",)),
     ("how much battery is left?", ("?battery",)),
