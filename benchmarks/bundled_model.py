@@ -19,6 +19,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,8 @@ DEFAULT_WORLDS = 20
 """The default world is rendered with the seeds 1 to this; training has others."""
 ALTITUDES_M = ((1.5, 40.0), (2.0, 8.0))
 """Half of a scene's frames are taken anywhere, half as low as flights search."""
+RANGES_M = (0.0, 2.0, 3.0, 6.0, 15.0, 30.0, 70.0)
+"""Recall is told for each of these ranges."""
 SAME_PLACE_IOU = 0.3
 """A wrong detection is ascribed to what it overlaps by so much, else to the background."""
 
@@ -133,6 +136,25 @@ def mistakes(
     return found
 
 
+def recall_by_range(
+    results: Sequence[ImageResult], seen: Sequence[Sequence[Seen]], confidence: float
+) -> dict[str, dict[str, float | None]]:
+    """Range → number of evaluated objects and the share that a detection of their class covers (IoU 0.5)."""
+    ranges_m, detected = [], []
+    for result, things in zip(results, seen, strict=True):
+        ranges_m += [thing.range_m for thing in things if thing.class_name in CLASS_NAMES]
+        same = result.true_class_ids[:, None] == result.class_ids
+        good = same & (overlaps(result.true_boxes, result.boxes) >= 0.5) & (result.confidences >= confidence)
+        detected += np.where(result.ignored, np.nan, good.any(axis=1)).tolist()
+    of_place, found = np.digitize(ranges_m, RANGES_M) - 1, np.array(detected)
+    table: dict[str, dict[str, float | None]] = {}
+    for place, (least, greatest) in enumerate(pairwise(RANGES_M)):
+        judged = found[(of_place == place) & ~np.isnan(found)]
+        recall = float(judged.mean()) if len(judged) else math.nan
+        table[f"{least:.0f} to {greatest:.0f} m"] = {"objects": len(judged), "recall": _rounded(recall)}
+    return table
+
+
 def summary(
     results: Sequence[ImageResult], seen: Sequence[Sequence[Seen]], names: Sequence[str], confidence: float
 ) -> dict[str, Any]:
@@ -154,6 +176,7 @@ def summary(
             }
             for name in names
         },
+        "ranges": recall_by_range(results, seen, confidence),
         "wrong": {f"{there} called {said}": n for (said, there), n in _counted(wrong)},
         "boats_at_10_to_60_m": sum(
             thing.class_name == "boat" and 10 <= thing.range_m <= 60 for things in seen for thing in things
@@ -228,6 +251,12 @@ def lines(report: Mapping[str, Any]) -> list[str]:
                     f"  {name:<8} {one['objects']:5d} objects  precision {one['precision']}  "
                     f"recall {one['recall']}  AP50 {one['ap50']}  AP50-95 {one['ap50_95']}"
                 )
+        recalls = ", ".join(
+            f"{place} {one['recall']} of {one['objects']}"
+            for place, one in part["ranges"].items()
+            if one["objects"]
+        )
+        text.append(f"  recall at {recalls or 'no range'}")
         wrong = ", ".join(f"{what} {count}" for what, count in list(part["wrong"].items())[:12])
         text.append(f"  wrong: {wrong or 'none'}")
         text.append(
