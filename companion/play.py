@@ -50,6 +50,7 @@ class PlayOptions:
         scene: scene file or name of a bundled scene; None: the demo world.
         seed: random seed of the world and the simulated vehicles.
         vehicles: number of simulated vehicles, one service each; see `cameras`.
+        with_camera: whether any vehicle has a camera.
         vehicle_url: `udpin://HOST:PORT` to which an autopilot sends; None: the simulated vehicle.
         autopilot: autopilot firmware to emulate: px4 or ardupilot.
     """
@@ -59,10 +60,13 @@ class PlayOptions:
     vehicles: int = 1
     vehicle_url: str | None = None
     autopilot: str = "px4"
+    with_camera: bool = True
 
     @property
     def cameras(self) -> int:
         """How many vehicles have a camera: all of up to `_MAX_CAMERAS`, else the first one."""
+        if not self.with_camera:
+            return 0
         return self.vehicles if self.vehicles <= _MAX_CAMERAS else 1
 
 
@@ -165,7 +169,7 @@ def _opened(options: PlayOptions, scene: Scene) -> AbstractAsyncContextManager[S
     if options.cameras > 1:
         rate_hz = min(scene.camera.rate_hz, _CAMERA_RATE_HZ / options.cameras)
     camera = SimOptions(
-        camera=f"companion-play-{os.getpid()}",
+        camera=_camera_name(options),
         seed=options.seed,
         scene=options.scene,
         camera_rate_hz=rate_hz,
@@ -179,9 +183,13 @@ def _opened(options: PlayOptions, scene: Scene) -> AbstractAsyncContextManager[S
     return camera_of_autopilot(options.vehicle_url, camera)
 
 
+def _camera_name(options: PlayOptions) -> str | None:
+    return f"companion-play-{os.getpid()}" if options.with_camera else None
+
+
 def _services(settings: Settings, options: PlayOptions, vehicle: SimProcess, say: Say) -> list[Service]:
     """Create a service for each vehicle; that of one without a camera has no perception."""
-    name = f"companion-play-{os.getpid()}"
+    name = _camera_name(options)
     first = session_settings(vehicle.port, name, chosen=settings, system_id=vehicle.system_id)
     if options.vehicle_url is None:
         first = _with(
@@ -193,7 +201,7 @@ def _services(settings: Settings, options: PlayOptions, vehicle: SimProcess, say
         if zenoh.mode == "peer":
             listen = (f"{_TCP}127.0.0.1:{free_port(socket.SOCK_STREAM)}",)
             zenoh = zenoh.model_copy(update={"listen": listen, "connect": zenoh.listen or zenoh.connect})
-        with_camera = number <= options.cameras
+        camera = camera_name(name, number) if name is not None and number <= options.cameras else None
         several.append(
             _with(
                 first,
@@ -202,8 +210,8 @@ def _services(settings: Settings, options: PlayOptions, vehicle: SimProcess, say
                     "system_id": number,
                     "url": f"udpin://127.0.0.1:{vehicle.port + number - 1}",
                 },
-                source={"uri": f"shm://{camera_name(name, number)}" if with_camera else NO_SOURCE},
-                detector={"enabled": first.detector.enabled and with_camera},
+                source={"uri": NO_SOURCE if camera is None else f"shm://{camera}"},
+                detector={"enabled": first.detector.enabled and camera is not None},
                 recording={"video": None},
                 metrics={"listen": None},
             ).model_copy(update={"zenoh": zenoh})
@@ -242,8 +250,11 @@ def _print_next_commands(services: list[Service], cameras: int, scene: Scene, sa
     connect = "" if zenoh == type(zenoh)() else f" --connect {(zenoh.listen or zenoh.connect)[0]}"
     known = services[0].perception.status.class_names
     classes = sorted({item.class_name for item in scene.world.objects} & set(known))
-    say(f"the scene {scene.name!r} has: {', '.join(classes) or 'no class of the model'}")
-    if cameras < len(services):
+    if cameras:
+        say(f"the scene {scene.name!r} has: {', '.join(classes) or 'no class of the model'}")
+    else:
+        say("no camera (--source none): commands that need to see an object are refused")
+    if 0 < cameras < len(services):
         say(f"only {services[0].settings.vehicle.name} has a camera: more than {_MAX_CAMERAS} vehicles")
     say("ready for commands; in another terminal:")
     for number, service in enumerate(services, 1):
@@ -253,5 +264,5 @@ def _print_next_commands(services: list[Service], cameras: int, scene: Scene, sa
         if classes and number <= cameras:
             target = "car" if "car" in classes else classes[0]
             say(f'  companion send{to} "seek {target}"')
-    say(f"  companion echo{connect} detections")
+    say(f"  companion echo{connect} {'detections' if cameras else 'vehicle'}")
     say("Ctrl-C ends it")

@@ -25,7 +25,7 @@ from companion.relay import Relay
 from companion.service import Service
 from companion.settings import Settings
 from companion.settings.calibration import adopt_calibration
-from companion.settings.perception import DEFAULT_MODEL
+from companion.settings.perception import DEFAULT_MODEL, NO_SOURCE
 from mavlink_sim.camera.scene import CameraSettings
 from mavlink_sim.testing import free_port, free_udp_port_range
 from vision.camera_model import CameraCalibration
@@ -60,7 +60,7 @@ class SimOptions:
     """Options of the simulation.
 
     Attributes:
-        camera: name of the shared memory for the camera's frames; see `camera_name`.
+        camera: name of the shared memory for the camera's frames; see `camera_name`. None: no camera.
         seed: random seed of the world and the simulated vehicle.
         scene: scene file or name of a bundled scene; None: the demo world.
         camera_rate_hz: frames per second; None: the scene's own.
@@ -71,7 +71,7 @@ class SimOptions:
         gcs_port: UDP port for a ground station; None: a free one.
     """
 
-    camera: str
+    camera: str | None
     seed: int
     scene: str | None = None
     camera_rate_hz: float | None = 30.0
@@ -164,7 +164,9 @@ async def simulator(options: SimOptions) -> AsyncIterator[SimProcess]:
     arguments = ["--onboard-port", str(port), "--onboard-bind", "0"]
     arguments += ["--gcs-port", str(gcs_port), "--gcs-bind", "0", "--autopilot", options.autopilot]
     if options.vehicles > 1:
-        arguments += ["--vehicles", str(options.vehicles), "--cameras", str(options.cameras)]
+        arguments += ["--vehicles", str(options.vehicles)]
+        if options.camera is not None:
+            arguments += ["--cameras", str(options.cameras)]
     if options.autopilot == "px4":
         for name, value in SIMULATOR_PARAMETERS.items():
             arguments += ["--param", f"{name}={value:g}"]
@@ -205,9 +207,11 @@ async def camera_of_autopilot(url: str, options: SimOptions) -> AsyncIterator[Si
 
 
 async def _spawn(arguments: Sequence[str], options: SimOptions) -> asyncio.subprocess.Process:
-    arguments = [*arguments, "--camera", options.camera, "--seed", str(options.seed)]
-    if options.camera_rate_hz is not None:
-        arguments += ["--camera-rate", f"{options.camera_rate_hz:g}"]
+    arguments = [*arguments, "--seed", str(options.seed)]
+    if options.camera is not None:
+        arguments += ["--camera", options.camera]
+        if options.camera_rate_hz is not None:
+            arguments += ["--camera-rate", f"{options.camera_rate_hz:g}"]
     if options.scene is not None:
         arguments += ["--scene", options.scene]
     if options.truth_path is not None:
@@ -239,7 +243,7 @@ def camera_name(camera: str, number: int) -> str:
 
 def session_settings(
     port: int,
-    camera: str,
+    camera: str | None,
     *,
     chosen: Settings | None = None,
     video: Path | None = None,
@@ -250,6 +254,7 @@ def session_settings(
     """Return settings for a vehicle on a loopback port and a simulated camera whose frames carry the lens.
 
     Args:
+        camera: name of the shared memory with the frames; None: no camera and no perception.
         chosen: settings to keep, except vehicle, source, camera and cameras; None: defaults, and zenoh on a
             free port.
     """
@@ -268,6 +273,8 @@ def session_settings(
     values["vehicle"] |= {"url": f"udpin://127.0.0.1:{port}", "system_id": system_id}
     # The worker starts together with the simulator, whose first frame takes some seconds.
     values["source"] = {"uri": f"shm://{camera}", "open_timeout_s": _SIMULATOR_START_S}
+    if camera is None:
+        values["source"], values["detector"]["enabled"] = {"uri": NO_SOURCE}, False
     if chosen is None:
         values["zenoh"] = {"listen": (f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}",)}
     if video is not None:

@@ -12,6 +12,7 @@ import typer
 
 from companion.cli.flags import EXIT_BAD_INPUT, plain_errors
 from companion.settings import Settings
+from companion.settings.perception import NO_SOURCE
 from vision.gc_pause import gc_paused
 
 EXIT_FAILED = 1
@@ -38,15 +39,24 @@ def play(
 ) -> None:
     """Run vehicle, camera and service together.
 
-    Takes commands on the terminal and by `companion send` until Ctrl-C.
+    Takes commands on the terminal and by `companion send` until Ctrl-C. With --source none no vehicle has a
+    camera.
 
     With --vehicle-url the vehicle is the autopilot that sends to that UDP port. A camera in the built-in
     world is rendered from its pose.
     """
-    if refused := [key for key in given if key.startswith(_OWN)]:
-        typer.echo(f"companion: {refused[0]}: play uses its own camera; remove the option", err=True)
+    with_camera = given.get("source.uri") != NO_SOURCE
+    own = [key for key in given if key.startswith(_OWN) and (with_camera or key != "source.uri")]
+    if own:
+        only = ", or give --source none for no camera" if own[0] == "source.uri" else ""
+        typer.echo(f"companion: {own[0]}: play uses its own camera; remove the option{only}", err=True)
         raise typer.Exit(EXIT_BAD_INPUT)
     url = given.get("vehicle.url")
+    if url is not None and not with_camera:
+        typer.echo(
+            "companion: --source none with --vehicle-url: nothing is simulated; use companion run", err=True
+        )
+        raise typer.Exit(EXIT_BAD_INPUT)
     if url is not None and vehicles > 1:
         typer.echo(
             f"companion: --vehicles {vehicles}: expected one vehicle with --vehicle-url; remove the option",
@@ -72,7 +82,7 @@ def play(
     service = logging.getLogger("companion.service")
     service.propagate = False
     service.addHandler(logging.NullHandler())
-    options = PlayOptions(scene, seed, vehicles, url, autopilot)
+    options = PlayOptions(scene, seed, vehicles, url, autopilot, with_camera)
     errors = (SimSessionError, LinkError, PerceptionStartError, BusError, MetricsError, PluginError)
     output = LineOutput(sys.stdout.fileno())
     with plain_errors(*errors):

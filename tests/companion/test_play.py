@@ -152,9 +152,25 @@ def test_play_in_the_air_holds_and_ends_on_ctrl_c(tmp_path: Path, small: list[st
         assert not list(Path("/dev/shm").glob(f"*companion-play-{running.pid}*"))
 
 
+def test_play_without_a_camera_flies_and_starts_no_perception(tmp_path: Path) -> None:
+    with playing(tmp_path, "--source", "none", "--vehicles", "2") as running:
+        assert any("no camera" in line for line in running.lines)
+        with running.client() as session:
+            reply = send_command(session, "vehicle2", "takeoff 3", timeout_s=60.0)
+            assert reply["success"], reply
+            reply = send_command(session, "vehicle1", "seek car", timeout_s=20.0)
+            assert not reply["success"], reply
+        started = [Path(f"/proc/{pid}/cmdline").read_bytes() for pid in descendants(running.pid)]
+        assert [b"mavlink_sim" in words for words in started] == [True], started
+        assert not list(Path("/dev/shm").glob(f"*companion-play-{running.pid}*"))
+        running.signal(signal.SIGINT)
+        assert running.process.wait(20) == 0
+
+
 def test_up_to_four_vehicles_have_a_camera_each() -> None:
     cameras = [PlayOptions(vehicles=count).cameras for count in (1, 2, 4, 5, 8)]
     assert cameras == [1, 2, 4, 1, 1]
+    assert [PlayOptions(vehicles=count, with_camera=False).cameras for count in (1, 20)] == [0, 0]
 
 
 def test_play_exits_with_1_when_simulator_dies(tmp_path: Path, small: list[str]) -> None:
@@ -172,6 +188,8 @@ def test_play_exits_with_1_when_simulator_dies(tmp_path: Path, small: list[str])
     [
         (("--source", "photo.jpg"), "source.uri"),
         (("--camera-mount-pitch-deg", "-10"), "camera.mount_pitch_deg"),
+        (("--source", "none", "--camera-mount-pitch-deg", "-10"), "camera.mount_pitch_deg"),
+        (("--source", "none", "--vehicle-url", "udpin://127.0.0.1:14540"), "--vehicle-url"),
         (("--scene", "no-such-scene"), "no-such-scene"),
         (("--vehicle-url", "tcp://127.0.0.1:5760"), "udpin://"),
         (("--vehicle-url", "udpin://127.0.0.1:14540", "--vehicles", "2"), "--vehicles"),
