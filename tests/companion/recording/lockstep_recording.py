@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import struct
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import cv2
+from mcap.exceptions import EndOfFile
+from mcap.reader import NonSeekingReader
 
 from companion.bench.lockstep_flight import LockstepFlight
 from companion.bench.rendered_camera import RenderedCamera
@@ -31,6 +34,15 @@ def new_writer(folder: Path, **limits: float) -> RecordingWriter:
     """A writer of large files, unless limited."""
     chosen = {"max_bytes": GIGABYTE, "max_duration_s": 3600.0, "max_total_bytes": GIGABYTE} | limits
     return RecordingWriter(folder, "vehicle1", **chosen)  # type: ignore[arg-type]
+
+
+def library_times(path: Path) -> list[int]:
+    """The log times that the mcap library reads of a file without an end, in the order of writing."""
+    found: list[int] = []
+    with path.open("rb") as file, suppress(EndOfFile, struct.error):
+        for _, _, message in NonSeekingReader(file).iter_messages(log_time_order=False):
+            found.append(message.log_time)
+    return found
 
 
 @contextmanager

@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 
 from companion.recording import RecordingError
 from companion.recording.files import Channel, RecordingReader, recover
-from tests.companion.recording.lockstep_recording import new_writer
+from tests.companion.recording.lockstep_recording import library_times, new_writer
 
 NUMBERS = Channel("numbers", "companion.numbers", b'{"type":"object"}')
 RAW = Channel("raw", encoding="mavlink")
@@ -69,6 +69,7 @@ def test_every_whole_chunk_of_a_cut_file_is_read(whole: Path, tmp_path: Path) ->
         reader = RecordingReader(cut)
         found = [message.log_time_ns for message in reader.messages()]
         assert found == list(range(PER_CHUNK * sum(end <= at for end in ends)))
+        assert library_times(cut) == found
         # Beyond the last chunk and its index only the summary is missing.
         assert reader.problems or at > ends[-1]
 
