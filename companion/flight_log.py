@@ -43,7 +43,8 @@ class RecordingSummary:
         large: topic of images, depth images and point clouds → how many are recorded.
         losses: the recorder's last note about losses.
         metadata: of the file, such as the clock of a ULog in it.
-        problems: damage of the file.
+        problems: damage of the file, and a line if it is not ended.
+        ended: whether the file has its end: not while it is being recorded.
     """
 
     path: Path
@@ -58,6 +59,7 @@ class RecordingSummary:
     losses: dict[str, Any] = field(default_factory=dict)
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
+    ended: bool = True
 
     def as_dict(self) -> dict[str, Any]:
         """Return it as JSON-able data."""
@@ -79,6 +81,7 @@ class RecordingSummary:
             "losses": self.losses,
             "metadata": self.metadata,
             "problems": self.problems,
+            "ended": self.ended,
         }
 
     @property
@@ -130,6 +133,7 @@ def summarize(path: Path) -> RecordingSummary:
     found.lines.sort(key=lambda line: line[0])
     found.metadata = reader.metadata
     found.problems += reader.problems
+    found.ended = reader.ended
     return found
 
 
@@ -170,7 +174,8 @@ def listed(found: RecordingSummary) -> str:
         f"{found.duration_s:.0f} s",
         f"{found.size / 1e6:.1f} MB",
         flights,
-        *(["damaged"] if found.problems else []),
+        *(["not ended"] if not found.ended else []),
+        *(["damaged"] if len(found.problems) > (not found.ended) else []),
     ]
     return "  ".join(words)
 

@@ -211,7 +211,9 @@ class RecordingReader:
     """Reads the messages of one file, in the order of writing. Only whole chunks are read.
 
     Attributes:
-        problems: what could not be read, a line each; complete after `messages` has ended, as the next.
+        problems: what could not be read, a line each; complete after `messages` has ended, as the next two.
+        ended: whether the file has its end, without which `problems` has a line: it is still being recorded,
+            or was cut off.
         metadata: name of a metadata record → its entries.
 
     Raises:
@@ -221,6 +223,7 @@ class RecordingReader:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.problems: list[str] = []
+        self.ended = True
         self.metadata: dict[str, dict[str, str]] = {}
         try:
             with path.open("rb") as file:
@@ -235,7 +238,7 @@ class RecordingReader:
 
     def messages(self, *topics: str) -> Iterator[Recorded]:
         """Return the messages of these topics; none: of all."""
-        self.problems = []
+        self.problems, self.ended = [], True
         schemas: dict[int, Schema] = {}
         channels: dict[int, Channel] = {}
         for record in self._records():
@@ -258,7 +261,11 @@ class RecordingReader:
                 header = file.read(_HEADER_BYTES)
                 length = int.from_bytes(header[1:], "little")
                 if len(header) < _HEADER_BYTES or at + _HEADER_BYTES + length > self._size:
-                    self.problems.append(f"{self.path}: ends inside a record, at byte {at} of {self._size}")
+                    self.ended = False
+                    self.problems.append(
+                        f"{self.path}: not ended, still being recorded or cut off: "
+                        f"no whole record at byte {at} of {self._size}"
+                    )
                     return
                 opcode = header[0]
                 if opcode == Opcode.DATA_END:

@@ -94,6 +94,30 @@ def test_list_has_a_line_for_each_file_and_one_for_a_bad_one(path: Path, tmp_pat
     assert "c.mcap" in done.stderr
 
 
+def test_a_recording_without_an_end_is_not_called_damaged(path: Path, tmp_path: Path) -> None:
+    """As of one that is being recorded: read at a whole chunk, or inside the next."""
+    content = path.read_bytes()
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    first = summary.chunk_indexes[0]
+    end = first.chunk_start_offset + first.chunk_length
+    (tmp_path / "a.mcap").write_bytes(content[:end])
+    (tmp_path / "b.mcap").write_bytes(content[: end + 20])
+    (tmp_path / "c.mcap").write_bytes(content[: end - 20] + b"\0" + content[end - 19 :])
+    done = companion_here("log", "list", tmp_path, cwd=tmp_path)
+    states = [line.rpartition("  ")[2] for line in done.stdout.splitlines()]
+    assert states == ["not ended", "not ended", "damaged"]
+    found = [
+        json.loads(line)
+        for line in companion_here("log", "list", tmp_path, "--json", cwd=tmp_path).stdout.splitlines()
+    ]
+    assert [each["ended"] for each in found] == [False, False, True]
+    shown = companion_here("log", "show", tmp_path / "a.mcap", cwd=tmp_path).stdout.splitlines()
+    assert "not ended" in shown[0]
+    assert "not ended" in shown[-1]
+
+
 def test_recover_writes_a_complete_file(path: Path, tmp_path: Path) -> None:
     (tmp_path / "cut.mcap").write_bytes(path.read_bytes()[:-400])  # in the summary: no message is lost
     done = companion_here("log", "recover", "cut.mcap", "whole.mcap", cwd=tmp_path)
