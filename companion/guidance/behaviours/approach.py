@@ -199,8 +199,8 @@ class ApproachBehaviour(Behaviour):
         if self._track is None:
             return f"looking for {self._subject.phrase}"
         if self._wait_point is not None:
-            return f"lost {self._subject.phrase}, waiting"
-        return f"{self._subject.name} {self._range_m:.1f} m away"
+            return f"lost {self._subject.phrase_now(self._last_id)}, waiting"
+        return f"{self._subject.phrase_now(self._last_id)} {self._range_m:.1f} m away"
 
     def _observe(self, context: BehaviourContext, position: Vector3, yaw_rad: float) -> None:
         if (track := self._track) is not None:

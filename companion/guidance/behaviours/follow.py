@@ -306,4 +306,6 @@ class FollowBehaviour(Behaviour):
         if self._track is None:
             return f"looking for {self._subject.phrase}"
         hidden = f", unseen for {self._unseen_s:.1f} s" if self._unseen_s > UNSEEN_S else ""
-        return f"following {self._subject.phrase}, {self._range_m:.1f} m away{hidden}"
+        return (
+            f"following {self._subject.phrase_now(self._track.track_id)}, {self._range_m:.1f} m away{hidden}"
+        )

@@ -57,6 +57,12 @@ class Wanted:
         """`the car`, `track 17`, or `marker 7`."""
         return f"the {self.class_name}" if self.class_name else self.name
 
+    def phrase_now(self, track_id: int | None) -> str:
+        """`phrase` with the id that the object has now: `track 31 (was 20)`."""
+        if self.track_id is None or track_id in (None, self.track_id):
+            return self.phrase
+        return f"track {track_id} (was {self.track_id})"
+
     def of(self, targets: Collection[Target], confidence: float = 0.0) -> list[Target]:
         """These objects' targets with at least a confidence; of `BehaviourContext.targets_of`."""
         return [

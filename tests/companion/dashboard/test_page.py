@@ -203,8 +203,9 @@ def test_clicked_car_is_followed(service: ServiceProcess, tab: Tab) -> None:
     tab.value("document.querySelector('#menu button').click()")
     tab.until(f"{REPLY}.startsWith('follow track={number}: done')")
     # From 14 m to the 8 m that it keeps, whatever id the car gets meanwhile.
-    said = f"state.topics.status.pilot.behaviour.match(/^following track {number}, ([0-9.]+) m/)"
-    tab.until(f"Math.abs({said}?.[1] - 8) < 0.5", 60.0)
+    called = f"({number}|[0-9]+ [(]was {number}[)])"
+    said = f"state.topics.status.pilot.behaviour.match(/^following track {called}, ([0-9.]+) m/)"
+    tab.until(f"Math.abs({said}?.[2] - 8) < 0.5", 60.0)
 
 
 SPEED = "Math.hypot(...state.topics.vehicle.velocity_ned_mps.slice(0, 2))"

@@ -210,6 +210,7 @@ def test_object_that_gets_another_id_in_its_place_is_flown_to_on(
     wanted_m = 8.0 if isinstance(behaviour, FollowBehaviour) else 2.0
     assert math.dist(flight.track[-1][:2], (25, 0)) == pytest.approx(wanted_m, abs=0.6)
     assert behaviour.take_notes() == ["track 1: the object is track 9 now"]
+    assert "track 9 (was 1)" in behaviour.status
 
 
 @pytest.mark.parametrize(
