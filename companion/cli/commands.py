@@ -505,12 +505,13 @@ def send(
     """Send a command to a running service. Waits for its outcome."""
     from companion.bus.client import NoAnswerError, client_settings, open_client, send_command
     from companion.bus.session import BusError
+    from companion.operator.reply_text import reply_text
 
     with plain_errors(NoAnswerError, BusError):
         client = client_settings(settings.zenoh, (connect,) if connect else ())
         with open_client(client) as session:
             reply = send_command(session, settings.vehicle.name, command, timeout_s=timeout)
-    typer.echo(f"{'done' if reply['success'] else 'failed'}: {reply['reason']}")
+    typer.echo(reply_text(reply))
     if not reply["success"]:
         raise typer.Exit(EXIT_FAILED)
 

@@ -23,6 +23,7 @@ from companion.language.endpoints import Endpoint, Message
 from companion.language.scene import Scene, SceneObject
 from companion.language.sentences import is_stop, understand
 from companion.language.tools import calls_in, read_call, tools_of
+from companion.operator.reply_text import reply_text
 
 MAX_TURNS = 8
 # A model's command of these alone needs no confirmation; its `stop` could end a pilot's flight.
@@ -258,7 +259,7 @@ class Conversation:
             return {"success": False, "reason": "the operator declined", "declined": True}
         self._last = commands[-1]
         self._reply = reply = await self._vehicle.command(text)
-        self._operator.show(_outcome(reply))
+        self._operator.show(reply_text(reply))
         return reply
 
     async def _answer(self, question: Question) -> dict[str, Any]:
@@ -291,7 +292,7 @@ async def answer_to(question: Question, vehicle: Vehicle, newest: Reply | None) 
 async def send_stop(vehicle: Vehicle, show: Callable[[str], None]) -> bool:
     """End offboard control, at once."""
     reply = await vehicle.command("stop")
-    show(_outcome(reply))
+    show(reply_text(reply))
     return bool(reply["success"])
 
 
@@ -317,10 +318,6 @@ def plan_of(commands: Sequence[Command], class_names: Sequence[str] | None) -> t
 
 def _toml(text: str) -> str:
     return json.dumps(text, ensure_ascii=False)
-
-
-def _outcome(reply: Reply) -> str:
-    return f"{'done' if reply['success'] else 'failed'}: {reply['reason']}"
 
 
 def _in_words(question: Question, answer: dict[str, Any]) -> str:

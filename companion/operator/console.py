@@ -11,6 +11,8 @@ from typing import Any, Protocol
 
 from aioconsole.stream import StandardStreamReader, StandardStreamReaderProtocol
 
+from companion.operator.reply_text import reply_text
+
 logger = logging.getLogger(__name__)
 
 _BANNER = "type a command (help, quit): takeoff 5, seek car, approach car distance=5, hold, land, rtl, stop"
@@ -73,8 +75,7 @@ async def _read_commands(
         except Exception as error:
             logger.exception("command %r failed", text)
             reply = {"success": False, "reason": f"{type(error).__name__}: {error}"}
-        result = "done" if reply["success"] else "failed"
-        _print(f"{text}: {result}: {reply['reason']}")
+        _print(f"{text}: {reply_text(reply)}")
 
     async def pass_on(line: str) -> None:
         assert ask is not None

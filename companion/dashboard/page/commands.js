@@ -36,9 +36,13 @@ export function onReply(answer) {
   if (!waiting.has(answer.id)) return; // of another window, or here a second time
   const then = waiting.get(answer.id);
   waiting.delete(answer.id);
-  const outcome = answer.success ? "done" : "failed";
-  reply(`${named(answer.vehicle, answer.command)}: ${outcome}: ${answer.reason}`, answer.success ? "good" : "bad");
+  reply(`${named(answer.vehicle, answer.command)}: ${outcome(answer)}`, answer.success ? "good" : "bad");
   if (then && answer.success && answer.vehicle === state.vehicle) then(answer);
+}
+
+function outcome({ success, reason }) {
+  if (success && reason === "in progress") return `accepted, ${reason}`; // an endless command
+  return `${success ? "done" : "failed"}: ${reason}`;
 }
 
 function reply(text, kind) {

@@ -201,7 +201,7 @@ def test_clicked_car_is_followed(service: ServiceProcess, tab: Tab) -> None:
     in_the_air(service, tab)
     number = click_track(tab)
     tab.value("document.querySelector('#menu button').click()")
-    tab.until(f"{REPLY}.startsWith('follow track={number}: done')")
+    tab.until(f"{REPLY} === 'follow track={number}: accepted, in progress'")
     # From 14 m to the 8 m that it keeps, whatever id the car gets meanwhile.
     called = f"({number}|[0-9]+ [(]was {number}[)])"
     said = f"state.topics.status.pilot.behaviour.match(/^following track {called}, ([0-9.]+) m/)"

@@ -36,6 +36,8 @@ class Service:
         self.asked.append(text)
         if text == "break":
             raise ZeroDivisionError("no such luck")
+        if text == "orbit":  # it has no end
+            return {"success": True, "reason": "in progress"}
         return {"success": text != "seek dragon", "reason": f"reason {len(self.asked)}"}
 
     def stop(self) -> None:
@@ -68,18 +70,19 @@ async def test_commands_are_answered_until_quit(terminal: int, capsys: pytest.Ca
     service = Service()
     assert terminal_is_free("/dev/video0")
     assert not terminal_is_free("-")
-    os.write(terminal, b"hold\n  seek dragon \n\nbreak\nhelp\n")
+    os.write(terminal, b"hold\n  seek dragon \n\nbreak\norbit\nhelp\n")
     running = asyncio.create_task(service.run())
-    while len(service.asked) < 3:
+    while len(service.asked) < 4:
         await asyncio.sleep(0.001)
     os.write(terminal, b"quit\nland\n")
     await running
-    assert service.asked == ["hold", "seek dragon", "break"]
+    assert service.asked == ["hold", "seek dragon", "break", "orbit"]
     assert service.stopped
     lines = capsys.readouterr().err.splitlines()
     assert "HELP" in lines
     assert "hold: done: reason 1" in lines
     assert "seek dragon: failed: reason 2" in lines
+    assert "orbit: accepted, in progress" in lines
     assert any("ZeroDivisionError" in line for line in lines)
     assert service.events == []
 
