@@ -98,7 +98,9 @@ export function openMenu(track, x, y, opener = null) {
   openedBy = opener;
   const title = document.createElement("p");
   title.textContent = `track ${track.id}, ${track.name}`;
-  menu.replaceChildren(title, ...Object.entries(TRACK_COMMANDS).map(([word, text]) => {
+  const hasGimbal = state.topics.status && state.topics.status.gimbal;
+  const offered = Object.entries(TRACK_COMMANDS).filter(([word]) => word !== "gimbal" || hasGimbal);
+  menu.replaceChildren(title, ...offered.map(([word, text]) => {
     const item = button(text, () => {
       closeMenu();
       send(`${word} track=${track.id}`);

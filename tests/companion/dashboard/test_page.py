@@ -151,7 +151,7 @@ def test_box_is_clicked_and_its_command_arrives(service: ServiceProcess, tab: Ta
     number = click_track(tab)
     title, *items = tab.value("[...document.querySelector('#menu').children].map((item) => item.textContent)")
     assert title.startswith(f"track {number}, ")
-    assert items[:3] == ["Follow", "Approach", "Orbit"]
+    assert items == ["Follow", "Approach", "Orbit"]  # and it has no gimbal
     tab.value("[...document.querySelectorAll('#menu button')][1].click()")
     # The vehicle is on the ground: the service answers, whatever it answers.
     answered = f"approach track={number}: "
@@ -426,8 +426,9 @@ def test_page_shows_the_state_and_the_menu_of_a_track(browser: Browser) -> None:
     found = {**FOUND, "ground_range_m": 4.2, "distance_m": 6.0, "depth_m": 5.4}
     jpeg = cv2.imencode(".jpg", np.zeros((480, 640, 3), np.uint8))[1].tobytes()
     asked, sent = {"velocity_ned_mps": [2.0, 0.0, 0.0]}, {"velocity_ned_mps": [1.5, 0.0, 0.0]}
+    status = {"healthy": True, "vehicle": {}, "limits": limits, "pilot": {"mission": MISSION}, "gimbal": None}
     messages = {
-        STATUS.key(NAME): {"healthy": True, "vehicle": {}, "limits": limits, "pilot": {"mission": MISSION}},
+        STATUS.key(NAME): status,
         VEHICLE.key(NAME): vehicle,
         SETPOINT.key(NAME): {"asked": asked, "sent": sent, "limited_by": ["speed"]},
         DETECTIONS.key(NAME): frame(
@@ -484,6 +485,11 @@ def test_page_shows_the_state_and_the_menu_of_a_track(browser: Browser) -> None:
         tab.press("Escape")
         assert tab.value("document.querySelector('#menu').hidden")
         assert tab.value(focus) == "#7"
+        assert text("#menu button") == ["Follow", "Approach", "Orbit"]
+        messages[STATUS.key(NAME)] = {**status, "gimbal": {"answers": True}}
+        wait_for(lambda: shown() and tab.value("state.topics.status.gimbal !== null"))
+        tab.press("Enter", "\r")
+        assert text("#menu button") == ["Follow", "Approach", "Orbit", "Point gimbal"]
         tab.close()
 
 
