@@ -86,7 +86,7 @@ async def _end(process: Process, end_s: float, say: Say) -> None:
     if await _ended(process, unsaid_s):
         return
     if end_s > unsaid_s:
-        say(f"has not ended yet; killed after {end_s:g} s")
+        say(f"has not ended yet; it will be killed in {end_s - unsaid_s:g} s")
     if not await _ended(process, end_s - unsaid_s):
         with suppress(ProcessLookupError):
             process.kill()

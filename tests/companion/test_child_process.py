@@ -49,6 +49,6 @@ def test_program_that_does_not_end_is_killed_and_named(
     (tmp_path / "hanging_program.py").write_text(HANGING)
     assert run("hanging_program", 0.2) == [
         "program: ready",
-        "program: has not ended yet; killed after 0.2 s",
+        "program: has not ended yet; it will be killed in 0.1 s",
         "program: did not end within 0.2 s; killed",
     ]
