@@ -41,6 +41,6 @@ def dashboard(
         )
         os.nice(NICENESS)
         try:
-            asyncio.run(serve(options, lambda url: print(f"dashboard: {url}", flush=True)))
+            asyncio.run(serve(options, lambda url: print(f"dashboard: {url}", flush=True), "--listen"))
         except KeyboardInterrupt:
             return

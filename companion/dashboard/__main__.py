@@ -29,7 +29,7 @@ def main(argument: str) -> int:
     on_parent_end(lambda: os._exit(0))  # zenoh's threads and open streams need no shutdown
     try:
         options = DashboardOptions(zenoh=zenoh, language=language, plugins=plugins, **values)
-        asyncio.run(serve(options, lambda url: print(url, flush=True)))
+        asyncio.run(serve(options, lambda url: print(url, flush=True), "--dashboard-listen"))
     except (DashboardError, BusError) as error:
         print(error, flush=True)
         return EXIT_REFUSED

@@ -95,11 +95,12 @@ class _Connection(H11Protocol):
             self.transport.close()
 
 
-async def serve(options: DashboardOptions, on_ready: Callable[[str], None]) -> None:
+async def serve(options: DashboardOptions, on_ready: Callable[[str], None], flag: str) -> None:
     """Serve until SIGINT or SIGTERM, or until cancelled.
 
     Args:
         on_ready: called with the page's address.
+        flag: what sets the address, for errors.
 
     Raises:
         DashboardError: the address is in use or not available, or the token is missing.
@@ -107,7 +108,7 @@ async def serve(options: DashboardOptions, on_ready: Callable[[str], None]) -> N
     host, port = split_listen(options.listen)
     token = None if options.token_file is None else read_token(options.token_file)
     access = Access(host, token)
-    with listening_socket(host, port) as listener:
+    with listening_socket(host, port, flag) as listener:
         fleet = Fleet(options.zenoh, options.vehicle)
         chats = Chats(fleet, options.language, options.plugins)
         server = http_server(create_app(fleet, chats, access))
@@ -152,7 +153,7 @@ def split_listen(listen: str, name: str = "dashboard.listen") -> tuple[str, int]
     return host, int(port)
 
 
-def listening_socket(host: str, port: int, flag: str = "--dashboard-listen") -> socket.socket:
+def listening_socket(host: str, port: int, flag: str) -> socket.socket:
     """Open the server's socket. `flag`: what sets its address, for errors. Raises DashboardError."""
     try:
         listener = socket.create_server((host, port))

@@ -39,7 +39,7 @@ async def serving(
     token = None if token_file is None else str(token_file)
     options = DashboardOptions(f"{listen}:{port}", token, zenoh, NAME, language or LanguageSection())
     ready = asyncio.Event()
-    running = asyncio.create_task(serve(options, lambda _url: ready.set()))
+    running = asyncio.create_task(serve(options, lambda _url: ready.set(), "--listen"))
     starting = asyncio.create_task(ready.wait())
     await asyncio.wait({running, starting}, return_when=asyncio.FIRST_COMPLETED)
     if running.done():

@@ -51,6 +51,7 @@ def test_command_serves_and_ends_on_ctrl_c(tmp_path: Path) -> None:
         assert busy.returncode == 2
         (line,) = busy.stderr.splitlines()
         assert address in line
+        assert " --listen " in line
 
 
 @pytest.mark.parametrize(
@@ -114,7 +115,8 @@ def test_child_whose_port_is_in_use_reports_one_line() -> None:
         )
         running = ServiceProcess(process, "")
         try:
-            running.wait_for_line(f"127.0.0.1:{port}", 60.0)
+            line = running.wait_for_line(f"127.0.0.1:{port}", 60.0)
+            assert " --dashboard-listen " in line
             with pytest.raises(TimeoutError):
                 running.wait_for_line("dashboard", 3.0, after=len(running.lines))
             assert process.poll() is None
