@@ -79,7 +79,9 @@ def test_goto_arrives_and_stays(flight: Flight) -> None:
 
 
 # 8 m at 4 m/s needs all the acceleration that the envelope allows: 3.7 m/s are flown.
-@pytest.mark.parametrize(("radius_m", "speed_mps", "laps"), [(10.0, 2.0, 1.2), (8.0, 4.0, 4.0)])
+@pytest.mark.parametrize(
+    ("radius_m", "speed_mps", "laps"), [(10.0, 2.0, 1.2), (8.0, 4.0, 4.0), (5.0, 3.0, 3.0)]
+)
 def test_an_orbit_keeps_radius_speed_and_nose(
     flight: Flight, radius_m: float, speed_mps: float, laps: float
 ) -> None:
