@@ -117,6 +117,8 @@ class LockstepFlight:
         self.inputs = InputAssembler(
             settings, perceived, lambda level, text: self.notes.append((level, text))
         )
+        if isinstance(driver, SimulatedDriver):
+            self.inputs.altitude_acceptance_m = driver.altitude_acceptance_m
         self.guidance = Guidance(options or guidance_options(settings, COMPANION))
         self.streamer = streamer_of(settings, driver.send_setpoint, lambda: driver.now_ns)
         self.events: list[GuidanceEvent] = []

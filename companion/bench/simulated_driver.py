@@ -134,6 +134,11 @@ class SimulatedDriver:
     def state(self) -> VehicleState:
         return self._state
 
+    @property
+    def altitude_acceptance_m(self) -> float | None:
+        """As the service reads it when the link has opened (`companion.service.health`)."""
+        return None if self._kind == ARDUPILOT else self.vehicle.vehicle.parameters.number("NAV_MC_ALT_RAD")
+
     def send_setpoint(self, setpoint: Setpoint) -> None:
         moved = setpoint.moved(self._state.reset_offset_ned_m)
         fields = self._profile.setpoint_fields(setpoint_fields(moved, self.vehicle.vehicle.system_id))

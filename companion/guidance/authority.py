@@ -19,9 +19,9 @@ from companion.vehicle.streamer import SILENCE_S, StreamState
 
 # The vehicle may show the old mode for this long after acknowledging a new one: a heartbeat period and more.
 SHOW_DELAY_S = 2.0
-# PX4 ends a take-off inside NAV_MC_ALT_RAD (0.8 m); the two height estimates differ by some more. A hold more
-# than this below the wanted height was requested by a pilot.
-TAKEOFF_SHORT_M = 1.3
+# PX4 ends a take-off inside NAV_MC_ALT_RAD, 0.8 m by default; the two height estimates differ by some more. A
+# hold further below the wanted height was requested by a pilot.
+DEFAULT_ACCEPTANCE_M, HEIGHT_MARGIN_M = 0.8, 0.5
 # The autopilot reports a failsafe within this time of its change of mode.
 REPORT_WINDOW_S = 1.0
 # Of a vehicle that may have landed.
@@ -45,6 +45,7 @@ class Authority:
         self._leaving_until_ns: float = 0
         self._dropped: dict[FlightMode, float] = {}
         self._takeoff_altitude_m = 0.0
+        self._acceptance_m: float | None = None
         self._was_armed = False
         self._failsafe_before = False
         self._changed_ns: int | None = None
@@ -106,12 +107,15 @@ class Authority:
         flying_by_setpoint: bool,
         sent: Setpoint | None = None,
         landing: bool = False,
+        altitude_acceptance_m: float | None = None,
     ) -> str | None:
         """Why command was lost; None while in command. Call it once per step.
 
         Args:
             sent: the setpoint the vehicle should fly now; None: none. landing: it leads to the ground.
+            altitude_acceptance_m: as in `GuidanceInput`.
         """
+        self._acceptance_m = altitude_acceptance_m
         shown = sent if state.mode is self._mode else None
         ignored = self.monitor.update(shown, state, landing=landing)
         if self._mode is None:
@@ -126,6 +130,11 @@ class Authority:
         if not explained:
             # A pilot's change also changes the intended mode; a failsafe keeps the one we requested.
             by_itself = state.intended_beside is state.mode and state.intended_mode is self._mode
+            if not by_itself and self._may_have_finished(state):
+                short_m = self._short_m(state)
+                return (
+                    f"the take-off ended {short_m:.1f} m short: a pilot or the autopilot changed to hold mode"
+                )
             who = "autopilot failsafe" if by_itself else "the pilot took over"
             return f"{who}: {_shown(state.mode)}"
         self._was_armed |= state.armed
@@ -188,10 +197,20 @@ class Authority:
             asking = self._leaving_until_ns == float("inf")  # a pilot's mode must not be asked away
             unknown = not asking and _may_have_landed(state) and state.heartbeat_ns <= self._changed_ns
             return unknown or not state.armed or state.landed is LandedState.ON_GROUND
-        if FlightMode.TAKEOFF in (self._mode, *self._leaving) and state.mode is FlightMode.HOLD:
-            short_m = self._takeoff_altitude_m - (state.altitude_m or 0.0)
-            return short_m <= TAKEOFF_SHORT_M
+        if self._holds_after_takeoff(state):
+            acceptance_m = DEFAULT_ACCEPTANCE_M if self._acceptance_m is None else self._acceptance_m
+            return self._short_m(state) <= acceptance_m + HEIGHT_MARGIN_M
         return False
+
+    def _holds_after_takeoff(self, state: VehicleState) -> bool:
+        return FlightMode.TAKEOFF in (self._mode, *self._leaving) and state.mode is FlightMode.HOLD
+
+    def _short_m(self, state: VehicleState) -> float:
+        return self._takeoff_altitude_m - (state.altitude_m or 0.0)
+
+    def _may_have_finished(self, state: VehicleState) -> bool:
+        """Whether a short take-off may be PX4's own: where it accepts the height is not known."""
+        return self._acceptance_m is None and state.autopilot == "PX4" and self._holds_after_takeoff(state)
 
 
 def silence(stream: StreamState, state: VehicleState, paused_s: float) -> str | None:

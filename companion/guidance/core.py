@@ -372,6 +372,7 @@ class Guidance:
             flying_by_setpoint=self.phase in (Phase.ENGAGING, Phase.OFFBOARD),
             sent=self.sent if fresh and self.phase is Phase.OFFBOARD else None,
             landing=self._landing,
+            altitude_acceptance_m=inputs.altitude_acceptance_m,
         )
         if why is not None or self._yielded is not None:
             self._yield(why, context)

@@ -186,6 +186,7 @@ class GuidanceInput:
         answers: to requests of earlier steps. commands: the new ones, oldest first.
         ending: the service ends: no command begins, and control is released.
         velocities: the newest message of each sender on the topic `velocity`, the first sender first.
+        altitude_acceptance_m: how far below its goal PX4 ends a climb (NAV_MC_ALT_RAD); None: not known.
     """
 
     state: VehicleState
@@ -205,6 +206,7 @@ class GuidanceInput:
     ending: bool = False
     steering_markers: MarkerSight = NO_MARKERS
     velocities: tuple[VelocityInput, ...] = ()
+    altitude_acceptance_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

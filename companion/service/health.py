@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 
 from companion.guidance.core import Guidance
 from companion.perception.cameras import WorkerCamera
+from companion.service.inputs import InputAssembler
 from companion.service.other_commanders import OtherCommanders
 from companion.service.systemd_notify import SystemdNotifier
 from companion.vehicle.driver import CommandRefusedError, Driver, SystemStatus
@@ -21,6 +22,7 @@ class Health:
     """Called by the guidance loop: when that hangs, the heartbeat and the watchdog stop too.
 
     Args:
+        inputs: gets what `check` reads for guidance.
         others: other services that command the vehicle; checked from here.
         on_event: called with (level, text) for the operator.
     """
@@ -28,12 +30,13 @@ class Health:
     def __init__(
         self,
         driver: Driver,
+        inputs: InputAssembler,
         cameras: Sequence[WorkerCamera],
         notifier: SystemdNotifier,
         others: OtherCommanders,
         on_event: Callable[[str, str], None],
     ) -> None:
-        self._driver, self._cameras, self._notifier = driver, cameras, notifier
+        self._driver, self._inputs, self._cameras, self._notifier = driver, inputs, cameras, notifier
         self._others, self._on_event = others, on_event
         self._heartbeat_due_ns = self._hud_due_ns = 0
         self._linked = False
@@ -43,19 +46,24 @@ class Health:
         return all(camera.seeing(now_ns) for camera in self._cameras) and self._driver.state.connected(now_ns)
 
     async def check(self) -> None:
-        """Check the autopilot's parameters once, after the link has opened."""
-        if self._driver.state.autopilot != "ArduPilot":
-            return
-        try:
-            timeout_s = await self._driver.get_parameter("GUID_TIMEOUT")
-        except CommandRefusedError as error:
-            self._on_event("warning", f"GUID_TIMEOUT cannot be read: {error}")
-            return
-        if timeout_s >= LONG_GUIDED_TIMEOUT_S:
+        """Read the autopilot's parameters that matter here once, after the link has opened."""
+        autopilot = self._driver.state.autopilot
+        if autopilot == "PX4":
+            self._inputs.altitude_acceptance_m = await self._parameter("NAV_MC_ALT_RAD")
+        timeout_s = await self._parameter("GUID_TIMEOUT") if autopilot == "ArduPilot" else None
+        if timeout_s is not None and timeout_s >= LONG_GUIDED_TIMEOUT_S:
             self._on_event(
                 "warning",
                 f"GUID_TIMEOUT is {timeout_s:g} s: ArduPilot flies on for that long on silence; set it to 1",
             )
+
+    async def _parameter(self, name: str) -> float | None:
+        """Return a parameter; None: it cannot be read, which is reported."""
+        try:
+            return await self._driver.get_parameter(name)
+        except CommandRefusedError as error:
+            self._on_event("warning", f"{name} cannot be read: {error}")
+            return None
 
     def after_step(self, now_ns: int, guidance: Guidance) -> None:
         """Run the periodic work; call after every step of guidance."""

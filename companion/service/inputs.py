@@ -55,6 +55,7 @@ class InputAssembler:
         steering: the camera whose targets behaviours get.
         history: the vehicle's states of the last few seconds.
         poses: the other vehicles. velocities: the messages on the topic `velocity`.
+        altitude_acceptance_m: as in `GuidanceInput`.
     """
 
     def __init__(
@@ -67,6 +68,7 @@ class InputAssembler:
         self.history = StateHistory()
         self.poses = PoseSharing(settings.vehicle.name, on_event)
         self.velocities = VelocitySenders(on_event)
+        self.altitude_acceptance_m: float | None = None
         self._markers = MarkerTracker(cameras, on_event)
         self._state: VehicleState | None = None
         self._obstacles: ObstacleSectors | None = None
@@ -141,6 +143,7 @@ class InputAssembler:
             ending,
             self._markers.steering_sight(self.steering, now_ns, self._settings.guidance.perception_max_age_s),
             self.velocities.newest(now_ns),
+            self.altitude_acceptance_m,
         )
 
     def step_context(self, mounting: GimbalMounting) -> StepContext:

@@ -108,7 +108,9 @@ class Service:
             record=self._tap.on_step,
         )
         self._notifier = SystemdNotifier()
-        self._health = Health(self.driver, self.cameras, self._notifier, self.others, self._event)
+        self._health = Health(
+            self.driver, self.inputs, self.cameras, self._notifier, self.others, self._event
+        )
         self.ready = self._ending = False
         self._status: StatusBody | None = None
         self._stop = asyncio.Event()

@@ -47,7 +47,7 @@ class LiveFlight:
         self.inputs = InputAssembler(settings, [PerceptionCamera(settings.of_camera(None))], self._event)
         started_ns = time.monotonic_ns() - round(ran_s * 1e9)
         self.others = OtherCommanders(settings.vehicle, "here", started_ns, self._event)
-        self._health = Health(self.driver, (), SystemdNotifier({}), self.others, self._event)
+        self._health = Health(self.driver, self.inputs, (), SystemdNotifier({}), self.others, self._event)
         self.loop = GuidanceLoop(
             self.guidance,
             self.inputs,

@@ -6,7 +6,10 @@ from typing import cast
 
 import pytest
 
+from companion.bench.lockstep_flight import plain_settings
+from companion.perception.cameras import PerceptionCamera
 from companion.service.health import Health
+from companion.service.inputs import InputAssembler
 from companion.service.other_commanders import OtherCommanders
 from companion.service.systemd_notify import SystemdNotifier
 from companion.settings.vehicle import VehicleSection
@@ -15,35 +18,58 @@ from companion.vehicle.state import VehicleState
 
 
 class FakeDriver:
-    """An autopilot with one parameter, or none."""
+    """An autopilot with some parameters."""
 
-    def __init__(self, autopilot: str | None, guided_timeout_s: float | None) -> None:
+    def __init__(self, autopilot: str | None, parameters: dict[str, float]) -> None:
         self.state = VehicleState(autopilot=autopilot)
-        self._guided_timeout_s = guided_timeout_s
+        self._parameters = parameters
 
     async def get_parameter(self, name: str) -> float:
-        assert name == "GUID_TIMEOUT"
-        if self._guided_timeout_s is None:
-            raise CommandRefusedError("parameter GUID_TIMEOUT: no answer")
-        return self._guided_timeout_s
+        if name not in self._parameters:
+            raise CommandRefusedError(f"parameter {name}: no answer")
+        return self._parameters[name]
+
+
+async def check(
+    autopilot: str | None, parameters: dict[str, float]
+) -> tuple[InputAssembler, list[tuple[str, str]]]:
+    """Run the check; returns what guidance gets, and the events."""
+    events: list[tuple[str, str]] = []
+
+    def on_event(level: str, text: str) -> None:
+        events.append((level, text))
+
+    settings = plain_settings()
+    inputs = InputAssembler(settings, [PerceptionCamera(settings.of_camera(None))], on_event)
+    driver = cast(Driver, FakeDriver(autopilot, parameters))
+    others = OtherCommanders(VehicleSection(), "here", 0, on_event)
+    await Health(driver, inputs, (), SystemdNotifier(), others, on_event).check()
+    return inputs, events
 
 
 @pytest.mark.parametrize(
-    ("autopilot", "guided_timeout_s", "warned"),
-    [
-        ("ArduPilot", 3.0, ["GUID_TIMEOUT is 3 s"]),
-        ("ArduPilot", 1.0, []),
-        ("ArduPilot", None, ["GUID_TIMEOUT cannot"]),
-        ("PX4", None, []),
-    ],
+    ("guided_timeout_s", "warned"),
+    [(3.0, ["GUID_TIMEOUT is 3 s"]), (1.0, []), (None, ["GUID_TIMEOUT cannot"])],
 )
-async def test_long_guided_timeout_is_warned(
-    autopilot: str, guided_timeout_s: float | None, warned: list[str]
-) -> None:
-    events: list[tuple[str, str]] = []
-    driver = cast(Driver, FakeDriver(autopilot, guided_timeout_s))
-    others = OtherCommanders(VehicleSection(), "here", 0, lambda level, text: events.append((level, text)))
-    health = Health(driver, (), SystemdNotifier(), others, lambda level, text: events.append((level, text)))
-    await health.check()
+async def test_long_guided_timeout_is_warned(guided_timeout_s: float | None, warned: list[str]) -> None:
+    parameters = {} if guided_timeout_s is None else {"GUID_TIMEOUT": guided_timeout_s}
+    inputs, events = await check("ArduPilot", parameters)
     assert [level for level, _ in events] == ["warning"] * len(warned)
     assert all(text.startswith(begin) for (_, text), begin in zip(events, warned, strict=True))
+    assert inputs.altitude_acceptance_m is None
+
+
+@pytest.mark.parametrize(
+    ("parameters", "read", "warned"),
+    [({"NAV_MC_ALT_RAD": 1.6}, 1.6, 0), ({}, None, 1)],
+)
+async def test_guidance_gets_px4s_altitude_acceptance(
+    parameters: dict[str, float], read: float | None, warned: int
+) -> None:
+    inputs, events = await check("PX4", parameters)
+    assert inputs.altitude_acceptance_m == read
+    assert [level for level, _ in events] == ["warning"] * warned
+
+
+async def test_unknown_autopilot_is_asked_for_no_parameter() -> None:
+    assert (await check(None, {}))[1] == []
