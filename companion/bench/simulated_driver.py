@@ -19,7 +19,13 @@ from companion.guidance.interface import (
     TakeOff,
 )
 from companion.vehicle.ardupilot_profile import ArduPilotProfile
-from companion.vehicle.autopilot_profile import ARDUPILOT, PX4, AutopilotProfile, Px4Profile
+from companion.vehicle.autopilot_profile import (
+    ARDUPILOT,
+    HOME_POSITION_ID,
+    PX4,
+    AutopilotProfile,
+    Px4Profile,
+)
 from companion.vehicle.driver import CommandRefusedError
 from companion.vehicle.gimbal_commands import CONFIGURE, PITCHYAW, RELEASE, UNCHANGED, pitchyaw_parameters
 from companion.vehicle.landing_target import LandingTarget, landing_target_fields
@@ -178,8 +184,12 @@ class SimulatedDriver:
                     request, refusal, lambda: self._state.armed, mav.MAV_CMD_COMPONENT_ARM_DISARM, 1.0
                 )
             case TakeOff(altitude_m):
+                if self._profile.takeoff_needs_home:
+                    # Moved by arming, and else sent every two seconds only. The answer comes at once.
+                    self.vehicle.send(self._long(mav.MAV_CMD_REQUEST_MESSAGE, HOME_POSITION_ID))
+                    self.receive()
                 try:
-                    values = self._profile.takeoff_parameters(altitude_m, state)
+                    values = self._profile.takeoff_parameters(altitude_m, self._state)
                 except CommandRefusedError as error:
                     self._answers.append(Answer(request.identifier, str(error)))
                     return

@@ -457,7 +457,9 @@ class Autopilot:
     def _detect_landing(self) -> None:
         airframe = self._airframe
         if self.ground.landed:
-            if airframe.floor_down_m - airframe.position[2] > TAKEOFF_DETECTION_HEIGHT_M:
+            # An estimate that drifts is no take-off.
+            height_m = airframe.floor_down_m - airframe.position[2]
+            if height_m > TAKEOFF_DETECTION_HEIGHT_M and not airframe.on_ground:
                 self.ground.leave(self.now_s)
                 self._send_text(INFO, "Takeoff detected\t", TAKEOFF_EVENT)
                 self._on_event("takeoff")

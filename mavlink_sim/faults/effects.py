@@ -358,6 +358,20 @@ def gps_drift(vehicle: FaultTarget, one: ActiveFault) -> None:
     one.undo.append(undo)
 
 
+def height_drift(vehicle: FaultTarget, one: ActiveFault) -> None:
+    """The estimated height drifts to an error, without a counted reset."""
+    up_m, over_s = one.fault.values["up"], one.fault.values["over"]
+    share = 0.0
+
+    def each_step(dt_s: float) -> None:
+        nonlocal share
+        share = min(share + dt_s / over_s, 1.0)
+        vehicle.estimate.set_error(one.number, (0.0, 0.0, -share * up_m))
+
+    one.each_step = each_step
+    one.undo.append(lambda: vehicle.estimate.set_error(one.number, None))
+
+
 def ekf_reset(vehicle: FaultTarget, one: ActiveFault) -> None:
     """The estimate jumps, and jumps back at the end of the fault."""
     values = one.fault.values

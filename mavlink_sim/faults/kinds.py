@@ -97,6 +97,14 @@ _TABLE: tuple[Kind, ...] = (
         ),
     ),
     Kind(
+        "height_drift",
+        "the estimated height drifts, as a barometer's; home is set again at arming",
+        (
+            Field("up", number(-100.0, 100.0, "m"), 0.73, "metres"),
+            Field("over", positive, 10.0, "seconds until the whole error is reached"),
+        ),
+    ),
+    Kind(
         "ekf_reset",
         "the estimate jumps, the vehicle does not; reset_counter counts it",
         (
