@@ -16,6 +16,7 @@ import os
 import re
 import struct
 import time
+import zlib
 from collections import deque
 from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
@@ -355,25 +356,38 @@ class ReportReader:
         raise FileReadError(f"{uri} lists no events metadata")
 
     async def _file(self, what: str, crc: int, uri: str) -> bytes:
-        """Read a metadata file from the cache, by its checksum, else from the autopilot."""
-        cached = cache_folder() / f"{what}-{crc:08x}.json"
-        if cached.is_file():
-            return cached.read_bytes()
+        """Return the JSON of a metadata file from the cache, by its checksum, else from the autopilot."""
         path = _MFTP.fullmatch(uri)
         if path is None:
             raise FileReadError(f"{uri}: only mftp:// is supported")
-        content = await self._files.read(path[1])
-        if path[1].endswith(".xz"):
-            content = lzma.decompress(content)
+        unpack = lzma.decompress if path[1].endswith(".xz") else bytes
+        cached = cache_folder() / f"{what}-{crc:08x}.json{'.xz' * path[1].endswith('.xz')}"
+        if cached.exists():
+            with contextlib.suppress(OSError, lzma.LZMAError):
+                served = cached.read_bytes()
+                content = unpack(served)
+                if _matches(crc, served, content):
+                    return content
+            logger.warning("%s: %s does not match its checksum: read again", self._url, cached)
+        served = await self._files.read(path[1])
+        content = unpack(served)
         json.loads(content)
+        if not _matches(crc, served, content):
+            logger.warning("%s: %s does not match its checksum: not cached", self._url, uri)
+            return content
         try:
             cached.parent.mkdir(parents=True, exist_ok=True)
             part = cached.with_suffix(f".{os.getpid()}")
-            part.write_bytes(content)
+            part.write_bytes(served)
             part.replace(cached)
         except OSError as error:
             logger.info("%s: metadata cannot be cached, it is read at every start: %s", self._url, error)
         return content
+
+
+def _matches(crc: int, served: bytes, content: bytes) -> bool:
+    """Whether a checksum is that of a file, as served or unpacked: PX4 computes its general one unpacked."""
+    return crc in (zlib.crc32(each, 0xFFFFFFFF) ^ 0xFFFFFFFF for each in (served, content))
 
 
 def cache_folder() -> Path:

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import lzma
 from pathlib import Path
 from typing import Any
 
@@ -34,8 +35,8 @@ async def test_px4_arming_refusal_has_its_reason(
             assert "No offboard signal" in texts
         finally:
             await driver.close()
-    events = next((tmp_path / "companion" / "metadata").glob("events-*.json"))
-    assert json.loads(events.read_bytes())["version"] == 2
+    events = next((tmp_path / "companion" / "metadata").glob("events-*.json.xz"))
+    assert json.loads(lzma.decompress(events.read_bytes()))["version"] == 2
 
 
 async def test_reasons_of_a_refusal_may_come_late(driver: Driver, autopilot: FakeAutopilot) -> None:

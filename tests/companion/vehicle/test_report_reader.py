@@ -1,13 +1,17 @@
 """STATUSTEXT, EVENT and MAVLink FTP at the lowest layer: frames in, reports and requests out."""
 
 import asyncio
+import json
+import lzma
 import struct
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.vehicle.framing import (
+    COMPONENT_METADATA_ID,
     CURRENT_EVENT_SEQUENCE_ID,
     EVENT_ID,
     REQUEST_EVENT_ID,
@@ -16,8 +20,9 @@ from companion.vehicle.framing import (
     pack_frame,
 )
 from companion.vehicle.report import Report
-from companion.vehicle.report_reader import FileReader, FileReadError, ReportReader, StatusTexts
+from companion.vehicle.report_reader import FileReader, FileReadError, ReportReader, StatusTexts, cache_folder
 from companion.vehicle.telemetry_state import TelemetryState
+from mavlink_sim.services.file_transfer import checksum
 
 
 def frame(message_id: int, payload: bytes) -> Frame:
@@ -67,16 +72,18 @@ def test_text_with_a_lost_chunk_is_dropped() -> None:
 
 
 class Autopilot:
-    """Serves one file by MAVLink FTP, losing every `loses`-th reply.
+    """Serves files by MAVLink FTP, losing every `loses`-th reply.
 
     Attributes:
+        on_frame: receives the replies.
         asked: (message id, payload) of every received message.
     """
 
-    def __init__(self, content: bytes = b"", loses: int = 0) -> None:
+    def __init__(self, files: Mapping[str, bytes] | None = None, loses: int = 0) -> None:
         self.asked: list[tuple[int, bytes]] = []
-        self._content, self._loses = content, loses
+        self._files, self._content, self._loses = dict(files or {}), b"", loses
         self.reader = FileReader(self.send, lambda: (1, 1))
+        self.on_frame: Callable[[Frame], object] = self.reader.on_frame
 
     def send(self, message_id: int, payload: bytes) -> None:
         self.asked.append((message_id, payload))
@@ -85,7 +92,9 @@ class Autopilot:
         sequence, session, opcode, size, _, _, _, offset = struct.unpack_from("<HBBBBBBI", payload, 3)
         data, answer = b"", 128
         if opcode == 4:
-            known = payload[15 : 15 + size] == b"etc/a.json"
+            content = self._files.get(payload[15 : 15 + size].decode())
+            self._content = content or b""
+            known = content is not None
             data, answer = (struct.pack("<I", len(self._content)), 128) if known else (b"\x0a", 129)
         elif opcode == 5:
             data = self._content[offset : offset + size]
@@ -93,7 +102,7 @@ class Autopilot:
             "<3BHBBBBBBI", 0, 1, 191, sequence + 1, session, answer, len(data), opcode, 0, 0, offset
         )
         answered = frame(110, (header + data).ljust(254, b"\0"))
-        asyncio.get_running_loop().call_soon(self.reader.on_frame, answered)
+        asyncio.get_running_loop().call_soon(self.on_frame, answered)
 
 
 @pytest.mark.parametrize(("size", "loses"), [(0, 0), (1, 0), (239, 0), (240, 0), (2000, 0), (2000, 4)])
@@ -102,7 +111,7 @@ async def test_file_is_read_despite_lost_replies(
 ) -> None:
     monkeypatch.setattr("companion.vehicle.report_reader._ATTEMPT_S", 0.02)
     content = bytes(number % 251 for number in range(size))
-    assert await Autopilot(content, loses).reader.read("etc/a.json") == content
+    assert await Autopilot({"etc/a.json": content}, loses).reader.read("etc/a.json") == content
 
 
 async def test_missing_file_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -158,3 +167,63 @@ async def test_events_wait_for_the_metadata(
     assert "COMPONENT_METADATA not received" in caplog.text
     reports: tuple[Report, ...] = link.telemetry.state.reports
     assert [report.text for report in reports] == ["event 0x01000005 (not in the metadata)"]
+
+
+class AutopilotWithMetadata(Autopilot):
+    """Has the text of one event. Its checksum is that of the file as served, as PX4's."""
+
+    def __init__(self, *, wrong_checksum: bool = False) -> None:
+        named = {"5": {"name": "tested", "message": "Tested"}}
+        group = {"namespace": "px4", "event_groups": {"default": {"events": named}}}
+        events = lzma.compress(json.dumps({"version": 2, "components": {"1": group}}).encode())
+        kind = {"type": 4, "uri": "mftp://events.xz", "fileCrc": checksum(events) ^ wrong_checksum}
+        self._general = json.dumps({"version": 1, "metadataTypes": [kind]}).encode()
+        super().__init__({"general.xz": lzma.compress(self._general), "events.xz": events})
+
+    async def read_texts(self) -> tuple[list[str], int]:
+        """Start with this autopilot; returns the texts of its event, and how many messages that took."""
+        telemetry, before = TelemetryState("udpin://test", lambda: None), len(self.asked)
+        reports = ReportReader("udpin://test", telemetry, self.send, self.command, lambda: (1, 1))
+        self.on_frame = reports.on_frame
+        reports.on_frame(event(1))
+        await reports.load_events()
+        return [report.text for report in telemetry.state.reports], len(self.asked) - before
+
+    async def command(self, *_: float) -> int:
+        # PX4's checksum of this file is the unpacked one's.
+        payload = struct.pack("<II100s", 0, checksum(self._general), b"mftp://general.xz")
+        asyncio.get_running_loop().call_soon(self.on_frame, frame(COMPONENT_METADATA_ID, payload))
+        return 0
+
+
+@pytest.fixture
+def cached(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[], list[Path]]:
+    """Returns the cached event metadata."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return lambda: list(cache_folder().glob("events-*"))
+
+
+@pytest.mark.parametrize("spoil", [lambda content: content[:40], lambda content: b"", lambda content: b"{}"])
+async def test_spoilt_cache_is_read_again(
+    cached: Callable[[], list[Path]], spoil: Callable[[bytes], bytes], caplog: pytest.LogCaptureFixture
+) -> None:
+    autopilot = AutopilotWithMetadata()
+    first = await autopilot.read_texts()
+    assert first[0] == ["Tested"]
+    assert await autopilot.read_texts() == (["Tested"], 0)
+    (events,) = cached()
+    events.write_bytes(spoil(events.read_bytes()))
+    assert caplog.messages == []
+    again = await autopilot.read_texts()
+    assert again[0] == ["Tested"]
+    assert 0 < again[1] < first[1]
+    assert [str(events) in message for message in caplog.messages] == [True]
+    assert await autopilot.read_texts() == (["Tested"], 0)
+
+
+async def test_metadata_with_a_wrong_checksum_is_used_but_not_cached(
+    cached: Callable[[], list[Path]], caplog: pytest.LogCaptureFixture
+) -> None:
+    assert (await AutopilotWithMetadata(wrong_checksum=True).read_texts())[0] == ["Tested"]
+    assert len(caplog.messages) == 1
+    assert cached() == []
