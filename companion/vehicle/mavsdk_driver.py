@@ -4,7 +4,9 @@ MAVSDK runs on its `raw://` connection: received bytes are passed to it, and the
 are sent from our asyncio loop. So its C++ threads send nothing to the vehicle by themselves: a program that
 hangs is silent. Its own HEARTBEAT (once a second; MAVSDK 4.1 for Python cannot turn it off) is dropped, so
 the only heartbeats on the wire are those of `send_heartbeat`. Its offboard plugin, which repeats the last
-setpoint from such a thread, is not used: setpoints are sent one by one through `mavlink_direct`.
+setpoint from such a thread, is not used: setpoints are sent one by one through `mavlink_direct`. Nor is its
+events plugin: `report_reader` serves both drivers and autopilots, also STATUSTEXT, and reads which modes an
+event affects, which that plugin does not give.
 """
 
 from __future__ import annotations
