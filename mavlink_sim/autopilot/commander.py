@@ -14,7 +14,7 @@ from collections.abc import Callable
 from mavlink_sim.autopilot import position_failsafe
 from mavlink_sim.autopilot.ground_contact import TAKEOFF_DETECTION_HEIGHT_M, GroundContact, asks_to_rise
 from mavlink_sim.autopilot.home import Home
-from mavlink_sim.autopilot.supervision import REASONS, Supervision, failing_checks
+from mavlink_sim.autopilot.supervision import REASONS, Supervision
 from mavlink_sim.flight import manual_flight
 from mavlink_sim.flight import tasks as flight
 from mavlink_sim.flight.attitude_control import AttitudeController, RatesSetpoint
@@ -218,7 +218,7 @@ class Autopilot:
 
     def report_checks(self) -> None:
         """Report the failing checks by their events, for RUN_PREARM_CHECKS and a refusal to arm."""
-        self.texts.extend(failing_checks(self))
+        self.supervision.report_checks()
 
     def disarm(self, force: bool = False, by: str = "external command") -> int:
         """MAV_RESULT of a disarming request; `force` stops the motors in the air too."""

@@ -1,7 +1,7 @@
 """Commander's supervision of links, battery and pilot: sets the failsafe conditions, executes pilot requests.
 
 The autopilot calls `update` once per step. Other checks (fence, motors) set their field of `conditions`.
-`failing_checks` are PX4's checks before arming, each reported by an event; names and texts are PX4 1.17's.
+`health_report` has PX4's checks before arming, each reported by an event; names and texts are PX4 1.17's.
 Times are seconds since boot. Names in capitals are PX4's parameters.
 """
 
@@ -28,6 +28,7 @@ EMERGENCY = 0  # MAV_SEVERITY_EMERGENCY
 WARNING = 4  # MAV_SEVERITY_WARNING
 ACCEPTED = 0  # MAV_RESULT
 
+REPORTS_APART_S = 2.0  # of PX4's checks, when they change
 PERIOD_S = 0.02  # Commander's own loop is about as fast; requests are processed immediately
 KILL_EVENT_LEVELS_IN_THE_AIR = 0x62
 # arm_disarm_reason_t of PX4's events
@@ -122,6 +123,8 @@ class Supervision:
         self._ever_had_mode = False
         self._disarmed_s = -math.inf
         self._announced_failsafe = (Action.NONE, Mode.HOLD)
+        self._reported: list[Text] = []
+        self._report_compared_s = 0.0
 
     def keep_equipment(self, before: Supervision) -> None:
         """Keep battery and transmitter over a reboot: they are no part of the autopilot."""
@@ -254,10 +257,12 @@ class Supervision:
         self._check_position()
         breached = autopilot.navigator.is_breached
         if breached and not self.conditions.geofence_breached:
-            autopilot.texts.extend(
-                failing_checks(autopilot, GEOFENCE_CHECKS)
-            )  # PX4 reports a check when it changes
+            self.report_checks()
         self.conditions.geofence_breached = breached
+        if now_s - self._report_compared_s >= REPORTS_APART_S:
+            self._report_compared_s = now_s
+            if health_report(autopilot) != self._reported:
+                self.report_checks()
         sticks_request = self._check_sticks()
         autopilot.follow_failsafes(self.run_failsafes(dt_s, sticks_request))
         killed_s = now_s - self._killed_since_s
@@ -265,6 +270,12 @@ class Supervision:
             autopilot.disarm(force=True, by="kill-switch")
         if self.failsafes.action is Action.DISARM and autopilot.armed:
             autopilot.disarm(force=True, by="failsafe")
+
+    def report_checks(self) -> None:
+        """Send the health and arming report."""
+        self._reported = health_report(self._autopilot)
+        self._report_compared_s = self._autopilot.now_s
+        self._autopilot.texts.extend(self._reported)
 
     def run_failsafes(self, dt_s: float = 0.0, sticks_request: bool = False) -> Mode:
         """Run the failsafe state machine. Returns the resulting mode."""
@@ -426,12 +437,14 @@ def _denied(why: str, event: str) -> Text:
     return Text(CRITICAL, f"Arming denied: {why}\t", (event_identifier(event), 0x62, b""))
 
 
-_ERROR, _INFO = 0x33, 0x66  # log levels: to the vehicle's own log and to ground stations
+_ERROR, _INFO, _PROTOCOL = 0x33, 0x66, 0x88  # log levels: to the vehicle's own log and to ground stations
 # PX4's health_component_t
 _NO_COMPONENT, _MANUAL_CONTROL, _SYSTEM = 0, 7, 20
+# Pressure, GPS, battery, magnetometer, accelerometer, gyroscope
+_PRESENT = 1 << 1 | 1 << 3 | 1 << 11 | 1 << 27 | 1 << 28 | 1 << 29
 _ALL_MODES = 0xFFFF_FFFF
 # PX4's NAVIGATION_STATE of each mode: its bit in the events' `modes`
-_NAVIGATION_STATES = {
+NAVIGATION_STATES = {
     Mode.MANUAL: 0,
     Mode.ALTCTL: 1,
     Mode.POSCTL: 2,
@@ -456,10 +469,30 @@ GEOFENCE_CHECKS = {
 _ALTITUDE_CRUISE = 1 << 8  # a manual mode that this vehicle does not have
 
 
-def failing_checks(autopilot: SupervisedAutopilot, only: Collection[str] | None = None) -> list[Text]:
-    """An event (without text) for each check that fails, whatever the mode. `only`: of these checks."""
+def health_report(autopilot: SupervisedAutopilot) -> list[Text]:
+    """The events of MAVLink's health and arming check protocol, without texts.
+
+    A summary of the modes that can be armed and flown, each failing check, the health of the components.
+    """
+    checks = failing_checks(autopilot)
+    failing_modes = errors = 0
+    for _, levels, (modes, component) in checks:
+        failing_modes |= modes
+        errors |= (levels == _ERROR) << component
+    unavailable = _bits([mode for mode in Mode if not autopilot.can_run(mode)])
+    can_arm, can_run = _ALL_MODES & ~failing_modes, _ALL_MODES & ~unavailable
+    events = (
+        ("commander_arming_check_summary", _PROTOCOL, struct.pack("<B4I", 0, errors, 0, can_arm, can_run)),
+        *((name, levels, struct.pack("<IB", *where)) for name, levels, where in checks),
+        ("commander_health_summary", _PROTOCOL, struct.pack("<B3I", 0, _PRESENT, 0, 0)),
+    )
+    return [Text(CRITICAL, "", (event_identifier(name), levels, values)) for name, levels, values in events]
+
+
+def failing_checks(autopilot: SupervisedAutopilot) -> list[tuple[str, int, tuple[int, int]]]:
+    """Of each check that fails, in any mode: its event's name, log levels, (bits of modes, component)."""
     with_position = [mode for mode in Mode if needs_position(mode)]
-    in_wrong_mode = autopilot.mode in MODES_PREVENTING_ARMING
+    in_wrong_mode = not autopilot.armed and autopilot.mode in MODES_PREVENTING_ARMING
     mission, sticks = autopilot.navigator.mission, autopilot.pilot_has_sticks
     breaches = autopilot.navigator.breaches
     unlinked = autopilot.lacks_ground_station
@@ -474,9 +507,7 @@ def failing_checks(autopilot: SupervisedAutopilot, only: Collection[str] | None 
         ("check_modes_cannot_takeoff", in_wrong_mode, _ERROR, MODES_PREVENTING_ARMING, _SYSTEM),
     )
     return [
-        Text(CRITICAL, "", (event_identifier(name), levels, struct.pack("<IB", _bits(modes), component)))
-        for name, fails, levels, modes, component in checks
-        if fails and (only is None or name in only)
+        (name, levels, (_bits(modes), component)) for name, fails, levels, modes, component in checks if fails
     ]
 
 
@@ -484,5 +515,5 @@ def _bits(modes: Collection[Mode] | None) -> int:
     """Of all modes for None."""
     if modes is None:
         return _ALL_MODES
-    bits = sum(1 << state for mode, state in _NAVIGATION_STATES.items() if mode in modes)
+    bits = sum(1 << state for mode, state in NAVIGATION_STATES.items() if mode in modes)
     return bits | _ALTITUDE_CRUISE if Mode.ALTCTL in modes else bits

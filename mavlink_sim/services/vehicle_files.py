@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable
 from functools import cache, partial
 from typing import Any
 
+from mavlink_sim.autopilot.supervision import NAVIGATION_STATES
 from mavlink_sim.px4.parameters import INT32, Parameter, Parameters, default_parameters, is_volatile
 from mavlink_sim.services.context import ServiceContext
 from mavlink_sim.services.file_transfer import FileSystem, checksum
@@ -102,6 +103,25 @@ _ARMING_CHECKS: dict[str, tuple[str, Arguments]] = {
     "check_modes_manual_control": ("No manual control input", _CHECK),
     "check_modes_cannot_takeoff": ("Mode not suitable for arming", _CHECK),
 }
+# The two events around the checks: PX4's health and arming check protocol
+_HEALTH, _MODES = "px4::health_component_t", "px4::navigation_mode_group_t"
+_SUMMARIES: dict[str, tuple[str, Arguments]] = {
+    "commander_arming_check_summary": (
+        "Arming checks",
+        (
+            ("uint8_t", "chunk_idx"),
+            (_HEALTH, "error"),
+            (_HEALTH, "warning"),
+            (_MODES, "can_arm"),
+            (_MODES, "can_run"),
+        ),
+    ),
+    "commander_health_summary": (
+        "Health report",
+        (("uint8_t", "chunk_idx"), (_HEALTH, "is_present"), (_HEALTH, "error"), (_HEALTH, "warning")),
+    ),
+}
+_BITFIELDS = ("health_component_t", "navigation_mode_group_t")
 _ENUMS: dict[str, tuple[str, dict[int, str]]] = {
     "failsafe_action_t": (
         "uint8_t",
@@ -131,6 +151,24 @@ _ENUMS: dict[str, tuple[str, dict[int, str]]] = {
             6: "Remaining flight time low",
         },
     ),
+    "health_component_t": (
+        "uint32_t",
+        {
+            1 << 0: "None",
+            1 << 1: "Absolute pressure",
+            1 << 3: "GPS",
+            1 << 7: "Remote Control (RC or Joystick)",
+            1 << 11: "Battery",
+            1 << 20: "System",
+            1 << 27: "Magnetometer",
+            1 << 28: "Accelerometer",
+            1 << 29: "Gyroscope",
+        },
+    ),
+    "navigation_mode_group_t": (
+        "uint32_t",
+        {1 << state: mode.title for mode, state in NAVIGATION_STATES.items()},
+    ),
     "arm_disarm_reason_t": (
         "uint8_t",
         {
@@ -154,29 +192,38 @@ def events_metadata() -> dict[str, Any]:
     default = {identifier: (name, words, arguments) for identifier, name, words, arguments in _RECORDED}
     default |= {event_identifier(name): (name, *text) for name, text in _DEFAULT.items()}
     checks = {event_identifier(name): (name, *text) for name, text in _ARMING_CHECKS.items()}
+    arming, health = ({event_identifier(name): (name, *text)} for name, text in _SUMMARIES.items())
     return {
         "version": 2,
         "components": {
             "1": {
                 "namespace": "px4",
-                "enums": {name: _enum(kind, entries) for name, (kind, entries) in _ENUMS.items()}
-                | {"navigation_mode_group_t": _enum("uint32_t", {}, is_bitfield=True)},
+                "supported_protocols": ["health_and_arming_check"],
+                "navigation_mode_groups": {
+                    "groups": {str(state): [mode.custom_mode] for mode, state in NAVIGATION_STATES.items()}
+                },
+                "enums": {
+                    name: _enum(kind, entries, is_bitfield=name in _BITFIELDS)
+                    for name, (kind, entries) in _ENUMS.items()
+                },
                 "event_groups": {
                     "default": {"events": _events(default)},
-                    "arming_check": {"events": _events(checks)},
+                    "arming_check": {"events": _events(arming, "summary") | _events(checks)},
+                    "health": {"events": _events(health, "summary")},
                 },
             }
         },
     }
 
 
-def _events(texts: dict[int, tuple[str, str, Arguments]]) -> dict[str, Any]:
+def _events(texts: dict[int, tuple[str, str, Arguments]], kind: str = "") -> dict[str, Any]:
     return {
         str(identifier & 0xFFFFFF): {
             "name": name,
             "message": words,
+            **({"type": kind} if kind else {}),
             **(
-                {"arguments": [{"type": kind, "name": word} for kind, word in arguments]} if arguments else {}
+                {"arguments": [{"type": each, "name": word} for each, word in arguments]} if arguments else {}
             ),
         }
         for identifier, (name, words, arguments) in texts.items()

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 from mavsdk.asyncio import ComponentType
 from mavsdk.asyncio.plugins.action import ActionAsync, ActionError
+from mavsdk.asyncio.plugins.events import EventsAsync
 from mavsdk.asyncio.plugins.gimbal import ControlMode, GimbalAsync, GimbalMode, SendMode
 from mavsdk.asyncio.plugins.info import InfoAsync
 from mavsdk.asyncio.plugins.manual_control import ManualControlAsync
@@ -211,3 +212,17 @@ async def test_a_remote_control_is_read() -> None:
         async with streaming(lambda: direct.send_message(override), 0.1):
             status = await wait_for(telemetry.subscribe_rc_status(), lambda update: update.is_available)
         assert status.signal_strength_percent == pytest.approx(100.0, abs=61.0)
+
+
+async def test_mavsdk_reports_health_and_arming_checks(system: MavsdkClient) -> None:
+    reports = system.plugin(EventsAsync).subscribe_health_and_arming_checks()
+    # As soon as it has the events' metadata it requests the checks; later reports come by themselves.
+    report = await wait_for(reports, lambda report: report.current_mode_intention.can_arm_or_run)
+    assert report.current_mode_intention.mode_name == "Hold"
+    assert report.current_mode_intention.problems == []
+    problems = {problem.message for problem in report.all_problems}
+    assert problems == {"No valid mission available", "No offboard signal", "No manual control input"}
+    present = {part.label for part in report.health_components if part.is_present}
+    assert {"GPS", "Battery"} <= present
+    faulty = {part.label for part in report.health_components if part.has_error}
+    assert faulty == {"System", "Remote Control (RC or Joystick)"}

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from mavlink_sim.px4.parameters import INT32, REAL32, Parameter, Parameters, is_volatile, parameter_hash
+from mavlink_sim.services.event_protocol import EVENTS_KEPT
 from mavlink_sim.wire.messages import dialect, parser
 from tests.mavlink_sim.conftest import SimHarness
 from tests.mavlink_sim.plan_client import upload, waypoint
@@ -184,7 +185,7 @@ def active(harness: SimHarness) -> list[Any]:
     harness.take_off(2.5)
     harness.command(21)
     harness.until(lambda: not harness.armed, 40.0)
-    harness.fly(0.1)
+    harness.fly(3.0)  # the checks have changed
     return list(harness.received("EVENT"))
 
 
@@ -196,26 +197,27 @@ def test_events__on_every_link_with_increasing_numbers(harness: SimHarness) -> N
 
 
 def test_source_request_event__stored_events_are_repeated(harness: SimHarness) -> None:
-    first = active(harness)
-    request_event(harness, 2, 4)
+    kept = active(harness)[-EVENTS_KEPT:]
+    request_event(harness, kept[1].sequence, kept[3].sequence)
     again = harness.received("EVENT")
     assert [(m.id, m.sequence, m.event_time_boot_ms, m.arguments) for m in again] == [
-        (m.id, m.sequence, m.event_time_boot_ms, m.arguments) for m in first[1:4]
+        (m.id, m.sequence, m.event_time_boot_ms, m.arguments) for m in kept[1:4]
     ]
 
 
 def test_source_response_event_error__for_a_missing_event(harness: SimHarness) -> None:
-    newest = active(harness)[-1].sequence
+    kept = active(harness)[-EVENTS_KEPT:]
+    oldest, newest = kept[0].sequence, kept[-1].sequence
     request_event(harness, 65535, 0)
     errors = harness.received("RESPONSE_EVENT_ERROR")
     assert [(message.sequence, message.sequence_oldest_available) for message in errors] == [
-        (65535, 1),
-        (0, 1),
+        (65535, oldest),
+        (0, oldest),
     ]
     assert {(message.target_system, message.target_component) for message in errors} == {(1, 191)}
     request_event(harness, newest + 1, 60000)
     assert 1 <= len(harness.received("RESPONSE_EVENT_ERROR")) <= 25  # not one for each of 60000
-    request_event(harness, 1, 3, target=(1, 100))
+    request_event(harness, oldest, oldest + 2, target=(1, 100))
     assert not harness.received("EVENT")
 
 
