@@ -104,6 +104,14 @@ def test_flight_command_table_is_complete() -> None:
     assert {type(command) for command in commands} == set(COMMANDS.values())
 
 
+def test_every_parameter_that_the_sitl_tests_set_is_documented() -> None:
+    sources = [path.read_text() for path in (ROOT / "tests" / "sitl").glob("*.py")]
+    names = {name for text in sources for name in re.findall(r'"([A-Z0-9]+_[A-Z0-9_]+)": ', text)}
+    assert len(names) > 10
+    page = (ROOT / "docs" / "how-to" / "sitl.md").read_text()
+    assert not {name for name in names if f"`{name}`" not in page}
+
+
 def test_index_lists_every_document() -> None:
     index = (ROOT / "docs" / "README.md").read_text()
     pages = {path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").glob("**/*.md")}
