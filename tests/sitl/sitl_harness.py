@@ -7,6 +7,7 @@ World frame: the autopilot's local NED.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import select
@@ -16,7 +17,6 @@ import threading
 import time
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -44,6 +44,8 @@ _DOWN = (dialect.MAV_LANDED_STATE_ON_GROUND, dialect.MAV_LANDED_STATE_UNDEFINED)
 _ANSWER_S = 3.0
 READY_S, GROUNDED_S = 180.0, 120.0
 SILENT_S = 1.0
+# A rebooting autopilot closes its TCP port for seconds.
+CONNECT_S, RECONNECT_S, RECONNECT_EVERY_S = 10.0, 60.0, 0.2
 ORBIT_MPS = 2.8
 # Measured: by autopilot and driver, by what was flown.
 FIGURES: dict[str, dict[str, dict[str, float | None]]] = {}
@@ -110,11 +112,12 @@ class AutopilotLink:
         self._changed = threading.Condition()
         self._peer: tuple[str, int] | None = None
         self._peer_s = -math.inf
+        self._lost_s: float | None = None
         if url.scheme is LinkScheme.UDP_IN:
             self._far = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
             self._far.bind(url.address)
         elif url.scheme is LinkScheme.TCP:
-            self._far = socket.create_connection(url.address, 10.0)
+            self._far = socket.create_connection(url.address, CONNECT_S)
         else:
             raise ValueError(f"COMPANION_SITL_URL={url}: expected udpin://HOST:PORT or tcp://HOST:PORT")
         self._near = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -240,8 +243,18 @@ class AutopilotLink:
         from_autopilot, from_service = dialect.MAVLink(None), dialect.MAVLink(None)
         from_autopilot.robust_parsing = from_service.robust_parsing = True
         while not self._closing.is_set():
-            for ready in select.select([self._far, self._near], [], [], 0.2)[0]:
-                data, sender = ready.recvfrom(65536)
+            open_sockets = [self._near] if self._lost_s is not None else [self._far, self._near]
+            received = select.select(open_sockets, [], [], RECONNECT_EVERY_S)[0]
+            if self._lost_s is not None and time.monotonic() - self._lost_s < RECONNECT_S:
+                self._reconnect()
+            for ready in received:
+                try:
+                    data, sender = ready.recvfrom(65536)
+                except ConnectionError:
+                    data, sender = b"", None
+                if not data and ready is self._far and ready.type is socket.SOCK_STREAM:
+                    self._lost_s = time.monotonic()
+                    continue
                 if ready is self._near:
                     sent = from_service.parse_buffer(data) or []
                     now_s = time.monotonic()
@@ -283,9 +296,18 @@ class AutopilotLink:
         self._peer_s = now_s
         return True
 
+    def _reconnect(self) -> None:
+        """Try once to connect again to an autopilot that has closed its TCP port."""
+        with contextlib.suppress(OSError):
+            connected = socket.create_connection(self.address, RECONNECT_EVERY_S)
+            connected.settimeout(CONNECT_S)
+            lost, self._far, self._lost_s = self._far, connected, None
+            lost.close()
+
     def _to_autopilot(self, data: bytes) -> None:
         if self._far.type is socket.SOCK_STREAM:
-            self._far.sendall(data)
+            with contextlib.suppress(OSError):  # closed: reading notices it too
+                self._far.sendall(data)
         elif self._peer is not None:
             self._far.sendto(data, self._peer)
 
@@ -398,7 +420,7 @@ def bring_down(link: AutopilotLink) -> None:
     link.set_mode(PARKED[link.autopilot or 0])
 
 
-@contextmanager
+@contextlib.contextmanager
 def repeated(period_s: float, act: Iterator[None]) -> Iterator[None]:
     """Advance an iterator again and again, in a thread."""
     ended = threading.Event()

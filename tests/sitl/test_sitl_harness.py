@@ -24,18 +24,22 @@ def link() -> Iterator[AutopilotLink]:
     opened.close()
 
 
+def heartbeat(custom_mode: int) -> bytes:
+    """Of a PX4 with system id 1."""
+    message = dialect.MAVLink_heartbeat_message(2, PX4, 1, custom_mode, 3, 3)
+    return bytes(message.pack(dialect.MAVLink(None, 1, 1)))
+
+
 class Sender:
-    """Heartbeats of a PX4 with system id 1, from an address of its own."""
+    """Sends heartbeats from an address of its own."""
 
     def __init__(self, link: AutopilotLink) -> None:
-        self._codec = dialect.MAVLink(None, 1, 1)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.connect(link.address)
         self.address = self._socket.getsockname()
 
     def heartbeat(self, custom_mode: int) -> None:
-        message = dialect.MAVLink_heartbeat_message(2, PX4, 1, custom_mode, 3, 3)
-        self._socket.send(bytes(message.pack(self._codec)))
+        self._socket.send(heartbeat(custom_mode))
 
     def close(self) -> None:
         self._socket.close()
@@ -71,3 +75,28 @@ def test_a_restarted_autopilot_may_have_another_address(
     second.heartbeat(TAKEOFF)
     link.until(lambda: len(link.modes) == 2, 5.0, "the second mode")
     assert not link.other_senders
+
+
+def test_a_tcp_autopilot_that_restarts_is_connected_again() -> None:
+    listening = socket.create_server(("127.0.0.1", free_port(socket.SOCK_STREAM)))
+    address = listening.getsockname()
+    link = AutopilotLink(parse_link_url(f"tcp://127.0.0.1:{address[1]}"))
+    try:
+        first, _ = listening.accept()
+        first.sendall(heartbeat(HOLD[PX4]))
+        link.until(lambda: link.modes, 5.0, "a mode")
+        listening.close()
+        first.close()
+        link.send(dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3))  # to nobody
+        listening = socket.create_server(address)
+        listening.settimeout(5.0)
+        second, _ = listening.accept()
+        second.settimeout(5.0)
+        second.sendall(heartbeat(TAKEOFF))
+        link.until(lambda: len(link.modes) == 2, 5.0, "the second mode")
+        link.set_mode(HOLD[PX4])
+        assert second.recv(1000)[7:10] == (76).to_bytes(3, "little")  # COMMAND_LONG
+        second.close()
+    finally:
+        link.close()
+        listening.close()
