@@ -72,6 +72,7 @@ class AutopilotLink:
     Attributes:
         service_port: the service listens there. address: where the autopilot's messages arrive.
         cut: nothing is passed on while it is true; what the autopilot sends is still recorded.
+        uplink_deaf: what the service sends is not passed on while it is true; it is still recorded.
         autopilot, system_id: MAV_AUTOPILOT of its first heartbeat, and who sent it; None and 0 before.
         modes: (time_s, custom_mode) of every change.
         poses, setpoints_s: everything since the start; when each setpoint of the service came.
@@ -87,7 +88,7 @@ class AutopilotLink:
 
     def __init__(self, url: LinkUrl) -> None:
         self.service_port, self.address = free_port(), url.address
-        self.cut = False
+        self.cut = self.uplink_deaf = False
         self.autopilot: int | None = None
         self.system_id = 0
         self.modes: list[tuple[float, int]] = []
@@ -267,7 +268,7 @@ class AutopilotLink:
                         for message in sent
                         if message.get_type() == "VISION_POSITION_ESTIMATE"
                     ]
-                    if not self.cut:
+                    if not (self.cut or self.uplink_deaf):
                         self._to_autopilot(data)
                     continue
                 if not self._from_peer(sender):

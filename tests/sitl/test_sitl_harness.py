@@ -41,6 +41,11 @@ class Sender:
     def heartbeat(self, custom_mode: int) -> None:
         self._socket.send(heartbeat(custom_mode))
 
+    def receive(self) -> bytes:
+        """The next datagram from the link."""
+        self._socket.settimeout(5.0)
+        return self._socket.recv(1000)
+
     def close(self) -> None:
         self._socket.close()
 
@@ -100,3 +105,20 @@ def test_a_tcp_autopilot_that_restarts_is_connected_again() -> None:
     finally:
         link.close()
         listening.close()
+
+
+def test_a_deaf_uplink_passes_on_telemetry_alone(link: AutopilotLink, senders: tuple[Sender, Sender]) -> None:
+    autopilot, _ = senders
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as service:
+        service.bind(("127.0.0.1", link.service_port))
+        service.settimeout(5.0)
+        link.uplink_deaf = True
+        autopilot.heartbeat(HOLD[PX4])
+        data, near = service.recvfrom(1000)
+        assert data == heartbeat(HOLD[PX4])
+        command = dialect.MAVLink_command_long_message(1, 1, 512, 0, 242, 0, 0, 0, 0, 0, 0)
+        service.sendto(command.pack(dialect.MAVLink(None, 1, 191)), near)
+        link.until(lambda: link.commands, 5.0, "recorded")
+        link.uplink_deaf = False
+        service.sendto(b"received", near)
+        assert autopilot.receive() == b"received"

@@ -10,10 +10,11 @@ import time
 import pytest
 
 from mavlink_sim.wire.messages import dialect
-from tests.sitl.sitl_harness import ARDUPILOT, READY_S, Flight
+from tests.sitl.conftest import Services
+from tests.sitl.sitl_harness import ARDUPILOT, READY_S, AutopilotLink, Flight, bring_down
 
 pytestmark = [pytest.mark.sitl, pytest.mark.timeout(400), pytest.mark.realtime]
-REBOOT_S = 60.0
+REBOOT_S, DEAF_S = 60.0, 6.0
 # A shell command that restarts a simulated autopilot that refuses to reboot, as PX4's does.
 RESTART = "COMPANION_SITL_RESTART"
 
@@ -23,13 +24,41 @@ def missing(flight: Flight) -> list[str]:
     return streams
 
 
-def test_streams_that_somebody_stops_are_asked_for_again(flight: Flight) -> None:
-    link = flight.link
-    link.until(lambda: flight.status and not missing(flight), 30.0, "all streams")
+def stop_streams(link: AutopilotLink) -> None:
+    """As another client may: all of ArduPilot's, LOCAL_POSITION_NED of PX4's."""
     if link.autopilot == ARDUPILOT:
         link.send(dialect.MAVLink_request_data_stream_message(link.system_id, 1, 0, 0, 0))
     else:
         link.command(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, 32, -1)
+
+
+def test_streams_come_after_an_uplink_that_was_deaf_at_the_start(
+    link: AutopilotLink, driver: str, services: Services
+) -> None:
+    bring_down(link)
+    services.close()
+    stop_streams(link)
+    link.until(lambda: not link.flown(time.monotonic() - 1.0), 10.0, "without positions")
+    link.uplink_deaf, started_s = True, time.monotonic()
+    try:
+        flight = services.flight(driver)
+        process = flight.service.process
+        link.until(lambda: flight.status and "LOCAL_POSITION_NED" in missing(flight), DEAF_S, "missing")
+        link.after(started_s + DEAF_S - time.monotonic())
+        assert any(at >= started_s for at, _ in link.commands)
+        assert not link.flown(started_s)
+    finally:
+        link.uplink_deaf = False
+    took_s = link.until(lambda: not missing(flight), 30.0, "complete")
+    assert flight.service.process is process
+    assert process.poll() is None
+    flight.note("uplink deaf at the start", complete_after_s=took_s)
+
+
+def test_streams_that_somebody_stops_are_asked_for_again(flight: Flight) -> None:
+    link = flight.link
+    link.until(lambda: flight.status and not missing(flight), 30.0, "all streams")
+    stop_streams(link)
     link.until(lambda: "LOCAL_POSITION_NED" in missing(flight), 15.0, "reported as missing")
     took_s = link.until(lambda: not missing(flight), 30.0, "complete again")
     flight.note("streams stopped by another", complete_after_s=took_s)
