@@ -126,7 +126,8 @@ def _fit(board: Board, used: Sequence[Marker], camera: CameraModel) -> BoardPose
     ]
     if len(used) > 1:
         starts = _promising(starts, model - centre, pixels, camera)
-    poses = fit_poses(model - centre, pixels, camera, starts)
+    sigma_px = max(marker.corner_sigma_px for marker in used)
+    poses = fit_poses(model - centre, pixels, camera, starts, sigma_px)
     if not poses:
         return None
     # A third one fits far worse.

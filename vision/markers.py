@@ -7,7 +7,8 @@ hardly differ in position, but in orientation. Both are kept, so that a caller w
 is level) can choose; `vision.marker_ambiguity` resolves them over several frames.
 
 The corners are intersections of lines through the marker's edges, which average over the pixels of a side: on
-rendered images of at least 40 px a side they are 0.03 px off, one sigma, OpenCV's own 0.17 px.
+rendered images of at least 40 px a side they are 0.03 px off, one sigma, OpenCV's own 0.17 px, or several
+pixels where it takes an edge of the sheet around the marker for the marker's.
 """
 
 from __future__ import annotations
@@ -28,13 +29,21 @@ from vision.camera_model import MIN_COSINE, CameraModel
 # the marker's side in the image, and never less than this many pixels.
 WORST_FIT, WORST_FIT_PX = 0.05, 2.0
 # Noise of a corner along each image axis, one sigma, from which covariances follow. That of rendered images
-# is smaller; a real lens is rarely calibrated better.
-CORNER_SIGMA_PX = 0.1
+# is smaller; a real lens is rarely calibrated better. That of OpenCV's corners, where lines do not fit.
+CORNER_SIGMA_PX, RAW_SIGMA_PX = 0.1, 1.0
 # Corner refinement: samples per side and the part of it they cover, so that the other sides do not disturb;
 # half the length of a sample's profile across the side, as a share of it and in pixels; the farthest that a
-# corner moves, the same way; and the number of passes (the quads that OpenCV finds are up to 2.5 px off).
+# corner moves, the same way; the most passes, and the movement of a corner at which they end.
 _SIDE_SAMPLES, _SIDE_PART = 24, (0.07, 0.93)
-_PROFILE_SHARE, _PROFILE_PX, _FARTHEST_SHARE, _FARTHEST_PX, _PASSES = 0.06, (1.5, 4.0), 0.08, 1.5, 2
+_PROFILE_SHARE, _PROFILE_PX, _FARTHEST_SHARE, _FARTHEST_PX = 0.06, (1.0, 4.0), 0.08, 1.5
+_MOST_PASSES, _SETTLED_PX = 10, 0.02
+# Edge points lie this near their line, RMS; on rendered images 0.12 px, beside an edge that is partly hidden
+# over 1 px.
+_SCATTER_PX = 0.5
+# Before it, the black square is searched on profiles that begin and end at these modules from OpenCV's sides.
+_SEARCHED_MODULES, _SEARCH_STEPS, _ROBUST_STEPS, _NEAR_PX = (-1.3, 0.7), 41, 6, 0.2
+_INSIDE_PX = 32
+_INSIDE_CORNERS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32) * _INSIDE_PX
 # Two poses rotated less than this apart are the same; the most iterations of a fit.
 SAME_RAD, _MAX_STEPS = 0.005, 8
 # OpenCV has two spellings of some names; the usual one is offered.
@@ -107,8 +116,8 @@ class MarkerPose:
         rotation: (3, 3) `optical_from_marker`; x to the marker's right, y to its upper edge, z out of it.
         reprojection_px: RMS reprojection error of its four corners, pixels.
         covariance: (6, 6) of the position, m², and of a small rotation about the camera's axes, rad², for
-            corners with a noise of `CORNER_SIGMA_PX`. To first order: seen face on from far away, the tilt's
-            is a lower bound.
+            corners with a noise of `CORNER_SIGMA_PX`, or more where they fit worse. To first order: seen face
+            on from far away, the tilt's is a lower bound.
     """
 
     position_camera_m: NDArray[np.float64]
@@ -127,6 +136,7 @@ class Marker:
         corners_px: (4, 2) float64 pixels: its upper left corner, then clockwise as printed.
         position_camera_m, rotation, reprojection_px, covariance: of the better fitting pose; see MarkerPose.
         other: the second pose that fits the same corners; None if there is none.
+        corner_sigma_px: noise of a corner along each image axis, one sigma.
     """
 
     identifier: int
@@ -137,6 +147,7 @@ class Marker:
     reprojection_px: float
     covariance: NDArray[np.float64]
     other: MarkerPose | None = None
+    corner_sigma_px: float = CORNER_SIGMA_PX
 
     @property
     def poses(self) -> tuple[MarkerPose, ...]:
@@ -170,7 +181,10 @@ class MarkerDetector:
         self.kind = kind
         parameters = cv2.aruco.DetectorParameters()
         parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-        self._detector = cv2.aruco.ArucoDetector(_dictionary(kind.dictionary), parameters)
+        dictionary = _dictionary(kind.dictionary)
+        # With the border of one module.
+        self._modules = dictionary.markerSize + 2
+        self._detector = cv2.aruco.ArucoDetector(dictionary, parameters)
 
     def detect(self, image_bgr: NDArray[np.uint8], camera: CameraModel) -> tuple[Marker, ...]:
         """Detect markers, sorted by id.
@@ -192,25 +206,34 @@ class MarkerDetector:
         if identifiers is None:
             return ()
         found = [
-            marker_from_corners(
-                int(identifier), _on_edges(grey, points, camera), self.kind.size_of(int(identifier)), camera
-            )
+            self._marker(grey, int(identifier), points, camera)
             for identifier, points in zip(np.ravel(identifiers), corners, strict=True)
         ]
         return tuple(sorted((marker for marker in found if marker), key=lambda marker: marker.identifier))
 
+    def _marker(
+        self, grey: NDArray[Any], identifier: int, corners_px: NDArray[Any], camera: CameraModel
+    ) -> Marker | None:
+        refined_px, sigma_px = _on_edges(grey, corners_px, self._modules, camera)
+        return marker_from_corners(identifier, refined_px, self.kind.size_of(identifier), camera, sigma_px)
+
 
 def marker_from_corners(
-    identifier: int, corners_px: NDArray[Any], size_m: float, camera: CameraModel
+    identifier: int,
+    corners_px: NDArray[Any],
+    size_m: float,
+    camera: CameraModel,
+    corner_sigma_px: float = CORNER_SIGMA_PX,
 ) -> Marker | None:
     """The marker with these corners; None where no pose in front of the camera fits.
 
     Args:
         corners_px: (4, 2) pixels: its upper left corner, then clockwise as printed.
         size_m: side of the black square, metres.
+        corner_sigma_px: noise of a corner along each image axis, one sigma.
     """
     corners = np.asarray(corners_px, np.float64).reshape(4, 2)
-    poses = marker_poses(corners, size_m, camera)
+    poses = marker_poses(corners, size_m, camera, corner_sigma_px)
     if not poses:
         return None
     best = poses[0]
@@ -223,17 +246,23 @@ def marker_from_corners(
         best.reprojection_px,
         best.covariance,
         poses[1] if len(poses) > 1 else None,
+        corner_sigma_px,
     )
     return marker if best.reprojection_px <= max(WORST_FIT_PX, WORST_FIT * marker.side_px) else None
 
 
-def marker_poses(corners_px: NDArray[np.float64], size_m: float, camera: CameraModel) -> list[MarkerPose]:
+def marker_poses(
+    corners_px: NDArray[np.float64],
+    size_m: float,
+    camera: CameraModel,
+    corner_sigma_px: float = CORNER_SIGMA_PX,
+) -> list[MarkerPose]:
     """The poses that fit the corners, the better one first: two, one or none.
 
     Poses behind the camera, or showing the marker's back, are dropped.
 
     Args:
-        corners_px: (4, 2) pixels, as `marker_from_corners`.
+        corners_px, corner_sigma_px: as of `marker_from_corners`.
     """
     if not np.isfinite(corners_px).all():
         return []
@@ -242,7 +271,7 @@ def marker_poses(corners_px: NDArray[np.float64], size_m: float, camera: CameraM
     plane = _plane(camera, corners_px)
     model = square(size_m)
     starts = [(rotation, _position(model @ rotation.T, plane)) for rotation in _rotations(model, plane)]
-    poses = fit_poses(model, corners_px, camera, starts)
+    poses = fit_poses(model, corners_px, camera, starts, corner_sigma_px)
     return [pose for pose in poses if pose.rotation[:, 2] @ pose.position_camera_m < 0.0]
 
 
@@ -251,12 +280,14 @@ def fit_poses(
     pixels: NDArray[np.float64],
     camera: CameraModel,
     starts: Iterable[tuple[NDArray[np.float64], NDArray[np.float64]]],
+    sigma_px: float = CORNER_SIGMA_PX,
 ) -> list[MarkerPose]:
     """Poses of a rigid set of points that fit its pixels, refined from starts; the best first, none twice.
 
     Args:
         model: (N, 3) points in their own frame, at least four. pixels: (N, 2) their projections.
         starts: (3, 3) rotations `optical_from_model` and (3,) positions in the optical frame.
+        sigma_px: noise of a pixel along each axis; for the covariance the residuals' if that is larger.
     """
     plane = _plane(camera, pixels)
     poses: list[MarkerPose] = []
@@ -268,7 +299,7 @@ def fit_poses(
         error_px = float(np.sqrt(((camera.project(ahead) - pixels) ** 2).sum(axis=1).mean()))
         jacobian = _jacobian(ahead - position, ahead)
         with contextlib.suppress(np.linalg.LinAlgError):
-            sigma = 2.0 * CORNER_SIGMA_PX / (camera.fx + camera.fy)
+            sigma = 2.0 * max(sigma_px, error_px / math.sqrt(2.0)) / (camera.fx + camera.fy)
             covariance = np.asarray(np.linalg.inv(jacobian.T @ jacobian) * sigma**2, np.float64)
             if math.isfinite(error_px):
                 poses.append(MarkerPose(position, rotation, error_px, covariance))
@@ -422,46 +453,122 @@ def _same(one: MarkerPose, other: MarkerPose) -> bool:
     return bool(np.trace(one.rotation.T @ other.rotation) > 1.0 + 2.0 * math.cos(SAME_RAD))
 
 
-def _on_edges(grey: NDArray[Any], corners_px: NDArray[Any], camera: CameraModel) -> NDArray[np.float64]:
-    """(4, 2) intersections of lines through the edges near these corners; the corners if lines do not fit."""
-    corners = found = np.asarray(corners_px, np.float64).reshape(4, 2)
+def _on_edges(
+    grey: NDArray[Any], corners_px: NDArray[Any], modules: int, camera: CameraModel
+) -> tuple[NDArray[np.float64], float]:
+    """(4, 2) intersections of lines through the edges of the black square, and their noise, pixels.
+
+    OpenCV's corners if lines do not fit.
+
+    Args:
+        corners_px: as OpenCV finds them. modules: of the marker's side, with its black border.
+    """
+    corners = np.asarray(corners_px, np.float64).reshape(4, 2)
     side_px = float(np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).mean())
-    reach_px = float(np.clip(_PROFILE_SHARE * side_px, *_PROFILE_PX))
-    for _ in range(_PASSES):
-        found = _lines_met(grey, found, reach_px, camera)
+    start = _inner_square(grey, corners, modules, camera)
+    start = found = start if np.isfinite(start).all() else corners
+    reach_px = np.clip(_PROFILE_SHARE * _across_px(start), *_PROFILE_PX)
+    for _ in range(_MOST_PASSES):
+        before, found = found, _lines_met(grey, found, reach_px, camera)
         # NaN fails the comparison.
-        if not np.abs(found - corners).max() < max(_FARTHEST_PX, _FARTHEST_SHARE * side_px):
-            return corners
-    return found
+        if not np.abs(found - start).max() < max(_FARTHEST_PX, _FARTHEST_SHARE * side_px):
+            break
+        if np.abs(found - before).max() < _SETTLED_PX:
+            return found, CORNER_SIGMA_PX
+    return corners, RAW_SIGMA_PX
+
+
+def _inner_square(
+    grey: NDArray[Any], corners: NDArray[np.float64], modules: int, camera: CameraModel
+) -> NDArray[np.float64]:
+    """(4, 2) corners of the black square, to a pixel; NaN where its edges are not found.
+
+    Where the background is brighter than the white margin around the marker (a sheet in shade), OpenCV may
+    give the margin's outer edge on some sides, up to a module off. On each profile from inside the black
+    border outwards, the first rise to the marker's own white is its edge.
+    """
+    across_px = _across_px(corners) / modules
+    steps = np.linspace(*_SEARCHED_MODULES, _SEARCH_STEPS)
+    bases, outward, profiles = _profiles(grey, corners, across_px[:, None] * steps)
+    inside = cv2.warpPerspective(
+        grey,
+        cv2.getPerspectiveTransform(corners.astype(np.float32), _INSIDE_CORNERS),
+        (_INSIDE_PX, _INSIDE_PX),
+    )
+    level = cv2.threshold(inside, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)[0]
+    rises = (profiles[:, :, :-1] < level) & (profiles[:, :, 1:] >= level)
+    known, first = rises.any(axis=2), rises.argmax(axis=2)
+    if (known.mean(axis=1) < 0.5).any():
+        return np.full((4, 2), np.nan)
+    place = across_px[:, None] * (steps[first] + steps[first + 1]) / 2.0
+    return _intersections(
+        bases + outward * place[..., None], np.asarray(known, np.float64), camera, _ROBUST_STEPS
+    )
+
+
+def _across_px(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(4,) extent of a quadrilateral across each side: foreshortened, it is less than the adjacent sides."""
+    lengths = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
+    return np.asarray(cv2.contourArea(corners.astype(np.float32)) / np.maximum(lengths, 1e-9), np.float64)
 
 
 def _lines_met(
-    grey: NDArray[Any], corners: NDArray[np.float64], reach_px: float, camera: CameraModel
+    grey: NDArray[Any], corners: NDArray[np.float64], reach_px: NDArray[np.float64], camera: CameraModel
 ) -> NDArray[np.float64]:
     """(4, 2) intersections of the lines through the edges; NaN where there are none.
 
     On each side the edge is located on profiles across it, at the centroid of the increase from black to
-    white. Lines are fitted without the lens's distortion, which bends them.
+    white.
+    """
+    steps = np.linspace(-1.0, 1.0, 2 * math.ceil(2.0 * reach_px.max()) + 1)
+    bases, outward, profiles = _profiles(grey, corners, reach_px[:, None] * steps)
+    rise = np.maximum(np.diff(profiles, axis=2), 0.0)
+    weight = rise.sum(axis=2)
+    place = reach_px[:, None] * (rise @ ((steps[:-1] + steps[1:]) / 2)) / np.maximum(weight, 1e-9)
+    return _intersections(bases + outward * place[..., None], weight, camera)
+
+
+def _profiles(
+    grey: NDArray[Any], corners: NDArray[np.float64], offsets: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Profiles across the sides: (4, S, 2) points on the sides, (4, 1, 2) outward, (4, S, M) brightness.
+
+    Args:
+        offsets: (4, M) pixels outwards, for each side.
     """
     along = np.roll(corners, -1, axis=0) - corners
     outward = np.column_stack([along[:, 1], -along[:, 0]]) / np.linalg.norm(along, axis=1, keepdims=True)
-    offsets = np.linspace(-reach_px, reach_px, 2 * math.ceil(2.0 * reach_px) + 1)
     bases = corners[:, None] + along[:, None] * np.linspace(*_SIDE_PART, _SIDE_SAMPLES)[:, None]
-    samples = bases[:, :, None] + outward[:, None, None] * offsets[:, None]
+    samples = bases[:, :, None] + outward[:, None, None] * offsets[:, None, :, None]
     maps = samples.reshape(4 * _SIDE_SAMPLES, -1, 2).astype(np.float32)
     profiles = cv2.remap(grey, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    rise = np.maximum(np.diff(profiles.reshape(samples.shape[:3]).astype(np.float64), axis=2), 0.0)
-    weight = rise.sum(axis=2)
-    place = (rise @ ((offsets[:-1] + offsets[1:]) / 2)) / np.maximum(weight, 1e-9)
-    points = _plane(camera, (bases + outward[:, None] * place[..., None]).reshape(-1, 2)).reshape(4, -1, 2)
+    return bases, outward[:, None], profiles.reshape(samples.shape[:3]).astype(np.float64)
+
+
+def _intersections(
+    points_px: NDArray[np.float64], weight: NDArray[np.float64], camera: CameraModel, robust_steps: int = 0
+) -> NDArray[np.float64]:
+    """(4, 2) intersections of lines through (4, S, 2) weighted points of the sides; NaN where none are.
+
+    Lines are fitted without the lens's distortion, which bends them.
+
+    Args:
+        robust_steps: of a fit to the absolute distances rather than to their squares.
+    """
+    points = _plane(camera, points_px.reshape(-1, 2)).reshape(4, -1, 2)
     if not np.isfinite(points).all():  # beyond the lens's rays
         return np.full((4, 2), np.nan)
-    weight = (weight / np.maximum(weight.sum(axis=1, keepdims=True), 1e-9))[..., None]
-    centres = (points * weight).sum(axis=1, keepdims=True)
-    normals = np.linalg.svd((points - centres) * np.sqrt(weight), full_matrices=False)[2][:, 1]
+    given = weight
+    for _ in range(robust_steps + 1):
+        share = (weight / np.maximum(weight.sum(axis=1, keepdims=True), 1e-9))[..., None]
+        centres = (points * share).sum(axis=1, keepdims=True)
+        normals = np.linalg.svd((points - centres) * np.sqrt(share), full_matrices=False)[2][:, 1]
+        off = np.abs((points - centres) @ normals[..., None])[..., 0]
+        weight = given / np.maximum(off * camera.fx, _NEAR_PX)
     lines = np.column_stack([normals, -(normals * centres[:, 0]).sum(axis=1)])
     met = np.cross(np.roll(lines, 1, axis=0), lines)
-    if np.abs(met[:, 2]).min() < 1e-9:
+    scatter = np.sqrt((share[..., 0] * np.square(off)).sum(axis=1)).max() * camera.fx
+    if np.abs(met[:, 2]).min() < 1e-9 or (scatter > _SCATTER_PX and not robust_steps):
         return np.full((4, 2), np.nan)
     return camera.project(np.column_stack([met[:, :2] / met[:, 2:], np.ones(4)]))
 

@@ -5,19 +5,17 @@ from __future__ import annotations
 import math
 import pickle
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mavlink_sim.camera.renderer import Renderer
-from mavlink_sim.world.fiducials import Print
-from mavlink_sim.world.structures import PLATE_THICKNESS_M
-from mavlink_sim.world.world import Ground, World, WorldObject
-from vision.camera_model import CameraModel, CameraMount
+from benchmarks.marker_poses import CAMERA, angle_deg, pose_errors
 from vision.marker_ambiguity import AmbiguityResolver
-from vision.marker_boards import Board, locate_board, ned_from_marker
+from vision.marker_boards import Board, locate_board
 from vision.markers import (
     CORNER_SIGMA_PX,
+    RAW_SIGMA_PX,
     Marker,
     MarkerDetector,
     MarkerKind,
@@ -28,13 +26,7 @@ from vision.markers import (
 from vision.rotation import matrix_from_euler
 
 Matrix = NDArray[np.float64]
-CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(70.0))
-GROUND = Ground(("concrete",), 0, 256, 0.05)
 SIZE_M = 0.5
-
-
-def angle_deg(one: Matrix, other: Matrix) -> float:
-    return math.degrees(math.acos(max(-1.0, min(1.0, (np.trace(one.T @ other) - 1.0) / 2.0))))
 
 
 def seen(rotation: Matrix, position: Matrix, rng: np.random.Generator, size_m: float = SIZE_M) -> Marker:
@@ -49,46 +41,53 @@ def nearest(marker: Marker, rotation: Matrix) -> MarkerPose:
     return min(marker.poses, key=lambda pose: angle_deg(pose.rotation, rotation))
 
 
-def looking_at(eye: Matrix, rng: np.random.Generator) -> Matrix:
-    """`ned_from_body` of a camera that has the origin in the image, rolled and off the centre."""
-    yaw, pitch = math.atan2(-eye[1], -eye[0]), -math.atan2(-eye[2], math.hypot(eye[0], eye[1]))
-    off = rng.uniform(-0.1, 0.1, 2)
-    heading = matrix_from_euler(0.0, 0.0, yaw + off[0])
-    return heading @ matrix_from_euler(rng.uniform(-0.4, 0.4), pitch + off[1], 0.0)
-
-
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", [0, 1, 2, 3, 4, 5, 711, 2003, 2017, 2095])
 def test_rendered_pose_is_true_within_2_percent_and_2_degrees(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    standing = bool(seed % 2)
-    printed = Print("APRILTAG_36h11", 7, SIZE_M, standing)
-    yaw = rng.uniform(-math.pi, math.pi)
-    renderer = Renderer(
-        World((WorldObject(0, "plate", (0, 0, 0), yaw, printed=printed),), GROUND), CAMERA, CameraMount()
-    )
-    ned = ned_from_marker(yaw, standing)
-    up = printed.board_side_m / 2 if standing else PLATE_THICKNESS_M
-    centre = np.array([0.0, 0.0, -up]) + (ned[:, 2] * PLATE_THICKNESS_M / 2 if standing else 0.0)
-    detector, checked = MarkerDetector(MarkerKind("APRILTAG_36h11", SIZE_M)), 0
-    for _ in range(20):
-        range_m, tilt, around = rng.uniform(1.2, 5.5), rng.uniform(0.0, 0.9), rng.uniform(-math.pi, math.pi)
-        out = ned @ [math.sin(tilt) * math.cos(around), math.sin(tilt) * math.sin(around), math.cos(tilt)]
-        eye = centre + range_m * out
-        if eye[2] > -0.3:
-            continue
-        attitude = looking_at(eye - centre, rng)
-        optical_from_ned = CameraMount().ned_from_optical(attitude).T
-        found = detector.detect(renderer.render(tuple(eye), attitude).image, CAMERA)
-        if not found or found[0].side_px < 40.0:
-            continue
-        position, rotation = optical_from_ned @ (centre - eye), optical_from_ned @ ned
-        assert np.linalg.norm(found[0].position_camera_m - position) < 0.02 * range_m
-        assert angle_deg(nearest(found[0], rotation).rotation, rotation) < 2.0
+    """In some of these, ground in the sun is brighter than the sheet around the marker, in shade."""
+    errors = [error for error in pose_errors(seed) if error is not None]
+    assert len(errors) >= 10
+    for error in errors:
+        assert error.range_share < 0.005
+        assert error.angle_deg < 2.0
+        assert error.corner_px < 0.1
         # The stated noise of the corners is above that of rendered ones.
-        off = np.linalg.solve(found[0].covariance[:3, :3], found[0].position_camera_m - position)
-        assert off @ (found[0].position_camera_m - position) < 16.0
-        checked += 1
-    assert checked >= 5
+        assert np.abs(error.normalized).max() < 3.0
+
+
+def test_covariance_of_rendered_poses_has_the_right_shape() -> None:
+    """Scaled to the noise of the rendered corners, two thirds of the errors lie within one sigma."""
+    errors = [error for seed in range(6) for error in pose_errors(seed) if error is not None]
+    corner_px = math.sqrt(float(np.mean([error.corner_px**2 for error in errors])))
+    normalized = np.abs([error.normalized for error in errors]) * CORNER_SIGMA_PX / corner_px
+    assert 0.6 < float((normalized < 1.0).mean()) < 0.78
+
+
+def test_corners_that_fit_badly_have_a_larger_covariance() -> None:
+    rotation, position = matrix_from_euler(0.3, 0.2, 0.3) @ np.diag([1.0, -1.0, -1.0]), np.array([0, 0, 4.0])
+    pixels = CAMERA.project(square(SIZE_M) @ rotation.T + position)
+    exact = marker_from_corners(3, pixels, SIZE_M, CAMERA)
+    rough = marker_from_corners(3, pixels, SIZE_M, CAMERA, RAW_SIGMA_PX)
+    displaced = np.array([[0.0, 0.0], [0.0, 0.0], [0.0, 0.0], [2.0, -2.0]])
+    wrong = marker_from_corners(3, pixels + displaced, SIZE_M, CAMERA)
+    assert exact is not None
+    assert rough is not None
+    assert wrong is not None
+    assert rough.corner_sigma_px == RAW_SIGMA_PX
+    assert np.allclose(rough.covariance, exact.covariance * (RAW_SIGMA_PX / CORNER_SIGMA_PX) ** 2)
+    off = np.abs(wrong.position_camera_m - position) / np.sqrt(np.diag(wrong.covariance)[:3])
+    assert off.max() < 3.0
+
+
+def test_marker_with_a_partly_hidden_edge_has_rough_corners() -> None:
+    image = np.full((480, 640), 255, np.uint8)
+    image[120:300, 200:380] = cv2.aruco.generateImageMarker(
+        cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11), 7, 180
+    )
+    (clear,) = MarkerDetector(MarkerKind("APRILTAG_36h11", SIZE_M)).detect(image, CAMERA)
+    assert clear.corner_sigma_px == CORNER_SIGMA_PX
+    image[120:128, 200:260] = 255
+    (hidden,) = MarkerDetector(MarkerKind("APRILTAG_36h11", SIZE_M)).detect(image, CAMERA)
+    assert hidden.corner_sigma_px == RAW_SIGMA_PX
 
 
 def test_two_thirds_of_positions_lie_within_one_sigma() -> None:
