@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import sys
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -50,6 +51,20 @@ def _note(text: str) -> None:
     typer.echo(f"companion: {text}", err=True)
 
 
+@contextmanager
+def _naming(missing: list[str]) -> Iterator[None]:
+    """Add to a CalibrationError what is missing for a complete set of views; else a line on it."""
+    from vision.calibration.calibrate import CalibrationError
+
+    wanted = f"missing for a complete set: {'; '.join(missing)}"
+    try:
+        yield
+    except CalibrationError as error:
+        raise CalibrationError(f"{error}; {wanted}" if missing else str(error)) from None
+    if missing:
+        _note(wanted)
+
+
 @calibrate.command()
 def lens(
     source: Annotated[str, typer.Argument(help="Folder of images, video, /dev/video0, shm://NAME or URL.")],
@@ -90,13 +105,12 @@ def lens(
         )
         with open_source(source, settings) as frames:
             collected = collect_views(frames, printed, _note, every)
+        with _naming(collected.collector.missing()):
+            result = calibrate_views(collected.collector.chosen())
         _note(
             f"{collected.frames} images, {collected.found} with the board, "
             f"{len(collected.collector.views)} different views"
         )
-        if missing := collected.collector.missing():
-            _note(f"missing for a complete set: {'; '.join(missing)}")
-        result = calibrate_views(collected.collector.chosen())
         for view, error in result.rejected:
             _note(f"rejected {view.name}: its error is {error:.2f} px")
         lines = result_lines(result)
@@ -150,13 +164,12 @@ def extrinsics(
         first, second = open_two(colour, infrared, settings, settings)
         with first, second:
             collected = collect_views(first, printed, _note, every, second)
+        with _naming(collected.collector.missing()):
+            result = extrinsics_from_views(collected.pairs, *lenses)
         views = len(collected.collector.views)
         _note(
             f"{collected.frames} pairs of images, {collected.found} with the board, {views} different views"
         )
-        if missing := collected.collector.missing():
-            _note(f"missing for a complete set: {'; '.join(missing)}")
-        result = extrinsics_from_views(collected.pairs, *lenses)
         for name, error in result.rejected:
             _note(f"rejected {name}: its error is {error:.2f} px")
         lines = extrinsics_lines(result)

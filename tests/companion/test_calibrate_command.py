@@ -220,9 +220,26 @@ def test_too_few_views(folder: Path, tmp_path: Path) -> None:
     few.mkdir()
     for number in range(5):
         (few / f"{number}.png").write_bytes((folder / f"view{number:02d}.png").read_bytes())
-    line = one_line_of_bad_input(calibrate(few, *BOARD_WORDS, "-o", tmp_path / "camera.yaml"))
+    done = calibrate(few, *BOARD_WORDS, "-o", tmp_path / "camera.yaml")
+    line = one_line_of_bad_input(done)
+    assert done.stderr.splitlines() == [line]
     assert "too few views" in line
     assert "5" in line
+    assert "more views" in line
+
+
+def test_too_few_pairs(pairs: Path, tmp_path: Path) -> None:
+    folders = [tmp_path / "colour", tmp_path / "infrared"]
+    for few in folders:
+        few.mkdir()
+        for image in sorted((pairs / few.name).iterdir())[:5]:
+            (few / image.name).write_bytes(image.read_bytes())
+    words = ("--colour-calibration", pairs / "colour.yaml", "--infrared-calibration", pairs / "depth.yaml")
+    done = calibrate("extrinsics", *folders, *BOARD_WORDS, *words, "-o", tmp_path / "depth.yaml")
+    line = one_line_of_bad_input(done)
+    assert done.stderr.splitlines() == [line]
+    assert "too few views" in line
+    assert "more views" in line
 
 
 def test_images_of_different_sizes(folder: Path, tmp_path: Path) -> None:
