@@ -76,7 +76,13 @@ def lens(
         Path, typer.Option("--output", "-o", help="Calibration file to write: ROS camera_info YAML.")
     ] = Path("camera.yaml"),
     report: Annotated[Path | None, typer.Option(help="Folder for a report: index.html and images.")] = None,
-    name: Annotated[str, typer.Option(help="Name of the camera in the file.")] = "camera",
+    name: Annotated[
+        str | None,
+        typer.Option(
+            help="Name of the camera in the file. Default: the source's address if it is of one camera "
+            "(/dev/v4l/by-id/…, realsense://SERIAL, oak://ID), else camera."
+        ),
+    ] = None,
     every: Annotated[int, typer.Option(min=1, help="Process every Nth frame of a video.")] = 1,
     width: Annotated[int | None, typer.Option(min=16, help="Width requested from a camera, pixels.")] = None,
     height: Annotated[
@@ -92,7 +98,7 @@ def lens(
     from companion.calibrate import collect_views, result_lines, write_report
     from vision.calibration.boards import Board
     from vision.calibration.calibrate import calibrate as calibrate_views
-    from vision.calibration.camera_info import write_camera_info
+    from vision.calibration.camera_info import camera_identity, write_camera_info
     from vision.sources import SourceError, SourceSettings, open_source
 
     logging.basicConfig(level=logging.WARNING, format="companion: %(message)s", stream=sys.stderr)
@@ -115,7 +121,8 @@ def lens(
             _note(f"rejected {view.name}: its error is {error:.2f} px")
         lines = result_lines(result)
         notes = (f"companion calibrate: {lines[0]}", lines[3])
-        write_camera_info(output, result.model, name, notes, settings.orientation)
+        camera = name or camera_identity(source) or "camera"
+        write_camera_info(output, result.model, camera, notes, settings.orientation)
         page = None if report is None else write_report(report, result, collected)
     for line in lines:
         typer.echo(line)
@@ -158,8 +165,8 @@ def extrinsics(
         printed = Board.parse(*board, square, marker, dictionary)
         settings = SourceSettings(every_frame=True, rotate_deg=rotate, mirror=mirror)
         lenses = []
-        for file in (colour_calibration, infrared_calibration):
-            (info := read_camera_info(file)).check_source(settings.orientation)
+        for file, uri in ((colour_calibration, colour), (infrared_calibration, infrared)):
+            (info := read_camera_info(file)).check_source(settings.orientation, uri=uri)
             lenses.append(info.model)
         first, second = open_two(colour, infrared, settings, settings)
         with first, second:
@@ -229,7 +236,7 @@ def mount(
         model = None
         if calibration is not None:
             info = read_camera_info(calibration)
-            info.check_source(reading.orientation)
+            info.check_source(reading.orientation, uri=source)
             model = info.model
         given = math.radians(roll), math.radians(pitch)
         with ExitStack() as opened:

@@ -138,8 +138,10 @@ def _given_settings(command: Callable[..., None]) -> Callable[..., None]:
     def wrapper(context: typer.Context, config_file: Path | None, **values: Any) -> None:
         given: dict[str, str | None] = context.meta[_GIVEN]
         overrides = {key: text for key, text in given.items() if text is not None}
+        # The command's own SOURCE, which a calibration file must fit.
+        uri = {"source.uri": values["source"]} if values.get("source") else {}
         with plain_errors(ConfigurationError):
-            settings = load_settings(config_file, overrides)
+            settings = load_settings(config_file, uri | overrides)
         if "given" in own.parameters:
             values["given"] = overrides
         command(settings, **values)

@@ -231,7 +231,7 @@ def check_calibration_file(values: Any, source: SourceSection) -> None:
     camera = values.get("camera") if isinstance(values, dict) else None
     if isinstance(camera, dict) and isinstance(file := camera.get("calibration_file"), str):
         info = read_camera_info(Path(file).expanduser())
-        info.check_source(source.opening().orientation, source.name)
+        info.check_source(source.opening().orientation, source.name, source.uri)
 
 
 def lens_settings(lens: CameraModel) -> dict[str, Any]:

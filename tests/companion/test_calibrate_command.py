@@ -18,6 +18,7 @@ import zenoh
 from numpy.typing import NDArray
 from typer.testing import CliRunner, Result
 
+import vision.sources
 from companion import calibrate as calibrate_module
 from companion.bus.config import zenoh_config
 from companion.calibrate import LiveTilt, collect_views, markers_of
@@ -240,6 +241,46 @@ def test_too_few_pairs(pairs: Path, tmp_path: Path) -> None:
     assert done.stderr.splitlines() == [line]
     assert "too few views" in line
     assert "more views" in line
+
+
+def test_calibration_of_another_camera_is_refused(folder: Path, tmp_path: Path) -> None:
+    """A camera with an address of its own needs no `--name`."""
+    own, other = "/dev/v4l/by-id/usb-front-video-index0", "/dev/v4l/by-id/usb-rear-video-index0"
+    file = tmp_path / "camera.yaml"
+    write_camera_info(file, LENS, own)
+    flags = ("--camera-calibration-file", str(file))
+    size, words = ("--size", "0.6"), ("--calibration", file)
+    for refused in (
+        calibrate("mount", other, "--marker", "7", *size, *words),
+        calibrate("extrinsics", other, "infrared", *BOARD_WORDS, *_lenses(file, folder / "truth.yaml")),
+        calibrate("extrinsics", "colour", other, *BOARD_WORDS, *_lenses(folder / "truth.yaml", file)),
+        CliRunner().invoke(app, ["markers", other, "--dictionary", "4X4_50", *size, *flags]),
+        CliRunner().invoke(app, ["config", "--source", other, *flags]),
+    ):
+        line = one_line_of_bad_input(refused)
+        assert own in line
+        assert other in line
+    for fits in (("--source", own, "--source-name", "front"), ("--source", "/dev/video0")):
+        assert CliRunner().invoke(app, ["config", *fits, *flags]).exit_code == 0
+
+
+def _lenses(colour: Path, infrared: Path) -> tuple[str | Path, ...]:
+    return ("--colour-calibration", colour, "--infrared-calibration", infrared)
+
+
+def test_address_of_one_camera_is_its_name(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened = vision.sources.open_source
+    monkeypatch.setattr("vision.sources.open_source", lambda _, settings: opened(str(folder), settings))
+    for source, name in (
+        ("/dev/v4l/by-id/usb-front-video-index0",) * 2,
+        ("realsense://0123",) * 2,
+        ("oak://", "camera"),
+        ("/dev/video0", "camera"),
+    ):
+        assert calibrate(source, *BOARD_WORDS, "-o", tmp_path / "camera.yaml").exit_code == 0
+        assert read_camera_info(tmp_path / "camera.yaml").name == (None if name == "camera" else name)
 
 
 def test_images_of_different_sizes(folder: Path, tmp_path: Path) -> None:

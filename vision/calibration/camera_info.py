@@ -16,6 +16,8 @@ from vision.plain_yaml import load_plain_yaml
 
 # The names that `companion calibrate` and ROS's camera_calibration write if none is given.
 _DEFAULT_NAMES = ("camera", "narrow_stereo")
+# Addresses that name one camera, wherever it is plugged in.
+_IDENTITIES = ("/dev/v4l/by-id/", "realsense://", "oak://")
 # Largest error of a product of rows of a rotation.
 _NO_ROTATION = 1e-3
 
@@ -38,8 +40,12 @@ class CameraInfo:
     orientation: Orientation | None
     registration: DepthCalibration | None = None
 
-    def check_source(self, orientation: Orientation, name: str | None = None) -> None:
+    def check_source(self, orientation: Orientation, name: str | None = None, uri: str | None = None) -> None:
         """Check that the calibration is of this source's images.
+
+        Args:
+            name: of the camera, compared with a file's name. uri: the source, compared where the file's name
+                is an address that identifies a camera, see `camera_identity`.
 
         Raises:
             ValueError: the source is turned otherwise, or is another camera; one line that names both.
@@ -52,11 +58,19 @@ class CameraInfo:
                     f"{_text(getattr(orientation, key))}: calibrate with the same --rotate and --mirror, or "
                     f"correct one of them"
                 )
-        if self.name is not None and name is not None and self.name != name:
+        key, given = "source.name", name
+        if self.name is not None and camera_identity(self.name) is not None:
+            key, given = "the source", None if uri is None else camera_identity(uri)
+        if self.name is not None and given is not None and self.name != given:
             raise ValueError(
                 f"the calibration file {self.path} is the calibration of another camera: camera_name is "
-                f"{self.name!r}, source.name {name!r}"
+                f"{self.name!r}, {key} {given!r}"
             )
+
+
+def camera_identity(uri: str) -> str | None:
+    """A source's address where it identifies one camera: by-id of V4L2, or a maker's serial number."""
+    return uri if any(uri.startswith(prefix) and uri != prefix for prefix in _IDENTITIES) else None
 
 
 def write_camera_info(
