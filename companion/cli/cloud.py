@@ -30,6 +30,8 @@ logger = logging.getLogger(__name__)
 CLOUD_SETTINGS = ("camera", "source", "plugins")
 # Of a source whose depth is paired with its images, the first frames may have none.
 _DEPTH_TIMEOUT_S = 2.0
+# A greater share of points below the plane: it cuts through what it should lie under.
+_BELOW_GROUND = 0.05
 _QUALITY: dict[str, list[int]] = {".png": [], ".jpg": [cv2.IMWRITE_JPEG_QUALITY, 80]}
 
 
@@ -108,6 +110,13 @@ def cloud(
         if clusters and voxel is not None:
             scene = scene_of(points, down, voxel_m=voxel)
             written, found = scene.voxels, scene.clusters
+            below = scene.ground is None or scene.ground.heights_m(written.points) < -3.0 * voxel
+            if np.mean(below) > _BELOW_GROUND:
+                typer.echo(
+                    f"companion: {source}: no level ground found, so the ground may be among the objects: "
+                    "give the vehicle's --attitude, or camera.mount_pitch_deg",
+                    err=True,
+                )
         elif voxel is not None:
             written = voxel_grid(points, voxel)
         write_cloud(output, written, binary=not text)

@@ -107,6 +107,7 @@ def test_clusters_are_the_walls_and_the_pole(frame: Frame, tmp_path: Path) -> No
     with shared(frame):
         result = run(URI, tmp_path / "cloud.ply", "--clusters", "--json", "--picture", picture)
     assert result.exit_code == 0, result.output
+    assert result.stderr == ""
     report = json.loads(result.stdout)
     assert set(report) == {"source", "file", "frame", "stamp_ns", "points", "clusters"}
     assert (report["source"], report["frame"]) == (URI, "body")
@@ -122,6 +123,17 @@ def test_clusters_are_the_walls_and_the_pole(frame: Frame, tmp_path: Path) -> No
     assert drawn is not None
     assert drawn.shape == (540, 960, 3)
     assert len(np.unique(drawn.reshape(-1, 3), axis=0)) > 500
+
+
+@pytest.mark.parametrize("pitch_deg", ["35", "50"])
+def test_ground_that_is_not_level_is_warned_about(frame: Frame, tmp_path: Path, pitch_deg: str) -> None:
+    """As of a camera whose tilt is not set."""
+    with shared(frame):
+        result = run(URI, tmp_path / "cloud.ply", "--clusters", "--attitude", "0", pitch_deg, "0")
+    assert result.exit_code == 0, result.output
+    (line,) = result.stderr.splitlines()
+    assert line.startswith("companion: ")
+    assert "--attitude" in line
 
 
 def test_depth_of_a_second_source_is_used(frame: Frame, tmp_path: Path) -> None:
