@@ -4,7 +4,8 @@
 
 The vehicle flies an orbit of 13 m at 5 m/s, 8 m above the ground, in wind of 2 m/s. The camera (640x480, 80°
 across, a lens with distortion) looks ahead and is fixed to the body. The pictures are levelled by the
-autopilot's attitude, received 50 times a second, as the perception worker has it. Errors: the slope of a line
+autopilot's attitude, received 50 times a second, as the perception worker has it, and by the true one, which
+shows what the levelling itself adds. Errors: the slope of a line
 through the horizon, its offset from where a level camera with that axis has it, and its bend: the greatest
 distance of the horizon from that line. `--save` writes the picture of median slope before and after.
 """
@@ -56,12 +57,17 @@ class Horizon:
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """A picture and its horizon, before and after levelling."""
+    """A picture and its horizon, before and after levelling.
+
+    Attributes:
+        level, exact: by the autopilot's attitude, by the true one.
+    """
 
     before: Image
     after: Image
     tilted: Horizon
     level: Horizon
+    exact: Horizon
 
 
 def pairs(seed: int, rolling_shutter_s: float, count: int = PICTURES) -> Iterator[Pair]:
@@ -72,17 +78,23 @@ def pairs(seed: int, rolling_shutter_s: float, count: int = PICTURES) -> Iterato
     camera = SimulatedCamera(replace(scene, camera=replace(scene.camera, shutter=shutter)))
     settings = plain_settings({"guidance.max_horizontal_speed_mps": "6"})
     flight = LockstepFlight.airborne(seed=seed, height_m=8.0, wind_mps=2.0, settings=settings)
-    attitudes = AttitudeHistory()
+    attitudes, truths = AttitudeHistory(), AttitudeHistory()
 
     def fly(seconds: float) -> None:
         for _ in range(round(seconds / TICK_S)):
             flight.run(TICK_S)
+            truths.add(flight.now_ns, flight.vehicle.truth.quaternion)
             if flight.state.attitude is not None:
                 attitudes.add(flight.state.attitude_ns, flight.state.attitude)
 
-    def pose_at(stamp_ns: int) -> tuple[CameraMount, NDArray[np.float64]] | None:
-        attitude = attitudes.at(stamp_ns)
-        return None if attitude is None else (MOUNT, attitude)
+    def levelled(history: AttitudeHistory, image: Image, stamp_ns: int) -> Image:
+        def pose_at(at_ns: int) -> tuple[CameraMount, NDArray[np.float64]] | None:
+            attitude = history.at(at_ns)
+            return None if attitude is None else (MOUNT, attitude)
+
+        poses = poses_of_readout(pose_at, stamp_ns, rolling_shutter_s)
+        assert poses is not None
+        return level_image(image, CAMERA, level_rotations(poses))
 
     flight.command(ORBIT)
     fly(SETTLED_S)
@@ -95,13 +107,11 @@ def pairs(seed: int, rolling_shutter_s: float, count: int = PICTURES) -> Iterato
             captured = camera.capture(truth.position_ned_m, attitude, stamp_ns, flight.seconds)
         assert captured is not None
         fly(LATENCY_S)
-        poses = poses_of_readout(pose_at, stamp_ns, rolling_shutter_s)
-        assert poses is not None
         before = captured.frame.image
-        after = level_image(before, CAMERA, level_rotations(poses))
+        after, exact = (levelled(history, before, stamp_ns) for history in (attitudes, truths))
         north, east, down = (attitude @ MOUNT.body_from_optical)[:, 2]
         elevation_rad = math.atan2(-down, math.hypot(north, east))
-        yield Pair(before, after, horizon_of(before, elevation_rad), horizon_of(after, elevation_rad))
+        yield Pair(before, after, *(horizon_of(image, elevation_rad) for image in (before, after, exact)))
 
 
 def horizon_of(image: Image, elevation_rad: float) -> Horizon:
@@ -155,16 +165,18 @@ def main() -> None:
         for pair in pairs(seed, arguments.rolling_shutter_ms / 1e3):
             taken.append(pair)
             if arguments.json:
-                print(json.dumps({"seed": seed, "before": asdict(pair.tilted), "after": asdict(pair.level)}))
+                by_attitude = {"before": pair.tilted, "after": pair.level, "exact": pair.exact}
+                print(json.dumps({"seed": seed} | {name: asdict(each) for name, each in by_attitude.items()}))
     for key in ("slope_deg", "offset_deg", "bend_deg"):
-        before, after = (
-            [abs(getattr(horizon, key)) for horizon in horizons]
-            for horizons in ([pair.tilted for pair in taken], [pair.level for pair in taken])
-        )
-        print(
-            f"{key}: before median {np.median(before):.2f}, largest {max(before):.2f}; "
-            f"after {np.median(after):.2f}, {max(after):.2f}; {len(taken)} pictures"
-        )
+        print(f"{key}, {len(taken)} pictures:")
+        for name, horizons in (
+            ("before", [pair.tilted for pair in taken]),
+            ("levelled by the autopilot's attitude", [pair.level for pair in taken]),
+            ("levelled by the true attitude", [pair.exact for pair in taken]),
+        ):
+            errors = [abs(getattr(horizon, key)) for horizon in horizons]
+            p50, p95 = np.percentile(errors, [50, 95])
+            print(f"  {name}: p50 {p50:.2f}, p95 {p95:.2f}, worst {max(errors):.2f}")
     if arguments.save is not None:
         by_slope = sorted(taken, key=lambda pair: abs(pair.tilted.slope_deg))
         write_picture(arguments.save, by_slope[len(by_slope) // 2])

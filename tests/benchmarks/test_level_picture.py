@@ -18,3 +18,4 @@ def test_horizon_of_an_orbit_is_level_within_half_a_degree(rolling_shutter_s: fl
         assert abs(pair.level.slope_deg) < LEVEL_DEG
         assert abs(pair.level.offset_deg) < LEVEL_DEG
         assert pair.level.bend_deg < 0.2
+        assert abs(pair.exact.slope_deg) < 0.05, "the rest is the autopilot's error"
