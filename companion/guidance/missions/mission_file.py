@@ -113,12 +113,11 @@ class MissionTable(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class _Read:
-    """A step with its command and branches: the index of a step, or a word."""
+    """A step with its branches: the index of a step, or a word; None: the file is invalid there."""
 
     table: StepTable
-    command: Command
-    on_success: int | str
-    on_failure: int | str
+    on_success: int | str | None
+    on_failure: int | str | None
 
 
 def find_mission(name: str) -> Path:
@@ -175,22 +174,24 @@ def plan_from(
         written = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise MissionError(f"{source}: invalid TOML: {error}") from error
+    problems: list[str] = []
+    table = None
     try:
         table = MissionTable.model_validate(written)
+        steps = table.step
     except ValidationError as error:
-        lines = [_problem_text(source, dict(problem)) for problem in error.errors()]
-        raise MissionError(*lines, *_bad_commands(written, source, class_names)) from error
-    problems: list[str] = []
-    read = _read_steps(table, source, class_names, problems)
-    if problems:
+        problems += [_problem_text(source, dict(problem)) for problem in error.errors()]
+        steps = _readable_steps(written.get("step"), {problem["loc"][1:3] for problem in error.errors()})
+    read, commands = _read_steps(steps, source, class_names, problems)
+    if len(read) <= MOST_STEPS:  # the time of these grows with the square
+        problems += _unreached(read, source)
+        problems += _never_left(read, source)
+    if table is None or problems:
         raise MissionError(*problems)
-    problems += _unreached(read, source)
-    problems += _never_left(read, source)
-    if problems:
-        raise MissionError(*problems)
+    context = BuildContext(footprint, loop_rate_hz=loop_rate_hz)
     return Plan(
         name=table.name or Path(source).stem,
-        steps=tuple(_planned(step, BuildContext(footprint, loop_rate_hz=loop_rate_hz)) for step in read),
+        steps=tuple(_planned(*step, context) for step in zip(read, commands, strict=True)),
         way_down=lambda word: parse(word).build(NO_CONTEXT),
         timeout_s=table.timeout_s,
     )
@@ -220,13 +221,15 @@ def _shown(plan: Plan, follows: int | str) -> str:
     return follows if isinstance(follows, str) else f"{plan.steps[follows].title}"
 
 
-def _planned(step: _Read, context: BuildContext) -> PlannedStep:
+def _planned(step: _Read, command: Command, context: BuildContext) -> PlannedStep:
     table = step.table
+    assert step.on_success is not None
+    assert step.on_failure is not None
     return PlannedStep(
-        title=table.name or str(step.command),
-        command=str(step.command),
-        make=lambda: step.command.build(context),
-        endless=step.command.endless,
+        title=table.name or str(command),
+        command=str(command),
+        make=lambda: command.build(context),
+        endless=command.endless,
         timeout_s=table.timeout_s,
         repeat=table.repeat,
         visits=table.visits,
@@ -259,26 +262,35 @@ def _problem_text(source: str, problem: dict[str, object]) -> str:
     return f"{': '.join(words)}: {key}: {problem['msg']}, got {found}"
 
 
-def _bad_commands(written: dict[str, object], source: str, class_names: Sequence[str] | None) -> list[str]:
-    """The invalid commands of a file whose tables are invalid, so that all errors are reported together."""
-    steps = written.get("step")
-    problems = []
-    for index, step in enumerate(steps if isinstance(steps, list) else []):
-        command = step.get("do") if isinstance(step, dict) else None
-        try:
-            if isinstance(command, str):
-                parse(command, class_names)
-        except GrammarError as error:
-            problems.append(f"{source}: step {index + 1}: {error}")
-    return problems
+def _readable_steps(written: object, bad: set[tuple[int | str, ...]]) -> list[StepTable]:
+    """Return what can be read of the steps of an invalid file, so that all errors are reported together.
+
+    Args:
+        written: the file's `step`.
+        bad: index and key of each invalid value.
+    """
+    steps = []
+    for index, step in enumerate(written if isinstance(written, list) else []):
+        given = step if isinstance(step, dict) else {}
+        fields: dict[str, object] = {
+            key: given[key] for key in StepTable.model_fields if key in given and (index, key) not in bad
+        }
+        if any(place[:1] == (index,) for place in bad):
+            # What was meant is not known: no error is made of it.
+            fields = {"do": None, "on_success": None, "on_failure": None, **fields}
+            fields |= {key: 1 for key in ("timeout_s", "visits") if (index, key) in bad}
+            if isinstance(given.get("name"), str):
+                fields["name"] = given["name"]  # a branch to it is valid
+        steps.append(StepTable.model_construct(**fields))  # type: ignore[arg-type]
+    return steps
 
 
 def _read_steps(
-    table: MissionTable, source: str, class_names: Sequence[str] | None, problems: list[str]
-) -> list[_Read]:
-    """Parse the command and the branches of every step. Errors are added to `problems`."""
+    steps: Sequence[StepTable], source: str, class_names: Sequence[str] | None, problems: list[str]
+) -> tuple[list[_Read], list[Command]]:
+    """Return the branches of every step, and the valid commands. Errors are added to `problems`."""
     named: dict[str, int] = {}
-    for index, step in enumerate(table.step):
+    for index, step in enumerate(steps):
         if step.name is None:
             continue
         where = f"{source}: {_called(index, step)}"
@@ -287,39 +299,42 @@ def _read_steps(
         elif step.name in named:
             problems.append(f"{where}: name already used by step {named[step.name] + 1}")
         named.setdefault(step.name, index)
-    read = []
-    for index, step in enumerate(table.step):
+    read, commands = [], []
+    for index, step in enumerate(steps):
         where = f"{source}: {_called(index, step)}"
-        followers = []
+        followers: list[int | str | None] = []
         for key, word in (("on_success", step.on_success), ("on_failure", step.on_failure)):
             if word == CONTINUE:
-                followers.append(index + 1 if index + 1 < len(table.step) else END)
+                followers.append(index + 1 if index + 1 < len(steps) else END)
             elif word in _ENDS:
                 followers.append(word)
-            elif word in named:
-                followers.append(named[word])
+            elif word is None or word in named:
+                followers.append(named.get(word))
             else:
                 known = [*_WORDS, *named]
                 problems.append(f"{where}: {key}: unknown step {word!r}; {nearest(word, known)}")
-                followers.append(ABORT)
+                followers.append(None)
+        read.append(_Read(step, *followers))
+        if step.do is None:
+            continue
         try:
             command = parse(step.do, class_names)
         except GrammarError as error:
             problems.append(f"{where}: {error}")
             continue
+        commands.append(command)
         if isinstance(command, Mission):
             problems.append(f"{where}: a mission cannot start another mission")
         if command.endless and step.timeout_s is None:
             problems.append(f"{where}: {step.do!r} does not end by itself; set timeout_s")
-        read.append(_Read(step, command, *followers))
-    return read
+    return read, commands
 
 
 def _unreached(read: Sequence[_Read], source: str) -> list[str]:
     """A line for every unreachable step."""
-    reached, waiting = {0}, [0]
+    reached, waiting = {0}, [0] if read else []
     while waiting:
-        fresh = _steps_after(read[waiting.pop()]) - reached
+        fresh = _steps_after(read, waiting.pop()) - reached
         reached |= fresh
         waiting += fresh
     return [
@@ -362,11 +377,15 @@ def _reach(read: Sequence[_Read], start: int) -> set[int]:
     reached: set[int] = set()
     waiting = [start]
     while waiting:
-        fresh = _steps_after(read[waiting.pop()]) - reached
+        fresh = _steps_after(read, waiting.pop()) - reached
         reached |= fresh
         waiting += fresh
     return reached
 
 
-def _steps_after(step: _Read) -> set[int]:
-    return {follows for follows in (step.on_success, step.on_failure) if isinstance(follows, int)}
+def _steps_after(read: Sequence[_Read], index: int) -> set[int]:
+    """The steps that can follow a step; all, if a branch of it is not known."""
+    branches = (read[index].on_success, read[index].on_failure)
+    if None in branches:
+        return set(range(len(read)))
+    return {follows for follows in branches if isinstance(follows, int)}

@@ -281,3 +281,48 @@ def test_table_and_command_problems_are_reported_together() -> None:
     problems = failure.value.problems
     assert len(problems) == 4
     assert [sum(f"step {step}" in problem for problem in problems) for step in (1, 2, 3)] == [1, 2, 1]
+
+
+def test_faults_of_tables_names_branches_and_graph_come_at_once() -> None:
+    text = """
+timeout_s = -2
+[[step]]
+name = "a"
+do = "takeof 5"
+timeout_s = -3
+[[step]]
+name = "a"
+do = "goto 1"
+on_success = "nowhere"
+[[step]]
+do = "mission other"
+on_success = "end"
+[[step]]
+name = "loop"
+do = "hold 1"
+on_success = "loop"
+"""
+    found = [line.removeprefix("m.toml: ") for line in problems(text.replace('"nowhere"', '"abort"'))]
+    assert [line.partition(" (")[0].partition(":")[0] for line in found] == [
+        "timeout_s",
+        "step 1",  # timeout_s
+        "step 2",  # the name
+        "step 1",  # the command
+        "step 2",  # the command
+        "step 3",  # a mission
+        "step 4",  # a loop without exit
+    ]
+    # Where an unknown branch leads is not known: nothing is called unreachable because of it.
+    both = [line.removeprefix("m.toml: ") for line in problems(text)]
+    assert sorted(set(both) - set(found))[0].startswith("step 2 (a): on_success: unknown step 'nowhere'")
+    assert set(found) <= set(both)
+    assert len(both) == 8
+
+
+def test_invalid_value_makes_no_second_error() -> None:
+    text = "[[step]]\ndo = 'hold'\ntimeout_s = -1\non_succes = 'b'\n[[step]]\nname = 'b'\ndo = 'land'\n"
+    assert len(problems(text)) == 2
+    text = "[[step]]\ndo = 'hold 1'\non_success = 7\n[[step]]\nname = 'b'\ndo = 8\n[[step]]\ndo = 'land'"
+    assert len(problems(text)) == 2
+    assert len(problems("step = [3, {do = 'land', on_success = 'end'}, {do = 'rtl'}]")) == 1
+    assert len(problems("[[step]]\ndo = 'hold 1'\n" * 201)) == 1
