@@ -29,6 +29,7 @@ from companion.cli.dashboard import dashboard
 from companion.cli.evaluate import evaluate
 from companion.cli.flags import (
     EXIT_BAD_INPUT,
+    CompanionCommands,
     Processes,
     RayAddress,
     check_seed_options,
@@ -84,6 +85,7 @@ ORDER = (
 
 app = typer.Typer(
     name="companion",
+    cls=CompanionCommands,
     help="Companion-computer service for PX4 and ArduPilot: detection, offboard flight, zenoh.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,

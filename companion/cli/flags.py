@@ -33,6 +33,9 @@ SHORT_NAMES = {
     "log.level": "--log-level",
 }
 
+# click's UsageError, through its public subclass: some versions of typer include their own click
+_UsageError: Any = typer.BadParameter.__base__
+
 Processes = Annotated[int, typer.Option(min=1, help="With --seeds: number of seeds at once.")]
 RayAddress = Annotated[
     str | None,
@@ -40,6 +43,37 @@ RayAddress = Annotated[
         "--ray", metavar="HOST:PORT", help="With --seeds: run them on this Ray cluster (extra cluster)."
     ),
 ]
+
+
+class CompanionCommands(typer.core.TyperGroup):
+    """The commands. The flag of a renamed setting is an error that names the new one, in every command."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command that was given."""
+        try:
+            return super().invoke(ctx)
+        except _UsageError as error:
+            if text := _renamed_flag(getattr(error, "option_name", ""), error.ctx):
+                raise _UsageError(text, error.ctx) from error
+            raise
+
+
+def _renamed_flag(flag: str, ctx: Any) -> str | None:
+    if flag.startswith("--views-"):
+        return (
+            f"{flag}: the sections [views.NAME] were renamed to [cameras.NAME] in version 0.2.0; "
+            "they stand in the settings file"
+        )
+    now = {_flag_of(old): _flag_of(new) for old, new in RENAMED.items()}.get(flag)
+    if now is None:
+        return None
+    text = f"{flag} was renamed to {now} in version 0.2.0"
+    known = {name for parameter in ctx.command.get_params(ctx) for name in parameter.opts}
+    return text if now in known else f"{text}; this command has no such option"
+
+
+def _flag_of(key: str) -> str:
+    return f"--{key.replace('.', '-').replace('_', '-')}"
 
 
 @contextmanager
@@ -171,11 +205,7 @@ def _flags_by_parameter(keys: tuple[str, ...]) -> dict[str, Flag]:
     if unknown := set(keys) - known:
         raise ValueError(f"no such settings or sections: {', '.join(sorted(unknown))}")
     chosen = [flag for flag in flags() if not keys or {flag.key, flag.key.partition(".")[0]} & set(keys)]
-    # Former names are hidden flags; using one is an error that names the new one.
-    former = [
-        Flag(old, str, None, "") for old, new in RENAMED.items() if new in {flag.key for flag in chosen}
-    ]
-    return {flag.key.replace(".", "__"): flag for flag in (*chosen, *former)}
+    return {flag.key.replace(".", "__"): flag for flag in chosen}
 
 
 @functools.cache
@@ -187,7 +217,7 @@ def _setting_parameters(keys: tuple[str, ...]) -> list[Any]:
 
     parameters = []
     for name, flag in _flags_by_parameter(keys).items():
-        names = [f"--{flag.key.replace('.', '-').replace('_', '-')}"]
+        names = [_flag_of(flag.key)]
         if short := SHORT_NAMES.get(flag.key):
             names.insert(0, short)
         panel = flag.key.partition(".")[0]
@@ -199,7 +229,6 @@ def _setting_parameters(keys: tuple[str, ...]) -> list[Any]:
                 help=flag.help,
                 metavar=_METAVARS[flag.type],
                 panel=panel,
-                hidden=flag.key in RENAMED,
             )
         )
     _declare(settings, parameters)
@@ -215,11 +244,8 @@ def _option(
     help: str,
     metavar: str | None = None,
     panel: str | None = None,
-    hidden: bool = False,
 ) -> inspect.Parameter:
-    option = typer.Option(
-        *names, help=help, metavar=metavar, rich_help_panel=panel, show_default=False, hidden=hidden
-    )
+    option = typer.Option(*names, help=help, metavar=metavar, rich_help_panel=panel, show_default=False)
     return inspect.Parameter(
         name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Annotated[kind, option]
     )

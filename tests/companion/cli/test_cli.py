@@ -351,3 +351,23 @@ def test_demo_does_not_wait_for_its_reader() -> None:
             assert "flown" in process.stderr.read()
         finally:
             process.kill()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "new", "there"),
+    [
+        (["detect", "x.mp4", "--detector-known-heights", "car=1.5"], "--detector-class-heights-m", False),
+        (["send", "stop", "--tracker-true-score=0.3"], "--tracker-confirm-score", False),
+        (["run", "--tracker-true-score", "0.3"], "--tracker-confirm-score", True),
+        (["calibrate", "mount", "x.mp4", "--camera-gimbal", "true"], "--camera-on-gimbal", False),
+        (["play", "--views-front-x", "1"], "[cameras.NAME]", True),
+    ],
+)
+def test_old_flag_names_the_new_one_in_every_command(
+    arguments: list[str], new: str, there: bool, tmp_path: Path
+) -> None:
+    done = companion_here(*arguments, cwd=tmp_path)
+    assert done.returncode == 2
+    [line] = [line for line in done.stderr.splitlines() if "renamed" in line]
+    assert new in line
+    assert ("no such option" not in line) == there
