@@ -10,6 +10,8 @@ import logging
 from collections.abc import Iterable
 from importlib.metadata import entry_points
 
+from vision.registry import RegistrationError
+
 logger = logging.getLogger(__name__)
 
 ENTRY_POINTS = "companion.plugins"
@@ -24,13 +26,16 @@ def load_plugins(names: Iterable[str]) -> None:
     """Import modules, each by its name or by the name of an entry point in ENTRY_POINTS.
 
     Raises:
-        PluginError: no such module, or it cannot be imported; the traceback is in the log.
+        PluginError: no such module, or it registers something invalid, or it cannot be imported; then the
+            traceback is in the log.
     """
     installed = {point.name: point.value for point in entry_points(group=ENTRY_POINTS)}
     for name in names:
         module = installed.get(name, name)
         try:
             importlib.import_module(module)
+        except RegistrationError as error:
+            raise PluginError(f"plugins: {name!r}: {error}") from error
         except Exception as error:
             if isinstance(error, ModuleNotFoundError) and error.name == module:
                 known = ", ".join(sorted(installed)) or "none"

@@ -22,6 +22,7 @@ from vision.model_files import find_model
 from vision.object_detector import (
     DETECTORS,
     YOLO,
+    DetectionsError,
     DetectorSettings,
     ObjectDetector,
     Timing,
@@ -266,7 +267,8 @@ def open_detector(kind: str, settings: DetectorSettings) -> ObjectDetector:
 
     Raises:
         ValueError: no such kind (the message lists the known ones), an unknown class, or an error of the kind
-            itself: `CheckpointError`, `RuntimeMissingError` and `RuntimeUnusableError` are ValueErrors.
+            itself: `CheckpointError`, `RuntimeMissingError` and `RuntimeUnusableError` are ValueErrors. Or
+            a plug-in's kind gives no `ObjectDetector` with `class_names`.
     """
     if (opener := DETECTORS.get(kind)) is None:
         raise ValueError(
@@ -274,7 +276,18 @@ def open_detector(kind: str, settings: DetectorSettings) -> ObjectDetector:
             "are known once its module is loaded (plugins.modules, --plugins-modules)"
         )
     opened = opener(settings)
-    return opened if kind == YOLO else _FilteredDetector(opened, kind, settings)
+    if kind == YOLO:
+        return opened
+    if not isinstance(opened, ObjectDetector):
+        raise ValueError(f"detector.kind {kind!r}: expected an ObjectDetector, got {_shown(opened)}")
+    names = getattr(opened, "class_names", None)
+    if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
+        raise ValueError(f"detector.kind {kind!r}: class_names must be a tuple of str, got {_shown(names)}")
+    return _FilteredDetector(opened, kind, settings)
+
+
+def _shown(value: object) -> str:
+    return f"{type(value).__name__} {' '.join(repr(value).split()):.60}"
 
 
 class _FilteredDetector(ObjectDetector):
@@ -284,7 +297,7 @@ class _FilteredDetector(ObjectDetector):
         self.class_names = tuple(inner.class_names)
         self.model_name, self.model_sha256 = inner.model_name or kind, inner.model_sha256
         self.runtime, self.precision, self.reason = inner.runtime, inner.precision, inner.reason
-        self._inner, self._confidence = inner, settings.confidence
+        self._inner, self._confidence, self._kind = inner, settings.confidence, kind
         wanted = settings.classes
         self._class_ids = None if wanted is None else resolve_classes(wanted, self.class_names)
 
@@ -293,9 +306,13 @@ class _FilteredDetector(ObjectDetector):
         found = self._inner.detect(image_bgr)
         elapsed_ms = (time.perf_counter() - started) * 1e3
         self.last_timing = self._inner.last_timing or Timing(0.0, elapsed_ms, 0.0)
+        if not isinstance(found, Detections):
+            raise DetectionsError(
+                f"detector.kind {self._kind!r}: detect must return Detections, got {_shown(found)}"
+            )
         if tuple(found.class_names) != self.class_names:
-            raise TypeError(
-                f"detector {self.model_name}: detections must have its class names {self.class_names}, "
+            raise DetectionsError(
+                f"detector.kind {self._kind!r}: detections must have its class names {self.class_names}, "
                 f"got {found.class_names}"
             )
         kept = found.confidence >= self._confidence

@@ -101,6 +101,10 @@ class ObjectDetector(ABC):
         """
 
 
+class DetectionsError(TypeError):
+    """`detect` of a plug-in returned something invalid. The message is one line that names its kind."""
+
+
 OpenDetector = Callable[[DetectorSettings], ObjectDetector]
 """Creates a detector. Raises ValueError, in one line, if it cannot."""
 

@@ -8,6 +8,10 @@ from typing import Any, Generic, TypeVar
 _Factory = TypeVar("_Factory")
 
 
+class RegistrationError(ValueError):
+    """A plug-in registers something invalid. The message is one line that names it."""
+
+
 class Registry(Generic[_Factory]):
     """Factories by name, in the order of registration.
 
@@ -28,14 +32,14 @@ class Registry(Generic[_Factory]):
             help_text: description, one line without a full stop.
 
         Raises:
-            ValueError: the name does not match the pattern, or is registered by another factory; the message
-                names both modules.
+            RegistrationError: the name does not match the pattern, or is registered by another factory; the
+                message names both modules.
         """
         if self._pattern.fullmatch(name) is None:
-            raise ValueError(f"{_name_of(factory)}: a {self._noun} must be {self._form}, got {name!r}")
+            raise RegistrationError(f"{_name_of(factory)}: a {self._noun} must be {self._form}, got {name!r}")
         other = self.get(name)
         if other is not None and _name_of(other) != _name_of(factory):
-            raise ValueError(
+            raise RegistrationError(
                 f"{_name_of(factory)}: {self._noun} {name!r} is already registered by {_name_of(other)}; "
                 "choose another name"
             )

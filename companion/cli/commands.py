@@ -396,7 +396,7 @@ def detect(
         from companion.detect import detect_source, make_save_folder
         from companion.plugins import PluginError, load_plugins
         from vision.detector import forget_measurements, open_detector
-        from vision.object_detector import DetectorSettings
+        from vision.object_detector import DetectionsError, DetectorSettings
         from vision.pipeline import FrameDetector
         from vision.runtimes.base import RuntimeUnusableError
         from vision.sources import SourceError, SourceSettings, open_source
@@ -433,7 +433,7 @@ def detect(
             width=width, height=height, rate_hz=rate, pixel_format=pixel_format, every_frame=True
         )
     write = functools.partial(print, flush=True)
-    unusable = (SourceError, OSError, RuntimeUnusableError)
+    unusable = (SourceError, OSError, RuntimeUnusableError, DetectionsError)
     with plain_errors(*unusable), open_source(source, settings) as frames:
         if detector.rendered_only:
             _warn_rendered_only([(source, detector.model_name)])

@@ -27,6 +27,7 @@ from companion.geometry.points import points_from
 from companion.guidance.behaviour import Behaviour
 from companion.guidance.search_pattern import Footprint
 from companion.guidance.targets.chosen import GimbalGoal
+from vision.registry import RegistrationError
 
 MOST_POINTS = 500
 FARTHEST_M = 5000.0
@@ -348,23 +349,25 @@ def behaviour(word: str, help_text: str) -> Callable[[type[_Kind]], type[_Kind]]
         help_text: one line without a full stop.
 
     Raises:
-        TypeError: a field's type is not annotated with an argument (`Annotated[float, Number(...)]`).
-        ValueError: the word has other characters, or is already registered.
+        RegistrationError: the word has other characters, or is already registered, or a field's type is not
+            annotated with an argument (`Annotated[float, Number(...)]`).
     """
 
     def register(kind: type[_Kind]) -> type[_Kind]:
+        name = f"{kind.__module__}.{kind.__qualname__}"
         if _WORD.fullmatch(word) is None:
-            raise ValueError(f"{kind.__qualname__}: a command must be one lower-case word, got {word!r}")
+            raise RegistrationError(f"{name}: a command must be one lower-case word, got {word!r}")
         if (other := COMMANDS.get(word)) is not None and not _same(kind, other):
-            raise ValueError(
-                f"{kind.__module__}: command {word!r} is already registered by {other.__module__}; "
-                "choose another word"
+            raise RegistrationError(
+                f"{name}: command {word!r} is already registered by {other.__module__}; choose another word"
             )
         made = dataclass(frozen=True)(kind)
         hints = get_type_hints(made, include_extras=True)
         for field in fields(made):
             if not any(isinstance(part, Argument) for part in get_args(hints[field.name])[1:2]):
-                raise TypeError(f"{kind.__qualname__}.{field.name}: expected Annotated[type, argument]")
+                raise RegistrationError(
+                    f"{name}.{field.name}: expected Annotated[type, argument], got {field.type}"
+                )
         made.word, made.help = word, help_text
         COMMANDS[word] = made
         return made

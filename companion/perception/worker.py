@@ -51,7 +51,7 @@ from companion.settings.calibration import adopt_calibration
 from companion.vehicle.precise_sleep import lower_priority
 from vision.detections import Detections
 from vision.frame import Frame
-from vision.object_detector import YOLO, ObjectDetector
+from vision.object_detector import YOLO, DetectionsError, ObjectDetector
 from vision.path_planner import PathRequest
 from vision.pipeline import PerceptionResult, Pipeline
 from vision.recording import Recording
@@ -260,7 +260,7 @@ def _work(begin: Begin, control: ControlChannel, sender: ResultSender) -> Ended 
             _run(pipeline, perception, control, sender)
         except EndOfStream:
             return Ended(True, "end of stream", pipeline.frames)
-        except SourceError as error:
+        except (SourceError, DetectionsError) as error:
             return Ended(False, _one_line(error), pipeline.frames)
         except Exception as error:
             traceback.print_exc()

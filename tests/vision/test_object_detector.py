@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 
 import numpy as np
@@ -13,6 +14,7 @@ from vision.detector import Detector, open_detector
 from vision.object_detector import (
     DETECTORS,
     YOLO,
+    DetectionsError,
     DetectorSettings,
     ObjectDetector,
     Timing,
@@ -44,6 +46,13 @@ class Wrong(Corners):
         return Detections.empty(("a", "b"))
 
 
+class Seven(Corners):
+    """Returns a number."""
+
+    def detect(self, image_bgr: NDArray[np.uint8], /) -> Detections:
+        return 7  # type: ignore[return-value]
+
+
 class Timed(Corners):
     """Has its own timing, name and runtime."""
 
@@ -53,7 +62,7 @@ class Timed(Corners):
 
 @pytest.fixture(autouse=True)
 def _kinds() -> Iterator[None]:
-    kinds = {"corners": Corners, "wrong": Wrong, "timed": Timed}
+    kinds = {"corners": Corners, "wrong": Wrong, "seven": Seven, "timed": Timed}
     for kind, opener in kinds.items():
         detector(kind, "of a test")(opener)
     yield
@@ -114,9 +123,32 @@ def test_detector_may_set_its_description() -> None:
     assert made.last_timing == Timing(1.0, 2.0, 3.0)
 
 
-def test_other_class_names_than_declared_are_an_error() -> None:
-    with pytest.raises(TypeError, match="class names"):
-        open_detector("wrong", DetectorSettings()).detect(FRAME)
+@pytest.mark.parametrize(("kind", "got"), [("wrong", r"\('a', 'b'\)"), ("seven", "int 7")])
+def test_wrong_result_of_a_plugin_is_named(kind: str, got: str) -> None:
+    with pytest.raises(DetectionsError, match=kind) as error:
+        open_detector(kind, DetectorSettings()).detect(FRAME)
+    assert re.search(f"'{kind}': .*got {got}$", str(error.value))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("opened", "got"),
+    [
+        (7, "int 7"),
+        (Corners, "ABCMeta <class"),
+        (type("Nameless", (Corners,), {"class_names": None})(None), "None"),
+    ],
+)
+def test_kind_that_opens_no_detector_is_named(opened: object, got: str) -> None:
+    def opener(settings: DetectorSettings) -> ObjectDetector:
+        return opened  # type: ignore[return-value]
+
+    detector("none", "of a test")(opener)
+    try:
+        with pytest.raises(ValueError, match=rf"'none'.*got .*{got}"):
+            open_detector("none", DetectorSettings())
+    finally:
+        DETECTORS.remove("none")
 
 
 def test_yolo_is_a_registered_kind() -> None:

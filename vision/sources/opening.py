@@ -91,7 +91,10 @@ def open_source(uri: str, settings: SourceSettings = SourceSettings()) -> Source
             "(/dev/video0), files, folders, FIFOs and - for standard input. Schemes of a plug-in are known "
             "once its module is loaded (plugins.modules, --plugins-modules)"
         )
-    return opener(uri, settings)
+    opened = opener(uri, settings)
+    if not isinstance(opened, Source):
+        raise SourceError(f"{name}: the plug-in of {scheme}:// must return a Source, got {opened!r:.60}")
+    return opened
 
 
 def _open_with_depth(uri: str, depth_uri: str, settings: SourceSettings) -> Source:

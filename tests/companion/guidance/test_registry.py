@@ -38,6 +38,14 @@ class WaitBehaviour(Behaviour):
 """
 
 
+PLUGIN_DETECTOR = """
+from vision.object_detector import detector
+
+@detector("yolo", "another one")
+def opener(settings): ...
+"""
+
+
 @pytest.fixture(autouse=True)
 def _table(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
     """Restores the command table and the loaded modules."""
@@ -75,26 +83,33 @@ def test_entry_point_gives_a_module_a_short_name(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "source"),
+    ("name", "source", "traced"),
     [
-        ("no_such_module", None),
-        ("with_a_bug", "1 / 0"),
-        ("needs_what_is_not_there", "import no_such_library_at_all"),
-        ("takes_a_word_of_ours", PLUGIN.format(word="hold")),
-        ("two_words", PLUGIN.format(word="wait here")),
+        ("no_such_module", None, False),
+        ("with_a_bug", "1 / 0", True),
+        ("needs_what_is_not_there", "import no_such_library_at_all", True),
+        ("takes_a_word_of_ours", PLUGIN.format(word="hold"), False),
+        ("two_words", PLUGIN.format(word="wait here"), False),
         (
             "no_argument",
             PLUGIN.format(word="wait").replace('Annotated[float, Number("duration", ', "float #"),
+            False,
         ),
+        ("takes_a_kind_of_ours", PLUGIN_DETECTOR, False),
     ],
 )
-def test_plugin_that_cannot_be_loaded_is_named(tmp_path: Path, name: str, source: str | None) -> None:
+def test_plugin_that_cannot_be_loaded_is_named(
+    tmp_path: Path, name: str, source: str | None, traced: bool, caplog: pytest.LogCaptureFixture
+) -> None:
     if source is not None:
         (tmp_path / f"{name}.py").write_text(source)
     before = dict(COMMANDS)
-    with pytest.raises(PluginError, match=name):
+    with pytest.raises(PluginError, match=name) as error:
         load_plugins([name])
     assert before == COMMANDS
+    assert "\n" not in str(error.value)
+    # A traceback helps where the plug-in's own code fails.
+    assert [record.exc_info is not None for record in caplog.records] == [True] * traced
 
 
 def test_schema_has_every_command_and_its_ranges() -> None:
