@@ -1,6 +1,7 @@
 """The companion-computer service for PX4 and ArduPilot vehicles, as a library.
 
-A behaviour of one's own needs no more than these names; `docs/how-to/plug-ins.md` shows how.
+A behaviour of one's own needs these names; `docs/how-to/plug-ins.md` shows how. Other types of arguments and
+`GrammarError` are in `companion.guidance.command`.
 
     from companion import Behaviour, Command, Number, Setpoint, behaviour
 
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     from companion.guidance.behaviour import (
         Behaviour,
         BehaviourContext,
-        BehaviourOutput,
         ModeRequest,
         Outcome,
         Requirement,
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
         ClassName,
         Command,
         EnumArgument,
-        GrammarError,
         Number,
         behaviour,
     )
@@ -44,14 +43,12 @@ _MODULES = {
         "Outcome",
         "Requirement",
         "BehaviourContext",
-        "BehaviourOutput",
     ),
     "companion.guidance.command": (
         "BuildContext",
         "ClassName",
         "Command",
         "EnumArgument",
-        "GrammarError",
         "Number",
         "behaviour",
     ),
@@ -65,12 +62,10 @@ _WHERE = {name: module for module, names in _MODULES.items() for name in names}
 __all__ = [
     "Behaviour",
     "BehaviourContext",
-    "BehaviourOutput",
     "BuildContext",
     "ClassName",
     "Command",
     "EnumArgument",
-    "GrammarError",
     "ModeRequest",
     "Number",
     "Outcome",

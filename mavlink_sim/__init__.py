@@ -10,6 +10,14 @@ its own process; `mavlink-sim` on the command line runs one on UDP.
 >>> vehicle.step(20.0)
 >>> abs(vehicle.truth.position_ned_m[0] - 10.0) < 1.0
 True
+
+A flight with the parameters of QUICK_FLIGHT takes half as long:
+
+>>> from mavlink_sim import QUICK_FLIGHT
+>>> quick = LockstepVehicle(seed=1, parameters=QUICK_FLIGHT)
+>>> quick.take_off(5.0)
+>>> quick.truth.time_s < 12.0
+True
 """
 
 from __future__ import annotations
@@ -18,20 +26,28 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from mavlink_sim.camera.scene import Scene
+    from mavlink_sim.camera.scene_file import load_scene
+    from mavlink_sim.camera.simulated_camera import SimulatedCamera, frame_truth
     from mavlink_sim.lockstep import CommandRefusedError, LockstepVehicle, NotReachedError, Truth
-    from mavlink_sim.testing import RunningSimulator, running_simulator
+    from mavlink_sim.testing import QUICK_FLIGHT, RunningSimulator, running_simulator
     from mavlink_sim.vehicles.fleet_world import FleetWorld
     from mavlink_sim.vehicles.vehicle import Vehicle
 
 __all__ = [
+    "QUICK_FLIGHT",
     "CommandRefusedError",
     "FleetWorld",
     "LockstepVehicle",
     "NotReachedError",
     "RunningSimulator",
+    "Scene",
+    "SimulatedCamera",
     "Truth",
     "Vehicle",
     "__version__",
+    "frame_truth",
+    "load_scene",
     "running_simulator",
 ]
 
@@ -40,9 +56,14 @@ _HOMES = {
     "FleetWorld": "vehicles.fleet_world",
     "LockstepVehicle": "lockstep",
     "NotReachedError": "lockstep",
+    "QUICK_FLIGHT": "testing",
     "RunningSimulator": "testing",
+    "Scene": "camera.scene",
+    "SimulatedCamera": "camera.simulated_camera",
     "Truth": "lockstep",
     "Vehicle": "vehicles.vehicle",
+    "frame_truth": "camera.simulated_camera",
+    "load_scene": "camera.scene_file",
     "running_simulator": "testing",
 }
 

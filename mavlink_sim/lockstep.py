@@ -141,6 +141,11 @@ class Truth:
         landed: by the land detector.
         collisions: count of those with the scene or another vehicle of its fleet world.
         collision: the newest; None before the first.
+
+    >>> from mavlink_sim import LockstepVehicle
+    >>> truth = LockstepVehicle(seed=1).truth
+    >>> truth.mode, truth.landed, truth.collisions
+    ('HOLD', True, 0)
     """
 
     time_s: float
@@ -181,6 +186,12 @@ class LockstepVehicle:
         events: one readable line per event so far ("armed", "mode HOLD", "landed"…).
         newest: of each link, the newest message of each type that it sent.
         dropped: of each link, the number of messages dropped because they were not read.
+
+    >>> from mavlink_sim import LockstepVehicle
+    >>> vehicle = LockstepVehicle(seed=1)
+    >>> vehicle.step(1.0)
+    >>> round(vehicle.truth.time_s, 3), vehicle.truth.on_ground
+    (1.0, True)
     """
 
     def __init__(

@@ -141,6 +141,12 @@ class RunningSimulator:
         vehicles: every vehicle of a fleet in order (the ports above are the first one's).
         events: every line it printed so far, in order, without the ready line.
         transcript: every line it printed, each after the seconds since it was started.
+
+    >>> from mavlink_sim import running_simulator
+    >>> with running_simulator(ready_after=0.0) as simulator:
+    ...     simulator.arm()
+    >>> "armed" in simulator.events
+    True
     """
 
     def __init__(self, process: subprocess.Popen[str], count: int = 1, autopilot: str = "px4") -> None:
@@ -404,6 +410,11 @@ def running_simulator(
         options: the other options of `mavlink-sim`, with underscores (`seed=1`, `speed=4.0`, `camera="name"`,
             `truth=path`, `wind=3.0`, `gusts=0.0`, `system_id=2`, `vehicles=3`); True for an option without a
             value, None for none.
+
+    >>> from mavlink_sim import QUICK_FLIGHT, running_simulator
+    >>> with running_simulator(seed=3, speed=4.0, parameters=QUICK_FLIGHT) as simulator:
+    ...     simulator.pymavlink_device.startswith("udpin:127.0.0.1:")
+    True
     """
     count = int(options.get("vehicles") or 1)  # type: ignore[arg-type]
     ports = free_udp_ports(2)

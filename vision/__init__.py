@@ -7,6 +7,12 @@
 >>> len(detections)
 0
 
+>>> from vision import CameraModel, MarkerDetector
+>>> from vision.markers import MarkerKind
+>>> camera = CameraModel.from_horizontal_fov(320, 240, 1.2)
+>>> MarkerDetector(MarkerKind("4X4_50", size_m=0.2)).detect(np.zeros((240, 320, 3), np.uint8), camera)
+()
+
 Names are imported lazily, so `import vision` alone is cheap.
 """
 

@@ -41,6 +41,12 @@ class CameraModel:
 
     Raises ValueError for a size or focal length that is not positive, or coefficients that do not belong to
     the distortion model.
+
+    >>> import math
+    >>> from vision import CameraModel
+    >>> camera = CameraModel.from_horizontal_fov(640, 480, math.radians(90.0))
+    >>> camera.project([[1.0, 0.0, 2.0]]).round(1).tolist()  # 1 m right, 2 m ahead
+    [[479.5, 239.5]]
     """
 
     width: int
@@ -259,6 +265,14 @@ class CameraMount:
         on_gimbal: pointed by a gimbal: roll, pitch and yaw are relative to the gimbal's frame (FRD, x along
             its axis), whose attitude is given per frame, see `held`.
         ned_from_gimbal: (3, 3) gimbal attitude at one moment, gimbal FRD to NED; None: unknown.
+
+    >>> import math
+    >>> import numpy as np
+    >>> from vision import CameraMount
+    >>> mount = CameraMount(pitch_rad=math.radians(-90.0))
+    >>> optical_axis = mount.ned_from_optical(np.eye(3))[:, 2]  # of a level vehicle
+    >>> (optical_axis.round(3) + 0.0).tolist()
+    [0.0, 0.0, 1.0]
     """
 
     forward_m: float = 0.0

@@ -56,6 +56,17 @@ class Detections:
         track_confirmed: (N,) bool, whether the track is confirmed and its class is not in doubt.
         track_first_ns: (N,) int64, capture stamp of the track's first detection, 0 without a track; None: not
             known.
+
+    >>> import numpy as np
+    >>> from vision import Detections
+    >>> found = Detections(
+    ...     np.array([[10, 20, 50, 60], [70, 20, 90, 40]], np.float32),
+    ...     np.array([0.9, 0.4], np.float32),
+    ...     np.array([1, 0]),
+    ...     ("person", "car"),
+    ... )
+    >>> found.names, found[found.confidence > 0.5].center.tolist()
+    (['car', 'person'], [[30.0, 40.0]])
     """
 
     xyxy: NDArray[np.float32]

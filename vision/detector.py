@@ -69,6 +69,12 @@ class Detector(ObjectDetector):
         metadata: of the file (licence, origin, score).
         rendered_only: `trained_on` in the metadata begins with RENDERED_SCENES.
         last_timing: of the latest `detect`; None before the first.
+
+    >>> import numpy as np
+    >>> from vision import Detector
+    >>> detector = Detector(classes=["car"], image_size=160, precision="float32")
+    >>> len(detector.detect(np.zeros((120, 160, 3), np.uint8)))
+    0
     """
 
     def __init__(

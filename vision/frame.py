@@ -23,6 +23,13 @@ class Frame:
         decode_ms: decoding time, milliseconds.
         media_s: position in the recording, seconds; None for a live source.
         file_name: of the image or video, without folder; empty if the frame is not from a file.
+
+    >>> import time
+    >>> import numpy as np
+    >>> from vision import Frame
+    >>> frame = Frame(np.zeros((120, 160, 3), np.uint8), captured_ns=time.monotonic_ns(), sequence=0)
+    >>> frame.width, frame.height
+    (160, 120)
     """
 
     image: NDArray[np.uint8]

@@ -36,6 +36,10 @@ class DetectorSettings:
         threads: processor threads; None: the detector's default.
         runtime: of the network, or `auto`.
         device: of torch, `cpu` or `cuda`.
+
+    >>> from vision import DetectorSettings
+    >>> DetectorSettings(classes=("car",)).image_size
+    640
     """
 
     model: str = "default"
@@ -76,6 +80,16 @@ class ObjectDetector(ABC):
         precision: `float32` for example; None where it does not apply.
         reason: why this runtime and precision, in words.
         rendered_only: its network was trained on rendered scenes only, as far as its file says.
+
+    >>> import numpy as np
+    >>> from vision import Detections, ObjectDetector
+    >>> class Nothing(ObjectDetector):
+    ...     class_names = ("car",)
+    ...
+    ...     def detect(self, image_bgr: np.ndarray, /) -> Detections:
+    ...         return Detections.empty(self.class_names)
+    >>> Nothing().detect(np.zeros((120, 160, 3), np.uint8)).names
+    []
     """
 
     class_names: tuple[str, ...]

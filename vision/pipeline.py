@@ -49,6 +49,13 @@ class PerceptionResult:
         obstacles: distance of the nearest one in each direction; None without depth or attitude.
         boards: those of the markers that belong to a board.
         depth: of the frame's depth image; None without one.
+
+    >>> from vision import Detections, PerceptionResult
+    >>> result = PerceptionResult(
+    ...     0, 1_000_000, 9_000_000, 640, 480, Detections.empty(("car",)), {"total": 8.0}, dropped=0
+    ... )
+    >>> (result.inferred_ns - result.captured_ns) / 1e6  # milliseconds
+    8.0
     """
 
     sequence: int
@@ -89,6 +96,19 @@ class Pipeline:
     Attributes:
         frames: frames read so far.
         object_selection: follows an object that an operator selects; None without a tracker.
+
+    >>> import tempfile
+    >>> import cv2, numpy as np
+    >>> from vision import PerceptionResult, Pipeline, open_source
+    >>> folder = tempfile.TemporaryDirectory()
+    >>> cv2.imwrite(f"{folder.name}/photo.png", np.zeros((120, 160, 3), np.uint8))
+    True
+    >>> results: list[PerceptionResult] = []
+    >>> with open_source(f"{folder.name}/photo.png") as source:
+    ...     Pipeline(source, detector=None).step(1.0, results.append)
+    True
+    >>> [(result.sequence, result.width) for result in results]
+    [(0, 160)]
     """
 
     def __init__(

@@ -296,6 +296,13 @@ async def connect(
     Raises:
         NoAnswerError: no service there. ValueError: several vehicles, and no name was given.
         BusError: the file cannot be used.
+
+    >>> from companion import connect
+    >>> async def main() -> None:
+    ...     async with connect("tcp/127.0.0.1:7447") as drone:
+    ...         await drone.takeoff(3)
+    ...         async for frame in drone.detections():
+    ...             print([found["class_name"] for found in frame["detections"]])
     """
     settings = client_settings(ZenohSection(config_file=config_file), (endpoint,))
     opened = open_client(settings)

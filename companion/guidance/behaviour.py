@@ -21,7 +21,12 @@ from vision.path_planner import PlannedPath
 
 
 class Requirement(StrEnum):
-    """What a behaviour needs to begin. A missing requirement is named in the refusal."""
+    """What a behaviour needs to begin. A missing requirement is named in the refusal.
+
+    >>> from companion import Requirement
+    >>> Requirement("in_air") is Requirement.IN_AIR
+    True
+    """
 
     POSITION = "position"  # fresh and valid local position and attitude
     IN_AIR = "in_air"
@@ -101,6 +106,12 @@ class BehaviourContext:
         goal_ned_m: `Outcome.goal_ned_m` of the previous behaviour; None: it had none.
         tracks: of the steering camera, those that have ended included.
         velocities: the newest message of each sender on the topic `velocity`, the first sender first.
+
+    >>> from companion import BehaviourContext
+    >>> from companion.vehicle.state import VehicleState
+    >>> context = BehaviourContext(now_ns=0, state=VehicleState(position_ned_m=(1.0, 2.0, -5.0)))
+    >>> context.state.position_ned_m, context.targets, context.perception_fresh
+    ((1.0, 2.0, -5.0), (), False)
     """
 
     now_ns: int
@@ -151,6 +162,10 @@ class Outcome:
     Attributes:
         success: the command was carried out. reason: how it ended, for people.
         goal_ned_m: position to hold now, local NED metres; None: where the vehicle comes to rest.
+
+    >>> from companion import Outcome
+    >>> Outcome(True, "arrived", goal_ned_m=(10.0, 0.0, -5.0)).success
+    True
     """
 
     success: bool
@@ -163,6 +178,11 @@ class ModeRequest:
     """Request one of the autopilot's own modes (take-off, land, return, hold) until the next output.
 
     `altitude_m` is for FlightMode.TAKEOFF: height above home. `arm`: arm first (only take-off does).
+
+    >>> from companion import ModeRequest
+    >>> from companion.vehicle.state import FlightMode
+    >>> ModeRequest(FlightMode.TAKEOFF, altitude_m=5.0, arm=True).mode.value
+    'takeoff'
     """
 
     mode: FlightMode
@@ -202,7 +222,18 @@ def needs_to_see(wanted: Wanted) -> frozenset[Requirement]:
 
 
 class Behaviour(ABC):
-    """Base class of behaviours. `name` is its word in the command grammar."""
+    """Base class of behaviours. `name` is its word in the command grammar.
+
+    >>> from companion import Behaviour, BehaviourContext, Requirement, Setpoint
+    >>> class Climb(Behaviour):
+    ...     name = "climb"
+    ...     requirements = frozenset({Requirement.POSITION, Requirement.IN_AIR})
+    ...
+    ...     def update(self, dt_s: float, context: BehaviourContext) -> Setpoint:
+    ...         return Setpoint.velocity((0.0, 0.0, -1.0), context.now_ns)
+    >>> Climb().active.name
+    'climb'
+    """
 
     name: str
     requirements: frozenset[Requirement] = frozenset()

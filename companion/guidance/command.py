@@ -43,7 +43,14 @@ class GrammarError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """A number with its unit and allowed range."""
+    """A number with its unit and allowed range.
+
+    >>> from typing import Annotated
+    >>> from companion import Number
+    >>> Radius = Annotated[float, Number("radius", "m", 2.0, 50.0, "of the circle")]  # the type of a field
+    >>> Radius.__metadata__[0].high
+    50.0
+    """
 
     key: str
     unit: str
@@ -54,7 +61,14 @@ class Number:
 
 @dataclass(frozen=True, slots=True)
 class ClassName:
-    """The name of an object class."""
+    """The name of an object class.
+
+    >>> from typing import Annotated
+    >>> from companion import ClassName
+    >>> Target = Annotated[str, ClassName("class", "of the object")]  # the type of a command's field
+    >>> Target.__metadata__[0].key
+    'class'
+    """
 
     key: str
     meaning: str
@@ -62,7 +76,14 @@ class ClassName:
 
 @dataclass(frozen=True, slots=True)
 class EnumArgument:
-    """One of a fixed set of words."""
+    """One of a fixed set of words.
+
+    >>> from typing import Annotated
+    >>> from companion import EnumArgument
+    >>> Side = Annotated[str, EnumArgument("side", ("left", "right"), "where to pass")]  # the type of a field
+    >>> Side.__metadata__[0].words
+    ('left', 'right')
+    """
 
     key: str
     words: tuple[str, ...]
@@ -213,6 +234,10 @@ class BuildContext:
         attachment: lines sent along with the command (a mission's text).
         check_requirements: `Guidance.check_requirements`; a mission calls it at each step.
         loop_rate_hz: updates of a behaviour a second; None: not known.
+
+    >>> from companion import BuildContext
+    >>> BuildContext(class_names=("person", "car")).class_names
+    ('person', 'car')
     """
 
     footprint: Footprint | None = None
@@ -235,6 +260,13 @@ class Command(ABC):
         renamed: former key of an argument → its current key, for the error message.
         either: keys of which exactly one must be given; the first may be written without its key.
         stated: names of fields that were asked for: the text has them also where they equal their default.
+
+    >>> from companion import Behaviour, BuildContext, Command
+    >>> class Wait(Command):
+    ...     def build(self, context: BuildContext) -> Behaviour:
+    ...         raise NotImplementedError
+    >>> Wait().endless
+    False
     """
 
     word: ClassVar[str]
@@ -351,6 +383,18 @@ def behaviour(word: str, help_text: str) -> Callable[[type[_Kind]], type[_Kind]]
     Raises:
         RegistrationError: the word has other characters, or is already registered, or a field's type is not
             annotated with an argument (`Annotated[float, Number(...)]`).
+
+    >>> from typing import Annotated
+    >>> from companion import Behaviour, BuildContext, Command, Number, behaviour
+    >>> @behaviour("climb", "climb at a constant speed")
+    ... class Climb(Command):
+    ...     speed_mps: Annotated[float, Number("speed", "m/s", 0.1, 5.0, "upwards")] = 1.0
+    ...
+    ...     def build(self, context: BuildContext) -> Behaviour:
+    ...         raise NotImplementedError
+    >>> from companion.guidance.grammar import parse
+    >>> parse("climb speed=2").speed_mps
+    2.0
     """
 
     def register(kind: type[_Kind]) -> type[_Kind]:

@@ -51,6 +51,11 @@ class Service:
         on_event: called in the loop with every event, besides the log and the bus.
         console: also accept commands from the terminal. ask: answers plain sentences there.
         dropped_lines: returns the number of dropped log lines, for `status`.
+
+    >>> from companion import Service, Settings
+    >>> service = Service(Settings())  # connects to nothing before `run`
+    >>> service.ready, list(service.events)
+    (False, [])
     """
 
     def __init__(

@@ -51,7 +51,12 @@ class CameraSections(Section):
 
 
 class Settings(Section):
-    """All settings."""
+    """All settings.
+
+    >>> from companion import Settings
+    >>> Settings.model_validate({"detector": {"image_size": 320}}).detector.image_size
+    320
+    """
 
     vehicle: VehicleSection = VehicleSection()
     source: SourceSection = SourceSection()

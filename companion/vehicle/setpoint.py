@@ -45,6 +45,11 @@ class Setpoint:
 
     Raises:
         ValueError: the form is none of the above, or a value is not finite.
+
+    >>> from companion import Setpoint
+    >>> setpoint = Setpoint.velocity((1.0, 0.0, 0.0), now_ns=0, yaw_rad=0.0)
+    >>> setpoint.expired(200_000_000), setpoint.expired(400_000_000)
+    (False, True)
     """
 
     deadline_ns: int

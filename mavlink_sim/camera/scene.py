@@ -151,7 +151,13 @@ class CameraSettings:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """A world at time 0, the paths of moving objects (by identifier), and the camera."""
+    """A world at time 0, the paths of moving objects (by identifier), and the camera.
+
+    >>> from mavlink_sim import load_scene
+    >>> scene = load_scene("village")
+    >>> len(scene.world.objects), scene.camera.model.width
+    (10, 640)
+    """
 
     world: World
     paths: Mapping[int, Motion] = field(default_factory=dict)

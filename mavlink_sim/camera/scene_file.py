@@ -208,6 +208,10 @@ def load_scene(file: str | FilePath) -> Scene:
 
     Raises:
         SceneError: there is no such file, it is not TOML, or it has invalid values; every problem is named.
+
+    >>> from mavlink_sim import load_scene
+    >>> load_scene("obstacle_course").name
+    'obstacle course'
     """
     path = FilePath(file)
     if str(file) in example_scenes():

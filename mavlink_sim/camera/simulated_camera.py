@@ -43,6 +43,17 @@ class SimulatedCamera:
     """The camera of a scene; the same calls give the same frames.
 
     `capture` returns its frames in-process; `process` runs one in its own process.
+
+    >>> import numpy as np
+    >>> from mavlink_sim import Scene, SimulatedCamera
+    >>> from mavlink_sim.camera.scene import CameraSettings
+    >>> from mavlink_sim.world.world import World, WorldObject
+    >>> from vision import CameraModel
+    >>> lens = CameraSettings(CameraModel.from_horizontal_fov(160, 120, 1.4))
+    >>> scene = Scene(World((WorldObject(0, "car", (12.0, 0.0, 0.0)),)), camera=lens)
+    >>> captured = SimulatedCamera(scene).capture((0.0, 0.0, -2.0), np.eye(3), stamp_ns=0)
+    >>> captured.frame.image.shape
+    (120, 160, 3)
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -134,6 +145,17 @@ def frame_truth(captured: Captured) -> dict[str, Any]:
 
     `xyxy` are the box's edges in pixels, `range_m` is horizontal from the camera to the footprint,
     `distance_m` is from the camera to the object's position. `stamp_ns` and `sequence` are the frame's.
+
+    >>> import numpy as np
+    >>> from mavlink_sim import Scene, SimulatedCamera, frame_truth
+    >>> from mavlink_sim.camera.scene import CameraSettings
+    >>> from mavlink_sim.world.world import World, WorldObject
+    >>> from vision import CameraModel
+    >>> lens = CameraSettings(CameraModel.from_horizontal_fov(160, 120, 1.4))
+    >>> scene = Scene(World((WorldObject(0, "car", (12.0, 0.0, 0.0)),)), camera=lens)
+    >>> captured = SimulatedCamera(scene).capture((0.0, 0.0, -2.0), np.eye(3), stamp_ns=0)
+    >>> [(seen["class_name"], seen["position_ned_m"]) for seen in frame_truth(captured)["objects"]]
+    [('car', [12.0, 0.0, 0.0])]
     """
     eye = captured.rendered.eye_ned_m
     objects = []

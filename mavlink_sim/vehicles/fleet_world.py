@@ -39,6 +39,17 @@ class FleetWorld:
 
     Args:
         size: the number of vehicles.
+
+    >>> from mavlink_sim import FleetWorld, LockstepVehicle
+    >>> pair = [LockstepVehicle(system_id=1), LockstepVehicle(system_id=2, start_ned_m=(6.0, 0.0))]
+    >>> world = FleetWorld(2)
+    >>> for member in pair:
+    ...     world.join(member.vehicle)
+    >>> for member in pair:
+    ...     member.step(0.004)
+    >>> world.meet()
+    >>> [member.truth.collisions for member in pair]
+    [0, 0]
     """
 
     def __init__(self, size: int) -> None:

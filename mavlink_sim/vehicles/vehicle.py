@@ -131,6 +131,11 @@ class Vehicle:
 
     Another firmware is a subclass (see `firmware`): the classes of its autopilot and parameters, the handlers
     of messages, and the telemetry.
+
+    >>> from mavlink_sim import LockstepVehicle
+    >>> vehicle = LockstepVehicle(seed=1, parameters={"MPC_LAND_SPEED": 1.0}).vehicle
+    >>> vehicle.parameters.get("MPC_LAND_SPEED").value, vehicle.system_id
+    (1.0, 1)
     """
 
     autopilot_class: type[Autopilot] = Autopilot

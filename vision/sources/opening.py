@@ -63,6 +63,16 @@ def open_source(uri: str, settings: SourceSettings = SourceSettings()) -> Source
     Raises:
         SourceError: it cannot be opened, or delivered no frame within `open_timeout_s`; one line with the
             reason.
+
+    >>> import tempfile
+    >>> import cv2, numpy as np
+    >>> from vision import open_source
+    >>> folder = tempfile.TemporaryDirectory()
+    >>> cv2.imwrite(f"{folder.name}/photo.png", np.zeros((120, 160, 3), np.uint8))
+    True
+    >>> with open_source(f"{folder.name}/photo.png") as source:
+    ...     source.live, next(iter(source)).width
+    (False, 160)
     """
     quiet_opencv()
     if settings.depth is not None:

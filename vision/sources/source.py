@@ -67,6 +67,10 @@ class SourceSettings:
         on_frame: called with every frame as it arrives, before the reader gets it, including frames that the
             reader is too slow for. A live source calls it in its own thread. A `SourceError` raised here ends
             the source.
+
+    >>> from vision import SourceSettings
+    >>> SourceSettings(width=640, height=480, pixel_format="MJPG").read_timeout_s
+    5.0
     """
 
     width: int | None = None
@@ -152,6 +156,18 @@ class Source(ABC):
         total_frames: number of frames, None if unknown. A video file's header may be slightly wrong.
         calibration: lens and mount, if the source provides them (shared memory can); constant while the
             source is open.
+
+    >>> import tempfile
+    >>> import cv2, numpy as np
+    >>> from vision import Source, open_source
+    >>> folder = tempfile.TemporaryDirectory()
+    >>> cv2.imwrite(f"{folder.name}/photo.png", np.zeros((120, 160, 3), np.uint8))
+    True
+    >>> def shapes(source: Source) -> list[tuple[str, tuple[int, ...]]]:
+    ...     return [(frame.file_name, frame.image.shape) for frame in source]
+    >>> with open_source(folder.name) as source:
+    ...     shapes(source)
+    [('photo.png', (120, 160, 3))]
     """
 
     uri: str

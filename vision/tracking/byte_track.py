@@ -118,6 +118,19 @@ class Tracker:
     Args:
         settings: thresholds and times.
         first_track_id: id of the first track; later ones count up.
+
+    >>> import numpy as np
+    >>> from vision import Detections, Tracker
+    >>> found = Detections(
+    ...     np.array([[10, 20, 50, 60], [70, 20, 90, 40]], np.float32),
+    ...     np.array([0.9, 0.4], np.float32),
+    ...     np.array([1, 0]),
+    ...     ("person", "car"),
+    ... )
+    >>> tracker = Tracker()
+    >>> frames = [tracker.update(found, captured_ns=index * 100_000_000) for index in range(5)]
+    >>> frames[-1].detections.track_id.tolist(), frames[-1].detections.track_confirmed.tolist()
+    ([1, 2], [True, True])
     """
 
     def __init__(self, settings: TrackerSettings | None = None, *, first_track_id: int = 1) -> None:
