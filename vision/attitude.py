@@ -10,6 +10,8 @@ import math
 
 Quaternion = tuple[float, float, float, float]
 
+IDENTITY: Quaternion = (1.0, 0.0, 0.0, 0.0)
+
 
 def quaternion_from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Quaternion:
     """The (w, x, y, z) quaternion of the same rotation as `matrix_from_euler`."""
@@ -35,6 +37,30 @@ def euler_from_quaternion(quaternion: Quaternion) -> tuple[float, float, float]:
         math.asin(max(-1.0, min(1.0, -2 * (x * z - w * y)))),
         math.atan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z)),
     )
+
+
+def product(first: Quaternion, second: Quaternion) -> Quaternion:
+    """`first` after `second`: (a_from_b, b_from_c) gives a_from_c."""
+    aw, ax, ay, az = first
+    bw, bx, by, bz = second
+    return (
+        aw * bw - ax * bx - ay * by - az * bz,
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+    )
+
+
+def inverse(quaternion: Quaternion) -> Quaternion:
+    """Of a unit quaternion."""
+    w, x, y, z = quaternion
+    return (w, -x, -y, -z)
+
+
+def third_axis(quaternion: Quaternion) -> tuple[float, float, float]:
+    """The body's down axis in the parent frame, of a unit quaternion."""
+    w, x, y, z = quaternion
+    return (2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y))
 
 
 def turned_about_down(yaw_rad: float, quaternion: Quaternion) -> Quaternion:
@@ -74,3 +100,12 @@ def unit_quaternion(quaternion: Quaternion) -> Quaternion:
         raise ValueError("a zero quaternion is not a rotation")
     w, x, y, z = (value / norm for value in quaternion)
     return (w, x, y, z)
+
+
+def unit_or_none(quaternion: Quaternion) -> Quaternion | None:
+    """The same rotation with length 1; None if it is none (zero or not finite)."""
+    w, x, y, z = quaternion
+    norm = math.hypot(w, x, y, z)
+    if not math.isfinite(norm) or norm < 1e-12:
+        return None
+    return (w / norm, x / norm, y / norm, z / norm)

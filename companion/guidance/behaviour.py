@@ -245,6 +245,8 @@ class Behaviour(ABC):
     neighbour_names: tuple[str, ...] = ()
     # Pitches that the gimbal must reach, radians above the horizon, if it requires GIMBAL.
     gimbal_pitches_rad: tuple[float, ...] = ()
+    # Replaced, never extended: a subclass need not call an `__init__`.
+    _new_notes: Sequence[str] = ()
 
     def goals(self, context: BehaviourContext) -> tuple[Vector3, ...]:
         """Points it would fly to if it began now, local NED metres, as far as they are known."""
@@ -268,9 +270,14 @@ class Behaviour(ABC):
         """A mode request was refused. True: the behaviour goes on without it; False: it ends."""
         return False
 
+    def add_notes(self, *texts: str) -> None:
+        """Add notes for people: each becomes an event."""
+        self._new_notes = [*self._new_notes, *texts]
+
     def take_notes(self) -> Sequence[str]:
         """Notes for people since the last call."""
-        return ()
+        notes, self._new_notes = self._new_notes, []
+        return notes
 
     @property
     def active(self) -> Behaviour:

@@ -12,6 +12,7 @@ from typing import Any
 
 from companion.vehicle.gimbal import LAST_ATTACHED_DEVICE, GimbalState, Quaternion, YawFrame
 from companion.vehicle.state import VehicleState, with_fields
+from vision.attitude import unit_quaternion
 
 Fields = Mapping[str, Any]
 
@@ -107,10 +108,9 @@ def _unit(values: Any) -> Quaternion | None:
     if not isinstance(values, list | tuple) or len(values) != 4:
         return None
     w, x, y, z = (_number(value) for value in values)
-    norm = math.sqrt(w * w + x * x + y * y + z * z)
-    if not 0.5 < norm < 2.0:  # NaN also fails the comparison
+    if not 0.5 < math.hypot(w, x, y, z) < 2.0:  # NaN also fails the comparison
         return None
-    return (w / norm, x / norm, y / norm, z / norm)
+    return unit_quaternion((w, x, y, z))
 
 
 def _number(value: float | None) -> float:

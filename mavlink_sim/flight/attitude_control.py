@@ -13,9 +13,16 @@ from dataclasses import dataclass
 
 from mavlink_sim.flight.position_control import Demand, PositionController
 from mavlink_sim.physics.airframe import MAX_THRUST_MPS2, Multirotor, Vector
-from mavlink_sim.physics.quaternions import IDENTITY, inverse, product, third_axis, unit
 from mavlink_sim.px4.parameters import Parameters
-from vision.attitude import Quaternion, quaternion_from_euler
+from vision.attitude import (
+    IDENTITY,
+    Quaternion,
+    inverse,
+    product,
+    quaternion_from_euler,
+    third_axis,
+    unit_or_none,
+)
 
 NAN = math.nan
 MAX_RATE_RADPS = math.radians(2000.0)  # the range of the gyroscopes; a setpoint may have any number
@@ -118,7 +125,7 @@ class AttitudeController:
             demanded = self.rates(setpoint, airframe)
             rates = _possible(demanded, airframe.rates)
             self._target = AttitudeTarget(
-                unit(setpoint.quaternion) or IDENTITY, demanded, abs(setpoint.thrust)
+                unit_or_none(setpoint.quaternion) or IDENTITY, demanded, abs(setpoint.thrust)
             )
         else:
             if setpoint is not self._setpoint:
@@ -135,7 +142,7 @@ class AttitudeController:
         """The body rates (FRD, rad/s) that turn the airframe into an attitude; NaN if that is no rotation."""
         if self._revision != self._parameters.revision:
             self._load()
-        wanted = unit(setpoint.quaternion)
+        wanted = unit_or_none(setpoint.quaternion)
         if wanted is None:
             return (NAN, NAN, NAN)
         attitude = quaternion_from_euler(airframe.roll_rad, airframe.pitch_rad, airframe.yaw_rad)
@@ -180,4 +187,4 @@ def _shortest(first: Vector, second: Vector) -> Quaternion | None:
     cosine = ax * bx + ay * by + az * bz
     if cosine < -1.0 + 1e-9:
         return None
-    return unit((1.0 + cosine, ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx))
+    return unit_or_none((1.0 + cosine, ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx))

@@ -13,9 +13,8 @@ from dataclasses import dataclass
 from enum import Enum
 
 from mavlink_sim.physics.airframe import Vector
-from mavlink_sim.physics.quaternions import product
 from mavlink_sim.px4.parameters import Parameters
-from vision.attitude import Quaternion
+from vision.attitude import Quaternion, product
 
 SLEW_RADPS = math.radians(120.0)  # slew rate to a new target, of a small brushless gimbal
 JOINT_RADPS = math.radians(300.0)  # greatest rate of stabilisation

@@ -98,7 +98,7 @@ def _read(file_name: str) -> tuple[Parameter, ...]:
     for line in text.splitlines():
         if line and not line.startswith("#"):
             name, kind, value = line.split()
-            number = int(value) if kind == "INT32" else _single(float(value))
+            number = int(value) if kind == "INT32" else single(float(value))
             found.append(Parameter(name, _TYPES[kind], number))
     return tuple(found)
 
@@ -198,7 +198,7 @@ class Parameters:
                 raise ValueError(f"parameter {name} is an INT32, got {value}; give a whole number")
             value = int(value)
         else:
-            value = _single(float(value))
+            value = single(float(value))
         changed = replace(parameter, value=value)
         self._parameters[name] = changed
         self.revision += 1
@@ -227,7 +227,7 @@ class Parameters:
         return float(struct.unpack("<f", struct.pack("<I", self.hash()))[0])
 
 
-def _single(value: float) -> float:
+def single(value: float) -> float:
     """The nearest float32, which is what the vehicle stores."""
     try:
         return float(struct.unpack("<f", struct.pack("<f", value))[0])

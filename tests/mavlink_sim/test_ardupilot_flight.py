@@ -9,8 +9,8 @@ import pytest
 
 from mavlink_sim import LockstepVehicle
 from mavlink_sim.lockstep import CommandRefusedError
-from mavlink_sim.physics.quaternions import inverse, product
 from mavlink_sim.wire.messages import dialect
+from vision.attitude import inverse, product
 
 ARM, TAKEOFF, SET_MODE, PAUSE_CONTINUE = 400, 22, 176, 193
 POSITION, VELOCITY, ACCELERATION = 0b110111111000, 0b110111000111, 0b110000111111

@@ -11,11 +11,17 @@ from hypothesis import strategies as st
 from mavlink_sim.flight.attitude_control import AttitudeController, AttitudeSetpoint, RatesSetpoint
 from mavlink_sim.flight.setpoints import attitude_setpoint
 from mavlink_sim.physics.airframe import GRAVITY_MPS2, LINEAR_DRAG_PER_S, MAX_THRUST_MPS2
-from mavlink_sim.physics.quaternions import inverse, product, third_axis, unit
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.messages import dialect
 from tests.mavlink_sim.conftest import SimHarness, position_setpoint
-from vision.attitude import euler_from_quaternion, quaternion_from_euler
+from vision.attitude import (
+    euler_from_quaternion,
+    inverse,
+    product,
+    quaternion_from_euler,
+    third_axis,
+    unit_or_none,
+)
 from vision.rotation import matrix_from_quaternion
 
 HOVER = GRAVITY_MPS2 / MAX_THRUST_MPS2
@@ -280,7 +286,7 @@ def test_heartbeat_is_stabilized_except_with_body_rates(
 def turned(attitude_rad: Any, rates_radps: Any, dt_s: float) -> tuple[float, float, float]:
     """(roll, pitch, yaw) after turning at these body rates for a short time."""
     p, q, r = (0.5 * rate * dt_s for rate in rates_radps)
-    step = unit((1.0, p, q, r))
+    step = unit_or_none((1.0, p, q, r))
     assert step is not None
     return euler_from_quaternion(product(quaternion_from_euler(*attitude_rad), step))
 
@@ -314,12 +320,12 @@ def test_the_quaternion_algebra_agrees_with_the_matrices(attitude_rad: tuple[flo
     assert third_axis(q) == pytest.approx(tuple(matrix_from_quaternion(q)[:, 2]), abs=1e-9)
     assert product(inverse(q), q) == pytest.approx((1.0, 0.0, 0.0, 0.0), abs=1e-9)
     w, x, y, z = q
-    assert unit((3.0 * w, 3.0 * x, 3.0 * y, 3.0 * z)) == pytest.approx(q)
+    assert unit_or_none((3.0 * w, 3.0 * x, 3.0 * y, 3.0 * z)) == pytest.approx(q)
 
 
 @pytest.mark.parametrize("values", [(0.0,) * 4, (math.nan, 0.0, 0.0, 1.0), (math.inf, 0.0, 0.0, 0.0)])
 def test_zero_quaternion_has_no_unit_quaternion(values: tuple[float, float, float, float]) -> None:
-    assert unit(values) is None
+    assert unit_or_none(values) is None
 
 
 @settings(max_examples=15, deadline=None)

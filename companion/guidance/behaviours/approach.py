@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 from companion.guidance.behaviour import (
     Behaviour,
@@ -117,7 +116,6 @@ class ApproachBehaviour(Behaviour):
         self._arrival, self._controller = Arrival(), PositionController()
         self._range_m = math.nan
         self._last_id: int | None = None
-        self._notes: list[str] = []
 
     def on_activate(self, context: BehaviourContext) -> None:
         position, _ = position_and_yaw(context.state)
@@ -186,10 +184,6 @@ class ApproachBehaviour(Behaviour):
         stop = (north - self._distance_m * math.cos(bearing), east - self._distance_m * math.sin(bearing))
         return RoutedSetpoint(setpoint, (position, (*stop, self._down_m)), facing=True)
 
-    def take_notes(self) -> Sequence[str]:
-        notes, self._notes = self._notes, []
-        return notes
-
     @property
     def gimbal_aim(self) -> GimbalAim | None:
         return None if self._tracking is None else self._tracking.aim
@@ -212,7 +206,7 @@ class ApproachBehaviour(Behaviour):
             elif context.now_ns - self._seen_ns > LOST_AFTER_S * 1e9:
                 fitting = self._subject.of(context.targets_of(self._subject), self._confidence)
                 self._track = track = self._found_again(track, fitting, position)
-            self._notes += self._subject.new_id(self._last_id, track.track_id)
+            self.add_notes(*self._subject.new_id(self._last_id, track.track_id))
             self._last_id = track.track_id
             return
         fitting = self._subject.of(context.targets_of(self._subject), self._confidence)

@@ -136,7 +136,6 @@ class PersistentApproach(Behaviour):
         self._begun_ns = 0
         self._tried = 0
         self._why = ""
-        self._notes: list[str] = []
 
     def on_activate(self, context: BehaviourContext) -> None:
         self._tried, self._why, self._seek = 0, "", None
@@ -172,10 +171,6 @@ class PersistentApproach(Behaviour):
         swept = None if self._seek is None else self._seek.gimbal_aim
         return swept or self._tracking.aim
 
-    def take_notes(self) -> tuple[str, ...]:
-        notes, self._notes = tuple(self._notes), []
-        return notes
-
     @property
     def status(self) -> str:
         if self._approach is not None:
@@ -189,7 +184,7 @@ class PersistentApproach(Behaviour):
             times = "once" if self._tried == 1 else f"{self._tried} times"
             return Outcome(False, self._why + (f"; searched again {times}" if self._tried else ""))
         self._tried += 1
-        self._notes.append(f"approach: {self._why}; searching, {self._tried} of {self._retries}")
+        self.add_notes(f"approach: {self._why}; searching, {self._tried} of {self._retries}")
         self._confirmer.reset(context.now_ns)
         self._hold_point, _ = position_and_yaw(context.state)
         self._looking_since_ns, self._begun_ns = None, context.now_ns
@@ -225,7 +220,7 @@ class PersistentApproach(Behaviour):
         return GimbalSweep(aim.pitch_rad, math.radians(USUAL_RATE_DPS), self._field_rad)
 
     def _go_there(self, context: BehaviourContext, note: str) -> BehaviourOutput:
-        self._notes.append(f"approach: {note}")
+        self.add_notes(f"approach: {note}")
         self._approach = self._make()
         self._approach.on_activate(context)
         return self._approach.update(0.0, context)

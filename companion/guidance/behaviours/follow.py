@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Annotated, ClassVar
 
 from companion.guidance.behaviour import (
@@ -169,7 +168,6 @@ class FollowBehaviour(Behaviour):
         self._course_rad: float | None = None
         self._range_m = math.nan
         self._unseen_s = 0.0
-        self._notes: list[str] = []
 
     def on_activate(self, context: BehaviourContext) -> None:
         position, _ = position_and_yaw(context.state)
@@ -260,7 +258,7 @@ class FollowBehaviour(Behaviour):
                 position,
             ):
                 self._seen_ns = track.captured_ns
-                self._notes += self._subject.new_id(before, track.track_id)
+                self.add_notes(*self._subject.new_id(before, track.track_id))
             return
         fitting = self._subject.of(context.targets_of(self._subject), self._confidence)
         if fitting:
@@ -292,10 +290,6 @@ class FollowBehaviour(Behaviour):
         else:
             why = "never seen with a known range"
         return f"lost {self._subject.phrase} for {self._unseen_s:.1f} s: {why}"
-
-    def take_notes(self) -> Sequence[str]:
-        notes, self._notes = self._notes, []
-        return notes
 
     @property
     def gimbal_aim(self) -> GimbalAim | None:

@@ -142,7 +142,6 @@ class PatrolBehaviour(Behaviour):
         self._approach_m, self._dwell_s = approach_m, dwell_s
         self._revisit_s, self._merge_radius_m = revisit_s, merge_radius_m
         self._known: list[_Known] = []
-        self._notes: list[str] = []
         self._aligner: YawAligner | None = None
         self._reported = False
         self._approach: ApproachBehaviour | None = None
@@ -185,10 +184,6 @@ class PatrolBehaviour(Behaviour):
             stops = f"{self._found} {'stop' if self._found == 1 else 'stops'}"
             return Outcome(True, f"{step.reason}, {stops}")
         return step
-
-    def take_notes(self) -> Sequence[str]:
-        notes, self._notes = self._notes, []
-        return notes
 
     @property
     def status(self) -> str:
@@ -306,7 +301,7 @@ class PatrolBehaviour(Behaviour):
         return f"{target.ground_range_m:.1f} m away, {north:.1f} m north and {east:.1f} m east of home"
 
     def _note(self, text: str) -> None:
-        self._notes.append(f"patrol: {text}")
+        self.add_notes(f"patrol: {text}")
 
 
 def _named(target: Target) -> str:

@@ -62,7 +62,6 @@ class VelocityBehaviour(Behaviour):
     def __init__(self, source: str | None = None) -> None:
         self._source = source
         self._others: set[str] = set()
-        self._notes: list[str] = []
         self._hold: HoldBehaviour | None = None
         self._down_m: float | None = None
         self._yaw_rad: float | None = None
@@ -102,16 +101,16 @@ class VelocityBehaviour(Behaviour):
         for other in valid:
             if other.source not in (self._source, *self._others) and len(self._others) < MAX_REPORTED:
                 self._others.add(other.source)
-                self._notes.append(f"velocities of {other.source} ignored: {self._source} steers")
+                self.add_notes(f"velocities of {other.source} ignored: {self._source} steers")
         own = next((one for one in valid if one.source == self._source), None)
         if own is not None:
             if self._received_ns is None or self._silent:
-                self._notes.append(f"{own.source} steers")
+                self.add_notes(f"{own.source} steers")
             self._received_ns, self._silent = own.received_ns, False
         elif self._received_ns is not None and not self._silent:
             self._silent = context.now_ns - self._received_ns > SILENT_S * 1e9
             if self._silent:
-                self._notes.append(f"{self._source} is silent: holding")
+                self.add_notes(f"{self._source} is silent: holding")
         return own
 
     def _held(self, dt_s: float, context: BehaviourContext) -> Setpoint:
@@ -143,11 +142,6 @@ class VelocityBehaviour(Behaviour):
         most_mps = math.hypot(*wanted) + MAX_CORRECTION_MPS
         over_ground = add_velocity_error(wanted, state, most_mps, HOLD_VELOCITY_GAIN)
         return (*over_ground, down_mps)
-
-    def take_notes(self) -> list[str]:
-        """See Behaviour."""
-        notes, self._notes = self._notes, []
-        return notes
 
     @property
     def status(self) -> str:

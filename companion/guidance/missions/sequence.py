@@ -106,7 +106,6 @@ class SequenceBehaviour(Behaviour):
         self._failure = ""
         self._ended = False
         self._goal_ned_m: Vector3 | None = None
-        self._notes: list[str] = []
         known = {name for step in plan.steps for name in step.make().class_names}
         self.class_names = tuple(sorted(known))
 
@@ -158,9 +157,8 @@ class SequenceBehaviour(Behaviour):
         return Outcome(False, f"{self.where}: {outcome.reason}")
 
     def take_notes(self) -> Sequence[str]:
-        inner = () if self._active is None else tuple(self._active.take_notes())
-        notes, self._notes = (*self._notes, *inner), []
-        return notes
+        self._collect_notes()
+        return super().take_notes()
 
     def request_failed(self, why: str) -> bool:
         """The autopilot refused a mode: the step fails, not the mission."""
@@ -260,7 +258,7 @@ class SequenceBehaviour(Behaviour):
         if outcome.success and self._repeats < planned.repeat:
             return self._begin(self._at, context, again=True)
         follows = planned.on_success if outcome.success else planned.on_failure
-        self._notes.append(f"mission {self._plan.name}: {where} {_done(outcome)}{_then(self._plan, follows)}")
+        self.add_notes(f"mission {self._plan.name}: {where} {_done(outcome)}{_then(self._plan, follows)}")
         return self._go_on(follows, f"{where}: {outcome.reason}", context)
 
     def _go_on(self, follows: int | str, reason: str, context: BehaviourContext) -> Outcome | None:
@@ -286,7 +284,7 @@ class SequenceBehaviour(Behaviour):
         self._active, self._first = self._first or planned.make(), None
         times = f", {self._repeats + 1} of {planned.repeat} times" if planned.repeat > 1 else ""
         number = f"step {index + 1} of {len(self._plan.steps)}"
-        self._notes.append(f"mission {self._plan.name}: {number}{times}: {planned.command}")
+        self.add_notes(f"mission {self._plan.name}: {number}{times}: {planned.command}")
         return None
 
     def _out_of_time(self, context: BehaviourContext) -> bool:
@@ -299,12 +297,12 @@ class SequenceBehaviour(Behaviour):
         self._goal_ned_m = None
         self._collect_notes()
         self._leave()
-        self._notes.append(f"mission {self._plan.name}: {reason}")
+        self.add_notes(f"mission {self._plan.name}: {reason}")
         return self._go_on(_final(self._plan.steps[self._at].on_failure), reason, context)
 
     def _collect_notes(self) -> None:
         if self._active is not None:
-            self._notes.extend(self._active.take_notes())
+            self.add_notes(*self._active.take_notes())
 
     def _leave(self) -> None:
         if self._active is not None and self._activated:

@@ -16,9 +16,8 @@ from mavlink_sim.flight import tasks as flight
 from mavlink_sim.flight.position_control import NAN, NOTHING, TrajectorySetpoint
 from mavlink_sim.flight.precision_landing import LandingTarget
 from mavlink_sim.physics.airframe import Multirotor, Vector
-from mavlink_sim.physics.quaternions import inverse, product
 from mavlink_sim.px4.parameters import Parameters
-from vision.attitude import Quaternion
+from vision.attitude import Quaternion, inverse, product
 
 ALTITUDE_REACHED_M = 0.5
 LOWEST_RETURN_M = 2.0  # RTL_ALT_MIN: the least height in the cone

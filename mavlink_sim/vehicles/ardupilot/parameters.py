@@ -10,12 +10,11 @@ Copter's (`_LOOPS`).
 from __future__ import annotations
 
 import math
-import struct
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 
-from mavlink_sim.px4.parameters import REAL32, Parameter, Parameters
+from mavlink_sim.px4.parameters import REAL32, Parameter, Parameters, single
 
 TAKEOFF_RAMP_S = 1.5  # from the first thrust to leaving the ground
 INT8, INT16, INT32 = 2, 4, 6  # MAV_PARAM_TYPE
@@ -188,7 +187,7 @@ class CopterParameters(Parameters):
             low, high = _RANGES[parameter.kind]
             number: int | float = min(max(int(value), low), high)
         else:
-            number = _single(value)
+            number = single(value)
         changed = replace(parameter, value=number)
         self._parameters[name] = changed
         self.revision += 1
@@ -206,11 +205,3 @@ class CopterParameters(Parameters):
         for name, formula in _LOOPS.items():
             value = formula(self)
             self._loops.set(name, round(value) if self._loops[name].kind == INT32 else value)
-
-
-def _single(value: float) -> float:
-    """The nearest float32, which is what the vehicle stores."""
-    try:
-        return float(struct.unpack("<f", struct.pack("<f", value))[0])
-    except OverflowError:
-        raise ValueError(f"{value} does not fit a 32-bit float") from None
