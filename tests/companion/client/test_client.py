@@ -9,9 +9,10 @@ import math
 import socket
 import subprocess
 import sys
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -235,18 +236,30 @@ async def test_slow_reader_gets_the_newest_messages(size: int) -> None:
         assert 0.0 <= stream.age_s < 5.0
 
 
-@pytest.mark.realtime
-async def test_message_that_waited_too_long_is_dropped() -> None:
-    async with connected() as (there, drone):
-        stream = drone.vehicle()
-        await watched(there, topics.VEHICLE)
-        there.bus.publish(topics.VEHICLE, {"number": 1})
-        await asyncio.sleep((topics.VEHICLE.max_age_s or 0.0) + 0.2)
-        waiting = asyncio.ensure_future(anext(stream))
-        await asyncio.sleep(0)
-        there.bus.publish(topics.VEHICLE, {"number": 2})
-        assert (await asyncio.wait_for(waiting, 10.0))["number"] == 2  # type: ignore[typeddict-item]
-        assert stream.dropped == 1
+class ScriptedSession:
+    """A session with one subscriber, called by the test."""
+
+    def declare_subscriber(self, key: str, put: Callable[[Any], None]) -> Any:
+        self.put = put
+        return SimpleNamespace(undeclare=lambda: None)
+
+    def receive(self, number: int) -> None:
+        data = json.dumps({"number": number}).encode()
+        self.put(SimpleNamespace(payload=SimpleNamespace(to_bytes=lambda: data)))
+
+
+@pytest.mark.parametrize(("waited_s", "first"), [(0.4, 1), (0.6, 2)])
+async def test_message_that_waited_too_long_is_dropped(
+    waited_s: float, first: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_s, session = 100.0, ScriptedSession()
+    monkeypatch.setattr("companion.client.stream.time", SimpleNamespace(monotonic=lambda: now_s))
+    stream: Stream[Any] = Drone(session, "alpha").vehicle(size=2)  # type: ignore[arg-type]
+    session.receive(1)
+    now_s += waited_s  # topics.VEHICLE.max_age_s is 0.5
+    session.receive(2)
+    assert (await asyncio.wait_for(anext(stream), 10.0))["number"] == first
+    assert stream.dropped == first - 1
 
 
 @pytest.mark.realtime
