@@ -13,8 +13,9 @@ from collections.abc import Callable
 import numpy as np
 
 from benchmarks.flights import FlightResult
-from companion.bench.lockstep_flight import Camera, LockstepFlight, camera_settings
-from companion.bench.rendered_camera import RenderedCamera, rendered_scene
+from benchmarks.rendered import camera_settings, rendered_scene
+from companion.bench.lockstep_flight import Camera, LockstepFlight
+from companion.bench.rendered_camera import RenderedCamera
 from companion.bench.synthetic_camera import SyntheticCamera
 from companion.bench.synthetic_detector import SceneObject, ScenePose, SyntheticDetector
 from companion.guidance.behaviour import Behaviour

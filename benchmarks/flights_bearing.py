@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.flights import FlightResult
-from companion.bench.lockstep_flight import Camera, LockstepFlight, Moment, camera_settings
-from companion.bench.rendered_camera import RenderedCamera, rendered_scene
+from benchmarks.rendered import camera_settings, rendered_scene
+from companion.bench.lockstep_flight import Camera, LockstepFlight, Moment
+from companion.bench.rendered_camera import RenderedCamera
 from companion.bench.synthetic_camera import SyntheticCamera
 from companion.bench.synthetic_detector import Faults, SceneObject, ScenePose, SyntheticDetector
 from companion.guidance.behaviours.orbit import OrbitBehaviour

@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.flights import FlightResult
-from companion.bench.lockstep_flight import LockstepFlight, camera_settings
+from benchmarks.rendered import camera_settings
+from companion.bench.lockstep_flight import LockstepFlight
 from companion.bench.synthetic_camera import SyntheticCamera
 from companion.guidance.behaviour import Outcome
 from companion.guidance.behaviours.land_on_marker import LandOnMarkerBehaviour

@@ -13,7 +13,8 @@ import math
 import numpy as np
 
 from benchmarks.flights import FlightResult
-from companion.bench.lockstep_flight import LockstepFlight, camera_settings
+from benchmarks.rendered import camera_settings
+from companion.bench.lockstep_flight import LockstepFlight
 from companion.bench.rendered_camera import RenderedCamera
 from companion.guidance.behaviours.goto import GotoBehaviour
 from mavlink_sim.camera.depth_camera import DepthSensor

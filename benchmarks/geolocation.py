@@ -32,8 +32,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.flights import add_seeds
-from companion.bench.lockstep_flight import LockstepFlight, camera_settings
-from companion.bench.rendered_camera import RenderedCamera, rendered_scene
+from benchmarks.rendered import camera_settings, rendered_scene
+from companion.bench.lockstep_flight import LockstepFlight
+from companion.bench.rendered_camera import RenderedCamera
 from companion.bench.synthetic_detector import SceneObject, ScenePose
 from companion.campaign import ClusterError, SeedError, map_seeds
 from companion.guidance.targets.fused import FusedPosition, FusedTracks

@@ -23,8 +23,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.rendered import rendered_scene
 from companion.bench.lockstep_flight import LockstepFlight, plain_settings
-from companion.bench.rendered_camera import rendered_scene
 from companion.bench.synthetic_detector import SceneObject, ScenePose
 from mavlink_sim.camera.lens import Shutter
 from mavlink_sim.camera.simulated_camera import SimulatedCamera

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.clear_mot import Labelled, MotScore, clear_mot
 from benchmarks.scenes import (
     CAMERA,
     MOTIONS,
@@ -29,7 +30,6 @@ from companion.bench.percentiles import percentiles
 from vision.detections import NO_TRACK, Detections
 from vision.tracking import AttitudeHistory, CameraView, Tracker, TrackerSettings, TrackState
 from vision.tracking.association import overlaps
-from vision.tracking.clear_mot import Labelled, MotScore, clear_mot
 from vision.tracking.tracks import XYXY
 
 ATTITUDE_RATE_HZ = 50.0

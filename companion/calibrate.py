@@ -48,7 +48,6 @@ class Collected:
         collector: with the views that differ.
         frames, found: numbers of processed frames, and of those with the board.
         images: name → the view's image, small, as JPEG.
-        interrupted: whether Ctrl-C ended it.
         others: name → the second camera's view at the same time.
     """
 
@@ -56,7 +55,6 @@ class Collected:
     frames: int = 0
     found: int = 0
     images: dict[str, bytes] = field(default_factory=dict)
-    interrupted: bool = False
     others: dict[str, BoardView] = field(default_factory=dict)
 
     @property
@@ -102,7 +100,6 @@ def collect_views(
     except KeyboardInterrupt:
         if not source.live:
             raise
-        collected.interrupted = True
     if not collected.collector.views:
         images = "images" if second is None else f"pairs of images with {second.uri}"
         raise CalibrationError(

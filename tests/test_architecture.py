@@ -91,7 +91,6 @@ SIMULATOR_LAYERS = {
     "autopilot": 4,
     "faults": 5,
     "services": 5,
-    "lockstep_link": 6,
     "vehicles": 6,
     "lockstep": 7,
     "realtime": 7,

@@ -76,11 +76,6 @@ class Letterbox:
         clipped: NDArray[np.float32] = np.clip(boxes, 0, limits, dtype=np.float32)
         return clipped
 
-    def to_input(self, xyxy: NDArray[Any]) -> NDArray[np.float32]:
-        """(N, 4) boxes in the frame → (N, 4) float32 in the network's input."""
-        boxes: NDArray[np.float32] = np.asarray(xyxy, np.float32).reshape(-1, 4) * self._scale + self._corner
-        return boxes
-
     @property
     def _scale(self) -> NDArray[np.float32]:
         # Sizes are whole pixels, so the scales of the two axes differ slightly, which matters for small

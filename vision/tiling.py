@@ -64,7 +64,6 @@ class TiledDetector:
     Attributes:
         detector: the detector run on each tile.
         last_timing: of the latest `detect`, all passes together; None before the first.
-        last_passes: number of passes for the latest frame.
     """
 
     def __init__(
@@ -88,7 +87,6 @@ class TiledDetector:
         self._overlap = overlap
         self._whole_frame = whole_frame
         self.last_timing: Timing | None = None
-        self.last_passes = 0
 
     @property
     def class_names(self) -> tuple[str, ...]:
@@ -102,7 +100,7 @@ class TiledDetector:
         tiles = tiles_of(width, height, self._tile_size, self._overlap)
         if len(tiles) == 1:
             found = self.detector.detect(image_bgr)
-            self.last_timing, self.last_passes = self.detector.last_timing, 1
+            self.last_timing = self.detector.last_timing
             return found
         spent = np.zeros(3)
         passes: list[Detections] = []
@@ -118,7 +116,6 @@ class TiledDetector:
             cuts.append(np.zeros(len(passes[-1]), np.bool_))
         merged = merge_passes(passes, cuts)
         self.last_timing = Timing(*map(float, spent))
-        self.last_passes = len(passes)
         return merged
 
     def _detect_part(self, part: NDArray[np.uint8], spent: NDArray[np.float64]) -> Detections:

@@ -35,7 +35,6 @@ from companion.settings.reading import load_settings
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3, VehicleState
 from mavlink_sim.lockstep import COMPANION, LockstepVehicle, Truth
-from vision.camera_model import CameraModel, CameraMount
 from vision.pipeline import PerceptionResult
 
 TICK_S = 0.01
@@ -384,33 +383,6 @@ class LockstepFlight:
 def plain_settings(changes: Mapping[str, str] | None = None) -> Settings:
     """The default settings with changes, whatever is configured on this machine."""
     return load_settings(os.devnull, dict(changes or {}), {})
-
-
-def camera_settings(
-    camera: CameraModel, mount: CameraMount, changes: Mapping[str, str] | None = None
-) -> Settings:
-    """The same for a calibrated camera that is mounted so.
-
-    The network computes in float32: `auto` measures, and would select another precision on another machine.
-    """
-    values = {
-        "detector.precision": "float32",
-        "camera.fx_px": camera.fx,
-        "camera.fy_px": camera.fy,
-        "camera.cx_px": camera.cx,
-        "camera.cy_px": camera.cy,
-        "camera.calibrated_width": camera.width,
-        "camera.calibrated_height": camera.height,
-        "camera.mount_forward_m": mount.forward_m,
-        "camera.mount_right_m": mount.right_m,
-        "camera.mount_down_m": mount.down_m,
-        "camera.mount_roll_deg": math.degrees(mount.roll_rad),
-        "camera.mount_pitch_deg": math.degrees(mount.pitch_rad),
-        "camera.mount_yaw_deg": math.degrees(mount.yaw_rad),
-        "camera.stabilized": str(mount.stabilized).lower(),
-        "camera.on_gimbal": str(mount.on_gimbal).lower(),
-    }
-    return plain_settings({key: str(value) for key, value in values.items()} | dict(changes or {}))
 
 
 class _Turn(Behaviour):

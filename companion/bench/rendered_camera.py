@@ -3,30 +3,20 @@
 from __future__ import annotations
 
 import contextlib
-import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-
-import numpy as np
+from collections.abc import Callable
+from dataclasses import replace
 
 from companion.bench.lockstep_flight import LockstepFlight
 from companion.bench.rendered_perception import RenderedPerception
-from companion.bench.synthetic_detector import SceneObject
 from companion.guidance.targets.from_detections import HistoryError, StateHistory
 from companion.perception.cameras import PerceptionCamera
 from companion.settings import Settings
-from companion.vehicle.state import Vector3, VehicleState
-from mavlink_sim.camera.depth_camera import DepthSensor
+from companion.vehicle.state import VehicleState
 from mavlink_sim.camera.renderer import Rendered
-from mavlink_sim.camera.scene import CameraSettings, Scene
+from mavlink_sim.camera.scene import Scene
 from mavlink_sim.lockstep import LockstepVehicle
-from mavlink_sim.world.world import Ground, Light, Sky, World, WorldObject
-from vision.camera_model import CameraModel, CameraMount
 from vision.pipeline import PerceptionResult
 from vision.tracking import SelectRequest
-
-# Where what is hidden is taken to.
-AWAY_M = 2000.0
 
 
 class RenderedCamera:
@@ -93,39 +83,3 @@ class RenderedCamera:
             return result
 
         return finish
-
-
-def rendered_scene(
-    objects: Sequence[SceneObject], camera: CameraModel, mount: CameraMount, seed: int, *, depth: bool = False
-) -> tuple[Scene, tuple[SceneObject, ...]]:
-    """The objects on a field, and the same with the sizes of those that are drawn, in their order.
-
-    Args:
-        objects: of classes that can be drawn; one that is hidden is taken away meanwhile.
-        depth: the camera is a stereo camera with depth; False: its frames have none.
-    """
-    rng = np.random.default_rng((seed, 73))
-    drawn, sized = [], []
-    for number, item in enumerate(objects):
-        thing = WorldObject(number, item.class_name, (0.0, 0.0, 0.0), appearance=int(rng.integers(2**31)))
-        rear, front, left, right = thing.footprint_m
-        drawn.append(thing)
-        sized.append(replace(item, size_m=(front - rear, right - left, item.size_m[2])))
-    ground = Ground(("meadow", "grass"), seed, 1024, 0.08)
-    world = World(tuple(drawn), ground, Light(float(rng.uniform(-math.pi, math.pi))), Sky(seed=seed))
-    motions = {number: _ObjectMotion(item) for number, item in enumerate(objects)}
-    sensor = DepthSensor() if depth else None
-    settings = CameraSettings(model=camera, mount=mount, depth=sensor, seed=seed)
-    return Scene(world, motions, settings, "campaign"), tuple(sized)
-
-
-@dataclass(frozen=True, slots=True)
-class _ObjectMotion:
-    item: SceneObject
-    speed_mps: float = 0.0  # nothing runs into it
-    period_s: float = 0.0
-
-    def pose_at(self, time_s: float) -> tuple[Vector3, float]:
-        pose = self.item.pose(time_s)
-        away_m = AWAY_M if self.item.hidden(time_s) else 0.0
-        return (pose.north_m + away_m, pose.east_m, 0.0), pose.yaw_rad

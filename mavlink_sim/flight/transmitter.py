@@ -16,16 +16,6 @@ LOWEST_US, CENTRE_US, HIGHEST_US = 1000, 1500, 2000
 DEAD_ZONE_US = 10  # RCn_DZ
 CHANNELS = 18  # of RC_CHANNELS and RC_CHANNELS_OVERRIDE
 MODE_SLOTS = 6
-# RC_MAP_* of the usual order of channels; a vehicle without calibration has none, and ignores the sticks.
-CALIBRATION: dict[str, float] = {
-    "RC_MAP_ROLL": 1,
-    "RC_MAP_PITCH": 2,
-    "RC_MAP_THROTTLE": 3,
-    "RC_MAP_YAW": 4,
-    "RC_MAP_FLTMODE": 5,
-    "RC_MAP_KILL_SW": 6,
-    "RC_MAP_RETURN_SW": 7,
-}
 TRANSMITTER_CHANNELS = 8
 
 # COM_FLTMODE1..6

@@ -43,6 +43,3 @@ class LocalFrame:
             (longitude_deg - HOME_LONGITUDE_DEG) * _METRES_PER_DEGREE * _LONGITUDE_SCALE - self.east_m,
             HOME_ALTITUDE_M - altitude_m,
         )
-
-
-SIH_FRAME = LocalFrame()

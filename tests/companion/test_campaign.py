@@ -17,8 +17,8 @@ import pytest
 from typer.testing import CliRunner
 
 from benchmarks import flights, geolocation
+from benchmarks.rendered import camera_settings
 from companion.bench import demo_flight
-from companion.bench.lockstep_flight import camera_settings
 from companion.campaign import MAX_RETRIES, ClusterError, SeedError, map_seeds, seeds_of
 from companion.cli import app
 from companion.settings import Settings

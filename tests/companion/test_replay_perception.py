@@ -13,8 +13,9 @@ import cv2
 import numpy as np
 import pytest
 
-from companion.bench.lockstep_flight import LockstepFlight, camera_settings
-from companion.bench.rendered_camera import RenderedCamera, rendered_scene
+from benchmarks.rendered import camera_settings, rendered_scene
+from companion.bench.lockstep_flight import LockstepFlight
+from companion.bench.rendered_camera import RenderedCamera
 from companion.bench.synthetic_detector import SceneObject, ScenePose
 from companion.bus.messages import ModelIdentity
 from companion.bus.topics import STATUS

@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 
 import pytest
 
+from mavlink_sim.physics.geography import LocalFrame
 from mavlink_sim.vehicles.vehicle import STEP_S, Vehicle
 from mavlink_sim.wire import setpoints
 from mavlink_sim.wire.messages import dialect
@@ -29,6 +30,17 @@ FAST_STREAMS = {
     if rate_hz > FAST_HZ
 }
 EVERYTHING = "everything"
+SIH_FRAME = LocalFrame()
+# RC_MAP_* of the usual order of channels; a vehicle without calibration has none, and ignores the sticks.
+CALIBRATION: dict[str, float] = {
+    "RC_MAP_ROLL": 1,
+    "RC_MAP_PITCH": 2,
+    "RC_MAP_THROTTLE": 3,
+    "RC_MAP_YAW": 4,
+    "RC_MAP_FLTMODE": 5,
+    "RC_MAP_KILL_SW": 6,
+    "RC_MAP_RETURN_SW": 7,
+}
 
 
 class SimHarness:

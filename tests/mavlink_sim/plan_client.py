@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from mavlink_sim.physics.geography import SIH_FRAME
 from mavlink_sim.wire.messages import dialect
-from tests.mavlink_sim.conftest import SimHarness
+from tests.mavlink_sim.conftest import SIH_FRAME, SimHarness
 
 NAN = math.nan
 COMPANION = (1, 191)

@@ -27,8 +27,8 @@ from mavsdk.asyncio.plugins.offboard import (
 from mavsdk.asyncio.plugins.param import ParamAsync, ParamError
 from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
 
-from mavlink_sim.flight.transmitter import CALIBRATION
 from mavlink_sim.testing import RunningSimulator, running_simulator, vehicle
+from tests.mavlink_sim.conftest import CALIBRATION
 from tests.mavlink_sim.mavsdk_client import MavsdkClient, mavsdk_client, meanwhile, wait_for
 
 pytestmark = pytest.mark.realtime

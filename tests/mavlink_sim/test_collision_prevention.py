@@ -17,10 +17,10 @@ from mavlink_sim.flight.collision_prevention import (
     ObstacleMap,
     limited_acceleration,
 )
-from mavlink_sim.flight.transmitter import CALIBRATION, Sticks
+from mavlink_sim.flight.transmitter import Sticks
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.messages import dialect
-from tests.mavlink_sim.conftest import SimHarness, velocity_setpoint
+from tests.mavlink_sim.conftest import CALIBRATION, SimHarness, velocity_setpoint
 from tests.mavlink_sim.plan_client import listen
 
 FAR_CM = 2100  # nothing within the 20 m of the sensor

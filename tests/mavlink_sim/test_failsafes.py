@@ -5,13 +5,13 @@ from __future__ import annotations
 import pytest
 
 from mavlink_sim.autopilot.failsafes import Action, Conditions, FailsafeMachine
-from mavlink_sim.flight.transmitter import CALIBRATION, Sticks
+from mavlink_sim.flight.transmitter import Sticks
 from mavlink_sim.physics.battery import BatteryWarning
 from mavlink_sim.px4.modes import Mode
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.announcements import Text, event_identifier
 from mavlink_sim.wire.messages import dialect
-from tests.mavlink_sim.conftest import SimHarness, velocity_setpoint
+from tests.mavlink_sim.conftest import CALIBRATION, SimHarness, velocity_setpoint
 
 GROUND_STATION = (245, 190)
 REMOTE_CONTROL = {**CALIBRATION, "COM_RC_IN_MODE": 0, "COM_FLTMODE1": 2, "COM_FLTMODE4": 4}

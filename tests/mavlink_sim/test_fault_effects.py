@@ -7,9 +7,8 @@ from typing import Any
 
 import pytest
 
-from mavlink_sim.physics.geography import SIH_FRAME
 from mavlink_sim.wire.messages import dialect
-from tests.mavlink_sim.conftest import SimHarness, position_setpoint, velocity_setpoint
+from tests.mavlink_sim.conftest import SIH_FRAME, SimHarness, position_setpoint, velocity_setpoint
 
 DO_SET_MODE, LAND, ARM, REQUEST_MESSAGE = 176, 21, 400, 512
 

@@ -8,9 +8,8 @@ import pytest
 
 from mavlink_sim import LockstepVehicle
 from mavlink_sim.missions.items import MissionItem
-from mavlink_sim.physics.geography import SIH_FRAME
 from mavlink_sim.wire.messages import dialect
-from tests.mavlink_sim.conftest import SimHarness, position_setpoint
+from tests.mavlink_sim.conftest import SIH_FRAME, SimHarness, position_setpoint
 from tests.mavlink_sim.plan_client import land, takeoff, upload, waypoint
 
 SET_HOME = 179

@@ -11,9 +11,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from mavlink_sim.missions.geofence import Area, inside_polygon
-from mavlink_sim.physics.geography import SIH_FRAME
 from mavlink_sim.wire.announcements import event_identifier
-from tests.mavlink_sim.conftest import SimHarness, velocity_setpoint
+from tests.mavlink_sim.conftest import SIH_FRAME, SimHarness, velocity_setpoint
 from tests.mavlink_sim.plan_client import circle, listen, polygon, upload
 
 FENCE = [(-20.0, -20.0), (-20.0, 20.0), (20.0, 20.0), (20.0, -20.0)]

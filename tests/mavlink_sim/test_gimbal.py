@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mavlink_sim.physics.geography import SIH_FRAME
 from mavlink_sim.physics.gimbal import Aim, Gimbal, Target
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.realtime.options import SimulationOptions
@@ -18,7 +17,7 @@ from mavlink_sim.realtime.sim_outputs import camera_turn_rad
 from mavlink_sim.realtime.simulation import Simulation
 from mavlink_sim.testing import free_udp_ports
 from mavlink_sim.wire.messages import dialect
-from tests.mavlink_sim.conftest import SimHarness
+from tests.mavlink_sim.conftest import SIH_FRAME, SimHarness
 from vision.attitude import quaternion_from_euler
 from vision.rotation import matrix_from_quaternion
 

@@ -15,9 +15,9 @@ from mavlink_sim.flight.setpoints import (
     trajectory_setpoint,
 )
 from mavlink_sim.physics.airframe import LINEAR_DRAG_PER_S
-from mavlink_sim.physics.geography import HOME_ALTITUDE_M, SIH_FRAME
+from mavlink_sim.physics.geography import HOME_ALTITUDE_M
 from mavlink_sim.wire.messages import dialect
-from tests.mavlink_sim.conftest import SimHarness
+from tests.mavlink_sim.conftest import SIH_FRAME, SimHarness
 
 pytestmark = pytest.mark.streams("POSITION_TARGET_LOCAL_NED")
 

@@ -17,11 +17,12 @@ from mavlink_sim.flight.manual_flight import (
     throttle_curve,
     with_dead_zone,
 )
-from mavlink_sim.flight.transmitter import CALIBRATION, Sticks
+from mavlink_sim.flight.transmitter import Sticks
 from mavlink_sim.physics.airframe import GRAVITY_MPS2, MAX_THRUST_MPS2, Multirotor
 from mavlink_sim.px4.modes import Mode
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.vehicles.vehicle import Vehicle
+from tests.mavlink_sim.conftest import CALIBRATION
 
 REMOTE_CONTROL = {**CALIBRATION, "COM_RC_IN_MODE": 0}
 

@@ -19,8 +19,8 @@ from mavsdk.plugins.mission.mission import MissionItem, MissionPlan
 from mavsdk.plugins.mission_raw.mission_raw import MissionItem as RawItem
 from mavsdk.plugins.mission_raw.mission_raw import MissionRawError, MissionRawResult
 
-from mavlink_sim.physics.geography import SIH_FRAME
 from mavlink_sim.testing import RunningSimulator, running_simulator
+from tests.mavlink_sim.conftest import SIH_FRAME
 from tests.mavlink_sim.mavsdk_client import LIMIT_S, MavsdkClient, mavsdk_client, meanwhile, wait_for
 from tests.mavlink_sim.plan_client import item, land, polygon, rally, takeoff, waypoint
 

@@ -13,10 +13,9 @@ from hypothesis import strategies as st
 from mavlink_sim.missions.items import item_of
 from mavlink_sim.missions.plan import Mission
 from mavlink_sim.missions.return_flight import Goal, destination, mission_route
-from mavlink_sim.physics.geography import SIH_FRAME
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.messages import dialect
-from tests.mavlink_sim.conftest import SimHarness
+from tests.mavlink_sim.conftest import SIH_FRAME, SimHarness
 from tests.mavlink_sim.plan_client import (
     NAN,
     RETURN,

@@ -9,11 +9,12 @@ import pytest
 
 from mavlink_sim.camera.scene import Path, Scene
 from mavlink_sim.flight.collision_prevention import UNKNOWN_CM
-from mavlink_sim.flight.transmitter import CALIBRATION, Sticks
+from mavlink_sim.flight.transmitter import Sticks
 from mavlink_sim.lockstep import LockstepVehicle
 from mavlink_sim.physics.obstacle_sensor import NOISE_M, NOTHING_CM
 from mavlink_sim.wire.streams import GCS_RATES_HZ, ONBOARD_RATES_HZ
 from mavlink_sim.world.world import World, WorldObject
+from tests.mavlink_sim.conftest import CALIBRATION
 
 OBSTACLE_DISTANCE = 330
 REQUEST_MESSAGE, SET_MESSAGE_INTERVAL, GET_MESSAGE_INTERVAL = 512, 511, 510

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mavlink_sim.flight.orbit import Orbit
-from mavlink_sim.physics.geography import HOME_ALTITUDE_M, SIH_FRAME
+from mavlink_sim.physics.geography import HOME_ALTITUDE_M
 from mavlink_sim.wire.messages import dialect
-from tests.mavlink_sim.conftest import SimHarness
+from tests.mavlink_sim.conftest import SIH_FRAME, SimHarness
 
 NAN = math.nan
 CENTRE = (12.0, 5.0, 0.0)

@@ -9,19 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mavlink_sim.autopilot.manual_control import ManualControl, RequestKind, Source
-from mavlink_sim.flight.transmitter import (
-    CALIBRATION,
-    Sticks,
-    Switches,
-    Transmitter,
-    read_sticks,
-    read_switches,
-)
+from mavlink_sim.flight.transmitter import Sticks, Switches, Transmitter, read_sticks, read_switches
 from mavlink_sim.px4.modes import Mode
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.announcements import event_identifier
 from mavlink_sim.wire.messages import dialect
-from tests.mavlink_sim.conftest import SimHarness
+from tests.mavlink_sim.conftest import CALIBRATION, SimHarness
 
 JOYSTICK = {"COM_RC_IN_MODE": 1}
 REMOTE_CONTROL = {**CALIBRATION, "COM_RC_IN_MODE": 0, "COM_FLTMODE1": 2, "COM_FLTMODE4": 4, "COM_FLTMODE6": 8}

@@ -8,10 +8,10 @@ from hypothesis import strategies as st
 
 from mavlink_sim.flight.tasks import reposition_goal
 from mavlink_sim.physics.airframe import Multirotor
-from mavlink_sim.physics.geography import HOME_ALTITUDE_M, SIH_FRAME
+from mavlink_sim.physics.geography import HOME_ALTITUDE_M
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.messages import dialect
-from tests.mavlink_sim.conftest import SimHarness, velocity_setpoint
+from tests.mavlink_sim.conftest import SIH_FRAME, SimHarness, velocity_setpoint
 
 NAN = math.nan
 CHANGE_MODE = 1.0

@@ -11,8 +11,9 @@ from mavsdk.asyncio.plugins.offboard import Attitude, AttitudeRate, OffboardAsyn
 from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
 
 from mavlink_sim.physics.airframe import GRAVITY_MPS2, MAX_THRUST_MPS2
-from mavlink_sim.physics.geography import HOME_ALTITUDE_M, SIH_FRAME
+from mavlink_sim.physics.geography import HOME_ALTITUDE_M
 from mavlink_sim.testing import RunningSimulator
+from tests.mavlink_sim.conftest import SIH_FRAME
 from tests.mavlink_sim.mavsdk_client import mavsdk_client, wait_for
 
 pytestmark = pytest.mark.realtime

@@ -11,9 +11,8 @@ from mavlink_sim.autopilot.ground_contact import RAMP_CREEP_MPS, GroundContact, 
 from mavlink_sim.flight import tasks as flight
 from mavlink_sim.flight.position_control import TrajectorySetpoint
 from mavlink_sim.physics.airframe import GRAVITY_MPS2, Multirotor
-from mavlink_sim.physics.geography import SIH_FRAME
 from mavlink_sim.px4.parameters import Parameters
-from tests.mavlink_sim.conftest import SimHarness, velocity_setpoint
+from tests.mavlink_sim.conftest import SIH_FRAME, SimHarness, velocity_setpoint
 
 NAN = math.nan
 

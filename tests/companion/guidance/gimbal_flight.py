@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from companion.bench.lockstep_flight import LockstepFlight, camera_settings
+from benchmarks.rendered import camera_settings
+from companion.bench.lockstep_flight import LockstepFlight
 from companion.bench.synthetic_camera import SyntheticCamera
 from companion.bench.synthetic_detector import Faults, SceneObject, ScenePose, SyntheticDetector
 from companion.guidance.search_pattern import Footprint

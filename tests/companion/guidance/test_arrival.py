@@ -12,7 +12,8 @@ from typing import TypedDict
 
 import pytest
 
-from companion.bench.lockstep_flight import LockstepFlight, Moment, camera_settings, plain_settings
+from benchmarks.rendered import camera_settings
+from companion.bench.lockstep_flight import LockstepFlight, Moment, plain_settings
 from companion.bench.simulated_driver import RATES_HZ, SimulatedDriver
 from companion.bench.synthetic_camera import SyntheticCamera
 from companion.bench.synthetic_detector import SceneObject, ScenePose, SyntheticDetector

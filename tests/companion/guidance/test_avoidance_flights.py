@@ -7,7 +7,8 @@ import math
 import pytest
 
 from benchmarks.flights_forest import CAMERA, SENSOR, Map, forest, run
-from companion.bench.lockstep_flight import FlightLog, LockstepFlight, camera_settings
+from benchmarks.rendered import camera_settings
+from companion.bench.lockstep_flight import FlightLog, LockstepFlight
 from companion.bench.rendered_camera import RenderedCamera
 from mavlink_sim.camera.depth_camera import DepthSensor
 from mavlink_sim.camera.scene import CameraSettings, Scene

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 
 import pytest
 
-from companion.bench.lockstep_flight import LockstepFlight, camera_settings
-from companion.bench.rendered_camera import RenderedCamera, rendered_scene
+from benchmarks.rendered import camera_settings, rendered_scene
+from companion.bench.lockstep_flight import LockstepFlight
+from companion.bench.rendered_camera import RenderedCamera
 from companion.bench.synthetic_detector import SceneObject, ScenePose
 from mavlink_sim.lockstep import LockstepVehicle
 from vision.camera_model import CameraModel, CameraMount

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from companion.bench.lockstep_flight import FlightLog, LockstepFlight, camera_settings
+from benchmarks.rendered import camera_settings
+from companion.bench.lockstep_flight import FlightLog, LockstepFlight
 from companion.bench.rendered_camera import RenderedCamera
 from companion.guidance.command import NO_CONTEXT, GrammarError
 from companion.guidance.grammar import json_schema, parse

@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from companion.bench.lockstep_flight import TICK_S, LockstepFlight, camera_settings
+from benchmarks.rendered import camera_settings
+from companion.bench.lockstep_flight import TICK_S, LockstepFlight
 from companion.bench.rendered_camera import RenderedCamera
 from companion.geometry.geodesy import latitude_longitude
 from companion.guidance.targets.from_detections import StateHistory

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.bench.lockstep_flight import camera_settings
+from benchmarks.rendered import camera_settings
 from companion.guidance.targets.from_detections import StateHistory
 from companion.guidance.targets.from_map import VisionGate
 from companion.guidance.targets.from_markers import LocalizedMarkers

@@ -11,15 +11,17 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common
 
 from benchmarks.flights_obstacles import CAMERA, MOUNT
-from companion.bench.lockstep_flight import LockstepFlight, camera_settings
+from benchmarks.rendered import camera_settings
+from companion.bench.lockstep_flight import LockstepFlight
 from companion.bench.rendered_camera import RenderedCamera
 from companion.vehicle.driver import Driver
 from companion.vehicle.obstacle_distance import MAXIMUM_CM, UNKNOWN_CM, obstacle_distance_fields
 from mavlink_sim.camera.depth_camera import DepthSensor
 from mavlink_sim.camera.scene import CameraSettings, Scene
-from mavlink_sim.flight.transmitter import CALIBRATION, Sticks
+from mavlink_sim.flight.transmitter import Sticks
 from mavlink_sim.world.world import World, WorldObject
 from tests.companion.vehicle.fake_autopilot import FakeAutopilot, wait_for_state
+from tests.mavlink_sim.conftest import CALIBRATION
 from vision.obstacle_sectors import SECTORS, ObstacleSectors
 
 # In wire order: time_usec, distances, min_distance, max_distance, sensor_type, increment, then the extension

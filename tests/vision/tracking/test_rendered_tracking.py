@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from benchmarks.clear_mot import MotScore, clear_mot
 from benchmarks.scenes import MOTIONS, Motion, SyntheticDetector, scene_frames, without_image
 from benchmarks.tracking import Seen, attitudes_of, no_tracking, tracked
 from vision.tracking import TrackerSettings
-from vision.tracking.clear_mot import MotScore, clear_mot
 
 SECONDS, RATE_HZ = 5.0, 10.0
 SETTINGS = TrackerSettings()

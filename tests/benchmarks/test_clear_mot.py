@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from vision.tracking.clear_mot import Labelled, MotScore, clear_mot
+from benchmarks.clear_mot import Labelled, MotScore, clear_mot
 
 Frame = tuple[dict[int, float], dict[int, float]]
 

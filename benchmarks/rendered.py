@@ -1,0 +1,84 @@
+"""Settings and scenes of flights in lockstep with a calibrated, rendered camera."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from companion.bench.lockstep_flight import plain_settings
+from companion.bench.synthetic_detector import SceneObject
+from companion.settings import Settings
+from companion.vehicle.state import Vector3
+from mavlink_sim.camera.depth_camera import DepthSensor
+from mavlink_sim.camera.scene import CameraSettings, Scene
+from mavlink_sim.world.world import Ground, Light, Sky, World, WorldObject
+from vision.camera_model import CameraModel, CameraMount
+
+# Where what is hidden is taken to.
+AWAY_M = 2000.0
+
+
+def camera_settings(
+    camera: CameraModel, mount: CameraMount, changes: Mapping[str, str] | None = None
+) -> Settings:
+    """The default settings for a calibrated camera that is mounted so, with changes.
+
+    The network computes in float32: `auto` measures, and would select another precision on another machine.
+    """
+    values = {
+        "detector.precision": "float32",
+        "camera.fx_px": camera.fx,
+        "camera.fy_px": camera.fy,
+        "camera.cx_px": camera.cx,
+        "camera.cy_px": camera.cy,
+        "camera.calibrated_width": camera.width,
+        "camera.calibrated_height": camera.height,
+        "camera.mount_forward_m": mount.forward_m,
+        "camera.mount_right_m": mount.right_m,
+        "camera.mount_down_m": mount.down_m,
+        "camera.mount_roll_deg": math.degrees(mount.roll_rad),
+        "camera.mount_pitch_deg": math.degrees(mount.pitch_rad),
+        "camera.mount_yaw_deg": math.degrees(mount.yaw_rad),
+        "camera.stabilized": str(mount.stabilized).lower(),
+        "camera.on_gimbal": str(mount.on_gimbal).lower(),
+    }
+    return plain_settings({key: str(value) for key, value in values.items()} | dict(changes or {}))
+
+
+def rendered_scene(
+    objects: Sequence[SceneObject], camera: CameraModel, mount: CameraMount, seed: int, *, depth: bool = False
+) -> tuple[Scene, tuple[SceneObject, ...]]:
+    """The objects on a field, and the same with the sizes of those that are drawn, in their order.
+
+    Args:
+        objects: of classes that can be drawn; one that is hidden is taken away meanwhile.
+        depth: the camera is a stereo camera with depth; False: its frames have none.
+    """
+    rng = np.random.default_rng((seed, 73))
+    drawn, sized = [], []
+    for number, item in enumerate(objects):
+        thing = WorldObject(number, item.class_name, (0.0, 0.0, 0.0), appearance=int(rng.integers(2**31)))
+        rear, front, left, right = thing.footprint_m
+        drawn.append(thing)
+        sized.append(replace(item, size_m=(front - rear, right - left, item.size_m[2])))
+    ground = Ground(("meadow", "grass"), seed, 1024, 0.08)
+    world = World(tuple(drawn), ground, Light(float(rng.uniform(-math.pi, math.pi))), Sky(seed=seed))
+    motions = {number: _ObjectMotion(item) for number, item in enumerate(objects)}
+    sensor = DepthSensor() if depth else None
+    settings = CameraSettings(model=camera, mount=mount, depth=sensor, seed=seed)
+    return Scene(world, motions, settings, "campaign"), tuple(sized)
+
+
+@dataclass(frozen=True, slots=True)
+class _ObjectMotion:
+    item: SceneObject
+    speed_mps: float = 0.0  # nothing runs into it
+    period_s: float = 0.0
+
+    def pose_at(self, time_s: float) -> tuple[Vector3, float]:
+        pose = self.item.pose(time_s)
+        away_m = AWAY_M if self.item.hidden(time_s) else 0.0
+        return (pose.north_m + away_m, pose.east_m, 0.0), pose.yaw_rad
