@@ -47,7 +47,7 @@ DEFAULT_WORLDS = 20
 ALTITUDES_M = ((1.5, 40.0), (2.0, 8.0))
 """Half of a scene's frames are taken anywhere, half as low as flights search."""
 RANGES_M = (0.0, 2.0, 3.0, 6.0, 15.0, 30.0, 70.0)
-"""Recall is told for each of these ranges."""
+"""Recall is printed for each of these ranges."""
 SAME_PLACE_IOU = 0.3
 """A wrong detection is ascribed to what it overlaps by so much, else to the background."""
 
