@@ -276,7 +276,9 @@ class Behaviour(ABC):
 
     def take_notes(self) -> Sequence[str]:
         """Notes for people since the last call."""
-        notes, self._new_notes = self._new_notes, []
+        if not self._new_notes:  # nothing is assigned: the behaviour may be frozen
+            return ()
+        notes, self._new_notes = self._new_notes, ()
         return notes
 
     @property

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import pytest
 
@@ -290,6 +291,21 @@ class Curious(Behaviour):
     def update(self, dt_s: float, context: BehaviourContext) -> Setpoint:
         self.seen.append((dt_s, context.sent))
         return Setpoint.velocity((9.0, 0.0, 0.0), context.now_ns)
+
+
+@dataclass(frozen=True)
+class Steady(Behaviour):
+    name = "steady"
+
+    def update(self, dt_s: float, context: BehaviourContext) -> Setpoint:
+        return Setpoint.velocity((1.0, 0.0, 0.0), context.now_ns)
+
+
+def test_behaviour_may_be_a_frozen_dataclass() -> None:
+    harness = GuidanceHarness(flying())
+    harness.command(Steady())
+    harness.run(1.0)
+    assert harness.guidance.behaviour == Steady()
 
 
 def test_sent_setpoint_is_passed_to_the_behaviour() -> None:
