@@ -20,8 +20,9 @@ from companion.vehicle.streamer import SILENCE_S, StreamState
 # The vehicle may show the old mode for this long after acknowledging a new one: a heartbeat period and more.
 SHOW_DELAY_S = 2.0
 # PX4 ends a take-off inside NAV_MC_ALT_RAD, 0.8 m by default; the two height estimates differ by some more. A
-# hold further below the wanted height was requested by a pilot.
-DEFAULT_ACCEPTANCE_M, HEIGHT_MARGIN_M = 0.8, 0.5
+# hold further below the wanted height was requested by a pilot. PX4 allows up to 200 m: above the largest
+# value here it is no sign of how a take-off ended.
+DEFAULT_ACCEPTANCE_M, LARGEST_ACCEPTANCE_M, HEIGHT_MARGIN_M = 0.8, 2.0, 0.5
 # The autopilot reports a failsafe within this time of its change of mode.
 REPORT_WINDOW_S = 1.0
 # Of a vehicle that may have landed.
@@ -44,7 +45,7 @@ class Authority:
         self._leaving: set[FlightMode] = set()
         self._leaving_until_ns: float = 0
         self._dropped: dict[FlightMode, float] = {}
-        self._takeoff_altitude_m = 0.0
+        self._takeoff_altitude_m = self._begun_altitude_m = 0.0
         self._acceptance_m: float | None = None
         self._was_armed = False
         self._failsafe_before = False
@@ -62,7 +63,7 @@ class Authority:
         self._leaving = set()
         self._leaving_until_ns = 0
         self._dropped = {}
-        self._takeoff_altitude_m = state.altitude_m or 0.0
+        self._takeoff_altitude_m = self._begun_altitude_m = state.altitude_m or 0.0
         self._was_armed = state.armed
         self._failsafe_before = state.failsafe
 
@@ -78,6 +79,8 @@ class Authority:
         if mode is FlightMode.TAKEOFF:
             self._leaving |= {FlightMode.HOLD}
             self._takeoff_altitude_m = altitude_m if altitude_m is not None else 0.0
+            # Not below home: where the height has drifted, arming moves home.
+            self._begun_altitude_m = max(state.altitude_m or 0.0, 0.0)
             # From the ground, disarmed after our own landing.
             self._was_armed = state.armed
         self._mode = mode
@@ -116,6 +119,8 @@ class Authority:
             altitude_acceptance_m: as in `GuidanceInput`.
         """
         self._acceptance_m = altitude_acceptance_m
+        if altitude_acceptance_m is not None and not 0.0 <= altitude_acceptance_m <= LARGEST_ACCEPTANCE_M:
+            self._acceptance_m = None  # NaN too
         shown = sent if state.mode is self._mode else None
         ignored = self.monitor.update(shown, state, landing=landing)
         if self._mode is None:
@@ -130,7 +135,7 @@ class Authority:
         if not explained:
             # A pilot's change also changes the intended mode; a failsafe keeps the one we requested.
             by_itself = state.intended_beside is state.mode and state.intended_mode is self._mode
-            if not by_itself and self._may_have_finished(state):
+            if not by_itself and self._may_have_finished(state, now_ns):
                 short_m = self._short_m(state)
                 return (
                     f"the take-off ended {short_m:.1f} m short: a pilot or the autopilot changed to hold mode"
@@ -197,20 +202,29 @@ class Authority:
             asking = self._leaving_until_ns == float("inf")  # a pilot's mode must not be asked away
             unknown = not asking and _may_have_landed(state) and state.heartbeat_ns <= self._changed_ns
             return unknown or not state.armed or state.landed is LandedState.ON_GROUND
-        if self._holds_after_takeoff(state):
-            acceptance_m = DEFAULT_ACCEPTANCE_M if self._acceptance_m is None else self._acceptance_m
-            return self._short_m(state) <= acceptance_m + HEIGHT_MARGIN_M
+        if self._holds_after_takeoff(state, now_ns):
+            # More than half of the climb is missing: PX4's end only where the climb is low.
+            half_m = (self._takeoff_altitude_m - self._begun_altitude_m) / 2.0
+            return self._short_m(state) <= min(self._reach_m, max(half_m, DEFAULT_ACCEPTANCE_M))
         return False
 
-    def _holds_after_takeoff(self, state: VehicleState) -> bool:
-        return FlightMode.TAKEOFF in (self._mode, *self._leaving) and state.mode is FlightMode.HOLD
+    def _holds_after_takeoff(self, state: VehicleState, now_ns: int) -> bool:
+        leaving = FlightMode.TAKEOFF in self._leaving and now_ns <= self._leaving_until_ns
+        return (self._mode is FlightMode.TAKEOFF or leaving) and state.mode is FlightMode.HOLD
+
+    @property
+    def _reach_m(self) -> float:
+        """How far below the wanted height PX4 may end a take-off."""
+        acceptance_m = DEFAULT_ACCEPTANCE_M if self._acceptance_m is None else self._acceptance_m
+        return acceptance_m + HEIGHT_MARGIN_M
 
     def _short_m(self, state: VehicleState) -> float:
         return self._takeoff_altitude_m - (state.altitude_m or 0.0)
 
-    def _may_have_finished(self, state: VehicleState) -> bool:
-        """Whether a short take-off may be PX4's own: where it accepts the height is not known."""
-        return self._acceptance_m is None and state.autopilot == "PX4" and self._holds_after_takeoff(state)
+    def _may_have_finished(self, state: VehicleState, now_ns: int) -> bool:
+        """Whether a short take-off may be PX4's own: it accepts the height there, or where is not known."""
+        accepted = self._acceptance_m is None or self._short_m(state) <= self._reach_m
+        return accepted and state.autopilot == "PX4" and self._holds_after_takeoff(state, now_ns)
 
 
 def silence(stream: StreamState, state: VehicleState, paused_s: float) -> str | None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 
 from companion.bench.lockstep_flight import LockstepFlight, plain_settings
 from companion.bench.simulated_driver import RATES_HZ, SimulatedDriver
-from companion.vehicle.state import LandedState
+from companion.guidance.behaviour import Outcome
+from companion.vehicle.state import FlightMode, LandedState
 from mavlink_sim.lockstep import LockstepVehicle
 from mavlink_sim.wire.messages import dialect
 
@@ -26,27 +29,102 @@ def test_takeoff_that_px4_ends_early_reaches_its_height() -> None:
     assert flight.state.altitude_m == pytest.approx(6.0, abs=0.3)
 
 
-@pytest.mark.parametrize(
-    ("acceptance_m", "reason"),
-    [
-        (1.6, "the pilot took over: hold mode"),
-        (None, "m short: a pilot or the autopilot changed to hold mode"),
-    ],
-)
-def test_hold_in_mid_takeoff_ends_the_command(acceptance_m: float | None, reason: str) -> None:
-    flight = on_ground(NAV_MC_ALT_RAD=1.6)  # 1.3 m short
-    flight.inputs.altitude_acceptance_m = acceptance_m
-    identifier = flight.command("takeoff 6")
-    assert flight.run_until(lambda: (flight.state.altitude_m or 0.0) > 2.5, 30.0)
-    hold_mode = dialect.MAVLink_command_long_message(
-        1, 1, dialect.MAV_CMD_DO_SET_MODE, 0, 1, 4, 3, 0, 0, 0, 0
+def pilot_selects(flight: LockstepFlight, auto_mode: int) -> None:
+    """A ground station requests an AUTO mode of PX4: 3 is HOLD, 6 is LAND."""
+    request = dialect.MAVLink_command_long_message(
+        1, 1, dialect.MAV_CMD_DO_SET_MODE, 0, 1, 4, auto_mode, 0, 0, 0, 0
     )
-    flight.vehicle.send(hold_mode, source=(255, 190))
-    assert flight.run_until(lambda: flight.outcome(identifier), 5.0)
+    flight.vehicle.send(request, source=(255, 190))
+
+
+def held_in_climb(flight: LockstepFlight, wanted_m: float, hold_m: float) -> tuple[float, Outcome]:
+    """A pilot's HOLD at a height of a take-off: how far it was short when it showed, and the outcome."""
+    identifier = flight.command(f"takeoff {wanted_m}")
+    assert flight.run_until(lambda: (flight.state.altitude_m or 0.0) > hold_m, 30.0)
+    assert flight.state.mode is FlightMode.TAKEOFF
+    pilot_selects(flight, 3)
+    assert flight.run_until(lambda: flight.state.mode is FlightMode.HOLD, 5.0)
+    short_m = wanted_m - (flight.state.altitude_m or 0.0)
+    assert flight.run_until(lambda: flight.outcome(identifier), 60.0)
     outcome = flight.outcome(identifier)
     assert outcome is not None
+    return short_m, outcome
+
+
+PILOT = "the pilot took over: hold mode"
+SOMEONE = "m short: a pilot or the autopilot changed to hold mode"
+
+
+@pytest.mark.parametrize(
+    ("acceptance_m", "wanted_m", "hold_m", "reason"),
+    [
+        (1.6, 6.0, 2.5, PILOT),
+        (None, 6.0, 2.5, SOMEONE),
+        *((not_used, 2.5, 0.5, SOMEONE) for not_used in (2.1, 200.0, math.inf, math.nan, -1.0)),
+        (2.0, 2.5, 0.5, SOMEONE),  # inside the radius, but less than half of the climb
+        (0.8, 2.5, 0.5, PILOT),
+        (0.8, 1.5, 0.5, SOMEONE),
+    ],
+)
+def test_hold_in_mid_takeoff_ends_the_command(
+    acceptance_m: float | None, wanted_m: float, hold_m: float, reason: str
+) -> None:
+    flight = on_ground()
+    flight.inputs.altitude_acceptance_m = acceptance_m
+    _, outcome = held_in_climb(flight, wanted_m, hold_m)
     assert not outcome.success
     assert outcome.reason.endswith(reason)
+    assert flight.state.mode is FlightMode.HOLD
+
+
+def test_hold_just_outside_the_acceptance_is_a_pilots() -> None:
+    flight = on_ground()
+    short_m, outcome = held_in_climb(flight, 6.0, 4.6)
+    assert 1.3 < short_m < 1.45
+    assert not outcome.success
+    assert outcome.reason == PILOT
+    assert flight.state.mode is FlightMode.HOLD
+
+
+def test_hold_just_inside_the_acceptance_is_px4s() -> None:
+    flight = on_ground()
+    short_m, outcome = held_in_climb(flight, 6.0, 4.75)
+    assert 1.15 < short_m < 1.3
+    assert outcome.success, outcome.reason
+    assert flight.state.altitude_m == pytest.approx(6.0, abs=0.3)
+
+
+@pytest.mark.parametrize(
+    ("after", "auto_mode", "shown"),
+    [
+        (FlightMode.HOLD, 6, FlightMode.LAND),
+        (FlightMode.OFFBOARD, 6, FlightMode.LAND),
+        (FlightMode.OFFBOARD, 3, FlightMode.HOLD),
+    ],
+)
+def test_pilot_stops_the_rest_of_a_takeoff(after: FlightMode, auto_mode: int, shown: FlightMode) -> None:
+    flight = on_ground()
+    identifier = flight.command("takeoff 6")
+    assert flight.run_until(lambda: (flight.state.altitude_m or 0.0) > 4.75, 30.0)
+    pilot_selects(flight, 3)
+    assert flight.run_until(lambda: flight.state.mode is after, 10.0)
+    assert flight.outcome(identifier) is None
+    pilot_selects(flight, auto_mode)
+    assert flight.run_until(lambda: flight.outcome(identifier), 3.0)
+    outcome = flight.outcome(identifier)
+    assert outcome is not None
+    assert outcome.reason == f"the pilot took over: {shown.value} mode"
+    flight.run(3.0)
+    assert flight.state.mode is shown
+
+
+@pytest.mark.parametrize("wanted_m", [1.0, 1.5, 2.5])
+def test_low_takeoff_reaches_its_height(wanted_m: float) -> None:
+    flight = on_ground()
+    outcome = flight.fly(f"takeoff {wanted_m}", 60.0).outcome
+    assert outcome is not None
+    assert outcome.success, outcome.reason
+    assert flight.state.altitude_m == pytest.approx(wanted_m, abs=0.3)
 
 
 @pytest.mark.parametrize("up_m", [0.73, -0.73])
