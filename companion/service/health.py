@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable, Sequence
 
+from companion.guidance.authority import DEFAULT_ACCEPTANCE_M
 from companion.guidance.core import Guidance
 from companion.perception.cameras import WorkerCamera
 from companion.service.inputs import InputAssembler
@@ -40,33 +42,49 @@ class Health:
         self._others, self._on_event = others, on_event
         self._heartbeat_due_ns = self._hud_due_ns = 0
         self._linked = False
+        self._link_count = 0
+        self._check_due = asyncio.Event()
 
     def healthy(self, now_ns: int) -> bool:
         """Whether every camera delivers results and the autopilot is connected."""
         return all(camera.seeing(now_ns) for camera in self._cameras) and self._driver.state.connected(now_ns)
 
+    async def run(self) -> None:
+        """Run `check` whenever the link has opened or returned, or the autopilot has restarted."""
+        while True:
+            await self._check_due.wait()
+            self._check_due.clear()
+            await self.check()
+
     async def check(self) -> None:
-        """Read the autopilot's parameters that matter here once, after the link has opened."""
+        """Read the autopilot's parameters that matter here."""
         autopilot = self._driver.state.autopilot
         if autopilot == "PX4":
-            self._inputs.altitude_acceptance_m = await self._parameter("NAV_MC_ALT_RAD")
-        timeout_s = await self._parameter("GUID_TIMEOUT") if autopilot == "ArduPilot" else None
+            assumed = f"{DEFAULT_ACCEPTANCE_M:g} m assumed"
+            self._inputs.altitude_acceptance_m = await self._parameter("NAV_MC_ALT_RAD", assumed)
+        timeout_s = None
+        if autopilot == "ArduPilot":
+            timeout_s = await self._parameter("GUID_TIMEOUT", "check that it is 1")
         if timeout_s is not None and timeout_s >= LONG_GUIDED_TIMEOUT_S:
             self._on_event(
                 "warning",
                 f"GUID_TIMEOUT is {timeout_s:g} s: ArduPilot flies on for that long on silence; set it to 1",
             )
 
-    async def _parameter(self, name: str) -> float | None:
-        """Return a parameter; None: it cannot be read, which is reported."""
+    async def _parameter(self, name: str, otherwise: str) -> float | None:
+        """Return a parameter; None: it cannot be read, which is reported with what follows."""
         try:
             return await self._driver.get_parameter(name)
         except CommandRefusedError as error:
-            self._on_event("warning", f"{name} cannot be read: {error}")
+            self._on_event("warning", f"{error}: {otherwise}")
             return None
 
     def after_step(self, now_ns: int, guidance: Guidance) -> None:
         """Run the periodic work; call after every step of guidance."""
+        if self._driver.link_count != self._link_count:
+            self._link_count = self._driver.link_count
+            self._inputs.altitude_acceptance_m = None  # it may have been changed meanwhile
+            self._check_due.set()
         linked = self._driver.state.connected(now_ns)
         if linked != self._linked:
             self._linked = linked

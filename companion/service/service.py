@@ -144,7 +144,7 @@ class Service:
                 self.driver.connect(self.settings.vehicle.connect_timeout_s),
                 *(camera.start() for camera in self.cameras),
             )
-            loops = [self._loop.run(), self.streamer.run(), self._publish_status(), self._health.check()]
+            loops = [self._loop.run(), self.streamer.run(), self._publish_status(), self._health.run()]
             loops.append(self._publisher.publish_vehicle(self.guidance, self.streamer, self.cameras))
             if self._console and all(terminal_is_free(camera.settings.source.uri) for camera in self.cameras):
                 console = run_console(self.command, self.stop, grammar.describe(), self._event, self._ask)

@@ -104,6 +104,7 @@ class AutopilotDriver(ABC):
         self._time_sent_ns = 0
         self._signs = False  # the autopilot's frames are signed
         self._only_heartbeats = True
+        self.link_count = 0
         self._streams: StreamRequests | None = None
         self._reports = ReportReader(
             self.url,
@@ -492,6 +493,7 @@ class AutopilotDriver(ABC):
         """Log when the autopilot goes silent, restarts and returns, and request its streams again then."""
         while True:
             self._telemetry.restarted.clear()
+            self.link_count += 1
             streams.restart()
             self._gimbal_commands.request_search()
             if not await self._wait_silent():

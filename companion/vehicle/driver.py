@@ -62,6 +62,10 @@ class Driver(Protocol):
         """Close the link. Never raises; can be called twice."""
 
     @property
+    def link_count(self) -> int:
+        """How often the link has opened, returned after silence, or the autopilot has restarted."""
+
+    @property
     def state(self) -> VehicleState:
         """The newest snapshot; a new object for every change."""
 

@@ -187,6 +187,7 @@ async def test_booting_heartbeat_is_a_restart(
     seen_ns = driver.state.heartbeat_ns
     await wait_until(lambda: driver.state.heartbeat_ns > seen_ns, 5.0)
     assert caplog.text.count("has restarted") == 1
+    assert driver.link_count == 2
 
 
 async def test_absent_streams_are_missing(driver: Driver, autopilot: FakeAutopilot) -> None:

@@ -126,6 +126,7 @@ async def test_driver_continues_after_a_vehicle_restart(
             with running_simulator(speed=4.0, onboard_port=first.onboard_port):
                 await wait_until(lambda: "received again" in caplog.text, 15.0)
                 await wait_for_state(driver, complete)
+                assert driver.link_count > 1
                 await driver.arm()
                 await driver.disarm()
     lines = [record.getMessage() for record in caplog.records]
