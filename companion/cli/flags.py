@@ -134,7 +134,7 @@ def settings_command(
 
     def register(command: Callable[..., None]) -> Callable[..., None]:
         kind = type("_WithSettings", (_WithSettings,), {"keys": keys, "make_epilog": staticmethod(epilog)})
-        return app.command(cls=kind)(_given_settings(command))
+        return app.command(cls=kind)(_given_settings(command, keys))
 
     return register
 
@@ -163,7 +163,7 @@ class _WithSettings(typer.core.TyperCommand):
             formatter.write(f"\n{text}\n")
 
 
-def _given_settings(command: Callable[..., None]) -> Callable[..., None]:
+def _given_settings(command: Callable[..., None], keys: tuple[str, ...]) -> Callable[..., None]:
     """Return the command with the signature for typer: without `settings`, with `--config`."""
     own = inspect.signature(command)
     hints = get_type_hints(command, include_extras=True)
@@ -172,10 +172,12 @@ def _given_settings(command: Callable[..., None]) -> Callable[..., None]:
     def wrapper(context: typer.Context, config_file: Path | None, **values: Any) -> None:
         given: dict[str, str | None] = context.meta[_GIVEN]
         overrides = {key: text for key, text in given.items() if text is not None}
-        # The command's own SOURCE, which a calibration file must fit.
-        uri = {"source.uri": values["source"]} if values.get("source") else {}
+        # The command's own SOURCE, if it is read with camera's lens; `preview` needs that for --level alone.
+        with_lens = "camera" in keys and values.get("level", True)
         with plain_errors(ConfigurationError):
-            settings = load_settings(config_file, uri | overrides)
+            settings = load_settings(
+                config_file, overrides, read_uri=values.get("source") if with_lens else None
+            )
         if "given" in own.parameters:
             values["given"] = overrides
         command(settings, **values)

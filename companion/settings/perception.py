@@ -222,8 +222,11 @@ class CameraSection(Section):
         )
 
 
-def check_calibration_file(values: Any, source: SourceSection) -> None:
+def check_calibration_file(values: Any, source: SourceSection, read_uri: str | None = None) -> None:
     """Check that `camera.calibration_file` in a table of sections is of the images of its source.
+
+    Args:
+        read_uri: a command's own source, which is read instead of `source.uri`.
 
     Raises:
         ValueError: it is of another camera, or of images that are turned otherwise.
@@ -231,7 +234,7 @@ def check_calibration_file(values: Any, source: SourceSection) -> None:
     camera = values.get("camera") if isinstance(values, dict) else None
     if isinstance(camera, dict) and isinstance(file := camera.get("calibration_file"), str):
         info = read_camera_info(Path(file).expanduser())
-        info.check_source(source.opening().orientation, source.name, source.uri)
+        info.check_source(source.opening().orientation, source.name, read_uri or source.uri)
 
 
 def lens_settings(lens: CameraModel) -> dict[str, Any]:

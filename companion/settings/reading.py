@@ -93,6 +93,7 @@ def load_settings(
     path: str | Path | None = None,
     overrides: Mapping[str, str] | None = None,
     environment: Mapping[str, str] | None = None,
+    read_uri: str | None = None,
 ) -> Settings:
     """Load the settings in effect.
 
@@ -101,6 +102,7 @@ def load_settings(
         overrides: dotted key → text, from flags. An empty text or `none` unsets an optional value; commas
             separate the items of a list.
         environment: `COMPANION_SECTION_KEY` → text; None: the process's own.
+        read_uri: the source that is read with `camera`'s lens, if it is not `source.uri`.
 
     Raises:
         ConfigurationError: with every problem found.
@@ -112,7 +114,7 @@ def load_settings(
     reading.take_environment(os.environ if environment is None else environment)
     for key, text in (overrides or {}).items():
         reading.take_text(key, text, "given as a flag")
-    return reading.settings()
+    return reading.settings(read_uri)
 
 
 def changed(settings: Settings, changes: Mapping[str, str]) -> Settings:
@@ -195,7 +197,7 @@ class _Reading:
             return
         self._take(table, name, value, origin)
 
-    def settings(self) -> Settings:
+    def settings(self, read_uri: str | None = None) -> Settings:
         values: dict[str, Any] = {}
         for table, items in self._values.items():
             section = values
@@ -203,7 +205,7 @@ class _Reading:
                 section = section.setdefault(word, {})
             section.update(items)
         try:
-            settings = Settings.model_validate(values)
+            settings = Settings.model_validate(values, context={"read_uri": read_uri})
         except ValidationError as error:
             problems = [*self._problems, *(self._explain(details) for details in error.errors())]
             # A list with several bad items is one problem.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Self
 
-from pydantic import Field, ModelWrapValidatorHandler, model_validator
+from pydantic import Field, ModelWrapValidatorHandler, ValidationInfo, model_validator
 
 from companion.settings.bus import ZenohSection
 from companion.settings.guidance import GuidanceSection
@@ -78,9 +78,11 @@ class Settings(Section):
 
     @model_validator(mode="wrap")
     @classmethod
-    def _calibration_fits(cls, values: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+    def _calibration_fits(
+        cls, values: Any, handler: ModelWrapValidatorHandler[Self], info: ValidationInfo
+    ) -> Self:
         settings = handler(values)
-        check_calibration_file(values, settings.source)
+        check_calibration_file(values, settings.source, (info.context or {}).get("read_uri"))
         return settings
 
     @classmethod

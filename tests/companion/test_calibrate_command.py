@@ -45,7 +45,7 @@ from vision.camera_model import CameraModel, CameraMount
 from vision.frame import Frame
 from vision.markers import MarkerKind
 from vision.rotation import matrix_from_euler
-from vision.sources import Source, SourceStatistics
+from vision.sources import Source, SourceError, SourceStatistics
 
 # A small lens and board, so that views are rendered and found fast.
 LENS = LENSES["webcam"].scaled(320, 240)
@@ -262,6 +262,70 @@ def test_calibration_of_another_camera_is_refused(folder: Path, tmp_path: Path) 
         assert other in line
     for fits in (("--source", own, "--source-name", "front"), ("--source", "/dev/video0")):
         assert CliRunner().invoke(app, ["config", *fits, *flags]).exit_code == 0
+
+
+_READERS = {
+    "preview": (),
+    "depth": (),
+    "markers": ("--dictionary", "4X4_50", "--size", "0.6"),
+    "cloud": ("cloud.ply",),
+    "calibrate mount": ("--marker", "7", "--size", "0.6"),
+}
+
+
+@pytest.fixture
+def opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The addresses that are opened; there is nothing at any of them. The current folder is empty."""
+    uris: list[str] = []
+
+    def open_source(uri: str, _: object) -> Source:
+        uris.append(uri)
+        raise SourceError(f"{uri}: nothing")
+
+    monkeypatch.setattr("vision.sources.open_source", open_source)
+    monkeypatch.chdir(tmp_path)
+    return uris
+
+
+@pytest.mark.parametrize("reader", _READERS)
+@pytest.mark.parametrize(
+    ("source", "settings"),
+    [
+        ("shm://front", '[source]\nshare = "front"'),
+        ("/dev/video2", '[cameras.rear.source]\nuri = "/dev/video2"'),
+    ],
+)
+def test_source_of_the_service_is_read_by_a_command(
+    reader: str, source: str, settings: str, opened: list[str]
+) -> None:
+    Path("companion.toml").write_text(settings)
+    done = CliRunner().invoke(app, [*reader.split(), source, *_READERS[reader]])
+    assert opened == [source], done.output
+
+
+def test_lens_must_fit_the_source_that_is_read(opened: list[str]) -> None:
+    own, other = "/dev/v4l/by-id/usb-front-video-index0", "/dev/v4l/by-id/usb-rear-video-index0"
+    write_camera_info(Path("camera.yaml"), LENS, own)
+    lens = ("--camera-calibration-file", "camera.yaml")
+    for reader in ("depth", "markers", "cloud"):
+        Path("companion.toml").write_text(
+            f'[source]\nuri = "{own}"\n[camera]\ncalibration_file = "camera.yaml"'
+        )
+        assert own in one_line_of_bad_input(CliRunner().invoke(app, [reader, other, *_READERS[reader]]))
+        Path("companion.toml").write_text(f'[source]\nuri = "{other}"')
+        CliRunner().invoke(app, [reader, own, *_READERS[reader], *lens])
+    assert opened == [own] * 3
+
+
+def test_command_that_uses_no_lens_reads_another_camera(opened: list[str]) -> None:
+    own, other = "/dev/v4l/by-id/usb-front-video-index0", "/dev/v4l/by-id/usb-rear-video-index0"
+    write_camera_info(Path("camera.yaml"), LENS, own)
+    Path("companion.toml").write_text(f'[source]\nuri = "{own}"\n[camera]\ncalibration_file = "camera.yaml"')
+    for reader in ("preview", "calibrate mount"):
+        CliRunner().invoke(app, [*reader.split(), other, *_READERS[reader]])
+    assert opened == [other] * 2
+    levelled = CliRunner().invoke(app, ["preview", other, "--level", "--save", "pictures"])
+    assert own in one_line_of_bad_input(levelled)
 
 
 def _lenses(colour: Path, infrared: Path) -> tuple[str | Path, ...]:
