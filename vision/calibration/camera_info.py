@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,8 @@ from vision.plain_yaml import load_plain_yaml
 
 # The names that `companion calibrate` and ROS's camera_calibration write if none is given.
 _DEFAULT_NAMES = ("camera", "narrow_stereo")
-# Addresses that name one camera, wherever it is plugged in.
+# Addresses that name one camera, wherever it is plugged in. By-id names are of maker, model and serial
+# number: identical cameras without one share a name.
 _IDENTITIES = ("/dev/v4l/by-id/", "realsense://", "oak://")
 # Largest error of a product of rows of a rotation.
 _NO_ROTATION = 1e-3
@@ -45,7 +47,8 @@ class CameraInfo:
 
         Args:
             name: of the camera, compared with a file's name. uri: the source, compared where the file's name
-                is an address that identifies a camera, see `camera_identity`.
+                is an address that identifies a camera, see `camera_identity`: devices of this computer by
+                where their addresses lead, others only if this one identifies a camera too.
 
         Raises:
             ValueError: the source is turned otherwise, or is another camera; one line that names both.
@@ -60,7 +63,7 @@ class CameraInfo:
                 )
         key, given = "source.name", name
         if self.name is not None and camera_identity(self.name) is not None:
-            key, given = "the source", None if uri is None else camera_identity(uri)
+            key, given = "the source", None if uri is None or _same_camera(self.name, uri) else uri
         if self.name is not None and given is not None and self.name != given:
             raise ValueError(
                 f"the calibration file {self.path} is the calibration of another camera: camera_name is "
@@ -71,6 +74,21 @@ class CameraInfo:
 def camera_identity(uri: str) -> str | None:
     """A source's address where it identifies one camera: by-id of V4L2, or a maker's serial number."""
     return uri if any(uri.startswith(prefix) and uri != prefix for prefix in _IDENTITIES) else None
+
+
+def _same_camera(identity: str, uri: str) -> bool:
+    """Whether two addresses may be of one camera."""
+    # One device may have several by-id names, and every one has a number.
+    nodes = _node(identity), _node(uri)
+    if None not in nodes:
+        return nodes[0] == nodes[1]
+    return camera_identity(uri) in (None, identity)
+
+
+def _node(uri: str) -> str | None:
+    """The device file that an address leads to; None: of no device, or of one that is not plugged in."""
+    path = f"/dev/video{int(uri)}" if uri.isdecimal() else uri
+    return os.path.realpath(path) if path.startswith("/dev/") and os.path.exists(path) else None
 
 
 def write_camera_info(

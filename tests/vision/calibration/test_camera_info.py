@@ -104,6 +104,47 @@ def test_unusable_file_is_refused_with_its_name(tmp_path: Path, old: str, new: s
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("source", "fits"),
+    [
+        ("/dev/v4l/by-id/usb-front-index0", True),
+        ("/dev/v4l/by-id/usb-maker_front-index0", True),  # the same device's other name
+        ("/dev/v4l/by-path/usb-1-index0", True),
+        ("/dev/video2", True),
+        ("2", True),
+        ("/dev/v4l/by-id/usb-rear-index0", False),
+        ("/dev/v4l/by-id/usb-unplugged-index0", False),
+        ("/dev/v4l/by-path/usb-2-index0", False),
+        ("/dev/video4", False),
+        ("4", False),
+        ("realsense://1", False),
+        ("/dev/video9", True),  # what is not plugged in, or no device, is not known to be another camera
+        ("/dev/v4l/by-path/usb-9-index0", True),
+        ("csi://0", True),
+        ("shm://rear", True),
+        ("flight.mp4", True),
+    ],
+)
+def test_addresses_are_compared_by_their_device(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: str, fits: bool
+) -> None:
+    own = "/dev/v4l/by-id/usb-front-index0"
+    lens = CameraModel.from_horizontal_fov(640, 480, 1.2)
+    write_camera_info(file := tmp_path / "camera.yaml", lens, own)
+    info = read_camera_info(file)
+    front, rear = "/dev/video2", "/dev/video4"
+    nodes = {front: front, own: front, rear: rear, "/dev/v4l/by-id/usb-rear-index0": rear}
+    nodes |= {"/dev/v4l/by-id/usb-maker_front-index0": front}
+    nodes |= {"/dev/v4l/by-path/usb-1-index0": front, "/dev/v4l/by-path/usb-2-index0": rear}
+    monkeypatch.setattr("os.path.exists", nodes.__contains__)
+    monkeypatch.setattr("os.path.realpath", nodes.__getitem__)
+    if fits:
+        info.check_source(Orientation(), uri=source)
+    else:
+        with pytest.raises(ValueError, match=f"another camera.*{own}.*{source}"):
+            info.check_source(Orientation(), uri=source)
+
+
 def test_missing_file_and_other_bytes_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"none\.yaml"):
         read_camera_info(tmp_path / "none.yaml")
