@@ -29,6 +29,7 @@ from vision.object_detector import (
     detector,
     resolve_classes,
 )
+from vision.registry import shown
 from vision.runtimes.base import PRECISIONS, Device, Precision
 from vision.runtimes.selection import RuntimeChoice, check_runtime, start_runtime
 from vision.runtimes.source import ModelSource, read_source
@@ -285,15 +286,11 @@ def open_detector(kind: str, settings: DetectorSettings) -> ObjectDetector:
     if kind == YOLO:
         return opened
     if not isinstance(opened, ObjectDetector):
-        raise ValueError(f"detector.kind {kind!r}: expected an ObjectDetector, got {_shown(opened)}")
+        raise ValueError(f"detector.kind {kind!r}: expected an ObjectDetector, got {shown(opened)}")
     names = getattr(opened, "class_names", None)
     if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
-        raise ValueError(f"detector.kind {kind!r}: class_names must be a tuple of str, got {_shown(names)}")
+        raise ValueError(f"detector.kind {kind!r}: class_names must be a tuple of str, got {shown(names)}")
     return _FilteredDetector(opened, kind, settings)
-
-
-def _shown(value: object) -> str:
-    return f"{type(value).__name__} {' '.join(repr(value).split()):.60}"
 
 
 class _FilteredDetector(ObjectDetector):
@@ -314,7 +311,7 @@ class _FilteredDetector(ObjectDetector):
         self.last_timing = self._inner.last_timing or Timing(0.0, elapsed_ms, 0.0)
         if not isinstance(found, Detections):
             raise DetectionsError(
-                f"detector.kind {self._kind!r}: detect must return Detections, got {_shown(found)}"
+                f"detector.kind {self._kind!r}: detect must return Detections, got {shown(found)}"
             )
         if tuple(found.class_names) != self.class_names:
             raise DetectionsError(

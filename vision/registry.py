@@ -58,5 +58,10 @@ class Registry(Generic[_Factory]):
         return ", ".join(f"{name} ({help_text})" for name, (help_text, _) in self._entries.items())
 
 
+def shown(value: object) -> str:
+    """What a plug-in returned instead of what it should, in one line."""
+    return f"{type(value).__name__} {' '.join(repr(value).split()):.60}"
+
+
 def _name_of(factory: Any) -> str:
     return f"{factory.__module__}.{factory.__qualname__}"

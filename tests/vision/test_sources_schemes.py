@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -58,6 +59,29 @@ def test_unknown_scheme_lists_the_known_ones(grey: str) -> None:
     for scheme in ("file", "rtsp", "rtsps", "http", "https", "udp", "shm", grey):
         assert f" {scheme} (" in str(caught.value)
     assert "plugins.modules" in str(caught.value)
+
+
+def test_wrong_result_of_a_plugin_is_one_line_and_is_closed() -> None:
+    class Opened(np.ndarray[tuple[int, ...], np.dtype[np.uint8]]):
+        closed = False
+
+        def close(self) -> None:
+            self.closed = True
+
+    opened: list[Any] = [np.zeros((3, 4), np.uint8).view(Opened), Opened, None]
+
+    def open_wrong(uri: str, settings: SourceSettings) -> Source:
+        return cast(Source, opened[int(uri[-1])])
+
+    source("wrong", "no source")(open_wrong)
+    try:
+        for number, kind in enumerate(("Opened", "type", "NoneType")):
+            with pytest.raises(SourceError, match=rf"wrong:// must return a Source, got {kind} .+") as caught:
+                open_source(f"wrong://{number}")
+            assert "\n" not in str(caught.value)
+    finally:
+        SOURCES.remove("wrong")
+    assert opened[0].closed
 
 
 @pytest.mark.parametrize("scheme", ["shm", "Grey", "1grey", "grey://", ""])

@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 
 from vision.calibration.camera_info import read_registration
+from vision.registry import shown
 from vision.sources.camera import CameraCapture, camera_device, check_camera
 from vision.sources.capture import Capture, LoopingCapture
 from vision.sources.csi import CsiCapture, check_csi_program, csi_settings, parse_csi_number
@@ -103,7 +104,9 @@ def open_source(uri: str, settings: SourceSettings = SourceSettings()) -> Source
         )
     opened = opener(uri, settings)
     if not isinstance(opened, Source):
-        raise SourceError(f"{name}: the plug-in of {scheme}:// must return a Source, got {opened!r:.60}")
+        with contextlib.suppress(Exception):  # a plug-in's own class, or nothing to close
+            opened.close()
+        raise SourceError(f"{name}: the plug-in of {scheme}:// must return a Source, got {shown(opened)}")
     return opened
 
 
