@@ -46,19 +46,19 @@ RayAddress = Annotated[
 
 
 class CompanionCommands(typer.core.TyperGroup):
-    """The commands. The flag of a renamed setting is an error that names the new one, in every command."""
+    """The commands. One without a setting names the new flag too if it is given the setting's former one."""
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command that was given."""
         try:
             return super().invoke(ctx)
         except _UsageError as error:
-            if text := _renamed_flag(getattr(error, "option_name", ""), error.ctx):
+            if text := _renamed_flag(getattr(error, "option_name", "")):
                 raise _UsageError(text, error.ctx) from error
             raise
 
 
-def _renamed_flag(flag: str, ctx: Any) -> str | None:
+def _renamed_flag(flag: str) -> str | None:
     if flag.startswith("--views-"):
         return (
             f"{flag}: the sections [views.NAME] were renamed to [cameras.NAME] in version 0.2.0; "
@@ -67,9 +67,7 @@ def _renamed_flag(flag: str, ctx: Any) -> str | None:
     now = {_flag_of(old): _flag_of(new) for old, new in RENAMED.items()}.get(flag)
     if now is None:
         return None
-    text = f"{flag} was renamed to {now} in version 0.2.0"
-    known = {name for parameter in ctx.command.get_params(ctx) for name in parameter.opts}
-    return text if now in known else f"{text}; this command has no such option"
+    return f"{flag} was renamed to {now} in version 0.2.0; this command has no such option"
 
 
 def _flag_of(key: str) -> str:
@@ -207,7 +205,11 @@ def _flags_by_parameter(keys: tuple[str, ...]) -> dict[str, Flag]:
     if unknown := set(keys) - known:
         raise ValueError(f"no such settings or sections: {', '.join(sorted(unknown))}")
     chosen = [flag for flag in flags() if not keys or {flag.key, flag.key.partition(".")[0]} & set(keys)]
-    return {flag.key.replace(".", "__"): flag for flag in chosen}
+    # Former names are hidden flags: using one is reported with all other errors of the settings.
+    former = [
+        Flag(old, str, None, "") for old, new in RENAMED.items() if new in {flag.key for flag in chosen}
+    ]
+    return {flag.key.replace(".", "__"): flag for flag in (*chosen, *former)}
 
 
 @functools.cache
@@ -231,6 +233,7 @@ def _setting_parameters(keys: tuple[str, ...]) -> list[Any]:
                 help=flag.help,
                 metavar=_METAVARS[flag.type],
                 panel=panel,
+                hidden=flag.key in RENAMED,
             )
         )
     _declare(settings, parameters)
@@ -246,8 +249,11 @@ def _option(
     help: str,
     metavar: str | None = None,
     panel: str | None = None,
+    hidden: bool = False,
 ) -> inspect.Parameter:
-    option = typer.Option(*names, help=help, metavar=metavar, rich_help_panel=panel, show_default=False)
+    option = typer.Option(
+        *names, help=help, metavar=metavar, rich_help_panel=panel, show_default=False, hidden=hidden
+    )
     return inspect.Parameter(
         name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Annotated[kind, option]
     )

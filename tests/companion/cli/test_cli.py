@@ -358,7 +358,7 @@ def test_demo_does_not_wait_for_its_reader() -> None:
     [
         (["detect", "x.mp4", "--detector-known-heights", "car=1.5"], "--detector-class-heights-m", False),
         (["send", "stop", "--tracker-true-score=0.3"], "--tracker-confirm-score", False),
-        (["run", "--tracker-true-score", "0.3"], "--tracker-confirm-score", True),
+        (["run", "--tracker-true-score", "0.3"], "tracker.confirm_score", True),
         (["calibrate", "mount", "x.mp4", "--camera-gimbal", "true"], "--camera-on-gimbal", False),
         (["play", "--views-front-x", "1"], "[cameras.NAME]", True),
     ],
@@ -371,3 +371,13 @@ def test_old_flag_names_the_new_one_in_every_command(
     [line] = [line for line in done.stderr.splitlines() if "renamed" in line]
     assert new in line
     assert ("no such option" not in line) == there
+
+
+def test_old_flag_is_reported_with_all_other_faults(tmp_path: Path) -> None:
+    (tmp_path / "companion.toml").write_text("[tracker]\nlost_s = 1.0\n[detector]\nimage_size = 1\n")
+    done = companion_here("run", "--tracker-true-score", "0.3", "--detector-every", "none", cwd=tmp_path)
+    assert done.returncode == 2
+    lines = done.stderr.splitlines()
+    for key in ("tracker.confirm_score", "tracker.coast_timeout_s", "detector.image_size", "detector.every"):
+        assert len([line for line in lines if key in line]) == 1, done.stderr
+    assert "--tracker-true-score" not in companion_here("run", "--help", cwd=tmp_path).stdout
