@@ -261,11 +261,10 @@ class RecordingReader:
                 header = file.read(_HEADER_BYTES)
                 length = int.from_bytes(header[1:], "little")
                 if len(header) < _HEADER_BYTES or at + _HEADER_BYTES + length > self._size:
-                    self.ended = False
-                    self.problems.append(
-                        f"{self.path}: not ended, still being recorded or cut off: "
-                        f"no whole record at byte {at} of {self._size}"
-                    )
+                    file.seek(max(self._size - len(MAGIC), len(MAGIC)))
+                    self.ended = file.read(len(MAGIC)) == MAGIC
+                    what = "damaged" if self.ended else "not ended, still being recorded or cut off"
+                    self.problems.append(f"{self.path}: {what}: no whole record at byte {at} of {self._size}")
                     return
                 opcode = header[0]
                 if opcode == Opcode.DATA_END:

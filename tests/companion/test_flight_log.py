@@ -105,14 +105,17 @@ def test_a_recording_without_an_end_is_not_called_damaged(path: Path, tmp_path: 
     (tmp_path / "a.mcap").write_bytes(content[:end])
     (tmp_path / "b.mcap").write_bytes(content[: end + 20])
     (tmp_path / "c.mcap").write_bytes(content[: end - 20] + b"\0" + content[end - 19 :])
+    # The length of a record; the end is there.
+    length = first.chunk_start_offset + 8
+    (tmp_path / "d.mcap").write_bytes(content[:length] + b"\x7f" + content[length + 1 :])
     done = companion_here("log", "list", tmp_path, cwd=tmp_path)
     states = [line.rpartition("  ")[2] for line in done.stdout.splitlines()]
-    assert states == ["not ended", "not ended", "damaged"]
+    assert states == ["not ended", "not ended", "damaged", "damaged"]
     found = [
         json.loads(line)
         for line in companion_here("log", "list", tmp_path, "--json", cwd=tmp_path).stdout.splitlines()
     ]
-    assert [each["ended"] for each in found] == [False, False, True]
+    assert [each["ended"] for each in found] == [False, False, True, True]
     shown = companion_here("log", "show", tmp_path / "a.mcap", cwd=tmp_path).stdout.splitlines()
     assert "not ended" in shown[0]
     assert "not ended" in shown[-1]
