@@ -29,7 +29,7 @@ def quaternion_from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> 
 def euler_from_quaternion(quaternion: Quaternion) -> tuple[float, float, float]:
     """(roll, pitch, yaw) in radians of a (w, x, y, z) quaternion; roll, yaw in -π..π, pitch in -π/2..π/2.
 
-    Raises ValueError if it is zero.
+    Raises ValueError if it is zero or not finite.
     """
     w, x, y, z = unit_quaternion(quaternion)
     return (
@@ -39,7 +39,7 @@ def euler_from_quaternion(quaternion: Quaternion) -> tuple[float, float, float]:
     )
 
 
-def product(first: Quaternion, second: Quaternion) -> Quaternion:
+def quaternion_product(first: Quaternion, second: Quaternion) -> Quaternion:
     """`first` after `second`: (a_from_b, b_from_c) gives a_from_c."""
     aw, ax, ay, az = first
     bw, bx, by, bz = second
@@ -51,13 +51,13 @@ def product(first: Quaternion, second: Quaternion) -> Quaternion:
     )
 
 
-def inverse(quaternion: Quaternion) -> Quaternion:
+def quaternion_inverse(quaternion: Quaternion) -> Quaternion:
     """Of a unit quaternion."""
     w, x, y, z = quaternion
     return (w, -x, -y, -z)
 
 
-def third_axis(quaternion: Quaternion) -> tuple[float, float, float]:
+def body_down_axis(quaternion: Quaternion) -> tuple[float, float, float]:
     """The body's down axis in the parent frame, of a unit quaternion."""
     w, x, y, z = quaternion
     return (2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y))
@@ -73,7 +73,7 @@ def turned_about_down(yaw_rad: float, quaternion: Quaternion) -> Quaternion:
 def slerp(first: Quaternion, second: Quaternion, fraction: float) -> Quaternion:
     """Interpolate between two attitudes on the shorter arc (Shoemake 1985); above 1 it extrapolates.
 
-    Raises ValueError if one is zero.
+    Raises ValueError if one is zero or not finite.
     """
     a, b = unit_quaternion(first), unit_quaternion(second)
     cosine = sum(p * q for p, q in zip(a, b, strict=True))
@@ -94,12 +94,10 @@ def wrap_angle(angle_rad: float) -> float:
 
 
 def unit_quaternion(quaternion: Quaternion) -> Quaternion:
-    """The same rotation with length 1. Raises ValueError for a zero quaternion."""
-    norm = math.sqrt(sum(value * value for value in quaternion))
-    if norm == 0.0:
-        raise ValueError("a zero quaternion is not a rotation")
-    w, x, y, z = (value / norm for value in quaternion)
-    return (w, x, y, z)
+    """The same rotation with length 1. Raises ValueError if it is none (zero or not finite)."""
+    if (unit := unit_or_none(quaternion)) is None:
+        raise ValueError(f"not a rotation: quaternion {quaternion}")
+    return unit
 
 
 def unit_or_none(quaternion: Quaternion) -> Quaternion | None:

@@ -17,10 +17,10 @@ from mavlink_sim.px4.parameters import Parameters
 from vision.attitude import (
     IDENTITY,
     Quaternion,
-    inverse,
-    product,
+    body_down_axis,
     quaternion_from_euler,
-    third_axis,
+    quaternion_inverse,
+    quaternion_product,
     unit_or_none,
 )
 
@@ -146,11 +146,11 @@ class AttitudeController:
         if wanted is None:
             return (NAN, NAN, NAN)
         attitude = quaternion_from_euler(airframe.roll_rad, airframe.pitch_rad, airframe.yaw_rad)
-        back = inverse(attitude)
-        w, x, y, z = product(back, _weighted(attitude, wanted, self._yaw_weight))
+        back = quaternion_inverse(attitude)
+        w, x, y, z = quaternion_product(back, _weighted(attitude, wanted, self._yaw_weight))
         sign = 2.0 if w >= 0.0 else -2.0
         feed_forward = setpoint.yaw_rate_radps if math.isfinite(setpoint.yaw_rate_radps) else 0.0
-        down_x, down_y, down_z = third_axis(back)
+        down_x, down_y, down_z = body_down_axis(back)
         gain_p, gain_q, gain_r = self._gains
         limit_p, limit_q, limit_r = self._limits
         return (
@@ -170,14 +170,14 @@ def _possible(rates: Vector, now: Vector) -> Vector:
 
 def _weighted(attitude: Quaternion, wanted: Quaternion, yaw_weight: float) -> Quaternion:
     """The demanded attitude with only a share of its rotation about the thrust axis."""
-    reduced = _shortest(third_axis(attitude), third_axis(wanted))
+    reduced = _shortest(body_down_axis(attitude), body_down_axis(wanted))
     if reduced is None:
         return wanted  # upside down: every direction is as short
-    reduced = product(reduced, attitude)
-    about_thrust = product(inverse(reduced), wanted)
+    reduced = quaternion_product(reduced, attitude)
+    about_thrust = quaternion_product(quaternion_inverse(reduced), wanted)
     angle = 2.0 * math.atan2(about_thrust[3], about_thrust[0])
     half = 0.5 * yaw_weight * math.remainder(angle, math.tau)
-    return product(reduced, (math.cos(half), 0.0, 0.0, math.sin(half)))
+    return quaternion_product(reduced, (math.cos(half), 0.0, 0.0, math.sin(half)))
 
 
 def _shortest(first: Vector, second: Vector) -> Quaternion | None:

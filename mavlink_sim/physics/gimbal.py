@@ -14,7 +14,7 @@ from enum import Enum
 
 from mavlink_sim.physics.airframe import Vector
 from mavlink_sim.px4.parameters import Parameters
-from vision.attitude import Quaternion, product
+from vision.attitude import Quaternion, quaternion_product
 
 SLEW_RADPS = math.radians(120.0)  # slew rate to a new target, of a small brushless gimbal
 JOINT_RADPS = math.radians(300.0)  # greatest rate of stabilisation
@@ -86,7 +86,7 @@ class Gimbal:
     @property
     def body_quaternion(self) -> Quaternion:
         """`body_from_gimbal`, (w, x, y, z): the current mount of a camera on it."""
-        return product(_about_z(self.pan_rad), _about_y(self.tilt_rad))
+        return quaternion_product(_about_z(self.pan_rad), _about_y(self.tilt_rad))
 
     def angular_velocity(self, body_rates: Vector) -> Vector:
         """About the gimbal's own axes, rad/s, given the vehicle's body rates (FRD)."""
@@ -143,7 +143,7 @@ class Gimbal:
 
     def _aim_angles(self, attitude: Quaternion) -> None:
         """The pose that follows from the joints."""
-        self.quaternion = product(attitude, self.body_quaternion)
+        self.quaternion = quaternion_product(attitude, self.body_quaternion)
         x, y, z = _x_axis(self.quaternion)
         self.pitch_rad = math.asin(min(max(-z, -1.0), 1.0))
         if math.hypot(x, y) > 1e-6:

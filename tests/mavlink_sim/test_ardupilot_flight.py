@@ -10,7 +10,7 @@ import pytest
 from mavlink_sim import LockstepVehicle
 from mavlink_sim.lockstep import CommandRefusedError
 from mavlink_sim.wire.messages import dialect
-from vision.attitude import inverse, product
+from vision.attitude import quaternion_inverse, quaternion_product
 
 ARM, TAKEOFF, SET_MODE, PAUSE_CONTINUE = 400, 22, 176, 193
 POSITION, VELOCITY, ACCELERATION = 0b110111111000, 0b110111000111, 0b110000111111
@@ -347,7 +347,9 @@ def landing_target(north: float, east: float, vehicle: LockstepVehicle, *, frame
     x, y, z = (
         position - here for position, here in zip((north, east, 0.3), truth.position_ned_m, strict=True)
     )
-    body = product(product(inverse(truth.quaternion), (0.0, x, y, z)), truth.quaternion)[1:]
+    body = quaternion_product(
+        quaternion_product(quaternion_inverse(truth.quaternion), (0.0, x, y, z)), truth.quaternion
+    )[1:]
     angle_x, angle_y = math.atan2(body[1], body[2]), math.atan2(-body[0], body[2])
     return dialect.MAVLink_landing_target_message(
         0, 0, frame, angle_x, angle_y, math.hypot(*body), 0.0, 0.0, *body, [1, 0, 0, 0], 2, valid

@@ -15,12 +15,13 @@ from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.messages import dialect
 from tests.mavlink_sim.conftest import SimHarness, position_setpoint
 from vision.attitude import (
+    body_down_axis,
     euler_from_quaternion,
-    inverse,
-    product,
     quaternion_from_euler,
-    third_axis,
+    quaternion_inverse,
+    quaternion_product,
     unit_or_none,
+    unit_quaternion,
 )
 from vision.rotation import matrix_from_quaternion
 
@@ -109,7 +110,7 @@ def test_attitude_is_taken_and_thrust_is_not_adjusted_to_tilt(harness: SimHarnes
     airframe = harness.vehicle.airframe
     seen = [math.degrees(angle) for angle in (airframe.roll_rad, airframe.pitch_rad, airframe.yaw_rad)]
     assert seen == pytest.approx([20.0, -10.0, 60.0], abs=1.0)
-    down = third_axis(quaternion_from_euler(airframe.roll_rad, airframe.pitch_rad, airframe.yaw_rad))
+    down = body_down_axis(quaternion_from_euler(airframe.roll_rad, airframe.pitch_rad, airframe.yaw_rad))
     drag = LINEAR_DRAG_PER_S
     expected = [-GRAVITY_MPS2 * axis - drag * v for axis, v in zip(down, airframe.velocity, strict=True)]
     expected[2] += GRAVITY_MPS2
@@ -288,7 +289,7 @@ def turned(attitude_rad: Any, rates_radps: Any, dt_s: float) -> tuple[float, flo
     p, q, r = (0.5 * rate * dt_s for rate in rates_radps)
     step = unit_or_none((1.0, p, q, r))
     assert step is not None
-    return euler_from_quaternion(product(quaternion_from_euler(*attitude_rad), step))
+    return euler_from_quaternion(quaternion_product(quaternion_from_euler(*attitude_rad), step))
 
 
 angles = st.floats(-3.1, 3.1)
@@ -310,15 +311,15 @@ def test_the_controller_turns_any_attitude_into_any_other(
         now = (airframe.roll_rad, airframe.pitch_rad, airframe.yaw_rad)
         airframe.roll_rad, airframe.pitch_rad, airframe.yaw_rad = turned(now, demanded, 0.01)
     reached = quaternion_from_euler(airframe.roll_rad, airframe.pitch_rad, airframe.yaw_rad)
-    assert abs(product(inverse(reached), wanted)[0]) > 0.9999
+    assert abs(quaternion_product(quaternion_inverse(reached), wanted)[0]) > 0.9999
 
 
 @settings(max_examples=60, deadline=None)
 @given(attitudes)
 def test_the_quaternion_algebra_agrees_with_the_matrices(attitude_rad: tuple[float, float, float]) -> None:
     q = quaternion_from_euler(*attitude_rad)
-    assert third_axis(q) == pytest.approx(tuple(matrix_from_quaternion(q)[:, 2]), abs=1e-9)
-    assert product(inverse(q), q) == pytest.approx((1.0, 0.0, 0.0, 0.0), abs=1e-9)
+    assert body_down_axis(q) == pytest.approx(tuple(matrix_from_quaternion(q)[:, 2]), abs=1e-9)
+    assert quaternion_product(quaternion_inverse(q), q) == pytest.approx((1.0, 0.0, 0.0, 0.0), abs=1e-9)
     w, x, y, z = q
     assert unit_or_none((3.0 * w, 3.0 * x, 3.0 * y, 3.0 * z)) == pytest.approx(q)
 
@@ -326,6 +327,8 @@ def test_the_quaternion_algebra_agrees_with_the_matrices(attitude_rad: tuple[flo
 @pytest.mark.parametrize("values", [(0.0,) * 4, (math.nan, 0.0, 0.0, 1.0), (math.inf, 0.0, 0.0, 0.0)])
 def test_zero_quaternion_has_no_unit_quaternion(values: tuple[float, float, float, float]) -> None:
     assert unit_or_none(values) is None
+    with pytest.raises(ValueError, match="not a rotation"):
+        unit_quaternion(values)
 
 
 @settings(max_examples=15, deadline=None)

@@ -17,7 +17,7 @@ from mavlink_sim.flight.position_control import NAN, NOTHING, TrajectorySetpoint
 from mavlink_sim.flight.precision_landing import LandingTarget
 from mavlink_sim.physics.airframe import Multirotor, Vector
 from mavlink_sim.px4.parameters import Parameters
-from vision.attitude import Quaternion, inverse, product
+from vision.attitude import Quaternion, quaternion_inverse, quaternion_product
 
 ALTITUDE_REACHED_M = 0.5
 LOWEST_RETURN_M = 2.0  # RTL_ALT_MIN: the least height in the cone
@@ -133,7 +133,9 @@ def target_position(message: Any, position: Vector, quaternion: Quaternion, heig
     sight = line_of_sight(message)
     if sight is None:
         return None
-    north, east, down = product(product(quaternion, (0.0, *sight)), inverse(quaternion))[1:]
+    north, east, down = quaternion_product(
+        quaternion_product(quaternion, (0.0, *sight)), quaternion_inverse(quaternion)
+    )[1:]
     if down <= 0.0:
         return None
     scale = 1.0 if message.distance > 0.0 else max(height_m, 0.0) / down
