@@ -32,7 +32,10 @@ def matrix_from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> NDAr
 
 
 def matrix_from_quaternion(quaternion: Quaternion) -> NDArray[np.float64]:
-    """(3, 3) rotation of a (w, x, y, z) quaternion, normalised first. Raises ValueError if it is zero or not finite."""
+    """(3, 3) rotation of a (w, x, y, z) quaternion, normalised first.
+
+    Raises ValueError if it is zero or not finite.
+    """
     w, x, y, z = unit_quaternion(quaternion)
     return np.array(
         [
