@@ -56,7 +56,7 @@ def test_import_of_a_package_loads_nothing_heavy(package: str) -> None:
 
 @pytest.mark.usefixtures("_table")
 @pytest.mark.parametrize(("package", "name"), NAMES)
-def test_every_public_name_has_an_example_that_runs(package: str, name: str) -> None:
+def test_every_public_name_has_an_example_that_is_checked(package: str, name: str) -> None:
     module = importlib.import_module(package)
     described = getattr(module, name)
     finder = doctest.DocTestFinder(recurse=False)

@@ -225,14 +225,15 @@ class Behaviour(ABC):
     """Base class of behaviours. `name` is its word in the command grammar.
 
     >>> from companion import Behaviour, BehaviourContext, Requirement, Setpoint
+    >>> from companion.vehicle.state import VehicleState
     >>> class Climb(Behaviour):
     ...     name = "climb"
     ...     requirements = frozenset({Requirement.POSITION, Requirement.IN_AIR})
     ...
     ...     def update(self, dt_s: float, context: BehaviourContext) -> Setpoint:
     ...         return Setpoint.velocity((0.0, 0.0, -1.0), context.now_ns)
-    >>> Climb().active.name
-    'climb'
+    >>> Climb().update(0.05, BehaviourContext(now_ns=0, state=VehicleState())).velocity_ned_mps
+    (0.0, 0.0, -1.0)
     """
 
     name: str

@@ -262,11 +262,12 @@ class Command(ABC):
         stated: names of fields that were asked for: the text has them also where they equal their default.
 
     >>> from companion import Behaviour, BuildContext, Command
+    >>> from companion.guidance.behaviours.hold import HoldBehaviour
     >>> class Wait(Command):
     ...     def build(self, context: BuildContext) -> Behaviour:
-    ...         raise NotImplementedError
-    >>> Wait().endless
-    False
+    ...         return HoldBehaviour(10.0)
+    >>> Wait().build(BuildContext()).name
+    'hold'
     """
 
     word: ClassVar[str]
@@ -386,15 +387,17 @@ def behaviour(word: str, help_text: str) -> Callable[[type[_Kind]], type[_Kind]]
 
     >>> from typing import Annotated
     >>> from companion import Behaviour, BuildContext, Command, Number, behaviour
-    >>> @behaviour("climb", "climb at a constant speed")
-    ... class Climb(Command):
-    ...     speed_mps: Annotated[float, Number("speed", "m/s", 0.1, 5.0, "upwards")] = 1.0
+    >>> from companion.guidance.behaviours.hold import HoldBehaviour
+    >>> from companion.guidance.grammar import parse
+    >>> @behaviour("wait", "hold the position for some minutes")
+    ... class Wait(Command):
+    ...     minutes: Annotated[float, Number("minutes", "min", 0.1, 60.0, "how long")] = 1.0
     ...
     ...     def build(self, context: BuildContext) -> Behaviour:
-    ...         raise NotImplementedError
-    >>> from companion.guidance.grammar import parse
-    >>> parse("climb speed=2").speed_mps
-    2.0
+    ...         return HoldBehaviour(60.0 * self.minutes)
+    >>> command = parse("wait minutes=2")
+    >>> command.minutes, command.build(BuildContext()).name
+    (2.0, 'hold')
     """
 
     def register(kind: type[_Kind]) -> type[_Kind]:
