@@ -14,7 +14,7 @@ from mavlink_sim.world.shapes import CLASS_NAMES
 from vision.yolo.metrics import ImageResult
 
 
-def test_recall_by_range_is_of_evaluated_objects_and_of_the_right_class() -> None:
+def test_recall_counts_evaluated_objects_found_as_their_class() -> None:
     boxes = np.array([[0, 0, 10, 10], [20, 0, 30, 10], [40, 0, 50, 10], [60, 0, 70, 10]], np.float32)
     car, dog = CLASS_NAMES.index("car"), CLASS_NAMES.index("dog")
     result = ImageResult(

@@ -202,10 +202,11 @@ def test_clicked_car_is_followed(service: ServiceProcess, tab: Tab) -> None:
     number = click_track(tab)
     tab.value("document.querySelector('#menu button').click()")
     tab.until(f"{REPLY} === 'follow track={number}: accepted, in progress'")
-    # From 14 m to the 8 m that it keeps, whatever id the car gets meanwhile.
-    called = f"({number}|[0-9]+ [(]was {number}[)])"
+    # From 14 m to the 8 m that it keeps. If the car gets another id meanwhile, the status has both.
+    called = f"(?:{number}|([0-9]+) [(]was {number}[)])"
     said = f"state.topics.status.pilot.behaviour.match(/^following track {called}, ([0-9.]+) m/)"
     tab.until(f"Math.abs({said}?.[2] - 8) < 0.5", 60.0)
+    tab.until(f"{BOXES}.some((box) => box[4] === 'car' && box[6] === Number({said}?.[1] ?? {number}))")
 
 
 SPEED = "Math.hypot(...state.topics.vehicle.velocity_ned_mps.slice(0, 2))"
