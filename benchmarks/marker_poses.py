@@ -1,6 +1,7 @@
 """How true the poses of markers in rendered pictures are, and how honest their covariances.
 
     python -m benchmarks.marker_poses --seeds 1..10
+    python -m benchmarks.marker_poses --seeds 1..10 --blur-px 2 --noise 8
 
 Each seed is a scene with one AprilTag of 0.5 m, lying or standing on the ground in the sun, 20 times from 1.2
 to 5.5 m and up to 69° from its face (640x480, 70° across). Markers of at least 40 px a side count. Of two
@@ -44,17 +45,25 @@ class PoseError:
         range_share: error of the position, as a share of the range. angle_deg: of the attitude.
         corner_px: RMS error of the corners along each axis of the image.
         normalized: (6,) errors of position and rotation over their stated one-sigma errors.
+        corner_sigma_px: of the marker.
     """
 
     range_share: float
     angle_deg: float
     corner_px: float
     normalized: Matrix
+    corner_sigma_px: float
 
 
-def pose_errors(seed: int, count: int = PICTURES) -> Iterator[PoseError | None]:
-    """Of `count` pictures of one scene; None: no marker is found. The same seed gives the same."""
-    rng = np.random.default_rng(seed)
+def pose_errors(
+    seed: int, count: int = PICTURES, blur_px: float = 0.0, noise: float = 0.0
+) -> Iterator[PoseError | None]:
+    """Of `count` pictures of one scene; None: no marker is found. The same seed gives the same.
+
+    Args:
+        blur_px, noise: one sigma of a Gaussian blur, and then of noise of each colour (of 255).
+    """
+    rng, noise_rng = np.random.default_rng(seed), np.random.default_rng([seed, 1])
     standing = bool(seed % 2)
     printed = Print(KIND.dictionary, IDENTIFIER, KIND.size_m, standing)
     yaw = rng.uniform(-math.pi, math.pi)
@@ -78,7 +87,13 @@ def pose_errors(seed: int, count: int = PICTURES) -> Iterator[PoseError | None]:
         attitude = _looking_at(eye - centre, rng)
         optical_from_ned = CameraMount().ned_from_optical(attitude).T
         position, rotation = optical_from_ned @ (centre - eye), optical_from_ned @ ned
-        found = detector.detect(renderer.render(tuple(eye), attitude).image, CAMERA)
+        image = renderer.render(tuple(eye), attitude).image
+        if blur_px > 0.0:
+            image = np.asarray(cv2.GaussianBlur(image, (0, 0), blur_px), np.uint8)
+        if noise > 0.0:
+            noisy = image + noise_rng.normal(0.0, noise, image.shape)
+            image = np.clip(np.rint(noisy), 0.0, 255.0).astype(np.uint8)
+        found = detector.detect(image, CAMERA)
         if not found:
             yield None
             continue
@@ -95,6 +110,7 @@ def pose_errors(seed: int, count: int = PICTURES) -> Iterator[PoseError | None]:
             angle,
             float(np.sqrt(np.square(marker.corners_px - true_px).mean())),
             errors / np.sqrt(np.diag(pose.covariance)),
+            marker.corner_sigma_px,
         )
 
 
@@ -115,8 +131,15 @@ def main() -> None:
     """Print the errors of all pictures."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
     parser.add_argument("--seeds", default="1..10", help="FIRST..LAST")
-    first, _, last = parser.parse_args().seeds.partition("..")
-    taken = [error for seed in range(int(first), int(last or first) + 1) for error in pose_errors(seed)]
+    parser.add_argument("--blur-px", type=float, default=0.0, help="Gaussian blur of the pictures, one sigma")
+    parser.add_argument("--noise", type=float, default=0.0, help="noise of each colour, one sigma of 255")
+    given = parser.parse_args()
+    first, _, last = given.seeds.partition("..")
+    taken = [
+        error
+        for seed in range(int(first), int(last or first) + 1)
+        for error in pose_errors(seed, blur_px=given.blur_px, noise=given.noise)
+    ]
     errors = [error for error in taken if error is not None]
     print(f"{len(errors)} markers; {len(taken) - len(errors)} pictures without one")
     corner_px = math.sqrt(float(np.mean([error.corner_px**2 for error in errors])))
@@ -128,6 +151,10 @@ def main() -> None:
         p50, p95 = np.percentile(values, [50, 95])
         print(f"{name}: p50 {p50:.3f}, p95 {p95:.3f}, worst {max(values):.3f}")
     print(f"attitudes within 2 degrees: {sum(error.angle_deg <= 2.0 for error in errors)}")
+    rough = [error.corner_px for error in errors if error.corner_sigma_px > CORNER_SIGMA_PX]
+    print(
+        f"corners with a larger noise: {len(rough)}; {np.sqrt(np.mean(np.square(rough or [0.0]))):.3f} px RMS"
+    )
     normalized = np.abs([error.normalized for error in errors])
     inside, scaled = (float((normalized < bound).mean()) for bound in (1.0, corner_px / CORNER_SIGMA_PX))
     print(f"within one stated sigma: {inside:.1%}; worst {normalized.max():.1f} sigma")

@@ -16,6 +16,7 @@ from vision.marker_boards import Board, locate_board
 from vision.markers import (
     CORNER_SIGMA_PX,
     RAW_SIGMA_PX,
+    UNSETTLED_SIGMA_PX,
     Marker,
     MarkerDetector,
     MarkerKind,
@@ -42,7 +43,7 @@ def nearest(marker: Marker, rotation: Matrix) -> MarkerPose:
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2, 3, 4, 5, 711, 2003, 2017, 2095])
-def test_rendered_pose_is_true_within_2_percent_and_2_degrees(seed: int) -> None:
+def test_rendered_pose_is_true_within_5_per_mille_and_2_degrees(seed: int) -> None:
     """In some of these, ground in the sun is brighter than the sheet around the marker, in shade."""
     errors = [error for error in pose_errors(seed) if error is not None]
     assert len(errors) >= 10
@@ -88,6 +89,29 @@ def test_marker_with_a_partly_hidden_edge_has_rough_corners() -> None:
     image[120:128, 200:260] = 255
     (hidden,) = MarkerDetector(MarkerKind("APRILTAG_36h11", SIZE_M)).detect(image, CAMERA)
     assert hidden.corner_sigma_px == RAW_SIGMA_PX
+
+
+def test_small_blurred_noisy_marker_keeps_its_fitted_corners() -> None:
+    """Where the fit does not settle it is nearer than OpenCV's corners, and its noise is stated larger."""
+    printed = cv2.aruco.generateImageMarker(
+        cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11), 7, 320
+    )
+    detector, rng = MarkerDetector(MarkerKind("APRILTAG_36h11", SIZE_M)), np.random.default_rng(3)
+    errors_px, sigmas = [], []
+    for _ in range(40):
+        large = np.full((960, 1280), 255, np.uint8)  # eight times as large, then averaged
+        left, top = rng.integers(300, 500, 2)
+        large[top : top + 320, left : left + 320] = printed
+        image = cv2.GaussianBlur(cv2.resize(large, (160, 120), interpolation=cv2.INTER_AREA), (0, 0), 2.0)
+        noisy = np.clip(image + rng.normal(0.0, 8.0, image.shape), 0, 255).astype(np.uint8)
+        frame = cv2.copyMakeBorder(noisy, 0, 360, 0, 480, cv2.BORDER_CONSTANT, value=255)
+        for marker in detector.detect(frame, CAMERA):
+            true_px = np.add([[0, 0], [320, 0], [320, 320], [0, 320]], [left, top]) / 8 - 0.5
+            errors_px.append(float(np.abs(marker.corners_px - true_px).max()))
+            sigmas.append(marker.corner_sigma_px)
+    assert {CORNER_SIGMA_PX, UNSETTLED_SIGMA_PX} <= set(sigmas)
+    unsettled = [error for error, sigma in zip(errors_px, sigmas, strict=True) if sigma == UNSETTLED_SIGMA_PX]
+    assert max(unsettled) < 0.8
 
 
 def test_two_thirds_of_positions_lie_within_one_sigma() -> None:
