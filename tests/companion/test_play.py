@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -201,3 +202,22 @@ def test_play_refuses_invalid_options_in_one_line(tmp_path: Path, flags: tuple[s
     assert done.returncode == 2, done.stdout + done.stderr
     (line,) = done.stderr.splitlines()
     assert named in line
+
+
+@pytest.mark.slow
+def test_sentences_and_a_policy_fly_to_a_car(tmp_path: Path) -> None:
+    """As docs/how-to/ask.md and policies.md show it: the bundled model, patterns, the bundled policy."""
+    with playing(tmp_path) as running:
+        connect = ("--connect", running.endpoint)
+        for sentence, allowed in (("take off to three metres", "takeoff"), ("find a car", "seek")):
+            asked = companion(
+                *("ask", *connect, sentence, "--language-may", allowed), cwd=tmp_path, timeout_s=150.0
+            )
+            assert asked.returncode == 0, asked.stdout + asked.stderr
+            assert allowed in asked.stdout
+        sent = companion(
+            "send", *connect, "policy approach class=car distance=6", cwd=tmp_path, timeout_s=150.0
+        )
+        assert sent.returncode == 0, sent.stdout + sent.stderr
+        (ends_m,) = re.findall(r"([\d.]+) m", sent.stdout.partition("car")[2])[:1]
+        assert float(ends_m) == pytest.approx(6.0, abs=0.5)
