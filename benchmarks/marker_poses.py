@@ -25,7 +25,8 @@ from mavlink_sim.world.structures import PLATE_THICKNESS_M
 from mavlink_sim.world.world import Ground, World, WorldObject
 from vision.camera_model import CameraModel, CameraMount
 from vision.marker_boards import ned_from_marker
-from vision.markers import CORNER_SIGMA_PX, MarkerDetector, MarkerKind, square
+from vision.marker_edges import CORNER_SIGMA_PX
+from vision.markers import MarkerDetector, MarkerKind, square
 from vision.rotation import matrix_from_euler
 
 CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(70.0))

@@ -16,7 +16,8 @@ from itertools import permutations
 import numpy as np
 from numpy.typing import NDArray
 
-from vision.markers import CORNER_SIGMA_PX, Marker, MarkerPose
+from vision.marker_edges import CORNER_SIGMA_PX
+from vision.markers import Marker, MarkerPose
 
 # Costs and attitudes are averaged over this time; a marker unseen for longer begins again.
 MEMORY_S = 3.0

@@ -13,10 +13,8 @@ from numpy.typing import NDArray
 from benchmarks.marker_poses import CAMERA, angle_deg, pose_errors
 from vision.marker_ambiguity import AmbiguityResolver
 from vision.marker_boards import Board, locate_board
+from vision.marker_edges import CORNER_SIGMA_PX, RAW_SIGMA_PX, UNSETTLED_SIGMA_PX
 from vision.markers import (
-    CORNER_SIGMA_PX,
-    RAW_SIGMA_PX,
-    UNSETTLED_SIGMA_PX,
     Marker,
     MarkerDetector,
     MarkerKind,

@@ -26,7 +26,8 @@ from mavlink_sim.world.world import Ground, World, WorldObject
 from vision.attitude import quaternion_from_euler, wrap_angle
 from vision.camera_model import CameraModel, CameraMount
 from vision.marker_boards import Board, locate_board
-from vision.markers import CORNER_SIGMA_PX, Marker, marker_from_corners
+from vision.marker_edges import CORNER_SIGMA_PX
+from vision.markers import Marker, marker_from_corners
 from vision.rotation import matrix_from_euler
 
 CAMERA = CameraModel.from_horizontal_fov(400, 300, math.radians(80.0))
