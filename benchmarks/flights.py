@@ -174,8 +174,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     seeds = range(given.seed, given.seed + given.runs)
     try:
-        flown = fly(given.name, seeds, given.processes, ray=given.ray, rendered=given.rendered)
-        figures = summary(given.name, list(flown))
+        results = fly(given.name, seeds, given.processes, ray=given.ray, rendered=given.rendered)
+        figures = summary(given.name, list(results))
     except (UnknownFlightError, ClusterError, SeedError) as error:
         print(error, file=sys.stderr)
         return 2

@@ -1,6 +1,6 @@
 """Flights of `approach` without depth: the range comes from the ground plane.
 
-A car, a truck or a person stands 12 to 30 m away, anywhere in the picture's width, with another of its class
+A car, a truck or a person stands 12 to 30 m away, anywhere in the image's width, with another of its class
 and something else about; the wind is up to 3 m/s. A flight succeeds when the behaviour says that it arrived
 and the true distance to the object's nearest surface is off by 1.5 m at most, with no limit left on the way.
 """
@@ -54,7 +54,7 @@ def fly(
 
     Args:
         rendered: the camera is drawn and looked at by the real detector, tracker and ranging.
-        command: what is flown to an object of a class, to `DISTANCE_M`.
+        command: to an object of a class, to `DISTANCE_M`.
     """
     rng = np.random.default_rng((seed, 81))
     class_name = ("car", "person", "truck")[seed % 3]

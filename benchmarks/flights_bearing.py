@@ -4,7 +4,7 @@ The vehicle circles at a radius of 12.5 m in wind of up to 5 m/s, leaning by 12Â
 bearing of the object in the middle is compared with the truth at the moment of capture in three ways: by the
 attitude at that moment, as the service does it; by the newest attitude when the result comes 80 ms later; and
 by the heading alone, as if the vehicle never leaned. A flight succeeds when the first is within 1.5Â° in 95
-of 100 pictures. What is judged is the way from a box to a bearing, with boxes made of the truth or by the
+of 100 images. What is judged is the way from a box to a bearing, with boxes made of the truth or by the
 real detector.
 """
 
@@ -122,7 +122,7 @@ def run(seed: int, *, rendered: bool = False) -> FlightResult:
     good = p95(errors_deg["at_capture"]) <= WITHIN_DEG and not log.violations
     values = {f"bearing_error_{way}_p95_deg": p95(found) for way, found in errors_deg.items()}
     values["leaning_p50_deg"] = float(np.median(leaning_deg))
-    values["pictures"] = float(len(leaning_deg))
+    values["images"] = float(len(leaning_deg))
     reason = f"left the envelope: {log.violations}" if log.violations else "" if good else "bearings are off"
     return FlightResult(seed, good, values, reason)
 

@@ -9,7 +9,7 @@ airframe has PX4's SIH's drag and leans by 17° to fly 3 m/s, by 28° to gain sp
 Time on target is the share of guidance's turns, from 8 s after the beginning until the minute is over (a
 flight that ends before counts the rest as off target), at which by the truth both hold: the distance to the
 object's nearest surface is within 1.5 m of what was asked, and its middle is within 10° of the middle column
-of the picture. It counts while the object is hidden, too. A flight succeeds with 95 % of that time and no
+of the image. It counts while the object is hidden, too. A flight succeeds with 95 % of that time and no
 limit left.
 """
 
@@ -37,7 +37,7 @@ SIZES_M = {"car": (4.2, 1.8, 1.5), "person": (0.5, 0.6, 1.7)}
 SPEED_MPS = 3.0
 DISTANCE_M, HEIGHT_M = 8.0, 4.0
 SETTLING_S, FLIGHT_S = 8.0, 60.0
-RANGE_TOLERANCE_M, PICTURE_TOLERANCE_RAD = 1.5, math.radians(10.0)
+RANGE_TOLERANCE_M, IMAGE_TOLERANCE_RAD = 1.5, math.radians(10.0)
 LEAST_TIME_ON_TARGET = 0.95
 _STEP_S = 0.05
 
@@ -78,7 +78,7 @@ def run(seed: int, *, rendered: bool = False) -> FlightResult:
         error_m = goal.range_m(moment.truth.position_ned_m, moment.seconds) - DISTANCE_M
         off_rad = _off_middle(goal, moment)
         errors_m.append(abs(error_m))
-        on_target.append(abs(error_m) <= RANGE_TOLERANCE_M and abs(off_rad) <= PICTURE_TOLERANCE_RAD)
+        on_target.append(abs(error_m) <= RANGE_TOLERANCE_M and abs(off_rad) <= IMAGE_TOLERANCE_RAD)
 
     behaviour = FollowBehaviour(class_name, distance_m=DISTANCE_M)
     log = flight.fly(behaviour, FLIGHT_S, each=judge)
@@ -106,7 +106,7 @@ def run(seed: int, *, rendered: bool = False) -> FlightResult:
 
 
 def _off_middle(goal: SceneObject, moment: Moment) -> float:
-    """Angle of the object's middle beside the picture's middle column, by the truth; π behind the camera."""
+    """Angle of the object's middle beside the image's middle column, by the truth; π behind the camera."""
     pose, truth = goal.pose(moment.seconds), moment.truth
     ned_from_body = matrix_from_quaternion(truth.quaternion)
     eye = np.array(truth.position_ned_m) + ned_from_body @ MOUNT.position_frd_m

@@ -4,7 +4,7 @@ A pad of two AprilTags, a small one in its middle and a large one beside it, lie
 the vehicle begins, 6 to 9 m high. The wind is up to 3 m/s with its gusts (the built-in airframe has the drag
 of PX4's SIH, 1 N for each m/s on 1 kg: it leans by 17° against 3 m/s). Corners are off by 0.3 pixels (one
 sigma), frames come 80 ms late, one in twelve is missed, and so is half a second now and then; the camera sits
-a third of a degree (one sigma) from where the settings have it. Rendered flights see drawn pictures, searched
+a third of a degree (one sigma) from where the settings have it. Rendered flights see drawn images, searched
 by OpenCV, instead.
 The limits are the default ones, but for `max_acceleration_mps2` 5.
 
@@ -57,7 +57,7 @@ MARKER_SETTINGS = {
 
 
 def run(seed: int, *, rendered: bool = False) -> FlightResult:
-    """One landing, flown by us. `rendered`: pictures are drawn, and searched by OpenCV."""
+    """One landing, flown by us. `rendered`: images are drawn, and searched by OpenCV."""
     return land(seed, rendered=rendered)
 
 
@@ -74,7 +74,7 @@ def land(
     Args:
         by_autopilot: PX4's precision landing flies it, guided by LANDING_TARGET.
         pad_speed_mps: of a pad that moves in a line.
-        rendered: pictures are drawn and searched; else corners are put where geometry has them.
+        rendered: images are drawn and searched; else corners are put where geometry has them.
         max_acceleration_mps2: of the envelope.
     """
     rng = np.random.default_rng((seed, 149))
@@ -91,10 +91,10 @@ def land(
         MOUNT.down_m,
         *(np.array([MOUNT.roll_rad, MOUNT.pitch_rad, MOUNT.yaw_rad]) + rng.normal(0.0, MOUNT_SIGMA_RAD, 3)),
     )
-    pictures = DrawnCamera(pad, truly) if rendered else ProjectedCamera(pad, truly, rng)
+    finder = DrawnCamera(pad, truly) if rendered else ProjectedCamera(pad, truly, rng)
     camera = SyntheticCamera(
         camera_settings(CAMERA, MOUNT, MARKER_SETTINGS),
-        find_markers=pictures.look,
+        find_markers=finder.look,
         rate_hz=10.0 if rendered else 20.0,
     )
     flight = LockstepFlight.airborne(
@@ -189,7 +189,7 @@ class ProjectedCamera:
 
 
 class DrawnCamera:
-    """Pictures of the pad, drawn and searched."""
+    """Images of the pad, drawn and searched."""
 
     def __init__(self, pad: Pad, mount: CameraMount) -> None:
         plates = tuple(
@@ -206,6 +206,6 @@ class DrawnCamera:
         self._detector = MarkerDetector(MarkerKind(DICTIONARY, SIZES_M[MIDDLE], SIZES_M))
 
     def look(self, truth: Truth, seconds: float) -> tuple[Marker, ...] | None:
-        """The markers that OpenCV finds in the picture."""
-        picture = self._renderer.render(truth.position_ned_m, matrix_from_quaternion(truth.quaternion))
-        return self._detector.detect(np.ascontiguousarray(picture.image), CAMERA)
+        """The markers that OpenCV finds in the image."""
+        image = self._renderer.render(truth.position_ned_m, matrix_from_quaternion(truth.quaternion))
+        return self._detector.detect(np.ascontiguousarray(image.image), CAMERA)

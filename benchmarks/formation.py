@@ -214,7 +214,7 @@ class Member:
 
     @property
     def behaviour(self) -> Behaviour | None:
-        """What is flown now."""
+        """The active command."""
         return self.flight.guidance.behaviour
 
     @property
@@ -260,7 +260,7 @@ class Fleet:
         return member
 
     def command(self, name: str, behaviour: Behaviour) -> str | None:
-        """Let a vehicle fly it; the words of the refusal, if it is refused."""
+        """Let a vehicle fly it; why not, if it is refused."""
         member = self.members[name]
         before = len(member.flight.events)
         commanded = member.flight.command(behaviour)

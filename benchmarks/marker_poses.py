@@ -1,4 +1,4 @@
-"""How true the poses of markers in rendered pictures are, and how honest their covariances.
+"""How true the poses of markers in rendered images are, and how honest their covariances.
 
     python -m benchmarks.marker_poses --seeds 1..10
     python -m benchmarks.marker_poses --seeds 1..10 --blur-px 2 --noise 8
@@ -32,7 +32,7 @@ from vision.rotation import matrix_from_euler
 CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(70.0))
 GROUND = Ground(("concrete",), 0, 256, 0.05)
 KIND = MarkerKind("APRILTAG_36h11", 0.5)
-IDENTIFIER, LEAST_SIDE_PX, PICTURES = 7, 40.0, 20
+IDENTIFIER, LEAST_SIDE_PX, IMAGES = 7, 40.0, 20
 RANGES_M, MOST_TILT_RAD = (1.2, 5.5), 1.2
 
 Matrix = NDArray[np.float64]
@@ -57,9 +57,9 @@ class PoseError:
 
 
 def pose_errors(
-    seed: int, count: int = PICTURES, blur_px: float = 0.0, noise: float = 0.0
+    seed: int, count: int = IMAGES, blur_px: float = 0.0, noise: float = 0.0
 ) -> Iterator[PoseError | None]:
-    """Of `count` pictures of one scene; None: no marker is found. The same seed gives the same.
+    """Of `count` images of one scene; None: no marker is found. The same seed gives the same.
 
     Args:
         blur_px, noise: one sigma of a Gaussian blur, and then of noise of each colour (of 255).
@@ -129,10 +129,10 @@ def _looking_at(eye: Matrix, rng: np.random.Generator) -> Matrix:
 
 
 def main() -> None:
-    """Print the errors of all pictures."""
+    """Print the errors of all images."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
     parser.add_argument("--seeds", default="1..10", help="FIRST..LAST")
-    parser.add_argument("--blur-px", type=float, default=0.0, help="Gaussian blur of the pictures, one sigma")
+    parser.add_argument("--blur-px", type=float, default=0.0, help="Gaussian blur of the images, one sigma")
     parser.add_argument("--noise", type=float, default=0.0, help="noise of each colour, one sigma of 255")
     given = parser.parse_args()
     first, _, last = given.seeds.partition("..")
@@ -142,7 +142,7 @@ def main() -> None:
         for error in pose_errors(seed, blur_px=given.blur_px, noise=given.noise)
     ]
     errors = [error for error in taken if error is not None]
-    print(f"{len(errors)} markers; {len(taken) - len(errors)} pictures without one")
+    print(f"{len(errors)} markers; {len(taken) - len(errors)} images without one")
     corner_px = math.sqrt(float(np.mean([error.corner_px**2 for error in errors])))
     for name, values in (
         ("position, % of the range", [100.0 * error.range_share for error in errors]),

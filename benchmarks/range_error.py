@@ -4,9 +4,9 @@
 
 Conditions: the built-in camera (640x480, 70° across, 20° down on the body, no distortion) in demo worlds and
 in the scene `village`; 2.5 to 8 m above level ground, roll and pitch of the vehicle up to 10°, objects at all
-headings, 3 to 25 m away, in the whole width of the picture. Boxes are the detector's (image size 320), those
+headings, 3 to 25 m away, in the whole width of the image. Boxes are the detector's (image size 320), those
 that agree with the truth in class and by an IoU of 0.5, of objects of which 60 % is seen; boxes that the
-picture's edge cuts are among them. Depth is that of a stereo camera with a baseline of 5 cm (`DepthSensor`).
+image's edge cuts are among them. Depth is that of a stereo camera with a baseline of 5 cm (`DepthSensor`).
 The pose is exact, but for the share of errors within the targets' own sigma it has the errors that
 `companion/guidance/targets/range_error.py` states: tilt, heading and height above home. The truth is the
 horizontal distance from the vehicle to the nearest point of the object's surface, or to its footprint, the
@@ -89,7 +89,7 @@ class Sample:
     Attributes:
         true_m: horizontal, from the vehicle. error_m: what was measured less that; NaN: nothing was measured.
         noisy_m: the same with the estimated pose. sigma_m: the target's own `range_sigma_m` then.
-        cut: the object goes beyond the picture's edge.
+        cut: the object goes beyond the image's edge.
     """
 
     source: str
@@ -137,7 +137,7 @@ def _renderer(rng: np.random.Generator) -> Renderer:
 
 
 def _view(renderer: Renderer, rng: np.random.Generator) -> View | None:
-    """None: no pose was found from which the object drawn is in the picture."""
+    """None: no pose was found from which the object drawn is in the image."""
     item = _object(renderer.world, rng)
     for _ in range(60):
         range_m = rng.uniform(RANGE_M[0], NEAR_M if rng.random() < NEAR_SHARE else RANGE_M[1])
@@ -265,7 +265,7 @@ def _targets(
 
 
 def rows(measured: Iterable[Sample]) -> list[Row]:
-    """By source and band of true ranges; of the widest band also by class, and what the picture cuts."""
+    """By source and band of true ranges; of the widest band also by class, and what the image cuts."""
     measured = list(measured)
     table = []
     for source, bands in BANDS.items():

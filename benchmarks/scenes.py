@@ -237,5 +237,5 @@ class SyntheticDetector:
 
 
 def without_image(frame: SceneFrame) -> SceneFrame:
-    """The frame's truth alone: a long sequence's pictures are large."""
+    """The frame's truth alone: a long sequence's images are large."""
     return replace(frame, image=np.zeros((1, 1, 3), np.uint8))

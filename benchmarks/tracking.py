@@ -33,7 +33,7 @@ from vision.tracking.association import overlaps
 from vision.tracking.tracks import XYXY
 
 ATTITUDE_RATE_HZ = 50.0
-# Of the attitudes, one sigma: an autopilot's estimate against the picture of a camera that is well mounted.
+# Of the attitudes, one sigma: an autopilot's estimate against the image of a camera that is well mounted.
 ATTITUDE_NOISE_RAD = 0.002
 SAME_IOU = 0.3
 
@@ -53,7 +53,7 @@ def measure_tracking(
 
     Args:
         rate_hz: of the camera; `drop` of its frames are missing.
-        model: a checkpoint that looks at the rendered pictures; None: boxes made of the truth, with faults.
+        model: a checkpoint that looks at the rendered images; None: boxes made of the truth, with faults.
 
     Raises:
         CheckpointError: the model cannot be read.
@@ -181,7 +181,7 @@ def believed(
             for track in tracker.tracks
             if track.state is TrackState.CONFIRMED
             and stamp_ns - track.last_ns < settings.coast_timeout_s * 1e9
-            and _in_picture(track.xyxy)
+            and _in_image(track.xyxy)
         ]
         boxes = np.array([track.xyxy for track in tracks]).reshape(-1, 4)
         labelled.append(_against_truth(seen.frame, [track.track_id for track in tracks], boxes))
@@ -200,7 +200,7 @@ def attitudes_of(motion: Motion, seconds: float, seed: int = 0) -> AttitudeHisto
     return history
 
 
-def _in_picture(xyxy: XYXY) -> bool:
+def _in_image(xyxy: XYXY) -> bool:
     left, top, right, bottom = xyxy
     return 0 <= (left + right) / 2 < CAMERA.width and 0 <= (top + bottom) / 2 < CAMERA.height
 

@@ -107,8 +107,8 @@ def make_save_folder(folder: Path, source: str) -> None:
     Raises:
         ValueError: it is a file, cannot be created, or contains the source's images.
     """
-    pictures = Path(source)
-    if pictures.exists() and folder.resolve() in (pictures.resolve(), pictures.resolve().parent):
+    images = Path(source)
+    if images.exists() and folder.resolve() in (images.resolve(), images.resolve().parent):
         raise ValueError(
             f"--save {folder}: this folder contains the source; give another, so that no image is overwritten"
         )

@@ -39,7 +39,7 @@ class RecordingSummary:
 
     Attributes:
         began_ns, ended_ns: Unix time of its first and last message; 0 without one.
-        lines: (Unix time, kind, text) of events, modes and refusals, in order.
+        lines: (Unix time, kind, text) of events, modes and refused commands, in order.
         large: topic of images, depth images and point clouds → how many are recorded.
         losses: the recorder's last note about losses.
         metadata: of the file, such as the clock of a ULog in it.

@@ -1,4 +1,4 @@
-"""`companion preview` and `companion depth`: what a source delivers, as lines and as pictures in a folder."""
+"""`companion preview` and `companion depth`: what a source delivers, as lines and as images in a folder."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ class PreviewOptions:
     """What is shown.
 
     Attributes:
-        topic: where the service publishes this source's pictures.
-        save: folder of the pictures, `<sequence>.jpg`; None: none are saved.
-        grey: the picture in grey, a third as wide and high.
-        period_s: interval of lines and pictures, seconds; 0: every frame.
+        topic: where the service publishes this source's images.
+        save: folder of the images, `<sequence>.jpg`; None: none are saved.
+        grey: the image in grey, a third as wide and high.
+        period_s: interval of lines and images, seconds; 0: every frame.
         limit: number of lines after which it ends; None: with the source.
-        level: levels the pictures; None: they stay as they are.
+        level: levels the images; None: they stay as they are.
     """
 
     topic: str
@@ -55,7 +55,7 @@ class PreviewOptions:
     level: Levelling | None = None
 
 
-def save_picture(folder: Path, frame: Frame, image: NDArray[np.uint8]) -> None:
+def save_image(folder: Path, frame: Frame, image: NDArray[np.uint8]) -> None:
     """Write `<sequence>.jpg`. Raises OSError if it cannot be written."""
     path = folder / f"{frame.sequence:06d}.jpg"
     if not cv2.imwrite(str(path), image):
@@ -78,7 +78,7 @@ class RateMeter:
 
 
 def preview_source(source: Source, options: PreviewOptions, write: Callable[[str], None]) -> int:
-    """Print a line, and save a picture, every `period_s` until the source ends.
+    """Print a line, and save an image, every `period_s` until the source ends.
 
     A source that ends after its first frame has one line.
 
@@ -86,7 +86,7 @@ def preview_source(source: Source, options: PreviewOptions, write: Callable[[str
         Number of lines.
 
     Raises:
-        OSError: a picture cannot be written.
+        OSError: an image cannot be written.
     """
     if options.save is not None:
         options.save.mkdir(parents=True, exist_ok=True)
@@ -99,7 +99,9 @@ def preview_source(source: Source, options: PreviewOptions, write: Callable[[str
         lines = status_lines(source, frame, rate_hz, options.topic)
         write("  ".join(lines))
         if options.save is not None:
-            save_picture(options.save, frame, picture(frame, lines, grey=options.grey, level=options.level))
+            save_image(
+                options.save, frame, preview_image(frame, lines, grey=options.grey, level=options.level)
+            )
         shown += 1
 
     for frame in source:
@@ -131,7 +133,7 @@ def status_lines(source: Source, frame: Frame, rate_hz: float | None, topic: str
     )
 
 
-def picture(
+def preview_image(
     frame: Frame, lines: tuple[str, ...], *, grey: bool, level: Levelling | None = None
 ) -> NDArray[np.uint8]:
     """The frame with its lines, (height, width, 3) BGR; with `grey` a third as wide and high."""
@@ -206,7 +208,7 @@ class DepthRecorder:
     """Saves the frames of a pipeline with their detections and the depth at the centre.
 
     Args:
-        folder: of the pictures; None: none are saved.
+        folder: of the images; None: none are saved.
     """
 
     def __init__(self, folder: Path | None) -> None:
@@ -218,7 +220,7 @@ class DepthRecorder:
         """Save a frame. Raises OSError if it cannot be written."""
         if self._folder is not None and frame.depth_m is not None:
             centre_m = centre_depth(frame.depth_m)
-            save_picture(self._folder, frame, annotate(frame.image, detections, centre_m=centre_m))
+            save_image(self._folder, frame, annotate(frame.image, detections, centre_m=centre_m))
 
 
 def depth_source(
@@ -248,7 +250,7 @@ def depth_source(
         if result.depth is None:
             if not shown:
                 raise SourceError(
-                    "the source delivers no depth; name the depth of its pictures in source.depth"
+                    "the source delivers no depth; name the depth of its images in source.depth"
                 )
             return
         shown += 1

@@ -1,4 +1,4 @@
-"""The house's one rule: imports run downwards only. `docs/architecture.md` draws the same picture."""
+"""Imports run downwards only. `docs/architecture.md` has the same layers."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 
-# Each room of `companion` and its floor; a room may import from lower floors alone.
-FLOORS = {
+# Each package and module of `companion` with its layer; it may import from lower layers alone.
+COMPANION_LAYERS = {
     "campaign": 0,
     "child_process": 0,
     "geometry": 0,
@@ -50,7 +50,7 @@ FLOORS = {
     "cli": 10,
 }
 # The same inside `companion.guidance`: its folders, and its own files.
-GUIDANCE_FLOORS = {
+GUIDANCE_LAYERS = {
     "motion": 0,
     "search_pattern": 0,
     "targets": 0,
@@ -180,7 +180,7 @@ def circles(package: str) -> set[frozenset[str]]:
     return found
 
 
-def room(module: str) -> str:
+def part(module: str) -> str:
     """`companion.guidance.core` → guidance."""
     return module.split(".")[1]
 
@@ -202,19 +202,21 @@ def test_the_simulator_imports_only_geometry_and_frames_of_vision() -> None:
 def test_only_sim_session_demonstration_training_and_benchmarks_know_the_simulator() -> None:
     for name, path in modules().items():
         if name.startswith("companion.") and any(m.startswith("mavlink_sim") for m in imports_of(name, path)):
-            assert room(name) in MAY_IMPORT_SIMULATOR, f"{name} imports the simulator"
+            assert part(name) in MAY_IMPORT_SIMULATOR, f"{name} imports the simulator"
 
 
-def test_rooms_of_the_companion_import_downwards_only() -> None:
+def test_parts_of_the_companion_import_downwards_only() -> None:
     for name, path in modules().items():
         if not name.startswith("companion."):
             continue
-        here = room(name)
-        assert here in FLOORS, f"{name}: a new room; give it a floor here and in docs/architecture.md"
+        here = part(name)
+        assert here in COMPANION_LAYERS, (
+            f"{name}: a new part; give it a layer here and in docs/architecture.md"
+        )
         for other in imports_of(name, path):
-            if not other.startswith("companion.") or room(other) == here:
+            if not other.startswith("companion.") or part(other) == here:
                 continue
-            assert FLOORS[room(other)] < FLOORS[here], f"{name} imports upwards: {other}"
+            assert COMPANION_LAYERS[part(other)] < COMPANION_LAYERS[here], f"{name} imports upwards: {other}"
 
 
 def test_parts_of_guidance_import_downwards_only() -> None:
@@ -222,20 +224,24 @@ def test_parts_of_guidance_import_downwards_only() -> None:
         if not name.startswith("companion.guidance."):
             continue
         here = name.split(".")[2]
-        assert here in GUIDANCE_FLOORS, f"{name}: a new part of guidance; give it a floor here"
+        assert here in GUIDANCE_LAYERS, f"{name}: a new part of guidance; give it a layer here"
         for other in imports_of(name, path):
             there = other.removeprefix("companion.guidance").split(".")[1:2]
             if other.startswith("companion.guidance.") and there != [here]:
-                assert GUIDANCE_FLOORS[there[0]] < GUIDANCE_FLOORS[here], f"{name} imports upwards: {other}"
+                assert GUIDANCE_LAYERS[there[0]] < GUIDANCE_LAYERS[here], f"{name} imports upwards: {other}"
 
 
 def test_every_part_with_a_layer_exists() -> None:
-    tables = {"companion": FLOORS, "companion/guidance": GUIDANCE_FLOORS, "mavlink_sim": SIMULATOR_LAYERS}
+    tables = {
+        "companion": COMPANION_LAYERS,
+        "companion/guidance": GUIDANCE_LAYERS,
+        "mavlink_sim": SIMULATOR_LAYERS,
+    }
     for folder, table in tables.items():
         parts = {path.stem for path in (ROOT / folder).iterdir() if path.suffix == ".py" or path.is_dir()}
         assert not table.keys() - parts, folder
     assert not (SIMULATOR_MAY_IMPORT | {"vision"}) - modules().keys()
-    assert MAY_IMPORT_SIMULATOR <= FLOORS.keys()
+    assert MAY_IMPORT_SIMULATOR <= COMPANION_LAYERS.keys()
 
 
 def test_guidance_has_no_clock_and_no_input_or_output() -> None:
@@ -335,7 +341,7 @@ def test_no_circular_imports(package: str) -> None:
 
 
 @pytest.mark.parametrize("package", ["companion", "vision", "mavlink_sim"])
-def test_every_room_stands_in_the_document(package: str) -> None:
+def test_every_part_stands_in_the_document(package: str) -> None:
     document = (ROOT / "docs" / "architecture.md").read_text()
     names = {
         f"`{path.name}`" if path.suffix == ".py" else f"`{path.name}/`"

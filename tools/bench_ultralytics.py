@@ -1,7 +1,7 @@
-"""Ultralytics and this detector on the same pictures in the same run, in turn; for development only.
+"""Ultralytics and this detector on the same images in the same run, in turn; for development only.
 
 Each contestant is a process of its own (`companion.bench.detector`), and they take turns, so that whatever
-else the machine does falls on all alike. Ultralytics is measured as anybody calls it, `predict` on a picture:
+else the machine does falls on all alike. Ultralytics is measured as anybody calls it, `predict` on an image:
 as installed (it chooses its threads), with the threads forced, and on its own OpenVINO export.
 
     python -m tools.bench_ultralytics --model yolov8n.pt --python OTHER_VENV/bin/python --threads 2
@@ -42,18 +42,18 @@ def contestant() -> int:
     import torch
     from ultralytics import YOLO
 
-    pictures = np.load(order["pictures"])
+    images = np.load(order["images"])
     model = YOLO(order["model"], task="detect")
-    size = list(pictures.shape[1:3])
+    size = list(images.shape[1:3])
 
-    def predict(picture: Any) -> list[float]:
+    def predict(image: Any) -> list[float]:
         started = time.perf_counter()
-        result = model.predict(picture, imgsz=size, device="cpu", verbose=False)[0]
+        result = model.predict(image, imgsz=size, device="cpu", verbose=False)[0]
         total_ms = (time.perf_counter() - started) * 1e3
         before, network = result.speed["preprocess"], result.speed["inference"]
         return [before, network, total_ms - before - network]
 
-    predict(pictures[0])
+    predict(images[0])
     # After the first call: it sets its own number then.
     if order["threads"] is not None:
         torch.set_num_threads(order["threads"])
@@ -63,7 +63,7 @@ def contestant() -> int:
     _say({"runtime": name, "precision": "float32", "threads": threads, "memory_mb": memory_mb()})
     for line in sys.stdin:
         before = time.process_time()
-        times = [predict(pictures[number % len(pictures)]) for number in range(int(line))]
+        times = [predict(images[number % len(images)]) for number in range(int(line))]
         spent = {"processor_s": time.process_time() - before, "memory_mb": memory_mb()}
         _say({"times_ms": times, **spent})
     return 0
@@ -116,7 +116,7 @@ def main() -> int:
     parser.add_argument("--only", default="", help="of " + ", ".join((*CONTESTANTS, *OURS)))
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
-    from companion.bench.detector import Measured, draw_pictures, in_turn, machine, table
+    from companion.bench.detector import Measured, draw_images, in_turn, machine, table
 
     width, height = (int(number) for number in arguments.frame.split("x"))
     wanted = arguments.only.split(",") if arguments.only else [*CONTESTANTS, *OURS]
@@ -125,7 +125,7 @@ def main() -> int:
         folder = Path(name)
         order: dict[str, Any] = {
             "model": str(arguments.model),
-            "pictures": str(draw_pictures(folder / "pictures.npy", width, height)),
+            "images": str(draw_images(folder / "images.npy", width, height)),
             "image_size": max(width, height),
             "precision": "auto",
             "classes": None,

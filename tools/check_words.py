@@ -27,6 +27,10 @@ INSTEAD = {
     "keeper": "supervisor",
     "lest": "so that ... not",
     "manners": "profile",
+    "picture": "image, frame",
+    "pictures": "images, frames",
+    "refusal": "error, rejection, denial",
+    "refusals": "errors, rejections, denials",
     "stranger": "other, unknown",
     "strangers": "others, unknown",
     "tell": "report, publish, log, send, show",
@@ -39,7 +43,9 @@ PHRASES = {
     "counts as true": "is confirmed",
     "count as true": "be confirmed",
     "under way": "in progress",
+    r"being flown": "active",
     r"for ever\b": "forever, until cancelled",
+    r"what is flown|nothing is flown": "the active behaviour; nothing is executed",
     "what flies": "the active behaviour, the vehicle",
 }
 # Names of others: of a library, and of a file format's key.

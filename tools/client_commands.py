@@ -33,7 +33,7 @@ from typing import Any, Literal
 Reply = dict[str, Any]
 """`command`, `success`, `reason`; of a mission also `steps`, of select `track` and `class`."""
 
-NOT_FLOWN = frozenset({NOT_FLOWN})
+NON_FLIGHT = frozenset({NON_FLIGHT})
 """Commands that leave the vehicle's flight as it is, or that end it."""
 
 
@@ -62,7 +62,7 @@ def source() -> str:
     """Return the file's text."""
     no_flight = [kind.word for kind in COMMANDS.values() if kind is Select or kind.aim is not Command.aim]
     words = ", ".join(f'"{word}"' for word in [*no_flight, "stop"])
-    head = HEAD.replace("{NOT_FLOWN}", f"{{{words}}}")
+    head = HEAD.replace("{NON_FLIGHT}", f"{{{words}}}")
     text = head + "".join(map(_method, COMMANDS.values())) + TAIL
     command = [sys.executable, "-m", "ruff", "format", "--stdin-filename", str(FILE), "-"]
     done = subprocess.run(command, input=text, capture_output=True, text=True, check=True)

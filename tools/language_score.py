@@ -44,7 +44,7 @@ class Recorder:
 
     def __init__(self, model: Endpoint) -> None:
         self.model, self.said, self.refused = model, "", 0
-        self.earlier, self.flown, self.questions = list[Message](), list[str](), list[str]()
+        self.earlier, self.executed, self.questions = list[Message](), list[str](), list[str]()
 
     async def answer(self, messages: Sequence[Message], tools: Any, on_text: Any) -> Message:
         if self.earlier:
@@ -61,7 +61,7 @@ class Recorder:
 
     async def command(self, text: str) -> dict[str, Any]:
         first, _, plan = text.partition("\n")
-        self.flown += [step["do"] for step in tomllib.loads(plan)["step"]] if plan else [first]
+        self.executed += [step["do"] for step in tomllib.loads(plan)["step"]] if plan else [first]
         return {"command": text, "success": True, "reason": "done"}
 
     async def scene(self) -> Scene:
@@ -82,14 +82,14 @@ def refers_to_earlier(text: str) -> bool:
 
 
 async def verdict(text: str, expected: Sequence[str], model: Endpoint) -> tuple[str, Recorder]:
-    """`expected`: all commands, as in the table; empty: none may be flown. More questions are allowed."""
+    """`expected`: all commands, as in the table; empty: none may be executed. More questions are allowed."""
     recorder = Recorder(model)
     operator = Operator(lambda _: None, lambda _: None, lambda: asyncio.sleep(0, True))
     conversation = Conversation(recorder, operator, json_schema(CLASSES), CLASSES, endpoint=recorder)
     if refers_to_earlier(text):
         recorder.earlier += [Message("assistant", "", (ORBIT,)), Message("assistant", "The boat is circled.")]
         await conversation.ask("circle the boat at ten metres")
-        recorder.flown.clear()
+        recorder.executed.clear()
     try:
         await conversation.ask(text)
     except LanguageError as error:
@@ -99,9 +99,9 @@ async def verdict(text: str, expected: Sequence[str], model: Endpoint) -> tuple[
     asked = [each for each in expected if each.startswith("?")]
     # A model cannot ask for a colour or a track.
     answered = all(any(f"{each} ".startswith(f"{given} ") for given in recorder.questions) for each in asked)
-    if [parse(each) for each in recorder.flown] == wanted and answered:
+    if [parse(each) for each in recorder.executed] == wanted and answered:
         return "right", recorder
-    return "wrong call" if recorder.flown else "refused" if recorder.refused else "no call", recorder
+    return "wrong call" if recorder.executed else "refused" if recorder.refused else "no call", recorder
 
 
 def main() -> None:
@@ -121,7 +121,7 @@ def main() -> None:
             found, recorder = asyncio.run(verdict(text, expected, model))
             seconds.append(time.perf_counter() - started)
             verdicts[found] += 1
-            calls = "; ".join([*recorder.questions, *recorder.flown]) or repr(recorder.said[:200])
+            calls = "; ".join([*recorder.questions, *recorder.executed]) or repr(recorder.said[:200])
             print(f"{found:10} {seconds[-1]:6.1f} s  {text!r}: {calls}", flush=True)
         times = f"median {statistics.median(seconds):.1f} s, most {max(seconds):.1f} s a sentence"
         print(f"{name}: {verdicts['right']} of {len(seconds)} right; {dict(verdicts)}; {times}\n")

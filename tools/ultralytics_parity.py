@@ -2,7 +2,7 @@
 
 For each model table that an installed `ultralytics` knows, a network with random weights and lively
 normalisation statistics is saved as its trainer saves one (a pickled model, float16). Both sides read the
-file. Compared on one picture of noise:
+file. Compared on one image of noise:
 
 * maps: everything the head gives before boxes are selected, float32, largest difference;
 * folded: the same with our normalisation folded into the convolutions, and what folding costs on their side;
@@ -47,13 +47,13 @@ def oracle_model(name: str, classes: int | None = None) -> nn.Module:
     return model
 
 
-def pictures(count: int, height: int, width: int, generator: torch.Generator) -> Tensor:
-    """Noise of every size, from a pixel to a quarter of the picture, for deep layers to see."""
-    picture = torch.zeros(count, 3, height, width)
+def noise_images(count: int, height: int, width: int, generator: torch.Generator) -> Tensor:
+    """Noise of every size, from a pixel to a quarter of the image, for deep layers to see."""
+    image = torch.zeros(count, 3, height, width)
     for cell in (1, 4, 16, 64):
         coarse = torch.rand(count, 3, height // cell + 1, width // cell + 1, generator=generator)
-        picture += nn.functional.interpolate(coarse, (height, width), mode="bilinear") / 4
-    return picture
+        image += nn.functional.interpolate(coarse, (height, width), mode="bilinear") / 4
+    return image
 
 
 def enliven(model: nn.Module, image: Tensor, seed: int) -> None:
@@ -73,13 +73,13 @@ def enliven(model: nn.Module, image: Tensor, seed: int) -> None:
             if isinstance(getattr(module, "gamma", None), nn.Parameter):
                 uniform(module.gamma, 0.2, 0.8)
         for norm in norms:
-            norm.momentum = None  # A cumulative average: the statistics of exactly these pictures.
+            norm.momentum = None  # A cumulative average: the statistics of exactly these images.
             norm.reset_running_stats()
             uniform(norm.weight, 0.7, 1.3)
             uniform(norm.bias, -0.2, 0.2)
         model.train()
         for _ in range(2):
-            model(pictures(2, 256, 320, generator))
+            model(noise_images(2, 256, 320, generator))
         for norm in norms:
             norm.momentum = 0.03
             uniform(spread := torch.empty_like(norm.running_var), 0.8, 1.25)
@@ -169,7 +169,7 @@ def compare(
 
     torch.manual_seed(seed)
     fresh = oracle_model(name, classes)
-    image = pictures(1, 256, 320, torch.Generator().manual_seed(seed + 1))
+    image = noise_images(1, 256, 320, torch.Generator().manual_seed(seed + 1))
     enliven(fresh, image, seed)
     path = folder / f"{name}.pt"
     save(path, fresh.fuse() if folded else fresh)

@@ -288,10 +288,10 @@ def _draw_panel(image: NDArray[np.uint8], lines: Sequence[str], sizes: _Sizes) -
     scale = sizes.font_scale
     margin, inside = 2 * sizes.padding, 2 * sizes.padding
     widest = max(cv2.getTextSize(line, _FONT, scale, sizes.stroke)[0][0] for line in lines)
-    room = width - 2 * margin - 2 * inside
-    if widest > room > 0:  # a long line is scaled down, not cut
-        scale *= room / widest
-        widest = room
+    available = width - 2 * margin - 2 * inside
+    if widest > available > 0:  # a long line is scaled down, not cut
+        scale *= available / widest
+        widest = available
     (_, text_height), baseline = cv2.getTextSize("Ag", _FONT, scale, sizes.stroke)
     pitch = text_height + baseline + sizes.padding
     panel = (

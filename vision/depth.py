@@ -82,7 +82,7 @@ def depth_millimetres(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
     """Depth (height, width) as little-endian integers, as depth cameras deliver it and ROS has it (REP 118).
 
     0: unknown, or nearer than half a millimetre or farther than 65.535 m. `to_metres` of
-    `vision.sources.depth_pictures` is the inverse: exact for depth that came in whole millimetres.
+    `vision.sources.depth_images` is the inverse: exact for depth that came in whole millimetres.
     """
     with np.errstate(invalid="ignore"):
         known = (depth_m > 0.0) & (depth_m < _END_M)

@@ -50,7 +50,7 @@ class DepthCalibration:
         Args:
             depth_m: (h, w) metres along the depth camera's optical axis, of any size of its lens's aspect;
                 NaN, infinite or not above zero if unknown.
-            width, height: of the colour picture.
+            width, height: of the colour image.
 
         Returns:
             (height, width) metres along the colour camera's optical axis, NaN if unknown.
@@ -63,7 +63,7 @@ class DepthCalibration:
 
 
 class _Table:
-    """The curves of all depth pixels in colour pictures of one size."""
+    """The curves of all depth pixels in colour images of one size."""
 
     def __init__(self, calibration: DepthCalibration, size: tuple[int, int], colour: tuple[int, int]) -> None:
         depth = scaled_to_frames(calibration.depth, *size)
@@ -82,7 +82,7 @@ class _Table:
         self._curves = tuple(each.T.astype(np.float32) for each in (first, linear, square))
         self._forward = rays[:, 2].astype(np.float32)
         self._forward_m = np.float32(calibration.position_m[2])
-        # Pixels of the colour picture that a depth pixel covers, in both directions.
+        # Pixels of the colour image that a depth pixel covers, in both directions.
         by_row = first.reshape(*size[::-1], 2)
         apart = np.abs(np.diff(by_row, axis=1)).max(axis=2)
         larger = float(np.nanmedian(apart)) if np.isfinite(apart).any() else 1.0

@@ -1,6 +1,6 @@
-"""Levels pictures by the attitude at their capture: the horizon is horizontal.
+"""Levels images by the attitude at their capture: the horizon is horizontal.
 
-A picture is only rotated about the optical centre, so distances do not matter. The direction of the optical
+An image is only rotated about the optical centre, so distances do not matter. The direction of the optical
 axis is kept. A fixed camera that looks steeply down, where no horizon is, is levelled as if the vehicle were
 level; one on a gimbal stays as it is. With a rolling shutter every row has its own rotation (Forssén and
 Ringaby 2010, "Rectifying rolling shutter video").
@@ -39,7 +39,7 @@ _OUTSIDE_PX = -1e6
 
 
 def level_camera(camera: CameraModel) -> CameraModel:
-    """The lens of the levelled picture: without distortion, apart from a fisheye, which stays one."""
+    """The lens of the levelled image: without distortion, apart from a fisheye, which stays one."""
     if camera.distortion_model == EQUIDISTANT:
         return camera
     return replace(camera, distortion=(), distortion_model="plumb_bob")
@@ -51,7 +51,7 @@ def poses_of_readout(
     """The poses at equal intervals from the first row to the last one; one without a rolling shutter.
 
     Args:
-        captured_ns: the stamp of the picture, at the middle of its readout.
+        captured_ns: the stamp of the image, at the middle of its readout.
         readout_s: from the exposure of the first row to that of the last; 0: global shutter.
 
     Returns:
@@ -63,10 +63,10 @@ def poses_of_readout(
 
 
 def level_rotations(poses: Sequence[tuple[CameraMount, Rotation]]) -> NDArray[np.float64]:
-    """(N, 3, 3) rotations from the optical frame of each pose to that of the levelled picture.
+    """(N, 3, 3) rotations from the optical frame of each pose to that of the levelled image.
 
     Args:
-        poses: as of `poses_of_readout`; the levelled picture has the direction of the middle one.
+        poses: as of `poses_of_readout`; the levelled image has the direction of the middle one.
 
     Raises:
         ValueError: a camera is on a gimbal and the gimbal's attitude is missing.
@@ -92,14 +92,14 @@ def level_image(
     level_from_optical: NDArray[np.float64],
     rotate_deg: int = 0,
 ) -> NDArray[np.uint8]:
-    """The picture of the levelled camera, of the same size; black where the camera saw nothing.
+    """The image of the levelled camera, of the same size; black where the camera saw nothing.
 
     Args:
         image: (height, width) or (height, width, 3).
-        camera: the lens of the picture; its size is that of the image.
+        camera: the lens of the image, with its size.
         level_from_optical: (3, 3); or (N, 3, 3) at equal intervals from the first row that was read to the
             last one, see `level_rotations`.
-        rotate_deg: clockwise, by which the picture was rotated after the readout (`source.rotate_deg`).
+        rotate_deg: clockwise, by which the image was rotated after the readout (`source.rotate_deg`).
 
     Returns:
         With the lens `level_camera(camera)`.
@@ -141,7 +141,7 @@ def _grid(camera: CameraModel) -> tuple[NDArray[np.float64], NDArray[np.float64]
 
 @lru_cache(maxsize=4)
 def _level_rays(camera: CameraModel) -> tuple[NDArray[np.float64], float]:
-    """(N, 3) rays of the levelled picture's grid, and the least z of a ray that the camera sees."""
+    """(N, 3) rays of the levelled image's grid, and the least z of a ray that the camera sees."""
     columns, rows = np.meshgrid(*_grid(camera))
     rays = level_camera(camera).rays(np.column_stack([columns.ravel(), rows.ravel()]))
     right, bottom = camera.width - 1.0, camera.height - 1.0
@@ -153,7 +153,7 @@ def _level_rays(camera: CameraModel) -> tuple[NDArray[np.float64], float]:
 def _project(
     camera: CameraModel, rays: NDArray[np.float64], level_from_optical: NDArray[np.float64], lowest_z: float
 ) -> NDArray[np.float64]:
-    """(N, 2) pixels of rays of the levelled picture; NaN beyond the corners, where a lens model may fold."""
+    """(N, 2) pixels of rays of the levelled image; NaN beyond the corners, where a lens model may fold."""
     if level_from_optical.ndim == 2:
         seen = rays @ level_from_optical
     else:

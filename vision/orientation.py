@@ -1,15 +1,15 @@
-"""Mirrors and rotates what a camera delivers: picture, depth, lens model and mount.
+"""Mirrors and rotates what a camera delivers: image, depth, lens model and mount.
 
-The picture is mirrored left to right first, and then rotated clockwise. Both only move pixels:
+The image is mirrored left to right first, and then rotated clockwise. Both only move pixels:
 
 * Lens: focal lengths and principal point move with the pixels; by 90 or 270 degrees x and y are exchanged.
   The radial distortion stays, the tangential one (p1, p2) rotates as a vector does.
 * Mount: the position stays. The optical frame turns about its own axis z, which is the mount's innermost
   angle: only roll changes, by `-rotate_deg`. Mirroring changes nothing: it undoes the mirror image that the
-  source delivers (a mirror in front of the lens, a webcam's selfie picture), of which no mount exists.
+  source delivers (a mirror in front of the lens, a webcam's selfie image), of which no mount exists.
 
 So a camera that is fixed upside down, with `rotate_deg=180`, has a roll of 0. What a person calibrates or
-measures is that of the delivered picture; only a calibration that the source brings is converted here.
+measures is that of the delivered image; only a calibration that the source brings is converted here.
 """
 
 from __future__ import annotations
@@ -47,16 +47,16 @@ class Orientation:
         """Whether it changes anything."""
         return self.mirror or self.rotate_deg != 0
 
-    def pixels(self, picture: NDArray[_Number]) -> NDArray[_Number]:
-        """A picture (height, width, 3) or depth (height, width); 90 and 270 degrees exchange its sides."""
+    def pixels(self, image: NDArray[_Number]) -> NDArray[_Number]:
+        """An image (height, width, 3) or depth (height, width); 90 and 270 degrees exchange its sides."""
         if self.mirror:
-            picture = cv2.flip(picture, 1).astype(picture.dtype, copy=False)
+            image = cv2.flip(image, 1).astype(image.dtype, copy=False)
         if self.rotate_deg:
-            picture = cv2.rotate(picture, _ROTATE_CODES[self.rotate_deg]).astype(picture.dtype, copy=False)
-        return picture
+            image = cv2.rotate(image, _ROTATE_CODES[self.rotate_deg]).astype(image.dtype, copy=False)
+        return image
 
     def model(self, model: CameraModel) -> CameraModel:
-        """The lens of the picture that `pixels` returns."""
+        """The lens of the image that `pixels` returns."""
         if self.mirror:
             distortion = _with_tangential(model, lambda p1, p2: (p1, -p2))
             model = replace(model, cx=model.width - 1 - model.cx, distortion=distortion)
@@ -75,12 +75,12 @@ class Orientation:
         return model
 
     def mount(self, mount: CameraMount) -> CameraMount:
-        """The mount of the picture that `pixels` returns."""
+        """The mount of the image that `pixels` returns."""
         roll_rad = mount.roll_rad - math.radians(self.rotate_deg)
         return replace(mount, roll_rad=math.remainder(roll_rad, math.tau))
 
     def calibration(self, calibration: CameraCalibration) -> CameraCalibration:
-        """Lens and mount of the picture that `pixels` returns."""
+        """Lens and mount of the image that `pixels` returns."""
         mount = None if calibration.mount is None else self.mount(calibration.mount)
         return CameraCalibration(self.model(calibration.model), mount)
 

@@ -52,7 +52,7 @@ class PathRequest:
         reference: (north, east) metres, the line that would be flown without obstacles, from about the
             vehicle on; its last point is the goal.
         clearance_m: least distance of the vehicle's centre from an obstacle.
-        number: of what is flown; its paths have the same.
+        number: of the active behaviour; its paths have the same.
     """
 
     reference: tuple[Point, ...]

@@ -46,10 +46,10 @@ _BY_SIGHT = f"approach car distance=5 speed={SPEED_MPS:g}"
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """What is done to which process, while what is flown."""
+    """What is done to which process, during which command."""
 
     name: str
-    flown: str
+    command: str
     process: str
     number: signal.Signals
 
@@ -171,16 +171,16 @@ def _fly_into(fault: Fault, settings: Settings, service_pid: int, truth: Path) -
     with open_client(client_settings(settings.zenoh), timeout_s=_READY_S) as session:
         listen(session, "status", lambda _, text: statuses.append(json.loads(text)))
         _command(session, settings, f"takeoff {ALTITUDE_M:g}", patient=True)
-        if fault.flown is _BY_SIGHT:
+        if fault.command is _BY_SIGHT:
             _command(session, settings, "seek car")
         # Not waited for: an approach answers when it is there.
         session.get(
-            command_key(settings.vehicle.name), lambda _: None, payload=fault.flown, timeout=_COMMAND_S
+            command_key(settings.vehicle.name), lambda _: None, payload=fault.command, timeout=_COMMAND_S
         )
         deadline_s = time.monotonic() + _COMMAND_S
         while not (statuses and _steady(truth)):
             if time.monotonic() > deadline_s:
-                raise SimSessionError(f"{fault.flown!r} was not flown steadily within {_COMMAND_S:g} s")
+                raise SimSessionError(f"{fault.command!r} was not flown steadily within {_COMMAND_S:g} s")
             time.sleep(0.1)
         pid = service_pid if fault.process == "service" else statuses[-1]["perception"]["pid"]
         fault_ns = time.monotonic_ns()

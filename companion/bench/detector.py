@@ -22,7 +22,7 @@ import numpy as np
 
 ROUNDS = 5
 _WARM_UP = 8
-_PICTURES = 8
+_IMAGES = 8
 # Columns of the table, with their widths.
 _TABLE = {
     "runtime": 12,
@@ -80,16 +80,16 @@ class Measured:
         self._process.communicate()
         self._errors.close()
 
-    def detect(self, pictures: int, *, count: bool = True) -> None:
-        """Detect in so many pictures; `count` False: only to get warm."""
-        answer = self._ask(str(pictures))
+    def detect(self, images: int, *, count: bool = True) -> None:
+        """Detect in so many images; `count` False: only to get warm."""
+        answer = self._ask(str(images))
         self.answer |= {"memory_mb": answer["memory_mb"]}
         if count:
             self._times += answer["times_ms"]
             self._processor_s += answer["processor_s"]
 
     def figures(self) -> dict[str, Any]:
-        """All that was measured, milliseconds of one picture, pixels in, boxes out.
+        """All that was measured, milliseconds of one image, pixels in, boxes out.
 
         `processor_ms` is the mean processor time of all threads: other load changes it far less.
         """
@@ -140,7 +140,7 @@ def measure_detectors(
     width: int = 640,
     height: int = 480,
 ) -> dict[str, Any]:
-    """Every runtime in `runtimes`, in turn, on the same drawn pictures of `width` × `height`.
+    """Every runtime in `runtimes`, in turn, on the same drawn images of `width` × `height`.
 
     Returns:
         `machine`, what was asked, and `rows`, one a runtime.
@@ -154,12 +154,12 @@ def measure_detectors(
         "classes": None if classes is None else list(classes),
     }
     with tempfile.TemporaryDirectory() as folder:
-        pictures = draw_pictures(Path(folder) / "pictures.npy", width, height)
+        images = draw_images(Path(folder) / "images.npy", width, height)
         command = [sys.executable, "-m", "companion.bench.detector"]
         measured: list[Measured] = []
         try:
             for runtime in runtimes:
-                one = Measured(runtime, command, {**order, "runtime": runtime, "pictures": str(pictures)})
+                one = Measured(runtime, command, {**order, "runtime": runtime, "images": str(images)})
                 measured.append(one)
             in_turn(measured, frames)
             rows = [one.figures() for one in measured]
@@ -170,7 +170,7 @@ def measure_detectors(
 
 
 def in_turn(measured: Sequence[Measured], frames: int) -> None:
-    """Let each detect in `frames` pictures, a part of them each time it is its turn."""
+    """Let each detect in `frames` images, a part of them each time it is its turn."""
     for one in measured:
         one.detect(_WARM_UP, count=False)
     parts = [frames // ROUNDS + (number < frames % ROUNDS) for number in range(ROUNDS)]
@@ -179,12 +179,12 @@ def in_turn(measured: Sequence[Measured], frames: int) -> None:
             one.detect(part)
 
 
-def draw_pictures(path: Path, width: int, height: int) -> Path:
-    """A few pictures of the built-in world, (N, height, width, 3) uint8 BGR, as a numpy file."""
+def draw_images(path: Path, width: int, height: int) -> Path:
+    """A few images of the built-in world, (N, height, width, 3) uint8 BGR, as a numpy file."""
     from mavlink_sim.datasets.training_scenes import random_scene
 
     rng = np.random.default_rng(0)
-    np.save(path, np.stack([random_scene(rng, width, height)[0] for _ in range(_PICTURES)]))
+    np.save(path, np.stack([random_scene(rng, width, height)[0] for _ in range(_IMAGES)]))
     return path
 
 
@@ -251,8 +251,8 @@ def main() -> int:
             classes=order["classes"],
             runtime=order["runtime"],
         )
-        pictures = np.load(order["pictures"])
-        detector.detect(pictures[0])
+        images = np.load(order["images"])
+        detector.detect(images[0])
     except (ValueError, OSError, RuntimeError) as error:  # sent to the caller
         print(json.dumps({"error": " ".join(str(error).split())}), flush=True)
         return 1
@@ -262,7 +262,7 @@ def main() -> int:
         times = []
         before = time.process_time()
         for number in range(int(line)):
-            detector.detect(pictures[number % len(pictures)])
+            detector.detect(images[number % len(images)])
             timing = detector.last_timing
             assert timing is not None
             times.append([timing.preprocess_ms, timing.inference_ms, timing.postprocess_ms])

@@ -52,7 +52,7 @@ class _Figures:
 def measure_latency(seconds: float, *, driver: str) -> dict[str, object]:
     """Fly `seek` and `approach` and time every setpoint that is the first after a new detection message.
 
-    `capture_to_setpoint` starts at the pose's stamp in the simulator, before the picture is drawn.
+    `capture_to_setpoint` starts at the pose's stamp in the simulator, before the image is drawn.
     `beyond_network` is what the companion adds to the network: from when the frame is there, less the
     network's own time. Every stage is a median: those of `PerceptionResult.timing_ms`, among them
     `capture` and `inference`, which are not the companion's; then `deliver`, from when the result was known

@@ -96,7 +96,7 @@ class LockstepDriver(Protocol):
 class _Pending:
     identifier: int
     command: int
-    refusal: str
+    failure: str
     shown: Callable[[], bool] | None
     until_ns: float
 
@@ -179,9 +179,9 @@ class SimulatedDriver:
                     sub,
                 )
             case Arm():
-                refusal = "the vehicle refused to arm"
+                failure = "the vehicle refused to arm"
                 self._command(
-                    request, refusal, lambda: self._state.armed, mav.MAV_CMD_COMPONENT_ARM_DISARM, 1.0
+                    request, failure, lambda: self._state.armed, mav.MAV_CMD_COMPONENT_ARM_DISARM, 1.0
                 )
             case TakeOff(altitude_m):
                 if self._profile.takeoff_needs_home:
@@ -245,7 +245,7 @@ class SimulatedDriver:
             if pending.shown is not None and pending.shown():
                 self._answer(pending, None)
             elif now_ns > pending.until_ns:
-                self._answer(pending, f"{pending.refusal}: nothing shows after {SHOWN_TIMEOUT_S:g} s")
+                self._answer(pending, f"{pending.failure}: nothing shows after {SHOWN_TIMEOUT_S:g} s")
 
     def _on_event(self, message: Any, now_ns: int) -> None:
         event = Event(message.id, message.sequence, message.log_levels, message.arguments)
@@ -256,14 +256,14 @@ class SimulatedDriver:
     def _command(
         self,
         request: Request,
-        refusal: str,
+        failure: str,
         shown: Callable[[], bool] | None,
         number: int,
         *parameters: float,
     ) -> None:
-        """One COMMAND_LONG. `shown`: what ends it besides a refusal; None: its acknowledgement."""
+        """One COMMAND_LONG. `shown`: what ends it besides an error; None: its acknowledgement."""
         until_ns = self.now_ns + SHOWN_TIMEOUT_S * 1e9
-        self._pending.append(_Pending(request.identifier, number, refusal, shown, until_ns))
+        self._pending.append(_Pending(request.identifier, number, failure, shown, until_ns))
         self.vehicle.send(self._long(number, *parameters))
 
     def _long(self, number: int, *parameters: float) -> object:
@@ -275,7 +275,7 @@ class SimulatedDriver:
         if pending is None or message.result == IN_PROGRESS:
             return
         if message.result != ACCEPTED:
-            self._answer(pending, f"{pending.refusal} ({result_name(message.result)})")
+            self._answer(pending, f"{pending.failure} ({result_name(message.result)})")
         elif pending.shown is None:
             self._answer(pending, None)
 

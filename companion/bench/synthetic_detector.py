@@ -20,7 +20,7 @@ from vision.camera_model import CameraModel, CameraMount
 from vision.detections import Detections
 from vision.rotation import matrix_from_quaternion
 
-# Of an object's outline inside the picture and not hidden: with less it is not found.
+# Of an object's outline inside the image and not hidden: with less it is not found.
 LEAST_VISIBLE = 0.35
 LEAST_PIXELS = 5.0
 NEAR_M = 0.1

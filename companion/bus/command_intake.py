@@ -43,7 +43,7 @@ class CommandIntake:
         self.refused = 0
 
     def read(self, size: int, payload: Callable[[], bytes], sender: bytes = b"") -> tuple[str | None, str]:
-        """Return the command's text, or None and the reason of the refusal.
+        """Return the command's text, or None and why it is refused.
 
         Args:
             size: of the payload, bytes. payload: called only if the size is allowed.

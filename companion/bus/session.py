@@ -118,7 +118,7 @@ class Bus:
         # While zenoh sends kept messages to a frozen reader, a put of that topic waits for seconds, as does a
         # reply to one. So neither is sent by the loop, and the reader of an image delays no command's result.
         self._kept_puts = ThreadPoolExecutor(1, "zenoh kept messages")
-        self._room_for_kept = threading.Semaphore(_MOST_UNSENT)
+        self._kept_slots = threading.Semaphore(_MOST_UNSENT)
         self._command_replies = ThreadPoolExecutor(1, "zenoh command replies")
         self._query_replies = ThreadPoolExecutor(1, "zenoh query replies")
         self._listeners = tuple(listeners)
@@ -257,7 +257,7 @@ class Bus:
         payload = body if isinstance(body, str | bytes) else encode(body)
         if not topic.cached and len(payload) <= LARGE_BYTES:
             self._put(path, publisher, payload)
-        elif self._room_for_kept.acquire(blocking=False):
+        elif self._kept_slots.acquire(blocking=False):
             self._kept_puts.submit(self._put_kept, path, publisher, payload)
         else:
             self.publish_failed += 1
@@ -266,7 +266,7 @@ class Bus:
         try:
             self._put(path, publisher, payload)
         finally:
-            self._room_for_kept.release()
+            self._kept_slots.release()
 
     def _put(self, path: str, publisher: _Publisher, payload: str | bytes) -> None:
         try:

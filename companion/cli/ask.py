@@ -37,7 +37,7 @@ def ask(
 ) -> None:
     """Fly and answer plain sentences, by patterns or by a language model.
 
-    What moves the vehicle is shown first, and flown if you answer y. `stop` is sent at once.
+    What moves the vehicle is shown first, and executed if you answer y. `stop` is sent at once.
     """
     from companion.bus.client import NoAnswerError
     from companion.bus.session import BusError
@@ -123,7 +123,7 @@ class Terminal:
     async def confirm(self) -> bool:
         """Ask whether to fly what was shown."""
         if self._ended:
-            self.show("not flown: nobody confirms it; language.may lists what needs no confirmation")
+            self.show("not executed: nobody confirms it; language.may lists what needs no confirmation")
             return False
         # A console of the service prints whole lines only.
         (self.write if sys.stdin.isatty() else self.show)("fly this? [y/N] ")

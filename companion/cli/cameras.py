@@ -55,7 +55,7 @@ def _device_lines(device: VideoDevice) -> Iterator[str]:
     if device.stable_path is not None:
         yield f"  = {device.path}"
     if device.kind != "camera" and not device.error:
-        yield f"  {device.kind} node: delivers no pictures"
+        yield f"  {device.kind} node: delivers no images"
     if device.holders:
         yield f"  open in {', '.join(device.holders)}"
     for pixel_format in device.formats:
@@ -78,15 +78,15 @@ SOURCE_HELP = "/dev/video0, csi://0, file, folder, FIFO, - (standard input) or U
 def preview(
     settings: Settings,
     source: Annotated[str | None, typer.Argument(help=SOURCE_HELP)] = None,
-    save: Annotated[Path | None, typer.Option(help="Folder for a picture with each line.")] = None,
-    grey: Annotated[bool, typer.Option("--grey", help="Pictures in grey, a third as wide and high.")] = False,
+    save: Annotated[Path | None, typer.Option(help="Folder for an image with each line.")] = None,
+    grey: Annotated[bool, typer.Option("--grey", help="Images in grey, a third as wide and high.")] = False,
     period: Annotated[
-        float, typer.Option(min=0, help="Seconds between lines and pictures; 0: every frame.")
+        float, typer.Option(min=0, help="Seconds between lines and images; 0: every frame.")
     ] = 1.0,
     limit: Annotated[int | None, typer.Option(min=1, help="Maximum number of lines.")] = None,
     level: Annotated[
         bool,
-        typer.Option("--level", help="Level the pictures by the attitude of the vehicle (--vehicle-url)."),
+        typer.Option("--level", help="Level the images by the attitude of the vehicle (--vehicle-url)."),
     ] = False,
 ) -> None:
     """Show what a source delivers. Prints size, measured rate and stamp once a second. Ends on Ctrl-C."""
@@ -99,7 +99,7 @@ def preview(
     with ExitStack() as stack:
         stack.enter_context(plain_errors(LinkError, ValueError))
         if level and save is None:
-            raise ValueError("--level is for the pictures of --save DIR, which is not given")
+            raise ValueError("--level is for the images of --save DIR, which is not given")
         telemetry = stack.enter_context(attitudes_of(settings)) if level else None
         frames = stack.enter_context(opened(settings, source))
         levelling = None
@@ -113,7 +113,7 @@ def depth(
     settings: Settings,
     source: Annotated[str | None, typer.Argument(help=SOURCE_HELP)] = None,
     detect: Annotated[bool, typer.Option("--detect", help="Detect objects, and print their depth.")] = False,
-    save: Annotated[Path | None, typer.Option(help="Folder for a picture of each frame.")] = None,
+    save: Annotated[Path | None, typer.Option(help="Folder for an image of each frame.")] = None,
     limit: Annotated[int | None, typer.Option(min=1, help="Maximum number of frames.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the messages of the topic `depth`.")] = False,
 ) -> None:

@@ -60,8 +60,8 @@ def cloud(
             "--clusters", help="List the objects above the ground. Unless set: --voxel 0.1 --average 4."
         ),
     ] = False,
-    picture: Annotated[
-        Path | None, typer.Option(help="Picture of the cloud from behind and above: .png or .jpg.")
+    view: Annotated[
+        Path | None, typer.Option(help="View of the cloud from behind and above: .png or .jpg.")
     ] = None,
     text: Annotated[bool, typer.Option("--text", help="Write numbers as text instead of binary.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
@@ -72,14 +72,14 @@ def cloud(
         from vision.point_cloud.drawing import draw_cloud
         from vision.rotation import matrix_from_euler
 
-    if picture is not None and picture.suffix not in _QUALITY:
-        _refuse(f"{picture}: expected a name that ends in {' or '.join(_QUALITY)}")
+    if view is not None and view.suffix not in _QUALITY:
+        _refuse(f"{view}: expected a name that ends in {' or '.join(_QUALITY)}")
     if clusters:
         voxel, average = voxel or 0.1, average or 4
     # ValueError: a camera on a gimbal has no fixed mount, or the voxels are too small.
     with plain_errors(CloudFileError, ValueError, OSError):
         check_finite("--attitude", *attitude)
-        for path in (output, picture):
+        for path in (output, view):
             if path is not None:
                 check_folder(path)
         ned_from_body = matrix_from_euler(*(math.radians(angle) for angle in attitude))
@@ -120,10 +120,10 @@ def cloud(
         elif voxel is not None:
             written = voxel_grid(points, voxel)
         write_cloud(output, written, binary=not text)
-        if picture is not None:
+        if view is not None:
             drawn = draw_cloud(written, down, clusters=found, point_m=0.03 if voxel is None else voxel)
-            if not cv2.imwrite(str(picture), drawn, _QUALITY[picture.suffix]):
-                raise OSError(f"cannot write {picture}: check its folder and the free disk space")
+            if not cv2.imwrite(str(view), drawn, _QUALITY[view.suffix]):
+                raise OSError(f"cannot write {view}: check its folder and the free disk space")
     objects = [_record(cluster, down) for cluster in found]
     if as_json:
         report = {"source": source, "file": str(output), "frame": frame, "stamp_ns": points.stamp_ns}

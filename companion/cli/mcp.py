@@ -22,8 +22,8 @@ def mcp(
     allow: Annotated[
         str,
         typer.Option(
-            help="Commands that may be flown, such as takeoff,land. Default: none; stop and hold only end a "
-            "command that this server started."
+            help="Commands that may be executed, such as takeoff,land. Default: none; stop and hold only end "
+            "a command that this server started."
         ),
     ] = "",
     listen: Annotated[
@@ -37,9 +37,9 @@ def mcp(
 ) -> None:
     """Serve the vehicle's commands and state to language models by the Model Context Protocol.
 
-    Nobody confirms: only the commands of --allow are flown. Without it, `stop` and `hold` are sent only while
-    a command that this server started is being flown; they end it. After a pilot took over, nothing is flown
-    until an operator has commanded in another way, or this server is restarted.
+    Nobody confirms: only the commands of --allow are executed. Without it, `stop` and `hold` are sent only
+    while a command that this server started is active; they end it. After a pilot took over, nothing is
+    executed until an operator has commanded in another way, or this server is restarted.
     """
     try:
         import mcp.server  # noqa: F401

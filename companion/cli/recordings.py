@@ -200,7 +200,7 @@ def show_recording(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="A recording.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """Show a recording: events, modes, arming, refusals, images, depth, losses and damage."""
+    """Show a recording: events, modes, arming, refused commands, images, depth, losses and damage."""
     with _with_library():
         from companion.flight_log import shown, summarize
         from companion.recording import RecordingError

@@ -8,7 +8,7 @@ from typing import Any, Literal
 Reply = dict[str, Any]
 """`command`, `success`, `reason`; of a mission also `steps`, of select `track` and `class`."""
 
-NOT_FLOWN = frozenset({"gimbal", "select", "stop"})
+NON_FLIGHT = frozenset({"gimbal", "select", "stop"})
 """Commands that leave the vehicle's flight as it is, or that end it."""
 
 

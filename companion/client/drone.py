@@ -20,7 +20,7 @@ from companion.bus.bodies.frames import DepthBody, DetectionsBody, MarkersBody, 
 from companion.bus.bodies.service import EventBody, StatusBody
 from companion.bus.bodies.vehicle import ObstaclesBody, VehicleBody, VelocityBody
 from companion.bus.client import NoAnswerError, client_settings, open_client, send_command
-from companion.client.commands import NOT_FLOWN, Commands, Reply
+from companion.client.commands import NON_FLIGHT, Commands, Reply
 from companion.client.stream import Stream
 from companion.settings import ZenohSection
 
@@ -46,7 +46,7 @@ class Steering:
 
     def __init__(self, publisher: zenoh.Publisher, source: str) -> None:
         self._publisher, self.source = publisher, source
-        self._statuses, self._flown_instead = 0, ""
+        self._statuses, self._replaced_by = 0, ""
 
     def send(
         self,
@@ -69,8 +69,8 @@ class Steering:
             ValueError: a value is not finite or out of range.
             CommandFailedError: the command has ended, as far as `status` has shown it, within about 2 s.
         """
-        if self._flown_instead:
-            reason = f"ended, the vehicle flies something else: {self._flown_instead}"
+        if self._replaced_by:
+            reason = f"ended, the vehicle flies something else: {self._replaced_by}"
             raise CommandFailedError(
                 {"command": f"velocity source={self.source}", "success": False, "reason": reason}
             )
@@ -103,7 +103,7 @@ class Steering:
         behaviour: str = json.loads(sample.payload.to_string())["pilot"]["behaviour"]
         # The first one may have been made before the command began.
         own = self._statuses == 1 or behaviour.startswith(f"velocity of {self.source}")
-        self._flown_instead = "" if own else behaviour
+        self._replaced_by = "" if own else behaviour
 
 
 @cache
@@ -150,7 +150,7 @@ class Drone(Commands):
             reply = await asyncio.shield(outcome)
         except asyncio.CancelledError:
             word = text.lower().split()[:1]
-            if word and word[0] not in NOT_FLOWN:
+            if word and word[0] not in NON_FLIGHT:
                 await asyncio.shield(self._stop(outcome))
             raise
         if not reply["success"]:
@@ -158,14 +158,14 @@ class Drone(Commands):
         return reply
 
     async def _stop(self, outcome: asyncio.Future[Reply]) -> None:
-        """End a command: `stop`, again if the command reached the service, or began to be flown, after it."""
+        """End a command: `stop`, again if the command reached the service, or became active, after it."""
         for _ in range(3):
             answered = outcome.done()
             if answered and (outcome.exception() is not None or not outcome.result()["success"]):
                 return
             with suppress(NoAnswerError):
                 await self._send("stop", _STOP_TIMEOUT_S)
-                if answered:  # with success: an endless one is flown
+                if answered:  # with success: an endless one is active
                     return
             await asyncio.wait([outcome], timeout=_STOPPED_WITHIN_S)
 

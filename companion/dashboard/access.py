@@ -30,7 +30,7 @@ class DashboardError(RuntimeError):
     """The page cannot be served. The message is one line."""
 
 
-class Refusal(NamedTuple):
+class ErrorResponse(NamedTuple):
     """An HTTP status and one line of text."""
 
     status: int
@@ -106,7 +106,7 @@ class Access:
         """Whether a text is the token."""
         return self.token is not None and _equal(text, self.token)
 
-    def check(self, method: str, path: str, headers: Mapping[str, str]) -> Refusal | None:
+    def check(self, method: str, path: str, headers: Mapping[str, str]) -> ErrorResponse | None:
         """Check everything but the token; None: the request is accepted.
 
         Args:
@@ -114,16 +114,16 @@ class Access:
         """
         host = headers.get("host", "")
         if not self._host_is_ours(host):
-            return Refusal(403, f"Host {host!r} is not an address of this server")
+            return ErrorResponse(403, f"Host {host!r} is not an address of this server")
         origin = headers.get("origin")
         if origin is not None and origin not in (f"http://{host}", f"https://{host}"):
-            return Refusal(403, f"Origin {origin!r} is another page")
+            return ErrorResponse(403, f"Origin {origin!r} is another page")
         # Following a link to the page is harmless: it cannot be framed, and the link's page cannot read it.
         followed_link = method == "GET" and path == "/" and headers.get("sec-fetch-mode") == "navigate"
         if not followed_link and headers.get("sec-fetch-site", "none") not in ("same-origin", "none"):
-            return Refusal(403, "requested by another page")
+            return ErrorResponse(403, "requested by another page")
         if self.page and method not in ("GET", "HEAD") and HEADER not in headers:
-            return Refusal(403, f"the header {HEADER} is missing")
+            return ErrorResponse(403, f"the header {HEADER} is missing")
         return None
 
     def admits(self, headers: Mapping[str, str]) -> bool:

@@ -1,7 +1,7 @@
-"""One vehicle's messages: keeps the newest of each topic and the newest picture of each camera.
+"""One vehicle's messages: keeps the newest of each topic and the newest image of each camera.
 
 zenoh calls back on its own threads. Each message replaces the one before, so nothing grows, however slow the
-readers are. Only what a browser shows is subscribed: the state while a stream is open, a camera's pictures
+readers are. Only what a browser shows is subscribed: the state while a stream is open, a camera's images
 for two seconds after each request.
 """
 
@@ -26,9 +26,9 @@ from companion.dashboard.merge import Sighting
 
 logger = logging.getLogger(__name__)
 
-LARGEST_JSON_BYTES, LARGEST_PICTURE_BYTES = 1 << 18, 1 << 23
+LARGEST_JSON_BYTES, LARGEST_IMAGE_BYTES = 1 << 18, 1 << 23
 MAX_RATE_HZ = 15.0
-"""Of pictures; those in between are dropped."""
+"""Of images; those in between are dropped."""
 MAX_CAMERAS, MAX_BOXES = 16, 200
 MAX_TRACKS = 30
 """Of a vehicle, on the map."""
@@ -64,12 +64,12 @@ class News:
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class CameraImage:
     """A JPEG and the boxes of the same frame.
 
-    `about` is JSON-able: `sequence`, `captured_ns`, `annotated` (the boxes are also drawn in the picture),
+    `about` is JSON-able: `sequence`, `captured_ns`, `annotated` (the boxes are also drawn in the image),
     `boxes` and `boxes_sequence` (that of another frame if this one was not processed). A box is left, top,
-    right, bottom as fractions of the picture, class name, confidence, track id, track state.
+    right, bottom as fractions of the image, class name, confidence, track id, track state.
     """
 
     jpeg: bytes
@@ -81,7 +81,7 @@ class _Camera:
     """What is kept of one camera. `frames`: the newest detection messages."""
 
     frames: deque[dict[str, Any]] = field(default_factory=lambda: deque(maxlen=_KEPT_FRAMES))
-    picture: Picture | None = None
+    image: CameraImage | None = None
     due_s: float = 0.0
     lease_s: float = 0.0
     subscriber: Any = None
@@ -148,7 +148,7 @@ class Bridge:
         undeclare(self._subscribers)
 
     def close(self) -> None:
-        """End all subscriptions, those of pictures too."""
+        """End all subscriptions, those of images too."""
         self.unsubscribe()
         for camera in self._cameras.values():
             camera.lease_s = 0.0
@@ -171,8 +171,8 @@ class Bridge:
         with self._lock:
             return [sighting for sighting, seen_s in self._sightings.values() if seen_s > oldest_s]
 
-    async def picture(self, camera: str, after: int, timeout_s: float) -> Picture | None:
-        """Wait for a picture of another frame than `after`; None if none comes. `camera`: "" is the first."""
+    async def image(self, camera: str, after: int, timeout_s: float) -> CameraImage | None:
+        """Wait for an image of another frame than `after`; None if none comes. `camera`: "" is the first."""
         kept = self._camera(camera)
         session = self._link.session
         if kept is None or session is None:
@@ -180,19 +180,19 @@ class Bridge:
             return None
         kept.lease_s = time.monotonic() + _LEASE_S + timeout_s
         if kept.subscriber is None:
-            kept.picture = None
+            kept.image = None
             kept.subscriber = session.declare_subscriber(
                 IMAGE.key(self.vehicle, camera or None), lambda sample: self._on_image(kept, sample)
             )
         try:
             async with asyncio.timeout(timeout_s):
-                while kept.picture is None or kept.picture.about["sequence"] == after:
+                while kept.image is None or kept.image.about["sequence"] == after:
                     kept.arrived.clear()
                     await kept.arrived.wait()
         except TimeoutError:
             return None
         kept.lease_s = time.monotonic() + _LEASE_S
-        return kept.picture
+        return kept.image
 
     def news(self, after: int) -> News:
         """Return what came after a number."""
@@ -206,11 +206,11 @@ class Bridge:
             )
 
     def end_leases(self) -> None:
-        """End the subscriptions of pictures that nobody has asked for."""
+        """End the subscriptions of images that nobody has asked for."""
         for camera in self._cameras.values():
             if camera.subscriber is not None and time.monotonic() > camera.lease_s:
                 undeclare([camera.subscriber])
-                camera.subscriber = camera.picture = None
+                camera.subscriber = camera.image = None
 
     # --- on zenoh's threads
 
@@ -258,7 +258,7 @@ class Bridge:
         now_s = time.monotonic()
         # A camera's interval varies by some milliseconds.
         too_soon = now_s < camera.due_s - 0.2 / MAX_RATE_HZ
-        if too_soon or len(sample.payload) > LARGEST_PICTURE_BYTES:
+        if too_soon or len(sample.payload) > LARGEST_IMAGE_BYTES:
             return
         try:
             attachment = json.loads(sample.attachment.to_string()) if sample.attachment else {}
@@ -267,7 +267,7 @@ class Bridge:
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
             logger.debug("an image without usable attachment", exc_info=True)
             return
-        camera.picture = Picture(sample.payload.to_bytes(), about)
+        camera.image = CameraImage(sample.payload.to_bytes(), about)
         camera.due_s = max(camera.due_s + 1 / MAX_RATE_HZ, now_s)
         loop = self._link.loop
         if loop is not None and not loop.is_closed():

@@ -1,6 +1,6 @@
 """The chats of the page: plain sentences to a vehicle, by the same code as `companion ask`.
 
-A window has one chat for each vehicle. Its state is small and sent whole. What moves the vehicle is flown
+A window has one chat for each vehicle. Its state is small and sent whole. What moves the vehicle is executed
 after the window has confirmed it. A stop of the vehicle ends what its chats do, another command the plans
 that wait. The code that reads sentences loads OpenCV, so it is imported in a thread, from the server's start.
 """
@@ -122,13 +122,13 @@ class Chat:
         """Confirm or decline a plan; False: it does not wait any more."""
         if self._plan is None or self._plan[0] != number or self._plan[1].done():
             return False
-        self._plan[1].set_result("confirmed" if fly else "not flown")
+        self._plan[1].set_result("confirmed" if fly else "not executed")
         return True
 
     def end_plan(self, reason: str) -> None:
         """Decline the plan that waits, if there is one."""
         if self._plan is not None and not self._plan[1].done():
-            self._plan[1].set_result(f"not flown: {reason}")
+            self._plan[1].set_result(f"not executed: {reason}")
 
     async def confirm(self) -> bool:
         """Wait for the window's answer to the plan that was shown, at most `PLAN_S`."""
@@ -323,11 +323,11 @@ class _ChatDrone(Drone):
     async def command(self, text: str) -> Reply:
         """As the client's. Cancelled by a stop, it sends one of its own only if that stop does not end it."""
         self._before_command()
-        flown = asyncio.ensure_future(super().command(text))
+        running = asyncio.ensure_future(super().command(text))
         try:
-            return await asyncio.shield(flown)
+            return await asyncio.shield(running)
         except asyncio.CancelledError:
-            await asyncio.wait({flown}, timeout=_STOPPED_WITHIN_S)
-            flown.cancel()
-            await asyncio.gather(flown, return_exceptions=True)
+            await asyncio.wait({running}, timeout=_STOPPED_WITHIN_S)
+            running.cancel()
+            await asyncio.gather(running, return_exceptions=True)
             raise

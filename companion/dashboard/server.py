@@ -1,7 +1,7 @@
-"""The web server: the page, one stream of state, pictures on request, commands by POST.
+"""The web server: the page, one stream of state, images on request, commands by POST.
 
 Nothing is queued for a browser. The stream sends what is newest when the browser is ready for more, and a
-picture is sent when the browser asks for the next one. A connection whose data are not accepted for
+image is sent when the browser asks for the next one. A connection whose data are not accepted for
 `TCP_USER_TIMEOUT` is closed by the kernel.
 """
 
@@ -30,7 +30,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from companion.bus.bodies.vehicle import VelocityBody
-from companion.dashboard.access import COOKIE, Access, DashboardError, Refusal, read_token
+from companion.dashboard.access import COOKIE, Access, DashboardError, ErrorResponse, read_token
 from companion.dashboard.bridge import Bridge, News
 from companion.dashboard.chat import MAX_SENTENCE_CHARACTERS, Chats
 from companion.dashboard.fleet import MAX_VEHICLES, Fleet
@@ -39,7 +39,7 @@ from companion.settings import LanguageSection, ZenohSection
 NICENESS = 5
 """Of the server's process: the loop that steers has priority."""
 STREAM_PERIOD_S = 0.1
-PICTURE_WAIT_S = 0.5
+IMAGE_WAIT_S = 0.5
 FIRST_REQUEST_S = 5.0
 """A connection without a complete request head after this is closed: silent ones would use up the limit."""
 REPLY_WAIT_S = 1.0
@@ -49,7 +49,7 @@ ALL = "*"
 LONGEST_COMMAND, LARGEST_BODY_BYTES = 8000, 64 * 1024
 MAX_CONNECTIONS = 100
 MAX_STREAMS_PER_BROWSER = 2
-"""A browser opens 6 connections to one host. One window uses a stream and 2 for pictures, each of two windows
+"""A browser opens 6 connections to one host. One window uses a stream and 2 for images, each of two windows
 a stream and 1, so that a stop command has one at once."""
 _UNACCEPTED_MS = 15_000
 _SEND_BUFFER_BYTES = 256 * 1024
@@ -186,7 +186,7 @@ def create_app(fleet: Fleet, chats: Chats, access: Access) -> ASGIApp:
         return Response(files[name], media_type=_TYPES[Path(name).suffix])
 
     def bridge_of(vehicle: Any) -> Bridge | Response:
-        """Return the bridge of the vehicle in a request, or a refusal."""
+        """Return the bridge of the vehicle in a request, or an error."""
         if not isinstance(vehicle, str) or not re.fullmatch("([A-Za-z0-9][A-Za-z0-9_.-]{0,63})?", vehicle):
             return PlainTextResponse("vehicle: expected the name of a vehicle, or none for the first", 400)
         bridge = fleet.bridge(vehicle)
@@ -204,7 +204,7 @@ def create_app(fleet: Fleet, chats: Chats, access: Access) -> ASGIApp:
             _stream(fleet, bridge, streams, browser, chats, window), media_type="text/event-stream"
         )
 
-    async def picture(request: Request) -> Response:
+    async def image(request: Request) -> Response:
         try:
             after = int(request.query_params.get("after", "-1"))
         except ValueError:
@@ -215,14 +215,14 @@ def create_app(fleet: Fleet, chats: Chats, access: Access) -> ASGIApp:
         bridge = bridge_of(request.query_params.get("vehicle", ""))
         if isinstance(bridge, Response):
             return bridge
-        wait_s = 0.0 if request.query_params.get("wait") == "0" else PICTURE_WAIT_S
-        found = await bridge.picture(camera, after, wait_s)
+        wait_s = 0.0 if request.query_params.get("wait") == "0" else IMAGE_WAIT_S
+        found = await bridge.image(camera, after, wait_s)
         if found is None:
             return Response(status_code=204)
         return Response(found.jpeg, media_type="image/jpeg", headers={"x-frame": json.dumps(found.about)})
 
     async def read_body(request: Request) -> bytearray | Response:
-        """Return a request's body, or a refusal."""
+        """Return a request's body, or an error."""
         body = bytearray()
         async for chunk in request.stream():
             body += chunk
@@ -301,8 +301,8 @@ def create_app(fleet: Fleet, chats: Chats, access: Access) -> ASGIApp:
             return Response(status_code=204) if waited else PlainTextResponse("this plan has ended", 409)
         if not isinstance(text, str) or not 0 < len(text.strip()) <= MAX_SENTENCE_CHARACTERS:
             return PlainTextResponse(f"text: expected 1 to {MAX_SENTENCE_CHARACTERS} characters", 400)
-        refusal = await chats.ask(window, bridge.vehicle, text)
-        return PlainTextResponse(refusal, 429) if refusal else Response(status_code=204)
+        busy = await chats.ask(window, bridge.vehicle, text)
+        return PlainTextResponse(busy, 429) if busy else Response(status_code=204)
 
     async def clock(_request: Request) -> Response:
         return JSONResponse({"now_ns": time.monotonic_ns()})
@@ -311,7 +311,7 @@ def create_app(fleet: Fleet, chats: Chats, access: Access) -> ASGIApp:
         Route("/", page),
         *(Route(f"/{name}", file) for name in files if name != "page.html"),
         Route("/events", events),
-        Route("/picture", picture),
+        Route("/image", image),
         Route("/clock", clock),
         Route("/command", command, methods=["POST"]),
         Route("/velocity", velocity, methods=["POST"]),
@@ -406,7 +406,7 @@ class Guard:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
             return
-        refusal = self._refusal(Request(scope))
+        error = self._check(Request(scope))
 
         async def send_secured(message: Message) -> None:
             if message["type"] == "http.response.start":
@@ -414,23 +414,23 @@ class Guard:
                 message = {**message, "headers": [*message.get("headers", []), *extra]}
             await send(message)
 
-        if refusal is None:
+        if error is None:
             await self._application(scope, receive, send_secured)
         else:
-            await PlainTextResponse(f"{refusal.text}\n", refusal.status)(scope, receive, send_secured)
+            await PlainTextResponse(f"{error.text}\n", error.status)(scope, receive, send_secured)
 
-    def _refusal(self, request: Request) -> Refusal | None:
+    def _check(self, request: Request) -> ErrorResponse | None:
         headers = _joined(request.headers)
         path = request.url.path
-        if (refusal := self._access.check(request.method, path, headers)) is not None:
-            return refusal
+        if (error := self._access.check(request.method, path, headers)) is not None:
+            return error
         given = request.query_params.get("token") if path == "/" else None
         if given is not None and self._access.token is not None:
-            return None if self._access.token_is(given) else Refusal(401, "wrong token")
+            return None if self._access.token_is(given) else ErrorResponse(401, "wrong token")
         if self._access.admits(headers):
             return None
         once = "open /?token=… once, or " if self._access.page else ""
-        return Refusal(401, f"a token is needed: {once}send it as Authorization: Bearer …")
+        return ErrorResponse(401, f"a token is needed: {once}send it as Authorization: Bearer …")
 
 
 def _joined(headers: Headers) -> dict[str, str]:

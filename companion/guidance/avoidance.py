@@ -55,7 +55,7 @@ class Avoidance:
         margin_m: of the obstacle limits.
 
     Attributes:
-        path: (north, east) points of the path of the newest step; empty: none is flown.
+        path: (north, east) points of the path of the newest step; empty: none is active.
     """
 
     def __init__(self, margin_m: float) -> None:
@@ -66,7 +66,7 @@ class Avoidance:
         self.reset()
 
     def reset(self) -> None:
-        """A new behaviour begins: only a path that is planned for it is flown."""
+        """A new behaviour begins: only a path that is planned for it becomes active."""
         self._number += 1
         self.path: tuple[Point, ...] = ()
         self._planned: PlannedPath | None = None
@@ -221,8 +221,8 @@ def _corrected(
     Args:
         gain: of the error of the velocity in the direction.
     """
-    flown = (along_mps * direction[0], along_mps * direction[1])
-    north, east, _ = state.velocity_ned_mps or (*flown, 0.0)
+    planned = (along_mps * direction[0], along_mps * direction[1])
+    north, east, _ = state.velocity_ned_mps or (*planned, 0.0)
     is_mps = north * direction[0] + east * direction[1]
     wanted_mps = min(top_mps, along_mps + gain * (along_mps - is_mps))
     beside = (north - is_mps * direction[0], east - is_mps * direction[1])

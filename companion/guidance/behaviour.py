@@ -21,7 +21,7 @@ from vision.path_planner import PlannedPath
 
 
 class Requirement(StrEnum):
-    """What a behaviour needs to begin. A missing requirement is named in the refusal.
+    """What a behaviour needs to begin. A missing requirement is named in the reply.
 
     >>> from companion import Requirement
     >>> Requirement("in_air") is Requirement.IN_AIR
@@ -70,7 +70,7 @@ class VelocityInput:
         source: identifier of the sender.
         forward_mps, right_mps: horizontally, along and across the heading. up_mps: vertically.
         turn_radps: clockwise seen from above.
-        expires_ns: it must not be flown after that.
+        expires_ns: it must not be sent after that.
     """
 
     source: str

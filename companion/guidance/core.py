@@ -106,10 +106,10 @@ class Guidance:
     an autopilot mode nothing is streamed.
 
     Attributes:
-        asked: the last setpoint of a behaviour; None while none is flown.
+        asked: the last setpoint of a behaviour; None: none is active.
         sent: the same after the envelope (or the brake that is streamed while a mode is requested).
         limited_by: which limits acted on it.
-        path: (north, east) points of the way around obstacles that is flown; empty: none.
+        path: (north, east) points of the active path around obstacles; empty: none.
         phase: state of our command.
         gimbal: the gimbal controller; for its status.
     """
@@ -163,7 +163,7 @@ class Guidance:
 
     @property
     def behaviour(self) -> Behaviour | None:
-        """The behaviour being flown, including the hold between commands; None: none."""
+        """The active behaviour, including the hold between commands; None: none."""
         return self._behaviour
 
     @property
@@ -507,7 +507,7 @@ class Guidance:
             )
 
     def _conclude(self, outcome: Outcome, context: BehaviourContext, sent_count: int) -> None:
-        """The behaviour ended by itself: hold if setpoints are flown, else hand over to the autopilot."""
+        """The behaviour ended by itself: hold if setpoints are active, else hand over to the autopilot."""
         behaviour = self._behaviour
         if behaviour is not None and self.busy and self._command is None and not self._after_battery:
             # An endless command was answered when it began: nobody waits for how it ends.

@@ -1,4 +1,4 @@
-"""Check of a behaviour's requirements before it begins; a refusal names what is missing."""
+"""Check of a behaviour's requirements before it begins; the reply names what is missing."""
 
 from __future__ import annotations
 

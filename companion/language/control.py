@@ -6,7 +6,7 @@ import re
 from collections import deque
 from dataclasses import dataclass
 
-from companion.client.commands import NOT_FLOWN
+from companion.client.commands import NON_FLIGHT
 from companion.vehicle.state import FlightMode
 
 STICK_MODES = frozenset(
@@ -42,15 +42,15 @@ class Control:
     Attributes:
         lost: why command was lost, until the next command that flies; None: it was not.
         mode: the flight mode of an armed vehicle; empty: disarmed.
-        flown: the endless command of this program that is being flown; None: none is.
+        active: the active endless command of this program; None: none is.
     """
 
     lost: str | None = None
     mode: str = ""
-    flown: str | None = None
+    active: str | None = None
 
     def taken(self, *, flying: bool = False) -> str | None:
-        """Why no model may move the vehicle; None: it may. `flying`: a command of this program is flown."""
+        """Why no model may move the vehicle; None: it may. `flying`: a command of this program is active."""
         if self.lost is not None:
             return f"command was lost ({self.lost})"
         if self.mode in STICK_MODES or (self.mode in AUTOPILOT_MODES and not flying):
@@ -62,18 +62,18 @@ class CommandEvents:
     """What the service's events report about commands, read in their order.
 
     Attributes:
-        lost, flown: as in `Control`.
+        lost, active: as in `Control`.
     """
 
     def __init__(self) -> None:
         self.lost: str | None = None
-        self.flown: str | None = None
+        self.active: str | None = None
         self._sent: deque[str] = deque(maxlen=_KEPT_SENT)
 
     def send(self, text: str) -> None:
         """Note a command of this program, before it is sent."""
         line = text.partition("\n")[0]
-        if line.split(" ")[0] not in NOT_FLOWN - {"stop"}:
+        if line.split(" ")[0] not in NON_FLIGHT - {"stop"}:
             self._sent.append(line)
 
     def take(self, level: str, text: str) -> None:
@@ -81,23 +81,23 @@ class CommandEvents:
         if (found := _COMMAND.fullmatch(text)) is not None:
             self._begun(found["text"])
         elif text.startswith(_LOST):
-            self.lost, self.flown = text.removeprefix(_LOST), None
+            self.lost, self.active = text.removeprefix(_LOST), None
         elif text.endswith(_IN_PROGRESS):
             command = text.removesuffix(_IN_PROGRESS)
-            self.flown = command if command in self._sent else None
-        elif self.flown is not None and self._ends(self.flown, level, text):
-            self.flown = None
+            self.active = command if command in self._sent else None
+        elif self.active is not None and self._ends(self.active, level, text):
+            self.active = None
 
     def _begun(self, command: str) -> None:
         word = command.split(" ")[0]
-        if word not in NOT_FLOWN:
+        if word not in NON_FLIGHT:
             self.lost = None
-        if command not in self._sent and word not in NOT_FLOWN - {"stop"}:
-            self.flown = None
+        if command not in self._sent and word not in NON_FLIGHT - {"stop"}:
+            self.active = None
 
-    def _ends(self, flown: str, level: str, text: str) -> bool:
-        word = flown.split(" ")[0]
+    def _ends(self, active: str, level: str, text: str) -> bool:
+        word = active.split(" ")[0]
         if text.startswith(f"{word} ended: ") or f": {word} ends, " in text:
             return True
-        # A later command of this program was flown; a refused one leaves the earlier one as it is.
+        # A later command of this program became active; a refused one leaves the earlier one as it is.
         return level == "info" and any(text.startswith(f"{sent}: ") for sent in self._sent)

@@ -14,7 +14,7 @@ from collections.abc import Awaitable, Callable, Collection, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Protocol
 
-from companion.client.commands import NOT_FLOWN, Reply
+from companion.client.commands import NON_FLIGHT, Reply
 from companion.guidance.command import Command, GrammarError
 from companion.guidance.missions.mission_file import Mission, describe, plan_from
 from companion.language.clauses import Question, UnclearError
@@ -27,7 +27,7 @@ from companion.operator.reply_text import reply_text
 
 MAX_TURNS = 8
 # A model's command of these alone needs no confirmation; its `stop` could end a pilot's flight.
-_UNCONFIRMED_OF_MODEL = NOT_FLOWN - {"stop"}
+_UNCONFIRMED_OF_MODEL = NON_FLIGHT - {"stop"}
 KEPT_EXCHANGES = 10
 # An endless last step of a plan, such as a circle, ends after this.
 ENDLESS_S = 600.0
@@ -78,7 +78,7 @@ class Conversation:
         schema: the commands, as the queryable `commands` answers.
         class_names: the detector's; None: not known.
         endpoint: the language model; None: sentences are read by patterns.
-        may: commands that are flown without a confirmation, besides a single one that does not fly; not
+        may: commands that are executed without a confirmation, besides a single one that does not fly; not
             after a loss of command, nor while someone else flies.
     """
 
@@ -134,7 +134,7 @@ class Conversation:
                     self._operator.show(_in_words(intent, answer))
             if reading.done is not None:
                 self._operator.show("not in view: search first")
-            if commands and not (await self._propose(commands, NOT_FLOWN))["success"]:
+            if commands and not (await self._propose(commands, NON_FLIGHT))["success"]:
                 return False
             if reading.done is None:
                 return True
@@ -147,7 +147,7 @@ class Conversation:
         try:
             return await self._turns(endpoint, exchange)
         finally:
-            # What was flown is remembered, also after an error or a stop.
+            # What was executed is remembered, also after an error or a stop.
             if len(exchange) > 1:
                 ended = json.dumps({"success": False, "reason": "ended"})
                 exchange += [Message("tool", ended, answers=call) for call in exchange[-1].calls]
@@ -175,8 +175,8 @@ class Conversation:
                 return success
             # A text may also repeat what a label says: it is always confirmed.
             unconfirmed = None if written else _UNCONFIRMED_OF_MODEL
-            results, declined, flown = await self._execute(answer, unconfirmed)
-            success = success if flown is None else flown
+            results, declined, executed = await self._execute(answer, unconfirmed)
+            success = success if executed is None else executed
             exchange += results
             if declined:
                 exchange.append(Message("assistant", "The operator declined."))
@@ -191,7 +191,7 @@ class Conversation:
 
         Success is None if there were only questions.
 
-        Nothing is flown if a call of the answer is invalid: the rest may depend on it.
+        Nothing is executed if a call of the answer is invalid: the rest may depend on it.
 
         Args:
             unconfirmed: as in `_propose`; None: the calls were written as text, which the operator sees.
@@ -211,7 +211,10 @@ class Conversation:
                 invalid = True
                 contents.append({"error": str(error)})
                 self._operator.show(f"the model's call is refused: {error}")
-        reply: Reply = {"success": not invalid, "reason": "not flown: another call of this answer is invalid"}
+        reply: Reply = {
+            "success": not invalid,
+            "reason": "not executed: another call of this answer is invalid",
+        }
         declined = False
         if commands and not invalid:
             if unconfirmed is None:
@@ -251,8 +254,8 @@ class Conversation:
             free = words <= self._may.union(unconfirmed)
         else:
             # Several are a mission, which takes offboard control, also if none of them flies.
-            free = words <= self._may and not words <= NOT_FLOWN
-        if free and not words <= NOT_FLOWN and (why := (await self._vehicle.control()).taken()) is not None:
+            free = words <= self._may and not words <= NON_FLIGHT
+        if free and not words <= NON_FLIGHT and (why := (await self._vehicle.control()).taken()) is not None:
             self._operator.show(f"{why}: to be confirmed")
             free = False
         if not free and not await self._operator.confirm():

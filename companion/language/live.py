@@ -122,9 +122,9 @@ class LiveVehicle:
         await self._read_events()
         vehicle = await _next(self._drone.vehicle(), _STATE_S)
         if vehicle is None:
-            return Control("no state received from the service", flown=self._commands.flown)
+            return Control("no state received from the service", active=self._commands.active)
         mode = vehicle["mode"] if vehicle["armed"] else ""
-        return Control(self._commands.lost, mode, self._commands.flown)
+        return Control(self._commands.lost, mode, self._commands.active)
 
     async def forget_loss(self) -> None:
         """A loss of command until now does not count."""

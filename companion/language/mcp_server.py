@@ -1,8 +1,8 @@
 """The functions of `companion ask` for programs that speak the Model Context Protocol (MCP).
 
-Nobody confirms here: only listed commands are flown, and none after a loss of command until an operator has
-commanded. `stop` and `hold` that are not listed only end a command of this server. What the camera sees is
-data in a result.
+Nobody confirms here: only listed commands are executed, and none after a loss of command until an operator
+has commanded. `stop` and `hold` that are not listed only end a command of this server. What the camera sees
+is data in a result.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from starlette.applications import Starlette
 from starlette.routing import Route
 
 from companion.client import NoAnswerError
-from companion.client.commands import NOT_FLOWN, Reply
+from companion.client.commands import NON_FLIGHT, Reply
 from companion.guidance.command import Command, GrammarError
 from companion.language.clauses import QUESTIONS
 from companion.language.conversation import Vehicle, answer_to
@@ -36,7 +36,7 @@ MAX_SESSIONS = 16
 SESSION_IDLE_S = 60.0
 """A session without a request for so long ends: many clients do not end theirs. Longer than `WAIT_S`."""
 LARGEST_BODY_BYTES = 64 * 1024
-# These may end a command that is being flown.
+# These may end a command that is active.
 _ENDING = frozenset({"stop", "hold", "land", "rtl"})
 # Without --allow, these end a command of this server, and do nothing else.
 _ENDING_OWN = frozenset({"stop", "hold"})
@@ -54,7 +54,7 @@ class FlightTools:
 
     Args:
         schema: asks for the commands, as the queryable `commands` answers.
-        allowed: the commands that may be flown.
+        allowed: the commands that may be executed.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class FlightTools:
     ) -> None:
         self._vehicle, self._schema, self._allowed = vehicle, schema, frozenset(allowed)
         self._newest: Reply | None = None
-        self._flown: tuple[Command, asyncio.Task[Reply]] | None = None
+        self._active: tuple[Command, asyncio.Task[Reply]] | None = None
         self._sending: set[asyncio.Task[Reply]] = set()
 
     async def listed(self) -> list[types.Tool]:
@@ -94,7 +94,7 @@ class FlightTools:
             intent = read_call(ToolCall(name, arguments), class_names_of(await self._schema()))
             if not isinstance(intent, Command):
                 return await answer_to(intent, self._vehicle, self._newest)
-            if (why := await self._refusal(intent)) is not None:
+            if (why := await self._check_allowed(intent)) is not None:
                 self._newest = {"command": str(intent), "success": False, "reason": why}
                 return self._newest
             return await self._send(intent)
@@ -105,45 +105,45 @@ class FlightTools:
             return {"error": f"{type(error).__name__}: {error}"}
 
     async def close(self) -> None:
-        """End what is waited for; a command that is flown is stopped."""
+        """End what is waited for; an active command is stopped."""
         for task in tuple(self._sending):
             if not task.cancelling():  # a second one would interrupt the stop that the first sends
                 task.cancel()
         await asyncio.gather(*self._sending, return_exceptions=True)
 
-    async def _refusal(self, command: Command) -> str | None:
+    async def _check_allowed(self, command: Command) -> str | None:
         """Why a command is not sent; None: it is."""
         word, allowed = command.word, command.word in self._allowed
         allows = f"`companion mcp --allow {word}` allows it"
         if not allowed and word not in _ENDING_OWN:
             return f"{word} is not allowed here: {allows}"
-        if word in NOT_FLOWN and (allowed or self._flown is not None):
+        if word in NON_FLIGHT and (allowed or self._active is not None):
             return None
         control = await self._vehicle.control()
-        if not allowed and self._flown is None and control.flown is None:
+        if not allowed and self._active is None and control.active is None:
             return (
-                f"{word} is not sent: no command of this server is being flown; the operator has "
+                f"{word} is not sent: no command of this server is active; the operator has "
                 f"`companion send {word}` and the page, and {allows}"
             )
-        if word in NOT_FLOWN:
+        if word in NON_FLIGHT:
             return None
-        if (why := control.taken(flying=self._flown is not None)) is not None:
+        if (why := control.taken(flying=self._active is not None)) is not None:
             return (
                 f"{word} is not sent: {why}; an operator must command first, by `companion send hold` or the "
                 "page"
             )
-        if self._flown is not None and word not in _ENDING:
-            return f"{self._flown[0]} is still flown: wait for its end, or call `stop`"
+        if self._active is not None and word not in _ENDING:
+            return f"{self._active[0]} is still active: wait for its end, or call `stop`"
         return None
 
     async def _send(self, command: Command) -> Reply:
         task = asyncio.create_task(self._sent(command))
         self._sending.add(task)
         task.add_done_callback(self._sending.discard)
-        if command.word not in NOT_FLOWN:
-            self._flown = flown = command, task
-            self._newest = _running(command, "it is being flown")
-            task.add_done_callback(lambda _: self._forget(flown))
+        if command.word not in NON_FLIGHT:
+            self._active = active = command, task
+            self._newest = _running(command, "it is active")
+            task.add_done_callback(lambda _: self._forget(active))
         try:
             await asyncio.wait((task,), timeout=WAIT_S)
         except asyncio.CancelledError:
@@ -156,7 +156,7 @@ class FlightTools:
 
     async def _sent(self, command: Command) -> Reply:
         """Send a command; its reply, or why there is none. A command that replaced it is the newest one."""
-        own = self._flown
+        own = self._active
         try:
             reply = await self._vehicle.command(str(command))
         except asyncio.CancelledError:
@@ -171,12 +171,12 @@ class FlightTools:
         return reply
 
     def _ended(self, own: tuple[Command, asyncio.Task[Reply]] | None, reply: Reply) -> None:
-        if self._flown in (None, own):
+        if self._active in (None, own):
             self._newest = reply
 
-    def _forget(self, flown: tuple[Command, asyncio.Task[Reply]]) -> None:
-        if self._flown == flown:
-            self._flown = None
+    def _forget(self, active: tuple[Command, asyncio.Task[Reply]]) -> None:
+        if self._active == active:
+            self._active = None
 
 
 def _running(command: Command, why: str) -> Reply:

@@ -1,6 +1,6 @@
 """Questions and orders on zenoh: a queryable `ask` beside those of the service, in a process of the operator.
 
-Nobody confirms here: only the commands of `language.may` are flown.
+Nobody confirms here: only the commands of `language.may` are executed.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Lines:
         self.text = "\n".join(part for part in (self.text.rstrip("\n"), line) if part)
 
     async def confirm(self) -> bool:
-        self.show("not flown: nobody confirms it here; language.may lists what needs no confirmation")
+        self.show("not executed: nobody confirms it here; language.may lists what needs no confirmation")
         return False
 
 
@@ -46,7 +46,7 @@ async def serve(session: zenoh.Session, vehicle: str, converse: Callable[[Operat
     """Answer queries until cancelled, one at a time; `stop` ends the one that is being answered.
 
     The payload is a sentence, the reply JSON: {"success": bool, "answer": str}. A sentence that comes
-    meanwhile is refused: it would be flown when its asker no longer expects it.
+    meanwhile is refused: it would be executed when its asker no longer expects it.
 
     Args:
         converse: makes the conversation, whose history all queries share.

@@ -69,7 +69,7 @@ def check_words(name: str, words: Sequence[str], *, for_models: bool = False) ->
         if word not in COMMANDS:
             raise ValueError(f"{name}: unknown command {word!r}; {nearest(word, list(COMMANDS))}")
         if for_models and word in _NOT_FOR_MODELS:
-            raise ValueError(f"{name}: {word} is not for a model: the call does not show what is flown")
+            raise ValueError(f"{name}: {word} is not for a model: the call does not show the command")
 
 
 def class_names_of(schema: Mapping[str, Any]) -> tuple[str, ...] | None:
@@ -139,7 +139,7 @@ def read_call(call: ToolCall, class_names: Sequence[str] | None) -> Command | Qu
 
 def _check_offered(word: str) -> None:
     if word in _NOT_FOR_MODELS:
-        raise GrammarError(f"{word} is not for a model: the call does not show what is flown")
+        raise GrammarError(f"{word} is not for a model: the call does not show the command")
 
 
 def _written(name: str, key: Any, value: Any) -> str:

@@ -201,7 +201,7 @@ class WorkerCamera(PerceptionCamera):
             self._event(
                 "warning",
                 f"source.rotate_deg is 180 and camera.mount_roll_deg {roll_deg:g}: the mount is that of the "
-                f"rotated picture; a camera fixed upside down has mount_roll_deg 0",
+                f"rotated image; a camera fixed upside down has mount_roll_deg 0",
             )
         try:
             await self.supervisor.start()

@@ -17,7 +17,7 @@ from companion.bus.topics import DEPTH_IMAGE, DETECTIONS, IMAGE
 from companion.recording import RecordingError
 from companion.recording.convert import DEPTH_ENCODING, RUN_CHANNEL
 from companion.recording.files import RecordingReader
-from vision.sources.depth_pictures import to_metres
+from vision.sources.depth_images import to_metres
 
 # Some seconds of frames.
 MAX_WAITING = 100

@@ -48,7 +48,7 @@ class CommandHandler:
     ) -> None:
         self._read, self._on_command, self._on_event = read, on_command, on_event
         self._select = select
-        self._refusal = check_requirements
+        self._check_requirements = check_requirements
         self._identifiers = itertools.count(1)
         self._new: list[CommandInput] = []
         self._awaited: dict[int, asyncio.Future[Outcome]] = {}
@@ -71,7 +71,7 @@ class CommandHandler:
             self._report(command)
         else:
             self._unreported += 1
-        if (reason := self._refusal(command)) is not None:
+        if (reason := self._check_requirements(command)) is not None:
             if reported:
                 self._on_event("warning", f"{command.text}: {reason}")
             return {"command": command.text, "success": False, "reason": reason}
@@ -81,7 +81,7 @@ class CommandHandler:
         self._on_command()
         if not reported:
             await asyncio.wait({ended}, timeout=LASTING_S)
-            if not ended.done():  # it is flown, and no newer one has superseded it
+            if not ended.done():  # it is active, and no newer one has superseded it
                 reported, self._unreported = True, self._unreported - 1
                 self._report(command)
         # A cancelled caller does not stop the behaviour.
@@ -94,7 +94,7 @@ class CommandHandler:
             self._on_event("info" if outcome.success else "warning", f"{command.text}: {outcome.reason}")
         if outcome.success and command.behaviour is not None:
             self._succeeded = command
-            if command.endless and not reported:  # it is flown from now on
+            if command.endless and not reported:  # it is active from now on
                 asyncio.get_running_loop().call_later(LASTING_S, self._report_lasting, command, outcome)
         answer = {"success": outcome.success, "reason": outcome.reason}
         return {"command": command.text, **answer, **more}
@@ -112,7 +112,7 @@ class CommandHandler:
             self._on_event("info", f"{command.text}: {outcome.reason}")
 
     async def _select_object(self, command: Select) -> dict[str, Any]:
-        """Guidance is not asked: what is flown goes on."""
+        """Guidance is not asked: the active behaviour goes on."""
         answer = await self._select(command)
         if self._reported.take():
             self._on_event("info" if answer.success else "warning", f"{command}: {answer.reason}")

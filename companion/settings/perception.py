@@ -47,9 +47,9 @@ class SourceSection(Section):
     gain: Annotated[float | None, Field(ge=0, le=1e6)] = None
     """gain of a camera: a factor (csi://), the driver's unit (/dev/video0); unset as exposure_us"""
     mirror: bool = False
-    """the source delivers a mirror image: exchange left and right, of picture and depth"""
+    """the source delivers a mirror image: exchange left and right of image and depth"""
     rotate_deg: Annotated[int, Field(ge=0, le=270, multiple_of=90)] = 0
-    """rotate picture and depth clockwise, degrees; section camera describes the rotated picture"""
+    """rotate image and depth clockwise, degrees; section camera describes the rotated image"""
     name: Annotated[str | None, Field(min_length=1, max_length=40)] = None
     """the source's name in messages and preview; unset: its address"""
     depth: Annotated[str | None, Field(min_length=1)] = None

@@ -64,7 +64,7 @@ class AutopilotDriver(ABC):
     """The part of a driver above the encoding. `companion.vehicle.driver.Driver` has the contract."""
 
     library: str
-    flown_autopilots: frozenset[int] = frozenset({PX4})  # MAV_AUTOPILOT
+    supported_autopilots: frozenset[int] = frozenset({PX4})  # MAV_AUTOPILOT
 
     def __init__(
         self,
@@ -165,7 +165,7 @@ class AutopilotDriver(ABC):
             raise LinkError(f"{self.url}: could not be opened within {timeout_s:g} s") from error
         try:
             await self._first_heartbeat(timeout_s)
-            if self._autopilot_kind not in self.flown_autopilots:
+            if self._autopilot_kind not in self.supported_autopilots:
                 raise LinkError(unsupported_autopilot(self.url, self._system_id, self._autopilot_kind))
             await self._attach(max(deadline - time.monotonic(), 1.0))
         except BaseException:
@@ -258,7 +258,7 @@ class AutopilotDriver(ABC):
                     elif self._reports.on_frame(frame):
                         continue
                 ours.append(frame)
-        if ours and self._autopilot_kind in self.flown_autopilots:
+        if ours and self._autopilot_kind in self.supported_autopilots:
             self._on_frames(ours)
 
     def _send_signed_time(self, source: Source) -> None:
@@ -300,7 +300,7 @@ class AutopilotDriver(ABC):
 
     def _current_mode_from(self, frame: Frame) -> None:
         """Apply a CURRENT_MODE here, like HEARTBEAT: a library may deliver it after newer heartbeats."""
-        if self._autopilot_kind in self.flown_autopilots:
+        if self._autopilot_kind in self.supported_autopilots:
             shown, intended = _CURRENT_MODE.unpack(frame.padded(_CURRENT_MODE.size))
             fields = {"custom_mode": shown, "intended_custom_mode": intended}
             self._telemetry.handle("CURRENT_MODE", fields)

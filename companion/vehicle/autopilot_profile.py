@@ -71,7 +71,7 @@ class AutopilotProfile(ABC):
         return []
 
     def clear_request(self) -> None:  # noqa: B027 - PX4 reports its mode by itself
-        """Drop the remembered request after a refusal."""
+        """Drop the remembered request after it was rejected."""
 
     def setpoint_fields(self, fields: dict[str, Any]) -> dict[str, Any]:
         """Adapt the fields of SET_POSITION_TARGET_LOCAL_NED to this autopilot."""

@@ -99,14 +99,14 @@ class FlightCommands:
         """Request a mode, and return when the vehicle reports it."""
         telemetry = self._telemetry
         shown_mode, main, sub = telemetry.profile.mode_request(mode, telemetry.state)
-        refusals: list[int] = []
+        rejected: list[int] = []
 
         def watch(name: str, fields: Fields) -> None:
             # PX4 >= 1.16: the first acknowledgement always accepts, the second is the Commander's.
             if name != "COMMAND_ACK" or fields["command"] != _DO_SET_MODE or not self._ack_is_ours(fields):
                 return
             if fields["result"] not in (ACCEPTED, IN_PROGRESS):
-                refusals.append(fields["result"])
+                rejected.append(fields["result"])
 
         asked_ns = time.monotonic_ns()
         deadline = time.monotonic() + timeout_s
@@ -117,13 +117,13 @@ class FlightCommands:
         async with telemetry.watching(watch):
             result = await self._command(_DO_SET_MODE, _MODE_FLAG_CUSTOM, main, sub)
             if result != ACCEPTED:
-                refusals.append(result)
-            await telemetry.until(lambda: bool(refusals) or shown(), max(deadline - time.monotonic(), 0.0))
-        if refusals:
+                rejected.append(result)
+            await telemetry.until(lambda: bool(rejected) or shown(), max(deadline - time.monotonic(), 0.0))
+        if rejected:
             telemetry.profile.clear_request()
             hint = " (is a setpoint stream running?)" if mode is FlightMode.OFFBOARD else ""
             raise CommandRefusedError(
-                f"the vehicle refused mode {mode} ({result_name(refusals[0])}){hint}: "
+                f"the vehicle refused mode {mode} ({result_name(rejected[0])}){hint}: "
                 f"its mode is {telemetry.state.mode}"
             )
         if not shown():

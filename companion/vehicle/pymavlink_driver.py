@@ -57,7 +57,7 @@ class PymavlinkDriver(AutopilotDriver):
     """See `companion.vehicle.driver.Driver`."""
 
     library = "pymavlink"
-    flown_autopilots = frozenset({PX4, ARDUPILOT})
+    supported_autopilots = frozenset({PX4, ARDUPILOT})
 
     def __init__(
         self,

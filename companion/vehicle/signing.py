@@ -108,7 +108,7 @@ class FrameSigner:
 
     def accepts(self, frame: Frame) -> bool:
         """Whether a received frame is accepted; refused ones are counted, the first per reason is logged."""
-        reason = self._refusal_reason(frame)
+        reason = self._rejection_reason(frame)
         self.peer_late = reason == _OLD
         if reason is None:
             return True
@@ -122,7 +122,7 @@ class FrameSigner:
             )
         return False
 
-    def _refusal_reason(self, frame: Frame) -> str | None:
+    def _rejection_reason(self, frame: Frame) -> str | None:
         raw = frame.raw
         if not is_signed(raw):
             return None if _is_radio_message(frame) else "unsigned"

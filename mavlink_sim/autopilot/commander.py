@@ -60,7 +60,7 @@ OFFBOARD_LOSS_MARGIN_S = 0.06
 # PX4's land detector needs ground contact, then "maybe landed", then "landed": together about this long.
 LAND_DETECTION_S = 1.5
 # Least time between two texts that a mode is not available.
-REFUSALS_APART_S = 1.0
+DENIED_TEXT_PERIOD_S = 1.0
 IDLE_THRUST_MPS2 = 0.6
 
 
@@ -104,7 +104,7 @@ class Autopilot:
         self._takeoff_height_m: float | None = None
         self.task: flight.Task | None = None
         self._mode_after_disarming = Mode.HOLD
-        self._last_setpoint_s = self._refusal_sent_s = -math.inf
+        self._last_setpoint_s = self._denied_sent_s = -math.inf
         self._setpoint_needs_position = False
         self._rates_alone = False  # the newest offboard setpoint was of body rates
         self.navigator = Navigator(self, airframe, parameters, local_frame, on_event)
@@ -196,9 +196,9 @@ class Autopilot:
         """MAV_RESULT of an arming request. `by`: PX4's name of the source, a key of `supervision.REASONS`."""
         if self.armed:
             return ACCEPTED
-        refusal = self.supervision.refuses_arming(by)
-        if refusal is not None:
-            self.texts.append(refusal)
+        denied = self.supervision.refuses_arming(by)
+        if denied is not None:
+            self.texts.append(denied)
             return TEMPORARILY_REJECTED
         if not self.can_arm:
             if not self.sensors_ready:
@@ -217,7 +217,7 @@ class Autopilot:
         return ACCEPTED
 
     def report_checks(self) -> None:
-        """Report the failing checks by their events, for RUN_PREARM_CHECKS and a refusal to arm."""
+        """Report the failing checks by their events, for RUN_PREARM_CHECKS and when arming is denied."""
         self.supervision.report_checks()
 
     def disarm(self, force: bool = False, by: str = "external command") -> int:
@@ -232,7 +232,7 @@ class Autopilot:
         return ACCEPTED
 
     def set_mode(self, mode: Mode, report: bool = False) -> int:
-        """MAV_RESULT of a request for a mode; with `report`, a refusal is also a text."""
+        """MAV_RESULT of a request for a mode; with `report`, a rejected one is also a text."""
         if self.armed and not self.can_run(mode):
             if report:
                 self.report_unavailable(mode)
@@ -246,7 +246,7 @@ class Autopilot:
         return ACCEPTED
 
     def _refuses(self, mode: Mode) -> bool:
-        """Whether a command that would switch to this mode is refused; a refusal is reported."""
+        """Whether a command that would switch to this mode is refused, which is reported."""
         refused = self.armed and not self.can_run(mode)
         if refused:
             self.report_unavailable(mode)
@@ -254,8 +254,8 @@ class Autopilot:
 
     def report_unavailable(self, mode: Mode) -> None:
         """Report a refused mode, at most once per second as PX4 does."""
-        if self.now_s - self._refusal_sent_s > REFUSALS_APART_S:
-            self._refusal_sent_s = self.now_s
+        if self.now_s - self._denied_sent_s > DENIED_TEXT_PERIOD_S:
+            self._denied_sent_s = self.now_s
             self._send_text(CRITICAL, f"Switching to {mode.title} is currently not available\t")
 
     def can_run(self, mode: Mode) -> bool:

@@ -203,7 +203,7 @@ class Supervision:
     # ---- arming -----------------------------------------------------------------------------------------
 
     def refuses_arming(self, by: str) -> Text | None:
-        """The text of a refusal to arm; None if the supervision allows it."""
+        """Why arming is denied, as PX4's text; None if the supervision allows it."""
         autopilot = self._autopilot
         manual = autopilot.mode in MANUAL_MODES
         by_pilot = by != "external command"

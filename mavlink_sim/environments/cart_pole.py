@@ -69,8 +69,8 @@ class CartPole(Task):
     def draw(self) -> NDArray[np.uint8]:
         x, _, angle, _ = (float(value) for value in self._state[:, 0])
         top = (0.0, x + 2 * HALF_POLE_M * math.sin(angle), -2 * HALF_POLE_M * math.cos(angle))
-        picture = drawing.Picture(2.2 * TRACK_M, (0.0, 0.0, -0.6), (drawing.SIDE,))
-        picture.line((0.0, -TRACK_M, 0.0), (0.0, TRACK_M, 0.0), drawing.GREY)
-        picture.line((0.0, x - 0.2, 0.0), (0.0, x + 0.2, 0.0), drawing.VEHICLE, thickness=14)
-        picture.line((0.0, x, 0.0), top, drawing.TARGET, thickness=5)
-        return picture.image
+        canvas = drawing.Canvas(2.2 * TRACK_M, (0.0, 0.0, -0.6), (drawing.SIDE,))
+        canvas.line((0.0, -TRACK_M, 0.0), (0.0, TRACK_M, 0.0), drawing.GREY)
+        canvas.line((0.0, x - 0.2, 0.0), (0.0, x + 0.2, 0.0), drawing.VEHICLE, thickness=14)
+        canvas.line((0.0, x, 0.0), top, drawing.TARGET, thickness=5)
+        return canvas.image

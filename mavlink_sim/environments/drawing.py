@@ -1,4 +1,4 @@
-"""Plain pictures of an episode, drawn with lines and circles."""
+"""Plain images of an episode, drawn with lines and circles."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Place = Array | Sequence[float]
 Colour = tuple[int, int, int]
 
 
-class Picture:
+class Canvas:
     """Square views of one scene, side by side. All positions are (3,) NED, metres.
 
     Args:

@@ -199,17 +199,17 @@ class FlightTask(Task):
         """(count,) the newest measurement is too old, or the vehicle too low."""
         return np.asarray((self.age_s > MAX_AGE_S) | (self.model.position[2] > -self.lowest_m), np.bool_)
 
-    def sketch(self, picture: drawing.Picture) -> None:
+    def sketch(self, canvas: drawing.Canvas) -> None:
         """Draw what is around the first vehicle."""
-        picture.circle(self.target[:, 0], 0.4, drawing.TARGET, -1)
-        picture.circle(self.seen[:, 0], 0.4, drawing.SEEN)
+        canvas.circle(self.target[:, 0], 0.4, drawing.TARGET, -1)
+        canvas.circle(self.seen[:, 0], 0.4, drawing.SEEN)
 
     def draw(self) -> NDArray[np.uint8]:
         place, target = self.model.position[:, 0], self.target[:, 0]
-        picture = drawing.Picture(2.4 * max(8.0, *np.abs(target - place)), place)
-        self.sketch(picture)
+        canvas = drawing.Canvas(2.4 * max(8.0, *np.abs(target - place)), place)
+        self.sketch(canvas)
         nose, right, _ = self.model.rotation[:, :, 0].T
-        picture.line(place - right, place + right, drawing.VEHICLE)
-        picture.line(place, place + 1.5 * nose, drawing.VEHICLE)
-        picture.circle(place, 0.3, drawing.VEHICLE, -1)
-        return picture.image
+        canvas.line(place - right, place + right, drawing.VEHICLE)
+        canvas.line(place, place + 1.5 * nose, drawing.VEHICLE)
+        canvas.circle(place, 0.3, drawing.VEHICLE, -1)
+        return canvas.image

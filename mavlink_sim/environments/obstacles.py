@@ -98,8 +98,8 @@ class Obstacles(FlightTask):
     def measures(self) -> dict[str, Array]:
         return {"target_distance_m": self.distance_m, "clearance_m": self.clearance_m()}
 
-    def sketch(self, picture: drawing.Picture) -> None:
-        picture.circle(self.target[:, 0], REACHED_M, drawing.TARGET)
+    def sketch(self, canvas: drawing.Canvas) -> None:
+        canvas.circle(self.target[:, 0], REACHED_M, drawing.TARGET)
         for (north, east), radius in zip(self._trunks[:, :, 0].T, self._radius_m[:, 0], strict=True):
-            picture.circle((north, east, 0.0), radius, drawing.GREY, -1)
-            picture.line((north, east, 0.0), (north, east, -2.0 * HIGHEST_M), drawing.GREY)
+            canvas.circle((north, east, 0.0), radius, drawing.GREY, -1)
+            canvas.line((north, east, 0.0), (north, east, -2.0 * HIGHEST_M), drawing.GREY)

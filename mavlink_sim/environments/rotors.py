@@ -78,5 +78,5 @@ class Rotors(FlightTask):
     def measures(self) -> dict[str, Array]:
         return {"distance_m": self.distance_m}
 
-    def sketch(self, picture: drawing.Picture) -> None:
-        picture.circle(self.target[:, 0], 0.4, drawing.TARGET, -1)
+    def sketch(self, canvas: drawing.Canvas) -> None:
+        canvas.circle(self.target[:, 0], 0.4, drawing.TARGET, -1)

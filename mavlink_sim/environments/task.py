@@ -49,4 +49,4 @@ class Task(ABC):
 
     @abstractmethod
     def draw(self) -> NDArray[np.uint8]:
-        """(height, width, 3) RGB picture of the first episode."""
+        """(height, width, 3) RGB image of the first episode."""

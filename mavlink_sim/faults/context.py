@@ -19,7 +19,7 @@ from mavlink_sim.wire.messages import Outgoing
 # Of a message that the vehicle sends: the one to send instead, or None to drop it.
 Gate = Callable[[Link, Any], Any]
 # Of a command's identifier and parameters: the MAV_RESULT that it is refused with, or None.
-Refusal = Callable[[int, tuple[float, ...]], int | None]
+CommandCheck = Callable[[int, tuple[float, ...]], int | None]
 
 
 @dataclass
@@ -54,7 +54,7 @@ class FaultState(Protocol):
 
     deaf: bool
     gates: dict[int, Gate]
-    refusals: dict[int, Refusal]
+    command_checks: dict[int, CommandCheck]
     boot_offset_us: int
     second: dict[int, FaultTarget]
     winds: dict[int, Vector]

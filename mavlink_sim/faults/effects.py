@@ -516,7 +516,7 @@ def refuse_mode(vehicle: FaultTarget, one: ActiveFault) -> None:
     values = one.fault.values
     left = math.inf if values["count"] == "all" else int(values["count"])
 
-    def refusal(command: int, parameters: tuple[float, ...]) -> int | None:
+    def check(command: int, parameters: tuple[float, ...]) -> int | None:
         nonlocal left
         mode = requested_mode(command, parameters)
         if mode is None or values["mode"] not in ("any", mode.name):
@@ -526,8 +526,8 @@ def refuse_mode(vehicle: FaultTarget, one: ActiveFault) -> None:
             vehicle.faults.finish(one.number)
         return TEMPORARILY_REJECTED
 
-    vehicle.faults.refusals[one.number] = refusal
-    one.undo.append(partial(vehicle.faults.refusals.pop, one.number))
+    vehicle.faults.command_checks[one.number] = check
+    one.undo.append(partial(vehicle.faults.command_checks.pop, one.number))
 
 
 def reboot(vehicle: FaultTarget, one: ActiveFault) -> None:

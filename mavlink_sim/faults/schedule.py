@@ -19,7 +19,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from mavlink_sim.faults.context import ActiveFault, FaultTarget, Gate, Refusal
+from mavlink_sim.faults.context import ActiveFault, CommandCheck, FaultTarget, Gate
 from mavlink_sim.faults.effects import chosen_links, shifted
 from mavlink_sim.faults.grammar import Fault, FaultError, parse_fault
 from mavlink_sim.faults.kinds import EFFECTS, KINDS
@@ -42,7 +42,7 @@ class Faults:
 
     Attributes:
         deaf: the vehicle neither receives nor sends (it reboots).
-        refusals: called before each command is executed; by fault number.
+        command_checks: called before each command is executed; by fault number.
         gates: every message that the vehicle sends passes these; by fault number.
         boot_offset_us: added to the boot time in everything that is sent.
         elapsed_us: `now_s` in microseconds.
@@ -58,7 +58,7 @@ class Faults:
         self._on_event = on_event
         self.deaf = False
         self.gates: dict[int, Gate] = {}
-        self.refusals: dict[int, Refusal] = {}
+        self.command_checks: dict[int, CommandCheck] = {}
         self.boot_offset_us = 0
         self.second: dict[int, FaultTarget] = {}
         self.winds: dict[int, Vector] = {}
@@ -249,9 +249,9 @@ class Faults:
         return message
 
     def refuses(self, command: int, parameters: tuple[float, ...]) -> int | None:
-        """The MAV_RESULT of a refusal by a fault, before the command is executed; None: not refused."""
-        for refusal in list(self.refusals.values()):
-            result = refusal(command, parameters)
+        """The MAV_RESULT with which a fault rejects a command that is not executed yet; None: it does not."""
+        for check in list(self.command_checks.values()):
+            result = check(command, parameters)
             if result is not None:
                 return result
         return None

@@ -17,7 +17,7 @@ class CommandFilter(Protocol):
     """Faults that refuse commands before they are executed."""
 
     def refuses(self, command: int, parameters: tuple[float, ...]) -> int | None:
-        """The MAV_RESULT of the refusal; None: execute it."""
+        """The MAV_RESULT of a rejected command; None: execute it."""
 
 
 class ServiceContext(EventContext, FileContext, GimbalContext, Protocol):

@@ -389,8 +389,8 @@ class Server:
                 raise RequestRefusedError(Failure.UNKNOWN_COMMAND)
             session, data = handler(self, request)
             reply = replace(request, opcode=Opcode.ACK, session=session, data=data)
-        except RequestRefusedError as refusal:
-            reply = _nak(request, bytes([refusal.failure]))
+        except RequestRefusedError as error:
+            reply = _nak(request, bytes([error.failure]))
         except OSError as error:
             number = error.errno or errno.EIO
             failure = _FAILURE_OF_ERRNO.get(number)

@@ -184,7 +184,7 @@ def position_target_global_int(vehicle: ServiceContext) -> Any:
 
 
 def orbit_execution_status(vehicle: ServiceContext) -> Any:
-    """ORBIT_EXECUTION_STATUS (360) while an orbit is flown, else None. Radius positive: clockwise."""
+    """ORBIT_EXECUTION_STATUS (360) while an orbit is active, else None. Radius positive: clockwise."""
     task = vehicle.autopilot.task
     if not isinstance(task, Orbit) or task.refused:
         return None

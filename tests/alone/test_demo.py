@@ -71,14 +71,14 @@ def test_the_demonstration_finds_the_car_stops_before_it_and_lands(tmp_path: Pat
     assert not truth[-1]["armed"]
     video = cv2.VideoCapture(str(output / summary["video"]))
     assert int(video.get(cv2.CAP_PROP_FRAME_WIDTH)) == 640
-    pictures, filmed_s = 0, 0.0
+    images, filmed_s = 0, 0.0
     while video.grab():
-        pictures += 1
+        images += 1
         filmed_s = video.get(cv2.CAP_PROP_POS_MSEC) / 1000.0
     # Whole, from the first frame to the end, and moving.
     # A busy machine may miss some: the demonstration prints how many.
     most = round(filmed_s * _CAMERA_RATE_HZ) + 1
-    assert pictures > 3 * filmed_s, f"{pictures} of {most} pictures in {filmed_s:.2f} s; {gaps}"
+    assert images > 3 * filmed_s, f"{images} of {most} images in {filmed_s:.2f} s; {gaps}"
     events = [json.loads(line) for line in (output / "events.jsonl").read_text().splitlines()]
     (seen_ns,) = [event["stamp_ns"] for event in events if event["text"].startswith("perception running")]
     flown_ns = max(event["stamp_ns"] for event in events if event["text"].startswith(FLOWN))

@@ -60,9 +60,9 @@ def exported_model(small_model: Path, tmp_path_factory: pytest.TempPathFactory) 
 
 
 @pytest.fixture(scope="session")
-def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def image_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder of twenty small images."""
-    folder = tmp_path_factory.mktemp("pictures")
+    folder = tmp_path_factory.mktemp("images")
     rng = np.random.default_rng(0)
     for index in range(20):
         image = cv2.resize(rng.integers(0, 255, (12, 16, 3), dtype=np.uint8), (160, 120))
@@ -71,19 +71,19 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def filming(pictures: Path) -> list[str]:
+def filming(image_folder: Path) -> list[str]:
     """Flags for a service that reads the images, ten a second, without detection."""
     return [
-        *("--source", str(pictures), "--source-loop", "true", "--source-rate-hz", "10"),
+        *("--source", str(image_folder), "--source-loop", "true", "--source-rate-hz", "10"),
         *("--detector-enabled", "false", "--guidance-perception-max-age-s", "3"),
     ]
 
 
 @pytest.fixture
-def seeing(exported_model: Path, pictures: Path) -> list[str]:
+def seeing(exported_model: Path, image_folder: Path) -> list[str]:
     """Flags for a service that detects in the images, ten a second."""
     return [
-        *("--source", str(pictures), "--source-loop", "true", "--source-rate-hz", "10"),
+        *("--source", str(image_folder), "--source-loop", "true", "--source-rate-hz", "10"),
         *("--model", str(exported_model), "--detector-runtime", "onnxruntime"),
         *("--detector-image-size", "160"),
         *("--guidance-perception-max-age-s", "3"),

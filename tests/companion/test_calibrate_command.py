@@ -324,7 +324,7 @@ def test_command_that_uses_no_lens_reads_another_camera(opened: list[str]) -> No
     for reader in ("preview", "calibrate mount"):
         CliRunner().invoke(app, [*reader.split(), other, *_READERS[reader]])
     assert opened == [other] * 2
-    levelled = CliRunner().invoke(app, ["preview", other, "--level", "--save", "pictures"])
+    levelled = CliRunner().invoke(app, ["preview", other, "--level", "--save", "images"])
     assert own in one_line_of_bad_input(levelled)
 
 

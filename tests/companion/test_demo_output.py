@@ -68,7 +68,7 @@ async def test_a_failed_demo_returns_unless_the_pilot_flies(in_command: bool) ->
 
 
 @pytest.mark.parametrize("video_rate_hz", [demo._CAMERA_RATE_HZ, demo._SLOW_VIDEO_RATE_HZ])
-def test_video_of_the_demo_misses_no_picture(
+def test_video_of_the_demo_misses_no_image(
     video_rate_hz: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Frames come at the camera's rate, and the writer keeps up: each waits for the one before."""

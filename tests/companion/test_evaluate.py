@@ -108,9 +108,9 @@ def test_real_model_detects_objects_in_photographs(tmp_path: Path) -> None:
     assert score.map50 > 0.5
 
 
-def test_detect_and_evaluate_with_tiles(tmp_path: Path, small_model: Path, pictures: Path) -> None:
+def test_detect_and_evaluate_with_tiles(tmp_path: Path, small_model: Path, image_folder: Path) -> None:
     options = ["--model", str(small_model), "--image-size", "64", "--tiles", "--tile-size", "80"]
-    result = CliRunner().invoke(app, ["detect", str(pictures), *options, "--limit", "2", "--json"])
+    result = CliRunner().invoke(app, ["detect", str(image_folder), *options, "--limit", "2", "--json"])
     assert result.exit_code == 0, result.stderr
     assert [json.loads(line)["width"] for line in result.stdout.splitlines()] == [160, 160]
     image = tmp_path / "a.png"

@@ -1,4 +1,4 @@
-"""`companion log`: flights, modes, events and refusals of recordings."""
+"""`companion log`: flights, modes, events and refused commands of recordings."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ REFUSED = {
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Ten seconds with a flight of four, in two modes, with an event and a refusal."""
+    """Ten seconds with a flight of four, in two modes, with an event and a refused command."""
     writer, converter = new_writer(tmp_path_factory.mktemp("log")), Converter("vehicle1")
 
     def write(path: str, message: object, attachment: bytes | None = None) -> None:

@@ -19,8 +19,8 @@ pytestmark = pytest.mark.realtime
 
 
 @pytest.fixture
-def pictures(tmp_path: Path) -> Path:
-    folder = tmp_path / "pictures"
+def image_folder(tmp_path: Path) -> Path:
+    folder = tmp_path / "images"
     folder.mkdir()
     for index in range(4):
         image = np.full((240, 480, 3), (200, 40, 40), np.uint8)
@@ -44,9 +44,9 @@ def test_rate_of_a_slow_source_is_of_its_last_two_frames() -> None:
         assert meter.add(index * 5_000_000_000, index) == pytest.approx(0.2)
 
 
-def test_single_image_is_shown_and_saved(pictures: Path, tmp_path: Path) -> None:
+def test_single_image_is_shown_and_saved(image_folder: Path, tmp_path: Path) -> None:
     lines: list[str] = []
-    with open_source(str(pictures / "2.png")) as source:
+    with open_source(str(image_folder / "2.png")) as source:
         assert preview_source(source, PreviewOptions("v/image", tmp_path / "out"), lines.append) == 1
     assert len(lines) == 1
     assert "480x240  stamp" in lines[0]
@@ -55,35 +55,35 @@ def test_single_image_is_shown_and_saved(pictures: Path, tmp_path: Path) -> None
 
 @pytest.mark.parametrize(("grey", "shape"), [(False, (240, 480, 3)), (True, (80, 160, 3))])
 def test_every_frame_is_saved_with_its_lines(
-    pictures: Path, tmp_path: Path, grey: bool, shape: tuple[int, ...]
+    image_folder: Path, tmp_path: Path, grey: bool, shape: tuple[int, ...]
 ) -> None:
     lines: list[str] = []
-    with open_source(str(pictures)) as source:
+    with open_source(str(image_folder)) as source:
         options = PreviewOptions("companion/v/image", tmp_path / "out", grey, period_s=0.0)
         assert preview_source(source, options, lines.append) == 4
     assert len(lines) == 4
-    assert all(f"{pictures}  companion/v/image  480x240" in line for line in lines)
+    assert all(f"{image_folder}  companion/v/image  480x240" in line for line in lines)
     assert "Hz" in lines[1]
     saved = sorted((tmp_path / "out").iterdir())
     assert [path.name for path in saved] == ["000000.jpg", "000001.jpg", "000002.jpg", "000003.jpg"]
     image = cv2.imread(str(saved[0]))
     assert image is not None
     assert image.shape == shape
-    # The panel of lines is at the upper left, the picture's colour below it.
+    # The panel of lines is at the upper left, the image's colour below it.
     below = image[-1, -1].astype(int)
     assert np.ptp(below) < 8 if grey else abs(below - (200, 40, 40)).max() < 8
     assert image[: shape[0] // 3, : shape[1] // 3].std() > 20
 
 
-def test_preview_of_a_rotated_source(pictures: Path, tmp_path: Path) -> None:
+def test_preview_of_a_rotated_source(image_folder: Path, tmp_path: Path) -> None:
     done = companion_here(
-        "preview", pictures, "--limit", "2", "--period", "0", "--source-rotate-deg", "90",
+        "preview", image_folder, "--limit", "2", "--period", "0", "--source-rotate-deg", "90",
         "--source-name", "front", "--vehicle-name", "alpha", cwd=tmp_path,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()
     assert len(lines) == 2
-    assert lines[0].startswith(f"front ({pictures})  companion/alpha/image  240x480")
+    assert lines[0].startswith(f"front ({image_folder})  companion/alpha/image  240x480")
 
 
 def test_bad_source_of_preview_is_one_line(tmp_path: Path) -> None:
@@ -93,17 +93,17 @@ def test_bad_source_of_preview_is_one_line(tmp_path: Path) -> None:
     assert line.startswith("companion: /dev/video98765: no such camera")
 
 
-def test_preview_is_levelled_by_the_attitude_of_the_vehicle(pictures: Path, tmp_path: Path) -> None:
+def test_preview_is_levelled_by_the_attitude_of_the_vehicle(image_folder: Path, tmp_path: Path) -> None:
     with running_simulator() as simulator:
         done = companion(
-            "preview", pictures, "--level", "--save", tmp_path / "out", "--period", "0", "--limit", "15",
+            "preview", image_folder, "--level", "--save", tmp_path / "out", "--period", "0", "--limit", "15",
             "--vehicle-url", simulator.mavsdk_url, "--camera-mount-roll-deg", "30", "--source-rate-hz", "5",
             "--source-loop", "true", cwd=tmp_path,
         )  # fmt: skip
     assert done.returncode == 0, done.stderr
     images = [cv2.imread(str(path)) for path in sorted((tmp_path / "out").iterdir())]
     assert len(images) == 15
-    # Turned by 30 degrees: the picture's blue in the middle, black in the corners. On a busy computer an
+    # Turned by 30 degrees: the image's blue in the middle, black in the corners. On a busy computer an
     # attitude may be late, so not every one of them.
     turned = [image for image in images if image is not None and image[-1, (0, -1)].max() < 8]
     assert turned
@@ -118,10 +118,10 @@ def test_preview_is_levelled_by_the_attitude_of_the_vehicle(pictures: Path, tmp_
     ],
 )
 def test_preview_that_cannot_be_levelled_is_one_line(
-    pictures: Path, tmp_path: Path, options: tuple[str, ...], part: str
+    image_folder: Path, tmp_path: Path, options: tuple[str, ...], part: str
 ) -> None:
     url = f"udpin://127.0.0.1:{free_udp_ports(1)[0]}"
-    done = companion_here("preview", pictures, *options, "--vehicle-url", url, cwd=tmp_path)
+    done = companion_here("preview", image_folder, *options, "--vehicle-url", url, cwd=tmp_path)
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()
     assert part in line
@@ -139,20 +139,20 @@ def test_cameras_are_one_json_object(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def depth(pictures: Path) -> Path:
-    """Depth of the pictures: 3.42 m and more, with a hole of a quarter."""
-    folder = pictures.parent / "depth"
+def depth(image_folder: Path) -> Path:
+    """Depth of the images: 3.42 m and more, with a hole of a quarter."""
+    folder = image_folder.parent / "depth"
     folder.mkdir()
     for index in range(4):
-        picture = np.full((240, 480), 3420 + index, np.uint16)
-        picture[:, :120] = 0
-        cv2.imwrite(str(folder / f"{index}.png"), picture)
+        image = np.full((240, 480), 3420 + index, np.uint16)
+        image[:, :120] = 0
+        cv2.imwrite(str(folder / f"{index}.png"), image)
     return folder
 
 
-def test_depth_prints_the_messages_of_its_topic(pictures: Path, depth: Path, tmp_path: Path) -> None:
+def test_depth_prints_the_messages_of_its_topic(image_folder: Path, depth: Path, tmp_path: Path) -> None:
     done = companion(
-        "depth", pictures, "--source-depth", depth, "--json", "--save", tmp_path / "out", cwd=tmp_path
+        "depth", image_folder, "--source-depth", depth, "--json", "--save", tmp_path / "out", cwd=tmp_path
     )
     assert done.returncode == 0, done.stderr
     messages = [json.loads(line) for line in done.stdout.splitlines()]
@@ -168,10 +168,10 @@ def test_depth_prints_the_messages_of_its_topic(pictures: Path, depth: Path, tmp
     assert max(blue, green) < 90
 
 
-def test_depth_of_detections(pictures: Path, depth: Path, tmp_path: Path, exported_model: Path) -> None:
+def test_depth_of_detections(image_folder: Path, depth: Path, tmp_path: Path, exported_model: Path) -> None:
     done = companion(
-        "depth", pictures, "--source-depth", depth, "--source-depth-scale", "0.002", "--limit", "1", "--json",
-        "--detect", "--detector-model", exported_model, "--detector-runtime", "onnxruntime",
+        "depth", image_folder, "--source-depth", depth, "--source-depth-scale", "0.002", "--limit", "1",
+        "--json", "--detect", "--detector-model", exported_model, "--detector-runtime", "onnxruntime",
         "--detector-confidence", "0",
         "--detector-image-size", "160", "--tracker-enabled", "false", cwd=tmp_path,
     )  # fmt: skip
@@ -184,20 +184,20 @@ def test_depth_of_detections(pictures: Path, depth: Path, tmp_path: Path, export
     assert all(depth_m == pytest.approx(6.84, abs=0.01) for depth_m in known)
 
 
-def test_source_without_usable_depth_is_one_line(pictures: Path, depth: Path, tmp_path: Path) -> None:
+def test_source_without_usable_depth_is_one_line(image_folder: Path, depth: Path, tmp_path: Path) -> None:
     small = tmp_path / "small"
     small.mkdir()
     cv2.imwrite(str(small / "0.png"), np.full((24, 48), 1000, np.uint16))
     cv2.imwrite(str(tmp_path / "far.tiff"), np.full((240, 480), 3420.0, np.float32))
     cases: tuple[tuple[list[str | Path], str], ...] = (
         ([], "delivers no depth"),
-        (["--source-depth", small], "depth is 48x24, the picture 480x240"),
+        (["--source-depth", small], "depth is 48x24, the image 480x240"),
         (["--source-depth", tmp_path / "far.tiff"], "source.depth_scale"),
-        (["--source-depth", pictures], "16-bit integers or floats"),
+        (["--source-depth", image_folder], "16-bit integers or floats"),
         (["--source-depth", tmp_path / "nothing"], "no such file"),
     )
     for options, words in cases:
-        done = companion_here("depth", pictures, *options, cwd=tmp_path)
+        done = companion_here("depth", image_folder, *options, cwd=tmp_path)
         assert done.returncode == 2, done.stdout
         (line,) = done.stderr.splitlines()
         assert words in line

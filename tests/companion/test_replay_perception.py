@@ -35,7 +35,7 @@ from vision.detector import open_detector
 from vision.frame import Frame
 from vision.object_detector import DetectorSettings
 from vision.pipeline import PerceptionResult
-from vision.sources.depth_pictures import to_metres
+from vision.sources.depth_images import to_metres
 
 CAMERA = CameraModel.from_horizontal_fov(480, 360, math.radians(80.0))
 MOUNT = CameraMount(forward_m=0.1, pitch_rad=math.radians(-10.0))

@@ -124,7 +124,7 @@ async def test_it_flies_by_action_and_by_offboard(simulator: RunningSimulator, s
     await wait_for(telemetry.subscribe_armed(), lambda armed: not armed)
 
 
-async def test_refusal_raises_mavsdk_error() -> None:
+async def test_denied_command_raises_mavsdk_error() -> None:
     async with (
         vehicle(speed=SPEED, ready_after=600.0) as simulator,
         mavsdk_client(simulator.mavsdk_url, ComponentType.COMPANION_COMPUTER) as system,

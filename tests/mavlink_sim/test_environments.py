@@ -180,7 +180,7 @@ def test_trunk_ends_the_episode_and_is_in_its_sector() -> None:
 
 
 @pytest.mark.parametrize("name", TASKS)
-def test_picture_changes_with_the_flight(name: str) -> None:
+def test_image_changes_with_the_flight(name: str) -> None:
     env = make(name, render_mode="rgb_array")
     env.reset(seed=1)
     before = env.render()

@@ -254,17 +254,17 @@ def test_words_in_any_order(
     ],
 )
 def test_invalid_faults_refused_in_one_line(text: str, message: str) -> None:
-    with pytest.raises(FaultError) as refusal:
+    with pytest.raises(FaultError) as error:
         parse_fault(text, KINDS)
-    assert message in str(refusal.value)
-    assert "\n" not in str(refusal.value)
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
 
 
 @given(
     st.text(max_size=80)
     | st.lists(st.sampled_from([*KINDS, "at=1", "for=2", "0.5", "x", "link=all"])).map(" ".join)
 )
-def test_any_text_is_a_fault_or_a_refusal(text: str) -> None:
+def test_any_text_is_a_fault_or_an_error(text: str) -> None:
     try:
         fault = parse_fault(text, KINDS)
     except FaultError:

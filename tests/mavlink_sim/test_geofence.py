@@ -1,4 +1,4 @@
-"""The geofence: inside and outside, refusals, breaches."""
+"""The geofence: inside and outside, rejected requests, breaches."""
 
 from __future__ import annotations
 

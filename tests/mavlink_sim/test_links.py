@@ -43,7 +43,7 @@ def test_silent_ground_station_gets_no_texts(harness: SimHarness) -> None:
     assert harness.texts("gcs") == []
 
 
-def test_refusals_have_severity_critical(harness: SimHarness) -> None:
+def test_denials_have_severity_critical(harness: SimHarness) -> None:
     harness.heartbeats.append(("gcs", (245, 190), GCS))
     harness.fly(1.0)
     harness.command(400, 1)

@@ -68,7 +68,7 @@ def test_unavailable_mode_in_air_accepted_then_rejected(harness: SimHarness, mai
     assert harness.heartbeat().custom_mode == 0x03040000
 
 
-def test_refusal_text_goes_to_requesting_ground_station(harness: SimHarness) -> None:
+def test_denial_text_goes_to_requesting_ground_station(harness: SimHarness) -> None:
     harness.heartbeats.append(("gcs", (245, 190), 6))
     harness.take_off()
     harness.forget()

@@ -278,7 +278,7 @@ def test_rc_channels_override_is_a_remote_control() -> None:
     assert harness.received("RC_CHANNELS")[-1].chancount == 7
 
 
-def test_mode_switch_changes_mode_or_reports_refusal() -> None:
+def test_mode_switch_changes_mode_or_reports_why_not() -> None:
     harness = remote_control(COM_FLTMODE5=3)
     transmitter = harness.vehicle.transmitter
     harness.take_off()

@@ -75,7 +75,7 @@ def test_disarming_text_has_reason(received: SimHarness) -> None:
     ]
 
 
-def test_refusal_texts_are_critical_and_end_with_tab(received: SimHarness) -> None:
+def test_denial_texts_are_critical_and_end_with_tab(received: SimHarness) -> None:
     received.fly(0.1)
     received.command(400, 1)
     received.set_mode(77)

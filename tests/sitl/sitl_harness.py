@@ -172,7 +172,7 @@ class AutopilotLink:
         """Above home."""
         return self.home_ned_m[2] - self.poses[-1].position_ned_m[2]
 
-    def flown(self, since_s: float, until_s: float = math.inf) -> list[Pose]:
+    def trajectory(self, since_s: float, until_s: float = math.inf) -> list[Pose]:
         """The poses of that time."""
         first = bisect_left(self.poses, since_s, key=lambda pose: pose.time_s)
         return self.poses[first : bisect_right(self.poses, until_s, key=lambda pose: pose.time_s)]

@@ -110,7 +110,7 @@ def test_a_goal_moves_with_a_reset_of_the_estimate(flight: Flight, parameters: d
         """Metres and time of each step between two positions that is no flight."""
         steps = [
             (math.dist(one.position_ned_m, other.position_ned_m), other.time_s)
-            for one, other in pairwise(link.flown(since_s))
+            for one, other in pairwise(link.trajectory(since_s))
         ]
         return [step for step in steps if step[0] > RESET_M / 2]
 
@@ -120,7 +120,7 @@ def test_a_goal_moves_with_a_reset_of_the_estimate(flight: Flight, parameters: d
     link.after(3.0)
     jump_m, at_s = jumps()[0]
     assert jump_m == pytest.approx(RESET_M, abs=3.0)
-    flown = link.flown(at_s, at_s + 3.0)
+    flown = link.trajectory(at_s, at_s + 3.0)
     drift_m = max(math.dist(pose.position_ned_m, flown[0].position_ned_m) for pose in flown)
     assert drift_m < 1.5
     assert link.offboard

@@ -70,7 +70,7 @@ def test_goto_arrives_and_stays(flight: Flight) -> None:
     begun_s = time.monotonic()
     flight.fly("goto forward=15 right=0")
     took_s = time.monotonic() - begun_s
-    yaw_rad = link.flown(begun_s)[0].yaw_rad
+    yaw_rad = link.trajectory(begun_s)[0].yaw_rad
     goal = (start[0] + 15.0 * math.cos(yaw_rad), start[1] + 15.0 * math.sin(yaw_rad))
     link.after(2.0)
     error_m = horizontal_m(link.poses[-1], *goal)
@@ -94,7 +94,7 @@ def test_an_orbit_keeps_radius_speed_and_nose(
     )
     begun_s = time.monotonic()
     flight.fly(f"orbit radius={radius_m:g} speed={speed_mps:g} laps={laps:g}")
-    poses = link.flown(begun_s + 5.0)
+    poses = link.trajectory(begun_s + 5.0)
     radius_errors = [abs(horizontal_m(pose, *centre) - radius_m) for pose in poses]
     nose_errors = [
         abs(
@@ -129,7 +129,7 @@ def test_a_path_is_followed(flight: Flight) -> None:
     begun_s = time.monotonic()
     flight.fly("follow-path 0,0 15,0 15,15 0,15")
     took_s = time.monotonic() - begun_s
-    track = np.array([pose.position_ned_m[:2] for pose in link.flown(begun_s)]) - home[:2]
+    track = np.array([pose.position_ned_m[:2] for pose in link.trajectory(begun_s)]) - home[:2]
     errors = np.min([distances_m(track, *leg) for leg in pairwise(np.array(CORNERS_M))], axis=0)
     p50, worst = float(np.percentile(errors, 50)), float(errors.max())
     assert p50 < 1.0

@@ -37,10 +37,10 @@ def test_a_velocity_step_and_the_stop_after_it(flight: Flight) -> None:
         lambda: link.poses[-1].time_s > stop_s and link.poses[-1].speed_mps < STANDING_MPS, 20.0, "standing"
     )
     ended = link.poses[-1]
-    step = link.flown(begun_s, stop_s)
+    step = link.trajectory(begun_s, stop_s)
     highest_mps = max(pose.speed_mps for pose in step)
     assert highest_mps == pytest.approx(STEP_MPS, rel=0.25)
-    places = [pose.position_ned_m for pose in link.flown(stop_s, ended.time_s)]
+    places = [pose.position_ned_m for pose in link.trajectory(stop_s, ended.time_s)]
     flight.note(
         "velocity step to 3 m/s",
         after_1_s_mps=next(pose.speed_mps for pose in step if pose.time_s > begun_s + 1.0),

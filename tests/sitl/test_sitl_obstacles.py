@@ -111,9 +111,10 @@ def test_pilot_in_position_mode_stops_before_a_wall(
             link.until(lambda: link.poses[-1].speed_mps < STANDING_MPS, 30.0, "standing before the wall")
             link.after(5.0)
             nearest_m = WALL_M - max(
-                float((np.array(pose.position_ned_m[:2]) - start) @ ahead) for pose in link.flown(begun_s)
+                float((np.array(pose.position_ned_m[:2]) - start) @ ahead)
+                for pose in link.trajectory(begun_s)
             )
-            fastest = max(pose.speed_mps for pose in link.flown(begun_s))
+            fastest = max(pose.speed_mps for pose in link.trajectory(begun_s))
             flight.note("pilot before a wall", nearest_m=nearest_m, stands_m=left_m(), fastest_mps=fastest)
             assert link.modes[-1][1] == POSITION_MODE
             assert KEEP_M - 1.0 < nearest_m <= left_m() < KEEP_M + 1.5

@@ -31,12 +31,12 @@ def standing(link: AutopilotLink, since_s: float) -> tuple[float, float]:
     """Wait until it stands; seconds and metres from a moment on."""
 
     def stood() -> Pose | None:
-        return next((pose for pose in link.flown(since_s) if pose.speed_mps < STANDING_MPS), None)
+        return next((pose for pose in link.trajectory(since_s) if pose.speed_mps < STANDING_MPS), None)
 
     link.until(stood, 20.0, "standing")
     end = stood()
     assert end is not None
-    places = [pose.position_ned_m[:2] for pose in link.flown(since_s, end.time_s)]
+    places = [pose.position_ned_m[:2] for pose in link.trajectory(since_s, end.time_s)]
     return end.time_s - since_s, sum(math.dist(one, other) for one, other in pairwise(places))
 
 

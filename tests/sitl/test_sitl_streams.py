@@ -38,7 +38,7 @@ def test_streams_come_after_an_uplink_that_was_deaf_at_the_start(
     bring_down(link)
     services.close()
     stop_streams(link)
-    link.until(lambda: not link.flown(time.monotonic() - 1.0), 10.0, "without positions")
+    link.until(lambda: not link.trajectory(time.monotonic() - 1.0), 10.0, "without positions")
     link.uplink_deaf, started_s = True, time.monotonic()
     try:
         flight = services.flight(driver)
@@ -46,7 +46,7 @@ def test_streams_come_after_an_uplink_that_was_deaf_at_the_start(
         link.until(lambda: flight.status and "LOCAL_POSITION_NED" in missing(flight), DEAF_S, "missing")
         link.after(started_s + DEAF_S - time.monotonic())
         assert any(at >= started_s for at, _ in link.commands)
-        assert not link.flown(started_s)
+        assert not link.trajectory(started_s)
     finally:
         link.uplink_deaf = False
     took_s = link.until(lambda: not missing(flight), 30.0, "complete")

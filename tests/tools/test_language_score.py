@@ -63,7 +63,7 @@ async def test_verdict_counts_every_command_of_a_sentence(
 async def test_model_that_never_ends_is_asked_as_often_as_in_flight() -> None:
     model = ScriptedModel(*[calling(LAND)] * 3 * MAX_TURNS)
     found, recorder = await language_score.verdict("land", ["land"], model)
-    assert (found, model.asked, recorder.flown) == ("wrong call", MAX_TURNS, ["land"] * MAX_TURNS)
+    assert (found, model.asked, recorder.executed) == ("wrong call", MAX_TURNS, ["land"] * MAX_TURNS)
 
 
 def test_score_of_both_tables_is_printed(

@@ -12,7 +12,7 @@ from mavlink_sim.camera.depth_camera import DepthSensor, measured_depth
 from vision.camera_model import CameraModel, CameraMount
 from vision.depth import depth_millimetres, depth_summary, nearest_points
 from vision.rotation import matrix_from_euler
-from vision.sources.depth_pictures import to_metres
+from vision.sources.depth_images import to_metres
 
 HEIGHT, WIDTH = 48, 64
 SMALL = CameraModel.from_horizontal_fov(WIDTH, HEIGHT, math.radians(70.0))

@@ -67,7 +67,7 @@ def test_nearest_point_of_a_pixel_is_kept_and_holes_stay() -> None:
 
 
 @pytest.mark.parametrize("width", [80, 160, 320, 640])
-def test_larger_colour_pictures_have_no_gaps(width: int) -> None:
+def test_larger_colour_images_have_no_gaps(width: int) -> None:
     row = (1.0 / (0.2 + np.arange(160) / 400)).astype(np.float32)
     depth = np.broadcast_to(row, (120, 160))
     found = shifted(0.03).register(depth, width, width * 3 // 4)

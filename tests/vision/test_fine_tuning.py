@@ -48,7 +48,7 @@ def test_end_to_end_networks_are_refused_by_family(family: str) -> None:
         extend_classes(model(family), ("drone",))
 
 
-def picture(path: Path, width: int = 200, height: int = 100) -> Path:
+def write_image(path: Path, width: int = 200, height: int = 100) -> Path:
     """Grey, with a red rectangle from (20, 30) to (60, 70) and a green one from (120, 10) to (180, 90)."""
     image = np.full((height, width, 3), 114, np.uint8)
     image[30:70, 20:60] = RED
@@ -75,7 +75,7 @@ def numbered(tmp_path: Path, names: tuple[str, ...], sample: Sample) -> Training
 
 
 def test_classes_without_labels_are_labelled_by_the_starting_model(tmp_path: Path) -> None:
-    sample = Sample(picture(tmp_path / "a.png"), BOXES, np.array([1, 0]), ignored=np.array([False, True]))
+    sample = Sample(write_image(tmp_path / "a.png"), BOXES, np.array([1, 0]), ignored=np.array([False, True]))
     image = numbered(tmp_path, ("person", "Drone"), sample)
     # Not the person, a class with labels, and not the traffic light where a drone is labelled.
     assert image.class_ids.tolist() == [2, ~0, 1, ~1]
@@ -84,7 +84,7 @@ def test_classes_without_labels_are_labelled_by_the_starting_model(tmp_path: Pat
 
 def test_labels_of_all_classes_are_used_as_they_are(tmp_path: Path) -> None:
     boxes = np.array([[0.1, 0.3, 0.3, 0.7], [0.6, 0.1, 0.9, 0.9], [0, 0, 0.1, 0.1]], np.float32)
-    sample = Sample(picture(tmp_path / "a.png"), boxes, np.array([0, 1, 2]), in_fractions=True)
+    sample = Sample(write_image(tmp_path / "a.png"), boxes, np.array([0, 1, 2]), in_fractions=True)
     image = numbered(tmp_path, ("drone", "traffic_light", "person"), sample)
     assert image.class_ids.tolist() == [2, 1, 0]
     assert image.boxes[:2] == pytest.approx(BOXES, abs=1e-4)
@@ -98,7 +98,7 @@ def shown(image: NDArray[np.uint8], colour: tuple[int, int, int], box: NDArray[n
 
 
 def test_boxes_fit_their_objects_in_single_images_and_mosaics(tmp_path: Path) -> None:
-    item = TrainingImage(picture(tmp_path / "a.png"), BOXES, np.array([0, 1]))
+    item = TrainingImage(write_image(tmp_path / "a.png"), BOXES, np.array([0, 1]))
     scenes = LabelledScenes([item, item], known=2)
     counts = []
     for seed in range(30):
@@ -116,7 +116,7 @@ def test_boxes_fit_their_objects_in_single_images_and_mosaics(tmp_path: Path) ->
 
 
 def test_half_of_the_images_show_a_new_class(tmp_path: Path) -> None:
-    path = picture(tmp_path / "a.png")
+    path = write_image(tmp_path / "a.png")
     images = [TrainingImage(path, BOXES[:1], np.array([number == 0])) for number in range(20)]
     rng = np.random.default_rng(0)
 

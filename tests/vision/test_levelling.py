@@ -1,4 +1,4 @@
-"""Levelled pictures: rotations, the lens, and rolling shutters."""
+"""Levelled images: rotations, the lens, and rolling shutters."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ angles = st.floats(-MAX_LEAN_RAD, MAX_LEAN_RAD)
 
 
 def world_seen(camera: CameraModel, ned_from_rows: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """A picture of a far world: a bright sky above dark ground.
+    """An image of a far world: a bright sky above dark ground.
 
     Args:
         ned_from_rows: (height, 3, 3) `ned_from_optical` of each row.
@@ -79,8 +79,8 @@ def test_rows_of_a_rolling_shutter_are_levelled_each_by_its_attitude() -> None:
 
 
 @pytest.mark.parametrize("rotate_deg", [90, 180, 270])
-def test_rows_of_a_rotated_picture_are_those_of_the_sensor(rotate_deg: int) -> None:
-    """Levelling the rotated picture is rotating the levelled one."""
+def test_rows_of_a_rotated_image_are_those_of_the_sensor(rotate_deg: int) -> None:
+    """Levelling the rotated image is rotating the levelled one."""
     rng = np.random.default_rng(5)
     small = rng.integers(40, 255, (12, 16)).astype(np.uint8)
     image = np.asarray(cv2.resize(small, (320, 240), interpolation=cv2.INTER_CUBIC), np.uint8)
@@ -101,7 +101,7 @@ def test_rows_of_a_rotated_picture_are_those_of_the_sensor(rotate_deg: int) -> N
 
 
 @given(roll=angles, pitch=angles, heading=st.floats(-3.1, 3.1), mount_pitch=st.floats(-0.9, 0.5))
-def test_axis_is_kept_and_the_picture_is_level(
+def test_axis_is_kept_and_the_image_is_level(
     roll: float, pitch: float, heading: float, mount_pitch: float
 ) -> None:
     mount = CameraMount(pitch_rad=mount_pitch, yaw_rad=0.3)
@@ -133,7 +133,7 @@ def test_gimbal_that_looks_down_is_not_turned() -> None:
     assert math.atan2(rotation[1, 0], rotation[0, 0]) == pytest.approx(0.1)
 
 
-def test_level_picture_is_unchanged() -> None:
+def test_level_image_is_unchanged() -> None:
     image = np.random.default_rng(1).integers(1, 255, (240, 320, 3)).astype(np.uint8)
     rotations = level_rotations([(AHEAD, matrix_from_euler(0.0, 0.0, 2.0))])
     assert np.array_equal(level_image(image, PINHOLE, rotations), image)

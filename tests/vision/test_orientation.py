@@ -1,4 +1,4 @@
-"""Mirrored and rotated pictures: lens and mount stay those of the picture."""
+"""Mirrored and rotated images: lens and mount stay those of the image."""
 
 from __future__ import annotations
 
@@ -33,19 +33,19 @@ lenses = st.sampled_from([LENS, RATIONAL, FISHEYE, IDEAL_FISHEYE])
 
 
 def moved(pixel: tuple[int, int], orientation: Orientation) -> tuple[int, int]:
-    """Where a pixel (column, row) of a 640x480 picture goes, found in a picture."""
-    picture = np.zeros((480, 640), np.float32)
-    picture[pixel[1], pixel[0]] = 1.0
-    row, column = np.argwhere(orientation.pixels(picture))[0]
+    """Where a pixel (column, row) of a 640x480 image goes, found in an image."""
+    image = np.zeros((480, 640), np.float32)
+    image[pixel[1], pixel[0]] = 1.0
+    row, column = np.argwhere(orientation.pixels(image))[0]
     return int(column), int(row)
 
 
-def test_picture_is_mirrored_and_then_rotated_clockwise() -> None:
-    picture = np.array([[1, 2, 3], [4, 5, 6]], np.float32)
-    assert Orientation(90).pixels(picture).tolist() == [[4, 1], [5, 2], [6, 3]]
-    assert Orientation(180).pixels(picture).tolist() == [[6, 5, 4], [3, 2, 1]]
-    assert Orientation(0, mirror=True).pixels(picture).tolist() == [[3, 2, 1], [6, 5, 4]]
-    assert Orientation(90, mirror=True).pixels(picture).tolist() == [[6, 3], [5, 2], [4, 1]]
+def test_image_is_mirrored_and_then_rotated_clockwise() -> None:
+    image = np.array([[1, 2, 3], [4, 5, 6]], np.float32)
+    assert Orientation(90).pixels(image).tolist() == [[4, 1], [5, 2], [6, 3]]
+    assert Orientation(180).pixels(image).tolist() == [[6, 5, 4], [3, 2, 1]]
+    assert Orientation(0, mirror=True).pixels(image).tolist() == [[3, 2, 1], [6, 5, 4]]
+    assert Orientation(90, mirror=True).pixels(image).tolist() == [[6, 3], [5, 2], [4, 1]]
     for orientation in ORIENTATIONS:
         image = orientation.pixels(np.zeros((480, 640, 3), np.uint8))
         model = orientation.model(LENS)
@@ -55,7 +55,7 @@ def test_picture_is_mirrored_and_then_rotated_clockwise() -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(lenses, orientations, st.integers(0, 639), st.integers(0, 479))
-def test_ray_of_a_pixel_turns_with_the_picture(
+def test_ray_of_a_pixel_turns_with_the_image(
     lens: CameraModel, orientation: Orientation, column: int, row: int
 ) -> None:
     (before,) = lens.rays(np.array([[column, row]]))
@@ -94,7 +94,7 @@ def test_unknown_angle_is_refused() -> None:
 
 
 class OneFrame(Capture):
-    """A camera that brings its calibration, and delivers one picture with depth."""
+    """A camera that brings its calibration, and delivers one image with depth."""
 
     def __init__(self, raw: RawFrame, calibration: CameraCalibration) -> None:
         self._frames = [raw]
@@ -111,7 +111,7 @@ class OneFrame(Capture):
 
 @pytest.mark.parametrize("orientation", ORIENTATIONS, ids=str)
 def test_ground_point_is_ranged_equally_by_a_rotated_camera(orientation: Orientation) -> None:
-    """A camera fixed with a roll, its picture rotated back: the marker's place on the ground stays."""
+    """A camera fixed with a roll, its image rotated back: the marker's place on the ground stays."""
     plate_ned = (5.0, 0.7, 0.0)
     plate = WorldObject(0, "plate", plate_ned, 0.4, printed=Print("4X4_50", 7, 0.8))
     mount = CameraMount(0.1, -0.05, 0.0, math.radians(orientation.rotate_deg), math.radians(-35.0), 0.0)

@@ -215,7 +215,7 @@ def test_open_failure_is_a_one_line_error(
 
 @pytest.mark.parametrize("uri", ["photo.png", "-", "rtsp://u:secret@cam/1", "udp://:5600", "shm://front"])
 @pytest.mark.parametrize("key", ["exposure_us", "gain"])
-def test_exposure_of_pictures_already_taken_is_refused(uri: str, key: str) -> None:
+def test_exposure_of_images_already_taken_is_refused(uri: str, key: str) -> None:
     with pytest.raises(SourceError, match=rf"source\.{key} is for cameras") as error:
         open_source(uri, SourceSettings(**{key: 100.0}))  # type: ignore[arg-type]
     assert "secret" not in str(error.value)

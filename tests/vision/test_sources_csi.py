@@ -63,8 +63,8 @@ def test_cameras_of_a_jetson_come_from_its_nodes(monkeypatch: pytest.MonkeyPatch
     assert csi_cameras(devices) == (CsiCamera(0, "imx219 9-0010", ((1920, 1080, 60.0),)),)
 
 
-# A stand-in for both programs: notes its arguments, then writes the pictures of `size` until it is ended.
-# A picture is grey: 16 + 10 per picture, in the limited range of yuv420.
+# A stand-in for both programs: notes its arguments, then writes the images of `size` until it is ended.
+# An image is grey: 16 + 10 per image, in the limited range of yuv420.
 PROGRAM = """#!{python}
 import os, signal, sys, time
 arguments = sys.argv[1:]
@@ -80,7 +80,7 @@ WRITE = """
 print("GST_ARGUS: Creating output stream", file=sys.stderr if "--output" in arguments else sys.stdout)
 sys.stdout.flush()
 fd = 1 if "--output" in arguments else int(arguments[-1].removeprefix("fd="))
-for index in range({pictures}):
+for index in range({images}):
     os.write(fd, bytes([16 + 10 * index]) * ({width} * {height}) + b"\\x80" * ({width} * {height} // 2))
     time.sleep(0.01)
 {after}
@@ -99,8 +99,8 @@ class Board:
         path.write_text(PROGRAM.format(python=sys.executable, notes=str(self.notes), body=body))
         path.chmod(0o755)
 
-    def writes(self, name: str, *, pictures: int = 20, after: str = "time.sleep(60)") -> None:
-        self.install(name, WRITE.format(width=128, height=64, pictures=pictures, after=after))
+    def writes(self, name: str, *, images: int = 20, after: str = "time.sleep(60)") -> None:
+        self.install(name, WRITE.format(width=128, height=64, images=images, after=after))
 
     def started(self) -> list[list[str]]:
         """Of each start: process id, program, arguments."""
@@ -131,7 +131,7 @@ def wait_until_ended(pid: int) -> bool:
 
 @pytest.mark.realtime
 @pytest.mark.parametrize("name", ["rpicam-vid", "gst-launch-1.0"])
-def test_pictures_of_the_board_program_are_delivered(board: Board, name: str) -> None:
+def test_images_of_the_board_program_are_delivered(board: Board, name: str) -> None:
     board.writes(name)
     with open_source("csi://1", SIZE) as source:
         assert source.live
@@ -140,7 +140,7 @@ def test_pictures_of_the_board_program_are_delivered(board: Board, name: str) ->
         assert frame.image.shape == (64, 128, 3)
         assert frame.media_s is None
         values = np.unique(frame.image)
-        # The picture's luma in the full range: 0 for 16, and 255/219 more per step.
+        # The image's luma in the full range: 0 for 16, and 255/219 more per step.
         assert len(values) == 1
         assert abs(int(values[0]) - 255 / 219 * 10 * frame.sequence) <= 1
         ((pid, _, *arguments),) = board.started()
@@ -163,10 +163,10 @@ def test_pictures_of_the_board_program_are_delivered(board: Board, name: str) ->
 def test_mjpeg_of_the_board_program_is_delivered(board: Board) -> None:
     ok, jpeg = cv2.imencode(".jpg", np.full((50, 100, 3), 77, np.uint8))
     assert ok
-    (board.folder / "picture.jpg").write_bytes(jpeg.tobytes())
+    (board.folder / "image.jpg").write_bytes(jpeg.tobytes())
     board.install(
         "rpicam-vid",
-        f"data = open({str(board.folder / 'picture.jpg')!r}, 'rb').read()\n"
+        f"data = open({str(board.folder / 'image.jpg')!r}, 'rb').read()\n"
         "assert '--codec mjpeg' in ' '.join(arguments)\n"
         "while True:\n    os.write(1, data)\n    time.sleep(0.01)",
     )
@@ -180,7 +180,7 @@ def test_mjpeg_of_the_board_program_is_delivered(board: Board) -> None:
 
 @pytest.mark.realtime
 def test_program_that_ends_is_started_again(board: Board, caplog: pytest.LogCaptureFixture) -> None:
-    board.writes("rpicam-vid", pictures=3, after="sys.exit('ERROR: *** camera timed out ***')")
+    board.writes("rpicam-vid", images=3, after="sys.exit('ERROR: *** camera timed out ***')")
     with open_source("csi://0", SIZE) as source:
         deadline_s = time.monotonic() + 20.0
         while source.statistics.reopened < 2 and time.monotonic() < deadline_s:
@@ -201,7 +201,7 @@ def test_program_without_a_camera_is_a_one_line_error(board: Board) -> None:
 
 @pytest.mark.realtime
 def test_program_ends_when_its_parent_is_killed(board: Board) -> None:
-    board.writes("rpicam-vid", pictures=1)
+    board.writes("rpicam-vid", images=1)
     code = (
         "import os, signal\nfrom vision.sources import SourceSettings, open_source\n"
         "source = open_source('csi://0', SourceSettings(width=128, height=64))\n"

@@ -31,20 +31,20 @@ from vision.sources import (
     SourceStatistics,
     open_source,
 )
-from vision.sources.depth_pictures import decode_depth, to_metres
-from vision.sources.paired import DepthPictures, PairedCapture, paired_source
+from vision.sources.depth_images import decode_depth, to_metres
+from vision.sources.paired import DepthImages, PairedCapture, paired_source
 from vision.sources.shared import FrameSharing
 
 MILLIMETRES = np.array([[1500, 0], [65535, 250]], np.uint16)
 METRES = np.array([[1.5, np.nan], [np.inf, -1.0]], np.float32)
 
 
-def saved(path: Path, picture: NDArray[Any]) -> Path:
+def saved(path: Path, image: NDArray[Any]) -> Path:
     path.parent.mkdir(exist_ok=True)
     if path.suffix == ".npy":
-        np.save(path, picture)
+        np.save(path, image)
     else:
-        assert cv2.imwrite(str(path), picture)
+        assert cv2.imwrite(str(path), image)
     return path
 
 
@@ -93,7 +93,7 @@ def test_openexr_without_a_depth_channel_is_refused(tmp_path: Path) -> None:
         whole = saved_exr(tmp_path / "a.exr", dict.fromkeys(names, METRES)).read_bytes()
         with pytest.raises(SourceError, match=f"the only 'Z', got {', '.join(names)}"):
             decode_depth(Path("of-bytes.exr"), whole)
-    for data in (whole[: len(whole) // 2], whole[:-4], b"\x76\x2f\x31\x01", b"picture", b""):
+    for data in (whole[: len(whole) // 2], whole[:-4], b"\x76\x2f\x31\x01", b"image", b""):
         assert decode_depth(Path("of-bytes.exr"), data) is None
 
 
@@ -112,21 +112,21 @@ def test_floats_in_millimetres_are_refused_with_the_key() -> None:
 
 
 @pytest.mark.parametrize(
-    ("picture", "words"),
+    ("image", "words"),
     [
         (np.zeros((4, 4), np.uint8), r"16-bit integers or floats, got shape \(4, 4\) uint8"),
         (np.zeros((4, 4, 3), np.uint16), r"one channel.*got shape \(4, 4, 3\)"),
     ],
 )
-def test_picture_that_is_not_depth_is_refused(tmp_path: Path, picture: NDArray[Any], words: str) -> None:
+def test_image_that_is_not_depth_is_refused(tmp_path: Path, image: NDArray[Any], words: str) -> None:
     with pytest.raises(SourceError, match=words):
-        open_source(str(saved(tmp_path / "a.png", picture)), SourceSettings(as_depth=True))
+        open_source(str(saved(tmp_path / "a.png", image)), SourceSettings(as_depth=True))
 
 
 def folders(
     tmp_path: Path, count: int, depth_count: int, size: tuple[int, int] = (12, 16)
 ) -> tuple[str, SourceSettings]:
-    """A folder of colour pictures, and settings with one of depth: picture N is N + 1 metres away."""
+    """A folder of colour images, and settings with one of depth: image N is N + 1 metres away."""
     for index in range(count):
         saved(tmp_path / "colour" / f"{index}.png", np.full((12, 16, 3), index, np.uint8))
     for index in range(depth_count):
@@ -134,7 +134,7 @@ def folders(
     return str(tmp_path / "colour"), SourceSettings(depth=str(tmp_path / "depth"))
 
 
-def test_folders_are_paired_picture_by_picture(tmp_path: Path) -> None:
+def test_folders_are_paired_image_by_image(tmp_path: Path) -> None:
     uri, settings = folders(tmp_path, 4, 3)
     with open_source(uri, settings) as source:
         assert not source.live
@@ -169,10 +169,10 @@ def test_folders_with_other_names_are_paired_by_position(tmp_path: Path) -> None
         depths = [float(frame.depth_m[0, 0]) for frame in source if frame.depth_m is not None]
     assert depths == pytest.approx([1.0, 2.0, 3.0])
     (tmp_path / "depth" / "depth_1.png").unlink()
-    with pytest.raises(SourceError, match=r"^3 images in .*colour and 2 depth pictures in .* 0 is the first"):
+    with pytest.raises(SourceError, match=r"^3 images in .*colour and 2 depth images in .* 0 is the first"):
         open_source(uri, settings)
     saved(tmp_path / "depth" / "depth_0.npy", METRES)
-    with pytest.raises(SourceError, match="two depth pictures have the same name"):
+    with pytest.raises(SourceError, match="two depth images have the same name"):
         open_source(uri, settings)
 
 
@@ -206,7 +206,7 @@ def test_folders_in_real_time_stay_paired_and_rotated(tmp_path: Path) -> None:
 @pytest.mark.parametrize("realtime", [True, False])
 def test_depth_of_another_size_is_refused(tmp_path: Path, realtime: bool) -> None:
     uri, settings = folders(tmp_path, 2, 2, size=(6, 8))
-    with pytest.raises(SourceError, match="depth is 8x6, the picture 16x12"):
+    with pytest.raises(SourceError, match="depth is 8x6, the image 16x12"):
         open_source(uri, SourceSettings(depth=settings.depth, realtime=realtime))
 
 
@@ -257,7 +257,7 @@ def test_depth_that_cannot_be_paired_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.realtime
 def test_pipes_of_colour_and_gray16_are_paired(tmp_path: Path) -> None:
-    """The writer writes picture N and depth of N metres together, at 50 Hz."""
+    """The writer writes image N and depth of N metres together, at 50 Hz."""
     paths = [tmp_path / "colour.fifo", tmp_path / "depth.fifo"]
     for path in paths:
         os.mkfifo(path)
@@ -325,14 +325,14 @@ def frame_at(stamp_s: float, sequence: int = 0, depth_m: float | None = None) ->
 
 
 def paired(colour: list[Frame], depth: list[Frame]) -> Iterator[float | None]:
-    """The depth of each frame that a live pair delivers; the depth pictures have all arrived."""
-    pictures = DepthPictures()
+    """The depth of each frame that a live pair delivers; the depth images have all arrived."""
+    images = DepthImages()
     for frame in depth:
-        pictures.add(frame)
+        images.add(frame)
     capture = PairedCapture(
         ScriptedSource(colour, live=True),
         ScriptedSource([], live=True, ends=False),
-        pictures,
+        images,
         SourceSettings(open_timeout_s=0.2),
     )
     while True:
@@ -344,7 +344,7 @@ def paired(colour: list[Frame], depth: list[Frame]) -> Iterator[float | None]:
         yield None if raw.depth_m is None else float(raw.depth_m[0, 0])
 
 
-def test_live_pictures_are_paired_by_the_nearest_stamp() -> None:
+def test_live_images_are_paired_by_the_nearest_stamp() -> None:
     depth = [frame_at(1.000, depth_m=1.0), frame_at(1.033, depth_m=2.0), frame_at(1.066, depth_m=3.0)]
     colour = [frame_at(0.5), frame_at(1.004, 1), frame_at(1.030, 2), frame_at(1.055, 3), frame_at(1.090, 4)]
     # The first has no partner before the first pair, and is skipped; the last one's is 24 ms away.
@@ -359,24 +359,24 @@ def test_stamps_of_another_clock_are_refused() -> None:
 
 
 def test_depth_that_arrives_late_is_waited_for() -> None:
-    pictures = DepthPictures()
-    late = threading.Timer(0.01, pictures.add, [frame_at(1.0, depth_m=7.0)])
+    images = DepthImages()
+    late = threading.Timer(0.01, images.add, [frame_at(1.0, depth_m=7.0)])
     late.start()
-    found = pictures.nearest(1.0)
+    found = images.nearest(1.0)
     late.join()
     assert found is not None
     assert found[1][0, 0] == 7.0
     started_s = time.monotonic()
-    assert pictures.nearest(2.0) == found
+    assert images.nearest(2.0) == found
     assert 0.03 < time.monotonic() - started_s < 1.0
 
 
 def test_lost_depth_is_not_waited_for_until_it_is_back() -> None:
-    pictures = DepthPictures()
-    pictures.add(frame_at(1.0, depth_m=1.0))
+    images = DepthImages()
+    images.add(frame_at(1.0, depth_m=1.0))
     colour = ScriptedSource([frame_at(1.0 + index / 10, index) for index in range(30)], live=True)
     depth = ScriptedSource([], live=True, ends=False)
-    capture = PairedCapture(colour, depth, pictures, SourceSettings())
+    capture = PairedCapture(colour, depth, images, SourceSettings())
     for _ in range(4):
         assert capture.read(0.1) is not None
     started_s = time.monotonic()
@@ -385,8 +385,8 @@ def test_lost_depth_is_not_waited_for_until_it_is_back() -> None:
         assert raw is not None
         assert raw.depth_m is None
     assert time.monotonic() - started_s < 0.4  # 40 ms for each would be 0.8 s
-    pictures.add(frame_at(3.3, depth_m=1.0))
-    back = threading.Timer(0.01, pictures.add, [frame_at(3.4, depth_m=2.0)])
+    images.add(frame_at(3.3, depth_m=1.0))
+    back = threading.Timer(0.01, images.add, [frame_at(3.4, depth_m=2.0)])
     back.start()
     raw = capture.read(0.1)
     back.join()
@@ -400,7 +400,7 @@ def test_recordings_of_different_rates_are_paired_by_time() -> None:
     depth = ScriptedSource(
         [frame_at(index / 15, index, depth_m=1.0 + index) for index in range(3)], live=False
     )
-    with paired_source(colour, depth, DepthPictures(), SourceSettings()) as source:
+    with paired_source(colour, depth, DepthImages(), SourceSettings()) as source:
         depths = [None if frame.depth_m is None else float(frame.depth_m[0, 0]) for frame in source]
     assert depths == [1.0, None, 2.0, None, 3.0, None, None]
     assert colour.closed
@@ -416,7 +416,7 @@ def test_error_of_the_depth_source_ends_the_pair(caplog: pytest.LogCaptureFixtur
     colour = ScriptedSource([frame_at(index / 30, index) for index in range(7)], live=True)
     depth = Failing([], live=True, uri="depth.tiff")
     with pytest.raises(SourceError, match=r"source\.depth depth\.tiff: the median of depth is 3000 m"):
-        paired_source(colour, depth, DepthPictures(), SourceSettings())
+        paired_source(colour, depth, DepthImages(), SourceSettings())
     assert colour.closed
     assert depth.closed
 

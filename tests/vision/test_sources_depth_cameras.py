@@ -192,7 +192,7 @@ class OakNode:
 
 
 class FakeOak:
-    """`depthai` 3: one camera; picture N is followed by N + 1, and the queue is empty every other time."""
+    """`depthai` 3: one camera; image N is followed by N + 1, and the queue is empty every other time."""
 
     CameraBoardSocket = SimpleNamespace(CAM_A="A", CAM_B="B", CAM_C="C")
     ImgFrame = SimpleNamespace(Type=SimpleNamespace(BGR888i="BGR888i"))

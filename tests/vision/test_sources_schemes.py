@@ -34,7 +34,7 @@ class OneGrey(Capture):
 def grey() -> Iterator[str]:
     """The scheme of a source of grey images."""
 
-    @source("grey", "grey pictures")
+    @source("grey", "grey images")
     def open_grey(uri: str, settings: SourceSettings) -> Source:
         return SequentialSource(uri, OneGrey, settings)
 

@@ -1,4 +1,4 @@
-"""A picture of a point cloud from behind and above, without a window."""
+"""An image of a point cloud from behind and above, without a window."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from vision.point_cloud.clusters import Cluster
 
 _BACKGROUND, _LIGHT = (34, 30, 28), (235, 235, 235)
 _FOV_RAD = math.radians(60.0)
-# The picture looks down by this much, from where this share of the points is inside.
+# The image looks down by this much, from where this share of the points is inside.
 _DEPRESSION_RAD, _INSIDE_PERCENT = math.radians(32.0), 99.5
 _LARGEST_PX = 9
 # Of the corners of a box, numbered by bits: pairs that differ in one bit.
@@ -32,7 +32,7 @@ def draw_cloud(
     width: int = 960,
     height: int = 540,
 ) -> NDArray[np.uint8]:
-    """(height, width, 3) uint8 BGR picture of the points, seen from behind and above their origin.
+    """(height, width, 3) uint8 BGR image of the points, seen from behind and above their origin.
 
     Points without colours are coloured by their height. Nearer points cover farther ones. Boxes are those of
     the clusters, oriented, with the horizontal distance of their centre from the origin.
@@ -65,7 +65,7 @@ def draw_cloud(
 def _view(
     points: NDArray[np.float32], down: NDArray[np.float64], camera: CameraModel
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(3, 3) rotation to the optical frame of the picture, and (3,) the eye's position."""
+    """(3, 3) rotation to the optical frame of the image, and (3,) the eye's position."""
     middle = np.median(points, axis=0).astype(np.float64)
     ahead = middle - (middle @ down) * down
     if np.linalg.norm(ahead) < 1e-3:  # points straight below

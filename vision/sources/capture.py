@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from vision.camera_model import CameraCalibration
 from vision.frame import Frame
 from vision.orientation import Orientation
-from vision.sources.depth_pictures import to_metres
+from vision.sources.depth_images import to_metres
 from vision.sources.source import EndOfStream, SourceError, SourceSettings
 
 
@@ -142,7 +142,7 @@ class LoopingCapture(Capture):
 
 
 class OrientedCapture(Capture):
-    """A capture whose pictures, depth and calibration are mirrored and rotated."""
+    """A capture whose images, depth and calibration are mirrored and rotated."""
 
     def __init__(self, capture: Capture, orientation: Orientation) -> None:
         self._capture = capture
@@ -169,7 +169,7 @@ class OrientedCapture(Capture):
 
 
 class DepthCapture(Capture):
-    """A capture of depth pictures (uint16 or float), which it converts to metres; the image is black.
+    """A capture of depth images (uint16 or float), which it converts to metres; the image is black.
 
     One that has depth in metres beside its image (shared memory) is passed on.
     """
@@ -188,7 +188,7 @@ class DepthCapture(Capture):
         if raw is None or raw.depth_m is not None:
             return raw
         if raw.image.ndim != 2:
-            raise SourceError("it delivers colour pictures, not depth")
+            raise SourceError("it delivers colour images, not depth")
         depth_m = to_metres(raw.image, self._scale_m)
         return replace(raw, image=np.zeros((*depth_m.shape, 3), np.uint8), depth_m=depth_m)
 

@@ -1,7 +1,7 @@
 """Cameras on a board's CSI connector, `csi://0`, through the board's own program.
 
 On a Raspberry Pi that is rpicam-vid, on a Jetson gst-launch-1.0 with nvarguscamerasrc: the sensor needs the
-board's image processor, which OpenCV does not operate. The program writes pictures into a pipe. It is our
+board's image processor, which OpenCV does not operate. The program writes images into a pipe. It is our
 child: it ends with this process, however that ends, and is started again when it ends itself.
 
 Not tested with a real camera: the tests use stand-in programs with the same arguments and output.
@@ -53,7 +53,7 @@ class CsiCamera:
 
     Attributes:
         sensor: its name. modes: width, height and highest rate in Hz (None: not reported) of its readout
-            modes; the picture may have any smaller size.
+            modes; the image may have any smaller size.
     """
 
     number: int

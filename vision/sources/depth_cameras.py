@@ -1,6 +1,6 @@
 """Depth cameras: RealSense, `realsense://SERIAL`, and OAK, `oak://ID`; the first one found without a name.
 
-Depth is registered to the colour picture by the maker's library, `pyrealsense2` or `depthai` 3, which is
+Depth is registered to the colour image by the maker's library, `pyrealsense2` or `depthai` 3, which is
 imported when such a source is opened. Both bring their lens, not their mount.
 
 Not tested with a real camera: the tests use stand-in modules of the same interface, and the calls were
@@ -21,7 +21,7 @@ import numpy as np
 
 from vision.camera_model import CameraCalibration, CameraModel
 from vision.sources.capture import Capture, CaptureError, RawFrame
-from vision.sources.depth_pictures import to_metres
+from vision.sources.depth_images import to_metres
 from vision.sources.source import SourceError, SourceSettings
 
 logger = logging.getLogger(__name__)
@@ -167,7 +167,7 @@ class OakCapture(Capture):
             # The first pair has the lens, which must be known before it is delivered.
             self._first: Any = self._queue.get(timedelta(seconds=settings.open_timeout_s))
             if self._first is None:
-                raise CaptureError("it delivers no pictures with depth")
+                raise CaptureError("it delivers no images with depth")
         except RuntimeError as error:
             self._device.close()
             raise CaptureError(str(error)) from error

@@ -68,17 +68,17 @@ def _decode_colour(_path: Path, data: bytes) -> NDArray[np.uint8] | None:
 
 
 def partners(images: list[Path], depths: list[Path]) -> list[Path | None]:
-    """The depth picture of each image: of the same name without suffix, or of the same position.
+    """The depth image of each image: of the same name without suffix, or of the same position.
 
     Images without a partner have None. The position decides if no names agree and the numbers are the same.
 
     Raises:
-        SourceError: neither names nor numbers agree, or two depth pictures have one name.
+        SourceError: neither names nor numbers agree, or two depth images have one name.
     """
     by_stem = {path.stem: path for path in depths}
     if len(by_stem) < len(depths):
         raise SourceError(
-            f"{depths[0].parent}: two depth pictures have the same name without suffix; keep one of each"
+            f"{depths[0].parent}: two depth images have the same name without suffix; keep one of each"
         )
     paired = [by_stem.get(path.stem) for path in images]
     count = sum(path is not None for path in paired)
@@ -88,9 +88,9 @@ def partners(images: list[Path], depths: list[Path]) -> list[Path | None]:
         return list(depths)
     alone = next(path for path, partner in zip(images, paired, strict=True) if partner is None)
     raise SourceError(
-        f"{len(images)} images in {images[0].parent} and {len(depths)} depth pictures in {depths[0].parent} "
+        f"{len(images)} images in {images[0].parent} and {len(depths)} depth images in {depths[0].parent} "
         f"cannot be paired: {count} names without suffix agree, {alone.stem} is the first without a partner; "
-        f"give each depth picture the name of its image"
+        f"give each depth image the name of its image"
     )
 
 
@@ -99,7 +99,7 @@ class ImagesCapture(Capture):
 
     Args:
         paths: the images; None: no image for this interval.
-        decode: returns the picture of a file's bytes, None if unreadable.
+        decode: returns the image of a file's bytes, None if unreadable.
     """
 
     def __init__(
@@ -178,8 +178,8 @@ class VideoFileCapture(Capture):
         if not stamp_s > self._last_s:  # some containers carry no stamps, or repeat them
             stamp_s = self._last_s + self.interval_s
         self._last_s = stamp_s
-        picture = np.ascontiguousarray(image, dtype=np.uint8)
-        return RawFrame(picture, media_s=stamp_s, decode_ms=decode_ms, file_name=self._path.name)
+        pixels = np.ascontiguousarray(image, dtype=np.uint8)
+        return RawFrame(pixels, media_s=stamp_s, decode_ms=decode_ms, file_name=self._path.name)
 
     def close(self) -> None:
         self._capture.release()

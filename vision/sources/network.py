@@ -33,7 +33,7 @@ _RTP_FORMATS = {"rtp-h264": "H264/90000", "rtp-h265": "H265/90000", "rtp-jpeg": 
 _JPEG_PAYLOAD, _FIRST_DYNAMIC_PAYLOAD = 26, 96
 _LONGEST_STEP_S = 1.0  # a larger step of the stream's time is a discontinuity, not a pause
 _JPEG_TYPES = ("multipart/x-mixed-replace", "image/jpeg", "image/jpg", "video/x-motion-jpeg", "video/x-jpeg")
-_REFUSALS = {
+_HTTP_ERRORS = {
     401: "requires a user and password",
     403: "denies access",
     404: "has no such resource",
@@ -250,10 +250,10 @@ def open_http(uri: str, settings: SourceSettings) -> Capture:
         response = _opener(uri).open(bare, timeout=timeout_s)
     except urllib.error.HTTPError as error:
         with error:
-            text = f"the server {_REFUSALS.get(error.code, 'refuses')} (HTTP {error.code} {error.reason})"
+            text = f"the server {_HTTP_ERRORS.get(error.code, 'refuses')} (HTTP {error.code} {error.reason})"
         if error.code == 401:
             text += f"; put them into the address: {parts.scheme}://USER:PASSWORD@{parts.hostname}…"
-        if error.code in _REFUSALS:
+        if error.code in _HTTP_ERRORS:
             raise SourceError(text) from error
         raise CaptureError(text) from error
     except urllib.error.URLError as error:

@@ -18,12 +18,12 @@ from vision.sources.camera import CameraCapture, camera_device, check_camera
 from vision.sources.capture import Capture, LoopingCapture
 from vision.sources.csi import CsiCapture, check_csi_program, csi_settings, parse_csi_number
 from vision.sources.depth_cameras import OakCapture, RealsenseCapture, load_module
-from vision.sources.depth_pictures import DEPTH_SUFFIXES, decode_depth, is_depth_picture
+from vision.sources.depth_images import DEPTH_SUFFIXES, decode_depth, is_depth_image
 from vision.sources.files import ImagesCapture, VideoFileCapture, images_in, is_image, partners
 from vision.sources.latest import LatestSource
 from vision.sources.network import UdpStream, open_http, open_rtsp, without_password
 from vision.sources.opencv import quiet_opencv
-from vision.sources.paired import TOLERANCE_S, DepthPictures, depth_error, paired_source
+from vision.sources.paired import TOLERANCE_S, DepthImages, depth_error, paired_source
 from vision.sources.pipe import Fifo, PipeCapture, check_pipe_settings
 from vision.sources.registry import SOURCES, source
 from vision.sources.sequential import SequentialSource
@@ -31,7 +31,7 @@ from vision.sources.shared import SharedFrameCapture, check_name
 from vision.sources.source import RAW_PIXEL_FORMATS, Source, SourceError, SourceSettings
 
 _IMAGE_RATE_HZ = 10.0  # of images used as a camera without rate_hz
-# Their pictures are already taken when they arrive. A plug-in's scheme decides itself.
+# Their images are already taken when they arrive. A plug-in's scheme decides itself.
 _WITHOUT_EXPOSURE = ("file", "rtsp", "rtsps", "http", "https", "udp", "shm", "realsense", "oak")
 _WITHOUT_DEPTH = ("csi", "rtsp", "rtsps", "http", "https", "udp")
 
@@ -121,17 +121,17 @@ def _open_with_depth(uri: str, depth_uri: str, settings: SourceSettings) -> Sour
             registration = read_registration(settings.depth_calibration_file, settings.orientation)
         except ValueError as error:
             raise SourceError(str(error)) from error
-    pictures = DepthPictures()
-    # Recordings are read frame by frame, so that their pictures pair; the pair is played in real time.
+    depth_images = DepthImages()
+    # Recordings are read frame by frame, so that their images pair; the pair is played in real time.
     each = replace(settings, depth=None, depth_calibration_file=None, realtime=False, on_frame=None)
-    of_depth = replace(each, as_depth=True, exposure_us=None, gain=None, name=None, on_frame=pictures.add)
+    of_depth = replace(each, as_depth=True, exposure_us=None, gain=None, name=None, on_frame=depth_images.add)
     colour, depth = open_two(uri, depth_uri, each, of_depth)
     tolerance_s = TOLERANCE_S
     if _folder(uri) is not None and _folder(depth_uri) is not None:
-        # Their times are multiples of the interval: a picture pairs with its partner alone.
+        # Their times are multiples of the interval: an image pairs with its partner alone.
         tolerance_s = 0.25 / _image_rate_hz(settings)
     return paired_source(
-        colour, depth, pictures, settings, tolerance_s=tolerance_s, registration=registration
+        colour, depth, depth_images, settings, tolerance_s=tolerance_s, registration=registration
     )
 
 
@@ -183,7 +183,7 @@ def _refuse_exposure(name: str, settings: SourceSettings) -> None:
         if getattr(settings, key) is not None:
             raise SourceError(
                 f"{name}: source.{key} is for cameras (/dev/video0, csi://0); remove it, and set it in the "
-                f"program that makes these pictures"
+                f"program that makes these images"
             )
 
 
@@ -269,7 +269,7 @@ def _open_path(path: Path, settings: SourceSettings) -> Source:
         raise SourceError(f"{path}: no permission to read it")
     if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
         raise SourceError(f"{path}: neither a file, a folder, a FIFO nor a video device")
-    if settings.as_depth and (stat.S_ISDIR(mode) or is_depth_picture(path)):
+    if settings.as_depth and (stat.S_ISDIR(mode) or is_depth_image(path)):
         return _open_file(str(path), lambda: _depth_images(path, settings), settings)
     if stat.S_ISDIR(mode):
         return _open_file(

@@ -22,13 +22,13 @@ logger = logging.getLogger(__name__)
 
 TOLERANCE_S = 0.02
 """Largest difference of the stamps of a pair: cameras of 30 Hz that are not synchronized stay below it."""
-_WAIT_S = 0.04  # for a depth picture that arrives after its colour picture
-_KEPT = 8  # depth pictures of a live source
+_WAIT_S = 0.04  # for a depth image that arrives after its colour image
+_KEPT = 8  # depth images of a live source
 _LOST_WAITS = 3  # in vain and in a row: the depth source is lost
 
 
-class DepthPictures:
-    """The newest depth pictures of a live source, as they arrive."""
+class DepthImages:
+    """The newest depth images of a live source, as they arrive."""
 
     def __init__(self) -> None:
         self._kept: deque[tuple[float, NDArray[np.float32]]] = deque(maxlen=_KEPT)
@@ -44,7 +44,7 @@ class DepthPictures:
             self._changed.notify()
 
     def nearest(self, stamp_s: float) -> tuple[float, NDArray[np.float32]] | None:
-        """The picture with the nearest stamp; None before the first.
+        """The image with the nearest stamp; None before the first.
 
         Waits for it to arrive, but not while the depth source is lost: colour would be late for nothing.
         """
@@ -66,9 +66,9 @@ class PairedCapture(Capture):
     pair are skipped; later ones without a partner are delivered without depth.
 
     Args:
-        pictures: `on_frame` of the depth source, for live ones.
+        depth_images: `on_frame` of the depth source, for live ones.
         tolerance_s: largest difference of the stamps of a pair.
-        registration: of depth to the colour picture; None: it is registered.
+        registration: of depth to the colour image; None: it is registered.
     """
 
     silence_is_loss = False
@@ -77,13 +77,13 @@ class PairedCapture(Capture):
         self,
         colour: Source,
         depth: Source,
-        pictures: DepthPictures,
+        depth_images: DepthImages,
         settings: SourceSettings,
         tolerance_s: float = TOLERANCE_S,
         registration: DepthCalibration | None = None,
     ) -> None:
         self._tolerance_s, self._registration = tolerance_s, registration
-        self._colour, self._depth, self._pictures = colour, depth, pictures
+        self._colour, self._depth, self._depth_images = colour, depth, depth_images
         self._timeout_s = settings.open_timeout_s
         self._current: Frame | None = None
         self._next: Frame | None = None
@@ -135,7 +135,7 @@ class PairedCapture(Capture):
             f"the nearest is {self._smallest_gap_s:.3g} s away" if self._smallest_gap_s < 1e9 else "none came"
         )
         return SourceError(
-            f"no depth within {self._tolerance_s * 1000:.3g} ms of a picture, {gap}; both sources need "
+            f"no depth within {self._tolerance_s * 1000:.3g} ms of an image, {gap}; both sources need "
             f"the same clock, and recordings the same rate (source.rate_hz)"
         )
 
@@ -155,8 +155,8 @@ class PairedCapture(Capture):
                 raise SourceError(f"{self._depth.uri}: source.depth_calibration_file: {error}") from error
         if depth_m.shape != (frame.height, frame.width):
             raise SourceError(
-                f"{self._depth.uri}: depth is {depth_m.shape[1]}x{depth_m.shape[0]}, the picture "
-                f"{frame.width}x{frame.height}: depth must be registered to the colour picture and have its "
+                f"{self._depth.uri}: depth is {depth_m.shape[1]}x{depth_m.shape[0]}, the image "
+                f"{frame.width}x{frame.height}: depth must be registered to the colour image and have its "
                 f"size, or source.depth_calibration_file must be set (companion calibrate extrinsics)"
             )
         self._paired = True
@@ -164,7 +164,7 @@ class PairedCapture(Capture):
 
     def _live_depth(self, frame: Frame) -> tuple[float, NDArray[np.float32]] | None:
         stamp_s = frame.captured_ns / 1e9
-        nearest = self._pictures.nearest(stamp_s)
+        nearest = self._depth_images.nearest(stamp_s)
         if not self._depth_ended:
             try:
                 self._depth.read(0.0)  # raises its error
@@ -175,7 +175,7 @@ class PairedCapture(Capture):
         return None if nearest is None else (abs(nearest[0] - stamp_s), nearest[1])
 
     def _recorded_depth(self, frame: Frame) -> tuple[float, NDArray[np.float32]] | None:
-        """Advance through the recording while its next picture is nearer than the current one."""
+        """Advance through the recording while its next image is nearer than the current one."""
         while not self._depth_ended:
             if self._next is None:
                 try:
@@ -201,7 +201,7 @@ class PairedCapture(Capture):
                 logger.warning("%s: depth is back", self._depth.uri)
             self._paired_s = now_s
         elif self._paired_s >= 0.0 and now_s - self._paired_s > 1.0:
-            logger.warning("%s: no depth with the stamps of the pictures for 1 s", self._depth.uri)
+            logger.warning("%s: no depth with the stamps of the images for 1 s", self._depth.uri)
             self._paired_s = -1.0
 
     def close(self) -> None:
@@ -220,7 +220,7 @@ def _gap_s(one: Frame, other: Frame) -> float:
 def paired_source(
     colour: Source,
     depth: Source,
-    pictures: DepthPictures,
+    depth_images: DepthImages,
     settings: SourceSettings,
     *,
     tolerance_s: float = TOLERANCE_S,
@@ -240,7 +240,7 @@ def paired_source(
         if colour.live != depth.live:
             live, recorded = (colour, depth) if colour.live else (depth, colour)
             raise SourceError(
-                f"{live.uri} is live and {recorded.uri} a recording: their pictures have no common time"
+                f"{live.uri} is live and {recorded.uri} a recording: their images have no common time"
             )
     except SourceError:
         close()
@@ -250,7 +250,7 @@ def paired_source(
     uri = f"{colour.uri} with depth of {depth.uri}"
 
     def open_capture() -> Capture:
-        return PairedCapture(colour, depth, pictures, settings, tolerance_s, registration)
+        return PairedCapture(colour, depth, depth_images, settings, tolerance_s, registration)
 
     if colour.live or settings.realtime:
         paced = not colour.live

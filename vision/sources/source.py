@@ -43,17 +43,17 @@ class SourceSettings:
         gain: of a camera; of a CSI camera a factor, of a V4L2 camera in the driver's unit; None as
             `exposure_us`.
             Sources without exposure time or gain refuse them.
-        rotate_deg, mirror: mirror the picture left to right, then rotate it clockwise by 0, 90, 180 or 270
+        rotate_deg, mirror: mirror the image left to right, then rotate it clockwise by 0, 90, 180 or 270
             degrees; depth and the source's own calibration as well, see `vision.orientation`. `width` and
             `height` are those before it.
         name: for people, in messages before the address.
-        depth: address of a second source with the depth of this one's pictures, registered to them: 16-bit
+        depth: address of a second source with the depth of this one's images, registered to them: 16-bit
             PNG, 32-bit TIFF or OpenEXR, NPY, a pipe of raw `gray16`, or shared memory with depth. Two folders
             are paired by file name, other sources by stamp, see `vision.sources.paired`.
         depth_scale: metres per unit of that depth; None: 0.001 for 16-bit integers, 1 for floats.
-        depth_calibration_file: of a depth camera whose pictures are not registered, as `companion calibrate
+        depth_calibration_file: of a depth camera whose images are not registered, as `companion calibrate
             extrinsics` writes it.
-        as_depth: deliver depth pictures: `depth_m` with a black image. Set for the source that `depth` names.
+        as_depth: deliver depth images: `depth_m` with a black image. Set for the source that `depth` names.
         loop: restart a file at its end. Refused with `depth`.
         realtime: read a file at its own frame rate, newest frame wins: a file used as a camera. A pipe has
             its writer's rate.
@@ -126,7 +126,7 @@ class SourceSettings:
 
     @property
     def orientation(self) -> Orientation:
-        """What is done with each picture; false if nothing."""
+        """What is done with each image; false if nothing."""
         return Orientation(self.rotate_deg, self.mirror)
 
 

@@ -44,7 +44,7 @@ class ControlError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class FrameSize:
-    """One picture size of a pixel format. Of a range of sizes, its largest.
+    """One image size of a pixel format. Of a range of sizes, its largest.
 
     Attributes:
         rates_hz: frame rates, highest first; empty if the driver does not say.
@@ -74,7 +74,7 @@ class VideoDevice:
         path: /dev/videoN. stable_path: its name under /dev/v4l/by-id (or by-path), which stays the same;
             None without one.
         driver, card, bus: as the driver reports them.
-        kind: `camera`; `metadata`, the second node of many USB cameras, which delivers no pictures; `codec`,
+        kind: `camera`; `metadata`, the second node of many USB cameras, which delivers no images; `codec`,
             a converter or encoder; `other`, for example an output.
         formats: of a camera.
         holders: programs that have it open.

@@ -68,7 +68,7 @@ class StatusStepBody(TypedDict):
 
 
 class StatusMissionBody(TypedDict):
-    """The mission being flown."""
+    """The active mission."""
 
     name: str
     """its name"""
@@ -77,7 +77,7 @@ class StatusMissionBody(TypedDict):
     current: int
     """index of the active step"""
     failure: str
-    """why its failure handling is flown; empty: it is not"""
+    """why its failure handling is active; empty: it is not"""
     ended: list[StatusStepBody]
     """the last 20 steps"""
 
@@ -107,7 +107,7 @@ class StatusPilotBody(TypedDict):
     setpoints_sent: int
     """so far"""
     mission: StatusMissionBody | None
-    """null: no mission is flown"""
+    """null: no mission is active"""
 
 
 class StatusCameraBody(TypedDict):

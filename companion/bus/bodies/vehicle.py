@@ -119,7 +119,7 @@ class SetpointsBody(TypedDict):
     limited_by: list[str]
     """limits of the envelope that changed it"""
     path_ned_m: list[Two]
-    """north and east of the points of the way around obstacles that is flown; empty: none"""
+    """north and east of the points of the active path around obstacles; empty: none"""
 
 
 class PlanBody(TypedDict):

@@ -1,12 +1,12 @@
-// A canvas for each camera. Each picture is requested when the one before is drawn, so a slow connection gets
-// fewer pictures, never older ones. The cameras take turns: a browser has six connections to one host, and one
+// A canvas for each camera. Each image is requested when the one before is drawn, so a slow connection gets
+// fewer images, never older ones. The cameras take turns: a browser has six connections to one host, and one
 // has to be free for a stop command.
 
 import { drawBox } from "./canvas.js";
 import { openMenu, send } from "./commands.js";
 import { $, button, cameras, pause, setText, state } from "./state.js";
 
-const PICTURE_PERIOD_MS = 60;
+const IMAGE_PERIOD_MS = 60;
 const IDLE_PERIOD_MS = 500;
 const FAULT_PERIOD_MS = 1000;
 const DRAG_PX = 8;
@@ -39,13 +39,13 @@ function endTurn() {
 }
 
 function nextTurn() {
-  while (queue.length && inFlight < state.maxPictures) {
+  while (queue.length && inFlight < state.maxImages) {
     inFlight++;
     queue.shift()();
   }
 }
 
-const isCrowded = () => cameras.size > state.maxPictures;
+const isCrowded = () => cameras.size > state.maxImages;
 
 export function endCameras() {
   for (const view of cameras.values()) view.end();
@@ -60,10 +60,10 @@ export class Camera {
     this.ended = false;
     this.bitmap = null;
     this.about = null; // the frame and the boxes of `bitmap`
-    this.at = 0; // of the newest picture, in milliseconds of performance.now()
-    this.times = []; // of the pictures of the last two seconds
+    this.at = 0; // of the newest image, in milliseconds of performance.now()
+    this.times = []; // of the images of the last two seconds
     this.latencyMs = null;
-    this.isIdle = false; // the newest request got no picture
+    this.isIdle = false; // the newest request got no image
     this.status = {};
     this.drag = null;
 
@@ -95,7 +95,7 @@ export class Camera {
         await pause(300);
         continue;
       }
-      let period = PICTURE_PERIOD_MS;
+      let period = IMAGE_PERIOD_MS;
       try {
         const { status, frame, jpeg } = await this.request();
         this.isIdle = status === 204;
@@ -114,8 +114,8 @@ export class Camera {
     try {
       const after = this.about ? this.about.sequence : -1;
       const query = new URLSearchParams({ camera: this.name, after, vehicle: this.vehicle });
-      if (this.isIdle && isCrowded()) query.set("wait", 0); // a camera without pictures must not delay the others
-      const response = await fetch(`/picture?${query}`, { priority: "low" });
+      if (this.isIdle && isCrowded()) query.set("wait", 0); // a camera without images must not delay the others
+      const response = await fetch(`/image?${query}`, { priority: "low" });
       return { status: response.status, frame: response.headers.get("X-Frame"), jpeg: await response.blob() };
     } finally {
       endTurn();
@@ -140,7 +140,7 @@ export class Camera {
   }
 
   measure() {
-    // From the capture to the drawn picture, on the service's clock; unknown where that is another computer's.
+    // From the capture to the drawn image, on the service's clock; unknown where that is another computer's.
     if (state.offsetNs == null || !this.about.captured_ns) return;
     const ms = (performance.now() * 1e6 + state.offsetNs - this.about.captured_ns) / 1e6;
     this.latencyMs = ms > -5 && ms < 60000 ? Math.max(0, ms) : null;
@@ -165,7 +165,7 @@ export class Camera {
     g.setLineDash(about.boxes_sequence === about.sequence ? [] : [6 * scale, 4 * scale]);
     for (const box of about.boxes) {
       const isChosen = box[6] != null && box[6] === state.chosen;
-      if (!about.annotated || isChosen) drawBox(g, box, isChosen, scale); // else it is in the picture
+      if (!about.annotated || isChosen) drawBox(g, box, isChosen, scale); // else it is in the image
     }
     g.setLineDash([]);
     if (this.drag && this.drag.moved) {
@@ -182,10 +182,10 @@ export class Camera {
   writeCaption() {
     const ageS = this.at ? (performance.now() - this.at) / 1000 : null;
     const words = [this.label];
-    if (ageS == null) words.push("no picture yet");
-    else if (ageS > 1.5) words.push(`picture ${ageS.toFixed(0)} s old`);
+    if (ageS == null) words.push("no image yet");
+    else if (ageS > 1.5) words.push(`image ${ageS.toFixed(0)} s old`);
     else {
-      words.push(`${(this.times.length / 2).toFixed(0)} pictures/s`);
+      words.push(`${(this.times.length / 2).toFixed(0)} images/s`);
       if (this.latencyMs != null) words.push(`${this.latencyMs.toFixed(0)} ms to screen`);
     }
     if (this.status.rate_hz != null) words.push(`${this.status.rate_hz.toFixed(1)} results/s`);
@@ -207,7 +207,7 @@ export class Camera {
     if (event.button !== 0 || !this.bitmap) return;
     const [x, y] = this.pointOf(event);
     const selects = event.pointerType === "mouse" || this.figure.classList.contains("selecting");
-    const { boxes } = this.about; // a click means a box of this picture, although a newer one may come meanwhile
+    const { boxes } = this.about; // a click means a box of this image, although a newer one may come meanwhile
     this.drag = { x, y, px: event.clientX, py: event.clientY, moved: false, box: [x, y, x, y], boxes, selects };
     if (selects) this.canvas.setPointerCapture(event.pointerId);
   }

@@ -13,7 +13,7 @@ export const state = {
   alive: null,
   replaced: false, // the browser has too many windows of this page
   stream: null,
-  maxPictures: 0, // in flight
+  maxImages: 0, // in flight
   offsetNs: null, // of the dashboard's clock to performance.now()
   vehicle: address.get("vehicle") || "",
   vehicles: [],

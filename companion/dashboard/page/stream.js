@@ -10,7 +10,7 @@ const TRAIL_POINTS = 500;
 const TRACK_TRAIL_POINTS = 100;
 const TRACK_SHOWN_MS = 10000;
 const LOG_LINES = 200;
-const MAX_PICTURES = 2; // in flight; with the stream and those of a second window, a browser has connections left
+const MAX_IMAGES = 2; // in flight; with the stream and those of a second window, a browser has connections left
 
 export function connect() {
   if (state.stream || document.hidden || state.replaced) return;
@@ -36,7 +36,7 @@ export function disconnect() {
 }
 
 async function explain() {
-  // An EventSource does not report the status of a refusal.
+  // An EventSource does not report an HTTP error's status.
   try {
     const response = await fetch("/clock");
     state.refused = response.ok ? "" : (await response.text()).trim();
@@ -63,7 +63,7 @@ export function select(vehicle) {
 function onNews(news) {
   state.at = performance.now();
   state.refused = "";
-  state.maxPictures = news.windows > 1 ? 1 : MAX_PICTURES;
+  state.maxImages = news.windows > 1 ? 1 : MAX_IMAGES;
   state.problem = news.problem;
   state.alive = news.alive;
   state.ages = news.ages_s;

@@ -178,8 +178,8 @@ class ApproachBehaviour(Behaviour):
         wanted = (speed * math.cos(bearing), speed * math.sin(bearing))
         down_mps = correction(self._down_m - position[2])
         if not context.avoiding or error_m <= 0.0:
-            flown = add_velocity_error(wanted, state, self._speed_mps)
-            return Setpoint.velocity((*flown, down_mps), now_ns, yaw_rad=self._bearing_rad)
+            corrected = add_velocity_error(wanted, state, self._speed_mps)
+            return Setpoint.velocity((*corrected, down_mps), now_ns, yaw_rad=self._bearing_rad)
         setpoint = Setpoint.velocity((*wanted, down_mps), now_ns, yaw_rad=self._bearing_rad)
         stop = (north - self._distance_m * math.cos(bearing), east - self._distance_m * math.sin(bearing))
         return RoutedSetpoint(setpoint, (position, (*stop, self._down_m)), facing=True)

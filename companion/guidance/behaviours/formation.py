@@ -134,7 +134,7 @@ class FormationBehaviour(Behaviour):
 
     Attributes:
         note: published to the others; None while inactive.
-        slot_offset_ned_m: from the leader to the slot, as last flown.
+        slot_offset_ned_m: from the leader to the slot, as last commanded.
     """
 
     name = "formation"

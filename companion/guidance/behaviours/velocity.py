@@ -69,7 +69,7 @@ class VelocityBehaviour(Behaviour):
         self._silent = False
 
     def blocked_by(self, active: Behaviour, context: BehaviourContext) -> str | None:
-        """See Behaviour: a sender whose message is being flown keeps the vehicle."""
+        """See Behaviour: a sender whose message is active keeps the vehicle."""
         if not isinstance(active, VelocityBehaviour):
             return None
         sources = [one.source for one in _valid(context)]

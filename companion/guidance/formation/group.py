@@ -24,7 +24,7 @@ class Agreement:
     """The current agreement.
 
     Attributes:
-        plan: what is flown. slots: vehicle → slot, from 1. count: number of slots.
+        plan: the active plan. slots: vehicle → slot, from 1. count: number of slots.
         by: the vehicle that assigned them. members: names of all members, including silent ones.
         worst_error_m: greatest slot error of the members that are not silent.
     """
@@ -99,7 +99,7 @@ class Group:
     def _agreed_plan(self, plans: Sequence[Plan]) -> Plan:
         newest = max(plans, default=None)
         if self._plan is None:
-            # A command equal to the flown plan joins it; any other is a newer plan.
+            # A command equal to the active plan joins it; any other is a newer plan.
             if newest is not None and (newest.shape, newest.spacing_m) == (self.shape, self.spacing_m):
                 self._plan = newest
             else:

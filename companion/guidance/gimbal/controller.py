@@ -186,9 +186,9 @@ class GimbalControl:
     def _ours(self, now_ns: int, gimbal: GimbalState | None) -> bool:
         """Whether there is control to release.
 
-        After a refusal only a newer status of the manager decides: a release by a component without control
-        may take it from its owner (PX4 compares system and component ids separately). We may also have
-        control if only the answer to our request was lost.
+        After a rejected request only a newer status of the manager decides: a release by a component without
+        control may take it from its owner (PX4 compares system and component ids separately). We may also
+        have control if only the answer to our request was lost.
         """
         if self._doubted_ns is None:
             return self.held

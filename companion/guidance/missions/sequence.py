@@ -34,7 +34,7 @@ class PlannedStep:
         make: builds the behaviour.
         endless: it ends by its time-out, with success.
         timeout_s: after which it has failed (or, endless, succeeded); None: only the behaviour's own limits.
-        repeat: how often it is flown in succession, as long as it succeeds.
+        repeat: how often it is executed in succession, as long as it succeeds.
         visits: how often it may be started; once more fails the mission. None: no limit.
         on_success, on_failure: index of the next step, or `end`, `abort`, `rtl` or `land`.
     """
@@ -137,7 +137,7 @@ class SequenceBehaviour(Behaviour):
 
     @property
     def plan(self) -> Plan:
-        """The plan being flown."""
+        """The active plan."""
         return self._plan
 
     @property
@@ -147,7 +147,7 @@ class SequenceBehaviour(Behaviour):
 
     @property
     def failure(self) -> str:
-        """Why the failure handling is flown; empty: it is not."""
+        """Why the failure handling is active; empty: it is not."""
         return self._failure
 
     def with_step(self, outcome: Outcome) -> Outcome:
@@ -234,14 +234,14 @@ class SequenceBehaviour(Behaviour):
             return Outcome(False, f"{active.name} failed: {type(error).__name__}: {error}")
 
     def _late(self, planned: PlannedStep, now_ns: int) -> Outcome | None:
-        flown_s, limit_s = (now_ns - self._begun_ns) / 1e9, planned.timeout_s
-        if limit_s is None or flown_s < limit_s:
+        elapsed_s, limit_s = (now_ns - self._begun_ns) / 1e9, planned.timeout_s
+        if limit_s is None or elapsed_s < limit_s:
             return None
         if planned.endless and self._activated:
             return Outcome(True, f"flown for {limit_s:g} s")
-        return Outcome(False, f"timed out after {limit_s:g} s: {self._status_of_flown()}")
+        return Outcome(False, f"timed out after {limit_s:g} s: {self._status_of_active()}")
 
-    def _status_of_flown(self) -> str:
+    def _status_of_active(self) -> str:
         return self._active.status if self._active is not None else "not started"
 
     def _after(self, outcome: Outcome, context: BehaviourContext) -> Outcome | None:

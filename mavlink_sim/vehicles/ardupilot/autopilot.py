@@ -34,8 +34,8 @@ from mavlink_sim.vehicles.ardupilot.guided import Guided
 from mavlink_sim.vehicles.ardupilot.landing import Land, ReturnToLaunch
 from mavlink_sim.vehicles.ardupilot.modes import (
     ARMABLE,
-    FLOWN,
     POSITION_CONTROLLED,
+    SUPPORTED,
     WITHOUT_POSITION,
     CopterMode,
 )
@@ -134,7 +134,7 @@ class CopterAutopilot(Autopilot):
 
     @property
     def can_arm(self) -> bool:
-        return self._refusal() is None
+        return self._arming_error() is None
 
     @property
     def system_status(self) -> SystemState:
@@ -169,7 +169,7 @@ class CopterAutopilot(Autopilot):
         """The estimated position, local NED."""
         return self._airframe.position
 
-    def _refusal(self) -> str | None:
+    def _arming_error(self) -> str | None:
         """ArduPilot's reason against arming, without its prefix; None: it can arm."""
         mode: CopterMode = self.mode
         if mode not in WITHOUT_POSITION and not (self.sensors_ready and self.position_valid):
@@ -188,9 +188,9 @@ class CopterAutopilot(Autopilot):
     def arm(self, by: str = "external command") -> int:
         if self.armed:
             return ACCEPTED
-        refusal = self._refusal()
-        if refusal is not None:
-            self._send_text(CRITICAL, f"Arm: {refusal}")
+        error = self._arming_error()
+        if error is not None:
+            self._send_text(CRITICAL, f"Arm: {error}")
             return FAILED
         self.force_arm()
         return ACCEPTED
@@ -214,7 +214,7 @@ class CopterAutopilot(Autopilot):
 
     def request_mode(self, mode: CopterMode) -> int:
         """MAV_RESULT of a request for a mode. A disarmed vehicle accepts every one."""
-        if mode not in FLOWN:
+        if mode not in SUPPORTED:
             self._send_text(WARNING, f"No such mode {int(mode)}")
             return FAILED
         if mode is not self.mode and self.armed:
@@ -244,7 +244,7 @@ class CopterAutopilot(Autopilot):
         return FAILED if meant is None else self.request_mode(meant)
 
     def can_run(self, mode: Mode) -> bool:
-        return _PILOTS_MODES.get(mode) in FLOWN
+        return _PILOTS_MODES.get(mode) in SUPPORTED
 
     def user_takeoff(self, height_m: float) -> int:
         """NAV_TAKEOFF: to a height above home, only in GUIDED, armed, on the ground, and upwards."""
@@ -285,9 +285,9 @@ class CopterAutopilot(Autopilot):
 
     def send_prearm(self) -> None:
         """Send the reason against arming; a mode that does not allow it is reported only at arming."""
-        refusal = self._refusal()
-        if refusal is not None and "mode not armable" not in refusal:
-            self._send_text(CRITICAL, f"PreArm: {refusal}")
+        error = self._arming_error()
+        if error is not None and "mode not armable" not in error:
+            self._send_text(CRITICAL, f"PreArm: {error}")
 
     def _fly(self, dt_s: float, task: flight.Task, setpoint: flight.Setpoint) -> None:
         if isinstance(task, manual_flight.Stabilized):

@@ -61,7 +61,7 @@ def _modes(names: str) -> frozenset[CopterMode]:
 
 
 # The simulated modes; a request for another one is answered as by a build without it.
-FLOWN = _modes("STABILIZE ACRO ALT_HOLD AUTO GUIDED LOITER RTL LAND POSHOLD BRAKE")
+SUPPORTED = _modes("STABILIZE ACRO ALT_HOLD AUTO GUIDED LOITER RTL LAND POSHOLD BRAKE")
 # Possible without a horizontal position; LAND then descends without holding its position.
 WITHOUT_POSITION = _modes("STABILIZE ACRO ALT_HOLD LAND")
 ARMABLE = _modes("STABILIZE ACRO ALT_HOLD GUIDED LOITER POSHOLD")
@@ -75,4 +75,4 @@ def mode_of(custom_mode: int) -> CopterMode | None:
         mode = CopterMode(custom_mode)
     except ValueError:
         return None
-    return mode if mode in FLOWN else None
+    return mode if mode in SUPPORTED else None

@@ -209,9 +209,9 @@ async def test_queries_are_answered_with_a_body_an_image_or_an_error() -> None:
         answer = (await opened.ask("status")).ok
         assert answer is not None
         assert json.loads(answer.payload.to_string()) == {"value": None}
-        picture = (await opened.ask("image")).ok
-        assert picture is not None
-        assert (picture.payload.to_bytes(), picture.encoding) == (b"jpeg", zenoh.Encoding.IMAGE_JPEG)
+        jpeg = (await opened.ask("image")).ok
+        assert jpeg is not None
+        assert (jpeg.payload.to_bytes(), jpeg.encoding) == (b"jpeg", zenoh.Encoding.IMAGE_JPEG)
         error = (await opened.ask("cameras/down/image")).err
         assert error is not None
         assert json.loads(error.payload.to_string())["reason"].endswith("no image within 3 s")

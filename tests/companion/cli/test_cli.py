@@ -43,10 +43,10 @@ def one_line_of_bad_input(done: subprocess.CompletedProcess[str]) -> str:
 
 
 def test_detect_writes_one_json_object_per_frame(
-    exported_model: Path, pictures: Path, tmp_path: Path
+    exported_model: Path, image_folder: Path, tmp_path: Path
 ) -> None:
     done = companion(
-        "detect", pictures, "--model", exported_model, *ONNX, "--image-size", "160", "--confidence", "0",
+        "detect", image_folder, "--model", exported_model, *ONNX, "--image-size", "160", "--confidence", "0",
         "--json", "--every", "3", "--limit", "4", "--save", tmp_path / "saved", cwd=tmp_path,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -72,10 +72,10 @@ def test_detect_writes_one_json_object_per_frame(
 
 
 def test_detect_reports_tracks_with_track_option(
-    exported_model: Path, pictures: Path, tmp_path: Path
+    exported_model: Path, image_folder: Path, tmp_path: Path
 ) -> None:
     done = companion_here(
-        "detect", pictures, "--model", exported_model, *ONNX, "--image-size", "160", "--confidence", "0",
+        "detect", image_folder, "--model", exported_model, *ONNX, "--image-size", "160", "--confidence", "0",
         "--json", "--limit", "2", "--track", cwd=tmp_path,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -87,11 +87,11 @@ def test_detect_reports_tracks_with_track_option(
 
 
 def test_detect_without_json_writes_one_line_per_frame(
-    exported_model: Path, pictures: Path, tmp_path: Path
+    exported_model: Path, image_folder: Path, tmp_path: Path
 ) -> None:
     done = companion_here(
         "detect",
-        pictures,
+        image_folder,
         "--model",
         exported_model,
         *ONNX,
@@ -107,10 +107,12 @@ def test_detect_without_json_writes_one_line_per_frame(
     assert all(line.endswith(NO_OBJECTS) for line in lines)
 
 
-def test_detect_reports_only_requested_classes(exported_model: Path, pictures: Path, tmp_path: Path) -> None:
+def test_detect_reports_only_requested_classes(
+    exported_model: Path, image_folder: Path, tmp_path: Path
+) -> None:
     common: list[str | Path] = [
         "detect",
-        pictures,
+        image_folder,
         "--model",
         exported_model,
         *ONNX,
@@ -130,16 +132,16 @@ def test_detect_reports_only_requested_classes(exported_model: Path, pictures: P
     assert names("--classes", one) == {one}
 
 
-def test_missing_model_is_one_line(pictures: Path, tmp_path: Path) -> None:
-    line = one_line_of_bad_input(companion("detect", pictures, "--model", "no.pt", cwd=tmp_path))
+def test_missing_model_is_one_line(image_folder: Path, tmp_path: Path) -> None:
+    line = one_line_of_bad_input(companion("detect", image_folder, "--model", "no.pt", cwd=tmp_path))
     assert "no.pt" in line
 
 
-def test_truncated_checkpoint_is_one_line(small_model: Path, pictures: Path, tmp_path: Path) -> None:
+def test_truncated_checkpoint_is_one_line(small_model: Path, image_folder: Path, tmp_path: Path) -> None:
     broken = tmp_path / "broken.pt"
     content = small_model.read_bytes()
     broken.write_bytes(content[: len(content) // 2])
-    line = one_line_of_bad_input(companion_here("detect", pictures, "--model", broken, cwd=tmp_path))
+    line = one_line_of_bad_input(companion_here("detect", image_folder, "--model", broken, cwd=tmp_path))
     assert "broken.pt" in line
 
 
@@ -151,20 +153,28 @@ class _Hostile:
         return os.system, (f"touch {self.marker}",)
 
 
-def test_checkpoint_that_calls_system_is_refused(pictures: Path, tmp_path: Path) -> None:
+def test_checkpoint_that_calls_system_is_refused(image_folder: Path, tmp_path: Path) -> None:
     marker, hostile = tmp_path / "it-ran", tmp_path / "hostile.pt"
     with zipfile.ZipFile(hostile, "w") as archive:
         archive.writestr("hostile/data.pkl", pickle.dumps({"model": _Hostile(marker)}, protocol=2))
         archive.writestr("hostile/version", "3\n")
-    line = one_line_of_bad_input(companion("detect", pictures, "--model", hostile, cwd=tmp_path))
+    line = one_line_of_bad_input(companion("detect", image_folder, "--model", hostile, cwd=tmp_path))
     assert "system" in line
     assert not marker.exists()
 
 
 def test_unknown_class_is_one_line_with_nearest_names(
-    exported_model: Path, pictures: Path, tmp_path: Path
+    exported_model: Path, image_folder: Path, tmp_path: Path
 ) -> None:
-    arguments: list[str | Path] = ["detect", pictures, "--model", exported_model, *ONNX, "--classes", "persn"]
+    arguments: list[str | Path] = [
+        "detect",
+        image_folder,
+        "--model",
+        exported_model,
+        *ONNX,
+        "--classes",
+        "persn",
+    ]
     line = one_line_of_bad_input(companion_here(*arguments, cwd=tmp_path))
     assert "'persn'" in line
     assert "person" in line
@@ -186,10 +196,10 @@ def test_invalid_setting_is_one_line_with_key_and_range(tmp_path: Path) -> None:
     assert "0 to 1" in line
 
 
-def test_vehicle_without_answer_is_one_line(exported_model: Path, pictures: Path, tmp_path: Path) -> None:
+def test_vehicle_without_answer_is_one_line(exported_model: Path, image_folder: Path, tmp_path: Path) -> None:
     port = free_port()
     done = companion(
-        "run", "--source", pictures, "--source-loop", "true",
+        "run", "--source", image_folder, "--source-loop", "true",
         *("--model", exported_model, "--detector-runtime", "onnxruntime"),
         "--vehicle-url", f"udpin://127.0.0.1:{port}", "--vehicle-connect-timeout-s", "1",
         "--zenoh-listen", f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}", cwd=tmp_path,
@@ -270,24 +280,24 @@ def test_bench_setpoints_prints_json(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["default", "path", "export"])
 def test_detect_warns_of_a_model_of_rendered_scenes(
-    name: str, exported_model: Path, pictures: Path, tmp_path: Path
+    name: str, exported_model: Path, image_folder: Path, tmp_path: Path
 ) -> None:
     model, flags = {
         "default": ("default", ("--image-size", "96")),
         "path": (str(DEFAULT_WEIGHTS), ("--image-size", "96")),
         "export": (str(exported_model), (*ONNX, "--image-size", "160")),
     }[name]
-    done = companion_here("detect", pictures, "--limit", "2", "--model", model, *flags, cwd=tmp_path)
+    done = companion_here("detect", image_folder, "--limit", "2", "--model", model, *flags, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     (line,) = [line for line in done.stderr.splitlines() if "models pull" in line]
     assert f"'{model}'" in line
     assert "if these are camera images" in line
 
 
-def test_detect_is_silent_about_another_model(small_model: Path, pictures: Path, tmp_path: Path) -> None:
+def test_detect_is_silent_about_another_model(small_model: Path, image_folder: Path, tmp_path: Path) -> None:
     own = tmp_path / "own.safetensors"
     save_checkpoint(own, load_checkpoint(small_model).model, metadata={"trained_on": "6 images of set"})
-    done = companion_here("detect", pictures, "--model", own, "--image-size", "96", cwd=tmp_path)
+    done = companion_here("detect", image_folder, "--model", own, "--image-size", "96", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "models pull" not in done.stderr
 

@@ -1,4 +1,4 @@
-"""`companion cloud`: files, picture, JSON, and one line for bad input."""
+"""`companion cloud`: files, view, JSON, and one line for bad input."""
 
 from __future__ import annotations
 
@@ -103,9 +103,9 @@ def test_frame_and_attitude_turn_the_points(frame: Frame, tmp_path: Path) -> Non
 
 
 def test_clusters_are_the_walls_and_the_pole(frame: Frame, tmp_path: Path) -> None:
-    picture = tmp_path / "cloud.png"
+    view = tmp_path / "cloud.png"
     with shared(frame):
-        result = run(URI, tmp_path / "cloud.ply", "--clusters", "--json", "--picture", picture)
+        result = run(URI, tmp_path / "cloud.ply", "--clusters", "--json", "--view", view)
     assert result.exit_code == 0, result.output
     assert result.stderr == ""
     report = json.loads(result.stdout)
@@ -119,7 +119,7 @@ def test_clusters_are_the_walls_and_the_pole(frame: Frame, tmp_path: Path) -> No
         assert wall["size_m"][2] == pytest.approx(3.0, abs=0.4)  # upright
         assert wall["range_m"] == pytest.approx(math.hypot(*wall["centre_m"][:2]), abs=0.01)
     assert any(each["range_m"] == pytest.approx(8.0, abs=0.3) and each["size_m"][0] < 0.6 for each in others)
-    drawn = cv2.imread(str(picture))
+    drawn = cv2.imread(str(view))
     assert drawn is not None
     assert drawn.shape == (540, 960, 3)
     assert len(np.unique(drawn.reshape(-1, 3), axis=0)) > 500
@@ -138,9 +138,9 @@ def test_ground_that_is_not_level_is_warned_about(frame: Frame, tmp_path: Path, 
 
 def test_depth_of_a_second_source_is_used(frame: Frame, tmp_path: Path) -> None:
     depth_mm = np.full((frame.height, frame.width), 4000, np.uint16)
-    for name, picture in (("image", frame.image), ("depth", depth_mm)):
+    for name, array in (("image", frame.image), ("depth", depth_mm)):
         (tmp_path / name).mkdir()
-        cv2.imwrite(str(tmp_path / name / "000.png"), picture)
+        cv2.imwrite(str(tmp_path / name / "000.png"), array)
     folders = (tmp_path / "image", tmp_path / "a.ply", "--source-depth", tmp_path / "depth")
     result = run(*folders, "--camera-mount-pitch-deg", "-90", "--max-range", "5")
     assert result.exit_code == 0, result.output
@@ -171,11 +171,11 @@ def test_other_bad_input_is_one_line(frame: Frame, tmp_path: Path) -> None:
     output = tmp_path / "a.ply"
     with shared(frame):
         assert "a.las" in refused(URI, tmp_path / "a.las")
-        assert "a.gif" in refused(URI, output, "--picture", tmp_path / "a.gif")
+        assert "a.gif" in refused(URI, output, "--view", tmp_path / "a.gif")
         assert "--attitude" in refused(URI, output, "--attitude", "0", "nan", "0")
         missing = tmp_path / "missing" / "a.ply"
         assert refused(URI, missing) == f"companion: cannot write {missing}: no such folder"
-        assert "missing" in refused(URI, output, "--picture", tmp_path / "missing" / "a.png")
+        assert "missing" in refused(URI, output, "--view", tmp_path / "missing" / "a.png")
         assert "camera.fx_px" in refused(URI, output, "--camera-fx-px", "-1")
     with shared(frame, replace(DEFAULT_MOUNT, on_gimbal=True)):
         assert "gimbal" in refused(URI, output, "--frame", "body")

@@ -16,9 +16,9 @@ HOST = "127.0.0.1:8088"
 
 
 def status(access: Access, method: str, path: str, headers: dict[str, str]) -> int:
-    """The status of the refusal; 200 if there is none."""
-    refusal = access.check(method, path, headers)
-    return 200 if refusal is None else refusal.status
+    """The status of the error; 200 if there is none."""
+    error = access.check(method, path, headers)
+    return 200 if error is None else error.status
 
 
 @pytest.mark.parametrize(
@@ -32,7 +32,7 @@ def test_addresses_of_this_computer_are_accepted(host: str) -> None:
     "host", ["", "evil.example:8088", "127.0.0.1.evil.example", "192.168.1.5:8088", "localhost.evil"]
 )
 def test_other_host_is_refused_on_loopback(host: str) -> None:
-    for path in ("/", "/events", "/picture", "/page.js"):
+    for path in ("/", "/events", "/image", "/page.js"):
         assert status(LOCAL, "GET", path, {"host": host}) == 403
 
 
@@ -59,7 +59,7 @@ def test_another_page_may_only_link_to_the_page() -> None:
     other = {"host": HOST, "sec-fetch-site": "cross-site"}
     assert status(LOCAL, "GET", "/", {**other, "sec-fetch-mode": "navigate"}) == 200
     assert status(LOCAL, "GET", "/", {**other, "sec-fetch-mode": "no-cors"}) == 403
-    assert status(LOCAL, "GET", "/picture", {**other, "sec-fetch-mode": "navigate"}) == 403
+    assert status(LOCAL, "GET", "/image", {**other, "sec-fetch-mode": "navigate"}) == 403
 
 
 def test_token_is_needed_beyond_loopback() -> None:

@@ -170,50 +170,50 @@ async def test_useless_messages_are_ignored() -> None:
                 assert set(bridge.news(0).topics) == {"status"}
 
 
-async def test_picture_has_the_boxes_of_its_frame() -> None:
+async def test_image_has_the_boxes_of_its_frame() -> None:
     with publishing() as (service, endpoint):
         async with bridging(endpoint) as fleet:
             bridge = fleet.first
             with fleet.watching(bridge):
                 await until(lambda: bridge.alive)
-                asked = asyncio.create_task(bridge.picture("", -1, 20.0))
+                asked = asyncio.create_task(bridge.image("", -1, 20.0))
                 await until(lambda: service.image_is_watched)
                 service.publish(DETECTIONS.key(NAME), frame(4, detections=[]))
                 service.publish(DETECTIONS.key(NAME), frame(5))
                 service.publish(DETECTIONS.key(NAME), frame(6, detections=[]))
                 await until(lambda: '"sequence": 6' in bridge.news(0).topics.get("detections", ""))
                 service.image(5, b"five", annotated=False)
-                picture = await asked
-                assert picture is not None
-                assert picture.jpeg == b"five"
-                assert picture.about == {
+                image = await asked
+                assert image is not None
+                assert image.jpeg == b"five"
+                assert image.about == {
                     "sequence": 5,
                     "captured_ns": 5,
                     "annotated": False,
                     "boxes": [BOX],
                     "boxes_sequence": 5,
                 }
-                # The same picture is not sent twice. A frame that was not processed has the boxes before it.
-                assert await bridge.picture("", 5, 0.2) is None
+                # The same image is not sent twice. A frame that was not processed has the boxes before it.
+                assert await bridge.image("", 5, 0.2) is None
                 service.image(7)
-                picture = await bridge.picture("", 5, 10.0)
-                assert picture is not None
-                assert (picture.about["sequence"], picture.about["boxes_sequence"]) == (7, 6)
+                image = await bridge.image("", 5, 10.0)
+                assert image is not None
+                assert (image.about["sequence"], image.about["boxes_sequence"]) == (7, 6)
 
 
-async def test_at_most_fifteen_pictures_a_second() -> None:
+async def test_at_most_fifteen_images_a_second() -> None:
     with publishing() as (service, endpoint):
         async with bridging(endpoint) as fleet:
             await until(lambda: not fleet.problem)
-            asked = asyncio.create_task(fleet.first.picture("", -1, 20.0))
+            asked = asyncio.create_task(fleet.first.image("", -1, 20.0))
             await until(lambda: service.image_is_watched)
             shown: set[int] = set()
 
             async def show() -> None:
-                picture = await asked
-                while picture is not None:
-                    shown.add(picture.about["sequence"])
-                    picture = await fleet.first.picture("", picture.about["sequence"], 1.0)
+                image = await asked
+                while image is not None:
+                    shown.add(image.about["sequence"])
+                    image = await fleet.first.image("", image.about["sequence"], 1.0)
 
             showing = asyncio.create_task(show())
             begun_s = time.monotonic()
@@ -237,7 +237,7 @@ async def test_nothing_is_subscribed_without_a_browser() -> None:
             with fleet.watching(bridge):
                 await until(watched)
                 assert not service.image_is_watched
-                assert await bridge.picture("", -1, 0.3) is None
+                assert await bridge.image("", -1, 0.3) is None
                 await until(lambda: service.image_is_watched)
                 with fleet.watching(bridge):
                     pass

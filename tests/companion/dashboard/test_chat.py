@@ -132,7 +132,7 @@ async def test_plan_is_flown_after_its_confirmation_and_history_is_used() -> Non
         later = await window.until_plan()
         assert window.chat["exchanges"][1]["answer"] == "orbit radius=20 track=3"
         assert await window.post(plan=later, fly=False) == 204
-        assert (await window.until_answered()).splitlines()[-1] == "not flown"
+        assert (await window.until_answered()).splitlines()[-1] == "not executed"
         assert there.commands == ["orbit radius=10 track=3"]
         assert await window.post(plan=later, fly=True) == 409
         assert other.chat.get("exchanges", []) == []
@@ -230,7 +230,7 @@ async def test_plan_ends_with_another_command(by: str) -> None:
             assert await other.post(text="land") == 204
         else:
             there.bus.publish(topics.EVENTS, {"stamp_ns": 1, "level": "info", "text": "command: land"})
-        assert "not flown: " in await window.until_answered()
+        assert "not executed: " in await window.until_answered()
         assert window.chat["plan"] is None
         assert await window.post(plan=plan, fly=True) == 409
         await until(lambda: there.commands == ([] if by == "elsewhere" else ["land"]))
@@ -244,7 +244,7 @@ async def test_plan_ends_in_time_and_at_once_without_a_stream(
     chat = Chat(VEHICLE, no_conversation, lambda: watched)
     assert not await asyncio.wait_for(chat.confirm(), 20)
     assert chat.state()["plan"] is None
-    assert "not flown: " in chat.current.answer
+    assert "not executed: " in chat.current.answer
 
 
 async def test_plan_ends_with_the_last_stream_of_its_window() -> None:

@@ -193,13 +193,13 @@ async def test_command_reaches_the_named_vehicle_and_stop_all_reaches_all() -> N
             assert sorted(received[1:]) == [(NAME, "stop"), (OTHER, "stop")]
 
 
-async def test_picture_is_that_of_the_named_vehicle() -> None:
+async def test_image_is_that_of_the_named_vehicle() -> None:
     with two_vehicles() as (services, endpoint):
         async with serving(endpoint) as port:
             for sequence in range(3, 200):
                 for name, service in services.items():
                     service.image(sequence, name.encode())
-                status, _, body = await request(port, "GET", f"/picture?vehicle={OTHER}&after=-1")
+                status, _, body = await request(port, "GET", f"/image?vehicle={OTHER}&after=-1")
                 if status == 200:
                     break
             assert (status, body) == (200, OTHER.encode())

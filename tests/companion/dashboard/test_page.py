@@ -112,7 +112,7 @@ def rectangle(tab: Tab, selector: str) -> tuple[float, float, float, float]:
 def click_track(tab: Tab) -> int:
     """Click the largest box of a confirmed car and wait for its menu; returns the track's id.
 
-    As a person does, again if it has moved in the picture that was clicked.
+    As a person does, again if it has moved in the image that was clicked.
     """
     for _ in range(4):
         boxes = tab.until(f"{BOXES}.filter((box) => box[4] === 'car' && box[7] === 'confirmed')", 60.0)
@@ -130,11 +130,11 @@ def point_of(tab: Tab, box: list[Any]) -> tuple[float, float]:
     return x + (0.2 * left + 0.8 * right) * width, y + (0.2 * top + 0.8 * bottom) * height
 
 
-def test_click_means_a_box_of_the_picture_that_was_pressed(tab: Tab) -> None:
+def test_click_means_a_box_of_the_image_that_was_pressed(tab: Tab) -> None:
     boxes = tab.until(f"{BOXES}.filter((box) => box[4] === 'car' && box[7] === 'confirmed')", 60.0)
     x, y = point_of(tab, boxes[0])
     event = f"{{button: 0, pointerType: 'mouse', clientX: {x}, clientY: {y}, pointerId: 1}}"
-    # Between the two events, in one turn, a newer picture without boxes comes.
+    # Between the two events, in one turn, a newer image without boxes comes.
     tab.value(f"""
         const camera = [...cameras.values()].find((one) => one.about?.boxes.length);
         camera.canvas.setPointerCapture = () => null;
@@ -305,13 +305,13 @@ def test_page_says_when_the_dashboard_is_gone(service: ServiceProcess, tab: Tab)
 REQUESTS = "performance.getEntriesByType('resource').map((entry) => entry.toJSON())"
 
 
-def pictures(tab: Tab) -> list[dict[str, Any]]:
-    """The requests of pictures that have ended, with `camera`, `startTime` and `responseEnd` in ms."""
+def images(tab: Tab) -> list[dict[str, Any]]:
+    """The requests of images that have ended, with `camera`, `startTime` and `responseEnd` in ms."""
     found = [(urlsplit(entry["name"]), entry) for entry in tab.value(REQUESTS)]
     return [
         {**entry, "camera": parse_qs(url.query, keep_blank_values=True)["camera"][0]}
         for url, entry in found
-        if url.path == "/picture"
+        if url.path == "/image"
     ]
 
 
@@ -341,7 +341,7 @@ def test_cameras_take_turns_and_stop_has_a_free_connection(browser: Browser) -> 
             tab.value("performance.clearResourceTimings(); performance.setResourceTimingBufferSize(9999)")
 
         def answered() -> Counter[str]:
-            return Counter(one["camera"] for one in pictures(tab) if one["responseStatus"] == 200)
+            return Counter(one["camera"] for one in images(tab) if one["responseStatus"] == 200)
 
         def shown() -> bool:
             publish(0.2, *names)
@@ -350,28 +350,28 @@ def test_cameras_take_turns_and_stop_has_a_free_connection(browser: Browser) -> 
         wait_for(shown)
         begin()
         publish(4.0, *names)
-        assert most_at_once(pictures(tab)) == 2
+        assert most_at_once(images(tab)) == 2
         counts = answered()
         assert set(counts) == set(names)
         assert min(counts.values()) > 0.5 * max(counts.values())
-        # Cameras without pictures take no turns of the others.
+        # Cameras without images take no turns of the others.
         publish(1.0, "right")
         begin()
         publish(4.0, "right")
-        assert most_at_once(pictures(tab)) == 2
+        assert most_at_once(images(tab)) == 2
         assert answered()["right"] > 0.5 * max(counts.values())
         # A second window takes its part of the connections.
         other = open_page(browser, url)
-        other.until("state.maxPictures === 1 && cameras.size === 4")
-        tab.until("state.maxPictures === 1")
+        other.until("state.maxImages === 1 && cameras.size === 4")
+        tab.until("state.maxImages === 1")
         publish(1.0, *names)
         begin()
         publish(1.0, "right")
         other.value("document.querySelector('#stop').click()")
         other.until(f"{REPLY} === 'stop: done: holding'")
-        assert most_at_once(pictures(tab)) == 1
+        assert most_at_once(images(tab)) == 1
         (stop,) = [one for one in other.value(REQUESTS) if one["name"].endswith("/command")]
-        assert stop["requestStart"] - stop["startTime"] < 200.0  # a picture may be waited for for 500
+        assert stop["requestStart"] - stop["startTime"] < 200.0  # an image may be waited for for 500
         other.close()
         tab.close()
 
@@ -605,7 +605,7 @@ def test_chat_shows_a_plan_and_flies_what_is_confirmed(browser: Browser) -> None
         ask("take off to three metres")
         until(f"{newest} === 'takeoff altitude=3' && {waiting}")
         tab.value("document.querySelector('#decline').click()")
-        until(f"{newest}.endsWith('not flown')")
+        until(f"{newest}.endsWith('not executed')")
         # The space bar stops, and ends the plan that waits.
         ask("take off to four metres")
         until(waiting)

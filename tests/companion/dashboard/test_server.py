@@ -43,7 +43,7 @@ async def test_page_and_its_files_have_security_headers() -> None:
 
 async def test_requests_of_other_pages_are_refused() -> None:
     async with serving() as port:
-        for path in ("/", "/events", "/picture", "/clock", "/page.js"):
+        for path in ("/", "/events", "/image", "/clock", "/page.js"):
             for headers in ({"host": "evil.example"}, {"origin": "http://evil.example"}):
                 assert (await request(port, "GET", path, headers))[0] == 403
         body = {"text": "land"}
@@ -192,7 +192,7 @@ async def test_bad_commands_are_refused(body: bytes, status: int) -> None:
     async with serving() as port:
         assert (await request(port, "POST", "/command", POST, body))[0] == status
         for query in ("after=x", "camera=*", "camera=a/b", "camera=%24%2A", "vehicle=*", "vehicle=a/b"):
-            assert (await request(port, "GET", f"/picture?{query}"))[0] == 400
+            assert (await request(port, "GET", f"/image?{query}"))[0] == 400
         assert (await request(port, "GET", "/events?vehicle=a/b"))[0] == 400
 
 
@@ -222,17 +222,17 @@ async def test_velocity_reaches_the_vehicle_that_it_names() -> None:
         assert (await request(port, "POST", "/velocity", POST, sent))[0] == 503
 
 
-async def test_picture_has_its_frame_in_a_header() -> None:
+async def test_image_has_its_frame_in_a_header() -> None:
     with publishing() as (service, endpoint):
         async with serving(endpoint) as port:
             stream = await EventStream.open(port)
             await stream.next()
-            assert (await request(port, "GET", "/picture?camera="))[0] == 204
+            assert (await request(port, "GET", "/image?camera="))[0] == 204
             boxes: list[Any] = []
             for sequence in range(3, 200):
                 service.publish(DETECTIONS.key(NAME), frame(sequence))
                 service.image(sequence, b"\xff\xd8jpeg")
-                status, headers, body = await request(port, "GET", "/picture?camera=&after=-1")
+                status, headers, body = await request(port, "GET", "/image?camera=&after=-1")
                 boxes = json.loads(headers["x-frame"])["boxes"] if status == 200 else []
                 if boxes:
                     break

@@ -1,4 +1,4 @@
-"""Commands about exactly one track: refusals, flights, losses, and the gimbal."""
+"""Commands about exactly one track: requirements, flights, losses, and the gimbal."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def test_help_and_schema_show_the_choice() -> None:
     )
 
 
-# --- refusals
+# --- requirements
 
 
 def refused(harness: GuidanceHarness, behaviour: FollowBehaviour | OrbitBehaviour) -> str:

@@ -1,4 +1,4 @@
-"""Gimbal requests of guidance: their order, refusals, and missing answers."""
+"""Gimbal requests of guidance: their order, rejected requests, and missing answers."""
 
 from __future__ import annotations
 

@@ -225,7 +225,7 @@ def test_errors_name_what_to_give(text: str, parts: list[str]) -> None:
     assert [part for part in parts if part not in str(caught.value)] == []
 
 
-def test_refusals_give_the_reason() -> None:
+def test_refused_command_gives_the_reason() -> None:
     flight = gimbal_flight(person(180.0, 12.0))
     flight.run(1.0)
     assert "no confirmed person in the image" in refused(flight, "gimbal class=person")

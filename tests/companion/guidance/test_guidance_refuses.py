@@ -1,4 +1,4 @@
-"""Refusals: by guidance before a behaviour begins, or by the autopilot."""
+"""Refused commands: by guidance before a behaviour begins, or by the autopilot."""
 
 from collections.abc import Callable
 
@@ -54,7 +54,7 @@ def test_refused_offboard_ends_command_and_stream() -> None:
         (flying, lambda: SeekBehaviour("zebra"), ["seek needs", "zebra"]),
     ],
 )
-def test_refusal_names_what_is_missing(
+def test_refused_command_names_what_is_missing(
     vehicle: Callable[[], KinematicVehicle], behaviour: Callable[[], Behaviour], words: list[str]
 ) -> None:
     harness = GuidanceHarness(vehicle(), class_names=("car", "person"))
@@ -143,7 +143,7 @@ def test_goal_outside_the_fence_is_refused() -> None:
     assert not harness.command(GotoBehaviour(from_home_m=(10.0, 0.0))).done()
 
 
-def test_refusal_keeps_the_current_behaviour() -> None:
+def test_refused_command_keeps_the_current_behaviour() -> None:
     harness = GuidanceHarness(flying())
     future = engaged(harness)
     assert harness.command(TakeoffBehaviour()).done()

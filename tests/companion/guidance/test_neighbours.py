@@ -133,7 +133,7 @@ class Needy(Behaviour):
         raise NotImplementedError
 
 
-def test_missing_neighbour_is_named_in_the_refusal() -> None:
+def test_missing_neighbour_is_named_in_the_reply() -> None:
     neighbours = Neighbours("beta", "b")
 
     def words(now_ns: int) -> str | None:

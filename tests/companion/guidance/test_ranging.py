@@ -31,9 +31,9 @@ def why(command: str, means: RangeMeans) -> str | None:
 
 @pytest.mark.parametrize("command", NEEDING)
 def test_refused_without_any_means_of_ranging(command: str) -> None:
-    refusal = why(command, RangeMeans(False, False, frozenset({"car"})))
-    assert refusal is not None
-    assert "range to a kite" in refusal
+    reason = why(command, RangeMeans(False, False, frozenset({"car"})))
+    assert reason is not None
+    assert "range to a kite" in reason
 
 
 @pytest.mark.parametrize(

@@ -407,43 +407,43 @@ async def test_listed_command_is_confirmed_after_a_take_over(control: Control, a
 # --- who controls the vehicle
 
 ORBIT, GOTO = "orbit track=3", "goto forward=9 right=0"
-FLOWN = [("info", f"command: {ORBIT}"), ("info", f"{ORBIT}: in progress")]
+ACTIVE = [("info", f"command: {ORBIT}"), ("info", f"{ORBIT}: in progress")]
 LOST = ("warning", "command lost: the pilot took over: hold mode")
 
 
 @pytest.mark.parametrize(
-    ("sent", "events", "lost", "flown"),
+    ("sent", "events", "lost", "active"),
     [
-        ((ORBIT,), FLOWN, False, ORBIT),
-        ((), FLOWN, False, None),
-        ((ORBIT,), [*FLOWN, LOST], True, None),
-        ((ORBIT,), [*FLOWN, LOST, ("info", "command: gimbal pitch=-30")], True, None),
-        ((ORBIT,), [*FLOWN, LOST, ("info", "command: stop")], True, None),
-        ((ORBIT,), [*FLOWN, LOST, ("info", "command: hold (3 before it not logged)")], False, None),
-        ((ORBIT,), [*FLOWN, ("info", "command: gimbal pitch=-30")], False, ORBIT),
-        ((ORBIT,), [*FLOWN, ("info", "command: follow car")], False, None),
-        ((ORBIT,), [*FLOWN, ("info", "command: stop")], False, None),
-        ((ORBIT,), [*FLOWN, ("warning", "orbit ended: lost track 3")], False, None),
-        ((ORBIT,), [*FLOWN, ("warning", "battery at 12 %: orbit ends, rtl follows")], False, None),
+        ((ORBIT,), ACTIVE, False, ORBIT),
+        ((), ACTIVE, False, None),
+        ((ORBIT,), [*ACTIVE, LOST], True, None),
+        ((ORBIT,), [*ACTIVE, LOST, ("info", "command: gimbal pitch=-30")], True, None),
+        ((ORBIT,), [*ACTIVE, LOST, ("info", "command: stop")], True, None),
+        ((ORBIT,), [*ACTIVE, LOST, ("info", "command: hold (3 before it not logged)")], False, None),
+        ((ORBIT,), [*ACTIVE, ("info", "command: gimbal pitch=-30")], False, ORBIT),
+        ((ORBIT,), [*ACTIVE, ("info", "command: follow car")], False, None),
+        ((ORBIT,), [*ACTIVE, ("info", "command: stop")], False, None),
+        ((ORBIT,), [*ACTIVE, ("warning", "orbit ended: lost track 3")], False, None),
+        ((ORBIT,), [*ACTIVE, ("warning", "battery at 12 %: orbit ends, rtl follows")], False, None),
         (
             (ORBIT, GOTO),
-            [*FLOWN, ("info", f"command: {GOTO}"), ("warning", f"{GOTO}: too far")],
+            [*ACTIVE, ("info", f"command: {GOTO}"), ("warning", f"{GOTO}: too far")],
             False,
             ORBIT,
         ),
-        ((ORBIT, GOTO), [*FLOWN, ("info", f"command: {GOTO}"), ("info", f"{GOTO}: arrived")], False, None),
-        ((ORBIT, "stop"), [*FLOWN, ("info", "command: stop"), ("info", "stop: stopped")], False, None),
+        ((ORBIT, GOTO), [*ACTIVE, ("info", f"command: {GOTO}"), ("info", f"{GOTO}: arrived")], False, None),
+        ((ORBIT, "stop"), [*ACTIVE, ("info", "command: stop"), ("info", "stop: stopped")], False, None),
     ],
 )
 def test_events_say_who_commands(
-    sent: tuple[str, ...], events: list[tuple[str, str]], lost: bool, flown: str | None
+    sent: tuple[str, ...], events: list[tuple[str, str]], lost: bool, active: str | None
 ) -> None:
     commands = CommandEvents()
     for text in sent:
         commands.send(text)
     for event in events:
         commands.take(*event)
-    assert (commands.lost is not None, commands.flown) == (lost, flown)
+    assert (commands.lost is not None, commands.active) == (lost, active)
 
 
 @pytest.mark.parametrize(("text", "asked"), [("look down", 0), ("stop", 0), ("look down and look left", 1)])

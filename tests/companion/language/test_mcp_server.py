@@ -164,7 +164,7 @@ async def test_stop_and_hold_end_what_is_flown() -> None:
             await asyncio.wait_for(caller.vehicle.flying.wait(), 10)
             error, reply = await caller.call("goto", forward=1, right=0)
             assert error
-            assert "still flown" in reply["reason"]
+            assert "still active" in reply["reason"]
             assert (await caller.call(word))[1]["success"] is True
             assert (await asyncio.wait_for(going, 10))[0]
         assert caller.vehicle.commands == ["goto forward=9 right=0", "hold", "goto forward=9 right=0", "stop"]
@@ -180,7 +180,7 @@ async def test_stop_and_hold_end_only_a_command_of_this_server(word: str, mode: 
         for named in (f"`companion send {word}`", "the page", f"--allow {word}"):
             assert named in reply["reason"]
         assert vehicle.commands == []
-    vehicle.controlled = Control(mode="offboard", flown="orbit track=3")
+    vehicle.controlled = Control(mode="offboard", active="orbit track=3")
     async with calling("orbit", vehicle=vehicle) as caller:
         assert (await caller.call(word))[0] is False
     assert vehicle.commands == [word]
@@ -229,7 +229,7 @@ async def test_long_command_is_answered_before_its_end(monkeypatch: pytest.Monke
     async with calling("goto") as caller:
         error, reply = await caller.call("goto", forward=9, right=0)
         assert (error, reply["running"], caller.vehicle.cancelled) == (False, True, False)
-        assert "still flown" in (await caller.call("goto", forward=9, right=0))[1]["reason"]
+        assert "still active" in (await caller.call("goto", forward=9, right=0))[1]["reason"]
     assert caller.vehicle.cancelled  # at the end of the server
 
 

@@ -74,7 +74,7 @@ def test_two_models_on_one_camera_are_independent(
 
 
 def test_guidance_camera_selects_the_steering_camera(
-    exported_model: Path, pictures: Path, tmp_path: Path
+    exported_model: Path, image_folder: Path, tmp_path: Path
 ) -> None:
     shared = f"companion-test-{secrets.token_hex(4)}"
     (tmp_path / "companion.toml").write_text(
@@ -83,7 +83,7 @@ def test_guidance_camera_selects_the_steering_camera(
         f"[cameras.side.detector]\nmodel = {str(exported_model)!r}\n"
         "runtime = 'onnxruntime'\nimage_size = 96\n"
     )
-    flags = ["--source", str(pictures), "--source-loop", "true", "--source-rate-hz", "10"]
+    flags = ["--source", str(image_folder), "--source-loop", "true", "--source-rate-hz", "10"]
     with (
         running_simulator() as simulator,
         running_service(simulator.onboard_port, flags, cwd=tmp_path) as service,

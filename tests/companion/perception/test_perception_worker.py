@@ -232,9 +232,9 @@ def test_worker_without_a_service_exits() -> None:
 
 
 @pytest.fixture
-def few_images(pictures: Path, tmp_path: Path) -> Path:
+def few_images(image_folder: Path, tmp_path: Path) -> Path:
     """Few enough that all their results fit into the unread socket."""
-    for image in sorted(pictures.iterdir())[:3]:
+    for image in sorted(image_folder.iterdir())[:3]:
         shutil.copy(image, tmp_path)
     return tmp_path
 

@@ -84,11 +84,11 @@ def layout_topics() -> set[str]:
     return {*re.findall(r'"(/\w+)"', text), *plotted}
 
 
-def test_flight_is_recorded_and_replays(pictures: Path, exported_model: Path, tmp_path: Path) -> None:
+def test_flight_is_recorded_and_replays(image_folder: Path, exported_model: Path, tmp_path: Path) -> None:
     """With lossless images: the model of the flight finds the same again, bit for bit."""
     folder = tmp_path / "recordings"
     flags = [
-        *("--source", str(pictures), "--source-loop", "true", "--source-rate-hz", "5"),
+        *("--source", str(image_folder), "--source-loop", "true", "--source-rate-hz", "5"),
         *("--detector-model", str(exported_model), "--detector-runtime", "onnxruntime"),
         *("--detector-image-size", "160", "--detector-confidence", "0", "--tracker-enabled", "false"),
         *("--recording-directory", str(folder), "--recording-image-format", "png"),

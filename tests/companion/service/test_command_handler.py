@@ -61,7 +61,7 @@ async def flooded() -> Handler:
 
 async def test_flood_of_refused_commands_is_answered_but_not_logged() -> None:
     handler = await flooded()
-    assert len(handler.lines) == 2 * REPORTED_AT_ONCE  # each with its refusal
+    assert len(handler.lines) == 2 * REPORTED_AT_ONCE  # each with its reason
 
 
 async def test_command_flown_in_a_flood_is_logged(monkeypatch: pytest.MonkeyPatch) -> None:

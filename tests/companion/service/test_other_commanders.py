@@ -32,7 +32,7 @@ class Here(OtherCommanders):
         settings = VehicleSection(allow_other_commander=allowed)
         super().__init__(settings, "here", NOW_NS - 100 * S, lambda *event: self.events.append(event))
 
-    def refusal(
+    def reason(
         self, state: VehicleState, behaviour: Behaviour | None = None, *, in_command: bool = False
     ) -> str | None:
         command = CommandInput(1, "a command", behaviour or HoldBehaviour())
@@ -67,9 +67,9 @@ def status(**changes: Any) -> bytes:
     ],
 )
 def test_later_service_refuses_to_engage(state: VehicleState, refused: bool) -> None:
-    assert (Here().refusal(state) is not None) is refused
-    assert Here(allowed=True).refusal(state) is None
-    assert Here().refusal(state, in_command=True) is None
+    assert (Here().reason(state) is not None) is refused
+    assert Here(allowed=True).reason(state) is None
+    assert Here().reason(state, in_command=True) is None
 
 
 @pytest.mark.parametrize(
@@ -83,7 +83,7 @@ def test_later_service_refuses_to_engage(state: VehicleState, refused: bool) -> 
     ],
 )
 def test_commands_that_end_a_flight_are_allowed(behaviour: Behaviour, refused: bool) -> None:
-    assert (Here().refusal(beside(200.0), behaviour) is not None) is refused
+    assert (Here().reason(beside(200.0), behaviour) is not None) is refused
 
 
 def test_other_service_is_detected_by_its_status() -> None:
@@ -92,7 +92,7 @@ def test_other_service_is_detected_by_its_status() -> None:
     assert here.status(VehicleState(), NOW_NS) == [
         {"via": "zenoh", "identity": "there", "uptime_s": 300.0, "in_command": False}
     ]
-    assert here.refusal(VehicleState()) is not None
+    assert here.reason(VehicleState()) is not None
     assert here.status(VehicleState(), NOW_NS + 4 * S) == []
 
 

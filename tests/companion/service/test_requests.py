@@ -36,7 +36,7 @@ def runner_of(driver: FakeDriver) -> tuple[RequestRunner, asyncio.Event]:
     return RequestRunner(cast(Driver, driver), answered.set), answered
 
 
-async def refusal_of(driver: FakeDriver, request: Request) -> str | None:
+async def failure_of(driver: FakeDriver, request: Request) -> str | None:
     runner, answered = runner_of(driver)
     runner.start(request)
     async with asyncio.timeout(10):
@@ -49,15 +49,15 @@ async def refusal_of(driver: FakeDriver, request: Request) -> str | None:
 
 async def test_request_is_answered_with_its_result() -> None:
     hold = Request(7, SetMode(FlightMode.HOLD))
-    assert await refusal_of(FakeDriver(), Request(1, Arm())) is None
-    assert await refusal_of(FakeDriver(CommandRefusedError("denied")), hold) == "denied"
-    assert await refusal_of(FakeDriver(ZeroDivisionError("a bug")), hold) == "ZeroDivisionError: a bug"
-    assert await refusal_of(FakeDriver(), Request(2, FindGimbal())) == "gimbal manager not responding"
+    assert await failure_of(FakeDriver(), Request(1, Arm())) is None
+    assert await failure_of(FakeDriver(CommandRefusedError("denied")), hold) == "denied"
+    assert await failure_of(FakeDriver(ZeroDivisionError("a bug")), hold) == "ZeroDivisionError: a bug"
+    assert await failure_of(FakeDriver(), Request(2, FindGimbal())) == "gimbal manager not responding"
 
 
 async def test_internal_cancellation_is_answered() -> None:
     hold = Request(7, SetMode(FlightMode.HOLD))
-    assert await refusal_of(FakeDriver(asyncio.CancelledError()), hold) == "the request was cancelled"
+    assert await failure_of(FakeDriver(asyncio.CancelledError()), hold) == "the request was cancelled"
 
 
 async def test_cancelled_request_is_not_answered() -> None:

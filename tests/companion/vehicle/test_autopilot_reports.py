@@ -17,7 +17,7 @@ from tests.companion.vehicle.fake_autopilot import FakeAutopilot, wait_for_state
 pytestmark = pytest.mark.realtime
 
 
-async def test_px4_arming_refusal_has_its_reason(
+async def test_denied_arming_of_px4_has_its_reason(
     kind: DriverKind, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
@@ -39,7 +39,7 @@ async def test_px4_arming_refusal_has_its_reason(
     assert json.loads(lzma.decompress(events.read_bytes()))["version"] == 2
 
 
-async def test_reasons_of_a_refusal_may_come_late(driver: Driver, autopilot: FakeAutopilot) -> None:
+async def test_reasons_of_denied_arming_may_come_late(driver: Driver, autopilot: FakeAutopilot) -> None:
     """On a busy computer; the second one after the first."""
     loop = asyncio.get_running_loop()
 
@@ -57,7 +57,7 @@ async def test_reasons_of_a_refusal_may_come_late(driver: Driver, autopilot: Fak
         await driver.arm()
 
 
-async def test_copter_arming_refusal_has_its_reason() -> None:
+async def test_denied_arming_of_copter_has_its_reason() -> None:
     with running_simulator(autopilot="ardupilot", ready_after=600.0, speed=2.0) as simulator:
         driver = open_driver("pymavlink", f"udpin://127.0.0.1:{simulator.onboard_port}")
         await driver.connect(20.0)

@@ -238,7 +238,7 @@ async def test_open_failure_is_one_line_with_the_url(url: str, message: str) -> 
     assert "\n" not in str(caught.value)
 
 
-async def test_tcp_refusal_is_reported() -> None:
+async def test_refused_tcp_connection_is_reported() -> None:
     with pytest.raises(LinkError, match="Connection refused"):
         await open_link(parse_link_url(f"tcp://127.0.0.1:{free_port(socket.SOCK_STREAM)}"), Receiver())
 

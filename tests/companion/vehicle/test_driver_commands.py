@@ -32,7 +32,7 @@ async def test_arm_returns_when_the_vehicle_reports_it(driver: Driver, autopilot
     assert (arm.param1, arm.param2) == (1.0, 0.0)
 
 
-async def test_arm_refusal_has_its_reason(driver: Driver, autopilot: FakeAutopilot) -> None:
+async def test_denied_arming_has_its_reason(driver: Driver, autopilot: FakeAutopilot) -> None:
     autopilot.answers["COMMAND_LONG"] = lambda m: autopilot.acknowledge(m.command, 1)
     with pytest.raises(CommandRefusedError, match=r"\(temporarily rejected\): .*pre-arm"):
         await driver.arm()

@@ -1,4 +1,4 @@
-"""torch on a CUDA device: the boxes of the processor, constant memory, one-line refusals."""
+"""torch on a CUDA device: the boxes of the processor, constant memory, one-line errors."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ RED, BLUE = (30, 30, 160), (160, 50, 25)
 FRAME_NS = 50_000_000
 
 
-def picture(colour: tuple[int, int, int], left: int = 100, side: int = 120) -> NDArray[np.uint8]:
+def image_of(colour: tuple[int, int, int], left: int = 100, side: int = 120) -> NDArray[np.uint8]:
     """A striped square on noise."""
     image = np.random.default_rng(1).integers(80, 140, (300, 400, 3), np.uint8)
     image[60 : 60 + side, left : left + side] = colour
@@ -38,7 +38,7 @@ def similarity(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> float:
 
 
 def test_an_appearance_is_a_unit_vector_whatever_the_boxes_size() -> None:
-    image = picture(RED)
+    image = image_of(RED)
     boxes = np.array([(0, 0, 400, 300), (10, 10, 11, 11), (-50, -50, 30, 30), (5, 5, 5, 5)], np.float32)
     found = appearances(image, boxes)
     assert found.shape == (4, 60)
@@ -48,15 +48,15 @@ def test_an_appearance_is_a_unit_vector_whatever_the_boxes_size() -> None:
 
 
 def test_the_same_object_is_alike_when_blurred_moved_or_darker_and_another_colour_is_not() -> None:
-    same = picture(RED)
+    same = image_of(RED)
     assert similarity(same, same) == pytest.approx(1.0, abs=1e-5)
     assert similarity(same, np.asarray(cv2.GaussianBlur(same, (9, 9), 3), np.uint8)) > 0.97
-    assert similarity(same, picture(RED, left=106)) > 0.95
+    assert similarity(same, image_of(RED, left=106)) > 0.95
     for gain in (0.7, 0.8, 1.25):
         assert similarity(same, np.asarray(same * gain, np.uint8)) > 0.95
     for blue in (0.9, 1.1):
         assert similarity(same, np.asarray(same * [blue, 1.0, 1 / blue], np.uint8)) > 0.95
-    assert similarity(same, picture(BLUE)) < 0.8
+    assert similarity(same, image_of(BLUE)) < 0.8
 
 
 def test_another_object_at_the_predicted_place_does_not_take_the_track_over() -> None:
@@ -64,7 +64,7 @@ def test_another_object_at_the_predicted_place_does_not_take_the_track_over() ->
     ids = []
     for frame in range(12):
         gap = 6 <= frame < 9
-        image = picture(RED if frame < 6 else BLUE)
+        image = image_of(RED if frame < 6 else BLUE)
         found = seen(np.zeros((0, 4), np.float32) if gap else box())
         shown = tracker.update(found, frame * FRAME_NS + 1, image=image).detections
         ids.append(None if gap or shown.track_id is None else int(shown.track_id[0]))
@@ -75,7 +75,7 @@ def test_the_same_object_continues_its_track_after_a_gap() -> None:
     tracker = Tracker()
     for frame in range(12):
         found = seen(np.zeros((0, 4), np.float32) if 6 <= frame < 9 else box())
-        shown = tracker.update(found, frame * FRAME_NS + 1, image=picture(RED)).detections
+        shown = tracker.update(found, frame * FRAME_NS + 1, image=image_of(RED)).detections
     assert shown.track_id is not None
     assert shown.track_id.tolist() == [1]
 
@@ -83,7 +83,7 @@ def test_the_same_object_continues_its_track_after_a_gap() -> None:
 def test_an_object_that_changes_its_look_without_a_gap_keeps_its_track() -> None:
     tracker = Tracker()
     for frame in range(8):
-        image = picture(RED if frame < 4 else BLUE)
+        image = image_of(RED if frame < 4 else BLUE)
         shown = tracker.update(seen(box()), frame * FRAME_NS + 1, image=image).detections
     assert shown.track_id is not None
     assert shown.track_id.tolist() == [1]
@@ -93,7 +93,7 @@ def test_another_object_after_one_missed_frame_continues_the_track() -> None:
     tracker = Tracker()
     for frame in range(8):
         found = seen(np.zeros((0, 4), np.float32) if frame == 4 else box())
-        image = picture(RED if frame < 4 else BLUE)
+        image = image_of(RED if frame < 4 else BLUE)
         shown = tracker.update(found, frame * FRAME_NS + 1, image=image).detections
     assert shown.track_id is not None
     assert shown.track_id.tolist() == [1]
@@ -102,7 +102,7 @@ def test_another_object_after_one_missed_frame_continues_the_track() -> None:
 def test_small_boxes_are_matched_without_appearance() -> None:
     tracker = Tracker()
     for frame in range(8):
-        image = picture(RED if frame < 4 else BLUE, side=30)
+        image = image_of(RED if frame < 4 else BLUE, side=30)
         found = seen(np.zeros((0, 4), np.float32) if frame == 4 else box(side=30))
         shown = tracker.update(found, frame * FRAME_NS + 1, image=image).detections
     assert shown.track_id is not None
@@ -112,9 +112,9 @@ def test_small_boxes_are_matched_without_appearance() -> None:
 def test_appearance_is_of_the_largest_boxes_of_a_crowd() -> None:
     sides = MIN_LOOK_PX - 1 + np.random.default_rng(0).permutation(2 * MOST_LOOKS)
     boxes = np.concatenate([box(side=int(side)) for side in sides])
-    looks = _looks(picture(RED), seen(boxes))
+    looks = _looks(image_of(RED), seen(boxes))
     assert set(looks) == set(np.argsort(-sides)[:MOST_LOOKS].tolist())
     for index, look in looks.items():
-        np.testing.assert_array_equal(look, appearances(picture(RED), boxes[[index]])[0])
-    few = _looks(picture(RED), seen(boxes[sides <= MIN_LOOK_PX + 1]))
+        np.testing.assert_array_equal(look, appearances(image_of(RED), boxes[[index]])[0])
+    few = _looks(image_of(RED), seen(boxes[sides <= MIN_LOOK_PX + 1]))
     assert len(few) == 2  # The third is too small.

@@ -1,4 +1,4 @@
-"""Selection of an object by a rectangle: which track it is, its rules, and its refusals."""
+"""Selection of an object by a rectangle: which track it is, its rules, and its errors."""
 
 from __future__ import annotations
 

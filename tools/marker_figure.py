@@ -1,6 +1,6 @@
-"""The picture of docs/how-to/markers.md: markers of a map as the camera sees them, with outlines and axes.
+"""The image of docs/how-to/markers.md: markers of a map as the camera sees them, with outlines and axes.
 
-python -m tools.marker_picture docs/images/markers.jpg
+python -m tools.marker_figure docs/images/markers.jpg
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def draw() -> cv2.typing.MatLike:
 
 
 def main() -> None:
-    """Write the picture to the file that is named."""
+    """Write the image to the file that is named."""
     path = Path(sys.argv[1])
     if not cv2.imwrite(str(path), draw(), (cv2.IMWRITE_JPEG_QUALITY, 85)):
         raise SystemExit(f"cannot write {path}")

@@ -1,4 +1,4 @@
-"""Depth pictures as files and pipes hold them, and their conversion to metres."""
+"""Depth images as files and pipes hold them, and their conversion to metres."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ IMPLAUSIBLE_MEDIAN_M = 200.0
 _EXR_CHANNEL = "Z"
 
 
-def is_depth_picture(path: Path) -> bool:
-    """Whether the file name has the suffix of a depth picture."""
+def is_depth_image(path: Path) -> bool:
+    """Whether the file name has the suffix of a depth image."""
     return path.suffix.lower() in DEPTH_SUFFIXES
 
 
@@ -34,29 +34,29 @@ def decode_depth(path: Path, data: bytes) -> NDArray[Any] | None:
         SourceError: it holds something else than one channel of 16-bit integers or floats; or it is OpenEXR
             and the extra is missing, or not exactly one of several channels is `Z` or `LAYER.Z`.
     """
-    picture: Any = None
+    image: Any = None
     if path.suffix.lower() == ".exr":
-        picture = _decode_exr(path, data)
+        image = _decode_exr(path, data)
     elif path.suffix.lower() == ".npy":
         try:
-            picture = np.load(io.BytesIO(data), allow_pickle=False)
+            image = np.load(io.BytesIO(data), allow_pickle=False)
         except (ValueError, EOFError, OSError):
             return None
     elif data:
         try:
-            picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         except cv2.error:
-            picture = None
-    if picture is None:
+            image = None
+    if image is None:
         return None
-    if picture.ndim == 3 and picture.shape[2] == 1:
-        picture = picture[:, :, 0]
-    if picture.ndim != 2 or not (picture.dtype == np.uint16 or picture.dtype.kind == "f"):
+    if image.ndim == 3 and image.shape[2] == 1:
+        image = image[:, :, 0]
+    if image.ndim != 2 or not (image.dtype == np.uint16 or image.dtype.kind == "f"):
         raise SourceError(
-            f"{path}: depth must be one channel of 16-bit integers or floats, got shape {picture.shape} "
-            f"{picture.dtype}"
+            f"{path}: depth must be one channel of 16-bit integers or floats, got shape {image.shape} "
+            f"{image.dtype}"
         )
-    return np.asarray(picture)
+    return np.asarray(image)
 
 
 def _decode_exr(path: Path, data: bytes) -> NDArray[Any] | None:
@@ -84,20 +84,20 @@ def _decode_exr(path: Path, data: bytes) -> NDArray[Any] | None:
     return np.asarray(channels[found[0]].pixels)
 
 
-def to_metres(picture: NDArray[Any], scale_m: float | None) -> NDArray[np.float32]:
+def to_metres(image: NDArray[Any], scale_m: float | None) -> NDArray[np.float32]:
     """(height, width) float32 metres, NaN for holes: 0, negative, NaN and infinity.
 
     Args:
-        picture: (height, width), uint16 or float.
+        image: (height, width), uint16 or float.
         scale_m: metres per unit; None: by the type, see INTEGER_SCALE_M.
 
     Raises:
-        SourceError: half of a float picture is farther than 200 m: it is in another unit.
+        SourceError: half of a float image is farther than 200 m: it is in another unit.
     """
-    integer = picture.dtype.kind == "u"
+    integer = image.dtype.kind == "u"
     scale = (INTEGER_SCALE_M if integer else FLOAT_SCALE_M) if scale_m is None else scale_m
     with np.errstate(over="ignore", invalid="ignore"):
-        depth_m = picture.astype(np.float32) * np.float32(scale)
+        depth_m = image.astype(np.float32) * np.float32(scale)
         known = (depth_m > 0.0) & (depth_m < np.inf)
     depth_m[~known] = np.nan
     if not integer and known.any():

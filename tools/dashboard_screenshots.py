@@ -1,6 +1,6 @@
-"""The pictures of docs/how-to/dashboard.md: the page in Chromium, at a running `companion play`.
+"""The images of docs/how-to/dashboard.md: the page in Chromium, at a running `companion play`.
 
-python -m tools.dashboard_pictures docs/images
+python -m tools.dashboard_screenshots docs/images
 
 One vehicle seeks the car, a click on it opens the menu (dashboard.jpg), and *Follow* is pressed: the vehicle
 follows (dashboard-dark.jpg, dashboard-phone.jpg). Then a fleet of four flies (dashboard-fleet.jpg).
@@ -30,7 +30,7 @@ _CHARTS_S = 20.0
 
 
 def main() -> None:
-    """Write the pictures to the folder that is named."""
+    """Write the images to the folder that is named."""
     folder = Path(sys.argv[1])
     with _page() as tab:
         _one_vehicle(tab, folder)

@@ -1,10 +1,10 @@
-"""The horizon of an orbit at 5 m/s in levelled pictures: `benchmarks.level_picture`, one seed each."""
+"""The horizon of an orbit at 5 m/s in levelled images: `benchmarks.level_image`, one seed each."""
 
 from __future__ import annotations
 
 import pytest
 
-from benchmarks.level_picture import pairs
+from benchmarks.level_image import pairs
 
 LEVEL_DEG = 0.5
 

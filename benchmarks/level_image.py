@@ -1,13 +1,13 @@
-"""How level levelled pictures are: the horizon in rendered pictures of an orbit, before and after.
+"""How level levelled images are: the horizon in rendered images of an orbit, before and after.
 
-    python -m benchmarks.level_picture --seeds 1..5 [--rolling-shutter-ms 30] [--save FILE.jpg] [--json]
+    python -m benchmarks.level_image --seeds 1..5 [--rolling-shutter-ms 30] [--save FILE.jpg] [--json]
 
 The vehicle flies an orbit of 13 m at 5 m/s, 8 m above the ground, in wind of 2 m/s. The camera (640x480, 80°
-across, a lens with distortion) looks ahead and is fixed to the body. The pictures are levelled by the
+across, a lens with distortion) looks ahead and is fixed to the body. The images are levelled by the
 autopilot's attitude, received 50 times a second, as the perception worker has it, and by the true one, which
 shows what the levelling itself adds. Errors: the slope of a line
 through the horizon, its offset from where a level camera with that axis has it, and its bend: the greatest
-distance of the horizon from that line. `--save` writes the picture of median slope before and after.
+distance of the horizon from that line. `--save` writes the image of median slope before and after.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ CAMERA = replace(
 )
 MOUNT = CameraMount(forward_m=0.1)
 ORBIT = "orbit radius=13 speed=5"
-PERIOD_S, PICTURES, SETTLED_S = 1.3, 12, 6.0
+PERIOD_S, IMAGES, SETTLED_S = 1.3, 12, 6.0
 TICK_S = 0.01
 # Between the capture and the levelling the attitude of that moment is received.
 LATENCY_S = 0.06
@@ -48,7 +48,7 @@ Image = NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True)
 class Horizon:
-    """The horizon of a picture, degrees. `offset_deg`: below the row where it should be."""
+    """The horizon of an image, degrees. `offset_deg`: below the row where it should be."""
 
     slope_deg: float
     offset_deg: float
@@ -57,7 +57,7 @@ class Horizon:
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """A picture and its horizon, before and after levelling.
+    """An image and its horizon, before and after levelling.
 
     Attributes:
         level, exact: by the autopilot's attitude, by the true one.
@@ -70,8 +70,8 @@ class Pair:
     exact: Horizon
 
 
-def pairs(seed: int, rolling_shutter_s: float, count: int = PICTURES) -> Iterator[Pair]:
-    """The pictures of one orbit; the same seed gives the same."""
+def pairs(seed: int, rolling_shutter_s: float, count: int = IMAGES) -> Iterator[Pair]:
+    """The images of one orbit; the same seed gives the same."""
     car = SceneObject("car", (4.2, 1.8, 1.5), lambda _: ScenePose(14.0, 3.0, 0.7))
     scene, _ = rendered_scene([car], CAMERA, MOUNT, seed)
     shutter = Shutter(0.0, rolling_shutter_s) if rolling_shutter_s else None
@@ -124,11 +124,11 @@ def horizon_of(image: Image, elevation_rad: float) -> Horizon:
     seen = image.any(axis=2)
     ground = (colours[:, :, 1] > colours[:, :, 0]) & seen
     edge, top, columns = ground.argmax(axis=0), seen.argmax(axis=0), np.arange(image.shape[1])
-    # Not where the ground begins with the picture.
+    # Not where the ground begins with the image.
     shown = ground.any(axis=0) & (edge > top + 5)
     x, y = columns[shown].astype(np.float64), edge[shown].astype(np.float64)
     if len(x) < 100:
-        raise ValueError(f"the horizon is in {len(x)} columns of the picture, expected at least 100")
+        raise ValueError(f"the horizon is in {len(x)} columns of the image, expected at least 100")
     for _ in range(3):  # without what stands in front of it
         slope, start = np.polyfit(x, y, 1)
         off = y - (slope * x + start)
@@ -145,19 +145,19 @@ def horizon_of(image: Image, elevation_rad: float) -> Horizon:
     )
 
 
-def write_picture(path: Path, pair: Pair) -> None:
-    """The picture before and after, beside each other. Raises OSError if it cannot be written."""
+def write_image(path: Path, pair: Pair) -> None:
+    """The image before and after, beside each other. Raises OSError if it cannot be written."""
     if not cv2.imwrite(str(path), np.hstack([pair.before, pair.after]), [cv2.IMWRITE_JPEG_QUALITY, 85]):
         raise OSError(f"cannot write {path}: check free disk space and write permission")
 
 
 def main() -> None:
-    """Print the errors of all pictures, and save one."""
+    """Print the errors of all images, and save one."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
     parser.add_argument("--seeds", default="1..3", help="FIRST..LAST")
     parser.add_argument("--rolling-shutter-ms", type=float, default=0.0)
-    parser.add_argument("--save", type=Path, help="File of the picture of median slope, before and after.")
-    parser.add_argument("--json", action="store_true", help="Print one line for each picture.")
+    parser.add_argument("--save", type=Path, help="File of the image of median slope, before and after.")
+    parser.add_argument("--json", action="store_true", help="Print one line for each image.")
     arguments = parser.parse_args()
     first, _, last = arguments.seeds.partition("..")
     taken: list[Pair] = []
@@ -168,7 +168,7 @@ def main() -> None:
                 by_attitude = {"before": pair.tilted, "after": pair.level, "exact": pair.exact}
                 print(json.dumps({"seed": seed} | {name: asdict(each) for name, each in by_attitude.items()}))
     for key in ("slope_deg", "offset_deg", "bend_deg"):
-        print(f"{key}, {len(taken)} pictures:")
+        print(f"{key}, {len(taken)} images:")
         for name, horizons in (
             ("before", [pair.tilted for pair in taken]),
             ("levelled by the autopilot's attitude", [pair.level for pair in taken]),
@@ -179,7 +179,7 @@ def main() -> None:
             print(f"  {name}: p50 {p50:.2f}, p95 {p95:.2f}, worst {max(errors):.2f}")
     if arguments.save is not None:
         by_slope = sorted(taken, key=lambda pair: abs(pair.tilted.slope_deg))
-        write_picture(arguments.save, by_slope[len(by_slope) // 2])
+        write_image(arguments.save, by_slope[len(by_slope) // 2])
 
 
 if __name__ == "__main__":
