@@ -17,6 +17,16 @@ GROUND_STATION = (245, 190)
 REMOTE_CONTROL = {**CALIBRATION, "COM_RC_IN_MODE": 0, "COM_FLTMODE1": 2, "COM_FLTMODE4": 4}
 STEP_S = 0.02
 
+# STATUSTEXTs of PX4.
+HOLD_FIRST = "Failsafe activated: entering Hold for 5 seconds\t"
+ACTIVATED = "Failsafe activated\t"
+GROUND_STATION_REGAINED = "GCS connection regained\t"
+PILOT_TOOK_OVER = "Pilot took over using sticks\t"
+
+# Event lines of the simulator.
+STICKS_LOST_RTL = "failsafe: manual control lost, RTL"
+GROUND_STATION_LOST = "the ground station's heartbeat is lost"
+
 
 class Machine:
     """A state machine with a vehicle in the air, all links alive."""
@@ -63,7 +73,7 @@ def test_losing_remote_control_holds_5_s_and_then_returns() -> None:
     machine.conditions.manual_control_lost = True
     assert machine.run(4.9) is Mode.HOLD
     assert machine.run(0.2) is Mode.RTL
-    assert machine.texts == ["Failsafe activated: entering Hold for 5 seconds\t", "Failsafe activated\t"]
+    assert machine.texts == [HOLD_FIRST, ACTIVATED]
 
 
 @pytest.mark.parametrize(
@@ -284,10 +294,10 @@ def test_remote_control_switched_off_in_flight_ends_in_return() -> None:
     returning_s = harness.until(lambda: harness.mode == "RTL", 6.0)
     assert returning_s == pytest.approx(5.0, abs=0.1)
     harness.fly(0.1)
-    assert "Failsafe activated: entering Hold for 5 seconds\t" in harness.texts()
-    assert "Failsafe activated\t" in harness.texts()
+    assert HOLD_FIRST in harness.texts()
+    assert ACTIVATED in harness.texts()
     assert harness.heartbeat().system_status == 5
-    assert "failsafe: manual control lost, RTL" in harness.events
+    assert STICKS_LOST_RTL in harness.events
 
 
 def test_regained_rc_takes_over_by_sticks() -> None:
@@ -328,10 +338,10 @@ def test_losing_the_ground_station_returns_after_the_hold() -> None:
     lost_s = harness.until(lambda: "failsafe: ground station lost, HOLD" in harness.events, 5.0)
     assert 2.0 < lost_s < 3.1
     harness.until(lambda: harness.mode == "RTL", 6.0)
-    assert "the ground station's heartbeat is lost" in harness.events
+    assert GROUND_STATION_LOST in harness.events
     harness.send(dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3), "gcs", GROUND_STATION)
     harness.fly(0.2)
-    assert "GCS connection regained\t" in harness.texts()
+    assert GROUND_STATION_REGAINED in harness.texts()
     assert harness.mode == "RTL"
 
 
@@ -360,7 +370,7 @@ def test_sticks_moved_in_an_auto_mode_take_over(override: int, taken_over: bool)
     harness.vehicle.transmitter.sticks = Sticks(roll=0.5)
     harness.fly(0.3)
     assert harness.mode == ("POSCTL" if taken_over else "HOLD")
-    assert ("Pilot took over using sticks\t" in harness.texts()) is taken_over
+    assert (PILOT_TOOK_OVER in harness.texts()) is taken_over
 
 
 @pytest.mark.parametrize(

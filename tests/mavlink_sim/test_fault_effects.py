@@ -12,6 +12,15 @@ from tests.mavlink_sim.conftest import SIH_FRAME, SimHarness, position_setpoint,
 
 DO_SET_MODE, LAND, ARM, REQUEST_MESSAGE = 176, 21, 400, 512
 
+# STATUSTEXTs of PX4.
+GNSS_STOPPED = "GNSS data fusion stopped\t"
+MODE_REFUSED = "Switching to {} is currently not available\t"
+ORBIT_REFUSED = "Orbit command rejected"
+
+# Event lines of the simulator.
+BATTERY_LANDS = "failsafe: battery emergency, LAND"
+STICKS_LOST_RTL = "failsafe: manual control lost, RTL"
+
 
 def newest(harness: SimHarness, kind: str, within_s: float = 2.5) -> Any:
     """The next message of a kind."""
@@ -158,7 +167,7 @@ def test_offboard_position_descends_without_gps_and_resumes(harness: SimHarness)
     took_s = harness.until(lambda: harness.mode != "OFFBOARD", 6.0, setpoint)
     assert took_s == pytest.approx(3.8, abs=0.1)
     assert harness.mode == "LAND"  # how PX4 shows Descend
-    assert "GNSS data fusion stopped\t" in harness.texts()
+    assert GNSS_STOPPED in harness.texts()
     assert "Failsafe activated\t" in harness.texts()
     assert harness.heartbeat().system_status == 5
     harness.fly(1.5, setpoint)
@@ -256,7 +265,7 @@ def test_failed_battery_lands_vehicle() -> None:
     begin(harness, "battery emergency")
     harness.fly(0.1)
     assert harness.mode == "LAND"
-    assert "failsafe: battery emergency, LAND" in harness.events
+    assert BATTERY_LANDS in harness.events
     assert harness.heartbeat().system_status == 5
 
 
@@ -370,7 +379,7 @@ def test_pilot_fault_end_is_rc_loss_if_rc_enabled() -> None:
     harness.fly(0.3)
     assert harness.mode == "HOLD"
     harness.until(lambda: harness.mode == "RTL", 6.0)
-    assert "failsafe: manual control lost, RTL" in harness.events
+    assert STICKS_LOST_RTL in harness.events
 
 
 def test_mode_refused_given_count_then_accepted(harness: SimHarness) -> None:
@@ -428,10 +437,10 @@ def test_modes_needing_position_refused_except_land(harness: SimHarness) -> None
         ("Return", (20,)),
     ):
         assert harness.command(*command) == [1]
-        assert harness.texts()[-1] == f"Switching to {name} is currently not available\t"
+        assert harness.texts()[-1] == MODE_REFUSED.format(name)
         harness.fly(1.0)
     assert harness.command(34, 5, 2, 0, 0, nan, nan, nan) == [1]  # DO_ORBIT
-    assert harness.texts()[-1] == "Orbit command rejected"
+    assert harness.texts()[-1] == ORBIT_REFUSED
     assert len(harness.texts()) == 5
     assert harness.command(LAND) == [0]
     assert harness.set_mode(4, 6) == [0, 0]  # AUTO_LAND

@@ -16,6 +16,14 @@ from tests.mavlink_sim.conftest import SIH_FRAME, SimHarness, velocity_setpoint
 from tests.mavlink_sim.plan_client import circle, listen, polygon, upload
 
 FENCE = [(-20.0, -20.0), (-20.0, 20.0), (20.0, 20.0), (20.0, -20.0)]
+
+# STATUSTEXTs of PX4.
+WITHOUT_HOME = "Geofence invalid, doesn't contain Home position\t"
+WITHOUT_VEHICLE = "Geofence invalid, doesn't contain current vehicle position\t"
+BREACHED = "Geofence: approaching or outside geofence"
+HOLD_FIRST = "Failsafe activated: entering Hold for 5 seconds\t"
+REPOSITION_OUTSIDE = "Reposition is outside geofence\t"
+
 metres = st.floats(-100.0, 100.0)
 centimetres = st.integers(-10_000, 10_000)
 
@@ -75,7 +83,7 @@ def test_fence_without_home_is_dropped_and_reported(harness: SimHarness) -> None
     listen(harness)
     assert upload(harness, polygon(FENCE, inclusion=False), 1) == 0
     harness.fly(0.1)
-    assert harness.texts()[-1] == "Geofence invalid, doesn't contain Home position\t"
+    assert harness.texts()[-1] == WITHOUT_HOME
     harness.fly(0.5)
     assert harness.vehicle.autopilot.can_arm
 
@@ -87,7 +95,7 @@ def test_fence_breached_at_upload_is_dropped(harness: SimHarness) -> None:
     harness.fly(0.01)  # until the estimate knows
     upload(harness, polygon(FENCE), 1)
     harness.fly(0.5)
-    assert "Geofence invalid, doesn't contain current vehicle position\t" in harness.texts()
+    assert WITHOUT_VEHICLE in harness.texts()
     assert harness.mode == "HOLD"
     assert not harness.vehicle.autopilot.failsafe
 
@@ -103,7 +111,7 @@ def test_arming_refused_outside_fence() -> None:
     assert harness.vehicle.autopilot.can_arm
     harness.vehicle.airframe.position = (15.0, 0.0, 0.0)
     harness.fly(0.3)
-    assert harness.texts()[-1] == "Geofence: approaching or outside geofence"
+    assert harness.texts()[-1] == BREACHED
     assert harness.command(400, 1) == [1]
     assert harness.heartbeat().system_status == 0
 
@@ -137,7 +145,7 @@ def test_breach_executes_gf_action(action: int, mode: str) -> None:
     harness = SimHarness(ready_after_s=0.0, parameters={"GF_ACTION": action, "COM_FAIL_ACT_T": 0})
     fly_out(harness)
     assert harness.mode == mode
-    assert "Geofence: approaching or outside geofence" in harness.texts()
+    assert BREACHED in harness.texts()
     assert ("Failsafe activated\t" in harness.texts()) is (action != 1)
     events = [event.id for event in harness.received("EVENT")]
     assert (event_identifier("commander_failsafe_enter_generic_warn") in events) is (action == 1)
@@ -150,7 +158,7 @@ def test_breach_holds_before_return() -> None:
     harness = SimHarness(ready_after_s=0.0, parameters={"GF_ACTION": 3})
     fly_out(harness)
     assert harness.mode == "HOLD"
-    assert "Failsafe activated: entering Hold for 5 seconds\t" in harness.texts()
+    assert HOLD_FIRST in harness.texts()
     assert harness.until(lambda: harness.mode == "RTL", 6.0) == pytest.approx(4.8, abs=0.3)
 
 
@@ -175,7 +183,7 @@ def test_goal_outside_fence_refused(harness: SimHarness) -> None:
     point = (round(latitude * 1e7), round(longitude * 1e7), altitude)
     assert harness.command_int(192, (-1, 1, 0, math.nan), *point) == [0]
     harness.fly(2.0)
-    assert harness.texts()[-1] == "Reposition is outside geofence\t"
+    assert harness.texts()[-1] == REPOSITION_OUTSIDE
     assert math.hypot(*harness.vehicle.airframe.position[:2]) < 1.0
 
 

@@ -25,6 +25,10 @@ NAMES = ("vx", "vy", "vz", "afx", "afy", "afz", "yaw", "yaw_rate")
 POSITION_ALONE = 0xDF8
 ACCELERATION_ALONE = 0xC3F
 
+# STATUSTEXTs of PX4.
+FRAME_REFUSED = "SET_POSITION_TARGET_GLOBAL_INT invalid coordinate frame {}\t"
+FORCE_REFUSED = "SET_POSITION_TARGET_GLOBAL_INT force not supported\t"
+
 
 def globally(
     position: tuple[float, float, float] = (0.0, 0.0, 0.0),
@@ -79,7 +83,7 @@ def test_position_in_unsupported_frame_refused(harness: SimHarness, frame: int) 
     harness.forget()
     harness.send(globally(altitude_m=500.0, frame=frame))
     harness.fly(0.05)
-    assert harness.texts() == [f"SET_POSITION_TARGET_GLOBAL_INT invalid coordinate frame {frame}\t"]
+    assert harness.texts() == [FRAME_REFUSED.format(frame)]
     assert not harness.vehicle.autopilot.has_setpoints
 
 
@@ -100,7 +104,7 @@ def test_force_setpoint_refused(harness: SimHarness) -> None:
     harness.send(globally(altitude_m=500.0, mask=512))
     harness.send(globally(altitude_m=500.0, mask=0xDFF))
     harness.fly(0.05)
-    assert harness.texts() == ["SET_POSITION_TARGET_GLOBAL_INT force not supported\t"]
+    assert harness.texts() == [FORCE_REFUSED]
     assert not harness.vehicle.autopilot.has_setpoints
 
 

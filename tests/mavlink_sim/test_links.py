@@ -13,6 +13,17 @@ pytestmark = pytest.mark.streams("everything")
 GCS = 6
 ONBOARD_CONTROLLER = 18
 
+# STATUSTEXTs of PX4.
+TAKEOFF = ["Armed by external command\t", "Using default takeoff altitude: 2.5 m\t", "Takeoff detected\t"]
+ARMING_DENIED = [
+    "Preflight Fail: heading estimate not stable",
+    "Arming denied: Resolve system health failures first\t",
+]
+DISARMING_DENIED = "Disarming denied: not landed\t"
+UNKNOWN_MODE = "Unsupported main mode\t"
+COMPANION_LOST = "Connection to mission computer lost\t"
+COMPANION_REGAINED = "Onboard controller regained\t"
+
 
 def test_a_companion_gets_no_status_texts_but_gets_events(harness: SimHarness) -> None:
     harness.heartbeats.append(("onboard", (1, 191), ONBOARD_CONTROLLER))
@@ -25,11 +36,7 @@ def test_a_companion_gets_no_status_texts_but_gets_events(harness: SimHarness) -
 def test_texts_go_to_link_of_ground_station(harness: SimHarness) -> None:
     harness.heartbeats.append(("gcs", (245, 190), GCS))
     harness.take_off()
-    assert harness.texts("gcs") == [
-        "Armed by external command\t",
-        "Using default takeoff altitude: 2.5 m\t",
-        "Takeoff detected\t",
-    ]
+    assert harness.texts("gcs") == TAKEOFF
     assert {message.severity for message in harness.received("STATUSTEXT", "gcs")} == {6}
     assert harness.texts("onboard") == []
 
@@ -47,16 +54,13 @@ def test_denials_have_severity_critical(harness: SimHarness) -> None:
     harness.heartbeats.append(("gcs", (245, 190), GCS))
     harness.fly(1.0)
     harness.command(400, 1)
-    assert harness.texts() == [
-        "Preflight Fail: heading estimate not stable",
-        "Arming denied: Resolve system health failures first\t",
-    ]
+    assert harness.texts() == ARMING_DENIED
     assert {message.severity for message in harness.received("STATUSTEXT", "gcs")} == {2}
     harness.take_off()
     harness.command(400, 0)
-    assert harness.texts()[-1] == "Disarming denied: not landed\t"
+    assert harness.texts()[-1] == DISARMING_DENIED
     harness.set_mode(77)
-    assert harness.texts()[-1] == "Unsupported main mode\t"
+    assert harness.texts()[-1] == UNKNOWN_MODE
 
 
 def test_long_text_is_chunked(harness: SimHarness) -> None:
@@ -77,11 +81,11 @@ def test_companion_loss_reported_after_7_s(harness: SimHarness) -> None:
     harness.fly(3.0)
     del harness.heartbeats[1]
     started = harness.now_s
-    harness.until(lambda: "Connection to mission computer lost\t" in harness.texts(), 10.0)
+    harness.until(lambda: COMPANION_LOST in harness.texts(), 10.0)
     assert 6.0 < harness.now_s - started < 7.5
     harness.heartbeats.append(("onboard", (1, 191), ONBOARD_CONTROLLER))
     harness.fly(1.5)
-    assert harness.texts()[-1] == "Onboard controller regained\t"
+    assert harness.texts()[-1] == COMPANION_REGAINED
 
 
 def heartbeat(kind: int = GCS) -> Any:

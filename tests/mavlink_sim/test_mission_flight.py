@@ -34,6 +34,19 @@ from tests.mavlink_sim.plan_client import (
 
 SHORT = [takeoff(4.0), waypoint(8, 0, 4), land(8, 0)]
 
+# STATUSTEXTs of PX4.
+SHORT_FLOWN = [
+    "Executing Mission\t",
+    "Climb to 4.0 meters above home\t",
+    "Takeoff detected\t",
+    "Landing detected\t",
+    "Mission finished, landed\t",
+    "Disarmed by landing\t",
+]
+START_DENIED = "Mission start denied! No valid mission\t"
+FIRST_WAYPOINT_FAR = "First waypoint far away from home: 150m. Correct mission loaded?\t"
+RALLY_FRAME_UNKNOWN = "RTL: unsupported MAV_FRAME\t"
+
 
 @pytest.fixture
 def harness() -> SimHarness:
@@ -73,15 +86,7 @@ def test_a_mission_takes_off_flies_lands_and_disarms(harness: SimHarness) -> Non
     assert away(harness, 8, 0) < 1.0
     assert reached(harness) == [0, 1, 2]
     assert status(harness)[:3] == (2, 3, 5)
-    said = harness.texts()
-    assert said[-6:] == [
-        "Executing Mission\t",
-        "Climb to 4.0 meters above home\t",
-        "Takeoff detected\t",
-        "Landing detected\t",
-        "Mission finished, landed\t",
-        "Disarmed by landing\t",
-    ]
+    assert harness.texts()[-6:] == SHORT_FLOWN
 
 
 def test_mission_start_arms_and_begins_at_given_item(harness: SimHarness) -> None:
@@ -303,7 +308,7 @@ def test_infeasible_mission_stored_but_refused(
     harness.fly(0.1)
     assert words in harness.texts()
     assert harness.command(300) == [2]
-    assert harness.texts()[-1] == "Mission start denied! No valid mission\t"
+    assert harness.texts()[-1] == START_DENIED
     assert status(harness)[2] == 1
 
 
@@ -312,7 +317,7 @@ def test_a_far_first_waypoint_is_only_warned_of() -> None:
     listen(harness)
     upload(harness, [waypoint(150.5, 0, 5)])
     harness.fly(0.1)
-    assert "First waypoint far away from home: 150m. Correct mission loaded?\t" in harness.texts()
+    assert FIRST_WAYPOINT_FAR in harness.texts()
     assert harness.vehicle.autopilot.navigator.mission.valid
 
 
@@ -383,7 +388,7 @@ def test_rally_point_in_integer_frame_is_refused_as_px4_does() -> None:
     points = stored(rally(60, 0, frame=6))
     found, words = destination(points, Mission(), Parameters(), HOME, SIH_FRAME, (59.0, 0.0, -5.0))
     assert found.kind is Goal.HOME
-    assert words == ["RTL: unsupported MAV_FRAME\t"]
+    assert words == [RALLY_FRAME_UNKNOWN]
 
 
 def test_mission_route_leads_to_landing_or_home() -> None:

@@ -34,6 +34,12 @@ from tests.mavlink_sim.plan_client import (
 NAN = math.nan
 SQUARE = [(-50.0, -50.0), (-50.0, 50.0), (50.0, 50.0), (50.0, -50.0)]
 
+# STATUSTEXTs of PX4.
+TIMED_OUT = "Mission sync timeout\t"
+OTHER_PARTNER = "REJ. MIS ITEM: partner id mismatch\t"
+NO_TRANSFER = "IGN MISSION_ITEM: No transfer\t"
+NOT_IN_LIST = "WPM: WP CURR CMD: Not in list\t"
+
 
 @pytest.fixture
 def harness() -> SimHarness:
@@ -119,7 +125,7 @@ def test_unanswered_request_repeats_then_aborts(harness: SimHarness) -> None:
     asked = [m.seq for m in harness.received("MISSION_REQUEST_INT")]
     assert asked == [1] * 17  # every 250 ms
     harness.fly(2.0)
-    assert "Mission sync timeout\t" in harness.texts("gcs")  # on every link, as all of PX4's texts
+    assert TIMED_OUT in harness.texts("gcs")  # on every link, as all of PX4's texts
     assert len(harness.received("MISSION_REQUEST_INT")) <= 20
     assert upload(harness, [takeoff(5.0), RETURN]) == 0
 
@@ -144,12 +150,12 @@ def test_an_item_without_a_transfer_is_an_error(harness: SimHarness) -> None:
     listen(harness)
     harness.send(message(3, waypoint(5, 0, 5)), "gcs", (245, 190))
     harness.fly(0.01)
-    assert harness.texts()[-1:] == ["REJ. MIS ITEM: partner id mismatch\t"]
+    assert harness.texts()[-1:] == [OTHER_PARTNER]
     harness.send(count(0), "gcs", (245, 190))
     harness.send(message(3, waypoint(5, 0, 5)), "gcs", (245, 190))
     assert [m.type for m in harness.received("MISSION_ACK", "gcs")] == [0, 1]
     harness.fly(0.01)
-    assert harness.texts()[-1:] == ["IGN MISSION_ITEM: No transfer\t"]
+    assert harness.texts()[-1:] == [NO_TRANSFER]
 
 
 @pytest.mark.parametrize(
@@ -264,7 +270,7 @@ def test_set_current_confirmed_by_mission_current(harness: SimHarness) -> None:
     assert {(m.seq, m.total) for m in harness.received("MISSION_CURRENT")} == {(2, 3)}
     harness.send(dialect.MAVLink_mission_set_current_message(1, 1, 3), "gcs", (245, 190))
     harness.fly(0.01)
-    assert harness.texts()[-1] == "WPM: WP CURR CMD: Not in list\t"
+    assert harness.texts()[-1] == NOT_IN_LIST
     assert harness.command(224, 1) == [3]  # DO_SET_MISSION_CURRENT is none of PX4's commands
 
 

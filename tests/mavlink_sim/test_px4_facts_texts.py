@@ -10,6 +10,43 @@ from tests.mavlink_sim.conftest import SimHarness, velocity_setpoint
 INFO, CRITICAL = 6, 2
 GROUND_STATION = (245, 190)
 
+# As PX4 sends them, with their severities.
+ARMED = (INFO, "Armed by external command\t")
+LANDED = (INFO, "Landing detected\t")
+DISARMED = (INFO, "Disarmed by landing\t")
+DISARMED_BY_COMMAND = (INFO, "Disarmed by external command\t")
+DISARMED_ON_GROUND = (INFO, "Disarmed by auto preflight disarming\t")
+RETURN_STARTED = (INFO, "RTL: start return at 493 m (4 m above destination)\t")
+RETURN_LANDS = (INFO, "RTL: land at destination\t")
+FLIGHT = [
+    ARMED,
+    (INFO, "Using default takeoff altitude: 2.5 m\t"),
+    (INFO, "Takeoff detected\t"),
+    (INFO, "Landing at current position\t"),
+    LANDED,
+    DISARMED,
+]
+RETURN = [(INFO, "Returning to launch\t"), RETURN_STARTED, RETURN_LANDS, LANDED, DISARMED]
+REFUSALS = [
+    "Preflight Fail: heading estimate not stable",
+    "Arming denied: Resolve system health failures first\t",
+    "Unsupported main mode\t",
+    "SET_POSITION_TARGET_LOCAL_NED coordinate frame 9 unsupported\t",
+    "SET_POSITION_TARGET_LOCAL_NED invalid\t",
+    "SET_POSITION_TARGET_LOCAL_NED force not supported\t",
+    "Disarming denied: not landed\t",
+    "Switching to Offboard is currently not available\t",
+]
+COMPANION_LOST = (CRITICAL, "Connection to mission computer lost\t")
+LOSSES = [
+    (CRITICAL, "Failsafe activated\t"),
+    RETURN_STARTED,
+    RETURN_LANDS,
+    COMPANION_LOST,
+    (INFO, "Onboard controller regained\t"),
+]
+TAKEOFF_BELOW = (CRITICAL, "Already higher than takeoff altitude\t")
+
 
 def sent(harness: SimHarness, link: str = "gcs") -> list[tuple[int, str]]:
     """(severity, whole text) of every STATUSTEXT received."""
@@ -36,14 +73,7 @@ def test_texts_of_a_flight_by_command(received: SimHarness) -> None:
     received.command(21)
     received.until(lambda: not received.armed)
     received.fly(0.1)
-    assert sent(received) == [
-        (INFO, "Armed by external command\t"),
-        (INFO, "Using default takeoff altitude: 2.5 m\t"),
-        (INFO, "Takeoff detected\t"),
-        (INFO, "Landing at current position\t"),
-        (INFO, "Landing detected\t"),
-        (INFO, "Disarmed by landing\t"),
-    ]
+    assert sent(received) == FLIGHT
 
 
 def test_texts_of_a_return_are_info(received: SimHarness) -> None:
@@ -53,13 +83,7 @@ def test_texts_of_a_return_are_info(received: SimHarness) -> None:
     received.command(20)
     received.until(lambda: not received.armed)
     received.fly(0.1)
-    assert sent(received) == [
-        (INFO, "Returning to launch\t"),
-        (INFO, "RTL: start return at 493 m (4 m above destination)\t"),
-        (INFO, "RTL: land at destination\t"),
-        (INFO, "Landing detected\t"),
-        (INFO, "Disarmed by landing\t"),
-    ]
+    assert sent(received) == RETURN
 
 
 def test_disarming_text_has_reason(received: SimHarness) -> None:
@@ -70,8 +94,8 @@ def test_disarming_text_has_reason(received: SimHarness) -> None:
     received.until(lambda: not received.armed, 15.0)
     received.fly(0.1)
     assert [text for text in sent(received) if "Disarmed" in text[1]] == [
-        (INFO, "Disarmed by external command\t"),
-        (INFO, "Disarmed by auto preflight disarming\t"),
+        DISARMED_BY_COMMAND,
+        DISARMED_ON_GROUND,
     ]
 
 
@@ -88,16 +112,7 @@ def test_denial_texts_are_critical_and_end_with_tab(received: SimHarness) -> Non
     received.set_mode(6, source=GROUND_STATION, link="gcs")
     texts = sent(received)
     critical = [text for severity, text in texts if severity == CRITICAL]
-    assert critical == [
-        "Preflight Fail: heading estimate not stable",
-        "Arming denied: Resolve system health failures first\t",
-        "Unsupported main mode\t",
-        "SET_POSITION_TARGET_LOCAL_NED coordinate frame 9 unsupported\t",
-        "SET_POSITION_TARGET_LOCAL_NED invalid\t",
-        "SET_POSITION_TARGET_LOCAL_NED force not supported\t",
-        "Disarming denied: not landed\t",
-        "Switching to Offboard is currently not available\t",
-    ]
+    assert critical == REFUSALS
     assert {severity for severity, _ in texts} == {INFO, CRITICAL}
 
 
@@ -109,17 +124,11 @@ def test_texts_of_setpoint_and_companion_loss(received: SimHarness) -> None:
     del received.heartbeats[1]
     received.forget()
     last = received.now_s
-    received.until(lambda: "Connection to mission computer lost\t" in received.texts(), 10.0)
+    received.until(lambda: COMPANION_LOST in sent(received), 10.0)
     assert received.now_s - last == pytest.approx(7.0, abs=1.1)
     received.heartbeats.append(("onboard", (1, 191), 18))
     received.fly(1.5)
-    assert sent(received) == [
-        (CRITICAL, "Failsafe activated\t"),
-        (INFO, "RTL: start return at 493 m (4 m above destination)\t"),
-        (INFO, "RTL: land at destination\t"),
-        (CRITICAL, "Connection to mission computer lost\t"),
-        (INFO, "Onboard controller regained\t"),
-    ]
+    assert sent(received) == LOSSES
 
 
 def test_takeoff_below_current_altitude_sends_text(received: SimHarness) -> None:
@@ -128,9 +137,9 @@ def test_takeoff_below_current_altitude_sends_text(received: SimHarness) -> None
     assert received.command(22, 0, 0, 0, float("nan"), float("nan"), float("nan"), 5.0) == [0]
     received.until(lambda: not received.armed, 15.0)
     received.fly(0.1)
-    assert (CRITICAL, "Already higher than takeoff altitude\t") in sent(received)
+    assert TAKEOFF_BELOW in sent(received)
     assert received.height_m < 0.1
-    assert sent(received)[-1] == (INFO, "Disarmed by auto preflight disarming\t")
+    assert sent(received)[-1] == DISARMED_ON_GROUND
 
 
 def test_text_over_50_characters_is_chunked(received: SimHarness) -> None:
@@ -150,5 +159,5 @@ def test_texts_follow_ground_station_heartbeat() -> None:
     harness.wait_ready()
     harness.command(400, 1)
     harness.fly(0.1)
-    assert harness.texts("onboard") == ["Armed by external command\t"]
+    assert harness.texts("onboard") == [ARMED[1]]
     assert harness.texts("gcs") == []
