@@ -15,6 +15,15 @@ from vision.attitude import quaternion_inverse, quaternion_product
 ARM, TAKEOFF, SET_MODE, PAUSE_CONTINUE = 400, 22, 176, 193
 POSITION, VELOCITY, ACCELERATION = 0b110111111000, 0b110111000111, 0b110000111111
 
+# STATUSTEXTs of Copter, with their severities.
+NOT_ARMABLE = "Arm: {} mode not armable"
+NEED_POSITION = (2, "Arm: Need Position Estimate")
+AUTO_FAILED = (4, "Mode change to AUTO failed: init failed")
+NO_MODE_99 = (4, "No such mode 99")
+EKF_LANDS = (2, "EKF Failsafe: changed to LAND Mode")
+FENCE_BREACHED = (5, "Circle fence breached")
+TARGET_FRAME_REFUSED = "Plnd: Frame not supported "
+
 
 @pytest.fixture
 def copter() -> LockstepVehicle:
@@ -64,7 +73,7 @@ def test_unarmable_modes_accepted_while_disarmed_refuse_arming(copter: LockstepV
     assert copter.command(SET_MODE, 1, mode) == "ACCEPTED"
     assert copter.command(ARM, 1) == "FAILED"
     name = {6: "RTL", 9: "LAND", 17: "BRAKE", 3: "AUTO"}[mode]
-    assert texts(copter) == [(2, f"Arm: {name} mode not armable")]
+    assert texts(copter) == [(2, NOT_ARMABLE.format(name))]
     assert copter.command(ARM, 1, 2989) == "ACCEPTED"  # the magic number arms anyhow
 
 
@@ -73,7 +82,7 @@ def test_arming_guided_needs_position_stabilize_does_not() -> None:
     vehicle.send(dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
     vehicle.set_mode("GUIDED")
     assert vehicle.command(ARM, 1) == "FAILED"
-    assert texts(vehicle) == [(2, "Arm: Need Position Estimate")]
+    assert texts(vehicle) == [NEED_POSITION]
     vehicle.set_mode("STABILIZE")
     assert vehicle.command(ARM, 1) == "ACCEPTED"
 
@@ -279,7 +288,7 @@ def test_auto_without_mission_and_unknown_modes_refused(flying: LockstepVehicle)
     assert flying.command(SET_MODE, 1, 3) == "FAILED"
     assert flying.command(SET_MODE, 1, 99) == "FAILED"
     assert flying.command(SET_MODE, 0, 5) == "DENIED"
-    assert texts(flying) == [(4, "Mode change to AUTO failed: init failed"), (4, "No such mode 99")]
+    assert texts(flying) == [AUTO_FAILED, NO_MODE_99]
     with pytest.raises(CommandRefusedError):
         flying.set_mode("FLIP")
     with pytest.raises(ValueError, match="GUIDED"):
@@ -303,7 +312,7 @@ def test_lost_ground_station_returns_with_fs_gcs_enable(flying: LockstepVehicle)
 def test_a_lost_position_leads_to_land(flying: LockstepVehicle) -> None:
     flying.vehicle.faults.begin("gps_loss for=30")
     flying.run_until(lambda truth: truth.mode == "LAND", 30.0)
-    assert (2, "EKF Failsafe: changed to LAND Mode") in texts(flying)
+    assert EKF_LANDS in texts(flying)
     assert flying.command(SET_MODE, 1, 4) in ("FAILED", "TEMPORARILY_REJECTED")
 
 
@@ -313,7 +322,7 @@ def test_fence_breach_changes_mode(flying: LockstepVehicle) -> None:
     guided(flying, POSITION, 40.0, 0.0, -6.0)
     flying.run_until(lambda truth: truth.mode == "RTL", 20.0)
     assert flying.truth.position_ned_m[0] == pytest.approx(12.0, abs=0.5)
-    assert (5, "Circle fence breached") in texts(flying)
+    assert FENCE_BREACHED in texts(flying)
 
 
 def test_velocity_targets_stop_before_the_fence(flying: LockstepVehicle) -> None:
@@ -375,7 +384,7 @@ def test_land_uses_landing_target_in_supported_frames(
     missed = math.dist(flying.truth.position_ned_m[:2], (north, east))
     assert (missed < 0.8) is hits, missed  # in gusts that move a held position by 0.3 m
     sent_texts = [text for _, text in texts(flying)]
-    assert sent_texts.count("Plnd: Frame not supported ") == (frame == 1)
+    assert sent_texts.count(TARGET_FRAME_REFUSED) == (frame == 1)
 
 
 def test_pilot_takes_over_in_loiter_and_reboot_resets(flying: LockstepVehicle) -> None:

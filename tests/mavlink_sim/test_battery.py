@@ -14,6 +14,7 @@ from mavlink_sim.px4.parameters import Parameters
 from tests.mavlink_sim.conftest import SimHarness
 
 GROUND_STATION = (245, 190)
+EMERGENCY = "Emergency battery level\t"  # STATUSTEXT of PX4
 CHECKED = {"CBRK_SUPPLY_CHK": 0, "SIM_BAT_MIN_PCT": 0}
 
 
@@ -134,7 +135,7 @@ def test_arming_is_refused_on_an_empty_battery() -> None:
     harness.fly(6.0)
     assert not harness.vehicle.autopilot.can_arm
     assert harness.command(400, 1) == [1]
-    assert "Emergency battery level\t" in harness.texts()
+    assert EMERGENCY in harness.texts()
     harness.vehicle.autopilot.supervision.battery.forced_charge = None
     harness.fly(6.0)
     assert harness.command(400, 1) == [0]

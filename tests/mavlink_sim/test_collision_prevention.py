@@ -25,6 +25,7 @@ from tests.mavlink_sim.plan_client import listen
 
 FAR_CM = 2100  # nothing within the 20 m of the sensor
 STILL = (0.0, 0.0)
+FRAME_REFUSED = "Obstacle message received in unsupported frame 7\t"  # STATUSTEXT of PX4
 
 
 def parameters(**values: float) -> Parameters:
@@ -210,7 +211,7 @@ def test_message_fills_map_and_offboard_ignores_it() -> None:
     assert harness.vehicle.autopilot.navigator.obstacles.distances_cm == near
     harness.send(dialect.MAVLink_obstacle_distance_message(0, 0, near, 5, 20, 2000, 0.0, 0.0, 7))
     harness.fly(0.1)
-    assert harness.texts()[-1] == "Obstacle message received in unsupported frame 7\t"
+    assert harness.texts()[-1] == FRAME_REFUSED
     harness.take_off()
     north = velocity_setpoint(2, 0, 0)
     harness.offboard(north)

@@ -10,6 +10,7 @@ from tests.mavlink_sim.conftest import SimHarness, velocity_setpoint
 
 ALL_MODES = [(1, 0), (2, 0), (3, 0), (3, 2), (4, 2), (4, 3), (4, 4), (4, 5), (4, 6), (5, 0), (6, 0), (7, 0)]
 FOLLOW, PRECISION_LAND, ORBIT = (4, 8), (4, 9), (3, 1)
+MODE_REFUSED = "Switching to {} is currently not available\t"  # STATUSTEXT of PX4
 
 
 @pytest.mark.parametrize(("main", "sub"), ALL_MODES)
@@ -75,12 +76,12 @@ def test_denial_text_goes_to_requesting_ground_station(harness: SimHarness) -> N
     harness.set_mode(6)  # requested by the companion: no text
     assert harness.texts() == []
     harness.set_mode(6, source=(245, 190), link="gcs")
-    assert harness.texts() == ["Switching to Offboard is currently not available\t"]
+    assert harness.texts() == [MODE_REFUSED.format("Offboard")]
     harness.set_mode(3, source=(245, 190), link="gcs")
     assert len(harness.texts()) == 1  # once a second is enough
     harness.fly(1.0)
     harness.set_mode(3, source=(245, 190), link="gcs")
-    assert harness.texts()[1:] == ["Switching to Position is currently not available\t"]
+    assert harness.texts()[1:] == [MODE_REFUSED.format("Position")]
 
 
 def test_set_mode_message_has_one_real_answer(harness: SimHarness) -> None:

@@ -14,6 +14,7 @@ from tests.mavlink_sim.conftest import SIH_FRAME, SimHarness
 
 NAN = math.nan
 CENTRE = (12.0, 5.0, 0.0)
+RADIUS_EXCEEDED = "Orbit radius limit exceeded\t"  # STATUSTEXT of PX4
 
 
 def orbit(
@@ -151,7 +152,7 @@ def test_the_speed_is_limited_by_the_centripetal_acceleration(harness: SimHarnes
 def test_invalid_radius_accepted_reported_and_hovers(harness: SimHarness, radius_m: float) -> None:
     harness.heartbeats.append(("gcs", (245, 190), 6))
     circling(harness, seconds=0.1, radius_m=radius_m)
-    assert harness.texts()[-1] == "Orbit radius limit exceeded\t"
+    assert harness.texts()[-1] == RADIUS_EXCEEDED
     before = harness.vehicle.airframe.position
     harness.forget()
     harness.fly(5.0)

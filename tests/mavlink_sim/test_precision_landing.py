@@ -12,6 +12,7 @@ from tests.mavlink_sim.conftest import SimHarness
 from tests.mavlink_sim.plan_client import land, listen, takeoff, upload
 
 TARGET = (2.0, -1.5)
+FRAME_REFUSED = "Landing target: coordinate frame 12 unsupported\t"  # STATUSTEXT of PX4
 
 
 @pytest.fixture
@@ -132,5 +133,5 @@ def test_target_frame_refused_and_angles_ignored(harness: SimHarness) -> None:
     harness.send(target(1, 1, valid=0))
     harness.send(target(math.nan, 1))
     harness.fly(0.1)
-    assert harness.texts()[-1] == "Landing target: coordinate frame 12 unsupported\t"
+    assert harness.texts()[-1] == FRAME_REFUSED
     assert harness.vehicle.autopilot.navigator.target is None
