@@ -34,6 +34,8 @@ from tests.mavlink_sim.mavsdk_client import MavsdkClient, mavsdk_client, meanwhi
 pytestmark = pytest.mark.realtime
 
 SPEED = 4.0
+# As PX4 words the arming checks.
+ARMING_PROBLEMS = {"No valid mission available", "No offboard signal", "No manual control input"}
 
 
 @pytest.fixture
@@ -221,7 +223,7 @@ async def test_mavsdk_reports_health_and_arming_checks(system: MavsdkClient) -> 
     assert report.current_mode_intention.mode_name == "Hold"
     assert report.current_mode_intention.problems == []
     problems = {problem.message for problem in report.all_problems}
-    assert problems == {"No valid mission available", "No offboard signal", "No manual control input"}
+    assert problems == ARMING_PROBLEMS
     present = {part.label for part in report.health_components if part.is_present}
     assert {"GPS", "Battery"} <= present
     faulty = {part.label for part in report.health_components if part.has_error}

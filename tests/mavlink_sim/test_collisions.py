@@ -115,7 +115,7 @@ def test_too_fast_it_breaks_and_falls() -> None:
     vehicle = flying(WALL, height_m=3.0)
     steer(vehicle, velocity_setpoint(9.0, 0.0, 0.0), 4.0)
     crash = next(event for event in vehicle.events if event.startswith("crashed into"))
-    assert crash.startswith("crashed into wall-2 at ")
+    assert crash.split()[2] == "wall-2"
     assert float(crash.split()[-2]) > CRASH_MPS
     truth = vehicle.truth
     assert truth.crashed

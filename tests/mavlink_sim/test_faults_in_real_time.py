@@ -136,7 +136,8 @@ def test_faults_over_zenoh_are_answered() -> None:
         assert len(second["active"]) == 2
         refused = ask("", "wind")
         assert not refused["ok"]
-        assert "wind needs speed" in refused["text"]
+        assert refused["text"].startswith("wind ")
+        assert "needs speed" in refused["text"]
         assert ask("", "end all")["text"] == "ended 2"
         assert ask("")["text"] == "no faults"
         simulator.wait_for_event("fault 1 link_delay 0.2 for=60 ends")
@@ -148,5 +149,5 @@ def test_a_busy_control_endpoint_is_named() -> None:
         busy.bind(("127.0.0.1", 0))
         busy.listen()
         port = busy.getsockname()[1]
-        with pytest.raises(ControlError, match=f"--control tcp/127.0.0.1:{port}: zenoh cannot listen there"):
+        with pytest.raises(ControlError, match=f"--control tcp/127.0.0.1:{port}: .*listen"):
             FaultControl(f"tcp/127.0.0.1:{port}", 1, vehicle.faults)

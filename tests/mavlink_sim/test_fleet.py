@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import time
 from collections import defaultdict
 from pathlib import Path
@@ -134,7 +135,7 @@ def test_too_slow_machine_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     now_s += 3.0
     pace.report()
     assert len(reports) == 1
-    assert "15.00 times real time in the last 5 s, not 20" in reports[0]
+    assert re.findall(r"\d[\d.]*", reports[0]) == ["15.00", "5", "20"]
     now_s += 6.0
     pace.report()
     assert len(reports) == 1  # nothing lost since

@@ -166,7 +166,7 @@ def test_a_fall_is_a_hard_landing_and_a_landing_is_none() -> None:
     vehicle.run_until(lambda truth: truth.height_m < 1.5 or truth.mode == "HOLD", 20.0)
     vehicle.command(400, 0.0, 21196.0)  # motors off in the air
     vehicle.run_until(lambda truth: truth.on_ground, 10.0)
-    assert any(event.startswith(("hard landing at", "crashed at")) for event in vehicle.events)
+    assert any(event.split(" at ")[0] in ("hard landing", "crashed") for event in vehicle.events)
 
 
 # ---- faults and signatures on its links
@@ -293,7 +293,7 @@ def test_copy_is_independent() -> None:
 def test_copy_with_active_fault_refused() -> None:
     vehicle = LockstepVehicle({"onboard": {}})
     vehicle.vehicle.faults.begin("gust 6")
-    with pytest.raises(ValueError, match="fault gust is active"):
+    with pytest.raises(ValueError, match=r"copy: fault gust .*end it"):
         vehicle.copy()
     vehicle.vehicle.faults.end()
     vehicle.copy().step(1.0)

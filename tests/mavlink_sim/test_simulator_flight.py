@@ -19,6 +19,7 @@ from tests.mavlink_sim.mavsdk_client import mavsdk_client, meanwhile, wait_for
 pytestmark = pytest.mark.realtime
 
 SPEED = 4.0  # simulated seconds a second; setpoints are sent by the simulated clock
+SETPOINTS_LOST = "failsafe: offboard setpoints lost, RTL"  # an event line of docs/simulator.md
 
 
 class Companion:
@@ -99,7 +100,7 @@ def test_pymavlink_flies_offboard_loses_stream_and_comes_home() -> None:
         companion.link.close()
         simulator.wait_for_event("disarmed (after landing)")
     assert simulator.events[:5] == ["armed", "mode TAKEOFF", "takeoff", "mode HOLD", "mode OFFBOARD"]
-    assert "failsafe: offboard setpoints lost, RTL" in simulator.events
+    assert SETPOINTS_LOST in simulator.events
 
 
 AHEAD = {
