@@ -148,7 +148,7 @@ def test_non_empty_folder_refused(tmp_path: Path) -> None:
 
 def test_scene_without_viewpoint_refused(tmp_path: Path) -> None:
     full = World((WorldObject(0, "box", (0.0, 0.0, 0.0), size_m=(400.0, 400.0, 50.0)),))
-    with pytest.raises(DatasetError, match="found no viewpoint"):
+    with pytest.raises(DatasetError, match=r"no viewpoint between .* m "):
         make_dataset(tmp_path / "set", Scene(full), DatasetOptions(1, classes=("box",)))
 
 
@@ -284,7 +284,7 @@ def test_flights_have_every_kind_of_distractor_and_far_objects() -> None:
     assert min(ranges) < 6.0
 
 
-def test_more_kinds_of_objects_are_placed_as_often_as_the_classes() -> None:
+def test_more_kinds_of_objects_placed_as_often_as_classes() -> None:
     def drones(more: tuple[str, ...]) -> int:
         frames = (flight_frame(np.random.default_rng((5, n)), 160, 128, more) for n in range(12))
         return sum(item.world_object.class_name == "drone" for frame in frames for item in frame.objects)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import logging
 import math
@@ -110,7 +111,8 @@ def test_a_taken_port_gives_one_clear_line_and_code_two() -> None:
         finished = run("--onboard-bind", str(port), "--gcs-bind", "0")
     assert finished.returncode == 2
     (line,) = finished.stderr.strip().splitlines()
-    assert f"127.0.0.1:{port} is already in use" in line
+    assert f"UDP port 127.0.0.1:{port} " in line
+    assert "in use" in line
 
 
 def test_version_is_printed() -> None:
@@ -191,7 +193,7 @@ def test_failure_note_has_last_events() -> None:
         fail_with_running_vehicle("wind speed=3 direction=90")
     (note,) = failure.value.__notes__
     first, *lines = note.splitlines()
-    assert first == "last events of the vehicle:"
+    assert first.startswith("last events")
     assert any("ready: system 1" in line for line in lines)
     assert any("wind" in line for line in lines)
 
@@ -409,7 +411,7 @@ def test_each_line_is_flushed(tmp_path: Path) -> None:
 @needs_full
 def test_full_disk_reported_once_and_ends_file() -> None:
     file = TruthFile(FULL)
-    assert "/dev/full: No space left on device" in (file.write("line") or "")
+    assert f"/dev/full: {os.strerror(errno.ENOSPC)}" in (file.write("line") or "")
     assert file.write("line") is None
 
 

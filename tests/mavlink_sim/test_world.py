@@ -112,9 +112,9 @@ def test_range_ahead_of_car_is_to_its_bumper() -> None:
 
 
 def test_unknown_class_refused() -> None:
-    with pytest.raises(ValueError, match="unknown class 'zebra'"):
+    with pytest.raises(ValueError, match=r"object 0: .* class 'zebra'"):
         WorldObject(0, "zebra", (0.0, 0.0, 0.0))
-    with pytest.raises(ValueError, match="scale must be positive"):
+    with pytest.raises(ValueError, match=r"object 0: scale .*got 0\.0"):
         WorldObject(0, "car", (0.0, 0.0, 0.0), scale=0.0)
 
 
@@ -227,7 +227,7 @@ def test_variants_and_colours_follow_from_the_appearance_alone() -> None:
 
 
 def test_an_unknown_class_is_refused_with_the_known_ones() -> None:
-    with pytest.raises(ValueError, match=r"'zebra'.*autumn_tree, bale, barrel"):
+    with pytest.raises(ValueError, match=r"'zebra'.*" + ", ".join(sorted(BUILDERS)[:3])):
         shape_of("zebra", 0)
 
 
@@ -338,11 +338,11 @@ def test_invalid_print_refused(dictionary: str, identifier: int, size: float, me
 
 
 def test_only_plates_have_prints_and_only_structures_a_size() -> None:
-    with pytest.raises(ValueError, match="a plate must have a print"):
+    with pytest.raises(ValueError, match=r"object 0: .* plate .* print"):
         WorldObject(0, "plate", (0.0, 0.0, 0.0))
-    with pytest.raises(ValueError, match="a car has its own size"):
+    with pytest.raises(ValueError, match=r"object 0: .* car .* size_m"):
         WorldObject(0, "car", (0.0, 0.0, 0.0), size_m=(1.0, 1.0, 1.0))
-    with pytest.raises(ValueError, match="size must be three lengths"):
+    with pytest.raises(ValueError, match=r"wall's size .* 500 m, got \(1\.0, 0\.0, 1\.0\)"):
         WorldObject(0, "wall", (0.0, 0.0, 0.0), size_m=(1.0, 0.0, 1.0))
 
 
