@@ -123,7 +123,8 @@ def test_truncated_video_gives_its_frames_and_a_warning(
     with open_source(str(short)) as source:
         frames = list(source)
     assert 0 < len(frames) < 20
-    assert f"short.avi: ended after {len(frames)} frames: the file should have 20" in caplog.text
+    assert f"short.avi: ended after {len(frames)} " in caplog.text
+    assert "should have 20;" in caplog.text
 
 
 def test_a_folder_gives_its_images_in_natural_order_of_any_size(tmp_path: Path) -> None:
@@ -216,7 +217,7 @@ def test_open_failure_is_a_one_line_error(
 @pytest.mark.parametrize("uri", ["photo.png", "-", "rtsp://u:secret@cam/1", "udp://:5600", "shm://front"])
 @pytest.mark.parametrize("key", ["exposure_us", "gain"])
 def test_exposure_of_images_already_taken_is_refused(uri: str, key: str) -> None:
-    with pytest.raises(SourceError, match=rf"source\.{key} is for cameras") as error:
+    with pytest.raises(SourceError, match=rf"source\.{key} .*cameras \(/dev/video0") as error:
         open_source(uri, SourceSettings(**{key: 100.0}))  # type: ignore[arg-type]
     assert "secret" not in str(error.value)
 

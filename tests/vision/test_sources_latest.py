@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from collections.abc import Callable
@@ -17,6 +18,7 @@ from vision.sources.source import EndOfStream, SourceError, SourceSettings
 pytestmark = pytest.mark.realtime
 
 QUICK = SourceSettings(open_timeout_s=20.0, read_timeout_s=0.2, retry_min_s=0.01, retry_max_s=0.04)
+NOBODY = "nobody there"
 
 
 class ScriptedFeed(Capture):
@@ -49,7 +51,7 @@ def opener(*feeds: Capture | Exception) -> Callable[[], Capture]:
     remaining = list(feeds)
 
     def open_capture() -> Capture:
-        capture = remaining.pop(0) if remaining else CaptureError("nobody there")
+        capture = remaining.pop(0) if remaining else CaptureError(NOBODY)
         if isinstance(capture, Exception):
             raise capture
         return capture
@@ -71,8 +73,9 @@ def test_lost_capture_is_reopened_and_logged_once(caplog: pytest.LogCaptureFixtu
         assert frame.sequence == 1
         assert source.statistics.reopened == 1
     lines = [record.getMessage() for record in caplog.records]
-    assert lines[0] == "camera: lost: unplugged; reopening"
-    assert lines[1].startswith("camera: recovered after ")
+    assert lines[0].startswith("camera: lost: ")
+    assert "unplugged" in lines[0]
+    assert lines[1].startswith("camera: recovered ")
     assert len(lines) == 2
     assert first.closed == second.closed == 1
 
@@ -81,7 +84,7 @@ def test_silence_is_a_loss(caplog: pytest.LogCaptureFixture) -> None:
     with LatestSource("camera", opener(ScriptedFeed([1]), ScriptedFeed([2])), QUICK) as source:
         wait_for_frame(source, is_grey(1))
         wait_for_frame(source, is_grey(2))
-    assert "lost: no data" in caplog.text
+    assert re.search(r"camera: lost: .*data for \d", caplog.text)
 
 
 def test_retry_pause_doubles_up_to_its_limit(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -107,15 +110,17 @@ def test_retry_pause_doubles_up_to_its_limit(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_source_that_never_opens_names_cause_and_action() -> None:
-    settings = SourceSettings(open_timeout_s=0.2, retry_min_s=0.02)
+    settings, advice = SourceSettings(open_timeout_s=0.2, retry_min_s=0.02), "is it on?"
     with pytest.raises(SourceError) as caught:
-        LatestSource("camera", opener(), settings, advice="is it on?")
-    assert str(caught.value) == "camera: no frame within 0.2 s: nobody there; is it on?"
+        LatestSource("camera", opener(), settings, advice=advice)
+    assert str(caught.value).startswith("camera: no ")
+    assert str(caught.value).endswith(f"0.2 s: {NOBODY}; {advice}")
 
 
 def test_permanent_error_is_raised_at_once() -> None:
-    with pytest.raises(SourceError, match="camera: no permission"):
-        LatestSource("camera", opener(SourceError("no permission")), SourceSettings(open_timeout_s=600.0))
+    denied = SourceError("no permission")
+    with pytest.raises(SourceError, match=f"camera: {denied}"):
+        LatestSource("camera", opener(denied), SourceSettings(open_timeout_s=600.0))
 
 
 def test_unexpected_error_is_raised_in_the_reader() -> None:

@@ -77,14 +77,12 @@ def test_frame_of_a_dead_writer_is_ignored() -> None:
     with SharedFrameWriter(name, 6, 4, depth=False) as writer:
         old = Frame(np.zeros((4, 6, 3), np.uint8), time.monotonic_ns() - 60_000_000_000, 3)
         writer.write(old)
-        with pytest.raises(SourceError, match="no frame within"):
+        with pytest.raises(SourceError, match=rf"^shm://{name}: no frame .*0\.3 s"):
             open_source(f"shm://{name}", SourceSettings(open_timeout_s=0.3, retry_min_s=0.1))
 
 
 def test_missing_writer_is_a_one_line_error() -> None:
-    with pytest.raises(
-        SourceError, match=r"no frames in the shared memory 'test-none'.*is its writer running"
-    ):
+    with pytest.raises(SourceError, match=r"memory 'test-none' .*writer running"):
         open_source("shm://test-none", SourceSettings(open_timeout_s=0.3, retry_min_s=0.1))
 
 

@@ -29,6 +29,7 @@ from vision.sources.v4l2 import (
 U32, CHAR = ctypes.c_uint32, ctypes.c_char
 NODES = ("video0", "video1", "video2", "video10")
 YUYV, MJPG = 0x56595559, 0x47504A4D
+CARD = "HD Webcam: HD"
 
 
 class Capability(ctypes.Structure):
@@ -92,7 +93,7 @@ class FakeDriver:
         if not caps:
             raise OSError(errno.ENODEV, "No such device")
         answer = Capability.from_buffer(buffer)
-        answer.driver, answer.card, answer.bus_info = b"uvcvideo", b"HD Webcam: HD", b"usb-0000:00:14.0-1"
+        answer.driver, answer.card, answer.bus_info = b"uvcvideo", CARD.encode(), b"usb-0000:00:14.0-1"
         answer.capabilities, answer.device_caps = 0x84A00001, caps
 
     def _format(self, buffer: bytearray, _caps: int) -> None:
@@ -143,9 +144,9 @@ def test_devices_are_listed_with_kind_and_stable_name(dev: Path) -> None:
     assert [device.kind for device in devices] == ["camera", "metadata", "codec", "other"]
     assert devices[0].stable_path == dev / "v4l" / "by-id" / "usb-HD_Webcam-index0"
     assert devices[1].stable_path is None
-    assert (devices[0].driver, devices[0].card) == ("uvcvideo", "HD Webcam: HD")
+    assert (devices[0].driver, devices[0].card) == ("uvcvideo", CARD)
     assert devices[0].bus == "usb-0000:00:14.0-1"
-    assert devices[3] == VideoDevice(dev / "video10", error="No such device")
+    assert devices[3] == VideoDevice(dev / "video10", error=os.strerror(errno.ENODEV))
 
 
 def test_discrete_sizes_have_their_rates(dev: Path) -> None:
