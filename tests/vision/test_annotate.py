@@ -139,7 +139,7 @@ def test_label_marks_unconfirmed_tracks() -> None:
 
 @pytest.mark.parametrize("highlight", [-1, 1])
 def test_invalid_highlight_is_rejected(highlight: int) -> None:
-    with pytest.raises(IndexError, match="highlight must be"):
+    with pytest.raises(IndexError, match=rf"highlight .*0\.\.0, got {highlight}"):
         annotate(make_image(), seen([[1, 1, 5, 5]]), highlight=highlight)
 
 

@@ -57,12 +57,12 @@ def test_records_contain_the_track_fields() -> None:
 
 
 def test_track_arrays_are_all_given_or_none() -> None:
-    with pytest.raises(ValueError, match=r"track_score is missing"):
+    with pytest.raises(ValueError, match=r"track_id, track_score, track_confirmed .*; track_score is"):
         three(track_id=np.array([1, 2, 3]))
 
 
 def test_track_arrays_have_one_entry_per_box() -> None:
-    with pytest.raises(ValueError, match=r"track_confirmed must be \(3,\) like xyxy, got \(2,\)"):
+    with pytest.raises(ValueError, match=r"track_confirmed .*\(3,\) .*got \(2,\)"):
         three(
             track_id=np.array([1, 2, 3]),
             track_score=np.zeros(3, np.float32),

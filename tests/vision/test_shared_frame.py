@@ -269,7 +269,7 @@ def test_frame_of_another_size_is_rejected_with_both_sizes(name: str) -> None:
     with SharedFrameWriter(name, 16, 12, True) as writer:
         with pytest.raises(ValueError, match=r"16x12 .*8x6"):
             writer.write(frame(0, 8, 6))
-        with pytest.raises(ValueError, match="with depth, the frame has none"):
+        with pytest.raises(ValueError, match=r"with depth, .*none"):
             writer.write(frame(0, depth=False))
     with pytest.raises(ValueError, match="closed"):
         writer.write(frame(0))
@@ -297,7 +297,7 @@ def test_a_truncated_segment_is_rejected(name: str) -> None:
 
 @pytest.mark.parametrize("bad", ["", "..", "a/b", "../x", "n" * 300, "a\0b"])
 def test_invalid_segment_name_is_rejected(bad: str) -> None:
-    with pytest.raises(ValueError, match="plain file name"):
+    with pytest.raises(ValueError, match=r"plain file .*, got "):
         SharedFrameReader(bad)
 
 

@@ -99,13 +99,13 @@ def test_openexr_without_a_depth_channel_is_refused(tmp_path: Path) -> None:
 
 def test_openexr_without_its_extra_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
-    with pytest.raises(SourceError, match=r"mavlink-companion\[exr\].*32-bit TIFF or NPY"):
+    with pytest.raises(SourceError, match=r"a\.exr: .*mavlink-companion\[exr\].*32-bit TIFF"):
         decode_depth(tmp_path / "a.exr", b"")
 
 
 def test_floats_in_millimetres_are_refused_with_the_key() -> None:
     metres = np.full((4, 4), 3.0, np.float32)
-    with pytest.raises(SourceError, match=r"median of depth is 3000 m.*source\.depth_scale"):
+    with pytest.raises(SourceError, match=r"median .*3000 m.*source\.depth_scale"):
         to_metres(metres * 1000, None)
     np.testing.assert_allclose(to_metres(metres * 1000, 0.001), metres)
     assert np.isnan(to_metres(np.zeros((2, 2), np.float32), None)).all()
@@ -139,7 +139,8 @@ def test_folders_are_paired_image_by_image(tmp_path: Path) -> None:
     with open_source(uri, settings) as source:
         assert not source.live
         assert source.total_frames == 4
-        assert source.uri == f"{uri} with depth of {settings.depth}"
+        assert source.uri.split(" with depth ")[0] == uri
+        assert source.uri.endswith(f" {settings.depth}")
         frames = list(source)
     assert [int(frame.image[0, 0, 0]) for frame in frames] == [0, 1, 2, 3]
     depths = [None if frame.depth_m is None else round(float(frame.depth_m[0, 0]), 4) for frame in frames]
@@ -169,10 +170,10 @@ def test_folders_with_other_names_are_paired_by_position(tmp_path: Path) -> None
         depths = [float(frame.depth_m[0, 0]) for frame in source if frame.depth_m is not None]
     assert depths == pytest.approx([1.0, 2.0, 3.0])
     (tmp_path / "depth" / "depth_1.png").unlink()
-    with pytest.raises(SourceError, match=r"^3 images in .*colour and 2 depth images in .* 0 is the first"):
+    with pytest.raises(SourceError, match=r"^3 images .*colour .* 2 depth images .* 0 is"):
         open_source(uri, settings)
     saved(tmp_path / "depth" / "depth_0.npy", METRES)
-    with pytest.raises(SourceError, match="two depth images have the same name"):
+    with pytest.raises(SourceError, match=r"depth: two .* same name "):
         open_source(uri, settings)
 
 
@@ -226,7 +227,7 @@ def test_depth_of_a_camera_beside_the_colour_camera_is_registered(tmp_path: Path
         np.testing.assert_allclose(known, index + 1.25, rtol=1e-6)
         assert len(known) > 100
     assert len(frames) == 3
-    with pytest.raises(SourceError, match=r"depth\.yaml has rotate_deg 0.*rotate_deg is 90"):
+    with pytest.raises(SourceError, match=r"depth\.yaml .*rotate_deg 0.*rotate_deg is 90"):
         open_source(uri, replace(registered, rotate_deg=90))
     write_camera_info(file, depth.scaled(8, 4), "depth", registration=rig)
     with pytest.raises(SourceError, match=r"depth: source\.depth_calibration_file: .* 8x4.* 8x6"):
@@ -240,17 +241,17 @@ def test_depth_that_cannot_be_paired_is_refused(tmp_path: Path) -> None:
     held = os.open(fifo, os.O_RDWR)
     os.write(held, bytes(16 * 12 * 2))
     try:
-        with pytest.raises(SourceError, match=r"depth\.fifo is live and .* a recording"):
+        with pytest.raises(SourceError, match=r"depth\.fifo .*live .*colour .*recording"):
             open_source(uri, SourceSettings(depth=str(fifo), width=16, height=12))
-        with pytest.raises(SourceError, match="gray16 needs width and height"):
+        with pytest.raises(SourceError, match=r"gray16 .*width .*height"):
             open_source(uri, SourceSettings(depth=str(fifo)))
     finally:
         os.close(held)
-    with pytest.raises(SourceError, match=r"cannot be both source\.uri and source\.depth"):
+    with pytest.raises(SourceError, match=r"both source\.uri .* source\.depth"):
         open_source("-", SourceSettings(depth="-"))
     with pytest.raises(SourceError, match="delivers colour"):
         open_source(uri, SourceSettings(depth="rtsp://camera/1"))
-    with pytest.raises(SourceError, match=r"gray16 is depth: set it as source\.depth"):
+    with pytest.raises(SourceError, match=r"gray16 is depth: .* source\.depth"):
         open_source(str(fifo), SourceSettings(pixel_format="gray16", width=16, height=12))
     assert settings.depth is not None
 
@@ -352,7 +353,7 @@ def test_live_images_are_paired_by_the_nearest_stamp() -> None:
 
 
 def test_stamps_of_another_clock_are_refused() -> None:
-    with pytest.raises(SourceError, match="the nearest is 5 s away"):
+    with pytest.raises(SourceError, match=r"nearest .* 5 s "):
         list(paired([frame_at(10.0 + index / 30, index) for index in range(3)], [frame_at(5.0, depth_m=1.0)]))
     with pytest.raises(SourceError, match="none came"):
         list(paired([frame_at(10.0)], []))
@@ -415,7 +416,7 @@ def test_error_of_the_depth_source_ends_the_pair(caplog: pytest.LogCaptureFixtur
     caplog.set_level(logging.WARNING)
     colour = ScriptedSource([frame_at(index / 30, index) for index in range(7)], live=True)
     depth = Failing([], live=True, uri="depth.tiff")
-    with pytest.raises(SourceError, match=r"source\.depth depth\.tiff: the median of depth is 3000 m"):
+    with pytest.raises(SourceError, match=r"source\.depth depth\.tiff: .*median .* 3000 m"):
         paired_source(colour, depth, DepthImages(), SourceSettings())
     assert colour.closed
     assert depth.closed

@@ -132,7 +132,8 @@ def test_unsupported_distortion_of_a_realsense_is_not_used(
     monkeypatch.setitem(sys.modules, "pyrealsense2", FakeRealsense((0.1,), "kannala_brandt4"))
     with open_source("realsense://") as source:
         assert source.calibration is None
-    assert "kannala_brandt4, which is not supported" in caplog.text
+    assert "distortion kannala_brandt4, " in caplog.text
+    assert "not supported" in caplog.text
 
 
 def test_inverse_distortion_of_a_realsense_is_ignored_once(
@@ -149,7 +150,7 @@ def test_inverse_distortion_of_a_realsense_is_ignored_once(
 
 def test_missing_depth_camera_is_a_one_line_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyrealsense2", FakeRealsense())
-    with pytest.raises(SourceError, match=r"realsense://4711: .*No device connected.*is it plugged in"):
+    with pytest.raises(SourceError, match=r"realsense://4711: .*No device .*plugged in"):
         open_source("realsense://4711", SourceSettings(open_timeout_s=0.3))
 
 
@@ -160,7 +161,7 @@ def test_missing_library_names_the_extra(
     uri: str, module: str, extra: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(SourceError, match=rf"{uri}: needs pip install 'mavlink-companion\[{extra}\]'"):
+    with pytest.raises(SourceError, match=rf"^{uri}: .*'mavlink-companion\[{extra}\]'"):
         open_source(uri)
 
 
@@ -278,5 +279,5 @@ def test_oak_delivers_registered_depth_in_metres(platform: str, monkeypatch: pyt
 
 def test_missing_oak_is_a_one_line_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "depthai", FakeOak())
-    with pytest.raises(SourceError, match=r"oak://gone: .*Cannot find any device.*is it plugged in"):
+    with pytest.raises(SourceError, match=r"oak://gone: .*any device .*plugged in"):
         open_source("oak://gone", SourceSettings(open_timeout_s=0.3))
