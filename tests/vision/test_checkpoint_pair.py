@@ -73,7 +73,7 @@ def test_files_of_different_pairs_are_rejected(pair: Path, model: YoloModel) -> 
     kept = pair.with_suffix(".yaml").read_text()
     save_checkpoint(pair, build(model.description), metadata={})
     pair.with_suffix(".yaml").write_text(kept)
-    with pytest.raises(CheckpointError, match="do not match"):
+    with pytest.raises(CheckpointError, match=r"SHA-256 [0-9a-f]{64}, model\.yaml .* [0-9a-f]{64}; "):
         load_checkpoint(pair)
 
 
@@ -101,11 +101,11 @@ def test_half_a_pair_names_the_other_half(pair: Path) -> None:
     description = pair.with_suffix(".yaml")
     kept = description.read_text()
     description.unlink()
-    with pytest.raises(CheckpointError, match=r"model\.yaml: no such file; model\.safetensors needs it"):
+    with pytest.raises(CheckpointError, match=r"model\.yaml: .*file; model\.safetensors "):
         load_checkpoint(pair)
     description.write_text(kept)
     pair.unlink()
-    with pytest.raises(CheckpointError, match=r"model\.safetensors: no such file"):
+    with pytest.raises(CheckpointError, match=r"model\.safetensors: .*file; .*NAME\.safetensors"):
         load_checkpoint(description)
 
 

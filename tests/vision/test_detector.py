@@ -153,7 +153,7 @@ def test_nms_threshold_of_a_model_is_used_unless_another_is_given(
 @pytest.mark.parametrize("stated", ["0.5", True, 1.5, float("nan"), [0.5]])
 def test_nms_threshold_of_a_model_is_a_number_from_0_to_1(tmp_path: Path, stated: Any) -> None:
     save_checkpoint(tmp_path / "m.pt", eager_model(), metadata={"nms_iou": stated})
-    with pytest.raises(CheckpointError, match=r"m\.pt: nms_iou must be a number in 0\.\.1"):
+    with pytest.raises(CheckpointError, match=r"m\.pt: nms_iou .*0\.\.1, got"):
         detector_of(tmp_path / "m.pt")
 
 
@@ -215,7 +215,7 @@ def test_invalid_frame_is_rejected(model_path: Path, image: np.ndarray[Any, Any]
 
 
 def test_missing_model_is_a_one_line_error(tmp_path: Path) -> None:
-    with pytest.raises(CheckpointError, match="no such file"):
+    with pytest.raises(CheckpointError, match=r"none\.pt: no .*file; "):
         Detector(tmp_path / "none.pt")
 
 

@@ -137,7 +137,7 @@ def test_resumed_training_gives_uninterrupted_weights(trained: TrainedModel, tmp
 def test_resuming_another_network_is_rejected(tmp_path: Path) -> None:
     kept = tmp_path / "state.pt"
     train(replace(SMALL, time_limit_s=0.0), rectangles, silent, checkpoint=kept)
-    with pytest.raises(ValueError, match=r"is of the network .* settings require"):
+    with pytest.raises(ValueError, match=r"network .*0\.0625, .*settings .*0\.125, "):
         train(replace(SMALL, width_multiple=0.125), rectangles, silent, checkpoint=kept, resume=True)
 
 
@@ -146,7 +146,7 @@ def test_resuming_at_another_rate_of_new_classes_is_rejected(tmp_path: Path) -> 
     one_new = replace(SMALL, new_classes=1, new_class_rate=10.0)
     train(replace(one_new, time_limit_s=0.0), rectangles, silent, checkpoint=kept)
     for changed in ({"new_class_rate": 30.0}, {"new_classes": 2}, {"new_classes": 0}):
-        with pytest.raises(ValueError, match=r"another training, new classes: 1, learning 10 times"):
+        with pytest.raises(ValueError, match=r"another training, .*classes: 1, .* 10 times .*\(now "):
             train(replace(one_new, **changed), rectangles, silent, checkpoint=kept, resume=True)
     # Without new classes their rate has no effect.
     train(replace(SMALL, time_limit_s=0.0), rectangles, silent, checkpoint=kept)
