@@ -188,7 +188,7 @@ def test_few_classes_are_not_taken_for_another_layout(
 def test_two_classes_of_an_unknown_head_are_refused(others: dict[str, Any]) -> None:
     """RT-DETR's queries and selected boxes have 6 columns each."""
     metadata = {"names": {0: "a", 1: "b"}, **others}
-    with pytest.raises(RuntimeUnusableError, match="its head is not stated"):
+    with pytest.raises(RuntimeUnusableError, match=r"output0 \(1, 300, 6\).* 2 classes: .*head"):
         recognise(Path("a.onnx"), metadata, [Port("images", (1, 3, 64, 64))], [Port("output0", (1, 300, 6))])
 
 
@@ -302,7 +302,7 @@ def test_export_for_classification_is_refused(tmp_path: Path) -> None:
         {"output0": np.zeros((1, 2), np.float32)},
         metadata=stated(TWO, SIZE, task="classify"),
     )
-    with pytest.raises(RuntimeUnusableError, match="export for 'classify'") as caught:
+    with pytest.raises(RuntimeUnusableError, match=r"'classify'; .*detect") as caught:
         read_source(path)
     assert str(caught.value).startswith(f"{path}: ")
 
@@ -339,12 +339,12 @@ def test_long_text_in_metadata_is_not_parsed(key: str) -> None:
 def test_unknown_outputs_are_refused_with_their_shapes(tmp_path: Path) -> None:
     outputs = {"out": np.zeros((1, 5, 5), np.float32)}
     path = constant_onnx(tmp_path / "a.onnx", outputs, metadata=stated(TWO, SIZE))
-    with pytest.raises(RuntimeUnusableError, match=r"out \(1, 5, 5\) float32, which is no known layout"):
+    with pytest.raises(RuntimeUnusableError, match=r"^\S+: gives out \(1, 5, 5\) float32, .*2 classes"):
         read_source(path)
-    with pytest.raises(RuntimeUnusableError, match=r"no metadata of a known exporter.*models export"):
+    with pytest.raises(RuntimeUnusableError, match=r"no metadata .*out \(1, 5, 5\) float32, .*models export"):
         read_source(constant_onnx(tmp_path / "b.onnx", outputs))
     batch = constant_onnx(tmp_path / "c.onnx", outputs, size=(64, 96), input_type="UINT8")
-    with pytest.raises(RuntimeUnusableError, match="expected one image"):
+    with pytest.raises(RuntimeUnusableError, match=r"expected .*\(1, 3, height, width\)"):
         read_source(batch)
 
 
@@ -385,7 +385,7 @@ def test_names_beside_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
 
 def test_boxes_and_scores_of_yolo_nas_are_not_logits(tmp_path: Path) -> None:
     outputs = {"boxes": np.zeros((1, 126, 4), np.float32), "scores": np.zeros((1, 126, 80), np.float32)}
-    with pytest.raises(RuntimeUnusableError, match="no metadata of a known exporter"):
+    with pytest.raises(RuntimeUnusableError, match=r"no metadata .*boxes \(1, 126, 4\)"):
         read_source(constant_onnx(tmp_path / "a.onnx", outputs))
 
 
@@ -394,7 +394,7 @@ def test_objectness_of_one_everywhere_is_not_yolox(tmp_path: Path) -> None:
     rows = np.zeros((1, 126, 85), np.float32)
     rows[..., 4] = 1
     path = constant_onnx(tmp_path / "a.onnx", {"outputs": rows})
-    with pytest.raises(RuntimeUnusableError, match="YOLOv6, which is not supported") as caught:
+    with pytest.raises(RuntimeUnusableError, match=r"YOLOX, .*YOLOv6, .*not supported") as caught:
         Detector(path, runtime="onnxruntime")
     assert str(caught.value).startswith(f"{path}: ")
 
@@ -414,7 +414,9 @@ def test_damaged_openvino_file_is_refused_without_openvino(
     (tmp_path / "metadata.yaml").write_text("names: {0: car}\nstride: 32\n")
     result = CliRunner().invoke(app, ["models", "info", str(tmp_path)])
     assert result.exit_code == 2
-    assert f"{tmp_path / 'g.xml'}: is not an OpenVINO model" in result.stderr
+    assert f"{tmp_path / 'g.xml'}: " in result.stderr
+    assert "OpenVINO model: " in result.stderr
+    assert "<net" in result.stderr
     assert len(result.stderr.splitlines()) == 1
 
 
@@ -423,7 +425,7 @@ def test_torchscript_must_give_what_it_states(tmp_path: Path) -> None:
     facts = read_source(path).foreign
     assert facts is not None
     assert facts.layout == "selected"
-    with pytest.raises(RuntimeUnusableError, match="not what its file states"):
+    with pytest.raises(RuntimeUnusableError, match=r"network gave .*\(selected\): "):
         Detector(path, runtime="torch").detect(make_image(64, 96))
 
 
@@ -434,7 +436,7 @@ def test_torchscript_that_calls_nms_says_how_to_export(
         raise RuntimeError("\nUnknown builtin op: torchvision::nms.\nCould not find")
 
     monkeypatch.setattr("torch.jit.load", load)
-    with pytest.raises(RuntimeUnusableError, match="export it without nms=True"):
+    with pytest.raises(RuntimeUnusableError, match=r"NMS; .*nms=True"):
         Detector(exports["torchscript"], runtime="torch")
 
 

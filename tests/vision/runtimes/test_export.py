@@ -256,7 +256,7 @@ def test_anything_else_is_rejected_by_name(text: str) -> None:
 )
 def test_invalid_facts_are_rejected(change: dict[str, object]) -> None:
     text = json.dumps(json.loads(FACTS.to_json()) | change)
-    with pytest.raises(RuntimeUnusableError, match="companion models export"):
+    with pytest.raises(RuntimeUnusableError, match=r"^net\.engine: .* metadata .* \(.*models export`"):
         ExportedFacts.from_json(text, PATH)
 
 
@@ -325,5 +325,5 @@ def test_a_precision_that_a_plan_does_not_have_is_rejected(engine: Path) -> None
 
 
 def test_missing_plan_is_a_one_line_error(tmp_path: Path) -> None:
-    with pytest.raises(RuntimeUnusableError, match=r"none\.engine: no such file"):
+    with pytest.raises(RuntimeUnusableError, match=r"none\.engine: no .*file"):
         read_source(tmp_path / "none.engine")

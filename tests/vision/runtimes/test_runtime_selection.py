@@ -76,10 +76,10 @@ def test_runtime_rejects_unsupported_files(checkpoint: Path, tmp_path: Path) -> 
 
 def test_precisions_that_a_runtime_does_not_have_are_rejected(checkpoint: Path, tmp_path: Path) -> None:
     path = export(checkpoint, "torchscript", tmp_path / "net.torchscript", 64)
-    with pytest.raises(RuntimeUnusableError, match="computes in float32"):
+    with pytest.raises(RuntimeUnusableError, match=r"TorchScript .*float32, .* bfloat16"):
         Detector(path, precision="bfloat16")
     if installed("onnxruntime") and installed("onnx"):  # type: ignore[arg-type]
-        with pytest.raises(RuntimeUnusableError, match="computes in float32"):
+        with pytest.raises(RuntimeUnusableError, match=r"onnxruntime .*float32, .* float16"):
             Detector(checkpoint, runtime="onnxruntime", precision="float16")
 
 
@@ -87,7 +87,7 @@ def test_auto_is_torch_if_only_torch_is_installed(checkpoint: Path, monkeypatch:
     only(monkeypatch, "torch")
     detector = Detector(checkpoint, image_size=96, runtime="auto")
     assert detector.runtime == "torch"
-    assert "only installed runtime" in detector.runtime_reason
+    assert "only installed" in detector.runtime_reason
 
 
 class Trial:
@@ -159,7 +159,7 @@ def test_choice_is_remeasured_when_its_inputs_change(
         kept.write_text(json.dumps({"question": {}, "answer": []}))
     autotune.fastest_runtime(source, names, **CHOICE)
     assert asked.asked == 6
-    assert forget_choices("of another model") == 0
+    assert forget_choices("another-model") == 0
     assert forget_choices(weights_sha256(checkpoint)) == 1
     autotune.fastest_runtime(source, names, **CHOICE)
     assert asked.asked == 7
@@ -173,15 +173,16 @@ def test_uncacheable_choice_is_still_used(
     Trial(monkeypatch, {"torch": 2.0, "openvino": 1.0})
     name, _ = autotune.fastest_runtime(read_source(checkpoint), ["torch", "openvino"], **CHOICE)
     assert name == "openvino"
-    assert "cannot be stored" in caplog.text
+    assert "cannot be" in caplog.text
+    assert f"{tmp_path / 'file'}" in caplog.text
 
 
 def test_error_lists_every_runtimes_reason(
     checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    Trial(monkeypatch, {"openvino": "no", "onnxruntime": "never"})
-    with pytest.raises(RuntimeUnusableError, match="openvino: no; onnxruntime: never"):
+    Trial(monkeypatch, {"openvino": "no", "onnxruntime": "7"})
+    with pytest.raises(RuntimeUnusableError, match="openvino: no; onnxruntime: 7"):
         autotune.fastest_runtime(read_source(checkpoint), ["openvino", "onnxruntime"], **CHOICE)
 
 

@@ -123,7 +123,7 @@ def little_memory() -> Iterator[None]:
 
 def test_full_memory_is_one_line_and_leaves_a_usable_runtime(little_memory: Any) -> None:
     runtime = TorchRuntime(lively_model(), device="cuda")
-    with pytest.raises(RuntimeUnusableError, match=r"^device cuda: out of memory; [^\n]*$"):
+    with pytest.raises(RuntimeUnusableError, match=r"^device cuda: [^\n]* memory; [^\n]*image_size[^\n]*$"):
         runtime.infer(make_image(1920, 1920))
     assert runtime.infer(make_image(32, 32))[0].classes.shape[1:] == (4, 4)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 import warnings
 from pathlib import Path
 
@@ -78,7 +79,7 @@ def test_bfloat16_is_close_and_returns_float32() -> None:
 def test_without_native_bfloat16_auto_is_float32() -> None:
     runtime = TorchRuntime(lively_model())
     assert runtime.precision == "float32"
-    assert "not support bfloat16" in runtime.precision_reason
+    assert "support bfloat16" in runtime.precision_reason
 
 
 @pytest.mark.usefixtures("with_bfloat16")
@@ -92,7 +93,7 @@ def test_auto_uses_native_bfloat16_if_much_faster(
     monkeypatch.setattr(TorchRuntime, "_measured_ms", lambda self, *dtypes: [tuple(times[d] for d in dtypes)])
     runtime = TorchRuntime(lively_model())
     assert runtime.precision == chosen
-    assert "5.0 ms in float32" in runtime.precision_reason
+    assert re.search(rf"5\.0 ms .*float32, {half_ms} ms", runtime.precision_reason)
 
 
 @pytest.mark.usefixtures("with_bfloat16")
@@ -185,7 +186,9 @@ def test_torch_product_matches_numpy() -> None:
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="a CUDA device is here")
 def test_cuda_without_a_device_is_refused(checkpoint: Path) -> None:
-    with pytest.raises(RuntimeUnusableError, match=r"device cuda: torch .* finds no CUDA device"):
+    with pytest.raises(
+        RuntimeUnusableError, match=rf"device cuda: torch {re.escape(torch.__version__)} .*finds no "
+    ):
         Detector(checkpoint, device="cuda")
 
 
@@ -198,7 +201,7 @@ def test_cuda_names_the_driver_problem_that_torch_warns_of(
 
     monkeypatch.setattr(torch.version, "cuda", "13.0")
     monkeypatch.setattr(torch.cuda, "is_available", no_driver)
-    with pytest.raises(RuntimeUnusableError, match=r"\(the driver is too old \(found version 1\)\); [^\n]*$"):
+    with pytest.raises(RuntimeUnusableError, match=r"\(the driver .*old \(found version 1\)\); [^\n]*$"):
         Detector(checkpoint, device="cuda")
 
 
@@ -223,10 +226,12 @@ def test_other_errors_keep_their_type() -> None:
 def test_cuda_is_refused_for_other_runtimes_and_unknown_devices(checkpoint: Path) -> None:
     source = read_source(checkpoint)
     for runtime in ("openvino", "auto"):
-        with pytest.raises(RuntimeUnusableError, match=r"the device cuda is for a checkpoint"):
+        with pytest.raises(
+            RuntimeUnusableError, match=rf"device cuda .*checkpoint .*torch, .*with {runtime};"
+        ):
             selection.start_runtime(source, runtime, device="cuda")
     for device in ("tpu", "cuda:7"):
-        with pytest.raises(ValueError, match=f"^device must be cpu or cuda, got '{device}'[^\n]*$"):
+        with pytest.raises(ValueError, match=rf"^device .*cpu or cuda, .*'{device}'[^\n]*$"):
             Detector(checkpoint, device=device)  # type: ignore[arg-type]
 
 
