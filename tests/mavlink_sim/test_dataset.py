@@ -148,7 +148,7 @@ def test_non_empty_folder_refused(tmp_path: Path) -> None:
 
 def test_scene_without_viewpoint_refused(tmp_path: Path) -> None:
     full = World((WorldObject(0, "box", (0.0, 0.0, 0.0), size_m=(400.0, 400.0, 50.0)),))
-    with pytest.raises(DatasetError, match=r"no viewpoint between .* m "):
+    with pytest.raises(DatasetError, match=r"viewpoint between .* m "):
         make_dataset(tmp_path / "set", Scene(full), DatasetOptions(1, classes=("box",)))
 
 

@@ -113,9 +113,9 @@ def test_a_wrong_label_is_named_with_file_and_line(yolo: Path, line: str, expect
 
 
 def test_folder_without_data_set_is_rejected(tmp_path: Path) -> None:
-    with pytest.raises(DatasetError, match="no such file"):
+    with pytest.raises(DatasetError, match=r"none: no .*data\.yaml"):
         open_dataset(tmp_path / "none")
-    with pytest.raises(DatasetError, match="has no images"):
+    with pytest.raises(DatasetError, match=r"no images; .*labels/"):
         open_dataset(tmp_path)
     make_image(tmp_path / "images" / "a.jpg")
     with pytest.raises(DatasetError, match=r"labels/a\.txt"):
@@ -173,10 +173,10 @@ def test_a_wrong_entry_of_a_coco_file_is_named(
 def test_invalid_json_and_ambiguous_files_are_rejected(tmp_path: Path) -> None:
     path = coco(tmp_path)
     text(path.with_name("instances_train2017.json"), "{}")
-    with pytest.raises(DatasetError, match="several annotation files"):
+    with pytest.raises(DatasetError, match=r"several .*instances_train2017\.json"):
         open_dataset(tmp_path)
     assert open_dataset(tmp_path, split="val").root == path
-    with pytest.raises(DatasetError, match="is not JSON"):
+    with pytest.raises(DatasetError, match=r"x\.json: .*not JSON \("):
         open_dataset(text(tmp_path / "x.json", "{"))
 
 

@@ -118,7 +118,7 @@ def test_detector_may_set_its_description() -> None:
         "corners-2",
         "harris",
         "int8",
-        "there is no other",
+        Timed.reason,
     )
     assert made.last_timing == Timing(1.0, 2.0, 3.0)
 

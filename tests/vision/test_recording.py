@@ -168,7 +168,7 @@ def test_internal_error_ends_the_recording_with_a_log(
     give(recording, frame_of(2), SPOT[:0])
     recording.close()
     (record_logged,) = [record for record in caplog.records if record.levelno == logging.ERROR]
-    assert "list index out of range" in record_logged.getMessage()
+    assert "list index" in record_logged.getMessage()
     assert record_logged.exc_info is not None
     assert played(path)  # the frames before the error
 

@@ -84,14 +84,14 @@ def test_images_that_do_not_belong_together_are_rejected() -> None:
 def test_views_that_do_not_suffice_are_refused() -> None:
     rig = rig_of("plain")
     pairs = pairs_of(rig, 6)
-    with pytest.raises(CalibrationError, match=r"too few views.*5"):
+    with pytest.raises(CalibrationError, match=r"few views .*both cameras.*5"):
         extrinsics_from_views(pairs[:5], rig.colour, rig.depth)
     rng = np.random.default_rng(2)
     far = BoardPose(np.eye(3), np.array([0.0, 0.0, 8.0]))
     back = rig.rotation.T
     other = BoardPose(back, back @ (far.position_m - rig.position_m))
     level = [(view(far, rig.colour, "far", rng), view(other, rig.depth, "far", rng)) for _ in range(6)]
-    with pytest.raises(CalibrationError, match="do not determine"):
+    with pytest.raises(CalibrationError, match=r"not determine .* \d+ mm, "):
         extrinsics_from_views(level, rig.colour, rig.depth)
 
 
