@@ -90,7 +90,7 @@ def test_score_as_plain_values() -> None:
 
 
 def test_identities_must_differ_and_have_a_box_each() -> None:
-    with pytest.raises(ValueError, match=r"must differ, got \[1, 1\]"):
+    with pytest.raises(ValueError, match=r"differ, got \[1, 1\]"):
         Labelled([1, 1], np.zeros((2, 4)))
     with pytest.raises(ValueError, match=r"must be \(1, 4\), got \(2, 4\)"):
         Labelled([1], np.zeros((2, 4)))

@@ -29,7 +29,7 @@ def assert_not_the_pilots(flight: Flight, since_s: float) -> None:
     shown_s = next(at for at, _ in link.modes if at > since_s)
     link.after(3.0)
     assert not [at for at in link.setpoints_s if at > shown_s + 0.3]
-    assert not [event for event in flight.events[-6:] if "pilot took over" in event]
+    assert not [event for event in flight.events[-6:] if "pilot took" in event]
 
 
 def test_a_critical_battery_is_named(flight: Flight, parameters: dict[str, float]) -> None:

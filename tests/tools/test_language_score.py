@@ -90,4 +90,5 @@ def test_bad_step_is_one_line_and_exit_code_2(
     assert caught.value.code == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1
-    assert f"--every must be 1 or more, got {every}" in error
+    assert error.startswith("language_score: --every ")
+    assert error.endswith(f" 1 or more, got {every}\n")

@@ -173,21 +173,21 @@ def arguments(end: float) -> argparse.Namespace:
 def test_time_that_ends_before_the_first_scenes_is_an_error(tmp_path: Path) -> None:
     pool = Pool.of_size(9, RENDERERS)
     fill(pool, 0, 4)
-    with pytest.raises(TimeoutError, match="1 of the first 8 places"):
+    with pytest.raises(TimeoutError, match=r" 1 of .* 8 places"):
         train(pool, 1e-3, tmp_path / "new.safetensors", arguments(time.monotonic()))
 
 
 def test_failed_copy_ends_the_training(pool: Pool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    update = PoolCopy.update
+    update, full = PoolCopy.update, "no memory left"
 
     def fails_later(copied: PoolCopy) -> None:
         if copied.available:
-            raise MemoryError("no memory left")
+            raise MemoryError(full)
         update(copied)
 
     monkeypatch.setattr(PoolCopy, "update", fails_later)
     monkeypatch.setattr(train_bundled_model, "SIZES", ((32, 32, 50),))
-    with pytest.raises(RuntimeError, match="no memory left"):
+    with pytest.raises(RuntimeError, match=full):
         train(pool, 1e-3, tmp_path / "new.safetensors", arguments(time.monotonic() + 30))
     assert not list(tmp_path.iterdir())
 
@@ -201,7 +201,7 @@ def test_ended_renderer_ends_the_trainers() -> None:
     ]
     for process in (trainer, *renderers):
         process.start()
-    with pytest.raises(SystemExit, match="renderer 1 ended with exit code 3"):
+    with pytest.raises(SystemExit, match=r"renderer 1 .*code 3;"):
         join([trainer], renderers)
     assert [process.is_alive() for process in (trainer, *renderers)] == [False] * 3
 
