@@ -192,14 +192,14 @@ def test_vision_imports_nothing_of_the_others() -> None:
             assert not others, f"{name} imports {others}"
 
 
-def test_the_simulator_imports_only_geometry_and_frames_of_vision() -> None:
+def test_simulator_imports_only_geometry_and_frames_of_vision() -> None:
     for name, path in modules().items():
         if name.startswith("mavlink_sim"):
             others = {m for m in imports_of(name, path) if not m.startswith("mavlink_sim")}
             assert others <= SIMULATOR_MAY_IMPORT | {"vision"}, f"{name} imports {others}"
 
 
-def test_only_sim_session_demonstration_training_and_benchmarks_know_the_simulator() -> None:
+def test_only_listed_modules_import_the_simulator() -> None:
     for name, path in modules().items():
         if name.startswith("companion.") and any(m.startswith("mavlink_sim") for m in imports_of(name, path)):
             assert part(name) in MAY_IMPORT_SIMULATOR, f"{name} imports the simulator"

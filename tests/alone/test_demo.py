@@ -47,7 +47,7 @@ def test_demonstration_flies_an_autopilot_at_a_url(tmp_path: Path) -> None:
 
 
 @pytest.mark.timeout(240)
-def test_the_demonstration_finds_the_car_stops_before_it_and_lands(tmp_path: Path) -> None:
+def test_demonstration_finds_the_car_stops_before_it_and_lands(tmp_path: Path) -> None:
     output = tmp_path / "demo"
     done = demo(output, "--duration", "150")
     assert done.returncode == 0, done.stdout + done.stderr

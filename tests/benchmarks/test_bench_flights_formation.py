@@ -9,7 +9,7 @@ from benchmarks.flights import fly, summary
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
-def test_five_vehicles_fly_in_formation_through_turns_and_never_come_too_near(seed: int) -> None:
+def test_five_vehicles_fly_turns_in_formation_never_too_near(seed: int) -> None:
     (result,) = fly("formation", [seed])
     assert result.success, result.reason
     assert result.values["min_separation_m"] >= 3.0

@@ -22,7 +22,7 @@ def seen(*boxes: tuple[float, float], class_id: int = 0) -> Seen:
     return Seen(frame, Detections(xyxy, confidence, np.full(len(boxes), class_id), CLASS_NAMES))
 
 
-def test_without_a_tracker_an_identity_goes_from_a_frame_to_the_next_and_no_further() -> None:
+def test_without_tracker_an_identity_lasts_to_the_next_frame() -> None:
     frames = [
         seen((0, 0.9), (100, 0.9)),
         seen((104, 0.9), (3, 0.9)),
@@ -34,7 +34,7 @@ def test_without_a_tracker_an_identity_goes_from_a_frame_to_the_next_and_no_furt
     assert identities == [[1, 2], [2, 1], [2], [3, 2], [4]]
 
 
-def test_a_sequence_has_a_truth_for_every_frame_that_is_not_dropped() -> None:
+def test_sequence_has_a_truth_for_each_frame_not_dropped() -> None:
     frames = list(scene_frames(MOTIONS[1], seconds=1.5, rate_hz=8, seed=2, drop=0.3))
     assert 4 <= len(frames) < 12
     assert frames[0].captured_ns == 1_000_000_000

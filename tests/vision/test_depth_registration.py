@@ -85,7 +85,7 @@ def test_sizes_of_another_aspect_are_refused() -> None:
     assert shifted(0.0).register(np.ones((60, 80), np.float32), 320, 240).shape == (240, 320)
 
 
-def test_points_beyond_the_colour_lens_do_not_fold_into_its_image() -> None:
+def test_points_beyond_the_colour_lens_do_not_fold_into_image() -> None:
     wide = CameraModel.from_horizontal_fov(320, 240, 2.4)
     barrel = CameraModel(640, 480, 500.0, 500.0, 319.5, 239.5, (-0.3, 0.0, 0.0, 0.0, 0.0))
     beyond = wide.rays(np.array([[262.0, 119.5]]))

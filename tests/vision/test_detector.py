@@ -138,7 +138,7 @@ def test_detector_exposes_its_model_metadata(model_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("stated", "given", "used"), [(None, None, 0.7), (0.0, None, 0.0), (0.0, 0.7, 0.7)])
-def test_nms_threshold_of_a_model_is_used_unless_another_is_given(
+def test_nms_threshold_of_a_model_is_used_unless_one_is_given(
     tmp_path: Path, frame: np.ndarray[Any, Any], stated: float | None, given: float | None, used: float
 ) -> None:
     metadata = {} if stated is None else {"nms_iou": stated}

@@ -74,7 +74,7 @@ def numbered(tmp_path: Path, names: tuple[str, ...], sample: Sample) -> Training
     return image
 
 
-def test_classes_without_labels_are_labelled_by_the_starting_model(tmp_path: Path) -> None:
+def test_unlabelled_classes_are_labelled_by_the_starting_model(tmp_path: Path) -> None:
     sample = Sample(write_image(tmp_path / "a.png"), BOXES, np.array([1, 0]), ignored=np.array([False, True]))
     image = numbered(tmp_path, ("person", "Drone"), sample)
     # Not the person, a class with labels, and not the traffic light where a drone is labelled.

@@ -61,7 +61,7 @@ def test_horizon_is_horizontal_after_levelling(camera: CameraModel, roll_deg: fl
     assert np.abs(elevations).max() < 0.5
 
 
-def test_rows_of_a_rolling_shutter_are_levelled_each_by_its_attitude() -> None:
+def test_rolling_shutter_rows_are_levelled_by_their_attitudes() -> None:
     readout_s, rate_radps = 0.04, math.radians(150.0)
 
     def body_at(time_s: float) -> NDArray[np.float64]:

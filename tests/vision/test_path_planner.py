@@ -75,7 +75,7 @@ def test_unobserved_directions_stay_unknown() -> None:
     assert not grid.log_odds.any()
 
 
-def test_obstacle_stays_until_the_camera_looks_through_its_position() -> None:
+def test_obstacle_stays_until_the_camera_looks_through_it() -> None:
     grid = grid_with(((5.0, 0.0), 0.5))
     behind = np.full(DIRECTIONS, np.nan)
     behind[135:226] = np.inf
@@ -160,7 +160,7 @@ def test_blocked_goal_is_approached_then_refused() -> None:
     assert "1.3 m" in near.reason
 
 
-def test_blocked_reference_is_passed_to_the_point_nearest_its_end() -> None:
+def test_blocked_reference_is_passed_to_point_nearest_its_end() -> None:
     path = planned(grid_with(((6.0, 0.0), 0.5)), ((6.0, 0.0), (6.4, 0.0)))
     assert path.reason == ""
     assert math.dist(path.points[-1], (6.4, 0.0)) < 1.0

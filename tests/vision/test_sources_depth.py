@@ -211,7 +211,7 @@ def test_depth_of_another_size_is_refused(tmp_path: Path, realtime: bool) -> Non
         open_source(uri, SourceSettings(depth=settings.depth, realtime=realtime))
 
 
-def test_depth_of_a_camera_beside_the_colour_camera_is_registered(tmp_path: Path) -> None:
+def test_depth_of_a_camera_beside_the_colour_one_is_registered(tmp_path: Path) -> None:
     uri, settings = folders(tmp_path, 3, 3, size=(6, 8))
     colour, depth = (CameraModel.from_horizontal_fov(*size, 1.0) for size in ((32, 24), (8, 6)))
     rig = DepthCalibration(depth, colour, np.eye(3), np.array([0.0, 0.0, 0.25]))

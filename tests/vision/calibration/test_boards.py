@@ -57,7 +57,7 @@ def test_rendered_corners_are_found_where_the_lens_projects_them(board: Board, l
     assert np.abs(error.mean(axis=0)).max() < 0.06
 
 
-def test_partly_hidden_charuco_board_is_found_and_chessboard_is_not() -> None:
+def test_partly_hidden_charuco_is_found_and_chessboard_is_not() -> None:
     pose = BoardPose(np.eye(3), np.array([0.12, 0.0, 0.22]))
     rng = np.random.default_rng(1)
     charuco = CHARUCO.detect(BoardCamera(CHARUCO, LENSES["plain"]).render(pose, rng))

@@ -47,7 +47,7 @@ def test_an_appearance_is_a_unit_vector_whatever_the_boxes_size() -> None:
     assert appearances(image, boxes[:0]).shape == (0, 60)
 
 
-def test_the_same_object_is_alike_when_blurred_moved_or_darker_and_another_colour_is_not() -> None:
+def test_same_object_is_alike_and_another_colour_is_not() -> None:
     same = image_of(RED)
     assert similarity(same, same) == pytest.approx(1.0, abs=1e-5)
     assert similarity(same, np.asarray(cv2.GaussianBlur(same, (9, 9), 3), np.uint8)) > 0.97
@@ -59,7 +59,7 @@ def test_the_same_object_is_alike_when_blurred_moved_or_darker_and_another_colou
     assert similarity(same, image_of(BLUE)) < 0.8
 
 
-def test_another_object_at_the_predicted_place_does_not_take_the_track_over() -> None:
+def test_other_object_at_predicted_position_gets_no_track() -> None:
     tracker = Tracker()
     ids = []
     for frame in range(12):
@@ -80,7 +80,7 @@ def test_the_same_object_continues_its_track_after_a_gap() -> None:
     assert shown.track_id.tolist() == [1]
 
 
-def test_an_object_that_changes_its_look_without_a_gap_keeps_its_track() -> None:
+def test_object_that_changes_its_look_without_a_gap_keeps_track() -> None:
     tracker = Tracker()
     for frame in range(8):
         image = image_of(RED if frame < 4 else BLUE)
@@ -89,7 +89,7 @@ def test_an_object_that_changes_its_look_without_a_gap_keeps_its_track() -> None
     assert shown.track_id.tolist() == [1]
 
 
-def test_another_object_after_one_missed_frame_continues_the_track() -> None:
+def test_other_object_after_one_missed_frame_continues_track() -> None:
     tracker = Tracker()
     for frame in range(8):
         found = seen(np.zeros((0, 4), np.float32) if frame == 4 else box())

@@ -75,7 +75,7 @@ def target_of(detections: Detections) -> tuple[int, list[float]] | None:
     return None
 
 
-def test_rectangle_without_a_detection_becomes_a_track_that_is_followed(camera: Camera) -> None:
+def test_rectangle_without_a_detection_becomes_a_track(camera: Camera) -> None:
     assert target_of(camera.show()) is None
     answer = camera.select(120, 180, 180, 220)
     assert answer == Selected(True, "track 2, a target", 2, TARGET_CLASS)
@@ -99,7 +99,7 @@ def test_rectangle_on_a_detection_names_its_track(camera: Camera) -> None:
     assert target_of(camera.show()) is None
 
 
-def test_rectangle_that_a_detection_covers_by_less_than_half_is_another_object(camera: Camera) -> None:
+def test_rectangle_covered_by_less_than_half_is_another_object(camera: Camera) -> None:
     assert camera.select(440, 120, 640, 240).class_name == TARGET_CLASS
 
 
