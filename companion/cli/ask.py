@@ -35,9 +35,10 @@ def ask(
         bool, typer.Option("--serve", help="Answer what is asked on zenoh's key `ask`. Ends on Ctrl-C.")
     ] = False,
 ) -> None:
-    """Fly and answer plain sentences, by patterns or by a language model.
+    """Fly and answer plain sentences.
 
-    What moves the vehicle is shown first, and executed if you answer y. `stop` is sent at once.
+    They are read by patterns or by a language model. What moves the vehicle is shown first, and executed
+    if you answer y. `stop` is sent at once.
     """
     from companion.bus.client import NoAnswerError
     from companion.bus.session import BusError

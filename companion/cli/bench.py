@@ -113,7 +113,10 @@ def bench_bus(
     ] = None,
     as_json: _JSON = False,
 ) -> None:
-    """Measure the time from put to a subscriber in another process, while detectors use every core."""
+    """Measure the latency of zenoh under CPU load.
+
+    From put to a subscriber in another process, while detectors use every core.
+    """
     import os
 
     from companion.bench.bus import measure_bus, measure_recovery

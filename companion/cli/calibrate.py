@@ -41,8 +41,7 @@ _MIRROR = Annotated[bool, typer.Option("--mirror", help="Exchange left and right
 
 calibrate = typer.Typer(
     cls=_LensByDefault,
-    help="Calibrate a camera's lens (SOURCE), its mount on the vehicle (mount), or a depth camera's place on "
-    "it (extrinsics).",
+    help="Calibrate a lens, a mount or a depth camera's pose.\n\nSOURCE is that of the lens.",
     no_args_is_help=True,
 )
 
@@ -91,9 +90,10 @@ def lens(
     rotate: _ROTATE = 0,
     mirror: _MIRROR = False,
 ) -> None:
-    """Calibrate a lens from images of a board, and write camera.yaml for camera.calibration_file.
+    """Calibrate a lens from images of a board.
 
-    A live camera is read until the views are complete, or until Ctrl-C.
+    Writes camera.yaml for camera.calibration_file. A live camera is read until the views are complete, or
+    until Ctrl-C.
     """
     from companion.calibrate import collect_views, result_lines, write_report
     from vision.calibration.boards import Board
@@ -148,9 +148,10 @@ def extrinsics(
     rotate: _ROTATE = 0,
     mirror: _MIRROR = False,
 ) -> None:
-    """Measure where a depth camera is on a colour camera: depth.yaml, for source.depth_calibration_file.
+    """Measure the pose of a depth camera on a colour camera.
 
-    Both see one board at the same time. Two folders are paired by file name.
+    Writes depth.yaml for source.depth_calibration_file. Both see one board at the same time. Two folders
+    are paired by file name.
     """
     from companion.calibrate import collect_views, extrinsics_lines
     from vision.calibration.boards import Board
@@ -211,7 +212,10 @@ def mount(
     rotate: _ROTATE = 0,
     mirror: _MIRROR = False,
 ) -> None:
-    """Measure the camera's angles on the vehicle, and print them as settings."""
+    """Measure the camera's angles on the vehicle.
+
+    Prints them as settings.
+    """
     import math
 
     from companion.bus.client import NoAnswerError, client_settings, listen, open_client

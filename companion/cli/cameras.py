@@ -117,7 +117,10 @@ def depth(
     limit: Annotated[int | None, typer.Option(min=1, help="Maximum number of frames.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the messages of the topic `depth`.")] = False,
 ) -> None:
-    """Measure the depth of a source: at the centre and of each object. Prints one line per frame."""
+    """Measure the depth of a source.
+
+    At the centre and of each object, one line per frame.
+    """
     from companion.perception.assembly import CameraTelemetry, build_pipeline, load_detector
     from companion.preview import DepthRecorder, depth_source
 

@@ -66,7 +66,10 @@ def cloud(
     text: Annotated[bool, typer.Option("--text", help="Write numbers as text instead of binary.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """Write one frame's depth as a point cloud, with the colours of its image."""
+    """Write one frame's depth as a point cloud.
+
+    With the colours of its image.
+    """
     with gc_paused():
         from vision.point_cloud import CloudFileError, cloud_from_depth, scene_of, voxel_grid, write_cloud
         from vision.point_cloud.drawing import draw_cloud

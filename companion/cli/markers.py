@@ -38,9 +38,10 @@ def markers(
     save: Annotated[Path | None, typer.Option(help="Folder for annotated images.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object per frame.")] = False,
 ) -> None:
-    """Print the markers in the frames of a source: range, bearing, pose and their one-sigma errors.
+    """Print the markers in the frames of a source.
 
-    Directions and poses are in the body frame (forward, right, down), as the camera is mounted.
+    With range, bearing, pose and their one-sigma errors. Directions and poses are in the body frame
+    (forward, right, down), as the camera is mounted.
     """
     with gc_paused():
         from companion.markers import print_markers

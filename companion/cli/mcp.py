@@ -35,7 +35,7 @@ def mcp(
     ] = None,
     connect: Annotated[str | None, typer.Option(help="Zenoh endpoint of the service or its router.")] = None,
 ) -> None:
-    """Serve the vehicle's commands and state to language models by the Model Context Protocol.
+    """Serve commands and state to language models (MCP).
 
     Nobody confirms: only the commands of --allow are executed. Without it, `stop` and `hold` are sent only
     while a command that this server started is active; they end it. After a pilot took over, nothing is

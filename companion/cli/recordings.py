@@ -123,10 +123,11 @@ def collect(
     interval: Annotated[float, typer.Option(min=0, help="Least time between two images, seconds.")] = 1.0,
     most: Annotated[int, typer.Option(min=1, help="Number of images.")] = 200,
 ) -> None:
-    """Collect frames to label: those with tracks that were doubted, lost, or changed class.
+    """Collect frames to label.
 
-    From recordings, or from a running service until Ctrl-C. The labels are the model's own boxes; correct
-    them, then train with `companion train --data FOLDER`.
+    Those with tracks that were doubted, lost, or changed class, from recordings, or from a running
+    service until Ctrl-C. The labels are the model's own boxes; correct them, then train with `companion
+    train --data FOLDER`.
     """
     from companion.bus.client import NoAnswerError, client_settings
     from companion.bus.config import BusError
@@ -164,7 +165,10 @@ def sightings(
     as_geojson: Annotated[bool, typer.Option("--geojson", help="Print GeoJSON (RFC 7946).")] = False,
     as_kml: Annotated[bool, typer.Option("--kml", help="Print KML 2.2.")] = False,
 ) -> None:
-    """Print the objects in recordings: each confirmed track, its fused position and 95 % error ellipse."""
+    """Print the objects in recordings.
+
+    Each confirmed track, its fused position and 95 % error ellipse.
+    """
     if as_geojson == as_kml:
         typer.echo("companion: expected --geojson or --kml, one of them", err=True)
         raise typer.Exit(EXIT_BAD_INPUT)
@@ -200,7 +204,10 @@ def show_recording(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="A recording.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """Show a recording: events, modes, arming, refused commands, images, depth, losses and damage."""
+    """Show the contents of a recording.
+
+    Events, modes, arming, refused commands, images, depth, losses and damage.
+    """
     with _with_library():
         from companion.flight_log import shown, summarize
         from companion.recording import RecordingError
@@ -236,7 +243,10 @@ def write_tlog(
         Path | None, typer.Argument(metavar="OUTPUT", help="The new file; by default RECORDING with .tlog.")
     ] = None,
 ) -> None:
-    """Write the recorded MAVLink, both ways, as a .tlog for ground stations."""
+    """Write the recorded MAVLink as a .tlog.
+
+    Both directions, for ground stations.
+    """
     with _with_library():
         from companion.recording import RecordingError
         from companion.recording.tlog import write_tlog as write
@@ -254,7 +264,10 @@ def add_ulog(
     ulog: Annotated[Path, typer.Argument(metavar="ULOG", help="PX4's log of the same flight.")],
     output: Annotated[Path, typer.Option("--output", "-o", metavar="OUTPUT", help="The new file.")],
 ) -> None:
-    """Copy a recording and add PX4's log, in the recording's time."""
+    """Copy a recording and add PX4's log.
+
+    In the recording's time.
+    """
     with _with_library():
         from companion.recording import RecordingError
         from companion.recording.ulog import merge_ulog

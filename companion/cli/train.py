@@ -66,7 +66,10 @@ def train(
         float | None, typer.Option(help="Highest learning rate. Default: 0.001.", rich_help_panel=_DATA)
     ] = None,
 ) -> None:
-    """Train a detector: on labelled images (--data), or the default one on rendered scenes."""
+    """Train a detector.
+
+    On labelled images (--data), or the default one on rendered scenes.
+    """
     from companion.train import score_lines, train_default, train_on_data
     from vision.yolo.safe_pickle import CheckpointError
 

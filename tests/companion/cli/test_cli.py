@@ -319,6 +319,14 @@ def test_help_lists_commands_in_order_of_use() -> None:
     assert "--install-completion" in shown
 
 
+@pytest.mark.parametrize("group", [[], ["models"], ["calibrate"], ["bench"], ["log"]])
+def test_commands_in_the_help_have_a_whole_sentence(group: list[str]) -> None:
+    shown = CliRunner().invoke(app, [*group, "--help"], env={"COLUMNS": "80"}).stdout
+    listed = shown.partition("Commands:")[2].splitlines()[1:]
+    assert len(listed) > 2
+    assert all(line.endswith(".") and not line.endswith("...") for line in listed)
+
+
 def test_help_of_send_has_flight_commands_and_few_settings() -> None:
     shown = CliRunner().invoke(app, ["send", "--help"]).stdout
     assert len(shown.splitlines()) < 100
