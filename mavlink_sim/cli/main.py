@@ -11,11 +11,14 @@ import select
 import signal
 import sys
 import threading
+from importlib import import_module
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any, NoReturn
 
 import typer
+import typer.core
+import typer.main
 
 from mavlink_sim.camera.cli_options import CameraOutputs, CameraRate, CameraTruth, SceneName
 from mavlink_sim.physics.midair import REACH_M
@@ -35,7 +38,32 @@ MAX_GUSTS_MPS = 4.0  # two standard deviations are that wind
 # click's UsageError, through its public subclass: some versions of typer include their own click
 _USAGE_ERROR: Any = typer.BadParameter.__base__
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+# Module with the command's `app`, imported when it runs: most need OpenCV. Help, for the list of commands.
+_COMMANDS = {
+    "camera": ("mavlink_sim.camera.cli", "Render the built-in world for any autopilot's vehicle."),
+    "dataset": ("mavlink_sim.datasets.dataset", "Write labelled images for training."),
+    "board": ("mavlink_sim.datasets.board_views", "Write images of a calibration board."),
+    "bench": ("mavlink_sim.cli.bench", "Measure the speed of this machine."),
+}
+
+
+class _Commands(typer.core.TyperGroup):
+    """`mavlink-sim` with options of its own, and the commands."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        return list(_COMMANDS)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        if cmd_name not in _COMMANDS:
+            return None
+        return typer.main.get_command(import_module(_COMMANDS[cmd_name][0]).app)
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, text) for name, (_, text) in _COMMANDS.items()])
+
+
+app = typer.Typer(cls=_Commands, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
 
 def _fail(text: str) -> NoReturn:
@@ -78,18 +106,21 @@ def _refuse_without_camera(given: dict[str, float | None]) -> None:
             )
 
 
+def _refuse_options_before(context: typer.Context, command: str) -> None:
+    for name in context.params:
+        source = context.get_parameter_source(name)
+        if source is not None and source.name == "COMMANDLINE":
+            _fail(f"--{name.replace('_', '-')} is not for {command}: give its options after the name")
+
+
 def _check(name: str, value: float, low: float, high: float) -> None:
     if not low <= value <= high:
         _fail(f"--{name} {value:g}: expected {low:g} to {high:g}")
 
 
-@app.command(
-    epilog="Further commands: mavlink-sim camera (the built-in world seen from any autopilot's vehicle), "
-    "mavlink-sim dataset (labelled images for training), mavlink-sim board (images of a calibration board), "
-    "mavlink-sim bench (speed of this machine). "
-    "Each has --help."
-)
+@app.callback(invoke_without_command=True)
 def simulate(
+    context: typer.Context,
     onboard_port: Annotated[int, typer.Option(help="UDP port that the onboard link sends to.")] = 14540,
     onboard_bind: Annotated[
         int, typer.Option(help="UDP port that the onboard link binds; 0: a free one.")
@@ -184,6 +215,9 @@ def simulate(
     ] = False,
 ) -> None:
     """Fly a PX4-like multirotor on UDP until interrupted (Ctrl-C)."""
+    if context.invoked_subcommand is not None:
+        _refuse_options_before(context, context.invoked_subcommand)
+        return
     logging.basicConfig(
         level=logging.INFO if verbose else logging.WARNING, format="%(levelname)s %(name)s: %(message)s"
     )
@@ -331,32 +365,10 @@ def _run(fleet: Fleet, ready_file: Path | None, parent_pid: int | None) -> None:
     _print_line("stopped")
 
 
-def load() -> None:
-    """Import what typer would import only when it parses arguments (pydantic)."""
-    typer.main.get_command(app).make_context("mavlink-sim", [])
-
-
 def main() -> None:
     """The entry point; a usage error is one line on standard error, with exit code 2."""
     try:
-        if sys.argv[1:2] == ["dataset"]:
-            from mavlink_sim.datasets.dataset import app as dataset_app
-
-            code = dataset_app(sys.argv[2:], prog_name="mavlink-sim dataset", standalone_mode=False)
-        elif sys.argv[1:2] == ["camera"]:
-            from mavlink_sim.camera.cli import app as camera_app
-
-            code = camera_app(sys.argv[2:], prog_name="mavlink-sim camera", standalone_mode=False)
-        elif sys.argv[1:2] == ["board"]:
-            from mavlink_sim.datasets.board_views import app as board_app
-
-            code = board_app(sys.argv[2:], prog_name="mavlink-sim board", standalone_mode=False)
-        elif sys.argv[1:2] == ["bench"]:
-            from mavlink_sim.cli.bench import app as bench_app
-
-            code = bench_app(sys.argv[2:], prog_name="mavlink-sim bench", standalone_mode=False)
-        else:
-            code = app(standalone_mode=False)
+        code = app(prog_name="mavlink-sim", standalone_mode=False)
     except _USAGE_ERROR as error:
         print(f"mavlink-sim: {error.format_message()}", file=sys.stderr)
         code = 2
