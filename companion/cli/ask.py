@@ -11,17 +11,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from companion.cli.flags import plain_errors
-from companion.settings import Settings
+from companion.cli.flags import EXIT_FAILED, plain_errors
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
     from companion.language.conversation import Conversation, Operator
     from companion.language.endpoints import Endpoint
+    from companion.settings import Settings
 
 ASK_SETTINGS = ("zenoh", "vehicle.name", "language", "plugins")
-EXIT_FAILED = 1
 _BANNER = "ask, or say what to fly; `stop` stops at once, `cancel` ends an answer, `quit` the chat"
 
 

@@ -7,13 +7,15 @@ import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 import typer.core
 
 from companion.cli.flags import check_finite, check_folder, plain_errors, settings_command
-from companion.settings import Settings
+
+if TYPE_CHECKING:
+    from companion.settings import Settings
 
 
 class _LensByDefault(typer.core.TyperGroup):

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from companion.cli.flags import plain_errors
-from companion.settings import Settings
 
 if TYPE_CHECKING:
+    from companion.settings import Settings
     from vision.sources import Source
     from vision.sources.csi import CsiCamera
     from vision.sources.v4l2 import FrameSize, VideoDevice

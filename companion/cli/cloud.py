@@ -10,18 +10,18 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
-import cv2
-import numpy as np
 import typer
-from numpy.typing import NDArray
 
 from companion.cli.cameras import opened
 from companion.cli.flags import EXIT_BAD_INPUT, check_finite, check_folder, plain_errors
-from companion.settings import Settings
-from companion.settings.perception import CameraSection
 from vision.gc_pause import gc_paused
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from companion.settings import Settings
+    from companion.settings.perception import CameraSection
     from vision.frame import Frame
     from vision.point_cloud import Cluster
 
@@ -32,7 +32,7 @@ CLOUD_SETTINGS = ("camera", "source", "plugins")
 _DEPTH_TIMEOUT_S = 2.0
 # A greater share of points below the plane: it cuts through what it should lie under.
 _BELOW_GROUND = 0.05
-_QUALITY: dict[str, list[int]] = {".png": [], ".jpg": [cv2.IMWRITE_JPEG_QUALITY, 80]}
+_VIEW_SUFFIXES, _JPEG_QUALITY = (".png", ".jpg"), 80
 
 
 def cloud(
@@ -71,12 +71,15 @@ def cloud(
     With the colours of its image.
     """
     with gc_paused():
+        import cv2
+        import numpy as np
+
         from vision.point_cloud import CloudFileError, cloud_from_depth, scene_of, voxel_grid, write_cloud
         from vision.point_cloud.drawing import draw_cloud
         from vision.rotation import matrix_from_euler
 
-    if view is not None and view.suffix not in _QUALITY:
-        _refuse(f"{view}: expected a name that ends in {' or '.join(_QUALITY)}")
+    if view is not None and view.suffix not in _VIEW_SUFFIXES:
+        _refuse(f"{view}: expected a name that ends in {' or '.join(_VIEW_SUFFIXES)}")
     if clusters:
         voxel, average = voxel or 0.1, average or 4
     # ValueError: a camera on a gimbal has no fixed mount, or the voxels are too small.
@@ -125,7 +128,8 @@ def cloud(
         write_cloud(output, written, binary=not text)
         if view is not None:
             drawn = draw_cloud(written, down, clusters=found, point_m=0.03 if voxel is None else voxel)
-            if not cv2.imwrite(str(view), drawn, _QUALITY[view.suffix]):
+            quality = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY] if view.suffix == ".jpg" else []
+            if not cv2.imwrite(str(view), drawn, quality):
                 raise OSError(f"cannot write {view}: check its folder and the free disk space")
     objects = [_record(cluster, down) for cluster in found]
     if as_json:
@@ -163,6 +167,8 @@ def _record(cluster: Cluster, down: NDArray[np.float64]) -> dict[str, Any]:
     """One object above the ground, as JSON-able data."""
     centre = cluster.centre_m
     level = centre - (centre @ down) * down
+    import numpy as np
+
     numbers: dict[str, NDArray[Any]] = {
         "centre_m": centre,
         "size_m": cluster.size_m,

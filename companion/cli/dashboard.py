@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import os
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from companion.cli.flags import EXIT_BAD_INPUT, plain_errors
-from companion.settings import Settings
+
+if TYPE_CHECKING:
+    from companion.settings import Settings
 
 
 def dashboard(

@@ -5,18 +5,25 @@ from __future__ import annotations
 import functools
 import inspect
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 import typer.core
 import typer.main
 
-from companion.settings.reading import RENAMED, ConfigurationError, Flag, flags, load_settings
+from vision.gc_pause import gc_paused
 
+if TYPE_CHECKING:
+    from companion.settings.reading import Flag
+
+# The settings load pydantic, numpy and OpenCV: they are imported when a command runs or shows its own help.
+
+EXIT_FAILED = 1
 EXIT_BAD_INPUT = 2
+YOLO = "yolo"  # vision.object_detector.YOLO, without numpy
 _GIVEN = "companion.settings given as flags"  # in a context's `meta`
 
 # How the help shows the type of a setting; all of them are text to typer.
@@ -59,6 +66,8 @@ class CompanionCommands(typer.core.TyperGroup):
 
 
 def _renamed_flag(flag: str) -> str | None:
+    from companion.settings.reading import RENAMED
+
     if flag.startswith("--views-"):
         return (
             f"{flag}: the sections [views.NAME] were renamed to [cameras.NAME] in version 0.2.0; "
@@ -83,6 +92,25 @@ def plain_errors(*expected: type[Exception]) -> Iterator[None]:
         for line in str(error).splitlines():
             typer.echo(f"companion: {line}", err=True)
         raise typer.Exit(EXIT_BAD_INPUT) from error
+
+
+def warn_rendered_only(models: Iterable[tuple[str, str | None]]) -> None:
+    """Warn once if a model of rendered scenes may process camera images.
+
+    Args:
+        models: (source URI, name) of each model that was trained on rendered scenes only. The simulated
+            camera is read from shared memory. Any other source, the simulator's streams included, looks like
+            a camera.
+    """
+    for uri, model in models:
+        if not uri.startswith("shm://"):
+            typer.echo(
+                f"companion: the model '{model}' is trained on rendered scenes only and does not work on "
+                "camera images; if these are camera images, run `companion models pull yolo11n`, "
+                "then use --model yolo11n",
+                err=True,
+            )
+            return
 
 
 def check_finite(flag: str, *values: float) -> None:
@@ -164,10 +192,12 @@ class _WithSettings(typer.core.TyperCommand):
 def _given_settings(command: Callable[..., None], keys: tuple[str, ...]) -> Callable[..., None]:
     """Return the command with the signature for typer: without `settings`, with `--config`."""
     own = inspect.signature(command)
-    hints = get_type_hints(command, include_extras=True)
+    hints = get_type_hints(command, include_extras=True, localns={"Settings": Any})
 
     @functools.wraps(command)
     def wrapper(context: typer.Context, config_file: Path | None, **values: Any) -> None:
+        from companion.settings.reading import ConfigurationError, load_settings
+
         given: dict[str, str | None] = context.meta[_GIVEN]
         overrides = {key: text for key, text in given.items() if text is not None}
         # The command's own SOURCE, if it is read with camera's lens; `preview` needs that for --level alone.
@@ -201,6 +231,8 @@ def _declare(function: Any, parameters: list[inspect.Parameter]) -> None:
 
 @functools.cache
 def _flags_by_parameter(keys: tuple[str, ...]) -> dict[str, Flag]:
+    with gc_paused():
+        from companion.settings.reading import RENAMED, Flag, flags
     known = {name for flag in flags() for name in (flag.key, flag.key.partition(".")[0])}
     if unknown := set(keys) - known:
         raise ValueError(f"no such settings or sections: {', '.join(sorted(unknown))}")
@@ -218,6 +250,8 @@ def _setting_parameters(keys: tuple[str, ...]) -> list[Any]:
 
     def settings(**_values: Any) -> None:
         """Never run: typer creates parameters only for commands."""
+
+    from companion.settings.reading import RENAMED
 
     parameters = []
     for name, flag in _flags_by_parameter(keys).items():

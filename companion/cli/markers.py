@@ -6,14 +6,16 @@ import functools
 import logging
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from companion.cli.flags import EXIT_BAD_INPUT, plain_errors
-from companion.settings import Settings
-from companion.settings.perception import MarkersSection
 from vision.gc_pause import gc_paused
+
+if TYPE_CHECKING:
+    from companion.settings import Settings
+    from companion.settings.perception import MarkersSection
 
 MARKER_SETTINGS = ("camera", "markers.others", "markers.boards_file")
 

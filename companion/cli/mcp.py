@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from companion.cli.flags import EXIT_BAD_INPUT, plain_errors
-from companion.settings import Settings
 
 if TYPE_CHECKING:
     from companion.dashboard.access import Access
+    from companion.settings import Settings
 
 MCP_SETTINGS = ("zenoh", "vehicle.name", "plugins")
 

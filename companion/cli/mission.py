@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from companion.cli.flags import plain_errors
-from companion.settings import Settings
-from vision.object_detector import YOLO
+from companion.cli.flags import EXIT_FAILED, YOLO, plain_errors
 
-EXIT_FAILED = 1
+if TYPE_CHECKING:
+    from companion.settings import Settings
 
 
 def mission(

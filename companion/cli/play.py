@@ -6,16 +6,16 @@ import logging
 import sys
 import time
 from collections.abc import Mapping
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from companion.cli.flags import EXIT_BAD_INPUT, plain_errors
-from companion.settings import Settings
-from companion.settings.perception import NO_SOURCE
+from companion.cli.flags import EXIT_BAD_INPUT, EXIT_FAILED, plain_errors
 from vision.gc_pause import gc_paused
 
-EXIT_FAILED = 1
+if TYPE_CHECKING:
+    from companion.settings import Settings
+
 # Sections that play sets itself.
 _OWN = ("source.", "camera.")
 
@@ -45,6 +45,8 @@ def play(
     With --vehicle-url the vehicle is the autopilot that sends to that UDP port. A camera in the built-in
     world is rendered from its pose.
     """
+    from companion.settings.perception import NO_SOURCE
+
     with_camera = given.get("source.uri") != NO_SOURCE
     own = [key for key in given if key.startswith(_OWN) and (with_camera or key != "source.uri")]
     if own:

@@ -9,12 +9,14 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from companion.cli.flags import EXIT_BAD_INPUT, plain_errors
-from companion.settings import Settings
+
+if TYPE_CHECKING:
+    from companion.settings import Settings
 
 EXIT_DIFFERENT = 1
 RECORD_SETTINGS = tuple(

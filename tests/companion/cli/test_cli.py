@@ -19,11 +19,13 @@ import typer
 from typer.testing import CliRunner
 
 from companion.bus.topics import NO_OBJECTS, TOPICS
-from companion.cli import commands as companion_commands
+from companion.cli import flags
 from companion.cli.commands import app
+from companion.cli.flags import warn_rendered_only
 from companion.guidance.command import COMMANDS
 from mavlink_sim.testing import free_port
 from tests.companion.command_line import companion, companion_here
+from vision.object_detector import YOLO
 from vision.weights import DEFAULT_WEIGHTS
 from vision.yolo.checkpoint import load_checkpoint, save_checkpoint
 
@@ -270,6 +272,22 @@ def test_small_commands_do_not_load_torch(command: str, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
+def test_help_of_all_commands_loads_nothing_heavy(tmp_path: Path) -> None:
+    code = (
+        "import sys\nfrom companion.cli import app\napp(['--help'], standalone_mode=False)\n"
+        "heavy = {'pydantic', 'numpy', 'cv2', 'torch', 'zenoh', 'av', 'rich', 'companion.settings'}\n"
+        "print(sorted(heavy & set(sys.modules)))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_default_detector_of_the_command_line_is_that_of_vision() -> None:
+    assert flags.YOLO == YOLO
+
+
 def test_bench_setpoints_prints_json(tmp_path: Path) -> None:
     done = companion("bench", "setpoints", "--seconds", "1", "--load", "1", "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -303,7 +321,7 @@ def test_detect_is_silent_about_another_model(small_model: Path, image_folder: P
 
 
 def test_no_warning_for_the_simulated_camera(capsys: pytest.CaptureFixture[str]) -> None:
-    warn = companion_commands._warn_rendered_only
+    warn = warn_rendered_only
     warn([("shm://simulator", "default")])
     assert capsys.readouterr().err == ""
     warn([("shm://simulator", "default"), ("/dev/video0", "mine.onnx"), ("rtp://:5600", "default")])

@@ -1,0 +1,98 @@
+"""The command line of `companion run`: the service, until a signal ends it."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import logging
+import signal
+import sys
+from typing import TYPE_CHECKING
+
+import typer
+
+from companion.cli.flags import EXIT_FAILED, plain_errors, warn_rendered_only
+from vision.gc_pause import gc_paused
+
+if TYPE_CHECKING:
+    from companion.service import Service
+    from companion.settings import Settings
+
+
+def run(settings: Settings) -> None:
+    """Run the service. Ends on Ctrl-C or SIGTERM."""
+    with gc_paused():
+        from companion.bus.session import BusError
+        from companion.language.process import AskProcess
+        from companion.operator.line_output import use_for_standard_error
+        from companion.operator.metrics import MetricsError
+        from companion.perception.supervisor import PerceptionStartError
+        from companion.plugins import PluginError
+        from companion.service import Service
+        from companion.vehicle.driver import LinkError
+
+    # A stalled reader of standard error must not block the service. Before any handler uses the stream.
+    output = use_for_standard_error()
+    logging.basicConfig(
+        level=settings.log.level.upper(), format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr
+    )
+    with plain_errors(LinkError, PerceptionStartError, BusError, MetricsError, PluginError):
+        service = Service(
+            settings,
+            console=True,
+            ask=AskProcess(settings),
+            dropped_lines=lambda: 0 if output is None else output.dropped,
+        )
+        asyncio.run(_run_until_signal(settings, service))
+
+
+def _freeze_loaded_objects() -> None:
+    """Exclude all loaded objects from garbage collection.
+
+    A full collection of everything imported takes 15 ms, which would delay a setpoint.
+    """
+    gc.collect()
+    gc.freeze()
+
+
+async def _run_until_signal(settings: Settings, service: Service) -> None:
+    loop = asyncio.get_running_loop()
+    ready = asyncio.Event()
+
+    def on_ready() -> None:
+        ready.set()
+        _freeze_loaded_objects()
+        # Shared frames of one of our cameras are those of its source.
+        sources = [camera.settings.source for camera in service.cameras]
+        shared = {f"shm://{source.share}": source.uri for source in sources}
+        warn_rendered_only(
+            (shared.get(source.uri, source.uri), loaded.model)
+            for camera, source in zip(service.cameras, sources, strict=True)
+            if (loaded := camera.supervisor.ready) is not None and loaded.rendered_only
+        )
+
+    running = asyncio.ensure_future(service.run(on_ready))
+    for number in (signal.SIGINT, signal.SIGTERM):
+        # Before the service is ready there is nothing to shut down.
+        loop.add_signal_handler(number, lambda: service.stop() if service.ready else running.cancel())
+    page = asyncio.create_task(_run_dashboard(settings, ready))
+    try:
+        await running
+    except asyncio.CancelledError:
+        raise typer.Exit(EXIT_FAILED) from None
+    finally:
+        page.cancel()
+        await asyncio.gather(page, return_exceptions=True)
+
+
+async def _run_dashboard(settings: Settings, ready: asyncio.Event) -> None:
+    """Run the page once the service is ready, until cancelled."""
+    from companion.dashboard.process import dashboard_process
+
+    def say(line: str) -> None:
+        logger = logging.getLogger("companion")
+        logger.log(logging.INFO if "http://" in line else logging.WARNING, "%s", line)
+
+    await ready.wait()
+    async with dashboard_process(settings, say):
+        await asyncio.Event().wait()
