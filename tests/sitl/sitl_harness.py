@@ -46,7 +46,9 @@ READY_S, GROUNDED_S = 180.0, 120.0
 SILENT_S = 1.0
 # A rebooting autopilot closes its TCP port for seconds.
 CONNECT_S, RECONNECT_S, RECONNECT_EVERY_S = 10.0, 60.0, 0.2
-ORBIT_MPS = 2.8
+ORBIT_M, ORBIT_MPS = 10.0, 2.8
+# A shell command that restarts a simulated autopilot that refuses to reboot, as PX4's does.
+RESTART = "COMPANION_SITL_RESTART"
 # Measured: by autopilot and driver, by what was flown.
 FIGURES: dict[str, dict[str, dict[str, float | None]]] = {}
 
@@ -84,6 +86,8 @@ class AutopilotLink:
         other_senders: other addresses from which datagrams came; those are dropped.
         signed: its newest message bears a signature.
         attitude_rad: its newest roll, pitch and yaw.
+        parameters: the newest value and MAV_PARAM_TYPE of each, whoever asked for it.
+        sticks: the first four channels of its newest RC_CHANNELS.
     """
 
     def __init__(self, url: LinkUrl) -> None:
@@ -109,7 +113,9 @@ class AutopilotLink:
         self._boot_ms = 0
         self._yaw_rad = math.nan
         self.attitude_rad = (0.0, 0.0, 0.0)
-        self._parameters: dict[str, tuple[float, int]] = {}
+        self.sticks: tuple[int, ...] = ()
+        self.parameters: dict[str, tuple[float, int]] = {}
+        self._ftp_reply, self._shell_said = b"", ""
         self._changed = threading.Condition()
         self._peer: tuple[str, int] | None = None
         self._peer_s = -math.inf
@@ -186,11 +192,40 @@ class AutopilotLink:
 
     # --- a pilot at a ground station ----------------------------------------------------------------------
 
-    def send(self, message: Any) -> None:
-        """Put one message on the autopilot's link, from 245/190."""
+    def send(self, message: Any, component: int | None = None) -> None:
+        """Put one message on the autopilot's link, from 245/190, or from a component of its own system."""
+        if component is not None:
+            self._to_autopilot(message.pack(dialect.MAVLink(None, self.system_id, component)))
+            return
         self._pilot.signing.timestamp = max(self._pilot.signing.timestamp, signing_time())
         self._to_autopilot(message.pack(self._pilot))
         self._pilot.seq = (self._pilot.seq + 1) % 256
+
+    def shell(self, line: str) -> None:
+        """Have PX4's shell run a line. Skips where there is none."""
+        data = f"{line}\n".encode()
+        flags = dialect.SERIAL_CONTROL_FLAG_RESPOND | dialect.SERIAL_CONTROL_FLAG_EXCLUSIVE
+        padded = [*data.ljust(70, b"\0")]
+        shell, self._shell_said = dialect.SERIAL_CONTROL_DEV_SHELL, ""
+        self.send(dialect.MAVLink_serial_control_message(shell, flags, 0, 0, len(data), padded))
+        try:
+            self.until(lambda: line in self._shell_said, _ANSWER_S, f"answered to {line}")
+        except TimeoutError:
+            pytest.skip(f"the autopilot has no shell for {line!r}")
+
+    def write_file(self, path: str, content: bytes) -> None:
+        """Replace a file of the autopilot by MAVLink FTP, with at most 239 bytes."""
+        for sequence, opcode, data in (
+            (1, dialect.MAV_FTP_OPCODE_CREATEFILE, path.encode()),
+            (3, dialect.MAV_FTP_OPCODE_WRITEFILE, content),
+            (5, dialect.MAV_FTP_OPCODE_TERMINATESESSION, b""),
+        ):
+            self._ftp_reply = b""
+            payload = bytes([sequence, 0, 0, opcode, len(data), 0, 0, 0, 0, 0, 0, 0]) + data
+            padded = [*payload.ljust(251, b"\0")]
+            self.send(dialect.MAVLink_file_transfer_protocol_message(0, self.system_id, 1, padded))
+            self.until(lambda: self._ftp_reply, _ANSWER_S, f"answered for {path}")
+            assert self._ftp_reply[3] == dialect.MAV_FTP_OPCODE_ACK, self._ftp_reply[:16]
 
     def set_up_signing(self, key: bytes | None) -> None:
         """As a ground station does: the autopilot signs with this key from now on, and so does the pilot.
@@ -202,6 +237,10 @@ class AutopilotLink:
         since = 0 if key is None else signing_time() - SIGNING_MINUTE
         secret = bytes(32) if key is None else key
         self.send(dialect.MAVLink_setup_signing_message(self.system_id, 1, [*secret], since))
+        self.sign_with(key)
+
+    def sign_with(self, key: bytes | None) -> None:
+        """The pilot signs from now on. None: not any more."""
         signing = self._pilot.signing
         signing.secret_key, signing.sign_outgoing = key, key is not None
 
@@ -219,23 +258,23 @@ class AutopilotLink:
 
     def parameter(self, name: str) -> float | None:
         """Its value; None: there is none of that name."""
-        self._parameters.pop(name, None)
+        self.parameters.pop(name, None)
         self.send(dialect.MAVLink_param_request_read_message(self.system_id, 1, name.encode(), -1))
         try:
-            self.until(lambda: name in self._parameters, _ANSWER_S, f"answered for {name}")
+            self.until(lambda: name in self.parameters, _ANSWER_S, f"answered for {name}")
         except TimeoutError:
             return None
-        return self._parameters[name][0]
+        return self.parameters[name][0]
 
     def set_parameter(self, name: str, value: float) -> None:
         """Set one that `parameter` has read, and wait for its echo."""
-        kind = self._parameters[name][1]
+        kind = self.parameters[name][1]
         wire = value
         if self.autopilot == PX4 and kind != dialect.MAV_PARAM_TYPE_REAL32:
             (wire,) = struct.unpack("<f", struct.pack("<i", round(value)))
         self.send(dialect.MAVLink_param_set_message(self.system_id, 1, name.encode(), wire, kind))
         self.until(
-            lambda: math.isclose(self._parameters[name][0], value, rel_tol=1e-6), _ANSWER_S, f"{name} set"
+            lambda: math.isclose(self.parameters[name][0], value, rel_tol=1e-6), _ANSWER_S, f"{name} set"
         )
 
     # --- the thread ---------------------------------------------------------------------------------------
@@ -341,6 +380,12 @@ class AutopilotLink:
                 self.poses.append(Pose(now_s, place, velocity, self._yaw_rad))
             case "GLOBAL_POSITION_INT":
                 self.global_deg = (message.lat * 1e-7, message.lon * 1e-7)
+            case "RC_CHANNELS":
+                self.sticks = (message.chan1_raw, message.chan2_raw, message.chan3_raw, message.chan4_raw)
+            case "SERIAL_CONTROL":
+                self._shell_said += bytes(message.data[: message.count]).decode(errors="replace")
+            case "FILE_TRANSFER_PROTOCOL":
+                self._ftp_reply = bytes(message.payload)
             case "COMMAND_ACK":
                 self.results[message.command] = message.result
             case "STATUSTEXT":
@@ -349,7 +394,7 @@ class AutopilotLink:
                 value = message.param_value
                 if self.autopilot == PX4 and message.param_type != dialect.MAV_PARAM_TYPE_REAL32:
                     (value,) = struct.unpack("<i", struct.pack("<f", value))
-                self._parameters[message.param_id] = (float(value), message.param_type)
+                self.parameters[message.param_id] = (float(value), message.param_type)
 
     def _note_mode(self, custom_mode: int, now_s: float) -> None:
         if not self.modes or self.modes[-1][1] != custom_mode:
@@ -452,10 +497,13 @@ def set_for_test(link: AutopilotLink, values: dict[str, float]) -> dict[str, flo
     return before
 
 
-def orbiting(flight: Flight, height_m: float = 5.0) -> None:
-    """In the air, steadily at speed."""
+def orbiting(flight: Flight, height_m: float = 5.0) -> tuple[float, float]:
+    """In the air, steadily at speed; north and east of the orbit's centre."""
     flight.take_off(height_m)
-    flight.fly(f"orbit radius=10 speed={ORBIT_MPS:g}")
     link = flight.link
+    start = link.poses[-1]
+    flight.fly(f"orbit radius={ORBIT_M:g} speed={ORBIT_MPS:g}")
     link.until(lambda: link.poses[-1].speed_mps > 0.9 * ORBIT_MPS, 20.0, "at speed")
     link.after(1.0)
+    north, east, _ = start.position_ned_m
+    return north + ORBIT_M * math.cos(start.yaw_rad), east + ORBIT_M * math.sin(start.yaw_rad)

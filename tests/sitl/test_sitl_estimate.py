@@ -6,10 +6,14 @@ import math
 import time
 from itertools import pairwise
 
+import numpy as np
+import numpy.typing as npt
 import pytest
 
+from mavlink_sim.wire.messages import dialect
 from tests.sitl.sitl_harness import (
     ARDUPILOT,
+    ORBIT_M,
     PX4,
     READY_S,
     AutopilotLink,
@@ -18,7 +22,9 @@ from tests.sitl.sitl_harness import (
     orbiting,
     set_for_test,
 )
+from vision.attitude import wrap_angle
 
+Vector = npt.NDArray[np.float64]
 pytestmark = [pytest.mark.sitl, pytest.mark.timeout(500), pytest.mark.realtime]
 NO_GPS = {PX4: {"SIM_GPS_USED": 0.0}, ARDUPILOT: {"SIM_GPS1_ENABLE": 0.0}}
 NO_POSITION = "position estimate not valid"
@@ -28,6 +34,8 @@ LOSS_S, RETURN_S = 30.0, 60.0
 # A reset of the estimate, and of what was sent when it came.
 RESET_M, IN_TRANSIT_S = 22.0, 0.3
 METRES_PER_DEGREE = 111_319.0
+ZERO, GOTO_M, TURN_DEG = np.zeros(3), 30.0, 25.0
+EXTERNAL_ATTITUDE, EKF_YAW_RESET = 620, 104  # PX4's command; ArduPilot's auxiliary function
 
 
 def test_loss_of_gps_in_flight_ends_the_command(flight: Flight, parameters: dict[str, float]) -> None:
@@ -98,30 +106,102 @@ def reset_estimate(link: AutopilotLink, parameters: dict[str, float]) -> None:
         parameters |= set_for_test(link, {"SIM_GPS1_GLTCH_X": RESET_M / METRES_PER_DEGREE})
 
 
+def jumps(link: AutopilotLink, since_s: float) -> list[tuple[float, Vector]]:
+    """When the position made a step that is no flight, and that step."""
+    steps = [
+        (other.time_s, np.subtract(other.position_ned_m, one.position_ned_m))
+        for one, other in pairwise(link.flown(since_s))
+    ]
+    return [(at_s, step) for at_s, step in steps if np.linalg.norm(step) > RESET_M / 2]
+
+
+def track(link: AutopilotLink, since_s: float) -> Vector:
+    """The positions (n, 3) without the resets since then: where the vehicle flew."""
+    resets = jumps(link, since_s)
+    return np.array(
+        [
+            np.subtract(
+                pose.position_ned_m, sum((step for at_s, step in resets if at_s <= pose.time_s), ZERO)
+            )
+            for pose in link.flown(since_s)
+        ]
+    )
+
+
 def test_a_goal_moves_with_a_reset_of_the_estimate(flight: Flight, parameters: dict[str, float]) -> None:
     link = flight.link
     flight.take_off(5.0)
     flight.fly("hold")
+    since_s = time.monotonic()
     link.after(2.0)
     moved = flight.said("goals moved with it")
-    since_s = time.monotonic()
-
-    def jumps() -> list[tuple[float, float]]:
-        """Metres and time of each step between two positions that is no flight."""
-        steps = [
-            (math.dist(one.position_ned_m, other.position_ned_m), other.time_s)
-            for one, other in pairwise(link.trajectory(since_s))
-        ]
-        return [step for step in steps if step[0] > RESET_M / 2]
-
     reset_estimate(link, parameters)
-    link.until(jumps, LOSS_S, "reset")
+    link.until(lambda: jumps(link, since_s), LOSS_S, "reset")
     link.until(moved, 5.0, "reported as reset")
     link.after(3.0)
-    jump_m, at_s = jumps()[0]
+    at_s, step = jumps(link, since_s)[0]
+    jump_m = float(np.linalg.norm(step))
     assert jump_m == pytest.approx(RESET_M, abs=3.0)
     flown = link.trajectory(at_s, at_s + 3.0)
     drift_m = max(math.dist(pose.position_ned_m, flown[0].position_ned_m) for pose in flown)
     assert drift_m < 1.5
     assert link.offboard
     flight.note("reset of the estimate in a hold", jump_m=jump_m, moved_in_3_s_m=drift_m)
+
+
+def test_a_goto_arrives_at_its_moved_goal(flight: Flight, parameters: dict[str, float]) -> None:
+    link = flight.link
+    flight.take_off(5.0)
+    flight.fly("hold")
+    since_s = time.monotonic()
+    link.after(2.0)
+    start = link.poses[-1]
+    moved = flight.said("goals moved with it")
+    reset_estimate(link, parameters)  # Copter's follows after some seconds
+    flight.fly(f"goto forward={GOTO_M:g} right=0 speed=2")
+    link.after(2.0)
+    assert moved()
+    ahead = (math.cos(start.yaw_rad), math.sin(start.yaw_rad))
+    goal = np.add(start.position_ned_m[:2], np.multiply(GOTO_M, ahead))
+    error_m = math.dist(track(link, since_s)[-1][:2], goal)
+    flight.note(
+        "reset of the estimate in a goto", resets=len(jumps(link, since_s)), error_after_2_s_m=error_m
+    )
+    assert error_m < 2.0
+
+
+def test_an_orbit_keeps_its_moved_centre(flight: Flight, parameters: dict[str, float]) -> None:
+    link = flight.link
+    centre = orbiting(flight)
+    since_s = time.monotonic()
+    link.after(1.0)
+    moved = flight.said("goals moved with it")
+    reset_estimate(link, parameters)
+    link.until(lambda: jumps(link, since_s), LOSS_S, "reset")
+    link.until(moved, 5.0, "reported as reset")
+    link.after(10.0)
+    radii = np.linalg.norm(track(link, since_s)[:, :2] - centre, axis=1)
+    worst_m = float(np.abs(radii - ORBIT_M).max())
+    flight.note("reset of the estimate in an orbit", radius_error_max_m=worst_m)
+    assert worst_m < 2.0
+    assert flight.status["pilot"]["behaviour"].startswith("orbiting")
+
+
+def test_an_orbit_goes_on_after_a_reset_of_the_heading(flight: Flight) -> None:
+    link = flight.link
+    centre = orbiting(flight)
+    since_s = time.monotonic()
+    link.after(1.0)
+    if link.autopilot == PX4:
+        turned_deg = math.degrees(link.poses[-1].yaw_rad) + TURN_DEG
+        link.command(EXTERNAL_ATTITUDE, math.nan, math.nan, turned_deg, math.nan, math.nan, math.nan, 1.0)
+    else:
+        link.command(dialect.MAV_CMD_DO_AUX_FUNCTION, EKF_YAW_RESET, 2.0)
+    link.after(15.0)
+    yaws = [pose.yaw_rad for pose in link.flown(since_s)]
+    turned_deg = max(abs(math.degrees(wrap_angle(other - one))) for one, other in pairwise(yaws))
+    radii = np.linalg.norm(track(link, since_s)[:, :2] - centre, axis=1)
+    worst_m = float(np.abs(radii - ORBIT_M).max())
+    flight.note("reset of the heading in an orbit", step_deg=turned_deg, radius_error_max_m=worst_m)
+    assert worst_m < 3.0
+    assert flight.status["pilot"]["behaviour"].startswith("orbiting")

@@ -11,7 +11,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from tests.sitl.sitl_harness import NAMES, Flight, Pose
+from tests.sitl.conftest import Services
+from tests.sitl.sitl_harness import HOLD, NAMES, PX4, Flight, Pose, set_for_test
 from vision.attitude import wrap_angle
 
 pytestmark = [pytest.mark.sitl, pytest.mark.timeout(300), pytest.mark.realtime]
@@ -61,6 +62,24 @@ def test_take_off_and_land(flight: Flight) -> None:
     assert link.grounded
     flight.note("take-off to 5 m", time_s=took_s, height_m=height_m)
     flight.note("land from 5 m", time_s=time.monotonic() - begun_s)
+
+
+def test_a_take_off_that_px4_ends_early_is_finished(
+    flight: Flight, services: Services, parameters: dict[str, float]
+) -> None:
+    """PX4 holds up to NAV_MC_ALT_RAD below the height; that is no pilot's hold."""
+    link = flight.link
+    if link.autopilot != PX4:
+        pytest.skip("NAV_MC_ALT_RAD is PX4's")
+    parameters |= set_for_test(link, {"NAV_MC_ALT_RAD": 1.5})
+    services.close()
+    fresh = services.flight(flight.driver)  # it is read when the link opens
+    fresh.take_off(HEIGHT_M)
+    held = [at_s for at_s, mode in link.modes if mode == HOLD[PX4]]
+    ended_m = link.home_ned_m[2] - link.flown(held[-1])[0].position_ned_m[2]
+    assert link.height_m == pytest.approx(HEIGHT_M, abs=0.5)
+    assert not [event for event in fresh.events if "pilot" in event]
+    fresh.note("take-off with NAV_MC_ALT_RAD 1.5", px4_ended_at_m=ended_m, height_m=link.height_m)
 
 
 def test_goto_arrives_and_stays(flight: Flight) -> None:

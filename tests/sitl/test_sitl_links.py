@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import socket
+import struct
+import subprocess
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -19,12 +21,21 @@ from companion.vehicle.link_url import parse_link_url
 from mavlink_sim.testing import free_port
 from tests.companion.service_process import ServiceProcess, running_service
 from tests.sitl.conftest import Services
-from tests.sitl.sitl_harness import PX4, READY_S, AutopilotLink, Flight, bring_down
+from tests.sitl.sitl_harness import (
+    PX4,
+    READY_S,
+    RESTART,
+    AutopilotLink,
+    Flight,
+    bring_down,
+    set_for_test,
+    signing_time,
+)
 
 pytestmark = [pytest.mark.sitl, pytest.mark.timeout(400), pytest.mark.realtime]
 # udpin://HOST:PORT to which the autopilot's second link sends, for a second service.
 SECOND = "COMPANION_SITL_SECOND_URL"
-KEY = bytes(range(1, 33))
+KEY, PX4_KEY = bytes(range(1, 33)), "mavlink/mavlink-signing-key.bin"
 NAMED_S, SIGNED_S = 15.0, 10.0
 REFUSED = "another service commands this vehicle ("
 
@@ -39,14 +50,36 @@ def test_default_driver_flies_the_autopilot(link: AutopilotLink, services: Servi
     flight.fly("land")
 
 
+def restart(link: AutopilotLink) -> None:
+    """By the command of COMPANION_SITL_RESTART."""
+    boots = link.boots
+    subprocess.run(os.environ[RESTART], shell=True, check=True)
+    link.until(lambda: link.boots > boots, 60.0, "restarted")
+    link.until(lambda: link.ready, READY_S, "ready to be armed")
+
+
 @pytest.fixture
-def signing(flight: Flight) -> Iterator[AutopilotLink]:
+def signing(flight: Flight, parameters: dict[str, float]) -> Iterator[AutopilotLink]:
     """The autopilot signs what it sends, and takes nothing unsigned."""
     link = flight.link
     if link.autopilot == PX4:
-        pytest.skip(
-            "PX4 takes SETUP_SIGNING over USB alone, and unsigned messages unless MAV_SIGN_CFG says otherwise"
-        )
+        # It takes SETUP_SIGNING over USB alone, and reads its key when it starts.
+        if RESTART not in os.environ:
+            pytest.skip(f"{RESTART} names no command")
+        try:
+            link.write_file(PX4_KEY, KEY + struct.pack("<Q", signing_time()))
+            restart(link)
+            parameters |= set_for_test(link, {"MAV_SIGN_CFG": 2.0})
+            link.sign_with(KEY)
+            yield link
+            bring_down(link)
+        finally:
+            for name, value in parameters.items():
+                link.set_parameter(name, value)
+            link.write_file(PX4_KEY, b"")
+            link.sign_with(None)
+            restart(link)
+        return  # it goes on to sign, with a key of zeros, and takes what is unsigned
     link.set_up_signing(KEY)
     yield link
     bring_down(link)

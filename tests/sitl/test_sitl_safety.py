@@ -9,11 +9,15 @@ from itertools import pairwise
 
 import pytest
 
+from mavlink_sim.wire.messages import dialect
+from tests.sitl.conftest import Services
 from tests.sitl.sitl_harness import (
     ARDUPILOT,
     HOLD,
+    NAMES,
     OFFBOARD,
     PX4,
+    READY_S,
     STANDING_MPS,
     AutopilotLink,
     Flight,
@@ -143,19 +147,80 @@ def test_a_lost_link_ends_the_command_and_is_not_resumed(flight: Flight) -> None
     )
 
 
-def test_refused_arming_has_the_autopilots_own_reason(flight: Flight, parameters: dict[str, float]) -> None:
+def assert_arming_is_refused(flight: Flight, reason: str) -> None:
     link = flight.link
-    values, reason = (
-        ({"NAV_DLL_ACT": 2.0}, "No connection to the G")  # "GCS" or "ground control station"
-        if link.autopilot == PX4
-        else ({"BATT_ARM_VOLT": 90.0}, "below minimum arming voltage")
-    )
-    parameters |= set_for_test(link, values)
     link.until(lambda: not link.ready, 10.0, "not ready to be armed")
     reply = flight.command("takeoff 3")
     assert not reply["success"]
     assert reason.lower() in reply["reason"].lower()
     assert not link.armed
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "name", "value", "reason"),
+    [
+        (PX4, "NAV_DLL_ACT", 2.0, "No connection to the G"),  # "GCS" or "ground control station"
+        (ARDUPILOT, "BATT_ARM_VOLT", 90.0, "below minimum arming voltage"),
+    ],
+)
+def test_refused_arming_has_the_autopilots_own_reason(
+    flight: Flight, parameters: dict[str, float], autopilot: int, name: str, value: float, reason: str
+) -> None:
+    if flight.link.autopilot != autopilot:
+        pytest.skip(f"{name} is a parameter of {NAMES[autopilot]}")
+    parameters |= set_for_test(flight.link, {name: value})
+    assert_arming_is_refused(flight, reason)
+
+
+@pytest.mark.parametrize(
+    ("cause", "cure", "reason"),
+    [
+        ("sensor_mag_sim stop", "sensor_mag_sim start", "Found 0 compass (required: 1)"),
+        ("param set COM_ARMABLE 0", "param set COM_ARMABLE 1", "Vehicle is in safety configuration"),
+    ],
+)
+def test_a_failing_check_of_px4_is_the_reason(flight: Flight, cause: str, cure: str, reason: str) -> None:
+    link = flight.link
+    if link.autopilot != PX4:
+        pytest.skip("the shell is PX4's")
+    link.shell(cause)
+    try:
+        assert_arming_is_refused(flight, reason)
+    finally:
+        link.shell(cure)
+        link.until(lambda: link.ready, READY_S, "ready to be armed")
+
+
+def test_a_safety_switch_is_the_reason(flight: Flight) -> None:
+    link = flight.link
+    if link.autopilot != ARDUPILOT:
+        pytest.skip("PX4's simulation has no safety switch")
+    switch = dialect.MAV_CMD_DO_SET_SAFETY_SWITCH_STATE
+    link.command(switch, dialect.SAFETY_SWITCH_STATE_SAFE)
+    try:
+        assert_arming_is_refused(flight, "Hardware safety switch")
+    finally:
+        link.command(switch, dialect.SAFETY_SWITCH_STATE_DANGEROUS)
+        link.until(lambda: link.ready, READY_S, "ready to be armed")
+
+
+@pytest.mark.parametrize(("timeout_s", "warned"), [(3.0, True), (1.0, False)])
+def test_a_long_guid_timeout_is_warned_of(
+    flight: Flight, services: Services, parameters: dict[str, float], timeout_s: float, warned: bool
+) -> None:
+    link = flight.link
+    if link.autopilot != ARDUPILOT:
+        pytest.skip("PX4 has no GUID_TIMEOUT")
+    parameters |= set_for_test(link, {"GUID_TIMEOUT": timeout_s})
+    services.close()
+    link.parameters.pop("GUID_TIMEOUT")
+    service = services.flight(flight.driver).service
+    link.until(lambda: "GUID_TIMEOUT" in link.parameters, 10.0, "asked for GUID_TIMEOUT")
+    if warned:
+        service.wait_for_line("GUID_TIMEOUT is 3 s", 10.0)
+    else:
+        link.after(WATCHED_S)
+        assert not [line for line in service.last_lines() if "GUID_TIMEOUT" in line]
 
 
 def test_points_beyond_the_limits_are_refused(flight: Flight) -> None:

@@ -11,12 +11,10 @@ import pytest
 
 from mavlink_sim.wire.messages import dialect
 from tests.sitl.conftest import Services
-from tests.sitl.sitl_harness import ARDUPILOT, READY_S, AutopilotLink, Flight, bring_down
+from tests.sitl.sitl_harness import ARDUPILOT, READY_S, RESTART, AutopilotLink, Flight, bring_down
 
 pytestmark = [pytest.mark.sitl, pytest.mark.timeout(400), pytest.mark.realtime]
-REBOOT_S, DEAF_S = 60.0, 6.0
-# A shell command that restarts a simulated autopilot that refuses to reboot, as PX4's does.
-RESTART = "COMPANION_SITL_RESTART"
+REBOOT_S, DEAF_S, SLOW_HZ = 60.0, 6.0, 2
 
 
 def missing(flight: Flight) -> list[str]:
@@ -62,6 +60,21 @@ def test_streams_that_somebody_stops_are_asked_for_again(flight: Flight) -> None
     link.until(lambda: "LOCAL_POSITION_NED" in missing(flight), 15.0, "reported as missing")
     took_s = link.until(lambda: not missing(flight), 30.0, "complete again")
     flight.note("streams stopped by another", complete_after_s=took_s)
+
+
+def test_streams_that_another_station_slows_are_asked_for_again(flight: Flight) -> None:
+    link = flight.link
+    if link.autopilot != ARDUPILOT:
+        pytest.skip("PX4 takes no REQUEST_DATA_STREAM")
+    link.until(lambda: flight.status and not missing(flight), 30.0, "all streams")
+    link.send(dialect.MAVLink_request_data_stream_message(link.system_id, 1, 0, SLOW_HZ, 1))
+    link.until(lambda: "LOCAL_POSITION_NED" in missing(flight), 15.0, "reported as missing")
+    took_s = link.until(lambda: not missing(flight), 30.0, "complete again")
+    since_s = time.monotonic()
+    link.after(3.0)
+    rate_hz = len(link.flown(since_s)) / 3.0
+    assert rate_hz > 0.8 * 30.0  # what the service asks for
+    flight.note("streams slowed by another", complete_after_s=took_s, positions_hz=rate_hz)
 
 
 def test_a_vehicle_that_is_paused_ends_the_command(flight: Flight) -> None:
