@@ -9,7 +9,7 @@ from vision.detections import Detections
 from vision.pipeline import PerceptionResult
 
 
-def test_the_stages_add_up_to_the_latency_and_the_network_is_not_ours() -> None:
+def test_stages_add_up_to_the_latency_without_the_network() -> None:
     stages_ms = {"capture": 12.0, "decode": 0.5, "wait": 0.25, "preprocess": 0.125, "inference": 9.0}
     known_ms = sum(stages_ms.values())
     timing_ms = {**stages_ms, "total": 9.5}

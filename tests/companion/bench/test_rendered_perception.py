@@ -96,7 +96,7 @@ def test_stamps_are_of_the_simulated_clock(airborne: LockstepVehicle) -> None:
     assert (result.captured_ns, result.inferred_ns) == (5_000_000_000, 5_080_000_000)
 
 
-def test_frames_past_their_age_are_left_out_by_the_simulated_clock(airborne: LockstepVehicle) -> None:
+def test_stale_frames_are_left_out_by_the_simulated_clock(airborne: LockstepVehicle) -> None:
     perception = RenderedPerception(
         settings_of(detector__max_age_s="0.5"), airborne, scene_or_demo(None, SEED)
     )

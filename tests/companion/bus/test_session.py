@@ -108,7 +108,7 @@ async def test_bad_queries_are_answered_and_stop_passes_a_flood() -> None:
     async def handle(text: str) -> dict[str, Any]:
         received.append(text[:20])
         if text == "break":
-            raise ZeroDivisionError("no such luck")
+            raise ZeroDivisionError("break 1/0")
         return {"success": True, "reason": ""}
 
     bus = Bus(settings, "alpha", on_event=Events(), on_command=handle)
@@ -141,9 +141,10 @@ async def test_bad_queries_are_answered_and_stop_passes_a_flood() -> None:
     (refused_bytes,), (refused_size,) = answers["bytes"], answers["large"]
     assert answers["other sender"] == ["True"]
     assert "0xff" in refused_bytes
-    assert f"10000000 bytes, at most {LARGEST_COMMAND_BYTES}" in refused_size
+    assert "10000000 bytes" in refused_size
+    assert f" {LARGEST_COMMAND_BYTES} " in refused_size
     assert answers["empty"] == [""]
-    assert answers["raises"] == ["ZeroDivisionError: no such luck"]
+    assert answers["raises"] == ["ZeroDivisionError: break 1/0"]
     assert len(answers["flood"]) == 150
     assert "commands a second" in answers["flood"][-1]
     assert answers["stop"] == [""]
@@ -203,7 +204,7 @@ async def test_failing_command_is_sent_once() -> None:
 
     async def fail(text: str) -> dict[str, Any]:
         received.append(text)
-        raise RuntimeError("broken on purpose")
+        raise RuntimeError("fault 7")
 
     settings = ZenohSection(listen=(f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}",))
     bus = Bus(settings, "alpha", on_event=Events(), on_command=fail)
@@ -217,7 +218,7 @@ async def test_failing_command_is_sent_once() -> None:
         reply = await asyncio.to_thread(other_side)
     finally:
         await bus.close()
-    assert reply == {"command": "takeoff 5", "success": False, "reason": "RuntimeError: broken on purpose"}
+    assert reply == {"command": "takeoff 5", "success": False, "reason": "RuntimeError: fault 7"}
     assert received == ["takeoff 5"]
 
 
@@ -326,7 +327,7 @@ async def test_unknown_vehicle_has_no_service() -> None:
         def other_side() -> None:
             with (
                 open_client(client_settings(settings)) as session,
-                pytest.raises(NoAnswerError, match="no service for vehicle 'beta'"),
+                pytest.raises(NoAnswerError, match=r"service .* 'beta': .*vehicle\.name"),
             ):
                 send_command(session, "beta", "hold")
 

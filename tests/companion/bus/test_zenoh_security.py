@@ -136,7 +136,7 @@ async def test_unusable_file_of_the_children_is_named(tmp_path: Path, name: str,
 
 
 @pytest.mark.usefixtures("folder")
-async def test_dashboard_and_recorder_connect_with_the_file_of_the_children() -> None:
+async def test_dashboard_and_recorder_connect_with_the_childrens_file() -> None:
     endpoint, port = f"tls/127.0.0.1:{free_port(socket.SOCK_STREAM)}", free_port(socket.SOCK_STREAM)
     files = {"config_file": "vehicle1.json5", "child_config_file": "operator.json5"}
     settings = Settings.model_validate(
@@ -162,7 +162,7 @@ async def test_dashboard_and_recorder_connect_with_the_file_of_the_children() ->
         ):
             begun = sorted([await lines.get(), await lines.get()])
             assert begun[0] == f"dashboard: http://127.0.0.1:{port}/"
-            assert begun[1].startswith("recorder: recording to ")
+            assert begun[1].startswith("recorder: recording ")
             stream = await EventStream.open(port)
             while (news := await stream.next()) is not None and news["alive"] is not True:
                 pass

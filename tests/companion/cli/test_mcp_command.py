@@ -144,9 +144,9 @@ async def test_simulated_vehicle_is_left_to_its_pilot(tmp_path: Path) -> None:
                 assert " needs " in reply["reason"]  # an estimate that is not there yet
             assert reply["success"], reply
             assert (await call("state"))["height_above_home_m"] > 2.0
-            assert (await call("takeoff", altitude=3))["reason"].startswith(
-                "takeoff needs to be on the ground"
-            )
+            again = (await call("takeoff", altitude=3))["reason"]
+            assert again.startswith("takeoff needs ")
+            assert "the ground" in again
             going = asyncio.create_task(call("goto", forward=30, right=0))
             async with asyncio.timeout(20):
                 while not (await call("state"))["in_command"]:
@@ -165,7 +165,7 @@ async def test_simulated_vehicle_is_left_to_its_pilot(tmp_path: Path) -> None:
             async with asyncio.timeout(20):
                 while (await call("state"))["mode"] != "position":
                     await asyncio.sleep(0.1)
-            assert "the pilot took over" in (await call("orbit"))["reason"]
+            assert "pilot took" in (await call("orbit"))["reason"]
             assert (await call("stop"))["success"] is False
             assert (await call("state"))["mode"] == "position"
             operator = asyncio.to_thread(flown.command, "hold")
