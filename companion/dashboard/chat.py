@@ -40,7 +40,7 @@ _plan_numbers = itertools.count(1)
 _STOPPED_WITHIN_S = 1.0
 PLAN_S = 60.0
 """How long a plan waits for its confirmation."""
-_ENDED = "ended by stop"
+ENDED_BY_STOP = "ended by stop"
 _OTHER_COMMAND = "another command was sent"
 _NOT_WATCHED = "the window was closed or hidden"
 _BUSY = "busy with another sentence; STOP ends it"
@@ -154,7 +154,7 @@ class Chat:
                 self._conversation = await self._converse(self)
             await self._conversation.ask(text)
         except asyncio.CancelledError:
-            exchange.show(_ENDED)
+            exchange.show(ENDED_BY_STOP)
             raise
         except (NoAnswerError, LanguageError, PluginError, ValueError) as error:
             exchange.show(str(error))
@@ -198,7 +198,7 @@ class Chats:
         elif chat is None:
             return f"at most {MAX_CHATS} chats"
         elif stops != self._stops_of(vehicle):
-            chat.add(text).show(_ENDED)
+            chat.add(text).show(ENDED_BY_STOP)
         elif chat.busy:
             return _BUSY
         else:

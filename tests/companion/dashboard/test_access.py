@@ -64,7 +64,7 @@ def test_another_page_may_only_link_to_the_page() -> None:
 
 def test_token_is_needed_beyond_loopback() -> None:
     for host in ("0.0.0.0", "192.168.1.5", "drone.local", "::"):
-        with pytest.raises(DashboardError, match=r"dashboard\.token_file must be set"):
+        with pytest.raises(DashboardError, match=rf"{host} .* dashboard\.token_file must"):
             Access(host)
     assert is_loopback("127.0.0.1")
     assert is_loopback("localhost")
@@ -104,5 +104,5 @@ def test_token_file(tmp_path: Path) -> None:
         assert len(content) < 16 or content not in str(refused.value)
     path.write_text(f"{TOKEN}\n")
     assert read_token(path) == TOKEN
-    with pytest.raises(DashboardError, match="cannot be read"):
+    with pytest.raises(DashboardError, match="/none: cannot "):
         read_token(tmp_path / "none")

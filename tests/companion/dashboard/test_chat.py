@@ -12,12 +12,12 @@ import pytest
 
 import companion.dashboard.chat
 from companion.bus import topics
-from companion.dashboard.chat import Chat, Chats
+from companion.dashboard.chat import ENDED_BY_STOP, Chat, Chats
 from companion.dashboard.fleet import Fleet
 from companion.language import conversation, serve
 from companion.language.sentences import is_stop
 from companion.settings import LanguageSection, ZenohSection
-from tests.companion.cli.test_ask import Service, service
+from tests.companion.cli.test_ask import QUESTION, RED_CAR, Service, service
 from tests.companion.dashboard.serving import POST, EventStream, request, serving
 from tests.companion.dashboard.test_bridge import until
 from tests.companion.language.language_server import ollama
@@ -26,6 +26,9 @@ from tests.companion.language.language_server import serving as serving_model
 pytestmark = pytest.mark.realtime
 
 VEHICLE = "vehicle"
+AT_TEN_METRES = "circle the red car at ten metres"
+FARTHER = "twice as far"
+FORWARD = "go ten metres forward"
 
 
 class Window:
@@ -110,15 +113,13 @@ async def windows(
                 each.close()
 
 
-async def test_plan_is_flown_after_its_confirmation_and_history_is_used() -> None:
+async def test_confirmed_plan_is_flown_and_history_is_used() -> None:
     async with windows(names=("one", "two")) as (there, (window, other)):
         there.stopped.set()
-        assert await window.post(text="circle the red car at ten metres") == 204
+        assert await window.post(text=AT_TEN_METRES) == 204
         plan = await window.until_plan()
         assert window.chat["model"] == ""
-        assert window.chat["exchanges"] == [
-            {"asked": "circle the red car at ten metres", "answer": "orbit radius=10 track=3"}
-        ]
+        assert window.chat["exchanges"] == [{"asked": AT_TEN_METRES, "answer": "orbit radius=10 track=3"}]
         assert there.commands == []
         # Neither another window nor an earlier plan's number confirms it.
         assert await other.post(plan=plan, fly=True) == 409
@@ -126,9 +127,11 @@ async def test_plan_is_flown_after_its_confirmation_and_history_is_used() -> Non
         assert await window.post(text="land") == 429
         assert await window.post(plan=plan, fly=True) == 204
         answer = await window.until_answered()
-        assert answer.splitlines() == ["orbit radius=10 track=3", "confirmed", "done: orbit: ended"]
+        *plan_lines, done = answer.splitlines()
+        assert plan_lines == ["orbit radius=10 track=3", "confirmed"]
+        assert done.split(": ") == ["done", "orbit", "ended"]
         assert there.commands == ["orbit radius=10 track=3"]
-        assert await window.post(text="twice as far") == 204
+        assert await window.post(text=FARTHER) == 204
         later = await window.until_plan()
         assert window.chat["exchanges"][1]["answer"] == "orbit radius=20 track=3"
         assert await window.post(plan=later, fly=False) == 204
@@ -141,7 +144,7 @@ async def test_plan_is_flown_after_its_confirmation_and_history_is_used() -> Non
 @pytest.mark.parametrize("way", ["button", "sentence"])
 async def test_stop_is_sent_and_ends_the_plan_that_waits(way: str) -> None:
     async with windows() as (there, (window,)):
-        assert await window.post(text="circle the red car") == 204
+        assert await window.post(text=RED_CAR) == 204
         plan = await window.until_plan()
         if way == "button":
             await window.command("stop")
@@ -150,13 +153,13 @@ async def test_stop_is_sent_and_ends_the_plan_that_waits(way: str) -> None:
         await until(lambda: there.commands == ["stop"])
         await window.until(busy=False, plan=None)
         assert await window.post(plan=plan, fly=True) == 409
-        assert "ended by stop" in window.chat["exchanges"][0]["answer"]
+        assert ENDED_BY_STOP in window.chat["exchanges"][0]["answer"]
         assert there.commands == ["stop"]
 
 
 async def test_stop_ends_what_the_chat_flies() -> None:
     async with windows(LanguageSection(may=("goto",))) as (there, (window,)):
-        assert await window.post(text="go ten metres forward") == 204
+        assert await window.post(text=FORWARD) == 204
         await asyncio.wait_for(there.flying.wait(), 20)
         await window.command("stop")
         await window.until(busy=False)
@@ -188,12 +191,12 @@ async def test_stop_while_a_sentence_is_read_ends_it(monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr("companion.language.sentences.is_stop", slow_is_stop)
     async with windows(LanguageSection(may=("goto",))) as (there, (window,)):
-        asked = asyncio.create_task(window.post(text="go ten metres forward"))
+        asked = asyncio.create_task(window.post(text=FORWARD))
         await asyncio.wait_for(reading.wait(), 20)
         assert await window.command("stop") == 200
         read.set()
         assert await asked == 204
-        assert await window.until_answered() == "ended by stop"
+        assert await window.until_answered() == ENDED_BY_STOP
         assert there.commands == ["stop"]
 
 
@@ -215,14 +218,14 @@ async def test_sentence_that_survives_its_end_sends_no_command(monkeypatch: pyte
         assert await window.post(text="land") == 204
         await asyncio.wait_for(waiting.wait(), 20)
         await window.command("stop")
-        assert await window.until_answered() == "ended by stop"
+        assert await window.until_answered() == ENDED_BY_STOP
         assert there.commands == ["stop"]
 
 
 @pytest.mark.parametrize("by", ["page", "other window", "elsewhere"])
 async def test_plan_ends_with_another_command(by: str) -> None:
     async with windows(LanguageSection(may=("land",)), names=("one", "two")) as (there, (window, other)):
-        assert await window.post(text="circle the red car") == 204
+        assert await window.post(text=RED_CAR) == 204
         plan = await window.until_plan()
         if by == "page":
             await window.command("land")
@@ -249,7 +252,7 @@ async def test_plan_ends_in_time_and_at_once_without_a_stream(
 
 async def test_plan_ends_with_the_last_stream_of_its_window() -> None:
     async with windows(names=("one", "two")) as (there, (window, other)):
-        assert await window.post(text="circle the red car") == 204
+        assert await window.post(text=RED_CAR) == 204
         plan = await window.until_plan()
         window.close()
         await other.until_alone()
@@ -260,7 +263,7 @@ async def test_plan_ends_with_the_last_stream_of_its_window() -> None:
 async def test_stop_is_sent_if_all_chats_are_busy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(companion.dashboard.chat, "MAX_CHATS", 1)
     async with windows(names=("one", "two")) as (there, (window, other)):
-        assert await window.post(text="circle the red car") == 204
+        assert await window.post(text=RED_CAR) == 204
         await window.until_plan()
         assert await other.post(text="land") == 429
         assert await other.post(text="Halt!") == 204
@@ -284,7 +287,8 @@ async def test_question_is_answered_by_a_model_that_streams() -> None:
         serving_model(*answers) as script,
         windows(LanguageSection(model="small", url=script.url)) as (there, (window,)),
     ):
-        assert await window.post(text="what is down there?") == 204
+        question = "what is down there?"
+        assert await window.post(text=question) == 204
         assert (await window.until_answered()).startswith("two")
         assert window.chat["model"] == "small"
         assert len(script.requests) == 2
@@ -294,10 +298,11 @@ async def test_question_is_answered_by_a_model_that_streams() -> None:
 async def test_errors_are_shown_in_the_chat() -> None:
     language = LanguageSection(model="small", url="http://127.0.0.1:9")
     async with windows(language) as (_, (window,)):
-        assert await window.post(text="what do you see?") == 204
+        assert await window.post(text=QUESTION) == 204
         assert "ollama serve" in await window.until_answered()
     async with windows() as (_, (window,)):
-        assert await window.post(text="circle the unicorn") == 204
+        unknown = "circle the unicorn"
+        assert await window.post(text=unknown) == 204
         assert "unicorn" in await window.until_answered()
 
 

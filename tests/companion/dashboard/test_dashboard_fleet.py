@@ -171,7 +171,7 @@ def answering(services: dict[str, Publisher]) -> list[tuple[str, str]]:
     return received
 
 
-async def test_command_reaches_the_named_vehicle_and_stop_all_reaches_all() -> None:
+async def test_command_reaches_its_vehicle_and_stop_all_reaches_all() -> None:
     with two_vehicles() as (services, endpoint):
         received = answering(services)
         async with serving(endpoint) as port:

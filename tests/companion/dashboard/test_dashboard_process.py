@@ -86,7 +86,7 @@ asyncio.run(main())
 """
 
 
-def test_child_has_lower_priority_and_ends_when_its_parent_is_killed() -> None:
+def test_child_has_lower_priority_and_ends_with_a_killed_parent() -> None:
     port = free_port(socket.SOCK_STREAM)
     process = subprocess.Popen(
         [sys.executable, "-c", PARENT, f"127.0.0.1:{port}"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT
