@@ -10,7 +10,7 @@ import pytest
 from companion.language.scene import SceneObject
 from tests.companion.language.language_server import ollama, serving
 from tests.companion.language.sentence_table import SCENE
-from tests.companion.language.test_conversation import FakeVehicle, Talk, tool_results
+from tests.companion.language.test_conversation import REFUSAL, WARNING, FakeVehicle, Talk, tool_results
 
 
 async def test_unseen_object_is_searched_for_then_flown_to() -> None:
@@ -23,22 +23,24 @@ async def test_unseen_object_is_searched_for_then_flown_to() -> None:
         return await command(text)
 
     vehicle.command = found  # type: ignore[method-assign]
-    assert await talk.ask("find the green truck and circle it twice at ten metres")
+    sentence = "find the green truck and circle it twice at ten metres"
+    assert await talk.ask(sentence)
     assert vehicle.commands == ["seek truck", "orbit radius=10 laps=2 track=9"]
     assert talk.asked == 2
 
 
 async def test_questions_and_failures_in_words() -> None:
     talk = Talk(vehicle=FakeVehicle(refused="land"))
-    assert await talk.ask("what do you see?")
+    seen, which = "what do you see?", "follow the car"
+    assert await talk.ask(seen)
     assert "red car (track 3) 12 m away" in talk.lines[-1]
     assert await talk.ask("battery")
     assert "81" in talk.lines[-1]
     assert not await talk.ask("land")
     assert await talk.ask("why not?")
-    assert "on the ground" in talk.lines[-1]
-    assert "wind is strong" in talk.lines[-1]
-    assert not await talk.ask("follow the car")
+    assert REFUSAL in talk.lines[-1]
+    assert WARNING in talk.lines[-1]
+    assert not await talk.ask(which)
     assert "which car" in talk.lines[-1]
 
 
@@ -82,13 +84,15 @@ FAULT = "no detections received: perception is failed"
 async def test_model_gets_an_error_without_detections() -> None:
     async with serving(ollama(calls=[("seen", {"class": "car"})]), ollama("I am blind.")) as script:
         talk = Talk(script.url, vehicle=FakeVehicle(replace(SCENE, objects=(), fault=FAULT)))
-        assert await talk.ask("model: is the way free?")
+        question = "model: is the way free?"
+        assert await talk.ask(question)
         assert tool_results(script) == [{"error": FAULT}]
 
 
 async def test_described_object_is_not_searched_for_without_detections() -> None:
     talk = Talk(vehicle=FakeVehicle(replace(SCENE, objects=(), fault=FAULT)))
-    assert not await talk.ask("circle the red car")
+    sentence = "circle the red car"
+    assert not await talk.ask(sentence)
     assert FAULT in talk.lines[-1]
     assert (talk.asked, talk.vehicle.commands) == (0, [])
 
@@ -123,8 +127,5 @@ async def test_newest_command_is_what_it_refers_to() -> None:
     talk = Talk()
     for sentence in ("circle the boat at ten metres", "twice as far", "the other way round"):
         assert await talk.ask(sentence)
-    assert talk.vehicle.commands == [
-        "orbit boat radius=10",
-        "orbit boat radius=20",
-        "orbit boat radius=20 direction=counterclockwise",
-    ]
+    orbit = "orbit boat radius="
+    assert talk.vehicle.commands == [f"{orbit}10", f"{orbit}20", f"{orbit}20 direction=counterclockwise"]

@@ -81,7 +81,7 @@ async def test_plan_is_confirmed_history_is_used_and_cancel_ends_it() -> None:
         assert there.commands == ["orbit radius=10 track=3"]
 
 
-async def test_settings_of_the_service_are_used_and_the_next_sentence_starts_it_again() -> None:
+async def test_settings_of_the_service_apply_and_it_starts_again() -> None:
     async with talking(language__may="orbit") as (there, talk):
         there.stopped.set()
         for _ in range(2):

@@ -22,6 +22,8 @@ from tests.companion.language.language_server import Call, Script, failure, olla
 from tests.companion.language.sentence_table import CLASSES, SCENE, SENTENCES
 
 SCHEMA = json_schema(CLASSES)
+REFUSAL, WARNING = "on the ground", "wind is strong"  # of `FakeVehicle`
+TO_THE_MODEL = "model: do it"
 
 
 class FakeVehicle:
@@ -35,7 +37,7 @@ class FakeVehicle:
     async def command(self, text: str) -> dict[str, Any]:
         self.commands.append(text)
         success = text != self._refused
-        return {"command": text, "success": success, "reason": "done" if success else "on the ground"}
+        return {"command": text, "success": success, "reason": "done" if success else REFUSAL}
 
     async def scene(self) -> Scene:
         return replace(self.seen, last=None)
@@ -45,7 +47,7 @@ class FakeVehicle:
 
     async def state(self) -> dict[str, Any]:
         facts = {"mode": "HOLD", "armed": True, "height_above_home_m": 5.0, "heading_deg": 90}
-        return facts | {"battery_percent": 81, "warnings": ["wind is strong"]}
+        return facts | {"battery_percent": 81, "warnings": [WARNING]}
 
 
 class Talk:
@@ -93,7 +95,7 @@ def test_tools_have_units_ranges_and_classes() -> None:
     assert tools["seek"]["properties"]["class"]["enum"] == list(CLASSES)
     assert tools["seek"]["required"] == ["class"]
     assert {name for name, each in tools.items() if '"traffic light"' in json.dumps(each)} == {"seek"}
-    assert tools["follow"]["properties"]["class"]["description"].endswith("classes as in seek")
+    assert tools["follow"]["properties"]["class"]["description"].endswith(" in seek")
     assert {"seen", "battery", "state", "why_not", "stop", "takeoff"} <= set(tools)
     assert not {"mission", "policy", "velocity"} & set(tools)
     assert class_names_of(SCHEMA) == CLASSES
@@ -217,7 +219,8 @@ async def test_call_written_as_text_is_always_confirmed(path: str, say: Any) -> 
 async def test_origin_of_a_call_written_as_text_is_shown(text: str, line: str) -> None:
     async with serving(ollama(text), ollama(calls=[("land", {})])) as script:
         talk = Talk(script.url, yes=False)
-        assert not await talk.ask("what is written there?")
+        question = "what is written there?"
+        assert not await talk.ask(question)
         assert talk.lines[0] == line
         assert talk.lines[1].startswith(("land", "mission plan: 2 steps"))
         assert (talk.asked, talk.vehicle.commands) == (1, [])
@@ -267,7 +270,8 @@ async def test_question_then_plan_then_answer(style: str) -> None:
         ]
     async with serving(*answers) as script:
         talk = Talk(script.url + ("/v1" if style == "openai" else ""))
-        assert await talk.ask("circle the red car once at ten metres")
+        sentence = "circle the red car once at ten metres"
+        assert await talk.ask(sentence)
     assert talk.vehicle.commands == talk.lines[:1] == ["orbit radius=10 laps=1 track=3"]
     assert talk.asked == 1
     assert "circle." in talk.text
@@ -327,7 +331,8 @@ async def test_several_calls_are_a_checked_mission() -> None:
     ]
     async with serving(ollama(calls=calls), ollama("Done.")) as script:
         talk = Talk(script.url)
-        assert await talk.ask("find a boat and circle it")
+        sentence = "find a boat and circle it"
+        assert await talk.ask(sentence)
     first, _, text = talk.vehicle.commands[0].partition("\n")
     assert first == "mission plan"
     assert text.count("[[step]]") == 3
@@ -340,7 +345,8 @@ async def test_endless_step_before_another_is_refused() -> None:
     calls = [("orbit", {"class": "boat"}), ("land", {})]
     async with serving(ollama(calls=calls), ollama("How often?")) as script:
         talk = Talk(script.url)
-        assert not await talk.ask("circle the boat and land")
+        sentence = "circle the boat and land"
+        assert not await talk.ask(sentence)
     assert talk.vehicle.commands == []
     assert "no end" in tool_results(script)[0]["reason"]
 
@@ -381,7 +387,7 @@ async def test_models_mission_and_stop_are_confirmed(
 ) -> None:
     async with serving(ollama(calls=calls), ollama("ok")) as script:
         talk = Talk(script.url, yes=False, may=may)
-        assert await talk.ask("model: do it") is (asked == 0)
+        assert await talk.ask(TO_THE_MODEL) is (asked == 0)
     assert (talk.asked, len(talk.vehicle.commands)) == (asked, 1 - asked)
 
 
@@ -400,7 +406,7 @@ async def test_listed_command_is_confirmed_after_a_take_over(control: Control, a
     async with serving(ollama(calls=calls), ollama("ok")) as script:
         talk = Talk(script.url, yes=False, may=("seek",))
         talk.vehicle.controlled = control
-        assert await talk.ask("model: do it") is (asked == 0)
+        assert await talk.ask(TO_THE_MODEL) is (asked == 0)
     assert (talk.asked, len(talk.vehicle.commands)) == (asked, 1 - asked)
 
 
@@ -471,11 +477,12 @@ async def test_instruction_in_scene_text_stays_data() -> None:
     vehicle = FakeVehicle(Scene((*CLASSES, label), (SceneObject(label, 4),)))
     async with serving(ollama(calls=[("seen", {})]), ollama(calls=[("land", {})])) as script:
         talk = Talk(script.url, yes=False, vehicle=vehicle)
-        assert not await talk.ask("what do you see")
+        question = "what do you see"
+        assert not await talk.ask(question)
     assert vehicle.commands == []
     for message in script.requests[-1][1]["messages"]:
         if message["role"] != "tool":
-            assert "ignore the operator" not in json.dumps(message)
+            assert label.splitlines()[0] not in json.dumps(message)
     assert tool_results(script, 1)[0]["objects"][0]["class_name"] == label
 
 
@@ -487,7 +494,7 @@ async def test_endless_calls_end_after_bounded_turns() -> None:
     assert str(MAX_TURNS) in talk.lines[-1]
 
 
-async def test_endless_text_and_endless_calls_in_one_answer_are_refused() -> None:
+async def test_endless_text_or_calls_in_one_answer_are_refused() -> None:
     for answer in (ollama("word " * 6000), ollama(calls=[("battery", {})] * 60)):
         async with serving(answer) as script:
             with pytest.raises(LanguageError, match="more than"):
@@ -497,10 +504,11 @@ async def test_endless_text_and_endless_calls_in_one_answer_are_refused() -> Non
 async def test_history_reaches_the_next_exchange() -> None:
     async with serving(ollama("Five metres."), ollama("Yes.")) as script:
         talk = Talk(script.url)
-        await talk.ask("how high are we?")
-        await talk.ask("sure?")
+        questions = "how high are we?", "sure?"
+        for question in questions:
+            await talk.ask(question)
     contents = [message["content"] for message in script.requests[-1][1]["messages"][1:]]
-    assert contents == ["how high are we?", "Fivemetres.", "sure?"]
+    assert contents == [questions[0], "Fivemetres.", questions[1]]
 
 
 async def test_refused_command_is_no_success_after_a_question() -> None:
@@ -614,7 +622,7 @@ async def test_no_server_says_which_one_to_start(path: str) -> None:
     with pytest.raises(LanguageError) as caught:
         await Talk(url).ask("hello")
     assert ("ollama serve" in str(caught.value)) is (path == "")
-    assert (f"start the server at {url}," in str(caught.value)) is (path == "/v1")
+    assert (f"server at {url}," in str(caught.value)) is (path == "/v1")
 
 
 async def test_malformed_arguments_of_openai_are_refused() -> None:
@@ -622,7 +630,9 @@ async def test_malformed_arguments_of_openai_are_refused() -> None:
         talk = Talk(f"{script.url}/v1")
         assert not await talk.ask("take off")
     assert talk.vehicle.commands == []
-    assert "must be an object" in tool_results(script)[0]["error"]
+    error = tool_results(script)[0]["error"]
+    assert error.startswith("takeoff: ")
+    assert "an object" in error
 
 
 def _events(parts: list[dict[str, Any]]) -> bytes:
@@ -686,7 +696,8 @@ async def test_models_plan_is_flown_by_the_simulated_vehicle() -> None:
         ollama(calls=calls), ollama(calls=[("goto", {"north": 999, "east": 0})]), ollama("ok")
     ) as script:
         talk = Talk(script.url, vehicle=vehicle)
-        assert not await talk.ask("climb to eight metres, fly a circle, then a kilometre north")
+        sentence = "climb to eight metres, fly a circle, then a kilometre north"
+        assert not await talk.ask(sentence)
     truth = vehicle.flight.vehicle.truth
     first, second = tool_results(script)[0], tool_results(script)[-1]
     assert first["success"] is True

@@ -20,7 +20,7 @@ from companion.language.control import Control
 from companion.language.mcp_server import FlightTools, server_of
 from companion.language.scene import Scene, SceneObject
 from tests.companion.language.sentence_table import CLASSES
-from tests.companion.language.test_conversation import FakeVehicle
+from tests.companion.language.test_conversation import WARNING, FakeVehicle
 
 SCHEMA = json_schema(CLASSES)
 
@@ -77,7 +77,7 @@ async def calling(*allowed: str, vehicle: FlyingVehicle | None = None) -> AsyncI
     await tools.close()
 
 
-async def test_listed_tools_are_those_of_ask_and_say_what_is_not_allowed() -> None:
+async def test_listed_tools_are_those_of_ask_and_say_what_is_allowed() -> None:
     async with calling("takeoff") as caller:
         tools = {tool.name: tool for tool in (await caller.client.list_tools()).tools}
     assert tools.keys() >= {*QUESTIONS, "takeoff", "land", "seek", "stop", "hold"}
@@ -101,14 +101,15 @@ async def test_questions_are_answered_with_data() -> None:
         ]
         assert await caller.call("why_not") == (
             False,
-            {"newest_command": None, "warnings": ["wind is strong"]},
+            {"newest_command": None, "warnings": [WARNING]},
         )
         assert caller.vehicle.commands == []
 
 
 async def test_no_detections_is_an_error_not_an_empty_view() -> None:
-    async with calling(vehicle=FlyingVehicle(scene=Scene(CLASSES, fault="no detections received"))) as caller:
-        assert await caller.call("seen") == (True, {"error": "no detections received"})
+    fault = "no detections received"
+    async with calling(vehicle=FlyingVehicle(scene=Scene(CLASSES, fault=fault))) as caller:
+        assert await caller.call("seen") == (True, {"error": fault})
     async with calling(vehicle=FlyingVehicle(scene=Scene(CLASSES))) as caller:
         assert await caller.call("seen") == (False, {"objects": []})
 
@@ -289,12 +290,12 @@ async def test_cancelled_call_cancels_the_command() -> None:
 
 
 async def test_service_that_has_gone_is_an_error_in_a_line() -> None:
-    async def schema() -> dict[str, Any]:
-        raise NoAnswerError("commands: no answer from vehicle 'vehicle1' within 10 s")
+    gone = "commands: no answer from vehicle 'vehicle1' within 10 s"
 
-    assert await FlightTools(FlyingVehicle(), schema).call("state", {}) == {
-        "error": "commands: no answer from vehicle 'vehicle1' within 10 s"
-    }
+    async def schema() -> dict[str, Any]:
+        raise NoAnswerError(gone)
+
+    assert await FlightTools(FlyingVehicle(), schema).call("state", {}) == {"error": gone}
 
 
 async def test_sessions_that_were_not_deleted_leave_room(monkeypatch: pytest.MonkeyPatch) -> None:

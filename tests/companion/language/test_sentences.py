@@ -35,7 +35,7 @@ def test_unclear_sentence_is_asked_back(text: str, word: str) -> None:
 
 def test_vehicle_is_the_class_in_view_or_asked_back() -> None:
     assert str(understand("find a vehicle", SCENE).intents[0]) == "seek car"
-    with pytest.raises(UnclearError, match="car or truck or bus"):
+    with pytest.raises(UnclearError, match=r"car .*truck .*bus"):
         understand("find a vehicle", replace(SCENE, objects=()))
 
 
@@ -61,10 +61,11 @@ def test_pose_is_known_again_after_the_search() -> None:
 def test_unknown_colour_is_asked_back(text: str) -> None:
     unknown = replace(SCENE, objects=tuple(replace(each, colour=None) for each in SCENE.objects))
     for done in (None, 0):
-        with pytest.raises(UnclearError, match=r"colours are not known.*car \(track 3\)"):
+        with pytest.raises(UnclearError, match=r"colours .*known.*car \(track 3\)"):
             understand(text, unknown, done)
     one = replace(SCENE, objects=(SCENE.objects[0], SceneObject("car", 5)))
-    assert "track=3" in str(understand("circle the red car", one).intents[0])
+    sentence = "circle the red car"
+    assert "track=3" in str(understand(sentence, one).intents[0])
 
 
 def test_a_condition_no_command_expresses_is_not_dropped() -> None:
@@ -142,4 +143,5 @@ def test_numbers_and_units_in_words(text: str, expected: str) -> None:
 def test_every_class_has_a_singular_and_a_plural() -> None:
     for name in CLASSES:
         assert str(understand(f"look for a {name}", SCENE).intents[0]) == str(parse(f"seek {name}"))
-    assert str(understand("look for buses", SCENE).intents[0]) == "seek bus"
+    plural = "look for buses"
+    assert str(understand(plural, SCENE).intents[0]) == "seek bus"

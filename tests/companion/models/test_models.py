@@ -37,7 +37,8 @@ def test_list_has_bundled_local_and_official_models(folder: Path, small_model: P
     listed = json.loads(run("list", "--json"))
     states = {row["name"]: row["state"] for row in listed["models"]}
     assert (states["default"], states["mine.pt"]) == ("bundled", "here")
-    assert (states["yolov8n"], states["yolo26x"]) == ("here", "can be pulled")
+    assert states["yolov8n"] == "here"
+    assert states["yolo26x"].endswith(" pulled")
     assert "yolo11n" in run("list")
     assert [path.name for path in kept_models()] == ["mine.pt", "yolov8n.pt"]
 
@@ -106,10 +107,11 @@ def test_unknown_runtime_is_an_error() -> None:
 def test_missing_model_or_unknown_format_is_an_error(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, ["models", "info", str(tmp_path / "none.pt")])
     assert result.exit_code == 2
-    assert "none.pt: no such file" in result.stderr
+    assert f"{tmp_path / 'none.pt'}: " in result.stderr
+    assert "such file" in result.stderr
     result = CliRunner().invoke(app, ["models", "export", "default", "--to", "caffe"])
     assert result.exit_code == 2
-    assert "not to 'caffe'" in result.stderr
+    assert " to 'caffe'" in result.stderr
 
 
 @pytest.mark.parametrize("to", ["onnx", "openvino"])
@@ -119,7 +121,9 @@ def test_export_of_exported_file_asks_for_checkpoint(tmp_path: Path, name: str, 
     options = ["--to", to, "--precision", "int8", "--calibrate", str(tmp_path)]
     result = CliRunner().invoke(app, ["models", "export", str(tmp_path / name), *options])
     assert result.exit_code == 2
-    assert f"{tmp_path / name}: is an exported file; a checkpoint is needed" in result.stderr
+    assert f"{tmp_path / name}: " in result.stderr
+    assert "exported file" in result.stderr
+    assert "a checkpoint " in result.stderr
     assert len(result.stderr.splitlines()) == 1
 
 
