@@ -283,7 +283,7 @@ def test_lost_steps_are_counted(converter: Converter) -> None:
     assert (converter.first_step, converter.lost_steps) == (3, 3)
 
 
-def test_recorder_of_lossless_images_does_not_subscribe_to_the_preview() -> None:
+def test_recorder_of_lossless_images_does_not_get_the_preview() -> None:
     frames = {"image": "frames"}
     options = RecorderOptions(ZenohSection(), "vehicle1", "", True, True, True, 1, 1, 1, frames)
     names = [topic.name for topic in topics_of(options)]

@@ -105,14 +105,12 @@ def test_viewer_gets_messages_and_images(filming: list[str], tmp_path: Path) -> 
             viewer.close()
 
 
-def test_busy_port_and_bad_folder_are_reported_and_the_service_runs(
-    filming: list[str], tmp_path: Path
-) -> None:
+def test_service_reports_busy_port_and_bad_folder_and_runs(filming: list[str], tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with socket.create_server(("127.0.0.1", 0)) as taken, running_simulator() as simulator:
-        flags = ["--foxglove-listen", f"127.0.0.1:{taken.getsockname()[1]}"]
-        flags += ["--recording-directory", str(tmp_path / "file" / "folder")]
+        address, folder = f"127.0.0.1:{taken.getsockname()[1]}", tmp_path / "file" / "folder"
+        flags = ["--foxglove-listen", address, "--recording-directory", str(folder)]
         with running_service(simulator.onboard_port, [*filming, *flags], cwd=tmp_path) as service:
-            assert "foxglove: " in service.wait_for_line("cannot be served")
-            assert "recorder: " in service.wait_for_line("cannot be made")
+            assert "foxglove: " in service.wait_for_line(f"{address} cannot ")
+            assert "recorder: " in service.wait_for_line(f"{folder}: the folder ")
             assert service.command("stop")["success"]

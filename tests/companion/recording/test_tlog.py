@@ -73,7 +73,7 @@ def test_datagrams_of_both_directions_are_in_order_of_time(tmp_path: Path) -> No
     )
 
 
-def test_frame_across_reads_of_a_serial_link_has_the_last_ones_time(tmp_path: Path) -> None:
+def test_frame_across_reads_of_a_serial_link_has_the_last_time(tmp_path: Path) -> None:
     rng = random.Random(11)
     streams = {RECEIVED: messages(300, 1), SENT: messages(300, 2)}
     pieces: list[tuple[Channel, int, bytes]] = []

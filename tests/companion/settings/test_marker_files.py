@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import math
+import os
 from pathlib import Path
 
 import numpy as np
@@ -88,9 +90,9 @@ def test_settings_read_the_boards_and_their_sizes(file: Path) -> None:
     kind = settings.markers.kind()
     assert kind is not None
     assert (kind.size_of(3), kind.size_of(7), kind.size_of(9)) == (0.2, 0.3, 0.5)
-    with pytest.raises(ConfigurationError, match=r"marker 3 is 0\.3 m .* 0\.2 m in board 'dock'"):
+    with pytest.raises(ConfigurationError, match=r"marker 3 .*0\.3 m .* 0\.2 m .*'dock'"):
         load_settings(None, {"markers.boards_file": str(file), "markers.others": "3:0.3"})
-    with pytest.raises(ConfigurationError, match="No such file"):
+    with pytest.raises(ConfigurationError, match=rf"none\.toml: {os.strerror(errno.ENOENT)}"):
         load_settings(None, {"markers.boards_file": str(file.with_name("none.toml"))})
     assert Settings().markers.boards() == ()
     assert math.isclose(kind.size_of(4), 0.1)

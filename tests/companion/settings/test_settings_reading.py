@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import errno
 import math
 import os
 import tomllib
@@ -160,7 +161,9 @@ def test_class_heights_are_metres_by_class() -> None:
         "dining table": 0.75,
     }
     (line,) = problems(overrides={"detector.class_heights_m": "person:0"})
-    assert "person must be above 0 and at most 100 m, got 0" in line
+    assert "class_heights_m: person " in line
+    assert "above 0 and " in line
+    assert " 100 m, got 0" in line
 
 
 @pytest.mark.parametrize(
@@ -206,10 +209,9 @@ def test_unknown_key_suggests_the_nearest(key: str, nearest: str) -> None:
 
 def test_unknown_environment_variable_is_reported() -> None:
     (line,) = problems(COMPANION_DETECTOR_CONFIDENSE="1")
-    assert line == (
-        "unknown key detector.confidense (given as COMPANION_DETECTOR_CONFIDENSE); "
-        "did you mean detector.confidence?"
-    )
+    key, variable = "detector.confidense", "COMPANION_DETECTOR_CONFIDENSE"
+    assert line.startswith(f"unknown key {key} (given as {variable}); ")
+    assert line.endswith(" detector.confidence?")
 
 
 def test_all_problems_are_reported_at_once(tmp_path: Path) -> None:
@@ -252,19 +254,22 @@ def test_syntax_error_names_file_and_line(tmp_path: Path, content: bytes) -> Non
 def test_truncated_file_is_reported(tmp_path: Path) -> None:
     path = written(tmp_path / "c.toml", "[detector]\nclasses = [")
     (line,) = problems(path)
-    assert line.startswith(f"{path}, end of document: ")
+    assert line.startswith(f"{path}, end of ")
 
 
 def test_binary_file_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "c.toml"
     path.write_bytes(b"[log]\nlevel = '\xff'\n")
-    assert problems(path) == [f"{path}, line 2: not UTF-8 text, which TOML must be"]
+    (line,) = problems(path)
+    assert line.startswith(f"{path}, line 2: not UTF-8 text")
 
 
 def test_missing_file_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "none.toml"
-    assert problems(path) == [f"cannot read the settings file {path}: No such file or directory"]
-    assert problems(tmp_path) == [f"cannot read the settings file {tmp_path}: Is a directory"]
+    for unreadable, reason in ((path, errno.ENOENT), (tmp_path, errno.EISDIR)):
+        (line,) = problems(unreadable)
+        assert line.startswith("cannot read ")
+        assert line.endswith(f" {unreadable}: {os.strerror(reason)}")
 
 
 def test_example_file_has_every_default() -> None:
@@ -363,7 +368,7 @@ def test_renamed_key_names_the_new_one(old: str, new: str, tmp_path: Path) -> No
 def test_renamed_views_section_names_cameras(tmp_path: Path) -> None:
     path = tmp_path / "companion.toml"
     path.write_text('[views.down.source]\nuri = "down.mp4"\n')
-    with pytest.raises(ConfigurationError, match=r"\[views\].*was renamed to \[cameras\]"):
+    with pytest.raises(ConfigurationError, match=r"\[views\].*renamed .*\[cameras\]"):
         load_settings(path, {}, {})
 
 

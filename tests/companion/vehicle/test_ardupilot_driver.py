@@ -55,7 +55,7 @@ async def test_streams_parameters_and_modes_on_the_ground() -> None:
         await driver.set_parameter("GUID_TIMEOUT", 1.5)
         assert await driver.get_parameter("RTL_ALT") == 900.0
         assert await driver.get_parameter("GUID_TIMEOUT") == 1.5
-        with pytest.raises(CommandRefusedError, match="RTL_ALT is an integer"):
+        with pytest.raises(CommandRefusedError, match=r"RTL_ALT .*integer .*900\.5"):
             await driver.set_parameter("RTL_ALT", 900.5)
         with pytest.raises(CommandRefusedError, match="armed"):
             await driver.takeoff(3.0)
@@ -156,7 +156,7 @@ def test_copter_modes_map_to_px4_names() -> None:
     assert mode_of_custom_mode(21) is FlightMode.RETURN
     assert mode_of_custom_mode(99) is FlightMode.UNKNOWN
     assert custom_mode_of_mode(FlightMode.POSITION) == 5
-    with pytest.raises(ValueError, match="no mode takeoff"):
+    with pytest.raises(ValueError, match=r"ArduPilot .* mode takeoff; "):
         custom_mode_of_mode(FlightMode.TAKEOFF)
 
 

@@ -68,7 +68,7 @@ async def test_mode_is_sent_as_main_and_sub_mode(driver: Driver, autopilot: Fake
         (m.param1, m.param2, m.param3) for m in autopilot.received_named("COMMAND_LONG") if m.command == 176
     ]
     assert asked == [(1, 6, 0), (1, 4, 6), (1, 4, 5), (1, 4, 3)]
-    with pytest.raises(ValueError, match="mode unknown cannot be requested"):
+    with pytest.raises(ValueError, match=r"mode unknown .*; known: "):
         await driver.set_mode(FlightMode.UNKNOWN)
 
 
@@ -100,7 +100,7 @@ async def test_takeoff_without_home_is_refused(
     driver: Driver, autopilot: FakeAutopilot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(flight_commands, "_SHOWN_TIMEOUT_S", 0.2)
-    with pytest.raises(CommandRefusedError, match="home position not received"):
+    with pytest.raises(CommandRefusedError, match=r"home position .*: take-off"):
         await driver.takeoff(4.0)
     with pytest.raises(CommandRefusedError, match="above 0 m"):
         await driver.takeoff(-1.0)
@@ -109,7 +109,7 @@ async def test_takeoff_without_home_is_refused(
 
 async def test_unanswered_command_is_repeated_then_fails(driver: Driver, autopilot: FakeAutopilot) -> None:
     autopilot.answers.clear()
-    with pytest.raises(CommandRefusedError, match="no answer to command 400"):
+    with pytest.raises(CommandRefusedError, match=r"no answer .*command 400 "):
         await driver.arm()
     attempts = [m.confirmation for m in autopilot.received_named("COMMAND_LONG") if m.command == 400]
     assert len(attempts) >= 3
@@ -200,7 +200,7 @@ async def test_integer_parameters_are_sent_as_bytes(
 async def test_unknown_parameter_is_refused_by_name(
     driver: Driver, parameters: dict[str, tuple[int, bytes]]
 ) -> None:
-    with pytest.raises(CommandRefusedError, match="COM_NOT_THERE: no such parameter"):
+    with pytest.raises(CommandRefusedError, match=r"COM_NOT_THERE: .*such parameter"):
         await driver.get_parameter("COM_NOT_THERE")
     with pytest.raises(CommandRefusedError, match="16 characters"):
         await driver.get_parameter("A_NAME_LONGER_THAN_16")
@@ -235,7 +235,7 @@ async def test_command_callbacks_outlive_mavsdk(
         del subscribed
     finally:
         await driver.close()
-    with pytest.raises(CommandRefusedError, match="link was closed"):
+    with pytest.raises(CommandRefusedError, match="was closed"):
         await arming
     assert alive == [True] * len(callbacks)
 

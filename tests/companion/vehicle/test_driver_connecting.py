@@ -119,7 +119,7 @@ async def test_one_heartbeat_suffices_to_connect(
 
 
 async def test_busy_port_is_reported(kind: DriverKind, driver: Driver, port: int) -> None:
-    with pytest.raises(LinkError, match=rf"{port} is in use: .*QGroundControl"):
+    with pytest.raises(LinkError, match=rf"{port} is .*use: .*QGroundControl"):
         await open_driver(kind, f"udpin://127.0.0.1:{port}").connect(5.0)
 
 
@@ -232,7 +232,7 @@ async def test_udp_out_sends_the_first_heartbeat(kind: DriverKind, port: int) ->
 
 
 def test_open_driver_refuses_bad_arguments() -> None:
-    with pytest.raises(ValueError, match=r"'dronekit'.*pymavlink, mavsdk, auto"):
+    with pytest.raises(ValueError, match=r"'dronekit'.*pymavlink, mavsdk\b.* auto\b"):
         open_driver("dronekit", "udpin://0.0.0.0:14540")  # type: ignore[arg-type]  # refused
     with pytest.raises(ValueError, match="not a link url"):
         open_driver("mavsdk", "14540")

@@ -96,7 +96,7 @@ async def test_lost_acknowledgement_is_repeated(kind: DriverKind) -> None:
             await driver.disarm()
             simulator.fault("lost_ack command=400")
             await asyncio.to_thread(simulator.wait_for_event, "fault 2 lost_ack")
-            with pytest.raises(CommandRefusedError, match="no answer to command 400"):
+            with pytest.raises(CommandRefusedError, match=r"no answer .*command 400 "):
                 await driver.arm()
 
 

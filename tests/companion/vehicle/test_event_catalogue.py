@@ -67,7 +67,8 @@ def test_event_text(number: int, arguments: bytes, text: str) -> None:
 
 def test_check_has_its_group_and_modes() -> None:
     report = report_of(6, struct.pack("<IBB", 0x4000, 0, 2))
-    assert report == Report(5, 3, "No valid data from Compass 2", "arming_check", "an_event", 0x4000)
+    text = "No valid data from Compass 2"
+    assert report == Report(5, 3, text, "arming_check", "an_event", 0x4000)
     assert report is not None
     assert report.is_check
     hint = report_of(6, struct.pack("<IBB", 0x4000, 0, 2), INFO)

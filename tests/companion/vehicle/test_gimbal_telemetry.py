@@ -66,7 +66,7 @@ def test_stale_attitude_is_reported() -> None:
     assert gimbal.attitude_fresh(1_500_000_000)
     assert not gimbal.attitude_fresh(1_600_000_000)
     assert "2.0 s" in (gimbal.why_not_looking(3_000_000_000) or "")
-    assert GimbalState().why_not_looking(0) == "attitude not received"
+    assert "not received" in (GimbalState().why_not_looking(0) or "")
 
 
 @pytest.mark.parametrize("q", [None, [None] * 4, [0.0] * 4, [math.nan, 0, 0, 0], [1.0, 0.0], 0])

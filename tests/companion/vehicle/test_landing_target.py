@@ -69,5 +69,5 @@ def test_any_target_is_packed_with_its_position(
 
 
 def test_non_finite_target_is_refused() -> None:
-    with pytest.raises(ValueError, match="must be finite"):
+    with pytest.raises(ValueError, match=r"be finite, .*nan"):
         LandingTarget(0, 1, (math.nan, 0.0, 0.0), (0.0, 0.0, 1.0), 0.5)

@@ -41,15 +41,14 @@ def event(sequence: int, identifier: int = 0x01000005) -> Frame:
 
 
 def test_short_text_is_reported_without_its_tab() -> None:
-    assert StatusTexts().add(text(b"Arm: Need Position Estimate\t"), 7) == Report(
-        7, 2, "Arm: Need Position Estimate"
-    )
+    sent = b"Arm: Need Position Estimate\t"
+    assert StatusTexts().add(text(sent), 7) == Report(7, 2, sent[:-1].decode())
     assert StatusTexts().add(text(b"\t"), 7) is None
 
 
 def test_fence_breach_notice_is_a_warning() -> None:
-    report = StatusTexts().add(text(b"Circle fence breached", severity=5), 7)
-    assert report == Report(7, 4, "Circle fence breached")
+    sent = b"Circle fence breached"
+    assert StatusTexts().add(text(sent, severity=5), 7) == Report(7, 4, sent.decode())
 
 
 def test_long_text_is_reassembled() -> None:
@@ -116,9 +115,9 @@ async def test_file_is_read_despite_lost_replies(
 
 async def test_missing_file_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("companion.vehicle.report_reader._ATTEMPT_S", 0.01)
-    with pytest.raises(FileReadError, match=r"etc/b\.json: no such file"):
+    with pytest.raises(FileReadError, match=r"etc/b\.json: .*such file"):
         await Autopilot().reader.read("etc/b.json")
-    with pytest.raises(FileReadError, match="no MAVLink FTP answer"):
+    with pytest.raises(FileReadError, match=r"etc/b\.json: .*MAVLink FTP "):
         await FileReader(lambda *_: None, lambda: (1, 1)).read("etc/b.json")
 
 
@@ -164,9 +163,11 @@ async def test_events_wait_for_the_metadata(
     link.reader.on_frame(event(1))
     assert link.telemetry.state.reports == ()
     await link.reader.load_events()
-    assert "COMPONENT_METADATA not received" in caplog.text
+    assert "COMPONENT_METADATA not " in caplog.text
     reports: tuple[Report, ...] = link.telemetry.state.reports
-    assert [report.text for report in reports] == ["event 0x01000005 (not in the metadata)"]
+    (report,) = reports
+    assert report.text.startswith("event 0x01000005 (not ")
+    assert report.text.endswith(" metadata)")
 
 
 class AutopilotWithMetadata(Autopilot):
