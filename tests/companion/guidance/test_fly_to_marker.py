@@ -46,6 +46,7 @@ def flight_with(
     at: Callable[[float], tuple[float, float]] = lambda _: (AHEAD_M, 1.0),
     *,
     seed: int = 1,
+    rate_hz: float = 10.0,
 ) -> LockstepFlight:
     printed = Print("APRILTAG_36h11", 7, 0.8, standing=True)
     world = World(
@@ -55,7 +56,7 @@ def flight_with(
     settings: Settings = camera_settings(CAMERA, MOUNT, SETTINGS)
 
     def camera(vehicle: LockstepVehicle) -> RenderedCamera:
-        return RenderedCamera(settings, scene, vehicle, by_flight=True, depth=False)
+        return RenderedCamera(settings, scene, vehicle, rate_hz=rate_hz, by_flight=True, depth=False)
 
     flight = LockstepFlight.airborne(seed=seed, height_m=HEIGHT_M, wind_mps=1.5, camera=camera)
     flight.turn_to(0.0)
@@ -69,7 +70,7 @@ def reason(log: FlightLog) -> str:
 
 @pytest.mark.parametrize("seed", [pytest.param(3, marks=pytest.mark.slow), 8])
 def test_approach_stops_before_the_marker(seed: int) -> None:
-    flight = flight_with(seed=seed)
+    flight = flight_with(seed=seed, rate_hz=5.0)
     log = flight.fly("approach marker=7 distance=4", 60.0)
     assert log.outcome is not None
     assert log.outcome.success, log.outcome
@@ -83,7 +84,7 @@ def test_follow_keeps_its_distance_to_a_moving_marker() -> None:
     def path(time_s: float) -> tuple[float, float]:
         return AHEAD_M + 0.8 * min(time_s, 30.0), 0.5
 
-    flight = flight_with(path)
+    flight = flight_with(path, rate_hz=5.0)
     distances: list[float] = []
 
     def note() -> None:
@@ -100,7 +101,7 @@ def test_follow_keeps_its_distance_to_a_moving_marker() -> None:
 
 
 def test_orbit_circles_about_the_marker() -> None:
-    flight = flight_with(lambda _: (8.0, 0.0))
+    flight = flight_with(lambda _: (8.0, 0.0), rate_hz=5.0)
     radii: list[float] = []
 
     def note() -> None:
