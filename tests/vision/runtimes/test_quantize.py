@@ -35,7 +35,10 @@ def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture(scope="module", params=[("onnx", "onnxruntime"), ("openvino", "openvino")])
+@pytest.fixture(
+    scope="module",
+    params=[("onnx", "onnxruntime"), pytest.param(("openvino", "openvino"), marks=pytest.mark.slow)],
+)
 def quantised(
     request: pytest.FixtureRequest,
     checkpoint: Path,

@@ -68,16 +68,19 @@ def test_checkpoint_is_converted_once_for_a_named_runtime(checkpoint: Path, runt
     assert {path: path.stat().st_mtime_ns for path in cache_folder().iterdir()} == before
 
 
-def test_runtime_rejects_unsupported_files(checkpoint: Path, tmp_path: Path) -> None:
-    path = export(checkpoint, "torchscript", tmp_path / "net.torchscript", 64)
+@pytest.fixture(scope="module")
+def torchscript(checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return export(checkpoint, "torchscript", tmp_path_factory.mktemp("exported") / "net.torchscript", 64)
+
+
+def test_runtime_rejects_unsupported_files(torchscript: Path) -> None:
     with pytest.raises(RuntimeUnusableError, match=r"openvino .*\.torchscript"):
-        start_runtime(read_source(path), "openvino")
+        start_runtime(read_source(torchscript), "openvino")
 
 
-def test_precisions_that_a_runtime_does_not_have_are_rejected(checkpoint: Path, tmp_path: Path) -> None:
-    path = export(checkpoint, "torchscript", tmp_path / "net.torchscript", 64)
-    with pytest.raises(RuntimeUnusableError, match=r"TorchScript .*float32, .* bfloat16"):
-        Detector(path, precision="bfloat16")
+def test_precisions_that_a_runtime_does_not_have_are_rejected(checkpoint: Path, torchscript: Path) -> None:
+    with pytest.raises(RuntimeUnusableError, match="computes in float32"):
+        Detector(torchscript, precision="bfloat16")
     if installed("onnxruntime") and installed("onnx"):  # type: ignore[arg-type]
         with pytest.raises(RuntimeUnusableError, match=r"onnxruntime .*float32, .* float16"):
             Detector(checkpoint, runtime="onnxruntime", precision="float16")
