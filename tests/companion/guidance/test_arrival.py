@@ -175,9 +175,14 @@ def on_circle(
     return sorted(wide), sorted(nose)
 
 
-@pytest.mark.parametrize(("radius_m", "speed_mps"), [(8.0, 4.0), (10.0, 2.0), (5.0, 3.0)])
+ORBITS = [(8.0, 4.0), (10.0, 2.0), (5.0, 3.0)]
+
+
 @pytest.mark.parametrize(
-    ("name", "seed"), [("px4", 1), pytest.param("px4", 2, marks=pytest.mark.slow), ("slow", 3)]
+    ("radius_m", "speed_mps", "name", "seed"),
+    [*((*orbit, "px4", 1) for orbit in ORBITS), (5.0, 3.0, "slow", 3)]
+    + [pytest.param(*orbit, "px4", 2, marks=pytest.mark.slow) for orbit in ORBITS]
+    + [pytest.param(*orbit, "slow", 3, marks=pytest.mark.slow) for orbit in ORBITS[:2]],
 )
 def test_orbit_keeps_radius_and_heading(radius_m: float, speed_mps: float, name: str, seed: int) -> None:
     wide, nose = on_circle(radius_m, speed_mps, name, seed)

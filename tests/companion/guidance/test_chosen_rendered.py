@@ -85,7 +85,10 @@ def test_follow_by_track_keeps_to_the_farther_of_two_cars() -> None:
 
 @pytest.mark.parametrize(
     ("class_name", "size_m", "depth"),
-    [("rock", (1.0, 1.0, 0.8), True), ("shed", (3.0, 2.4, 2.6), False)],
+    [
+        pytest.param("rock", (1.0, 1.0, 0.8), True, marks=pytest.mark.slow),
+        ("shed", (3.0, 2.4, 2.6), False),
+    ],
     ids=["rock by depth", "shed by the ground"],
 )
 def test_selected_object_of_no_class_is_approached_and_held(

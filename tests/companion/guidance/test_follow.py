@@ -57,6 +57,7 @@ def test_command_builds_the_behaviour() -> None:
     assert not parse("follow car duration=10").endless
 
 
+@pytest.mark.slow
 def test_follow_a_person_for_a_minute_in_lockstep() -> None:
     result = run(4)
     assert result.success, result.reason

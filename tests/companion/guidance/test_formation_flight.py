@@ -68,7 +68,9 @@ def ended(fleet: Fleet, name: str) -> Outcome:
     return outcome
 
 
-@pytest.mark.parametrize("shape", ["line", "column", "wedge", "circle"])
+@pytest.mark.parametrize(
+    "shape", ["line", "circle", *(pytest.param(name, marks=pytest.mark.slow) for name in ("column", "wedge"))]
+)
 def test_followers_keep_their_slots_through_turns(shape: str) -> None:
     fleet = flying(4)
     follow(fleet, "bcd", shape)
@@ -242,6 +244,7 @@ def test_hovering_vehicle_is_flown_around() -> None:
     assert separated(fleet)
 
 
+@pytest.mark.slow
 def test_circle_of_six_on_a_figure_eight_keeps_separation() -> None:
     fleet = flying(7)
     follow(fleet, "bcdefg", "circle")
