@@ -22,13 +22,18 @@ pytestmark = pytest.mark.realtime
 
 # More than the command's own limits: its workers, its subscriber's process, its subscription.
 @pytest.mark.timeout(_LOADING_S + 3 * _START_S)
-def test_delay_to_another_process_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_delay_to_another_process_is_measured(
+    exported_model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     spawn = PerceptionProcess.spawn
 
     async def spawn_with_one_hertz(settings: Settings, standard_input: int) -> PerceptionProcess:
-        """A paced source would give one frame a second, also on a busy machine."""
+        """A paced source would give one frame a second, also on a busy machine. A small model starts soon."""
         source = settings.source.model_copy(update={"rate_hz": 1.0})
-        return await spawn(settings.model_copy(update={"source": source}), standard_input)
+        small = {"model": str(exported_model), "runtime": "onnxruntime", "image_size": 160}
+        detector = settings.detector.model_copy(update=small)
+        changed = settings.model_copy(update={"source": source, "detector": detector})
+        return await spawn(changed, standard_input)
 
     monkeypatch.setattr(PerceptionProcess, "spawn", spawn_with_one_hertz)
     command = ("bench", "bus", "--seconds", "1", "--rate-hz", "1000", "--load", "1", "--json")
