@@ -35,8 +35,8 @@ def companion(*arguments: str | Path, cwd: Path, timeout_s: float = 60.0) -> sub
 def companion_here(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
     """The same in this process, which saves half a second of imports.
 
-    Not for commands that keep running (`run`, `play`, `record`…): they set signal handlers and replace
-    standard error of the process.
+    Not for commands that keep running (`run`, `play`, `record`…), unless they are refused before: they set
+    signal handlers and replace standard error of the process.
     """
     command = [str(argument) for argument in arguments]
     unset = {key: None for key in os.environ if key.startswith("COMPANION_")}

@@ -22,7 +22,7 @@ from companion.bus.client import send_command
 from companion.bus.topics import DETECTIONS
 from companion.play import PlayOptions
 from mavlink_sim.testing import QUICK_FLIGHT, free_port, running_simulator, vehicle
-from tests.companion.command_line import companion
+from tests.companion.command_line import companion, companion_here
 from tests.companion.service_process import ServiceProcess
 
 pytestmark = pytest.mark.realtime
@@ -191,12 +191,24 @@ def test_play_exits_with_1_when_simulator_dies(tmp_path: Path, small: list[str])
         (("--camera-mount-pitch-deg", "-10"), "camera.mount_pitch_deg"),
         (("--source", "none", "--camera-mount-pitch-deg", "-10"), "camera.mount_pitch_deg"),
         (("--source", "none", "--vehicle-url", "udpin://127.0.0.1:14540"), "--vehicle-url"),
-        (("--scene", "no-such-scene"), "no-such-scene"),
-        (("--vehicle-url", "tcp://127.0.0.1:5760"), "udpin://"),
         (("--vehicle-url", "udpin://127.0.0.1:14540", "--vehicles", "2"), "--vehicles"),
     ],
 )
 def test_play_refuses_invalid_options_in_one_line(tmp_path: Path, flags: tuple[str, ...], named: str) -> None:
+    done = companion_here("play", *flags, cwd=tmp_path)
+    assert done.returncode == 2, done.stdout + done.stderr
+    (line,) = done.stderr.splitlines()
+    assert named in line
+
+
+@pytest.mark.parametrize(
+    ("flags", "named"),
+    [
+        (("--scene", "no-such-scene"), "no-such-scene"),
+        (("--vehicle-url", "tcp://127.0.0.1:5760"), "udpin://"),
+    ],
+)
+def test_play_that_cannot_start_is_one_line(tmp_path: Path, flags: tuple[str, ...], named: str) -> None:
     endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     done = companion("play", "--zenoh-listen", endpoint, *flags, cwd=tmp_path)
     assert done.returncode == 2, done.stdout + done.stderr

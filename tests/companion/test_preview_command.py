@@ -135,7 +135,7 @@ def test_cameras_are_one_json_object(tmp_path: Path) -> None:
     assert [device["path"] for device in listed["devices"]] == sorted(
         map(str, Path("/dev").glob("video[0-9]*")), key=lambda path: int(path.removeprefix("/dev/video"))
     )
-    assert companion("cameras", cwd=tmp_path).returncode == 0
+    assert companion_here("cameras", cwd=tmp_path).returncode == 0
 
 
 @pytest.fixture

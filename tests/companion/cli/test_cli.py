@@ -134,8 +134,8 @@ def test_detect_reports_only_requested_classes(
     assert names("--classes", one) == {one}
 
 
-def test_missing_model_is_one_line(image_folder: Path, tmp_path: Path) -> None:
-    line = one_line_of_bad_input(companion("detect", image_folder, "--model", "no.pt", cwd=tmp_path))
+def test_missing_model_is_one_line(images: Path, tmp_path: Path) -> None:
+    line = one_line_of_bad_input(companion_here("detect", images, "--model", "no.pt", cwd=tmp_path))
     assert "no.pt" in line
 
 
@@ -160,7 +160,7 @@ def test_checkpoint_that_calls_system_is_refused(image_folder: Path, tmp_path: P
     with zipfile.ZipFile(hostile, "w") as archive:
         archive.writestr("hostile/data.pkl", pickle.dumps({"model": _Hostile(marker)}, protocol=2))
         archive.writestr("hostile/version", "3\n")
-    line = one_line_of_bad_input(companion("detect", image_folder, "--model", hostile, cwd=tmp_path))
+    line = one_line_of_bad_input(companion_here("detect", images, "--model", hostile, cwd=tmp_path))
     assert "system" in line
     assert not marker.exists()
 
@@ -193,7 +193,7 @@ def test_unreadable_video_is_one_line(exported_model: Path, tmp_path: Path) -> N
 
 def test_invalid_setting_is_one_line_with_key_and_range(tmp_path: Path) -> None:
     (tmp_path / "companion.toml").write_text("[detector]\nconfidence = 1.5\n")
-    line = one_line_of_bad_input(companion("run", cwd=tmp_path))
+    line = one_line_of_bad_input(companion_here("run", cwd=tmp_path))
     assert "detector.confidence" in line
     assert "0 to 1" in line
 

@@ -15,7 +15,7 @@ import pytest
 
 from companion.dashboard.server import NICENESS
 from mavlink_sim.testing import free_port
-from tests.companion.command_line import companion
+from tests.companion.command_line import companion, companion_here
 from tests.companion.dashboard.serving import dashboard_command
 from tests.companion.service_process import ServiceProcess
 from tests.companion.test_play import descendants
@@ -65,8 +65,11 @@ def test_command_serves_and_ends_on_ctrl_c(tmp_path: Path) -> None:
         (("--dashboard-token-file", "missing.txt"), "dashboard.token_file"),
     ],
 )
-def test_bad_options_are_refused_in_one_line(tmp_path: Path, flags: tuple[str, ...], named: str) -> None:
-    done = companion("dashboard", "--connect", "tcp/127.0.0.1:9", *flags, cwd=tmp_path)
+def test_bad_options_are_refused_in_one_line(
+    tmp_path: Path, flags: tuple[str, ...], named: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("os.nice", lambda _: 0)  # this process keeps its priority
+    done = companion_here("dashboard", "--connect", "tcp/127.0.0.1:9", *flags, cwd=tmp_path)
     assert done.returncode == 2, done.stdout
     (line,) = done.stderr.splitlines()
     assert named in line
