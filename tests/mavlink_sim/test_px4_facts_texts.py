@@ -27,7 +27,7 @@ FLIGHT = [
     DISARMED,
 ]
 RETURN = [(INFO, "Returning to launch\t"), RETURN_STARTED, RETURN_LANDS, LANDED, DISARMED]
-REFUSALS = [
+DENIALS = [
     "Preflight Fail: heading estimate not stable",
     "Arming denied: Resolve system health failures first\t",
     "Unsupported main mode\t",
@@ -112,7 +112,7 @@ def test_denial_texts_are_critical_and_end_with_tab(received: SimHarness) -> Non
     received.set_mode(6, source=GROUND_STATION, link="gcs")
     texts = sent(received)
     critical = [text for severity, text in texts if severity == CRITICAL]
-    assert critical == REFUSALS
+    assert critical == DENIALS
     assert {severity for severity, _ in texts} == {INFO, CRITICAL}
 
 

@@ -87,7 +87,7 @@ def test_a_camera_moves_with_the_vehicle_and_ends_with_its_pose(
     assert frames[-1]["stamp_ns"] / 1e9 < cut_s + 0.1
     distances, heights = [], []
     for frame in frames:
-        (pose, *_) = link.flown(frame["stamp_ns"] / 1e9)
+        (pose, *_) = link.trajectory(frame["stamp_ns"] / 1e9)
         north, east, down = pose.position_ned_m
         ahead = (north + AHEAD_M * math.cos(pose.yaw_rad), east + AHEAD_M * math.sin(pose.yaw_rad))
         distances.append(math.dist(frame["camera_ned_m"], (*ahead, min(down, -LOWEST_M))))

@@ -110,7 +110,7 @@ def jumps(link: AutopilotLink, since_s: float) -> list[tuple[float, Vector]]:
     """When the position made a step that is no flight, and that step."""
     steps = [
         (other.time_s, np.subtract(other.position_ned_m, one.position_ned_m))
-        for one, other in pairwise(link.flown(since_s))
+        for one, other in pairwise(link.trajectory(since_s))
     ]
     return [(at_s, step) for at_s, step in steps if np.linalg.norm(step) > RESET_M / 2]
 
@@ -123,7 +123,7 @@ def track(link: AutopilotLink, since_s: float) -> Vector:
             np.subtract(
                 pose.position_ned_m, sum((step for at_s, step in resets if at_s <= pose.time_s), ZERO)
             )
-            for pose in link.flown(since_s)
+            for pose in link.trajectory(since_s)
         ]
     )
 
@@ -198,7 +198,7 @@ def test_an_orbit_goes_on_after_a_reset_of_the_heading(flight: Flight) -> None:
     else:
         link.command(dialect.MAV_CMD_DO_AUX_FUNCTION, EKF_YAW_RESET, 2.0)
     link.after(15.0)
-    yaws = [pose.yaw_rad for pose in link.flown(since_s)]
+    yaws = [pose.yaw_rad for pose in link.trajectory(since_s)]
     turned_deg = max(abs(math.degrees(wrap_angle(other - one))) for one, other in pairwise(yaws))
     radii = np.linalg.norm(track(link, since_s)[:, :2] - centre, axis=1)
     worst_m = float(np.abs(radii - ORBIT_M).max())

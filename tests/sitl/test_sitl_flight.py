@@ -76,7 +76,7 @@ def test_a_take_off_that_px4_ends_early_is_finished(
     fresh = services.flight(flight.driver)  # it is read when the link opens
     fresh.take_off(HEIGHT_M)
     held = [at_s for at_s, mode in link.modes if mode == HOLD[PX4]]
-    ended_m = link.home_ned_m[2] - link.flown(held[-1])[0].position_ned_m[2]
+    ended_m = link.home_ned_m[2] - link.trajectory(held[-1])[0].position_ned_m[2]
     assert link.height_m == pytest.approx(HEIGHT_M, abs=0.5)
     assert not [event for event in fresh.events if "pilot" in event]
     fresh.note("take-off with NAV_MC_ALT_RAD 1.5", px4_ended_at_m=ended_m, height_m=link.height_m)

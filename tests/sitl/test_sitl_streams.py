@@ -72,7 +72,7 @@ def test_streams_that_another_station_slows_are_asked_for_again(flight: Flight) 
     took_s = link.until(lambda: not missing(flight), 30.0, "complete again")
     since_s = time.monotonic()
     link.after(3.0)
-    rate_hz = len(link.flown(since_s)) / 3.0
+    rate_hz = len(link.trajectory(since_s)) / 3.0
     assert rate_hz > 0.8 * 30.0  # what the service asks for
     flight.note("streams slowed by another", complete_after_s=took_s, positions_hz=rate_hz)
 

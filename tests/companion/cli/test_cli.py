@@ -134,8 +134,8 @@ def test_detect_reports_only_requested_classes(
     assert names("--classes", one) == {one}
 
 
-def test_missing_model_is_one_line(images: Path, tmp_path: Path) -> None:
-    line = one_line_of_bad_input(companion_here("detect", images, "--model", "no.pt", cwd=tmp_path))
+def test_missing_model_is_one_line(image_folder: Path, tmp_path: Path) -> None:
+    line = one_line_of_bad_input(companion_here("detect", image_folder, "--model", "no.pt", cwd=tmp_path))
     assert "no.pt" in line
 
 
@@ -160,7 +160,7 @@ def test_checkpoint_that_calls_system_is_refused(image_folder: Path, tmp_path: P
     with zipfile.ZipFile(hostile, "w") as archive:
         archive.writestr("hostile/data.pkl", pickle.dumps({"model": _Hostile(marker)}, protocol=2))
         archive.writestr("hostile/version", "3\n")
-    line = one_line_of_bad_input(companion_here("detect", images, "--model", hostile, cwd=tmp_path))
+    line = one_line_of_bad_input(companion_here("detect", image_folder, "--model", hostile, cwd=tmp_path))
     assert "system" in line
     assert not marker.exists()
 

@@ -177,7 +177,7 @@ def test_other_bad_input_is_one_line(frame: Frame, tmp_path: Path) -> None:
         line = refused(URI, missing)
         assert f"write {missing}: " in line
         assert "such folder" in line
-        assert "missing" in refused(URI, output, "--image", tmp_path / "missing" / "a.png")
+        assert "missing" in refused(URI, output, "--view", tmp_path / "missing" / "a.png")
         assert "camera.fx_px" in refused(URI, output, "--camera-fx-px", "-1")
     with shared(frame, replace(DEFAULT_MOUNT, on_gimbal=True)):
         assert "gimbal" in refused(URI, output, "--frame", "body")

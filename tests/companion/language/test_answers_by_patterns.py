@@ -10,7 +10,7 @@ import pytest
 from companion.language.scene import SceneObject
 from tests.companion.language.language_server import ollama, serving
 from tests.companion.language.sentence_table import SCENE
-from tests.companion.language.test_conversation import REFUSAL, WARNING, FakeVehicle, Talk, tool_results
+from tests.companion.language.test_conversation import DENIED, WARNING, FakeVehicle, Talk, tool_results
 
 
 async def test_unseen_object_is_searched_for_then_flown_to() -> None:
@@ -38,7 +38,7 @@ async def test_questions_and_failures_in_words() -> None:
     assert "81" in talk.lines[-1]
     assert not await talk.ask("land")
     assert await talk.ask("why not?")
-    assert REFUSAL in talk.lines[-1]
+    assert DENIED in talk.lines[-1]
     assert WARNING in talk.lines[-1]
     assert not await talk.ask(which)
     assert "which car" in talk.lines[-1]

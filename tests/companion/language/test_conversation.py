@@ -22,7 +22,7 @@ from tests.companion.language.language_server import Call, Script, failure, olla
 from tests.companion.language.sentence_table import CLASSES, SCENE, SENTENCES
 
 SCHEMA = json_schema(CLASSES)
-REFUSAL, WARNING = "on the ground", "wind is strong"  # of `FakeVehicle`
+DENIED, WARNING = "on the ground", "wind is strong"  # of `FakeVehicle`
 TO_THE_MODEL = "model: do it"
 
 
@@ -37,7 +37,7 @@ class FakeVehicle:
     async def command(self, text: str) -> dict[str, Any]:
         self.commands.append(text)
         success = text != self._refused
-        return {"command": text, "success": success, "reason": "done" if success else REFUSAL}
+        return {"command": text, "success": success, "reason": "done" if success else DENIED}
 
     async def scene(self) -> Scene:
         return replace(self.seen, last=None)
