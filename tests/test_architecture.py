@@ -70,9 +70,11 @@ GUIDANCE_LAYERS = {
     "authority": 8,
     "avoidance": 8,
     "command_queue": 8,
-    "mode_sequence": 8,
     "requirements": 8,
-    "core": 9,
+    "setpoint_output": 9,
+    "mode_control": 10,
+    "behaviour_runner": 11,
+    "core": 12,
 }
 # The same for `mavlink_sim`: its packages and its own files. Imports inside functions and under
 # TYPE_CHECKING count as well.
@@ -101,7 +103,7 @@ SIMULATOR_LAYERS = {
 }
 MAX_SIMULATOR_LAYERS = 10
 # Besides these, only behaviours made of others call a behaviour; and unit tests of single updates.
-STEPS_BEHAVIOURS = ("companion/guidance/core.py",)
+STEPS_BEHAVIOURS = ("companion/guidance/behaviour_runner.py",)
 COMPOSED_BEHAVIOURS = ("companion/guidance/behaviours/", "companion/guidance/missions/sequence.py")
 SINGLE_STEP_TESTS = {
     "tests/companion/guidance/test_hold_orbit.py",

@@ -20,10 +20,11 @@ from companion.bench.simulated_driver import GIMBAL_RATES_HZ, RATES_HZ, Lockstep
 from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome, Requirement
 from companion.guidance.behaviours.select import Select
 from companion.guidance.command import GrammarError
-from companion.guidance.core import Guidance, GuidanceOptions, Phase
+from companion.guidance.core import Guidance, GuidanceOptions
 from companion.guidance.interface import CommandInput, GuidanceEvent, StreamStatus
 from companion.guidance.limits.envelope import Limits
 from companion.guidance.limits.obstacles import ObstacleRules
+from companion.guidance.mode_control import Phase
 from companion.guidance.motion import position_and_yaw
 from companion.guidance.targets.from_detections import StateHistory
 from companion.perception.cameras import PerceptionCamera

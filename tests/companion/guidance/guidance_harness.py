@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 
 from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome
 from companion.guidance.behaviours.hold import HoldBehaviour
-from companion.guidance.core import Guidance, GuidanceOptions, Phase
+from companion.guidance.core import Guidance, GuidanceOptions
 from companion.guidance.interface import (
     Action,
     Answer,
@@ -28,6 +28,7 @@ from companion.guidance.interface import (
     TakeOff,
 )
 from companion.guidance.limits.envelope import Limits
+from companion.guidance.mode_control import Phase
 from companion.guidance.targets.target import Target
 from companion.service.requests import apply_output
 from companion.vehicle.gimbal import NOBODY, Address, GimbalAim, GimbalState, YawFrame

@@ -7,9 +7,9 @@ import math
 import pytest
 
 from companion.bench.lockstep_flight import LockstepFlight
-from companion.guidance.core import Phase
 from companion.guidance.interface import EventKind
 from companion.guidance.limits.setpoint_monitor import REASON
+from companion.guidance.mode_control import Phase
 from companion.vehicle.state import FlightMode
 from companion.vehicle.streamer import StreamState
 from mavlink_sim.wire.messages import dialect

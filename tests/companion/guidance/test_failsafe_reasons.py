@@ -7,8 +7,8 @@ import pytest
 
 from companion.bench.lockstep_flight import LockstepFlight, plain_settings
 from companion.guidance.behaviours.orbit import OrbitBehaviour
-from companion.guidance.core import REASON_WAIT_S
 from companion.guidance.interface import GuidanceInput
+from companion.guidance.mode_control import REASON_WAIT_S
 from companion.vehicle.report import Report
 from companion.vehicle.state import FlightMode
 from mavlink_sim.px4.modes import Mode

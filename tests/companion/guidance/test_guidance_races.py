@@ -20,8 +20,8 @@ from companion.guidance.behaviours.follow_path import FollowPathBehaviour
 from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.behaviours.stop import StopBehaviour
 from companion.guidance.behaviours.takeoff import TakeoffBehaviour
-from companion.guidance.core import Phase
 from companion.guidance.interface import Answer, CommandInput, EventKind, FindGimbal, GuidanceInput, Request
+from companion.guidance.mode_control import Phase
 from companion.vehicle.gimbal import NOBODY, GimbalState, YawFrame
 from companion.vehicle.state import FlightMode, LandedState
 from tests.companion.guidance.guidance_harness import GuidanceHarness, engaged, flying, kinds, parked

@@ -14,9 +14,9 @@ from companion.guidance.behaviour import Behaviour, VelocityInput
 from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.behaviours.stop import StopBehaviour
 from companion.guidance.behaviours.velocity import VelocityBehaviour
-from companion.guidance.core import Phase
 from companion.guidance.interface import EventKind, GuidanceInput
 from companion.guidance.missions.sequence import Plan, PlannedStep, SequenceBehaviour
+from companion.guidance.mode_control import Phase
 from companion.service.velocity_senders import FORGET_S, MAX_SENDERS, VelocitySenders
 from companion.vehicle.state import FlightMode
 from tests.companion.guidance.guidance_harness import (

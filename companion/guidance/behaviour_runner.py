@@ -1,0 +1,305 @@
+"""The active behaviour: begin, update, act on its output, end; and the loss of our command."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+from companion.guidance.behaviour import (
+    Behaviour,
+    BehaviourContext,
+    BehaviourOutput,
+    ModeRequest,
+    Outcome,
+    Requirement,
+    RoutedSetpoint,
+)
+from companion.guidance.behaviours.hold import HoldBehaviour
+from companion.guidance.command_queue import CommandQueue
+from companion.guidance.interface import Answer, CommandInput, EventKind, GuidanceInput, OutputCollector
+from companion.guidance.limits.battery import ENDINGS, BatteryMinimum, BatteryMonitor
+from companion.guidance.mode_control import ModeControl, Phase
+from companion.guidance.setpoint_output import SetpointOutput
+from companion.vehicle.setpoint import Setpoint
+from companion.vehicle.state import FlightMode, Vector3
+from companion.vehicle.streamer import StreamState
+
+logger = logging.getLogger(__name__)
+
+# In OFFBOARD without a position estimate: brake for this long, then hand over to the autopilot.
+POSITION_LOSS_S = 2.0
+
+
+class BehaviourRunner:
+    """Part of the guidance core.
+
+    A behaviour that flew by setpoints is followed by a hold until the next command. After one that ended in
+    an autopilot mode nothing is streamed.
+
+    Args:
+        setpoints, modes: what the outputs of a behaviour act on.
+        queue: its waiting commands are superseded by a loss of command or a low battery.
+
+    Attributes:
+        behaviour: the active behaviour, including the hold between commands; None: none.
+        active: the same, inside a sequence its current one; None: none has been updated yet.
+        busy: a commanded behaviour has not ended yet.
+        gimbal_user: name of the behaviour that moves the gimbal; empty: none.
+        goal_ned_m: where the behaviour before wanted the vehicle; None: unknown.
+        failure: exception of the step before, in words; empty: none.
+    """
+
+    def __init__(
+        self,
+        setpoints: SetpointOutput,
+        modes: ModeControl,
+        battery: BatteryMinimum,
+        queue: CommandQueue,
+        out: OutputCollector,
+    ) -> None:
+        self.behaviour: Behaviour | None = None
+        self.busy = False
+        self.goal_ned_m: Vector3 | None = None
+        self.failure = ""
+        # Read once in each step, where an exception is handled.
+        self.active: Behaviour | None = None
+        self.gimbal_user = ""
+        self._landing = False
+        self._setpoints = setpoints
+        self._modes = modes
+        self._battery = BatteryMonitor(battery)
+        self._queue = queue
+        self._out = out
+        self._command: CommandInput | None = None
+        self._after_battery = self._activated = False
+        self._stepped_ns: int | None = None
+        self._position_lost_ns: int | None = None
+
+    def begin_command(self, behaviour: Behaviour, command: CommandInput, context: BehaviourContext) -> None:
+        """Replace the active behaviour by a command's."""
+        self.end(Outcome(False, f"replaced by {behaviour.name}"))
+        self._modes.prepare(context.state)
+        self._battery.reset()
+        self._begin(behaviour, command)
+        self._out.event(EventKind.STARTED, behaviour.name, "started")
+
+    def update(
+        self, context: BehaviourContext, before: BehaviourContext | None, inputs: GuidanceInput
+    ) -> None:
+        """Advance the active behaviour by one step. `before`: the previous step's input."""
+        if self.behaviour is None:
+            return
+        paused_s = 0.0 if before is None else (context.now_ns - before.now_ns) / 1e9
+        self._report_reset(self.behaviour, before, context)
+        why = self._modes.lost(context, inputs, paused_s, landing=self._landing)
+        if why is not None or self._modes.yielded is not None:
+            if (reason := self._modes.yield_command(why, context)) is not None:
+                self._lose(reason)
+            return
+        # Before any hook of the behaviour: its exception must not lose the autopilot's answers.
+        for answer in inputs.answers:
+            if answer.identifier == self._modes.request:
+                self._take_answer(answer, context)
+        if self.behaviour is not None:
+            self._monitor_battery(self.behaviour, context)
+        self._modes.request_next(context)
+        if self._modes.phase is Phase.ENGAGING and self._activated:
+            if (why := self._modes.engage(context, inputs.stream.sent_count)) is not None:
+                self._request_failed(why, context)
+        elif self.behaviour is not None:
+            self._run(self.behaviour, context, inputs.stream.sent_count)
+        if self._setpoints.streaming and self._modes.phase is not Phase.OFFBOARD:
+            self._setpoints.brake(context)
+
+    def answer_endless(self, inputs: GuidanceInput) -> None:
+        """Answer an endless command when the vehicle flies it."""
+        command = self._command
+        if command is None or not command.endless or self._modes.phase is not Phase.OFFBOARD:
+            return
+        if inputs.state.mode is FlightMode.OFFBOARD and inputs.stream.state is StreamState.FRESH:
+            self._out.result(command.identifier, Outcome(True, "in progress"))
+            self._command = None
+
+    def handle_error(self, error: Exception, context: BehaviourContext, sent_count: int) -> None:
+        """A hook of the behaviour raised: hold. Call it from the exception handler."""
+        name = "guidance" if self.behaviour is None else self.behaviour.name
+        failure = f"{type(error).__name__}: {error}"
+        if failure != self.failure:  # the gimbal's would be logged with every step
+            logger.exception("%s failed", name)
+        self.failure = failure
+        why = f"{name} failed: {failure}"
+        if self._modes.yielded is not None:
+            self._lose(self._modes.yielded)
+        elif self.busy:
+            try:
+                self._conclude(Outcome(False, why), context, sent_count)
+            except Exception:
+                logger.exception("the hold after %s failed", name)
+                self._lose(why)
+        else:
+            self._lose(why)
+
+    def end(self, outcome: Outcome, *, reported: bool = False) -> None:
+        """Remove the active behaviour and answer its command."""
+        behaviour, command, busy = self.behaviour, self._command, self.busy
+        after_battery, self._after_battery = self._after_battery, False
+        self.behaviour = self._command = self.active = None
+        self.busy, self._landing, self.gimbal_user = False, False, ""
+        if behaviour is None:
+            return
+        if self._activated:
+            try:
+                behaviour.on_deactivate()
+            except Exception:
+                logger.exception("%s failed to deactivate", behaviour.name)
+        if command is not None:
+            self._out.result(command.identifier, outcome)
+        if after_battery:
+            # No command waits for its result: log how it ended.
+            self._battery_event(behaviour, f"{behaviour.name} after low battery: {outcome.reason}")
+        if busy and not reported:
+            self._out.event(EventKind.ENDED, behaviour.name, outcome.reason, outcome)
+
+    def _begin(self, behaviour: Behaviour, command: CommandInput | None, *, busy: bool = True) -> None:
+        self.behaviour, self._command, self.busy = behaviour, command, busy
+        self._activated, self._position_lost_ns = False, None
+        self._setpoints.begin()
+        self.active, self._landing, self.gimbal_user = None, False, ""
+
+    def _run(self, behaviour: Behaviour, context: BehaviourContext, sent_count: int) -> None:
+        """Update the behaviour and act on its output."""
+        self._setpoints.path = ()
+        if Requirement.POSITION in behaviour.requirements and not self._position_known(context):
+            return
+        if not self._activated:
+            self._activated, self._stepped_ns = True, None
+            self._setpoints.activate()
+            behaviour.on_activate(context)
+            if self.busy:
+                self.goal_ned_m = None
+        dt_s = 0.0 if self._stepped_ns is None else (context.now_ns - self._stepped_ns) / 1e9
+        step: BehaviourOutput = behaviour.update(dt_s, context)
+        for note in behaviour.take_notes():
+            self._out.event(EventKind.NOTED, behaviour.name, note)
+        self._stepped_ns = context.now_ns
+        if isinstance(step, RoutedSetpoint):
+            offboard = self._modes.phase is Phase.OFFBOARD
+            step = self._setpoints.steer(step, context, behaviour.name, offboard=offboard)
+        self.active = active = behaviour.active
+        self._landing = active.landing
+        self.gimbal_user = active.name if active.gimbal_aim is not None else ""
+        match step:
+            case Outcome():
+                self._conclude(step, context, sent_count)
+            case ModeRequest():
+                if step != self._modes.requested:
+                    self._modes.start_request(step, context)
+            case Setpoint() if self._modes.phase is Phase.OFFBOARD:
+                self._setpoints.limit(step, context, dt_s, behaviour.name, landing=self._landing)
+            case Setpoint():
+                if self._modes.phase is not Phase.ENGAGING:
+                    self._modes.start_engaging(context, sent_count)
+            case _:
+                got = type(step).__name__
+                raise TypeError(f"update returned {got}, expected Setpoint, ModeRequest or Outcome")
+
+    def _report_reset(
+        self, behaviour: Behaviour, before: BehaviourContext | None, context: BehaviourContext
+    ) -> None:
+        """Log a reset of the estimate. Goals keep their position on the ground (`vehicle.state`)."""
+        if before is not None and context.state.reset_count > before.state.reset_count:
+            words = context.state.reset_words(before.state)
+            self._out.event(
+                EventKind.NOTED, behaviour.name, f"position estimate {words}; goals moved with it"
+            )
+
+    def _conclude(self, outcome: Outcome, context: BehaviourContext, sent_count: int) -> None:
+        """The behaviour ended by itself: hold if setpoints are active, else hand over to the autopilot."""
+        behaviour = self.behaviour
+        if behaviour is not None and self.busy and self._command is None and not self._after_battery:
+            # An endless command was answered when it began: nobody waits for how it ends.
+            text = f"{behaviour.name} ended: {outcome.reason}"
+            self._out.event(EventKind.NOTED, behaviour.name, text, warning=not outcome.success)
+        self.end(outcome)
+        self.goal_ned_m = outcome.goal_ned_m
+        # The requested mode may show before the answer to the request.
+        requested = self._modes.requested
+        handed_over = requested is not None and context.state.mode is requested.mode
+        if self._modes.phase is Phase.REQUESTING:
+            self._modes.drop_request()
+        if not self._setpoints.streaming or handed_over:
+            self._modes.release()
+            return
+        hold = HoldBehaviour()
+        self._begin(hold, None, busy=False)
+        if self._modes.phase is Phase.OFFBOARD:
+            self._run(hold, replace(context, goal_ned_m=self.goal_ned_m), sent_count)
+
+    def _monitor_battery(self, behaviour: Behaviour, context: BehaviourContext) -> None:
+        """Low battery ends the behaviour; the vehicle brakes until the configured action begins."""
+        state, now_ns = context.state, context.now_ns
+        if (why := self._battery.unknown(behaviour, state, now_ns)) is not None:
+            self._battery_event(behaviour, why)
+        if (why := self._battery.ending(behaviour, state, now_ns)) is None:
+            return
+        ending = ENDINGS[self._battery.minimum.action]()
+        self._battery_event(behaviour, f"{why}: {behaviour.name} ends, {ending.name} follows")
+        self.end(Outcome(False, why))
+        if self._modes.phase in (Phase.REQUESTING, Phase.DELEGATED):
+            self._modes.drop_request()
+        self._begin(ending, None)
+        self._after_battery = True
+
+    def _battery_event(self, behaviour: Behaviour, message: str) -> None:
+        self._out.event(EventKind.BATTERY, behaviour.name, message, warning=True)
+        self._queue.supersede(f"an event ({message})", self._out)
+
+    def _position_known(self, context: BehaviourContext) -> bool:
+        """Check the position estimate; without it brake, and after `POSITION_LOSS_S` give up command."""
+        fault = context.state.position_fault(context.now_ns)
+        if fault is None:
+            self._position_lost_ns = None
+            return True
+        if self._position_lost_ns is None:
+            logger.warning("position or attitude lost (%s): braking", fault)
+            self._position_lost_ns = context.now_ns
+        if context.now_ns - self._position_lost_ns > POSITION_LOSS_S * 1e9:
+            self._lose(f"position or attitude lost for {POSITION_LOSS_S:g} s ({fault})")
+        elif self._modes.phase is Phase.OFFBOARD:
+            self._setpoints.brake(context)
+        return False
+
+    def _take_answer(self, answer: Answer, context: BehaviourContext) -> None:
+        """Handle the answer to the pending request."""
+        engaging = self._modes.phase is Phase.ENGAGING
+        if (why := self._modes.take_answer(answer, context.now_ns)) is not None:
+            self._request_failed(why, context)
+        elif engaging and self._modes.phase is Phase.OFFBOARD:
+            self._stepped_ns = None
+            if self.behaviour is not None:
+                self._out.event(EventKind.ENGAGED, self.behaviour.name, "offboard engaged")
+
+    def _request_failed(self, why: str, context: BehaviourContext) -> None:
+        """The autopilot refused the request."""
+        behaviour = self.behaviour
+        if behaviour is not None and behaviour.request_failed(why):
+            self._modes.resume(context.state.mode)
+            return
+        self.end(Outcome(False, why))
+        if self._modes.phase is Phase.REQUESTING and self._setpoints.streaming:
+            self._modes.resume(context.state.mode)
+            self._begin(HoldBehaviour(), None, busy=False)
+        else:
+            self._modes.release()
+
+    def _lose(self, why: str) -> None:
+        """Command was lost: stop streaming and end the behaviour."""
+        self._setpoints.stop()
+        self.goal_ned_m = None
+        behaviour, outcome = self.behaviour, Outcome(False, why)
+        self.end(outcome, reported=True)
+        self._modes.release()
+        if behaviour is not None:
+            message = f"command lost: {why}"
+            self._out.event(EventKind.LOST, behaviour.name, message, outcome, warning=True)
+            self._queue.supersede(f"an event ({message})", self._out)

@@ -1,0 +1,128 @@
+"""The setpoint that is streamed: a behaviour's, after avoidance, obstacle limits and envelope; or a brake."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from companion.guidance.avoidance import Avoidance
+from companion.guidance.behaviour import BehaviourContext, Outcome, RoutedSetpoint
+from companion.guidance.interface import EventKind, OutputCollector
+from companion.guidance.limits.envelope import Envelope, Limits
+from companion.guidance.limits.obstacles import Constraint, ObstacleMemory, ObstacleRules
+from companion.vehicle.setpoint import Setpoint
+from companion.vehicle.state import Vector3, VehicleState
+from vision.occupancy_grid import Point
+from vision.path_planner import PathRequest
+
+
+class SetpointOutput:
+    """Part of the guidance core.
+
+    Args:
+        lifetime_s: of every setpoint; overrides the behaviour's.
+        out: receives the events.
+
+    Attributes:
+        streaming: setpoints are sent.
+        asked: the last setpoint of a behaviour; None: none is active.
+        sent: the same after the envelope (or the brake that is streamed while a mode is requested).
+        limited_by: which limits acted on it.
+        path: (north, east) points of the active path around obstacles; empty: none.
+    """
+
+    def __init__(
+        self, limits: Limits, obstacles: ObstacleRules, lifetime_s: float, out: OutputCollector
+    ) -> None:
+        self.streaming = False
+        self.asked: Setpoint | None = None
+        self.sent: Setpoint | None = None
+        self.limited_by: tuple[str, ...] = ()
+        self.path: tuple[Point, ...] = ()
+        self._obstacles = obstacles
+        self._lifetime_s = lifetime_s
+        self._out = out
+        self._envelope = Envelope(limits)
+        self._memory = ObstacleMemory()
+        self._avoidance = Avoidance(obstacles.margin_m)
+        self._constrained: tuple[BehaviourContext, tuple[Constraint, ...]] | None = None
+        self._blind = False
+
+    def begin(self) -> None:
+        """A new behaviour begins."""
+        self._blind = False
+
+    def activate(self) -> None:
+        """The behaviour's first update follows."""
+        self._avoidance.reset()
+
+    def reset(self) -> None:
+        """Our setpoints are active from now on: the envelope starts from the vehicle's own motion."""
+        self._envelope.reset()
+
+    def stop(self) -> None:
+        """Send no setpoints any more."""
+        self._envelope.reset()
+        self.streaming = False
+        self.asked = self.sent = None
+        self.limited_by = self.path = ()
+
+    def brake(self, context: BehaviourContext) -> None:
+        """Brake in this step."""
+        self.asked, self.limited_by = None, ()
+        self.sent = Setpoint.brake(context.now_ns, self._lifetime_s)
+        self._envelope.reset()
+
+    def steer(
+        self, routed: RoutedSetpoint, context: BehaviourContext, behaviour: str, *, offboard: bool
+    ) -> Setpoint | Outcome:
+        """A routed setpoint, led around obstacles. `behaviour`: its name. `offboard`: we are in OFFBOARD."""
+        constraints = self._obstacle_constraints(context)
+        step = self._avoidance.steer(routed, context, constraints, flying=offboard)
+        for note, warning in self._avoidance.take_notes():
+            self._out.event(EventKind.NOTED, behaviour, note, warning=warning)
+        self.path = self._avoidance.path
+        return step
+
+    def limit(
+        self, setpoint: Setpoint, context: BehaviourContext, dt_s: float, behaviour: str, *, landing: bool
+    ) -> None:
+        """Send a setpoint after the envelope; a brake where required depth is missing."""
+        # The lifetime is the operator's setting, not the behaviour's.
+        asked = replace(setpoint, deadline_ns=context.now_ns + round(self._lifetime_s * 1e9))
+        blind = self._obstacles.blind(context)
+        self._report_perception_fault(behaviour, blind)
+        if blind is not None:
+            self.brake(context)
+            self.asked, self.limited_by = asked, (blind,)
+            return
+        self._envelope.obstacle_constraints = self._obstacle_constraints(context)
+        self.asked = asked
+        self.sent, self.limited_by = self._envelope.apply(
+            asked, context.state, context.now_ns, dt_s, context.neighbours, landing=landing
+        )
+
+    def check_goals(self, goals: Sequence[Vector3], state: VehicleState) -> str | None:
+        """Why a goal is outside the limits, in words; None: none is."""
+        found = (self._envelope.check_goal(goal, state) for goal in goals)
+        return next((why for why in found if why is not None), None)
+
+    def take_path_request(self) -> PathRequest | None:
+        """The path to plan around obstacles, once; None: none is needed."""
+        return self._avoidance.take_request()
+
+    def _obstacle_constraints(self, context: BehaviourContext) -> tuple[Constraint, ...]:
+        """The obstacle limits of this step."""
+        if self._constrained is None or self._constrained[0] is not context:
+            filled = self._memory.filled(context, self._obstacles.margin_m)
+            self._constrained = (context, self._obstacles.constraints(filled))
+        return self._constrained[1]
+
+    def _report_perception_fault(self, behaviour: str, blind: str | None) -> None:
+        """Log once that the vehicle brakes without depth, and once that depth is back."""
+        if (blind is not None) is not self._blind:
+            self._blind = blind is not None
+            if blind is None:
+                self._out.event(EventKind.NOTED, behaviour, "depth is back")
+            else:
+                self._out.event(EventKind.BLIND, behaviour, f"braking: {blind}", warning=True)
