@@ -45,6 +45,14 @@ def scene(tmp_path: Path) -> str:
     return str(path)
 
 
+def make_ready(link: AutopilotLink, services: Services) -> None:
+    """On the ground, ready to be armed, and without a service."""
+    bring_down(link)
+    services.flight(None)  # ArduPilot says that it is ready only where it was asked to
+    link.until(lambda: link.ready, READY_S, "ready to be armed")
+    services.close()
+
+
 def take_off_by_a_pilot(link: AutopilotLink) -> None:
     """Without a service."""
     arm = dialect.MAV_CMD_COMPONENT_ARM_DISARM
@@ -62,9 +70,7 @@ def take_off_by_a_pilot(link: AutopilotLink) -> None:
 def test_a_camera_moves_with_the_vehicle_and_ends_with_its_pose(
     link: AutopilotLink, services: Services, scene: str, tmp_path: Path
 ) -> None:
-    services.close()
-    bring_down(link)
-    link.until(lambda: link.ready, READY_S, "ready to be armed")
+    make_ready(link, services)
     seen = tmp_path / "seen.jsonl"
     command = [sys.executable, "-m", "mavlink_sim", "camera", "--camera", f"sitl-{secrets.token_hex(6)}"]
     command += ["--vehicle-url", f"udpin://127.0.0.1:{link.service_port}", "--origin", "0,0,0"]
@@ -103,9 +109,7 @@ def test_a_camera_moves_with_the_vehicle_and_ends_with_its_pose(
 def test_play_flies_it_and_ends_with_its_pose(
     link: AutopilotLink, services: Services, scene: str, tmp_path: Path
 ) -> None:
-    services.close()
-    bring_down(link)
-    link.until(lambda: link.ready, READY_S, "ready to be armed")
+    make_ready(link, services)
     flags = ["--vehicle-url", f"udpin://127.0.0.1:{link.service_port}", "--scene", scene]
     flags += ["--detector-enabled", "false", "--guidance-min-battery-percent", "0"]
     try:
@@ -121,9 +125,7 @@ def test_play_flies_it_and_ends_with_its_pose(
 
 
 def test_the_demonstration_flies_it(link: AutopilotLink, services: Services, tmp_path: Path) -> None:
-    services.close()
-    bring_down(link)
-    link.until(lambda: link.ready, READY_S, "ready to be armed")
+    make_ready(link, services)
     done = companion(
         *("demo", "--output", tmp_path / "demo", "--vehicle-url", f"udpin://127.0.0.1:{link.service_port}"),
         cwd=tmp_path,
