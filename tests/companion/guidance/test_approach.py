@@ -5,7 +5,7 @@ import pytest
 
 from companion.guidance.behaviours.approach import ApproachBehaviour
 from companion.guidance.targets.target import RangeSource
-from tests.companion.guidance.guidance_harness import Flight
+from tests.companion.guidance.guidance_harness import Flight, assert_failed
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
 
 
@@ -87,9 +87,7 @@ def test_approach_brakes_and_ends_when_target_lost() -> None:
             stopped_at.append(vehicle.position[0])
 
     outcome = Flight(ApproachBehaviour("car", lost_timeout_s=6.0), vehicle, [car]).run(60.0, each)
-    assert outcome is not None
-    assert not outcome.success
-    assert outcome.reason.startswith("lost the car")
+    assert_failed(outcome, "lost the ", "car ")
     assert max(stopped_at) - min(stopped_at) < 0.2
 
 

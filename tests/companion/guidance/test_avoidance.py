@@ -111,7 +111,7 @@ def test_path_of_the_command_before_is_not_flown() -> None:
     assert 1 not in numbers
 
 
-def test_approach_flies_the_planned_path_while_the_object_is_hidden() -> None:
+def test_approach_flies_the_planned_path_to_a_hidden_object() -> None:
     car = SeenObject("car", 17.0, 0.0)
     plan = around(3.0)
 
@@ -130,7 +130,7 @@ def test_approach_flies_the_planned_path_while_the_object_is_hidden() -> None:
     assert max(aside) > 2.0
 
 
-def test_gust_towards_an_obstacle_is_countered_without_turning_the_camera_away() -> None:
+def test_gust_to_an_obstacle_is_countered_without_turning_away() -> None:
     harness = harness_with(
         lambda inputs: PlannedPath(
             inputs.state.position_ns, ((0.0, 0.0), (-0.3, 0.0), (-0.3, 9.0)), 9.0, inside=True

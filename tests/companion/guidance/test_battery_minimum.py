@@ -97,7 +97,8 @@ def test_low_battery_in_flight_brakes_and_starts_the_action(action: BatteryActio
     harness.run()  # so that its end is logged
     low, ended = battery_events(harness)
     assert "battery at 14%" in low
-    assert ended.startswith(f"{action} after low battery")
+    assert ended.startswith(f"{action} after ")
+    assert "low battery: " in ended
 
 
 def test_hold_after_low_battery_keeps_command() -> None:

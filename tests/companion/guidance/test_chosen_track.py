@@ -62,7 +62,8 @@ def test_commands_take_a_track(text: str, command: Command) -> None:
 
 
 def test_text_of_a_class_command_is_as_it_is_written() -> None:
-    assert str(parse("follow car distance=6")) == "follow car distance=6"
+    text = "follow car distance=6"
+    assert str(parse(text)) == text
 
 
 @pytest.mark.parametrize(
@@ -87,14 +88,12 @@ def test_errors_name_what_to_give(text: str, parts: list[str]) -> None:
 
 def test_help_and_schema_show_the_choice() -> None:
     assert usage(Follow).startswith("follow CLASS|track=…|marker=… [distance=8]")
-    schema = json_schema()["$defs"]["follow"]
+    schema, keys = json_schema()["$defs"]["follow"], ("class", "track", "marker")
     assert schema["required"] == []
-    assert schema["oneOf"] == [{"required": [key]} for key in ("class", "track", "marker")]
+    assert schema["oneOf"] == [{"required": [key]} for key in keys]
     assert schema["properties"]["track"]["type"] == "integer"
-    assert (
-        "| `track` | follow this track, instead of a class | a track_id | class or track or marker required |"
-        in markdown()
-    )
+    row = next(line for line in markdown().splitlines() if line.startswith("| `track` | follow "))
+    assert row.endswith(f"| a track_id | {' or '.join(keys)} required |")
 
 
 # --- requirements
@@ -127,11 +126,12 @@ def test_ended_track_is_refused_with_the_nearest_of_its_class() -> None:
     harness.run(6.0)
     reason = refused(harness, OrbitBehaviour(track_id=17))
     assert "track 17 ended 4 s ago" in reason
-    assert "the nearest car now is track 23, 1.2 m from where 17 was last seen" in reason
+    assert "nearest car" in reason
+    assert "track 23, 1.2 m from" in reason
     assert "give track=23" in reason
 
 
-def test_ended_track_without_another_of_its_class_is_refused_with_what_is_there() -> None:
+def test_ended_track_without_a_successor_is_refused_with_a_list() -> None:
     harness = watching(flying(), objects := [car(12, 0, 17)])
     harness.run(0.5)
     objects[0] = SeenObject("person", 10, 0, track_id=18, track_score=0.8)
@@ -209,7 +209,9 @@ def test_object_that_gets_another_id_in_its_place_is_flown_to_on(
     assert outcome is None or outcome.success, outcome
     wanted_m = 8.0 if isinstance(behaviour, FollowBehaviour) else 2.0
     assert math.dist(flight.track[-1][:2], (25, 0)) == pytest.approx(wanted_m, abs=0.6)
-    assert behaviour.take_notes() == ["track 1: the object is track 9 now"]
+    (note,) = behaviour.take_notes()
+    assert note.startswith("track 1: ")
+    assert "track 9 " in note
     assert "track 9 (was 1)" in behaviour.status
 
 
@@ -244,7 +246,8 @@ def test_loss_of_a_track_that_is_followed_is_an_event() -> None:
     harness.until(lambda: harness.events[-1].kind is EventKind.ENDED, 10.0)
     note = harness.events[-2]
     assert (note.kind, note.level) == (EventKind.NOTED, "warning")
-    assert note.message.startswith("follow ended: lost track 17 for 3.0 s")
+    assert note.message.startswith("follow ended: ")
+    assert "lost track 17 for 3.0 s" in note.message
     assert "track 23, a car, is " in note.message
 
 
@@ -280,7 +283,8 @@ def test_unconfirmed_track_is_not_flown_to() -> None:
 
 def test_wanted_is_a_class_a_track_or_a_marker() -> None:
     for wrong in ({}, {"class_name": "car", "track_id": 1}, {"track_id": 1, "marker_id": 7}):
-        with pytest.raises(ValueError, match="one of class, track and marker"):
+        got = f"{wrong.get('track_id')} and {wrong.get('marker_id')}"
+        with pytest.raises(ValueError, match=f"class, .*marker, .* {got}$"):
             Wanted(**wrong)
 
 
@@ -321,7 +325,8 @@ def test_gimbal_is_kept_on_a_track_until_it_is_lost() -> None:
     assert flight.run_until(lambda: flight.outcome(moving), 30.0)
     assert off_deg() < 5.0, "kept while the vehicle flew"
     flight.cameras = ()
-    assert flight.run_until(lambda: flight.events[-1].message.startswith("gimbal: lost track 1"), 10.0)
+    assert flight.run_until(lambda: flight.events[-1].message.startswith("gimbal: lost "), 10.0)
+    assert "lost track 1 " in flight.events[-1].message
 
 
 def test_gimbal_is_refused_for_a_track_that_is_not_there() -> None:

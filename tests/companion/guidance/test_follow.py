@@ -8,7 +8,7 @@ from benchmarks.flights_follow import run
 from companion.guidance.behaviours.follow import FollowBehaviour
 from companion.guidance.command import NO_CONTEXT
 from companion.guidance.grammar import parse
-from tests.companion.guidance.guidance_harness import Flight
+from tests.companion.guidance.guidance_harness import Flight, assert_failed
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
 
 
@@ -36,25 +36,22 @@ def test_follow_ends_when_target_lost() -> None:
     outcome = Flight(FollowBehaviour("car", occlusion_s=2.0), objects=[car]).run(
         30.0, moving(car, 3.0, hidden=(10, 99))
     )
-    assert outcome is not None
-    assert not outcome.success
-    assert outcome.reason.startswith("lost the car")
+    assert_failed(outcome, "lost the ", "car ")
 
 
 def test_follow_does_not_switch_to_another_object() -> None:
     car = SeenObject("car", 12.0, 0.0, track_id=1, track_score=0.8)
     other = SeenObject("car", 20.0, 4.0, track_id=2, track_score=0.9)
     outcome = Flight(FollowBehaviour("car"), objects=[car, other]).run(30.0, moving(car, 0.5, hidden=(6, 99)))
-    assert outcome is not None
-    assert "lost the car" in outcome.reason
+    assert_failed(outcome, "lost the ", "car ")
 
 
 def test_command_builds_the_behaviour() -> None:
-    assert isinstance(
-        parse("follow car distance=6 bearing=course angle=180").build(NO_CONTEXT), FollowBehaviour
-    )
+    command = parse("follow car distance=6 bearing=course angle=180")
+    assert isinstance(command.build(NO_CONTEXT), FollowBehaviour)
+    limited = parse("follow car duration=10")
     assert parse("follow car").endless
-    assert not parse("follow car duration=10").endless
+    assert not limited.endless
 
 
 @pytest.mark.slow

@@ -196,13 +196,13 @@ def test_impossible_leaders_are_refused() -> None:
     assert fleet.command("a", FormationBehaviour("line", "b")) is None
     fleet.run(1.0)
     reasons = [member.outcome.reason for member in fleet.members.values() if member.outcome is not None]
-    assert any("follow each other" in reason for reason in reasons)
+    assert any(reason.startswith(("a follows b: ", "b follows a: ")) for reason in reasons)
     refused = fleet.command("a", FormationBehaviour("line", "a"))
     assert refused is not None
-    assert "other than itself" in refused
+    assert "than itself" in refused
     refused = fleet.command("a", FormationBehaviour("line", "zeus"))
     assert refused is not None
-    assert "pose of zeus" in refused
+    assert "of zeus (none received" in refused
 
 
 def test_virtual_structure_flies_its_path_and_ends() -> None:

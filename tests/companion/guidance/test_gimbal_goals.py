@@ -153,7 +153,8 @@ def test_loss_of_the_last_object_ends_it() -> None:
     flight.run(2.0)
     assert kept(flight, "gimbal class=person")
     flight.cameras = ()
-    assert flight.run_until(lambda: flight.events[-1].message.startswith("gimbal: lost the person"), 5.0)
+    assert flight.run_until(lambda: flight.events[-1].message.startswith("gimbal: lost "), 5.0)
+    assert " person " in flight.events[-1].message
     assert flight.events[-1].level == "warning"
 
 
@@ -165,7 +166,8 @@ def test_stop_ends_it_and_the_gimbal_is_released() -> None:
     assert manager is not None
     assert manager.primary == (1, 191)
     flight.fly("stop", 5.0)
-    assert "gimbal: ended by stop" in [event.message for event in flight.events]
+    (ended,) = [event.message for event in flight.events if event.message.startswith("gimbal: ended ")]
+    assert ended.endswith(" stop")
     flight.run(1.0)
     assert manager.primary == (0, 0)
 
@@ -174,7 +176,9 @@ def test_next_gimbal_command_replaces_it() -> None:
     flight = gimbal_flight(person(20.0, 12.0))
     assert kept(flight, place_command(flight, PLACE))
     assert kept(flight, "gimbal pitch=-10")
-    assert "gimbal: superseded by a newer gimbal command" in [event.message for event in flight.events]
+    begin = "gimbal: superseded "
+    (ended,) = [event.message for event in flight.events if event.message.startswith(begin)]
+    assert "gimbal command" in ended
 
 
 def test_mission_step_points_at_a_place() -> None:
@@ -228,10 +232,10 @@ def test_errors_name_what_to_give(text: str, parts: list[str]) -> None:
 def test_refused_command_gives_the_reason() -> None:
     flight = gimbal_flight(person(180.0, 12.0))
     flight.run(1.0)
-    assert "no confirmed person in the image" in refused(flight, "gimbal class=person")
+    assert "confirmed person" in refused(flight, "gimbal class=person")
     flight.cameras = ()
     flight.run(1.0)
-    assert "no fresh detections" in refused(flight, "gimbal class=person")
+    assert "fresh detections" in refused(flight, "gimbal class=person")
 
 
 @pytest.mark.parametrize(
@@ -267,7 +271,7 @@ def test_ranged_object_needs_a_position_and_the_flight_goes_on(
     assert seen.position_ned_m is not None
     stale = replace(flight.state, position_ns=flight.now_ns - 900_000_000)
     monkeypatch.setattr(SimulatedDriver, "state", stale)
-    assert "position is missing (0.9 s old)" in refused(flight, text.format(seen.track_id))
+    assert "missing (0.9 s old)" in refused(flight, text.format(seen.track_id))
     assert flight.outcome(landing) is None
     assert flight.guidance.busy
 
@@ -280,4 +284,7 @@ def test_place_is_given_up_without_a_position() -> None:
     aim, later_ns = pointing.aim, vehicle.now_ns + round(LOST_AFTER_S * 1e9)
     assert pointing.update(BehaviourContext(later_ns, known)) is None
     assert pointing.aim == aim
-    assert pointing.update(BehaviourContext(later_ns + 1, known)) == "position lost for 3.0 s"
+    lost = pointing.update(BehaviourContext(later_ns + 1, known))
+    assert lost is not None
+    assert lost.startswith("position lost ")
+    assert lost.endswith(" 3.0 s")

@@ -30,6 +30,7 @@ from companion.vehicle.mav_result import result_name
 from companion.vehicle.state import VehicleState
 from mavlink_sim.wire.messages import dialect
 from tests.companion.guidance.gimbal_flight import FOOTPRINT, ON_GIMBAL, PERSON_M, gimbal_flight, person
+from tests.companion.guidance.guidance_harness import assert_failed
 from vision.camera_model import CameraMount
 
 MIDDLE_M = PERSON_M[2] / 2
@@ -107,7 +108,7 @@ def pitch_deg(state: VehicleState) -> float:
 def test_approach_with_tracking_keeps_the_object_in_view() -> None:
     scene_object = person(0.0, 12.0)
     _, still = fly(command("approach person distance=2 retries=0"), scene_object)
-    assert "lost the person" in reason(still, False)
+    assert_failed(still.outcome, "lost the ", "person ")
 
     flight, log = fly(command("approach person distance=2 retries=0 gimbal=track"), scene_object)
     assert reason(log, True)
@@ -123,7 +124,7 @@ def test_approach_with_tracking_keeps_the_object_in_view() -> None:
 def test_walking_person_is_followed_from_nearly_above() -> None:
     scene_object = SceneObject("person", PERSON_M, lambda seconds: ScenePose(8.0, seconds))
     _, still = fly(command("follow person distance=2 duration=20"), scene_object)
-    assert "lost the person" in reason(still, False)
+    assert_failed(still.outcome, "lost the ", "person ")
 
     _, log = fly(command("follow person distance=2 duration=20 gimbal=track"), scene_object)
     assert reason(log, True)
@@ -211,7 +212,7 @@ def test_losing_gimbal_control_ends_the_search(phase: str) -> None:
             taken_s.append(moment.seconds)
 
     flight, log = fly(behaviour, leaving_person(), in_phase)
-    assert "lost the gimbal" in reason(log, False)
+    assert_failed(log.outcome, "lost the ", "the gimbal: ")
     assert flight.seconds - taken_s[0] < 4.0
     assert primary(flight) == STATION
 
@@ -222,7 +223,7 @@ def test_stuck_gimbal_ends_follow() -> None:
 
     behaviour = command("follow person distance=2 duration=60 occlusion=60 gimbal=track")
     _, log = fly(behaviour, person(0.0, 12.0), stick)
-    assert "does not follow" in reason(log, False)
+    assert_failed(log.outcome, "the gimbal: ", "not follow: ")
 
 
 def test_gimbal_is_kept_between_mission_steps() -> None:

@@ -192,9 +192,11 @@ def test_text_of_a_command_parses_back(command: Command) -> None:
 
 
 def test_text_has_stated_values_also_if_they_are_the_default() -> None:
-    assert str(parse("orbit car direction=clockwise radius=10m")) == "orbit car radius=10 direction=clockwise"
+    ordered, stated = "orbit car radius=10 direction=clockwise", "orbit car radius=10"
+    parsed = parse("orbit car direction=clockwise radius=10m")
+    assert str(parsed) == ordered
     assert str(parse("orbit car")) == "orbit car"
-    assert parse("orbit car radius=10") == parse("orbit car")
+    assert parse(stated) == parse("orbit car")
 
 
 @given(commands)
@@ -239,5 +241,5 @@ def test_endless_commands(text: str, endless: bool) -> None:
     ],
 )
 def test_renamed_argument_names_the_new_one(text: str, old: str, new: str) -> None:
-    with pytest.raises(GrammarError, match=f"{old} was renamed to {new} in version"):
+    with pytest.raises(GrammarError, match=rf"{old} .*renamed .*{new} .*0\.2\.0"):
         parse(text)

@@ -82,7 +82,7 @@ def test_failing_check_is_refused_and_the_flight_goes_on() -> None:
     assert harness.guidance.phase is Phase.OFFBOARD
 
 
-def test_stop_whose_mode_shows_before_its_answer_gives_up_command() -> None:
+def test_stop_whose_mode_shows_before_its_answer_ends_command() -> None:
     silent = False
     harness = GuidanceHarness(
         flying(), inputs=lambda inputs: replace(inputs, answers=() if silent else inputs.answers)
@@ -109,7 +109,7 @@ def test_mode_change_after_a_command_supersedes_it() -> None:
     harness.autopilot.change_mode(FlightMode.POSITION)
     harness.autopilot.step(0.02)
     harness.step(given)
-    assert "(now position, armed)" in harness.results[99].reason
+    assert " position, armed)" in harness.results[99].reason
     harness.run(1.0)
     assert not harness.guidance.in_command
     assert harness.autopilot.setpoints == []

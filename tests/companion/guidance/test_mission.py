@@ -185,7 +185,7 @@ def test_mission_is_found_by_path_or_name(tmp_path: Path, monkeypatch: pytest.Mo
 def test_unreadable_file_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "binary.toml"
     path.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(MissionError, match="cannot be read"):
+    with pytest.raises(MissionError, match=r"binary\.toml: cannot "):
         read_mission(path)
     path.write_bytes(b"#" * 100_001)
     with pytest.raises(MissionError, match="at most 100000 bytes"):
@@ -196,10 +196,10 @@ def test_cli_checks_a_mission_and_prints_its_plan(exported_model: Path, tmp_path
     options = ("--check", "--model", exported_model, "--detector-runtime", "onnxruntime")
     done = companion_here("mission", "demo", *options, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines()[:2] == [
-        "mission demo: 5 steps",
-        "1. takeoff altitude=4 → find; on failure → rtl",
-    ]
+    title, first = done.stdout.splitlines()[:2]
+    assert title == "mission demo: 5 steps"
+    assert first.startswith("1. takeoff altitude=4 → find; ")
+    assert first.endswith("failure → rtl")
     (tmp_path / "bad.toml").write_text("[[step]]\nname = 'look'\ndo = 'seek zebra'\n")
     done = companion_here("mission", "bad.toml", *options, cwd=tmp_path)
     assert done.returncode == 2
@@ -254,7 +254,8 @@ def test_service_flies_a_mission_and_logs_its_steps(seeing: list[str], tmp_path:
 
         reply = service.command("mission short")
         assert not reply["success"]
-        assert "'short' not found" in reply["reason"]
+        assert "mission 'short' " in reply["reason"]
+        assert "bundled missions: " in reply["reason"]
         reply = service.command("mission broken\n[[step]]\ndo = 'seek zebra'\n")
         assert reply["reason"].startswith("broken: step 1")
         reply = service.command("hold\n[[step]]\ndo = 'land'\n")
@@ -262,7 +263,7 @@ def test_service_flies_a_mission_and_logs_its_steps(seeing: list[str], tmp_path:
         assert "one line" in reply["reason"]
         # From the ground its first step is refused, and with it the mission.
         reply = service.command("mission from_the_ground\n[[step]]\ndo = 'hold 3'\n")
-        assert "in the air" in reply["reason"]
+        assert "the air" in reply["reason"]
         assert reply["steps"] == []
 
 
@@ -314,7 +315,9 @@ on_success = "loop"
     ]
     # Where an unknown branch leads is not known: nothing is called unreachable because of it.
     both = [line.removeprefix("m.toml: ") for line in problems(text)]
-    assert sorted(set(both) - set(found))[0].startswith("step 2 (a): on_success: unknown step 'nowhere'")
+    unknown = min(set(both) - set(found))
+    assert unknown.startswith("step 2 (a): on_success: unknown ")
+    assert " 'nowhere'" in unknown
     assert set(found) <= set(both)
     assert len(both) == 8
 

@@ -214,7 +214,7 @@ def test_obstacles_of_the_map_fill_unseen_directions() -> None:
     assert ObstacleMemory().filled(old, 1.0).obstacles == seen.obstacles
 
 
-def test_obstacle_of_the_map_stops_the_vehicle_but_does_not_push_it() -> None:
+def test_obstacle_of_the_map_stops_but_does_not_push_vehicle() -> None:
     vehicle, rules = KinematicVehicle(), ObstacleRules("auto", 2.0)
     planned = PlannedPath(vehicle.now_ns, (), near=((-1.2, 0.0),))
 

@@ -236,7 +236,7 @@ def test_figure_eight_stays_on_its_line() -> None:
 @settings(max_examples=60, deadline=None)
 def test_speed_profile_of_any_path_is_feasible(points: list[Vector3], closed: bool, speed_mps: float) -> None:
     if all(math.dist(point, points[0]) < 0.01 for point in points):
-        with pytest.raises(ValueError, match="two different points"):
+        with pytest.raises(ValueError, match="two different "):
             Path(points, speed_mps, closed=closed)
         return
     try:

@@ -117,7 +117,7 @@ def test_linear_policy_flies_to_the_distance(write: Write) -> None:
     assert vehicle.yaw_rad == pytest.approx(bearing, abs=0.02)
 
 
-def test_axes_of_observation_and_action_are_those_of_the_level_frame(write: Write) -> None:
+def test_observation_and_action_axes_are_of_the_level_frame(write: Write) -> None:
     layers = linear(
         forward_m_s={"target_forward_m": 0.1},
         right_m_s={"target_right_m": 0.1},
@@ -160,7 +160,7 @@ def test_observation_outside_its_range_ends_the_policy(
 
 
 @pytest.mark.parametrize("height_m", [12.0, 15.0, 19.0])
-def test_bundled_policy_hands_back_at_heights_it_was_not_trained_at(height_m: float) -> None:
+def test_bundled_policy_hands_back_at_untrained_heights(height_m: float) -> None:
     vehicle = KinematicVehicle(position=[0.0, 0.0, -height_m])
     flight = Flight(
         parse("policy approach class=car distance=6").build(NO_CONTEXT),
@@ -220,7 +220,7 @@ def test_policy_goes_on_when_its_object_is_seen_again(write: Write) -> None:
     assert outcome is not None
     assert outcome.success, outcome.reason
     assert vehicle.position[0] == pytest.approx(12.0, abs=0.35)
-    assert "policy tried, lost the car, waiting" in statuses
+    assert any(text.startswith("policy tried, ") and text.endswith(" car, waiting") for text in statuses)
 
 
 def test_policy_without_an_object_holds_then_ends_in_hold(write: Write) -> None:
@@ -292,15 +292,15 @@ def test_unusable_description_is_refused_in_one_line(
 def test_policy_faster_than_the_loop_is_refused(write: Write, tmp_path: Path) -> None:
     command = parse(f'policy "{write()}" class=car')
     command.build(BuildContext(loop_rate_hz=20.0))
-    with pytest.raises(GrammarError, match=r"tried steps at 20 Hz, guidance only at 10 Hz: .*rate_hz"):
+    with pytest.raises(GrammarError, match=r"tried .* 20 Hz.* 10 Hz: .*guidance\.rate_hz"):
         command.build(BuildContext(loop_rate_hz=10.0))
     settings = plain_settings({"guidance.rate_hz": "10", "detector.enabled": "false"})
     inputs = InputAssembler(settings, [PerceptionCamera(settings.of_camera(None))], lambda *event: None)
-    with pytest.raises(GrammarError, match="guidance only at 10 Hz"):
+    with pytest.raises(GrammarError, match=r" 20 Hz.* 10 Hz: .*guidance\.rate_hz"):
         inputs.read_command(1, str(command), flying().state, lambda behaviour: None)
     mission = parse("mission one.toml")
     text = f"[[step]]\ndo = '{command}'"
-    with pytest.raises(GrammarError, match="guidance only at 10 Hz"):
+    with pytest.raises(GrammarError, match=r" 20 Hz.* 10 Hz: .*guidance\.rate_hz"):
         mission.build(BuildContext(attachment=text, loop_rate_hz=10.0))
 
 
@@ -309,34 +309,34 @@ def test_policy_must_observe_what_it_flies_to(tmp_path: Path) -> None:
     path = tmp_path / "old.onnx"
     layer = Layer(np.zeros((len(LIMITS), len(quantities))), np.zeros(len(LIMITS)))
     write_policy(path, DESCRIPTION.model_copy(update={"observation": quantities}), [layer])
-    with pytest.raises(GrammarError, match="old: does not observe target_age_s"):
+    with pytest.raises(GrammarError, match=r"old: .* observe target_age_s"):
         built(path)
 
 
 def test_file_that_is_no_policy_is_refused_in_one_line(write: Write, tmp_path: Path) -> None:
-    with pytest.raises(GrammarError, match=r"tried.onnx: has no description"):
+    with pytest.raises(GrammarError, match=r"tried.onnx: .*no description .*companion train-policy"):
         built(write(key="other"))
     path = write()
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(GrammarError, match=r"tried.onnx: no usable ONNX file: [^\n]+$"):
+    with pytest.raises(GrammarError, match=r"tried.onnx: .*usable ONNX .*: [^\n]+$"):
         built(path)
     path.write_bytes(b"")
-    with pytest.raises(GrammarError, match=r"tried.onnx: no usable ONNX file: [^\n]+$"):
+    with pytest.raises(GrammarError, match=r"tried.onnx: .*usable ONNX .*: [^\n]+$"):
         built(path)
     path.write_bytes(bytes(4_000_001))
-    with pytest.raises(GrammarError, match="at most 4000000 bytes, this file has 4000001"):
+    with pytest.raises(GrammarError, match=r"4000000 bytes, .* 4000001"):
         built(path)
-    with pytest.raises(GrammarError, match=r"policy 'none.onnx' not found: .*; bundled policies: "):
+    with pytest.raises(GrammarError, match=r"policy 'none.onnx' .*; bundled policies: "):
         parse("policy none.onnx class=car").build(NO_CONTEXT)
-    with pytest.raises(GrammarError, match=r"tried.onnx: its action is no number"):
+    with pytest.raises(GrammarError, match=r"tried.onnx: .*action .*\(.*nan.*\)"):
         built(write(linear(up_m_s={"bias": math.nan})))
     with pytest.raises(GrammarError, match=r"trained for a distance of 2 to 10 m, not 40 m"):
         built(write(), "distance=40")
 
 
 def test_policy_needs_a_class_or_a_track() -> None:
-    with pytest.raises(GrammarError, match="class or track is missing"):
+    with pytest.raises(GrammarError, match=r"class .*track .*missing"):
         parse("policy a.onnx")
     assert parse("policy a.onnx track=7").build is not None
 
@@ -392,9 +392,7 @@ def test_unknown_operator_is_named(write: Write) -> None:
     model = onnx.load(str(path := write()))
     model.graph.node[0].op_type = "LSTM"
     onnx.save(model, str(path))
-    with pytest.raises(
-        GrammarError, match=r"tried.onnx: .*operator LSTM with transB is not computed; known: Gemm"
-    ):
+    with pytest.raises(GrammarError, match=r"tried.onnx: .*LSTM .* transB .*; known: Gemm"):
         built(path)
 
 
@@ -441,7 +439,7 @@ def test_file_of_countless_parts_is_refused(write: Write) -> None:
     model = onnx.load(str(path := write()))
     onnx.helper.set_model_props(model, {str(index): "x" * 1000 for index in range(200)})
     onnx.save(model, str(path))
-    with pytest.raises(GrammarError, match=r"tried.onnx: .*bytes beside its weights, at most 200000"):
+    with pytest.raises(GrammarError, match=r"tried.onnx: .*bytes .*weights, .* 200000"):
         built(path)
     path.write_bytes(bytes([8, 1]) * 100_000)
     with pytest.raises(GrammarError, match=r"tried.onnx: .*more than 1000 fields"):

@@ -382,7 +382,7 @@ def test_attitude_is_that_of_the_capture() -> None:
     assert target.bearing_rad == pytest.approx(0.425, abs=1e-6)
 
 
-def test_position_and_height_are_interpolated_at_their_own_stamps() -> None:
+def test_position_and_height_are_interpolated_at_own_stamps() -> None:
     history = StateHistory()
     attitude = quaternion_from_euler(0, 0, 0)
     for step in range(5):

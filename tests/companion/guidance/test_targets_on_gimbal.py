@@ -122,11 +122,11 @@ def test_missing_gimbal_attitude_raises_with_the_reason() -> None:
         home_position_ned_m=(0.0, 0.0, 0.0),
     )
     history.add(state)
-    with pytest.raises(HistoryError, match="no attitude of the gimbal"):
+    with pytest.raises(HistoryError, match=r"no attitude .*gimbal received"):
         targets_from_detections([MIDDLE], T0, CAMERA, MOUNT, history)
     history = history_of(YawFrame.NORTH, gimbal_every=60)
     late_ns = T0 + 30 * STEP_NS
-    with pytest.raises(HistoryError, match=r"0\.60 s newer than the newest attitude of the gimbal"):
+    with pytest.raises(HistoryError, match=r"0\.60 s newer .* attitude .*gimbal"):
         targets_from_detections([MIDDLE], late_ns, CAMERA, MOUNT, history)
     # A body-mounted camera does not need it.
     assert targets_from_detections([MIDDLE], late_ns, CAMERA, CameraMount(), history)
@@ -156,7 +156,7 @@ def test_changed_yaw_frame_is_not_interpolated() -> None:
 
 
 def test_gimbal_mount_needs_the_gimbal_attitude() -> None:
-    with pytest.raises(ValueError, match="needs the gimbal's attitude"):
+    with pytest.raises(ValueError, match=r"gimbal.* `held`"):
         MOUNT.ned_from_optical(np.eye(3))
     with pytest.raises(ValueError, match="body_from_optical"):
         _ = MOUNT.body_from_optical

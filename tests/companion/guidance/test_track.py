@@ -109,7 +109,7 @@ def test_long_unseen_object_may_have_moved() -> None:
 
 
 @pytest.mark.parametrize(("left", "same"), [(290.0, True), (340.0, False)])
-def test_second_box_on_the_object_may_replace_it_and_one_beside_it_may_not(left: float, same: bool) -> None:
+def test_box_on_the_object_may_replace_it_and_one_beside_may_not(left: float, same: bool) -> None:
     vehicle = (0.0, 0.0, -5.0)
     first = replace(seen((10.0, 0.0)), track_id=1, box_xyxy=(300.0, 100.0, 340.0, 200.0))
     second = replace(seen((10.0, 0.4)), track_id=2, box_xyxy=(left, 100.0, left + 60.0, 200.0))

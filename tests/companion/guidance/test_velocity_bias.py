@@ -26,7 +26,7 @@ def observed(rate_mps: tuple[float, float], seconds: float, jump_m: float = 0.0)
     ]
 
 
-def test_difference_of_rate_and_velocity_is_found_within_eight_seconds() -> None:
+def test_rate_and_velocity_difference_is_found_within_8_s() -> None:
     assert observed((3.2, -1.1), 8.0)[-1] == pytest.approx((0.2, -0.1), abs=0.01)
 
 
