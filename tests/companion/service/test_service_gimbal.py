@@ -81,7 +81,9 @@ async def test_targets_need_the_gimbals_attitude() -> None:
     set_state(service, state_at(now_ns, None))
     see(service, now_ns)
     assert not service.cameras[0].targets
-    assert "no attitude of the gimbal" in service.status()["targets"]["localization_error"]
+    error = service.status()["targets"]["localization_error"]
+    assert "no attitude " in error
+    assert "gimbal received" in error
     gimbal = service.status()["gimbal"]
     assert gimbal is not None
     assert "not responding" in (gimbal["problem"] or "")
@@ -104,7 +106,9 @@ async def test_targets_need_the_gimbals_attitude() -> None:
     see(service, later_ns)
     assert not service.cameras[0].targets
     error = service.status()["targets"]["localization_error"]
-    assert "newer than the newest attitude of the gimbal" in error
+    assert " s newer than " in error
+    assert "attitude " in error
+    assert "gimbal" in error
     assert "2.0 s" in step(service, later_ns).gimbal.direction_fault
 
 
@@ -173,7 +177,7 @@ async def test_gimbal_of_a_camera_is_searched_and_its_loss_reported() -> None:
 
 
 def test_stabilized_and_on_gimbal_exclude_each_other() -> None:
-    with pytest.raises(ConfigurationError, match="on_gimbal and stabilized"):
+    with pytest.raises(ConfigurationError, match=r"on_gimbal .*stabilized exclude"):
         service_of(camera__on_gimbal="true", camera__stabilized="true")
 
 
