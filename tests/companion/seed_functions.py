@@ -11,7 +11,7 @@ from pathlib import Path
 def squared(seed: int) -> int:
     """The seed squared; 7 fails."""
     if seed == 7:
-        raise ValueError("no square of 7")
+        raise ValueError("refused 7")
     return seed * seed
 
 

@@ -104,7 +104,8 @@ def test_video_gives_a_calibration(tmp_path: Path) -> None:
     writer.release()
     done = calibrate(tmp_path / "views.avi", *BOARD_WORDS, "--every", "2", "-o", tmp_path / "camera.yaml")
     assert done.exit_code == 0, done.output
-    assert "12 images, 12 with the board, 12 different views" in done.stderr
+    assert "12 images, 12 with " in done.stderr
+    assert "12 different views" in done.stderr
     assert "missing" in done.stderr
     assert read_camera_info(tmp_path / "camera.yaml").model.fx == pytest.approx(LENS.fx, rel=0.02)
 
@@ -148,7 +149,8 @@ def test_folders_of_two_cameras_give_their_places(pairs: Path, tmp_path: Path) -
     output = tmp_path / "depth.yaml"
     done = extrinsics(pairs, "-o", output)
     assert done.exit_code == 0, done.output
-    assert "9 pairs of images, 9 with the board" in done.stderr
+    assert "9 pairs of " in done.stderr
+    assert ", 9 with " in done.stderr
     assert "image's" not in done.stderr  # the board need not reach the image's corners
     found, true = read_camera_info(output).registration, read_camera_info(pairs / "depth.yaml").registration
     assert found is not None
@@ -174,12 +176,13 @@ def test_wrong_files_of_two_cameras_are_refused(pairs: Path, folder: Path, tmp_p
     assert "280x210" in line
     words = ("--colour-calibration", pairs / "colour.yaml", "--infrared-calibration", pairs / "depth.yaml")
     line = one_line_of_bad_input(calibrate("extrinsics", pairs / "colour", folder, *BOARD_WORDS, *words))
-    assert "do not determine" in line
+    assert "not determine" in line
     empty = ("--board", "chessboard", "8x5", "--square", "0.03")
     line = one_line_of_bad_input(
         calibrate("extrinsics", pairs / "colour", pairs / "infrared", *empty, *words)
     )
-    assert "no board in any of 9 pairs" in line
+    assert "no board " in line
+    assert " of 9 pairs" in line
     flags = ("--source-depth", "depth/", "--source-depth-calibration-file", str(pairs / "colour.yaml"))
     done = CliRunner().invoke(app, ["config", *flags])
     assert "colour_from_depth" in one_line_of_bad_input(done)
@@ -200,18 +203,19 @@ def test_live_cameras_are_paired_by_their_stamps() -> None:
     collected = collect_views(colour, BOARD, lambda _: None, 1, Camera([40, 73, 140, 200], board))
     assert (collected.frames, collected.found) == (3, 3)  # 33-40, 66-73, 133-140
     assert len(collected.pairs) == 1  # the board did not move
-    with pytest.raises(CalibrationError, match="no board in any of 1 pairs"):
+    with pytest.raises(CalibrationError, match=r"no board .* of 1 pairs"):
         collect_views(Camera([0], board), BOARD, lambda _: None, 1, Camera([10], blank))
     recorded = Camera([0], board)
     recorded.live = False
-    with pytest.raises(ValueError, match="no common time"):
+    with pytest.raises(ValueError, match="common time"):
         collect_views(Camera([0], board), BOARD, lambda _: None, 1, recorded)
 
 
 def test_no_board_in_any_view(folder: Path, tmp_path: Path) -> None:
     words = ("--board", "chessboard", "8x5", "--square", "0.03")
     line = one_line_of_bad_input(calibrate(folder, *words, "-o", tmp_path / "camera.yaml"))
-    assert "no board in any of 18 images" in line
+    assert "no board " in line
+    assert " of 18 images" in line
     assert "8x5" in line
     assert not (tmp_path / "camera.yaml").exists()
 
@@ -224,8 +228,8 @@ def test_too_few_views(folder: Path, tmp_path: Path) -> None:
     done = calibrate(few, *BOARD_WORDS, "-o", tmp_path / "camera.yaml")
     line = one_line_of_bad_input(done)
     assert done.stderr.splitlines() == [line]
-    assert "too few views" in line
-    assert "5" in line
+    assert "few views" in line
+    assert ": 5 different" in line
     assert "more views" in line
 
 
@@ -239,7 +243,8 @@ def test_too_few_pairs(pairs: Path, tmp_path: Path) -> None:
     done = calibrate("extrinsics", *folders, *BOARD_WORDS, *words, "-o", tmp_path / "depth.yaml")
     line = one_line_of_bad_input(done)
     assert done.stderr.splitlines() == [line]
-    assert "too few views" in line
+    assert "few views" in line
+    assert "both cameras" in line
     assert "more views" in line
 
 
@@ -490,9 +495,11 @@ def test_angle_that_is_no_number_is_refused(flag: str) -> None:
     assert one_line_of_bad_input(done).startswith(f"companion: {flag} ")
 
 
-def test_missing_output_folder_is_refused_before_the_source_opens(tmp_path: Path) -> None:
-    line = one_line_of_bad_input(calibrate("none", *BOARD_WORDS, "-o", tmp_path / "no" / "camera.yaml"))
-    assert line == f"companion: cannot write {tmp_path / 'no' / 'camera.yaml'}: no such folder"
+def test_missing_output_folder_is_refused_before_source_opens(tmp_path: Path) -> None:
+    output = tmp_path / "no" / "camera.yaml"
+    line = one_line_of_bad_input(calibrate("none", *BOARD_WORDS, "-o", output))
+    assert f" write {output}: " in line
+    assert line.endswith("such folder")
 
 
 def test_live_camera_without_the_marker_says_what_it_sees(

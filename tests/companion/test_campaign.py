@@ -39,7 +39,7 @@ def test_seeds_are_numbers_and_ranges() -> None:
 def test_results_come_in_order_and_an_error_names_its_seed(processes: int) -> None:
     results = map_seeds(squared, [3, 1, 2, 7, 4], processes=processes)
     assert [next(results), next(results), next(results)] == [9, 1, 4]
-    with pytest.raises(SeedError, match="seed 7: ValueError: no square"):
+    with pytest.raises(SeedError, match="seed 7: ValueError: refused 7"):
         next(results)
 
 
@@ -144,11 +144,11 @@ def test_failed_seed_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest
     assert flights.main(["approach", "--runs", "1", "--seed", "7"]) == 2
     monkeypatch.setattr(geolocation, "flight_of", lambda seed, **_: squared(seed))
     assert geolocation.main(["--seeds", "7"]) == 2
-    assert capsys.readouterr().err.splitlines() == ["seed 7: ValueError: no square of 7"] * 2
+    assert capsys.readouterr().err.splitlines() == ["seed 7: ValueError: refused 7"] * 2
     monkeypatch.setattr(demo_flight, "fly_demo", lambda seed, **_: squared(seed))
     result = CliRunner().invoke(app, ["demo", "--seeds", "7"])
     assert result.exit_code == 2
-    assert result.stderr.splitlines() == ["companion: seed 7: ValueError: no square of 7"]
+    assert result.stderr.splitlines() == ["companion: seed 7: ValueError: refused 7"]
 
 
 def test_address_without_a_cluster_is_refused_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
@@ -236,7 +236,7 @@ def test_a_killed_worker_of_a_cluster_loses_no_seed(cluster: str, tmp_path: Path
 def test_an_error_on_a_cluster_names_its_seed(cluster: str, capsys: pytest.CaptureFixture[str]) -> None:
     results = map_seeds(squared, [2, 7, 4], ray=cluster)
     assert next(results) == 4
-    with pytest.raises(SeedError, match="seed 7: ValueError: no square"):
+    with pytest.raises(SeedError, match="seed 7: ValueError: refused 7"):
         next(results)
     with pytest.raises(SeedError, match="seed 3: no result"):
         list(map_seeds(killed, [3], ray=cluster))

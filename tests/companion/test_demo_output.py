@@ -54,7 +54,7 @@ class FailingService:
         self.commands.append(text)
         if text == "rtl":
             self.driver.state = LANDED
-        return {"success": text == "rtl", "reason": "the battery has 14%", "steps": []}
+        return {"success": text == "rtl", "reason": "battery 14%", "steps": []}
 
 
 @pytest.mark.parametrize("in_command", [True, False])
@@ -63,7 +63,7 @@ async def test_a_failed_demo_returns_unless_the_pilot_flies(in_command: bool) ->
     await demo._mission(cast(Service, service), flight)
     assert service.commands[1:] == (["rtl"] if in_command else [])
     assert flight.failure is not None
-    assert flight.failure.startswith("the battery has 14%")
+    assert flight.failure.startswith("battery 14%")
     assert flight.on_ground is flight.ended is in_command
 
 

@@ -64,12 +64,13 @@ def test_show_lists_what_happened_in_order(path: Path, tmp_path: Path) -> None:
     done = companion_here("log", "show", path, "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
+    refused = "goto: refused: too far"
     assert [(line["kind"], line["text"]) for line in found["lines"]] == [
         ("mode", "hold"),
         ("mode", "takeoff"),
         ("armed", ""),
         ("warning", "low battery"),
-        ("refused", "goto: refused: too far"),
+        ("refused", refused),
         ("mode", "hold"),
         ("disarmed", ""),
     ]

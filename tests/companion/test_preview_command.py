@@ -90,7 +90,8 @@ def test_bad_source_of_preview_is_one_line(tmp_path: Path) -> None:
     done = companion_here("preview", "/dev/video98765", cwd=tmp_path)
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()
-    assert line.startswith("companion: /dev/video98765: no such camera")
+    assert line.startswith("companion: /dev/video98765: ")
+    assert "such camera" in line
 
 
 def test_preview_is_levelled_by_the_attitude_of_the_vehicle(image_folder: Path, tmp_path: Path) -> None:

@@ -40,7 +40,8 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
         outcome = flight.fly(f"mission {mission}", 120.0).outcome
         assert outcome is not None
         assert outcome.success, outcome.reason
-        assert flight.fly("approach person distance=6", 30.0).moments
+        approach = "approach person distance=6"
+        assert flight.fly(approach, 30.0).moments
         refused = flight.fly("goto forward=900 right=0", 5.0).outcome
         assert refused is not None
         assert not refused.success
@@ -154,7 +155,9 @@ def test_missing_outputs_are_reported(flown: Path, tmp_path: Path) -> None:
         return None if lost else message
 
     found = replay([rewritten(flown, tmp_path, change)], {})
-    assert found.inexact == ["the outputs of 3 steps are not recorded, first of 10"]
+    (reason,) = found.inexact
+    assert "outputs of 3 steps " in reason
+    assert reason.endswith(" 10")
     assert found.differing_steps == 0
 
 

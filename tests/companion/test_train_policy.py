@@ -81,7 +81,7 @@ def test_policies_of_many_seeds_are_those_of_each_seed(tmp_path: Path) -> None:
 
 def test_failed_training_of_a_seed_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(*_: object) -> None:
-        raise RuntimeError("no policy")
+        raise RuntimeError("policy 7")
 
     monkeypatch.setattr(trainer, "judge", fails)
     command = ["train-policy", "companion/CartPole-v0", "--steps", "256", "--seeds", "3"]
@@ -89,7 +89,7 @@ def test_failed_training_of_a_seed_is_one_line(tmp_path: Path, monkeypatch: pyte
     assert result.exit_code == 2
     trained, failed = result.stderr.splitlines()
     assert trained.startswith("seed 3: step 256/256 return ")
-    assert failed == "companion: seed 3: RuntimeError: no policy"
+    assert failed == "companion: seed 3: RuntimeError: policy 7"
 
 
 def test_interrupted_trainings_of_many_seeds_resume(
@@ -121,7 +121,7 @@ def test_interrupted_trainings_of_many_seeds_resume(
 
 def test_training_resumes_with_its_state(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file, folder = tmp_path / "policy.onnx", tmp_path / "policy.onnx.training"
-    with pytest.raises(PolicyTrainingError, match=r"no state of a training in .*policy.onnx.training"):
+    with pytest.raises(PolicyTrainingError, match=r"no state .*policy\.onnx\.training: state\.pt"):
         train_policy(CART_POLE, 256, file, resume=True)
     train_policy(CART_POLE, 256, file)
     first = file.read_bytes()
@@ -138,7 +138,7 @@ def test_training_resumes_with_its_state(tmp_path: Path, capsys: pytest.CaptureF
     assert file.read_bytes() == second
     with pytest.raises(PolicyTrainingError, match="seed 0, not 1"):
         train_policy(replace(CART_POLE, seed=1), 1024, file, resume=True)
-    with pytest.raises(PolicyTrainingError, match="holds the state of a training: continue it with --resume"):
+    with pytest.raises(PolicyTrainingError, match=r"policy\.onnx\.training holds .* --resume\b"):
         train_policy(CART_POLE, 512, file)
 
 
@@ -161,8 +161,7 @@ def test_state_that_is_no_training_is_refused_and_runs_nothing(tmp_path: Path) -
     def refused() -> str:
         result = CliRunner().invoke(app, command)
         assert result.exit_code == 2
-        assert "--resume" in result.stderr
-        assert "state.pt is no state" in result.stderr
+        assert f"--resume: {state} is no " in result.stderr
         assert len(result.stderr.splitlines()) == 1
         return result.stderr
 
@@ -226,7 +225,7 @@ def test_behaviour_and_environment_name_the_same_quantities() -> None:
 
 def test_policy_of_another_environment_is_not_flown(tmp_path: Path) -> None:
     train_policy(CART_POLE, 256, tmp_path / "cart.onnx")
-    with pytest.raises(PolicyError, match=r"cart \(companion/CartPole-v0\): unknown observation 'cart_pos"):
+    with pytest.raises(PolicyError, match=r"cart \(companion/CartPole-v0\): .* observation 'cart_pos"):
         check_quantities(load_policy(tmp_path / "cart.onnx"))
 
 
