@@ -170,17 +170,22 @@ def test_missing_required_depth_is_refused() -> None:
 
 
 def test_brake_is_sent_while_depth_is_missing() -> None:
-    harness = GuidanceHarness(KinematicVehicle(mode=FlightMode.HOLD))
+    vehicle, seen = KinematicVehicle(mode=FlightMode.HOLD), True
+    harness = GuidanceHarness(
+        vehicle,
+        options=GuidanceOptions(obstacles=ObstacleRules("required")),
+        inputs=lambda inputs: replace(inputs, obstacles=sectors(vehicle.now_ns) if seen else None),
+    )
     harness.run(0.1)
     harness.command(GotoBehaviour(from_here_m=(30.0, 0.0)))
     harness.until(lambda: harness.guidance.phase == "offboard", 5.0)
     harness.run(1.0)
     assert math.hypot(*sent_velocity(harness)) > 1.0
-    harness.guidance.options = GuidanceOptions(obstacles=ObstacleRules("required"))
+    seen = False
     harness.run(0.1)
     assert sent_velocity(harness) == (0.0, 0.0, 0.0)
     assert [reason[:8] for reason in harness.guidance.limited_by] == ["no depth"]
-    harness.guidance.options = GuidanceOptions(obstacles=ObstacleRules("auto"))
+    seen = True
     harness.run(1.0)
     assert math.hypot(*sent_velocity(harness)) > 0.5
     assert [event.kind for event in harness.events][-2:] == [
