@@ -67,7 +67,7 @@ def test_head_gives_the_box_around_the_rotated_one(degrees: float) -> None:
         np.testing.assert_allclose(cell, expected, atol=1e-5)
 
 
-@pytest.mark.parametrize("family", ["YOLOv8", "YOLO11"])
+@pytest.mark.parametrize("family", ["YOLOv8", pytest.param("YOLO11", marks=pytest.mark.slow)])
 def test_checkpoint_and_its_export_find_the_same_boxes(
     tmp_path: Path, family: str, caplog: pytest.LogCaptureFixture
 ) -> None:
