@@ -5,8 +5,9 @@ and rotors are those of PX4's own SIH quadrotor (its SIH_* parameters). The atti
 quaternion, so there is no singular tilt. PX4's attitude and rate controllers, with its default gains, and its
 mixer with saturation run at every step, as on the real vehicle; the integral parts are replaced by their
 steady value on this balanced airframe. The attitude loop compares thrust axes (the "reduced attitude" of
-Brescianini, Hehn, D'Andrea, 2013), so it knows no gimbal lock. Plain floats in local names throughout: numpy
-scalars, or an object for a vector, would make the step, and every test in lockstep, several times slower.
+Brescianini, Hehn, D'Andrea, 2013), so it knows no gimbal lock. Plain floats in local names of one function:
+numpy scalars, or an object for a vector, would make the step, and every test in lockstep, several times
+slower; calls of a function for each loop and the mixer cost a tenth of a whole flight.
 """
 
 from __future__ import annotations
@@ -40,86 +41,6 @@ RATE_DRAG = 0.025 / (4 * 5.0 * 0.2)
 YAW_RATE_DRAG = 0.025 / (4 * 0.1)
 # Yaw is served last, but PX4 keeps this share of the range for it by lowering the thrust.
 YAW_MARGIN = 0.15
-
-
-def demanded_rates(
-    matrix: Matrix, tilt_x: float, tilt_y: float, tilt_z: float, yaw_rate_radps: float
-) -> Vector:
-    """Body rates (FRD, rad/s) that turn the thrust axis to the demanded direction.
-
-    Args:
-        matrix: the attitude, `ned_from_body`, row by row.
-        tilt_x, tilt_y, tilt_z: the demanded body down axis in the heading frame (x along the vehicle's
-            heading, z down), a unit vector.
-        yaw_rate_radps: demanded yaw rate about the vertical.
-    """
-    a, b, c, d, e, f, g, h, i = matrix
-    heading = math.sqrt(a * a + d * d)
-    if heading > 1e-6:
-        cosine, sine = a / heading, d / heading
-    else:  # the nose points straight up or down: the heading is that of the right axis
-        wing = math.sqrt(b * b + e * e)
-        cosine, sine = e / wing, -b / wing
-    north = cosine * tilt_x - sine * tilt_y
-    east = sine * tilt_x + cosine * tilt_y
-    # the demanded axis in the body frame
-    x = a * north + d * east + g * tilt_z
-    y = b * north + e * east + h * tilt_z
-    z = c * north + f * east + i * tilt_z
-    # 2 sin(angle / 2) about the axis e_z × wanted, as PX4 takes it from the error quaternion
-    if z > -0.98:
-        gain = ATTITUDE_GAIN_PER_S * math.sqrt(2.0 / (1.0 + z))
-        p = -gain * y
-        q = gain * x
-    else:  # upside down: every direction is as short; exactly upside down one must be selected
-        p = MAX_TILT_RATE_RADPS if y <= 0.0 else -MAX_TILT_RATE_RADPS
-        q = 10.0 * ATTITUDE_GAIN_PER_S * x
-    limit = MAX_TILT_RATE_RADPS
-    p = (limit if p > limit else -limit if p < -limit else p) + yaw_rate_radps * g
-    q = (limit if q > limit else -limit if q < -limit else q) + yaw_rate_radps * h
-    return (p, q, yaw_rate_radps * i)
-
-
-def mixed_thrusts(collective: float, wanted: Vector, rates: Vector, spin: Vector) -> Rotors:
-    """The rate controller and the mixer: each rotor's command, 0..1 (order as `Multirotor`).
-
-    At saturation, collective thrust is lowered first, then tilt is scaled down, and yaw gets the rest (PX4's
-    sequential desaturation without air mode).
-
-    Args:
-        collective: demanded thrust, 0..1.
-        wanted, rates: body rates, demanded and actual, rad/s; spin: angular acceleration, rad/s².
-    """
-    roll = RATE_P * (wanted[0] - rates[0]) - RATE_D * spin[0] + RATE_DRAG * wanted[0]
-    pitch = RATE_P * (wanted[1] - rates[1]) - RATE_D * spin[1] + RATE_DRAG * wanted[1]
-    yaw = YAW_RATE_P * (wanted[2] - rates[2]) + YAW_RATE_DRAG * wanted[2]
-    base = 0.0 if collective < 0.0 else 1.0 if collective > 1.0 else collective
-    spread = (roll if roll >= 0.0 else -roll) + (pitch if pitch >= 0.0 else -pitch)
-    if spread > 0.5:
-        scale = 0.5 / spread
-        roll *= scale
-        pitch *= scale
-        spread = 0.5
-    if base + spread > 1.0:
-        base = 1.0 - spread
-    if base < spread:
-        scale = base / spread
-        roll *= scale
-        pitch *= scale
-        spread = base
-    reserve = (yaw if yaw >= 0.0 else -yaw) if -YAW_MARGIN < yaw < YAW_MARGIN else YAW_MARGIN
-    if base + spread + reserve > 1.0:
-        base = max(1.0 - spread - reserve, spread)
-    margin = (1.0 - base if base > 0.5 else base) - spread
-    if margin < 0.0:
-        margin = 0.0
-    yaw = margin if yaw > margin else -margin if yaw < -margin else yaw
-    return (
-        base - roll + pitch + yaw,
-        base + roll - pitch + yaw,
-        base + roll + pitch - yaw,
-        base - roll - pitch - yaw,
-    )
 
 
 Vector = tuple[float, float, float]
@@ -340,8 +261,11 @@ class Multirotor:
 
     # ---- time -------------------------------------------------------------------------------------------
 
-    def advance(self, dt_s: float) -> None:
-        """Advance by `dt_s` (at most ~10 ms) towards what was commanded."""
+    def advance(self, dt_s: float, steps: int = 1) -> None:
+        """Advance by steps of `dt_s` (at most ~10 ms) towards what was commanded.
+
+        Several are for a vehicle clear of the ground: the attributes change at the end only.
+        """
         thrust, tilt_x, tilt_y, tilt_z, yaw_rate = self._demand
         if self.on_ground:
             blend = min(1.0, dt_s / ROTOR_TIME_CONSTANT_S)
@@ -359,96 +283,142 @@ class Multirotor:
                 self._stand(dt_s, lift)
                 return
             self.on_ground = False
-        matrix = self._matrix
-        rates = self.rates
-        if self._rate_demand is None:
-            wanted = demanded_rates(matrix, tilt_x, tilt_y, tilt_z, yaw_rate)
-        else:
-            wanted = self._rate_demand
-        p, q, r = rates
-        u0, u1, u2, u3 = self.rotor_commands = mixed_thrusts(
-            thrust / MAX_THRUST_MPS2, wanted, rates, self._spin
-        )
+        a, b, c, d, e, f, g, h, i = self._matrix
+        p, q, r = self.rates
+        spin_x, spin_y, spin_z = self._spin
+        w, x, y, z = self.quaternion
+        north, east, down = self.position
+        vx, vy, vz = self.velocity
+        t0, t1, t2, t3 = self.rotor_thrusts
+        e0, e1, e2, e3 = (0.0, 0.0, 0.0, 0.0) if self.crashed else self.rotor_effectiveness
         blend = dt_s / ROTOR_TIME_CONSTANT_S
         if blend > 1.0:
             blend = 1.0
-        t0, t1, t2, t3 = self.rotor_thrusts
-        e0, e1, e2, e3 = (0.0, 0.0, 0.0, 0.0) if self.crashed else self.rotor_effectiveness
-        t0 += (ROTOR_THRUST_MPS2 * u0 * e0 - t0) * blend
-        t1 += (ROTOR_THRUST_MPS2 * u1 * e1 - t1) * blend
-        t2 += (ROTOR_THRUST_MPS2 * u2 * e2 - t2) * blend
-        t3 += (ROTOR_THRUST_MPS2 * u3 * e3 - t3) * blend
-        self.rotor_thrusts = (t0, t1, t2, t3)
-
-        # torques of the rotors (1 kg, so m/s² are newtons), drag, and the gyroscopic coupling of the body
-        coupling = _COUPLING_KGM2
-        spin_x = (ARM_M * (t1 + t2 - t0 - t3) - ANGULAR_DRAG_NMS * p + coupling * q * r) / INERTIA_XY_KGM2
-        spin_y = (ARM_M * (t0 + t2 - t1 - t3) - ANGULAR_DRAG_NMS * q - coupling * p * r) / INERTIA_XY_KGM2
-        spin_z = (_TORQUE_PER_THRUST_M * (t0 + t1 - t2 - t3) - ANGULAR_DRAG_NMS * r) / INERTIA_Z_KGM2
-        self._spin = (spin_x, spin_y, spin_z)
-        p += spin_x * dt_s
-        q += spin_y * dt_s
-        r += spin_z * dt_s
-        self.rates = (p, q, r)
         half = 0.5 * dt_s
-        w, x, y, z = self.quaternion
-        self._move(dt_s, t0 + t1 + t2 + t3)
-        p *= half
-        q *= half
-        r *= half
-        w, x, y, z = (
-            w - x * p - y * q - z * r,
-            x + w * p + y * r - z * q,
-            y + w * q + z * p - x * r,
-            z + w * r + x * q - y * p,
-        )
-        scale = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
-        w *= scale
-        x *= scale
-        y *= scale
-        z *= scale
-        self.quaternion = (w, x, y, z)
-        xx, yy, zz = x * x, y * y, z * z
-        xy, xz, yz = x * y, x * z, y * z
-        wx, wy, wz = w * x, w * y, w * z
-        self._matrix = (
-            1.0 - 2.0 * (yy + zz),
-            2.0 * (xy - wz),
-            2.0 * (xz + wy),
-            2.0 * (xy + wz),
-            1.0 - 2.0 * (xx + zz),
-            2.0 * (yz - wx),
-            2.0 * (xz - wy),
-            2.0 * (yz + wx),
-            1.0 - 2.0 * (xx + yy),
-        )
+        limit, coupling = MAX_TILT_RATE_RADPS, _COUPLING_KGM2
+        collective = thrust / MAX_THRUST_MPS2
+        collective = 0.0 if collective < 0.0 else 1.0 if collective > 1.0 else collective
+        rate_demand = self._rate_demand
+        for _ in range(steps):
+            # the attitude loop: body rates (FRD) that turn the thrust axis to the demanded direction
+            if rate_demand is not None:
+                wanted_p, wanted_q, wanted_r = rate_demand
+            else:
+                heading = math.sqrt(a * a + d * d)
+                if heading > 1e-6:
+                    cosine, sine = a / heading, d / heading
+                else:  # the nose points straight up or down: the heading is that of the right axis
+                    wing = math.sqrt(b * b + e * e)
+                    cosine, sine = e / wing, -b / wing
+                tilt_north = cosine * tilt_x - sine * tilt_y
+                tilt_east = sine * tilt_x + cosine * tilt_y
+                # the demanded axis in the body frame
+                axis_x = a * tilt_north + d * tilt_east + g * tilt_z
+                axis_y = b * tilt_north + e * tilt_east + h * tilt_z
+                axis_z = c * tilt_north + f * tilt_east + i * tilt_z
+                # 2 sin(angle / 2) about the axis e_z × wanted, as PX4 takes it from the error quaternion
+                if axis_z > -0.98:
+                    gain = ATTITUDE_GAIN_PER_S * math.sqrt(2.0 / (1.0 + axis_z))
+                    wanted_p = -gain * axis_y
+                    wanted_q = gain * axis_x
+                else:  # upside down: every direction is as short; exactly upside down one must be selected
+                    wanted_p = limit if axis_y <= 0.0 else -limit
+                    wanted_q = 10.0 * ATTITUDE_GAIN_PER_S * axis_x
+                wanted_p = limit if wanted_p > limit else -limit if wanted_p < -limit else wanted_p
+                wanted_q = limit if wanted_q > limit else -limit if wanted_q < -limit else wanted_q
+                wanted_p += yaw_rate * g
+                wanted_q += yaw_rate * h
+                wanted_r = yaw_rate * i
 
-    def _move(self, dt_s: float, thrust: float) -> None:
-        x, y, z = self.position
-        vx, vy, vz = self.velocity
-        wx, wy, wz = self.wind
-        if self.gusts_mps > 0.0:
-            self._gust_left_s -= dt_s
-            if self._gust_left_s <= 0.0:
-                self._blow()
-            gx, gy, gz = self._gust
-            wx += gx
-            wy += gy
-            wz += gz
-        matrix = self._matrix
-        ax = LINEAR_DRAG_PER_S * (wx - vx) - thrust * matrix[2]
-        ay = LINEAR_DRAG_PER_S * (wy - vy) - thrust * matrix[5]
-        az = LINEAR_DRAG_PER_S * (wz - vz) - thrust * matrix[8] + GRAVITY_MPS2
-        vx += ax * dt_s
-        vy += ay * dt_s
-        vz += az * dt_s
-        z += vz * dt_s
-        self.acceleration = (ax, ay, az)
-        if z >= 0.0 and vz >= 0.0:
-            z = 0.0
-            vz = self._touch(vz, matrix[8])
-        self.position = (x + vx * dt_s, y + vy * dt_s, z)
-        self.velocity = (vx, vy, vz)
+            # The rate loop and the mixer. At saturation, collective thrust is lowered first, then tilt is
+            # scaled down, and yaw gets the rest (PX4's sequential desaturation without air mode).
+            roll = RATE_P * (wanted_p - p) - RATE_D * spin_x + RATE_DRAG * wanted_p
+            pitch = RATE_P * (wanted_q - q) - RATE_D * spin_y + RATE_DRAG * wanted_q
+            yaw = YAW_RATE_P * (wanted_r - r) + YAW_RATE_DRAG * wanted_r
+            base = collective
+            spread = (roll if roll >= 0.0 else -roll) + (pitch if pitch >= 0.0 else -pitch)
+            if spread > 0.5:
+                scale = 0.5 / spread
+                roll *= scale
+                pitch *= scale
+                spread = 0.5
+            if base + spread > 1.0:
+                base = 1.0 - spread
+            if base < spread:
+                scale = base / spread
+                roll *= scale
+                pitch *= scale
+                spread = base
+            reserve = (yaw if yaw >= 0.0 else -yaw) if -YAW_MARGIN < yaw < YAW_MARGIN else YAW_MARGIN
+            if base + spread + reserve > 1.0:
+                base = max(1.0 - spread - reserve, spread)
+            margin = (1.0 - base if base > 0.5 else base) - spread
+            if margin < 0.0:
+                margin = 0.0
+            yaw = margin if yaw > margin else -margin if yaw < -margin else yaw
+            u0 = base - roll + pitch + yaw
+            u1 = base + roll - pitch + yaw
+            u2 = base + roll + pitch - yaw
+            u3 = base - roll - pitch - yaw
+
+            t0 += (ROTOR_THRUST_MPS2 * u0 * e0 - t0) * blend
+            t1 += (ROTOR_THRUST_MPS2 * u1 * e1 - t1) * blend
+            t2 += (ROTOR_THRUST_MPS2 * u2 * e2 - t2) * blend
+            t3 += (ROTOR_THRUST_MPS2 * u3 * e3 - t3) * blend
+
+            # torques of the rotors (1 kg, so m/s² are newtons), drag, and the gyroscopic coupling of the body
+            spin_x = (ARM_M * (t1 + t2 - t0 - t3) - ANGULAR_DRAG_NMS * p + coupling * q * r) / INERTIA_XY_KGM2
+            spin_y = (ARM_M * (t0 + t2 - t1 - t3) - ANGULAR_DRAG_NMS * q - coupling * p * r) / INERTIA_XY_KGM2
+            spin_z = (_TORQUE_PER_THRUST_M * (t0 + t1 - t2 - t3) - ANGULAR_DRAG_NMS * r) / INERTIA_Z_KGM2
+            p += spin_x * dt_s
+            q += spin_y * dt_s
+            r += spin_z * dt_s
+
+            wx, wy, wz = self.wind
+            if self.gusts_mps > 0.0:
+                self._gust_left_s -= dt_s
+                if self._gust_left_s <= 0.0:
+                    self._blow()
+                gx, gy, gz = self._gust
+                wx += gx
+                wy += gy
+                wz += gz
+            lift = t0 + t1 + t2 + t3
+            ax = LINEAR_DRAG_PER_S * (wx - vx) - lift * c
+            ay = LINEAR_DRAG_PER_S * (wy - vy) - lift * f
+            az = LINEAR_DRAG_PER_S * (wz - vz) - lift * i + GRAVITY_MPS2
+            vx += ax * dt_s
+            vy += ay * dt_s
+            vz += az * dt_s
+            north += vx * dt_s
+            east += vy * dt_s
+            down += vz * dt_s
+            if down >= 0.0 and vz >= 0.0:
+                down = 0.0
+                vz = self._touch(vz, i)
+
+            half_p, half_q, half_r = p * half, q * half, r * half
+            w, x, y, z = (
+                w - x * half_p - y * half_q - z * half_r,
+                x + w * half_p + y * half_r - z * half_q,
+                y + w * half_q + z * half_p - x * half_r,
+                z + w * half_r + x * half_q - y * half_p,
+            )
+            scale = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
+            w *= scale
+            x *= scale
+            y *= scale
+            z *= scale
+            xx, yy, zz = x * x, y * y, z * z
+            xy, xz, yz = x * y, x * z, y * z
+            wx, wy, wz = w * x, w * y, w * z
+            a, b, c = 1.0 - 2.0 * (yy + zz), 2.0 * (xy - wz), 2.0 * (xz + wy)
+            d, e, f = 2.0 * (xy + wz), 1.0 - 2.0 * (xx + zz), 2.0 * (yz - wx)
+            g, h, i = 2.0 * (xz - wy), 2.0 * (yz + wx), 1.0 - 2.0 * (xx + yy)
+        self.rotor_commands, self.rotor_thrusts = (u0, u1, u2, u3), (t0, t1, t2, t3)
+        self._spin, self.rates = (spin_x, spin_y, spin_z), (p, q, r)
+        self.quaternion, self._matrix = (w, x, y, z), (a, b, c, d, e, f, g, h, i)
+        self.position, self.velocity, self.acceleration = (north, east, down), (vx, vy, vz), (ax, ay, az)
 
     def blow(self, gust: Vector) -> None:
         """Set the gust, NED m/s, instead of an own one; to be repeated every 32 ms."""

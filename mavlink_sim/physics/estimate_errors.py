@@ -133,9 +133,11 @@ class Estimate(Multirotor):
         self.age(dt_s)
         self.refresh()
 
-    def age(self, dt_s: float) -> None:
-        """Advance the errors; the attributes stay those of the last `refresh`."""
-        if self._noise:
+    def age(self, dt_s: float, steps: int = 1) -> None:
+        """Advance the errors by steps of `dt_s`; the attributes stay those of the last `refresh`."""
+        if not self._noise:
+            return
+        for _ in range(steps):
             self._rate_left_s -= dt_s
             if self._rate_left_s <= 1e-9:
                 self._shake()
@@ -316,7 +318,7 @@ class Estimate(Multirotor):
         """`command_rates` only, as `step`."""
         self.truth.command_rates(thrust_mps2, rates)
 
-    def advance(self, dt_s: float) -> None:
+    def advance(self, dt_s: float, steps: int = 1) -> None:
         """Does nothing: only the true airframe moves."""
 
     def fail_motor(self, index: int, effectiveness: float = 0.0) -> None:

@@ -76,7 +76,9 @@ class CollidingMultirotor(Multirotor):
 
     # ---- time -------------------------------------------------------------------------------------------
 
-    def advance(self, dt_s: float) -> None:
+    def advance(self, dt_s: float, steps: int = 1) -> None:
+        """Only one step: obstacles are searched after each."""
+        assert steps == 1
         super().advance(dt_s)
         x, y, z = self.position
         fx, fy, fz = self._checked_at

@@ -90,6 +90,7 @@ CONTROL_STEP_S = STEPS_PER_CONTROL * STEP_S
 BACKGROUND_GUSTS_MPS = 0.6
 GUST_SHARE_OF_WIND = 0.15
 OBSTACLE_SENSOR_PERIOD_S = 0.1
+CLEAR_OF_GROUND_M = 1.0  # above this height no contact is possible before the next control step
 MAX_WIND_MPS = 40.0  # a hurricane; a client may set any number
 # Measured: "Connection to mission computer lost" comes 7 s after the last heartbeat; COM_OBC_LOSS_T is 5 s.
 COMPANION_LOSS_MARGIN_S = 2.0
@@ -389,10 +390,36 @@ class Vehicle:
     def step(self, dt_s: float) -> None:
         """Advance time by any amount, in physics steps of 4 ms; a remainder waits for the next call."""
         self._leftover_s += dt_s
+        steps = 0
         while self._leftover_s >= STEP_S - 1e-9:
             self._leftover_s -= STEP_S
-            self._step()
+            steps += 1
+        while steps > 0:
+            steps -= self._step(steps)
         self.estimate.refresh()
+
+    def _quiet_steps(self, most: int) -> int:
+        """The number of steps, at least 1, in which only the airframe moves, clear of ground and objects."""
+        steps = min(most, self._steps_to_control)
+        airframe, autopilot = self.airframe, self.autopilot
+        if (
+            self.faults.known
+            or airframe.on_ground
+            or airframe.position[2] > -CLEAR_OF_GROUND_M
+            or self.collision_world is not None
+            or self._air is not None
+            or not self._origin_sent
+            or autopilot.texts
+            or autopilot.gimbal_commands
+            or self._wind_revision != self.parameters.revision
+            or (self._later and self._later[0][0] <= (self._boot_us + steps * STEP_US) / 1e6)
+        ):
+            return 1
+        for link in self.links.values():
+            if link.status_is_due or link.parameters_left or link.file_transfer is not None:
+                return 1
+            steps = min(steps, (link.streams.next_us - 1 - self._boot_us) // STEP_US + 1)
+        return max(steps, 1)
 
     def after(self, delay_s: float, action: Callable[[], object]) -> None:
         """Call `action` in a later step."""
@@ -460,12 +487,13 @@ class Vehicle:
             north, east = north + wind[0], east + wind[1]
         self.airframe.wind = (north, east, 0.0)
 
-    def _step(self) -> None:
+    def _step(self, most: int) -> int:
+        """Advance by 1 to `most` steps: by several if nothing is due between them. Returns their number."""
         faults = self.faults
         if not faults.known:
             faults.elapsed_us += STEP_US
         elif faults.step(STEP_S):
-            return
+            return 1
         self._boot_us += STEP_US
         estimate = self.estimate  # updated from the truth only before it is read
         if self._later and self._later[0][0] <= self._boot_us / 1e6 + 1e-9:
@@ -486,8 +514,13 @@ class Vehicle:
             self._check_companion()
         if self._air is not None:
             self.airframe.blow(self._air.gust_at(self.faults.elapsed_us))
-        self.airframe.advance(STEP_S)
-        estimate.age(STEP_S)
+        steps = self._quiet_steps(most) if most > 1 else 1
+        if steps > 1:
+            faults.elapsed_us += (steps - 1) * STEP_US
+            self._boot_us += (steps - 1) * STEP_US
+            self._steps_to_control -= steps - 1
+        self.airframe.advance(STEP_S, steps)
+        estimate.age(STEP_S, steps)
         if not self._origin_sent and self.autopilot.sensors_ready:
             self._origin_sent = True  # GPS_GLOBAL_ORIGIN is sent when it changes: once
             for link in self.links.values():
@@ -509,6 +542,7 @@ class Vehicle:
                 parameter_protocol.continue_list(link, self.parameters, STEP_S)
             if link.file_transfer is not None:
                 file_transfer.continue_transfer(link, self.now_s)
+        return steps
 
     def _check_companion(self) -> None:
         seen = self._companion_seen_s

@@ -53,6 +53,20 @@ def test_the_number_of_links_does_not_change_the_flight(fly: tuple[str, Any]) ->
     assert fly[1] == flight(5, {"onboard": {}})[1]
 
 
+@pytest.mark.parametrize("rates_hz", [{}, ONBOARD_RATES_HZ], ids=["quiet", "streams"])
+def test_the_length_of_the_steps_does_not_change_the_flight(rates_hz: dict[str, float]) -> None:
+    long, short = (LockstepVehicle({"onboard": rates_hz}, seed=4, wind_mps=3.0) for _ in range(2))
+    for vehicle in (long, short):
+        vehicle.take_off(3.0)
+        vehicle.set_velocity(1.0, -2.0, 0.1, 0.3)
+    for _ in range(20):
+        long.step(0.2)
+        for _ in range(50):
+            short.step(0.004)
+        assert long.truth == short.truth
+        assert long.receive_bytes() == short.receive_bytes()
+
+
 def test_another_process_flies_the_same_flight() -> None:
     program = (
         "import hashlib\nfrom mavlink_sim import LockstepVehicle\n"

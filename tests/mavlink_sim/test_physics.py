@@ -16,7 +16,6 @@ from mavlink_sim.physics.airframe import (
     GRAVITY_MPS2,
     MAX_THRUST_MPS2,
     Multirotor,
-    mixed_thrusts,
     rotation_matrix,
 )
 from mavlink_sim.physics.estimate_errors import Estimate
@@ -269,22 +268,43 @@ def test_ground_allows_landing_and_breaks_a_fall(down_mps: float, bounces: bool,
 shares = st.floats(-3.0, 3.0)
 
 
+def rotor_commands(thrust: float, p: float, q: float, r: float) -> tuple[float, float, float, float]:
+    """Of a vehicle that does not rotate, with a demanded thrust (0..1) and body rates."""
+    airframe, _ = hovering()
+    airframe.step_rates(STEP_S, thrust * MAX_THRUST_MPS2, (p, q, r))
+    return airframe.rotor_commands
+
+
 @given(shares, shares, shares, shares)
 def test_mixer_output_within_limits(thrust: float, roll: float, pitch: float, yaw: float) -> None:
-    rotors = mixed_thrusts(thrust, (10 * roll, 10 * pitch, 10 * yaw), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    rotors = rotor_commands(thrust, 10 * roll, 10 * pitch, 10 * yaw)
     assert all(-1e-9 <= rotor <= 1.0 + 1e-9 for rotor in rotors)
     assert sum(rotors) / 4 <= min(max(thrust, 0.0), 1.0) + 1e-9  # without air mode it adds no thrust
 
 
 def test_small_demands_are_not_changed() -> None:
-    front_right, rear_left, front_left, rear_right = mixed_thrusts(
-        0.5, (0.5, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-    )
+    front_right, rear_left, front_left, rear_right = rotor_commands(0.5, 0.5, 0.0, 0.0)
     assert front_left == rear_left > front_right == rear_right  # a roll to the right
-    nose_up = mixed_thrusts(0.5, (0.0, 0.5, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    nose_up = rotor_commands(0.5, 0.0, 0.5, 0.0)
     assert nose_up[0] == nose_up[2] > nose_up[1] == nose_up[3]
-    clockwise = mixed_thrusts(0.5, (0.0, 0.0, 0.1), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    clockwise = rotor_commands(0.5, 0.0, 0.0, 0.1)
     assert clockwise[0] == clockwise[1] > clockwise[2] == clockwise[3]
+
+
+def test_several_steps_at_once_equal_single_steps() -> None:
+    one, other = hovering(seed=3, gusts_mps=0.8)[0], hovering(seed=3, gusts_mps=0.8)[0]
+    for index in range(400):
+        for airframe in (one, other):
+            airframe.command(GRAVITY_MPS2 + 0.01 * index, 0.3, -0.2, 1.5)
+        one.advance(STEP_S, 3)
+        for _ in range(3):
+            other.advance(STEP_S)
+        assert one.position == other.position
+        assert one.velocity == other.velocity
+        assert one.acceleration == other.acceleration
+        assert one.matrix == other.matrix
+        assert one.rates == other.rates
+        assert one.rotor_commands == other.rotor_commands
 
 
 def test_full_thrust_climbs_and_drag_bounds_the_speed() -> None:

@@ -122,8 +122,8 @@ class CopterVehicle(Vehicle):
     def _check_companion(self) -> None:
         """Copter has no check of the companion's heartbeat."""
 
-    def _step(self) -> None:
-        super()._step()
+    def _step(self, most: int) -> int:
+        super()._step(1)
         copter = self.copter
         if copter.mode_changes != self._sent_mode_changes:
             self._sent_mode_changes = copter.mode_changes
@@ -132,6 +132,7 @@ class CopterVehicle(Vehicle):
         if copter.armed and not self._was_armed:
             self.send_home()  # home is where it was armed
         self._was_armed = copter.armed
+        return 1
 
     def _send_queued(self) -> None:
         """Send texts on every link with a client; no events, no gimbal commands."""
