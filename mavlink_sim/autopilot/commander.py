@@ -399,12 +399,13 @@ class Autopilot:
             self._send_text(INFO, "RTL: land at destination\t")
         if self.supervision.motors_stopped:
             self._idle(dt_s, 0.0)
-        elif isinstance(task, manual_flight.Stabilized):
+        elif task.demand is not None:
             self._fly_directly(dt_s, task.demand)
-        elif isinstance(task, manual_flight.Acro) and self._spooling():
-            self._idle(dt_s, IDLE_THRUST_MPS2)
         elif not isinstance(setpoint, TrajectorySetpoint):
-            self.demand = self.attitude.fly(dt_s, setpoint, airframe, self.controller, self.demand)
+            if isinstance(task, manual_flight.Acro) and self._spooling():
+                self._idle(dt_s, IDLE_THRUST_MPS2)
+            else:
+                self.demand = self.attitude.fly(dt_s, setpoint, airframe, self.controller, self.demand)
         elif self._rests(setpoint):
             self._idle(dt_s, IDLE_THRUST_MPS2)
         else:
@@ -563,10 +564,12 @@ class Autopilot:
 
     def _keep_landing(self) -> None:
         """A landing continues as a descent when the position is lost, and at one point when it is back."""
+        if self.mode is not Mode.LAND or not self.armed:
+            return
         descending = isinstance(self.task, position_failsafe.Descend)
         if descending and self.landed:
             return  # it is down
-        if self.armed and self.mode is Mode.LAND and descending is self.position_valid:
+        if descending is self.position_valid:
             self.task = self._landing_task()
 
     def _takeoff_height(self) -> float:

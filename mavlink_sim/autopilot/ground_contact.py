@@ -95,8 +95,9 @@ class GroundContact:
             wanted_down_mps: the downward speed setpoint; NaN without one.
         """
         airframe = self._airframe
-        sinking = wanted_down_mps > 0.05 or airframe.thrust_mps2 < 0.5 * GRAVITY_MPS2
-        if not airframe.on_ground or not sinking:
+        if not airframe.on_ground or not (
+            wanted_down_mps > 0.05 or airframe.thrust_mps2 < 0.5 * GRAVITY_MPS2
+        ):
             self._touching_since_s = None
             return False
         if self._touching_since_s is None:

@@ -37,6 +37,9 @@ THROTTLE_ABOVE_CENTRE = 0.2
 THROTTLE_LOW = -0.8
 REARMING_GRACE_S = 5.0
 # Modes in which the throttle is a climb rate; in the other manual modes it is thrust.
+# an enum's member takes as long as a call on Python 3.11: these are read at every control step
+_TERMINATE = Action.TERMINATE
+_NO_FAILSAFE = (Action.NONE, Mode.HOLD)
 CLIMB_RATE_MODES = frozenset({Mode.POSCTL, Mode.POSITION_SLOW, Mode.ALTCTL})
 AUTO_OVERRIDE, OFFBOARD_OVERRIDE = 1, 2  # COM_RC_OVERRIDE
 _BATTERY_TEXTS = {
@@ -122,7 +125,7 @@ class Supervision:
         self._mode_requested = False
         self._ever_had_mode = False
         self._disarmed_s = -math.inf
-        self._announced_failsafe = (Action.NONE, Mode.HOLD)
+        self._announced_failsafe = _NO_FAILSAFE
         self._reported: list[Text] = []
         self._report_compared_s = 0.0
 
@@ -148,7 +151,7 @@ class Supervision:
 
     @property
     def terminated(self) -> bool:
-        return self.failsafes.action is Action.TERMINATE
+        return self.failsafes.action is _TERMINATE
 
     @property
     def motors_stopped(self) -> bool:
@@ -297,6 +300,9 @@ class Supervision:
             autopilot.adopt_intention(intended)
             if sticks_request:
                 autopilot.announce("the pilot took over using the sticks")
+        if machine.action is _NO_FAILSAFE[0] and not was_in_failsafe:  # the usual case
+            autopilot.failsafe, self._announced_failsafe = False, _NO_FAILSAFE
+            return intended
         autopilot.failsafe = machine.in_failsafe
         mode = machine.mode(intended)
         announced = (machine.action, mode)

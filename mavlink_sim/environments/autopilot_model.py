@@ -16,6 +16,7 @@ from mavlink_sim.environments.task import STEP_S
 from mavlink_sim.flight.position_control import NAN, NOTHING, TrajectorySetpoint
 from mavlink_sim.lockstep import LockstepVehicle
 from mavlink_sim.px4.modes import Mode
+from mavlink_sim.wire.streams import EQUIPMENT_RATES_HZ
 
 _TAKEOFF_M = 5.0
 _SETTLED_S = 5.0
@@ -24,7 +25,7 @@ _SETTLED_S = 5.0
 @cache
 def hovering(noise: bool = True) -> LockstepVehicle:
     """A vehicle that hovers in OFFBOARD, without wind; to be copied."""
-    vehicle = LockstepVehicle({"onboard": {}}, noise=noise, gusts_mps=0.0)
+    vehicle = LockstepVehicle({"onboard": dict.fromkeys(EQUIPMENT_RATES_HZ, 0.0)}, noise=noise, gusts_mps=0.0)
     vehicle.take_off(_TAKEOFF_M)
     vehicle.set_velocity(0.0, 0.0, 0.0)
     vehicle.step(_SETTLED_S)

@@ -338,7 +338,7 @@ class Stabilized(Task):
         self._sticks = sticks
         self._yaw = YawByStick(parameters)
         self._tilt: Plane = (0.0, 0.0)
-        self.demand = Demand(0.0, 0.0, 0.0, 0.0)
+        self.demand: Demand = Demand(0.0, 0.0, 0.0, 0.0)
 
     def update(self, dt_s: float) -> TrajectorySetpoint:
         sticks, value, airframe = self._sticks(), self._parameters.number, self._airframe

@@ -9,7 +9,7 @@ import math
 from abc import ABC, abstractmethod
 
 from mavlink_sim.flight.attitude_control import AttitudeSetpoint, RatesSetpoint
-from mavlink_sim.flight.position_control import NAN, NOTHING, TrajectorySetpoint
+from mavlink_sim.flight.position_control import NAN, NOTHING, Demand, TrajectorySetpoint
 from mavlink_sim.physics.airframe import Multirotor, Vector
 from mavlink_sim.px4.parameters import Parameters
 
@@ -107,12 +107,13 @@ class Trajectory:
 
 
 class Task(ABC):
-    """Base of the flight tasks. `landing` and `finished` are read after each `update`."""
+    """Base of the flight tasks. `landing`, `finished` and `demand` are read after each `update`."""
 
     landing = False  # on the final descent
     finished = False
     taking_off = False  # climbing from the ground in a mode other than TAKEOFF
     goal: Vector | None = None  # the goal of an auto mode, for POSITION_TARGET_GLOBAL_INT
+    demand: Demand | None = None  # goes to the airframe instead of the setpoint
 
     @abstractmethod
     def update(self, dt_s: float) -> Setpoint:

@@ -463,14 +463,14 @@ class Navigator:
         autopilot = self._autopilot
         if not autopilot.armed and self._active:
             self._disarmed_since_active = True
-        task = autopilot.task
-        if isinstance(task, MissionFlight) and task.ended and not self.landed:
-            autopilot.hold_at(task.goal)
-        elif (
-            autopilot.armed and autopilot.mode is Mode.MISSION and not self.landed and not self.mission.valid
-        ):
-            autopilot.set_mode(Mode.HOLD)
-        self._repeat_reached()
+        if autopilot.armed and autopilot.mode is Mode.MISSION and not self.landed:
+            task = autopilot.task
+            if isinstance(task, MissionFlight) and task.ended:
+                autopilot.hold_at(task.goal)
+            elif not self.mission.valid:
+                autopilot.set_mode(Mode.HOLD)
+        if self.mission.reached >= 0:
+            self._repeat_reached()
         if self.now_s >= self._next_fence_check_s:
             self._next_fence_check_s = self.now_s + FENCE_PERIOD_S
             if self._checked_with != self._check_key():
@@ -478,9 +478,7 @@ class Navigator:
             self._check_fence()
 
     def _repeat_reached(self) -> None:
-        if self.mission.reached < 0 or self._repetitions >= REACHED_REPETITIONS:
-            return
-        if self.now_s >= self._next_reached_s:
+        if self._repetitions < REACHED_REPETITIONS and self.now_s >= self._next_reached_s:
             self._next_reached_s += REACHED_PERIOD_S
             self._repetitions += 1
             self.announcements.append(Reached(self.mission.reached))

@@ -53,6 +53,9 @@ class Mode(Enum):
     OFFBOARD = (6, 0)
     STABILIZED = (7, 0)
 
+    # a member is a single object: Enum's own hash is a Python function, called at every control step
+    __hash__ = object.__hash__
+
     @property
     def custom_mode(self) -> int:
         main, sub = self.value

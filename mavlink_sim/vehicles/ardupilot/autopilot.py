@@ -290,7 +290,7 @@ class CopterAutopilot(Autopilot):
             self._send_text(CRITICAL, f"PreArm: {error}")
 
     def _fly(self, dt_s: float, task: flight.Task, setpoint: flight.Setpoint) -> None:
-        if isinstance(task, manual_flight.Stabilized):
+        if task.demand is not None:
             self._fly_directly(dt_s, task.demand)
         elif self._stays_on_ground(task):
             self._idle(dt_s, IDLE_THRUST_MPS2)
