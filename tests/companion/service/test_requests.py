@@ -49,10 +49,10 @@ async def failure_of(driver: FakeDriver, request: Request) -> str | None:
 
 async def test_request_is_answered_with_its_result() -> None:
     hold = Request(7, SetMode(FlightMode.HOLD))
-    assert await refusal_of(FakeDriver(), Request(1, Arm())) is None
-    assert await refusal_of(FakeDriver(CommandRefusedError("denied")), hold) == "denied"
-    assert await refusal_of(FakeDriver(ZeroDivisionError("a bug")), hold) == "ZeroDivisionError: a bug"
-    refused = await refusal_of(FakeDriver(), Request(2, FindGimbal()))
+    assert await failure_of(FakeDriver(), Request(1, Arm())) is None
+    assert await failure_of(FakeDriver(CommandRefusedError("denied")), hold) == "denied"
+    assert await failure_of(FakeDriver(ZeroDivisionError("a bug")), hold) == "ZeroDivisionError: a bug"
+    refused = await failure_of(FakeDriver(), Request(2, FindGimbal()))
     assert refused is not None
     assert refused.startswith("gimbal manager ")
     assert "not responding" in refused
@@ -60,7 +60,7 @@ async def test_request_is_answered_with_its_result() -> None:
 
 async def test_internal_cancellation_is_answered() -> None:
     hold = Request(7, SetMode(FlightMode.HOLD))
-    assert "was cancelled" in (await refusal_of(FakeDriver(asyncio.CancelledError()), hold) or "")
+    assert "was cancelled" in (await failure_of(FakeDriver(asyncio.CancelledError()), hold) or "")
 
 
 async def test_cancelled_request_is_not_answered() -> None:

@@ -208,7 +208,7 @@ def test_frames_from_ffmpeg_on_standard_input(exported_model: Path, tmp_path: Pa
 def test_failure_notes_the_services_last_lines(tmp_path: Path) -> None:
     with (
         running_simulator() as simulator,
-        pytest.raises(TimeoutError, match="no such line") as failure,
+        pytest.raises(TimeoutError, match="line 7") as failure,
         running_service(simulator.onboard_port, ["--source", "none"], cwd=tmp_path) as service,
     ):
         service.wait_for_line("line 7", 0.1)
