@@ -217,5 +217,6 @@ def test_an_orbit_goes_on_after_a_reset_of_the_heading(flight: Flight) -> None:
     radii = np.linalg.norm(track(link, since_s)[:, :2] - centre, axis=1)
     worst_m = float(np.abs(radii - ORBIT_M).max())
     flight.note("reset of the heading in an orbit", step_deg=turned_deg, radius_error_max_m=worst_m)
+    assert turned_deg > TURN_DEG / 2
     assert worst_m < 3.0
     assert flight.status["pilot"]["behaviour"].startswith("orbiting")
