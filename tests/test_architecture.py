@@ -294,7 +294,11 @@ def test_only_guidance_steps_a_behaviour() -> None:
     callers = {}
     for folder in ("companion", "benchmarks", "examples", "tests", "tools"):
         for path in (ROOT / folder).rglob("*.py"):
-            if calls := _behaviour_calls(ast.parse(path.read_text())):
+            text = path.read_text()
+            # Few files have such a call; to parse all takes seconds.
+            if not (".update(" in text or ".on_activate(" in text):
+                continue
+            if calls := _behaviour_calls(ast.parse(text)):
                 callers[path.relative_to(ROOT).as_posix()] = calls
     for name in STEPS_BEHAVIOURS:
         assert callers.pop(name), name
