@@ -12,7 +12,7 @@ NAMES = ["px4", "gimbal", "ardupilot", "signed"]
 
 
 @pytest.mark.parametrize("target", TARGETS, ids=NAMES)
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 3))])
 def test_a_vehicle_in_lockstep_bears_mutated_mavlink(seed: int, target: Target) -> None:
     report = fuzz_in_lockstep(seed, 1500, target)
     assert report.messages > (300 if target.signed else 800)
