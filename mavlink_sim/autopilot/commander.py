@@ -379,12 +379,12 @@ class Autopilot:
         """Check failsafes and detectors, run the flight task, move the airframe."""
         self.now_s += dt_s
         self.navigator.update()
-        self.supervision.update(dt_s, self._airframe.thrust_mps2)
+        supervision, airframe = self.supervision, self._airframe
+        supervision.update(dt_s, airframe)
         self._keep_landing()
         while self._gimbal_schedule and self._gimbal_schedule[0][0] <= self.now_s:
             self.gimbal_commands.append(self._gimbal_schedule.popleft()[1])
-        airframe = self._airframe
-        if not self.armed or self.terminated:
+        if not self.armed or supervision.terminated:
             self._idle(dt_s, 0.0)
             if not self.landed and airframe.on_ground:
                 self._has_landed()
@@ -397,7 +397,7 @@ class Autopilot:
         setpoint = task.update(dt_s)
         if task.landing and not was_landing and self.mode is Mode.RTL:
             self._send_text(INFO, "RTL: land at destination\t")
-        if self.supervision.motors_stopped:
+        if supervision.motors_stopped:
             self._idle(dt_s, 0.0)
         elif task.demand is not None:
             self._fly_directly(dt_s, task.demand)
@@ -406,7 +406,7 @@ class Autopilot:
                 self._idle(dt_s, IDLE_THRUST_MPS2)
             else:
                 self.demand = self.attitude.fly(dt_s, setpoint, airframe, self.controller, self.demand)
-        elif self._rests(setpoint):
+        elif self.ground.landed and self._rests(setpoint):
             self._idle(dt_s, IDLE_THRUST_MPS2)
         else:
             self.attitude.release()
@@ -449,9 +449,7 @@ class Autopilot:
         return self.ground.armed_for_s(self.now_s) < self._parameters.number("COM_SPOOLUP_TIME")
 
     def _rests(self, setpoint: TrajectorySetpoint) -> bool:
-        """Whether it is landed with a setpoint that does not climb."""
-        if not self.ground.landed:
-            return False
+        """Whether it stays on the ground, where it is: the setpoint does not climb."""
         rises = asks_to_rise(self.task, setpoint, self._airframe.position[2]) and not self._spooling()
         return self.ground.rests(self.now_s, rises=rises)
 

@@ -19,6 +19,7 @@ from mavlink_sim.autopilot.position_failsafe import needs_position
 from mavlink_sim.flight.transmitter import Sticks, Transmitter, read_sticks, read_switches
 from mavlink_sim.missions import geofence
 from mavlink_sim.missions.navigator import Navigator
+from mavlink_sim.physics.airframe import Multirotor
 from mavlink_sim.physics.battery import Battery, BatteryWarning
 from mavlink_sim.px4.modes import MANUAL_MODES, MODES_PREVENTING_ARMING, Mode
 from mavlink_sim.px4.parameters import Parameters
@@ -156,7 +157,7 @@ class Supervision:
     @property
     def motors_stopped(self) -> bool:
         """Killed or terminated: the motors are off in every mode."""
-        return self.killed or self.terminated
+        return self.killed or self.failsafes.action is _TERMINATE
 
     @property
     def lacks_ground_station(self) -> bool:
@@ -241,7 +242,7 @@ class Supervision:
 
     # ---- one step ---------------------------------------------------------------------------------------
 
-    def update(self, dt_s: float, thrust_mps2: float) -> None:
+    def update(self, dt_s: float, airframe: Multirotor) -> None:
         """Every PERIOD_S: read the remote control, run the checks, act."""
         self._since_watch_s += dt_s
         if self._since_watch_s < PERIOD_S - 1e-9:
@@ -253,7 +254,7 @@ class Supervision:
             self.remote_control(self.transmitter.channels())
         for request in self.manual_control.update(now_s):
             self._carry_out(request)
-        self.battery.step(dt_s, autopilot.armed, thrust_mps2)
+        self.battery.step(dt_s, autopilot.armed, airframe.thrust_mps2)
         self._check_manual_control()
         self._check_ground_station()
         self._monitor_battery()

@@ -471,8 +471,8 @@ class Navigator:
                 autopilot.set_mode(Mode.HOLD)
         if self.mission.reached >= 0:
             self._repeat_reached()
-        if self.now_s >= self._next_fence_check_s:
-            self._next_fence_check_s = self.now_s + FENCE_PERIOD_S
+        if autopilot.now_s >= self._next_fence_check_s:
+            self._next_fence_check_s = autopilot.now_s + FENCE_PERIOD_S
             if self._checked_with != self._check_key():
                 self._check_mission()
             self._check_fence()

@@ -299,6 +299,8 @@ class Multirotor:
         collective = thrust / MAX_THRUST_MPS2
         collective = 0.0 if collective < 0.0 else 1.0 if collective > 1.0 else collective
         rate_demand = self._rate_demand
+        gusty = self.gusts_mps > 0.0
+        air_x, air_y, air_z = self._air_velocity() if gusty else self.wind
         for _ in range(steps):
             # the attitude loop: body rates (FRD) that turn the thrust axis to the demanded direction
             if rate_demand is not None:
@@ -374,19 +376,15 @@ class Multirotor:
             q += spin_y * dt_s
             r += spin_z * dt_s
 
-            wx, wy, wz = self.wind
-            if self.gusts_mps > 0.0:
+            if gusty:
                 self._gust_left_s -= dt_s
                 if self._gust_left_s <= 0.0:
                     self._blow()
-                gx, gy, gz = self._gust
-                wx += gx
-                wy += gy
-                wz += gz
+                    air_x, air_y, air_z = self._air_velocity()
             lift = t0 + t1 + t2 + t3
-            ax = LINEAR_DRAG_PER_S * (wx - vx) - lift * c
-            ay = LINEAR_DRAG_PER_S * (wy - vy) - lift * f
-            az = LINEAR_DRAG_PER_S * (wz - vz) - lift * i + GRAVITY_MPS2
+            ax = LINEAR_DRAG_PER_S * (air_x - vx) - lift * c
+            ay = LINEAR_DRAG_PER_S * (air_y - vy) - lift * f
+            az = LINEAR_DRAG_PER_S * (air_z - vz) - lift * i + GRAVITY_MPS2
             vx += ax * dt_s
             vy += ay * dt_s
             vz += az * dt_s
@@ -398,17 +396,15 @@ class Multirotor:
                 vz = self._touch(vz, i)
 
             half_p, half_q, half_r = p * half, q * half, r * half
-            w, x, y, z = (
-                w - x * half_p - y * half_q - z * half_r,
-                x + w * half_p + y * half_r - z * half_q,
-                y + w * half_q + z * half_p - x * half_r,
-                z + w * half_r + x * half_q - y * half_p,
-            )
-            scale = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
-            w *= scale
-            x *= scale
-            y *= scale
-            z *= scale
+            new_w = w - x * half_p - y * half_q - z * half_r
+            new_x = x + w * half_p + y * half_r - z * half_q
+            new_y = y + w * half_q + z * half_p - x * half_r
+            new_z = z + w * half_r + x * half_q - y * half_p
+            scale = 1.0 / math.sqrt(new_w * new_w + new_x * new_x + new_y * new_y + new_z * new_z)
+            w = new_w * scale
+            x = new_x * scale
+            y = new_y * scale
+            z = new_z * scale
             xx, yy, zz = x * x, y * y, z * z
             xy, xz, yz = x * y, x * z, y * z
             wx, wy, wz = w * x, w * y, w * z
@@ -424,6 +420,11 @@ class Multirotor:
         """Set the gust, NED m/s, instead of an own one; to be repeated every 32 ms."""
         self._gust = gust
         self._gust_left_s = 1.0
+
+    def _air_velocity(self) -> Vector:
+        """Wind and gust."""
+        (wx, wy, wz), (gx, gy, gz) = self.wind, self._gust
+        return (wx + gx, wy + gy, wz + gz)
 
     def _blow(self) -> None:
         """The next gust (a first-order Gauss-Markov process)."""

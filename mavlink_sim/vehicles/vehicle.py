@@ -389,18 +389,18 @@ class Vehicle:
 
     def step(self, dt_s: float) -> None:
         """Advance time by any amount, in physics steps of 4 ms; a remainder waits for the next call."""
-        self._leftover_s += dt_s
-        steps = 0
-        while self._leftover_s >= STEP_S - 1e-9:
-            self._leftover_s -= STEP_S
+        left_s, steps = self._leftover_s + dt_s, 0
+        while left_s >= STEP_S - 1e-9:
+            left_s -= STEP_S
             steps += 1
+        self._leftover_s = left_s
         while steps > 0:
             steps -= self._step(steps)
         self.estimate.refresh()
 
     def _quiet_steps(self, most: int) -> int:
         """The number of steps, at least 1, in which only the airframe moves, clear of ground and objects."""
-        steps = min(most, self._steps_to_control)
+        steps = most if most < self._steps_to_control else self._steps_to_control
         airframe, autopilot = self.airframe, self.autopilot
         if (
             self.faults.known
@@ -418,8 +418,9 @@ class Vehicle:
         for link in self.links.values():
             if link.status_is_due or link.parameters_left or link.file_transfer is not None:
                 return 1
-            steps = min(steps, (link.streams.next_us - 1 - self._boot_us) // STEP_US + 1)
-        return max(steps, 1)
+            free = (link.streams.next_us - 1 - self._boot_us) // STEP_US + 1
+            steps = free if free < steps else steps
+        return steps if steps > 1 else 1
 
     def after(self, delay_s: float, action: Callable[[], object]) -> None:
         """Call `action` in a later step."""
@@ -521,6 +522,8 @@ class Vehicle:
             self._steps_to_control -= steps - 1
         self.airframe.advance(STEP_S, steps)
         estimate.age(STEP_S, steps)
+        if steps > 1:
+            return steps  # nothing is due
         if not self._origin_sent and self.autopilot.sensors_ready:
             self._origin_sent = True  # GPS_GLOBAL_ORIGIN is sent when it changes: once
             for link in self.links.values():
