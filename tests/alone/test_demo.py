@@ -58,7 +58,7 @@ def test_demonstration_flies_an_autopilot_at_a_url(tmp_path: Path) -> None:
 
 @pytest.mark.timeout(240)
 @pytest.mark.parametrize("quick", [True, pytest.param(False, marks=pytest.mark.slow)])
-def test_the_demonstration_finds_the_car_stops_before_it_and_lands(tmp_path: Path, quick: bool) -> None:
+def test_demonstration_finds_the_car_stops_before_it_and_lands(tmp_path: Path, quick: bool) -> None:
     output = tmp_path / "demo"
     seed = ("--seed", str(NEAR_SEED)) if quick else ()
     done = demo(output, "--duration", "150", *seed, quick=quick)
