@@ -70,7 +70,7 @@ def test_ardupilot_works_with_default_settings(seeing: list[str], tmp_path: Path
             vehicle = received.get(timeout=10)["vehicle"]
 
 
-@pytest.mark.parametrize("driver", [pytest.param("mavsdk", marks=pytest.mark.slow), "pymavlink"])
+@pytest.mark.parametrize("driver", ["mavsdk", "pymavlink"])
 def test_flight_by_commands_with_a_subscriber(driver: str, seeing: list[str], tmp_path: Path) -> None:
     with (
         running_simulator(parameters=QUICK_FLIGHT) as simulator,

@@ -37,7 +37,7 @@ def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(
     scope="module",
-    params=[("onnx", "onnxruntime"), pytest.param(("openvino", "openvino"), marks=pytest.mark.slow)],
+    params=[("onnx", "onnxruntime"), ("openvino", "openvino")],
 )
 def quantised(
     request: pytest.FixtureRequest,
