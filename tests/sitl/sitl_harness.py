@@ -492,9 +492,23 @@ def set_for_test(link: AutopilotLink, values: dict[str, float]) -> dict[str, flo
         if value is None:
             pytest.skip(f"this autopilot has no parameter {name}")
         before[name] = value
-    for name, value in values.items():
-        link.set_parameter(name, value)
+    try:
+        for name, value in values.items():
+            link.set_parameter(name, value)
+    except TimeoutError:  # the caller does not get what to restore
+        for name, value in before.items():
+            link.set_parameter(name, value)
+        raise
     return before
+
+
+def command_or_skip(link: AutopilotLink, number: int, *parameters: float) -> None:
+    """One COMMAND_LONG. Skips where it is not accepted, as by a built-in simulated vehicle."""
+    link.results.pop(number, None)
+    link.command(number, *parameters)
+    link.until(lambda: number in link.results, _ANSWER_S, f"answered to command {number}")
+    if link.results[number] != dialect.MAV_RESULT_ACCEPTED:
+        pytest.skip(f"this autopilot does not take command {number}")
 
 
 def orbiting(flight: Flight, height_m: float = 5.0) -> tuple[float, float]:

@@ -19,6 +19,7 @@ from tests.sitl.sitl_harness import (
     AutopilotLink,
     Flight,
     bring_down,
+    command_or_skip,
     orbiting,
     set_for_test,
 )
@@ -94,15 +95,6 @@ def test_without_gps_a_take_off_is_refused(flight: Flight, parameters: dict[str,
     flown_s = time.monotonic() - restored_s
     flight.fly("land")
     flight.note("loss of GPS on the ground", lost_after_s=refused_s, flown_after_s=flown_s)
-
-
-def command_or_skip(link: AutopilotLink, number: int, *parameters: float) -> None:
-    """Built-in simulated vehicles have no command that resets their estimate."""
-    link.results.pop(number, None)
-    link.command(number, *parameters)
-    link.until(lambda: number in link.results, 5.0, f"answered to command {number}")
-    if link.results[number] != dialect.MAV_RESULT_ACCEPTED:
-        pytest.skip(f"this autopilot does not take command {number}")
 
 
 def reset_estimate(link: AutopilotLink, parameters: dict[str, float]) -> None:

@@ -131,6 +131,7 @@ def test_copter_returns_when_heartbeats_of_our_system_end(
                 link.send(heartbeat, dialect.MAV_COMP_ID_GIMBAL)
             yield
 
+    already = len(link.texts)
     with repeated(0.5, heartbeats()):
         flight.service.signal(signal.SIGKILL)
         ended_s = time.monotonic()
@@ -143,7 +144,6 @@ def test_copter_returns_when_heartbeats_of_our_system_end(
     link.until(lambda: link.grounded, GROUNDED_S, "landed and disarmed")
     landed_s = time.monotonic() - ended_s
     # Without a heartbeat the failsafe stays, and Copter does not arm.
-    already = len(link.texts)
     services.flight(flight.driver)
     link.until(lambda: "GCS Failsafe Cleared" in link.texts[already:], 10.0, "cleared")
     of = "a gimbal beside us" if gimbal else "kill -9"

@@ -22,6 +22,7 @@ from tests.sitl.sitl_harness import (
     AutopilotLink,
     Flight,
     Pose,
+    command_or_skip,
     orbiting,
     set_for_test,
 )
@@ -196,7 +197,7 @@ def test_a_safety_switch_is_the_reason(flight: Flight) -> None:
     if link.autopilot != ARDUPILOT:
         pytest.skip("PX4's simulation has no safety switch")
     switch = dialect.MAV_CMD_DO_SET_SAFETY_SWITCH_STATE
-    link.command(switch, dialect.SAFETY_SWITCH_STATE_SAFE)
+    command_or_skip(link, switch, dialect.SAFETY_SWITCH_STATE_SAFE)
     try:
         assert_arming_is_refused(flight, "Hardware safety switch")
     finally:
