@@ -20,6 +20,7 @@ from tests.sitl.sitl_harness import (
     PX4,
     AutopilotLink,
     Flight,
+    bring_down,
     orbiting,
     repeated,
     set_for_test,
@@ -144,6 +145,7 @@ def test_copter_returns_when_heartbeats_of_our_system_end(
     returned_s = link.modes[-1][0] - ended_s
     link.until(lambda: link.grounded, GROUNDED_S, "landed and disarmed")
     landed_s = time.monotonic() - ended_s
+    bring_down(link)  # RTL allows no arming
     # Without a heartbeat the failsafe stays, and Copter does not arm; the simulated vehicle's ends earlier.
     services.flight(flight.driver)
     link.until(
