@@ -186,7 +186,7 @@ def test_failed_copy_ends_the_training(pool: Pool, tmp_path: Path, monkeypatch: 
         update(copied)
 
     monkeypatch.setattr(PoolCopy, "update", fails_later)
-    monkeypatch.setattr(train_bundled_model, "SIZES", ((32, 32, 50),))
+    monkeypatch.setattr(train_bundled_model, "SIZES", ((64, 64, 50),))
     with pytest.raises(RuntimeError, match=full):
         train(pool, 1e-3, tmp_path / "new.safetensors", arguments(time.monotonic() + 600))
     assert not list(tmp_path.iterdir())
