@@ -39,6 +39,9 @@ _FRONT_SIGMAS = 5.0
 # A surface begins before its first cell, because a cell is a mean and the wrong ones are left out: by the
 # range that this share of the cells spans, at most so many metres and this share of the range.
 _SPAN_FRACTION, _SPAN_MAX_M, _SPAN_MAX_SHARE = 0.05, 0.2, 0.1
+# The ends of an object: the nearer cells, by this quantile, of this share of its box on each side. What is
+# farther behind the nearest cell than so many widths is background.
+_END_SHARE, _END_QUANTILE, _END_WIDTHS = 0.2, 0.2, 2.0
 # The noise is measured by the smaller differences of neighbours, this share of them, the others may be edges;
 # and the root mean square of that share of normal differences, in sigma.
 _SMOOTH_SHARE, _SMOOTH_RMS, _SMOOTH_MIN = 0.8, 0.6616, 8
@@ -106,7 +109,18 @@ def nearest_points(
     down: NDArray[np.float64],
     lens_height_m: float | None = None,
 ) -> NDArray[np.float32]:
-    """The point of each object's visible surface that is horizontally nearest to the camera.
+    """The points of `surfaces`."""
+    return surfaces(depth_m, xyxy, camera, down, lens_height_m)[0]
+
+
+def surfaces(
+    depth_m: NDArray[np.float32],
+    xyxy: NDArray[Any],
+    camera: CameraModel,
+    down: NDArray[np.float64],
+    lens_height_m: float | None = None,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """The point of each object's visible surface that is horizontally nearest to the camera, and its middle.
 
     The box is averaged into cells of inverse depth, in which a stereo camera's noise is uniform. Ground and
     sky are excluded, and the remaining cells are sorted by horizontal range. The range of the nearest ones is
@@ -127,14 +141,15 @@ def nearest_points(
             measured below the box. None: unknown.
 
     Returns:
-        (N, 3) float32 metres, optical frame (right, down, forward); NaN where too little of the box has known
-        depth.
+        (N, 3) float32 metres, optical frame (right, down, forward), and (N,) float32, the column of the
+        middle between the object's ends: the nearer end looks larger, so it is not the box's centre. NaN
+        where too little of the box has known depth.
     """
     boxes = np.asarray(xyxy, np.float64).reshape(-1, 4)
-    points = np.empty((len(boxes), 3))
+    found = np.empty((len(boxes), 4))
     for index, box in enumerate(boxes.tolist()):
-        points[index] = _nearest_point(depth_m, box, camera, down, lens_height_m)
-    for index, hiding in _hidden(points, boxes, camera):
+        found[index] = _surface(depth_m, box, camera, down, lens_height_m)
+    for index, hiding in _hidden(found[:, :3], boxes, camera):
         visible_m = depth_m.copy()
         for left, top, right, bottom in boxes[hiding].tolist():
             columns, rows = _pixels(left, right, camera.width), _pixels(top, bottom, camera.height)
@@ -144,10 +159,11 @@ def nearest_points(
         visible = visible_m[slice(*rows), slice(*columns)]
         if np.count_nonzero((visible > 0.0) & (visible < np.inf)) < _VISIBLE_SHARE * visible.size:
             continue
-        behind = _nearest_point(visible_m, boxes[index].tolist(), camera, down, lens_height_m)
+        behind = _surface(visible_m, boxes[index].tolist(), camera, down, lens_height_m)
         if not np.isnan(behind).any():
-            points[index] = behind
-    return points.astype(np.float32)
+            found[index] = behind
+    points = found.astype(np.float32)
+    return points[:, :3], points[:, 3]
 
 
 def _hidden(
@@ -166,14 +182,15 @@ def _hidden(
         yield index, in_front[index]
 
 
-def _nearest_point(
+def _surface(
     depth_m: NDArray[np.float32],
     box: list[float],
     camera: CameraModel,
     down: NDArray[np.float64],
     lens_height_m: float | None,
 ) -> NDArray[np.float64]:
-    nothing = np.full(3, np.nan)
+    """(4,) the nearest point, and the column of the middle."""
+    nothing = np.full(4, np.nan)
     if not all(map(math.isfinite, box)):
         return nothing
     height, width = depth_m.shape
@@ -209,7 +226,30 @@ def _nearest_point(
     index = order[first]
     range_m = _front(ranges_m[order[first:]], along_m[order[first:]], level[index] * noise_m[index])
     point: NDArray[np.float64] = rays[index] * (range_m / level[index] if level[index] else along_m[index])
-    return point
+    middle_px = _middle_px(rays[order[first:], 0], along_m[order[first:]], box, camera)
+    return np.append(point, middle_px)
+
+
+def _middle_px(
+    x: NDArray[np.float64], along_m: NDArray[np.float64], box: list[float], camera: CameraModel
+) -> float:
+    """Column of the middle between the ends of an object; the box's centre where one of them is not seen.
+
+    Args:
+        x, along_m: of its cells, nearest first: rays' right over forward, and depth.
+    """
+    row = (box[1] + box[3]) / 2.0 - 0.5
+    sides = camera.rays(np.array([[box[0] - 0.5, row], [box[2] - 0.5, row]]))
+    first_x, last_x = np.where(sides[:, 2] > MIN_COSINE, sides[:, 0] / sides[:, 2], np.nan).tolist()
+    wide = last_x - first_x
+    centre, half = (box[0] + box[2]) / 2.0, (box[2] - box[0]) / 2.0
+    ends = along_m[x < first_x + _END_SHARE * wide], along_m[x > last_x - _END_SHARE * wide]
+    if not all(len(end) for end in ends):
+        return centre
+    farthest_m = float(along_m[0]) * (1.0 + _END_WIDTHS * wide)
+    # The projection of the point halfway between the two.
+    left_m, right_m = (min(_quantile(end, _END_QUANTILE), farthest_m) for end in ends)
+    return float(centre + half * (right_m - left_m) / (right_m + left_m))
 
 
 def _front(sorted_m: NDArray[np.float64], along_m: NDArray[np.float64], noise_m: float) -> float:

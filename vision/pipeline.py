@@ -26,6 +26,8 @@ logger = logging.getLogger(__name__)
 
 _WARN_INTERVAL_NS = 10_000_000_000
 
+SurfacesIn = Callable[[Frame, NDArray[np.float32]], tuple[NDArray[np.float32], NDArray[np.float32]]]
+
 
 @dataclass(frozen=True, slots=True)
 class PerceptionResult:
@@ -122,7 +124,7 @@ class Pipeline:
         view_at: Callable[[Frame], CameraView | None] = lambda _: None,
         find_markers: Callable[[Frame], tuple[tuple[Marker, ...], tuple[BoardPose, ...]]] | None = None,
         obstacles_in: Callable[[Frame], ObstacleSectors | None] = lambda _: None,
-        nearest_in: Callable[[Frame, NDArray[np.float32]], NDArray[np.float32]] | None = None,
+        surfaces_in: SurfacesIn | None = None,
         clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         """
@@ -136,8 +138,8 @@ class Pipeline:
                 detection, when the vehicle's attitude of that moment has arrived.
             find_markers: called for every processed frame; returns the markers and the boards.
             obstacles_in: called for every processed frame with depth.
-            nearest_in: returns the nearest points (N, 3) of the objects in boxes (N, 4) of a frame with
-                depth, see `vision.depth.nearest_points`; None: no ranges are measured.
+            surfaces_in: returns nearest points (N, 3) and middles (N,) of the objects in boxes (N, 4) of a
+                frame with depth, see `vision.depth.surfaces`; None: no ranges are measured.
             clock_ns: the clock of the frames' stamps, CLOCK_MONOTONIC nanoseconds.
         """
         self._source = source
@@ -151,7 +153,7 @@ class Pipeline:
         self._view_at = view_at
         self._find_markers = find_markers
         self._obstacles_in = obstacles_in
-        self._nearest_in = nearest_in
+        self._surfaces_in = surfaces_in
         self._clock_ns = clock_ns
         self._newest = Detections.empty(detector.class_names if detector else ())
         self._next_sequence = 0
@@ -236,9 +238,9 @@ class Pipeline:
         obstacles, depth = None, None
         if frame.depth_m is not None:
             obstacles, depth = self._obstacles_in(frame), depth_summary(frame.depth_m)
-            if self._nearest_in is not None:
-                nearest = self._nearest_in(frame, detections.xyxy)
-                detections = replace(detections, nearest_camera_m=nearest)
+            if self._surfaces_in is not None:
+                nearest, middle_px = self._surfaces_in(frame, detections.xyxy)
+                detections = replace(detections, nearest_camera_m=nearest, middle_px=middle_px)
         ranged_ns = time.perf_counter_ns()
         timing_ms["range"] = (ranged_ns - tracked_ns) / 1e6
         markers, boards = (None, ()) if self._find_markers is None else self._find_markers(frame)

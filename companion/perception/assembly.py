@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from companion.perception.path_planning import PathPlanning, PositionHistory
 from companion.settings import Settings
 from vision.camera_model import CameraMount
-from vision.depth import nearest_points
+from vision.depth import surfaces
 from vision.frame import Frame
 from vision.gc_pause import gc_paused
 from vision.levelling import Levelling, level_image, level_rotations, poses_of_readout
@@ -20,7 +20,7 @@ from vision.marker_boards import BoardPose, locate_board
 from vision.markers import Marker, MarkerDetector
 from vision.object_detector import ObjectDetector
 from vision.obstacle_sectors import ObstacleSectors, obstacle_sectors
-from vision.pipeline import FrameDetector, FrameRecorder, Pipeline
+from vision.pipeline import FrameDetector, FrameRecorder, Pipeline, SurfacesIn
 from vision.sources import Source
 from vision.tracking import AttitudeHistory, CameraView, Tracker
 from vision.tracking.camera_motion import Array
@@ -69,7 +69,7 @@ def build_pipeline(
         view_at=_view_at(settings, telemetry),
         find_markers=marker_finder(settings),
         obstacles_in=_obstacles_in(settings, telemetry),
-        nearest_in=_nearest_in(settings, telemetry),
+        surfaces_in=_surfaces_in(settings, telemetry),
         clock_ns=clock_ns,
     )
 
@@ -209,10 +209,8 @@ def _obstacles_in(
     return obstacles_in
 
 
-def _nearest_in(
-    settings: Settings, telemetry: CameraTelemetry
-) -> Callable[[Frame, NDArray[np.float32]], NDArray[np.float32]]:
-    """Return a function from a frame's boxes to the nearest points of the objects in them.
+def _surfaces_in(settings: Settings, telemetry: CameraTelemetry) -> SurfacesIn:
+    """Return a function from a frame's boxes to the nearest points and the middles of the objects in them.
 
     Without an attitude at the capture the vehicle is assumed level. The attitude selects the point of the
     surface that is nearest over ground, it does not change the point's position in the optical frame.
@@ -220,7 +218,9 @@ def _nearest_in(
     pose_at = _pose_at(settings, telemetry)
     mount = settings.camera.mount()
 
-    def nearest_in(frame: Frame, xyxy: NDArray[np.float32]) -> NDArray[np.float32]:
+    def surfaces_in(
+        frame: Frame, xyxy: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         assert frame.depth_m is not None
         pose = pose_at(frame.captured_ns)
         attitude: Array = np.eye(3)
@@ -232,6 +232,6 @@ def _nearest_in(
                 lens_height_m = telemetry.height_m - float(attitude[2] @ used.position_frd_m)
         camera = settings.camera.model(frame.width, frame.height)
         down = used.ned_from_optical(attitude)[2]
-        return nearest_points(frame.depth_m, xyxy, camera, down, lens_height_m)
+        return surfaces(frame.depth_m, xyxy, camera, down, lens_height_m)
 
-    return nearest_in
+    return surfaces_in

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from mavlink_sim.camera.depth_camera import DepthSensor, measured_depth
 from vision.camera_model import CameraModel, CameraMount
-from vision.depth import depth_millimetres, depth_summary, nearest_points
+from vision.depth import depth_millimetres, depth_summary, nearest_points, surfaces
 from vision.rotation import matrix_from_euler
 from vision.sources.depth_images import to_metres
 
@@ -180,6 +180,46 @@ def test_nearest_corner_of_a_rotated_cuboid_is_found(
     assume(inside(scene))
     assume(scene.true_m > 2.0)
     assert ground_range_m(scene, scene.depth_m, scene.box) == pytest.approx(scene.true_m, abs=0.15)
+
+
+def middle_error_m(scene: Scene, column: float, *, north_m: float, east_m: float) -> float:
+    """Across the line of sight, of a column at half the box's height."""
+    row = (scene.box[1] + scene.box[3]) / 2 - 0.5
+    north, east, _ = scene.ned_from_optical @ CAMERA.rays(np.array([[column - 0.5, row]]))[0]
+    off_rad = math.atan2(east, north) - math.atan2(east_m, north_m)
+    return abs(off_rad) * math.hypot(north_m, east_m)
+
+
+@pytest.mark.parametrize("baseline_m", [None, 0.1])
+@pytest.mark.parametrize("east_m", [-2.0, 0.0, 2.0])
+def test_middle_of_a_long_object_is_not_that_of_its_box(east_m: float, baseline_m: float | None) -> None:
+    rng, boxes_m, middles_m = np.random.default_rng(3), [], []
+    at = {"north_m": 11.0, "east_m": east_m}
+    for yaw_rad in (0.3, 0.5, 0.7, 2.3, 2.5, 2.7):
+        scene = cuboid_scene(yaw_rad=yaw_rad, size_m=(7.0, 2.4, 2.5), height_m=5.0, **at)
+        depth_m = scene.depth_m
+        if baseline_m is not None:
+            depth_m = measured_depth(depth_m, CAMERA.fx, DepthSensor(baseline_m=baseline_m), rng)
+        _, (column,) = surfaces(depth_m, np.array([scene.box]), CAMERA, scene.down)
+        boxes_m.append(middle_error_m(scene, (scene.box[0] + scene.box[2]) / 2, **at))
+        middles_m.append(middle_error_m(scene, float(column), **at))
+    assert np.mean(boxes_m) > 0.5
+    assert np.mean(middles_m) < 0.5 * np.mean(boxes_m)
+
+
+def test_background_beside_a_narrow_object_does_not_move_its_middle() -> None:
+    depth_m = depth_of(30.0)
+    depth_m[10:40, 28:34] = 6.0
+    _, (column,) = surfaces(depth_m, np.array([[28, 10, 36, 40]]), SMALL, LEVEL)
+    assert abs(column - 32.0) < 1.0
+
+
+def test_middle_is_the_boxs_where_one_end_has_no_depth() -> None:
+    depth_m = depth_of(6.0)
+    depth_m[:, 28:34] = 9.0
+    depth_m[:, 20:28] = np.nan
+    _, (column,) = surfaces(depth_m, np.array([[20, 10, 44, 40]]), SMALL, LEVEL)
+    assert column == 32.0
 
 
 def test_range_is_over_ground_and_not_along_the_axis() -> None:

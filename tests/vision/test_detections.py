@@ -20,6 +20,7 @@ def three(**tracks: Any) -> Detections:
         np.array([0, 1, 1]),
         ("person", "car"),
         np.array([[0.1, 0.2, 1.0], [np.nan] * 3, [0.3, 0.4, 3.0]], np.float32),
+        middle_px=np.array([1.5, np.nan, 9.25], np.float32),
         **tracks,
     )
 
@@ -48,6 +49,10 @@ def test_slice_keeps_all_fields(index: Any) -> None:
     assert untracked.track_id is None
     assert untracked.track_score is None
     assert untracked.track_confirmed is None
+
+
+def test_records_contain_the_middle_where_it_is_known() -> None:
+    assert [record.get("middle_px") for record in three()] == [1.5, None, 9.25]
 
 
 def test_records_contain_the_track_fields() -> None:

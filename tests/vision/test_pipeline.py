@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from vision.camera_model import CameraModel
-from vision.depth import nearest_points
+from vision.depth import surfaces
 from vision.detections import Detections
 from vision.frame import Frame
 from vision.frame_selection import Selection
@@ -70,10 +70,10 @@ def frame_of(sequence: int, *, spot_x: int = 40, depth_m: float | None = None) -
     return Frame(image, time.monotonic_ns(), sequence, depth)
 
 
-def nearest_in(frame: Frame, xyxy: np.ndarray) -> np.ndarray:
+def surfaces_in(frame: Frame, xyxy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     assert frame.depth_m is not None
     camera = CameraModel.from_horizontal_fov(WIDTH, HEIGHT, 1.0)
-    return nearest_points(frame.depth_m, xyxy, camera, np.array([0.0, 1.0, 0.0]))
+    return surfaces(frame.depth_m, xyxy, camera, np.array([0.0, 1.0, 0.0]))
 
 
 def run(pipeline: Pipeline) -> list[PerceptionResult]:
@@ -106,7 +106,7 @@ def test_every_stage_is_timed() -> None:
 
 def test_depth_gives_every_detection_its_range() -> None:
     frames = Frames(frame_of(0, depth_m=6.5), frame_of(1))
-    near, none = run(Pipeline(frames, BrightSpot(), nearest_in=nearest_in))
+    near, none = run(Pipeline(frames, BrightSpot(), surfaces_in=surfaces_in))
     assert near.detections.depth_m == pytest.approx([6.5])
     assert near.depth is not None
     assert near.depth.valid_share == 1.0
@@ -212,7 +212,7 @@ def test_tracker_sets_ids_and_keeps_weak_detections_of_tracks() -> None:
 
 def test_ranges_are_measured_for_tracked_detections_too() -> None:
     (result,) = run(
-        Pipeline(Frames(frame_of(0, depth_m=6.5)), Flickering(), tracker=Tracker(), nearest_in=nearest_in)
+        Pipeline(Frames(frame_of(0, depth_m=6.5)), Flickering(), tracker=Tracker(), surfaces_in=surfaces_in)
     )
     assert result.detections.depth_m == pytest.approx([6.5])
 

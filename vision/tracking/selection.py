@@ -307,6 +307,7 @@ def _with_target(detections: Detections, target: _Target) -> Detections:
         class_id=np.append(detections.class_id, len(detections.class_names)),
         class_names=(*detections.class_names, TARGET_CLASS),
         nearest_camera_m=np.concatenate([detections.nearest_camera_m, np.full((1, 3), math.nan, np.float32)]),
+        middle_px=np.append(detections.middle_px, np.float32(math.nan)),
         track_id=np.append(detections.track_id, target.track_id),
         track_score=np.append(detections.track_score, np.float32(target.scores.median)),
         track_confirmed=np.append(detections.track_confirmed, True),

@@ -90,7 +90,8 @@ class DetectionBody(PositionBody):
     track_age_s: float | None
     """time from the track's first detection to this frame; null without a track"""
     bearing_rad: float | None
-    """direction of the box's centre at the capture, clockwise from north"""
+    """direction of the object at the capture, clockwise from north: of its box's centre, with depth of the
+    middle between its ends"""
     elevation_rad: float | None
     """the same above the horizon"""
     ground_range_m: float | None

@@ -218,8 +218,9 @@ def targets_from_detections(
 ) -> tuple[Target, ...]:
     """The targets of one frame, in the order of its detections. Boxes where the lens has no rays have none.
 
-    The range comes from the detection's nearest point if it has one (`nearest_camera_m`, from depth), else
-    from the intersection of the ray through the box's lower edge with the ground, less `CONTACT_INSET_M`. The
+    The range comes from the detection's nearest point if it has one (`nearest_camera_m`, from depth), and the
+    direction from the middle between the object's ends (`middle_px`). Else the direction is that of the box,
+    and the range is that of the ground at the ray through its lower edge, less `CONTACT_INSET_M`. The
     ground is assumed flat, at the level below the vehicle (`VehicleState.ground`) or else of home. That gives
     no range if the box touches the image's lower edge, or the ray points less than 2° down; then the class's
     height in `heights_m` is used, if the box is not cut off at its top or bottom.
@@ -255,7 +256,7 @@ class _Sight(NamedTuple):
     """The geometry of one box: NED vectors from the vehicle, offsets in metres; NaN: unknown.
 
     Attributes:
-        direction: unit vector to the box's centre; NaN where the lens has no rays.
+        direction: unit vector to the object's middle, or the box's centre; NaN where the lens has no rays.
         nearest: to the nearest point of its surface, by depth.
         on_ground: to the intersection of the middle of its lower edge with the ground.
         lens: to the optical centre.
@@ -281,8 +282,10 @@ def _sights(
     unknown = [math.nan] * 3
     nearest = np.array([detection["nearest_camera_m"] or unknown for detection in detections], np.float64)
     pixels = np.empty((4 * count, 2))
-    middle = (left + right) / 2
-    contact = middle + _contact_px(right - left, bottom - top, _roll_rad(mount, pose))
+    centre = (left + right) / 2
+    middle = np.array([each.get("middle_px", math.nan) for each in detections], np.float64) - 0.5
+    middle = np.where(np.isfinite(middle), middle, centre)
+    contact = centre + _contact_px(right - left, bottom - top, _roll_rad(mount, pose))
     pixels[:, 0] = np.concatenate([middle, contact, contact, contact + 1.0])
     pixels[:, 1] = np.concatenate([(top + bottom) / 2, bottom, bottom + 1.0, bottom])
     lines = PixelRays.of(camera, mount, pose.ned_from_body, pixels)

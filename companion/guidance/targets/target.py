@@ -34,13 +34,14 @@ class Target:
     Attributes:
         class_name, confidence: from the detector, of this frame.
         captured_ns: CLOCK_MONOTONIC stamp of the frame.
-        bearing_rad: direction of the box's centre, clockwise from north, -π..π (attitude removed).
+        bearing_rad: direction of the object's middle, clockwise from north, -π..π (attitude removed): with
+            depth that between its ends, else the box's centre.
         elevation_rad: above the horizon, positive up.
         ground_range_m: horizontal, from the vehicle to the object's nearest surface; NaN when unknown. At the
             capture time, like all fields: for the range now use `position_ned_m` and the current position.
         range_source: source of `ground_range_m`.
-        position_ned_m: local NED; None when the range is unknown. `ground_range_m` away in the direction of
-            the box's centre, or of its foot if the range comes from the ground or the class's height: the
+        position_ned_m: local NED; None when the range is unknown. `ground_range_m` away in the direction
+            `bearing_rad`, or of its foot if the range comes from the ground or the class's height: the
             nearest point itself jumps between the corners of a turning object.
         box_xyxy: pixels, as detected.
         track_id: constant from frame to frame; None without a track.

@@ -232,6 +232,17 @@ def test_position_is_at_the_box_not_the_nearest_corner() -> None:
     assert math.atan2(east, north) == pytest.approx(bearing)
 
 
+def test_position_is_in_the_direction_of_the_middle_by_depth() -> None:
+    history = history_of(quaternion_from_euler(0.0, 0.0, 0.0), position=(0.0, 0.0, -8.0))
+    seen = detection((420, 200, 520, 280), (0.5, 0.2, 6.0), middle_px=480.0)
+    (target,) = targets_from_detections([seen], T0, CAMERA, CameraMount(), history)
+    bearing = math.atan((479.5 - CAMERA.cx) / CAMERA.fx)
+    assert target.bearing_rad == pytest.approx(bearing)
+    assert target.position_ned_m is not None
+    assert math.atan2(*target.position_ned_m[1::-1]) == pytest.approx(bearing)
+    assert target.ground_range_m == pytest.approx(math.hypot(0.5, 6.0))
+
+
 def test_box_cut_by_the_edge_has_a_larger_sigma() -> None:
     history = history_of(quaternion_from_euler(0.0, 0.0, 0.0))
     whole, cut = targets_from_detections(
