@@ -1,19 +1,23 @@
 """Error of the positions of tracks: rendered flights, the bundled detector, the functions that fly.
 
-    python -m benchmarks.geolocation --seeds 1..10 [--processes 2] [--depth] [--json]
+    python -m benchmarks.geolocation --seeds 1..10 [--processes 2] [--depth] [--mount-deg 0.3] [--json]
 
 Each flight shows four standing objects 12 to 40 m ahead, on level ground. The vehicle flies 10 to 15 m
 forward and up to 8 m to the side at 3 m/s, 3 to 8 m above the ground, nose forward, in wind of 2 m/s. Camera:
 640x480, 80° across, 20° down on the body, 10 frames a second, image size 320; with `--depth` a stereo camera
 of 5 cm. Errors: those of the simulated autopilot's estimate (those of PX4, see
-`mavlink_sim/physics/estimate_errors.py`), and of the camera's mount, 0.3° one sigma on each axis, constant
-over a flight.
+`mavlink_sim/physics/estimate_errors.py`), and of the camera's mount, 0.3° one sigma on each axis (or
+`--mount-deg`), constant over a flight.
 
 The truth of a detection is a point in the direction of the object's middle, at the range of the nearest point
 of its surface; the object is the one whose true box agrees best. Of a track it is these points fused as the
 track's positions are. Seen from elsewhere it is another point of a long object, and where something hides a
 part of the object the middle of the rest is elsewhere: so the distance to the object's footprint is printed
 too, 0 on it. The range is the mean of the ranges.
+
+`bound_…` is what exact boxes and depth would leave: the true points, located by the flight's own estimate and
+the believed mount, with depth at their true distance, else where their ray meets the ground, and fused the
+same way.
 """
 
 from __future__ import annotations
@@ -23,7 +27,7 @@ import json
 import math
 import sys
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import NamedTuple
@@ -37,6 +41,7 @@ from companion.bench.lockstep_flight import LockstepFlight
 from companion.bench.rendered_camera import RenderedCamera
 from companion.bench.synthetic_detector import SceneObject, ScenePose
 from companion.campaign import ClusterError, SeedError, map_seeds
+from companion.guidance.targets.from_detections import Pose
 from companion.guidance.targets.fused import FusedPosition, FusedTracks
 from companion.guidance.targets.target import Target
 from companion.vehicle.state import Vector3
@@ -45,6 +50,7 @@ from mavlink_sim.lockstep import LockstepVehicle
 from mavlink_sim.world.mesh import surface_range_to
 from mavlink_sim.world.world import WorldObject, range_to
 from vision.camera_model import CameraModel, CameraMount
+from vision.rotation import matrix_from_quaternion
 from vision.tracking.association import overlaps
 
 CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(80.0))
@@ -67,6 +73,7 @@ class Located:
     Attributes:
         error_m: of the fused position. relative_m: the same without the vehicle's own position error.
         off_m: its distance to the object's footprint.
+        bound_m: the error that remains with exact boxes and depth, of pose and mount.
         single_m: median error of its detections. range_m: mean of them.
         moving: it was taken for moving.
         within_95: the truth is in the 95 % ellipse.
@@ -78,25 +85,30 @@ class Located:
     error_m: float
     relative_m: float
     off_m: float
+    bound_m: float
     single_m: float
     moving: bool
     within_95: bool
 
 
 class _Shown(NamedTuple):
-    """A frame, with the vehicle's true position at its capture and the error of its estimate."""
+    """A frame, with the vehicle's true pose at its capture and the error of its estimate."""
 
     vehicle: Vector3
+    ned_from_body: NDArray[np.float64]
     drift: NDArray[np.float64]
     rendered: Rendered
 
 
-def flight_of(seed: int, *, depth: bool) -> list[Located]:
+_Locate = Callable[[Target, Sequence[float], _Shown], NDArray[np.float64]]
+
+
+def flight_of(seed: int, *, depth: bool, mount_sigma_rad: float = MOUNT_SIGMA_RAD) -> list[Located]:
     """The tracks of one flight that were seen whole in at least ten frames; the same seed gives the same."""
     rng = np.random.default_rng((seed, 57))
     placed = [_object(name, number, rng) for number, name in enumerate(SIZES_M)]
     scene, _ = rendered_scene(placed, CAMERA, MOUNT, seed, depth=depth)
-    errors = rng.normal(0.0, MOUNT_SIGMA_RAD, 3)
+    errors = rng.normal(0.0, mount_sigma_rad, 3)
     believed = replace(MOUNT, roll_rad=errors[0], pitch_rad=MOUNT.pitch_rad + errors[1], yaw_rad=errors[2])
     settings = camera_settings(CAMERA, believed, {"detector.image_size": "320", "detector.threads": "1"})
 
@@ -111,33 +123,40 @@ def flight_of(seed: int, *, depth: bool) -> list[Located]:
     flight.turn_to(0.0)
     seen: dict[int, dict[int, Target]] = {}
     shown: dict[int, _Shown] = {}
-    before = flight.now_ns, *_positions(flight)
+    poses: dict[int, Pose] = {}
+    before = flight.now_ns, *_poses(flight)
 
     def collect() -> None:
         nonlocal before
         newest = cameras[0].shown
         if newest is not None and (not shown or shown[max(shown)].rendered is not newest):
             shown[before[0]] = _Shown(*before[1:], newest)  # captured at the beginning of the tick
-        before = flight.now_ns, *_positions(flight)
+        before = flight.now_ns, *_poses(flight)
         for target in flight.inputs.steering.targets:
             if target.track_id is not None and target.trusted and target.position_covariance is not None:
                 seen.setdefault(target.track_id, {})[target.captured_ns] = target
+                if target.captured_ns not in poses:
+                    poses[target.captured_ns] = flight.inputs.history.at(target.captured_ns)
+
+    def locate(target: Target, point_ned_m: Sequence[float], frame: _Shown) -> NDArray[np.float64]:
+        return _located_by_pose(point_ned_m, frame, poses[target.captured_ns], believed, depth=depth)
 
     forward_m, right_m = rng.uniform(10.0, 15.0), rng.uniform(-8.0, 8.0)
     flight.fly(f"goto north={forward_m:.1f} east={right_m:.1f} heading=0 speed=3", 30.0, on_tick=collect)
     fused = flight.inputs.steering.fused
     tracks = [
-        _located(position, [(target, shown[ns]) for ns, target in of_track.items() if ns in shown])
+        _located(position, [(target, shown[ns]) for ns, target in of_track.items() if ns in shown], locate)
         for track_id, of_track in seen.items()
         if (position := fused.position(track_id, 0)) is not None  # its newest
     ]
     return [track for track in tracks if track is not None]
 
 
-def _positions(flight: LockstepFlight) -> tuple[Vector3, NDArray[np.float64]]:
-    """The vehicle's true position, and (2,) metres north and east by which its estimate is off."""
-    true, estimated = flight.vehicle.truth.position_ned_m, flight.vehicle.vehicle.estimate.position
-    return true, np.array(estimated[:2]) - true[:2]
+def _poses(flight: LockstepFlight) -> tuple[Vector3, NDArray[np.float64], NDArray[np.float64]]:
+    """The vehicle's true position and attitude, and (2,) metres north and east that its estimate is off."""
+    true, estimated = flight.vehicle.truth, flight.vehicle.vehicle.estimate.position
+    off = np.array(estimated[:2]) - true.position_ned_m[:2]
+    return true.position_ned_m, matrix_from_quaternion(true.quaternion), off
 
 
 def _object(name: str, number: int, rng: np.random.Generator) -> SceneObject:
@@ -146,7 +165,7 @@ def _object(name: str, number: int, rng: np.random.Generator) -> SceneObject:
     return SceneObject(name, SIZES_M[name], lambda _: ScenePose(float(north), float(east), float(yaw)))
 
 
-def _located(fused: FusedPosition, seen: list[tuple[Target, _Shown]]) -> Located | None:
+def _located(fused: FusedPosition, seen: list[tuple[Target, _Shown]], locate: _Locate) -> Located | None:
     """The track against the object that most of its boxes show; None: fewer than ten show all of it."""
     truths = [_object_of(target, frame.rendered) for target, frame in seen]
     shown = [item for item in truths if item is not None]
@@ -166,13 +185,20 @@ def _located(fused: FusedPosition, seen: list[tuple[Target, _Shown]]) -> Located
         if target.position_ned_m is not None
     ]
     shifted = [(target, truth + frame.drift, frame) for target, truth, frame in of_object]
-    truth, relative = (points[-1][1] if fused.moving else _fused(points) for points in (of_object, shifted))
+    item = next(item for item in shown if item.identifier == identifier)
+    # Depth is measured at the object's middle height, the ground at its foot.
+    by_pose = [
+        (target, locate(target, (*truth, -item.height_m / 2), frame), frame)
+        for target, truth, frame in of_object
+    ]
+    truth, relative, bound = (
+        points[-1][1] if fused.moving else _fused(points) for points in (of_object, shifted, by_pose)
+    )
     position = np.array(fused.position_ned_m[:2])
     error = position - truth
     major_m, minor_m, orientation = fused.ellipse
     axis = np.array((math.cos(orientation), math.sin(orientation)))
     along, across = error @ axis, error @ (-axis[1], axis[0])
-    item = next(item for item in shown if item.identifier == identifier)
     return Located(
         item.class_name,
         len(of_object),
@@ -180,6 +206,7 @@ def _located(fused: FusedPosition, seen: list[tuple[Target, _Shown]]) -> Located
         round(math.hypot(*error), 3),
         round(math.hypot(*(position - relative)), 3),
         round(range_to(item, fused.position_ned_m), 3),
+        round(math.hypot(*(bound - truth)), 3),
         round(float(np.median(singles)), 3),
         fused.moving,
         bool((along / major_m) ** 2 + (across / minor_m) ** 2 <= CHI_SQUARED_95),
@@ -195,6 +222,22 @@ def _fused(of_object: list[tuple[Target, NDArray[np.float64], _Shown]]) -> NDArr
         position = tracks.position(0, target.captured_ns)
     assert position is not None
     return np.array(position.position_ned_m[:2])
+
+
+def _located_by_pose(
+    point_ned_m: Sequence[float], frame: _Shown, pose: Pose, believed: CameraMount, *, depth: bool
+) -> NDArray[np.float64]:
+    """(2,) metres north and east: where a true point is by the estimated pose and the believed mount."""
+    lens = frame.vehicle + frame.ned_from_body @ MOUNT.position_frd_m
+    north, east, down = point_ned_m
+    seen = np.array((north, east, down if depth else 0.0)) - lens
+    in_camera = MOUNT.ned_from_optical(frame.ned_from_body).T @ seen
+    offset = believed.ned_from_optical(pose.ned_from_body) @ in_camera
+    own = pose.ned_from_body @ believed.position_frd_m
+    if not depth:
+        offset *= (pose.height_m - own[2]) / offset[2]
+    located: NDArray[np.float64] = np.array(pose.position_ned_m[:2]) + own[:2] + offset[:2]
+    return located
 
 
 def _object_of(target: Target, rendered: Rendered) -> WorldObject | None:
@@ -220,17 +263,22 @@ def summary(found: list[Located]) -> dict[str, float]:
     errors = np.array([each.error_m for each in found])
     relative = np.array([each.relative_m / each.range_m for each in found])
     off = np.array([each.off_m / each.range_m for each in found])
+    bound = np.array([each.bound_m / each.range_m for each in found])
     singles = np.array([each.single_m / each.range_m for each in found])
     return {
         "tracks": len(found),
         "median_m": round(float(np.median(errors)), 3),
         "p95_m": round(float(np.percentile(errors, 95)), 3),
         "median_of_range": round(float(np.median(share)), 4),
+        "p68_of_range": round(float(np.percentile(share, 68)), 4),
         "p95_of_range": round(float(np.percentile(share, 95)), 4),
         "within_3_percent": round(float(np.mean(share <= 0.03)), 3),
         "relative_median_of_range": round(float(np.median(relative)), 4),
         "relative_p95_of_range": round(float(np.percentile(relative, 95)), 4),
         "relative_within_3_percent": round(float(np.mean(relative <= 0.03)), 3),
+        "bound_median_of_range": round(float(np.median(bound)), 4),
+        "bound_p95_of_range": round(float(np.percentile(bound, 95)), 4),
+        "bound_within_3_percent": round(float(np.mean(bound <= 0.03)), 3),
         "off_median_of_range": round(float(np.median(off)), 4),
         "off_p95_of_range": round(float(np.percentile(off, 95)), 4),
         "off_within_3_percent": round(float(np.mean(off <= 0.03)), 3),
@@ -247,13 +295,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add_seeds(parser, "1..3")
     parser.add_argument("--depth", action="store_true", help="a camera with depth")
     parser.add_argument(
+        "--mount-deg",
+        type=float,
+        default=math.degrees(MOUNT_SIGMA_RAD),
+        help="one sigma of the mount's error",
+    )
+    parser.add_argument(
         "--json", action="store_true", help="print one JSON object per flight, then the summary"
     )
     given = parser.parse_args(arguments)
     found = []
     try:
         flights = map_seeds(
-            partial(flight_of, depth=given.depth), given.seeds, processes=given.processes, ray=given.ray
+            partial(flight_of, depth=given.depth, mount_sigma_rad=math.radians(given.mount_deg)),
+            given.seeds,
+            processes=given.processes,
+            ray=given.ray,
         )
         for seed, of_flight in zip(given.seeds, flights, strict=True):
             found += of_flight
