@@ -37,10 +37,11 @@ REASONS = {"stick gesture": 1, "RC switch": 2, "external command": 4, "kill-swit
 THROTTLE_ABOVE_CENTRE = 0.2
 THROTTLE_LOW = -0.8
 REARMING_GRACE_S = 5.0
-# Modes in which the throttle is a climb rate; in the other manual modes it is thrust.
 # an enum's member takes as long as a call on Python 3.11: these are read at every control step
+_NONE = Action.NONE
 _TERMINATE = Action.TERMINATE
-_NO_FAILSAFE = (Action.NONE, Mode.HOLD)
+_NO_FAILSAFE = (_NONE, Mode.HOLD)
+# Modes in which the throttle is a climb rate; in the other manual modes it is thrust.
 CLIMB_RATE_MODES = frozenset({Mode.POSCTL, Mode.POSITION_SLOW, Mode.ALTCTL})
 AUTO_OVERRIDE, OFFBOARD_OVERRIDE = 1, 2  # COM_RC_OVERRIDE
 _BATTERY_TEXTS = {
@@ -301,7 +302,7 @@ class Supervision:
             autopilot.adopt_intention(intended)
             if sticks_request:
                 autopilot.announce("the pilot took over using the sticks")
-        if machine.action is _NO_FAILSAFE[0] and not was_in_failsafe:  # the usual case
+        if machine.action is _NONE and not was_in_failsafe:  # the usual case
             autopilot.failsafe, self._announced_failsafe = False, _NO_FAILSAFE
             return intended
         autopilot.failsafe = machine.in_failsafe

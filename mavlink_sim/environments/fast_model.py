@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mavlink_sim.environments.spaces import Array
 from mavlink_sim.environments.task import STEP_S
-from mavlink_sim.flight.position_control import ANTI_WINDUP
+from mavlink_sim.flight.position_control import ANTI_WINDUP, LEAST_LIFT_MPS2, MOST_LIFT_MPS2
 from mavlink_sim.physics.airframe import (
     ANGULAR_DRAG_NMS,
     ARM_M,
@@ -132,7 +132,7 @@ class FastModel:
         """(4, count) rotor commands 0..1: velocity loop, attitude loop, rate loop and mixer."""
         error = velocity - self.velocity
         demand = self._p * error + self._integral - self._d * self.acceleration
-        lift = np.clip(GRAVITY_MPS2 - demand[2], 0.12 * MAX_THRUST_MPS2, 0.97 * MAX_THRUST_MPS2)
+        lift = np.clip(GRAVITY_MPS2 - demand[2], LEAST_LIFT_MPS2, MOST_LIFT_MPS2)
         sideways = np.hypot(demand[0], demand[1])
         level = demand[:2] * np.minimum(1.0, self._max_sideways / np.maximum(sideways, _TINY))
         length = np.sqrt(GRAVITY_MPS2**2 + level[0] ** 2 + level[1] ** 2)

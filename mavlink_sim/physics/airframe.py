@@ -87,7 +87,8 @@ class Multirotor:
         rotor_effectiveness: 0..1 for each rotor; 0 is a failed one. See `fail_motor`.
         on_ground: touching the ground.
         crashed: it hit the ground too hard or upside down: the rotors are broken.
-        on_touch: called with that speed at every contact.
+        on_touch: called with the downward speed, m/s, at every contact with the ground, before the motion and
+            the rotors of that step are set.
         collisions: count, with objects and vehicles. last_collision: the newest; None before the first.
         on_collision: called with each.
         floor_down_m: NED z of the surface it stands or last stood on; 0 is the ground.
@@ -264,8 +265,12 @@ class Multirotor:
     def advance(self, dt_s: float, steps: int = 1) -> None:
         """Advance by steps of `dt_s` (at most ~10 ms) towards what was commanded.
 
-        Several are for a vehicle clear of the ground: the attributes change at the end only.
+        Clear of the ground the attributes change only after the last of several steps.
         """
+        if steps > 1 and self.on_ground:
+            for _ in range(steps):
+                self.advance(dt_s)
+            return
         thrust, tilt_x, tilt_y, tilt_z, yaw_rate = self._demand
         if self.on_ground:
             blend = min(1.0, dt_s / ROTOR_TIME_CONSTANT_S)
@@ -301,7 +306,8 @@ class Multirotor:
         rate_demand = self._rate_demand
         gusty = self.gusts_mps > 0.0
         air_x, air_y, air_z = self._air_velocity() if gusty else self.wind
-        for _ in range(steps):
+        remaining = 0  # steps after a contact
+        for left in range(steps - 1, -1, -1):
             # the attitude loop: body rates (FRD) that turn the thrust axis to the demanded direction
             if rate_demand is not None:
                 wanted_p, wanted_q, wanted_r = rate_demand
@@ -394,6 +400,7 @@ class Multirotor:
             if down >= 0.0 and vz >= 0.0:
                 down = 0.0
                 vz = self._touch(vz, i)
+                remaining = left
 
             half_p, half_q, half_r = p * half, q * half, r * half
             new_w = w - x * half_p - y * half_q - z * half_r
@@ -411,10 +418,14 @@ class Multirotor:
             a, b, c = 1.0 - 2.0 * (yy + zz), 2.0 * (xy - wz), 2.0 * (xz + wy)
             d, e, f = 2.0 * (xy + wz), 1.0 - 2.0 * (xx + zz), 2.0 * (yz - wx)
             g, h, i = 2.0 * (xz - wy), 2.0 * (yz + wx), 1.0 - 2.0 * (xx + yy)
+            if remaining:
+                break
         self.rotor_commands, self.rotor_thrusts = (u0, u1, u2, u3), (t0, t1, t2, t3)
         self._spin, self.rates = (spin_x, spin_y, spin_z), (p, q, r)
         self.quaternion, self._matrix = (w, x, y, z), (a, b, c, d, e, f, g, h, i)
         self.position, self.velocity, self.acceleration = (north, east, down), (vx, vy, vz), (ax, ay, az)
+        for _ in range(remaining):  # it stands now, bounces, or has no rotors
+            self.advance(dt_s)
 
     def blow(self, gust: Vector) -> None:
         """Set the gust, NED m/s, instead of an own one; to be repeated every 32 ms."""

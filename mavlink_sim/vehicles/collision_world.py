@@ -77,15 +77,15 @@ class CollidingMultirotor(Multirotor):
     # ---- time -------------------------------------------------------------------------------------------
 
     def advance(self, dt_s: float, steps: int = 1) -> None:
-        """Only one step: obstacles are searched after each."""
-        assert steps == 1
-        super().advance(dt_s)
-        x, y, z = self.position
-        fx, fy, fz = self._checked_at
-        x, y, z = x - fx, y - fy, z - fz
-        margin = self._clearance_m = self._clearance_m - self._obstacles.top_speed_mps * dt_s
-        if margin < 0.0 or x * x + y * y + z * z > margin * margin:
-            self._sense_obstacles(dt_s)
+        """See Multirotor. Obstacles are searched after each step."""
+        for _ in range(steps):
+            super().advance(dt_s)
+            x, y, z = self.position
+            fx, fy, fz = self._checked_at
+            x, y, z = x - fx, y - fy, z - fz
+            margin = self._clearance_m = self._clearance_m - self._obstacles.top_speed_mps * dt_s
+            if margin < 0.0 or x * x + y * y + z * z > margin * margin:
+                self._sense_obstacles(dt_s)
 
     def _sense_obstacles(self, dt_s: float) -> None:
         """Handle contacts, and measure the distance to the next obstacle."""

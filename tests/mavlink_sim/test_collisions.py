@@ -73,6 +73,17 @@ def let_pass(body: Multirotor, clock: list[float], seconds: float) -> None:
         body.advance(STEP_S)
 
 
+def test_several_steps_search_obstacles_after_each() -> None:
+    (one, _), (other, _) = airframe(WALL), airframe(WALL)
+    for body in (one, other):
+        throw(body, (FACE_M - RADIUS_M - 0.02, 0.0, -2.0), (3.0, 0.0, 0.0))
+    one.advance(STEP_S, 10)
+    for _ in range(10):
+        other.advance(STEP_S)
+    assert one.collisions == other.collisions == 1
+    assert (one.position, one.velocity) == (other.position, other.velocity)
+
+
 def test_a_wall_stops_a_vehicle_and_leaves_it_flying() -> None:
     vehicle = flying(WALL)
     steer(vehicle, velocity_setpoint(2.0, 0.0, 0.0), 8.0)

@@ -134,7 +134,7 @@ class CopterAutopilot(Autopilot):
 
     @property
     def can_arm(self) -> bool:
-        return self._arming_error() is None
+        return self._reason_against_arming() is None
 
     @property
     def system_status(self) -> SystemState:
@@ -169,7 +169,7 @@ class CopterAutopilot(Autopilot):
         """The estimated position, local NED."""
         return self._airframe.position
 
-    def _arming_error(self) -> str | None:
+    def _reason_against_arming(self) -> str | None:
         """ArduPilot's reason against arming, without its prefix; None: it can arm."""
         mode: CopterMode = self.mode
         if mode not in WITHOUT_POSITION and not (self.sensors_ready and self.position_valid):
@@ -188,9 +188,9 @@ class CopterAutopilot(Autopilot):
     def arm(self, by: str = "external command") -> int:
         if self.armed:
             return ACCEPTED
-        error = self._arming_error()
-        if error is not None:
-            self._send_text(CRITICAL, f"Arm: {error}")
+        reason = self._reason_against_arming()
+        if reason is not None:
+            self._send_text(CRITICAL, f"Arm: {reason}")
             return FAILED
         self.force_arm()
         return ACCEPTED
@@ -285,9 +285,9 @@ class CopterAutopilot(Autopilot):
 
     def send_prearm(self) -> None:
         """Send the reason against arming; a mode that does not allow it is reported only at arming."""
-        error = self._arming_error()
-        if error is not None and "mode not armable" not in error:
-            self._send_text(CRITICAL, f"PreArm: {error}")
+        reason = self._reason_against_arming()
+        if reason is not None and "mode not armable" not in reason:
+            self._send_text(CRITICAL, f"PreArm: {reason}")
 
     def _fly(self, dt_s: float, task: flight.Task, setpoint: flight.Setpoint) -> None:
         if task.demand is not None:

@@ -123,7 +123,7 @@ class CopterVehicle(Vehicle):
         """Copter has no check of the companion's heartbeat."""
 
     def _step(self, most: int) -> int:
-        super()._step(1)
+        super()._step(1)  # one: mode and home are compared after each step
         copter = self.copter
         if copter.mode_changes != self._sent_mode_changes:
             self._sent_mode_changes = copter.mode_changes
