@@ -70,7 +70,7 @@ class VelocityInput:
         source: identifier of the sender.
         forward_mps, right_mps: horizontally, along and across the heading. up_mps: vertically.
         turn_radps: clockwise seen from above.
-        expires_ns: it must not be sent after that.
+        expires_ns: it must not be used after that.
     """
 
     source: str

@@ -31,7 +31,7 @@ POSITION_LOSS_S = 2.0
 
 
 class BehaviourRunner:
-    """Part of the guidance core.
+    """Begins, updates and ends the active behaviour, and acts on its output.
 
     A behaviour that flew by setpoints is followed by a hold until the next command. After one that ended in
     an autopilot mode nothing is streamed.
@@ -139,6 +139,14 @@ class BehaviourRunner:
         else:
             self._lose(why)
 
+    def clear_failure(self) -> None:
+        """This step raised nothing."""
+        self.failure = ""
+
+    def forget_goal(self) -> None:
+        """Where the behaviour before wanted the vehicle is no longer valid."""
+        self.goal_ned_m = None
+
     def end(self, outcome: Outcome, *, reported: bool = False) -> None:
         """Remove the active behaviour and answer its command."""
         behaviour, command, busy = self.behaviour, self._command, self.busy
@@ -168,7 +176,7 @@ class BehaviourRunner:
 
     def _run(self, behaviour: Behaviour, context: BehaviourContext, sent_count: int) -> None:
         """Update the behaviour and act on its output."""
-        self._setpoints.path = ()
+        self._setpoints.clear_path()
         if Requirement.POSITION in behaviour.requirements and not self._position_known(context):
             return
         if not self._activated:

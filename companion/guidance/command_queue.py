@@ -21,7 +21,7 @@ class _Waiting:
 
 
 class CommandQueue:
-    """Part of the guidance core.
+    """Holds commands until the gimbal that they need is known; a newer command supersedes them.
 
     Args:
         gimbal: carries out commands that only point the gimbal.

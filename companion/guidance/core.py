@@ -68,14 +68,14 @@ class GuidanceOptions:
 
 
 class Guidance:
-    """One vehicle's guidance.
+    """One vehicle's guidance. Its options are fixed at construction.
 
     Attributes:
         gimbal: the gimbal controller; for its status.
     """
 
     def __init__(self, options: GuidanceOptions | None = None) -> None:
-        self.options = options = options or GuidanceOptions()
+        self._options = options = options or GuidanceOptions()
         self.gimbal = GimbalController(options.own_address, options.gimbal)
         self._out = OutputCollector()
         self._setpoints = SetpointOutput(options.limits, options.obstacles, options.lifetime_s, self._out)
@@ -87,6 +87,11 @@ class Guidance:
         self._class_names: tuple[str, ...] | None = None
         self._mode_changes = 0
         self._landing_target_ns = self._obstacle_distance_ns = 0
+
+    @property
+    def options(self) -> GuidanceOptions:
+        """The operator's settings."""
+        return self._options
 
     @property
     def active(self) -> Behaviour | None:
@@ -105,12 +110,12 @@ class Guidance:
 
     @property
     def sent(self) -> Setpoint | None:
-        """The same after the envelope (or the brake that is streamed while a mode is requested)."""
+        """The last setpoint after the envelope, or the brake that is streamed while a mode is requested."""
         return self._setpoints.sent
 
     @property
     def limited_by(self) -> tuple[str, ...]:
-        """Which limits acted on it."""
+        """Names of the limits that changed `sent`."""
         return self._setpoints.limited_by
 
     @property
@@ -164,7 +169,7 @@ class Guidance:
         for answer in inputs.answers:
             self.gimbal.take_answer(answer, now_ns, out)
         if inputs.mode_changes != self._mode_changes and self.phase is Phase.IDLE:
-            self._runner.goal_ned_m = None  # flown by someone else since
+            self._runner.forget_goal()  # flown by someone else since
         self._mode_changes = inputs.mode_changes
         before, context = self._context, self._observe(now_ns, inputs)
         self._context, self._class_names = context, inputs.class_names
@@ -189,7 +194,7 @@ class Guidance:
         except Exception as error:
             self._runner.handle_error(error, context, inputs.stream.sent_count)
         else:
-            self._runner.failure = ""
+            self._runner.clear_failure()
         self._runner.answer_endless(inputs)
         return self._output(landing_target)
 

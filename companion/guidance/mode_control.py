@@ -32,7 +32,7 @@ class Phase(StrEnum):
 
 
 class ModeControl:
-    """Part of the guidance core.
+    """Requests OFFBOARD and the autopilot's modes for behaviours, and detects the loss of our command.
 
     Args:
         setpoints: stopped when we give up command or an autopilot mode begins.
@@ -42,7 +42,6 @@ class ModeControl:
         phase: state of our command.
         requested: the mode request that is pending or active; None: none.
         request: identifier of the pending request; None: none.
-        yielded: why command was lost, while the autopilot's own reason is awaited; None: it was not.
     """
 
     def __init__(self, setpoints: SetpointOutput, out: OutputCollector) -> None:
@@ -59,7 +58,7 @@ class ModeControl:
 
     @property
     def yielded(self) -> str | None:
-        """See the class."""
+        """Why command was lost, while the autopilot's own reason is awaited; None: it was not."""
         return None if self._yielded is None else self._yielded[1]
 
     def prepare(self, state: VehicleState) -> None:
@@ -108,7 +107,8 @@ class ModeControl:
     def start_engaging(self, context: BehaviourContext, sent_count: int) -> None:
         """Stream a brake; OFFBOARD is requested after `SETPOINTS_BEFORE_OFFBOARD` setpoints."""
         self.drop_request()
-        self.phase, self._setpoints.streaming = Phase.ENGAGING, True
+        self.phase = Phase.ENGAGING
+        self._setpoints.start()
         self._engaging_since_ns = context.now_ns
         self._sent_before_engaging = sent_count
         self._authority.request(FlightMode.OFFBOARD, context.state)

@@ -17,7 +17,7 @@ from vision.path_planner import PathRequest
 
 
 class SetpointOutput:
-    """Part of the guidance core.
+    """Applies avoidance, obstacle limits and envelope to a behaviour's setpoint, or brakes.
 
     Args:
         lifetime_s: of every setpoint; overrides the behaviour's.
@@ -26,8 +26,8 @@ class SetpointOutput:
     Attributes:
         streaming: setpoints are sent.
         asked: the last setpoint of a behaviour; None: none is active.
-        sent: the same after the envelope (or the brake that is streamed while a mode is requested).
-        limited_by: which limits acted on it.
+        sent: the last setpoint after the envelope, or the brake that is streamed while a mode is requested.
+        limited_by: names of the limits that changed `sent`.
         path: (north, east) points of the active path around obstacles; empty: none.
     """
 
@@ -59,6 +59,14 @@ class SetpointOutput:
     def reset(self) -> None:
         """Our setpoints are active from now on: the envelope starts from the vehicle's own motion."""
         self._envelope.reset()
+
+    def start(self) -> None:
+        """Send setpoints from now on."""
+        self.streaming = True
+
+    def clear_path(self) -> None:
+        """No path around obstacles is active."""
+        self.path = ()
 
     def stop(self) -> None:
         """Send no setpoints any more."""
