@@ -2,8 +2,8 @@
 
     python -m tools.check_words [FILE ...]
 
-Every Python and Markdown file that git knows is read: identifiers (split at `_` and at capitals), comments,
-docstrings, messages and prose. The exit code is 1 where a word is found.
+Every Python, Markdown, JavaScript, HTML and TOML file that git knows is read: identifiers (split at `_` and
+at capitals), comments, docstrings, messages and prose. The exit code is 1 where a word is found.
 """
 
 from __future__ import annotations
@@ -69,8 +69,9 @@ def findings(text: str) -> Iterator[tuple[int, str, str]]:
 
 def main(arguments: Sequence[str]) -> int:
     """The command line. Returns the exit code."""
+    patterns = ("*.py", "*.md", "*.js", "*.html", "*.toml")
     known = subprocess.run(
-        ["git", "ls-files", "-z", "*.py", "*.md"], check=True, capture_output=True, text=True
+        ["git", "ls-files", "-z", *patterns], check=True, capture_output=True, text=True
     ).stdout.split("\0")
     skipped = {"tools/check_words.py", "tests/tools/test_check_words.py", "CHANGELOG.md"}
     paths = list(arguments) or [path for path in known if path and path not in skipped]

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -28,3 +29,16 @@ def test_a_finding_is_exit_code_1(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert capsys.readouterr().out.startswith(f"{path}:1: 'told'")
     path.write_text("sent = 1\n")
     assert main([str(path)]) == 0
+
+
+@pytest.mark.parametrize("name", ["a.py", "a.md", "a.js", "a.html", "a.toml"])
+def test_files_that_git_knows_are_read(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    subprocess.run(["git", "init", "-q"], check=True)
+    Path(name).write_text("told\n")
+    assert main([]) == 0
+    subprocess.run(["git", "add", name], check=True)
+    assert main([]) == 1
+    assert capsys.readouterr().out.startswith(f"{name}:1: 'told'")
