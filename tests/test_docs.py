@@ -104,7 +104,7 @@ def test_every_parameter_that_the_sitl_tests_set_is_documented() -> None:
     names = {name for text in sources for name in re.findall(r'"([A-Z0-9]+_[A-Z0-9_]+)": ', text)}
     assert len(names) > 10
     page = (ROOT / "docs" / "how-to" / "sitl.md").read_text()
-    (listed,) = re.findall(r"They set parameters .*? of ArduPilot\.", page, re.DOTALL)
+    (listed,) = re.findall(r"They set parameters, .*?\sof ArduPilot\.", page, re.DOTALL)
     assert not {name for name in names if f"`{name}`" not in listed}
 
 

@@ -180,7 +180,9 @@ def _fly_into(fault: Fault, settings: Settings, service_pid: int, truth: Path) -
         deadline_s = time.monotonic() + _COMMAND_S
         while not (statuses and _steady(truth)):
             if time.monotonic() > deadline_s:
-                raise SimSessionError(f"{fault.command!r} was not flown steadily within {_COMMAND_S:g} s")
+                raise SimSessionError(
+                    f"the vehicle did not fly {fault.command!r} steadily within {_COMMAND_S:g} s"
+                )
             time.sleep(0.1)
         pid = service_pid if fault.process == "service" else statuses[-1]["perception"]["pid"]
         fault_ns = time.monotonic_ns()

@@ -36,8 +36,8 @@ def ask(
 ) -> None:
     """Fly and answer plain sentences.
 
-    They are read by patterns or by a language model. What moves the vehicle is shown first, and executed
-    if you answer y. `stop` is sent at once.
+    They are read by patterns or by a language model. Commands that move the vehicle are shown first, and
+    sent if you answer y. `stop` is sent at once.
     """
     from companion.bus.client import NoAnswerError
     from companion.bus.session import BusError

@@ -36,7 +36,7 @@ def bench_detector(
     against: Annotated[Path | None, typer.Option(help="Earlier --json result to compare with.")] = None,
     as_json: _JSON = False,
 ) -> None:
-    """Measure the time per frame of each runtime. Milliseconds from pixels to boxes."""
+    """Measure the time per frame of each runtime. Prints milliseconds from pixels to boxes."""
     from companion.bench.detector import BenchError, measure_detectors, read_result, table
     from vision.runtimes.base import RUNTIMES, installed
 
@@ -115,7 +115,7 @@ def bench_bus(
 ) -> None:
     """Measure the latency of zenoh under CPU load.
 
-    From put to a subscriber in another process, while detectors use every core.
+    Measures the time from put to a subscriber in another process, while detectors use every core.
     """
     import os
 
@@ -136,7 +136,7 @@ def bench_deadman(
     runs: Annotated[int, typer.Option(min=1, help="Number of flights per fault, half a minute each.")] = 3,
     as_json: _JSON = False,
 ) -> None:
-    """Measure the reaction to process faults. Seconds until braking, stop and leaving OFFBOARD."""
+    """Measure the reaction to process faults. Prints seconds until braking, stop and leaving OFFBOARD."""
     from rich.console import Console
 
     from companion.bench.deadman import deadman_table, measure_deadman

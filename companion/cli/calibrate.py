@@ -43,7 +43,8 @@ _MIRROR = Annotated[bool, typer.Option("--mirror", help="Exchange left and right
 
 calibrate = typer.Typer(
     cls=_LensByDefault,
-    help="Calibrate a lens, a mount or a depth camera's pose.\n\nSOURCE is that of the lens.",
+    help="Calibrate a lens, a mount or a depth camera's pose.\n\n"
+    "`companion calibrate SOURCE` is `companion calibrate lens SOURCE`.",
     no_args_is_help=True,
 )
 

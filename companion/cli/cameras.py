@@ -119,7 +119,7 @@ def depth(
 ) -> None:
     """Measure the depth of a source.
 
-    At the centre and of each object, one line per frame.
+    Prints the depth at the centre, and with --detect that of each object, one line per frame.
     """
     from companion.perception.assembly import CameraTelemetry, build_pipeline, load_detector
     from companion.preview import DepthRecorder, depth_source

@@ -68,7 +68,7 @@ def cloud(
 ) -> None:
     """Write one frame's depth as a point cloud.
 
-    With the colours of its image.
+    The points have the colours of its image.
     """
     with gc_paused():
         import cv2
@@ -165,10 +165,10 @@ def _capture(settings: Settings, uri: str) -> tuple[Frame, NDArray[np.float32], 
 
 def _record(cluster: Cluster, down: NDArray[np.float64]) -> dict[str, Any]:
     """One object above the ground, as JSON-able data."""
-    centre = cluster.centre_m
-    level = centre - (centre @ down) * down
     import numpy as np
 
+    centre = cluster.centre_m
+    level = centre - (centre @ down) * down
     numbers: dict[str, NDArray[Any]] = {
         "centre_m": centre,
         "size_m": cluster.size_m,

@@ -1,4 +1,7 @@
-"""Shared parts of the commands: one-line errors, and settings as flags (`--detector-image-size 320`)."""
+"""Shared parts of the commands: settings as flags (`--detector-image-size 320`), shared options.
+
+Also one-line errors, checks of values and options, and the warning for a model of rendered scenes.
+"""
 
 from __future__ import annotations
 

@@ -127,7 +127,7 @@ def collect(
 ) -> None:
     """Collect frames to label.
 
-    Those with tracks that were doubted, lost, or changed class, from recordings, or from a running
+    Writes those with tracks that were doubted, lost, or changed class, from recordings, or from a running
     service until Ctrl-C. The labels are the model's own boxes; correct them, then train with `companion
     train --data FOLDER`.
     """
@@ -169,7 +169,7 @@ def sightings(
 ) -> None:
     """Print the objects in recordings.
 
-    Each confirmed track, its fused position and 95 % error ellipse.
+    Prints each confirmed track with its fused position and 95 % error ellipse.
     """
     if as_geojson == as_kml:
         typer.echo("companion: expected --geojson or --kml, one of them", err=True)
@@ -189,7 +189,7 @@ def list_recordings(
     directory: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of recordings.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object per file.")] = False,
 ) -> None:
-    """List the recordings of a folder. One line each: vehicle, start, duration, size, flights."""
+    """List the recordings of a folder. Prints for each: vehicle, start, duration, size, flights."""
     with _with_library():
         from companion.flight_log import listed, summaries
         from companion.recording import RecordingError
@@ -208,7 +208,7 @@ def show_recording(
 ) -> None:
     """Show the contents of a recording.
 
-    Events, modes, arming, refused commands, images, depth, losses and damage.
+    Prints events, modes, arming, refused commands, images, depth, losses and damage.
     """
     with _with_library():
         from companion.flight_log import shown, summarize
@@ -247,7 +247,7 @@ def write_tlog(
 ) -> None:
     """Write the recorded MAVLink as a .tlog.
 
-    Both directions, for ground stations.
+    The file has both directions, for ground stations.
     """
     with _with_library():
         from companion.recording import RecordingError
@@ -268,7 +268,7 @@ def add_ulog(
 ) -> None:
     """Copy a recording and add PX4's log.
 
-    In the recording's time.
+    Converts the log's times to the recording's.
     """
     with _with_library():
         from companion.recording import RecordingError

@@ -68,7 +68,7 @@ def train(
 ) -> None:
     """Train a detector.
 
-    On labelled images (--data), or the default one on rendered scenes.
+    Trains it on labelled images (--data), or the default one on rendered scenes.
     """
     from companion.train import score_lines, train_default, train_on_data
     from vision.yolo.safe_pickle import CheckpointError

@@ -1,8 +1,9 @@
 """The chats of the page: plain sentences to a vehicle, by the same code as `companion ask`.
 
-A window has one chat for each vehicle. Its state is small and sent whole. What moves the vehicle is executed
-after the window has confirmed it. A stop of the vehicle ends what its chats do, another command the plans
-that wait. The code that reads sentences loads OpenCV, so it is imported in a thread, from the server's start.
+A window has one chat for each vehicle. Its state is small and sent whole. Commands that move the vehicle are
+sent after the window has confirmed them. A stop of the vehicle ends what its chats do, another command the
+plans that wait. The code that reads sentences loads OpenCV, so it is imported in a thread, from the server's
+start.
 """
 
 from __future__ import annotations

@@ -301,8 +301,8 @@ def create_app(fleet: Fleet, chats: Chats, access: Access) -> ASGIApp:
             return Response(status_code=204) if waited else PlainTextResponse("this plan has ended", 409)
         if not isinstance(text, str) or not 0 < len(text.strip()) <= MAX_SENTENCE_CHARACTERS:
             return PlainTextResponse(f"text: expected 1 to {MAX_SENTENCE_CHARACTERS} characters", 400)
-        busy = await chats.ask(window, bridge.vehicle, text)
-        return PlainTextResponse(busy, 429) if busy else Response(status_code=204)
+        reason = await chats.ask(window, bridge.vehicle, text)
+        return PlainTextResponse(reason, 429) if reason else Response(status_code=204)
 
     async def clock(_request: Request) -> Response:
         return JSONResponse({"now_ns": time.monotonic_ns()})

@@ -46,7 +46,7 @@ async def serve(session: zenoh.Session, vehicle: str, converse: Callable[[Operat
     """Answer queries until cancelled, one at a time; `stop` ends the one that is being answered.
 
     The payload is a sentence, the reply JSON: {"success": bool, "answer": str}. A sentence that comes
-    meanwhile is refused: it would be executed when its asker no longer expects it.
+    meanwhile is refused: its commands would be sent when its asker no longer expects it.
 
     Args:
         converse: makes the conversation, whose history all queries share.

@@ -33,7 +33,7 @@ POSE_LOST_S = 3.0
 TRUTH_RATE_HZ = 20.0
 POLL_S = 0.05
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
 
 class CameraError(Exception):

@@ -19,7 +19,7 @@ from mavlink_sim.wire.streams import GCS_RATES_HZ, ONBOARD_RATES_HZ
 if TYPE_CHECKING:
     from vision.camera_model import CameraModel
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
 FLEET_STEP_S = 0.004
 SLICES = 5  # the best slice is used, to exclude disturbances

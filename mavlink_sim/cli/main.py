@@ -110,7 +110,8 @@ def _refuse_options_before(context: typer.Context, command: str) -> None:
     for name in context.params:
         source = context.get_parameter_source(name)
         if source is not None and source.name == "COMMANDLINE":
-            _fail(f"--{name.replace('_', '-')} is not for {command}: give its options after the name")
+            option = f"--{name.replace('_', '-')}"
+            _fail(f"{option} is an option of mavlink-sim alone; give options of {command} after its name")
 
 
 def _check(name: str, value: float, low: float, high: float) -> None:

@@ -317,7 +317,7 @@ class _Coco:
         return {"images": self._images, "annotations": self._annotations, "categories": categories}
 
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
 
 class Layout(StrEnum):
