@@ -59,8 +59,11 @@ def test_every_command_in_documents_is_valid(words: list[str]) -> None:
     # A group passes the rest to its command, which must accept all of it.
     while hasattr(command, "resolve_command"):
         rest = [*context._protected_args, *context.args]
-        if not rest and getattr(command, "invoke_without_command", False):
-            return
+        if getattr(command, "invoke_without_command", False):
+            if not rest:
+                return
+            # Its own options are not for its commands, which refuse them when they run.
+            assert rest == words[1:], f"{' '.join(words)}: options before {rest[0]}"
         assert rest, f"{' '.join(words)}: no command"
         name, command, rest = command.resolve_command(context, rest)
         assert command is not None, f"{' '.join(words)}: no command {name!r}"

@@ -21,6 +21,7 @@ from companion.bus.client import NoAnswerError
 from companion.client import Drone
 from companion.client.commands import Reply
 from companion.dashboard.fleet import Fleet
+from companion.operator.reply_text import ENDED_BY_STOP
 from companion.plugins import PluginError, load_plugins
 from companion.settings import LanguageSection
 
@@ -41,7 +42,6 @@ _plan_numbers = itertools.count(1)
 _STOPPED_WITHIN_S = 1.0
 PLAN_S = 60.0
 """How long a plan waits for its confirmation."""
-ENDED_BY_STOP = "ended by stop"
 _OTHER_COMMAND = "another command was sent"
 _NOT_WATCHED = "the window was closed or hidden"
 _BUSY = "busy with another sentence; STOP ends it"

@@ -18,6 +18,7 @@ from companion.client import NoAnswerError
 from companion.language.conversation import Conversation, Operator
 from companion.language.endpoints import LanguageError
 from companion.language.sentences import is_stop
+from companion.operator.reply_text import ENDED_BY_STOP
 
 ASK = "ask"
 MAX_SENTENCE_BYTES = 2000
@@ -80,7 +81,7 @@ async def serve(session: zenoh.Session, vehicle: str, converse: Callable[[Operat
         running = loop.create_task(_attempt(conversation, text))
         try:
             await asyncio.wait((running,))
-            await reply(query, "ended by stop" if running.cancelled() else running.result(), lines.text)
+            await reply(query, ENDED_BY_STOP if running.cancelled() else running.result(), lines.text)
         finally:
             running.cancel()
             await asyncio.gather(running, return_exceptions=True)

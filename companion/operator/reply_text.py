@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+ENDED_BY_STOP = "ended by stop"  # the answer to a sentence that a stop ended
 _IN_PROGRESS = "in progress"  # the reason in the reply to an accepted endless command
 
 

@@ -17,7 +17,7 @@ from companion.bench.lockstep_flight import plain_settings
 from companion.bus.session import zenoh_config
 from companion.bus.topics import DETECTIONS, IMAGE
 from companion.cli import app
-from companion.collect import CHANGED, DoubtFinder, collect, live_frames
+from companion.collect import DoubtFinder, collect, live_frames
 from companion.guidance.core import GuidanceOptions
 from companion.recording.convert import Converter
 from companion.recording.encoding import dumps
@@ -55,7 +55,7 @@ def test_doubted_lost_and_changed_tracks_are_reasons() -> None:
     for sequence in range(4):
         assert finder.update(message(sequence, track(1, "car"), track(2, "dog", "tentative"))) == []
     assert finder.update(message(4, track(1, "car"), track(2, "dog", "tentative"))) == ["doubted dog 2"]
-    assert finder.update(message(5, track(1, "truck"))) == [f"{CHANGED} car 1 to truck"]
+    assert finder.update(message(5, track(1, "truck"))) == ["changed class car 1 to truck"]
     assert finder.update(message(6)) == ["lost truck 1"]
     assert finder.update(message(7)) == []
 

@@ -137,7 +137,7 @@ def test_hidden_call_in_a_checkpoint_is_not_run(tmp_path: Path, foreign: Classes
     ],
 )
 def test_misuse_of_allowed_names_is_rejected(tmp_path: Path, program: bytes, refused: str) -> None:
-    with pytest.raises(UnsafeCheckpointError, match=rf"{refused}.*; .* run"):
+    with pytest.raises(UnsafeCheckpointError, match=rf"{refused}.*; nothing was run"):
         load_checkpoint(archive(tmp_path / "evil.pt", program))
 
 
@@ -324,7 +324,7 @@ def test_a_truncated_file_is_rejected_at_every_length(tmp_path: Path, own_bytes:
 
 
 @pytest.mark.parametrize("step", [4999, pytest.param(997, marks=pytest.mark.slow)])
-def test_a_truncated_pickle_is_rejected_at_every_length(
+def test_truncated_pickle_is_rejected_at_several_lengths(
     tmp_path: Path, foreign_pickle: tuple[bytes, dict[str, bytes]], step: int
 ) -> None:
     pickled, members = foreign_pickle

@@ -106,7 +106,8 @@ def test_code_in_a_yolox_checkpoint_is_not_run(tmp_path: Path) -> None:
             return os.system, (f"touch {tmp_path / 'it-ran'}",)
 
     torch.save({"model": {}, "callback": Evil()}, tmp_path / "x.pth")
-    with pytest.raises(UnsafeCheckpointError, match=rf"pickle .*'{os.system.__module__}\.system'.* run"):
+    refused = rf"pickle .*'{os.system.__module__}\.system'.*nothing was run"
+    with pytest.raises(UnsafeCheckpointError, match=refused):
         load_yolox(tmp_path / "x.pth")
     assert not (tmp_path / "it-ran").exists()
 

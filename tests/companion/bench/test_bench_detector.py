@@ -67,7 +67,7 @@ def test_what_was_not_measured_before_says_so() -> None:
         "frames_per_s",
     )
     row = dict.fromkeys([*names, "memory_mb", "first_detection_s"], 1)
-    assert table({"rows": [row]}, {"rows": []})[1].endswith("measured before")
+    assert table({"rows": [row]}, {"rows": []})[1].endswith("not measured before")
 
 
 @pytest.mark.parametrize(

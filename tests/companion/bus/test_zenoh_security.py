@@ -162,7 +162,7 @@ async def test_dashboard_and_recorder_connect_with_the_childrens_file() -> None:
         ):
             begun = sorted([await lines.get(), await lines.get()])
             assert begun[0] == f"dashboard: http://127.0.0.1:{port}/"
-            assert begun[1].startswith("recorder: recording ")
+            assert begun[1].startswith("recorder: recording to ")  # _ROUTINE of companion.service.factory
             stream = await EventStream.open(port)
             while (news := await stream.next()) is not None and news["alive"] is not True:
                 pass

@@ -12,10 +12,11 @@ import pytest
 
 import companion.dashboard.chat
 from companion.bus import topics
-from companion.dashboard.chat import ENDED_BY_STOP, Chat, Chats
+from companion.dashboard.chat import Chat, Chats
 from companion.dashboard.fleet import Fleet
 from companion.language import conversation, serve
 from companion.language.sentences import is_stop
+from companion.operator.reply_text import ENDED_BY_STOP
 from companion.settings import LanguageSection, ZenohSection
 from tests.companion.cli.test_ask import QUESTION, RED_CAR, Service, service
 from tests.companion.dashboard.serving import POST, EventStream, request, serving
@@ -153,6 +154,7 @@ async def test_stop_is_sent_and_ends_the_plan_that_waits(way: str) -> None:
         await until(lambda: there.commands == ["stop"])
         await window.until(busy=False, plan=None)
         assert await window.post(plan=plan, fly=True) == 409
+        assert "stop" in ENDED_BY_STOP
         assert ENDED_BY_STOP in window.chat["exchanges"][0]["answer"]
         assert there.commands == ["stop"]
 

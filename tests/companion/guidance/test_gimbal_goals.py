@@ -232,10 +232,10 @@ def test_errors_name_what_to_give(text: str, parts: list[str]) -> None:
 def test_refused_command_gives_the_reason() -> None:
     flight = gimbal_flight(person(180.0, 12.0))
     flight.run(1.0)
-    assert "confirmed person" in refused(flight, "gimbal class=person")
+    assert "no confirmed person" in refused(flight, "gimbal class=person")
     flight.cameras = ()
     flight.run(1.0)
-    assert "fresh detections" in refused(flight, "gimbal class=person")
+    assert "no fresh detections" in refused(flight, "gimbal class=person")
 
 
 @pytest.mark.parametrize(

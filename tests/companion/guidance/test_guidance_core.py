@@ -337,6 +337,7 @@ def test_closing_ends_behaviour_and_stream() -> None:
     future = engaged(harness)
     harness.close()
     assert future.result() == Outcome(False, ENDING)
+    assert "service" in ENDING
     sent = len(harness.autopilot.setpoints)
     harness.run(0.5)
     assert len(harness.autopilot.setpoints) == sent

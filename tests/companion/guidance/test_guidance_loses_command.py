@@ -105,7 +105,7 @@ def test_stopped_streamer_ends_command() -> None:
     harness.streaming = False
     harness.run(0.1)
     outcome = harness.outcome(harness.command(HoldBehaviour()), 10.0)
-    assert_failed(outcome, "offboard ", "setpoint sent")
+    assert_failed(outcome, "offboard ", "no setpoint sent")
 
 
 def test_autopilot_failsafe_ends_command() -> None:

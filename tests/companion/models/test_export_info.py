@@ -37,7 +37,7 @@ def test_info_has_layout_size_and_task_of_an_export(tmp_path: Path) -> None:
         "outputs",
         "input",
     ]
-    assert "its boxes" in lines[3]
+    assert "only its boxes" in lines[3]
 
 
 def test_unknown_export_is_bad_input_in_one_line(tmp_path: Path) -> None:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+import queue
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 import zenoh
 
+from companion.bus.client import listen
 from companion.bus.topics import command_key
 from mavlink_sim.testing import QUICK_FLIGHT, running_simulator
 from tests.companion.service_process import ServiceProcess, running_service
@@ -54,6 +57,15 @@ def send_batch(session: zenoh.Session, start: int) -> list[bool]:
     return answers
 
 
+def pilot_of(service: ServiceProcess) -> dict[str, Any]:
+    """Of the next status."""
+    received: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+    with service.client() as session:
+        listen(session, "status", lambda _key, text: received.put(json.loads(text)))
+        pilot: dict[str, Any] = received.get(timeout=10)["pilot"]
+        return pilot
+
+
 def flood(service: ServiceProcess) -> tuple[int, float, float]:
     """(number of answers, MiB that the service grew by after the warm-up, seconds)."""
     began_s, answered, warm_mib = time.monotonic(), 0, 0.0
@@ -83,6 +95,7 @@ def test_flight_goes_on_through_100_000_bad_queries(filming: list[str], tmp_path
         assert answered == QUERIES
         assert growth_mib < GROWTH_MIB
         assert len(lines) < lasting_s + 10
-        assert not any("lost" in line for line in lines)
+        assert not any("lost" in line or "ended" in line for line in lines)
+        assert pilot_of(service)["behaviour"].startswith("orbiting")
         assert service.command("land")["success"]
         simulator.wait_for_event("disarmed")
