@@ -148,6 +148,7 @@ def test_copter_returns_when_heartbeats_of_our_system_end(
     bring_down(link)  # RTL allows no arming
     # Without a heartbeat the failsafe stays, and Copter does not arm; the simulated vehicle's ends earlier.
     services.flight(flight.driver)
+    link.ready = False  # that may be of the flight; in its failsafe Copter reports that it is not ready
     link.until(
         lambda: link.ready or "GCS Failsafe Cleared" in link.texts[already:], 10.0, "without a failsafe"
     )

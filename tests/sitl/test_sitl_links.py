@@ -152,7 +152,7 @@ def beside(flight: Flight, services: Services, tmp_path: Path) -> Iterator[Besid
     link.until(lambda: not flight.status["vehicle"]["other_commanders"], NAMED_S, "alone again")
 
 
-def test_two_services_of_one_name_name_each_other_and_the_later_refuses(beside: Beside) -> None:
+def test_two_services_of_one_name_are_reported_and_one_refuses(beside: Beside) -> None:
     first, link = beside.first, beside.first.link
     second = beside.start("vehicle1")
     named_s = link.until(lambda: beside.named() == {"mavlink", "zenoh"}, NAMED_S, "named both ways")
