@@ -347,7 +347,7 @@ def test_no_circular_imports(package: str) -> None:
 
 
 @pytest.mark.parametrize("package", ["companion", "vision", "mavlink_sim"])
-def test_every_part_stands_in_the_document(package: str) -> None:
+def test_every_part_is_in_the_document(package: str) -> None:
     document = (ROOT / "docs" / "architecture.md").read_text()
     names = {
         f"`{path.name}`" if path.suffix == ".py" else f"`{path.name}/`"

@@ -136,7 +136,7 @@ def test_saved_images_keep_their_names(two_squares: Path, tmp_path: Path) -> Non
     assert [line.split()[0] for line in lines] == ["boat.jpg", "boat.png", "squares.avi"]
 
 
-def test_save_folder_with_the_source_or_a_file_is_refused(two_squares: Path) -> None:
+def test_save_folder_of_the_source_or_that_is_a_file_is_refused(two_squares: Path) -> None:
     for source in (two_squares, two_squares.parent):
         with pytest.raises(ValueError, match=rf"--save {two_squares.parent}: .*source"):
             make_save_folder(two_squares.parent, str(source))

@@ -194,8 +194,10 @@ def test_play_exits_with_1_when_simulator_dies(tmp_path: Path, small: list[str])
         (("--vehicle-url", "udpin://127.0.0.1:14540", "--vehicles", "2"), "--vehicles"),
     ],
 )
+@pytest.mark.timeout(20)  # options that are not refused start everything here
 def test_play_refuses_invalid_options_in_one_line(tmp_path: Path, flags: tuple[str, ...], named: str) -> None:
-    done = companion_here("play", *flags, cwd=tmp_path)
+    endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    done = companion_here("play", "--zenoh-listen", endpoint, *flags, cwd=tmp_path)
     assert done.returncode == 2, done.stdout + done.stderr
     (line,) = done.stderr.splitlines()
     assert named in line

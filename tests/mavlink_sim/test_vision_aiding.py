@@ -64,7 +64,7 @@ def test_position_follows_vision_without_gnss_and_stays_valid() -> None:
     assert not vehicle.vehicle.vision.position_fused
 
 
-def test_vision_moves_nothing_while_gnss_is_fused_or_bits_off() -> None:
+def test_vision_moves_nothing_with_gnss_fused_or_its_bits_off() -> None:
     for control, lose in ((1, False), (0, True), (8, True)):
         vehicle = hovering(control)
         before = error(vehicle)

@@ -250,7 +250,7 @@ async def test_dead_camera_is_not_a_free_view(
     assert ("no object" in printed) is free
 
 
-async def test_questions_on_zenoh_are_answered_and_fly_what_they_may(
+async def test_zenoh_questions_are_answered_and_fly_what_is_allowed(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     async with service() as there:

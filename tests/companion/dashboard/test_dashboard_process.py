@@ -65,6 +65,7 @@ def test_command_serves_and_ends_on_ctrl_c(tmp_path: Path) -> None:
         (("--dashboard-token-file", "missing.txt"), "dashboard.token_file"),
     ],
 )
+@pytest.mark.timeout(20)  # an option that is not refused starts a server here
 def test_bad_options_are_refused_in_one_line(
     tmp_path: Path, flags: tuple[str, ...], named: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

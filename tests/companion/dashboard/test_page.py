@@ -376,7 +376,7 @@ def test_cameras_take_turns_and_stop_has_a_free_connection(browser: Browser) -> 
         tab.close()
 
 
-def test_page_shows_that_no_service_answers_and_its_states_age(browser: Browser) -> None:
+def test_page_shows_a_silent_service_and_the_age_of_its_state(browser: Browser) -> None:
     endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     with dashboard_command(endpoint) as url:
         tab = open_page(browser, url)

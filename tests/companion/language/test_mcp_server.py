@@ -77,7 +77,7 @@ async def calling(*allowed: str, vehicle: FlyingVehicle | None = None) -> AsyncI
     await tools.close()
 
 
-async def test_listed_tools_are_those_of_ask_and_say_what_is_allowed() -> None:
+async def test_listed_tools_are_those_of_ask_and_say_what_is_refused() -> None:
     async with calling("takeoff") as caller:
         tools = {tool.name: tool for tool in (await caller.client.list_tools()).tools}
     assert tools.keys() >= {*QUESTIONS, "takeoff", "land", "seek", "stop", "hold"}

@@ -59,7 +59,7 @@ def test_same_object_is_alike_and_another_colour_is_not() -> None:
     assert similarity(same, image_of(BLUE)) < 0.8
 
 
-def test_other_object_at_predicted_position_gets_no_track() -> None:
+def test_other_object_at_predicted_position_gets_a_new_track() -> None:
     tracker = Tracker()
     ids = []
     for frame in range(12):
