@@ -82,7 +82,8 @@ def test_command_flies_around_a_pillar(command: str, end: tuple[float, float]) -
 
 @pytest.mark.slow
 def test_approach_flies_around_a_pillar() -> None:
-    car = WorldObject(1, "car", (17.0, 1.5, 0.0), 1.2, appearance=3)
+    # Seen beside the pillar; the straight way would pass the pillar at 0.4 m.
+    car = WorldObject(1, "car", (17.0, -1.8, 0.0), 0.0, appearance=3)
     flown = Flight(car, detector=True)
     log = flown.fly("approach car distance=5 speed=2")
     flown.assert_passed(log)
