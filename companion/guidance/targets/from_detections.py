@@ -421,6 +421,7 @@ def _target(
         distance_m=math.hypot(*offset),
         distance_sigma_m=distance_sigma_m,
         cut=box.cut,
+        cut_above=top <= _edge_margin_px(detection["xyxy"], camera),
         range_sigma_m=sigma_m,
         across_sigma_m=across_sigma_m(*_range_and_drop(offset, sight.lens), box, pose.error),
         vehicle_sigma_m=pose.error.horizontal_m,
@@ -429,9 +430,13 @@ def _target(
 
 def _cut(xyxy: Sequence[float], camera: CameraModel) -> bool:
     """Whether the left, right or lower edge of the image may cut an object off, by its box."""
-    left, top, right, bottom = xyxy
-    margin_px = max(EDGE_PX, CUT_SIGMAS * edge_sigma_px(bottom - top, camera.width))
-    return min(left, camera.width - right, camera.height - bottom) <= margin_px
+    left, _, right, bottom = xyxy
+    return min(left, camera.width - right, camera.height - bottom) <= _edge_margin_px(xyxy, camera)
+
+
+def _edge_margin_px(xyxy: Sequence[float], camera: CameraModel) -> float:
+    """How near to the image's edge a box may be that the edge cuts off."""
+    return max(EDGE_PX, CUT_SIGMAS * edge_sigma_px(xyxy[3] - xyxy[1], camera.width))
 
 
 def _range_and_drop(offset: list[float], lens: list[float]) -> tuple[float, float]:

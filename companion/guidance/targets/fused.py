@@ -68,12 +68,14 @@ class _Track:
     def update(self, target: Target, vehicle: Vector3, covariance: NDArray[np.float64]) -> None:
         expected = self._motion.at(target.captured_ns)
         fit = expected.fit(target, vehicle)
-        if fit.squared > OUTLIER_SIGMA**2:
+        # Of an object that leaves the image at the top, a part is detected at last: its middle is elsewhere.
+        disagrees = self._disagrees(target, covariance)
+        if (disagrees and target.cut_above and not self.moving) or fit.squared > OUTLIER_SIGMA**2:
             self._leave_out(target, vehicle, covariance)
             return
         self._outliers = []
         self._motion = expected.update(fit)
-        if self.moving or self._disagrees(target, covariance):
+        if self.moving or disagrees:
             self._restart()
         self._forget((target.captured_ns - self._newest.captured_ns) / 1e9)
         self._add(target, covariance)

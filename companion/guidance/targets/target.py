@@ -55,7 +55,8 @@ class Target:
             marker's centre.
         depth_sigma_m, distance_sigma_m: one sigma of `depth_m` and of `distance_m`; NaN: not stated, as for
             a marker.
-        cut: the image's edge may cut the object off, so the box's centre is not the object's.
+        cut: the image's left, right or lower edge may cut the object off, so the box's centre is not the
+            object's. cut_above: the upper edge may.
         range_sigma_m: one sigma of `ground_range_m`; NaN: not stated.
         across_sigma_m: the same across the line of sight, horizontal.
         vehicle_sigma_m: one sigma of the vehicle's own horizontal position, on each axis, common to all of
@@ -77,6 +78,7 @@ class Target:
     depth_m: float = math.nan
     distance_m: float = math.nan
     cut: bool = False
+    cut_above: bool = False
     range_sigma_m: float = math.nan
     across_sigma_m: float = math.nan
     vehicle_sigma_m: float = 0.0

@@ -226,6 +226,19 @@ def test_object_that_leaves_the_image_keeps_its_position() -> None:
     assert not position_of(tracks).moving
 
 
+def test_part_of_an_object_that_leaves_at_the_top_is_left_out() -> None:
+    """The upper edge of the image hides more and more of a truck, at last its right half."""
+    tracks, vehicle = FusedTracks(), (0.0, 0.0, -5.0)
+    for frame in range(22):
+        east_m = -1.6 if frame >= 20 else 0.0
+        target = seen(vehicle, (20.0, east_m), frame, sigma_m=0.3, across_m=0.1)
+        tracks.update([replace(target, cut_above=frame >= 15)], vehicle, target.captured_ns)
+    assert position_of(tracks).position_ned_m[:2] == pytest.approx((20.0, 0.0))
+    third = replace(seen(vehicle, (20.0, -1.6), 22, sigma_m=0.3, across_m=0.1), cut_above=True)
+    tracks.update([third], vehicle, third.captured_ns)  # three that fit each other: it was moved
+    assert position_of(tracks).position_ned_m[:2] == pytest.approx((20.0, -1.6), abs=0.01)
+
+
 def test_cut_off_box_counts_until_the_object_is_seen_whole() -> None:
     tracks, vehicle = FusedTracks(), (0.0, 0.0, -5.0)
     for frame in range(3):

@@ -279,6 +279,15 @@ def test_box_within_the_error_of_its_edges_may_be_cut() -> None:
     boxes = [(left, 300, left + 60, 400) for left in (4, CAMERA.width - 64, 10, CAMERA.width - 70)]
     found = targets_from_detections(list(map(detection, boxes)), T0, CAMERA, MOUNT, history)
     assert [target.cut for target in found] == [True, True, False, False]
+    assert not any(target.cut_above for target in found)
+
+
+def test_box_at_the_upper_edge_is_cut_above_only() -> None:
+    history = history_of(quaternion_from_euler(0.0, 0.0, 0.0))
+    boxes = [detection((300, top, 360, top + 100)) for top in (0, 4, 10)]
+    found = targets_from_detections(boxes, T0, CAMERA, MOUNT, history)
+    assert [target.cut_above for target in found] == [True, True, False]
+    assert not any(target.cut for target in found)
 
 
 def test_contact_of_a_wide_box_is_less_known_beside_the_middle() -> None:
