@@ -123,6 +123,16 @@ def test_an_exported_file_carries_its_facts(exported: Any, checkpoint: Path, kin
     assert facts.source_sha256 == hashlib.sha256(checkpoint.read_bytes()).hexdigest()
 
 
+def test_openvino_does_not_report_its_use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    needs("openvino")
+    from openvino.tools.ovc.telemetry_utils import init_ovc_telemetry
+
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.delenv("CI", raising=False)
+    init_ovc_telemetry()  # as its converter does; to report, it would store who this is
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_export_is_written_beside_its_checkpoint(checkpoint: Path, tmp_path: Path) -> None:
     copy = tmp_path / "mine.pt"
     copy.write_bytes(checkpoint.read_bytes())
