@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mavlink_sim.camera.ground_view import Buffers
 from mavlink_sim.camera.renderer import Renderer
 from mavlink_sim.world.world import Ground, World, WorldObject
 from vision.attitude import Quaternion, quaternion_from_euler
@@ -176,13 +175,13 @@ def scene_frames(
         for index, (name, place, yaw) in enumerate(FURNITURE)
     )
     ground = Ground(("meadow", "grass"), seed, 512, 0.08)
-    buffers = Buffers(CAMERA.width, CAMERA.height)
+    renderer = Renderer(World((), ground), CAMERA, MOUNT)
     for index in range(round(seconds * rate_hz)):
         if index and rng.random() < drop:
             continue
         time_s = index / rate_hz
         objects = tuple(walker.at(number, time_s) for number, walker in enumerate(moving)) + fixed
-        renderer = Renderer(World(objects, ground), CAMERA, MOUNT, buffers=buffers)
+        renderer.place(objects)
         north, east = motion.position(time_s)
         rendered = renderer.render(
             (north, east, -HEIGHT_M), matrix_from_quaternion(motion.attitude_wxyz(time_s))

@@ -118,8 +118,8 @@ class CameraModel:
         which its polynomial ascends.
         """
         points = np.asarray(points_optical, np.float64).reshape(-1, 3)
-        pixels = np.full((len(points), 2), np.nan)
         if self.distortion_model == EQUIDISTANT:
+            pixels = np.full((len(points), 2), np.nan)
             across = np.sqrt((points[:, :2] ** 2).sum(axis=1))
             theta = np.arctan2(across, points[:, 2])
             seen = (theta <= _max_theta(self.distortion)) & (points.any(axis=1))
@@ -127,13 +127,10 @@ class CameraModel:
             scale = _equidistant(self.distortion, theta)[0] / np.where(across > 0.0, across, 1.0)
             pixels[seen] = (points[:, :2] * scale[:, None] * (self.fx, self.fy) + (self.cx, self.cy))[seen]
             return pixels
-        ahead = points[:, 2] > 1e-9
-        if ahead.any():
-            plane = points[ahead, :2] / points[ahead, 2:]
-            if self.distortion:
-                plane = _distorted(self.distortion, plane)
-            pixels[ahead] = plane * (self.fx, self.fy) + (self.cx, self.cy)
-        return pixels
+        plane = points[:, :2] / np.where(points[:, 2:] > 1e-9, points[:, 2:], np.nan)
+        if self.distortion:
+            plane = _distorted(self.distortion, plane)
+        return plane * (self.fx, self.fy) + (self.cx, self.cy)
 
     def rays(self, pixels: NDArray[Any]) -> NDArray[np.float64]:
         """(N, 2) pixels → (N, 3) unit vectors in the optical frame; NaN where no ray reaches the pixel.

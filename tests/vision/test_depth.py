@@ -17,6 +17,9 @@ from vision.sources.depth_images import to_metres
 HEIGHT, WIDTH = 48, 64
 SMALL = CameraModel.from_horizontal_fov(WIDTH, HEIGHT, math.radians(70.0))
 CAMERA = CameraModel.from_horizontal_fov(320, 240, math.radians(70.0))
+COLUMNS, ROWS = np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height))
+RAYS = CAMERA.rays(np.column_stack([COLUMNS.ravel(), ROWS.ravel()])).T
+RAYS /= RAYS[2]  # (3, pixels), at unit depth
 LEVEL = np.array([0.0, 1.0, 0.0])
 
 
@@ -123,27 +126,24 @@ def cuboid_scene(
 ) -> Scene:
     """By intersecting each pixel's ray with the ground and with the cuboid (slab method)."""
     ned_from_optical = CameraMount().ned_from_optical(matrix_from_euler(roll_rad, pitch_rad, 0.0))
-    columns, rows = np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height))
-    rays = CAMERA.rays(np.column_stack([columns.ravel(), rows.ravel()]))
-    rays /= rays[:, 2:]
-    directions = rays @ ned_from_optical.T
+    directions = ned_from_optical @ RAYS
     c, s = math.cos(yaw_rad), math.sin(yaw_rad)
     to_cuboid = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-    origin = to_cuboid @ np.array([-north_m, -east_m, -height_m])
+    origin = to_cuboid @ np.array([[-north_m], [-east_m], [-height_m]])
     length, width, tall = size_m
-    low, high = np.array([-length / 2, -width / 2, -tall]), np.array([length / 2, width / 2, 0.0])
+    low, high = np.array([[-length / 2], [-width / 2], [-tall]]), np.array([[length / 2], [width / 2], [0.0]])
     with np.errstate(divide="ignore", invalid="ignore"):
-        ground_m = np.where(directions[:, 2] > 1e-6, height_m / directions[:, 2], np.nan)
-        slopes = directions @ to_cuboid.T
+        ground_m = np.where(directions[2] > 1e-6, height_m / directions[2], np.nan)
+        slopes = to_cuboid @ directions
         first, second = (low - origin) / slopes, (high - origin) / slopes
-    enters, leaves = np.minimum(first, second).max(axis=1), np.maximum(first, second).min(axis=1)
+    enters, leaves = np.minimum(first, second).max(axis=0), np.maximum(first, second).min(axis=0)
     seen = (leaves >= enters) & (enters > 0.0)
     depth_m = np.where(seen, enters, ground_m).reshape(CAMERA.height, CAMERA.width).astype(np.float32)
     where = np.nonzero(seen.reshape(depth_m.shape))
     box = (0.0, 0.0, 0.0, 0.0)
     if len(where[0]):
         box = (where[1].min(), where[0].min(), where[1].max() + 1.0, where[0].max() + 1.0)
-    outside = np.maximum(np.abs(origin[:2]) - (length / 2, width / 2), 0.0)
+    outside = np.maximum(np.abs(origin[:2, 0]) - (length / 2, width / 2), 0.0)
     return Scene(depth_m, box, ned_from_optical[2], ned_from_optical, float(np.hypot(*outside)))
 
 

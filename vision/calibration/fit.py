@@ -138,7 +138,8 @@ class _Problem:
 
     def first_poses(self, model: CameraModel) -> tuple[Array, Array]:
         """The board's poses from homographies. Raises ValueError where there is none."""
-        poses = [_first_pose(view, model) for view in self.views]
+        rays = np.split(model.rays(self.corners), self.starts[1:])
+        poses = [_first_pose(view, seen) for view, seen in zip(self.views, rays, strict=True)]
         return np.array([rotation for rotation, _ in poses]), np.array([position for _, position in poses])
 
     def better_poses(
@@ -275,9 +276,8 @@ class _Problem:
         return Fit(model, rotations, positions, tuple(np.split(errors, self.starts[1:])), sigmas)
 
 
-def _first_pose(view: BoardView, model: CameraModel) -> tuple[Array, Array]:
-    """The board's rotation and position from the homography of its plane (Zhang 2000)."""
-    rays = model.rays(view.corners_px)
+def _first_pose(view: BoardView, rays: Array) -> tuple[Array, Array]:
+    """The board's rotation and position from the homography of its plane (Zhang 2000) and its corners' rays."""
     used = rays[:, 2] > _AHEAD  # NaN is not
     plane = rays[used, :2] / rays[used, 2:]
     homography = cv2.findHomography(view.points_m[used], plane)[0] if used.sum() >= 4 else None
