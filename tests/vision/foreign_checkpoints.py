@@ -9,6 +9,7 @@ import sys
 import types
 import zipfile
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -41,8 +42,13 @@ FOREIGN_NAMES = {"AreaAttention": "AAttn", "LargeKernelDWConv": "RepVGGDW"}
 
 def trained_model(description: ModelDescription | None = None, seed: int = 0) -> YoloModel:
     """A small network whose normalisations have statistics."""
+    return copy.deepcopy(_trained(description or yolov8_description(SMALL, NAMES), seed))
+
+
+@cache
+def _trained(description: ModelDescription, seed: int) -> YoloModel:
     torch.manual_seed(seed)
-    model = build(description or yolov8_description(SMALL, NAMES))
+    model = build(description)
     for _ in range(2):
         model(torch.rand(2, 3, 64, 64))
     return model.eval()

@@ -44,10 +44,22 @@ def eager_model(class_id: int = 2) -> YoloModel:
     return model
 
 
-@pytest.fixture
-def model_path(tmp_path: Path) -> Path:
-    save_checkpoint(tmp_path / "m.pt", eager_model(), metadata={"licence": "Apache-2.0"})
-    return tmp_path / "m.pt"
+@pytest.fixture(scope="module")
+def model_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("model") / "m.pt"
+    save_checkpoint(path, eager_model(), metadata={"licence": "Apache-2.0"})
+    return path
+
+
+@pytest.fixture(scope="module")
+def detector(model_path: Path) -> Detector:
+    return detector_of(model_path, image_size=64)
+
+
+@pytest.fixture(scope="module")
+def larger_detector(model_path: Path) -> Detector:
+    """Of inputs as large as the frame."""
+    return detector_of(model_path, image_size=128)
 
 
 @pytest.fixture
@@ -60,8 +72,8 @@ def detector_of(path: Path, **arguments: Any) -> Detector:
     return Detector(path, precision="float32", **arguments)
 
 
-def test_boxes_are_in_the_pixels_of_the_frame(model_path: Path, frame: np.ndarray[Any, Any]) -> None:
-    found = detector_of(model_path, image_size=64).detect(frame)
+def test_boxes_are_in_the_pixels_of_the_frame(detector: Detector, frame: np.ndarray[Any, Any]) -> None:
+    found = detector.detect(frame)
     # The input is half the frame's size; each cell of 32 predicts 2 × 2 cells around its centre.
     assert len(found) == 2
     assert set(found.names) == {"car"}
@@ -70,8 +82,7 @@ def test_boxes_are_in_the_pixels_of_the_frame(model_path: Path, frame: np.ndarra
     assert found.confidence[0] == pytest.approx(1 / (1 + np.exp(-1.0)), abs=1e-3)
 
 
-def test_a_frame_of_another_size_needs_no_new_detector(model_path: Path) -> None:
-    detector = detector_of(model_path, image_size=64)
+def test_a_frame_of_another_size_needs_no_new_detector(detector: Detector) -> None:
     for height, width in ((64, 128), (128, 96), (33, 250), (1, 1)):
         found = detector.detect(np.zeros((height, width, 3), np.uint8))
         assert np.all(found.xyxy >= 0)
@@ -85,7 +96,9 @@ def test_only_requested_classes_are_reported(model_path: Path, frame: np.ndarray
 
 
 @pytest.mark.parametrize("change", ["read-only", "mirrored", "a part of a larger one", "channels turned"])
-def test_frame_may_have_any_memory_layout(model_path: Path, frame: np.ndarray[Any, Any], change: str) -> None:
+def test_frame_may_have_any_memory_layout(
+    detector: Detector, larger_detector: Detector, frame: np.ndarray[Any, Any], change: str
+) -> None:
     larger = np.zeros((100, 200, 3), np.uint8)
     changed = {
         "read-only": frame.copy(),
@@ -96,10 +109,9 @@ def test_frame_may_have_any_memory_layout(model_path: Path, frame: np.ndarray[An
     if change == "a part of a larger one":
         changed[:] = frame
     changed.flags.writeable = change != "read-only"
-    for image_size in (64, 128):
-        detector = detector_of(model_path, image_size=image_size)
-        expected = detector.detect(np.ascontiguousarray(changed).copy())
-        np.testing.assert_array_equal(detector.detect(changed).xyxy, expected.xyxy)
+    for each in (detector, larger_detector):
+        expected = each.detect(np.ascontiguousarray(changed).copy())
+        np.testing.assert_array_equal(each.detect(changed).xyxy, expected.xyxy)
 
 
 def test_a_prepared_detector_detects_as_any_other(model_path: Path, frame: np.ndarray[Any, Any]) -> None:
@@ -110,9 +122,12 @@ def test_a_prepared_detector_detects_as_any_other(model_path: Path, frame: np.nd
 
 
 def test_sparse_boxes_equal_dense_boxes(
-    model_path: Path, frame: np.ndarray[Any, Any], monkeypatch: pytest.MonkeyPatch
+    model_path: Path,
+    larger_detector: Detector,
+    frame: np.ndarray[Any, Any],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    one_by_one = detector_of(model_path, image_size=128).detect(frame)
+    one_by_one = larger_detector.detect(frame)
     monkeypatch.setattr(detector_module, "_SPARSE_FROM", 2.0)
     whole = detector_of(model_path, image_size=128).detect(frame)
     np.testing.assert_allclose(one_by_one.xyxy, whole.xyxy, atol=1e-3)
@@ -129,8 +144,7 @@ def test_detection_is_timed_by_stage(model_path: Path, frame: np.ndarray[Any, An
     assert timing.total_ms == timing.preprocess_ms + timing.inference_ms + timing.postprocess_ms
 
 
-def test_detector_exposes_its_model_metadata(model_path: Path) -> None:
-    detector = detector_of(model_path, image_size=64)
+def test_detector_exposes_its_model_metadata(detector: Detector) -> None:
     assert detector.class_names == NAMES
     assert detector.metadata == {"licence": "Apache-2.0"}
     assert detector.description is not None
@@ -143,9 +157,9 @@ def test_nms_threshold_of_a_model_is_used_unless_one_is_given(
 ) -> None:
     metadata = {} if stated is None else {"nms_iou": stated}
     save_checkpoint(tmp_path / "m.pt", eager_model(), metadata=metadata)
-    boxes = detector_of(tmp_path / "m.pt", iou=given).detect(frame).xyxy
-    expected = detector_of(tmp_path / "m.pt", iou=used).detect(frame).xyxy
-    other = detector_of(tmp_path / "m.pt", iou=0.0 if used else 0.7).detect(frame).xyxy
+    boxes = detector_of(tmp_path / "m.pt", iou=given, image_size=64).detect(frame).xyxy
+    expected = detector_of(tmp_path / "m.pt", iou=used, image_size=64).detect(frame).xyxy
+    other = detector_of(tmp_path / "m.pt", iou=0.0 if used else 0.7, image_size=64).detect(frame).xyxy
     assert boxes.tolist() == expected.tolist()
     assert len(boxes) != len(other)
 
@@ -209,9 +223,9 @@ def test_a_class_whose_name_is_a_number_is_found_by_name() -> None:
     ],
     ids=["grey", "with alpha", "float", "empty"],
 )
-def test_invalid_frame_is_rejected(model_path: Path, image: np.ndarray[Any, Any]) -> None:
+def test_invalid_frame_is_rejected(detector: Detector, image: np.ndarray[Any, Any]) -> None:
     with pytest.raises(ValueError, match="frame"):
-        detector_of(model_path, image_size=64).detect(image)
+        detector.detect(image)
 
 
 def test_missing_model_is_a_one_line_error(tmp_path: Path) -> None:

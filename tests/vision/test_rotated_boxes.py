@@ -89,7 +89,7 @@ def test_checkpoint_and_its_export_find_the_same_boxes(
 
 def test_openvino_in_bfloat16_gives_nearly_the_sides(tmp_path: Path) -> None:
     pytest.importorskip("openvino", reason="openvino is an optional extra")
-    exported = export(checkpoint(tmp_path, "YOLO11"), "openvino", image_size=96)
+    exported = export(checkpoint(tmp_path, "YOLOv8"), "openvino", image_size=96)
     image = make_image(64, 96)
     try:
         rounded = runtime_of_file("openvino", exported, precision="bfloat16").infer(image)
@@ -110,7 +110,7 @@ def test_int8_export_keeps_sides_angles_and_classes_in_float(tmp_path: Path) -> 
     photographs.mkdir()
     for number in range(16):
         assert cv2.imwrite(str(photographs / f"{number:02}.png"), make_image(64, 64, seed=number))
-    exported = export(checkpoint(tmp_path, "YOLO11"), "onnx", image_size=64, calibrate=photographs)
+    exported = export(checkpoint(tmp_path, "YOLOv8"), "onnx", image_size=64, calibrate=photographs)
     nodes = onnx.load(str(exported)).graph.node
     int8 = {name for node in nodes if node.op_type == "DequantizeLinear" for name in node.output}
     convolutions = [node for node in nodes if node.op_type == "Conv"]

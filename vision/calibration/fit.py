@@ -277,7 +277,7 @@ class _Problem:
 
 
 def _first_pose(view: BoardView, rays: Array) -> tuple[Array, Array]:
-    """The board's rotation and position from the homography of its plane (Zhang 2000) and its corners' rays."""
+    """The board's rotation and position from the homography to its corners' rays (Zhang 2000)."""
     used = rays[:, 2] > _AHEAD  # NaN is not
     plane = rays[used, :2] / rays[used, 2:]
     homography = cv2.findHomography(view.points_m[used], plane)[0] if used.sum() >= 4 else None

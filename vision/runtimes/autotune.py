@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from vision.runtimes.base import Precision, RuntimeName, RuntimeUnusableError, version
+from vision.runtimes.base import Precision, RuntimeName, RuntimeUnusableError, required, version
 from vision.runtimes.source import ModelSource, read_source
 from vision.runtimes.start import start_named
 from vision.runtimes.stored_choice import StoredChoice
@@ -155,6 +155,7 @@ def main(text: str) -> int:
     request = json.loads(text)
     _end_with_parent(request.pop("parent_pid"))
     try:
+        required(request["runtime"])  # before torch is imported to read a checkpoint
         source = read_source(Path(request.pop("path")))
         answer: float | str = measure(source, **request)
     except (ValueError, RuntimeError, OSError, ImportError) as error:  # reported to the parent process

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.vision.runtimes.conftest import NAMES, lively_model, make_image
@@ -56,8 +56,10 @@ def exported(checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
     def of(kind: ExportKind) -> Path:
         needs(*{"onnx": ("onnx", "onnxruntime"), "openvino": ("openvino",)}.get(kind, ()))
         if kind not in made:
-            path = folder / f"net{SUFFIXES[kind]}"
-            made[kind] = export(checkpoint, kind, path, 96, model_family="YOLOv8")
+            (folder / kind).mkdir()
+            copy = folder / kind / "net.pt"
+            copy.write_bytes(checkpoint.read_bytes())
+            made[kind] = export(copy, kind, image_size=96, model_family="YOLOv8")
         return made[kind]
 
     return of
@@ -133,11 +135,10 @@ def test_openvino_does_not_report_its_use(tmp_path: Path, monkeypatch: pytest.Mo
     assert list(tmp_path.iterdir()) == []
 
 
-def test_export_is_written_beside_its_checkpoint(checkpoint: Path, tmp_path: Path) -> None:
-    copy = tmp_path / "mine.pt"
-    copy.write_bytes(checkpoint.read_bytes())
-    assert export(copy, "torchscript", image_size=64) == tmp_path / "mine.torchscript"
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.pt", "mine.torchscript"]
+def test_export_is_written_beside_its_checkpoint(exported: Any) -> None:
+    path = exported("torchscript")
+    assert path == path.parent / "net.torchscript"
+    assert sorted(path.name for path in path.parent.iterdir()) == ["net.pt", "net.torchscript"]
 
 
 def test_file_with_wrong_outputs_is_not_kept(
@@ -229,6 +230,7 @@ FACTS = ExportedFacts(
 names = st.text(min_size=1, max_size=20)
 
 
+@settings(max_examples=40)
 @given(
     class_names=st.lists(names, min_size=1, max_size=5).map(tuple),
     strides=st.lists(st.integers(1, 128), min_size=1, max_size=4).map(tuple),

@@ -88,7 +88,7 @@ def test_precisions_that_a_runtime_does_not_have_are_rejected(checkpoint: Path, 
 
 def test_auto_is_torch_if_only_torch_is_installed(checkpoint: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     only(monkeypatch, "torch")
-    detector = Detector(checkpoint, image_size=96, runtime="auto")
+    detector = Detector(checkpoint, image_size=96, runtime="auto", precision="float32")
     assert detector.runtime == "torch"
     assert "only installed" in detector.runtime_reason
 
