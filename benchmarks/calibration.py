@@ -182,12 +182,13 @@ def mount_error(seed: int) -> MountError:
     found: list[Marker] = []
     detector = MarkerDetector(MarkerKind("4X4_50", MARKER_M))
     effects = ImageEffects(blur_sigma_px=0.5, noise_sigma=2.0)
+    printed = Print("4X4_50", 7, MARKER_M)
+    world = World((), Ground(("concrete",), seed, 256, 0.05))
+    renderer = Renderer(world, lens, mount, effects, rng=rng)
     for _ in range(MOUNT_IMAGES):
         north, east = ahead[:2] * reach + rng.normal(0.0, 0.1, 2)
-        printed = Print("4X4_50", 7, MARKER_M)
-        plate = WorldObject(0, "plate", (float(north), float(east), 0.0), nose + heading, printed=printed)
-        world = World((plate,), Ground(("concrete",), seed, 256, 0.05))
-        renderer = Renderer(world, lens, mount, effects, rng=rng)
+        place = (float(north), float(east), 0.0)
+        renderer.place([WorldObject(0, "plate", place, nose + heading, printed=printed)])
         image = renderer.render((0.0, 0.0, -height_m), attitude).image
         found += detector.detect(image, lens)
     result = mount_from_markers(found, heading, roll, pitch)
