@@ -60,8 +60,7 @@ def start_runtime(
         RuntimeMissingError: the named runtime is not installed. There is no fallback.
         RuntimeUnusableError: it cannot run this file, or not in this precision.
     """
-    if choice != "auto" and choice not in RUNTIMES:
-        raise ValueError(f"runtime must be auto, {', '.join(RUNTIMES)}; got {choice!r}")
+    check_choice(choice)
     if device not in DEVICES:
         raise ValueError(
             f"device must be {' or '.join(DEVICES)}, got {device!r}; CUDA_VISIBLE_DEVICES selects one of "
@@ -91,6 +90,12 @@ def start_runtime(
     return SelectedRuntime(
         start_named(source, name, class_ids, precision, threads, image_size, sparse_boxes), reason
     )
+
+
+def check_choice(choice: str) -> None:
+    """Raise ValueError for what is no `RuntimeChoice`."""
+    if choice != "auto" and choice not in RUNTIMES:
+        raise ValueError(f"runtime must be auto, {', '.join(RUNTIMES)}; got {choice!r}")
 
 
 def check_runtime(source: ModelSource, choice: RuntimeChoice) -> None:
