@@ -105,6 +105,7 @@ class SyntheticDetector:
     ) -> None:
         self._gimbal = gimbal
         self._things, self._camera, self._mount = tuple(things), camera, mount
+        self._corners = [_corners(thing) for thing in things]
         self._with_depth, self._faults = with_depth, faults or Faults()
         self._rng = np.random.default_rng((seed, 71))
         self.class_names = tuple(dict.fromkeys(thing.class_name for thing in things if thing.class_name))
@@ -120,11 +121,7 @@ class SyntheticDetector:
         rng, faults = self._rng, self._faults
         boxes: list[NDArray[np.float64]] = []
         confidences, classes, nearest = [], [], []
-        outlines = [
-            outline
-            for index, thing in enumerate(self._things)
-            if (outline := self._outline(index, thing, eye, optical_from_ned, seconds)) is not None
-        ]
+        outlines = self._outlines(eye, optical_from_ned, seconds)
         for outline in outlines:
             thing = self._things[outline.thing]
             missed, shake = rng.random() < faults.missed, rng.normal(0.0, faults.jitter, 4)
@@ -168,33 +165,27 @@ class SyntheticDetector:
             np.array(nearest, np.float32),
         )
 
-    def _outline(
-        self,
-        index: int,
-        thing: SceneObject,
-        eye: NDArray[np.float64],
-        optical_from_ned: NDArray[np.float64],
-        seconds: float,
-    ) -> _Outline | None:
-        pose = thing.pose(seconds)
-        c, s = math.cos(pose.yaw_rad), math.sin(pose.yaw_rad)
-        turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        corners = CORNERS * thing.size_m
-        # As of real things, wheels and feet stand behind the surface; small things stand on nearly all of it.
-        inset_m = np.minimum(np.array(thing.size_m[:2]) / 8, CONTACT_INSET_M)
-        corners[ON_GROUND, :2] -= CORNERS[ON_GROUND, :2] * 2 * inset_m
-        corners = corners @ turn.T + (pose.north_m, pose.east_m, 0.0)
+    def _outlines(
+        self, eye: NDArray[np.float64], optical_from_ned: NDArray[np.float64], seconds: float
+    ) -> list[_Outline]:
+        """Of each object that is wholly ahead of the camera and partly in its image."""
+        corners = np.empty((len(self._things), len(CORNERS), 3))
+        for index, thing in enumerate(self._things):
+            pose = thing.pose(seconds)
+            c, s = math.cos(pose.yaw_rad), math.sin(pose.yaw_rad)
+            turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+            corners[index] = self._corners[index] @ turn.T + (pose.north_m, pose.east_m, 0.0)
         points = (corners - eye) @ optical_from_ned.T
-        if points[:, 2].min() < NEAR_M:
-            return None
-        pixels = self._camera.project(points)
-        whole = np.concatenate([pixels.min(axis=0), pixels.max(axis=0)]) + 0.5  # edges, not pixels
-        limits = np.array((float(self._camera.width), float(self._camera.height)) * 2)
-        shown = np.clip(whole, 0.0, limits)
-        area, kept = float(np.prod(whole[2:] - whole[:2])), float(np.prod(shown[2:] - shown[:2]))
-        if kept <= 0.0:
-            return None
-        return _Outline(index, shown, float(np.linalg.norm(points, axis=1).min()), kept / area)
+        pixels = self._camera.project(points).reshape(-1, len(CORNERS), 2)
+        wholes = np.concatenate([pixels.min(axis=1), pixels.max(axis=1)], axis=1) + 0.5  # edges, not pixels
+        shown = np.clip(wholes, 0.0, (float(self._camera.width), float(self._camera.height)) * 2)
+        areas, kept = (np.prod(boxes[:, 2:] - boxes[:, :2], axis=1) for boxes in (wholes, shown))
+        nearest_m = np.linalg.norm(points, axis=2).min(axis=1)
+        # NaN where a corner is behind the camera.
+        return [
+            _Outline(int(index), shown[index], float(nearest_m[index]), float(kept[index] / areas[index]))
+            for index in np.flatnonzero((points[:, :, 2].min(axis=1) >= NEAR_M) & (kept > 0.0))
+        ]
 
     def _nearest(
         self,
@@ -227,6 +218,15 @@ class SyntheticDetector:
         index = int(ranges_m.argmin())
         point: NDArray[np.float64] = rays[index] * (enters[index] if met[index] else math.nan)
         return point
+
+
+def _corners(thing: SceneObject) -> NDArray[np.float64]:
+    """(8, 3) from its middle on the ground."""
+    corners = CORNERS * thing.size_m
+    # As of real things, wheels and feet stand behind the surface; small things stand on nearly all of it.
+    inset_m = np.minimum(np.array(thing.size_m[:2]) / 8, CONTACT_INSET_M)
+    corners[ON_GROUND, :2] -= CORNERS[ON_GROUND, :2] * 2 * inset_m
+    return np.asarray(corners, np.float64)
 
 
 def _hidden(outline: _Outline, outlines: Sequence[_Outline]) -> float:
