@@ -95,8 +95,13 @@ def test_the_same_flight_has_no_differences(flight: Flight) -> None:
 
 
 def test_each_kind_of_difference_is_seen(ours: list[Received]) -> None:
-    few = {"ATTITUDE", "VFR_HUD", "COMMAND_ACK", "EXTENDED_SYS_STATE", "LOCAL_POSITION_NED"}
-    ours = [received for received in ours if received.kind in few]
+    # Of the streams a fifth is enough.
+    few = {"ATTITUDE": 5, "VFR_HUD": 5, "LOCAL_POSITION_NED": 5, "COMMAND_ACK": 1, "EXTENDED_SYS_STATE": 1}
+    ours = [
+        received
+        for kind, step in few.items()
+        for received in [received for received in ours if received.kind == kind][::step]
+    ]
 
     def keys(changed: list[Received]) -> set[str]:
         return {difference.key for difference in compare(ours, changed)}

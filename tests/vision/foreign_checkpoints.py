@@ -42,10 +42,14 @@ FOREIGN_NAMES = {"AreaAttention": "AAttn", "LargeKernelDWConv": "RepVGGDW"}
 
 def trained_model(description: ModelDescription | None = None, seed: int = 0) -> YoloModel:
     """A small network whose normalisations have statistics."""
-    return copy.deepcopy(_trained(description or yolov8_description(SMALL, NAMES), seed))
+    return copy.deepcopy(_small(seed)) if description is None else _trained(description, seed)
 
 
 @cache
+def _small(seed: int) -> YoloModel:
+    return _trained(yolov8_description(SMALL, NAMES), seed)
+
+
 def _trained(description: ModelDescription, seed: int) -> YoloModel:
     torch.manual_seed(seed)
     model = build(description)
