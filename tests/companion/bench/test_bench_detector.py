@@ -33,7 +33,9 @@ def bench(model: Path, *more: str) -> str:
     return result.output
 
 
-def test_measurement_has_all_figures_and_can_be_compared(small_model: Path, tmp_path: Path) -> None:
+def test_measurement_has_all_figures_and_can_be_compared(
+    small_model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     earlier = json.loads(bench(small_model, "--json", "--classes", "car"))
     (row,) = earlier["rows"]
     assert (row["runtime"], row["threads"], row["frames"]) == ("torch", 1, 6)
@@ -46,12 +48,14 @@ def test_measurement_has_all_figures_and_can_be_compared(small_model: Path, tmp_
     assert row["memory_mb"] > 10
     assert row["first_detection_s"] > 0
     (tmp_path / "earlier.json").write_text(json.dumps(earlier))
+    later = earlier | {"rows": [row | {"p50_ms": 2 * row["p50_ms"]}]}
+    monkeypatch.setattr("companion.bench.detector.measure_detectors", lambda *_, **__: later)
     heading, line = bench(small_model, "--against", str(tmp_path / "earlier.json")).splitlines()
     assert heading.split() == [
         "runtime", "precision", "threads", "fastest_ms", "p50_ms", "p99_ms", "around_p50_ms", "processor_ms",
         "frames_per_s", "memory_mb", "first_detection_s",
     ]  # fmt: skip
-    assert f"p50 was {row['p50_ms']} ms" in line
+    assert line.endswith(f"p50 was {row['p50_ms']} ms: 2.00 of it")
 
 
 def test_what_was_not_measured_before_says_so() -> None:

@@ -160,7 +160,8 @@ def test_precision_is_measured_on_one_thread_for_a_limited_time(monkeypatch: pyt
 
 
 @pytest.mark.usefixtures("with_bfloat16")
-def test_auto_measures_both_where_it_must() -> None:
+def test_auto_measures_both_where_it_must(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch_runtime_module, "_TRIAL_S", 0.05)
     runtime = TorchRuntime(lively_model())
     assert runtime.precision in ("float32", "bfloat16")
     assert runtime.precision_reason.startswith("measured")
