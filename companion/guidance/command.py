@@ -21,6 +21,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, fields, replace
+from functools import cache
 from typing import Any, ClassVar, TypeVar, dataclass_transform, get_args, get_type_hints
 
 from companion.geometry.points import points_from
@@ -343,10 +344,11 @@ def both_of(keys: Sequence[str]) -> str:
     return f"{'both ' if len(keys) == 2 else ''}{' and '.join(keys)}"
 
 
-def arguments_of(kind: type[Command]) -> list[tuple[Field[Any], Argument]]:
+@cache  # evaluates annotations: half a millisecond
+def arguments_of(kind: type[Command]) -> tuple[tuple[Field[Any], Argument], ...]:
     """The fields of a command with their argument types, in order."""
     hints = get_type_hints(kind, include_extras=True)
-    return [(field, get_args(hints[field.name])[1]) for field in fields(kind)]
+    return tuple((field, get_args(hints[field.name])[1]) for field in fields(kind))
 
 
 def default_of(field: Field[Any]) -> Any:
