@@ -278,9 +278,13 @@ def _behaviour_calls(tree: ast.AST) -> list[tuple[bool, str]]:
             method, looping = node.name, False
         looping = looping or isinstance(node, loops)
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr != method:
-            arguments = [ast.unparse(each) for each in (*node.args, *(word.value for word in node.keywords))]
-            steps = len(arguments) == 2 and (activates or "context" in arguments[1].lower())
-            if node.func.attr == "on_activate" or (node.func.attr == "update" and steps):
+            arguments = [*node.args, *(word.value for word in node.keywords)]
+            steps = (
+                node.func.attr == "update"
+                and len(arguments) == 2
+                and (activates or "context" in ast.unparse(arguments[1]).lower())
+            )
+            if steps or node.func.attr == "on_activate":
                 found.append((looping, ast.unparse(node)))
         for child in ast.iter_child_nodes(node):
             visit(child, method, looping)
