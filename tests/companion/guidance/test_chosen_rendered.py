@@ -35,7 +35,7 @@ class Flight:
         cameras: list[RenderedCamera] = []
 
         def camera(vehicle: LockstepVehicle) -> RenderedCamera:
-            cameras.append(RenderedCamera(settings, scene, vehicle, by_flight=True, depth=depth))
+            cameras.append(RenderedCamera(settings, scene, vehicle, rate_hz=5.0, by_flight=True, depth=depth))
             return cameras[0]
 
         self.flight = LockstepFlight.airborne(seed=seed, height_m=3.0, wind_mps=1.0, camera=camera)

@@ -76,6 +76,7 @@ async def test_flight_until_the_pilot_takes_over(kind: str) -> None:
             assert service.streamer.sent_count == sent
 
 
+@pytest.mark.slow
 async def test_goto_and_follow_path_with_the_built_in_vehicle() -> None:
     """By the telemetry's position: where goto ends, and the cross-track error of follow-path."""
     with running_simulator(speed=SPEED, seed=3, parameters=QUICK_FLIGHT) as simulator:

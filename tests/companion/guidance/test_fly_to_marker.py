@@ -82,18 +82,18 @@ def test_approach_stops_before_the_marker(seed: int) -> None:
 
 def test_follow_keeps_its_distance_to_a_moving_marker() -> None:
     def path(time_s: float) -> tuple[float, float]:
-        return AHEAD_M + 0.8 * min(time_s, 30.0), 0.5
+        return 8.0 + 0.8 * time_s, 0.5
 
     flight = flight_with(path, rate_hz=5.0)
     distances: list[float] = []
 
     def note() -> None:
-        if flight.seconds > 14.0:
+        if flight.seconds > 7.0:
             north, east, _ = flight.vehicle.truth.position_ned_m
             goal = path(flight.seconds)
             distances.append(math.hypot(goal[0] - north, goal[1] - east))
 
-    log = flight.fly("follow marker=7 distance=5 duration=22", 40.0, on_tick=note)
+    log = flight.fly("follow marker=7 distance=5 duration=14", 30.0, on_tick=note)
     assert log.outcome is not None
     assert log.outcome.success, log.outcome
     assert np.percentile(np.abs(np.array(distances) - 5.0), 90) < 0.8
@@ -101,7 +101,7 @@ def test_follow_keeps_its_distance_to_a_moving_marker() -> None:
 
 
 def test_orbit_circles_about_the_marker() -> None:
-    flight = flight_with(lambda _: (8.0, 0.0))
+    flight = flight_with(lambda _: (8.0, 0.0), rate_hz=5.0)
     radii: list[float] = []
 
     def note() -> None:
@@ -119,7 +119,7 @@ def test_marker_that_disappears_ends_the_command() -> None:
     def path(time_s: float) -> tuple[float, float]:
         return (AHEAD_M, 1.0) if time_s < 3.0 else FAR_AWAY
 
-    log = flight_with(path).fly("approach marker=7 distance=3 lost_timeout=2", 30.0)
+    log = flight_with(path, rate_hz=5.0).fly("approach marker=7 distance=3 lost_timeout=2", 30.0)
     assert log.outcome is not None
     assert not log.outcome.success
     assert reason(log).startswith("lost marker 7 for 2.")

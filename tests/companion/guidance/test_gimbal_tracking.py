@@ -123,9 +123,6 @@ def test_approach_with_tracking_keeps_the_object_in_view() -> None:
 
 def test_walking_person_is_followed_from_nearly_above() -> None:
     scene_object = SceneObject("person", PERSON_M, lambda seconds: ScenePose(8.0, seconds))
-    _, still = fly(command("follow person distance=2 duration=20"), scene_object)
-    assert_failed(still.outcome, "lost the ", "person ")
-
     _, log = fly(command("follow person distance=2 duration=20 gimbal=track"), scene_object)
     assert reason(log, True)
     assert max(off_rad(moment, scene_object) for moment in log.moments[20:]) < IN_THE_MIDDLE_RAD
@@ -150,7 +147,7 @@ def test_cut_off_object_gets_a_range_by_pointing_at_it(word: str) -> None:
     scene_object = SceneObject("car", (4.0, 1.8, 1.5), person(0.0, 9.0).pose)
     # an approach ends by itself long before; a follow holds there
     flight, log = fly(
-        command(f"{word} car distance=4 gimbal=track"), scene_object, begin_deg=-14.0, limit_s=30.0
+        command(f"{word} car distance=4 gimbal=track"), scene_object, begin_deg=-14.0, limit_s=15.0
     )
     first = next(seen for moment in log.moments for seen in moment.context.targets)
     assert first.position_ned_m is None

@@ -87,14 +87,15 @@ def test_patrol_with_approach_returns_to_its_path() -> None:
 
 @pytest.mark.parametrize("with_identity", [True, False])
 def test_same_object_stops_it_again_after_revisit_only(with_identity: bool) -> None:
-    car = SeenObject("car", 12.0, 5.0, track_id=7 if with_identity else None)
+    small = ((0.0, 0.0), (12.0, 0.0), (12.0, 12.0), (0.0, 12.0))
+    car = SeenObject("car", 6.0, 3.0, track_id=7 if with_identity else None)
     outcome, notes, _ = active(
-        PatrolBehaviour(ROUND, ["car"], laps=2.0, dwell_s=1.0, revisit_s=600.0), [car], 400
+        PatrolBehaviour(small, ["car"], laps=2.0, dwell_s=1.0, revisit_s=600.0), [car], 400
     )
     assert outcome is not None
     assert outcome.success, outcome.reason
     assert len(notes) == 1
-    behaviour = PatrolBehaviour(ROUND, ["car"], laps=2.0, dwell_s=1.0, revisit_s=20.0)
+    behaviour = PatrolBehaviour(small, ["car"], laps=2.0, dwell_s=1.0, revisit_s=10.0)
     outcome, notes, _ = active(behaviour, [car], 400)
     assert outcome is not None
     assert outcome.success, outcome.reason

@@ -75,7 +75,7 @@ def pitches(log: FlightLog) -> list[float]:
     return found
 
 
-@pytest.mark.parametrize("bearing_deg", [0.0, 150.0])
+@pytest.mark.parametrize("bearing_deg", [pytest.param(0.0, marks=pytest.mark.slow), 150.0])
 def test_sweep_finds_an_object_nearly_below(bearing_deg: float) -> None:
     scene_object = person(bearing_deg)
     flight, log, seen = fly("seek person sweep=-60", scene_object)
