@@ -6,8 +6,10 @@ import math
 from dataclasses import astuple
 
 import cv2
+import pytest
 
 from mavlink_sim.cli.bench import measure_camera, measure_fleet, measure_lockstep
+from vision.camera_model import CameraModel
 
 
 def test_lockstep_bench_has_every_figure() -> None:
@@ -22,7 +24,9 @@ def test_fleet_bench_reports_cpu_share() -> None:
     assert share > 0.0
 
 
-def test_camera_bench_restores_opencv_settings() -> None:
+def test_camera_bench_restores_opencv_settings(monkeypatch: pytest.MonkeyPatch) -> None:
+    small = CameraModel.from_horizontal_fov(64, 48, math.radians(70.0))
+    monkeypatch.setattr("mavlink_sim.camera.renderer.DEFAULT_CAMERA", small)
     before = cv2.getNumThreads()
     cv2.setNumThreads(2)
     try:

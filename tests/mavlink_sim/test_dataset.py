@@ -102,11 +102,11 @@ def test_yolo_labels_match_truth(tmp_path: Path) -> None:
 def test_coco_files_read_by_pycocotools(tmp_path: Path) -> None:
     coco = pytest.importorskip("pycocotools.coco", reason="COCO's own reader is not installed")
     folder = tmp_path / "set"
-    labels = make_dataset(folder, None, DatasetOptions(6, layout="coco", size=(160, 128), validation=0.5))
+    labels = make_dataset(folder, None, DatasetOptions(4, layout="coco", size=(160, 128), validation=0.5))
     found = ignored = 0
     for split in ("train", "val"):
         book = coco.COCO(str(folder / "annotations" / f"instances_{split}.json"))
-        assert len(book.getImgIds()) == 3
+        assert len(book.getImgIds()) == 2
         for image in book.loadImgs(book.getImgIds()):
             raster = cv2.imread(str(folder / "images" / split / image["file_name"]))
             assert raster is not None
@@ -199,7 +199,7 @@ Scenes = list[tuple[Image, Boxes, ClassIds]]
 
 @pytest.fixture(scope="module")
 def scenes() -> Scenes:
-    return [random_scene(np.random.default_rng((7, index)), 256, 256) for index in range(24)]
+    return [random_scene(np.random.default_rng((7, index)), 256, 256) for index in range(16)]
 
 
 def test_a_scene_follows_from_its_generator_alone() -> None:
@@ -236,8 +236,7 @@ def test_most_images_show_several_objects(scenes: Scenes) -> None:
     assert 3.0 < counts.mean() < 10.0
     assert counts.max() <= 14
     assert {int(name) for _, _, ids in scenes for name in ids} == set(range(len(CLASS_NAMES)))
-    empties = [len(random_scene(np.random.default_rng((1, n)), 64, 64)[2]) == 0 for n in range(40)]
-    assert any(empties)
+    assert any(len(random_scene(np.random.default_rng((1, n)), 64, 64)[2]) == 0 for n in range(40))
 
 
 def test_the_focal_length_is_within_what_was_asked() -> None:
@@ -274,7 +273,7 @@ def test_too_small_objects_have_negative_id() -> None:
 
 def test_flights_have_every_kind_of_distractor_and_far_objects() -> None:
     ranges, names = [], set()
-    for n in range(30):
+    for n in range(15):
         for item in flight_frame(np.random.default_rng((4, n)), 160, 128).objects:
             names.add(item.world_object.class_name)
             if item.world_object.class_name in CLASS_NAMES:

@@ -4,6 +4,7 @@ import itertools
 import math
 import statistics
 from bisect import bisect_left
+from collections.abc import Mapping
 from typing import Any
 
 import pytest
@@ -346,14 +347,16 @@ def test_full_thrust_climbs_and_drag_bounds_the_speed() -> None:
 REPORTED = {"LOCAL_POSITION_NED": 20.0, "GPS_RAW_INT": 8.0, "ATTITUDE": 50.0, "HIGHRES_IMU": 50.0}
 
 
-def holding(seconds: float, **options: Any) -> tuple[dict[str, list[Any]], list[Any], LockstepVehicle]:
+def holding(
+    seconds: float, rates_hz: Mapping[str, float] = REPORTED, **options: Any
+) -> tuple[dict[str, list[Any]], list[Any], LockstepVehicle]:
     """A vehicle holding its position in OFFBOARD: its messages by type, and the truth at the same time."""
-    vehicle = LockstepVehicle({"onboard": REPORTED}, **options)
+    vehicle = LockstepVehicle({"onboard": rates_hz}, **options)
     vehicle.take_off(5.0)
     vehicle.set_position(0.0, 0.0, -5.0, yaw_rad=0.0)
     vehicle.step(12.0)
     vehicle.receive()
-    reported: dict[str, list[Any]] = {name: [] for name in REPORTED}
+    reported: dict[str, list[Any]] = {name: [] for name in rates_hz}
     truths = []
     for _ in range(round(seconds / 0.05)):
         vehicle.step(0.05)
@@ -367,7 +370,7 @@ def holding(seconds: float, **options: Any) -> tuple[dict[str, list[Any]], list[
 def test_held_position_error_matches_real_vehicle() -> None:
     spreads, farthest = [], []
     for seed in range(6):
-        reported, _, _ = holding(40.0, seed=seed)
+        reported, _, _ = holding(40.0, {"LOCAL_POSITION_NED": 20.0}, seed=seed)
         positions = [(one.x, one.y, one.z) for one in reported["LOCAL_POSITION_NED"]]
         spreads.append([statistics.pstdev(axis) for axis in zip(*positions, strict=True)])
         farthest.append(max(math.hypot(x, y) for x, y, _ in positions))

@@ -311,7 +311,7 @@ def drawn(width: int, height: int, strip_rows: int, pose: tuple[float, float, fl
         return renderer.render((3.0, -2.0, -height_m), matrix_from_euler(roll_rad, pitch_rad, 0.7))
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(
     size=st.sampled_from([(1, 1), (1, 65), (7, 129), (64, 2), (90, 66), (160, 128)]),
     rows=st.sampled_from([1, 7, 64]),
