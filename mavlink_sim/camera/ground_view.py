@@ -135,7 +135,7 @@ def _painted_tile(ground: Ground) -> MipAtlas:
     if ground.road_east_m is not None:
         _paint_road(colours, ground, ground.road_east_m, north, east[0], rough)
     if ground.pad:
-        colours = _pad(colours, north, east)
+        _paint_pad(colours, north[:, 0], east[0])
     return mip_atlas(to_image(colours))
 
 
@@ -199,16 +199,19 @@ def _paint_road(
     colours[where] = blend_by_mask(part, _colour(226, 230, 230), marks)
 
 
-def _pad(colours: Plane, north: Plane, east: Plane) -> Plane:
-    """A round concrete pad of 2.2 m radius with a white ring and an H."""
+def _paint_pad(colours: Plane, north: Plane, east: Plane) -> None:
+    """Paint a round concrete pad of 2.2 m radius with a white ring and an H into the tile, in place."""
+    rows, columns = np.flatnonzero(np.abs(north) < 2.2), np.flatnonzero(np.abs(east) < 2.2)
+    where = np.ix_(rows, columns)
+    north, east = north[rows][:, None], east[columns][None, :]
     away = np.hypot(north, east)
     pad = np.clip((2.2 - away) * 12, 0, 1).astype(np.float32)
-    colours = blend_by_mask(colours, _colour(150, 152, 152), pad)
+    part = blend_by_mask(colours[where], _colour(150, 152, 152), pad)
     ring = np.abs(away - 1.85) < 0.14
     bars = (np.abs(np.abs(east) - 0.5) < 0.13) & (np.abs(north) < 0.85)
     cross = (np.abs(north) < 0.13) & (np.abs(east) < 0.5)
     marks = (ring | bars | cross).astype(np.float32)
-    return blend_by_mask(colours, _colour(236, 238, 238), marks)
+    colours[where] = blend_by_mask(part, _colour(236, 238, 238), marks)
 
 
 def draw_ground(world: World, view: View, buffers: Buffers, inverse_depth: Plane) -> Image:
