@@ -97,7 +97,7 @@ class Path:
 
     def direction(self, along_m: float) -> Vector3:
         """`PathPoint.direction` there, alone."""
-        return self._directions[self._part(along_m)[0]]
+        return self._directions[self._index(self._on_path(along_m))]
 
     def nearest(self, position: Vector3, from_m: float, to_m: float) -> float:
         """Distance along the path of the point nearest to `position`, between `from_m` and `to_m`."""
@@ -114,9 +114,12 @@ class Path:
     def _part(self, along_m: float) -> tuple[int, float]:
         """Index of the segment at a distance along the path, and the fraction of it."""
         along_m = self._on_path(along_m)
-        index = min(max(bisect_right(self._at, along_m) - 1, 0), len(self._points) - 2)
+        index = self._index(along_m)
         fraction = (along_m - self._at[index]) / (self._at[index + 1] - self._at[index])
         return index, min(max(fraction, 0.0), 1.0)
+
+    def _index(self, on_path_m: float) -> int:
+        return min(max(bisect_right(self._at, on_path_m) - 1, 0), len(self._directions) - 1)
 
     def _position(self, along_m: float) -> Vector3:
         """The position alone: `nearest` evaluates many."""

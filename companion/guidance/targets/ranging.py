@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -48,6 +49,11 @@ def sees_ground(camera: CameraModel, pitch_rad: float) -> bool:
     Args:
         pitch_rad: of the camera above the horizon, with the vehicle level.
     """
+    return _lower_edge_rad(camera) - pitch_rad > MIN_DEPRESSION_RAD
+
+
+@lru_cache(maxsize=8)
+def _lower_edge_rad(camera: CameraModel) -> float:
+    """Angle of the middle of the image's lower edge below the camera's axis."""
     _, down, forward = camera.rays(np.array([[camera.cx, camera.height - 1]]))[0]
-    below_axis_rad = math.atan2(down, forward)
-    return below_axis_rad - pitch_rad > MIN_DEPRESSION_RAD
+    return math.atan2(down, forward)
