@@ -29,7 +29,11 @@ def person(bearing_deg: float, distance_m: float = 4.0) -> SceneObject:
 
 
 def gimbal_flight(
-    *scene_objects: SceneObject, seed: int = 5, mount: CameraMount = ON_GIMBAL, **options: Any
+    *scene_objects: SceneObject,
+    seed: int = 5,
+    mount: CameraMount = ON_GIMBAL,
+    rate_hz: float = 5.0,
+    **options: Any,
 ) -> LockstepFlight:
     """In the air, with a detector that sees the objects through the gimbal's camera."""
     vehicles: list[LockstepVehicle] = []
@@ -41,7 +45,7 @@ def gimbal_flight(
 
     def camera(vehicle: LockstepVehicle) -> SyntheticCamera:
         vehicles.append(vehicle)
-        return SyntheticCamera(camera_settings(CAMERA, mount), detect=detector)
+        return SyntheticCamera(camera_settings(CAMERA, mount), detect=detector, rate_hz=rate_hz)
 
     # Box noise of the detector is tested elsewhere.
     detector = SyntheticDetector(

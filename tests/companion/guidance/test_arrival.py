@@ -145,7 +145,7 @@ def test_approach_fixes_its_goal_on_arrival(name: str, seed: int) -> None:
     mount = CameraMount(forward_m=0.1, pitch_rad=math.radians(-10.0))
     car = SceneObject("car", (4.2, 1.8, 1.5), lambda _: ScenePose(15.0, 3.0, 0.5))
     detector = SyntheticDetector([car], camera, mount, seed=seed, with_depth=True)
-    seeing = SyntheticCamera(camera_settings(camera, mount), detect=detector)
+    seeing = SyntheticCamera(camera_settings(camera, mount), detect=detector, rate_hz=5.0)
     flight = LockstepFlight.airborne(height_m=2.5, camera=lambda _: seeing, **air(name, seed))
     flight.turn_to(math.atan2(3.0, 15.0))
     outcome, hold = then_hold(flight, ApproachBehaviour("car", distance_m=5.0))

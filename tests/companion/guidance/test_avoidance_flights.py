@@ -42,7 +42,7 @@ class Flight:
             seed=seed,
             height_m=2.5,
             wind_mps=1.5,
-            camera=lambda vehicle: RenderedCamera(settings, self.scene, vehicle),
+            camera=lambda vehicle: RenderedCamera(settings, self.scene, vehicle, rate_hz=5.0),
             scene=self.scene,
         )
         self.flight.turn_to(0.0)
