@@ -67,14 +67,10 @@ def test_plugin_flies_its_circle(installed: Path, monkeypatch: pytest.MonkeyPatc
 @pytest.mark.timeout(200)
 @pytest.mark.vehicle(parameters=QUICK_FLIGHT)
 def test_service_flies_an_installed_plugin(
-    installed: Path,
-    vehicle: RunningSimulator,
-    filming: list[str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    installed: Path, vehicle: RunningSimulator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(installed), os.environ.get("PYTHONPATH", "")]))
-    flags = [*filming, "--plugins-modules", "circle"]
+    flags = ["--source", "none", "--plugins-modules", "circle"]
     with running_service(vehicle.onboard_port, flags, cwd=tmp_path) as service:
         service.take_off(3.0)
         send = [
