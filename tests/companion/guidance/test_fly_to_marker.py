@@ -128,7 +128,7 @@ def test_marker_that_disappears_ends_the_command() -> None:
 
 
 def test_other_marker_and_one_seen_briefly_are_not_flown_to() -> None:
-    other = flight_with(lambda _: (6.0, 0.0))
+    other = flight_with(lambda _: (6.0, 0.0), rate_hz=5.0)
     log = other.fly("approach marker=8 lost_timeout=1.5", 20.0)
     assert "never seen" in reason(log)
     assert math.dist(other.vehicle.truth.position_ned_m[:2], (0.0, 0.0)) < 1.0
@@ -138,7 +138,8 @@ def test_other_marker_and_one_seen_briefly_are_not_flown_to() -> None:
 
     log = flight_with(glimpse).fly("approach marker=7 lost_timeout=2", 20.0)
     assert UNCONFIRMED_MARKER in reason(log)
-    assert "no localized 'marker 7'" in reason(flight_with(lambda _: FAR_AWAY).fly("orbit marker=7", 20.0))
+    unseen = flight_with(lambda _: FAR_AWAY, rate_hz=5.0)
+    assert "no localized 'marker 7'" in reason(unseen.fly("orbit marker=7", 20.0))
 
 
 def test_marker_needs_detection_with_the_steering_camera() -> None:

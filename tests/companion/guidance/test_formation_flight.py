@@ -227,15 +227,15 @@ def test_virtual_structure_flies_its_path_and_ends() -> None:
 
 def test_next_vehicle_takes_over_the_virtual_structure() -> None:
     fleet = flying(3)
-    points = ((0.0, 0.0), (40.0, 0.0))
+    points = ((0.0, 0.0), (24.0, 0.0))
     for name in "abc":
         fleet.command(name, FormationBehaviour("line", "virtual", points=points))
-    fleet.run(14.0)
+    fleet.run(8.0)
     fleet.members["a"].muted = fleet.members["a"].deaf = True
     assert fleet.run_until(lambda: all(fleet.members[name].outcome for name in "bc"), 90.0)
     assert all(ended(fleet, name).success for name in "bc")
     norths = [fleet.members[name].airframe.place()[0] for name in "bc"]
-    assert norths == pytest.approx([40.0, 40.0], abs=1.5)
+    assert norths == pytest.approx([24.0, 24.0], abs=1.5)
 
 
 def test_hovering_vehicle_is_flown_around() -> None:

@@ -186,7 +186,7 @@ def test_message_has_the_capture_time_pose_and_covariance() -> None:
 
 @pytest.mark.parametrize("seed", [pytest.param(1, marks=pytest.mark.slow), 6])
 def test_without_gnss_above_a_map_the_vehicle_holds_0_3_m(tmp_path: Path, seed: int) -> None:
-    flight = flight_above(tmp_path, seed, rate_hz=8.0)
+    flight = flight_above(tmp_path, seed, rate_hz=6.0)
     flight.run(1.0)
     flight.vehicle.vehicle.faults.begin("gps_loss")
     flight.run(0.5)
