@@ -25,9 +25,8 @@ FENCE_BREACHED = (5, "Circle fence breached")
 TARGET_FRAME_REFUSED = "Plnd: Frame not supported "
 
 
-@pytest.fixture
-def copter() -> LockstepVehicle:
-    """Ready to be armed, in STABILIZE, with a companion's heartbeat."""
+@pytest.fixture(scope="module")
+def ready() -> LockstepVehicle:
     vehicle = LockstepVehicle(autopilot="ardupilot", seed=4, ready_after_s=0.0)
     vehicle.send(dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
     vehicle.step(0.1)
@@ -35,10 +34,23 @@ def copter() -> LockstepVehicle:
 
 
 @pytest.fixture
-def flying(copter: LockstepVehicle) -> LockstepVehicle:
-    copter.take_off(6.0)
-    copter.step(3.0)
-    return copter
+def copter(ready: LockstepVehicle) -> LockstepVehicle:
+    """Ready to be armed, in STABILIZE, with a companion's heartbeat."""
+    return ready.copy()
+
+
+@pytest.fixture(scope="module")
+def flown(ready: LockstepVehicle) -> LockstepVehicle:
+    vehicle = ready.copy()
+    vehicle.take_off(6.0)
+    vehicle.step(3.0)
+    return vehicle
+
+
+@pytest.fixture
+def flying(flown: LockstepVehicle) -> LockstepVehicle:
+    """In the air, in GUIDED."""
+    return flown.copy()
 
 
 def texts(vehicle: LockstepVehicle) -> list[tuple[int, str]]:

@@ -23,9 +23,9 @@ def flight(seed: int, links: dict[str, dict[str, float]] | None = None) -> tuple
     vehicle = LockstepVehicle(
         {"onboard": ONBOARD_RATES_HZ, "gcs": GCS_RATES_HZ} if links is None else links, seed=seed
     )
-    vehicle.take_off(4.0)
-    vehicle.set_position(3.0, 2.0, -5.0, yaw_rad=0.5)
-    vehicle.step(5.0)
+    vehicle.take_off(2.5)
+    vehicle.set_position(3.0, 2.0, -3.0, yaw_rad=0.5)
+    vehicle.step(3.0)
     vehicle.land()
     vehicle.stop_setpoints()
     digest = hashlib.sha256()
@@ -271,7 +271,7 @@ def test_copy_flies_byte_equal(autopilot: str, options: dict[str, Any]) -> None:
         wind_mps=3.0,
         **options,
     )
-    first.take_off(4.0)
+    first.take_off(2.5)
     first.repeat(dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3), 1.0)
     first.vehicle.faults.begin("gps_loss for=0.5")
     first.vehicle.faults.begin("wind 4 at=60")
@@ -283,7 +283,7 @@ def test_copy_flies_byte_equal(autopilot: str, options: dict[str, Any]) -> None:
     second = first.copy()
     for vehicle in (first, second):
         vehicle.send_bytes(half[9:])
-        vehicle.step(6.0)
+        vehicle.step(3.0)
     assert all_messages(first) == all_messages(second)
     assert first.events == second.events
     assert any("mode LAND" in event for event in second.events)

@@ -202,7 +202,9 @@ def test_close_to_home_a_return_turns_to_the_heading_of_home(
     assert math.degrees(harness.vehicle.airframe.yaw_rad) == pytest.approx(landed_deg, abs=3.0)
 
 
-@pytest.mark.parametrize(("seed", "wind_mps"), [(0, 0.0), (1, 0.0), (2, 5.0)])
+@pytest.mark.parametrize(
+    ("seed", "wind_mps"), [*(pytest.param(seed, 0.0, marks=pytest.mark.slow) for seed in (0, 1)), (2, 5.0)]
+)
 def test_return_in_moving_air_ends_at_home_too(seed: int, wind_mps: float) -> None:
     harness = SimHarness(gusts_mps=None, seed=seed, wind_mps=wind_mps)
     harness.take_off(6.0)

@@ -120,5 +120,5 @@ def test_flight_in_gusts_counts_as_following(autopilot: str) -> None:
     flight = LockstepFlight.airborne(seed=4, height_m=6.0, wind_mps=3.0, gusts_mps=0.6, autopilot=autopilot)
     for command in ("goto forward=20 right=10 speed=4", "orbit radius=6 speed=2", "hold"):
         flight.command(command)
-        flight.run(12.0)
+        flight.run(8.0)
     assert not [event for event in flight.events if event.kind is EventKind.LOST]

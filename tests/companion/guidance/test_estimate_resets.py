@@ -82,7 +82,7 @@ def test_hard_manoeuvres_are_not_resets(autopilot: str) -> None:
     flight = airborne(autopilot)
     for command in ("goto 20 0 speed=5", "goto 0 0 speed=5", "orbit radius=6 speed=3", "stop"):
         flight.command(command)
-        flight.run(8.0)
+        flight.run(5.0)
     assert flight.state.reset_count == 0
     assert flight.state.reset_offset_ned_m == (0.0, 0.0, 0.0)
 
