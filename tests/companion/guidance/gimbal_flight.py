@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from functools import cache
 
 from benchmarks.rendered import camera_settings
 from companion.bench.lockstep_flight import LockstepFlight
+from companion.bench.simulated_driver import GIMBAL_RATES_HZ, RATES_HZ, SimulatedDriver
 from companion.bench.synthetic_camera import SyntheticCamera
 from companion.bench.synthetic_detector import Faults, SceneObject, ScenePose, SyntheticDetector
 from companion.guidance.search_pattern import Footprint
@@ -28,27 +29,35 @@ def person(bearing_deg: float, distance_m: float = 4.0) -> SceneObject:
     return SceneObject("person", PERSON_M, lambda _: pose)
 
 
+@cache
+def in_the_air(seed: int, wind_mps: float) -> LockstepVehicle:
+    """It flies there once: the tests fly copies, which are equal bit for bit."""
+    vehicle = LockstepVehicle(
+        {"onboard": RATES_HZ | GIMBAL_RATES_HZ}, seed=seed, wind_mps=wind_mps, gimbal=True
+    )
+    vehicle.take_off(HEIGHT_M)
+    return vehicle
+
+
 def gimbal_flight(
     *scene_objects: SceneObject,
     seed: int = 5,
     mount: CameraMount = ON_GIMBAL,
     rate_hz: float = 5.0,
-    **options: Any,
+    wind_mps: float = 0.0,
 ) -> LockstepFlight:
     """In the air, with a detector that sees the objects through the gimbal's camera."""
-    vehicles: list[LockstepVehicle] = []
+    vehicle = in_the_air(seed, wind_mps).copy()
 
     def gimbal_attitude() -> Quaternion:
-        gimbal = vehicles[0].vehicle.gimbal
+        gimbal = vehicle.vehicle.gimbal
         assert gimbal is not None
         return gimbal.quaternion
-
-    def camera(vehicle: LockstepVehicle) -> SyntheticCamera:
-        vehicles.append(vehicle)
-        return SyntheticCamera(camera_settings(CAMERA, mount), detect=detector, rate_hz=rate_hz)
 
     # Box noise of the detector is tested elsewhere.
     detector = SyntheticDetector(
         scene_objects, CAMERA, mount, seed=seed, faults=Faults(0.0, 0.05, 0.0, 0.0), gimbal=gimbal_attitude
     )
-    return LockstepFlight.airborne(seed=seed, height_m=HEIGHT_M, camera=camera, gimbal=True, **options)
+    settings = camera_settings(CAMERA, mount)
+    camera = SyntheticCamera(settings, detect=detector, rate_hz=rate_hz)
+    return LockstepFlight(SimulatedDriver(vehicle), settings, [camera])
