@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import zenoh
+from pymavlink.dialects.v20 import common as mavlink
 
 from companion.bus.client import client_settings, open_client, send_command
 from companion.settings import ZenohSection
@@ -109,6 +110,30 @@ class ServiceProcess:
             raise
         finally:
             self._reader.join(10)
+
+
+@contextmanager
+def heartbeats() -> Iterator[int]:
+    """An autopilot on the ground that sends only heartbeats, of which a service becomes ready; yields the port.
+
+    For tests that neither fly nor read telemetry: a simulator costs as much of the processor as the service.
+    """
+    port, ended = free_port(), threading.Event()
+    codec = mavlink.MAVLink(None, 1, 1)
+    message = mavlink.MAVLink_heartbeat_message(2, 12, 29, 0x03040000, 3, 3)
+
+    def send() -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            while not ended.wait(0.2):
+                sender.sendto(message.pack(codec), ("127.0.0.1", port))
+
+    sending = threading.Thread(target=send, name="heartbeats", daemon=True)
+    sending.start()
+    try:
+        yield port
+    finally:
+        ended.set()
+        sending.join()
 
 
 @contextmanager

@@ -20,12 +20,13 @@ import zenoh
 from companion.bus.client import listen
 from companion.bus.topics import command_key
 from mavlink_sim.testing import QUICK_FLIGHT, RunningSimulator, free_port, running_simulator
-from tests.companion.service_process import ServiceProcess, running_service
+from tests.companion.service_process import ServiceProcess, heartbeats, running_service
 
 pytestmark = pytest.mark.realtime
 
 # COM_OF_LOSS_T of the simulated vehicle (PX4's default), and the tolerance.
 LOSS_S, ALLOWED_S = 1.0, 0.5
+NO_CAMERA = ("--source", "none")
 
 
 def truth(path: Path) -> list[dict[str, Any]]:
@@ -54,10 +55,10 @@ def fly(service: ServiceProcess) -> None:
     assert service.command("hold") == {"command": "hold", "success": True, "reason": "in progress"}
 
 
-def test_ardupilot_works_with_default_settings(seeing: list[str], tmp_path: Path) -> None:
+def test_ardupilot_works_with_default_settings(tmp_path: Path) -> None:
     with (
         running_simulator(autopilot="ardupilot") as simulator,
-        running_service(simulator.onboard_port, seeing, cwd=tmp_path) as service,
+        running_service(simulator.onboard_port, NO_CAMERA, cwd=tmp_path) as service,
         service.client() as session,
     ):
         received: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
@@ -70,36 +71,24 @@ def test_ardupilot_works_with_default_settings(seeing: list[str], tmp_path: Path
             vehicle = received.get(timeout=10)["vehicle"]
 
 
-@pytest.mark.parametrize("driver", ["mavsdk", "pymavlink"])
-def test_flight_by_commands_with_a_subscriber(driver: str, seeing: list[str], tmp_path: Path) -> None:
+def test_flight_by_commands_with_the_mavsdk_driver(tmp_path: Path) -> None:
     with (
         running_simulator(parameters=QUICK_FLIGHT) as simulator,
-        running_service(simulator.onboard_port, [*seeing, "--driver", driver], cwd=tmp_path) as service,
-        service.client() as session,
+        running_service(
+            simulator.onboard_port, [*NO_CAMERA, "--driver", "mavsdk"], cwd=tmp_path
+        ) as service,
     ):
-        received: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
-        listen(session, "detections", lambda _key, text: received.put(json.loads(text)))
         service.take_off(2.5)
         assert service.command("orbit radius=3 speed=1")["success"]
-        refused = service.command("seek bicycle")
-        assert not refused["success"]
-        assert " class 'bicycle'" in refused["reason"]
         assert service.command("land")["success"]
         simulator.wait_for_event("disarmed")
-        messages = [received.get(timeout=10) for _ in range(30)]
-    published = [message["published_ns"] for message in messages]
-    assert published == sorted(published)
-    # Numbers may be skipped (newest frame wins) but never repeat.
-    sequences = [message["sequence"] for message in messages]
-    assert sequences == sorted(set(sequences))
-    assert all(m["captured_ns"] <= m["inferred_ns"] <= m["published_ns"] for m in messages)
 
 
-def test_stopped_service_does_not_retake_command(filming: list[str], tmp_path: Path) -> None:
+def test_stopped_service_does_not_retake_command(tmp_path: Path) -> None:
     path = tmp_path / "truth.jsonl"
     with (
         running_simulator(truth=path, parameters=QUICK_FLIGHT) as simulator,
-        running_service(simulator.onboard_port, filming, cwd=tmp_path) as service,
+        running_service(simulator.onboard_port, NO_CAMERA, cwd=tmp_path) as service,
     ):
         fly(service)
         stopped_ns = time.monotonic_ns()
@@ -124,7 +113,7 @@ def assert_ends_in_hold(service: ServiceProcess, simulator: RunningSimulator, nu
     simulator.wait_for_event("mode HOLD", since=offboard)
 
 
-def test_killed_perception_worker_is_replaced_in_flight(seeing: list[str], tmp_path: Path) -> None:
+def test_flight_with_detections_survives_a_killed_worker(seeing: list[str], tmp_path: Path) -> None:
     path = tmp_path / "truth.jsonl"
     with (
         running_simulator(truth=path, parameters=QUICK_FLIGHT) as simulator,
@@ -133,7 +122,13 @@ def test_killed_perception_worker_is_replaced_in_flight(seeing: list[str], tmp_p
     ):
         statuses: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
         listen(session, "status", lambda _key, text: statuses.put(json.loads(text)))
-        fly(service)
+        received: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+        listen(session, "detections", lambda _key, text: received.put(json.loads(text)))
+        service.take_off(2.5)
+        assert service.command("orbit radius=3 speed=1")["success"]
+        refused = service.command("seek bicycle")
+        assert not refused["success"]
+        assert " class 'bicycle'" in refused["reason"]
         before = statuses.get(timeout=10)["perception"]
         while not statuses.empty():
             before = statuses.get()["perception"]
@@ -152,12 +147,20 @@ def test_killed_perception_worker_is_replaced_in_flight(seeing: list[str], tmp_p
         assert after["restarts"] == 1
         assert truth(path)[-1]["mode"] == "OFFBOARD"
         assert_ends_in_hold(service, simulator, signal.SIGINT)
+    messages = [received.get(timeout=10) for _ in range(received.qsize())]
+    assert len(messages) >= 30
+    published = [message["published_ns"] for message in messages]
+    assert published == sorted(published)
+    # Numbers may be skipped (newest frame wins) but never repeat.
+    sequences = [message["sequence"] for message in messages]
+    assert sequences == sorted(set(sequences))
+    assert all(m["captured_ns"] <= m["inferred_ns"] <= m["published_ns"] for m in messages)
 
 
-def test_lost_vehicle_is_reconnected_and_held_at_shutdown(filming: list[str], tmp_path: Path) -> None:
+def test_lost_vehicle_is_reconnected_and_held_at_shutdown(tmp_path: Path) -> None:
     with (
         running_simulator(parameters=QUICK_FLIGHT) as first,
-        running_service(first.onboard_port, filming, cwd=tmp_path) as service,
+        running_service(first.onboard_port, NO_CAMERA, cwd=tmp_path) as service,
     ):
         fly(service)
         first.kill()
@@ -189,10 +192,8 @@ def test_frames_from_ffmpeg_on_standard_input(exported_model: Path, tmp_path: Pa
     ]
     try:
         with (
-            running_simulator() as simulator,
-            running_service(
-                simulator.onboard_port, flags, cwd=tmp_path, stdin=writer.stdout.fileno()
-            ) as service,
+            heartbeats() as port,
+            running_service(port, flags, cwd=tmp_path, stdin=writer.stdout.fileno()) as service,
             service.client() as session,
         ):
             received: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
@@ -205,29 +206,34 @@ def test_frames_from_ffmpeg_on_standard_input(exported_model: Path, tmp_path: Pa
         writer.stdout.close()
 
 
-def test_failure_notes_the_services_last_lines(tmp_path: Path) -> None:
+def test_failure_notes_the_services_last_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    program = tmp_path / "python"
+    program.write_text("#!/bin/sh\necho ready: commands on vehicle1 >&2\necho line 6 >&2\nexec sleep 60\n")
+    program.chmod(0o700)
+    monkeypatch.setattr("sys.executable", str(program))
     with (
-        running_simulator() as simulator,
         pytest.raises(TimeoutError, match="line 7") as failure,
-        running_service(simulator.onboard_port, ["--source", "none"], cwd=tmp_path) as service,
+        running_service(14540, [], cwd=tmp_path) as service,
     ):
+        service.wait_for_line("line 6")
         service.wait_for_line("line 7", 0.1)
     (note,) = failure.value.__notes__
     assert "ready: commands " in note
+    assert "line 6" in note
 
 
-def test_two_services_detect_each_other_and_one_flies(filming: list[str], tmp_path: Path) -> None:
+def test_two_services_detect_each_other_and_one_flies(tmp_path: Path) -> None:
     second_endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     statuses: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
     with contextlib.ExitStack() as running:
         simulator = running.enter_context(running_simulator(parameters=QUICK_FLIGHT))
-        first = running.enter_context(running_service(simulator.onboard_port, filming, cwd=tmp_path))
+        first = running.enter_context(running_service(simulator.onboard_port, NO_CAMERA, cwd=tmp_path))
         session = running.enter_context(first.client())
         listen(session, "status", lambda _key, text: statuses.put(json.loads(text)))
         # Started within 2 s of each other, neither would be the first.
         while statuses.get(timeout=20)["uptime_s"] < 3.0:
             pass
-        flags = [*filming, "--zenoh-connect", first.endpoint, "--zenoh-listen", second_endpoint]
+        flags = [*NO_CAMERA, "--zenoh-connect", first.endpoint, "--zenoh-listen", second_endpoint]
         second = running.enter_context(
             running_service(simulator.gcs_port, flags, cwd=tmp_path, endpoint=second_endpoint)
         )
