@@ -11,6 +11,9 @@ import numpy as np
 import pytest
 
 from benchmarks.rendered import camera_settings
+from companion.guidance.behaviour import BehaviourContext
+from companion.guidance.behaviours.land_on_marker import LandOnMarkerBehaviour
+from companion.guidance.requirements import check_requirements
 from companion.guidance.targets.from_detections import StateHistory
 from companion.guidance.targets.from_map import VisionGate
 from companion.guidance.targets.from_markers import LocalizedMarkers
@@ -32,9 +35,9 @@ HEIGHT_M = 3.0
 
 
 class Flight:
-    """A level vehicle that heads north, with a downward camera above markers."""
+    """A level vehicle that heads north, with a camera (downward, unless given) above markers."""
 
-    def __init__(self, tmp_path: Path) -> None:
+    def __init__(self, tmp_path: Path, pitch_deg: float = -90.0) -> None:
         file = tmp_path / "map.toml"
         file.write_text(
             "".join(
@@ -45,7 +48,7 @@ class Flight:
         )
         settings = camera_settings(
             CAMERA,
-            CameraMount(pitch_rad=-math.pi / 2),
+            CameraMount(pitch_rad=math.radians(pitch_deg)),
             {
                 "markers.dictionary": "APRILTAG_36h11",
                 "markers.size_m": str(SIZE_M),
@@ -133,6 +136,16 @@ def test_marker_seen_twice_in_a_frame_is_refused(flight: Flight) -> None:
     assert flight.tracker.sight(flight.now_ns, 0.5).targets == ()
     assert [flight.confirmed(one) for _ in range(3)] == [[False], [False], [True]]
     assert [target.identifier for target in flight.tracker.sight(flight.now_ns, 0.5).targets] == [5]
+
+
+def test_landing_on_a_marker_needs_a_camera_down(tmp_path: Path) -> None:
+    for pitch_deg, refused in ((-20.0, True), (-90.0, False)):
+        flight = Flight(tmp_path, pitch_deg)
+        flight.frame([])
+        state = VehicleState(heartbeat_ns=flight.now_ns)
+        context = BehaviourContext(flight.now_ns, state, markers=flight.tracker.sight(flight.now_ns, 0.5))
+        why = check_requirements(LandOnMarkerBehaviour(7), context, None)
+        assert ("camera.mount_pitch_deg is -20" in (why or "")) is refused
 
 
 def test_marker_that_jumps_in_ned_is_not_confirmed(flight: Flight) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from mavlink_sim.testing import free_port, running_simulator
-from tests.companion.service_process import running_service
+from tests.companion.service_process import heartbeats, running_service
 
 pytestmark = pytest.mark.realtime
 pytest.importorskip("foxglove", reason="foxglove-sdk is an optional extra")
@@ -105,12 +105,12 @@ def test_viewer_gets_messages_and_images(filming: list[str], tmp_path: Path) -> 
             viewer.close()
 
 
-def test_service_reports_busy_port_and_bad_folder_and_runs(filming: list[str], tmp_path: Path) -> None:
+def test_service_reports_busy_port_and_bad_folder_and_runs(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with socket.create_server(("127.0.0.1", 0)) as taken, running_simulator() as simulator:
+    with socket.create_server(("127.0.0.1", 0)) as taken, heartbeats() as port:
         address, folder = f"127.0.0.1:{taken.getsockname()[1]}", tmp_path / "file" / "folder"
-        flags = ["--foxglove-listen", address, "--recording-directory", str(folder)]
-        with running_service(simulator.onboard_port, [*filming, *flags], cwd=tmp_path) as service:
+        flags = ["--source", "none", "--foxglove-listen", address, "--recording-directory", str(folder)]
+        with running_service(port, flags, cwd=tmp_path) as service:
             assert "foxglove: " in service.wait_for_line(f"{address} cannot ")
             assert "recorder: " in service.wait_for_line(f"{folder}: the folder ")
-            assert service.command("stop")["success"]
+            assert "no link" not in service.command("stop")["reason"]

@@ -24,7 +24,7 @@ from companion.recording.files import RecordingReader
 from companion.replay import replay
 from mavlink_sim.testing import QUICK_FLIGHT, running_simulator
 from tests.companion.recording.lockstep_recording import library_times
-from tests.companion.service_process import ServiceProcess, running_service
+from tests.companion.service_process import ServiceProcess, heartbeats, running_service
 
 pytestmark = pytest.mark.realtime
 
@@ -137,36 +137,11 @@ def test_flight_is_recorded_and_replays(image_folder: Path, exported_model: Path
     assert names["HEARTBEAT"]
 
 
-def test_full_disk_is_one_event_and_the_flight_goes_on(filming: list[str], tmp_path: Path) -> None:
+def test_recorder_is_started_again_but_not_for_a_full_disk(filming: list[str], tmp_path: Path) -> None:
     """The limit of a file's size stands for a full disk: the same write fails, with EFBIG for ENOSPC."""
     folder = tmp_path / "recordings"
     with (
         running_simulator(parameters=QUICK_FLIGHT) as simulator,
-        running_service(
-            simulator.onboard_port, [*filming, "--recording-directory", str(folder)], cwd=tmp_path
-        ) as service,
-    ):
-        service.take_off(2.5)
-        wait_for(lambda: files(folder))
-        recorder = recorder_of(service)
-        _, hard = resource.prlimit(recorder, resource.RLIMIT_FSIZE)
-        resource.prlimit(recorder, resource.RLIMIT_FSIZE, (files(folder)[0].stat().st_size, hard))
-        line = service.wait_for_line("cannot be written")
-        assert str(files(folder)[0]) in line
-        assert service.command("hold")["success"]
-        assert service.stop() == 0
-    assert [each for each in service.last_lines() if "recorder" in each].count(line) == 1
-    assert not [each for each in service.lines if "started again" in each]
-    (path,) = files(folder)
-    reader = RecordingReader(path)
-    assert len(list(reader.messages())) > 100
-    assert len(reader.problems) == 1  # it has no end
-
-
-def test_killed_recorder_leaves_a_file_and_is_started_again(filming: list[str], tmp_path: Path) -> None:
-    folder = tmp_path / "recordings"
-    with (
-        running_simulator() as simulator,
         running_service(
             simulator.onboard_port, [*filming, "--recording-directory", str(folder)], cwd=tmp_path
         ) as service,
@@ -180,62 +155,64 @@ def test_killed_recorder_leaves_a_file_and_is_started_again(filming: list[str], 
         (first,) = files(folder)
         assert messages_of(first)["guidance_input"] > 20
         assert library_times(first) == [message.log_time_ns for message in RecordingReader(first).messages()]
+        service.take_off(2.5)
         wait_for(lambda: len(files(folder)) == 2 and messages_of(files(folder)[1])["guidance_input"] > 20)
-        assert service.command("stop")["success"]
+        recorder = recorder_of(service)
+        _, hard = resource.prlimit(recorder, resource.RLIMIT_FSIZE)
+        resource.prlimit(recorder, resource.RLIMIT_FSIZE, (files(folder)[1].stat().st_size, hard))
+        line = service.wait_for_line("cannot be written")
+        assert str(files(folder)[1]) in line
+        assert service.command("hold")["success"]
+        assert service.stop() == 0
+    assert [each for each in service.last_lines() if "recorder" in each].count(line) == 1
+    assert len([each for each in service.lines if "started again" in each]) == 1
     before, after = map(steps_of, files(folder))
     # Only the last chunk, of a second, is missing: the steps wait for the new recorder.
     assert after[0]["now_ns"] - before[-1]["now_ns"] < 2e9
     assert [each["step"] for each in after] == list(range(after[0]["step"], after[-1]["step"] + 1))
-    second = replay([files(folder)[1]], {})
-    assert second.inexact  # it does not begin with the service
-
-
-def test_recorder_ends_with_a_killed_service(filming: list[str], tmp_path: Path) -> None:
-    folder = tmp_path / "recordings"
-    with (
-        running_simulator() as simulator,
-        running_service(
-            simulator.onboard_port, [*filming, "--recording-directory", str(folder)], cwd=tmp_path
-        ) as service,
-    ):
-        wait_for(lambda: files(folder) and messages_of(files(folder)[0])["guidance_input"] > 20)
-        recorder = recorder_of(service)
-        service.signal(signal.SIGKILL)
-
-        def ended() -> bool:
-            with contextlib.suppress(ProcessLookupError, FileNotFoundError):
-                return "Z" in Path(f"/proc/{recorder}/stat").read_text().rpartition(")")[2].split()[0]
-            return True
-
-        wait_for(ended)
-    (path,) = files(folder)
-    reader = RecordingReader(path)
+    second = files(folder)[1]
+    reader = RecordingReader(second)
     assert len(list(reader.messages())) > 100
-    assert reader.problems == []
+    assert len(reader.problems) == 1  # it has no end
+    assert replay([second], {}).inexact  # it does not begin with the service
 
 
-def test_recorder_joins_a_running_service(filming: list[str], tmp_path: Path) -> None:
-    folder = tmp_path / "recordings"
+def test_recorder_joins_a_service_and_ends_with_a_killed_one(filming: list[str], tmp_path: Path) -> None:
+    own, joined = tmp_path / "recordings", tmp_path / "joined"
     with (
-        running_simulator() as simulator,
-        running_service(simulator.onboard_port, filming, cwd=tmp_path) as service,
+        heartbeats() as port,
+        running_service(port, [*filming, "--recording-directory", str(own)], cwd=tmp_path) as service,
     ):
         command = [
             sys.executable,
             "-m",
             "companion.cli",
             "record",
-            str(folder),
+            str(joined),
             "--connect",
             service.endpoint,
         ]
         recorder = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE)
-        wait_for(lambda: files(folder) and messages_of(files(folder)[0])["guidance_input"] > 20)
+        wait_for(lambda: files(joined) and messages_of(files(joined)[0])["guidance_input"] > 20)
         recorder.terminate()
         _, printed = recorder.communicate(timeout=60)
         assert recorder.returncode == 0
         assert len(printed.splitlines()) == 2
-    (path,) = files(folder)
+
+        child = recorder_of(service)
+        service.signal(signal.SIGKILL)
+
+        def ended() -> bool:
+            with contextlib.suppress(ProcessLookupError, FileNotFoundError):
+                return "Z" in Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()[0]
+            return True
+
+        wait_for(ended)
+    (path,) = files(own)
+    reader = RecordingReader(path)
+    assert len(list(reader.messages())) > 100
+    assert reader.problems == []
+    (path,) = files(joined)
     assert RecordingReader(path).problems == []
     assert messages_of(path)["/image"]
     assert replay([path], {}).inexact

@@ -74,9 +74,7 @@ def test_ardupilot_works_with_default_settings(tmp_path: Path) -> None:
 def test_flight_by_commands_with_the_mavsdk_driver(tmp_path: Path) -> None:
     with (
         running_simulator(parameters=QUICK_FLIGHT) as simulator,
-        running_service(
-            simulator.onboard_port, [*NO_CAMERA, "--driver", "mavsdk"], cwd=tmp_path
-        ) as service,
+        running_service(simulator.onboard_port, [*NO_CAMERA, "--driver", "mavsdk"], cwd=tmp_path) as service,
     ):
         service.take_off(2.5)
         assert service.command("orbit radius=3 speed=1")["success"]
@@ -208,14 +206,13 @@ def test_frames_from_ffmpeg_on_standard_input(exported_model: Path, tmp_path: Pa
 
 def test_failure_notes_the_services_last_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     program = tmp_path / "python"
-    program.write_text("#!/bin/sh\necho ready: commands on vehicle1 >&2\necho line 6 >&2\nexec sleep 60\n")
+    program.write_text("#!/bin/sh\necho line 6 >&2\necho ready: commands on vehicle1 >&2\nexec sleep 60\n")
     program.chmod(0o700)
     monkeypatch.setattr("sys.executable", str(program))
     with (
         pytest.raises(TimeoutError, match="line 7") as failure,
         running_service(14540, [], cwd=tmp_path) as service,
     ):
-        service.wait_for_line("line 6")
         service.wait_for_line("line 7", 0.1)
     (note,) = failure.value.__notes__
     assert "ready: commands " in note
