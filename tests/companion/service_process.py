@@ -114,9 +114,9 @@ class ServiceProcess:
 
 @contextmanager
 def heartbeats() -> Iterator[int]:
-    """An autopilot on the ground that sends only heartbeats, of which a service becomes ready; yields the port.
+    """An autopilot that sends heartbeats only: the service becomes ready. Yields the port.
 
-    For tests that neither fly nor read telemetry: a simulator costs as much of the processor as the service.
+    For tests that neither fly nor read telemetry: a simulator needs as much of the processor as the service.
     """
     port, ended = free_port(), threading.Event()
     codec = mavlink.MAVLink(None, 1, 1)

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from companion.operator.metrics import MetricsError, MetricsServer
-from mavlink_sim.testing import free_port, running_simulator
-from tests.companion.service_process import running_service
+from mavlink_sim.testing import free_port
+from tests.companion.service_process import heartbeats, running_service
 
 pytestmark = pytest.mark.realtime
 
@@ -29,8 +29,8 @@ def test_metrics_of_a_running_service(seeing: list[str], tmp_path: Path) -> None
     port = free_port(socket.SOCK_STREAM)
     flags = [*seeing, "--metrics-listen", f"127.0.0.1:{port}", "--detector-rate-hz", "4"]
     with (
-        running_simulator() as simulator,
-        running_service(simulator.onboard_port, flags, cwd=tmp_path) as service,
+        heartbeats() as vehicle_port,
+        running_service(vehicle_port, flags, cwd=tmp_path) as service,
     ):
         service.wait_for_line("autopilot heartbeat received")
         numbers = fetch(port)

@@ -18,8 +18,7 @@ from companion.perception.cameras import open_cameras, threads_each
 from companion.perception.supervisor import PerceptionSupervisor
 from companion.settings import CameraSection, DetectorSection, Settings, SourceSection
 from companion.settings.reading import ConfigurationError, load_settings, to_toml
-from mavlink_sim.testing import running_simulator
-from tests.companion.service_process import running_service
+from tests.companion.service_process import heartbeats, running_service
 
 pytestmark = pytest.mark.realtime
 
@@ -45,8 +44,8 @@ def test_two_models_on_one_camera_are_independent(
                 return message
 
     with (
-        running_simulator() as simulator,
-        running_service(simulator.onboard_port, seeing, cwd=tmp_path) as service,
+        heartbeats() as port,
+        running_service(port, seeing, cwd=tmp_path) as service,
         service.client() as session,
     ):
         listen(session, "companion/*/**/detections", lambda key, text: received.put((key, json.loads(text))))
@@ -85,8 +84,8 @@ def test_guidance_camera_selects_the_steering_camera(
     )
     flags = ["--source", str(image_folder), "--source-loop", "true", "--source-rate-hz", "10"]
     with (
-        running_simulator() as simulator,
-        running_service(simulator.onboard_port, flags, cwd=tmp_path) as service,
+        heartbeats() as port,
+        running_service(port, flags, cwd=tmp_path) as service,
     ):
         # Only the classes of that camera's model can be sought.
         assert " class 'bicycle'" in service.command("seek bicycle")["reason"]

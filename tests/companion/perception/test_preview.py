@@ -5,8 +5,12 @@ from __future__ import annotations
 import json
 import queue
 import threading
+import time
 import uuid
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +24,10 @@ from companion.perception.messages import CloudPreview, DepthPreview, Preview
 from companion.perception.previews import MAX_CLOUD_POINTS, CloudEncoder, PreviewEncoder
 from companion.settings import PreviewSection
 from companion.settings.perception import CameraSection
-from mavlink_sim.testing import running_simulator
-from tests.companion.service_process import running_service
+from tests.companion.service_process import heartbeats, running_service
 from vision.detections import Detections
 from vision.frame import Frame
+from vision.sources.shared import FrameSharing
 
 pytestmark = pytest.mark.realtime
 
@@ -130,67 +134,72 @@ def test_clouds_are_rate_limited_and_on_demand() -> None:
     assert clouds_of(PreviewSection(), [Frame(IMAGE, 0, 0)]) == []
 
 
-def test_clouds_and_depth_images_only_with_a_subscriber(tmp_path: Path) -> None:
-    camera = f"cloud-{uuid.uuid4().hex[:8]}"
-    scene = tmp_path / "bare.toml"
-    scene.write_text('[ground]\nkinds = ["concrete"]\ntile_texels = 256\ntexel_m = 0.05\n')
-    flags = [
-        *("--source", f"shm://{camera}", "--detector-enabled", "false"),
-        *("--guidance-perception-max-age-s", "3"),
-    ]
-    samples: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
+@contextmanager
+def shared_frames() -> Iterator[str]:
+    """Frames of a wall in shared memory, ten a second; yields the name."""
+    name, ended = f"wall-{uuid.uuid4().hex[:8]}", threading.Event()
+
+    def write() -> None:
+        sharing = FrameSharing(name)
+        sequence = 0
+        while not ended.wait(0.1):
+            sharing.write(replace(wall(160, 120), captured_ns=time.monotonic_ns(), sequence=sequence))
+            sequence += 1
+        sharing.close()
+
+    writing = threading.Thread(target=write, name="frames", daemon=True)
+    writing.start()
+    try:
+        yield name
+    finally:
+        ended.set()
+        writing.join()
+
+
+def test_images_clouds_and_depth_only_with_a_subscriber(tmp_path: Path) -> None:
     statuses: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
-    with (
-        running_simulator(scene=scene, camera=camera, camera_rate=5.0, seed=5) as simulator,
-        running_service(simulator.onboard_port, flags, cwd=tmp_path) as service,
-        service.client() as session,
-    ):
-        listen(session, "status", lambda _key, text: statuses.put(json.loads(text)))
-        published = statuses.get(timeout=10)["bus"]["published"]
-        assert (published["cloud"], published["depth_image"]) == (0, 0)
-        with session.declare_subscriber("companion/*/cloud", samples.put):
-            sample = samples.get(timeout=30)
-        with session.declare_subscriber("companion/*/depth_image", samples.put):
-            image = samples.get(timeout=30)
-    assert sample.attachment is not None
-    about = json.loads(sample.attachment.to_string())
-    assert about["frame_id"] == "vehicle1/camera"
-    points = np.frombuffer(sample.payload.to_bytes(), [("xyz", "<f4", 3), ("rgba", "u1", 4)])
-    assert len(points) == about["points"] > 100
-    assert 0.0 < points["xyz"][:, 2].min() < points["xyz"][:, 2].max() < 20.5
-    assert image.attachment is not None
-    size = json.loads(image.attachment.to_string())
-    millimetres = np.frombuffer(zlib.decompress(image.payload.to_bytes()), "<u2")
-    assert len(millimetres) == size["width"] * size["height"]
-    assert np.count_nonzero(millimetres) > 1000
 
-
-def test_previews_only_with_a_subscriber(seeing: list[str], tmp_path: Path) -> None:
-    statuses: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
-    samples: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
-
-    def images_published() -> int:
+    def published() -> dict[str, int]:
         while not statuses.empty():
             statuses.get()
-        return int(statuses.get(timeout=10)["bus"]["published"]["image"])
+        counts: dict[str, int] = statuses.get(timeout=10)["bus"]["published"]
+        return {name: counts[name] for name in ("image", "cloud", "depth_image")}
+
+    def sample_of(session: zenoh.Session, topic: str) -> tuple[zenoh.Sample, dict[str, Any]]:
+        """One sample and its attachment, from a subscriber that is gone then."""
+        samples: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
+        with session.declare_subscriber(f"companion/*/{topic}", samples.put):
+            sample = samples.get(timeout=30)
+        assert sample.attachment is not None
+        return sample, json.loads(sample.attachment.to_string())
 
     with (
-        running_simulator() as simulator,
-        running_service(simulator.onboard_port, seeing, cwd=tmp_path) as service,
+        heartbeats() as port,
+        shared_frames() as name,
+        running_service(
+            port, ["--source", f"shm://{name}", "--detector-enabled", "false"], cwd=tmp_path
+        ) as service,
         service.client() as session,
     ):
         listen(session, "status", lambda _key, text: statuses.put(json.loads(text)))
-        assert images_published() == 0
-        with session.declare_subscriber("companion/*/image", samples.put):
-            sample = samples.get(timeout=30)
-        image = cv2.imdecode(np.frombuffer(sample.payload.to_bytes(), np.uint8), cv2.IMREAD_COLOR)
-        assert image is not None
-        assert image.shape == (120, 160, 3)
-        assert sample.encoding == zenoh.Encoding.IMAGE_JPEG
-        assert sample.attachment is not None
-        assert json.loads(sample.attachment.to_string())["camera"] is None
-        # The subscriber has gone: the count stops.
-        before, now = images_published(), images_published()
+        assert published() == {"image": 0, "cloud": 0, "depth_image": 0}
+        cloud, about_cloud = sample_of(session, "cloud")
+        depth, about_depth = sample_of(session, "depth_image")
+        jpeg, about_image = sample_of(session, "image")
+        # The subscribers have gone: the counts stop.
+        before, now = published(), published()
         while now != before:
-            before, now = now, images_published()
-        assert now > 0
+            before, now = now, published()
+        assert min(now.values()) > 0
+    image = cv2.imdecode(np.frombuffer(jpeg.payload.to_bytes(), np.uint8), cv2.IMREAD_COLOR)
+    assert image is not None
+    assert image.shape == (120, 160, 3)
+    assert jpeg.encoding == zenoh.Encoding.IMAGE_JPEG
+    assert about_image["camera"] is None
+    assert about_cloud["frame_id"] == "vehicle1/camera"
+    points = np.frombuffer(cloud.payload.to_bytes(), [("xyz", "<f4", 3), ("rgba", "u1", 4)])
+    assert len(points) == about_cloud["points"] > 50
+    np.testing.assert_allclose(points["xyz"][:, 2], 4.0, atol=1e-3)
+    millimetres = np.frombuffer(zlib.decompress(depth.payload.to_bytes()), "<u2")
+    assert len(millimetres) == about_depth["width"] * about_depth["height"] == 160 * 120
+    assert (millimetres == 4000).all()

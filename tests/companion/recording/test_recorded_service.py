@@ -90,7 +90,8 @@ def test_flight_is_recorded_and_replays(image_folder: Path, exported_model: Path
     flags = [
         *("--source", str(image_folder), "--source-loop", "true", "--source-rate-hz", "5"),
         *("--detector-model", str(exported_model), "--detector-runtime", "onnxruntime"),
-        *("--detector-image-size", "160", "--detector-confidence", "0", "--tracker-enabled", "false"),
+        *("--detector-image-size", "160", "--detector-confidence", "0", "--detector-iou", "0.3"),
+        *("--tracker-enabled", "false"),
         *("--recording-directory", str(folder), "--recording-image-format", "png"),
     ]
     with (

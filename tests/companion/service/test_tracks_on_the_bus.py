@@ -1,4 +1,4 @@
-"""Published tracks: a real service, a simulated vehicle's attitude, a real zenoh network."""
+"""Published tracks: a real service, a real zenoh network."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from typing import Any
 import pytest
 
 from companion.bus.client import listen
-from mavlink_sim.testing import running_simulator
-from tests.companion.service_process import running_service
+from tests.companion.service_process import heartbeats, running_service
 
 pytestmark = pytest.mark.realtime
 
@@ -24,8 +23,8 @@ def test_identities_and_their_events_are_published(seeing: list[str], tmp_path: 
         *("--tracker-high-confidence", "0", "--tracker-low-confidence", "0", "--tracker-confirm-score", "0"),
     ]
     with (
-        running_simulator() as simulator,
-        running_service(simulator.onboard_port, flags, cwd=tmp_path) as service,
+        heartbeats() as port,
+        running_service(port, flags, cwd=tmp_path) as service,
         service.client() as session,
     ):
         tracks: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
