@@ -53,7 +53,7 @@ yaw_deg = 90
 width = 320
 height = 240
 horizontal_fov_deg = 70
-rate_hz = 10
+rate_hz = 5
 [camera.mount]
 pitch_deg = -20
 """
@@ -87,8 +87,7 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServiceProcess
     listen = f"127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     folder = tmp_path_factory.mktemp("play")
     (folder / "car.toml").write_text(SCENE)
-    detector = ("--detector-rate-hz", "8", "--detector-image-size", "320")
-    flags = ("--scene", "car.toml", "--dashboard-listen", listen, *detector)
+    flags = ("--scene", "car.toml", "--dashboard-listen", listen, "--detector-image-size", "320")
     with playing(folder, *flags) as running:
         running.wait_for_line(f"dashboard: http://{listen}/", 60.0)
         running.url = f"http://{listen}/"

@@ -32,20 +32,6 @@ pytestmark = pytest.mark.realtime
 DEADLINE_S = 60.0
 
 
-@pytest.fixture(scope="module")
-def tiny_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    import torch
-
-    from vision.yolo.architecture import build
-    from vision.yolo.checkpoint import save_checkpoint
-    from vision.yolo.published import yolov8_description
-
-    torch.manual_seed(1)
-    path = tmp_path_factory.mktemp("model") / "tiny.pt"
-    save_checkpoint(path, build(yolov8_description((0.33, 0.125, 128), ("car", "person"))), metadata={})
-    return path
-
-
 @pytest.fixture
 def photos(tmp_path: Path) -> Path:
     folder = tmp_path / "photos"
@@ -110,9 +96,9 @@ def alive(pid: int) -> bool:
     return state != "Z"
 
 
-async def test_results_have_classes_stamps_and_timing(photos: Path, tiny_model: Path) -> None:
+async def test_results_have_classes_stamps_and_timing(photos: Path, exported_model: Path) -> None:
     set_scheduler_slice()  # as the service's loop
-    async with supervised(settings_of(photos, tiny_model, **{"detector.confidence": "0"})) as (
+    async with supervised(settings_of(photos, exported_model, **{"detector.confidence": "0"})) as (
         supervisor,
         recorder,
     ):
@@ -120,7 +106,7 @@ async def test_results_have_classes_stamps_and_timing(photos: Path, tiny_model: 
         set_scheduler_slice(DEFAULT_NS)
         status = supervisor.status
         first = recorder.results[0]
-        assert supervisor.class_names == status.class_names == ("car", "person")
+        assert supervisor.class_names == status.class_names == ("person", "car", "boat")
         assert status.state is PerceptionState.RUNNING
         assert status.results == len(recorder.results)
         assert status.frames >= status.results
@@ -138,25 +124,23 @@ async def test_results_have_classes_stamps_and_timing(photos: Path, tiny_model: 
         own = os.getpriority(os.PRIO_PROCESS, 0)
         assert os.getpriority(os.PRIO_PROCESS, pid) == min(own + NICENESS, 19)
         assert slice_of(pid) != SHORTEST_NS
+        loaded = await asyncio.to_thread(Path(f"/proc/{pid}/maps").read_text)
+        assert "onnxruntime" in loaded
+        assert "libtorch" not in loaded
     assert not alive(pid)
     assert supervisor.status.state is PerceptionState.STOPPED
     assert supervisor.status.pid is None
 
 
-async def test_worker_with_exported_model_does_not_load_torch(photos: Path, exported_model: Path) -> None:
-    async with supervised(settings_of(photos, exported_model)) as (supervisor, recorder):
-        await until(lambda: recorder.results)
-        pid = supervisor.status.pid
-        loaded = await asyncio.to_thread(Path(f"/proc/{pid}/maps").read_text)
-    assert "onnxruntime" in loaded
-    assert "libtorch" not in loaded
-
-
-async def test_without_a_detector_results_are_empty(photos: Path) -> None:
+async def test_without_a_detector_nothing_is_detected_or_selected(photos: Path) -> None:
     async with supervised(settings_of(photos)) as (supervisor, recorder):
         await until(lambda: len(recorder.results) >= 3)
         assert all(len(result.detections) == 0 for result in recorder.results)
         assert supervisor.class_names == ()
+        answer = await supervisor.select(SelectRequest((0.25, 0.25, 0.5, 0.5)))
+        assert not answer.success
+        assert "detector.enabled " in answer.reason
+        assert "tracker.enabled " in answer.reason
 
 
 async def test_detector_every_skips_frames(photos: Path) -> None:
@@ -178,34 +162,16 @@ async def test_end_of_source_finishes_perception(photos: Path) -> None:
         assert supervisor.status.frames + supervisor.status.dropped >= 3
 
 
-@pytest.mark.parametrize(
-    ("overrides", "named"),
-    [
-        ({"source.uri": "/nowhere/street.mp4"}, "/nowhere/street.mp4: no such file"),
-        ({"detector.enabled": "true", "detector.model": "/nowhere/m.pt"}, "/nowhere/m.pt: no such file"),
-        ({"detector.enabled": "true", "detector.kind": "rad"}, "unknown kind 'rad'"),
-        ({"plugins.modules": "no_such_module"}, "no module 'no_such_module'"),
-        ({"recording.video": "/dev/null/v.webm"}, "/dev/null/v.webm: cannot be written"),
-    ],
-)
-async def test_start_failure_is_one_line(photos: Path, overrides: dict[str, str], named: str) -> None:
+async def test_start_failure_is_one_line(photos: Path) -> None:
     supervisor = PerceptionSupervisor(
-        settings_of(photos, **overrides), on_result=lambda _: None, on_event=lambda *_: None
+        settings_of("/nowhere/street.mp4"), on_result=lambda _: None, on_event=lambda *_: None
     )
     with pytest.raises(PerceptionStartError) as caught:
         await supervisor.start()
-    assert named in str(caught.value)
+    assert "/nowhere/street.mp4: no such file" in str(caught.value)
     assert "\n" not in str(caught.value)
     assert supervisor.status.state is PerceptionState.FAILED
     assert supervisor.status.pid is None
-    await supervisor.stop()
-
-
-async def test_unknown_class_suggests_the_nearest(photos: Path, exported_model: Path) -> None:
-    settings = settings_of(photos, exported_model, **{"detector.classes": "persn"})
-    supervisor = PerceptionSupervisor(settings, on_result=lambda _: None, on_event=lambda *_: None)
-    with pytest.raises(PerceptionStartError, match=r"'persn'.*person"):
-        await supervisor.start()
     await supervisor.stop()
 
 
@@ -251,14 +217,6 @@ async def test_selected_object_is_a_track_until_its_worker_ends(
     assert "not running (stopped)" in stopped.reason
 
 
-async def test_selection_without_a_detector_is_refused(photos: Path) -> None:
-    async with supervised(settings_of(photos)) as (supervisor, _recorder):
-        answer = await supervisor.select(SelectRequest((0.25, 0.25, 0.5, 0.5)))
-        assert not answer.success
-        assert "detector.enabled " in answer.reason
-        assert "tracker.enabled " in answer.reason
-
-
 async def test_selection_fails_when_the_worker_dies_before_it_answers(
     patterned: Path, exported_model: Path
 ) -> None:
@@ -275,8 +233,9 @@ async def test_selection_fails_when_the_worker_dies_before_it_answers(
         assert "has ended" in answer.reason
 
 
-async def test_killed_worker_is_replaced_and_sequence_continues(photos: Path) -> None:
-    async with supervised(settings_of(photos)) as (supervisor, recorder):
+async def test_killed_worker_is_replaced_and_sequence_continues(photos: Path, tmp_path: Path) -> None:
+    settings = settings_of(photos, **{"recording.video": str(tmp_path / "flight.webm")})
+    async with supervised(settings) as (supervisor, recorder):
         await until(lambda: len(recorder.results) >= 3)
         pid = supervisor.status.pid
         assert pid is not None
@@ -289,13 +248,17 @@ async def test_killed_worker_is_replaced_and_sequence_continues(photos: Path) ->
             supervisor.watch(watched)
         await until(lambda: supervisor.status.state is PerceptionState.RESTARTING)
         before = len(recorder.results)
-        await until(lambda: len(recorder.results) > before)
+        await until(lambda: len(recorder.results) > before + 3)
         assert recorder.has_event(f"process {pid} was killed", "SIGKILL; ", "restarting (1 of 5)")
         assert recorder.has_event("perception restored")
         assert supervisor.status.restarts == 1
         assert supervisor.status.pid not in (None, pid)
         sequences = [result.sequence for result in recorder.results]
         assert sequences == sorted(set(sequences))
+    # The new worker does not overwrite the video.
+    assert (tmp_path / "flight.webm").exists()
+    with open_source(str(tmp_path / "flight-2.webm"), SourceSettings()) as source:
+        assert len(list(source)) >= 1
 
 
 async def test_stopped_worker_is_stuck_and_replaced(photos: Path) -> None:
@@ -313,26 +276,16 @@ async def test_stopped_worker_is_stuck_and_replaced(photos: Path) -> None:
 
 async def test_repeatedly_dying_worker_is_given_up(photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("companion.perception.supervisor._BACK_OFF_S", (0.01,))
+    monkeypatch.setattr("companion.perception.supervisor.MAX_RESTARTS", 2)
     async with supervised(settings_of(photos)) as (supervisor, recorder):
         while supervisor.status.state is not PerceptionState.FAILED:
             if supervisor.status.pid is not None and supervisor.status.state is PerceptionState.RUNNING:
                 os.kill(supervisor.status.pid, signal.SIGKILL)
                 await until(lambda: supervisor.status.state is not PerceptionState.RUNNING)
             await asyncio.sleep(0.01)
-        assert supervisor.status.restarts == 5
+        assert supervisor.status.restarts == 2
         assert recorder.events[-1][0] == "error"
-        assert "6 times in 60 s" in recorder.events[-1][1]
-
-
-async def test_stopped_worker_does_not_block_stop(photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("companion.perception.supervisor.STOP_S", 0.3)
-    monkeypatch.setattr("companion.perception.supervisor.TERMINATE_S", 0.3)
-    async with supervised(settings_of(photos)) as (supervisor, recorder):
-        pid = supervisor.status.pid
-        assert pid is not None
-        os.kill(pid, signal.SIGSTOP)
-    assert recorder.has_event(f"process {pid} was killed", "SIGKILL")
-    assert not alive(pid)
+        assert "3 times in 60 s" in recorder.events[-1][1]
 
 
 async def test_incomplete_video_is_reported_at_stop(
@@ -368,14 +321,6 @@ async def test_worker_death_during_stop_is_reported(photos: Path) -> None:
         os.kill(pid, signal.SIGKILL)
         await stopping
     assert recorder.has_event(f"process {pid} was killed", "SIGKILL")
-
-
-async def test_normal_end_is_not_reported(photos: Path, tmp_path: Path) -> None:
-    video = tmp_path / "flight.webm"
-    async with supervised(settings_of(photos, **{"recording.video": str(video)})) as (_, recorder):
-        await until(lambda: len(recorder.results) >= 3)
-    assert [level for level, _ in recorder.events] == ["info"]
-    assert video.stat().st_size > 0
 
 
 async def test_cancelled_start_leaves_no_process(photos: Path, exported_model: Path) -> None:
@@ -432,24 +377,9 @@ async def test_video_is_finished_at_stop(photos: Path, tmp_path: Path) -> None:
     async with supervised(settings) as (supervisor, recorder):
         supervisor.send_hud(("seek car", "height 5.0 m"), "car")
         await until(lambda: len(recorder.results) >= 20)
+    assert [level for level, _ in recorder.events] == ["info"]  # a normal end is not reported
     with open_source(str(path), SourceSettings()) as source:
         assert len(list(source)) >= 3
-
-
-async def test_replaced_worker_records_into_a_new_file(photos: Path, tmp_path: Path) -> None:
-    settings = settings_of(photos, **{"recording.video": str(tmp_path / "flight.webm")})
-    async with supervised(settings) as (supervisor, recorder):
-        await until(lambda: len(recorder.results) >= 3)
-        assert supervisor.status.pid is not None
-        os.kill(supervisor.status.pid, signal.SIGKILL)
-        await until(
-            lambda: supervisor.status.restarts == 1 and supervisor.status.state is PerceptionState.RUNNING
-        )
-        before = len(recorder.results)
-        await until(lambda: len(recorder.results) > before + 3)
-    assert (tmp_path / "flight.webm").exists()
-    with open_source(str(tmp_path / "flight-2.webm"), SourceSettings()) as source:
-        assert len(list(source)) >= 1
 
 
 SERVICE = """
@@ -465,7 +395,7 @@ async def main():
         on_event=lambda level, text: print("event", text, flush=True),
     )
     await supervisor.start()
-    print("pid", supervisor.status.pid, "torch" in sys.modules, flush=True)
+    print("pid", supervisor.status.pid, flush=True)
     while supervisor.status.state.value not in ("finished", "failed"):
         await asyncio.sleep(0.05)
     print("state", supervisor.status.state.value, supervisor.status.frames, flush=True)
@@ -489,11 +419,10 @@ def wait_for_line(process: subprocess.Popen[str], beginning: str) -> str:
     raise AssertionError(f"it ended without a line {beginning!r}")
 
 
-def test_worker_dies_with_a_killed_service(photos: Path, tiny_model: Path) -> None:
-    arguments = [f"source.uri={photos}", "source.loop=true", f"detector.model={tiny_model}"]
+def test_worker_dies_with_a_killed_service(photos: Path) -> None:
+    arguments = [f"source.uri={photos}", "source.loop=true", "detector.enabled=no"]
     with service(subprocess.DEVNULL, *arguments) as process:
-        _, pid, torch_in_service = wait_for_line(process, "pid").split()
-        assert torch_in_service == "False"
+        _, pid = wait_for_line(process, "pid").split()
         assert alive(int(pid))
         process.kill()
     deadline_s = time.monotonic() + DEADLINE_S

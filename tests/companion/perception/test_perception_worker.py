@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
+import re
 import select
 import shutil
 import socket
@@ -15,11 +16,13 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
 from companion.perception.messages import (
     Attitude,
+    Begin,
     Ended,
     Heartbeat,
     Hud,
@@ -29,6 +32,7 @@ from companion.perception.messages import (
     Report,
     ResultLogHandler,
     ResultSender,
+    StartFailed,
     packed,
     read_message,
     receive,
@@ -42,7 +46,7 @@ from companion.perception.process import (
     Watchdog,
     log_printed,
 )
-from companion.perception.worker import ControlChannel
+from companion.perception.worker import ControlChannel, _work
 from companion.settings.reading import load_settings
 from vision.detections import Detections
 from vision.pipeline import PerceptionResult
@@ -218,6 +222,28 @@ async def test_end_of_stream_within_a_message() -> None:
     reader.feed_data(packed(Hud(("a",), "car"))[:-1])
     reader.feed_eof()
     assert await read_message(reader) is None
+
+
+@pytest.mark.parametrize(
+    ("overrides", "named"),
+    [
+        ({"source.uri": "/nowhere/street.mp4"}, r"/nowhere/street\.mp4: no such file"),
+        ({"detector.model": "/nowhere/m.pt"}, r"/nowhere/m\.pt: no such file"),
+        ({"detector.kind": "rad"}, "unknown kind 'rad'"),
+        ({"detector.classes": "persn"}, "'persn'.*person"),
+        ({"plugins.modules": "no_such_module"}, "no module 'no_such_module'"),
+        ({"recording.video": "/dev/null/v.webm"}, r"/dev/null/v\.webm: cannot be written"),
+    ],
+)
+def test_failure_of_a_start_is_one_line(
+    overrides: dict[str, str], named: str, exported_model: Path, image_folder: Path
+) -> None:
+    values = {"source.uri": str(image_folder), "detector.runtime": "onnxruntime", "detector.image_size": "64"}
+    settings = load_settings(os.devnull, {**values, "detector.model": str(exported_model), **overrides}, {})
+    failed = _work(Begin(settings), Mock(), Mock())
+    assert isinstance(failed, StartFailed)
+    assert re.search(named, failed.text)
+    assert "\n" not in failed.text
 
 
 def test_worker_without_a_service_exits() -> None:

@@ -41,7 +41,7 @@ place_m = [4.0, 0.0]
 width = 320
 height = 240
 horizontal_fov_deg = 80
-rate_hz = 5
+rate_hz = 3
 [camera.mount]
 pitch_deg = -25
 """
@@ -69,7 +69,7 @@ def test_every_message_of_a_flight_is_valid(tmp_path: Path) -> None:
     ):
         session.declare_subscriber("companion/vehicle1/**", samples.put)
         replies: list[dict[str, Any]] = []
-        service.take_off(3.0)
+        service.take_off(2.5)
         for text in ("hold duration=1", "dance", "land"):
             replies.append(service.command_when_it_can(text, 90.0))
     assert [reply["success"] for reply in replies] == [True, False, True], replies
