@@ -13,7 +13,6 @@ import numpy as np
 from vision.camera_model import CameraModel
 from vision.depth_registration import DepthCalibration
 from vision.orientation import Orientation
-from vision.plain_yaml import load_plain_yaml
 
 # The names that `companion calibrate` and ROS's camera_calibration write if none is given.
 _DEFAULT_NAMES = ("camera", "narrow_stereo")
@@ -134,6 +133,9 @@ def read_camera_info(path: Path) -> CameraInfo:
         ValueError: it cannot be read, is not such a file, or has an unknown distortion model; one line that
             names the file.
     """
+    # The YAML reader takes 30 ms to import, and every program with settings imports this module.
+    from vision.plain_yaml import load_plain_yaml
+
     try:
         content = load_plain_yaml(path.read_bytes().decode("utf-8"))
         if not isinstance(content, dict):

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import http.client
 import ipaddress
 import os
 import socket
 import tempfile
 import time
-import urllib.error
-import urllib.request
 from collections import deque
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 from urllib.parse import SplitResult, parse_qsl, unquote, urlencode, urlsplit, urlunsplit
 
 import cv2
@@ -24,6 +22,11 @@ from vision.sources.capture import Capture, CaptureError, RawFrame
 from vision.sources.opencv import open_ffmpeg, read_capture
 from vision.sources.source import SourceError, SourceSettings
 from vision.sources.stream_formats import MjpegParser
+
+# The HTTP library is imported by what uses it: every program with settings imports this module.
+if TYPE_CHECKING:
+    import http.client
+    import urllib.request
 
 # No reordering buffer before the decoder, and no frame threads in it.
 _LOW_LATENCY = {"fflags": "nobuffer", "flags": "low_delay"}
@@ -243,6 +246,9 @@ def open_http(uri: str, settings: SourceSettings) -> Capture:
         SourceError: refused (401, 403, 404, 410).
         CaptureError: no response, or an error that may be temporary.
     """
+    import http.client
+    import urllib.error
+
     parts = urlsplit(uri)
     bare = urlunsplit(parts._replace(netloc=parts.netloc.rpartition("@")[2]))
     try:
@@ -269,6 +275,8 @@ def open_http(uri: str, settings: SourceSettings) -> Capture:
 
 
 def _opener(uri: str) -> urllib.request.OpenerDirector:
+    import urllib.request
+
     parts = urlsplit(uri)
     if parts.username is None:
         return urllib.request.build_opener()
@@ -291,12 +299,14 @@ class HttpMjpegCapture(Capture):
         self._socket = socket.socket(fileno=os.dup(response.fileno()))
 
     def read(self, timeout_s: float) -> RawFrame | None:
+        from http.client import HTTPException
+
         while not self._ready:
             try:
                 data = self._response.read1(1 << 16)
             except TimeoutError as error:
                 raise CaptureError("no more data arrived") from error
-            except (OSError, http.client.HTTPException) as error:
+            except (OSError, HTTPException) as error:
                 raise CaptureError(f"the connection failed: {error}") from error
             if not data:
                 raise CaptureError("the server closed the connection")
