@@ -28,6 +28,13 @@ from tests.companion.service_process import ServiceProcess
 pytestmark = pytest.mark.realtime
 
 READY = "Ctrl-C ends it"
+# With vehicles that take off and land quickly.
+QUICK = """
+from companion import cli, sim_session
+from mavlink_sim.testing import QUICK_FLIGHT
+sim_session.SIMULATOR_PARAMETERS.update(QUICK_FLIGHT)
+cli.main()
+"""
 
 
 @contextmanager
@@ -36,7 +43,7 @@ def playing(folder: Path, *flags: str) -> Iterator[ServiceProcess]:
     endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     process = subprocess.Popen(
         [
-            *(sys.executable, "-m", "companion.cli", "play", "--zenoh-listen", endpoint),
+            *(sys.executable, "-c", QUICK, "play", "--zenoh-listen", endpoint),
             *("--dashboard-listen", "", *flags),
         ],
         cwd=folder,
@@ -106,14 +113,14 @@ def test_play_flies_an_autopilot_at_a_url_and_ends_on_ctrl_c(tmp_path: Path, sma
         url = f"udpin://127.0.0.1:{simulator.onboard_port}"
         running = stack.enter_context(playing(tmp_path, "--vehicle-url", url, *small))
         assert any(line.endswith(": boat, car") for line in running.lines)
-        for text in ("takeoff 3", "land"):
-            sent = companion("send", "--connect", running.endpoint, text, cwd=tmp_path, timeout_s=120.0)
-            assert sent.returncode == 0, sent.stdout + sent.stderr
+        sent = companion("send", "--connect", running.endpoint, "takeoff 2", cwd=tmp_path, timeout_s=120.0)
+        assert sent.returncode == 0, sent.stdout + sent.stderr
+        assert running.command("land")["success"]
         assert any("armed" in event for event in simulator.events)
         with running.client() as session:
             message = next_detections(session, "vehicle1")
         assert (message["width"], message["height"]) == (160, 120)
-        busy = companion("play", "--zenoh-listen", running.endpoint, cwd=tmp_path)
+        busy = companion_here("play", "--zenoh-listen", running.endpoint, cwd=tmp_path)
         assert busy.returncode == 2
         (line,) = busy.stderr.splitlines()
         assert running.endpoint in line
@@ -138,7 +145,7 @@ def test_demonstration_refuses_an_armed_autopilot(tmp_path: Path) -> None:
 def test_play_in_the_air_holds_and_ends_on_ctrl_c(tmp_path: Path, small: list[str]) -> None:
     with playing(tmp_path, "--vehicles", "2", *small) as running:
         with running.client() as session:
-            for text in ("takeoff 3", "hold"):
+            for text in ("takeoff 2", "hold"):
                 reply = send_command(session, "vehicle2", text, timeout_s=60.0)
                 assert reply["success"], reply
             # It sees by its own camera.
@@ -157,7 +164,7 @@ def test_play_without_a_camera_flies_and_starts_no_perception(tmp_path: Path) ->
     with playing(tmp_path, "--source", "none", "--vehicles", "2") as running:
         assert any("no camera" in line for line in running.lines)
         with running.client() as session:
-            reply = send_command(session, "vehicle2", "takeoff 3", timeout_s=60.0)
+            reply = send_command(session, "vehicle2", "takeoff 2", timeout_s=60.0)
             assert reply["success"], reply
             reply = send_command(session, "vehicle1", "seek car", timeout_s=20.0)
             assert not reply["success"], reply
