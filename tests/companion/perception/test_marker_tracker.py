@@ -145,7 +145,8 @@ def test_landing_on_a_marker_needs_a_camera_down(tmp_path: Path) -> None:
         state = VehicleState(heartbeat_ns=flight.now_ns)
         context = BehaviourContext(flight.now_ns, state, markers=flight.tracker.sight(flight.now_ns, 0.5))
         why = check_requirements(LandOnMarkerBehaviour(7), context, None)
-        assert ("camera.mount_pitch_deg is -20" in (why or "")) is refused
+        assert ("straight down (camera.mount_pitch_deg is -20)" in (why or "")) is refused
+        assert ("straight down" in (why or "")) is refused
 
 
 def test_marker_that_jumps_in_ned_is_not_confirmed(flight: Flight) -> None:
