@@ -62,9 +62,10 @@ def add_attitude(perception: RenderedPerception, vehicle: LockstepVehicle, now_n
 
 
 def flown(seed: int, frames: int) -> list[PerceptionResult]:
+    """By a vehicle of that seed in one world, whose ground takes long to paint."""
     vehicle = LockstepVehicle(seed=seed)
     vehicle.take_off(4.0)
-    perception = RenderedPerception(settings_of(), vehicle, scene_or_demo(None, seed))
+    perception = RenderedPerception(settings_of(), vehicle, scene_or_demo(None, SEED))
     results = []
     for _ in range(frames):
         vehicle.step(0.1)
