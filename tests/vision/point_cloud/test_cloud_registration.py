@@ -26,7 +26,7 @@ def test_alignment_recovers_the_motion_of_a_rendered_camera(method: Any, seed: i
 @pytest.mark.parametrize("method", ["plane_icp", "gicp"])
 def test_flat_ground_does_not_determine_the_motion(method: Any) -> None:
     rng = np.random.default_rng(6)
-    flat = np.column_stack([rng.uniform(0, 10, (20_000, 2)), rng.normal(2.0, 0.002, 20_000)])
+    flat = np.column_stack([rng.uniform(0, 10, (6_000, 2)), rng.normal(2.0, 0.002, 6_000)])
     cloud = PointCloud(flat.astype(np.float32))
     found = align(cloud, cloud.transformed(np.eye(3), np.array([0.2, 0.1, 0.1])), method=method)
     assert not found.determined
