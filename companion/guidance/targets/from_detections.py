@@ -435,7 +435,7 @@ def _cut(xyxy: Sequence[float], camera: CameraModel) -> bool:
 
 
 def _edge_margin_px(xyxy: Sequence[float], camera: CameraModel) -> float:
-    """How near to the image's edge a box may be that the edge cuts off."""
+    """Largest distance from an edge of the image, pixels, at which it may cut the object off."""
     return max(EDGE_PX, CUT_SIGMAS * edge_sigma_px(xyxy[3] - xyxy[1], camera.width))
 
 

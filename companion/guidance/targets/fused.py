@@ -68,9 +68,10 @@ class _Track:
     def update(self, target: Target, vehicle: Vector3, covariance: NDArray[np.float64]) -> None:
         expected = self._motion.at(target.captured_ns)
         fit = expected.fit(target, vehicle)
-        # Of an object that leaves the image at the top, a part is detected at last: its middle is elsewhere.
         disagrees = self._disagrees(target, covariance)
-        if (disagrees and target.cut_above and not self.moving) or fit.squared > OUTLIER_SIGMA**2:
+        if target.cut_above and disagrees and not self.moving:
+            return  # only a part of it was detected: the middle of the part is not the object's
+        if fit.squared > OUTLIER_SIGMA**2:
             self._leave_out(target, vehicle, covariance)
             return
         self._outliers = []

@@ -226,17 +226,28 @@ def test_object_that_leaves_the_image_keeps_its_position() -> None:
     assert not position_of(tracks).moving
 
 
-def test_part_of_an_object_that_leaves_at_the_top_is_left_out() -> None:
-    """The upper edge of the image hides more and more of a truck, at last its right half."""
+@pytest.mark.parametrize("step_m", [0.2, 1.6])
+def test_part_of_an_object_that_leaves_at_the_top_is_left_out(step_m: float) -> None:
+    """The upper edge of the image hides more and more of a truck: less and less of its left half is seen."""
     tracks, vehicle = FusedTracks(), (0.0, 0.0, -5.0)
-    for frame in range(22):
-        east_m = -1.6 if frame >= 20 else 0.0
+    for frame in range(27):
+        east_m = -min(step_m * max(frame - 14, 0), 3.0)
         target = seen(vehicle, (20.0, east_m), frame, sigma_m=0.3, across_m=0.1)
         tracks.update([replace(target, cut_above=frame >= 15)], vehicle, target.captured_ns)
-    assert position_of(tracks).position_ned_m[:2] == pytest.approx((20.0, 0.0))
-    third = replace(seen(vehicle, (20.0, -1.6), 22, sigma_m=0.3, across_m=0.1), cut_above=True)
-    tracks.update([third], vehicle, third.captured_ns)  # three that fit each other: it was moved
-    assert position_of(tracks).position_ned_m[:2] == pytest.approx((20.0, -1.6), abs=0.01)
+        assert not position_of(tracks).moving
+    assert position_of(tracks).position_ned_m[:2] == pytest.approx((20.0, 0.0), abs=0.1)
+    whole = seen(vehicle, (20.0, -3.0), 27, sigma_m=0.3, across_m=0.1)
+    for frame in range(27, 30):
+        tracks.update([replace(whole, captured_ns=T0 + frame * PERIOD_NS)], vehicle, T0 + frame * PERIOD_NS)
+    assert position_of(tracks).position_ned_m[:2] == pytest.approx((20.0, -3.0), abs=0.1)
+
+
+def test_whole_object_at_the_upper_edge_counts() -> None:
+    tracks, vehicle = FusedTracks(), (0.0, 0.0, -5.0)
+    for frame in range(20):
+        target = seen(vehicle, (20.0, 0.0 if frame < 5 else 0.2), frame, sigma_m=0.3, across_m=0.1)
+        tracks.update([replace(target, cut_above=frame >= 5)], vehicle, target.captured_ns)
+    assert position_of(tracks).position_ned_m[1] == pytest.approx(0.15, abs=0.02)
 
 
 def test_cut_off_box_counts_until_the_object_is_seen_whole() -> None:
