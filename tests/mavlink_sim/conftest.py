@@ -50,8 +50,9 @@ class SimHarness:
         streams: the fast streams that are not switched off at the start, or everything.
     """
 
-    # Most tests begin in the air: a vehicle with default options flies there once and is copied afterwards.
-    _in_the_air: ClassVar[dict[str, tuple[bytes, dict[str, list[tuple[float, Any]]]]]] = {}
+    # Most tests begin ready or in the air: a vehicle with default options gets there once and is copied
+    # afterwards.
+    _stored: ClassVar[dict[str, tuple[bytes, dict[str, list[tuple[float, Any]]]]]] = {}
 
     def __init__(self, streams: Collection[str] = (), **options: Any) -> None:
         if unknown := set(streams) - FAST_STREAMS - {EVERYTHING}:
@@ -220,22 +221,26 @@ class SimHarness:
         return -self.vehicle.airframe.position[2]
 
     def wait_ready(self) -> None:
-        self.until(lambda: self.vehicle.autopilot.can_arm, 10.0)
+        self._once("ready", lambda: self.until(lambda: self.vehicle.autopilot.can_arm, 10.0))
 
     def take_off(self, height_m: float | None = None) -> None:
         """Arm, take off, wait for HOLD and a short time more."""
+        self._once(f"at {height_m} m", lambda: self._fly_up(height_m))
+
+    def _once(self, what: str, get_there: Callable[[], object]) -> None:
+        """Get there, or copy the vehicle with the same options that got there before."""
         plain = all(isinstance(value, (str, int, float, tuple, dict)) for value in self._options.values())
         if self._vehicle is not None or self.heartbeats or not plain:
-            self._fly_up(height_m)
+            get_there()
             return
-        key = repr((sorted(self._options.items()), sorted(self._switched_off), height_m))
-        if key not in self._in_the_air:
-            self._fly_up(height_m)
+        key = repr((sorted(self._options.items()), sorted(self._switched_off), what))
+        if key not in self._stored:
+            get_there()
             inbox = {link: list(messages) for link, messages in self._inbox.items()}
-            self._in_the_air[key] = (pickle.dumps((self._vehicle, self._events)), inbox)
+            self._stored[key] = (pickle.dumps((self._vehicle, self._events)), inbox)
             gc.collect()
             gc.freeze()  # thousands of permanent messages: excluded from garbage collection
-        stored, inbox = self._in_the_air[key]
+        stored, inbox = self._stored[key]
         self._vehicle, self._events = pickle.loads(stored)
         self._inbox = defaultdict(list, {link: list(messages) for link, messages in inbox.items()})
 

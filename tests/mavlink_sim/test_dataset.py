@@ -244,7 +244,7 @@ def test_the_focal_length_is_within_what_was_asked() -> None:
 
     def mean_side(focal_px: tuple[float, float]) -> float:
         sides: list[float] = []
-        for n in range(12):
+        for n in range(6):
             _, boxes, _ = random_scene(np.random.default_rng((2, n)), 256, 256, focal_px)
             sides += np.sqrt((boxes[:, 2:] - boxes[:, :2]).prod(axis=1)).tolist()
         return float(np.median(sides))
@@ -263,7 +263,7 @@ def test_other_frames_follow_from_their_generator_too(draw: Callable[..., Render
 
 def test_too_small_objects_have_negative_id() -> None:
     small = 0
-    for n in range(12):
+    for n in range(8):
         _, boxes, ids = training_scene(np.random.default_rng((3, n)), 160, 128)
         sides = boxes[:, 2:] - boxes[:, :2]
         assert (sides[ids >= 0] >= LEARNED_SIDE_PX).all()

@@ -28,7 +28,7 @@ def speed_mps(state: VehicleState) -> float:
     return math.hypot(*state.velocity_ned_mps[:2])
 
 
-@pytest.mark.parametrize("kind", ["pymavlink", "mavsdk"])
+@pytest.mark.parametrize("kind", ["pymavlink", pytest.param("mavsdk", marks=pytest.mark.slow)])
 async def test_flight_until_the_pilot_takes_over(kind: str) -> None:
     # Arming moves home by what the height has drifted.
     drift = ["height_drift 0.73 over=2"]

@@ -141,7 +141,7 @@ def test_tracking_includes_the_camera_mount_pitch() -> None:
     assert max(off_rad(moment, scene_object, down_rad) for moment in log.moments[20:]) < IN_THE_MIDDLE_RAD
 
 
-@pytest.mark.parametrize("word", ["approach", "follow"])
+@pytest.mark.parametrize("word", ["approach", pytest.param("follow", marks=pytest.mark.slow)])
 def test_cut_off_object_gets_a_range_by_pointing_at_it(word: str) -> None:
     """The image ends 46° down, above its wheels: no range until the gimbal points at it."""
     scene_object = SceneObject("car", (4.0, 1.8, 1.5), person(0.0, 9.0).pose)

@@ -243,7 +243,7 @@ def test_service_flies_a_mission_and_logs_its_steps(seeing: list[str], tmp_path:
     flown_at.mkdir()
     with (
         running_simulator(speed=2.0, parameters=QUICK_FLIGHT) as simulator,
-        running_service(simulator.onboard_port, seeing, cwd=flown_at) as service,
+        running_service(simulator.onboard_port, [*seeing, "--source-rate-hz", "3"], cwd=flown_at) as service,
     ):
         # The service cannot access the file: its text is sent with the command.
         done = companion("mission", "short.toml", "--connect", service.endpoint, cwd=tmp_path / "here")
