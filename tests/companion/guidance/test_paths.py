@@ -188,7 +188,7 @@ def test_route_ahead_ends_at_a_reversal_until_it_is_reached() -> None:
 def test_closed_path_starts_at_its_first_point() -> None:
     points = [(0.0, 0.0), (15.0, 0.0), (15.0, 15.0), (0.0, 15.0)]
     vehicle = KinematicVehicle(position=[15.0, -15.0, -5.0])
-    flight, outcome = active(FollowPathBehaviour(points, 4.0, laps=1.0), 200.0, vehicle)
+    flight, outcome = active(FollowPathBehaviour(points, 4.0, laps=2.0), 200.0, vehicle)
     assert outcome.success
     first = next(i for i, position in enumerate(flight.track) if math.dist(position, (0, 0, -5)) < 1.5)
     second = next(i for i, position in enumerate(flight.track) if math.dist(position, (15, 15, -5)) < 1.5)
