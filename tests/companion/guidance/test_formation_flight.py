@@ -89,7 +89,7 @@ def test_followers_keep_their_slots_through_turns(shape: str) -> None:
 
 
 def test_joining_vehicle_gets_a_slot_with_separation() -> None:
-    fleet = flying(5)
+    fleet = flying(5, as_text=True)
     follow(fleet, "bc", "line")
     # c takes a detour: d and e are on the direct path.
     assert fleet.run_until(lambda: settled(fleet, "bc"), 60.0)
