@@ -159,11 +159,14 @@ def _is_video(frame: Frame) -> bool:
 
 def _place(frame: Frame) -> str:
     """Return `photo.jpg`, `street.mp4  12.480 s`, or the sequence number of a frame without a file."""
-    if not frame.file_name:
+    name = frame.file_name
+    if not name:
         return f"{frame.sequence:6d}"
+    if not name.isprintable():  # a line end, or bytes that are not UTF-8
+        name = name.encode("unicode_escape").decode()
     if frame.media_s is None or not _is_video(frame):
-        return frame.file_name
-    return f"{frame.file_name}  {frame.media_s:8.3f} s"
+        return name
+    return f"{name}  {frame.media_s:8.3f} s"
 
 
 def _label(record: DetectionRecord) -> str:
@@ -181,15 +184,18 @@ def _save(folder: Path, frame: Frame, detections: Detections) -> None:
         stem = f"{name.stem}_{stem}"
     elif frame.file_name:
         stem = name.stem
-        suffix = name.suffix if cv2.haveImageWriter(frame.file_name) else f"{name.suffix}.jpg"
+        suffix = name.suffix if cv2.haveImageWriter(f"image{name.suffix}") else f"{name.suffix}.jpg"
     _write_image(folder / f"{stem}{suffix}", frame.image)
     drawn = annotate(frame.image, detections, faint_below=FAINT_BELOW)
     _write_image(folder / ANNOTATED / f"{stem}{suffix}", drawn)
 
 
 def _write_image(path: Path, image: NDArray[np.uint8]) -> None:
-    if not cv2.imwrite(str(path), image):
-        raise OSError(f"cannot write {path}: check free disk space and write permission")
+    # Encoded in memory: OpenCV crashes on a name that is not UTF-8.
+    done, data = cv2.imencode(path.suffix, image)
+    if not done:
+        raise OSError(f"cannot write {path}: OpenCV cannot encode this image as {path.suffix}")
+    path.write_bytes(data.tobytes())
 
 
 def _progress(source: Source, every: int, limit: int | None) -> AbstractContextManager[Callable[[], None]]:

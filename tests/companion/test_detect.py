@@ -1,6 +1,7 @@
 """Tracks in `companion detect`."""
 
 import json
+import os
 import time
 from pathlib import Path
 from typing import Any
@@ -134,6 +135,21 @@ def test_saved_images_keep_their_names(two_squares: Path, tmp_path: Path) -> Non
     assert sorted(path.name for path in saved.iterdir() if path.is_file()) == names
     assert sorted(path.name for path in (saved / "detections").iterdir()) == names
     assert [line.split()[0] for line in lines] == ["boat.jpg", "boat.png", "squares.avi"]
+
+
+def test_names_that_are_not_utf8_or_have_line_ends_are_escaped_and_saved(tmp_path: Path) -> None:
+    photos, saved = tmp_path / "photos", tmp_path / "saved"
+    photos.mkdir()
+    names = [os.fsdecode(b"caf\xe9.png"), "two\nlines.png"]
+    image = cv2.imencode(".png", np.full((60, 80, 3), 255, np.uint8))[1].tobytes()
+    for name in names:
+        (photos / name).write_bytes(image)
+    make_save_folder(saved, str(photos))
+    lines: list[str] = []
+    with open_source(str(photos)) as source:
+        detect_source(source, WhiteBlobDetector(), save=saved, write=lines.append)
+    assert [line.split()[0] for line in lines] == [r"caf\udce9.png", r"two\nlines.png"]
+    assert sorted(path.name for path in (saved / "detections").iterdir()) == names
 
 
 def test_save_folder_of_the_source_or_that_is_a_file_is_refused(two_squares: Path) -> None:

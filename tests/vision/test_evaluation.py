@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +13,7 @@ import numpy as np
 import pytest
 
 from vision.detections import Detections
-from vision.evaluation.datasets import Dataset, DatasetError, open_dataset
+from vision.evaluation.datasets import Dataset, DatasetError, open_dataset, read_image
 from vision.evaluation.misses import WorstMisses
 
 
@@ -50,6 +52,15 @@ def test_images_and_labels_in_separate_folders(yolo: Path) -> None:
     assert dataset.samples[0].class_ids.tolist() == [0, 1]
     assert pixels(dataset, 1) == [[20, 10, 60, 50]]  # The box of a polygon.
     assert len(dataset.samples[2].boxes) == 0
+
+
+def test_image_with_a_name_that_is_not_utf8_is_read(yolo: Path) -> None:
+    image = next((yolo / "images").rglob("a.jpg"))
+    renamed = image.rename(image.with_name(os.fsdecode(b"caf\xe9.jpg")))
+    assert read_image(renamed).shape == (100, 200, 3)
+    for unreadable in (image, renamed.parent):
+        with pytest.raises(DatasetError, match=re.escape(str(unreadable))):
+            read_image(unreadable)
 
 
 def test_labels_without_their_image_are_rejected(yolo: Path) -> None:

@@ -404,6 +404,12 @@ def test_folder_without_one_model_is_refused(tmp_path: Path) -> None:
         read_source(tmp_path)
 
 
+@pytest.mark.parametrize("suffix", [b".pt", b".onnx", b".xml", b".torchscript"])
+def test_file_with_a_name_that_is_not_utf8_is_refused(suffix: bytes) -> None:
+    with pytest.raises(CheckpointError, match="not UTF-8"):
+        read_source(Path(os.fsdecode(b"caf\xe9" + suffix)))
+
+
 @pytest.mark.parametrize("head", [b"", b"<?xml version='1.0'?>"])
 def test_damaged_openvino_file_is_refused_without_openvino(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, head: bytes

@@ -214,6 +214,13 @@ def test_open_failure_is_a_one_line_error(
     assert capfd.readouterr().err == ""  # no output of OpenCV or FFmpeg
 
 
+def test_video_with_a_name_that_is_not_utf8_is_refused(video: Path, tmp_path: Path) -> None:
+    copied = tmp_path / os.fsdecode(b"caf\xe9.avi")
+    copied.write_bytes(video.read_bytes())
+    with pytest.raises(SourceError, match="not UTF-8"):
+        open_source(str(copied))
+
+
 @pytest.mark.parametrize("uri", ["photo.png", "-", "rtsp://u:secret@cam/1", "udp://:5600", "shm://front"])
 @pytest.mark.parametrize("key", ["exposure_us", "gain"])
 def test_exposure_of_images_already_taken_is_refused(uri: str, key: str) -> None:

@@ -135,7 +135,12 @@ def _images_below(folder: Path) -> Iterator[Path]:
 
 def read_image(path: Path) -> NDArray[np.uint8]:
     """(height, width, 3) uint8 BGR, rotated by its EXIF orientation; raises `DatasetError`."""
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    # Decoded from memory: OpenCV crashes on a name that is not UTF-8.
+    try:
+        data = np.frombuffer(path.read_bytes(), np.uint8)
+    except OSError as error:
+        raise DatasetError(f"{path}: cannot be read ({error.strerror or error})") from None
+    image = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
     if image is None:
         raise DatasetError(f"{path}: cannot be read as an image; it may be truncated")
     return image.astype(np.uint8, copy=False)

@@ -83,12 +83,16 @@ def read_source(path: Path) -> ModelSource:
     """Read a checkpoint, or the facts of an exported file.
 
     Raises:
-        CheckpointError: a checkpoint that cannot be read.
+        CheckpointError: a checkpoint that cannot be read, or a name that is not UTF-8.
         RuntimeMissingError: an exported file, and no runtime that reads it is installed.
         RuntimeUnusableError: an exported file that is damaged or has no metadata.
     """
     if path.is_dir():
         path = _file_in(path)
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:  # the runtimes fail in their own ways
+        raise CheckpointError(f"{path}: the name is not UTF-8; rename the file") from None
     kind = kind_of(path)
     if kind is None:
         if not path.exists():  # checked before torch is imported

@@ -149,6 +149,10 @@ class VideoFileCapture(Capture):
     def __init__(self, path: Path) -> None:
         if path.stat().st_size == 0:
             raise SourceError(f"{path}: the file is empty")
+        try:
+            str(path).encode()
+        except UnicodeEncodeError:  # OpenCV would crash
+            raise SourceError(f"{path}: the name is not UTF-8; rename the file") from None
         self._path = path
         self._capture = open_ffmpeg(str(path))
         if not self._capture.isOpened():
