@@ -22,7 +22,8 @@ class ModelInfo:
 
     Attributes:
         file, size_bytes, sha256: of the file that holds the weights.
-        model_family, scale: for example YOLOv8 and n; an unpublished size has the scale "own".
+        model_family, scale: for example YOLOv8 and n; an unpublished size has the scale "own", YOLOv3-tiny
+            an empty one.
         parameters: number of trainable parameters.
         gflops: multiplications and additions counted separately, for one square image of `image_size` pixels.
         end_to_end: the head needs no NMS.
@@ -78,7 +79,7 @@ def model_info(path: Path, image_size: int = 640, runtime: RuntimeChoice = "torc
         size_bytes=weights.stat().st_size,
         sha256=digest,
         model_family=facts.model_family,
-        scale=facts.scale or "own",
+        scale="own" if facts.scale is None else facts.scale,
         parameters=facts.parameters,
         gflops=round(facts.gflops, 2),
         image_size=image_size,
@@ -103,7 +104,7 @@ def info_lines(info: ModelInfo) -> list[str]:
         "official": f"{info.official} ({KNOWN[info.official].url})"
         if info.official
         else "not in the catalogue",
-        "family": f"{info.model_family}, scale {info.scale}",
+        "family": f"{info.model_family}, scale {info.scale}" if info.scale else info.model_family,
         "head": "end to end, without NMS" if info.end_to_end else "with NMS",
         "parameters": f"{info.parameters / 1e6:.2f} million",
         "work": f"{info.gflops:.1f} GFLOPs for {info.image_size}x{info.image_size}",

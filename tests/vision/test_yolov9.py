@@ -176,6 +176,26 @@ def test_family_and_strides_are_recognised(name: str) -> None:
 
 
 @pytest.mark.parametrize(
+    ("scale", "first", "pooling"),
+    [("t", 16, 128), ("s", 32, 256), ("m", 32, 480), ("c", 64, 512), (None, 16, 256)],
+)
+def test_scale_is_known_by_its_channels(scale: str | None, first: int, pooling: int) -> None:
+    rows = yolov9("AConv", "ELAN1")
+    rows["backbone"][0][3] = [first, 3, 2]
+    rows["backbone"][9][3] = [pooling, 64]
+    model = build_shapes(ModelDescription.from_plain(rows, FEW))
+    assert describe(model, 64).scale == scale
+
+
+def test_scale_e_has_two_backbones_and_v3_tiny_has_no_scale() -> None:
+    rows = yolov9_e()
+    rows["backbone"][1][3] = [64, 3, 2]
+    rows["backbone"].insert(18, [-1, 1, "SPPELAN", [512, 64]])
+    assert describe(build_shapes(ModelDescription.from_plain(rows, FEW)), 64).scale == "e"
+    assert describe(build_shapes(described("YOLOv3-tiny")), 64).scale == ""
+
+
+@pytest.mark.parametrize(
     ("name", "row", "changed", "expected"),
     [
         ("YOLOv9, t to m", 2, ("ELAN1", [16, 15, 8]), "even channels, got 15"),

@@ -58,6 +58,13 @@ SCALES: Mapping[str, Mapping[str, Scale]] = {
     "YOLO26": _LATE_SCALES,
 }
 """Model family → scale letter → its multipliers, as published."""
+# YOLOv9 has a table of rows per scale, without multipliers: channels of the first convolution and of SPPELAN.
+_YOLOV9_SCALES: dict[tuple[object, object], str] = {
+    (16, 128): "t",
+    (32, 256): "s",
+    (32, 480): "m",
+    (64, 512): "c",
+}
 
 _USUAL_STRIDES = (8, 16, 32)
 
@@ -239,7 +246,8 @@ class ModelFacts:
     Attributes:
         model_family: as `YOLOv8`, `YOLO11`; with `-P2` or `-P6` if the head also reads a finer or a coarser
             level; `unknown` for a custom network.
-        scale: the letter, if the multipliers are the published ones of that family; else None.
+        scale: the letter, if the multipliers are the published ones of that family; empty for YOLOv3-tiny,
+            which has one size; else None.
         parameters: of the network as given. Folding batch normalisation reduces them, and so does dropping
             the training-only branches of an end-to-end head.
         gflops: 10⁹ floating-point operations per image (a multiplication and an addition are two) of
@@ -303,6 +311,16 @@ def model_family_of(model: YoloModel) -> str:
 
 
 def _scale(description: ModelDescription, model_family: str) -> str | None:
+    if model_family == "YOLOv3-tiny":
+        return ""
+    if model_family == "YOLOv9":
+        first, pooling = (
+            next((row.arguments[0] for row in description.rows if row.layer == layer), None)
+            for layer in ("Conv", "SPPELAN")
+        )
+        letter = _YOLOV9_SCALES.get((first, pooling))
+        two_backbones = any(row.layer == "CBLinear" for row in description.rows)
+        return "e" if two_backbones and letter == "c" else letter
     for letter, (depth, width, most) in SCALES.get(model_family.partition("-")[0], {}).items():
         # The first releases had a table per scale, with channels limited in the rows.
         if (description.depth_multiple, description.width_multiple) == (depth, width) and (
