@@ -165,6 +165,16 @@ def test_images_without_objects_can_be_trained_on() -> None:
     ).all()
 
 
+def test_network_that_gives_nothing_any_more_is_an_error() -> None:
+    start = train(replace(SMALL, stages=(Stage(96, 96, 8, 1),)), rectangles, silent).model
+    with torch.no_grad():
+        for branch in start.detect.cv3:
+            branch[-1].weight.zero_()  # type: ignore[index]
+            branch[-1].bias.fill_(-1e4)  # type: ignore[index]
+    with pytest.raises(FloatingPointError, match=r"step 0 .*rate"):
+        train(SMALL, rectangles, silent, start=start)
+
+
 def test_stages_of_different_sizes_follow_each_other() -> None:
     seen: list[Progress] = []
     train(replace(SMALL, stages=(Stage(64, 64, 2, 2), Stage(96, 64, 1, 1))), rectangles, seen.append)

@@ -221,7 +221,7 @@ def train(
         FileNotFoundError: `resume` without such a file.
         ValueError: the checkpoint is of another network, seed, size or `origin`; `start` is of another
             network; or `scenes` returns an invalid scene.
-        FloatingPointError: the loss is not finite.
+        FloatingPointError: the loss is not finite, or exactly 0.
     """
     started = time.monotonic()
     torch.set_num_threads(settings.threads)
@@ -264,9 +264,10 @@ def train(
         with torch.autocast("cpu", torch.bfloat16, enabled=settings.bfloat16):
             outputs = model(network_input(images))
         loss = detection_loss([level.float() for level in outputs], model.strides, truth)
-        if not torch.isfinite(loss.total):
+        # A loss of exactly 0 is a network that gives nothing any more, and learns nothing.
+        if not torch.isfinite(loss.total) or loss.total == 0:
             raise FloatingPointError(
-                f"the loss of step {step} is {float(loss.total)}; lower the learning rate"
+                f"the loss of step {step} is {float(loss.total.detach())}; lower the learning rate"
             )
         optimiser.zero_grad(set_to_none=True)
         loss.total.backward()  # type: ignore[no-untyped-call]
