@@ -167,8 +167,8 @@ def test_service_publishes_detections_of_plugins(
 
 @pytest.mark.vehicle(parameters=QUICK_FLIGHT)
 @pytest.mark.timeout(200)
-def test_square_is_flown_by_velocities(vehicle: RunningSimulator, filming: list[str], tmp_path: Path) -> None:
-    with running_service(vehicle.onboard_port, filming, cwd=tmp_path) as service:
+def test_square_is_flown_by_velocities(vehicle: RunningSimulator, tmp_path: Path) -> None:
+    with running_service(vehicle.onboard_port, ["--source", "none"], cwd=tmp_path) as service:
         asyncio.run(wait_until_it_can_take_off(service.endpoint))
         done = run_python(EXAMPLES / "steer.py", service.endpoint, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
