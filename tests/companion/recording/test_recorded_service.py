@@ -157,7 +157,7 @@ def test_recorder_is_started_again_but_not_for_a_full_disk(filming: list[str], t
         assert messages_of(first)["guidance_input"] > 20
         assert library_times(first) == [message.log_time_ns for message in RecordingReader(first).messages()]
         service.take_off(2.5)
-        wait_for(lambda: len(files(folder)) == 2 and messages_of(files(folder)[1])["guidance_input"] > 20)
+        wait_for(lambda: len(files(folder)) == 2 and messages_of(files(folder)[1])["guidance_input"] > 100)
         recorder = recorder_of(service)
         _, hard = resource.prlimit(recorder, resource.RLIMIT_FSIZE)
         resource.prlimit(recorder, resource.RLIMIT_FSIZE, (files(folder)[1].stat().st_size, hard))
