@@ -226,7 +226,7 @@ def test_virtual_structure_flies_its_path_and_ends() -> None:
 
 
 def test_next_vehicle_takes_over_the_virtual_structure() -> None:
-    fleet = flying(3)
+    fleet = flying(3, as_text=True)
     points = ((0.0, 0.0), (24.0, 0.0))
     for name in "abc":
         fleet.command(name, FormationBehaviour("line", "virtual", points=points))
