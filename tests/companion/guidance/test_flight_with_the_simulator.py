@@ -28,6 +28,14 @@ def speed_mps(state: VehicleState) -> float:
     return math.hypot(*state.velocity_ned_mps[:2])
 
 
+def off_m(state: VehicleState, north_m: float, east_m: float) -> float:
+    """Horizontal distance from a point that is given from home."""
+    home, here = state.home_position_ned_m, state.position_ned_m
+    assert home is not None
+    assert here is not None
+    return math.dist(here[:2], (home[0] + north_m, home[1] + east_m))
+
+
 @pytest.mark.parametrize("kind", ["pymavlink", pytest.param("mavsdk", marks=pytest.mark.slow)])
 async def test_flight_until_the_pilot_takes_over(kind: str) -> None:
     # Arming moves home by what the height has drifted.
@@ -46,8 +54,11 @@ async def test_flight_until_the_pilot_takes_over(kind: str) -> None:
             assert outcome.success, outcome.reason
             assert driver.state.altitude_m == pytest.approx(3.0, abs=0.6)
 
-            assert await service.fly("orbit radius=6 speed=2") == Outcome(True, "in progress")
+            path = "follow-path 0,0 5,0 5,5 speed=2 laps=0"
+            assert await service.fly(path) == Outcome(True, "in progress")
             assert driver.state.mode is FlightMode.OFFBOARD
+            await service.until(lambda: off_m(driver.state, 5.0, 0.0) < 1.0)
+            await service.until(lambda: off_m(driver.state, 5.0, 3.0) < 1.0)
             await service.until(lambda: speed_mps(driver.state) > 1.5)
             assert guidance.busy
 
