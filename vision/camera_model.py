@@ -65,6 +65,7 @@ class CameraModel:
                 f"fx {self.fx}, fy {self.fy}"
             )
         check_distortion(self.distortion_model, self.distortion)
+        object.__setattr__(self, "distortion", tuple(self.distortion))  # a list has no hash
 
     @classmethod
     def from_horizontal_fov(cls, width: int, height: int, fov_rad: float) -> CameraModel:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -85,6 +86,14 @@ def test_pixel_where_the_image_is_folded_has_no_ray() -> None:
 def test_number_of_coefficients_belongs_to_the_model(model: str, count: int) -> None:
     with pytest.raises(ValueError, match=f"{model}.*got {count}"):
         CameraModel(640, 480, 300.0, 300.0, 320.0, 240.0, (0.0,) * count, model)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("camera", [BARREL, FISHEYE], ids=["barrel", "fisheye"])
+def test_coefficients_may_be_a_list(camera: CameraModel) -> None:
+    given = replace(camera, distortion=list(camera.distortion))  # type: ignore[arg-type]
+    assert given == camera
+    assert hash(given) == hash(camera)
+    assert np.isfinite(given.rays(np.array([[10.0, 20.0]]))).all()
 
 
 def test_unknown_distortion_model_is_refused() -> None:
