@@ -97,7 +97,7 @@ class Path:
 
     def direction(self, along_m: float) -> Vector3:
         """`PathPoint.direction` there, alone."""
-        return self._directions[self._index(self._on_path(along_m))]
+        return self._directions[self._segment(along_m)[0]]
 
     def nearest(self, position: Vector3, from_m: float, to_m: float) -> float:
         """Distance along the path of the point nearest to `position`, between `from_m` and `to_m`."""
@@ -113,13 +113,14 @@ class Path:
 
     def _part(self, along_m: float) -> tuple[int, float]:
         """Index of the segment at a distance along the path, and the fraction of it."""
-        along_m = self._on_path(along_m)
-        index = self._index(along_m)
-        fraction = (along_m - self._at[index]) / (self._at[index + 1] - self._at[index])
+        index, on_path_m = self._segment(along_m)
+        fraction = (on_path_m - self._at[index]) / (self._at[index + 1] - self._at[index])
         return index, min(max(fraction, 0.0), 1.0)
 
-    def _index(self, on_path_m: float) -> int:
-        return min(max(bisect_right(self._at, on_path_m) - 1, 0), len(self._directions) - 1)
+    def _segment(self, along_m: float) -> tuple[int, float]:
+        """Index of the segment at a distance along the path, and that distance within one lap or the ends."""
+        on_path_m = along_m % self.length_m if self.closed else min(max(along_m, 0.0), self.length_m)
+        return min(max(bisect_right(self._at, on_path_m) - 1, 0), len(self._directions) - 1), on_path_m
 
     def _position(self, along_m: float) -> Vector3:
         """The position alone: `nearest` evaluates many."""
@@ -132,9 +133,6 @@ class Path:
             start[1] + fraction * (end[1] - start[1]),
             start[2] + fraction * (end[2] - start[2]),
         )
-
-    def _on_path(self, along_m: float) -> float:
-        return along_m % self.length_m if self.closed else min(max(along_m, 0.0), self.length_m)
 
     def _allowed(self, speed_mps: float) -> list[float]:
         """Greatest speed at each point: that of its bend, and from which the next one's can be reached."""
