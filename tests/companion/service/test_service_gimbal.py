@@ -207,3 +207,25 @@ def test_camera_looking_up_has_no_range_from_ground() -> None:
         ranging = step(service, now_ns).ranging
         assert (ranging.depth, ranging.ground) == (False, ground)
         assert "car" in ranging.classes
+
+
+async def test_landing_on_a_marker_needs_a_camera_down() -> None:
+    """Without markers at all it is refused in `test_land_on_marker`."""
+
+    async def reason(pitch_deg: str) -> str:
+        service, now_ns = service_of(
+            markers__dictionary="4X4_50", markers__size_m="0.5",
+            camera__horizontal_fov_deg="80", camera__mount_pitch_deg=pitch_deg,
+        ), time.monotonic_ns()  # fmt: skip
+        service.ready = True
+        set_state(service, state_at(now_ns, None))
+        service.inputs.on_result(service.cameras[0], replace(seen(now_ns), markers=()))
+        reply = asyncio.create_task(service.command("land-on-marker 7"))
+        await asyncio.sleep(0)
+        service._loop._step(now_ns)
+        refused = await reply
+        assert not refused["success"]
+        return str(refused["reason"])
+
+    assert "straight down (camera.mount_pitch_deg is -20)" in await reason("-20")
+    assert "straight down" not in await reason("-90")
