@@ -90,6 +90,16 @@ class FlightLog:
     violations: dict[str, float] = field(default_factory=dict)
 
 
+def vehicle_in_the_air(
+    *, seed: int, height_m: float = 5.0, wind_mps: float = 0.0, **options: Any
+) -> LockstepVehicle:
+    """In HOLD, with the streams of `SimulatedDriver`; arguments and errors as `LockstepFlight.airborne`."""
+    rates_hz = RATES_HZ | GIMBAL_RATES_HZ if options.get("gimbal") else RATES_HZ
+    vehicle = LockstepVehicle({"onboard": rates_hz}, seed=seed, wind_mps=wind_mps, **options)
+    vehicle.take_off(height_m, limit_s=90.0)
+    return vehicle
+
+
 class LockstepFlight:
     """One vehicle with its guidance.
 
@@ -157,15 +167,26 @@ class LockstepFlight:
         Raises:
             NotReachedError, CommandRefusedError: the vehicle did not take off.
         """
-        rates_hz = RATES_HZ | GIMBAL_RATES_HZ if options.get("gimbal") else RATES_HZ
-        vehicle = LockstepVehicle({"onboard": rates_hz}, seed=seed, wind_mps=wind_mps, **options)
-        vehicle.take_off(height_m, limit_s=90.0)
+        vehicle = vehicle_in_the_air(seed=seed, height_m=height_m, wind_mps=wind_mps, **options)
         seen = None if camera is None else camera(vehicle)
-        chosen = settings or (plain_settings() if seen is None else seen.perceived.settings)
+        return cls.of_vehicle(vehicle, camera=seen, settings=settings, limits=limits, rules=rules)
+
+    @classmethod
+    def of_vehicle(
+        cls,
+        vehicle: LockstepVehicle,
+        *,
+        camera: Camera | None = None,
+        settings: Settings | None = None,
+        limits: Limits | None = None,
+        rules: ObstacleRules | None = None,
+    ) -> LockstepFlight:
+        """As `airborne`, with a vehicle that is ready, for example a copy of `vehicle_in_the_air`."""
+        chosen = settings or (plain_settings() if camera is None else camera.perceived.settings)
         guided = guidance_options(chosen, COMPANION)
         guided = replace(guided, limits=limits or guided.limits, obstacles=rules or guided.obstacles)
         driver = SimulatedDriver(vehicle, range_finder_height=chosen.guidance.range_finder_height)
-        return cls(driver, chosen, [] if seen is None else [seen], guided)
+        return cls(driver, chosen, [] if camera is None else [camera], guided)
 
     @property
     def vehicle(self) -> LockstepVehicle:

@@ -6,12 +6,10 @@ import math
 from functools import cache
 
 from benchmarks.rendered import camera_settings
-from companion.bench.lockstep_flight import LockstepFlight
-from companion.bench.simulated_driver import GIMBAL_RATES_HZ, RATES_HZ, SimulatedDriver
+from companion.bench.lockstep_flight import LockstepFlight, vehicle_in_the_air
 from companion.bench.synthetic_camera import SyntheticCamera
 from companion.bench.synthetic_detector import Faults, SceneObject, ScenePose, SyntheticDetector
 from companion.guidance.search_pattern import Footprint
-from mavlink_sim import LockstepVehicle
 from vision.attitude import Quaternion
 from vision.camera_model import CameraModel, CameraMount
 
@@ -20,6 +18,8 @@ ON_GIMBAL = CameraMount(forward_m=0.1, on_gimbal=True)
 FOOTPRINT = Footprint(math.radians(80.0), 0.0)
 HEIGHT_M = 10.0
 PERSON_M = (0.5, 0.6, 1.7)
+# It flies there once: the tests fly copies, which are equal bit for bit.
+in_the_air = cache(vehicle_in_the_air)
 
 
 def person(bearing_deg: float, distance_m: float = 4.0) -> SceneObject:
@@ -27,16 +27,6 @@ def person(bearing_deg: float, distance_m: float = 4.0) -> SceneObject:
     bearing = math.radians(bearing_deg)
     pose = ScenePose(distance_m * math.cos(bearing), distance_m * math.sin(bearing))
     return SceneObject("person", PERSON_M, lambda _: pose)
-
-
-@cache
-def in_the_air(seed: int, wind_mps: float) -> LockstepVehicle:
-    """It flies there once: the tests fly copies, which are equal bit for bit."""
-    vehicle = LockstepVehicle(
-        {"onboard": RATES_HZ | GIMBAL_RATES_HZ}, seed=seed, wind_mps=wind_mps, gimbal=True
-    )
-    vehicle.take_off(HEIGHT_M)
-    return vehicle
 
 
 def gimbal_flight(
@@ -47,7 +37,7 @@ def gimbal_flight(
     wind_mps: float = 0.0,
 ) -> LockstepFlight:
     """In the air, with a detector that sees the objects through the gimbal's camera."""
-    vehicle = in_the_air(seed, wind_mps).copy()
+    vehicle = in_the_air(seed=seed, height_m=HEIGHT_M, wind_mps=wind_mps, gimbal=True).copy()
 
     def gimbal_attitude() -> Quaternion:
         gimbal = vehicle.vehicle.gimbal
@@ -58,6 +48,5 @@ def gimbal_flight(
     detector = SyntheticDetector(
         scene_objects, CAMERA, mount, seed=seed, faults=Faults(0.0, 0.05, 0.0, 0.0), gimbal=gimbal_attitude
     )
-    settings = camera_settings(CAMERA, mount)
-    camera = SyntheticCamera(settings, detect=detector, rate_hz=rate_hz)
-    return LockstepFlight(SimulatedDriver(vehicle), settings, [camera])
+    camera = SyntheticCamera(camera_settings(CAMERA, mount), detect=detector, rate_hz=rate_hz)
+    return LockstepFlight.of_vehicle(vehicle, camera=camera)
