@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from vision.runtimes.base import required
 from vision.yolo.architecture import YoloModel
 
 ULTRALYTICS = {
@@ -164,9 +165,9 @@ def ultralytics_torchscript(
 
 def ultralytics_openvino(folder: Path, onnx_path: Path, names: Sequence[str], size: tuple[int, int]) -> Path:
     """A folder with `NAME.xml`, `NAME.bin` and `metadata.yaml`."""
-    import openvino
     import yaml
 
+    openvino = required("openvino")
     folder.mkdir()
     openvino.save_model(
         openvino.convert_model(str(onnx_path)), str(folder / "net.xml"), compress_to_fp16=False

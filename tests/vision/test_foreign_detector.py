@@ -19,12 +19,12 @@ from tests.vision.foreign_files import (
     ultralytics_openvino,
     ultralytics_torchscript,
 )
-from tests.vision.runtimes.conftest import NAMES, lively_model, make_image
+from tests.vision.runtimes.conftest import NAMES, lively_model, make_image, needs
 from vision.detections import Detections
 from vision.detector import Detector, class_names_of
 from vision.foreign.class_names import COCO_NAMES, names_beside
 from vision.foreign.layouts import Port, recognise
-from vision.runtimes.base import RuntimeUnusableError
+from vision.runtimes.base import RuntimeUnusableError, installed
 from vision.runtimes.selection import RuntimeChoice
 from vision.runtimes.source import read_source
 from vision.yolo.checkpoint import CheckpointError, save_checkpoint
@@ -54,15 +54,9 @@ def exports(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         "dynamic": ultralytics_onnx(folder / "dynamic.onnx", model(), SIZE, dynamic=True),
         "torchscript": ultralytics_torchscript(folder / "net.torchscript", model(), SIZE),
     }
-    if _has_openvino():
+    if installed("openvino"):
         found["folder"] = ultralytics_openvino(folder / "net_openvino_model", fixed, NAMES, SIZE)
     return found
-
-
-def _has_openvino() -> bool:
-    import importlib.util
-
-    return importlib.util.find_spec("openvino") is not None
 
 
 def assert_same_boxes(expected: Detections, found: Detections) -> None:
@@ -86,7 +80,7 @@ def test_export_has_the_boxes_of_its_checkpoint(
     exports: dict[str, Path], kind: str, runtime: RuntimeChoice
 ) -> None:
     if runtime == "openvino":
-        pytest.importorskip("openvino", reason="openvino is an optional extra")
+        needs("openvino")
     options: dict[str, Any] = {"confidence": 0.3, "threads": 1, "precision": "float32"}
     checkpoint = Detector(exports["checkpoint"], image_size=96, square=False, **options)
     export = Detector(exports[kind], image_size=96, runtime=runtime, **options)

@@ -29,7 +29,7 @@ from tests.vision.foreign_files import (
     ultralytics_openvino,
     ultralytics_torchscript,
 )
-from tests.vision.runtimes.conftest import lively_model, make_image
+from tests.vision.runtimes.conftest import lively_model, make_image, needs
 from tests.vision.test_yolov9 import FOREIGN_YOLOV9, described
 from tests.vision.test_yolox import save_yolox
 from vision.detector import Detector
@@ -38,8 +38,7 @@ from vision.weights import DEFAULT_WEIGHTS
 from vision.yolo.published import yolov8_description
 from vision.yolo.safe_pickle import _HANDLERS
 
-for package in ("onnx", "onnxruntime", "openvino"):
-    pytest.importorskip(package, reason=f"{package} is an optional extra")
+needs("onnx", "onnxruntime", "openvino")
 
 SIZE = (64, 96)
 TWO = ("car", "dog")

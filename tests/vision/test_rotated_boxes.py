@@ -21,7 +21,7 @@ from tests.vision.foreign_checkpoints import (
     save_foreign,
     trained_model,
 )
-from tests.vision.runtimes.conftest import make_image
+from tests.vision.runtimes.conftest import make_image, needs
 from vision.detector import Detector
 from vision.foreign.layouts import TASKS
 from vision.runtimes.base import RuntimeUnusableError
@@ -88,7 +88,7 @@ def test_checkpoint_and_its_export_find_the_same_boxes(
 
 
 def test_openvino_in_bfloat16_gives_nearly_the_sides(tmp_path: Path) -> None:
-    pytest.importorskip("openvino", reason="openvino is an optional extra")
+    needs("openvino")
     exported = export(checkpoint(tmp_path, "YOLOv8"), "openvino", image_size=96)
     image = make_image(64, 96)
     try:

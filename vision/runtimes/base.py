@@ -22,8 +22,7 @@ Device = Literal["cpu", "cuda"]
 DEVICES: tuple[Device, ...] = ("cpu", "cuda")
 PRECISIONS: tuple[Precision, ...] = ("auto", "float32", "bfloat16", "float16")
 
-# Without this package OpenVINO's converter does not report each use to its makers over the network.
-sys.modules.setdefault("openvino_telemetry", None)  # type: ignore[arg-type]  # None: it cannot be imported
+_TELEMETRY = "openvino_telemetry"
 
 
 class RuntimeUnusableError(ValueError):
@@ -100,12 +99,33 @@ def required(runtime: RuntimeName, *, also: str | None = None) -> Any:
                 f"pip install 'mavlink-companion[{runtime}]'"
             )
     try:
-        return importlib.import_module(runtime)
+        return _import_openvino() if runtime == "openvino" else importlib.import_module(runtime)
     except ImportError as error:
         raise RuntimeMissingError(
             f"the runtime {runtime} is installed but cannot be loaded: {error}; "
             f"reinstall it: pip install --force-reinstall 'mavlink-companion[{runtime}]'"
         ) from error
+
+
+def _import_openvino() -> Any:
+    """Import OpenVINO so that it does not report its use.
+
+    With its telemetry package it reports its import and each conversion to its makers over the network, and
+    stores an identifier in `~/intel`.
+    """
+    before = {name: sys.modules[name] for name in (_TELEMETRY,) if name in sys.modules}
+    sys.modules[_TELEMETRY] = None  # type: ignore[assignment]  # It cannot be imported.
+    try:
+        openvino = importlib.import_module("openvino")
+    finally:
+        del sys.modules[_TELEMETRY]
+        sys.modules.update(before)
+    # The program may have imported OpenVINO before, with its telemetry.
+    for name, module in list(sys.modules.items()):
+        telemetry = getattr(module, "tm", None) if name.startswith("openvino.tools.ovc.") else None
+        if getattr(telemetry, "__name__", None) == _TELEMETRY:
+            module.tm = importlib.import_module("openvino.tools.ovc.telemetry_stub")  # type: ignore[attr-defined]
+    return openvino
 
 
 def bfloat16_instructions() -> str:

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from companion.cli import app
-from tests.vision.runtimes.conftest import lively_model, make_image
+from tests.vision.runtimes.conftest import lively_model, make_image, needs
 from vision.detector import Detector
 from vision.runtimes import export as export_module
 from vision.runtimes.base import RuntimeName, RuntimeUnusableError
@@ -46,7 +46,7 @@ def quantised(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> tuple[Path, RuntimeName]:
     kind, runtime = request.param
-    pytest.importorskip(runtime, reason=f"{runtime} is an optional extra")
+    needs(runtime)
     path = tmp_path_factory.mktemp("int8") / f"net{SUFFIXES[kind]}"
     return export(checkpoint, kind, path, SIDE, calibrate=photographs), runtime
 

@@ -6,12 +6,14 @@ import importlib.metadata
 import importlib.util
 import json
 import logging
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.vision.runtimes.conftest import make_image
+from tests.vision.runtimes.conftest import make_image, needs
 from vision.detector import Detector
 from vision.runtimes import autotune, base, stored_choice
 from vision.runtimes.base import RuntimeMissingError, RuntimeName, RuntimeUnusableError, installed
@@ -50,10 +52,44 @@ def test_broken_runtime_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
         base.required("openvino")
 
 
+TELEMETRY = """
+events = []
+class Telemetry:
+    def __init__(self, *_, **__): events.append("init")
+    def send_event(self, *event): events.append(event)
+    def start_session(self, *_): pass
+    def end_session(self, *_): pass
+    def force_shutdown(self, *_): pass
+"""
+
+
+@pytest.mark.parametrize("imported_before", [False, True])
+def test_openvino_does_not_report_its_use(tmp_path: Path, imported_before: bool) -> None:
+    needs("openvino")
+    package = tmp_path / "openvino_telemetry"
+    (package / "backend").mkdir(parents=True)
+    (package / "__init__.py").write_text(TELEMETRY)
+    (package / "backend" / "__init__.py").write_text("backend_ga4 = None\n")
+    program = (
+        f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n"
+        f"if {imported_before}: import openvino\n"
+        "from vision.runtimes.base import required\n"
+        "before = len(sys.modules['openvino_telemetry'].events) if 'openvino' in sys.modules else 0\n"
+        "openvino = required('openvino')\n"
+        "try: openvino.convert_model('none.onnx')\n"
+        "except Exception: pass\n"
+        "import openvino_telemetry\n"
+        "print(before, len(openvino_telemetry.events))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    before, after = map(int, done.stdout.split())
+    assert after == before
+    assert (before > 0) == imported_before  # of its import, which it reports itself
+
+
 @pytest.mark.parametrize("runtime", ["onnxruntime", "openvino"])
 def test_checkpoint_is_converted_once_for_a_named_runtime(checkpoint: Path, runtime: RuntimeName) -> None:
-    pytest.importorskip(runtime, reason=f"{runtime} is an optional extra")
-    pytest.importorskip("onnx", reason="onnx comes with the optional extras")
+    needs(runtime, "onnx")
     image = make_image(64, 96)
     for classes in (None, ["car", "dog"]) if runtime == "onnxruntime" else (["car", "dog"],):
         settings: dict[str, Any] = {"image_size": 96, "classes": classes, "threads": 1, "confidence": 0.3}
