@@ -31,7 +31,7 @@ from vision.object_detector import (
 )
 from vision.registry import shown
 from vision.runtimes.base import PRECISIONS, Device, Precision
-from vision.runtimes.selection import RuntimeChoice, check_choice, check_runtime, start_runtime
+from vision.runtimes.selection import RuntimeChoice, check_runtime, check_runtime_name, start_runtime
 from vision.runtimes.source import ModelSource, read_source
 from vision.runtimes.stored_choice import forget_choices
 from vision.weights import DEFAULT_WEIGHTS
@@ -123,7 +123,7 @@ class Detector(ObjectDetector):
             raise ValueError(f"precision must be {', '.join(PRECISIONS)}; got {precision!r}")
         if threads is not None and threads < 1:
             raise ValueError(f"threads must be at least 1, got {threads}")
-        check_choice(runtime)  # before torch is imported to read a checkpoint
+        check_runtime_name(runtime)  # before torch is imported to read a checkpoint
         fit(image_size, image_size, image_size)  # Rejects a bad size now, not at the first frame.
         source = read_source(_model_path(model))
         self._stride = max(source.strides)

@@ -60,7 +60,7 @@ def start_runtime(
         RuntimeMissingError: the named runtime is not installed. There is no fallback.
         RuntimeUnusableError: it cannot run this file, or not in this precision.
     """
-    check_choice(choice)
+    check_runtime_name(choice)
     if device not in DEVICES:
         raise ValueError(
             f"device must be {' or '.join(DEVICES)}, got {device!r}; CUDA_VISIBLE_DEVICES selects one of "
@@ -92,7 +92,7 @@ def start_runtime(
     )
 
 
-def check_choice(choice: str) -> None:
+def check_runtime_name(choice: str) -> None:
     """Raise ValueError for what is no `RuntimeChoice`."""
     if choice != "auto" and choice not in RUNTIMES:
         raise ValueError(f"runtime must be auto, {', '.join(RUNTIMES)}; got {choice!r}")

@@ -42,6 +42,21 @@ def test_missing_runtime_names_its_extra(
         runtime_of_file(runtime, checkpoint)
 
 
+def test_wrong_runtime_name_is_refused_before_the_model_is_read() -> None:
+    wrong: Any = "abacus"
+    with pytest.raises(ValueError, match="runtime must be auto, torch"):
+        Detector("/none.pt", runtime=wrong)
+
+
+def test_missing_runtime_is_not_measured_nor_the_model_read(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(autotune, "_end_with_parent", lambda parent: None)
+    only(monkeypatch, "torch")
+    assert autotune.main(json.dumps({"parent_pid": 0, "path": "/none.pt", "runtime": "tensorrt"})) == 0
+    assert "mavlink-companion[tensorrt]" in capsys.readouterr().out
+
+
 def test_broken_runtime_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(name: str) -> Any:
         raise ImportError("libsomething.so.1: cannot open shared object file")
