@@ -119,7 +119,10 @@ def shade(colours: Plane, light: Plane) -> Plane:
 
 def _per_channel(plane: Plane) -> Plane:
     """A plane (H, W) once for each of the three channels: numpy broadcasts a last axis in twice the time."""
-    return np.asarray(cv2.merge((plane, plane, plane)), np.float32)
+    if not plane.size:  # OpenCV merges no empty planes.
+        return np.empty((*plane.shape, 3), plane.dtype)
+    merged: Plane = np.asarray(cv2.merge((plane, plane, plane)))
+    return merged
 
 
 def _grass(rng: np.random.Generator, size: int) -> Plane:

@@ -15,13 +15,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from mavlink_sim.camera import ground_view
-from mavlink_sim.camera.ground_view import Buffers
+from mavlink_sim.camera.ground_view import Buffers, ground_atlas
 from mavlink_sim.camera.image_effects import MILD_EFFECTS, ImageEffects
 from mavlink_sim.camera.renderer import DEFAULT_CAMERA, DEFAULT_MOUNT, Rendered, Renderer, VisibleObject
 from mavlink_sim.datasets.training_scenes import random_scene
 from mavlink_sim.world.shapes import CLASS_NAMES
 from mavlink_sim.world.textures import GUTTER, mip_atlas
-from mavlink_sim.world.world import Ground, Light, Sky, World, WorldObject, demo_world
+from mavlink_sim.world.world import Ground, Light, Patch, Sky, World, WorldObject, demo_world
 from vision.camera_model import CameraModel, CameraMount
 from vision.geolocation import PixelRays
 from vision.rotation import matrix_from_euler
@@ -242,6 +242,12 @@ def test_shadow_points_away_from_sun() -> None:
     # North is up in the image, the sun is in the north.
     assert darker[bottom + 2, middle].mean() > 20
     assert abs(darker[top - 4, middle].mean()) < 3
+
+
+def test_pad_and_patches_may_be_smaller_than_a_texel() -> None:
+    plain = Ground(("concrete",), 0, 64, 5.0)
+    painted = replace(plain, pad=True, patches=(Patch("water", 0.0, 0.0, 0.2),))
+    assert np.array_equal(ground_atlas(painted).pixels, ground_atlas(plain).pixels)
 
 
 def test_frames_are_independent() -> None:
