@@ -181,7 +181,8 @@ class SyntheticDetector:
         shown = np.clip(wholes, 0.0, (float(self._camera.width), float(self._camera.height)) * 2)
         areas, kept = (np.prod(boxes[:, 2:] - boxes[:, :2], axis=1) for boxes in (wholes, shown))
         nearest_m = np.linalg.norm(points, axis=2).min(axis=1)
-        # NaN where a corner is behind the camera.
+        # The box of an object with a corner that the lens cannot see is NaN, and so is its part in the image:
+        # NaN > 0 is False.
         return [
             _Outline(int(index), shown[index], float(nearest_m[index]), float(kept[index] / areas[index]))
             for index in np.flatnonzero((points[:, :, 2].min(axis=1) >= NEAR_M) & (kept > 0.0))
@@ -221,7 +222,10 @@ class SyntheticDetector:
 
 
 def _corners(thing: SceneObject) -> NDArray[np.float64]:
-    """(8, 3) from its middle on the ground."""
+    """(8, 3) corners of the object's box, in the order of `CORNERS`.
+
+    In metres forward, right and down of the middle of its base.
+    """
     corners = CORNERS * thing.size_m
     # As of real things, wheels and feet stand behind the surface; small things stand on nearly all of it.
     inset_m = np.minimum(np.array(thing.size_m[:2]) / 8, CONTACT_INSET_M)
