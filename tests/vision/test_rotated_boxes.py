@@ -110,12 +110,17 @@ def test_int8_export_keeps_sides_angles_and_classes_in_float(tmp_path: Path) -> 
     photographs.mkdir()
     for number in range(16):
         assert cv2.imwrite(str(photographs / f"{number:02}.png"), make_image(64, 64, seed=number))
-    exported = export(checkpoint(tmp_path, "YOLOv8"), "onnx", image_size=64, calibrate=photographs)
-    nodes = onnx.load(str(exported)).graph.node
-    int8 = {name for node in nodes if node.op_type == "DequantizeLinear" for name in node.output}
-    convolutions = [node for node in nodes if node.op_type == "Conv"]
-    in_float = [node for node in convolutions if node.input[1] not in int8]
-    assert len(in_float) == 3 * 3 < len(convolutions)  # of sides, angles and classes, at three levels
+    exported = export(checkpoint(tmp_path, "YOLO11"), "onnx", image_size=64, calibrate=photographs)
+    graph = onnx.load(str(exported)).graph
+    shapes = {weights.name: tuple(weights.dims) for weights in graph.initializer}
+    quantised = {node.output[0]: node.input[0] for node in graph.node if node.op_type == "DequantizeLinear"}
+    weights = [node.input[1] for node in graph.node if node.op_type == "Conv"]
+    # The last ones of angles, classes and sides, at three levels.
+    in_float = [shapes[name] for name in weights if name not in quantised]
+    assert sorted(shape[0] for shape in in_float) == [1] * 3 + [len(NAMES)] * 3 + [4 * 16] * 3
+    assert {shape[2:] for shape in in_float} == {(1, 1)}
+    int8 = [shapes[quantised[name]] for name in weights if name in quantised]
+    assert len([shape for shape in int8 if shape[1:] == (1, 3, 3)]) >= 2 * 3  # depthwise, of the classes
 
 
 def test_network_gives_distances_of_all_cells() -> None:
