@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from typer.testing import CliRunner
 
-from companion.bench.detector import BenchError, read_result, table
+from companion.bench.detector import BenchError, measure_detectors, read_result, table
 from companion.cli import app
 from vision.yolo.architecture import build
 from vision.yolo.checkpoint import save_checkpoint
@@ -36,8 +37,22 @@ def bench(model: Path, *more: str) -> str:
 def test_measurement_has_all_figures_and_can_be_compared(
     small_model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    earlier = json.loads(bench(small_model, "--json", "--classes", "car"))
+    results = []
+
+    def measure(*arguments: Any, **options: Any) -> dict[str, Any]:
+        results.append(measure_detectors(*arguments, **options))
+        return results[-1]
+
+    monkeypatch.setattr("companion.bench.detector.measure_detectors", measure)
+    heading, line = bench(small_model, "--classes", "car").splitlines()
+    (earlier,) = results
     (row,) = earlier["rows"]
+    names = [
+        "runtime", "precision", "threads", "fastest_ms", "p50_ms", "p99_ms", "around_p50_ms", "processor_ms",
+        "frames_per_s", "memory_mb", "first_detection_s",
+    ]  # fmt: skip
+    assert heading.split() == names
+    assert line.split() == [str(row[name]) for name in names]
     assert (row["runtime"], row["threads"], row["frames"]) == ("torch", 1, 6)
     assert earlier["classes"] == ["car"]
     assert earlier["frame"] == "64x48"
@@ -47,14 +62,12 @@ def test_measurement_has_all_figures_and_can_be_compared(
     assert row["processor_ms"] > 0
     assert row["memory_mb"] > 10
     assert row["first_detection_s"] > 0
-    (tmp_path / "earlier.json").write_text(json.dumps(earlier))
+    monkeypatch.setattr("companion.bench.detector.measure_detectors", lambda *_, **__: earlier)
+    (tmp_path / "earlier.json").write_text(bench(small_model, "--json"))
+    assert json.loads((tmp_path / "earlier.json").read_text()) == earlier
     later = earlier | {"rows": [row | {"p50_ms": 2 * row["p50_ms"]}]}
     monkeypatch.setattr("companion.bench.detector.measure_detectors", lambda *_, **__: later)
-    heading, line = bench(small_model, "--against", str(tmp_path / "earlier.json")).splitlines()
-    assert heading.split() == [
-        "runtime", "precision", "threads", "fastest_ms", "p50_ms", "p99_ms", "around_p50_ms", "processor_ms",
-        "frames_per_s", "memory_mb", "first_detection_s",
-    ]  # fmt: skip
+    _, line = bench(small_model, "--against", str(tmp_path / "earlier.json")).splitlines()
     assert line.endswith(f"p50 was {row['p50_ms']} ms: 2.00 of it")
 
 
