@@ -40,7 +40,8 @@ def test_recall_counts_evaluated_objects_found_as_their_class() -> None:
 def test_every_scene_is_judged_and_frames_are_drawn_once(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # To paint the ground of every scene takes twice as long as all the rest.
+    # test_renderer.py draws a ground with patches, a road and a pad (the built-in world's, as the village's);
+    # test_rendered_perception.py draws marker_landing and test_cloud_command.py obstacle_course.
     plain = mip_atlas(np.full((64, 64, 3), 110, np.uint8))
     monkeypatch.setattr(ground_view, "ground_atlas", lambda ground: plain)
     folder = tmp_path / "frames"

@@ -257,7 +257,6 @@ def test_other_frames_follow_from_their_generator_too(draw: Callable[..., Render
     first, again = (draw(np.random.default_rng(5), 160, 128) for _ in range(2))
     assert np.array_equal(first.image, again.image)
     assert first.image.shape == (128, 160, 3)
-    # Of the same example world, whose ground is painted already.
     assert not np.array_equal(first.image, draw(np.random.default_rng(8), 160, 128).image)
 
 
