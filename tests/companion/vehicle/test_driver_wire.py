@@ -15,6 +15,7 @@ from pymavlink.dialects.v20 import common as mavlink
 from companion.vehicle.driver import Driver, SystemStatus
 from companion.vehicle.drivers import open_driver
 from companion.vehicle.framing import CURRENT_MODE_ID, pack_frame
+from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
 from tests.companion.vehicle.fake_autopilot import (
@@ -57,6 +58,40 @@ async def test_position_setpoint_ignores_velocity(driver: Driver, autopilot: Fak
     (message,) = await autopilot.wait_for(SETPOINT)
     assert (message.x, message.y, message.z, message.yaw) == (10.0, 20.0, -5.0, 1.25)
     assert message.type_mask == 0b1001_1111_1000
+
+
+async def test_landing_target_has_the_autopilots_coordinates(
+    driver: Driver, autopilot: FakeAutopilot
+) -> None:
+    for boot_ms, (north, east) in ((1000, (0.0, 0.0)), (1020, (7.0, -2.0))):  # a reset of the estimate
+        autopilot.send(mavlink.MAVLink_local_position_ned_message(boot_ms, north, east, -4.0, 0.0, 0.0, 0.0))
+    await wait_for_state(driver, lambda state: state.reset_offset_ned_m == (7.0, -2.0, 0.0))
+    driver.send_landing_target(LandingTarget(5_000_123_000, 7, (3.0, -1.5, 0.25), (0.5, -0.25, 4.0), 0.5))
+    (message,) = await autopilot.wait_for("LANDING_TARGET")
+    distance = math.hypot(0.5, -0.25, 4.0)
+    size = 2 * math.atan(0.25 / distance)
+    values = message.to_dict()
+    assert values.pop("mavpackettype") == "LANDING_TARGET"
+    quaternion = values.pop("q")
+    assert values == pytest.approx(
+        {
+            "time_usec": 5_000_123,
+            "target_num": 7,
+            "frame": mavlink.MAV_FRAME_LOCAL_NED,
+            "angle_x": math.atan2(-0.25, 4.0),
+            "angle_y": math.atan2(-0.5, 4.0),
+            "distance": distance,
+            "size_x": size,
+            "size_y": size,
+            "x": 10.0,
+            "y": -3.5,
+            "z": 0.25,
+            "type": mavlink.LANDING_TARGET_TYPE_VISION_FIDUCIAL,
+            "position_valid": 1,
+        }
+    )
+    assert quaternion == [1.0, 0.0, 0.0, 0.0]
+    assert (message.get_srcSystem(), message.get_srcComponent()) == (1, 191)
 
 
 async def test_every_setpoint_is_sent_once(driver: Driver, autopilot: FakeAutopilot) -> None:
