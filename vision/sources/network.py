@@ -292,21 +292,22 @@ class HttpMjpegCapture(Capture):
     """The images of an endless HTTP response."""
 
     def __init__(self, response: http.client.HTTPResponse) -> None:
+        import http.client
+
         self._response = response
+        self._errors = (OSError, http.client.HTTPException)
         self._parser = MjpegParser()
         self._ready: deque[tuple[NDArray[np.uint8], int, float]] = deque()
         # A second descriptor of the same connection, to end a read from another thread.
         self._socket = socket.socket(fileno=os.dup(response.fileno()))
 
     def read(self, timeout_s: float) -> RawFrame | None:
-        from http.client import HTTPException
-
         while not self._ready:
             try:
                 data = self._response.read1(1 << 16)
             except TimeoutError as error:
                 raise CaptureError("no more data arrived") from error
-            except (OSError, HTTPException) as error:
+            except self._errors as error:
                 raise CaptureError(f"the connection failed: {error}") from error
             if not data:
                 raise CaptureError("the server closed the connection")
