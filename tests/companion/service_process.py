@@ -120,7 +120,14 @@ def heartbeats() -> Iterator[int]:
     """
     port, ended = free_port(), threading.Event()
     codec = mavlink.MAVLink(None, 1, 1)
-    message = mavlink.MAVLink_heartbeat_message(2, 12, 29, 0x03040000, 3, 3)
+    message = mavlink.MAVLink_heartbeat_message(
+        mavlink.MAV_TYPE_QUADROTOR,
+        mavlink.MAV_AUTOPILOT_PX4,
+        mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED,
+        4 << 16 | 3 << 24,  # PX4's AUTO.LOITER: main mode and sub mode
+        mavlink.MAV_STATE_STANDBY,
+        3,  # the MAVLink version
+    )
 
     def send() -> None:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:

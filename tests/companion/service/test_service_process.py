@@ -55,7 +55,7 @@ def fly(service: ServiceProcess) -> None:
     assert service.command("hold") == {"command": "hold", "success": True, "reason": "in progress"}
 
 
-def test_ardupilot_works_with_default_settings(tmp_path: Path) -> None:
+def test_ardupilot_is_recognized_by_a_service_without_a_camera(tmp_path: Path) -> None:
     with (
         running_simulator(autopilot="ardupilot") as simulator,
         running_service(simulator.onboard_port, NO_CAMERA, cwd=tmp_path) as service,
@@ -71,13 +71,18 @@ def test_ardupilot_works_with_default_settings(tmp_path: Path) -> None:
             vehicle = received.get(timeout=10)["vehicle"]
 
 
-def test_flight_by_commands_with_the_mavsdk_driver(tmp_path: Path) -> None:
+def test_flight_with_detections_and_the_mavsdk_driver(seeing: list[str], tmp_path: Path) -> None:
+    flags = [*seeing, "--source-rate-hz", "2", "--driver", "mavsdk"]
     with (
         running_simulator(parameters=QUICK_FLIGHT) as simulator,
-        running_service(simulator.onboard_port, [*NO_CAMERA, "--driver", "mavsdk"], cwd=tmp_path) as service,
+        running_service(simulator.onboard_port, flags, cwd=tmp_path) as service,
+        service.client() as session,
     ):
+        detections: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
         service.take_off(2.5)
         assert service.command("orbit radius=3 speed=1")["success"]
+        listen(session, "detections", lambda _key, text: detections.put(json.loads(text)))
+        assert detections.get(timeout=10)["vehicle"] == "vehicle1"
         assert service.command("land")["success"]
         simulator.wait_for_event("disarmed")
 
@@ -130,7 +135,7 @@ def test_flight_with_detections_survives_a_killed_worker(seeing: list[str], tmp_
         before = statuses.get(timeout=10)["perception"]
         while not statuses.empty():
             before = statuses.get()["perception"]
-        count = len(service.lines)
+        count, killed_ns = len(service.lines), time.monotonic_ns()
         os.kill(before["pid"], signal.SIGKILL)
         service.wait_for_line("perception", after=count)
         deadline = time.monotonic() + 40
@@ -144,7 +149,9 @@ def test_flight_with_detections_survives_a_killed_worker(seeing: list[str], tmp_
                 break
         assert after["restarts"] == 1
         assert truth(path)[-1]["mode"] == "OFFBOARD"
-        messages = [received.get(timeout=10) for _ in range(30)]
+        messages = [received.get(timeout=10)]
+        while len(messages) < 30 or messages[-1]["captured_ns"] < killed_ns:
+            messages.append(received.get(timeout=10))
         assert_ends_in_hold(service, simulator, signal.SIGINT)
     messages += [received.get() for _ in range(received.qsize())]
     published = [message["published_ns"] for message in messages]
