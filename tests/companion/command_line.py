@@ -14,6 +14,13 @@ from typer.testing import CliRunner
 from companion.cli.commands import app
 
 COLUMNS = {"COLUMNS": "200", "NO_COLOR": "1"}
+# `companion`, whose simulated vehicles take off and land quickly: for `python -c`.
+QUICK = """
+from companion import cli, sim_session
+from mavlink_sim.testing import QUICK_FLIGHT
+sim_session.SIMULATOR_PARAMETERS.update(QUICK_FLIGHT)
+cli.main()
+"""
 
 
 def companion(*arguments: str | Path, cwd: Path, timeout_s: float = 60.0) -> subprocess.CompletedProcess[str]:

@@ -22,28 +22,22 @@ from companion.bus.client import send_command
 from companion.bus.topics import DETECTIONS
 from companion.play import PlayOptions
 from mavlink_sim.testing import QUICK_FLIGHT, free_port, running_simulator, vehicle
-from tests.companion.command_line import companion, companion_here
+from tests.companion.command_line import QUICK, companion, companion_here
 from tests.companion.service_process import ServiceProcess
 
 pytestmark = pytest.mark.realtime
 
 READY = "Ctrl-C ends it"
-# With vehicles that take off and land quickly.
-QUICK = """
-from companion import cli, sim_session
-from mavlink_sim.testing import QUICK_FLIGHT
-sim_session.SIMULATOR_PARAMETERS.update(QUICK_FLIGHT)
-cli.main()
-"""
 
 
 @contextmanager
-def playing(folder: Path, *flags: str) -> Iterator[ServiceProcess]:
-    """A running `companion play` that is ready for commands."""
+def playing(folder: Path, *flags: str, quick: bool = True) -> Iterator[ServiceProcess]:
+    """A running `companion play` that is ready for commands; not quick: exactly as a user starts it."""
     endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    program = ("-c", QUICK) if quick else ("-m", "companion.cli")
     process = subprocess.Popen(
         [
-            *(sys.executable, "-c", QUICK, "play", "--zenoh-listen", endpoint),
+            *(sys.executable, *program, "play", "--zenoh-listen", endpoint),
             *("--dashboard-listen", "", *flags),
         ],
         cwd=folder,
@@ -182,7 +176,7 @@ def test_up_to_four_vehicles_have_a_camera_each() -> None:
 
 
 def test_play_exits_with_1_when_simulator_dies(tmp_path: Path, small: list[str]) -> None:
-    with playing(tmp_path, *small) as running:
+    with playing(tmp_path, *small, quick=False) as running:
         started = descendants(running.pid)
         vehicle = next(pid for pid in started if b"mavlink_sim" in Path(f"/proc/{pid}/cmdline").read_bytes())
         os.kill(vehicle, signal.SIGKILL)
@@ -228,7 +222,7 @@ def test_play_that_cannot_start_is_one_line(tmp_path: Path, flags: tuple[str, ..
 @pytest.mark.slow
 def test_sentences_and_a_policy_fly_to_a_car(tmp_path: Path) -> None:
     """As docs/how-to/ask.md and policies.md show it: the bundled model, patterns, the bundled policy."""
-    with playing(tmp_path) as running:
+    with playing(tmp_path, quick=False) as running:
         connect = ("--connect", running.endpoint)
         for sentence, allowed in (("take off to three metres", "takeoff"), ("find a car", "seek")):
             asked = companion(
