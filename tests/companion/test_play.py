@@ -114,7 +114,7 @@ def test_play_flies_an_autopilot_at_a_url_and_ends_on_ctrl_c(tmp_path: Path, sma
         with running.client() as session:
             message = next_detections(session, "vehicle1")
         assert (message["width"], message["height"]) == (160, 120)
-        busy = companion_here("play", "--zenoh-listen", running.endpoint, cwd=tmp_path)
+        busy = companion("play", "--zenoh-listen", running.endpoint, cwd=tmp_path)
         assert busy.returncode == 2
         (line,) = busy.stderr.splitlines()
         assert running.endpoint in line
