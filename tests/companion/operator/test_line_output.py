@@ -133,14 +133,14 @@ def test_program_exits_with_a_full_pipe(pipe: Pipe) -> None:
         process.kill()
 
 
-def test_service_works_with_an_unread_log(pipe: Pipe, tmp_path: Path) -> None:
+def test_service_works_with_an_unread_log(filming: list[str], pipe: Pipe, tmp_path: Path) -> None:
     fill(pipe[1])
     endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     settings = client_settings(ZenohSection(listen=(endpoint,)))
     statuses: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
     with running_simulator(parameters=QUICK_FLIGHT) as simulator:
-        command = [sys.executable, "-m", "companion.cli", "run", "--source", "none", "--log-level", "debug"]
-        command += ["--dashboard-listen", ""]
+        command = [sys.executable, "-m", "companion.cli", "run", *filming, "--source-rate-hz", "2"]
+        command += ["--log-level", "debug", "--dashboard-listen", ""]
         command += [f"--vehicle-url=udpin://127.0.0.1:{simulator.onboard_port}", f"--zenoh-listen={endpoint}"]
         process = subprocess.Popen(
             command, stdin=subprocess.DEVNULL, stdout=pipe[1], stderr=pipe[1], cwd=tmp_path

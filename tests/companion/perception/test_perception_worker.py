@@ -240,7 +240,8 @@ def test_failure_of_a_start_is_one_line(
 ) -> None:
     values = {"source.uri": str(image_folder), "detector.runtime": "onnxruntime", "detector.image_size": "64"}
     settings = load_settings(os.devnull, {**values, "detector.model": str(exported_model), **overrides}, {})
-    failed = _work(Begin(settings), Mock(), Mock())
+    control = Mock(stopping=True)  # a start that does not fail ends at once
+    failed = _work(Begin(settings), control, Mock())
     assert isinstance(failed, StartFailed)
     assert re.search(named, failed.text)
     assert "\n" not in failed.text
@@ -332,11 +333,11 @@ def test_reset_restarts_the_silence() -> None:
     assert watchdog.silent_s(51.0) == 1.0
 
 
-def test_worker_and_supervisor_import_nothing_that_is_rarely_used() -> None:
-    rare = {"torch", "yaml", "urllib.request"}
-    code = (
-        "import companion.perception.supervisor, companion.perception.worker, sys\n"
-        f"print(sorted({rare} & set(sys.modules)))"
-    )
+@pytest.mark.parametrize(
+    "modules", ["companion.perception.supervisor, companion.perception.worker", "companion.service"]
+)
+def test_service_and_worker_import_no_torch_yaml_or_http(modules: str) -> None:
+    unwanted = {"torch", "yaml", "http.client", "urllib.request"}
+    code = f"import {modules}, sys\nprint(sorted({unwanted} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
