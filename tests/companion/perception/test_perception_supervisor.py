@@ -391,7 +391,7 @@ async def main():
     settings = load_settings("/dev/null", dict(text.split("=", 1) for text in sys.argv[1:]), {})
     supervisor = PerceptionSupervisor(
         settings,
-        on_result=lambda result: print("result", result.sequence, result.width, flush=True),
+        on_result=lambda _: print("result", "torch" in sys.modules, flush=True),
         on_event=lambda level, text: print("event", text, flush=True),
     )
     await supervisor.start()
@@ -419,10 +419,13 @@ def wait_for_line(process: subprocess.Popen[str], beginning: str) -> str:
     raise AssertionError(f"it ended without a line {beginning!r}")
 
 
-def test_worker_dies_with_a_killed_service(photos: Path) -> None:
-    arguments = [f"source.uri={photos}", "source.loop=true", "detector.enabled=no"]
+def test_worker_dies_with_a_killed_service_without_torch(photos: Path, exported_model: Path) -> None:
+    arguments = [f"source.uri={photos}", "source.loop=true", f"detector.model={exported_model}"]
+    arguments += ["detector.runtime=onnxruntime", "detector.image_size=64", "detector.threads=1"]
     with service(subprocess.DEVNULL, *arguments) as process:
         _, pid = wait_for_line(process, "pid").split()
+        for _ in range(2):
+            assert wait_for_line(process, "result") == "result False"
         assert alive(int(pid))
         process.kill()
     deadline_s = time.monotonic() + DEADLINE_S

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
+import math
 import queue
 import threading
 import time
 import uuid
 import zlib
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -89,8 +92,22 @@ def clouds_of(settings: PreviewSection, frames: list[Frame], *, watched: bool = 
 
 
 def wall(width: int, height: int, stamp_ns: int = 0) -> Frame:
+    """A wall 4 m away, its lower half 3 m, its right half in another colour."""
     depth_m = np.full((height, width), 4.0, np.float32)
-    return Frame(np.full((height, width, 3), (1, 2, 3), np.uint8), stamp_ns, stamp_ns // 100_000_000, depth_m)
+    depth_m[height // 2 :] = 3.0
+    image = np.full((height, width, 3), (1, 2, 3), np.uint8)
+    image[:, width // 2 :] = (4, 5, 6)
+    return Frame(image, stamp_ns, stamp_ns // 100_000_000, depth_m)
+
+
+def assert_is_of_the_wall(points: np.ndarray[Any, Any]) -> None:
+    """For the default lens (80 deg wide), an image of 4:3 and voxels of at most 0.5 m."""
+    x, y, z = points["xyz"].T
+    np.testing.assert_allclose(z, np.where(y < 0, 4.0, 3.0), atol=1e-3)
+    half_m = 4.0 * math.tan(math.radians(40.0))
+    assert (x.min(), x.max()) == pytest.approx((-half_m, half_m), abs=0.5)
+    assert (y.min(), y.max()) == pytest.approx((-0.75 * half_m, 0.75 * half_m * 3 / 4), abs=0.5)
+    assert (points["rgba"] == np.where(x[:, None] < 0, (3, 2, 1, 255), (6, 5, 4, 255))).all()
 
 
 @pytest.mark.parametrize("images", [True, False])
@@ -109,7 +126,7 @@ def test_depth_images_are_of_the_frames_of_the_images(images: bool) -> None:
     assert [each.sequence for each in depths] == [0, 2]
     assert [each.sequence for each in found if isinstance(each, Preview)] == [0, 2, 9] * images
     assert (depths[0].width, depths[0].height) == (64, 48)
-    assert zlib.decompress(depths[0].data) == np.full(64 * 48, 4000, "<u2").tobytes()
+    assert zlib.decompress(depths[0].data) == np.repeat(np.array([4000, 3000], "<u2"), 64 * 24).tobytes()
 
 
 def test_cloud_has_points_and_colours_of_the_frame() -> None:
@@ -117,8 +134,7 @@ def test_cloud_has_points_and_colours_of_the_frame() -> None:
     assert (cloud.sequence, cloud.captured_ns) == (5, 500_000_000)
     points = np.frombuffer(cloud.data, [("xyz", "<f4", 3), ("rgba", "u1", 4)])
     assert len(points) == cloud.points > 50
-    np.testing.assert_allclose(points["xyz"][:, 2], 4.0, atol=1e-4)
-    assert (points["rgba"] == (3, 2, 1, 255)).all()
+    assert_is_of_the_wall(points)
 
 
 def test_clouds_of_large_frames_are_bounded() -> None:
@@ -140,20 +156,18 @@ def shared_frames() -> Iterator[str]:
     name, ended = f"wall-{uuid.uuid4().hex[:8]}", threading.Event()
 
     def write() -> None:
-        sharing = FrameSharing(name)
-        sequence = 0
-        while not ended.wait(0.1):
+        for sequence in count():
             sharing.write(replace(wall(160, 120), captured_ns=time.monotonic_ns(), sequence=sequence))
-            sequence += 1
-        sharing.close()
+            if ended.wait(0.1):
+                break
 
-    writing = threading.Thread(target=write, name="frames", daemon=True)
-    writing.start()
-    try:
-        yield name
-    finally:
-        ended.set()
-        writing.join()
+    with FrameSharing(name) as sharing, ThreadPoolExecutor(1) as executor:
+        writing = executor.submit(write)
+        try:
+            yield name
+        finally:
+            ended.set()
+            writing.result()  # or its exception
 
 
 def test_images_clouds_and_depth_only_with_a_subscriber(tmp_path: Path) -> None:
@@ -199,7 +213,7 @@ def test_images_clouds_and_depth_only_with_a_subscriber(tmp_path: Path) -> None:
     assert about_cloud["frame_id"] == "vehicle1/camera"
     points = np.frombuffer(cloud.payload.to_bytes(), [("xyz", "<f4", 3), ("rgba", "u1", 4)])
     assert len(points) == about_cloud["points"] > 50
-    np.testing.assert_allclose(points["xyz"][:, 2], 4.0, atol=1e-3)
+    assert_is_of_the_wall(points)
     millimetres = np.frombuffer(zlib.decompress(depth.payload.to_bytes()), "<u2")
     assert len(millimetres) == about_depth["width"] * about_depth["height"] == 160 * 120
-    assert (millimetres == 4000).all()
+    assert (millimetres == np.repeat([4000, 3000], 160 * 60)).all()
