@@ -8,7 +8,7 @@ ALLOW_CUDA ?=
 TORCH := --constraint constraints.txt $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) torch
 # Tests at once: of those that compute, and of those that fly in real time and mostly wait.
 WORKERS ?= auto
-REALTIME_WORKERS ?= 5
+REALTIME_WORKERS ?= 6
 # The files with real-time tests, without those that need an autopilot: each of the workers imports what it is given.
 REALTIME = $(sort $(shell grep -rl mark.realtime tests --include='test_*.py' | xargs grep -L mark.sitl))
 BIN := $(VENV)/bin

@@ -39,6 +39,7 @@ from companion.settings import Settings
 from companion.settings.perception import CameraSection, DetectorSection
 from vision.detections import TRACK_CONFIRMED, DetectionRecord
 from vision.frame import Frame
+from vision.model_files import find_model
 from vision.pipeline import PerceptionResult, Pipeline
 from vision.runtimes.exported import kind_of
 from vision.sources.source import OneFrame
@@ -340,13 +341,14 @@ def _as_in_flight(
 ) -> DetectorSection:
     """Every image is processed, with the runtime and precision that `auto` selected in the flight.
 
-    Selecting again may come out otherwise, and two replays would differ. An exported file needs another
-    runtime than the checkpoint of the flight.
+    Selecting again may come out otherwise, and two replays would differ. A file of another kind than the
+    flight's may need another runtime.
     """
     changes: dict[str, Any] = {"model": model, "every": 1, "rate_hz": None, "max_age_s": None}
     changes["threads"] = section.threads or threads
-    if section.runtime == "torch" and kind_of(Path(model)) not in (None, "torchscript"):
-        return section.model_copy(update=changes | {"runtime": "auto"})
+    other_kind = kind_of(find_model(model)) != kind_of(find_model(section.model))
+    if other_kind and section.runtime in (None, "auto", "torch"):
+        return section.model_copy(update=changes | {"runtime": None})
     changes["runtime"] = section.runtime if section.runtime != "auto" else status.get("runtime", "torch")
     if section.precision == "auto":
         changes["precision"] = status.get("precision") or "float32"

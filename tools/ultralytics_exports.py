@@ -36,8 +36,7 @@ def compare(file: Path, images: list[NDArray[np.uint8]], precision: Precision) -
     from ultralytics import RTDETR, YOLO
 
     source = read_source(file)
-    runtime = source.runners()[0]
-    ours = Detector(file, confidence=CONFIDENCE, iou=IOU, runtime=runtime, precision=precision)
+    ours = Detector(file, confidence=CONFIDENCE, iou=IOU, precision=precision)
     assert source.foreign is not None
     theirs = (RTDETR if source.foreign.layout == "queries" else YOLO)(str(file), task=source.foreign.task)
     least, largest, boxes, alone = 1.0, 0.0, 0, 0

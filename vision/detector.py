@@ -89,7 +89,7 @@ class Detector(ObjectDetector):
         precision: Precision = "auto",
         threads: int | None = None,
         square: bool = False,
-        runtime: RuntimeChoice = "torch",
+        runtime: RuntimeChoice | None = None,
         device: Device = "cpu",
     ) -> None:
         """Load the model.
@@ -108,11 +108,13 @@ class Detector(ObjectDetector):
             threads: processor threads of the runtime (torch: of the whole process); None: its default.
             square: pad the input to a square rather than to the next multiple of the stride.
             device: `cpu`, or `cuda` for a checkpoint on torch.
-            runtime: by name, or `auto` for the fastest installed one (measured once, cached).
+            runtime: by name, or `auto` for the fastest installed one (measured once, cached). None: torch for
+                a checkpoint and TorchScript, onnxruntime for `.onnx`, openvino for `.xml` or its folder,
+                tensorrt for `.engine`.
 
         Raises:
             CheckpointError: the model cannot be read.
-            RuntimeMissingError: the named runtime is not installed; the message names its extra.
+            RuntimeMissingError: the runtime is not installed; the message names its extra.
             RuntimeUnusableError: the runtime cannot run this model, or not in this precision.
             ValueError: an unknown class (the message names the nearest), or a number out of range.
         """
@@ -325,7 +327,9 @@ class _FilteredDetector(ObjectDetector):
         return found[kept]
 
 
-def class_names_of(model: str | Path = DEFAULT_MODEL, runtime: RuntimeChoice = "torch") -> tuple[str, ...]:
+def class_names_of(
+    model: str | Path = DEFAULT_MODEL, runtime: RuntimeChoice | None = None
+) -> tuple[str, ...]:
     """Class names of a model, id → name, without loading it into a runtime.
 
     Raises:

@@ -34,7 +34,7 @@ class DetectorSettings:
         image_size: longer side of a network's input, pixels.
         precision: of the network, or `auto`.
         threads: processor threads; None: the detector's default.
-        runtime: of the network, or `auto`.
+        runtime: of the network, or `auto`; None: the default for the file of `model`.
         device: of torch, `cpu` or `cuda`.
 
     >>> from vision import DetectorSettings
@@ -49,7 +49,7 @@ class DetectorSettings:
     image_size: int = 640
     precision: Precision = "auto"
     threads: int | None = None
-    runtime: RuntimeChoice = "torch"
+    runtime: RuntimeChoice | None = None
     device: Device = "cpu"
 
 

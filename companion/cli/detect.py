@@ -34,8 +34,12 @@ def detect(
         int, typer.Option(min=32, help="Longer side of the network's input, pixels.")
     ] = 640,
     runtime: Annotated[
-        str, typer.Option(help="Runtime: torch, onnxruntime, openvino, tensorrt or auto.")
-    ] = "torch",
+        str | None,
+        typer.Option(
+            help="Runtime: torch, onnxruntime, openvino, tensorrt or auto. Default: that of the file, "
+            "torch for a checkpoint."
+        ),
+    ] = None,
     precision: Annotated[str, typer.Option(help="Precision: auto, float32, bfloat16 or float16.")] = "auto",
     device: Annotated[str, typer.Option(help="Device of torch: cpu or cuda.")] = "cpu",
     threads: Annotated[int | None, typer.Option(min=1, help="CPU threads of the network.")] = None,

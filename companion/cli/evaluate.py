@@ -29,8 +29,12 @@ def evaluate(
         typer.Option(min=0, max=1, help="NMS IoU threshold. Default: that of the model, else 0.7."),
     ] = None,
     runtime: Annotated[
-        str, typer.Option(help="Runtime: torch, onnxruntime, openvino, tensorrt or auto.")
-    ] = "torch",
+        str | None,
+        typer.Option(
+            help="Runtime: torch, onnxruntime, openvino, tensorrt or auto. Default: that of the file, "
+            "torch for a checkpoint."
+        ),
+    ] = None,
     precision: Annotated[
         str | None,
         typer.Option(

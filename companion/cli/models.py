@@ -50,8 +50,8 @@ def info(
     runtime: Annotated[
         str | None,
         typer.Option(
-            help="Runtime: torch, onnxruntime, openvino, tensorrt or auto. Default: torch for a checkpoint, "
-            "the first installed one for an exported file."
+            help="Runtime: torch, onnxruntime, openvino, tensorrt or auto. Default: that of the file, "
+            "torch for a checkpoint."
         ),
     ] = None,
     as_json: _JSON = False,
@@ -68,7 +68,7 @@ def info(
             export = export_info(source, image_size, runtime)  # type: ignore[arg-type]  # checked there
             plain, lines = export.plain(), export_lines(export)
         else:
-            found = model_info(source.path, image_size, runtime or "torch")  # type: ignore[arg-type]
+            found = model_info(source.path, image_size, runtime)  # type: ignore[arg-type]
             plain, lines = found.plain(), info_lines(found)
     if as_json:
         typer.echo(json.dumps(plain))
@@ -146,8 +146,7 @@ def export(
             model_family=model_family,
             calibrate=calibrate,
         )
-    reader = {"onnx": "onnxruntime", "torchscript": "torch"}.get(to, to)
-    typer.echo(f"{written} ({written.stat().st_size} bytes), for --model with --runtime {reader}")
+    typer.echo(f"{written} ({written.stat().st_size} bytes), for --model")
 
 
 @models.command()

@@ -7,7 +7,6 @@ from typing import Any
 
 from vision.detector import Detector
 from vision.foreign.layouts import LAYOUTS, TASKS
-from vision.runtimes.base import installed
 from vision.runtimes.selection import RuntimeChoice
 from vision.runtimes.source import ModelSource
 from vision.yolo.checkpoint_pair import weights_sha256
@@ -29,7 +28,7 @@ class ExportInfo:
         classes: id → name.
         names_from: where the class names are from.
         licence: as stated in the file; None if missing.
-        runtime, precision: on this computer.
+        runtime, runtime_reason, precision: on this computer.
         stated: further metadata in the file.
     """
 
@@ -46,6 +45,7 @@ class ExportInfo:
     names_from: str
     licence: str | None
     runtime: str
+    runtime_reason: str
     precision: str
     stated: dict[str, Any]
 
@@ -56,15 +56,10 @@ class ExportInfo:
 def export_info(source: ModelSource, image_size: int, runtime: RuntimeChoice | None) -> ExportInfo:
     """Describe an exported file, and load it to determine its precision on this computer.
 
-    Args:
-        runtime: None: the first installed one that runs the file.
-
     Raises:
         RuntimeUnusableError: the runtime is missing or does not run the file.
     """
-    runners = source.runners()
-    first: RuntimeChoice = next((name for name in runners if installed(name)), runners[0])
-    detector = Detector(source.path, image_size=image_size, runtime=runtime or first)
+    detector = Detector(source.path, image_size=image_size, runtime=runtime)
     stated = dict(source.metadata)
     licence = stated.pop("licence", None)
     found = detector.foreign
@@ -82,6 +77,7 @@ def export_info(source: ModelSource, image_size: int, runtime: RuntimeChoice | N
         names_from="its metadata" if found is None else found.names_from,
         licence=None if licence is None else str(licence),
         runtime=detector.runtime,
+        runtime_reason=detector.runtime_reason,
         precision=f"{detector.precision} ({detector.precision_reason})",
         stated=stated,
     )
@@ -100,7 +96,7 @@ def export_lines(info: ExportInfo) -> list[str]:
         "outputs": f"{info.layout}: {info.layout_text}",
         "input": f"{size}, stride {info.stride}",
         "classes": f"{len(info.classes)} (from {info.names_from}): {shown}",
-        "runs here": f"on {info.runtime}",
+        "runs here": f"on {info.runtime} ({info.runtime_reason})",
         "precision": info.precision,
         "licence": info.licence or "not stated in the file",
         **{key: str(value) for key, value in info.stated.items() if isinstance(value, str | int | float)},

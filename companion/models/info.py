@@ -57,7 +57,7 @@ class ModelInfo:
         return asdict(self)
 
 
-def model_info(path: Path, image_size: int = 640, runtime: RuntimeChoice = "torch") -> ModelInfo:
+def model_info(path: Path, image_size: int = 640, runtime: RuntimeChoice | None = None) -> ModelInfo:
     """Read and describe a checkpoint, and load it to determine its precision on this computer.
 
     Raises:

@@ -51,10 +51,12 @@ from companion.settings.calibration import adopt_calibration
 from companion.vehicle.precise_sleep import lower_priority
 from vision.detections import Detections
 from vision.frame import Frame
+from vision.model_files import find_model
 from vision.object_detector import YOLO, DetectionsError, ObjectDetector
 from vision.path_planner import PathRequest
 from vision.pipeline import PerceptionResult, Pipeline
 from vision.recording import Recording
+from vision.runtimes.exported import kind_of
 from vision.sources import EndOfStream, Source, SourceError, open_source
 from vision.sources.shared import FrameSharing
 from vision.tracking import Selected, SelectRequest
@@ -281,8 +283,12 @@ def _heartbeat_while_loading(settings: Settings, sender: ResultSender) -> Iterat
         while not loaded.wait(_LOADING_PERIOD_S):
             sender.put_newest(Heartbeat(0))
 
-    others = settings.detector.kind != YOLO or bool(settings.plugins.modules)
-    if settings.detector.runtime != "torch" or others:
+    section = settings.detector
+    model = find_model(section.model)
+    by_torch = section.runtime == "torch" or (
+        section.runtime is None and kind_of(model) is None and not model.is_dir()
+    )
+    if not by_torch or section.kind != YOLO or settings.plugins.modules:
         threading.Thread(target=send_heartbeats, name="loading", daemon=True).start()
     try:
         yield

@@ -268,8 +268,8 @@ class DetectorSection(Section):
     """NMS IoU threshold; unset: that of the model's description, else 0.7"""
     image_size: Annotated[int, Field(ge=32, le=4096, multiple_of=32)] = 640
     """longer side of the network's input, pixels"""
-    runtime: Literal["auto", "torch", "onnxruntime", "openvino", "tensorrt"] = "torch"
-    """inference runtime; auto uses the fastest installed, measured once on this board"""
+    runtime: Literal["auto", "torch", "onnxruntime", "openvino", "tensorrt"] | None = None
+    """inference runtime; auto measures the fastest once; unset: torch for checkpoints, else the file's own"""
     precision: Literal["auto", "float32", "bfloat16", "float16"] = "auto"
     """arithmetic of the network; auto uses bfloat16 if the processor supports it well"""
     device: Literal["cpu", "cuda"] = "cpu"

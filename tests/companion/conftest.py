@@ -84,7 +84,6 @@ def seeing(exported_model: Path, image_folder: Path) -> list[str]:
     """Flags for a service that detects in the images, ten a second."""
     return [
         *("--source", str(image_folder), "--source-loop", "true", "--source-rate-hz", "10"),
-        *("--model", str(exported_model), "--detector-runtime", "onnxruntime"),
-        *("--detector-image-size", "160"),
+        *("--model", str(exported_model), "--detector-image-size", "160"),
         *("--guidance-perception-max-age-s", "3"),
     ]

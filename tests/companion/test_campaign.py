@@ -72,7 +72,7 @@ def test_detectors_of_campaigns_take_no_measured_choice(monkeypatch: pytest.Monk
     monkeypatch.setattr(demo_flight, "RenderedCamera", camera)
     with pytest.raises(InterruptedError):
         demo_flight.fly_demo(3)
-    assert [(each.detector.runtime, each.detector.precision) for each in taken] == [("torch", "float32")] * 2
+    assert [(each.detector.runtime, each.detector.precision) for each in taken] == [(None, "float32")] * 2
     assert taken[1].detector.threads == 1
 
 

@@ -95,6 +95,15 @@ def test_export_has_the_boxes_of_its_checkpoint(
     assert export.foreign.fixed_size == (None if kind == "dynamic" else SIZE)
 
 
+@pytest.mark.parametrize(
+    ("kind", "runtime"), [("fixed", "onnxruntime"), ("folder", "openvino"), ("torchscript", "torch")]
+)
+def test_export_runs_on_the_runtime_of_its_kind(exports: dict[str, Path], kind: str, runtime: str) -> None:
+    if runtime == "openvino":
+        pytest.importorskip("openvino", reason="openvino is an optional extra")
+    assert Detector(exports[kind], threads=1).runtime == runtime
+
+
 def test_classes_are_filtered_after_the_best_is_known(exports: dict[str, Path]) -> None:
     image = make_image(64, 96, seed=3)
     every = Detector(exports["fixed"], confidence=0.3, runtime="onnxruntime").detect(image)

@@ -38,7 +38,7 @@ class SelectedRuntime:
 
 def start_runtime(
     source: ModelSource,
-    choice: RuntimeChoice,
+    choice: RuntimeChoice | None,
     *,
     class_ids: Sequence[int] | None = None,
     precision: Precision = "auto",
@@ -50,6 +50,7 @@ def start_runtime(
     """Load a model on the requested runtime.
 
     Args:
+        choice: None: the first of `source.runners()`, installed or not.
         class_ids: sorted; a checkpoint's network computes only these. For an exported file the classes are
             filtered afterwards.
         sparse_boxes: compute a checkpoint's boxes only at candidate cells; for thresholds that few cells
@@ -57,10 +58,13 @@ def start_runtime(
         device: `cuda` for a checkpoint on torch; the other runtimes choose theirs.
 
     Raises:
-        RuntimeMissingError: the named runtime is not installed. There is no fallback.
+        RuntimeMissingError: the named runtime, or the one of None, is not installed. There is no fallback.
         RuntimeUnusableError: it cannot run this file, or not in this precision.
     """
     check_runtime_name(choice)
+    reason = "as requested"
+    if choice is None:
+        choice, reason = source.runners()[0], "the default for this kind of file"
     if device not in DEVICES:
         raise ValueError(
             f"device must be {' or '.join(DEVICES)}, got {device!r}; CUDA_VISIBLE_DEVICES selects one of "
@@ -74,7 +78,7 @@ def start_runtime(
         )
     if choice != "auto":
         runtime = start_named(source, choice, class_ids, precision, threads, image_size, sparse_boxes, device)
-        return SelectedRuntime(runtime, "as requested")
+        return SelectedRuntime(runtime, reason)
     candidates = [name for name in source.runners() if installed(name)]
     if len(candidates) == 1:
         name, reason = candidates[0], "the only installed runtime for this model"
@@ -92,18 +96,19 @@ def start_runtime(
     )
 
 
-def check_runtime_name(choice: str) -> None:
-    """Raise ValueError for what is no `RuntimeChoice`."""
-    if choice != "auto" and choice not in RUNTIMES:
+def check_runtime_name(choice: str | None) -> None:
+    """Raise ValueError for what is no `RuntimeChoice` or None."""
+    if choice not in (None, "auto", *RUNTIMES):
         raise ValueError(f"runtime must be auto, {', '.join(RUNTIMES)}; got {choice!r}")
 
 
-def check_runtime(source: ModelSource, choice: RuntimeChoice) -> None:
+def check_runtime(source: ModelSource, choice: RuntimeChoice | None) -> None:
     """Raise the RuntimeUnusableError or RuntimeMissingError of `start_runtime` without starting anything."""
     if choice == "auto":
         if not any(installed(name) for name in source.runners()):
             required(source.runners()[0])  # raises with what to install
         return
+    choice = choice or source.runners()[0]
     if choice not in source.runners():
         raise cannot_run(source, choice)
     if choice != "torch":

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from vision.yolo.architecture import YoloModel
     from vision.yolo.description import ModelDescription
 
-# Runtimes of each kind of file. All of them run a checkpoint, by an export.
+# Runtimes of each kind of file, its default first. All of them run a checkpoint, by an export.
 _RUNNERS: dict[ExportKind, tuple[RuntimeName, ...]] = {
     "onnx": ("onnxruntime", "openvino"),
     "openvino": ("openvino",),
@@ -73,7 +73,7 @@ class ModelSource:
         return self.kind == "tensorrt" or (self.facts is not None and self.facts.precision == "int8")
 
     def runners(self) -> tuple[RuntimeName, ...]:
-        """The runtimes that can run this kind of file."""
+        """The runtimes that can run this kind of file, the default first."""
         if self.kind is None:
             return ("torch",) if self.foreign else ("torch", "onnxruntime", "openvino", "tensorrt")
         return _RUNNERS[self.kind]
@@ -134,7 +134,8 @@ def _facts(path: Path, kind: ExportKind) -> ExportedFacts | ForeignFacts:
         from vision.runtimes.tensorrt_runtime import tensorrt_facts
 
         return tensorrt_facts(path)
-    if kind == "onnx" and installed("onnxruntime"):
+    # Without both, the error names the default one.
+    if kind == "onnx" and (installed("onnxruntime") or not installed("openvino")):
         from vision.runtimes.onnx_runtime import onnx_facts
 
         return onnx_facts(path)

@@ -31,8 +31,6 @@ from vision.yolo.checkpoint import load_checkpoint, save_checkpoint
 
 pytestmark = pytest.mark.realtime
 
-ONNX = ("--runtime", "onnxruntime")
-
 
 def one_line_of_bad_input(done: subprocess.CompletedProcess[str]) -> str:
     """Return the only line on standard error; check that the exit code is 2."""
@@ -48,7 +46,7 @@ def test_detect_writes_one_json_object_per_frame(
     exported_model: Path, image_folder: Path, tmp_path: Path
 ) -> None:
     done = companion(
-        "detect", image_folder, "--model", exported_model, *ONNX, "--image-size", "160", "--confidence", "0",
+        "detect", image_folder, "--model", exported_model, "--image-size", "160", "--confidence", "0",
         "--json", "--every", "3", "--limit", "4", "--save", tmp_path / "saved", cwd=tmp_path,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -77,7 +75,7 @@ def test_detect_reports_tracks_with_track_option(
     exported_model: Path, image_folder: Path, tmp_path: Path
 ) -> None:
     done = companion_here(
-        "detect", image_folder, "--model", exported_model, *ONNX, "--image-size", "160", "--confidence", "0",
+        "detect", image_folder, "--model", exported_model, "--image-size", "160", "--confidence", "0",
         "--json", "--limit", "2", "--track", cwd=tmp_path,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -96,7 +94,6 @@ def test_detect_without_json_writes_one_line_per_frame(
         image_folder,
         "--model",
         exported_model,
-        *ONNX,
         "--image-size",
         "160",
         "--confidence",
@@ -117,7 +114,6 @@ def test_detect_reports_only_requested_classes(
         image_folder,
         "--model",
         exported_model,
-        *ONNX,
         "--image-size",
         "160",
         "--confidence",
@@ -173,7 +169,6 @@ def test_unknown_class_is_one_line_with_nearest_names(
         image_folder,
         "--model",
         exported_model,
-        *ONNX,
         "--classes",
         "persn",
     ]
@@ -185,9 +180,7 @@ def test_unknown_class_is_one_line_with_nearest_names(
 def test_unreadable_video_is_one_line(exported_model: Path, tmp_path: Path) -> None:
     video = tmp_path / "broken.mp4"
     video.write_bytes(b"\0\0\0\x18ftypmp42" + bytes(1000))
-    line = one_line_of_bad_input(
-        companion_here("detect", video, "--model", exported_model, *ONNX, cwd=tmp_path)
-    )
+    line = one_line_of_bad_input(companion_here("detect", video, "--model", exported_model, cwd=tmp_path))
     assert "broken.mp4" in line
 
 
@@ -301,7 +294,7 @@ def test_detect_warns_of_a_model_of_rendered_scenes(
     model, flags = {
         "default": ("default", ("--image-size", "96")),
         "path": (str(DEFAULT_WEIGHTS), ("--image-size", "96")),
-        "export": (str(exported_model), (*ONNX, "--image-size", "160")),
+        "export": (str(exported_model), ("--image-size", "160")),
     }[name]
     done = companion_here("detect", image_folder, "--limit", "2", "--model", model, *flags, cwd=tmp_path)
     assert done.returncode == 0, done.stderr

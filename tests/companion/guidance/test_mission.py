@@ -193,7 +193,7 @@ def test_unreadable_file_is_reported(tmp_path: Path) -> None:
 
 
 def test_cli_checks_a_mission_and_prints_its_plan(exported_model: Path, tmp_path: Path) -> None:
-    options = ("--check", "--model", exported_model, "--detector-runtime", "onnxruntime")
+    options = ("--check", "--model", exported_model)
     done = companion_here("mission", "demo", *options, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     title, first = done.stdout.splitlines()[:2]
@@ -207,7 +207,7 @@ def test_cli_checks_a_mission_and_prints_its_plan(exported_model: Path, tmp_path
     assert done.stderr.startswith("companion: bad.toml: step 1 (look)")
     assert "'zebra'" in done.stderr
     assert done.stderr.count("\n") == 1
-    done = companion_here("mission", "demo", *options[:3], cwd=tmp_path)
+    done = companion_here("mission", "demo", *options, "--detector-runtime", "torch", cwd=tmp_path)
     assert done.returncode == 2
     assert "cannot run .onnx files" in done.stderr
 

@@ -26,6 +26,7 @@ def test_info_has_layout_size_and_task_of_an_export(tmp_path: Path) -> None:
     assert plain["written_by"] == "Ultralytics 8.4.190"
     assert (plain["kind"], plain["task"], plain["layout"]) == ("onnx", "pose", "cells")
     assert (plain["stride"], plain["input_size"], plain["runtime"]) == (32, [64, 96], "onnxruntime")
+    assert "default" in plain["runtime_reason"]
     assert plain["classes"] == ["car", "dog"]
     assert plain["licence"].startswith("AGPL-3.0")
     lines = CliRunner().invoke(app, ["models", "info", str(path)]).output.splitlines()

@@ -66,7 +66,6 @@ def settings_of(source: Path | str, model: Path | None = None, /, **overrides: s
         "source.rate_hz": "50",
         "detector.enabled": "false",
         **({} if model is None else {"detector.enabled": "true", "detector.model": str(model)}),
-        **({"detector.runtime": "onnxruntime"} if model is not None and model.suffix == ".onnx" else {}),
         "detector.image_size": "64",
         "detector.threads": "1",
         "detector.precision": "float32",

@@ -46,7 +46,7 @@ from companion.perception.process import (
     Watchdog,
     log_printed,
 )
-from companion.perception.worker import ControlChannel, _work
+from companion.perception.worker import ControlChannel, _heartbeat_while_loading, _work
 from companion.settings.reading import load_settings
 from vision.detections import Detections
 from vision.pipeline import PerceptionResult
@@ -311,6 +311,21 @@ def test_loading_worker_has_a_longer_limit() -> None:
     watchdog.ready()
     assert watchdog.stuck_after_s == FIRST_RESULT_S
     assert watchdog.silent_s(107.5) == 2.5
+
+
+@pytest.mark.parametrize(
+    ("values", "sends"),
+    [
+        ({}, False),
+        ({"detector.model": "any.onnx"}, True),
+        ({"detector.model": "any.onnx", "detector.runtime": "torch"}, False),
+        ({"detector.runtime": "auto"}, True),
+    ],
+)
+def test_heartbeats_while_a_model_loads_that_may_take_long(values: dict[str, str], sends: bool) -> None:
+    settings = load_settings(Path(os.devnull), {"source.uri": "none", **values}, environment={})
+    with _heartbeat_while_loading(settings, Mock()):
+        assert ("loading" in {thread.name for thread in threading.enumerate()}) is sends
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import importlib.util
 import json
 import subprocess
 import sys
@@ -15,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.vision.runtimes.conftest import NAMES, lively_model, make_image, needs
-from vision.detector import Detector
+from vision.detector import Detector, class_names_of
 from vision.runtimes import export as export_module
 from vision.runtimes.base import RUNTIMES, RuntimeMissingError, RuntimeName, RuntimeUnusableError, installed
 from vision.runtimes.export import export
@@ -97,12 +98,50 @@ def test_an_exported_file_is_a_model_by_itself(
     np.testing.assert_allclose(a.xyxy, b.xyxy, atol=0.1)
 
 
+@pytest.mark.parametrize(
+    ("kind", "runtime"),
+    [(None, "torch"), ("onnx", "onnxruntime"), ("openvino", "openvino"), ("torchscript", "torch")],
+)
+def test_each_kind_of_file_has_its_default_runtime(
+    exported: Any, checkpoint: Path, kind: ExportKind | None, runtime: RuntimeName
+) -> None:
+    path = checkpoint if kind is None else exported(kind)
+    assert class_names_of(path) == NAMES
+    found = Detector(path, image_size=96, threads=1, precision="float32")
+    assert (found.runtime, found.class_names) == (runtime, NAMES)
+    assert "default" in found.runtime_reason
+
+
+@pytest.mark.parametrize("others", [(), ("openvino",)])
+def test_missing_default_runtime_is_named_and_not_replaced(
+    exported: Any, monkeypatch: pytest.MonkeyPatch, others: tuple[str, ...]
+) -> None:
+    needs(*others)
+    path = exported("onnx")
+    real = importlib.util.find_spec
+    absent = {"onnxruntime", "openvino"} - set(others)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name in absent else real(name))
+    for read in (Detector, class_names_of):
+        with pytest.raises(RuntimeMissingError, match=r"mavlink-companion\[onnxruntime\]"):
+            read(path)
+
+
+@pytest.mark.parametrize(("kind", "runtime"), [("onnx", "torch"), ("openvino", "onnxruntime")])
+def test_a_named_runtime_of_other_files_is_refused(
+    exported: Any, kind: ExportKind, runtime: RuntimeName
+) -> None:
+    path = exported(kind)
+    for read in (Detector, class_names_of):
+        with pytest.raises(RuntimeUnusableError, match=f"{runtime} cannot run {SUFFIXES[kind]} files"):
+            read(path, runtime=runtime)
+
+
 @pytest.mark.parametrize("kind", ["onnx", "openvino"])
 def test_an_exported_file_is_run_without_torch(exported: Any, kind: ExportKind) -> None:
     runtime = {"onnx": "onnxruntime", "openvino": "openvino"}[kind]
     program = (
         "import sys, numpy as np; from vision.detector import Detector\n"
-        f"found = Detector({str(exported(kind))!r}, runtime={runtime!r}, image_size=96, threads=1)\n"
+        f"found = Detector({str(exported(kind))!r}, image_size=96, threads=1)\n"
         "found.detect(np.zeros((64, 96, 3), np.uint8))\n"
         "print(found.runtime, 'torch' in sys.modules)"
     )
@@ -302,6 +341,8 @@ def engine(tmp_path: Path) -> Path:
 def test_running_without_tensorrt_names_the_extra(engine: Path) -> None:
     with pytest.raises(RuntimeMissingError, match=r"mavlink-companion\[tensorrt\]"):
         TensorRtRuntime(engine)
+    with pytest.raises(RuntimeMissingError, match=r"mavlink-companion\[tensorrt\]"):
+        Detector(engine)  # the default of its kind of file
 
 
 @absent
