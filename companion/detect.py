@@ -195,7 +195,10 @@ def _write_image(path: Path, image: NDArray[np.uint8]) -> None:
     done, data = cv2.imencode(path.suffix, image)
     if not done:
         raise OSError(f"cannot write {path}: OpenCV cannot encode this image as {path.suffix}")
-    path.write_bytes(data.tobytes())
+    try:
+        path.write_bytes(data.tobytes())
+    except OSError as error:
+        raise OSError(f"cannot write {path}: {error.strerror}") from error
 
 
 def _progress(source: Source, every: int, limit: int | None) -> AbstractContextManager[Callable[[], None]]:

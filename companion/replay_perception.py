@@ -41,6 +41,7 @@ from vision.detections import TRACK_CONFIRMED, DetectionRecord
 from vision.frame import Frame
 from vision.model_files import find_model
 from vision.pipeline import PerceptionResult, Pipeline
+from vision.runtimes.base import PRECISIONS
 from vision.runtimes.exported import kind_of
 from vision.sources.source import OneFrame
 from vision.tracking import TARGET_CLASS
@@ -349,9 +350,9 @@ def _as_in_flight(
     other_kind = kind_of(find_model(model)) != kind_of(find_model(section.model))
     if other_kind and section.runtime in (None, "auto", "torch"):
         return section.model_copy(update=changes | {"runtime": None})
-    changes["runtime"] = section.runtime if section.runtime != "auto" else status.get("runtime", "torch")
-    if section.precision == "auto":
-        changes["precision"] = status.get("precision") or "float32"
+    changes["runtime"] = section.runtime if section.runtime != "auto" else status.get("runtime")
+    if section.precision == "auto" and (precision := status.get("precision", "float32")) in PRECISIONS:
+        changes["precision"] = precision  # another one, such as int8, is the file's
     return section.model_copy(update=changes)
 
 

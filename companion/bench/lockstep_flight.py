@@ -93,7 +93,10 @@ class FlightLog:
 def vehicle_in_the_air(
     *, seed: int, height_m: float = 5.0, wind_mps: float = 0.0, **options: Any
 ) -> LockstepVehicle:
-    """In HOLD, with the streams of `SimulatedDriver`; arguments and errors as `LockstepFlight.airborne`."""
+    """A vehicle in HOLD, with the streams of `SimulatedDriver`.
+
+    Arguments and errors as `LockstepFlight.airborne`.
+    """
     rates_hz = RATES_HZ | GIMBAL_RATES_HZ if options.get("gimbal") else RATES_HZ
     vehicle = LockstepVehicle({"onboard": rates_hz}, seed=seed, wind_mps=wind_mps, **options)
     vehicle.take_off(height_m, limit_s=90.0)

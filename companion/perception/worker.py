@@ -284,11 +284,8 @@ def _heartbeat_while_loading(settings: Settings, sender: ResultSender) -> Iterat
             sender.put_newest(Heartbeat(0))
 
     section = settings.detector
-    model = find_model(section.model)
-    by_torch = section.runtime == "torch" or (
-        section.runtime is None and kind_of(model) is None and not model.is_dir()
-    )
-    if not by_torch or section.kind != YOLO or settings.plugins.modules:
+    default = "torch" if kind_of(find_model(section.model)) is None else None
+    if (section.runtime or default) != "torch" or section.kind != YOLO or settings.plugins.modules:
         threading.Thread(target=send_heartbeats, name="loading", daemon=True).start()
     try:
         yield

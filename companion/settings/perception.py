@@ -269,7 +269,7 @@ class DetectorSection(Section):
     image_size: Annotated[int, Field(ge=32, le=4096, multiple_of=32)] = 640
     """longer side of the network's input, pixels"""
     runtime: Literal["auto", "torch", "onnxruntime", "openvino", "tensorrt"] | None = None
-    """inference runtime; auto measures the fastest once; unset: torch for checkpoints, else the file's own"""
+    """runtime of the network; unset: the file's, torch for a checkpoint; auto: the fastest, measured once"""
     precision: Literal["auto", "float32", "bfloat16", "float16"] = "auto"
     """arithmetic of the network; auto uses bfloat16 if the processor supports it well"""
     device: Literal["cpu", "cuda"] = "cpu"

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import time
 from pathlib import Path
 from typing import Any
@@ -150,6 +151,16 @@ def test_names_that_are_not_utf8_or_have_line_ends_are_escaped_and_saved(tmp_pat
         detect_source(source, WhiteBlobDetector(), save=saved, write=lines.append)
     assert [line.split()[0] for line in lines] == [r"caf\udce9.png", r"two\nlines.png"]
     assert sorted(path.name for path in (saved / "detections").iterdir()) == names
+
+
+def test_image_that_cannot_be_written_is_named(two_squares: Path, tmp_path: Path) -> None:
+    make_save_folder(tmp_path / "saved", str(two_squares))
+    shutil.rmtree(tmp_path / "saved")
+    with (
+        open_source(str(two_squares)) as source,
+        pytest.raises(OSError, match=f"cannot write {tmp_path}/saved/"),
+    ):
+        detect_source(source, WhiteBlobDetector(), save=tmp_path / "saved", write=list[str]().append)
 
 
 def test_save_folder_of_the_source_or_that_is_a_file_is_refused(two_squares: Path) -> None:

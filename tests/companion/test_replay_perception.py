@@ -188,6 +188,7 @@ def test_exported_file_of_the_model_is_another_model(lossless: Path, exported_mo
         ("a.pt", "torch", "b.onnx", (None, "auto")),
         ("a.onnx", None, "b.pt", (None, "auto")),
         ("a.onnx", "openvino", "b.pt", ("openvino", "bfloat16")),
+        ("a.pt", "torch", ".", (None, "auto")),  # a folder is OpenVINO's
     ],
 )
 def test_a_model_of_another_kind_of_file_gets_its_own_runtime(
@@ -200,6 +201,12 @@ def test_a_model_of_another_kind_of_file_gets_its_own_runtime(
     found = _as_in_flight(section, 2, {"runtime": "openvino", "precision": "bfloat16"}, model)
     assert (found.model, found.threads) == (model, 2)
     assert (found.runtime, found.precision) == expected
+
+
+def test_precision_of_a_file_is_not_asked_for() -> None:
+    status = {"precision": "int8"}
+    assert _as_in_flight(DetectorSection(model="a.onnx"), 2, status, "a.onnx").precision == "auto"
+    assert _as_in_flight(DetectorSection(model="a.onnx", runtime="auto"), 2, {}, "a.onnx").runtime is None
 
 
 def test_frames_without_an_image_are_counted(lossless: Path, tmp_path: Path) -> None:

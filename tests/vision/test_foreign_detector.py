@@ -100,7 +100,7 @@ def test_export_has_the_boxes_of_its_checkpoint(
 )
 def test_export_runs_on_the_runtime_of_its_kind(exports: dict[str, Path], kind: str, runtime: str) -> None:
     if runtime == "openvino":
-        pytest.importorskip("openvino", reason="openvino is an optional extra")
+        needs("openvino")
     assert Detector(exports[kind], threads=1).runtime == runtime
 
 

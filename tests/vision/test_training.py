@@ -164,7 +164,7 @@ def test_images_without_objects_can_be_trained_on() -> None:
     ).all()
 
 
-def test_network_that_gives_nothing_any_more_is_an_error() -> None:
+def test_loss_of_zero_is_an_error() -> None:
     start = train(replace(SMALL, stages=(Stage(96, 96, 8, 1),)), rectangles, silent).model
     with torch.no_grad():
         for branch in start.detect.cv3:

@@ -30,7 +30,7 @@ class RuntimeUnusableError(ValueError):
 
 
 class RuntimeMissingError(RuntimeUnusableError):
-    """A runtime was requested by name and is not installed. The message names the extra to install."""
+    """A runtime that was requested, or is a file's default, is not installed. The message names the extra."""
 
 
 class Runtime(Protocol):
@@ -110,7 +110,7 @@ def required(runtime: RuntimeName, *, also: str | None = None) -> Any:
 def _import_openvino() -> Any:
     """Import OpenVINO so that it does not report its use.
 
-    With its telemetry package it reports its import and each conversion to its makers over the network, and
+    With its telemetry package it reports its import and each conversion to Intel over the network, and
     stores an identifier in `~/intel`.
     """
     before = {name: sys.modules[name] for name in (_TELEMETRY,) if name in sys.modules}

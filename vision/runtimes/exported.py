@@ -114,7 +114,9 @@ def not_ours(path: Path) -> RuntimeUnusableError:
 
 
 def kind_of(path: Path) -> ExportKind | None:
-    """The kind by the file suffix; None for a checkpoint."""
+    """The kind by the file suffix; None for a checkpoint. A folder is OpenVINO's."""
+    if path.is_dir():
+        return "openvino"
     return next((kind for kind, suffix in SUFFIXES.items() if path.suffix == suffix), None)
 
 

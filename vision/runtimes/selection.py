@@ -14,6 +14,7 @@ from vision.runtimes.base import (
     Device,
     Precision,
     Runtime,
+    RuntimeMissingError,
     RuntimeUnusableError,
     installed,
     required,
@@ -62,15 +63,15 @@ def start_runtime(
         RuntimeUnusableError: it cannot run this file, or not in this precision.
     """
     check_runtime_name(choice)
-    reason = "as requested"
-    if choice is None:
-        choice, reason = source.runners()[0], "the default for this kind of file"
     if device not in DEVICES:
         raise ValueError(
             f"device must be {' or '.join(DEVICES)}, got {device!r}; CUDA_VISIBLE_DEVICES selects one of "
             "several GPUs"
         )
     check_runtime(source, choice)
+    reason = "as requested"
+    if choice is None:
+        choice, reason = source.runners()[0], "the default for this kind of file"
     if device != "cpu" and (choice != "torch" or source.kind is not None or source.foreign is not None):
         raise RuntimeUnusableError(
             f"{source.path}: the device {device} is for a checkpoint with the runtime torch, not for this "
@@ -97,7 +98,7 @@ def start_runtime(
 
 
 def check_runtime_name(choice: str | None) -> None:
-    """Raise ValueError for what is no `RuntimeChoice` or None."""
+    """Raise ValueError unless it is a `RuntimeChoice` or None."""
     if choice not in (None, "auto", *RUNTIMES):
         raise ValueError(f"runtime must be auto, {', '.join(RUNTIMES)}; got {choice!r}")
 
@@ -108,8 +109,16 @@ def check_runtime(source: ModelSource, choice: RuntimeChoice | None) -> None:
         if not any(installed(name) for name in source.runners()):
             required(source.runners()[0])  # raises with what to install
         return
+    by_default = choice is None
     choice = choice or source.runners()[0]
     if choice not in source.runners():
         raise cannot_run(source, choice)
-    if choice != "torch":
+    if choice == "torch":
+        return
+    try:
         required(choice)
+    except RuntimeMissingError as error:
+        others = [name for name in source.runners() if by_default and installed(name)]
+        if not others:
+            raise
+        raise RuntimeMissingError(f"{error}, or use the runtime {others[0]}") from None

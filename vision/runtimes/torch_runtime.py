@@ -1,4 +1,4 @@
-"""torch, the default runtime: a checkpoint's network as a traced graph, or TorchScript; on CPU or CUDA."""
+"""torch, the default runtime of checkpoints: their network as a traced graph, or TorchScript; CPU or CUDA."""
 
 from __future__ import annotations
 

@@ -264,7 +264,7 @@ def train(
         with torch.autocast("cpu", torch.bfloat16, enabled=settings.bfloat16):
             outputs = model(network_input(images))
         loss = detection_loss([level.float() for level in outputs], model.strides, truth)
-        # A loss of exactly 0 is a network that gives nothing any more, and learns nothing.
+        # At exactly 0 every class probability has underflowed: there is no gradient.
         if not torch.isfinite(loss.total) or loss.total == 0:
             raise FloatingPointError(
                 f"the loss of step {step} is {float(loss.total.detach())}; lower the learning rate"

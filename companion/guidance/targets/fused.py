@@ -24,6 +24,9 @@ RESTART_SIGMA = 3.0
 # A detection this many sigma from where the object was expected is left out: it may have the range of another
 # object in front. So many in a row that fit each other as well show that the object was moved.
 OUTLIER_SIGMA, OUTLIERS = 5.0, 3
+# A box at the image's upper edge shows a part of an object if it is lower than this share of the newest box
+# that the edge did not cut off: of an object that leaves at the top, half of its width may be detected last.
+PART = 0.5
 # Without a position for this long an object may be anywhere, although its boxes are still detected.
 STALE_S = MEMORY_S / 2.0
 # A track that was not seen for this long has ended (`tracker.max_age_s` is less by default).
@@ -57,6 +60,7 @@ class _Track:
     """
 
     def __init__(self, target: Target, vehicle: Vector3, covariance: NDArray[np.float64]) -> None:
+        self._whole_px = 0.0
         self._begin(target, vehicle, covariance)
 
     def _begin(self, target: Target, vehicle: Vector3, covariance: NDArray[np.float64]) -> None:
@@ -68,15 +72,14 @@ class _Track:
     def update(self, target: Target, vehicle: Vector3, covariance: NDArray[np.float64]) -> None:
         expected = self._motion.at(target.captured_ns)
         fit = expected.fit(target, vehicle)
-        disagrees = self._disagrees(target, covariance)
-        if target.cut_above and disagrees and not self.moving:
-            return  # only a part of it was detected: the middle of the part is not the object's
+        if target.cut_above and _height_px(target) < PART * self._whole_px:
+            return  # the middle of a small part is not the object's
         if fit.squared > OUTLIER_SIGMA**2:
             self._leave_out(target, vehicle, covariance)
             return
         self._outliers = []
         self._motion = expected.update(fit)
-        if self.moving or disagrees:
+        if self.moving or self._disagrees(target, covariance):
             self._restart()
         self._forget((target.captured_ns - self._newest.captured_ns) / 1e9)
         self._add(target, covariance)
@@ -161,6 +164,13 @@ class _Track:
         self._weighted_down += weight * down
         self._count += 1
         self._newest = target
+        if not target.cut_above:
+            self._whole_px = _height_px(target)
+
+
+def _height_px(target: Target) -> float:
+    _, top, _, bottom = target.box_xyxy
+    return bottom - top
 
 
 class FusedTracks:

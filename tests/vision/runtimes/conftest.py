@@ -58,7 +58,7 @@ def own_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Monk
 
 
 def needs(*packages: str) -> None:
-    """Skip the test where one is not installed; none is imported: OpenVINO would report it to its makers."""
+    """Skip the test where one is not installed; none is imported: OpenVINO would report it to Intel."""
     for package in packages:
         if importlib.util.find_spec(package) is None:
             pytest.skip(f"{package} is an optional extra", allow_module_level=True)

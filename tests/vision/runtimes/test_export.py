@@ -122,8 +122,9 @@ def test_missing_default_runtime_is_named_and_not_replaced(
     absent = {"onnxruntime", "openvino"} - set(others)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name in absent else real(name))
     for read in (Detector, class_names_of):
-        with pytest.raises(RuntimeMissingError, match=r"mavlink-companion\[onnxruntime\]"):
+        with pytest.raises(RuntimeMissingError, match=r"mavlink-companion\[onnxruntime\]") as caught:
             read(path)
+        assert ("use the runtime openvino" in str(caught.value)) is bool(others)
 
 
 @pytest.mark.parametrize(("kind", "runtime"), [("onnx", "torch"), ("openvino", "onnxruntime")])
