@@ -60,7 +60,7 @@ class _Track:
     """
 
     def __init__(self, target: Target, vehicle: Vector3, covariance: NDArray[np.float64]) -> None:
-        self._whole_px = 0.0
+        self._whole_height = 0.0
         self._begin(target, vehicle, covariance)
 
     def _begin(self, target: Target, vehicle: Vector3, covariance: NDArray[np.float64]) -> None:
@@ -70,10 +70,10 @@ class _Track:
         self._add(target, covariance)
 
     def update(self, target: Target, vehicle: Vector3, covariance: NDArray[np.float64]) -> None:
+        if target.cut_above and _height(target) < PART * self._whole_height:
+            return  # the middle of a small part is not the object's
         expected = self._motion.at(target.captured_ns)
         fit = expected.fit(target, vehicle)
-        if target.cut_above and _height_px(target) < PART * self._whole_px:
-            return  # the middle of a small part is not the object's
         if fit.squared > OUTLIER_SIGMA**2:
             self._leave_out(target, vehicle, covariance)
             return
@@ -165,12 +165,13 @@ class _Track:
         self._count += 1
         self._newest = target
         if not target.cut_above:
-            self._whole_px = _height_px(target)
+            self._whole_height = _height(target)
 
 
-def _height_px(target: Target) -> float:
+def _height(target: Target) -> float:
+    """Of its box, in pixels at a range of 1 m, so that it is the same from near and far."""
     _, top, _, bottom = target.box_xyxy
-    return bottom - top
+    return (bottom - top) * target.ground_range_m
 
 
 class FusedTracks:

@@ -240,6 +240,16 @@ def test_part_of_an_object_that_leaves_at_the_top_is_left_out() -> None:
     assert position_of(tracks).position_ned_m[:2] == pytest.approx((20.0, 0.0))
 
 
+def test_whole_object_farther_away_at_the_upper_edge_counts() -> None:
+    """Its box is lower than half of the one from near, because it is far."""
+    tracks = FusedTracks()
+    for frame, range_m in enumerate((5.0, 20.0)):
+        vehicle, box = (20.0 - range_m, 0.0, -5.0), (180.0, 0.0, 300.0, 800.0 / range_m)
+        target = replace(seen(vehicle, (20.0, 0.0), frame), cut_above=frame > 0, box_xyxy=box)
+        tracks.update([target], vehicle, target.captured_ns)
+    assert position_of(tracks).captured_ns == T0 + PERIOD_NS
+
+
 def test_object_that_moves_along_the_upper_edge_is_moving() -> None:
     """3 m/s; its box is cut off, but not to a small part. It was never seen whole, or before."""
     for first_cut in (0, 10):
