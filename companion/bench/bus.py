@@ -15,7 +15,7 @@ from contextlib import asynccontextmanager
 from multiprocessing.connection import Connection
 from pathlib import Path
 from subprocess import DEVNULL
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -33,6 +33,8 @@ from companion.vehicle.precise_sleep import DEFAULT_NS, set_scheduler_slice
 from mavlink_sim.datasets.training_scenes import random_scene
 from mavlink_sim.testing import free_port
 
+Priority = Literal["low", "idle"]
+
 VEHICLE = "bench"
 # Ten detections with every field: 6 kB of JSON.
 DETECTIONS = 10
@@ -49,7 +51,7 @@ _WARM_UP_MESSAGES = 20
 _WARM_UP = -1
 
 
-def measure_bus(seconds: float, *, rate_hz: float, load: int) -> dict[str, Any]:
+def measure_bus(seconds: float, *, rate_hz: float, load: int, priority: Priority = "low") -> dict[str, Any]:
     """Time messages of ten detections from this process to a subscriber with default priority in another one.
 
     This process has the priority of the service. `put_to_subscriber` is from immediately before the message
@@ -58,17 +60,18 @@ def measure_bus(seconds: float, *, rate_hz: float, load: int) -> dict[str, Any]:
     Args:
         rate_hz: of the messages. One that is late delays the next ones: the result has the achieved rate.
         load: number of perception workers beside it: the bundled model, one thread each, no pause.
+        priority: of the workers (`detector.priority`).
 
     Raises:
         RuntimeError: the subscriber or a worker does not start.
     """
-    return asyncio.run(_measure_bus(seconds, rate_hz, load))
+    return asyncio.run(_measure_bus(seconds, rate_hz, load, priority))
 
 
-async def _measure_bus(seconds: float, rate_hz: float, load: int) -> dict[str, Any]:
+async def _measure_bus(seconds: float, rate_hz: float, load: int, priority: Priority) -> dict[str, Any]:
     build_ns: list[int] = []
     put_ns: list[int] = []
-    async with _detecting(load) as frames, _Reader(_read_detections) as reader:
+    async with _detecting(load, priority) as frames, _Reader(_read_detections) as reader:
         set_scheduler_slice()  # as the service
         await _until_watched(reader.bus)
         before, started_s = sum(frames), time.monotonic()
@@ -104,7 +107,7 @@ async def _measure_bus(seconds: float, rate_hz: float, load: int) -> dict[str, A
 
 
 @asynccontextmanager
-async def _detecting(number: int) -> AsyncIterator[list[int]]:
+async def _detecting(number: int, priority: Priority) -> AsyncIterator[list[int]]:
     """Run perception workers, each on one thread and without a pause; yields their numbers of frames."""
     frames = [0] * number
     workers: list[PerceptionProcess] = []
@@ -115,7 +118,8 @@ async def _detecting(number: int) -> AsyncIterator[list[int]]:
         settings = Settings.model_validate(
             {
                 "source": {"uri": str(image), "loop": True, "realtime": False},
-                "detector": {"threads": 1, "image_size": 320},  # as in `companion play`
+                # The size of `companion play`.
+                "detector": {"threads": 1, "image_size": 320, "priority": priority},
             }
         )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -20,7 +20,9 @@ def bench_detector(
     model: Annotated[str, typer.Option(help="Checkpoint or exported file.")] = "default",
     runtime: Annotated[
         str | None,
-        typer.Option(help="Runtime: torch, onnxruntime, openvino, tensorrt or auto. Default: all installed."),
+        typer.Option(
+            help="Runtime: torch, onnxruntime, openvino, tensorrt or auto. Default: all that run it."
+        ),
     ] = None,
     image_size: Annotated[
         int, typer.Option(min=32, help="Longer side of the network's input, pixels.")
@@ -38,16 +40,23 @@ def bench_detector(
 ) -> None:
     """Measure the time per frame of each runtime. Prints milliseconds from pixels to boxes."""
     from companion.bench.detector import BenchError, measure_detectors, read_result, table
+    from vision.detector import DEFAULT_MODEL
+    from vision.model_files import find_model
     from vision.runtimes.base import RUNTIMES, installed
+    from vision.runtimes.source import read_source
 
     try:
         width, height = (int(number) for number in frame.split("x"))
     except ValueError:
         raise typer.BadParameter(f"{frame!r} is not WIDTHxHEIGHT", param_hint="--frame") from None
-    wanted = [name for name in RUNTIMES if installed(name)] if runtime is None else [runtime]
     named = None if classes is None else [name.strip() for name in classes.split(",") if name.strip()]
     with plain_errors(BenchError, ValueError):
         earlier = None if against is None else read_result(against)
+        if runtime is not None:
+            wanted = [runtime]
+        else:
+            known = RUNTIMES if model == DEFAULT_MODEL else read_source(find_model(model)).runners()
+            wanted = [name for name in known if installed(name)]
         result = measure_detectors(
             model,
             runtimes=wanted,
@@ -107,6 +116,9 @@ def bench_bus(
     load: Annotated[
         int | None, typer.Option(min=0, help="Number of detectors that run beside it. Default: one per core.")
     ] = None,
+    priority: Annotated[
+        Literal["low", "idle"], typer.Option(help="Priority of the detectors, as detector.priority.")
+    ] = "low",
     recovered: Annotated[
         int | None,
         typer.Option(min=1, help="Instead publish this many messages of a recovered topic; count the lost."),
@@ -127,7 +139,7 @@ def bench_bus(
             figures = measure_recovery(recovered)
         else:
             detectors = len(os.sched_getaffinity(0)) if load is None else load
-            figures = measure_bus(seconds, rate_hz=rate_hz, load=detectors)
+            figures = measure_bus(seconds, rate_hz=rate_hz, load=detectors, priority=priority)
     _print_figures(figures, as_json)
 
 

@@ -48,7 +48,7 @@ from companion.perception.previews import CloudEncoder, PreviewEncoder
 from companion.plugins import PluginError, load_plugins
 from companion.settings import Settings
 from companion.settings.calibration import adopt_calibration
-from companion.vehicle.precise_sleep import lower_priority
+from companion.vehicle.precise_sleep import lower_priority, run_when_idle
 from vision.detections import Detections
 from vision.frame import Frame
 from vision.model_files import find_model
@@ -202,6 +202,8 @@ def main(arguments: list[str]) -> int:
     begin = receive(connection)
     if not isinstance(begin, Begin):
         return 1
+    if begin.settings.detector.priority == "idle":
+        run_when_idle()
     control = ControlChannel(connection)
     signal.signal(signal.SIGTERM, lambda _signal, _frame: control.stop())
     sender = ResultSender(socket.socket(fileno=reports), on_lost=control.stop)

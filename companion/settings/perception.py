@@ -276,6 +276,8 @@ class DetectorSection(Section):
     """where torch computes a checkpoint; cuda: an NVIDIA GPU"""
     threads: Annotated[int | None, Field(ge=1, le=256)] = None
     """CPU threads of the network; unset: all processors but one, divided among the cameras"""
+    priority: Literal["low", "idle"] = "low"
+    """of its process on a busy core; idle: every other program interrupts it and may take all the time"""
     every: Annotated[int, Field(ge=1, le=1000)] = 1
     """process every Nth frame"""
     rate_hz: Annotated[float | None, Field(gt=0, le=1000)] = None

@@ -142,6 +142,12 @@ async def test_without_a_detector_nothing_is_detected_or_selected(photos: Path) 
         assert "tracker.enabled " in answer.reason
 
 
+async def test_worker_of_idle_priority_is_interrupted_by_every_program(photos: Path) -> None:
+    async with supervised(settings_of(photos, **{"detector.priority": "idle"})) as (supervisor, _):
+        # Not until it has results: beside other tests it may get almost no time.
+        await until(lambda: (pid := supervisor.status.pid) and os.sched_getscheduler(pid) == os.SCHED_IDLE)
+
+
 async def test_detector_every_skips_frames(photos: Path) -> None:
     async with supervised(settings_of(photos, **{"detector.every": "5"})) as (supervisor, recorder):
         await until(lambda: len(recorder.results) >= 4)
