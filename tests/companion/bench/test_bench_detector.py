@@ -7,23 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 from typer.testing import CliRunner
 
 from companion.bench.detector import BenchError, measure_detectors, read_result, table
 from companion.cli import app
-from vision.yolo.architecture import build
-from vision.yolo.checkpoint import save_checkpoint
-from vision.yolo.published import yolov8_description
-
-
-@pytest.fixture(scope="module")
-def small_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    torch.manual_seed(0)
-    model = build(yolov8_description((0.1, 0.01, 64), ("person", "car")))
-    path = tmp_path_factory.mktemp("model") / "small.pt"
-    save_checkpoint(path, model, metadata={})
-    return path
 
 
 def bench(model: Path, *more: str) -> str:
@@ -85,6 +72,22 @@ def test_what_was_not_measured_before_says_so() -> None:
     )
     row = dict.fromkeys([*names, "memory_mb", "first_detection_s"], 1)
     assert table({"rows": [row]}, {"rows": []})[1].endswith("not measured before")
+
+
+def test_exported_file_is_measured_on_the_runtimes_that_run_it(
+    small_model: Path, exported_model: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[list[str]] = []
+
+    def measure(model: str, *, runtimes: list[str], **_: Any) -> dict[str, Any]:
+        asked.append(list(runtimes))
+        return {"rows": []}
+
+    monkeypatch.setattr("companion.bench.detector.measure_detectors", measure)
+    monkeypatch.setattr("vision.runtimes.base.installed", lambda _: True)
+    for model in (small_model, exported_model):
+        assert CliRunner().invoke(app, ["bench", "detector", "--model", str(model), "--json"]).exit_code == 0
+    assert asked == [["torch", "onnxruntime", "openvino", "tensorrt"], ["onnxruntime", "openvino"]]
 
 
 @pytest.mark.parametrize(
