@@ -62,7 +62,7 @@ def _one_vehicle(tab: Tab, folder: Path) -> None:
     time.sleep(1.0)  # until the menu's box is drawn as the chosen one
     tab.screenshot(folder / "dashboard.jpg")
     tab.value("document.querySelector('#menu button').click()")
-    _succeeded(tab, "follow")
+    _succeeded(tab, "follow", "accepted, in progress")
     time.sleep(_CHARTS_S)
     if not (behaviour := tab.value("state.topics.status.pilot.behaviour")).startswith("following"):
         raise SystemExit(f"the vehicle does not follow: {behaviour}")
@@ -92,8 +92,8 @@ def _command(tab: Tab, text: str) -> None:
     _succeeded(tab, text)
 
 
-def _succeeded(tab: Tab, text: str) -> None:
-    reply = tab.until(f"{REPLY}.match(/{text}.*: (done|failed): .*/)?.[0]", _FLIGHT_S)
+def _succeeded(tab: Tab, text: str, success: str = "done: ") -> None:
+    reply = tab.until(f"{REPLY}.match(/{text}.*: ({success}|failed: ).*/)?.[0]", _FLIGHT_S)
     if ": failed: " in reply:
         raise SystemExit(reply)
 
