@@ -7,15 +7,17 @@ import multiprocessing
 import socket
 import threading
 import time
+from multiprocessing.synchronize import Semaphore
 
 import numpy as np
 
-from companion.vehicle.precise_sleep import set_scheduler_slice
+from companion.vehicle.precise_sleep import DEFAULT_NS, set_scheduler_slice
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.streamer import Streamer
 
 # SET_POSITION_TARGET_LOCAL_NED in MAVLink 2: what a setpoint weighs on the wire.
 _SETPOINT_BYTES = 65
+_START_S = 30.0
 
 
 def measure_setpoints(seconds: float, *, rate_hz: float, load: int) -> dict[str, object]:
@@ -24,10 +26,14 @@ def measure_setpoints(seconds: float, *, rate_hz: float, load: int) -> dict[str,
     The receiver stamps in a thread that blocks in `recv`, so its own wake-up is part of the figure.
     """
     context = multiprocessing.get_context("spawn")
-    loaded = [context.Process(target=busy, daemon=True) for _ in range(load)]
+    started = context.Semaphore(0)
+    loaded = [context.Process(target=busy, args=(started,), daemon=True) for _ in range(load)]
     for process in loaded:
         process.start()
     try:
+        for _ in loaded:
+            if not started.acquire(timeout=_START_S):
+                raise RuntimeError(f"the busy processes did not start within {_START_S:g} s")
         arrivals_ns = asyncio.run(_stream(seconds, rate_hz))
     finally:
         for process in loaded:
@@ -51,14 +57,17 @@ async def _stream(seconds: float, rate_hz: float) -> list[int]:
     sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     sender.connect(receiver.getsockname())
     arrivals_ns: list[int] = []
+    receiving = threading.Event()
 
     def receive() -> None:
         set_scheduler_slice()
+        receiving.set()
         while receiver.recv(256):
             arrivals_ns.append(time.monotonic_ns())
 
     thread = threading.Thread(target=receive)
     thread.start()
+    receiving.wait()
 
     def send(_: Setpoint) -> None:
         sender.send(bytes(_SETPOINT_BYTES))
@@ -75,8 +84,10 @@ async def _stream(seconds: float, rate_hz: float) -> list[int]:
     return arrivals_ns
 
 
-def busy() -> None:
-    """Use one core until killed."""
+def busy(started: Semaphore) -> None:
+    """Use one core until killed, with the policy of any program. `started` is released before."""
+    set_scheduler_slice(DEFAULT_NS)
+    started.release()
     value = 0
     while True:
         value += 1

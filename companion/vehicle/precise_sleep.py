@@ -35,6 +35,7 @@ DEFAULT_NS = 0
 # System call numbers: the C library has no wrapper.
 _SCHED_SETATTR = {"x86_64": 314, "aarch64": 274, "armv7l": 380, "riscv64": 274}
 _SCHED_OTHER = 0
+_REAL_TIME = (1, 2)  # SCHED_FIFO, SCHED_RR
 # struct sched_attr, first version: size, policy, flags, nice, priority, runtime, deadline, period.
 _SCHED_ATTR = struct.Struct("=IIQiIQQQ")
 
@@ -106,10 +107,15 @@ def _error(call: str) -> OSError:
 
 
 def set_scheduler_slice(slice_ns: int = SHORTEST_NS, thread: int = 0) -> bool:
-    """Set the slice of a thread (0: this one). False: not supported by this system, nothing has changed."""
+    """Set the slice of a thread (0: this one). False: not supported by this system, nothing has changed.
+
+    A thread of a real-time policy needs no short slice, and keeps its policy; `DEFAULT_NS` ends it.
+    """
     number = _SCHED_SETATTR.get(platform.machine())
     if not sys.platform.startswith("linux") or number is None:
         return False
+    if slice_ns != DEFAULT_NS and os.sched_getscheduler(thread) in _REAL_TIME:
+        return True
     nice = os.getpriority(os.PRIO_PROCESS, thread)
     attributes = _SCHED_ATTR.pack(_SCHED_ATTR.size, _SCHED_OTHER, 0, nice, 0, slice_ns, 0, 0)
     libc = ctypes.CDLL(None, use_errno=True)
@@ -120,18 +126,27 @@ def set_scheduler_slice(slice_ns: int = SHORTEST_NS, thread: int = 0) -> bool:
 
 
 def lower_priority(niceness: int) -> None:
-    """Lower the priority of this process, before it starts threads.
+    """Lower the priority of this process: of its threads, and of those they start.
 
-    Its slice becomes the kernel's: a process inherits the short one of the service's thread that starts it.
+    Policy and slice become those of any program; they were inherited from the thread that started it.
     """
     os.nice(niceness)
-    set_scheduler_slice(DEFAULT_NS)
+    nice = os.getpriority(os.PRIO_PROCESS, 0)
+    for thread in _threads():
+        os.setpriority(os.PRIO_PROCESS, thread, nice)
+        set_scheduler_slice(DEFAULT_NS, thread)
 
 
 def run_when_idle() -> None:
-    """Let every other program interrupt this process (SCHED_IDLE, sched(7)), before it starts threads.
+    """Let every other program interrupt the threads of this process (SCHED_IDLE, sched(7)).
 
     A program that wakes up waits for the slice of a process of low priority, with 250 ticks a second up to
     4 ms, but never for one of this policy. A busy program on the same core leaves it almost no time.
     """
-    os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+    for thread in _threads():
+        os.sched_setscheduler(thread, os.SCHED_IDLE, os.sched_param(0))
+
+
+def _threads() -> list[int]:
+    """This process's threads: libraries start some as they are imported."""
+    return [int(name) for name in os.listdir("/proc/self/task")] if sys.platform.startswith("linux") else [0]

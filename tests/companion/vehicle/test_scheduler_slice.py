@@ -59,6 +59,27 @@ def test_unknown_machine_is_unsupported(monkeypatch: pytest.MonkeyPatch) -> None
     assert set_scheduler_slice() is False
 
 
+REAL_TIME = """
+import os
+from companion.vehicle.precise_sleep import lower_priority, set_scheduler_slice
+try:
+    os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+except PermissionError:
+    print("not permitted")
+else:
+    print(set_scheduler_slice(), os.sched_getscheduler(0) == os.SCHED_RR)
+    lower_priority(3)
+    print(os.sched_getscheduler(0) == os.SCHED_OTHER)
+"""
+
+
+def test_real_time_policy_is_kept_by_the_service_and_left_by_its_programs() -> None:
+    printed = subprocess.run([sys.executable, "-c", REAL_TIME], capture_output=True, text=True, check=True)
+    if printed.stdout == "not permitted\n":
+        pytest.skip("this user may not use a real-time policy")
+    assert printed.stdout == "True True\nTrue\n"
+
+
 PROGRAM = """
 from companion.vehicle.precise_sleep import lower_priority
 lower_priority(3)
