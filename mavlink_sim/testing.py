@@ -28,11 +28,12 @@ READY = re.compile(r"^ready: system (\d+), onboard \S+:(\d+) -> (\d+), ground st
 
 FLEET_READY = re.compile(r"^ready: \d+ vehicles")
 
-# PX4 parameters with which a flight in real time takes half as long: it is at 2.5 m after 3.7 s instead of
+# PX4 parameters with which a flight in real time takes half as long: it is at 2.5 m after 2.9 s instead of
 # 6.6 s, and on the ground and disarmed after 3.9 s instead of 8.4 s.
 QUICK_FLIGHT = {
     "COM_SPOOLUP_TIME": 0.0,
-    "MPC_TKO_RAMP_T": 1.0,
+    "MPC_TKO_RAMP_T": 0.3,
+    "MPC_JERK_AUTO": 40.0,
     "MPC_LAND_SPEED": 2.0,
     "MPC_LAND_CRWL": 1.0,
     "COM_DISARM_LAND": 0.2,
