@@ -27,7 +27,6 @@ from mavlink_sim.testing import free_port
 from tests.companion.command_line import companion, companion_here
 from vision.object_detector import YOLO
 from vision.weights import DEFAULT_WEIGHTS
-from vision.yolo.checkpoint import load_checkpoint, save_checkpoint
 
 pytestmark = pytest.mark.realtime
 
@@ -306,6 +305,8 @@ def test_detect_warns_of_a_model_of_rendered_scenes(
 
 def test_detect_is_silent_about_another_model(small_model: Path, image_folder: Path, tmp_path: Path) -> None:
     own = tmp_path / "own.safetensors"
+    from vision.yolo.checkpoint import load_checkpoint, save_checkpoint
+
     save_checkpoint(own, load_checkpoint(small_model).model, metadata={"trained_on": "6 images of set"})
     done = companion_here("detect", image_folder, "--model", own, "--image-size", "96", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
