@@ -21,6 +21,8 @@ from tests.companion.vehicle.fake_autopilot import streaming, wait_for_state, wa
 
 pytestmark = pytest.mark.realtime
 
+# For what AutopilotDriver does, whatever link it has.
+SHARED = pytest.mark.parametrize("kind", ["pymavlink", pytest.param("mavsdk", marks=pytest.mark.slow)])
 PARAMETERS = {"COM_OF_LOSS_T": 2.0, "COM_OBL_RC_ACT": 4.0}
 
 
@@ -110,6 +112,7 @@ async def test_refused_mode_fails_at_once(kind: DriverKind) -> None:
             assert time.monotonic() - asked_s < 2.5  # before the timeout of 3 s
 
 
+@SHARED
 async def test_link_loss_and_return_are_logged(kind: DriverKind, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     with simulated() as simulator:
@@ -123,6 +126,7 @@ async def test_link_loss_and_return_are_logged(kind: DriverKind, caplog: pytest.
             await wait_for_state(driver, lambda s: s.position_fresh(time.monotonic_ns()))
 
 
+@SHARED
 async def test_delayed_telemetry_has_measurement_stamps(
     kind: DriverKind,
 ) -> None:
@@ -140,6 +144,7 @@ async def test_delayed_telemetry_has_measurement_stamps(
             await wait_until(lambda: bool(late) and late[-1] > 200_000_000, 5.0)
 
 
+@SHARED
 async def test_heartbeats_only_is_connected_with_a_stale_position(
     kind: DriverKind,
 ) -> None:
@@ -153,6 +158,7 @@ async def test_heartbeats_only_is_connected_with_a_stale_position(
             assert driver.state.connected(time.monotonic_ns())
 
 
+@SHARED
 async def test_stopped_stream_is_requested_until_received(kind: DriverKind) -> None:
     with simulated() as simulator:
         async with connected(kind, simulator) as driver:
@@ -165,6 +171,7 @@ async def test_stopped_stream_is_requested_until_received(kind: DriverKind) -> N
             await wait_for_state(driver, lambda s: not s.missing_streams)
 
 
+@SHARED
 async def test_vehicle_is_usable_after_a_reboot(kind: DriverKind, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     with simulated() as simulator:
@@ -184,6 +191,7 @@ async def test_vehicle_is_usable_after_a_reboot(kind: DriverKind, caplog: pytest
             assert driver.state.home_altitude_amsl_m == pytest.approx(before, abs=0.5)
 
 
+@SHARED
 async def test_clock_jump_back_is_one_warning(kind: DriverKind, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     with simulated() as simulator:
@@ -218,6 +226,7 @@ async def test_second_autopilot_with_its_own_id_is_ignored(
             assert all(abs(state.position_ned_m[1]) < 5.0 for state in seen if state.position_ned_m)
 
 
+@SHARED
 async def test_second_autopilot_with_the_same_id_prevents_arming(
     kind: DriverKind, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -239,6 +248,7 @@ async def test_second_autopilot_with_the_same_id_prevents_arming(
             await driver.arm()
 
 
+@SHARED
 async def test_delayed_setpoints_keep_the_vehicle_in_offboard(kind: DriverKind) -> None:
     with simulated(parameters=PARAMETERS, seed=4) as simulator:
         async with connected(kind, simulator) as driver:
