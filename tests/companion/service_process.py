@@ -20,8 +20,14 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from companion.bus.client import client_settings, open_client, send_command
 from companion.settings import ZenohSection
-from mavlink_sim.testing import free_port
+from mavlink_sim.testing import QUICK_FLIGHT, free_port
 
+# Options of a vehicle at twice real time. Setpoints may be as late as in real time: COM_OF_LOSS_T is 1 s.
+TWICE: dict[str, Any] = {
+    "speed": 2.0,
+    "ready_after": 0.0,
+    "parameters": {**QUICK_FLIGHT, "COM_OF_LOSS_T": 2.0},
+}
 START_S = 60.0
 LINES_NOTED = 40
 

@@ -21,9 +21,9 @@ import zenoh
 from companion.bus.client import send_command
 from companion.bus.topics import DETECTIONS
 from companion.play import PlayOptions
-from mavlink_sim.testing import QUICK_FLIGHT, free_port, running_simulator, vehicle
+from mavlink_sim.testing import free_port, running_simulator, vehicle
 from tests.companion.command_line import QUICK, companion, companion_here
-from tests.companion.service_process import ServiceProcess
+from tests.companion.service_process import TWICE, ServiceProcess
 
 pytestmark = pytest.mark.realtime
 
@@ -103,7 +103,7 @@ def next_detections(session: zenoh.Session, vehicle: str) -> dict[str, Any]:
 def test_play_flies_an_autopilot_at_a_url_and_ends_on_ctrl_c(tmp_path: Path, small: list[str]) -> None:
     """Any autopilot: here a simulated vehicle that has no camera of its own, with system id 7."""
     with ExitStack() as stack:
-        simulator = stack.enter_context(running_simulator(system_id=7, parameters=QUICK_FLIGHT))
+        simulator = stack.enter_context(running_simulator(system_id=7, **TWICE))
         url = f"udpin://127.0.0.1:{simulator.onboard_port}"
         running = stack.enter_context(playing(tmp_path, "--vehicle-url", url, *small))
         assert any(line.endswith(": boat, car") for line in running.lines)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from companion.preview import PreviewOptions, RateMeter, preview_source
-from mavlink_sim.testing import free_udp_ports, running_simulator
+from mavlink_sim.testing import free_udp_ports, vehicle
 from tests.companion.bus.message_check import check_message
 from tests.companion.command_line import companion, companion_here
 from vision.sources import open_source
@@ -95,7 +95,7 @@ def test_bad_source_of_preview_is_one_line(tmp_path: Path) -> None:
 
 
 def test_preview_is_levelled_by_the_attitude_of_the_vehicle(image_folder: Path, tmp_path: Path) -> None:
-    with running_simulator() as simulator:
+    with vehicle() as simulator:
         done = companion(
             "preview", image_folder, "--level", "--save", tmp_path / "out", "--period", "0", "--limit", "15",
             "--vehicle-url", simulator.mavsdk_url, "--camera-mount-roll-deg", "30", "--source-rate-hz", "5",

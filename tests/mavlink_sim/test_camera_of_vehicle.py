@@ -17,10 +17,10 @@ from typing import Any
 
 import pytest
 
-from mavlink_sim.camera.cli import POSE_LOST_S
+from mavlink_sim.camera import cli
 from mavlink_sim.camera.vehicle_pose import AutopilotLink, LinkError
 from mavlink_sim.cli.main import main
-from mavlink_sim.testing import free_port, running_simulator
+from mavlink_sim.testing import free_port, vehicle
 from mavlink_sim.wire.endpoint import UdpEndpoint
 from mavlink_sim.wire.messages import Outgoing, dialect, parser
 from vision.shared_frame import SHARED_MEMORY_DIRECTORY, SharedFrameReader, segment_path
@@ -138,13 +138,22 @@ def small(tmp_path: Path) -> str:
     return str(path)
 
 
-def test_no_autopilot_is_refused_after_ten_seconds(name: str, small: str) -> None:
-    port = free_port()
-    finished = run("--vehicle-url", f"udpin://127.0.0.1:{port}", "--camera", name, "--scene", small)
-    assert finished.returncode == 2
-    (line,) = finished.stderr.splitlines()
+def test_no_autopilot_is_refused_after_ten_seconds(
+    name: str, small: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.VEHICLE_TIMEOUT_S == 10.0
+    monkeypatch.setattr(cli, "VEHICLE_TIMEOUT_S", 0.3)
+    url = f"udpin://127.0.0.1:{free_port()}"
+    arguments = ["--vehicle-url", url, "--camera", name, "--scene", small]
+    monkeypatch.setattr("sys.argv", ["mavlink-sim", "camera", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2
+    output = capsys.readouterr()
+    (line,) = output.err.splitlines()
+    assert "within 0.3 s" in line
     assert "HEARTBEAT" in line
-    assert finished.stdout == ""
+    assert output.out == ""
 
 
 @pytest.mark.parametrize("systems", [(4, 9), (4, 4)])
@@ -220,9 +229,7 @@ def test_frames_are_drawn_from_another_autopilots_pose(
 ) -> None:
     """Where each frame's eye is, against the simulator's own truth at the frame's stamp; then a lost pose."""
     seen, flight = tmp_path / "seen.jsonl", tmp_path / "flown.jsonl"
-    with running_simulator(
-        truth=tmp_path / "truth.jsonl", autopilot=autopilot, noise="off", gusts=0.0
-    ) as sim:
+    with vehicle(truth=tmp_path / "truth.jsonl", autopilot=autopilot, noise="off", gusts=0.0) as sim:
         command = [sys.executable, "-m", "mavlink_sim", "camera", "--camera", name, "--camera-rate", "10"]
         command += ["--scene", small]
         command += ["--vehicle-url", f"udpin://127.0.0.1:{sim.gcs_port}", "--origin", "0,0,0"]
@@ -250,7 +257,7 @@ def test_frames_are_drawn_from_another_autopilots_pose(
         finally:
             process.kill()
     assert process.returncode == 1
-    assert f"stopped {POSE_LOST_S:g} s ago" in events.splitlines()[-1]
+    assert f"stopped {cli.POSE_LOST_S:g} s ago" in events.splitlines()[-1]
     assert not segment_path(name).exists()
     true = [json.loads(line) for line in (tmp_path / "truth.jsonl").read_text().splitlines()]
     for line in seen.read_text().splitlines():

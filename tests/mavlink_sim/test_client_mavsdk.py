@@ -27,7 +27,7 @@ from mavsdk.asyncio.plugins.offboard import (
 from mavsdk.asyncio.plugins.param import ParamAsync, ParamError
 from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
 
-from mavlink_sim.testing import RunningSimulator, running_simulator, vehicle
+from mavlink_sim.testing import QUICK_FLIGHT, RunningSimulator, vehicle
 from tests.mavlink_sim.conftest import CALIBRATION
 from tests.mavlink_sim.mavsdk_client import MavsdkClient, mavsdk_client, meanwhile, wait_for
 
@@ -143,9 +143,11 @@ async def test_denied_command_raises_mavsdk_error() -> None:
 @asynccontextmanager
 async def connected(**options: Any) -> AsyncIterator[tuple[RunningSimulator, MavsdkClient]]:
     """A simulator, and MAVSDK as its ground station."""
-    with running_simulator(**options) as simulator:
-        async with mavsdk_client(f"udpin://127.0.0.1:{simulator.gcs_port}") as system:
-            yield simulator, system
+    async with (
+        vehicle(**options) as simulator,
+        mavsdk_client(f"udpin://127.0.0.1:{simulator.gcs_port}") as system,
+    ):
+        yield simulator, system
 
 
 def streaming(send: Callable[[], Any], period_s: float) -> AbstractAsyncContextManager[None]:
@@ -159,10 +161,8 @@ def streaming(send: Callable[[], Any], period_s: float) -> AbstractAsyncContextM
 
 async def test_a_joystick_flies_the_vehicle_in_position_mode() -> None:
     # lenient about the stream's gaps: the machine may be busy
-    async with connected(speed=1.0, parameters={"COM_RC_IN_MODE": 1, "COM_RC_LOSS_T": 5}) as (
-        simulator,
-        system,
-    ):
+    parameters = {**QUICK_FLIGHT, "COM_RC_IN_MODE": 1, "COM_RC_LOSS_T": 10}
+    async with connected(speed=2.0, parameters=parameters) as (simulator, system):
         action = system.plugin(ActionAsync)
         telemetry = system.plugin(TelemetryAsync)
         manual = system.plugin(ManualControlAsync)

@@ -19,7 +19,7 @@ from mavsdk.plugins.mission.mission import MissionItem, MissionPlan
 from mavsdk.plugins.mission_raw.mission_raw import MissionItem as RawItem
 from mavsdk.plugins.mission_raw.mission_raw import MissionRawError, MissionRawResult
 
-from mavlink_sim.testing import RunningSimulator, running_simulator
+from mavlink_sim.testing import QUICK_FLIGHT, RunningSimulator, vehicle
 from tests.mavlink_sim.conftest import SIH_FRAME
 from tests.mavlink_sim.mavsdk_client import LIMIT_S, MavsdkClient, mavsdk_client, meanwhile, wait_for
 from tests.mavlink_sim.plan_client import item, land, polygon, rally, takeoff, waypoint
@@ -34,7 +34,7 @@ async def mavsdk_flight(
     speed: float = 1.0, of_ground_station: bool = False
 ) -> AsyncIterator[tuple[RunningSimulator, MavsdkClient]]:
     """A vehicle in its process and MAVSDK's view of it, ready to arm, on the onboard link or the other."""
-    with running_simulator(speed=speed, parameters={"RTL_RETURN_ALT": 5.0}) as simulator:
+    async with vehicle(speed=speed, parameters={**QUICK_FLIGHT, "RTL_RETURN_ALT": 5.0}) as simulator:
         port = simulator.gcs_port if of_ground_station else simulator.onboard_port
         async with mavsdk_client(f"udpin://127.0.0.1:{port}") as system:
             await wait_for(system.plugin(TelemetryAsync).subscribe_health(), lambda health: health.is_armable)

@@ -13,7 +13,7 @@ from mavsdk.asyncio.plugins.mavlink_direct import MavlinkDirectAsync, MavlinkMes
 from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
 from pymavlink import mavutil
 
-from mavlink_sim.testing import running_simulator
+from mavlink_sim.testing import QUICK_FLIGHT, vehicle
 from tests.mavlink_sim.mavsdk_client import mavsdk_client, meanwhile, wait_for
 
 pytestmark = pytest.mark.realtime
@@ -72,7 +72,7 @@ class Companion:
 
 
 def test_pymavlink_flies_offboard_loses_stream_and_comes_home() -> None:
-    with running_simulator(speed=SPEED) as simulator:
+    with vehicle(speed=SPEED, parameters={**QUICK_FLIGHT, "RTL_RETURN_ALT": 5.0}) as simulator:
         companion = Companion(simulator.onboard_port)
         companion.until(lambda: companion.newest["HEARTBEAT"].system_status == 3)
         companion.command(400, 1)
@@ -125,7 +125,7 @@ def message(name: str, fields: dict[str, float]) -> MavlinkMessage:
 
 
 async def test_mavsdk_flies_the_vehicle() -> None:
-    with running_simulator(speed=SPEED) as simulator:
+    async with vehicle(speed=SPEED, parameters=QUICK_FLIGHT) as simulator:
         url = f"udpin://127.0.0.1:{simulator.onboard_port}"
         async with mavsdk_client(url, ComponentType.COMPANION_COMPUTER) as system:
             action, telemetry = system.plugin(ActionAsync), system.plugin(TelemetryAsync)

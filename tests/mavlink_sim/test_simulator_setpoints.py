@@ -12,7 +12,7 @@ from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
 
 from mavlink_sim.physics.airframe import GRAVITY_MPS2, MAX_THRUST_MPS2
 from mavlink_sim.physics.geography import HOME_ALTITUDE_M
-from mavlink_sim.testing import RunningSimulator
+from mavlink_sim.testing import QUICK_FLIGHT, RunningSimulator
 from tests.mavlink_sim.conftest import SIH_FRAME
 from tests.mavlink_sim.mavsdk_client import mavsdk_client, wait_for
 
@@ -26,7 +26,7 @@ def distance_m(update: Any, north: float, east: float) -> float:
     return math.hypot(update.position.north_m - north, update.position.east_m - east)
 
 
-@pytest.mark.vehicle(speed=SPEED, px4="1.15")
+@pytest.mark.vehicle(speed=SPEED, px4="1.15", parameters=QUICK_FLIGHT)
 async def test_mavsdk_flies_every_kind_of_setpoint(vehicle: RunningSimulator) -> None:
     async with mavsdk_client(vehicle.mavsdk_url, ComponentType.COMPANION_COMPUTER) as system:
         action, telemetry = system.plugin(ActionAsync), system.plugin(TelemetryAsync)

@@ -10,28 +10,31 @@ import time
 from pathlib import Path
 from typing import Any
 
-import httpx2
 import pytest
-from mcp.client import Client
-from mcp.client.stdio import StdioServerParameters, stdio_client
-from mcp.client.streamable_http import streamable_http_client
 from typer.testing import CliRunner
 
 from companion.bench.lockstep_flight import plain_settings
 from companion.cli import app
 from companion.cli.mcp import _access, _serve
-from mavlink_sim.testing import QUICK_FLIGHT, free_port, running_simulator
+from mavlink_sim.testing import free_port, running_simulator
 from tests.companion.cli.test_ask import service, shown
-from tests.companion.service_process import running_service
+from tests.companion.service_process import TWICE, running_service
 
 TOKEN = "0123456789abcdef0123456789abcdef"
 
 
+# The SDK is imported by the tests that need it: it takes a second of every worker's collection.
+
+
 def process(endpoint: str, vehicle: str, *flags: str) -> Any:
-    """The server as a client starts it."""
+    """The server, and its client, which starts it."""
+    from mcp.client import Client
+    from mcp.client.stdio import StdioServerParameters, stdio_client
+
     arguments = ["-m", "companion.cli", "mcp", "--connect", endpoint, "--vehicle-name", vehicle, *flags]
     environment = {"PYTHONPATH": os.pathsep.join(sys.path)}
-    return stdio_client(StdioServerParameters(command=sys.executable, args=arguments, env=environment))
+    server = StdioServerParameters(command=sys.executable, args=arguments, env=environment)
+    return Client(stdio_client(server))
 
 
 @pytest.fixture
@@ -44,7 +47,7 @@ def token_file(tmp_path: Path) -> Path:
 
 async def test_process_answers_and_ends_what_it_flies_with_its_client() -> None:
     async with service() as there:
-        async with Client(process(there.endpoint, "vehicle", "--allow", "orbit")) as client:
+        async with process(there.endpoint, "vehicle", "--allow", "orbit") as client:
             names = [tool.name for tool in (await client.list_tools()).tools]
             assert {"seen", "orbit", "land"} <= set(names)
             seen = (await client.call_tool("seen", {})).structured_content["objects"]
@@ -66,6 +69,10 @@ async def test_process_answers_and_ends_what_it_flies_with_its_client() -> None:
 async def test_http_serves_programs_with_the_token(
     mode: str, token_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    import httpx2
+    from mcp.client import Client
+    from mcp.client.streamable_http import streamable_http_client
+
     listen = f"127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     url = f"http://{listen}/mcp"
     settings = plain_settings({"vehicle.name": "vehicle"})
@@ -129,11 +136,11 @@ def test_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.realtime
 async def test_simulated_vehicle_is_left_to_its_pilot(tmp_path: Path) -> None:
     with (
-        running_simulator(parameters=QUICK_FLIGHT) as simulator,
+        running_simulator(**TWICE) as simulator,
         running_service(simulator.onboard_port, ["--source", "none"], cwd=tmp_path) as flown,
     ):
         allowed = ("--allow", "takeoff,goto,orbit")
-        async with Client(process(flown.endpoint, "vehicle1", *allowed)) as client:
+        async with process(flown.endpoint, "vehicle1", *allowed) as client:
 
             async def call(name: str, **arguments: Any) -> dict[str, Any]:
                 content: dict[str, Any] = (await client.call_tool(name, arguments)).structured_content

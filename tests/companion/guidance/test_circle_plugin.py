@@ -13,8 +13,8 @@ import pytest
 
 from companion.bench.lockstep_flight import LockstepFlight, plain_settings
 from companion.guidance.command import COMMANDS
-from mavlink_sim.testing import QUICK_FLIGHT, RunningSimulator
-from tests.companion.service_process import running_service
+from mavlink_sim.testing import RunningSimulator
+from tests.companion.service_process import TWICE, running_service
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "circle"
 
@@ -65,7 +65,7 @@ def test_plugin_flies_its_circle(installed: Path, monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.realtime
 @pytest.mark.timeout(200)
-@pytest.mark.vehicle(parameters=QUICK_FLIGHT)
+@pytest.mark.vehicle(speed=2.0, parameters=TWICE["parameters"])
 def test_service_flies_an_installed_plugin(
     installed: Path, vehicle: RunningSimulator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

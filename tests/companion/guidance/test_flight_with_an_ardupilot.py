@@ -10,7 +10,7 @@ import pytest
 
 from companion.guidance.behaviour import Outcome
 from companion.vehicle.state import FlightMode, VehicleState
-from mavlink_sim.testing import running_simulator
+from mavlink_sim.testing import vehicle
 from tests.companion.live_flight import LiveFlight, ground_station
 
 pytestmark = pytest.mark.realtime
@@ -26,7 +26,7 @@ def speed_mps(state: VehicleState) -> float:
 
 async def test_flight_until_the_pilot_takes_over_ardupilot() -> None:
     with (
-        running_simulator(autopilot="ardupilot", ready_after=0.0, speed=2.0, seed=3) as simulator,
+        vehicle(autopilot="ardupilot", speed=2.0, seed=3, parameters={"LAND_SPEED": 200}) as simulator,
         ground_station(simulator.gcs_port) as station,
     ):
         service = LiveFlight("pymavlink", simulator.onboard_port)

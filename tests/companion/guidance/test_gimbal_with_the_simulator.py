@@ -10,6 +10,7 @@ import pytest
 from companion.vehicle.gimbal import NOBODY, GimbalState
 from mavlink_sim.testing import running_simulator
 from tests.companion.live_flight import STATION, LiveFlight, ground_station
+from tests.companion.service_process import TWICE
 from vision.detections import Detections
 from vision.pipeline import PerceptionResult
 
@@ -42,7 +43,7 @@ class FlightWithGimbal(LiveFlight):
 
 async def test_sweep_gimbal_command_and_station_takeover() -> None:
     with (
-        running_simulator(speed=2.0, gimbal=True) as simulator,
+        running_simulator(gimbal=True, **TWICE) as simulator,
         ground_station(simulator.gcs_port) as station,
     ):
 

@@ -18,9 +18,9 @@ from companion.guidance.missions.mission_file import (
     read_mission,
 )
 from companion.guidance.missions.sequence import ABORT, END, LAND, RTL
-from mavlink_sim.testing import QUICK_FLIGHT, running_simulator
+from mavlink_sim.testing import running_simulator
 from tests.companion.command_line import companion, companion_here
-from tests.companion.service_process import running_service
+from tests.companion.service_process import TWICE, running_service
 
 NAMES = ("person", "car", "traffic light")
 DOCUMENT = Path(__file__).parents[3] / "docs" / "flight.md"
@@ -242,7 +242,7 @@ def test_service_flies_a_mission_and_logs_its_steps(seeing: list[str], tmp_path:
     flown_at = tmp_path / "service"
     flown_at.mkdir()
     with (
-        running_simulator(speed=2.0, parameters=QUICK_FLIGHT) as simulator,
+        running_simulator(**TWICE) as simulator,
         running_service(simulator.onboard_port, [*seeing, "--source-rate-hz", "3"], cwd=flown_at) as service,
     ):
         # The service cannot access the file: its text is sent with the command.

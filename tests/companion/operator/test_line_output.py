@@ -22,7 +22,8 @@ import pytest
 from companion.bus.client import client_settings, listen, open_client, send_command
 from companion.operator.line_output import LineOutput
 from companion.settings import ZenohSection
-from mavlink_sim.testing import QUICK_FLIGHT, free_port, running_simulator
+from mavlink_sim.testing import free_port, running_simulator
+from tests.companion.service_process import TWICE
 
 pytestmark = pytest.mark.realtime
 
@@ -138,7 +139,7 @@ def test_service_works_with_an_unread_log(filming: list[str], pipe: Pipe, tmp_pa
     endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     settings = client_settings(ZenohSection(listen=(endpoint,)))
     statuses: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
-    with running_simulator(parameters=QUICK_FLIGHT) as simulator:
+    with running_simulator(**TWICE) as simulator:
         command = [sys.executable, "-m", "companion.cli", "run", *filming, "--source-rate-hz", "2"]
         command += ["--log-level", "debug", "--dashboard-listen", ""]
         command += [f"--vehicle-url=udpin://127.0.0.1:{simulator.onboard_port}", f"--zenoh-listen={endpoint}"]

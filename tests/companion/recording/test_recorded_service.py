@@ -22,9 +22,9 @@ from pymavlink import mavutil
 
 from companion.recording.files import RecordingReader
 from companion.replay import replay
-from mavlink_sim.testing import QUICK_FLIGHT, running_simulator
+from mavlink_sim.testing import running_simulator
 from tests.companion.recording.lockstep_recording import library_times
-from tests.companion.service_process import ServiceProcess, heartbeats, running_service
+from tests.companion.service_process import TWICE, ServiceProcess, heartbeats, running_service
 
 pytestmark = pytest.mark.realtime
 
@@ -95,7 +95,7 @@ def test_flight_is_recorded_and_replays(image_folder: Path, exported_model: Path
         *("--recording-directory", str(folder), "--recording-image-format", "png"),
     ]
     with (
-        running_simulator(parameters=QUICK_FLIGHT) as simulator,
+        running_simulator(**TWICE) as simulator,
         running_service(simulator.onboard_port, flags, cwd=tmp_path) as service,
     ):
         service.take_off(2.5)
@@ -142,7 +142,7 @@ def test_recorder_is_started_again_but_not_for_a_full_disk(filming: list[str], t
     """The limit of a file's size stands for a full disk: the same write fails, with EFBIG for ENOSPC."""
     folder = tmp_path / "recordings"
     with (
-        running_simulator(parameters=QUICK_FLIGHT) as simulator,
+        running_simulator(**TWICE) as simulator,
         running_service(
             simulator.onboard_port, [*filming, "--recording-directory", str(folder)], cwd=tmp_path
         ) as service,

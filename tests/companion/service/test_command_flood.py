@@ -14,7 +14,7 @@ import zenoh
 
 from companion.bus.client import listen
 from companion.bus.topics import command_key
-from mavlink_sim.testing import QUICK_FLIGHT, running_simulator
+from mavlink_sim.testing import QUICK_FLIGHT, vehicle
 from tests.companion.service_process import ServiceProcess, running_service
 
 pytestmark = [pytest.mark.realtime, pytest.mark.slow]
@@ -82,7 +82,7 @@ def flood(service: ServiceProcess) -> tuple[int, float, float]:
 @pytest.mark.timeout(600)
 def test_flight_goes_on_through_100_000_bad_queries(filming: list[str], tmp_path: Path) -> None:
     with (
-        running_simulator(parameters=QUICK_FLIGHT) as simulator,
+        vehicle(parameters=QUICK_FLIGHT) as simulator,
         running_service(simulator.onboard_port, filming, cwd=tmp_path) as service,
     ):
         service.take_off(2.5)

@@ -66,7 +66,7 @@ def test_service_lands_on_the_commanded_marker(tmp_path: Path, method: str) -> N
     driver = "pymavlink" if method == "offboard" else "mavsdk"
     with (
         running_simulator(
-            scene=scene, camera=camera, truth=truth, seed=3, parameters=QUICK_FLIGHT
+            scene=scene, camera=camera, truth=truth, ready_after=0.0, seed=3, parameters=QUICK_FLIGHT
         ) as simulator,
         running_service(
             simulator.onboard_port, [*wanted, "--vehicle-driver", driver], cwd=tmp_path

@@ -63,7 +63,9 @@ def test_every_message_of_a_flight_is_valid(tmp_path: Path) -> None:
     ]  # fmt: skip
     samples: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
     with (
-        running_simulator(scene=scene, camera=camera, seed=3, parameters=QUICK_FLIGHT) as simulator,
+        running_simulator(
+            scene=scene, camera=camera, ready_after=0.0, seed=3, parameters=QUICK_FLIGHT
+        ) as simulator,
         running_service(simulator.onboard_port, flags, cwd=tmp_path) as service,
         service.client() as session,
     ):

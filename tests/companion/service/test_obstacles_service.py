@@ -86,7 +86,7 @@ def in_the_air(
     )  # fmt: skip
     with (
         running_simulator(
-            scene=scene, camera=camera, truth=path, seed=2, parameters=QUICK_FLIGHT
+            scene=scene, camera=camera, truth=path, ready_after=0.0, seed=2, parameters=QUICK_FLIGHT
         ) as simulator,
         running_service(simulator.onboard_port, flags, cwd=folder) as service,
     ):

@@ -17,8 +17,9 @@ from companion.service.other_commanders import OtherCommanders
 from companion.settings.vehicle import VehicleSection
 from companion.vehicle.commander import Commander
 from companion.vehicle.state import FlightMode, VehicleState
-from mavlink_sim.testing import QUICK_FLIGHT, running_simulator
+from mavlink_sim.testing import running_simulator
 from tests.companion.live_flight import LiveFlight
+from tests.companion.service_process import TWICE
 
 S = 1_000_000_000
 NOW_NS = 1000 * S
@@ -129,8 +130,8 @@ def test_appearance_and_loss_are_reported_once() -> None:
 @pytest.mark.realtime
 @pytest.mark.parametrize(("kind", "autopilot"), [("mavsdk", "px4"), ("pymavlink", "ardupilot")])
 async def test_two_services_on_two_links_of_one_vehicle(kind: str, autopilot: str) -> None:
-    parameters = QUICK_FLIGHT if autopilot == "px4" else None
-    with running_simulator(autopilot=autopilot, parameters=parameters) as simulator:
+    options = TWICE if autopilot == "px4" else {**TWICE, "parameters": {"LAND_SPEED": 200}}
+    with running_simulator(autopilot=autopilot, **options) as simulator:
         first = LiveFlight(kind, simulator.onboard_port, ran_s=60.0)
         second = LiveFlight(kind, simulator.gcs_port)
         async with first.running(), second.running():

@@ -20,7 +20,7 @@ import zenoh
 from companion.bus.client import listen
 from companion.bus.topics import command_key
 from mavlink_sim.testing import QUICK_FLIGHT, RunningSimulator, free_port, running_simulator
-from tests.companion.service_process import ServiceProcess, heartbeats, running_service
+from tests.companion.service_process import TWICE, ServiceProcess, heartbeats, running_service
 
 pytestmark = pytest.mark.realtime
 
@@ -57,7 +57,7 @@ def fly(service: ServiceProcess) -> None:
 
 def test_ardupilot_is_recognized_by_a_service_without_a_camera(tmp_path: Path) -> None:
     with (
-        running_simulator(autopilot="ardupilot") as simulator,
+        running_simulator(autopilot="ardupilot", ready_after=0.0) as simulator,
         running_service(simulator.onboard_port, NO_CAMERA, cwd=tmp_path) as service,
         service.client() as session,
     ):
@@ -74,7 +74,7 @@ def test_ardupilot_is_recognized_by_a_service_without_a_camera(tmp_path: Path) -
 def test_flight_with_detections_and_the_mavsdk_driver(seeing: list[str], tmp_path: Path) -> None:
     flags = [*seeing, "--source-rate-hz", "2", "--driver", "mavsdk"]
     with (
-        running_simulator(parameters=QUICK_FLIGHT) as simulator,
+        running_simulator(**TWICE) as simulator,
         running_service(simulator.onboard_port, flags, cwd=tmp_path) as service,
         service.client() as session,
     ):
@@ -90,7 +90,7 @@ def test_flight_with_detections_and_the_mavsdk_driver(seeing: list[str], tmp_pat
 def test_stopped_service_does_not_retake_command(tmp_path: Path) -> None:
     path = tmp_path / "truth.jsonl"
     with (
-        running_simulator(truth=path, parameters=QUICK_FLIGHT) as simulator,
+        running_simulator(truth=path, ready_after=0.0, parameters=QUICK_FLIGHT) as simulator,
         running_service(simulator.onboard_port, NO_CAMERA, cwd=tmp_path) as service,
     ):
         fly(service)
@@ -119,7 +119,7 @@ def assert_ends_in_hold(service: ServiceProcess, simulator: RunningSimulator, nu
 def test_flight_with_detections_survives_a_killed_worker(seeing: list[str], tmp_path: Path) -> None:
     path = tmp_path / "truth.jsonl"
     with (
-        running_simulator(truth=path, parameters=QUICK_FLIGHT) as simulator,
+        running_simulator(truth=path, **TWICE) as simulator,
         running_service(simulator.onboard_port, seeing, cwd=tmp_path) as service,
         service.client() as session,
     ):
@@ -164,7 +164,7 @@ def test_flight_with_detections_survives_a_killed_worker(seeing: list[str], tmp_
 
 def test_lost_vehicle_is_reconnected_and_held_at_shutdown(tmp_path: Path) -> None:
     with (
-        running_simulator(parameters=QUICK_FLIGHT) as first,
+        running_simulator(**TWICE) as first,
         running_service(first.onboard_port, NO_CAMERA, cwd=tmp_path) as service,
     ):
         fly(service)
@@ -172,7 +172,7 @@ def test_lost_vehicle_is_reconnected_and_held_at_shutdown(tmp_path: Path) -> Non
         service.wait_for_line("autopilot heartbeat lost")
         count = len(service.lines)
         with running_simulator(
-            onboard_port=first.onboard_port, onboard_bind=first.onboard_bind, parameters=QUICK_FLIGHT
+            onboard_port=first.onboard_port, onboard_bind=first.onboard_bind, **TWICE
         ) as second:
             service.wait_for_line("autopilot heartbeat received", after=count)
             fly(service)
@@ -230,7 +230,7 @@ def test_two_services_detect_each_other_and_one_flies(tmp_path: Path) -> None:
     second_endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     statuses: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
     with contextlib.ExitStack() as running:
-        simulator = running.enter_context(running_simulator(parameters=QUICK_FLIGHT))
+        simulator = running.enter_context(running_simulator(**TWICE))
         first = running.enter_context(running_service(simulator.onboard_port, NO_CAMERA, cwd=tmp_path))
         session = running.enter_context(first.client())
         listen(session, "status", lambda _key, text: statuses.put(json.loads(text)))

@@ -15,7 +15,7 @@ from companion.vehicle.driver import CommandRefusedError, Driver
 from companion.vehicle.drivers import DriverKind, open_driver
 from companion.vehicle.state import FlightMode, HeightSource, LandedState, VehicleState
 from companion.vehicle.vision_position import VisionPosition
-from mavlink_sim.testing import RunningSimulator, running_simulator
+from mavlink_sim.testing import RunningSimulator, vehicle
 from tests.companion.vehicle.fake_autopilot import streaming, wait_for_state, wait_until
 
 pytestmark = pytest.mark.realtime
@@ -50,7 +50,7 @@ def complete(state: VehicleState) -> bool:
 
 
 async def test_state_parameters_modes_and_arming_on_the_ground(kind: DriverKind) -> None:
-    with running_simulator(speed=4.0) as simulator:
+    with vehicle(speed=4.0) as simulator:
         async with connected(kind, simulator) as driver:
             state = await wait_for_state(driver, complete)
             assert state.mode is FlightMode.HOLD
@@ -83,7 +83,7 @@ async def test_state_parameters_modes_and_arming_on_the_ground(kind: DriverKind)
 
 
 async def test_px4_failsafe_acts_when_setpoints_end(kind: DriverKind) -> None:
-    with running_simulator(speed=6.0, parameters=FLIGHT) as simulator:
+    with vehicle(speed=6.0, parameters=FLIGHT) as simulator:
         async with connected(kind, simulator) as driver:
             await wait_for_state(driver, complete)
             await driver.takeoff(3.0)
@@ -117,13 +117,13 @@ async def test_driver_continues_after_a_vehicle_restart(
     kind: DriverKind, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
-    with running_simulator(speed=4.0) as first:
+    with vehicle(speed=4.0) as first:
         async with connected(kind, first) as driver:
             await wait_for_state(driver, complete)
             first.kill()
             await wait_until(lambda: "no heartbeat" in caplog.text, 15.0)
             assert not driver.state.connected(time.monotonic_ns())
-            with running_simulator(speed=4.0, onboard_port=first.onboard_port):
+            with vehicle(speed=4.0, onboard_port=first.onboard_port):
                 await wait_until(lambda: "received again" in caplog.text, 15.0)
                 await wait_for_state(driver, complete)
                 assert driver.link_count > 1
@@ -134,7 +134,7 @@ async def test_driver_continues_after_a_vehicle_restart(
 
 
 async def test_two_vehicles_are_independent(kind: DriverKind) -> None:
-    with running_simulator(speed=4.0) as one, running_simulator(speed=4.0, system_id=2) as two:
+    with vehicle(speed=4.0) as one, vehicle(speed=4.0, system_id=2) as two:
         async with connected(kind, one) as first, connected(kind, two, system_id=2) as second:
             await asyncio.gather(wait_for_state(first, complete), wait_for_state(second, complete))
             await asyncio.gather(second.takeoff(3.0), second.arm())
@@ -147,7 +147,7 @@ async def test_two_vehicles_are_independent(kind: DriverKind) -> None:
 
 async def test_vision_position_reaches_the_estimator(kind: DriverKind) -> None:
     covariance = tuple(0.01 if index in (0, 6, 11, 15, 18, 20) else 0.0 for index in range(21))
-    with running_simulator(parameters={"EKF2_EV_CTRL": 1}) as simulator:
+    with vehicle(parameters={"EKF2_EV_CTRL": 1}) as simulator:
         async with connected(kind, simulator) as driver:
             await wait_for_state(driver, complete)
             simulator.fault("gps_loss")

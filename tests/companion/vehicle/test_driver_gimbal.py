@@ -16,7 +16,7 @@ from companion.vehicle.driver import CommandRefusedError, Driver
 from companion.vehicle.drivers import DriverKind, open_driver
 from companion.vehicle.gimbal import NOBODY, GimbalAim, YawFrame
 from companion.vehicle.state import VehicleState
-from mavlink_sim.testing import running_simulator
+from mavlink_sim.testing import vehicle
 from tests.companion.live_flight import ground_station
 from tests.companion.vehicle.fake_autopilot import FakeAutopilot, gimbal_of, wait_for_state, wait_until
 from vision.attitude import quaternion_from_euler
@@ -37,7 +37,7 @@ async def connected(kind: DriverKind, port: int) -> AsyncIterator[Driver]:
 
 async def test_gimbal_control_is_taken_used_and_released(kind: DriverKind) -> None:
     with (
-        running_simulator(speed=2.0, gimbal=True) as simulator,
+        vehicle(speed=2.0, gimbal=True) as simulator,
         ground_station(simulator.gcs_port) as station,
     ):
         async with connected(kind, simulator.onboard_port) as driver:
@@ -98,7 +98,7 @@ async def test_gimbal_control_is_taken_used_and_released(kind: DriverKind) -> No
 
 
 async def test_missing_gimbal_is_not_logged(kind: DriverKind, caplog: pytest.LogCaptureFixture) -> None:
-    with running_simulator(speed=4.0) as simulator:
+    with vehicle(speed=4.0) as simulator:
         async with connected(kind, simulator.onboard_port) as driver:
             assert not await driver.find_gimbal()
             assert driver.state.gimbal is None
