@@ -126,10 +126,11 @@ def test_nearest_marker_options_win(run: Any) -> None:
 
     @pytest.mark.vehicle(system_id=7, parameters={"MIS_TAKEOFF_ALT": 7.0})
     def test_its_own(make_vehicle):
-        assert value(make_vehicle(), 7, b"MIS_TAKEOFF_ALT") == 7.0
+        first = make_vehicle()
         other = make_vehicle(system_id=8, parameters={"MIS_TAKEOFF_ALT": 8.0})
         assert value(other, 8, b"MIS_TAKEOFF_ALT") == 8.0
-        assert value(make_vehicle(), 7, b"COM_OF_LOSS_T") == 0.5
+        assert value(first, 7, b"MIS_TAKEOFF_ALT") == 7.0
+        assert value(first, 7, b"COM_OF_LOSS_T") == 0.5
     """,
         "--strict-markers",
     )
@@ -165,14 +166,14 @@ def test_parallel_tests_have_separate_vehicles(run: Any) -> None:
         + """
     import pytest
 
-    @pytest.mark.parametrize("number", range(4))
+    @pytest.mark.parametrize("number", range(2))
     def test_it(vehicle, number):
         arm(vehicle)
-        assert number != 3
+        assert number != 1
     """,
         *("-p", "xdist", "-n", "2", "--basetemp=temporary"),
     )
-    result.assert_outcomes(passed=3, failed=1)
+    result.assert_outcomes(passed=1, failed=1)
     result.stdout.fnmatch_lines(["*- vehicle 1 -*", "log:*vehicle.log"])
 
 

@@ -20,7 +20,7 @@ from tests.companion.service_process import ServiceProcess, running_service
 
 pytestmark = pytest.mark.realtime
 
-WALL_NORTH_M, THICKNESS_M, MARGIN_M = 12.0, 0.4, 2.0
+WALL_NORTH_M, THICKNESS_M, MARGIN_M = 9.0, 0.4, 2.0
 # As for `python -m benchmarks.flights obstacles`: gusts push it a little into the margin.
 ALLOWED_M = 1.0
 SCENE = """
@@ -103,9 +103,9 @@ def test_flies_around_a_pillar_to_the_goal(tmp_path: Path) -> None:
     scene = SCENE.format(kind="box", north_m=6.0, size_m=[1.0, 1.0, 6.0])
     flags = ("--guidance-avoid", "true", "--guidance-obstacle-margin-m", "1")
     with in_the_air(tmp_path, scene, *flags) as (_, service, truth):
-        reply = service.command_when_it_can("goto north=11 east=0 speed=2", 90.0)
+        reply = service.command_when_it_can("goto north=9 east=0 speed=2", 90.0)
         assert reply["success"], reply
-        last = truth.wait_for(lambda row: north_m(row) > 10.0)
+        last = truth.wait_for(lambda row: north_m(row) > 8.0)
         assert last["collisions"] == 0
         passing = [row["position_ned_m"][:2] for row in truth.rows if 5.0 < north_m(row) < 7.0]
         assert min(abs(east - 0.2) for _, east in passing) > 0.5 + 0.6  # half its width
@@ -122,7 +122,7 @@ def test_brakes_before_a_wall_and_without_depth(tmp_path: Path) -> None:
         with ThreadPoolExecutor(2) as operators:
             there = operators.submit(service.command_when_it_can, "goto north=40 east=0 speed=3", 90.0)
             truth.wait_for(lambda row: north_mps(row) > 1.5)
-            stands = truth.wait_for(lambda row: north_m(row) > 8.0 and abs(north_mps(row)) < 0.3)
+            stands = truth.wait_for(lambda row: north_m(row) > 5.0 and abs(north_mps(row)) < 0.3)
             truth.wait_for(lambda row: row["stamp_ns"] > stands["stamp_ns"] + 3e9)
             assert WALL_NORTH_M - THICKNESS_M / 2 - max(map(north_m, truth.rows)) >= MARGIN_M - ALLOWED_M
             assert truth.rows[-1]["collisions"] == 0

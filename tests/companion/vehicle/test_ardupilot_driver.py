@@ -17,7 +17,7 @@ from companion.vehicle.driver import CommandRefusedError, Driver, SystemStatus
 from companion.vehicle.drivers import open_driver
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
-from mavlink_sim.testing import RunningSimulator, free_port, running_simulator
+from mavlink_sim.testing import RunningSimulator, free_port, vehicle
 from tests.companion.vehicle.fake_autopilot import SETPOINT, FakeAutopilot, wait_for_state, wait_until
 
 pytestmark = pytest.mark.realtime
@@ -26,7 +26,8 @@ pytestmark = pytest.mark.realtime
 @asynccontextmanager
 async def copter(speed: float = 4.0) -> AsyncIterator[tuple[Driver, RunningSimulator]]:
     """A Copter in its own process, and a connected driver with a known home."""
-    with running_simulator(autopilot="ardupilot", ready_after=0.0, speed=speed, seed=3) as simulator:
+    quick = {"LAND_SPEED": 200}
+    async with vehicle(autopilot="ardupilot", speed=speed, seed=3, parameters=quick) as simulator:
         driver = open_driver("pymavlink", f"udpin://127.0.0.1:{simulator.onboard_port}")
         await driver.connect(20.0)
         try:
