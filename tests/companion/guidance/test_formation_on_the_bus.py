@@ -20,9 +20,8 @@ from companion.bus.vehicle_messages import pose_message
 from companion.guidance.behaviours.formation import FormationBehaviour
 from companion.guidance.formation.neighbours import Neighbourhood
 from companion.settings import ZenohSection
-from mavlink_sim.testing import FleetMember, RunningSimulator, free_port, running_simulator
+from mavlink_sim.testing import QUICK_FLIGHT, FleetMember, RunningSimulator, free_port, running_simulator
 from tests.companion.live_flight import LiveFlight
-from tests.companion.service_process import TWICE
 
 pytestmark = pytest.mark.realtime
 
@@ -93,7 +92,9 @@ async def until(condition: Callable[[], object], timeout_s: float = 60.0) -> Non
 
 
 async def test_vehicles_share_poses_and_fly_in_formation() -> None:
-    with running_simulator(vehicles=VEHICLES, spacing=7.0, **TWICE) as simulator:
+    with running_simulator(
+        vehicles=VEHICLES, spacing=7.0, ready_after=0.0, parameters=QUICK_FLIGHT
+    ) as simulator:
         async with companions(simulator, VEHICLES) as fleet:
             leader, followers = fleet[0], fleet[1:]
             names = {member.name for member in fleet}
