@@ -359,7 +359,6 @@ class FallibleEstimate(Estimate):
 
     __slots__ = (
         "_errors",
-        "_yaw_error_rad",
         "fix_lost",
         "gps_drift",
         "held_xy_m",
@@ -369,7 +368,6 @@ class FallibleEstimate(Estimate):
 
     def __init__(self, truth: Multirotor, seed: int = 0, noise: bool = True) -> None:
         self._errors: dict[int, tuple[Vector, Vector, float]] = {}
-        self._yaw_error_rad = 0.0
         self.held_xy_m: tuple[float, float] | None = None
         self.reset_counter = 0
         self.position_valid = True
@@ -386,7 +384,7 @@ class FallibleEstimate(Estimate):
         else:
             self._errors[number] = (position_m, velocity_mps, yaw_rad)
         self.offset = _sum(error[0] for error in self._errors.values())
-        self._yaw_error_rad = sum(error[2] for error in self._errors.values())
+        self.yaw_offset_rad = sum(error[2] for error in self._errors.values())
 
     def restart(self, faults: Collection[int]) -> None:
         """Restart the filter; the errors of the faults with these numbers stay."""
@@ -420,25 +418,6 @@ class FallibleEstimate(Estimate):
     def gps_position(self) -> Vector:
         """The GPS receiver's position, NED metres, without the filter's errors."""
         return _sum((self.truth.position, self.gps_error, *self.gps_drift.values()))
-
-    @property
-    def quaternion(self) -> Quaternion:  # type: ignore[override, misc, unused-ignore]
-        """The attitude with its errors."""
-        w, x, y, z = super().quaternion
-        if self._yaw_error_rad == 0.0:
-            return (w, x, y, z)
-        cosine, sine = math.cos(self._yaw_error_rad / 2.0), math.sin(self._yaw_error_rad / 2.0)
-        return (cosine * w - sine * z, cosine * x - sine * y, cosine * y + sine * x, cosine * z + sine * w)
-
-    @quaternion.setter
-    def quaternion(self, value: Quaternion) -> None:
-        """Does nothing: the attitude is the airframe's."""
-
-    @property  # type: ignore[misc, unused-ignore]
-    def yaw_rad(self) -> float:  # type: ignore[override, misc, unused-ignore]
-        """Heading, clockwise from north."""
-        yaw_rad = super().yaw_rad
-        return math.remainder(yaw_rad + self._yaw_error_rad, math.tau) if self._yaw_error_rad else yaw_rad
 
 
 def _sum(vectors: Iterable[Vector]) -> Vector:
