@@ -37,6 +37,7 @@ from vision.yolo.safe_pickle import AllowedGlobal, unpickle
 
 
 def test_a_saved_model_comes_back_the_same(tmp_path: Path) -> None:
+    """It is readable by torch without trust, and can be trained further."""
     model = trained_model()
     save_checkpoint(tmp_path / "m.pt", model, metadata={"licence": "Apache-2.0", "score": {"map50": 0.9}})
     loaded = load_checkpoint(tmp_path / "m.pt")
@@ -47,21 +48,12 @@ def test_a_saved_model_comes_back_the_same(tmp_path: Path) -> None:
     assert {parameter.dtype for parameter in loaded.model.parameters()} == {torch.float32}
     assert_same_maps(model, loaded.model)
     assert [path.name for path in tmp_path.iterdir()] == ["m.pt"]
-
-
-def test_a_saved_model_is_readable_by_torch_without_trust(tmp_path: Path) -> None:
-    save_checkpoint(tmp_path / "m.pt", trained_model(), metadata={})
     content = torch.load(tmp_path / "m.pt", weights_only=True)
     assert content["format"] == FORMAT
     floating = {tensor.dtype for tensor in content["state_dict"].values() if tensor.is_floating_point()}
     assert floating == {torch.float16}
-
-
-def test_a_loaded_model_can_be_trained_further(tmp_path: Path) -> None:
-    save_checkpoint(tmp_path / "m.pt", trained_model(), metadata={})
-    model = load_checkpoint(tmp_path / "m.pt").model.train()
-    sum(level.square().sum() for level in model(torch.rand(2, 3, 64, 64))).backward()
-    assert model.model[0].get_parameter("conv.weight").grad is not None
+    sum(level.square().sum() for level in loaded.model.train()(torch.rand(2, 3, 64, 64))).backward()
+    assert loaded.model.model[0].get_parameter("conv.weight").grad is not None
 
 
 def test_a_model_with_folded_normalisation_comes_back_folded(tmp_path: Path) -> None:
@@ -128,25 +120,33 @@ def test_weights_that_do_not_fit_are_named(tmp_path: Path, key: str, tensor: Ten
 
 
 def test_a_foreign_checkpoint_gives_the_network_that_was_trained(tmp_path: Path, foreign: Classes) -> None:
+    """Without the library; leftovers of training are ignored, and the names may be a list."""
     model = trained_model()
-    path = save_foreign(tmp_path / "f.pt", as_foreign(model, foreign))
-    loaded = load_checkpoint(path)
-    assert loaded.class_names == NAMES
-    assert loaded.metadata["licence"] == "AGPL-3.0"
-    assert loaded.metadata["origin"] == "Ultralytics 8.0.0"
-    assert_same_maps(model, loaded.model)
-
-
-def test_foreign_checkpoint_needs_no_library(tmp_path: Path, foreign: Classes) -> None:
-    path = save_foreign(tmp_path / "f.pt", as_foreign(trained_model(), foreign))
+    norm = model.model[0].get_submodule("bn")
+    assert isinstance(norm, nn.BatchNorm2d)
+    norm.eps = 0.02
+    path = save_foreign(
+        tmp_path / "f.pt",
+        as_foreign(model, foreign, names=list(NAMES)),
+        best_fitness=np.float64(0.5),
+        train_args={"save_dir": pathlib.PurePosixPath("runs/train"), "imgsz": 640, "seed": 2**40},
+        optimizer={"state": {0: {"momentum_buffer": torch.zeros(3)}}},
+        note=b"\x00\xff",
+        classes={"a", "b"},
+    )
     before = {name: module for name, module in sys.modules.items() if name.startswith("ultralytics")}
     for name in before:
         del sys.modules[name]
     try:
-        load_checkpoint(path)
+        loaded = load_checkpoint(path)
         assert not any(name.startswith("ultralytics") for name in sys.modules)
     finally:
         sys.modules.update(before)
+    assert loaded.class_names == NAMES
+    assert loaded.metadata["licence"] == "AGPL-3.0"
+    assert loaded.metadata["origin"] == "Ultralytics 8.0.0"
+    assert loaded.model.model[0].get_submodule("bn").eps == 0.02
+    assert_same_maps(model, loaded.model)
 
 
 def test_the_averaged_weights_are_preferred(tmp_path: Path, foreign: Classes) -> None:
@@ -154,31 +154,9 @@ def test_the_averaged_weights_are_preferred(tmp_path: Path, foreign: Classes) ->
     path = save_foreign(
         tmp_path / "f.pt", as_foreign(model, foreign), ema=as_foreign(averaged, foreign), updates=5
     )
-    assert_same_maps(averaged, load_checkpoint(path).model)
-
-
-def test_training_leftovers_in_the_file_are_ignored(tmp_path: Path, foreign: Classes) -> None:
-    path = save_foreign(
-        tmp_path / "f.pt",
-        as_foreign(trained_model(), foreign),
-        best_fitness=np.float64(0.5),
-        train_args={"save_dir": pathlib.PurePosixPath("runs/train"), "imgsz": 640, "seed": 2**40},
-        optimizer={"state": {0: {"momentum_buffer": torch.zeros(3)}}},
-        note=b"\x00\xff",
-        classes={"a", "b"},
-    )
-    assert load_checkpoint(path).class_names == NAMES
-
-
-def test_the_epsilon_of_each_normalisation_is_kept(tmp_path: Path, foreign: Classes) -> None:
-    model = trained_model()
-    norm = model.model[0].get_submodule("bn")
-    assert isinstance(norm, nn.BatchNorm2d)
-    norm.eps = 0.02
-    path = save_foreign(tmp_path / "f.pt", as_foreign(model, foreign))
-    loaded = load_checkpoint(path).model
-    assert loaded.model[0].get_submodule("bn").eps == 0.02
-    assert_same_maps(model, loaded)
+    loaded = load_checkpoint(path)
+    assert loaded.class_names == NAMES
+    assert_same_maps(averaged, loaded.model)
 
 
 def test_the_activation_is_the_one_that_was_trained(tmp_path: Path, foreign: Classes) -> None:
@@ -187,13 +165,9 @@ def test_the_activation_is_the_one_that_was_trained(tmp_path: Path, foreign: Cla
         if isinstance(module, Conv):
             module.act = nn.ReLU()
     path = save_foreign(tmp_path / "f.pt", as_foreign(model, foreign))
-    assert load_checkpoint(path).description.activation == "ReLU"
-    assert_same_maps(model, load_checkpoint(path).model)
-
-
-def test_names_may_be_a_list(tmp_path: Path, foreign: Classes) -> None:
-    path = save_foreign(tmp_path / "f.pt", as_foreign(trained_model(), foreign, names=list(NAMES)))
-    assert load_checkpoint(path).class_names == NAMES
+    loaded = load_checkpoint(path)
+    assert loaded.description.activation == "ReLU"
+    assert_same_maps(model, loaded.model)
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ by `tools/ultralytics_parity.py` and `tools/golden_maps.py`; no test needs it.
 from __future__ import annotations
 
 import dataclasses
+from functools import cache
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from torch import Tensor
 from tests.vision.dense_decoding import decoded
 from vision.yolo.architecture import ArchitectureError, ModelDescription, YoloModel, build, build_shapes
 from vision.yolo.postprocess import select_boxes
-from vision.yolo.published import SCALES, describe, published_description
+from vision.yolo.published import SCALES, describe, model_family_of, published_description
 
 COCO_SIZED = [f"class {index}" for index in range(80)]
 FEW = ("car", "dog", "boat")
@@ -104,9 +105,16 @@ def lively(model_family: str = "YOLO26", scale: str = "n", **changes: object) ->
 
 
 @pytest.mark.parametrize(("model_family", "scale"), EVERY)
-def test_each_scale_has_the_published_number_of_parameters(model_family: str, scale: str) -> None:
+def test_each_scale_has_the_published_facts(model_family: str, scale: str) -> None:
     model = build_shapes(published_description(model_family, scale, COCO_SIZED))
     assert sum(parameter.numel() for parameter in model.parameters()) == PARAMETERS[model_family][scale]
+    assert model_family_of(model) == model_family
+    if scale == "n" or (model_family, scale) == ("YOLOv8", "x"):
+        found = describe(model)
+        assert (found.model_family, found.scale) == (model_family, scale)
+        assert found.parameters == PARAMETERS[model_family][scale]
+        assert found.end_to_end == (model_family in ("YOLOv10", "YOLO26"))
+        assert scale == "x" or found.gflops == pytest.approx(GFLOPS[model_family], abs=0.1)
 
 
 def test_every_published_network_is_counted() -> None:
@@ -136,23 +144,33 @@ def test_outputs_match_the_reference(model_family: str, scale: str) -> None:
             ("model.5.cv2.conv.weight", "model.10.attn.pe.conv.weight", "model.10.ffn.1.bn.bias"),
         ),
         ("YOLOv10", "s", ("model.8.m.0.cv1.2.conv.conv.weight", "model.8.m.0.cv1.2.conv1.bn.bias")),
-        ("YOLO11", "n", ("model.2.m.0.cv1.conv.weight", "model.10.m.0.attn.qkv.conv.weight")),
-        ("YOLO11", "m", ("model.2.m.0.cv3.conv.weight", "model.2.m.0.m.1.cv2.conv.weight")),
         (
             "YOLO11",
             "n",
-            ("model.23.cv3.0.0.0.conv.weight", "model.23.cv3.0.1.1.bn.bias", "model.23.cv3.0.2.bias"),
+            (
+                *("model.2.m.0.cv1.conv.weight", "model.10.m.0.attn.qkv.conv.weight"),
+                *("model.23.cv3.0.0.0.conv.weight", "model.23.cv3.0.1.1.bn.bias", "model.23.cv3.0.2.bias"),
+            ),
         ),
-        ("YOLOv8", "n", ("model.0.bn.running_var", "model.2.m.0.cv1.conv.weight", "model.9.cv2.bn.bias")),
+        ("YOLO11", "m", ("model.2.m.0.cv3.conv.weight", "model.2.m.0.m.1.cv2.conv.weight")),
         (
             "YOLOv8",
             "n",
-            ("model.22.cv2.0.0.conv.weight", "model.22.cv3.2.2.bias", "model.22.dfl.conv.weight"),
+            (
+                *("model.0.bn.running_var", "model.2.m.0.cv1.conv.weight", "model.9.cv2.bn.bias"),
+                *("model.22.cv2.0.0.conv.weight", "model.22.cv3.2.2.bias", "model.22.dfl.conv.weight"),
+            ),
         ),
         ("YOLO12", "n", ("model.6.m.0.0.attn.qkv.conv.weight", "model.6.m.0.1.mlp.1.bn.bias")),
         ("YOLO12", "l", ("model.6.gamma", "model.8.gamma", "model.6.m.3.1.attn.pe.conv.weight")),
-        ("YOLO26", "n", ("model.22.m.0.0.cv1.conv.weight", "model.22.m.0.1.attn.proj.conv.weight")),
-        ("YOLO26", "n", ("model.23.one2one_cv2.0.2.bias", "model.23.one2one_cv3.2.1.0.conv.weight")),
+        (
+            "YOLO26",
+            "n",
+            (
+                *("model.22.m.0.0.cv1.conv.weight", "model.22.m.0.1.attn.proj.conv.weight"),
+                *("model.23.one2one_cv2.0.2.bias", "model.23.one2one_cv3.2.1.0.conv.weight"),
+            ),
+        ),
     ],
 )
 def test_parameter_names_match_published_checkpoints(
@@ -187,18 +205,6 @@ def test_an_unpublished_network_is_rejected_with_the_known_ones(
 
 
 # Facts of a network
-
-
-@pytest.mark.parametrize("model_family", SCALES)
-def test_family_scale_and_gflops_are_recognised(model_family: str) -> None:
-    for scale in ("n", "x"):
-        model = build_shapes(published_description(model_family, scale, COCO_SIZED))
-        facts = describe(model, 640 if scale == "n" else 64)
-        assert (facts.model_family, facts.scale) == (model_family, scale)
-        assert facts.parameters == PARAMETERS[model_family][scale]
-        assert facts.end_to_end == (model_family in ("YOLOv10", "YOLO26"))
-        if scale == "n":
-            assert facts.gflops == pytest.approx(GFLOPS[model_family], abs=0.1)
 
 
 def test_gflops_grow_with_image_size_not_with_folding() -> None:
@@ -257,7 +263,9 @@ def reference_boxes(
     return [(cell, kind) for score, cell, kind in best if score > confidence]
 
 
+@cache
 def lively_outputs() -> tuple[YoloModel, list[Tensor]]:
+    """No test changes them."""
     model = lively()
     with torch.inference_mode():
         return model, model(make_image())
