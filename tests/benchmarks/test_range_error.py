@@ -1,10 +1,11 @@
-"""The benchmark's measurement on a few frames; its bounds leave room for what few frames can show."""
+"""Benchmarks of rendered ranges on a few frames: their bounds leave room for what few frames can show."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
+from benchmarks.point_cloud import timed
 from benchmarks.range_error import View, rows, samples, views
 from mavlink_sim.world.mesh import surface_range_to
 from mavlink_sim.world.world import WorldObject, range_to
@@ -13,11 +14,11 @@ from vision.detector import Detector
 
 @pytest.fixture(scope="module")
 def seen() -> list[View]:
-    return list(views(5, 24))
+    return list(views(7, 14))
 
 
 def test_a_seed_gives_the_same_frames(seen: list[View]) -> None:
-    again = next(views(5, 1))
+    again = next(views(7, 1))
     assert np.array_equal(again.image, seen[0].image)
     assert np.array_equal(again.depth_m, seen[0].depth_m, equal_nan=True)
 
@@ -40,3 +41,12 @@ def test_ranges_of_the_detector_are_near_the_truth(seen: list[View]) -> None:
     assert abs(depth.median_m) < 0.05
     assert abs(exact.median_m) < 0.03
     assert table["ground_plane", "5-25 m"].median_abs_m < 0.6
+
+
+def test_frames_have_points_clusters_and_times(seen: list[View]) -> None:
+    results = [timed(view) for view in seen[:4]]
+    for result in results:
+        assert result["points"] > result["voxels"] > result["above_ground"] > 0
+        assert 0.0 < result["points_ms"] < result["total_ms"]
+        assert result["total_ms"] == pytest.approx(result["points_ms"] + result["scene_ms"])
+    assert sum(result["clusters"] for result in results) >= 2

@@ -6,9 +6,11 @@ import math
 from dataclasses import astuple
 
 import cv2
+import numpy as np
 import pytest
 
 from mavlink_sim.cli.bench import measure_camera, measure_fleet, measure_lockstep
+from mavlink_sim.world.textures import mip_atlas
 from vision.camera_model import CameraModel
 
 
@@ -27,6 +29,9 @@ def test_fleet_bench_reports_cpu_share() -> None:
 def test_camera_bench_restores_opencv_settings(monkeypatch: pytest.MonkeyPatch) -> None:
     small = CameraModel.from_horizontal_fov(64, 48, math.radians(70.0))
     monkeypatch.setattr("mavlink_sim.camera.renderer.DEFAULT_CAMERA", small)
+    # What the ground looks like does not matter here, and to paint it takes seconds.
+    plain = mip_atlas(np.full((64, 64, 3), 110, np.uint8))
+    monkeypatch.setattr("mavlink_sim.camera.ground_view.ground_atlas", lambda ground: plain)
     before = cv2.getNumThreads()
     cv2.setNumThreads(2)
     try:

@@ -128,15 +128,15 @@ def test_coco_files_read_by_pycocotools(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("scene", [SCENE, None])
 def test_a_seed_gives_the_same_files_again_whatever_the_count(tmp_path: Path, scene: Scene | None) -> None:
-    options = DatasetOptions(2, seed=2, size=(96, 96), validation=0.0)
-    make_dataset(tmp_path / "one", scene, options)
-    make_dataset(tmp_path / "two", scene, options)
-    assert files(tmp_path / "one") == files(tmp_path / "two")
-    make_dataset(tmp_path / "short", scene, DatasetOptions(1, seed=2, size=(96, 96), validation=0.0))
-    rasters = {name: digest for name, digest in files(tmp_path / "short").items() if name.endswith(".jpg")}
-    assert rasters.items() <= files(tmp_path / "one").items()
-    make_dataset(tmp_path / "other", scene, DatasetOptions(1, seed=3, size=(96, 96), validation=0.0))
-    assert not rasters.items() & files(tmp_path / "other").items()
+    def made(name: str, count: int, seed: int) -> dict[str, str]:
+        make_dataset(tmp_path / name, scene, DatasetOptions(count, seed=seed, size=(96, 96), validation=0.0))
+        return files(tmp_path / name)
+
+    one, two = made("one", 1, 2), made("two", 2, 2)
+    assert one == made("again", 1, 2)
+    rasters = {name: digest for name, digest in one.items() if name.endswith(".jpg")}
+    assert rasters.items() <= two.items()
+    assert not rasters.items() & made("other", 1, 3).items()
 
 
 def test_non_empty_folder_refused(tmp_path: Path) -> None:

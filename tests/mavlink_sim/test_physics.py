@@ -367,10 +367,14 @@ def holding(
     return reported, truths, vehicle
 
 
-def test_held_position_error_matches_real_vehicle() -> None:
+@pytest.fixture(scope="module")
+def held() -> list[tuple[dict[str, list[Any]], list[Any], LockstepVehicle]]:
+    return [holding(40.0, {"LOCAL_POSITION_NED": 20.0}, seed=seed) for seed in range(6)]
+
+
+def test_held_position_error_matches_real_vehicle(held: list[Any]) -> None:
     spreads, farthest = [], []
-    for seed in range(6):
-        reported, _, _ = holding(40.0, {"LOCAL_POSITION_NED": 20.0}, seed=seed)
+    for reported, _, _ in held:
         positions = [(one.x, one.y, one.z) for one in reported["LOCAL_POSITION_NED"]]
         spreads.append([statistics.pstdev(axis) for axis in zip(*positions, strict=True)])
         farthest.append(max(math.hypot(x, y) for x, y, _ in positions))
@@ -383,8 +387,8 @@ def test_held_position_error_matches_real_vehicle() -> None:
     assert max(farthest) < 0.9
 
 
-def test_estimate_differs_slightly_from_truth() -> None:
-    reported, truths, vehicle = holding(40.0, seed=4)
+def test_estimate_differs_slightly_from_truth(held: list[Any]) -> None:
+    reported, truths, vehicle = held[4]
     errors = []
     times_s = [truth.time_s for truth in truths]
     for one in reported["LOCAL_POSITION_NED"]:

@@ -36,12 +36,20 @@ from vision.yolo.published import published_description
 OBB_FOREIGN = FOREIGN | {"OBB": "ultralytics.nn.modules.head", "OBBModel": "ultralytics.nn.tasks"}
 
 
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("rotated")
+
+
 def checkpoint(folder: Path, family: str) -> Path:
+    path = folder / f"{family}.pt"
+    if path.exists():
+        return path
     model = trained_model(rotated(published_description(family, SMALL, NAMES)))
     with pytest.MonkeyPatch.context() as patch:
         classes = foreign_classes(patch, OBB_FOREIGN)
         whole = as_foreign(model, classes | {"DetectionModel": classes["OBBModel"]})
-        return save_foreign(folder / "rotated.pt", whole)
+        return save_foreign(path, whole)
 
 
 @pytest.mark.parametrize("degrees", [-44, -20, 0, 30, 45, 90, 134])
@@ -69,11 +77,11 @@ def test_head_gives_the_box_around_the_rotated_one(degrees: float) -> None:
 
 @pytest.mark.parametrize("family", ["YOLOv8", pytest.param("YOLO11", marks=pytest.mark.slow)])
 def test_checkpoint_and_its_export_find_the_same_boxes(
-    tmp_path: Path, family: str, caplog: pytest.LogCaptureFixture
+    folder: Path, family: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     for package in ("onnx", "onnxruntime"):
         pytest.importorskip(package, reason=f"{package} is an optional extra")
-    path = checkpoint(tmp_path, family)
+    path = checkpoint(folder, family)
     image = make_image(64, 96)
     detector = Detector(path, image_size=96, confidence=0, precision="float32", threads=1)
     found = detector.detect(image)
@@ -87,9 +95,9 @@ def test_checkpoint_and_its_export_find_the_same_boxes(
     np.testing.assert_array_equal(again.class_id, found.class_id)
 
 
-def test_openvino_in_bfloat16_gives_nearly_the_sides(tmp_path: Path) -> None:
+def test_openvino_in_bfloat16_gives_nearly_the_sides(folder: Path) -> None:
     needs("openvino")
-    exported = export(checkpoint(tmp_path, "YOLOv8"), "openvino", image_size=96)
+    exported = export(checkpoint(folder, "YOLOv8"), "openvino", image_size=96)
     image = make_image(64, 96)
     try:
         rounded = runtime_of_file("openvino", exported, precision="bfloat16").infer(image)

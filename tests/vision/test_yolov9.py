@@ -23,7 +23,7 @@ from tests.vision.foreign_checkpoints import (
 from tests.vision.test_model_families import FEW, facts, filled, make_image
 from vision.yolo.architecture import ArchitectureError, ModelDescription, build_shapes
 from vision.yolo.checkpoint import load_checkpoint
-from vision.yolo.published import describe, model_family_of
+from vision.yolo.published import _scale, describe, model_family_of
 
 FOREIGN_YOLOV9 = {
     **FOREIGN,
@@ -169,9 +169,11 @@ def test_checkpoint_of_the_reference_is_read(
 @pytest.mark.parametrize("name", TABLES)
 def test_family_and_strides_are_recognised(name: str) -> None:
     model = build_shapes(described(name))
-    assert model_family_of(model) == name.partition(",")[0]
-    assert model.strides == ((16, 32) if name == "YOLOv3-tiny" else (8, 16, 32))
-    assert describe(model, 64).gflops > 0
+    tiny, found = name == "YOLOv3-tiny", describe(model, 64)
+    assert found.model_family == model_family_of(model) == name.partition(",")[0]
+    assert model.strides == ((16, 32) if tiny else (8, 16, 32))
+    assert found.gflops > 0
+    assert found.scale == ("" if tiny else None)
     assert ModelDescription.from_plain(model.description.to_plain()) == model.description
 
 
@@ -183,16 +185,14 @@ def test_scale_is_known_by_its_channels(scale: str | None, first: int, pooling: 
     rows = yolov9("AConv", "ELAN1")
     rows["backbone"][0][3] = [first, 3, 2]
     rows["backbone"][9][3] = [pooling, 64]
-    model = build_shapes(ModelDescription.from_plain(rows, FEW))
-    assert describe(model, 64).scale == scale
+    assert _scale(ModelDescription.from_plain(rows, FEW), "YOLOv9") == scale
 
 
-def test_scale_e_has_two_backbones_and_v3_tiny_has_no_scale() -> None:
+def test_scale_e_has_two_backbones() -> None:
     rows = yolov9_e()
     rows["backbone"][1][3] = [64, 3, 2]
     rows["backbone"].insert(18, [-1, 1, "SPPELAN", [512, 64]])
     assert describe(build_shapes(ModelDescription.from_plain(rows, FEW)), 64).scale == "e"
-    assert describe(build_shapes(described("YOLOv3-tiny")), 64).scale == ""
 
 
 @pytest.mark.parametrize(

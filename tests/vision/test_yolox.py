@@ -74,6 +74,13 @@ def test_detector_runs_a_yolox_checkpoint(tmp_path: Path) -> None:
     assert detector.foreign.layout == "yolox"
 
 
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("yolox") / "x.pth"
+    save_yolox(path)
+    return path
+
+
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
@@ -85,10 +92,11 @@ def test_detector_runs_a_yolox_checkpoint(tmp_path: Path) -> None:
         ({"backbone.backbone.stem.conv.conv.weight": torch.zeros(9999, 1, 1, 1)}, "its stem"),
     ],
 )
-def test_weights_that_do_not_fit_are_refused(tmp_path: Path, change: dict[str, Any], expected: str) -> None:
+def test_weights_that_do_not_fit_are_refused(
+    saved: Path, tmp_path: Path, change: dict[str, Any], expected: str
+) -> None:
     path = tmp_path / "x.pth"
-    save_yolox(path)
-    content = torch.load(path, weights_only=True)
+    content = torch.load(saved, weights_only=True)
     for name, value in change.items():
         content["model"].pop(name, None)
         if value is not None:
