@@ -11,6 +11,8 @@ import cv2
 import pytest
 
 from companion.demo import _CAMERA_RATE_HZ
+from companion.guidance.missions.mission_file import MISSIONS_FOLDER
+from companion.sim_session import MISSION
 from mavlink_sim.testing import QUICK_FLIGHT, running_simulator
 from tests.companion.command_line import QUICK
 
@@ -18,14 +20,42 @@ URL_LIMIT_S = 150
 FLOWN = "mission demo: flown, "  # 5 steps, or more where the car was sought again
 # The car of this world is near (18 m), but not in the first image (bearing 55 deg): it is searched for.
 NEAR_SEED = 5
-# With a vehicle that takes off and lands quickly, 10 s less, and a third of the images: half of the work.
+# A third of the images, a vehicle that climbs, returns and descends quickly, and a mission that turns and
+# flies quickly: a third of the work.
 FEWER = 3
-QUICK_DEMO = f"from companion import demo\ndemo._CAMERA_RATE_HZ /= {FEWER}\n{QUICK}"
+QUICKER_FLIGHT = {
+    "MPC_ACC_HOR": 5.0,
+    "MPC_JERK_AUTO": 20.0,
+    "MPC_LAND_SPEED": 2.5,
+    "MPC_TKO_RAMP_T": 0.5,
+    "MPC_TKO_SPEED": 3.0,
+    "MPC_XY_ERR_MAX": 10.0,
+    "MPC_Z_VEL_MAX_DN": 3.0,
+    "RTL_RETURN_ALT": 4.0,
+}
+QUICK_DEMO = f"""
+from companion import demo
+from mavlink_sim.testing import QUICK_FLIGHT
+demo._CAMERA_RATE_HZ /= {FEWER}
+QUICK_FLIGHT.update({QUICKER_FLIGHT})
+{QUICK}"""
+QUICK_STEPS = {
+    "seek car": "seek car rate=1",
+    "distance=5": "distance=5 speed=3",
+    "duration=3": "duration=1",
+}
 
 
 def demo(output: Path, *flags: str, quick: bool = False) -> subprocess.CompletedProcess[str]:
     """`companion demo` as a process of its own."""
     program = ("-c", QUICK_DEMO) if quick else ("-m", "companion.cli")
+    if quick:
+        # A mission file of this name in the working directory comes before the bundled one.
+        mission = (MISSIONS_FOLDER / f"{MISSION}.toml").read_text()
+        for step, quicker in QUICK_STEPS.items():
+            assert step in mission
+            mission = mission.replace(step, quicker)
+        (output.parent / f"{MISSION}.toml").write_text(mission)
     return subprocess.run(
         [sys.executable, *program, "demo", "--output", str(output), *flags],
         cwd=output.parent,
