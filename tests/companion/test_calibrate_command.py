@@ -71,6 +71,15 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.fixture(scope="module")
+def few(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The first of the views, just enough for a calibration."""
+    path = tmp_path_factory.mktemp("few")
+    for image in sorted(folder.glob("*.png"))[:6]:
+        (path / image.name).symlink_to(image)
+    return path
+
+
 def test_folder_gives_a_calibration_and_a_report(folder: Path, tmp_path: Path) -> None:
     output, report = tmp_path / "camera.yaml", tmp_path / "report"
     done = calibrate(folder, *BOARD_WORDS, "-o", output, "--report", report, "--name", "front")
@@ -89,6 +98,9 @@ def test_folder_gives_a_calibration_and_a_report(folder: Path, tmp_path: Path) -
     for file in files:
         assert cv2.imread(str(report / file)) is not None
     assert all(f"view{number:02d}.png" in page for number in range(18))
+    done = CliRunner().invoke(app, ["config", "--camera-calibration-file", str(output)])
+    assert done.exit_code == 0, done.output
+    assert f"fx_px = {lens.fx}" in done.stdout
 
 
 def test_video_gives_a_calibration(tmp_path: Path) -> None:
@@ -110,17 +122,9 @@ def test_video_gives_a_calibration(tmp_path: Path) -> None:
     assert read_camera_info(tmp_path / "camera.yaml").model.fx == pytest.approx(LENS.fx, rel=0.02)
 
 
-def test_written_file_is_accepted_by_the_settings(folder: Path, tmp_path: Path) -> None:
+def test_calibration_of_turned_images_says_so(few: Path, marker_images: Path, tmp_path: Path) -> None:
     output = tmp_path / "camera.yaml"
-    assert calibrate(folder, *BOARD_WORDS, "-o", output).exit_code == 0
-    done = CliRunner().invoke(app, ["config", "--camera-calibration-file", str(output)])
-    assert done.exit_code == 0, done.output
-    assert f"fx_px = {read_camera_info(output).model.fx}" in done.stdout
-
-
-def test_calibration_of_turned_images_says_so(folder: Path, marker_images: Path, tmp_path: Path) -> None:
-    output = tmp_path / "camera.yaml"
-    assert calibrate(folder, *BOARD_WORDS, "-o", output, "--rotate", "180", "--mirror").exit_code == 0
+    assert calibrate(few, *BOARD_WORDS, "-o", output, "--rotate", "180", "--mirror").exit_code == 0
     assert {"rotate_deg: 180", "mirror: true"} <= set(output.read_text().splitlines())
     flags = ("--camera-calibration-file", str(output))
     done = CliRunner().invoke(app, ["config", *flags])
@@ -137,6 +141,15 @@ def pairs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("pairs") / "pairs"
     write_board_pairs(path, BOARD, LENS, LENSES["plain"].scaled(280, 210), 9, 3)
     return path
+
+
+def first_pairs(pairs: Path, count: int, path: Path) -> tuple[Path, Path]:
+    """Folders at a path with the first of the views of both cameras."""
+    for camera in ("colour", "infrared"):
+        (path / camera).mkdir(parents=True)
+        for image in sorted((pairs / camera).iterdir())[:count]:
+            (path / camera / image.name).symlink_to(image)
+    return path / "colour", path / "infrared"
 
 
 def extrinsics(pairs: Path, *options: str | Path, **files: Path) -> Result:
@@ -167,7 +180,7 @@ def test_folders_of_two_cameras_give_their_places(pairs: Path, tmp_path: Path) -
     assert "mirror" in one_line_of_bad_input(turned)
 
 
-def test_wrong_files_of_two_cameras_are_refused(pairs: Path, folder: Path, tmp_path: Path) -> None:
+def test_wrong_files_of_two_cameras_are_refused(pairs: Path, few: Path, tmp_path: Path) -> None:
     line = one_line_of_bad_input(extrinsics(pairs, infrared=pairs / "none.yaml"))
     assert "none.yaml" in line
     write_camera_info(other := tmp_path / "other.yaml", LENSES["plain"].scaled(640, 360), "other")
@@ -175,14 +188,13 @@ def test_wrong_files_of_two_cameras_are_refused(pairs: Path, folder: Path, tmp_p
     assert "640x360" in line
     assert "280x210" in line
     words = ("--colour-calibration", pairs / "colour.yaml", "--infrared-calibration", pairs / "depth.yaml")
-    line = one_line_of_bad_input(calibrate("extrinsics", pairs / "colour", folder, *BOARD_WORDS, *words))
+    line = one_line_of_bad_input(calibrate("extrinsics", pairs / "colour", few, *BOARD_WORDS, *words))
     assert "not determine" in line
     empty = ("--board", "chessboard", "8x5", "--square", "0.03")
-    line = one_line_of_bad_input(
-        calibrate("extrinsics", pairs / "colour", pairs / "infrared", *empty, *words)
-    )
+    folders = first_pairs(pairs, 2, tmp_path)
+    line = one_line_of_bad_input(calibrate("extrinsics", *folders, *empty, *words))
     assert "no board " in line
-    assert " of 9 pairs" in line
+    assert " of 2 pairs" in line
     flags = ("--source-depth", "depth/", "--source-depth-calibration-file", str(pairs / "colour.yaml"))
     done = CliRunner().invoke(app, ["config", *flags])
     assert "colour_from_depth" in one_line_of_bad_input(done)
@@ -211,21 +223,21 @@ def test_live_cameras_are_paired_by_their_stamps() -> None:
         collect_views(Camera([0], board), BOARD, lambda _: None, 1, recorded)
 
 
-def test_no_board_in_any_view(folder: Path, tmp_path: Path) -> None:
+def test_no_board_in_any_view(few: Path, tmp_path: Path) -> None:
     words = ("--board", "chessboard", "8x5", "--square", "0.03")
-    line = one_line_of_bad_input(calibrate(folder, *words, "-o", tmp_path / "camera.yaml"))
+    line = one_line_of_bad_input(calibrate(few, *words, "-o", tmp_path / "camera.yaml"))
     assert "no board " in line
-    assert " of 18 images" in line
+    assert " of 6 images" in line
     assert "8x5" in line
     assert not (tmp_path / "camera.yaml").exists()
 
 
 def test_too_few_views(folder: Path, tmp_path: Path) -> None:
-    few = tmp_path / "few"
-    few.mkdir()
+    fewer = tmp_path / "fewer"
+    fewer.mkdir()
     for number in range(5):
-        (few / f"{number}.png").write_bytes((folder / f"view{number:02d}.png").read_bytes())
-    done = calibrate(few, *BOARD_WORDS, "-o", tmp_path / "camera.yaml")
+        (fewer / f"{number}.png").symlink_to(folder / f"view{number:02d}.png")
+    done = calibrate(fewer, *BOARD_WORDS, "-o", tmp_path / "camera.yaml")
     line = one_line_of_bad_input(done)
     assert done.stderr.splitlines() == [line]
     assert "few views" in line
@@ -234,11 +246,7 @@ def test_too_few_views(folder: Path, tmp_path: Path) -> None:
 
 
 def test_too_few_pairs(pairs: Path, tmp_path: Path) -> None:
-    folders = [tmp_path / "colour", tmp_path / "infrared"]
-    for few in folders:
-        few.mkdir()
-        for image in sorted((pairs / few.name).iterdir())[:5]:
-            (few / image.name).write_bytes(image.read_bytes())
+    folders = first_pairs(pairs, 5, tmp_path)
     words = ("--colour-calibration", pairs / "colour.yaml", "--infrared-calibration", pairs / "depth.yaml")
     done = calibrate("extrinsics", *folders, *BOARD_WORDS, *words, "-o", tmp_path / "depth.yaml")
     line = one_line_of_bad_input(done)
@@ -338,12 +346,9 @@ def _lenses(colour: Path, infrared: Path) -> tuple[str | Path, ...]:
 
 
 def test_address_of_one_camera_is_its_name(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    few: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    opened, few = vision.sources.open_source, tmp_path / "few"
-    few.mkdir()
-    for path in sorted(folder.glob("*.png"))[:6]:
-        (few / path.name).symlink_to(path)
+    opened = vision.sources.open_source
     monkeypatch.setattr("vision.sources.open_source", lambda _, settings: opened(str(few), settings))
     for source, name in (
         ("/dev/v4l/by-id/usb-front-video-index0",) * 2,
@@ -395,7 +400,7 @@ class Live(Source):
         self._frames = self._rendered()
 
     def _rendered(self) -> Iterator[Frame]:
-        rng = np.random.default_rng(8)
+        rng = np.random.default_rng(1)  # a seed that covers the image soon
         camera, poses = BoardCamera(BOARD, LENS), board_poses(BOARD, LENS, rng)
         while True:
             grey = camera.render(next(poses), rng)
