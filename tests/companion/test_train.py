@@ -108,29 +108,23 @@ def test_class_of_own_images_is_added_and_scored(labelled: Path, small_model: Pa
     assert load_checkpoint(tmp_path / "again.safetensors").class_names == written.class_names
 
 
-def test_interrupted_training_on_images_resumes(labelled: Path, small_model: Path, tmp_path: Path) -> None:
-    whole, cut = tmp_path / "whole.safetensors", tmp_path / "cut.safetensors"
-    options = {"start": str(small_model), "image_size": 64, "batch_size": 2, "workers": 0, "steps": 4}
+def test_interrupted_training_on_images_resumes_by_its_own_options_only(
+    labelled: Path, small_model: Path, tmp_path: Path
+) -> None:
+    whole, cut, other = tmp_path / "whole.safetensors", tmp_path / "cut.safetensors", tmp_path / "other.pt"
+    options = {"start": str(small_model), "image_size": 64, "batch_size": 2, "workers": 0, "steps": 3}
     torch.manual_seed(0)
     train_on_data(labelled, whole, **options)  # type: ignore[arg-type]
     torch.manual_seed(1)  # Nothing depends on the process's generator.
     train_on_data(labelled, cut, time_limit_s=0.0, **options)  # type: ignore[arg-type]
     assert load_checkpoint(cut).metadata["steps_done"] == 1
-    assert train_command(labelled, small_model, cut, "--steps", "4", "--resume").exit_code == 0
-    assert weights_sha256(cut) == weights_sha256(whole)
-    assert load_checkpoint(cut).metadata == load_checkpoint(whole).metadata
-
-
-def test_resume_of_another_training_is_refused(labelled: Path, small_model: Path, tmp_path: Path) -> None:
-    output, other = tmp_path / "mine.safetensors", tmp_path / "other.pt"
-    assert train_command(labelled, small_model, output, "--steps", "1").exit_code == 0
-    before = output.read_bytes()
+    before = cut.read_bytes()
     loaded = load_checkpoint(small_model)
     torch.nn.init.zeros_(next(loaded.model.parameters()))
     save_checkpoint(other, loaded.model, metadata={})
 
     def differing(start: Path, *options: str) -> set[str]:
-        result = train_command(labelled, start, output, "--steps", "2", "--resume", *options)
+        result = train_command(labelled, start, cut, "--steps", "3", "--resume", *options)
         assert result.exit_code == 2
         (error,) = [line for line in result.stderr.splitlines() if line.startswith("companion:")]
         return {key for key in ("data", "start", "seed", "batches") if f" {key}: " in error}
@@ -142,9 +136,14 @@ def test_resume_of_another_training_is_refused(labelled: Path, small_model: Path
     labels.write_text("1 0.5 0.5 0.25 0.3333\n")
     assert differing(small_model) == {"data"}
     labels.write_text(corrected)
-    shutil.copy(labelled / "images" / "val" / "5.png", labelled / "images" / "train")
+    added = labelled / "images" / "train" / "5.png"
+    shutil.copy(labelled / "images" / "val" / "5.png", added)
     assert differing(small_model) == {"data"}
-    assert output.read_bytes() == before
+    added.unlink()
+    assert cut.read_bytes() == before
+    assert train_command(labelled, small_model, cut, "--steps", "3", "--resume").exit_code == 0
+    assert weights_sha256(cut) == weights_sha256(whole)
+    assert load_checkpoint(cut).metadata == load_checkpoint(whole).metadata
 
 
 @pytest.mark.parametrize("existing", ["mine.safetensors.training", "mine.safetensors", "mine.yaml"])

@@ -38,6 +38,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_same_seed_gives_the_same_file_and_another_does_not(tmp_path: Path) -> None:
+    """Its description has the range of what the episodes visited."""
     files = [tmp_path / name for name in ("a.onnx", "b.onnx", "c.onnx")]
     for file, seed in zip(files, (3, 3, 4), strict=True):
         figures = train_policy(replace(APPROACH, seed=seed), 512, file)
@@ -50,6 +51,14 @@ def test_same_seed_gives_the_same_file_and_another_does_not(tmp_path: Path) -> N
     assert policy.description.environment == "companion/Approach-v0"
     assert policy.description.rate_hz == 20.0
     assert list((tmp_path / "a.onnx.training" / "tensorboard").rglob("events.out.tfevents.*"))
+    limits = {each.name: each for each in description_of("companion/Approach-v0").observation}
+    found = {each.name: each for each in policy.description.observation}
+    for name, each in found.items():
+        assert limits[name].low <= each.low < each.high <= limits[name].high
+    # Episodes begin at heights of 1.5 to 3.5 m, 6 to 30 m away.
+    assert -10.0 < found["target_up_m"].low < -1.5
+    assert found["target_forward_m"].high < 35.0
+    assert 4.4 <= found["distance_wanted_m"].low
 
 
 def test_policies_of_many_seeds_are_those_of_each_seed(tmp_path: Path) -> None:
@@ -119,7 +128,9 @@ def test_interrupted_trainings_of_many_seeds_resume(
     assert torch.load(state, weights_only=True)["steps"] == 1024
 
 
-def test_training_resumes_with_its_state(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_training_resumes_with_its_state(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     file, folder = tmp_path / "policy.onnx", tmp_path / "policy.onnx.training"
     with pytest.raises(PolicyTrainingError, match=r"no state .*policy\.onnx\.training: state\.pt"):
         train_policy(CART_POLE, 256, file, resume=True)
@@ -140,6 +151,9 @@ def test_training_resumes_with_its_state(tmp_path: Path, capsys: pytest.CaptureF
         train_policy(replace(CART_POLE, seed=1), 1024, file, resume=True)
     with pytest.raises(PolicyTrainingError, match=r"policy\.onnx\.training holds .* --resume\b"):
         train_policy(CART_POLE, 512, file)
+    monkeypatch.setitem(trainer.EPISODES, "ppo", 8)
+    with pytest.raises(PolicyTrainingError, match="episodes 16, not 8"):
+        train_policy(CART_POLE, 1024, file, resume=True)
 
 
 class _Runs:
@@ -187,26 +201,6 @@ def test_state_that_is_no_training_is_refused_and_runs_nothing(tmp_path: Path) -
     assert not run.exists()
 
 
-def test_resume_with_other_sizes_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    train_policy(CART_POLE, 256, tmp_path / "policy.onnx")
-    monkeypatch.setitem(trainer.EPISODES, "ppo", 8)
-    with pytest.raises(PolicyTrainingError, match="episodes 16, not 8"):
-        train_policy(CART_POLE, 512, tmp_path / "policy.onnx", resume=True)
-
-
-def test_described_range_is_what_the_episodes_visited(tmp_path: Path) -> None:
-    train_policy(APPROACH, 256, tmp_path / "policy.onnx")
-    described = load_policy(tmp_path / "policy.onnx").description
-    limits = {each.name: each for each in description_of("companion/Approach-v0").observation}
-    found = {each.name: each for each in described.observation}
-    for name, each in found.items():
-        assert limits[name].low <= each.low < each.high <= limits[name].high
-    # Episodes begin at heights of 1.5 to 3.5 m, 6 to 30 m away.
-    assert -10.0 < found["target_up_m"].low < -1.5
-    assert found["target_forward_m"].high < 35.0
-    assert 4.4 <= found["distance_wanted_m"].low
-
-
 def test_sac_writes_its_policy_and_resumes(tmp_path: Path) -> None:
     training = replace(APPROACH, algorithm="sac")
     file = tmp_path / "policy.onnx"
@@ -245,11 +239,11 @@ def test_unknown_environment_or_algorithm_is_refused_in_one_line(tmp_path: Path)
 def test_missing_extra_is_named_and_help_does_not_need_it() -> None:
     code = (
         "import sys; sys.modules['stable_baselines3'] = None\n"
-        "from companion.cli import app; app(sys.argv[1:])"
+        "from companion.cli import app; app(['train-policy', '--help'], standalone_mode=False)\n"
+        "app(['train-policy', 'companion/CartPole-v0'])"
     )
-    command = [sys.executable, "-c", code, "train-policy"]
-    wanted = subprocess.run([*command, "companion/CartPole-v0"], capture_output=True, text=True)
-    assert wanted.returncode == 2
-    assert "mavlink-companion[rl]" in wanted.stderr
-    assert len(wanted.stderr.splitlines()) == 1
-    assert subprocess.run([*command, "--help"], capture_output=True, text=True).returncode == 0
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert "--algorithm" in done.stdout
+    assert done.returncode == 2
+    assert "mavlink-companion[rl]" in done.stderr
+    assert len(done.stderr.splitlines()) == 1
