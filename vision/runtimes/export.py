@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import logging
 import os
 import tempfile
@@ -224,7 +225,8 @@ def _write_tensorrt(network: Network, facts: ExportedFacts, path: Path) -> None:
     from vision.runtimes.tensorrt_runtime import build_plan
 
     onnx_path = path.with_suffix(".onnx")
-    _write_onnx(network, facts, onnx_path)
+    # TensorRT computes in the types of the file.
+    _write_onnx(copy.deepcopy(network).in_precision(torch.float16), facts, onnx_path)
     plan = build_plan(onnx_path, largest_side=facts.image_size, stride=max(facts.strides))
     path.write_bytes(with_facts(facts, plan))
     onnx_path.unlink()

@@ -1,4 +1,4 @@
-"""TensorRT, on an NVIDIA GPU (TensorRT 10's API; the CUDA runtime through NVIDIA's `cuda-python`)."""
+"""TensorRT, on an NVIDIA GPU (the API of 10 and 11; the CUDA runtime through NVIDIA's `cuda-python`)."""
 
 from __future__ import annotations
 
@@ -20,12 +20,11 @@ _WORKSPACE_BYTES = 1 << 30
 _CUDA = "cuda.bindings.runtime"
 
 
-def build_plan(onnx_path: Path, *, largest_side: int, stride: int, half: bool = True) -> bytes:
-    """The serialised engine, in float16 where the GPU supports it; takes minutes on a small board.
+def build_plan(onnx_path: Path, *, largest_side: int, stride: int) -> bytes:
+    """The serialised engine, in the file's precision; takes minutes on a small board.
 
     Args:
         largest_side: of an input; the plan is tuned for three quarters of it in height.
-        half: allow float16.
 
     Raises:
         RuntimeMissingError: TensorRT is not installed.
@@ -34,15 +33,15 @@ def build_plan(onnx_path: Path, *, largest_side: int, stride: int, half: bool = 
     tensorrt = required("tensorrt")
     trt_logger = tensorrt.Logger(tensorrt.Logger.ERROR)
     builder = tensorrt.Builder(trt_logger)
-    definition = builder.create_network(0)
+    # TensorRT 11 has only strongly typed networks, and ignores the flag.
+    strongly_typed = 1 << int(tensorrt.NetworkDefinitionCreationFlag.STRONGLY_TYPED)
+    definition = builder.create_network(strongly_typed)
     parser = tensorrt.OnnxParser(definition, trt_logger)
     if not parser.parse_from_file(str(onnx_path)):
         errors = "; ".join(str(parser.get_error(index)) for index in range(parser.num_errors))
         raise RuntimeUnusableError(f"{onnx_path}: TensorRT cannot read it: {errors[:500]}")
     config = builder.create_builder_config()
     config.set_memory_pool_limit(tensorrt.MemoryPoolType.WORKSPACE, _WORKSPACE_BYTES)
-    if half and builder.platform_has_fast_fp16:
-        config.set_flag(tensorrt.BuilderFlag.FP16)
     profile = builder.create_optimization_profile()
     usual = (1, max(stride, largest_side * 3 // 4 // stride * stride), largest_side, 3)
     profile.set_shape(INPUT, (1, stride, stride, 3), usual, (1, largest_side, largest_side, 3))
@@ -91,6 +90,14 @@ class TensorRtRuntime:
         self._engine = engine
         self._context = engine.create_execution_context()
         names = [engine.get_tensor_name(index) for index in range(engine.num_io_tensors)]
+        for name in names:
+            found = engine.get_tensor_dtype(name)
+            expected = tensorrt.DataType.UINT8 if name == INPUT else tensorrt.DataType.FLOAT
+            if found != expected:
+                raise RuntimeUnusableError(
+                    f"{path}: {name} of this plan is {found}, expected {expected}: export it again with "
+                    "`companion models export`"
+                )
         kinds = {"sides": 0, "neck": 0, "classes": 1, "features": 2}
         self._outputs = sorted(
             (name for name in names if name != INPUT),

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import ctypes
+import enum
 import hashlib
 import importlib.util
 import json
 import subprocess
 import sys
+from importlib.machinery import ModuleSpec
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,6 +19,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mavlink_sim.datasets.training_scenes import random_scene
 from tests.vision.runtimes.conftest import NAMES, lively_model, make_image, needs
 from vision.detector import Detector, class_names_of
 from vision.runtimes import export as export_module
@@ -22,6 +27,7 @@ from vision.runtimes.base import RUNTIMES, RuntimeMissingError, RuntimeName, Run
 from vision.runtimes.export import export
 from vision.runtimes.exported import (
     FORMAT,
+    INPUT,
     MAGIC,
     SUFFIXES,
     ExportedFacts,
@@ -34,6 +40,7 @@ from vision.runtimes.network import Network
 from vision.runtimes.source import read_source, runtime_of_file
 from vision.runtimes.tensorrt_runtime import TensorRtRuntime, build_plan
 from vision.runtimes.torch_runtime import TorchRuntime
+from vision.weights import DEFAULT_WEIGHTS
 
 PAIRS: list[tuple[ExportKind, RuntimeName]] = [
     ("onnx", "onnxruntime"),
@@ -361,3 +368,155 @@ def test_a_precision_that_a_plan_does_not_have_is_rejected(engine: Path) -> None
 def test_missing_plan_is_a_one_line_error(tmp_path: Path) -> None:
     with pytest.raises(RuntimeUnusableError, match=r"none\.engine: no .*file"):
         read_source(tmp_path / "none.engine")
+
+
+class DataType(enum.Enum):
+    UINT8 = "tensor(uint8)"
+    HALF = "tensor(float16)"
+    FLOAT = "tensor(float)"
+
+
+class StandInEngine:
+    """An ONNX file as a plan, computed by ONNX Runtime; it is its own execution context."""
+
+    def __init__(self, plan: Any) -> None:
+        import onnxruntime
+
+        self.session = onnxruntime.InferenceSession(bytes(plan), providers=["CPUExecutionProvider"])
+        self.ports = [*self.session.get_inputs(), *self.session.get_outputs()]
+        self.num_io_tensors = len(self.ports)
+        self.addresses: dict[str, int] = {}
+
+    def get_tensor_name(self, index: int) -> str:
+        return str(self.ports[index].name)
+
+    def get_tensor_dtype(self, name: str) -> DataType:
+        return next(DataType(port.type) for port in self.ports if port.name == name)
+
+    def create_execution_context(self) -> StandInEngine:
+        return self
+
+    def set_input_shape(self, name: str, shape: tuple[int, ...]) -> bool:
+        self.input = np.zeros(shape, np.uint8)
+        self.results = dict(zip([port.name for port in self.ports[1:]], self.run(), strict=True))
+        return True
+
+    def run(self) -> Any:
+        return self.session.run(None, {INPUT: self.input})
+
+    def get_tensor_shape(self, name: str) -> tuple[int, ...]:
+        return tuple(self.results[name].shape)
+
+    def set_tensor_address(self, name: str, pointer: int) -> None:
+        self.addresses[name] = pointer
+
+    def execute_async_v3(self, stream: int) -> bool:
+        ctypes.memmove(self.input.ctypes.data, self.addresses[INPUT], self.input.nbytes)
+        for name, result in zip(self.results, self.run(), strict=True):
+            ctypes.memmove(self.addresses[name], result.ctypes.data, result.nbytes)
+        return True
+
+
+class StandInTensorRt:
+    """Those Python names of TensorRT that both 10 and 11 have, and CUDA's copies within the memory here."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.flags: list[int] = []
+        self.parsed = b""
+        self.buffers: list[Any] = []
+
+        def copied(to: int, source: int, size: int, *_: Any) -> tuple[int]:
+            ctypes.memmove(to, source, size)
+            return (0,)
+
+        def allocated(size: int) -> tuple[int, int]:
+            self.buffers.append(ctypes.create_string_buffer(size))
+            return 0, ctypes.addressof(self.buffers[-1])
+
+        accepted = SimpleNamespace(
+            create_network=self.flags.append,
+            create_builder_config=lambda: SimpleNamespace(
+                set_memory_pool_limit=lambda pool, size: None, add_optimization_profile=lambda profile: 0
+            ),
+            create_optimization_profile=lambda: SimpleNamespace(set_shape=lambda *shapes: None),
+            build_serialized_network=lambda network, config: self.parsed,
+        )
+        of_tensorrt = {
+            "Logger": type("Logger", (), {"ERROR": 1, "__init__": lambda *_: None}),
+            "Builder": lambda log: accepted,
+            "OnnxParser": lambda network, log: SimpleNamespace(parse_from_file=self.parse),
+            "Runtime": lambda log: SimpleNamespace(deserialize_cuda_engine=StandInEngine),
+            "NetworkDefinitionCreationFlag": enum.IntEnum("Flag", {"STRONGLY_TYPED": 1}),
+            "MemoryPoolType": enum.Enum("MemoryPoolType", ["WORKSPACE"]),
+            "DataType": DataType,
+        }
+        of_cuda = {
+            "cudaStreamCreate": lambda: (0, 1),
+            "cudaStreamSynchronize": lambda stream: (0,),
+            "cudaMalloc": allocated,
+            "cudaFree": lambda pointer: (0,),
+            "cudaMemcpyAsync": copied,
+            "cudaMemcpyKind": SimpleNamespace(cudaMemcpyHostToDevice=1, cudaMemcpyDeviceToHost=2),
+        }
+        for name, content in {"tensorrt": of_tensorrt, "cuda.bindings.runtime": of_cuda}.items():
+            module = ModuleType(name)
+            module.__spec__ = ModuleSpec(name, None)
+            vars(module).update(content)
+            monkeypatch.setitem(sys.modules, name, module)
+
+    def parse(self, path: str) -> bool:
+        self.parsed = Path(path).read_bytes()
+        return True
+
+
+@pytest.fixture
+def tensorrt(monkeypatch: pytest.MonkeyPatch) -> StandInTensorRt:
+    needs("onnx", "onnxruntime")
+    return StandInTensorRt(monkeypatch)
+
+
+def test_plan_is_built_strongly_typed_from_float16(
+    tensorrt: StandInTensorRt, checkpoint: Path, tmp_path: Path
+) -> None:
+    onnx = pytest.importorskip("onnx")
+    path = export(checkpoint, "tensorrt", tmp_path / "net.engine", image_size=96)
+    assert [found.name for found in tmp_path.iterdir()] == ["net.engine"]
+    assert tensorrt.flags == [1 << 1]
+    graph = onnx.load_from_string(tensorrt.parsed).graph
+    weights = {
+        node.output[0]: node.attribute[0].t.data_type for node in graph.node if node.op_type == "Constant"
+    } | {tensor.name: tensor.data_type for tensor in graph.initializer}
+    convolved = [weights[node.input[1]] for node in graph.node if node.op_type == "Conv"]
+    # The last convolution of the classes of each level stays in float32.
+    assert convolved.count(onnx.TensorProto.FLOAT) == 3
+    assert convolved.count(onnx.TensorProto.FLOAT16) == len(convolved) - 3 > 30
+    plan, reference = TensorRtRuntime(path), TorchRuntime(lively_model(), precision="float32")
+    assert plan.precision == "float16"
+    for size in ((96, 96), (64, 96)):
+        for a, b in zip(plan.infer(make_image(*size)), reference.infer(make_image(*size)), strict=True):
+            np.testing.assert_allclose(a.classes, b.classes, atol=0.2)
+
+
+def test_plan_has_the_boxes_of_float32(tensorrt: StandInTensorRt, tmp_path: Path) -> None:
+    path = export(DEFAULT_WEIGHTS, "tensorrt", tmp_path / "net.engine", image_size=320)
+    image = random_scene(np.random.default_rng(0), 640, 480)[0]
+    expected = Detector("default", image_size=320, precision="float32").detect(image)
+    found = Detector(path, image_size=320).detect(image)
+    assert len(found) == len(expected) > 4
+    np.testing.assert_allclose(found.xyxy, expected.xyxy, atol=0.5)
+    np.testing.assert_allclose(found.confidence, expected.confidence, atol=0.01)
+
+
+def test_plan_with_outputs_in_half_is_refused(
+    tensorrt: StandInTensorRt, exported: Any, tmp_path: Path
+) -> None:
+    onnx = pytest.importorskip("onnx")
+    model = onnx.load(str(exported("onnx")))
+    output = model.graph.output[0]
+    cast = onnx.helper.make_node("Cast", [output.name], ["half"], to=onnx.TensorProto.FLOAT16)
+    model.graph.node.append(cast)
+    output.name, output.type.tensor_type.elem_type = "half", onnx.TensorProto.FLOAT16
+    path = tmp_path / "net.engine"
+    path.write_bytes(with_facts(FACTS, model.SerializeToString()))
+    with pytest.raises(RuntimeUnusableError, match=r"net\.engine: half .*HALF.* expected .*FLOAT"):
+        TensorRtRuntime(path)
