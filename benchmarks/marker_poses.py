@@ -145,6 +145,8 @@ def main() -> None:
     parser.add_argument("--noise", type=float, default=0.0, help="noise of each colour, one sigma of 255")
     parser.add_argument("--samples", type=int, default=1, help="samples along each side of a pixel")
     given = parser.parse_args()
+    if given.samples < 1:
+        parser.error("--samples must be at least 1")
     first, _, last = given.seeds.partition("..")
     taken = [
         error

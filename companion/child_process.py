@@ -14,6 +14,8 @@ from asyncio.subprocess import PIPE, STDOUT, Process
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 
+from companion.scheduling import schedule_as_any_program
+
 # Exit code of a program that has printed in one line why it cannot work: it is not started again.
 EXIT_REFUSED = 2
 MAX_RESTARTS = 5
@@ -63,6 +65,7 @@ async def _run_again(name: str, words: tuple[str, str], say: Say, end_s: float) 
             # Ctrl-C in the terminal is for the parent, which then closes the pipe.
             process_group=0,
         )
+        schedule_as_any_program(process.pid)
         try:
             assert process.stdout is not None
             while line := await process.stdout.readline():

@@ -16,6 +16,7 @@ COMPANION_LAYERS = {
     "child_process": 0,
     "geometry": 0,
     "plugins": 0,
+    "scheduling": 0,
     "settings": 1,
     "vehicle": 2,
     "relay": 3,

@@ -18,8 +18,8 @@ from pathlib import Path
 
 import mavlink_sim
 
-# Half of a step's time; more modules gain little. What is compiled has to survive `LockstepVehicle.copy`, a
-# pickle: so does no subclass of `Multirotor` with attributes of its own that is not compiled.
+# Half of a step's time; more modules gain little. `LockstepVehicle.copy` pickles the vehicle: a subclass of a
+# compiled class that is not compiled loses its own attributes there (`CollidingMultirotor`, of a scene).
 MODULES = ("physics/airframe.py", "physics/estimate_errors.py", "flight/position_control.py")
 _FUTURE = "from __future__ import annotations\n"
 _CLASS = re.compile(r"^class ", re.MULTILINE)
@@ -42,7 +42,8 @@ def compile_simulator(folder: Path) -> None:
 
     folder.mkdir(parents=True)
     source = Path(mavlink_sim.__file__).parent
-    package = folder / source.name
+    build = folder / "build"  # the package appears complete or not at all
+    package = build / source.name
     shutil.copytree(source, package, ignore=shutil.ignore_patterns("__pycache__"))
     # its imports for type checkers would make mypy read everything, with torch: minutes
     (package / "__init__.py").write_text("", encoding="utf-8")
@@ -50,15 +51,16 @@ def compile_simulator(folder: Path) -> None:
         text = (package / name).read_text(encoding="utf-8")
         text = text.replace(_FUTURE, f"{_FUTURE}from mypy_extensions import mypyc_attr\n", 1)
         (package / name).write_text(_CLASS.sub(_DECORATED, text), encoding="utf-8")
-    with contextlib.chdir(folder):
+    with contextlib.chdir(build):
         flags = ["--ignore-missing-imports", f"--cache-dir={os.devnull}"]
         extensions = mypycify([*flags, *(f"{package.name}/{name}" for name in MODULES)], debug_level="0")
         for extension in extensions:
             extension.extra_compile_args.append(_SEPARATE_ROUNDING)
-        build = ["--quiet", "build_ext", "--inplace"]
-        setup(name=package.name, packages=[], py_modules=[], ext_modules=extensions, script_args=build)
-        shutil.rmtree("build")
+        words = ["--quiet", "build_ext", "--inplace"]
+        setup(name=package.name, packages=[], py_modules=[], ext_modules=extensions, script_args=words)
     shutil.copy(source / "__init__.py", package)
+    package.rename(folder / source.name)
+    shutil.rmtree(build)
 
 
 def main() -> None:
@@ -66,7 +68,10 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("folder", type=Path, help="New folder, for PYTHONPATH")
-    compile_simulator(parser.parse_args().folder)
+    folder = parser.parse_args().folder
+    if folder.exists():
+        raise SystemExit(f"{folder} exists: remove it, or name another")
+    compile_simulator(folder)
 
 
 if __name__ == "__main__":

@@ -28,8 +28,8 @@ from companion.bus.client import client_settings, open_client, subscribe_kept
 from companion.bus.session import Bus, encode
 from companion.perception.messages import Report, StartFailed
 from companion.perception.process import PerceptionProcess
+from companion.scheduling import schedule_as_any_program, set_scheduler_slice
 from companion.settings import Settings, ZenohSection
-from companion.vehicle.precise_sleep import DEFAULT_NS, set_scheduler_slice
 from mavlink_sim.datasets.training_scenes import random_scene
 from mavlink_sim.testing import free_port
 
@@ -244,7 +244,7 @@ class _Reader:
 
 
 def _read_detections(endpoint: str, connection: Connection) -> None:
-    set_scheduler_slice(DEFAULT_NS)  # of any program, not the service's
+    schedule_as_any_program()
     times: list[tuple[int, int]] = []
 
     def receive(sample: zenoh.Sample) -> None:

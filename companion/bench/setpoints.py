@@ -11,7 +11,7 @@ from multiprocessing.synchronize import Semaphore
 
 import numpy as np
 
-from companion.vehicle.precise_sleep import DEFAULT_NS, set_scheduler_slice
+from companion.scheduling import schedule_as_any_program, set_scheduler_slice
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.streamer import Streamer
 
@@ -33,7 +33,7 @@ def measure_setpoints(seconds: float, *, rate_hz: float, load: int) -> dict[str,
     try:
         for _ in loaded:
             if not started.acquire(timeout=_START_S):
-                raise RuntimeError(f"the busy processes did not start within {_START_S:g} s")
+                raise RuntimeError(f"the busy processes did not start within {_START_S:g} s; use fewer")
         arrivals_ns = asyncio.run(_stream(seconds, rate_hz))
     finally:
         for process in loaded:
@@ -86,7 +86,7 @@ async def _stream(seconds: float, rate_hz: float) -> list[int]:
 
 def busy(started: Semaphore) -> None:
     """Use one core until killed, with the policy of any program. `started` is released before."""
-    set_scheduler_slice(DEFAULT_NS)
+    schedule_as_any_program()
     started.release()
     value = 0
     while True:

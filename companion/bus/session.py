@@ -35,8 +35,8 @@ from companion.bus.topics import (
     alive_key,
     command_key,
 )
+from companion.scheduling import set_scheduler_slice
 from companion.settings import ZenohSection
-from companion.vehicle.precise_sleep import set_scheduler_slice
 
 __all__ = ["Bus", "BusError", "encode", "zenoh_config"]
 

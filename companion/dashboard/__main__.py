@@ -15,8 +15,8 @@ from companion.bus.config import BusError
 from companion.child_process import EXIT_REFUSED, on_parent_end
 from companion.dashboard.access import DashboardError
 from companion.dashboard.server import NICENESS, DashboardOptions, serve
+from companion.scheduling import lower_priority
 from companion.settings import LanguageSection
-from companion.vehicle.precise_sleep import lower_priority
 
 
 def main(argument: str) -> int:

@@ -13,9 +13,9 @@ from asyncio.subprocess import PIPE, STDOUT, Process
 from collections.abc import Callable
 from contextlib import suppress
 
+from companion.scheduling import schedule_as_any_program
 from companion.settings import Settings
 from companion.settings.reading import flags
-from companion.vehicle.precise_sleep import DEFAULT_NS, set_scheduler_slice
 
 NICENESS = 5
 _SECTIONS = ("zenoh", "language", "plugins")
@@ -52,7 +52,7 @@ class AskProcess:
             )
             with suppress(OSError):  # it has ended already
                 os.setpriority(os.PRIO_PROCESS, self._process.pid, min(os.nice(0) + NICENESS, 19))
-                set_scheduler_slice(DEFAULT_NS, self._process.pid)  # not the service's, which it inherits
+            schedule_as_any_program(self._process.pid)
             self._reading = asyncio.create_task(_pass_on(self._process, write))
         assert self._process is not None
         assert self._process.stdin is not None

@@ -26,6 +26,7 @@ from companion.perception.messages import (
     packed,
     read_message,
 )
+from companion.scheduling import schedule_as_any_program
 from companion.settings import Settings
 from vision.path_planner import PathRequest
 from vision.tracking import SelectRequest
@@ -113,6 +114,7 @@ class PerceptionProcess:
                 # Ctrl-C in the terminal is for the service, which then stops the worker.
                 process_group=0,
             )
+            schedule_as_any_program(process.pid)
             failing.pop_all()
         worker = cls(process, reports, control, printed)
         worker._put(Begin(settings, first_track_id, record_as))

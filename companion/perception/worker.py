@@ -46,9 +46,9 @@ from companion.perception.messages import (
 )
 from companion.perception.previews import CloudEncoder, PreviewEncoder
 from companion.plugins import PluginError, load_plugins
+from companion.scheduling import lower_priority, run_when_idle
 from companion.settings import Settings
 from companion.settings.calibration import adopt_calibration
-from companion.vehicle.precise_sleep import lower_priority, run_when_idle
 from vision.detections import Detections
 from vision.frame import Frame
 from vision.model_files import find_model

@@ -18,8 +18,8 @@ from companion.bus.client import open_client, subscribe_kept
 from companion.bus.topics import CLOUD, DEPTH_IMAGE, IMAGE, MAVLINK, RECORDER_TOPICS, ROOT, TOPICS, Topic
 from companion.recording.convert import RECORDER_CHANNEL, RUN_CHANNEL, Converter, stored_schema
 from companion.recording.files import FLUSH_S, Channel, Recorded, RecordingWriter
+from companion.scheduling import lower_priority
 from companion.settings import ZenohSection
-from companion.vehicle.precise_sleep import lower_priority
 
 # The service and its perception have priority.
 _NICER = 10

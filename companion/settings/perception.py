@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -277,7 +278,7 @@ class DetectorSection(Section):
     threads: Annotated[int | None, Field(ge=1, le=256)] = None
     """CPU threads of the network; unset: all processors but one, divided among the cameras"""
     priority: Literal["low", "idle"] = "low"
-    """of its process on a busy core; idle: every other program interrupts it and may take all the time"""
+    """of the perception process; idle: it runs when the service and what it starts need no processor"""
     every: Annotated[int, Field(ge=1, le=1000)] = 1
     """process every Nth frame"""
     rate_hz: Annotated[float | None, Field(gt=0, le=1000)] = None
@@ -292,6 +293,12 @@ class DetectorSection(Section):
     """side of a tile, pixels of the frame; best equal to image_size"""
     tile_overlap: Annotated[float, Field(ge=0, le=0.8)] = 0.2
     """overlap of neighbouring tiles, share of a tile"""
+
+    @model_validator(mode="after")
+    def _idle_on_linux(self) -> Self:
+        if self.priority == "idle" and not hasattr(os, "SCHED_IDLE"):
+            raise ValueError("priority: idle is a policy of Linux: set low")
+        return self
 
     @model_validator(mode="after")
     def _valid_heights(self) -> Self:

@@ -17,7 +17,8 @@ from collections.abc import Callable
 from contextlib import AbstractAsyncContextManager
 from enum import StrEnum
 
-from companion.vehicle.precise_sleep import Sleep, precise_sleep, set_scheduler_slice
+from companion.scheduling import set_scheduler_slice
+from companion.vehicle.precise_sleep import Sleep, precise_sleep
 from companion.vehicle.setpoint import Setpoint
 
 logger = logging.getLogger(__name__)

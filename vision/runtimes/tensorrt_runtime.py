@@ -33,7 +33,7 @@ def build_plan(onnx_path: Path, *, largest_side: int, stride: int) -> bytes:
     tensorrt = required("tensorrt")
     trt_logger = tensorrt.Logger(tensorrt.Logger.ERROR)
     builder = tensorrt.Builder(trt_logger)
-    # TensorRT 11 has only strongly typed networks, and ignores the flag.
+    # TensorRT 11 has only strongly typed networks; by its migration guide the flag stays, without effect.
     strongly_typed = 1 << int(tensorrt.NetworkDefinitionCreationFlag.STRONGLY_TYPED)
     definition = builder.create_network(strongly_typed)
     parser = tensorrt.OnnxParser(definition, trt_logger)

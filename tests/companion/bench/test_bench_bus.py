@@ -12,8 +12,8 @@ import pytest
 
 from companion.bench.bus import _LOADING_S, _START_S, _detections, measure_bus, measure_recovery
 from companion.perception.process import PerceptionProcess
+from companion.scheduling import DEFAULT_NS, set_scheduler_slice
 from companion.settings import Settings
-from companion.vehicle.precise_sleep import DEFAULT_NS, set_scheduler_slice
 from tests.companion.bus.message_check import check_message
 from tests.companion.command_line import companion_here
 

@@ -15,7 +15,7 @@ import pytest
 
 from companion.bench.lockstep_flight import plain_settings
 from companion.language.process import NICENESS, AskProcess
-from companion.vehicle.precise_sleep import DEFAULT_NS, SHORTEST_NS, set_scheduler_slice
+from companion.scheduling import DEFAULT_NS, SHORTEST_NS, set_scheduler_slice
 from tests.companion.cli.test_ask import Service, service
 from tests.companion.test_play import descendants
 from tests.companion.vehicle.thread_slice import slice_of

@@ -20,8 +20,8 @@ import pytest
 
 from companion.perception.supervisor import PerceptionStartError, PerceptionState, PerceptionSupervisor
 from companion.perception.worker import NICENESS
+from companion.scheduling import DEFAULT_NS, SHORTEST_NS, set_scheduler_slice
 from companion.settings.reading import Settings, load_settings
-from companion.vehicle.precise_sleep import DEFAULT_NS, SHORTEST_NS, set_scheduler_slice
 from tests.companion.vehicle.thread_slice import slice_of
 from vision.pipeline import PerceptionResult
 from vision.sources import SourceSettings, open_source

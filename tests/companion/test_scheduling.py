@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import pytest
 
-from companion.vehicle.precise_sleep import SHORTEST_NS, set_scheduler_slice
+from companion.scheduling import SHORTEST_NS, schedule_as_any_program, set_scheduler_slice
 from tests.companion.vehicle.thread_slice import slice_of
 
 needs_slices = pytest.mark.skipif(slice_of(0) is None, reason="this system has no slices")
@@ -48,7 +48,7 @@ def test_scheduler_slice_is_set_and_niceness_kept() -> None:
 
 
 def test_refused_slice_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("companion.vehicle.precise_sleep._SCHED_OTHER", 99)  # no such policy
+    monkeypatch.setattr("companion.scheduling._SCHED_OTHER", 99)  # no such policy
     supported, before, after = in_a_thread(set_scheduler_slice)
     assert supported is False
     assert after == before
@@ -61,15 +61,22 @@ def test_unknown_machine_is_unsupported(monkeypatch: pytest.MonkeyPatch) -> None
 
 REAL_TIME = """
 import os
-from companion.vehicle.precise_sleep import lower_priority, set_scheduler_slice
+import threading
+from companion.scheduling import lower_priority, set_scheduler_slice
 try:
-    os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+    os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(1))
 except PermissionError:
     print("not permitted")
 else:
-    print(set_scheduler_slice(), os.sched_getscheduler(0) == os.SCHED_RR)
+    print(set_scheduler_slice(), os.sched_getscheduler(0) & os.SCHED_RR)
+    os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+    end = threading.Event()
+    thread = threading.Thread(target=end.wait)
+    thread.start()
+    print(os.sched_getscheduler(thread.native_id))
     lower_priority(3)
-    print(os.sched_getscheduler(0) == os.SCHED_OTHER)
+    print(os.sched_getscheduler(0), os.sched_getscheduler(thread.native_id))
+    end.set()
 """
 
 
@@ -77,11 +84,23 @@ def test_real_time_policy_is_kept_by_the_service_and_left_by_its_programs() -> N
     printed = subprocess.run([sys.executable, "-c", REAL_TIME], capture_output=True, text=True, check=True)
     if printed.stdout == "not permitted\n":
         pytest.skip("this user may not use a real-time policy")
-    assert printed.stdout == "True True\nTrue\n"
+    assert printed.stdout == f"True {os.SCHED_RR}\n{os.SCHED_RR}\n0 0\n"
+
+
+def test_a_program_that_is_started_is_no_part_of_the_service() -> None:
+    """Its parent says so, before the program can."""
+    process = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+    try:
+        os.sched_setscheduler(process.pid, os.SCHED_BATCH, os.sched_param(0))
+        schedule_as_any_program(process.pid)
+        assert os.sched_getscheduler(process.pid) == os.SCHED_OTHER
+    finally:
+        process.communicate(b"\n")
+    schedule_as_any_program(process.pid)  # it has ended: nothing to do
 
 
 PROGRAM = """
-from companion.vehicle.precise_sleep import lower_priority
+from companion.scheduling import lower_priority
 lower_priority(3)
 print(flush=True)
 input()
