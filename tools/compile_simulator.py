@@ -14,6 +14,7 @@ import contextlib
 import os
 import re
 import shutil
+import tempfile
 from pathlib import Path
 
 import mavlink_sim
@@ -40,27 +41,32 @@ def compile_simulator(folder: Path) -> None:
     from mypyc.build import mypycify
     from setuptools import setup
 
-    folder.mkdir(parents=True)
+    if folder.exists():
+        raise FileExistsError(f"{folder} exists: remove it, or name another")
+    folder.parent.mkdir(parents=True, exist_ok=True)
     source = Path(mavlink_sim.__file__).parent
-    build = folder / "build"  # the package appears complete or not at all
-    package = build / source.name
-    shutil.copytree(source, package, ignore=shutil.ignore_patterns("__pycache__"))
-    # its imports for type checkers would make mypy read everything, with torch: minutes
-    (package / "__init__.py").write_text("", encoding="utf-8")
-    for name in MODULES:
-        text = (package / name).read_text(encoding="utf-8")
-        text = text.replace(_FUTURE, f"{_FUTURE}from mypy_extensions import mypyc_attr\n", 1)
-        (package / name).write_text(_CLASS.sub(_DECORATED, text), encoding="utf-8")
-    with contextlib.chdir(build):
-        flags = ["--ignore-missing-imports", f"--cache-dir={os.devnull}"]
-        extensions = mypycify([*flags, *(f"{package.name}/{name}" for name in MODULES)], debug_level="0")
-        for extension in extensions:
-            extension.extra_compile_args.append(_SEPARATE_ROUNDING)
-        words = ["--quiet", "build_ext", "--inplace"]
-        setup(name=package.name, packages=[], py_modules=[], ext_modules=extensions, script_args=words)
-    shutil.copy(source / "__init__.py", package)
-    package.rename(folder / source.name)
-    shutil.rmtree(build)
+    # it appears complete or not at all
+    with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as name:
+        work = Path(name) / folder.name
+        package = work / source.name
+        shutil.copytree(source, package, ignore=shutil.ignore_patterns("__pycache__"))
+        # its imports for type checkers would make mypy read everything, with torch: minutes
+        (package / "__init__.py").write_text("", encoding="utf-8")
+        for module in MODULES:
+            text = (package / module).read_text(encoding="utf-8")
+            text = text.replace(_FUTURE, f"{_FUTURE}from mypy_extensions import mypyc_attr\n", 1)
+            (package / module).write_text(_CLASS.sub(_DECORATED, text), encoding="utf-8")
+        with contextlib.chdir(work):
+            flags = ["--ignore-missing-imports", f"--cache-dir={os.devnull}"]
+            paths = [f"{package.name}/{module}" for module in MODULES]
+            extensions = mypycify([*flags, *paths], debug_level="0")
+            for extension in extensions:
+                extension.extra_compile_args.append(_SEPARATE_ROUNDING)
+            build = ["--quiet", "build_ext", "--inplace"]
+            setup(name=package.name, packages=[], py_modules=[], ext_modules=extensions, script_args=build)
+            shutil.rmtree("build")
+        shutil.copy(source / "__init__.py", package)
+        work.rename(folder)
 
 
 def main() -> None:
@@ -68,10 +74,10 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("folder", type=Path, help="New folder, for PYTHONPATH")
-    folder = parser.parse_args().folder
-    if folder.exists():
-        raise SystemExit(f"{folder} exists: remove it, or name another")
-    compile_simulator(folder)
+    try:
+        compile_simulator(parser.parse_args().folder)
+    except FileExistsError as error:
+        raise SystemExit(str(error)) from None
 
 
 if __name__ == "__main__":
