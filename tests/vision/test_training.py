@@ -60,6 +60,11 @@ def nothing(_rng: np.random.Generator | None, width: int, height: int) -> Labell
     return np.zeros((height, width, 3), np.uint8), np.zeros((0, 4), np.float32), np.zeros(0, np.int64)
 
 
+def nothing_or_rectangles(rng: np.random.Generator, width: int, height: int) -> LabelledImage:
+    """Objects only in the wide images."""
+    return rectangles(rng, width, height) if width == 96 else nothing(rng, width, height)
+
+
 SMALL = TrainingSettings(
     class_names=("red", "green"),
     stages=(Stage(64, 64, 4, 4),),
@@ -170,8 +175,9 @@ def test_loss_of_zero_is_an_error(trained: TrainedModel) -> None:
 def test_stages_of_other_sizes_and_images_without_objects_train() -> None:
     seen: list[Progress] = []
     stages = Stage(64, 64, 2, 2), Stage(96, 64, 1, 1)
-    trained = train(replace(SMALL, stages=stages), nothing, seen.append)
+    trained = train(replace(SMALL, stages=stages), nothing_or_rectangles, seen.append)
     assert [(p.step, p.steps) for p in seen] == [(1, 3), (2, 3), (3, 3)]
+    assert [p.box_loss > 0 for p in seen] == [False, False, True]
     assert torch.isfinite(weights(trained)).all()
 
 
