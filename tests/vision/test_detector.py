@@ -90,6 +90,7 @@ def test_a_frame_of_another_size_needs_no_new_detector(detector: Detector) -> No
 
 
 def test_only_requested_classes_are_reported(model_path: Path, frame: np.ndarray[Any, Any]) -> None:
+    assert len(detector_of(model_path, classes=["car"], image_size=64).detect(frame))
     assert len(detector_of(model_path, classes=["person", 2], image_size=64).detect(frame))
     assert not len(detector_of(model_path, classes=["person", 1], image_size=64).detect(frame))
 
@@ -239,10 +240,16 @@ def test_missing_bundled_model_is_reported(tmp_path: Path, monkeypatch: pytest.M
 @pytest.mark.skipif(not REFERENCE.is_file(), reason=f"{REFERENCE} is not here; set COMPANION_TEST_DATA")
 @pytest.mark.parametrize(
     ("variant", "arguments", "every"),
-    [("rect", {}, 1), ("rect_person_car", {"classes": [0, 2]}, 4), ("square", {"square": True}, 4)],
+    [
+        ("rect", {}, 1),
+        ("rect_person_car", {"classes": [0, 2]}, 4),
+        ("square", {"square": True}, 4),
+        pytest.param("rect_person_car", {"classes": [0, 2]}, 1, marks=pytest.mark.slow),
+        pytest.param("square", {"square": True}, 1, marks=pytest.mark.slow),
+    ],
 )
 def test_real_photographs_match_the_reference(variant: str, arguments: dict[str, Any], every: int) -> None:
-    """The variants on every fourth: among them are photographs with and without an object of the classes."""
+    """Fast variants on every fourth: among them are photographs with and without an object of the classes."""
     detector = Detector(COCO_MODEL, precision="float32", **arguments)
     for entry in json.loads(REFERENCE.read_text())["images"][::every]:
         image = cv2.imread(str(TEST_DATA / "coco" / "images" / entry["name"]))
