@@ -104,7 +104,7 @@ def test_an_exported_file_is_a_model_by_itself(
     assert alone.class_names == class_names_of(path) == class_names_of(checkpoint) == NAMES
     assert alone.metadata == {"licence": "Apache-2.0"}
     assert (alone.runtime, alone.precision) == (runtime, "float32")
-    assert ("as requested" if named else "default") in alone.runtime_reason
+    assert alone.runtime_reason == "as requested" if named else "default" in alone.runtime_reason
     assert source.runtime == "torch"
     assert "default" in source.runtime_reason
     image = make_image(64, 96)

@@ -81,7 +81,9 @@ def test_int8_file_states_its_precision(quantised: tuple[Path, RuntimeName]) -> 
         Detector(path, runtime=name, image_size=SIDE, precision="float32")
 
 
-@pytest.mark.parametrize("quantised", KINDS[:1], indirect=True)
+@pytest.mark.parametrize(
+    "quantised", [KINDS[0], pytest.param(KINDS[1], marks=pytest.mark.slow)], indirect=True
+)
 def test_evaluation_of_int8_file_needs_no_precision(
     quantised: tuple[Path, RuntimeName], tmp_path: Path
 ) -> None:
