@@ -231,8 +231,7 @@ def test_bombs_and_mutations_are_rejected_by_name(tmp_path: Path) -> None:
         assert_harmless(path, report)
     for (name, (_, expected)), report in zip(BOMBS.items(), reports, strict=False):
         assert re.search(expected, report["outcome"]), (name, report)
-    if not real:
-        pytest.skip(f"{REAL} is not here; set COMPANION_TEST_DATA")
-    report = reports[paths.index(REAL)]
-    assert report["outcome"] == "loaded 80 classes"
-    assert report["bytes"] < 3 * REAL.stat().st_size
+    if real:
+        report = reports[paths.index(REAL)]
+        assert report["outcome"] == "loaded 80 classes"
+        assert report["bytes"] < 3 * REAL.stat().st_size
