@@ -17,7 +17,7 @@ def test_alignment_recovers_the_motion_of_a_rendered_camera(seed: int) -> None:
     methods: tuple[Any, ...] = ("plane_icp", "gicp")
     for method in methods:
         found = align(views.source, views.target, method=method)
-        assert found.converged
+        assert found.converged, method
         assert found.inlier_share > 0.9
         assert found.determined
         assert angle_deg(found.rotation, views.rotation) < 0.3
