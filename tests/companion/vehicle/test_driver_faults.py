@@ -21,7 +21,8 @@ from tests.companion.vehicle.fake_autopilot import streaming, wait_for_state, wa
 
 pytestmark = pytest.mark.realtime
 
-# For what AutopilotDriver does, whatever link it has.
+# For what AutopilotDriver does with received messages. MAVSDK's are passed to it by other code, so these
+# tests are run with it too, in `make test-slow`.
 SHARED = pytest.mark.parametrize("kind", ["pymavlink", pytest.param("mavsdk", marks=pytest.mark.slow)])
 PARAMETERS = {"COM_OF_LOSS_T": 2.0, "COM_OBL_RC_ACT": 4.0}
 
@@ -226,7 +227,6 @@ async def test_second_autopilot_with_its_own_id_is_ignored(
             assert all(abs(state.position_ned_m[1]) < 5.0 for state in seen if state.position_ned_m)
 
 
-@SHARED
 async def test_second_autopilot_with_the_same_id_prevents_arming(
     kind: DriverKind, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -248,7 +248,6 @@ async def test_second_autopilot_with_the_same_id_prevents_arming(
             await driver.arm()
 
 
-@SHARED
 async def test_delayed_setpoints_keep_the_vehicle_in_offboard(kind: DriverKind) -> None:
     with simulated(parameters=PARAMETERS, seed=4) as simulator:
         async with connected(kind, simulator) as driver:
