@@ -22,7 +22,9 @@ from companion.bus.client import client_settings, open_client, send_command
 from companion.settings import ZenohSection
 from mavlink_sim.testing import QUICK_FLIGHT, free_port
 
-# Options of a vehicle at twice real time. Setpoints may be as late as in real time: COM_OF_LOSS_T is 1 s.
+# Options of a vehicle at twice real time. Setpoints may be as late as in real time: COM_OF_LOSS_T, 1 s by
+# default, is of simulated time. ClockSync does not settle at this speed, so messages are stamped by their
+# arrival: test_flight_with_detections_and_the_mavsdk_driver flies in real time, with synchronized stamps.
 TWICE: dict[str, Any] = {
     "speed": 2.0,
     "ready_after": 0.0,

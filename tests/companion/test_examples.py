@@ -22,7 +22,7 @@ import pytest
 from benchmarks.scenes import MOTIONS, scene_frames
 from companion import connect
 from companion.bus.client import listen
-from mavlink_sim.testing import RunningSimulator
+from mavlink_sim.testing import QUICK_FLIGHT, RunningSimulator
 from tests.companion.command_line import companion
 from tests.companion.service_process import TWICE, running_service
 
@@ -133,7 +133,7 @@ def test_mission_is_checked_for_the_classes_of_the_plugin(tmp_path: Path) -> Non
 
 
 @pytest.mark.usefixtures("installed")
-@pytest.mark.vehicle(speed=2.0, parameters=TWICE["parameters"])
+@pytest.mark.vehicle.with_args(**TWICE)
 @pytest.mark.timeout(200)
 def test_service_publishes_detections_of_plugins(
     vehicle: RunningSimulator, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -165,7 +165,7 @@ def test_service_publishes_detections_of_plugins(
     assert all(pattern.match(line) for line in lines)
 
 
-@pytest.mark.vehicle(speed=2.0, parameters=TWICE["parameters"])
+@pytest.mark.vehicle(parameters=QUICK_FLIGHT)  # real time: it closes a loop of yaw at 10 Hz
 @pytest.mark.timeout(200)
 def test_square_is_flown_by_velocities(vehicle: RunningSimulator, tmp_path: Path) -> None:
     with running_service(vehicle.onboard_port, ["--source", "none"], cwd=tmp_path) as service:

@@ -23,11 +23,9 @@ from tests.companion.service_process import TWICE, running_service
 TOKEN = "0123456789abcdef0123456789abcdef"
 
 
-# The SDK is imported by the tests that need it: it takes a second of every worker's collection.
-
-
 def process(endpoint: str, vehicle: str, *flags: str) -> Any:
     """The server, and its client, which starts it."""
+    # The SDK is imported by the functions that need it: it takes a second of every worker's collection.
     from mcp.client import Client
     from mcp.client.stdio import StdioServerParameters, stdio_client
 
@@ -154,7 +152,7 @@ async def test_simulated_vehicle_is_left_to_its_pilot(tmp_path: Path) -> None:
             again = (await call("takeoff", altitude=3))["reason"]
             assert again.startswith("takeoff needs ")
             assert "the ground" in again
-            going = asyncio.create_task(call("goto", forward=30, right=0))
+            going = asyncio.create_task(call("goto", forward=90, right=0))
             async with asyncio.timeout(20):
                 while not (await call("state"))["in_command"]:
                     await asyncio.sleep(0.1)

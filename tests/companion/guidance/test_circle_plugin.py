@@ -65,7 +65,7 @@ def test_plugin_flies_its_circle(installed: Path, monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.realtime
 @pytest.mark.timeout(200)
-@pytest.mark.vehicle(speed=2.0, parameters=TWICE["parameters"])
+@pytest.mark.vehicle.with_args(**TWICE)
 def test_service_flies_an_installed_plugin(
     installed: Path, vehicle: RunningSimulator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

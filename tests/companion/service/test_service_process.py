@@ -74,7 +74,7 @@ def test_ardupilot_is_recognized_by_a_service_without_a_camera(tmp_path: Path) -
 def test_flight_with_detections_and_the_mavsdk_driver(seeing: list[str], tmp_path: Path) -> None:
     flags = [*seeing, "--source-rate-hz", "2", "--driver", "mavsdk"]
     with (
-        running_simulator(**TWICE) as simulator,
+        running_simulator(ready_after=0.0, parameters=QUICK_FLIGHT) as simulator,
         running_service(simulator.onboard_port, flags, cwd=tmp_path) as service,
         service.client() as session,
     ):
