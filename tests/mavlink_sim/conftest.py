@@ -7,6 +7,7 @@ import math
 import pickle
 from collections import defaultdict
 from collections.abc import Callable, Collection
+from pathlib import Path
 from typing import Any, ClassVar
 
 import pytest
@@ -31,6 +32,15 @@ FAST_STREAMS = {
 }
 EVERYTHING = "everything"
 SIH_FRAME = LocalFrame()
+SMALL = """
+[ground]
+kinds = ["concrete"]
+tile_texels = 256
+texel_m = 0.05
+[camera]
+width = 160
+height = 120
+"""
 # RC_MAP_* of the usual order of channels; a vehicle without calibration has none, and ignores the sticks.
 CALIBRATION: dict[str, float] = {
     "RC_MAP_ROLL": 1,
@@ -279,3 +289,11 @@ def harness(request: pytest.FixtureRequest) -> SimHarness:
     """A vehicle in still air, on the ground, just booted."""
     marker = request.node.get_closest_marker("streams")
     return SimHarness(streams=() if marker is None else marker.args)
+
+
+@pytest.fixture
+def small(tmp_path: Path) -> str:
+    """A scene that is made and rendered quickly."""
+    path = tmp_path / "small.toml"
+    path.write_text(SMALL)
+    return str(path)

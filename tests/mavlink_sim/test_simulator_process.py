@@ -30,17 +30,6 @@ from vision.shared_frame import SharedFrameReader, segment_path
 pytestmark = pytest.mark.realtime
 
 
-SMALL = """
-[ground]
-kinds = ["concrete"]
-tile_texels = 256
-texel_m = 0.05
-[camera]
-width = 160
-height = 120
-"""
-
-
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-m", "mavlink_sim", *arguments], capture_output=True, text=True, timeout=60
@@ -283,11 +272,9 @@ def camera_process(pid: int) -> int:
     raise AssertionError("the simulator has no camera process")
 
 
-def test_camera_start_and_loss_reported_vehicle_continues(tmp_path: Path) -> None:
+def test_camera_start_and_loss_reported_vehicle_continues(small: str, tmp_path: Path) -> None:
     name = f"camera-{tmp_path.parent.name}-{tmp_path.name}-{os.getpid()}"
-    scene = tmp_path / "small.toml"
-    scene.write_text(SMALL)
-    with running_simulator(camera=name, camera_rate=10.0, scene=scene) as simulator:
+    with running_simulator(camera=name, camera_rate=10.0, scene=small) as simulator:
         simulator.wait_for_event(f"camera {name} is on", 60.0)
         with SharedFrameReader(name) as reader:
             frame = reader.latest()
