@@ -304,9 +304,9 @@ def test_detect_warns_of_a_model_of_rendered_scenes(
 
 
 def test_detect_is_silent_about_another_model(small_model: Path, image_folder: Path, tmp_path: Path) -> None:
-    own = tmp_path / "own.safetensors"
     from vision.yolo.checkpoint import load_checkpoint, save_checkpoint
 
+    own = tmp_path / "own.safetensors"
     save_checkpoint(own, load_checkpoint(small_model).model, metadata={"trained_on": "6 images of set"})
     done = companion_here("detect", image_folder, "--model", own, "--image-size", "96", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
