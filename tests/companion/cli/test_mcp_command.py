@@ -32,7 +32,8 @@ def process(endpoint: str, vehicle: str, *flags: str) -> Any:
     arguments = ["-m", "companion.cli", "mcp", "--connect", endpoint, "--vehicle-name", vehicle, *flags]
     environment = {"PYTHONPATH": os.pathsep.join(sys.path)}
     server = StdioServerParameters(command=sys.executable, args=arguments, env=environment)
-    return Client(stdio_client(server))
+    # by default the standard error of the first import, which may be that of a test's CliRunner
+    return Client(stdio_client(server, errlog=sys.stderr))
 
 
 @pytest.fixture
