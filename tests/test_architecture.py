@@ -13,7 +13,7 @@ ROOT = Path(__file__).parent.parent
 # Each package and module of `companion` with its layer; it may import from lower layers alone.
 COMPANION_LAYERS = {
     "campaign": 0,
-    "child_process": 0,
+    "child_process": 1,
     "geometry": 0,
     "plugins": 0,
     "scheduling": 0,
