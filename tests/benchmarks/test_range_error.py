@@ -1,4 +1,4 @@
-"""Benchmarks of rendered ranges on a few frames: their bounds leave room for what few frames can show."""
+"""Benchmarks of rendered ranges on a few frames: their bounds are wide enough for few frames."""
 
 from __future__ import annotations
 
