@@ -95,6 +95,22 @@ class _Connection(H11Protocol):
             self.transport.close()
 
 
+class _Server(uvicorn.Server):
+    """A server that leaves nothing in the event loop when it is cancelled.
+
+    uvicorn would leave its listening socket in the loop's selector, and the next socket with the number of
+    that one, of whatever kind, would never be read.
+    """
+
+    async def serve(self, sockets: list[socket.socket] | None = None) -> None:
+        try:
+            await super().serve(sockets)
+        finally:
+            if self.started:
+                for server in self.servers:
+                    server.close()
+
+
 async def serve(options: DashboardOptions, on_ready: Callable[[str], None], flag: str) -> None:
     """Serve until SIGINT or SIGTERM, or until cancelled.
 
@@ -129,7 +145,7 @@ async def serve(options: DashboardOptions, on_ready: Callable[[str], None], flag
 
 def http_server(application: ASGIApp) -> uvicorn.Server:
     """A server without a log of requests, whose connections are bounded."""
-    return uvicorn.Server(
+    return _Server(
         uvicorn.Config(
             application,
             http=_Connection,

@@ -41,6 +41,12 @@ async def test_page_and_its_files_have_security_headers() -> None:
             assert (await request(port, "GET", path))[0] == 404
 
 
+async def test_sockets_opened_after_a_server_has_ended_are_read() -> None:
+    for _ in range(2):
+        async with serving() as port:
+            assert (await request(port, "GET", "/clock"))[0] == 200
+
+
 async def test_requests_of_other_pages_are_refused() -> None:
     async with serving() as port:
         for path in ("/", "/events", "/image", "/clock", "/page.js"):
