@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from functools import cache
 
 from benchmarks.rendered import camera_settings
-from companion.bench.lockstep_flight import LockstepFlight, vehicle_in_the_air
+from companion.bench.lockstep_flight import LockstepFlight
 from companion.bench.synthetic_camera import SyntheticCamera
 from companion.bench.synthetic_detector import Faults, SceneObject, ScenePose, SyntheticDetector
 from companion.guidance.search_pattern import Footprint
+from tests.companion.guidance.guidance_harness import in_the_air
 from vision.attitude import Quaternion
 from vision.camera_model import CameraModel, CameraMount
 
@@ -18,8 +18,6 @@ ON_GIMBAL = CameraMount(forward_m=0.1, on_gimbal=True)
 FOOTPRINT = Footprint(math.radians(80.0), 0.0)
 HEIGHT_M = 10.0
 PERSON_M = (0.5, 0.6, 1.7)
-# It flies there once: the tests fly copies, which are equal bit for bit.
-in_the_air = cache(vehicle_in_the_air)
 
 
 def person(bearing_deg: float, distance_m: float = 4.0) -> SceneObject:
@@ -37,7 +35,7 @@ def gimbal_flight(
     wind_mps: float = 0.0,
 ) -> LockstepFlight:
     """In the air, with a detector that sees the objects through the gimbal's camera."""
-    vehicle = in_the_air(seed=seed, height_m=HEIGHT_M, wind_mps=wind_mps, gimbal=True).copy()
+    vehicle = in_the_air(seed=seed, height_m=HEIGHT_M, wind_mps=wind_mps, gimbal=True)
 
     def gimbal_attitude() -> Quaternion:
         gimbal = vehicle.vehicle.gimbal

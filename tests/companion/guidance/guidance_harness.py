@@ -6,7 +6,10 @@ import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cache
+from typing import Any
 
+from companion.bench.lockstep_flight import vehicle_in_the_air
 from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome
 from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.core import Guidance, GuidanceOptions
@@ -36,6 +39,7 @@ from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
 from companion.vehicle.streamer import Streamer
+from mavlink_sim.lockstep import LockstepVehicle
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject, look
 from vision.attitude import quaternion_from_euler
 from vision.obstacle_sectors import ObstacleSectors
@@ -45,6 +49,13 @@ CLIMB_MPS = 1.5
 DISARM_AFTER_LANDING_S = 2.0
 STEP_S = 0.02
 SHOWN_TIMEOUT_S = 3.0
+
+_airborne = cache(vehicle_in_the_air)
+
+
+def in_the_air(**options: Any) -> LockstepVehicle:
+    """As `vehicle_in_the_air`, which flies there once: copies are equal bit for bit."""
+    return _airborne(**options).copy()
 
 
 @dataclass

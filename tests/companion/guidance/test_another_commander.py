@@ -14,14 +14,17 @@ from companion.vehicle.state import FlightMode
 from companion.vehicle.streamer import StreamState
 from mavlink_sim.wire.messages import dialect
 from mavlink_sim.wire.setpoints import velocity_setpoint
+from tests.companion.guidance.guidance_harness import in_the_air
 
 STATION = (255, 190)
 PAUSE, CONTINUE = 0.0, 1.0
 
 
-def airborne(autopilot: str, seed: int = 1) -> LockstepFlight:
+def airborne(autopilot: str) -> LockstepFlight:
     """In wind and gusts, 6 m above home."""
-    return LockstepFlight.airborne(seed=seed, height_m=6.0, wind_mps=2.0, gusts_mps=0.4, autopilot=autopilot)
+    return LockstepFlight.of_vehicle(
+        in_the_air(seed=1, height_m=6.0, wind_mps=2.0, gusts_mps=0.4, autopilot=autopilot)
+    )
 
 
 def pause_or_continue(flight: LockstepFlight, choice: float) -> None:
@@ -47,7 +50,13 @@ def lost(flight: LockstepFlight) -> bool:
     return True
 
 
-@pytest.mark.parametrize("command", ["orbit radius=8 speed=2", "goto forward=60 right=0", "figure-eight"])
+@pytest.mark.parametrize(
+    "command",
+    [
+        "orbit radius=8 speed=2",
+        *(pytest.param(text, marks=pytest.mark.slow) for text in ("goto forward=60 right=0", "figure-eight")),
+    ],
+)
 def test_pause_by_ground_station_ends_command(command: str) -> None:
     flight = airborne("ardupilot")
     flight.command(command)

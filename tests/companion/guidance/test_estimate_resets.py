@@ -7,22 +7,16 @@ from dataclasses import replace
 
 import pytest
 
-from companion.bench.lockstep_flight import LockstepFlight, plain_settings
-from companion.bench.simulated_driver import SimulatedDriver
+from companion.bench.lockstep_flight import LockstepFlight
 from companion.guidance.interface import EventKind, GuidanceInput
-from mavlink_sim.lockstep import LockstepVehicle
-from tests.companion.guidance.guidance_harness import GuidanceHarness, engaged, flying
+from tests.companion.guidance.guidance_harness import GuidanceHarness, engaged, flying, in_the_air
 
 RESET_NED_M = (5.0, 3.0, -1.0)
 RESET = "ekf_reset 5 3 -1"
 
 
 def airborne(autopilot: str) -> LockstepFlight:
-    if autopilot == "px4":
-        return LockstepFlight.airborne(seed=4)
-    vehicle = LockstepVehicle(autopilot="ardupilot", seed=4)
-    vehicle.take_off(5.0)
-    return LockstepFlight(SimulatedDriver(vehicle), plain_settings())
+    return LockstepFlight.of_vehicle(in_the_air(seed=4, autopilot=autopilot))
 
 
 def distance_m(flight: LockstepFlight, point_ned_m: tuple[float, ...]) -> float:
@@ -30,7 +24,7 @@ def distance_m(flight: LockstepFlight, point_ned_m: tuple[float, ...]) -> float:
 
 
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
-@pytest.mark.parametrize("reset_s", [3.0, 0.5])
+@pytest.mark.parametrize("reset_s", [pytest.param(3.0, marks=pytest.mark.slow), 0.5])
 def test_goal_keeps_its_ground_position_through_a_reset(autopilot: str, reset_s: float) -> None:
     flight = airborne(autopilot)
     goal = (25.0, 4.0, flight.vehicle.truth.position_ned_m[2])
@@ -77,7 +71,7 @@ def test_hold_keeps_its_position_through_resets(autopilot: str) -> None:
     assert flight.state.reset_offset_ned_m == pytest.approx((0.0, 0.0, 0.0), abs=0.3)
 
 
-@pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+@pytest.mark.parametrize("autopilot", ["px4", pytest.param("ardupilot", marks=pytest.mark.slow)])
 def test_hard_manoeuvres_are_not_resets(autopilot: str) -> None:
     flight = airborne(autopilot)
     for command in ("goto 20 0 speed=5", "goto 0 0 speed=5", "orbit radius=6 speed=3", "stop"):

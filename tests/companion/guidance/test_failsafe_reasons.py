@@ -13,7 +13,7 @@ from companion.vehicle.report import Report
 from companion.vehicle.state import FlightMode
 from mavlink_sim.px4.modes import Mode
 from mavlink_sim.wire.messages import dialect
-from tests.companion.guidance.guidance_harness import GuidanceHarness, assert_failed, engaged, flying
+from tests.companion.guidance.guidance_harness import GuidanceHarness, assert_failed, engaged, flying, in_the_air
 
 SOON = {"COM_FAIL_ACT_T": 0.0}
 FENCE = {"GF_MAX_HOR_DIST": 10.0}
@@ -37,7 +37,7 @@ def test_px4_failsafe_has_its_cause_and_is_left_to_px4(
 ) -> None:
     """Also its hold, which PX4 would leave for a return 1.2 s after our last setpoint."""
     settings = plain_settings({"guidance.min_battery_percent": "0"})
-    flight = LockstepFlight.airborne(seed=4, settings=settings)
+    flight = LockstepFlight.of_vehicle(in_the_air(seed=4), settings=settings)
     for name, value in parameters.items():
         flight.vehicle.vehicle.parameters.set(name, value)
     identifier = flight.command("goto 45 0")
@@ -57,7 +57,7 @@ def test_px4_failsafe_has_its_cause_and_is_left_to_px4(
 
 
 def test_other_mode_change_is_reported_as_pilot() -> None:
-    flight = LockstepFlight.airborne(seed=4)
+    flight = LockstepFlight.of_vehicle(in_the_air(seed=4))
     identifier = flight.command("goto 30 0")
     flight.run(3.0)
     flight.vehicle.vehicle.autopilot.set_mode(Mode.HOLD)

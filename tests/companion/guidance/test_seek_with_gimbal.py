@@ -27,7 +27,7 @@ from tests.companion.guidance.gimbal_flight import (
     gimbal_flight,
     person,
 )
-from tests.companion.guidance.guidance_harness import assert_failed
+from tests.companion.guidance.guidance_harness import assert_failed, in_the_air
 
 # Bounds of the combined errors of image, gimbal and estimator.
 DIRECTION_BOUND_RAD, PLACE_BOUND_M = math.radians(1.5), 0.6
@@ -100,7 +100,7 @@ def test_sweep_finds_an_object_nearly_below(bearing_deg: float) -> None:
 def test_mission_step_holds_until_the_gimbal_points_there() -> None:
     table = '[[step]]\ndo = "gimbal pitch=-50"\n[[step]]\ndo = "hold duration=1"\n'
     mission = SequenceBehaviour(plan_from(table, "looks"), lambda behaviour: None)
-    flight = LockstepFlight.airborne(seed=5, height_m=HEIGHT_M, gimbal=True)
+    flight = LockstepFlight.of_vehicle(in_the_air(seed=5, height_m=HEIGHT_M, gimbal=True))
     log = flight.fly(mission, 20.0)
     assert log.outcome is not None
     assert log.outcome.success, log.outcome.reason
