@@ -89,9 +89,8 @@ def test_followers_keep_their_slots_through_turns(shape: str) -> None:
 
 
 def test_joining_vehicle_gets_a_slot_with_separation() -> None:
-    fleet = flying(5, as_text=True)
+    fleet = flying(5, positions=[(0.0, 0.0), (0.0, -6.0), (0.0, 6.0), (-6.0, 6.0), (-12.0, 0.0)])
     follow(fleet, "bc", "line")
-    # c takes a detour: d and e are on the direct path.
     assert fleet.run_until(lambda: settled(fleet, "bc"), 60.0)
     follow(fleet, "de", "line")
     assert fleet.run_until(lambda: settled(fleet, "bcde"), 40.0)
@@ -156,17 +155,7 @@ def test_followers_hold_without_leader_and_resume() -> None:
     assert separated(fleet)
 
 
-def test_slots_are_kept_when_the_assigning_vehicle_is_lost() -> None:
-    fleet = flying(4)
-    follow(fleet, "bcd", "wedge")
-    assert fleet.run_until(lambda: settled(fleet, "bcd"), 30.0)
-    before = slots(fleet, "b")
-    fleet.members["b"].muted = True
-    fleet.run(3.0)
-    assert slots(fleet, "c") == before
-
-
-def test_command_to_one_changes_the_shape_for_all() -> None:
+def test_shape_changes_for_all_and_slots_outlast_their_assigner() -> None:
     fleet = flying(4)
     follow(fleet, "bcd", "wedge")
     assert fleet.run_until(lambda: settled(fleet, "bcd"), 30.0)
@@ -178,13 +167,17 @@ def test_command_to_one_changes_the_shape_for_all() -> None:
         assert behaviour is not None
         assert "line" in behaviour.status
     assert separated(fleet)
+    before = slots(fleet, "b")
+    fleet.members["b"].muted = True
+    fleet.run(3.0)
+    assert slots(fleet, "c") == before
 
 
 def test_requested_slot_is_assigned_once() -> None:
     fleet = flying(4)
     follow(fleet, "b", "line", slot=3)
     follow(fleet, "c", "line")
-    assert fleet.run_until(lambda: settled(fleet, "bc"), 30.0)
+    fleet.run(2.0)
     assert slots(fleet, "b") == {"b": 3, "c": 1}
     follow(fleet, "d", "line", slot=3)
     fleet.run(2.0)
