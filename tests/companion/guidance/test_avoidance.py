@@ -12,6 +12,7 @@ import pytest
 from companion.guidance.behaviours.approach import ApproachBehaviour
 from companion.guidance.behaviours.goto import GotoBehaviour
 from companion.guidance.behaviours.hold import HoldBehaviour
+from companion.guidance.behaviours.patrol import PatrolBehaviour
 from companion.guidance.core import GuidanceOptions
 from companion.guidance.interface import EventKind, GuidanceInput, GuidanceOutput
 from companion.guidance.limits.obstacles import ObstacleRules
@@ -74,6 +75,13 @@ def test_goto_flies_the_planned_path() -> None:
     request = harness.path_requests[0]
     assert request.clearance_m == pytest.approx(1.2)
     assert request.reference[-1] == pytest.approx((12.0, 0.0), abs=0.1)
+
+
+def test_patrol_flies_the_planned_path() -> None:
+    harness = harness_with(around(3.0))
+    harness.run(0.1)
+    harness.command(PatrolBehaviour(((0.0, 0.0), (12.0, 0.0)), ["car"]))
+    harness.until(lambda: harness.vehicle.position[1] > 2.0, 10.0)
 
 
 def test_flown_path_is_shown_while_it_is_flown() -> None:

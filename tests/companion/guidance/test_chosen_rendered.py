@@ -78,7 +78,7 @@ def test_follow_by_track_keeps_to_the_farther_of_two_cars() -> None:
     log = seen.flight.fly(f"follow track={farther.track_id} distance=9", 30.0)
     assert log.outcome is not None
     assert log.outcome.reason == "in progress"
-    seen.flight.run(10.0)
+    seen.flight.run(8.0)
     assert seen.flight.guidance.busy
     assert seen.range_m(1) == pytest.approx(9.0, abs=0.8)
 
