@@ -47,7 +47,7 @@ from vision.path_planner import PathRequest
 
 CLIMB_MPS = 1.5
 DISARM_AFTER_LANDING_S = 2.0
-STEP_S = 0.02
+STEP_S = 0.04  # the service steps every 0.05 s (`guidance.rate_hz`)
 SHOWN_TIMEOUT_S = 3.0
 
 _airborne = cache(vehicle_in_the_air)
@@ -258,7 +258,7 @@ class Pending:
 
 
 class GuidanceHarness:
-    """Autopilot, streamer and guidance at 50 Hz of a simulated clock.
+    """Autopilot, streamer and guidance in steps of `STEP_S` of a simulated clock.
 
     Args:
         options: of guidance.

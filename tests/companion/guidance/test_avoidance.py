@@ -18,7 +18,7 @@ from companion.guidance.interface import EventKind, GuidanceInput, GuidanceOutpu
 from companion.guidance.limits.obstacles import ObstacleRules
 from companion.recording.encoding import decode, encode
 from companion.settings.reading import ConfigurationError, load_settings
-from tests.companion.guidance.guidance_harness import GuidanceHarness, assert_failed, flying
+from tests.companion.guidance.guidance_harness import STEP_S, GuidanceHarness, assert_failed, flying
 from tests.companion.guidance.kinematic_vehicle import SeenObject, look
 from vision.path_planner import PlannedPath
 
@@ -59,7 +59,7 @@ def flown(harness: GuidanceHarness, seconds: float) -> list[tuple[float, ...]]:
     harness.run(0.1)
     harness.command(GotoBehaviour(from_here_m=(12.0, 0.0), speed_mps=2.0))
     track = []
-    for _ in range(round(seconds / 0.02)):
+    for _ in range(round(seconds / STEP_S)):
         harness.run()
         track.append(tuple(harness.vehicle.position))
     return track
@@ -131,7 +131,7 @@ def test_approach_flies_the_planned_path_to_a_hidden_object() -> None:
     harness.run(0.1)
     pending = harness.command(ApproachBehaviour("car", distance_m=5.0))
     aside: list[float] = []
-    while not pending.done() and len(aside) < 2000:
+    while not pending.done() and len(aside) < 1000:
         harness.run()
         aside.append(harness.vehicle.position[1])
     assert pending.result().success, pending.result().reason
@@ -158,7 +158,7 @@ def test_nothing_beyond_the_observed_part_is_flown() -> None:
     track = flown(harness_with(around(0.0, free_m=0.0)), 6.0)
     assert max(north for north, _, _ in track) < 0.5
     slow = flown(harness_with(around(0.0, free_m=1.5)), 6.0)
-    fastest = max(math.dist(a, b) / 0.02 for a, b in pairwise(slow))
+    fastest = max(math.dist(a, b) / STEP_S for a, b in pairwise(slow))
     assert 0.5 < fastest < 1.42  # stops within 1 m at 1 m/s²
 
 

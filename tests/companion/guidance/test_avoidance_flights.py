@@ -71,9 +71,7 @@ class Flight:
     [
         pytest.param("goto north=14 east=0 speed=2", (14.0, 0.0), marks=pytest.mark.slow),
         ("follow-path points=3,0;14,0;14,4 speed=2", (14.0, 4.0)),
-        pytest.param(
-            "patrol points=0,0;11,0 classes=car laps=1 speed=2", (0.0, 0.0), marks=pytest.mark.slow
-        ),
+        pytest.param("patrol points=0,0;11,0 classes=car laps=1 speed=2", (0.0, 0.0), marks=pytest.mark.slow),
     ],
     ids=["goto", "follow-path", "patrol"],
 )

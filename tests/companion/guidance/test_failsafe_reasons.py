@@ -13,7 +13,14 @@ from companion.vehicle.report import Report
 from companion.vehicle.state import FlightMode
 from mavlink_sim.px4.modes import Mode
 from mavlink_sim.wire.messages import dialect
-from tests.companion.guidance.guidance_harness import GuidanceHarness, assert_failed, engaged, flying, in_the_air
+from tests.companion.guidance.guidance_harness import (
+    STEP_S,
+    GuidanceHarness,
+    assert_failed,
+    engaged,
+    flying,
+    in_the_air,
+)
 
 SOON = {"COM_FAIL_ACT_T": 0.0}
 FENCE = {"GF_MAX_HOR_DIST": 10.0}
@@ -95,9 +102,9 @@ def test_heartbeat_first_stops_stream_and_waits_for_reason(
     future = engaged(harness, OrbitBehaviour())
     harness.autopilot.change_mode(FlightMode.RETURN)
     changed_ns.append(harness.vehicle.now_ns)
-    harness.run(0.02)
+    harness.run()
     sent = len(harness.autopilot.setpoints)
-    harness.run(max(late_s, 0.02))
+    harness.run(max(late_s, STEP_S))
     if late_s > REASON_WAIT_S:  # never reported: not requested by us
         who = "pilot took over"
     assert_failed(future.result(), who, "return mode")

@@ -17,6 +17,7 @@ from companion.guidance.interface import EventKind
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode
 from tests.companion.guidance.guidance_harness import (
+    STEP_S,
     GuidanceHarness,
     assert_failed,
     engaged,
@@ -46,7 +47,7 @@ def test_hold_follows_a_behaviour_until_the_next_command() -> None:
     assert (harness.outcome(future)).success
     sent = len(harness.autopilot.setpoints)
     harness.run(2.0)
-    assert len(harness.autopilot.setpoints) >= sent + 99
+    assert len(harness.autopilot.setpoints) >= sent + round(2.0 / STEP_S) - 1
     assert harness.guidance.behaviour is not None
     assert harness.guidance.behaviour.name == "hold"
     assert not harness.guidance.busy
@@ -320,7 +321,7 @@ def test_sent_setpoint_is_passed_to_the_behaviour() -> None:
     assert harness.guidance.sent.velocity_ned_mps == pytest.approx((5.0, 0.0, 0.0))
     assert harness.guidance.limited_by
     dt_s, sent = behaviour.seen[-1]
-    assert dt_s == pytest.approx(0.02)
+    assert dt_s == pytest.approx(STEP_S)
     assert sent is not None
     assert sent.velocity_ned_mps == pytest.approx((5.0, 0.0, 0.0))
 

@@ -24,7 +24,14 @@ from companion.guidance.interface import Answer, CommandInput, EventKind, FindGi
 from companion.guidance.mode_control import Phase
 from companion.vehicle.gimbal import NOBODY, GimbalState, YawFrame
 from companion.vehicle.state import FlightMode, LandedState
-from tests.companion.guidance.guidance_harness import GuidanceHarness, engaged, flying, kinds, parked
+from tests.companion.guidance.guidance_harness import (
+    STEP_S,
+    GuidanceHarness,
+    engaged,
+    flying,
+    kinds,
+    parked,
+)
 
 
 def test_takeoff_without_position_stops_climbing() -> None:
@@ -107,7 +114,7 @@ def test_mode_change_after_a_command_supersedes_it() -> None:
     harness.run(0.1)
     given = CommandInput(99, "hold", HoldBehaviour(), mode_changes=harness.autopilot.mode_changes)
     harness.autopilot.change_mode(FlightMode.POSITION)
-    harness.autopilot.step(0.02)
+    harness.autopilot.step(STEP_S)
     harness.step(given)
     assert " position, armed)" in harness.results[99].reason
     harness.run(1.0)

@@ -22,7 +22,7 @@ from companion.guidance.limits.envelope import Limits
 from companion.guidance.path import ACCELERATION_MPS2, Path, PathFollower
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3, VehicleState
-from tests.companion.guidance.guidance_harness import Flight
+from tests.companion.guidance.guidance_harness import STEP_S, Flight
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle
 from vision.attitude import wrap_angle
 
@@ -58,7 +58,7 @@ def test_goto_flies_straight_with_yaw_along_the_path() -> None:
             math.hypot(*(b - a for a, b in zip(*pair, strict=True)))
             for pair in zip(flight.track, flight.track[1:], strict=False)
         )
-        < 3.2 / 50
+        < 3.2 * STEP_S
     )
 
 
@@ -206,7 +206,7 @@ def test_slow_climb_keeps_its_speed() -> None:
     flight, outcome = active(behaviour)
     assert outcome.success
     steps = itertools.pairwise(flight.track)
-    assert max(abs(b[2] - a[2]) for a, b in steps) < 0.25 / 50
+    assert max(abs(b[2] - a[2]) for a, b in steps) < 0.25 * STEP_S
 
 
 @pytest.mark.parametrize("text", ["goto 1 2", "follow-path 1,2 3,4", "goto forward=1 right=1 altitude=5"])
@@ -225,7 +225,7 @@ def test_figure_eight_stays_on_its_line() -> None:
     assert outcome.success, outcome.reason
     line = lemniscate((0.0, 0.0, -5.0), 0.7, 10.0)
     legs = list(zip(line, line[1:] + line[:1], strict=True))
-    settled = flight.track[100::5]
+    settled = flight.track[50::3]
     assert max(min(off_the_line(position, *leg) for leg in legs) for position in settled) < 0.8
     ends = [(s * 10 * math.cos(0.7), s * 10 * math.sin(0.7), -5.0) for s in (1, -1)]
     for end in ends:

@@ -8,7 +8,7 @@ from companion.guidance.behaviours.patrol import Patrol, PatrolBehaviour
 from companion.guidance.command import NO_CONTEXT
 from companion.guidance.grammar import parse
 from companion.vehicle.state import FlightMode
-from tests.companion.guidance.guidance_harness import Flight, GuidanceHarness, assert_failed
+from tests.companion.guidance.guidance_harness import STEP_S, Flight, GuidanceHarness, assert_failed
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
 
 ROUND = ((0.0, 0.0), (24.0, 0.0), (24.0, 24.0), (0.0, 24.0))
@@ -63,7 +63,7 @@ def test_patrol_stops_faces_reports_and_continues() -> None:
     assert len(notes) == 1
     assert notes[0].startswith("patrol: found a car (track 7)")
     assert "18.0 m north and 6.0 m east" in notes[0]
-    assert len(standing) * 0.02 > 3.5
+    assert len(standing) * STEP_S > 3.5
     point, yaw = standing[-1]
     assert yaw == pytest.approx(math.atan2(6.0 - point[1], 18.0 - point[0]), abs=math.radians(4))
     # Every part of the path was flown.

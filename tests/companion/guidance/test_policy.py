@@ -194,7 +194,7 @@ def test_bundled_policy_brakes_a_second_after_losing_its_object() -> None:
     speeds: dict[float, float] = {}
 
     def each(seconds: float, vehicle: KinematicVehicle) -> None:
-        car.visible = seconds < 3.0
+        car.visible = seconds < 2.9
         speeds[round(seconds, 1)] = math.hypot(*vehicle.velocity)
 
     flight = Flight(parse("policy approach class=car distance=6").build(NO_CONTEXT), vehicle, [car])
