@@ -14,7 +14,7 @@ from vision.detector import Detector
 
 @pytest.fixture(scope="module")
 def seen() -> list[View]:
-    return list(views(7, 14))
+    return list(views(7, 12))
 
 
 def test_a_seed_gives_the_same_frames(seen: list[View]) -> None:

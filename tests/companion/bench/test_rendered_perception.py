@@ -21,6 +21,7 @@ from companion.settings.reading import load_settings
 from mavlink_sim.camera.process import CameraProcess
 from mavlink_sim.camera.scene_file import scene_or_demo
 from mavlink_sim.lockstep import LockstepVehicle
+from mavlink_sim.world.world import Ground
 from vision.frame import Frame
 from vision.pipeline import PerceptionResult
 from vision.shared_frame import SharedFrameReader, SharedFrameWriter, segment_path
@@ -36,6 +37,9 @@ CAMERA = {
     "detector.image_size": "320",
     "detector.threads": "1",
 }
+# The demonstration's, on a ground that is painted soon, also by the camera's process.
+DEMO = scene_or_demo(None, SEED)
+SCENE = replace(DEMO, world=replace(DEMO.world, ground=Ground(("grass",), SEED, 256, 0.1)))
 
 
 def settings_of(**changes: str) -> Settings:
@@ -62,10 +66,10 @@ def add_attitude(perception: RenderedPerception, vehicle: LockstepVehicle, now_n
 
 
 def flown(seed: int, frames: int) -> list[PerceptionResult]:
-    """By a vehicle of that seed in one world, whose ground takes long to paint."""
+    """By a vehicle of that seed in one world."""
     vehicle = LockstepVehicle(seed=seed)
     vehicle.take_off(4.0)
-    perception = RenderedPerception(settings_of(), vehicle, scene_or_demo(None, SEED))
+    perception = RenderedPerception(settings_of(), vehicle, SCENE)
     results = []
     for _ in range(frames):
         vehicle.step(0.1)
@@ -90,7 +94,7 @@ def test_same_seed_gives_same_results() -> None:
 
 
 def test_stamps_are_of_the_simulated_clock(airborne: LockstepVehicle) -> None:
-    perception = RenderedPerception(settings_of(), airborne, scene_or_demo(None, SEED))
+    perception = RenderedPerception(settings_of(), airborne, SCENE)
     captured = perception.capture(5_000_000_000)
     assert captured is not None
     result = perception.process(captured.frame, 5_080_000_000)
@@ -100,7 +104,7 @@ def test_stamps_are_of_the_simulated_clock(airborne: LockstepVehicle) -> None:
 
 def test_stale_frames_are_left_out_by_the_simulated_clock(airborne: LockstepVehicle) -> None:
     perception = RenderedPerception(
-        settings_of(detector__max_age_s="0.5"), airborne, scene_or_demo(None, SEED)
+        settings_of(detector__max_age_s="0.5"), airborne, SCENE
     )
     captured = perception.capture(5_000_000_000)
     assert captured is not None
@@ -111,11 +115,11 @@ def test_stale_frames_are_left_out_by_the_simulated_clock(airborne: LockstepVehi
 
 def test_frame_is_the_camera_process_s_frame(airborne: LockstepVehicle, segment: str) -> None:
     """The first of a real-time run for the same seed and pose, the sensor's noise included."""
-    perception = RenderedPerception(settings_of(), airborne, scene_or_demo(None, SEED))
+    perception = RenderedPerception(settings_of(), airborne, SCENE)
     stamp_ns, truth = time.monotonic_ns(), airborne.truth
     here = perception.capture(stamp_ns)
     assert here is not None
-    camera = CameraProcess(scene_or_demo(None, SEED), rate_hz=30.0, shared_name=segment)
+    camera = CameraProcess(SCENE, rate_hz=30.0, shared_name=segment)
     camera.start()
     try:
         camera.send_pose(truth.position_ned_m, truth.quaternion, stamp_ns, airborne.vehicle.faults.now_s)
@@ -138,7 +142,7 @@ async def test_result_is_the_worker_s_result(airborne: LockstepVehicle, segment:
         # A worker measures which precision is faster, and a busy computer decides otherwise.
         detector__precision="float32",
     )
-    perception = RenderedPerception(settings, airborne, scene_or_demo(None, SEED))
+    perception = RenderedPerception(settings, airborne, SCENE)
     stamp_ns, truth = time.monotonic_ns(), airborne.truth
     captured = perception.capture(stamp_ns)
     assert captured is not None

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from benchmarks.flights_obstacles import ALLOWED_M, MARGIN_M, run
+from benchmarks import flights_obstacles
+from benchmarks.flights_obstacles import ALLOWED_M, MARGIN_M
 from companion.bus.messages import obstacles_message
 from companion.guidance.behaviour import BehaviourContext
 from companion.guidance.behaviours.goto import GotoBehaviour
@@ -251,10 +252,11 @@ def test_message_distinguishes_unknown_from_free() -> None:
 
 
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
-def test_goto_stops_before_an_obstacle(seed: int) -> None:
-    result = run(seed)
+def test_goto_stops_before_an_obstacle(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(flights_obstacles, "FLIGHT_S", 12.0)
+    result = flights_obstacles.run(seed)
     assert result.success, result.reason
-    assert result.values["nearest_m"] >= MARGIN_M - ALLOWED_M
+    assert MARGIN_M - ALLOWED_M <= result.values["nearest_m"] < MARGIN_M + 1.0
 
 
 @pytest.mark.parametrize("height_m", [-2.0, 0.0, 0.3, 3.0])
