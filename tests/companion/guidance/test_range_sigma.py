@@ -1,4 +1,4 @@
-"""The stated sigma of a range holds: of 10,000 simulated targets, 63 to 73 % of the errors are within it."""
+"""The stated sigma of a range holds: of 5,000 simulated targets, 63 to 73 % of the errors are within it."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from vision.geolocation import DEPTH_OF_WIDTH, ErrorEllipse, position_covariance
 from vision.rotation import matrix_from_quaternion
 
 CAMERA = CameraModel.from_horizontal_fov(1280, 960, math.radians(80))
-COUNT = 3_400  # 10,200 in all
+COUNT = 1_700  # 5,100 in all
 T0 = 5_000_000_000
 ERROR = range_error.PoseError()
 Vector = NDArray[np.float64]
