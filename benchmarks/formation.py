@@ -17,10 +17,10 @@ from typing import Any
 from companion.bench.lockstep_flight import TICK_S, LockstepFlight, plain_settings
 from companion.bench.simulated_driver import SimulatedDriver
 from companion.bus.vehicle_messages import pose_message
+from companion.geometry.geodesy import GeodeticOrigin
 from companion.guidance.behaviour import Behaviour, Outcome
 from companion.guidance.behaviours.formation import FormationBehaviour
 from companion.guidance.behaviours.hold import HoldBehaviour
-from companion.guidance.formation.neighbours import Anchor
 from companion.guidance.formation.pose import pose_from_message
 from companion.guidance.interface import Answer, EventKind, Request, SetMode
 from companion.guidance.limits.envelope import Limits
@@ -41,7 +41,7 @@ POSES_HZ = 10.0
 # Of what PX4 sends a companion by itself, what its state is made of.
 _FOLDED_RATES_HZ = {name: rate_hz for name, rate_hz in ONBOARD_RATES_HZ.items() if name in TELEMETRY_MESSAGES}
 # Where the fleet's common frame has its origin; any place away from the poles would do.
-_ORIGIN = Anchor(47.3977, 8.5456, 488.0, (0.0, 0.0, 0.0))
+_ORIGIN = GeodeticOrigin(47.3977, 8.5456, 488.0)
 
 
 class LockstepAirframe(SimulatedDriver):
@@ -80,7 +80,10 @@ class LockstepAirframe(SimulatedDriver):
 
 
 class PointAirframe:
-    """A point that follows velocities by a first-order lag, in gusts; its estimate errs by centimetres."""
+    """A point that follows velocities by a first-order lag, in gusts; its estimate errs by centimetres.
+
+    The estimate is new with every second step, as an autopilot's at 50 Hz.
+    """
 
     LAG_S = 0.35
 
@@ -94,6 +97,7 @@ class PointAirframe:
         self._setpoint: Setpoint | None = None
         self._mode = FlightMode.HOLD
         self._answers: list[Answer] = []
+        self._steps = 0
         self.state = self._estimate()
 
     def place(self) -> Vector3:
@@ -127,7 +131,7 @@ class PointAirframe:
     def _estimate(self) -> VehicleState:
         now_ns = self.now_ns
         north, east, down = (value + self._chance.gauss(0.0, 0.03) for value in self._place)
-        latitude, longitude, altitude_m = _ORIGIN.globally((north, east, down))
+        latitude, longitude, altitude_m = _ORIGIN.place((north, east, down))
         v_north, v_east, v_down = (value + self._chance.gauss(0.0, 0.05) for value in self._velocity)
         return VehicleState(
             heartbeat_ns=now_ns,
@@ -146,7 +150,7 @@ class PointAirframe:
             latitude_deg=latitude,
             longitude_deg=longitude,
             altitude_amsl_m=altitude_m,
-            home_altitude_amsl_m=_ORIGIN.altitude_m,
+            home_altitude_amsl_m=_ORIGIN.altitude_amsl_m,
             home_position_ned_m=(0.0, 0.0, 0.0),
         )
 
@@ -177,7 +181,9 @@ class PointAirframe:
         self._yaw_rate_radps += (rate - self._yaw_rate_radps) * share
         self._yaw_rad = wrap_angle(self._yaw_rad + self._yaw_rate_radps * dt_s)
         self.now_ns += round(dt_s * 1e9)
-        self.state = self._estimate()
+        self._steps += 1
+        if self._steps % 2 == 0:
+            self.state = self._estimate()
 
 
 @dataclass(frozen=True, slots=True)
