@@ -73,15 +73,6 @@ def test_service_flies_an_installed_plugin(
     flags = ["--source", "none", "--plugins-modules", "circle"]
     with running_service(vehicle.onboard_port, flags, cwd=tmp_path) as service:
         service.take_off(3.0)
-        send = [
-            sys.executable,
-            "-m",
-            "companion.cli",
-            "send",
-            "circle radius=4",
-            "--connect",
-            service.endpoint,
-        ]
-        sent = subprocess.run(send, capture_output=True, text=True, timeout=60, cwd=tmp_path)
-        assert sent.returncode == 0, sent.stderr
+        reply = service.command("circle radius=4")
+        assert reply["success"], reply
         assert service.command("land")["success"]
