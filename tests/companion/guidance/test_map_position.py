@@ -213,7 +213,7 @@ def test_without_gnss_above_a_map_the_vehicle_holds_0_3_m(tmp_path: Path, seed: 
 def test_without_localise_or_fusion_the_position_is_lost(
     tmp_path: Path, localise: bool, control: int
 ) -> None:
-    flight = flight_above(tmp_path, 1, localise=localise, control=control, rate_hz=2.0)
+    flight = flight_above(tmp_path, 1, localise=localise, control=control, rate_hz=1.0)
     flight.vehicle.vehicle.faults.begin("gps_loss")
     flight.run(7.0)
     assert not flight.vehicle.vehicle.vision.position_fused
