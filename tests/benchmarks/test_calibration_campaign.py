@@ -26,7 +26,7 @@ def test_seed_gives_its_lens() -> None:
 
 
 def test_fisheye_is_calibrated_from_rendered_views() -> None:
-    check_lens(3, 10)
+    check_lens(3, 7)
 
 
 def test_mounts_are_measured_by_two_processes_in_order_of_seeds(capsys: pytest.CaptureFixture[str]) -> None:
