@@ -103,9 +103,7 @@ def test_stamps_are_of_the_simulated_clock(airborne: LockstepVehicle) -> None:
 
 
 def test_stale_frames_are_left_out_by_the_simulated_clock(airborne: LockstepVehicle) -> None:
-    perception = RenderedPerception(
-        settings_of(detector__max_age_s="0.5"), airborne, SCENE
-    )
+    perception = RenderedPerception(settings_of(detector__max_age_s="0.5"), airborne, SCENE)
     captured = perception.capture(5_000_000_000)
     assert captured is not None
     assert perception.process(captured.frame, 5_400_000_000) is not None
