@@ -94,9 +94,16 @@ def as_foreign(model: YoloModel, classes: Classes, **attributes: Any) -> Any:
         module.__dict__["_modules"] = {
             key: None if child is None else relabelled(child) for key, child in module._modules.items()
         }
+        module.__dict__["_parameters"] = {
+            key: None if weight is None else nn.Parameter(weight.detach().half())
+            for key, weight in module._parameters.items()
+        }
+        module.__dict__["_buffers"] = {
+            key: buffer.half() if buffer.is_floating_point() else buffer
+            for key, buffer in module._buffers.items()
+        }
         return module
 
-    model = copy.deepcopy(model)
     table = model.description.to_plain()
     whole: Any = classes["DetectionModel"]()
     whole.model = nn.Sequential(*[relabelled(layer) for layer in model.model])
@@ -109,7 +116,7 @@ def as_foreign(model: YoloModel, classes: Classes, **attributes: Any) -> Any:
     whole.stride = strides
     for name, value in attributes.items():
         setattr(whole, name, value)
-    return whole.half()
+    return whole
 
 
 def save_foreign(path: Path, model: nn.Module, **content: Any) -> Path:
