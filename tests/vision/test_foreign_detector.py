@@ -59,6 +59,21 @@ def exports(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return found
 
 
+OPTIONS: dict[str, Any] = {"image_size": 96, "confidence": 0.3, "threads": 1, "precision": "float32"}
+
+
+@pytest.fixture(scope="module")
+def image() -> Any:
+    """Without padding, so that a fixed size and a multiple of the stride are the same input."""
+    return make_image(64, 96, seed=3)
+
+
+@pytest.fixture(scope="module")
+def expected(exports: dict[str, Path], image: Any) -> Detections:
+    """The boxes of the checkpoint."""
+    return Detector(exports["checkpoint"], square=False, **OPTIONS).detect(image)
+
+
 def assert_same_boxes(expected: Detections, found: Detections) -> None:
     assert len(expected) == len(found)
     np.testing.assert_allclose(expected.xyxy, found.xyxy, atol=0.05)
@@ -77,18 +92,13 @@ def assert_same_boxes(expected: Detections, found: Detections) -> None:
     ],
 )
 def test_export_has_the_boxes_of_its_checkpoint(
-    exports: dict[str, Path], kind: str, runtime: RuntimeChoice
+    exports: dict[str, Path], image: Any, expected: Detections, kind: str, runtime: RuntimeChoice
 ) -> None:
     if runtime == "openvino":
         needs("openvino")
-    options: dict[str, Any] = {"confidence": 0.3, "threads": 1, "precision": "float32"}
-    checkpoint = Detector(exports["checkpoint"], image_size=96, square=False, **options)
     # Without a name on the runtime of its kind.
     named = runtime if (kind, runtime) == ("fixed", "openvino") else None
-    export = Detector(exports[kind], image_size=96, runtime=named, **options)
-    # Without padding, so that a fixed size and a multiple of the stride are the same input.
-    image = make_image(64, 96, seed=3)
-    expected = checkpoint.detect(image)
+    export = Detector(exports[kind], runtime=named, **OPTIONS)
     assert len(expected) > 3
     assert_same_boxes(expected, export.detect(image))
     assert (export.class_names, export.runtime) == (NAMES, runtime)
@@ -97,8 +107,7 @@ def test_export_has_the_boxes_of_its_checkpoint(
     assert export.foreign.fixed_size == (None if kind == "dynamic" else SIZE)
 
 
-def test_classes_are_filtered_after_the_best_is_known(exports: dict[str, Path]) -> None:
-    image = make_image(64, 96, seed=3)
+def test_classes_are_filtered_after_the_best_is_known(exports: dict[str, Path], image: Any) -> None:
     every = Detector(exports["fixed"], confidence=0.3, runtime="onnxruntime").detect(image)
     wanted = every.class_names[int(every.class_id[0])]
     some = Detector(exports["fixed"], classes=[wanted], confidence=0.3, runtime="onnxruntime").detect(image)

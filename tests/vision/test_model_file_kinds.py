@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+import tempfile
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -111,6 +113,13 @@ def torchscript_with_nms(folder: Path) -> Path:
         )
     finally:
         library._destroy()
+
+
+@cache
+def torchscript() -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        made = ultralytics_torchscript(Path(folder) / "net.torchscript", lively_model(), SIZE)
+        return made.read_bytes()
 
 
 def written(name: str, content: bytes) -> Callable[[Path], Path]:
@@ -231,13 +240,9 @@ FILES: dict[str, Callable[[Path], Path]] = {
     "ONNX with boxes and logits": CONSTANT["ONNX with boxes and logits"],
     "other ONNX, also of YOLO-NAS": bare({"out": zeros(1, 5)}),
     "Ultralytics OpenVINO folder": CONSTANT["Ultralytics OpenVINO folder"],
-    "Ultralytics TorchScript": lambda folder: ultralytics_torchscript(
-        folder / "net.torchscript", lively_model(), SIZE
-    ),
+    "Ultralytics TorchScript": lambda folder: written("net.torchscript", torchscript())(folder),
     "… with `nms=True` (TorchScript)": torchscript_with_nms,
-    "TorchScript named `.pt`": lambda folder: ultralytics_torchscript(
-        folder / "net.pt", lively_model(), SIZE
-    ),
+    "TorchScript named `.pt`": lambda folder: written("net.pt", torchscript())(folder),
     "TensorRT plan of others": written("net.engine", bytes(64)),
     "`.tflite` and others": written("net.tflite", b"\x1c\x00\x00\x00TFL3"),
 }

@@ -91,16 +91,22 @@ def test_exported_network_matches_torch_at_every_size(
     assert found.threads >= 1
 
 
+ASKED: dict[str, Any] = {"image_size": 96, "precision": "float32", "classes": ["car", "boat"]}
+
+
+@pytest.fixture(scope="module")
+def source(checkpoint: Path) -> Detector:
+    return Detector(checkpoint, **ASKED)
+
+
 @pytest.mark.parametrize(("kind", "runtime"), PAIRS)
 def test_an_exported_file_is_a_model_by_itself(
-    exported: Any, checkpoint: Path, kind: ExportKind, runtime: RuntimeName
+    exported: Any, checkpoint: Path, source: Detector, kind: ExportKind, runtime: RuntimeName
 ) -> None:
     """Without a name it runs on the runtime of its kind: for `.onnx` that is ONNX Runtime."""
     needs(runtime)
     path, named = exported(kind), (kind, runtime) == ("onnx", "openvino")
-    asked: Any = {"image_size": 96, "precision": "float32", "classes": ["car", "boat"]}
-    alone = Detector(path, runtime=runtime if named else None, threads=1, **asked)
-    source = Detector(checkpoint, **asked)
+    alone = Detector(path, runtime=runtime if named else None, threads=1, **ASKED)
     assert alone.class_names == class_names_of(path) == class_names_of(checkpoint) == NAMES
     assert alone.metadata == {"licence": "Apache-2.0"}
     assert (alone.runtime, alone.precision) == (runtime, "float32")
@@ -476,7 +482,7 @@ def tensorrt(monkeypatch: pytest.MonkeyPatch) -> StandInTensorRt:
 
 
 def test_plan_is_built_strongly_typed_from_float16(
-    tensorrt: StandInTensorRt, checkpoint: Path, tmp_path: Path
+    tensorrt: StandInTensorRt, checkpoint: Path, reference: TorchRuntime, tmp_path: Path
 ) -> None:
     onnx = pytest.importorskip("onnx")
     path = export(checkpoint, "tensorrt", tmp_path / "net.engine", image_size=96)
@@ -490,7 +496,7 @@ def test_plan_is_built_strongly_typed_from_float16(
     # The last convolution of the classes of each level stays in float32.
     assert convolved.count(onnx.TensorProto.FLOAT) == 3
     assert convolved.count(onnx.TensorProto.FLOAT16) == len(convolved) - 3 > 30
-    plan, reference = TensorRtRuntime(path), TorchRuntime(lively_model(), precision="float32")
+    plan = TensorRtRuntime(path)
     assert plan.precision == "float16"
     for size in ((96, 96), (64, 96)):
         for a, b in zip(plan.infer(make_image(*size)), reference.infer(make_image(*size)), strict=True):

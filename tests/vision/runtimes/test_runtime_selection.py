@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from tests.vision.runtimes.conftest import make_image, needs
+from vision.detections import Detections
 from vision.detector import Detector
 from vision.runtimes import autotune, base, stored_choice
 from vision.runtimes.base import RuntimeMissingError, RuntimeName, RuntimeUnusableError, installed
@@ -103,21 +104,29 @@ def test_openvino_does_not_report_its_use(tmp_path: Path, imported_before: bool)
     assert (before > 0) == imported_before  # of its import, which it reports itself
 
 
+SETTINGS: dict[str, Any] = {"precision": "float32", "image_size": 96, "threads": 1, "confidence": 0.3}
+
+
+@pytest.fixture(scope="module")
+def every(checkpoint: Path) -> Detections:
+    return Detector(checkpoint, **SETTINGS).detect(make_image(64, 96))
+
+
 @pytest.mark.parametrize("runtime", ["onnxruntime", "openvino"])
-def test_checkpoint_is_converted_once_for_a_named_runtime(checkpoint: Path, runtime: RuntimeName) -> None:
+def test_checkpoint_is_converted_once_for_a_named_runtime(
+    checkpoint: Path, every: Detections, runtime: RuntimeName
+) -> None:
     needs(runtime, "onnx")
-    image = make_image(64, 96)
-    every = Detector(checkpoint, precision="float32", image_size=96, threads=1, confidence=0.3).detect(image)
     for classes in (None, ["car", "dog"]) if runtime == "onnxruntime" else (["car", "dog"],):
-        settings: dict[str, Any] = {"image_size": 96, "classes": classes, "threads": 1, "confidence": 0.3}
         reference = every if classes is None else every[np.isin(every.names, classes)]
         assert len(reference)
-        found = Detector(checkpoint, runtime=runtime, precision="float32", **settings).detect(image)
+        detector = Detector(checkpoint, runtime=runtime, classes=classes, **SETTINGS)
+        found = detector.detect(make_image(64, 96))
         assert found.names == reference.names
         assert found.confidence == pytest.approx(reference.confidence, abs=1e-3)
         assert found.xyxy == pytest.approx(reference.xyxy, abs=0.05)
     before = {path: path.stat().st_mtime_ns for path in cache_folder().iterdir()}
-    Detector(checkpoint, runtime=runtime, precision="float32", **settings)
+    Detector(checkpoint, runtime=runtime, classes=classes, **SETTINGS)
     assert {path: path.stat().st_mtime_ns for path in cache_folder().iterdir()} == before
 
 
