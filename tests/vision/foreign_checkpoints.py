@@ -99,7 +99,7 @@ def as_foreign(model: YoloModel, classes: Classes, **attributes: Any) -> Any:
             for key, weight in module._parameters.items()
         }
         module.__dict__["_buffers"] = {
-            key: buffer.half() if buffer.is_floating_point() else buffer
+            key: buffer.half() if buffer is not None and buffer.is_floating_point() else buffer
             for key, buffer in module._buffers.items()
         }
         return module

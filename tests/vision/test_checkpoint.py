@@ -77,6 +77,15 @@ def test_metadata_must_be_plain_values(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """The content of a model that we saved."""
+    path = tmp_path_factory.mktemp("saved") / "m.pt"
+    save_checkpoint(path, trained_model(), metadata={})
+    content: dict[str, Any] = torch.load(path, weights_only=True)
+    return content
+
+
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
@@ -89,10 +98,9 @@ def test_metadata_must_be_plain_values(tmp_path: Path) -> None:
     ],
 )
 def test_our_format_with_a_part_wrong_is_rejected(
-    tmp_path: Path, change: dict[str, Any], expected: str
+    tmp_path: Path, saved: dict[str, Any], change: dict[str, Any], expected: str
 ) -> None:
-    save_checkpoint(tmp_path / "m.pt", trained_model(), metadata={})
-    torch.save(torch.load(tmp_path / "m.pt", weights_only=True) | change, tmp_path / "m.pt")
+    torch.save(saved | change, tmp_path / "m.pt")
     with pytest.raises(CheckpointError, match=expected):
         load_checkpoint(tmp_path / "m.pt")
 
@@ -107,11 +115,10 @@ def test_our_format_with_a_part_wrong_is_rejected(
     ],
     ids=["shape", "type", "not a number", "unknown"],
 )
-def test_weights_that_do_not_fit_are_named(tmp_path: Path, key: str, tensor: Tensor, expected: str) -> None:
-    save_checkpoint(tmp_path / "m.pt", trained_model(), metadata={})
-    content = torch.load(tmp_path / "m.pt", weights_only=True)
-    content["state_dict"][key] = tensor
-    torch.save(content, tmp_path / "m.pt")
+def test_weights_that_do_not_fit_are_named(
+    tmp_path: Path, saved: dict[str, Any], key: str, tensor: Tensor, expected: str
+) -> None:
+    torch.save(saved | {"state_dict": saved["state_dict"] | {key: tensor}}, tmp_path / "m.pt")
     with pytest.raises(CheckpointError, match=expected):
         load_checkpoint(tmp_path / "m.pt")
 

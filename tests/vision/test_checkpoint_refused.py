@@ -210,16 +210,16 @@ def test_nested_references_are_rejected_at_once(tmp_path: Path, depth: int) -> N
         load_checkpoint(archive(tmp_path / "m.pt", program))
 
 
-@pytest.mark.parametrize("name", ["", "\x1b[2Jcar", "a\nb"])
-def test_unprintable_class_name_is_rejected(tmp_path: Path, name: str) -> None:
+def test_unprintable_name_of_a_class_or_weight_is_rejected(tmp_path: Path) -> None:
     save_checkpoint(tmp_path / "m.pt", trained_model(), metadata={})
     content = torch.load(tmp_path / "m.pt", weights_only=True)
-    content["description"]["names"] = [name, "dog"]
     content["state_dict"]["\x1b\n"] = torch.zeros(1)
-    torch.save(content, tmp_path / "m.pt")
-    with pytest.raises(CheckpointError, match="printable") as caught:
-        load_checkpoint(tmp_path / "m.pt")
-    assert str(caught.value).isprintable()
+    for name in ("", "\x1b[2Jcar", "a\nb"):
+        content["description"]["names"] = [name, "dog"]
+        torch.save(content, tmp_path / "m.pt")
+        with pytest.raises(CheckpointError, match="printable") as caught:
+            load_checkpoint(tmp_path / "m.pt")
+        assert str(caught.value).isprintable()
     content["description"]["names"] = ["car", "dog"]
     torch.save(content, tmp_path / "m.pt")
     with pytest.raises(CheckpointError, match="1 unknown") as caught:
@@ -323,7 +323,7 @@ def test_a_truncated_file_is_rejected_at_every_length(tmp_path: Path, own_bytes:
         assert str(path) in str(caught.value)
 
 
-@pytest.mark.parametrize("step", [4999, pytest.param(997, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("step", [9973, pytest.param(997, marks=pytest.mark.slow)])
 def test_truncated_pickle_is_rejected_at_several_lengths(
     tmp_path: Path, foreign_pickle: tuple[bytes, dict[str, bytes]], step: int
 ) -> None:
@@ -364,7 +364,7 @@ def test_a_file_with_changed_bytes_loads_or_is_rejected(
     loads_or_names_the_reason(tmp_path / "changed.pt")
 
 
-@UNHURRIED
+@settings(UNHURRIED, max_examples=30)
 @given(edits=EDITS)
 def test_a_pickle_with_changed_bytes_loads_or_is_rejected(
     tmp_path: Path, foreign_pickle: tuple[bytes, dict[str, bytes]], edits: list[tuple[float, int]]
