@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mavlink_sim.camera.renderer import Renderer
+from mavlink_sim.camera.renderer import Rendered, Renderer
 from mavlink_sim.world.fiducials import Print
 from mavlink_sim.world.world import Ground, World, WorldObject
 from vision.camera_model import CameraCalibration, CameraModel, CameraMount
@@ -109,15 +110,21 @@ class OneFrame(Capture):
         """Nothing is open."""
 
 
+PLATE_NED = (5.0, 0.7, 0.0)
+
+
+@cache
+def rendered_marker(mount: CameraMount) -> Rendered:
+    plate = WorldObject(0, "plate", PLATE_NED, 0.4, printed=Print("4X4_50", 7, 0.8))
+    world = World((plate,), Ground(("concrete",), 0, 256, 0.05))
+    return Renderer(world, LENS, mount).render((0.0, 0.0, -3.0), np.eye(3))
+
+
 @pytest.mark.parametrize("orientation", ORIENTATIONS, ids=str)
 def test_ground_point_is_ranged_equally_by_a_rotated_camera(orientation: Orientation) -> None:
     """A camera fixed with a roll, its image rotated back: the marker's place on the ground stays."""
-    plate_ned = (5.0, 0.7, 0.0)
-    plate = WorldObject(0, "plate", plate_ned, 0.4, printed=Print("4X4_50", 7, 0.8))
     mount = CameraMount(0.1, -0.05, 0.0, math.radians(orientation.rotate_deg), math.radians(-35.0), 0.0)
-    rendered = Renderer(World((plate,), Ground(("concrete",), 0, 256, 0.05)), LENS, mount).render(
-        (0.0, 0.0, -3.0), np.eye(3)
-    )
+    rendered = rendered_marker(mount)
     # Seen through a mirror, the camera delivers a mirror image and is calibrated with it.
     seen = Orientation(0, orientation.mirror)
     capture = OneFrame(
@@ -140,7 +147,7 @@ def test_ground_point_is_ranged_equally_by_a_rotated_camera(orientation: Orienta
     rays = PixelRays.of(calibration.model, calibration.mount, np.eye(3), pixel)
     column, row = np.rint(pixel[0]).astype(int)
     body_ned = np.array([0.0, 0.0, -3.0])
-    np.testing.assert_allclose(rays.on_ground(3.0)[0] + body_ned, plate_ned, atol=0.02)
+    np.testing.assert_allclose(rays.on_ground(3.0)[0] + body_ned, PLATE_NED, atol=0.02)
     np.testing.assert_allclose(
-        rays.at_depth(frame.depth_m[[row], [column]])[0] + body_ned, plate_ned, atol=0.03
+        rays.at_depth(frame.depth_m[[row], [column]])[0] + body_ned, PLATE_NED, atol=0.03
     )

@@ -9,7 +9,7 @@ from benchmarks.scenes import MOTIONS, Motion, SyntheticDetector, scene_frames, 
 from benchmarks.tracking import Seen, attitudes_of, no_tracking, tracked
 from vision.tracking import TrackerSettings
 
-SECONDS, RATE_HZ = 5.0, 10.0
+SECONDS, RATE_HZ = 3.0, 10.0
 SETTINGS = TrackerSettings()
 Scores = dict[str, dict[str, MotScore]]
 
