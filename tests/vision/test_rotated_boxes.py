@@ -21,7 +21,7 @@ from tests.vision.foreign_checkpoints import (
     save_foreign,
     trained_model,
 )
-from tests.vision.runtimes.conftest import make_image, needs
+from tests.vision.runtimes.conftest import make_image, needs, small_description
 from vision.detector import Detector
 from vision.foreign.layouts import TASKS
 from vision.runtimes.base import RuntimeUnusableError
@@ -42,10 +42,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def checkpoint(folder: Path, family: str) -> Path:
+    """With the head of this family."""
     path = folder / f"{family}.pt"
     if path.exists():
         return path
-    model = trained_model(rotated(published_description(family, SMALL, NAMES)))
+    description = replace(small_description(NAMES), light_classes=family == "YOLO11")
+    model = trained_model(rotated(description))
     with pytest.MonkeyPatch.context() as patch:
         classes = foreign_classes(patch, OBB_FOREIGN)
         whole = as_foreign(model, classes | {"DetectionModel": classes["OBBModel"]})
