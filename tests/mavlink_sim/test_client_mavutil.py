@@ -1,4 +1,4 @@
-"""pymavlink's mavutil, mavparm and mavftp as a client."""
+"""pymavlink's mavutil and mavparm as a client."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SPEED = 4.0
 REAL32, INT32 = 9, 6
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def simulator() -> Iterator[RunningSimulator]:
     with vehicle(speed=SPEED) as running:
         yield running
@@ -26,9 +26,12 @@ def simulator() -> Iterator[RunningSimulator]:
 
 @pytest.fixture
 def link(simulator: RunningSimulator) -> Iterator[Any]:
+    """To the vehicle on the ground, in LOITER."""
     connection = mavutil.mavlink_connection(simulator.pymavlink_device, source_system=255)
     assert connection.wait_heartbeat(timeout=20) is not None
     yield connection
+    connection.set_mode("LOITER")
+    until(connection, lambda: connection.flightmode == "LOITER")
     connection.close()
 
 
@@ -90,12 +93,3 @@ def test_all_parameters_are_fetched_written_and_saved(
     assert answer.param_type == INT32
     parameters.save(str(tmp_path / "saved.parm"))
     assert "MIS_TAKEOFF_ALT" in (tmp_path / "saved.parm").read_text()
-
-
-def test_mavftp_lists_the_root_folder(link: Any) -> None:
-    from pymavlink import mavftp
-
-    files = mavftp.MAVFTP(link, target_system=1, target_component=1)
-    files.cmd_list(["/"])
-    files.process_ftp_reply("ListDirectory", timeout=10)
-    assert files.list_result

@@ -8,6 +8,7 @@ import os
 import struct
 import zlib
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -384,7 +385,11 @@ def test_pymavlinks_own_client_stores_and_loads(simulator: RunningSimulator, tmp
     )
     try:
         link.wait_heartbeat(timeout=20)
+        link.recv_match = partial(link.recv_match, blocking=True)  # MAVFTP calls it in a loop without a wait
         ftp = mavftp.MAVFTP(link, 1, 1)
+        ftp.cmd_list(["/"])
+        ftp.process_ftp_reply("ListDirectory", timeout=10)
+        assert ftp.list_result
         assert ftp.cmd_put([str(source), "log/flight"]).error_code == 0
         assert ftp.process_ftp_reply("CreateFile", timeout=30).error_code == 0
         assert ftp.cmd_get(["log/flight", str(target)]).error_code == 0
