@@ -43,38 +43,68 @@ def run(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 @pytest.mark.realtime
-def test_passing_test_leaves_no_files(run: Any, pytester: pytest.Pytester) -> None:
+def test_vehicles_of_a_run(run: Any, pytester: pytest.Pytester) -> None:
+    """The options of the nearest marker, an option that does not exist, and what tests leave behind."""
     result = run(
         ARMING
         + """
-    def test_it(vehicle):
-        arm(vehicle)
+    import pytest
+
+    pytestmark = pytest.mark.vehicle(system_id=9, speed=2, parameters={"COM_OF_LOSS_T": 0.5})
+
+    def value(vehicle, system, name):
+        link = mavutil.mavlink_connection(vehicle.pymavlink_device)
+        beat = link.wait_heartbeat(timeout=20)
+        assert beat.get_srcSystem() == system
+        link.mav.param_request_read_send(system, 1, name, -1)
+        found = link.recv_match(type="PARAM_VALUE", blocking=True, timeout=20).param_value
+        link.close()
+        return found
+
+    def test_passes(vehicle):
+        assert value(vehicle, 9, b"COM_OF_LOSS_T") == 0.5
         print("vehicle", vehicle.pid)
-    """,
-        "--basetemp=temporary",
-        "-s",
-    )
-    result.assert_outcomes(passed=1)
-    (pid,) = re.findall(r"vehicle (\d+)", result.stdout.str())
-    assert not Path(f"/proc/{pid}").exists()
-    assert list(pytester.path.glob("temporary/vehicles/*")) == []
 
+    @pytest.mark.vehicle(system_id=7, parameters={"MIS_TAKEOFF_ALT": 7.0})
+    def test_its_own(make_vehicle):
+        first = make_vehicle()
+        other = make_vehicle(system_id=8, parameters={"MIS_TAKEOFF_ALT": 8.0})
+        assert value(other, 8, b"MIS_TAKEOFF_ALT") == 8.0
+        assert value(first, 7, b"MIS_TAKEOFF_ALT") == 7.0
+        assert value(first, 7, b"COM_OF_LOSS_T") == 0.5
 
-@pytest.mark.realtime
-def test_failing_test_keeps_log_and_traffic_and_names_them(run: Any, pytester: pytest.Pytester) -> None:
-    result = run(
-        ARMING
-        + """
-    def test_it(vehicle):
+    @pytest.mark.vehicle(system_id=1)
+    def test_fails(vehicle):
         arm(vehicle)
         assert vehicle is None
+
+    def test_kills(vehicle):
+        vehicle.kill()
+        assert False
+
+    @pytest.mark.vehicle(wnd=5)
+    def test_a(vehicle): pass
+
+    @pytest.mark.vehicle(parameters={"COM_OF": 1})
+    def test_b(vehicle): pass
+
+    @pytest.mark.vehicle(5)
+    def test_c(vehicle): pass
     """,
-        "--basetemp=temporary",
+        *("--basetemp=temporary", "--strict-markers", "-rP"),
     )
-    result.assert_outcomes(failed=1)
+    result.assert_outcomes(passed=2, failed=2, errors=3)
+    result.stdout.fnmatch_lines(
+        ["*No such option: --wnd*", "*no parameter 'COM_OF'*", "*takes options by name*"]
+    )
     result.stdout.fnmatch_lines(["*- vehicle 1 -*", "log:*vehicle.log", "traffic:*gcs-1.tlog", "* armed"])
-    (log,) = pytester.path.glob("temporary/vehicles/*test_it-1/vehicle.log")
+    (pid,) = re.findall(r"vehicle (\d+)\n", result.stdout.str())
+    assert not Path(f"/proc/{pid}").exists()
+    (log,) = pytester.path.glob("temporary/vehicles/*test_fails-1/vehicle.log")
+    (killed,) = pytester.path.glob("temporary/vehicles/*test_kills-1/vehicle.log")
+    assert set(pytester.path.glob("temporary/vehicles/*")) == {log.parent, killed.parent}
     assert f"log:     {log}" in result.stdout.str()
+    assert "code -9" in killed.read_text()
     lines = log.read_text().splitlines()
     assert "ready: system 1" in lines[0]
     assert lines[1].endswith(" armed")
@@ -88,108 +118,26 @@ def test_failing_test_keeps_log_and_traffic_and_names_them(run: Any, pytester: p
 
 
 @pytest.mark.realtime
-def test_logs_folder_option_and_separate_runs(run: Any, pytester: pytest.Pytester) -> None:
-    code = """
-    def test_it(make_vehicle):
-        make_vehicle(system_id=2)
-        make_vehicle(system_id=3)
-        assert False
-    """
-    result = run(code, "--vehicle-logs=artifacts")
-    result.assert_outcomes(failed=1)
-    result.stdout.fnmatch_lines(["*- vehicle 1 -*", "*- vehicle 2 -*"])
-    folders = sorted(pytester.path.glob("artifacts/*"))
-    output = [(folder / "vehicle.log").read_text() for folder in folders]
-    assert ["ready: system 2" in output[0], "ready: system 3" in output[1]] == [True, True]
-
-
-@pytest.mark.realtime
-def test_nearest_marker_options_win(run: Any) -> None:
-    result = run(
-        """
-    import pytest
-    from pymavlink import mavutil
-
-    pytestmark = pytest.mark.vehicle(system_id=9, speed=2, parameters={"COM_OF_LOSS_T": 0.5})
-
-    def value(vehicle, system, name):
-        link = mavutil.mavlink_connection(vehicle.pymavlink_device)
-        beat = link.wait_heartbeat(timeout=20)
-        assert beat.get_srcSystem() == system
-        link.mav.param_request_read_send(system, 1, name, -1)
-        found = link.recv_match(type="PARAM_VALUE", blocking=True, timeout=20).param_value
-        link.close()
-        return found
-
-    def test_the_module_s(vehicle):
-        assert value(vehicle, 9, b"COM_OF_LOSS_T") == 0.5
-
-    @pytest.mark.vehicle(system_id=7, parameters={"MIS_TAKEOFF_ALT": 7.0})
-    def test_its_own(make_vehicle):
-        first = make_vehicle()
-        other = make_vehicle(system_id=8, parameters={"MIS_TAKEOFF_ALT": 8.0})
-        assert value(other, 8, b"MIS_TAKEOFF_ALT") == 8.0
-        assert value(first, 7, b"MIS_TAKEOFF_ALT") == 7.0
-        assert value(first, 7, b"COM_OF_LOSS_T") == 0.5
-    """,
-        "--strict-markers",
-    )
-    result.assert_outcomes(passed=2)
-
-
-@pytest.mark.realtime
-def test_an_option_that_does_not_exist_is_named(run: Any) -> None:
-    result = run(
-        """
-    import pytest
-
-    @pytest.mark.vehicle(wnd=5)
-    def test_a(vehicle): pass
-
-    @pytest.mark.vehicle(parameters={"COM_OF": 1})
-    def test_b(vehicle): pass
-
-    @pytest.mark.vehicle(5)
-    def test_c(vehicle): pass
-    """
-    )
-    result.assert_outcomes(errors=3)
-    result.stdout.fnmatch_lines(
-        ["*No such option: --wnd*", "*no parameter 'COM_OF'*", "*takes options by name*"]
-    )
-
-
-@pytest.mark.realtime
-def test_parallel_tests_have_separate_vehicles(run: Any) -> None:
+def test_parallel_tests_have_separate_vehicles(run: Any, pytester: pytest.Pytester) -> None:
     result = run(
         ARMING
         + """
     import pytest
 
     @pytest.mark.parametrize("number", range(2))
-    def test_it(vehicle, number):
-        arm(vehicle)
+    def test_it(make_vehicle, number):
+        arm(make_vehicle())
+        if number == 1:
+            make_vehicle(system_id=3)
         assert number != 1
     """,
-        *("-p", "xdist", "-n", "2", "--basetemp=temporary"),
+        *("-p", "xdist", "-n", "2", "--vehicle-logs=artifacts"),
     )
     result.assert_outcomes(passed=1, failed=1)
-    result.stdout.fnmatch_lines(["*- vehicle 1 -*", "log:*vehicle.log"])
-
-
-@pytest.mark.realtime
-def test_killed_vehicle_log_has_exit_code(run: Any, pytester: pytest.Pytester) -> None:
-    result = run(
-        """
-    def test_it(vehicle):
-        vehicle.kill()
-        assert False
-    """,
-        "--basetemp=temporary",
-    )
-    result.assert_outcomes(failed=1)
-    (log,) = pytester.path.glob("temporary/vehicles/*test_it-1/vehicle.log")
-    assert "code -9" in log.read_text()
+    result.stdout.fnmatch_lines(["*- vehicle 1 -*", "log:*vehicle.log", "*- vehicle 2 -*"])
+    folders = sorted(pytester.path.glob("artifacts/*"))
+    output = [(folder / "vehicle.log").read_text() for folder in folders]
+    assert ["ready: system 1" in output[0], "ready: system 3" in output[1]] == [True, True]
 
 
 def test_loading_the_plugin_loads_nothing_heavy() -> None:
