@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import os
 import re
+import runpy
 import shlex
 import subprocess
 import sys
+import threading
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 import yaml
 
-from mavlink_sim.testing import RunningSimulator, free_port, free_udp_ports, running_simulator
+from mavlink_sim.cli.main import main
+from mavlink_sim.realtime.fleet import Fleet
+from mavlink_sim.testing import READY, free_port, free_udp_ports, running_simulator
 
 pytestmark = pytest.mark.realtime
 
@@ -33,30 +38,31 @@ OF_THE_VEHICLE = [line for line in COMMANDS if line.startswith("mavlink-sim") an
 
 
 @pytest.mark.parametrize("line", OF_THE_VEHICLE)
-def test_every_command_of_the_vehicle_starts_it(line: str, tmp_path: Path) -> None:
-    words = shlex.split(line)[1:]
+def test_every_command_of_the_vehicle_starts_it(
+    line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = shlex.split(line)
     if "--camera" in words:  # a name only of this test
         words[words.index("--camera") + 1] = f"document-{tmp_path.parent.name}-{tmp_path.name}"
     ports = [str(port) for port in free_udp_ports(2)]
     elsewhere = ["--onboard-bind", "0", "--gcs-bind", "0", "--onboard-port", ports[0], "--gcs-port", ports[1]]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "mavlink_sim", *words, *elsewhere],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        cwd=tmp_path,
-        env=environment(),
-    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", [*words, *elsewhere])
+    monkeypatch.setattr("signal.signal", lambda number, handler: None)  # pytest's stay
+    run = Fleet.run
+
+    def run_shortly(fleet: Fleet) -> None:
+        threading.Timer(0.1, fleet.stop).start()
+        run(fleet)
+
+    monkeypatch.setattr(Fleet, "run", run_shortly)
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 0
+    output = capsys.readouterr().out.splitlines()
     count = int(words[words.index("--vehicles") + 1]) if "--vehicles" in words else 1
-    simulator = RunningSimulator(process, count)
-    try:
-        simulator.wait_until_ready(60.0)
-    finally:
-        code = simulator.stop()
-        assert process.stdout is not None
-        process.stdout.close()
-    assert code == 0, simulator.events
+    assert sum(READY.match(line) is not None for line in output) == count
+    assert output[-1] == "stopped"
 
 
 def environment() -> dict[str, str]:
@@ -77,16 +83,8 @@ def scripts() -> list[str]:
 def test_every_example_runs(script: str, tmp_path: Path) -> None:
     port = free_port()
     (tmp_path / "example.py").write_text(script.replace("14540", str(port)))
-    with running_simulator(onboard_port=port):
-        finished = subprocess.run(
-            [sys.executable, "example.py"],
-            cwd=tmp_path,
-            env=environment(),
-            capture_output=True,
-            text=True,
-            timeout=60,
-        )
-    assert finished.returncode == 0, finished.stderr
+    with running_simulator(onboard_port=port) if "14540" in script else nullcontext():
+        runpy.run_path(str(tmp_path / "example.py"), run_name="__main__")
 
 
 def test_the_example_for_pytest_passes(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> None:
