@@ -21,6 +21,7 @@ import pytest
 from pymavlink import mavutil
 
 from mavlink_sim.cli.main import main
+from mavlink_sim.realtime.fleet import Fleet
 from mavlink_sim.testing import free_port, free_udp_ports, running_simulator
 from mavlink_sim.wire.endpoint import PEER_SILENCE_S, PortInUseError, TrafficLog, UdpEndpoint, recording
 from mavlink_sim.wire.messages import Outgoing, dialect, parser
@@ -30,10 +31,13 @@ from vision.shared_frame import SharedFrameReader, segment_path
 pytestmark = pytest.mark.realtime
 
 
-def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "mavlink_sim", *arguments], capture_output=True, text=True, timeout=60
-    )
+def run_main(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    """Run the command in this process; its exit code."""
+    monkeypatch.setattr("sys.argv", ["mavlink-sim", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert isinstance(ended.value.code, int)
+    return ended.value.code
 
 
 @pytest.mark.parametrize(
@@ -85,10 +89,7 @@ def test_a_bad_value_gives_one_clear_line_and_code_two(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr("sys.argv", ["mavlink-sim", "--onboard-bind", "0", "--gcs-bind", "0", *arguments])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code == 2
+    assert run_main(monkeypatch, "--onboard-bind", "0", "--gcs-bind", "0", *arguments) == 2
     output = capsys.readouterr()
     assert output.out == ""
     (line,) = output.err.strip().splitlines()
@@ -98,62 +99,58 @@ def test_a_bad_value_gives_one_clear_line_and_code_two(
 
 
 def test_unwritable_ready_file_is_one_line_and_code_2() -> None:
-    finished = run("--onboard-bind", "0", "--gcs-bind", "0", "--ready-file", "/nonexistent/folder/ready")
+    command = [sys.executable, "-m", "mavlink_sim", "--onboard-bind", "0", "--gcs-bind", "0"]
+    finished = subprocess.run(
+        [*command, "--ready-file", "/nonexistent/folder/ready"], capture_output=True, text=True, timeout=60
+    )
     assert finished.returncode == 2
     assert len(finished.stderr.strip().splitlines()) == 1
     assert "--ready-file" in finished.stderr
 
 
-def test_a_taken_port_gives_one_clear_line_and_code_two() -> None:
+def test_a_taken_port_gives_one_clear_line_and_code_two(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
         port = taken.getsockname()[1]
-        finished = run("--onboard-bind", str(port), "--gcs-bind", "0")
-    assert finished.returncode == 2
-    (line,) = finished.stderr.strip().splitlines()
+        assert run_main(monkeypatch, "--onboard-bind", str(port), "--gcs-bind", "0") == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
     assert f"UDP port 127.0.0.1:{port} " in line
     assert "in use" in line
 
 
-def test_version_is_printed() -> None:
-    finished = run("--version")
-    assert (finished.returncode, finished.stdout) == (0, f"mavlink-sim {version('mavlink-companion')}\n")
+def test_version_is_printed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_main(monkeypatch, "--version") == 0
+    assert capsys.readouterr().out == f"mavlink-sim {version('mavlink-companion')}\n"
 
 
-def wander_m(truth: Path, **options: Any) -> float:
-    """The greatest horizontal distance of a vehicle from its hold position within 10 s."""
-    with running_simulator(truth=truth, speed=10.0, ready_after=0.0, **options) as simulator:
-        link = mavutil.mavlink_connection(f"udpin:127.0.0.1:{simulator.onboard_port}", source_system=245)
-        link.wait_heartbeat(timeout=20)
-        link.mav.command_long_send(1, 1, 400, 0, 1, 0, 0, 0, 0, 0, 0)
-        link.mav.command_long_send(1, 1, 22, 0, *([math.nan] * 7))
-        simulator.wait_for_event("mode HOLD", 60.0)
-        held_ms = link.recv_match(type="ATTITUDE", blocking=True, timeout=20).time_boot_ms
-        while link.recv_match(type="ATTITUDE", blocking=True, timeout=20).time_boot_ms < held_ms + 12_000:
-            pass
-        link.close()
-    positions = [json.loads(line)["position_ned_m"] for line in truth.read_text().splitlines()[-200:]]
-    return max(math.dist(position[:2], positions[0][:2]) for position in positions)
+@pytest.mark.parametrize(
+    ("options", "least_m", "most_m"), [("--wind=0 --gusts=0", 0.0, 0.001), ("", 0.05, 5.0)]
+)
+def test_without_wind_gusts_and_noise_it_is_still(
+    options: str, least_m: float, most_m: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The greatest horizontal distance from its hold position within 10 s."""
+    positions: list[tuple[float, ...]] = []
 
+    def hold(fleet: Fleet) -> None:
+        vehicle = fleet.simulations[0].vehicle
+        vehicle.step(0.1)
+        vehicle.autopilot.arm()
+        vehicle.autopilot.takeoff(2.5)
+        vehicle.step(15.0)
+        assert vehicle.autopilot.mode.name == "HOLD"
+        for _ in range(200):
+            vehicle.step(0.05)
+            positions.append(vehicle.airframe.position[:2])
 
-def test_without_wind_gusts_and_noise_it_is_still(tmp_path: Path) -> None:
-    assert wander_m(tmp_path / "still.jsonl", wind=0, gusts=0, noise=False) < 0.001
-    assert wander_m(tmp_path / "usual.jsonl", noise="off") > 0.05
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_signal_ends_it_cleanly(number: signal.Signals) -> None:
-    with running_simulator() as simulator:
-        simulator.process.send_signal(number)
-        assert simulator.wait_for_event("stopped", 20.0) == "stopped"
-        assert simulator.process.wait(20.0) == 0
-
-
-def fail_with_running_vehicle(fault: str) -> None:
-    with running_simulator() as simulator:
-        simulator.fault(fault)
-        simulator.wait_for_event(fault.split()[0], 20.0)
-        pytest.fail("timeout")
+    monkeypatch.setattr("signal.signal", lambda number, handler: None)  # pytest's stay
+    monkeypatch.setattr(Fleet, "run", hold)
+    ends = [f"--{name}-port={port}" for name, port in zip(("onboard", "gcs"), free_udp_ports(2), strict=True)]
+    ends += ["--onboard-bind=0", "--gcs-bind=0"]
+    assert run_main(monkeypatch, *ends, "--ready-after=0", "--noise=off", *options.split()) == 0
+    assert least_m <= max(math.dist(position, positions[0]) for position in positions) < most_m
 
 
 def positions_in(truth: Path) -> list[list[float]]:
@@ -164,10 +161,12 @@ def positions_in(truth: Path) -> list[list[float]]:
 
 def test_setpoint_methods_fly_it_until_they_stop(tmp_path: Path) -> None:
     truth = tmp_path / "truth.jsonl"
-    with running_simulator(ready_after=0.0, wind=0.0, gusts=0.0, truth=truth) as simulator:
+    still: dict[str, Any] = {"wind": 0.0, "gusts": 0.0, "noise": False}
+    with running_simulator(ready_after=0.0, speed=2.0, truth=truth, **still) as simulator:
         simulator.set_velocity(0.0, 0.0, -1.5)
         simulator.arm()
         simulator.wait_for_event("takeoff")
+        assert all(math.hypot(*position[:2]) < 0.001 for position in positions_in(truth))
         simulator.set_position(3.0, 0.0, -3.0, yaw_rad=1.0)
         with pytest.raises(ValueError, match="finite numbers"):
             simulator.set_velocity(math.nan, 0.0, 0.0)
@@ -180,36 +179,14 @@ def test_setpoint_methods_fly_it_until_they_stop(tmp_path: Path) -> None:
     assert [event for event in simulator.events if event.startswith("mode")][:1] == ["mode OFFBOARD"]
 
 
-def test_refused_setpoint_mode_is_timeout_error() -> None:
-    with (
-        running_simulator(ready_after=0.0, faults=["refuse_mode"]) as simulator,
-        pytest.raises(TimeoutError, match="mode OFFBOARD"),
-    ):
-        simulator.set_position(0.0, 0.0, -3.0)
-
-
-def test_failure_note_has_last_events() -> None:
-    with pytest.raises(pytest.fail.Exception, match="timeout") as failure:
-        fail_with_running_vehicle("wind speed=3 direction=90")
-    (note,) = failure.value.__notes__
-    first, *lines = note.splitlines()
-    assert first.startswith("last events")
-    assert any("ready: system 1" in line for line in lines)
-    assert any("wind" in line for line in lines)
-
-
-def test_ready_file_has_pid_and_ports(tmp_path: Path) -> None:
-    ready = tmp_path / "ready.json"
-    with running_simulator(ready_file=ready) as simulator:
+def use_until_refused(ready: Path) -> None:
+    options: dict[str, Any] = {"system_id": 3, "ready_file": ready, "ready_after": 0.0}
+    with running_simulator(faults=["refuse_mode"], **options) as simulator:
         assert json.loads(ready.read_text()) == {
             "pid": simulator.pid,
             "onboard_bind": simulator.onboard_bind,
             "gcs_bind": simulator.gcs_bind,
         }
-
-
-def test_both_links_send_from_the_start_and_answer() -> None:
-    with running_simulator(system_id=3) as simulator:
         for port in (simulator.onboard_port, simulator.gcs_port):
             link = mavutil.mavlink_connection(f"udpin:127.0.0.1:{port}", source_system=245)
             beat = link.wait_heartbeat(timeout=20)
@@ -218,10 +195,24 @@ def test_both_links_send_from_the_start_and_answer() -> None:
             value = link.recv_match(type="PARAM_VALUE", blocking=True, timeout=20)
             assert value.param_value == 1.0
             link.close()
+        simulator.fault("wind speed=3 direction=90")
+        simulator.wait_for_event("wind", 20.0)
+        simulator.set_position(0.0, 0.0, -3.0)
 
 
-def test_clock_runs_at_given_speed() -> None:
-    with running_simulator(speed=8.0) as simulator:
+def test_ready_file_both_links_refused_mode_and_failure_note(tmp_path: Path) -> None:
+    with pytest.raises(TimeoutError, match="mode OFFBOARD") as failure:
+        use_until_refused(tmp_path / "ready.json")
+    (note,) = failure.value.__notes__
+    first, *lines = note.splitlines()
+    assert first.startswith("last events")
+    assert any("ready: system 3" in line for line in lines)
+    assert any("wind" in line for line in lines)
+
+
+def test_clock_runs_at_given_speed_and_truth_is_on_record(tmp_path: Path) -> None:
+    truth = tmp_path / "truth.jsonl"
+    with running_simulator(truth=truth, speed=8.0) as simulator:
         link = mavutil.mavlink_connection(f"udpin:127.0.0.1:{simulator.onboard_port}", source_system=245)
         first = link.recv_match(type="ATTITUDE", blocking=True, timeout=20)
         started = time.monotonic()
@@ -230,17 +221,10 @@ def test_clock_runs_at_given_speed() -> None:
             last = link.recv_match(type="ATTITUDE", blocking=True, timeout=20)
         # only an upper bound: a busy machine makes it slower, nothing may make it faster
         assert time.monotonic() - started > 0.6
-        link.close()
-
-
-def test_the_truth_is_on_record_line_by_line(tmp_path: Path) -> None:
-    truth = tmp_path / "truth.jsonl"
-    with running_simulator(truth=truth, speed=4.0) as simulator:
-        link = mavutil.mavlink_connection(f"udpin:127.0.0.1:{simulator.onboard_port}", source_system=245)
-        while link.recv_match(type="ATTITUDE", blocking=True, timeout=20).time_boot_ms < 3000:
-            pass
         lines = truth.read_text().splitlines()  # while it runs
         link.close()
+    # `running_simulator` sends SIGTERM; Ctrl-C is below, with a camera
+    assert (simulator.events[-1], simulator.process.returncode) == ("stopped", 0)
     records = [json.loads(line) for line in lines]
     assert len(records) > 30
     last = records[-1]
