@@ -40,7 +40,7 @@ ARMING_PROBLEMS = {"No valid mission available", "No offboard signal", "No manua
 
 @pytest.fixture
 async def simulator() -> AsyncIterator[RunningSimulator]:
-    async with vehicle(speed=SPEED) as running:
+    async with vehicle(speed=SPEED, gimbal=True, parameters=QUICK_FLIGHT) as running:
         yield running
 
 
@@ -50,7 +50,7 @@ async def system(simulator: RunningSimulator) -> AsyncIterator[MavsdkClient]:
         yield client
 
 
-async def test_mavsdk_reads_info_parameters_and_state(system: MavsdkClient) -> None:
+async def test_mavsdk_reads_state_and_turns_the_gimbal(system: MavsdkClient) -> None:
     information = system.plugin(InfoAsync)
     telemetry = system.plugin(TelemetryAsync)
     parameters = system.plugin(ParamAsync)
@@ -84,6 +84,36 @@ async def test_mavsdk_reads_info_parameters_and_state(system: MavsdkClient) -> N
     ):
         with pytest.raises(ParamError, match=result):
             await request
+
+    reports = system.plugin(EventsAsync).subscribe_health_and_arming_checks()
+    # As soon as it has the events' metadata it requests the checks; later reports come by themselves.
+    report = await wait_for(reports, lambda report: report.current_mode_intention.can_arm_or_run)
+    assert report.current_mode_intention.mode_name == "Hold"
+    assert report.current_mode_intention.problems == []
+    problems = {problem.message for problem in report.all_problems}
+    assert problems == ARMING_PROBLEMS
+    present = {part.label for part in report.health_components if part.is_present}
+    assert {"GPS", "Battery"} <= present
+    faulty = {part.label for part in report.health_components if part.has_error}
+    assert faulty == {"System", "Remote Control (RC or Joystick)"}
+
+    gimbal = system.plugin(GimbalAsync)
+    listed = await wait_for(gimbal.subscribe_gimbal_list(), lambda update: bool(update.gimbals))
+    found = listed.gimbals[0]
+    assert found.gimbal_device_id == 1
+    await gimbal.take_control(found.gimbal_id, ControlMode.PRIMARY)
+    await gimbal.set_angles(found.gimbal_id, 0.0, -40.0, 25.0, GimbalMode.YAW_FOLLOW, SendMode.ONCE)
+    looking = await wait_for(
+        gimbal.subscribe_attitude(), lambda update: abs(update.euler_angle_forward.pitch_deg + 40.0) < 0.5
+    )
+    assert looking.gimbal_id == found.gimbal_id
+    await wait_for(
+        gimbal.subscribe_attitude(), lambda update: abs(update.euler_angle_forward.yaw_deg - 25.0) < 0.5
+    )
+    await gimbal.release_control(found.gimbal_id)
+    battery = await wait_for(telemetry.subscribe_battery(), lambda update: update.voltage_v > 0.0)
+    assert battery.voltage_v == pytest.approx(16.2, abs=0.1)
+    assert battery.remaining_percent == pytest.approx(100.0, abs=2.0)
 
 
 async def test_it_flies_by_action_and_by_offboard(simulator: RunningSimulator, system: MavsdkClient) -> None:
@@ -183,27 +213,6 @@ async def test_a_joystick_flies_the_vehicle_in_position_mode() -> None:
         await asyncio.to_thread(simulator.wait_for_event, "disarmed (after landing)")
 
 
-async def test_gimbal_and_battery_are_read_and_gimbal_is_turned() -> None:
-    async with connected(speed=4.0, gimbal=True) as (_, system):
-        gimbal, telemetry = system.plugin(GimbalAsync), system.plugin(TelemetryAsync)
-        listed = await wait_for(gimbal.subscribe_gimbal_list(), lambda update: bool(update.gimbals))
-        found = listed.gimbals[0]
-        assert found.gimbal_device_id == 1
-        await gimbal.take_control(found.gimbal_id, ControlMode.PRIMARY)
-        await gimbal.set_angles(found.gimbal_id, 0.0, -40.0, 25.0, GimbalMode.YAW_FOLLOW, SendMode.ONCE)
-        looking = await wait_for(
-            gimbal.subscribe_attitude(), lambda update: abs(update.euler_angle_forward.pitch_deg + 40.0) < 0.5
-        )
-        assert looking.gimbal_id == found.gimbal_id
-        await wait_for(
-            gimbal.subscribe_attitude(), lambda update: abs(update.euler_angle_forward.yaw_deg - 25.0) < 0.5
-        )
-        await gimbal.release_control(found.gimbal_id)
-        battery = await wait_for(telemetry.subscribe_battery(), lambda update: update.voltage_v > 0.0)
-        assert battery.voltage_v == pytest.approx(16.2, abs=0.1)
-        assert battery.remaining_percent == pytest.approx(100.0, abs=2.0)
-
-
 async def test_a_remote_control_is_read() -> None:
     parameters = {**CALIBRATION, "COM_RC_IN_MODE": 0, "COM_RC_LOSS_T": 5}
     async with connected(speed=1.0, parameters=parameters) as (_, system):
@@ -214,17 +223,3 @@ async def test_a_remote_control_is_read() -> None:
         async with streaming(lambda: direct.send_message(override), 0.1):
             status = await wait_for(telemetry.subscribe_rc_status(), lambda update: update.is_available)
         assert status.signal_strength_percent == pytest.approx(100.0, abs=61.0)
-
-
-async def test_mavsdk_reports_health_and_arming_checks(system: MavsdkClient) -> None:
-    reports = system.plugin(EventsAsync).subscribe_health_and_arming_checks()
-    # As soon as it has the events' metadata it requests the checks; later reports come by themselves.
-    report = await wait_for(reports, lambda report: report.current_mode_intention.can_arm_or_run)
-    assert report.current_mode_intention.mode_name == "Hold"
-    assert report.current_mode_intention.problems == []
-    problems = {problem.message for problem in report.all_problems}
-    assert problems == ARMING_PROBLEMS
-    present = {part.label for part in report.health_components if part.is_present}
-    assert {"GPS", "Battery"} <= present
-    faulty = {part.label for part in report.health_components if part.has_error}
-    assert faulty == {"System", "Remote Control (RC or Joystick)"}

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from pymavlink import mavparm, mavutil
 
-from mavlink_sim.testing import RunningSimulator, vehicle
+from mavlink_sim.testing import QUICK_FLIGHT, RunningSimulator, vehicle
 
 pytestmark = pytest.mark.realtime
 
@@ -20,7 +20,7 @@ REAL32, INT32 = 9, 6
 
 @pytest.fixture(scope="module")
 def simulator() -> Iterator[RunningSimulator]:
-    with vehicle(speed=SPEED) as running:
+    with vehicle(speed=SPEED, parameters=QUICK_FLIGHT) as running:
         yield running
 
 

@@ -49,6 +49,7 @@ def known(state: VehicleState) -> bool:
 
 async def test_streams_parameters_and_modes_on_the_ground() -> None:
     async with copter() as (driver, _):
+        assert isinstance(driver, AutopilotDriver)
         assert driver.state.mode is FlightMode.STABILIZED
         assert driver.state.altitude_m == pytest.approx(0.0, abs=0.5)
         assert await driver.get_parameter("RTL_ALT") == 1500.0  # an INT32, sent as a number
@@ -66,6 +67,13 @@ async def test_streams_parameters_and_modes_on_the_ground() -> None:
         await driver.set_mode(FlightMode.HOLD)  # GUIDED: a Copter cannot be armed in BRAKE
         await driver.arm()
         await driver.disarm()
+
+        # Streams that stop are restored.
+        stop = {"req_stream_id": mavlink.MAV_DATA_STREAM_ALL, "req_message_rate": 0, "start_stop": 0}
+        driver._send_message("REQUEST_DATA_STREAM", {"target_system": 1, "target_component": 1, **stop})
+        await wait_for_state(driver, lambda s: not s.position_fresh(time.monotonic_ns()))
+        await wait_for_state(driver, lambda s: "LOCAL_POSITION_NED" in s.missing_streams)
+        await wait_for_state(driver, known)
 
 
 async def test_copter_brakes_on_silence_and_stays_in_guided() -> None:
@@ -95,19 +103,16 @@ async def test_copter_brakes_on_silence_and_stays_in_guided() -> None:
 
         await driver.set_mode(FlightMode.HOLD)
         assert simulator.wait_for_event("mode BRAKE")
-        await driver.set_mode(FlightMode.LAND)
-        await wait_for_state(driver, lambda s: not s.armed, 30.0)
-        assert [str(mode) for mode in modes][-6:] == ["hold", "takeoff", "hold", "offboard", "hold", "land"]
-
-
-async def test_guided_that_we_did_not_request_is_offboard() -> None:
-    async with copter() as (driver, simulator):
-        await driver.set_mode(FlightMode.HOLD)
-        await driver.arm()
-        await driver.takeoff(3.0)
-        await wait_for_state(driver, lambda s: s.mode is FlightMode.HOLD)
         simulator.fault("pilot_takeover mode=POSCTL")
         await wait_for_state(driver, lambda s: s.mode is FlightMode.POSITION)  # LOITER
+        simulator.fault("end all")
+        await driver.set_mode(FlightMode.LAND)
+        await wait_for_state(driver, lambda s: not s.armed, 30.0)
+        flown = [str(mode) for mode in modes][-7:]
+        assert flown == ["hold", "takeoff", "hold", "offboard", "hold", "position", "land"]
+
+
+def test_guided_that_we_did_not_request_is_offboard() -> None:
     profile = ArduPilotProfile()
     state = VehicleState(armed=True, landed=LandedState.IN_AIR)
     profile.mode_request(FlightMode.HOLD, VehicleState())
@@ -140,16 +145,6 @@ async def test_quick_reboot_is_detected_by_timesync(
         assert "LOCAL_POSITION_NED" not in driver._telemetry._boot_ms  # not received again yet
         await wait_for_state(driver, known)
         assert "no heartbeat" not in caplog.text
-
-
-async def test_stopped_streams_are_restored() -> None:
-    async with copter() as (driver, _):
-        assert isinstance(driver, AutopilotDriver)
-        stop = {"req_stream_id": mavlink.MAV_DATA_STREAM_ALL, "req_message_rate": 0, "start_stop": 0}
-        driver._send_message("REQUEST_DATA_STREAM", {"target_system": 1, "target_component": 1, **stop})
-        await wait_for_state(driver, lambda s: not s.position_fresh(time.monotonic_ns()))
-        await wait_for_state(driver, lambda s: "LOCAL_POSITION_NED" in s.missing_streams)
-        await wait_for_state(driver, known)
 
 
 def test_copter_modes_map_to_px4_names() -> None:

@@ -15,13 +15,13 @@ from companion.vehicle.driver import CommandRefusedError, Driver
 from companion.vehicle.drivers import DriverKind, open_driver
 from companion.vehicle.state import FlightMode, HeightSource, LandedState, VehicleState
 from companion.vehicle.vision_position import VisionPosition
-from mavlink_sim.testing import RunningSimulator, vehicle
+from mavlink_sim.testing import QUICK_FLIGHT, RunningSimulator, vehicle
 from tests.companion.vehicle.fake_autopilot import streaming, wait_for_state, wait_until
 
 pytestmark = pytest.mark.realtime
 
 # Simulated seconds are short; the loss timeout is long enough in them for a busy test machine.
-FLIGHT = {"COM_OF_LOSS_T": 4.0, "COM_OBL_RC_ACT": 4.0}
+FLIGHT = {**QUICK_FLIGHT, "COM_OF_LOSS_T": 4.0, "COM_OBL_RC_ACT": 4.0}
 
 
 @asynccontextmanager
@@ -49,9 +49,9 @@ def complete(state: VehicleState) -> bool:
     )
 
 
-async def test_state_parameters_modes_and_arming_on_the_ground(kind: DriverKind) -> None:
-    with vehicle(speed=4.0) as simulator:
-        async with connected(kind, simulator) as driver:
+async def test_state_parameters_modes_and_arming_of_two_vehicles(kind: DriverKind) -> None:
+    with vehicle(speed=4.0) as simulator, vehicle(speed=4.0, system_id=2, parameters=QUICK_FLIGHT) as two:
+        async with connected(kind, simulator) as driver, connected(kind, two, system_id=2) as second:
             state = await wait_for_state(driver, complete)
             assert state.mode is FlightMode.HOLD
             assert state.landed is LandedState.ON_GROUND
@@ -80,6 +80,15 @@ async def test_state_parameters_modes_and_arming_on_the_ground(kind: DriverKind)
             assert driver.state.armed
             await driver.disarm()
             assert not driver.state.armed
+
+            await wait_for_state(second, complete)
+            assert await second.get_parameter("COM_OF_LOSS_T") == 1.0
+            await asyncio.gather(second.takeoff(3.0), second.arm())
+            await wait_for_state(second, lambda s: (s.altitude_m or 0.0) > 1.0)
+            assert not driver.state.armed
+            assert driver.state.altitude_m is not None
+            assert driver.state.altitude_m < 0.5
+            await second.set_mode(FlightMode.LAND)
 
 
 async def test_px4_failsafe_acts_when_setpoints_end(kind: DriverKind) -> None:
@@ -131,18 +140,6 @@ async def test_driver_continues_after_a_vehicle_restart(
                 await driver.disarm()
     lines = [record.getMessage() for record in caplog.records]
     assert sum("no heartbeat" in line or "received again" in line for line in lines) == 2
-
-
-async def test_two_vehicles_are_independent(kind: DriverKind) -> None:
-    with vehicle(speed=4.0) as one, vehicle(speed=4.0, system_id=2) as two:
-        async with connected(kind, one) as first, connected(kind, two, system_id=2) as second:
-            await asyncio.gather(wait_for_state(first, complete), wait_for_state(second, complete))
-            await asyncio.gather(second.takeoff(3.0), second.arm())
-            await wait_for_state(second, lambda s: (s.altitude_m or 0.0) > 1.0)
-            assert not first.state.armed
-            assert first.state.altitude_m is not None
-            assert first.state.altitude_m < 0.5
-            await second.set_mode(FlightMode.LAND)
 
 
 async def test_vision_position_reaches_the_estimator(kind: DriverKind) -> None:

@@ -16,7 +16,7 @@ from companion.vehicle.autopilot_driver import AutopilotDriver
 from companion.vehicle.driver import CommandRefusedError, Driver
 from companion.vehicle.drivers import DriverKind, open_driver
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
-from mavlink_sim.testing import RunningSimulator, running_simulator
+from mavlink_sim.testing import QUICK_FLIGHT, RunningSimulator, running_simulator
 from tests.companion.vehicle.fake_autopilot import streaming, wait_for_state, wait_until
 
 pytestmark = pytest.mark.realtime
@@ -24,7 +24,7 @@ pytestmark = pytest.mark.realtime
 # For what AutopilotDriver does with received messages. MAVSDK's are passed to it by other code, so these
 # tests are run with it too, in `make test-slow`.
 SHARED = pytest.mark.parametrize("kind", ["pymavlink", pytest.param("mavsdk", marks=pytest.mark.slow)])
-PARAMETERS = {"COM_OF_LOSS_T": 2.0, "COM_OBL_RC_ACT": 4.0}
+PARAMETERS = {**QUICK_FLIGHT, "COM_OF_LOSS_T": 2.0, "COM_OBL_RC_ACT": 4.0}
 
 
 def simulated(**options: Any) -> AbstractContextManager[RunningSimulator]:
