@@ -7,7 +7,8 @@ import json
 import math
 import subprocess
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 from mavlink_sim.camera.depth_camera import DepthSensor
 from mavlink_sim.camera.renderer import Rendered
 from mavlink_sim.camera.scene import CameraSettings, Scene
+from mavlink_sim.datasets import training_scenes
 from mavlink_sim.datasets.dataset import DatasetError, DatasetOptions, make_dataset
 from mavlink_sim.datasets.training_scenes import (
     LEARNED_SIDE_PX,
@@ -45,6 +47,25 @@ SCENE = Scene(
     ),
     camera=CameraSettings(CameraModel.from_horizontal_fov(160, 120, math.radians(75.0)), depth=DepthSensor()),
 )
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick_worlds() -> Iterator[None]:
+    """Worlds of training with a coarse ground, and few tiles: painting is most of the time of a frame."""
+
+    def coarse(scene: Scene) -> Scene:
+        ground = scene.world.ground
+        texel_m = ground.texel_m * ground.tile_texels / 128
+        return replace(
+            scene, world=replace(scene.world, ground=replace(ground, tile_texels=128, texel_m=texel_m))
+        )
+
+    scenes = tuple(coarse(scene) for scene in training_scenes._scenes())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(training_scenes, "_scenes", lambda: scenes)
+        patch.setattr(training_scenes, "TILES", 4)
+        patch.setattr(training_scenes, "PAINTED_TILES", 1)
+        yield
 
 
 def files(folder: Path) -> dict[str, str]:
@@ -285,7 +306,7 @@ def test_flights_have_every_kind_of_distractor_and_far_objects() -> None:
 
 def test_more_kinds_of_objects_placed_as_often_as_classes() -> None:
     def drones(more: tuple[str, ...]) -> int:
-        frames = (flight_frame(np.random.default_rng((5, n)), 160, 128, more) for n in range(12))
+        frames = (flight_frame(np.random.default_rng((5, n)), 160, 128, more) for n in range(24))
         return sum(item.world_object.class_name == "drone" for frame in frames for item in frame.objects)
 
     assert drones(("drone",)) >= drones(()) + 5

@@ -305,7 +305,7 @@ def test_effects_change_image_as_named() -> None:
     assert np.ptp(grey, axis=2).max() <= 1.0
 
 
-WORLD = demo_world(1)
+WORLD = replace(demo_world(1), ground=replace(demo_world(1).ground, tile_texels=256, texel_m=0.4))
 
 
 def drawn(width: int, height: int, strip_rows: int, pose: tuple[float, float, float]) -> Rendered:

@@ -19,7 +19,7 @@ from companion.vehicle.obstacle_distance import MAXIMUM_CM, UNKNOWN_CM, obstacle
 from mavlink_sim.camera.depth_camera import DepthSensor
 from mavlink_sim.camera.scene import CameraSettings, Scene
 from mavlink_sim.flight.transmitter import Sticks
-from mavlink_sim.world.world import World, WorldObject
+from mavlink_sim.world.world import Ground, World, WorldObject
 from tests.companion.vehicle.fake_autopilot import FakeAutopilot, wait_for_state
 from tests.mavlink_sim.conftest import CALIBRATION
 from vision.obstacle_sectors import SECTORS, ObstacleSectors
@@ -81,7 +81,7 @@ def test_pilot_in_position_mode_stops_before_a_wall(send: bool) -> None:
     settings = camera_settings(CAMERA, MOUNT, flags)
     wall = WorldObject(0, "wall", (14.0, 0.0, 0.0), math.pi, size_m=(30.0, 0.4, 6.0))
     sensed = CameraSettings(model=CAMERA, mount=MOUNT, depth=DepthSensor(), seed=1)
-    scene = Scene(World((wall,)), {}, sensed, "wall")
+    scene = Scene(World((wall,), Ground(("concrete",), 0, 256, 0.05)), {}, sensed, "wall")
     flight = LockstepFlight.airborne(
         seed=1,
         height_m=2.5,
@@ -94,7 +94,7 @@ def test_pilot_in_position_mode_stops_before_a_wall(send: bool) -> None:
     flight.turn_to(0.0)
     flight.vehicle.set_mode("POSCTL")
     pilot.sticks = Sticks(pitch=1.0)
-    flight.run(12.0)
+    flight.run(12.0 if send else 5.0)
     truth = flight.vehicle.truth
     assert truth.mode == ("POSCTL" if send else "HOLD")
     left_m = 14.0 - 0.2 - truth.position_ned_m[0]
