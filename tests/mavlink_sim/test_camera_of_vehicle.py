@@ -105,19 +105,19 @@ def test_a_bad_camera_option_is_one_line_and_code_two(
         assert word in line
 
 
-def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "mavlink_sim", "camera", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=DEADLINE_S)
-
-
-def test_a_port_in_use_is_refused(name: str) -> None:
+def test_a_port_in_use_is_refused(
+    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     taken = UdpEndpoint("127.0.0.1", 0, 1)
+    arguments = ["--vehicle-url", f"udpin://127.0.0.1:{taken.port}", "--camera", name]
+    monkeypatch.setattr("sys.argv", ["mavlink-sim", "camera", *arguments])
     try:
-        finished = run("--vehicle-url", f"udpin://127.0.0.1:{taken.port}", "--camera", name)
+        with pytest.raises(SystemExit) as ended:
+            main()
     finally:
         taken.close()
-    assert finished.returncode == 2
-    (line,) = finished.stderr.splitlines()
+    assert ended.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
     assert "in use" in line
 
 
@@ -140,11 +140,13 @@ def test_no_autopilot_is_refused_after_ten_seconds(
 
 
 @pytest.mark.parametrize("systems", [(4, 9), (4, 4)])
-def test_two_autopilots_on_one_port_are_refused(name: str, systems: tuple[int, int]) -> None:
+def test_two_autopilots_on_one_port_are_refused(name: str, small: str, systems: tuple[int, int]) -> None:
     port = free_port()
     ends = [UdpEndpoint("127.0.0.1", 0, port) for _ in range(2)]
     command = [sys.executable, "-m", "mavlink_sim", "camera", "--vehicle-url", f"udpin://127.0.0.1:{port}"]
-    process = subprocess.Popen([*command, "--camera", name], stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [*command, "--camera", name, "--scene", small], stderr=subprocess.PIPE, text=True
+    )
     try:
         deadline_s = time.monotonic() + DEADLINE_S
         while process.poll() is None:

@@ -111,7 +111,7 @@ async def test_mavsdk_uploads_starts_pauses_and_finishes_a_mission() -> None:
         assert (await mission.download_mission()).mission_items == []
 
 
-async def test_mavsdk_uploads_and_downloads_raw_plans() -> None:
+async def test_mavsdk_uploads_and_downloads_raw_plans_and_a_geofence() -> None:
     async with mavsdk_flight() as (_, system):
         missions = system.plugin(MissionRawAsync)
         flight = raw([takeoff(4.0), waypoint(5, 5, 4.0), item(93, None, 2.0), land(5, 5)])
@@ -132,20 +132,17 @@ async def test_mavsdk_uploads_and_downloads_raw_plans() -> None:
         seen = await wait_for(missions.subscribe_mission_progress(), lambda progress: progress.current == 2)
         assert seen.total == 4
 
-
-async def test_mavsdk_sets_and_clears_a_geofence() -> None:
-    async with mavsdk_flight() as (_, system):
-        fence = system.plugin(GeofenceAsync)
+        geofence = system.plugin(GeofenceAsync)
         corners = [Point(*position(*corner)) for corner in ((-30, -30), (30, -30), (30, 30), (-30, 30))]
         inside = Polygon(corners, FenceType.INCLUSION)
         around = Circle(Point(*position(0, 0)), 15.0, FenceType.INCLUSION)
-        await fence.upload_geofence(GeofenceData([inside], [around]))
-        back = await fence.download_geofence()
-        assert len(back.polygons[0].points) == 4
-        assert back.circles[0].radius == pytest.approx(15.0)
+        await geofence.upload_geofence(GeofenceData([inside], [around]))
+        stored = await geofence.download_geofence()
+        assert len(stored.polygons[0].points) == 4
+        assert stored.circles[0].radius == pytest.approx(15.0)
 
-        await fence.clear_geofence()
-        assert not (await fence.download_geofence()).circles
+        await geofence.clear_geofence()
+        assert not (await geofence.download_geofence()).circles
 
 
 async def test_mavsdk_geofence_breach_holds_and_reports() -> None:

@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 import pytest
 
+from mavlink_sim.cli.main import main
 from mavlink_sim.testing import free_port
 from vision.shared_frame import SHARED_MEMORY_DIRECTORY, SharedFrameReader, segment_path
 
@@ -100,15 +101,18 @@ def test_scene_flight_with_three_camera_outputs(tmp_path: Path) -> None:
     assert flight[0]["objects"][1]["position_ned_m"] != flight[-1]["objects"][1]["position_ned_m"]
 
 
-def test_invalid_scene_explained_and_not_started(tmp_path: Path) -> None:
+def test_invalid_scene_explained_and_not_started(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     scene = tmp_path / "field.toml"
     scene.write_text("[camera]\nwidth = 'wide'\n", "utf-8")
-    command = [sys.executable, "-m", "mavlink_sim", "--onboard-bind", "0", "--gcs-bind", "0"]
     for arguments, message in (
         (["--scene", str(scene), "--camera", "unborn"], "camera.width"),
         (["--camera-output", "gopher://x"], "shm://NAME"),
     ):
-        made = subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=DEADLINE_S)
-        assert made.returncode == 2
-        assert message in made.stderr
-        assert "Traceback" not in made.stderr
+        monkeypatch.setattr("sys.argv", ["mavlink-sim", "--onboard-bind=0", "--gcs-bind=0", *arguments])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        assert ended.value.code == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert message in line
