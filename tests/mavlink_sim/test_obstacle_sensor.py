@@ -12,6 +12,7 @@ from mavlink_sim.flight.collision_prevention import UNKNOWN_CM
 from mavlink_sim.flight.transmitter import Sticks
 from mavlink_sim.lockstep import LockstepVehicle
 from mavlink_sim.physics.obstacle_sensor import NOISE_M, NOTHING_CM
+from mavlink_sim.testing import QUICK_FLIGHT
 from mavlink_sim.wire.streams import GCS_RATES_HZ, ONBOARD_RATES_HZ
 from mavlink_sim.world.world import World, WorldObject
 from tests.mavlink_sim.conftest import CALIBRATION
@@ -26,7 +27,8 @@ LINKS = {"onboard": dict.fromkeys(ONBOARD_RATES_HZ, 0.0), "gcs": GCS_RATES_HZ}
 
 def flying(*objects: WorldObject, height_m: float = 3.0, **options: Any) -> LockstepVehicle:
     calm = {"scene": World(objects), "gusts_mps": 0.0, "noise": False, "obstacle_sensor": True}
-    vehicle = LockstepVehicle(LINKS, **{**calm, **options})
+    quick = {"ready_after_s": 0.0, "parameters": QUICK_FLIGHT}
+    vehicle = LockstepVehicle(LINKS, **{**calm, **quick, **options})
     vehicle.take_off(height_m)
     return vehicle
 
@@ -35,7 +37,7 @@ def piloted(*objects: WorldObject, scene: Scene | None = None, **parameters: flo
     """In Position mode, its pilot at the sticks."""
     vehicle = flying(
         scene=World(objects) if scene is None else scene,
-        parameters={**CALIBRATION, "COM_RC_IN_MODE": 0, "CP_GUIDE_ANG": 0, **parameters},
+        parameters={**QUICK_FLIGHT, **CALIBRATION, "COM_RC_IN_MODE": 0, "CP_GUIDE_ANG": 0, **parameters},
     )
     vehicle.vehicle.transmitter.on = True
     vehicle.step(0.5)

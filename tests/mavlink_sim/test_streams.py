@@ -55,15 +55,12 @@ def settled(harness: SimHarness) -> SimHarness:
     return harness
 
 
-def test_the_onboard_streams_have_the_measured_rates(settled: SimHarness) -> None:
+def test_streams_have_the_measured_rates(settled: SimHarness) -> None:
     seen = counts(settled, "onboard", 20.0)
     assert set(seen) == set(MEASURED_ONBOARD_HZ)  # nothing else, in particular no RC_CHANNELS
     for name, rate in MEASURED_ONBOARD_HZ.items():
         assert seen[name] / 20.0 == pytest.approx(rate, rel=0.01, abs=0.051), name
-
-
-def test_gcs_streams_have_measured_rates(settled: SimHarness) -> None:
-    seen = counts(settled, "gcs", 20.0)
+    seen = Counter(item.message.get_type() for _, item in settled.inbox["gcs"])
     assert set(seen) <= set(MEASURED_ONBOARD_HZ)
     for name, rate in MEASURED_GCS_HZ.items():
         assert seen.pop(name) / 20.0 == pytest.approx(rate, rel=0.01, abs=0.051), name

@@ -8,13 +8,15 @@ from typing import Any
 import pytest
 
 from mavlink_sim.lockstep import LockstepVehicle
+from mavlink_sim.testing import QUICK_FLIGHT
 from mavlink_sim.wire.messages import dialect
 
 Vector = tuple[float, float, float]
 
 
 def hovering(control: int = 1, **parameters: Any) -> LockstepVehicle:
-    vehicle = LockstepVehicle(seed=3, wind_mps=0.0, parameters={"EKF2_EV_CTRL": control, **parameters})
+    parameters = {**QUICK_FLIGHT, "EKF2_EV_CTRL": control, **parameters}
+    vehicle = LockstepVehicle({"onboard": {}}, seed=3, wind_mps=0.0, ready_after_s=0.0, parameters=parameters)
     vehicle.take_off(4.0)
     return vehicle
 
