@@ -125,6 +125,7 @@ async def test_it_flies_by_action_and_by_offboard(simulator: RunningSimulator, s
     with pytest.raises(OffboardError, match="NO_SETPOINT_SET"):
         await offboard.start()
     await action.set_takeoff_altitude(4.0)
+    assert await action.get_takeoff_altitude() == pytest.approx(4.0)
     await action.set_return_to_launch_altitude(12.0)
     assert await action.get_return_to_launch_altitude() == 12.0
     await action.arm()
@@ -154,6 +155,8 @@ async def test_it_flies_by_action_and_by_offboard(simulator: RunningSimulator, s
     await asyncio.to_thread(simulator.wait_for_event, "mode RTL")
     await action.land()
     await wait_for(telemetry.subscribe_armed(), lambda armed: not armed)
+    await asyncio.to_thread(simulator.wait_for_event, "disarmed (after landing)")
+    assert "landed" in simulator.events
 
 
 async def test_denied_command_raises_mavsdk_error() -> None:
@@ -223,3 +226,7 @@ async def test_a_remote_control_is_read() -> None:
         async with streaming(lambda: direct.send_message(override), 0.1):
             status = await wait_for(telemetry.subscribe_rc_status(), lambda update: update.is_available)
         assert status.signal_strength_percent == pytest.approx(100.0, abs=61.0)
+        values = dict.fromkeys((f"param{number}" for number in range(1, 8)), 0)
+        request = {"target_system": 1, "target_component": 1, "confirmation": 0, "command": 512, **values}
+        command = MavlinkMessage("COMMAND_LONG", 245, 190, 1, 1, json.dumps({**request, "param1": 148}))
+        assert json.loads((await direct.send_command(command)).fields_json)["result"] == 0

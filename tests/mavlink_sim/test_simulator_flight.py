@@ -1,20 +1,13 @@
-"""Whole flights over UDP, by pymavlink and by MAVSDK."""
+"""A whole flight over UDP, by pymavlink; MAVSDK's are in test_client_mavsdk.py."""
 
-import asyncio
-import json
 import time
 from collections.abc import Callable
 from typing import Any
 
 import pytest
-from mavsdk.asyncio import ComponentType
-from mavsdk.asyncio.plugins.action import ActionAsync, ActionError
-from mavsdk.asyncio.plugins.mavlink_direct import MavlinkDirectAsync, MavlinkMessage
-from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
 from pymavlink import mavutil
 
 from mavlink_sim.testing import QUICK_FLIGHT, vehicle
-from tests.mavlink_sim.mavsdk_client import mavsdk_client, meanwhile, wait_for
 
 pytestmark = pytest.mark.realtime
 
@@ -101,64 +94,3 @@ def test_pymavlink_flies_offboard_loses_stream_and_comes_home() -> None:
         simulator.wait_for_event("disarmed (after landing)")
     assert simulator.events[:5] == ["armed", "mode TAKEOFF", "takeoff", "mode HOLD", "mode OFFBOARD"]
     assert SETPOINTS_LOST in simulator.events
-
-
-AHEAD = {
-    **dict.fromkeys(("time_boot_ms", "x", "y", "z", "vy", "vz", "afx", "afy", "afz", "yaw", "yaw_rate"), 0),
-    "coordinate_frame": 8,
-    "type_mask": 1479,
-    "vx": 1.5,
-}
-TO_OFFBOARD: dict[str, float] = {
-    "command": 176,
-    "confirmation": 0,
-    "param1": 1,
-    "param2": 6,
-    **dict.fromkeys(("param3", "param4", "param5", "param6", "param7"), 0),
-}
-
-
-def message(name: str, fields: dict[str, float]) -> MavlinkMessage:
-    """A message from the companion to the autopilot."""
-    addressed = {"target_system": 1, "target_component": 1, **fields}
-    return MavlinkMessage(name, 1, 191, 1, 1, json.dumps(addressed))
-
-
-async def test_mavsdk_flies_the_vehicle() -> None:
-    async with vehicle(speed=SPEED, parameters=QUICK_FLIGHT) as simulator:
-        url = f"udpin://127.0.0.1:{simulator.onboard_port}"
-        async with mavsdk_client(url, ComponentType.COMPANION_COMPUTER) as system:
-            action, telemetry = system.plugin(ActionAsync), system.plugin(TelemetryAsync)
-            direct = system.plugin(MavlinkDirectAsync)
-            await wait_for(telemetry.subscribe_health(), lambda health: health.is_armable)
-
-            await action.set_takeoff_altitude(3.0)
-            assert await action.get_takeoff_altitude() == pytest.approx(3.0)
-            await action.arm()
-            await action.takeoff()
-            await wait_for(
-                telemetry.subscribe_position(), lambda position: position.relative_altitude_m > 2.2
-            )
-            await wait_for(telemetry.subscribe_flight_mode(), lambda mode: mode.name == "HOLD")
-            with pytest.raises(ActionError):
-                await action.disarm()  # in the air
-
-            async def stream() -> None:
-                while True:
-                    await direct.send_message(message("SET_POSITION_TARGET_LOCAL_NED", AHEAD))
-                    await asyncio.sleep(0.02)
-
-            async with meanwhile(stream()):
-                await wait_for(direct.subscribe_message("POSITION_TARGET_LOCAL_NED"))
-                answer = await direct.send_command(message("COMMAND_LONG", TO_OFFBOARD))
-                assert json.loads(answer.fields_json)["result"] == 0
-                await wait_for(telemetry.subscribe_flight_mode(), lambda mode: mode.name == "OFFBOARD")
-                await wait_for(
-                    telemetry.subscribe_position_velocity_ned(), lambda p: p.position.north_m > 3.0
-                )
-            await action.hold()
-            await action.land()
-            await asyncio.to_thread(simulator.wait_for_event, "mode LAND")
-            await wait_for(telemetry.subscribe_armed(), lambda armed: not armed)
-        simulator.wait_for_event("disarmed (after landing)")
-    assert "landed" in simulator.events
