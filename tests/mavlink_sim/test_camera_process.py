@@ -73,7 +73,7 @@ def first_frame(camera: CameraProcess, position: tuple[float, float, float], yaw
     return got[0]
 
 
-def test_frame_shows_its_pose_and_has_its_stamp(camera: CameraProcess) -> None:
+def test_frames_show_their_poses_the_newest_wins_and_stopping_cleans_up(camera: CameraProcess) -> None:
     frame = first_frame(camera, (1.0, 0.0, -2.0), 0.0)
     here = Renderer(WORLD, CAMERA, CameraMount()).render((1.0, 0.0, -2.0), np.eye(3))
     assert frame.depth_m is not None
@@ -84,9 +84,6 @@ def test_frame_shows_its_pose_and_has_its_stamp(camera: CameraProcess) -> None:
     assert turned.depth_m is not None
     assert not np.allclose(turned.depth_m, here.depth_m, equal_nan=True)
 
-
-def test_the_newest_of_many_poses_wins(camera: CameraProcess) -> None:
-    first_frame(camera, (0.0, 0.0, -2.0), 0.0)
     for number in range(200):
         camera.send_pose((0.0, 0.0, -2.0), (1.0, 0.0, 0.0, 0.0), number + 1)
     assert camera.shared_name is not None
@@ -97,13 +94,10 @@ def test_the_newest_of_many_poses_wins(camera: CameraProcess) -> None:
             return frame is not None and frame.captured_ns == 200
 
         until(newest, "the last pose drawn")
-        frame = reader.latest()
-        assert frame is not None
-        assert frame.sequence < 150
+        last = reader.latest()
+        assert last is not None
+        assert last.sequence < 150
 
-
-def test_stopping_ends_the_process_and_removes_the_memory(camera: CameraProcess) -> None:
-    first_frame(camera, (0.0, 0.0, -2.0), 0.0)
     assert camera.alive
     camera.stop()
     assert not camera.alive

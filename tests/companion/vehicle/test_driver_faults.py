@@ -261,7 +261,12 @@ async def test_delayed_setpoints_keep_the_vehicle_in_offboard(kind: DriverKind) 
 
 
 @pytest.mark.parametrize(
-    ("kind", "autopilot"), [("pymavlink", "px4"), ("mavsdk", "px4"), ("pymavlink", "ardupilot")]
+    ("kind", "autopilot"),
+    [
+        ("pymavlink", "px4"),
+        pytest.param("mavsdk", "px4", marks=pytest.mark.slow),  # as in SHARED
+        ("pymavlink", "ardupilot"),
+    ],
 )
 async def test_estimator_reset_and_loss_are_in_the_state(kind: DriverKind, autopilot: str) -> None:
     with simulated(autopilot=autopilot, speed=4.0) as simulator:

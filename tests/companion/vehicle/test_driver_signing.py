@@ -141,7 +141,8 @@ def test_key_is_not_in_settings_or_log(tmp_path: Path, caplog: pytest.LogCapture
     assert read_key(path).hex() not in output
 
 
-@pytest.mark.parametrize("firmware", ["px4", "ardupilot"])
+# The driver signs for every autopilot with the same code.
+@pytest.mark.parametrize("firmware", ["px4", pytest.param("ardupilot", marks=pytest.mark.slow)])
 async def test_signed_link_works_and_wrong_key_is_reported(
     tmp_path: Path, firmware: str, caplog: pytest.LogCaptureFixture
 ) -> None:
