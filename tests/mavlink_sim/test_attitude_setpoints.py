@@ -296,7 +296,7 @@ angles = st.floats(-3.1, 3.1)
 attitudes = st.tuples(angles, st.floats(-1.5, 1.5), angles)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(attitudes, attitudes)
 def test_the_controller_turns_any_attitude_into_any_other(
     start: tuple[float, float, float], goal: tuple[float, float, float]
