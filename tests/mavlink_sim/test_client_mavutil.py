@@ -79,8 +79,10 @@ def test_all_parameters_are_fetched_written_and_saved(
     count = 0
     while "_HASH_CHECK" not in parameters or len(parameters) < count + 1:
         assert time.monotonic() < deadline, len(parameters)
-        message = link.recv_match(type="PARAM_VALUE", blocking=True, timeout=10.0)
-        assert message is not None
+        message = link.recv_match(type="PARAM_VALUE", blocking=True, timeout=5.0)
+        if message is None:  # one was lost, as any datagram on a busy machine
+            link.param_fetch_all()
+            continue
         count = message.param_count
         parameters[message.param_id] = message.param_value
     assert parameters["COM_OF_LOSS_T"] == 1.0
