@@ -14,6 +14,8 @@ from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
 from typing import Any
 
+from anyio.from_thread import start_blocking_portal
+
 from companion.dashboard.access import HEADER
 from companion.dashboard.server import DashboardOptions, serve
 from companion.settings import LanguageSection, ZenohSection
@@ -68,6 +70,13 @@ async def request(
             connection.close()
 
     return await asyncio.to_thread(send)
+
+
+@contextmanager
+def dashboard_here(endpoint: str) -> Iterator[str]:
+    """`serving` in a thread; yields the page's address."""
+    with start_blocking_portal() as portal, portal.wrap_async_context_manager(serving(endpoint)) as port:
+        yield f"http://127.0.0.1:{port}/"
 
 
 @contextmanager
