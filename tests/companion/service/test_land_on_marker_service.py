@@ -38,7 +38,7 @@ yaw_deg = 30
 width = 320
 height = 240
 horizontal_fov_deg = 80
-rate_hz = 10
+rate_hz = 5
 [camera.mount]
 pitch_deg = -90
 """

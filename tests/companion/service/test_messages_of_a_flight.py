@@ -57,7 +57,7 @@ def test_every_message_of_a_flight_is_valid(tmp_path: Path) -> None:
     )
     flags = [
         "--source-uri", f"shm://{camera}", "--detector-image-size", "320",
-        "--guidance-obstacles", "auto", "--guidance-perception-max-age-s", "1.0",
+        "--guidance-obstacles", "auto", "--guidance-avoid", "true", "--guidance-perception-max-age-s", "1.0",
         "--markers-dictionary", "4X4_50", "--markers-size-m", "0.6",
         "--config", str(second),
     ]  # fmt: skip
@@ -72,7 +72,7 @@ def test_every_message_of_a_flight_is_valid(tmp_path: Path) -> None:
         session.declare_subscriber("companion/vehicle1/**", samples.put)
         replies: list[dict[str, Any]] = []
         service.take_off(2.5)
-        for text in ("hold duration=1", "dance", "land"):
+        for text in ("goto north=2 east=0", "dance", "land"):
             replies.append(service.command_when_it_can(text, 90.0))
     assert [reply["success"] for reply in replies] == [True, False, True], replies
 
@@ -90,6 +90,8 @@ def test_every_message_of_a_flight_is_valid(tmp_path: Path) -> None:
         closed_reply = closed(schema_of(CommandReplyBody))
         assert set(reply) <= set(closed_reply["properties"])
 
+    # `goto` flies what the worker has planned.
+    assert any(body["path_ned_m"] for body in bodies["setpoint"])
     frames = [body for body in bodies["detections"] if body["camera"] is None]
     assert {body["model_sha256"] for body in frames} == {weights_sha256(DEFAULT_WEIGHTS)}
     cars = [(body, car) for body in frames for car in body["detections"] if car["track_state"] == "confirmed"]

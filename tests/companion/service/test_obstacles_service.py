@@ -99,6 +99,9 @@ def north_m(row: dict[str, Any]) -> float:
     return float(row["position_ned_m"][0])
 
 
+# `test_avoidance_flights` passes it in lockstep, and a planned path is flown by
+# `test_every_message_of_a_flight_is_valid`.
+@pytest.mark.slow
 def test_flies_around_a_pillar_to_the_goal(tmp_path: Path) -> None:
     scene = SCENE.format(kind="box", north_m=6.0, size_m=[1.0, 1.0, 6.0])
     flags = ("--guidance-avoid", "true", "--guidance-obstacle-margin-m", "1")
