@@ -23,12 +23,12 @@ from tests.companion.service_process import heartbeats, running_service
 pytestmark = pytest.mark.realtime
 
 
-def test_two_models_on_one_camera_are_independent(
+def test_two_models_on_one_camera_and_the_second_steers(
     seeing: list[str], exported_model: Path, tmp_path: Path
 ) -> None:
     shared = f"companion-test-{secrets.token_hex(4)}"
     (tmp_path / "companion.toml").write_text(
-        f'[source]\nshare = "{shared}"\n'
+        f'[guidance]\ncamera = "down"\n[source]\nshare = "{shared}"\n'
         f'[cameras.down.source]\nuri = "shm://{shared}"\n'
         f"[cameras.down.detector]\nmodel = {str(exported_model)!r}\nruntime = 'onnxruntime'\n"
         "image_size = 96\nclasses = ['boat']\n"
@@ -55,12 +55,14 @@ def test_two_models_on_one_camera_are_independent(
         assert (first["width"], first["height"]) == (down["width"], down["height"]) == (160, 120)
         status = statuses.get(timeout=10)
         assert status["perception"]["pid"] != status["cameras"]["down"]["pid"]
-        assert status["targets"]["camera"] is None
+        assert status["targets"]["camera"] == "down"
+        assert " class 'bicycle'" in service.command("seek bicycle")["reason"]
+        assert "the air" in service.command("seek boat")["reason"]
 
         os.kill(status["cameras"]["down"]["pid"], signal.SIGKILL)
         service.wait_for_line("camera down: perception lost")
         service.wait_for_line("camera down: perception restored")
-        # Both cameras have the model of rendered scenes.
+        # Both cameras have the model of rendered scenes, and read frames that are not the simulator's.
         (line,) = [line for line in service.lines if "models pull" in line]
         assert "'small.onnx'" in line.replace(str(exported_model), "small.onnx")
         while not received.empty():
@@ -70,28 +72,6 @@ def test_two_models_on_one_camera_are_independent(
             pass
         assert status["perception"]["restarts"] == 0
     assert not Path("/dev/shm", shared).exists()
-
-
-def test_guidance_camera_selects_the_steering_camera(
-    exported_model: Path, image_folder: Path, tmp_path: Path
-) -> None:
-    shared = f"companion-test-{secrets.token_hex(4)}"
-    (tmp_path / "companion.toml").write_text(
-        '[detector]\nenabled = false\n[guidance]\ncamera = "side"\n'
-        f'[source]\nshare = "{shared}"\n[cameras.side.source]\nuri = "shm://{shared}"\n'
-        f"[cameras.side.detector]\nmodel = {str(exported_model)!r}\n"
-        "runtime = 'onnxruntime'\nimage_size = 96\n"
-    )
-    flags = ["--source", str(image_folder), "--source-loop", "true", "--source-rate-hz", "10"]
-    with (
-        heartbeats() as port,
-        running_service(port, flags, cwd=tmp_path) as service,
-    ):
-        # Only the classes of that camera's model can be sought.
-        assert " class 'bicycle'" in service.command("seek bicycle")["reason"]
-        assert "the air" in service.command("seek boat")["reason"]
-        # It reads the first camera's frames, which are not the simulator's.
-        service.wait_for_line("models pull")
 
 
 @pytest.mark.parametrize(
