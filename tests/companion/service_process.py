@@ -24,7 +24,7 @@ from mavlink_sim.testing import QUICK_FLIGHT, free_port
 
 # Options of a vehicle at twice real time. Setpoints may be as late as in real time: COM_OF_LOSS_T, 1 s by
 # default, is of simulated time. ClockSync does not settle at this speed, so messages are stamped by their
-# arrival: test_flight_with_detections_and_the_mavsdk_driver flies in real time, with synchronized stamps.
+# arrival: test_mavsdk_flight_with_frames_on_standard_input flies in real time, with synchronized stamps.
 TWICE: dict[str, Any] = {
     "speed": 2.0,
     "ready_after": 0.0,

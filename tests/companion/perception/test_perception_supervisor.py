@@ -405,7 +405,7 @@ FRAME = bytes(64 * 48 * 3)
 
 def raw_settings(descriptor: int, patch: pytest.MonkeyPatch, **overrides: str) -> Settings:
     """Raw frames from a descriptor in place of standard input; the service itself reads descriptor 0 in
-    `test_frames_from_ffmpeg_on_standard_input`."""
+    `test_mavsdk_flight_with_frames_on_standard_input`."""
     patch.setattr(
         "companion.perception.supervisor.StandardInput", partial(StandardInput, descriptor=descriptor)
     )

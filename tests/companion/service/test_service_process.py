@@ -19,8 +19,8 @@ import zenoh
 
 from companion.bus.client import listen
 from companion.bus.topics import command_key
-from mavlink_sim.testing import QUICK_FLIGHT, RunningSimulator, free_port, running_simulator
-from tests.companion.service_process import TWICE, ServiceProcess, heartbeats, running_service
+from mavlink_sim.testing import QUICK_FLIGHT, free_port, running_simulator
+from tests.companion.service_process import TWICE, ServiceProcess, running_service
 
 pytestmark = pytest.mark.realtime
 
@@ -71,49 +71,77 @@ def test_ardupilot_is_recognized_by_a_service_without_a_camera(tmp_path: Path) -
             vehicle = received.get(timeout=10)["vehicle"]
 
 
-def test_flight_with_detections_and_the_mavsdk_driver(seeing: list[str], tmp_path: Path) -> None:
-    flags = [*seeing, "--source-rate-hz", "2", "--driver", "mavsdk"]
-    with (
-        running_simulator(ready_after=0.0, parameters=QUICK_FLIGHT) as simulator,
-        running_service(simulator.onboard_port, flags, cwd=tmp_path) as service,
-        service.client() as session,
-    ):
-        detections: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
-        service.take_off(2.5)
-        assert service.command("orbit radius=3 speed=1")["success"]
-        listen(session, "detections", lambda _key, text: detections.put(json.loads(text)))
-        assert detections.get(timeout=10)["vehicle"] == "vehicle1"
-        assert service.command("land")["success"]
-        simulator.wait_for_event("disarmed")
+def test_mavsdk_flight_with_frames_on_standard_input(exported_model: Path, tmp_path: Path) -> None:
+    writer = subprocess.Popen(
+        [
+            *(imageio_ffmpeg.get_ffmpeg_exe(), "-re", "-f", "lavfi", "-i", "testsrc=size=64x48:rate=5"),
+            *("-f", "rawvideo", "-pix_fmt", "bgr24", "-"),
+        ],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+    )
+    assert writer.stdout is not None
+    flags = [
+        *("--source", "-", "--source-pixel-format", "bgr24", "--source-width", "64", "--source-height", "48"),
+        *("--model", str(exported_model), "--detector-runtime", "onnxruntime", "--detector-image-size", "64"),
+        *("--guidance-perception-max-age-s", "3", "--driver", "mavsdk"),
+    ]
+    try:
+        with (
+            running_simulator(ready_after=0.0, parameters=QUICK_FLIGHT) as simulator,
+            running_service(
+                simulator.onboard_port, flags, cwd=tmp_path, stdin=writer.stdout.fileno()
+            ) as service,
+            service.client() as session,
+        ):
+            detections: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+            service.take_off(2.5)
+            assert service.command("orbit radius=3 speed=1")["success"]
+            listen(session, "detections", lambda _key, text: detections.put(json.loads(text)))
+            messages = [detections.get(timeout=20) for _ in range(3)]
+            assert service.command("land")["success"]
+            simulator.wait_for_event("disarmed")
+    finally:
+        writer.kill()
+        writer.wait()
+        writer.stdout.close()
+    found = {(message["vehicle"], message["width"], message["height"]) for message in messages}
+    assert found == {("vehicle1", 64, 48)}
 
 
-def test_stopped_service_does_not_retake_command(tmp_path: Path) -> None:
+def test_lost_vehicle_is_reconnected_and_no_command_retaken(tmp_path: Path) -> None:
     path = tmp_path / "truth.jsonl"
     with (
-        running_simulator(truth=path, ready_after=0.0, parameters=QUICK_FLIGHT) as simulator,
-        running_service(simulator.onboard_port, NO_CAMERA, cwd=tmp_path) as service,
+        running_simulator(**TWICE) as first,
+        running_service(first.onboard_port, NO_CAMERA, cwd=tmp_path) as service,
     ):
         fly(service)
-        stopped_ns = time.monotonic_ns()
-        service.signal(signal.SIGSTOP)
-        row = wait_for_truth(path, lambda r: r["stamp_ns"] > stopped_ns and r["mode"] != "OFFBOARD")
-        assert row["armed"]
-        assert (row["stamp_ns"] - stopped_ns) / 1e9 <= LOSS_S + ALLOWED_S
-        service.signal(signal.SIGCONT)
-        service.wait_for_line("command lost")
-        landed = wait_for_truth(path, lambda r: r["stamp_ns"] > stopped_ns and not r["armed"], 60.0)
-        between = [r for r in truth(path) if row["stamp_ns"] <= r["stamp_ns"] < landed["stamp_ns"]]
-        back = [r["stamp_ns"] for r in between if r["mode"] == "OFFBOARD"]
-        times_s = [(at - row["stamp_ns"]) / 1e9 for at in (*back[:1], *back[-1:])]
-        assert not back, f"in OFFBOARD again at {times_s} s: {service.lines}"
-
-
-def assert_ends_in_hold(service: ServiceProcess, simulator: RunningSimulator, number: signal.Signals) -> None:
-    simulator.wait_for_event("mode OFFBOARD")
-    offboard = simulator.events.index("mode OFFBOARD")
-    service.signal(number)
-    assert service.process.wait(20) == 0
-    simulator.wait_for_event("mode HOLD", since=offboard)
+        first.kill()
+        service.wait_for_line("autopilot heartbeat lost")
+        count = len(service.lines)
+        with running_simulator(
+            onboard_port=first.onboard_port,
+            onboard_bind=first.onboard_bind,
+            truth=path,
+            ready_after=0.0,
+            parameters=QUICK_FLIGHT,
+        ) as second:
+            service.wait_for_line("autopilot heartbeat received", after=count)
+            fly(service)
+            second.wait_for_event("takeoff")
+            stopped_ns = time.monotonic_ns()
+            service.signal(signal.SIGSTOP)
+            row = wait_for_truth(path, lambda r: r["stamp_ns"] > stopped_ns and r["mode"] != "OFFBOARD")
+            assert row["armed"]
+            assert (row["stamp_ns"] - stopped_ns) / 1e9 <= LOSS_S + ALLOWED_S
+            service.signal(signal.SIGCONT)
+            service.wait_for_line("command lost", after=count)
+            landed = wait_for_truth(path, lambda r: r["stamp_ns"] > stopped_ns and not r["armed"], 60.0)
+            between = [r for r in truth(path) if row["stamp_ns"] <= r["stamp_ns"] < landed["stamp_ns"]]
+            back = [r["stamp_ns"] for r in between if r["mode"] == "OFFBOARD"]
+            times_s = [(at - row["stamp_ns"]) / 1e9 for at in (*back[:1], *back[-1:])]
+            assert not back, f"in OFFBOARD again at {times_s} s: {service.lines}"
 
 
 def test_flight_with_detections_survives_a_killed_worker(seeing: list[str], tmp_path: Path) -> None:
@@ -152,7 +180,10 @@ def test_flight_with_detections_survives_a_killed_worker(seeing: list[str], tmp_
         messages = [received.get(timeout=10)]
         while len(messages) < 30 or messages[-1]["captured_ns"] < killed_ns:
             messages.append(received.get(timeout=10))
-        assert_ends_in_hold(service, simulator, signal.SIGINT)
+        offboard = simulator.events.index("mode OFFBOARD")
+        service.signal(signal.SIGINT)
+        assert service.process.wait(20) == 0
+        simulator.wait_for_event("mode HOLD", since=offboard)
     messages += [received.get() for _ in range(received.qsize())]
     published = [message["published_ns"] for message in messages]
     assert published == sorted(published)
@@ -160,55 +191,6 @@ def test_flight_with_detections_survives_a_killed_worker(seeing: list[str], tmp_
     sequences = [message["sequence"] for message in messages]
     assert sequences == sorted(set(sequences))
     assert all(m["captured_ns"] <= m["inferred_ns"] <= m["published_ns"] for m in messages)
-
-
-def test_lost_vehicle_is_reconnected_and_held_at_shutdown(tmp_path: Path) -> None:
-    with (
-        running_simulator(**TWICE) as first,
-        running_service(first.onboard_port, NO_CAMERA, cwd=tmp_path) as service,
-    ):
-        fly(service)
-        first.kill()
-        service.wait_for_line("autopilot heartbeat lost")
-        count = len(service.lines)
-        with running_simulator(
-            onboard_port=first.onboard_port, onboard_bind=first.onboard_bind, **TWICE
-        ) as second:
-            service.wait_for_line("autopilot heartbeat received", after=count)
-            fly(service)
-            second.wait_for_event("takeoff")
-            assert_ends_in_hold(service, second, signal.SIGTERM)
-
-
-def test_frames_from_ffmpeg_on_standard_input(exported_model: Path, tmp_path: Path) -> None:
-    writer = subprocess.Popen(
-        [
-            *(imageio_ffmpeg.get_ffmpeg_exe(), "-re", "-f", "lavfi", "-i", "testsrc=size=64x48:rate=20"),
-            *("-f", "rawvideo", "-pix_fmt", "bgr24", "-"),
-        ],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-    )
-    assert writer.stdout is not None
-    flags = [
-        *("--source", "-", "--source-pixel-format", "bgr24", "--source-width", "64", "--source-height", "48"),
-        *("--model", str(exported_model), "--detector-runtime", "onnxruntime", "--detector-image-size", "64"),
-    ]
-    try:
-        with (
-            heartbeats() as port,
-            running_service(port, flags, cwd=tmp_path, stdin=writer.stdout.fileno()) as service,
-            service.client() as session,
-        ):
-            received: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
-            listen(session, "detections", lambda _key, text: received.put(json.loads(text)))
-            messages = [received.get(timeout=20) for _ in range(3)]
-        assert {(message["width"], message["height"]) for message in messages} == {(64, 48)}
-    finally:
-        writer.kill()
-        writer.wait()
-        writer.stdout.close()
 
 
 def test_failure_notes_the_services_last_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
