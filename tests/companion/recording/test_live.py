@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from mavlink_sim.testing import free_port, running_simulator
-from tests.companion.service_process import heartbeats, running_service
+from tests.companion.service_process import TWICE, heartbeats, running_service
 
 pytestmark = pytest.mark.realtime
 pytest.importorskip("foxglove", reason="foxglove-sdk is an optional extra")
@@ -60,11 +60,10 @@ class Viewer:
             yield opcode & 0xF, self._file.read(length)
 
     def wait_for_channel(self, topic: str) -> dict[str, Any]:
-        for opcode, data in self.frames():
+        while topic not in self.channels:
+            opcode, data = next(self.frames())
             if opcode == TEXT and (message := json.loads(data)).get("op") == "advertise":
                 self.channels |= {channel["topic"]: channel for channel in message["channels"]}
-            if topic in self.channels:
-                break
         return self.channels[topic]
 
     def wait_for_message(self, subscription: int) -> tuple[int, dict[str, Any]]:
@@ -81,7 +80,7 @@ def test_viewer_gets_messages_and_images(filming: list[str], tmp_path: Path) -> 
     port = free_port(socket.SOCK_STREAM)
     flags = [*filming, "--foxglove-listen", f"127.0.0.1:{port}"]
     with (
-        running_simulator() as simulator,
+        running_simulator(**TWICE) as simulator,
         running_service(simulator.onboard_port, flags, cwd=tmp_path) as service,
     ):
         service.wait_for_line("foxglove: open ws://")
