@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import json
+import queue
 import socket
 import sys
 import threading
 import urllib.request
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from companion.bus.client import listen
 from companion.operator.metrics import MetricsError, MetricsServer
 from mavlink_sim.testing import free_port
 from tests.companion.service_process import heartbeats, running_service
@@ -25,13 +29,28 @@ def fetch(port: int) -> dict[str, float]:
     return {name: float(value) for name, _, value in pairs}
 
 
-def test_metrics_of_a_running_service(seeing: list[str], tmp_path: Path) -> None:
+def test_metrics_and_tracks_of_a_running_service(seeing: list[str], tmp_path: Path) -> None:
     port = free_port(socket.SOCK_STREAM)
-    flags = [*seeing, "--metrics-listen", f"127.0.0.1:{port}", "--detector-rate-hz", "4"]
+    # An untrained network has low confidences; all its non-overlapping boxes are used.
+    flags = [
+        *(*seeing, "--metrics-listen", f"127.0.0.1:{port}", "--detector-rate-hz", "4"),
+        *("--confidence", "0", "--detector-iou", "0.05"),
+        *("--tracker-high-confidence", "0", "--tracker-low-confidence", "0", "--tracker-confirm-score", "0"),
+    ]
+    tracks: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+    detections: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
     with (
         heartbeats() as vehicle_port,
         running_service(vehicle_port, flags, cwd=tmp_path) as service,
+        service.client() as session,
     ):
+        listen(session, "tracks", lambda _key, text: tracks.put(json.loads(text)))
+        listen(session, "detections", lambda _key, text: detections.put(json.loads(text)))
+        message, frame = tracks.get(timeout=30), detections.get(timeout=30)
+        while frame["sequence"] < message["sequence"]:
+            frame = detections.get(timeout=30)
+        while message["sequence"] < frame["sequence"]:
+            message = tracks.get(timeout=30)
         service.wait_for_line("autopilot heartbeat received")
         numbers = fetch(port)
         while not numbers.get('companion_frames_skipped_total{camera="",reason="rate"}'):
@@ -47,6 +66,13 @@ def test_metrics_of_a_running_service(seeing: list[str], tmp_path: Path) -> None
         assert 0 <= quantiles[0] <= quantiles[1]
     with pytest.raises(OSError, match="refused"):
         fetch(port)
+    assert message["captured_ns"] == frame["captured_ns"]
+    assert message["vehicle"] == "vehicle1"
+    assert message["camera"] is None
+    updates = {e["track_id"] for e in message["events"] if e["event"] in ("new", "update")}
+    assert updates
+    assert updates == {f["track_id"] for f in frame["detections"] if f["track_state"] == "confirmed"}
+    assert frame["timing_ms"]["track"] >= 0
 
 
 def test_metrics_are_empty_before_the_first_status() -> None:
