@@ -10,7 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import jsonschema
 import numpy as np
 import pytest
 from mcap.reader import make_reader
@@ -20,6 +19,7 @@ from companion.recording.boot_clock import Boot, BootClock, align
 from companion.recording.files import RecordingReader
 from companion.recording.ulog import merge_ulog
 from tests.companion.command_line import companion_here
+from tests.companion.recording.test_recorded_service import schema_errors
 from tests.companion.recording.ulog_flight import (
     Flight,
     link_pieces,
@@ -44,10 +44,9 @@ def bodies(path: Path, topic: str) -> list[tuple[int, Any]]:
     "flight",
     [
         Flight(1),
-        Flight(2, drift=-80e-6, seconds=300.0),
-        Flight(3, booted_s=90_000.0, delay_s=0.003, seconds=120.0),
+        Flight(3, booted_s=90_000.0, drift=-80e-6, delay_s=0.003, seconds=120.0),
     ],
-    ids=["short", "drift", "slow link"],
+    ids=["short", "drift and slow link"],
 )
 def test_clocks_are_aligned_within_the_stated_error(flight: Flight, tmp_path: Path) -> None:
     path, offset_ns = write_recording(tmp_path, link_pieces(flight))
@@ -155,8 +154,7 @@ def test_every_type_of_value_is_json_by_its_schema(tmp_path: Path) -> None:
     assert early[1]["timestamp"] == 1
     begin_ns = bodies(tmp_path / "out.mcap", "ulog/vehicle_attitude")[0][0]
     assert abs(early[0] - begin_ns) < 10_000_000
-    for message in RecordingReader(tmp_path / "out.mcap").messages("ulog/mixed", "ulog/vehicle_attitude"):
-        jsonschema.validate(json.loads(message.data), json.loads(message.channel.schema))
+    assert schema_errors(tmp_path / "out.mcap") == []
 
 
 def test_merged_file_has_the_recording_the_log_and_the_clock(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from pymavlink.dialects.v20 import common
 
 from companion.bench.lockstep_flight import plain_settings
@@ -43,12 +44,12 @@ class Flight:
     def now_ns(self, boot_us: float) -> float:
         return boot_us * 1000 / (1 + self.drift) - self.booted_s * 1e9 + BEGIN_NS
 
-    def attitudes(self) -> Iterator[tuple[float, int, tuple[float, ...]]]:
+    def attitudes(self) -> Iterator[tuple[float, int, list[float]]]:
         """(CLOCK_MONOTONIC ns, stamp in microseconds, quaternion) at 250 Hz, in single precision."""
-        rng = random.Random(self.seed)
-        for number in range(round(self.seconds * 250)):
+        rng = np.random.default_rng(self.seed)
+        drawn = rng.uniform(-1, 1, (round(self.seconds * 250), 4)).astype(np.float32)
+        for number, values in enumerate(drawn.tolist()):
             now_ns = BEGIN_NS + number * 4e6
-            values = struct.unpack("<4f", struct.pack("<4f", *(rng.uniform(-1, 1) for _ in range(4))))
             yield now_ns, self.boot_us(now_ns), values
 
 
