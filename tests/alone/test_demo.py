@@ -18,10 +18,11 @@ from tests.companion.command_line import QUICK
 
 URL_LIMIT_S = 150
 FLOWN = "mission demo: flown, "  # 5 steps, or more where the car was sought again
-# The car of this world is near (18 m), but not in the first image (bearing 55 deg): it is searched for.
-NEAR_SEED = 5
-# A third of the images, a vehicle that climbs, returns and descends quickly, and a mission that turns and
-# flies quickly: a third of the work.
+# The car of this world is near (17 m), but not in the first image (bearing 74 deg): it is searched for.
+NEAR_SEED = 186
+# A third of the images, a vehicle that climbs and descends quickly, and a mission that turns and flies
+# quickly and lands where it stands: a third of the work. The slow case returns home, and so do the flights
+# in lockstep.
 FEWER = 3
 QUICKER_FLIGHT = {
     "MPC_ACC_HOR": 5.0,
@@ -29,7 +30,6 @@ QUICKER_FLIGHT = {
     "MPC_TKO_SPEED": 3.0,
     "MPC_XY_ERR_MAX": 10.0,
     "MPC_Z_VEL_MAX_DN": 3.0,
-    "RTL_RETURN_ALT": 4.0,
 }
 QUICK_DEMO = f"""
 from companion import demo
@@ -38,9 +38,10 @@ demo._CAMERA_RATE_HZ /= {FEWER}
 QUICK_FLIGHT.update({QUICKER_FLIGHT})
 {QUICK}"""
 QUICK_STEPS = {
-    "seek car": "seek car rate=1",
+    "seek car": "seek car rate=1 laps=0.5",  # the circle's half with the car in it
     "distance=5": "distance=5 speed=3",
     "duration=3": "duration=1",
+    'do = "rtl"': 'do = "land"',
 }
 
 
