@@ -5,8 +5,9 @@ from __future__ import annotations
 import base64
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Literal
 
@@ -42,6 +43,16 @@ CAMERA = CameraModel.from_horizontal_fov(480, 360, math.radians(80.0))
 MOUNT = CameraMount(forward_m=0.1, pitch_rad=math.radians(-10.0))
 SETTINGS = {"detector.image_size": "256", "detector.threads": "1", "preview.annotate": "false"}
 
+open_once = cache(open_detector)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def models_loaded_once() -> Iterator[None]:
+    """Loading takes as long as a replay, and a network keeps nothing from one frame to the next."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("vision.detector.open_detector", open_once)
+        yield
+
 
 @pytest.fixture(scope="module")
 def lossless(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -57,7 +68,7 @@ def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def _approach(folder: Path, camera: Callable[[LockstepVehicle], RenderedCamera], seconds: float) -> Path:
     flight = LockstepFlight.airborne(seed=11, height_m=3.0, wind_mps=1.0, camera=camera)
-    detector = open_detector("yolo", DetectorSettings(DEFAULT_MODEL, image_size=256, threads=1))
+    detector = open_once("yolo", DetectorSettings(DEFAULT_MODEL, image_size=256, threads=1))
     with recording(flight, folder, images=".png", model=ModelIdentity("own", detector.model_sha256)) as path:
         approach = "approach car distance=8"
         assert flight.fly(approach, seconds).moments

@@ -62,10 +62,8 @@ def test_resume_without_state_is_refused(tmp_path: Path) -> None:
         train_default(tmp_path / "model.pt", resume=True)
 
 
-@pytest.fixture
-def labelled(tmp_path: Path) -> Path:
+def write_labelled(folder: Path) -> Path:
     """A YOLO set of six grey images with a bright square each, class `Drone`; two are for validation."""
-    folder = tmp_path / "set"
     for index in range(6):
         split = "val" if index > 3 else "train"
         image = np.full((60, 80, 3), 90, np.uint8)
@@ -79,6 +77,11 @@ def labelled(tmp_path: Path) -> Path:
     return folder
 
 
+@pytest.fixture
+def labelled(tmp_path: Path) -> Path:
+    return write_labelled(tmp_path / "set")
+
+
 SHORT = ("--image-size", "64", "--batch-size", "2", "--workers", "0")
 
 
@@ -87,9 +90,17 @@ def train_command(data: Path, model: Path | str, output: Path, *options: str) ->
     return CliRunner().invoke(app, [*arguments, *SHORT, *options])
 
 
-def test_class_of_own_images_is_added_and_scored(labelled: Path, small_model: Path, tmp_path: Path) -> None:
-    output = tmp_path / "out" / "mine.safetensors"
-    result = train_command(labelled, small_model, output, "--steps", "3")
+@pytest.fixture(scope="module")
+def trained(small_model: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Result]:
+    """A labelled set, the model of three steps on it, and the command's result."""
+    folder = tmp_path_factory.mktemp("trained")
+    data, output = write_labelled(folder / "set"), folder / "out" / "mine.safetensors"
+    torch.manual_seed(0)
+    return data, output, train_command(data, small_model, output, "--steps", "3")
+
+
+def test_class_of_own_images_is_added_and_scored(trained: tuple[Path, Path, Result]) -> None:
+    _, output, result = trained
     assert result.exit_code == 0, result.stderr
     header, row, last = result.stdout.splitlines()
     assert header.split()[2:] == ["mAP50:", "before", "after", "mAP50-95:", "before", "after"]
@@ -102,21 +113,23 @@ def test_class_of_own_images_is_added_and_scored(labelled: Path, small_model: Pa
     assert not Detector(output, image_size=64).rendered_only
     assert (written.metadata["steps_done"], written.metadata["score"]["images"]) == (3, 2)
     assert "width_multiple" not in written.metadata["settings"]
-    # The result can be trained again.
-    again = train_command(labelled, output, tmp_path / "again.safetensors", "--steps", "1")
-    assert again.exit_code == 0, again.stderr
-    assert load_checkpoint(tmp_path / "again.safetensors").class_names == written.class_names
 
 
 def test_interrupted_training_on_images_resumes_by_its_own_options_only(
-    labelled: Path, small_model: Path, tmp_path: Path
+    trained: tuple[Path, Path, Result], small_model: Path, tmp_path: Path
 ) -> None:
-    whole, cut, other = tmp_path / "whole.safetensors", tmp_path / "cut.safetensors", tmp_path / "other.pt"
-    options = {"start": str(small_model), "image_size": 64, "batch_size": 2, "workers": 0, "steps": 3}
-    torch.manual_seed(0)
-    train_on_data(labelled, whole, **options)  # type: ignore[arg-type]
+    labelled, whole, _ = trained
+    cut, other = tmp_path / "cut.safetensors", tmp_path / "other.pt"
     torch.manual_seed(1)  # Nothing depends on the process's generator.
-    train_on_data(labelled, cut, time_limit_s=0.0, **options)  # type: ignore[arg-type]
+    train_on_data(
+        *(labelled, cut),
+        start=str(small_model),
+        image_size=64,
+        batch_size=2,
+        workers=0,
+        steps=3,
+        time_limit_s=0.0,
+    )
     assert load_checkpoint(cut).metadata["steps_done"] == 1
     before = cut.read_bytes()
     loaded = load_checkpoint(small_model)
@@ -186,15 +199,19 @@ def test_output_that_is_the_start_is_refused(
 
 
 def test_without_validation_images_training_images_are_judged(
-    labelled: Path, small_model: Path, tmp_path: Path
+    labelled: Path, trained: tuple[Path, Path, Result], tmp_path: Path
 ) -> None:
+    """The start is itself the result of a training: it can be trained again."""
+    _, start, _ = trained
     (labelled / "data.yaml").write_text("train: images/train\nnames: [Person, Drone]\n")
-    result = train_command(labelled, small_model, tmp_path / "mine.safetensors", "--steps", "1")
+    result = train_command(labelled, start, tmp_path / "mine.safetensors", "--steps", "1")
     assert result.exit_code == 0, result.stderr
     last = result.stdout.splitlines()[-1]
     assert "on 4 images, " in last
     assert last.endswith("training images")
-    assert load_checkpoint(tmp_path / "mine.safetensors").metadata["score"]["held_out"] is False
+    again = load_checkpoint(tmp_path / "mine.safetensors")
+    assert again.metadata["score"]["held_out"] is False
+    assert again.class_names == load_checkpoint(start).class_names
 
 
 @pytest.mark.parametrize(
