@@ -35,6 +35,7 @@ def main_of(program: str, **constants: float) -> Callable[[str], Coroutine[Any, 
     """Its function `main`, with other values of its constants."""
     names: dict[str, Any] = {"__name__": "example"}
     exec(program, names)
+    assert constants.keys() <= names.keys()
     names.update(constants)
     main: Callable[[str], Coroutine[Any, Any, None]] = names["main"]
     return main
@@ -109,7 +110,7 @@ def test_example_has_at_most_forty_lines(path: Path) -> None:
 @pytest.mark.usefixtures("installed")
 def test_commands_find_the_square_and_classes_of_the_plugins(tmp_path: Path) -> None:
     kind = ("--detector-kind", "red", *PLUGINS)
-    detect = ("detect", "square://320x240?rate=20", *kind, "--limit", "4", "--track", "--json")
+    detect = ("detect", "square://320x240?rate=5", *kind, "--limit", "4", "--track", "--json")
     missions = []
     for name in ("blob", "car"):
         (tmp_path / f"{name}.toml").write_text(f"[[step]]\ndo = 'takeoff 3'\n[[step]]\ndo = 'seek {name}'\n")
@@ -117,7 +118,7 @@ def test_commands_find_the_square_and_classes_of_the_plugins(tmp_path: Path) -> 
     (code, output, errors), *checks = run_commands(detect, *missions, cwd=tmp_path)
     assert code == 0, errors
     # The warning of the bundled model is about the built-in kind: the summary alone.
-    (summary,) = errors.splitlines()
+    (summary,) = [line for line in errors.splitlines() if "frames dropped" not in line]  # by a busy machine
     assert summary.startswith("companion: 4 frames, ")
     frames = [json.loads(line) for line in output.splitlines()]
     assert [(frame["width"], frame["height"]) for frame in frames] == [(320, 240)] * 4

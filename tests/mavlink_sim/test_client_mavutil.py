@@ -30,6 +30,9 @@ def link(simulator: RunningSimulator) -> Iterator[Any]:
     connection = mavutil.mavlink_connection(simulator.pymavlink_device, source_system=255)
     assert connection.wait_heartbeat(timeout=20) is not None
     yield connection
+    if connection.motors_armed():  # the test failed in the air
+        connection.set_mode("LAND")
+        connection.motors_disarmed_wait()
     connection.set_mode("LOITER")
     until(connection, lambda: connection.flightmode == "LOITER")
     connection.close()

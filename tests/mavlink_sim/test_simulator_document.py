@@ -49,6 +49,7 @@ def test_every_command_of_the_vehicle_starts_it(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.argv", [*words, *elsewhere])
     monkeypatch.setattr("signal.signal", lambda number, handler: None)  # pytest's stay
+    monkeypatch.setattr("gc.freeze", lambda: None)  # keep the objects of other tests collectable
     run = Fleet.run
 
     def run_shortly(fleet: Fleet) -> None:

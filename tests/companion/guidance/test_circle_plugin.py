@@ -14,6 +14,7 @@ import pytest
 from companion.bench.lockstep_flight import LockstepFlight, plain_settings
 from companion.guidance.command import COMMANDS
 from mavlink_sim.testing import RunningSimulator
+from tests.companion.command_line import companion_here
 from tests.companion.service_process import TWICE, running_service
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "circle"
@@ -73,6 +74,10 @@ def test_service_flies_an_installed_plugin(
     flags = ["--source", "none", "--plugins-modules", "circle"]
     with running_service(vehicle.onboard_port, flags, cwd=tmp_path) as service:
         service.take_off(3.0)
-        reply = service.command("circle radius=4")
-        assert reply["success"], reply
-        assert service.command("land")["success"]
+        # `send` does not know the command: the service does.
+        sent = companion_here("send", "circle radius=4", "--connect", service.endpoint, cwd=tmp_path)
+        assert sent.returncode == 0, sent.stdout + sent.stderr
+        assert "accepted" in sent.stdout
+        landed = companion_here("send", "land", "--connect", service.endpoint, cwd=tmp_path)
+        assert landed.returncode == 0, landed.stdout + landed.stderr
+        assert landed.stdout.startswith("done: ")

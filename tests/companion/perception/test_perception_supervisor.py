@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator
-from contextlib import asynccontextmanager, contextmanager
+from contextlib import asynccontextmanager, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
@@ -420,7 +420,8 @@ def writing(frames: Iterable[bytes]) -> Iterator[int]:
     reading, target = os.pipe()
 
     def write() -> None:
-        with open(target, "wb", buffering=0) as writer:
+        # A test that fails stops reading.
+        with suppress(BrokenPipeError), open(target, "wb", buffering=0) as writer:
             for data in frames:
                 writer.write(data)
 
@@ -429,8 +430,8 @@ def writing(frames: Iterable[bytes]) -> Iterator[int]:
     try:
         yield reading
     finally:
-        thread.join(DEADLINE_S)
         os.close(reading)
+        thread.join(DEADLINE_S)
 
 
 async def test_frames_from_a_pipe_are_all_read(monkeypatch: pytest.MonkeyPatch) -> None:

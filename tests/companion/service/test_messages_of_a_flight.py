@@ -107,6 +107,7 @@ def test_every_message_of_a_flight_is_valid(tmp_path: Path) -> None:
     state = next(body for body in bodies["vehicle"] if body["latitude_deg"] is not None)
     assert 0.0 < middle["latitude_deg"] - state["latitude_deg"] < 2e-4
     assert max(car["track_age_s"] for _, car in cars) > 1.0
+    assert {body["targets"]["camera"] for body in bodies["status"]} == {None}  # the first one steers
     assert {body["camera"] for body in bodies["transforms"]} == {None, "second"}
     (lens,) = {tuple(body["k"]) for body in bodies["camera_info"] if body["camera"] is None}
     assert lens[2] == 159.5

@@ -135,6 +135,7 @@ def test_lost_vehicle_is_reconnected_and_no_command_retaken(tmp_path: Path) -> N
             row = wait_for_truth(path, lambda r: r["stamp_ns"] > stopped_ns and r["mode"] != "OFFBOARD")
             assert row["armed"]
             assert (row["stamp_ns"] - stopped_ns) / 1e9 <= LOSS_S + ALLOWED_S
+            count = len(service.lines)
             service.signal(signal.SIGCONT)
             service.wait_for_line("command lost", after=count)
             landed = wait_for_truth(path, lambda r: r["stamp_ns"] > stopped_ns and not r["armed"], 60.0)

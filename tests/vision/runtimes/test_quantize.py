@@ -117,7 +117,11 @@ def test_int8_that_differs_too_much_is_not_kept(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(export_module, "_INT8_TOLERANCE", 0.0)
-    monkeypatch.setattr(export_module, "_write_int8", lambda *given: shutil.copy(quantised[0], given[3]))
+
+    def write(network: object, facts: object, to: str, path: Path, calibration: object) -> None:
+        shutil.copy(quantised[0], path)
+
+    monkeypatch.setattr(export_module, "_write_int8", write)
     with pytest.raises(RuntimeUnusableError, match=r"quantised: .* differ by \d\.\d+ .*most 0\.0 "):
         export(checkpoint, "onnx", tmp_path / "net.onnx", SIDE, calibrate=photographs)
     assert not list(tmp_path.iterdir())
