@@ -85,7 +85,7 @@ def page_at(window: Tab, url: str) -> Iterator[Tab]:
     try:
         yield window
     finally:
-        window.value("sessionStorage.clear()")
+        window.value("location.protocol === 'http:' && sessionStorage.clear()")
         window.send("Emulation.setFocusEmulationEnabled", enabled=False)
         window.send("Page.navigate", url="about:blank")
 
