@@ -364,7 +364,7 @@ def test_cameras_take_turns_and_stop_has_a_free_connection(browser: Browser, win
 
         wait_for(shown)
         begin()
-        publish(3.0, *names)
+        publish(4.0, *names)
         assert most_at_once(images(tab)) == 2
         counts = answered()
         assert set(counts) == set(names)
@@ -372,7 +372,7 @@ def test_cameras_take_turns_and_stop_has_a_free_connection(browser: Browser, win
         # Cameras without images take no turns of the others.
         publish(1.0, "right")
         begin()
-        publish(3.0, "right")
+        publish(4.0, "right")
         assert most_at_once(images(tab)) == 2
         assert answered()["right"] > 0.5 * max(counts.values())
         # A second window takes its part of the connections.
