@@ -28,6 +28,7 @@ _PLY_TYPES = {
     **dict.fromkeys(("float", "float32"), "<f4"),
     **dict.fromkeys(("double", "float64"), "<f8"),
 }
+_PCD_TYPES = {"<i1", "<i2", "<i4", "<i8", "<u1", "<u2", "<u4", "<u8", "<f4", "<f8"}
 _COLOURS = ("red", "green", "blue")
 _XYZ = ("x", "y", "z")
 
@@ -171,6 +172,10 @@ def _read_pcd(data: bytes) -> PointCloud:
         zip(header["FIELDS"], header["TYPE"], header["SIZE"], counts, strict=True)
     ):
         code = f"<{letter.lower()}{size}"
+        if code not in _PCD_TYPES:
+            raise ValueError(
+                f"field {name!r} has TYPE {letter!r} and SIZE {size!r}, expected I, U or F and its bytes"
+            )
         if name in ("rgb", "rgba") and (size, kind) == ("4", "binary"):
             code = "<u4"  # a float's bits
         unique = name if name != "_" else f"_{index}"  # padding

@@ -165,6 +165,7 @@ PCD_HEADER = b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 3\nHEIGH
         ("a.pcd", PCD_HEADER % (1, b"binary_compressed"), "binary_compressed"),
         ("a.pcd", PCD_HEADER % (3, b"binary") + bytes(20), "1 of 3"),
         ("a.pcd", b"FIELDS x y\nSIZE 4 4\nTYPE F F\nPOINTS 1\nDATA binary\n" + bytes(8), "z"),
+        ("a.pcd", PCD_HEADER.replace(b"TYPE F", b"TYPE \0") % (1, b"binary") + bytes(20), "TYPE"),
         ("a.xyz", b"1 2 3", ".ply or .pcd"),
     ],
 )
