@@ -33,6 +33,7 @@ test: $(READY)
 test-slow: $(READY)
 	$(BIN)/python -m pytest tests/alone -m slow
 	$(BIN)/python -m pytest --ignore tests/alone -n $(WORKERS) -m slow
+	$(BIN)/python -m pytest --ignore tests/alone -n $(WORKERS) -m "hypothesis and not slow" --hypothesis-profile explore
 
 lint: $(READY)
 	$(BIN)/ruff check .

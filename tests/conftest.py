@@ -10,9 +10,9 @@ import typer
 from hypothesis import settings
 
 # How long an example takes says more of the machine than of the code. The same examples every time, so that a
-# failure is of the change; `--hypothesis-profile=explore` tries new ones.
-settings.register_profile("steady", deadline=None, derandomize=True)
-settings.register_profile("explore", deadline=None)
+# failure is of the change; `make test-slow` tries more and new ones.
+settings.register_profile("steady", deadline=None, derandomize=True, max_examples=40)
+settings.register_profile("explore", deadline=None, max_examples=300)
 settings.load_profile("steady")
 
 # Tests run side by side: a thread pool of torch or OpenCV in each of them would only wait for the others'.
