@@ -20,6 +20,10 @@ from tests.companion.vehicle.fake_autopilot import streaming, wait_for_state, wa
 
 pytestmark = pytest.mark.realtime
 
+# pymavlink, the default, flies in every test of the service; what no library does by itself is tested with one.
+FLIGHTS = pytest.mark.parametrize("kind", ["mavsdk", pytest.param("pymavlink", marks=pytest.mark.slow)])
+SHARED = pytest.mark.parametrize("kind", ["pymavlink", pytest.param("mavsdk", marks=pytest.mark.slow)])
+
 # Simulated seconds are short; the loss timeout is long enough in them for a busy test machine.
 FLIGHT = {**QUICK_FLIGHT, "COM_OF_LOSS_T": 4.0, "COM_OBL_RC_ACT": 4.0}
 
@@ -49,6 +53,7 @@ def complete(state: VehicleState) -> bool:
     )
 
 
+@FLIGHTS
 async def test_state_parameters_modes_and_arming_of_two_vehicles(kind: DriverKind) -> None:
     with vehicle(speed=4.0) as simulator, vehicle(speed=4.0, system_id=2, parameters=QUICK_FLIGHT) as two:
         async with connected(kind, simulator) as driver, connected(kind, two, system_id=2) as second:
@@ -91,6 +96,7 @@ async def test_state_parameters_modes_and_arming_of_two_vehicles(kind: DriverKin
             await second.set_mode(FlightMode.LAND)
 
 
+@FLIGHTS
 async def test_px4_failsafe_acts_when_setpoints_end(kind: DriverKind) -> None:
     with vehicle(speed=6.0, parameters=FLIGHT) as simulator:
         async with connected(kind, simulator) as driver:
@@ -122,6 +128,7 @@ async def test_px4_failsafe_acts_when_setpoints_end(kind: DriverKind) -> None:
             await wait_for_state(driver, lambda s: not s.armed and s.landed is LandedState.ON_GROUND, 30.0)
 
 
+@SHARED
 async def test_driver_continues_after_a_vehicle_restart(
     kind: DriverKind, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -142,6 +149,7 @@ async def test_driver_continues_after_a_vehicle_restart(
     assert sum("no heartbeat" in line or "received again" in line for line in lines) == 2
 
 
+@FLIGHTS
 async def test_vision_position_reaches_the_estimator(kind: DriverKind) -> None:
     covariance = tuple(0.01 if index in (0, 6, 11, 15, 18, 20) else 0.0 for index in range(21))
     with vehicle(parameters={"EKF2_EV_CTRL": 1}) as simulator:

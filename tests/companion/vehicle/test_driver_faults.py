@@ -21,8 +21,8 @@ from tests.companion.vehicle.fake_autopilot import streaming, wait_for_state, wa
 
 pytestmark = pytest.mark.realtime
 
-# For what AutopilotDriver does with received messages. MAVSDK's are passed to it by other code, so these
-# tests are run with it too, in `make test-slow`.
+# For what AutopilotDriver does, with whichever library: with MAVSDK, in `make test-slow`. The commands and
+# parameters on a bad link are each library's own.
 SHARED = pytest.mark.parametrize("kind", ["pymavlink", pytest.param("mavsdk", marks=pytest.mark.slow)])
 PARAMETERS = {**QUICK_FLIGHT, "COM_OF_LOSS_T": 2.0, "COM_OBL_RC_ACT": 4.0}
 
@@ -76,6 +76,7 @@ async def test_commands_and_parameters_work_on_a_bad_link(kind: DriverKind) -> N
                 assert not driver.state.armed
 
 
+@SHARED
 async def test_corrupted_messages_do_not_reach_the_state(kind: DriverKind) -> None:
     """No damaged message may reach the state: the height stays near the ground and the mode is valid."""
     with simulated(faults=["corrupt 0.5 way=out"], seed=3) as simulator:
@@ -90,6 +91,7 @@ async def test_corrupted_messages_do_not_reach_the_state(kind: DriverKind) -> No
                 assert state.battery_fraction is None or state.battery_fraction > 0.5
 
 
+@SHARED
 async def test_refused_mode_fails_and_lost_acknowledgement_is_repeated(kind: DriverKind) -> None:
     with simulated(faults=["refuse_mode LAND"]) as simulator:
         async with connected(kind, simulator) as driver:
@@ -154,7 +156,7 @@ async def test_stopped_stream_is_requested_and_clock_jump_back_is_one_warning(
     kind: DriverKind, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
-    with simulated() as simulator:
+    with simulated(speed=1.0) as simulator:
         async with connected(kind, simulator) as driver:
             await ready(driver)
             never = -1.0
@@ -198,6 +200,7 @@ async def test_vehicle_is_usable_after_a_reboot(kind: DriverKind, caplog: pytest
             assert driver.state.home_altitude_amsl_m == pytest.approx(before, abs=0.5)
 
 
+@SHARED
 async def test_second_autopilot_is_ignored_or_prevents_arming(
     kind: DriverKind, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -233,6 +236,7 @@ async def test_second_autopilot_is_ignored_or_prevents_arming(
             await driver.arm()
 
 
+@SHARED
 async def test_delayed_setpoints_keep_the_vehicle_in_offboard(kind: DriverKind) -> None:
     with simulated(parameters=PARAMETERS, seed=4) as simulator:
         async with connected(kind, simulator) as driver:
