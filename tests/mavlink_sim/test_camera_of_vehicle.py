@@ -208,7 +208,7 @@ def test_listen_only_sends_nothing() -> None:
         AutopilotLink("udpout://127.0.0.1:14540", listen_only=True)
 
 
-@pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+@pytest.mark.parametrize("autopilot", ["px4", pytest.param("ardupilot", marks=pytest.mark.slow)])
 def test_frames_are_drawn_from_another_autopilots_pose(
     name: str, small: str, tmp_path: Path, autopilot: str
 ) -> None:

@@ -80,8 +80,8 @@ async def test_mavsdk_uploads_starts_pauses_and_finishes_a_mission() -> None:
         plan = MissionPlan(
             [
                 mission_item(0, 0, vehicle_action=MissionItem.VehicleAction.TAKEOFF),
-                mission_item(8, 0, speed_m_s=3.0),
-                mission_item(8, 12, camera_action=MissionItem.CameraAction.TAKE_PHOTO),
+                mission_item(5, 0, speed_m_s=3.0),
+                mission_item(5, 8, camera_action=MissionItem.CameraAction.TAKE_PHOTO),
             ]
         )
         await mission.set_return_to_launch_after_mission(True)
@@ -145,6 +145,7 @@ async def test_mavsdk_uploads_and_downloads_raw_plans_and_a_geofence() -> None:
         assert not (await geofence.download_geofence()).circles
 
 
+@pytest.mark.slow
 async def test_mavsdk_geofence_breach_holds_and_reports() -> None:
     # in real time: texts go to a ground station whose heartbeat comes often enough
     async with mavsdk_flight(1.0, of_ground_station=True) as (simulator, system):

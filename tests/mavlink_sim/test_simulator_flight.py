@@ -78,7 +78,7 @@ def test_pymavlink_flies_offboard_loses_stream_and_comes_home() -> None:
         companion.command(511, 436, 50_000)
         companion.command(176, 1, 6)
         companion.until(lambda: companion.mode() == 0x00060000, ahead)
-        companion.until(lambda: companion.newest["LOCAL_POSITION_NED"].x > 5.0, ahead)
+        companion.until(lambda: companion.newest["LOCAL_POSITION_NED"].x > 3.0, ahead)
 
         # no more setpoints: the failsafe returns and lands without any command
         companion.until(lambda: companion.newest["CURRENT_MODE"].custom_mode == 0x05040000)

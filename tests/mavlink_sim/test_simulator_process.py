@@ -170,11 +170,11 @@ def test_setpoint_methods_fly_it_until_they_stop(tmp_path: Path) -> None:
         simulator.arm()
         simulator.wait_for_event("takeoff")
         assert all(math.hypot(*position[:2]) < 0.001 for position in positions_in(truth))
-        simulator.set_position(3.0, 0.0, -3.0, yaw_rad=1.0)
+        simulator.set_position(2.0, 0.0, -2.0, yaw_rad=1.0)
         with pytest.raises(ValueError, match="finite numbers"):
             simulator.set_velocity(math.nan, 0.0, 0.0)
         deadline = time.monotonic() + 40.0
-        while not any(math.dist(position, (3.0, 0.0, -3.0)) < 0.5 for position in positions_in(truth)):
+        while not any(math.dist(position, (2.0, 0.0, -2.0)) < 0.5 for position in positions_in(truth)):
             assert time.monotonic() < deadline, simulator.events
             time.sleep(0.1)
         simulator.stop_setpoints()
@@ -220,10 +220,10 @@ def test_clock_runs_at_given_speed_and_truth_is_on_record(tmp_path: Path) -> Non
         first = link.recv_match(type="ATTITUDE", blocking=True, timeout=20)
         started = time.monotonic()
         last = first
-        while last.time_boot_ms - first.time_boot_ms < 8000:
+        while last.time_boot_ms - first.time_boot_ms < 4000:
             last = link.recv_match(type="ATTITUDE", blocking=True, timeout=20)
         # only an upper bound: a busy machine makes it slower, nothing may make it faster
-        assert time.monotonic() - started > 0.6
+        assert time.monotonic() - started > 0.3
         lines = truth.read_text().splitlines()  # while it runs
         link.close()
     # `running_simulator` sends SIGTERM; Ctrl-C is below, with a camera
