@@ -160,9 +160,9 @@ def pair(
 # Each tuple contains the one before twice.
 MAZE = b"]q\x09" + b"h\x09h\x09\x86q\x09" * 200
 BOMBS: dict[str, tuple[Callable[[Path], Path], str]] = {
-    "lists": (lambda p: pickled(p, b"]" * (6 << 20)), "makes more values"),
-    "dictionaries": (lambda p: pickled(p, b"}NNs" * (1 << 20)), "makes more values"),
-    "tuples": (lambda p: pickled(p, b"N\x85" * (3 << 20)), "makes more values"),
+    "lists": (lambda p: pickled(p, b"]" * (1 << 20)), "makes more values"),
+    "dictionaries": (lambda p: pickled(p, b"}NNs" * (1 << 18)), "makes more values"),
+    "tuples": (lambda p: pickled(p, b"N\x85" * (1 << 20)), "makes more values"),
     "remembered values": (
         lambda p: pickled(p, b"N" + b"".join(b"r" + k.to_bytes(4, "little") for k in range(1 << 18))),
         "makes more values",

@@ -241,7 +241,7 @@ def test_missing_bundled_model_is_reported(tmp_path: Path, monkeypatch: pytest.M
 @pytest.mark.parametrize(
     ("variant", "arguments", "every"),
     [
-        ("rect", {}, 2),
+        ("rect", {}, 4),
         ("rect_person_car", {"classes": [0, 2]}, 4),
         ("square", {"square": True}, 4),
         pytest.param("rect", {}, 1, marks=pytest.mark.slow),

@@ -46,7 +46,7 @@ def true_errors(seed: int) -> list[PoseError]:
 
 
 @pytest.mark.parametrize(
-    "seeds", [(0, 1, 711, 2003), pytest.param((0, 1, 711, 2003, 2017, 2095), marks=pytest.mark.slow)], ids=len
+    "seeds", [(1, 711, 2003), pytest.param((0, 1, 711, 2003, 2017, 2095), marks=pytest.mark.slow)], ids=len
 )
 def test_rendered_poses_are_true_with_a_covariance_of_their_shape(seeds: tuple[int, ...]) -> None:
     """Scaled to the noise of the rendered corners, two thirds of the errors lie within one sigma.

@@ -102,8 +102,9 @@ def test_tiny_model_overfits_eight_images() -> None:
     assert seen[-1].remaining_s == 0
 
 
-def test_same_seed_gives_same_weights_for_any_workers(trained: TrainedModel) -> None:
-    again = train(replace(SMALL, workers=2), rectangles, silent)
+@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_same_seed_gives_same_weights_for_any_workers(trained: TrainedModel, workers: int) -> None:
+    again = train(replace(SMALL, workers=workers), rectangles, silent)
     assert torch.equal(weights(trained), weights(again))
 
 

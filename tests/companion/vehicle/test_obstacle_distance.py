@@ -28,6 +28,7 @@ from vision.obstacle_sectors import SECTORS, ObstacleSectors
 # increment_f, angle_offset, frame.
 LAYOUT = struct.Struct("<Q72H2H2B2fB")
 FREE_CM = MAXIMUM_CM + 1
+WALL_M = 9.0
 
 
 def sectors(near: dict[int, float]) -> ObstacleSectors:
@@ -79,7 +80,7 @@ async def test_both_drivers_send_obstacle_distance(driver: Driver, autopilot: Fa
 def test_pilot_in_position_mode_stops_before_a_wall(send: bool) -> None:
     flags = {"detector.enabled": "false", "guidance.send_obstacle_distance": str(send)}
     settings = camera_settings(CAMERA, MOUNT, flags)
-    wall = WorldObject(0, "wall", (14.0, 0.0, 0.0), math.pi, size_m=(30.0, 0.4, 6.0))
+    wall = WorldObject(0, "wall", (WALL_M, 0.0, 0.0), math.pi, size_m=(30.0, 0.4, 6.0))
     sensed = CameraSettings(model=CAMERA, mount=MOUNT, depth=DepthSensor(), seed=1)
     scene = Scene(World((wall,), Ground(("concrete",), 0, 256, 0.05)), {}, sensed, "wall")
     flight = LockstepFlight.airborne(
@@ -94,9 +95,9 @@ def test_pilot_in_position_mode_stops_before_a_wall(send: bool) -> None:
     flight.turn_to(0.0)
     flight.vehicle.set_mode("POSCTL")
     pilot.sticks = Sticks(pitch=1.0)
-    flight.run(12.0 if send else 5.0)
+    flight.run(8.0 if send else 5.0)
     truth = flight.vehicle.truth
     assert truth.mode == ("POSCTL" if send else "HOLD")
-    left_m = 14.0 - 0.2 - truth.position_ned_m[0]
+    left_m = WALL_M - 0.2 - truth.position_ned_m[0]
     # Without data PX4 does not move, and changes to HOLD.
-    assert (2.2 < left_m < 4.0) if send else left_m > 12.0
+    assert (2.2 < left_m < 4.0) if send else left_m > WALL_M - 2.0

@@ -29,7 +29,8 @@ def views_of(
     ]
 
 
-@pytest.mark.parametrize("lens", LENSES)
+# The model of "plain" is that of "webcam", which the tests below recover.
+@pytest.mark.parametrize("lens", ["webcam", "wide", "fisheye", pytest.param("plain", marks=pytest.mark.slow)])
 def test_lens_is_recovered_with_its_distortion_model(lens: str) -> None:
     true = LENSES[lens]
     result = calibrate(views_of(true, 14))

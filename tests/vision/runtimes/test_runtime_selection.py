@@ -112,7 +112,7 @@ def every(checkpoint: Path) -> Detections:
     return Detector(checkpoint, **SETTINGS).detect(make_image(64, 96))
 
 
-@pytest.mark.parametrize("runtime", ["onnxruntime", "openvino"])
+@pytest.mark.parametrize("runtime", ["onnxruntime", pytest.param("openvino", marks=pytest.mark.slow)])
 def test_checkpoint_is_converted_once_for_a_named_runtime(
     checkpoint: Path, every: Detections, runtime: RuntimeName
 ) -> None:
