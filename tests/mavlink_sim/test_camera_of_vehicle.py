@@ -10,6 +10,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -140,29 +141,38 @@ def test_no_autopilot_is_refused_after_ten_seconds(
 
 
 @pytest.mark.parametrize("systems", [(4, 9), (4, 4)])
-def test_two_autopilots_on_one_port_are_refused(name: str, small: str, systems: tuple[int, int]) -> None:
+def test_two_autopilots_on_one_port_are_refused(
+    name: str,
+    small: str,
+    systems: tuple[int, int],
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
     port = free_port()
     ends = [UdpEndpoint("127.0.0.1", 0, port) for _ in range(2)]
-    command = [sys.executable, "-m", "mavlink_sim", "camera", "--vehicle-url", f"udpin://127.0.0.1:{port}"]
-    process = subprocess.Popen(
-        [*command, "--camera", name, "--scene", small], stderr=subprocess.PIPE, text=True
-    )
-    try:
-        deadline_s = time.monotonic() + DEADLINE_S
-        while process.poll() is None:
-            assert time.monotonic() < deadline_s
+    stopped = threading.Event()
+
+    def send() -> None:
+        while not stopped.wait(0.05):
             for system, end in zip(systems, ends, strict=True):
                 end.receive()
                 end.send([heartbeat(system)])
-            time.sleep(0.05)
-        ports = [end.port for end in ends]
+
+    sending = threading.Thread(target=send)
+    arguments = ["--vehicle-url", f"udpin://127.0.0.1:{port}", "--camera", name, "--scene", small]
+    monkeypatch.setattr("sys.argv", ["mavlink-sim", "camera", *arguments])
+    sending.start()
+    try:
+        with pytest.raises(SystemExit) as ended:
+            main()
     finally:
-        process.kill()
-        _, events = process.communicate()
+        stopped.set()
+        sending.join()
+        ports = [end.port for end in ends]
         for end in ends:
             end.close()
-    assert process.returncode == 2
-    (line,) = events.splitlines()
+    assert ended.value.code == 2
+    (line,) = capfd.readouterr().err.splitlines()
     for word in ("4 and 9",) if systems == (4, 9) else ("system id 4", *(f":{port}" for port in ports)):
         assert word in line
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import subprocess
-import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +19,7 @@ from numpy.typing import NDArray
 from mavlink_sim.camera.depth_camera import DepthSensor
 from mavlink_sim.camera.renderer import Rendered
 from mavlink_sim.camera.scene import CameraSettings, Scene
+from mavlink_sim.cli.main import main
 from mavlink_sim.datasets import training_scenes
 from mavlink_sim.datasets.dataset import DatasetError, DatasetOptions, make_dataset
 from mavlink_sim.datasets.training_scenes import (
@@ -202,17 +201,22 @@ height = 96
 """
 
 
-def test_command_writes_data_set_and_reports_counts(tmp_path: Path) -> None:
+def test_command_writes_data_set_and_reports_counts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     scene = tmp_path / "field.toml"
     scene.write_text(SCENE_FILE, "utf-8")
-    command = [sys.executable, "-m", "mavlink_sim", "dataset", str(tmp_path / "set"), "--scene", str(scene)]
-    made = subprocess.run([*command, "--frames", "3"], capture_output=True, text=True, timeout=100)
-    assert made.returncode == 0, made.stderr
-    assert "3 images" in made.stdout
+    command = ["mavlink-sim", "dataset", str(tmp_path / "set"), "--scene", str(scene), "--frames", "3"]
+    monkeypatch.setattr("sys.argv", command)
+    with pytest.raises(SystemExit) as made:
+        main()
+    assert made.value.code == 0
+    assert "3 images" in capsys.readouterr().out
     assert len(truth_of(tmp_path / "set")) == 3
-    again = subprocess.run([*command, "--frames", "3"], capture_output=True, text=True, timeout=100)
-    assert again.returncode == 2
-    assert "empty folder" in again.stderr
+    with pytest.raises(SystemExit) as again:
+        main()
+    assert again.value.code == 2
+    assert "empty folder" in capsys.readouterr().err
 
 
 Scenes = list[tuple[Image, Boxes, ClassIds]]

@@ -98,7 +98,9 @@ def test_vehicles_of_a_run(run: Any, pytester: pytest.Pytester) -> None:
     result.stdout.fnmatch_lines(
         ["*No such option: --wnd*", "*no parameter 'COM_OF'*", "*takes options by name*"]
     )
-    result.stdout.fnmatch_lines(["*- vehicle 1 -*", "log:*vehicle.log", "*- vehicle 2 -*", "log:*vehicle.log"])
+    result.stdout.fnmatch_lines(
+        ["*- vehicle 1 -*", "log:*-1/vehicle.log", "*- vehicle 2 -*", "log:*-2/vehicle.log"]
+    )
     result.stdout.fnmatch_lines(["log:*test_fails-1/vehicle.log", "traffic:*gcs-1.tlog", "* armed"])
     (pid,) = re.findall(r"vehicle (\d+)\n", result.stdout.str())
     assert not Path(f"/proc/{pid}").exists()

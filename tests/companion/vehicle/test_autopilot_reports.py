@@ -17,6 +17,8 @@ from tests.companion.vehicle.fake_autopilot import FakeAutopilot, wait_for_state
 pytestmark = pytest.mark.realtime
 
 
+# Both drivers pass every frame to the same reader.
+@pytest.mark.parametrize("kind", ["pymavlink", pytest.param("mavsdk", marks=pytest.mark.slow)])
 async def test_denied_arming_of_px4_has_its_reason(
     kind: DriverKind, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

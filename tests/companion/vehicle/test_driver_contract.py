@@ -20,7 +20,7 @@ from tests.companion.vehicle.fake_autopilot import streaming, wait_for_state, wa
 
 pytestmark = pytest.mark.realtime
 
-# pymavlink, the default, flies in every test of the service; what no library does by itself is tested with one.
+# pymavlink, the default, flies in the service's tests. What AutopilotDriver does is the same with both.
 FLIGHTS = pytest.mark.parametrize("kind", ["mavsdk", pytest.param("pymavlink", marks=pytest.mark.slow)])
 SHARED = pytest.mark.parametrize("kind", ["pymavlink", pytest.param("mavsdk", marks=pytest.mark.slow)])
 
