@@ -97,6 +97,8 @@ async def test_gimbal_control_is_taken_used_and_released(kind: DriverKind) -> No
             await wait_for_state(driver, lambda s: gimbal_of(s).primary_control == NOBODY)
 
 
+# Both drivers search it with the same code.
+@pytest.mark.parametrize("kind", ["pymavlink", pytest.param("mavsdk", marks=pytest.mark.slow)])
 async def test_missing_gimbal_is_not_logged(kind: DriverKind, caplog: pytest.LogCaptureFixture) -> None:
     with vehicle(speed=4.0) as simulator:
         async with connected(kind, simulator.onboard_port) as driver:
