@@ -24,6 +24,7 @@ from benchmarks.scenes import MOTIONS, scene_frames
 from companion import connect
 from companion.bus.client import listen
 from mavlink_sim.testing import QUICK_FLIGHT, RunningSimulator
+from tests.companion.command_line import companion_here
 from tests.companion.service_process import TWICE, running_service
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -57,11 +58,11 @@ async def wait_until_it_can_take_off(endpoint: str) -> None:
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with the source and the detector installed by pip."""
+    """Return a folder with the plug-ins installed by pip."""
     pytest.importorskip("setuptools")
     folder = tmp_path_factory.mktemp("plugins")
     copies = []
-    for name in ("detector", "source"):
+    for name in ("circle", "detector", "source"):
         (folder / name).mkdir()
         for file in (EXAMPLES / name).iterdir():
             if file.is_file():
@@ -156,14 +157,15 @@ def test_invalid_plugin_options_are_one_line(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("installed")
 @pytest.mark.vehicle.with_args(**TWICE)
 @pytest.mark.timeout(200)
-def test_service_publishes_detections_of_plugins(
+def test_service_detects_and_flies_by_plugins(
     vehicle: RunningSimulator,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     page = CLIENT_PAGE.read_text().partition("```python\n")[2].partition("```")[0]
-    flags = [*("--source", "square://320x240?rate=10", "--detector-kind", "red"), *PLUGINS]
+    flags = [*("--source", "square://320x240?rate=10", "--detector-kind", "red")]
+    flags += ["--plugins-modules", "red,square,circle"]
     with running_service(vehicle.onboard_port, flags, cwd=tmp_path) as service:
         with service.client() as session:
             detections: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
@@ -181,6 +183,10 @@ def test_service_publishes_detections_of_plugins(
         asyncio.run(main_of(page)(service.endpoint))
         names = ast.literal_eval(capsys.readouterr().out)
         run_example(monkeypatch, "subscribe.py", service.endpoint, "takeoff 2")
+        # `send` does not know the command: the service does.
+        sent = companion_here("send", "circle radius=4", "--connect", service.endpoint, cwd=tmp_path)
+        assert sent.returncode == 0, sent.stdout + sent.stderr
+        assert "accepted" in sent.stdout
     assert set(names) <= {"blob"}
     *lines, reply = capsys.readouterr().out.splitlines()
     assert reply.startswith("takeoff 2: done")

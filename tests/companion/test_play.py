@@ -116,7 +116,6 @@ def test_play_flies_an_autopilot_at_a_url_and_ends_on_ctrl_c(tmp_path: Path, sma
         running = stack.enter_context(playing(tmp_path, "--vehicle-url", url, *small, quick=False))
         assert any(line.endswith(": boat, car") for line in running.lines)
         running.take_off(2.0)
-        assert running.command("land")["success"]
         assert any("armed" in event for event in simulator.events)
         with running.client() as session:
             message = next_detections(session, "vehicle1")

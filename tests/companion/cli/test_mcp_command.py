@@ -163,9 +163,9 @@ async def test_simulated_vehicle_is_left_to_its_pilot(tmp_path: Path) -> None:
                 while (await call("state"))["in_command"]:
                     await asyncio.sleep(0.1)
             assert "--allow stop" in (await call("stop"))["reason"]
-            for _ in range(2):  # an endless one is answered when it is flown
-                assert (await call("orbit"))["success"] is True
-                assert (await call("stop"))["success"] is True
+            # An endless one is answered when it is flown.
+            assert (await call("orbit"))["success"] is True
+            assert (await call("stop"))["success"] is True
             assert (await call("orbit"))["success"] is True
             simulator.fault("pilot_takeover mode=POSCTL")
             async with asyncio.timeout(20):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
+import re
 import socket
 import time
 from collections import Counter
@@ -17,6 +19,7 @@ import numpy as np
 import pytest
 import zenoh
 
+from companion.bus.client import listen
 from companion.bus.topics import DETECTIONS, EVENTS, IMAGE, ROOT, SETPOINT, STATUS, VEHICLE
 from companion.guidance.grammar import json_schema
 from mavlink_sim.testing import free_port
@@ -163,18 +166,6 @@ def test_click_means_a_box_of_the_image_that_was_pressed(tab: Tab) -> None:
     assert tab.value("document.querySelector('#menu').textContent").startswith(f"track {boxes[0][6]}, ")
 
 
-def test_box_is_clicked_and_its_command_arrives(service: ServiceProcess, tab: Tab) -> None:
-    number = click_track(tab)
-    title, *items = tab.value("[...document.querySelector('#menu').children].map((item) => item.textContent)")
-    assert title.startswith(f"track {number}, ")
-    assert items == ["Follow", "Approach", "Orbit"]  # and it has no gimbal
-    tab.value("[...document.querySelectorAll('#menu button')][1].click()")
-    # The vehicle is on the ground: the service answers, whatever it answers.
-    answered = f"approach track={number}: "
-    tab.until(f"/^{answered}(done|failed): (?!no )/.test({REPLY})")
-    assert tab.value("document.querySelector('#menu').hidden")
-
-
 def test_rectangle_selects_what_is_in_it(tab: Tab) -> None:
     tab.until("[...cameras.values()].some((camera) => camera.bitmap !== null)")
     left, top, width, height = rectangle(tab, "figure canvas")
@@ -216,7 +207,11 @@ def in_the_air(service: ServiceProcess, tab: Tab) -> None:
 def test_clicked_car_is_followed(service: ServiceProcess, tab: Tab) -> None:
     in_the_air(service, tab)
     number = click_track(tab)
+    title, *items = tab.value("[...document.querySelector('#menu').children].map((item) => item.textContent)")
+    assert title.startswith(f"track {number}, ")
+    assert items == ["Follow", "Approach", "Orbit"]  # and it has no gimbal
     tab.value("document.querySelector('#menu button').click()")
+    assert tab.value("document.querySelector('#menu').hidden")
     tab.until(f"{REPLY} === 'follow track={number}: accepted, in progress'")
     # From 14 m to the 8 m that it keeps. If the car gets another id meanwhile, the status has both.
     called = f"(?:{number}|([0-9]+) [(]was {number}[)])"
@@ -225,7 +220,6 @@ def test_clicked_car_is_followed(service: ServiceProcess, tab: Tab) -> None:
     tab.until(f"{BOXES}.some((box) => box[4] === 'car' && box[6] === Number({said}?.[1] ?? {number}))")
 
 
-SPEED = "Math.hypot(...state.topics.vehicle.velocity_ned_mps.slice(0, 2))"
 STEERING = "document.querySelector('#steer').getAttribute('aria-pressed') === 'true'"
 PAD = "navigator.getGamepads = () => [null, {mapping: 'standard', axes: [0, 0, 0, AXIS]}]"
 
@@ -234,41 +228,37 @@ def hold_key(tab: Tab, kind: str) -> None:
     tab.send("Input.dispatchKeyEvent", type=kind, key="w", code="KeyW", windowsVirtualKeyCode=87)
 
 
-def test_keys_and_gamepad_steer_and_a_lost_page_brakes(
+def test_keys_and_gamepad_steer_and_a_lost_page_brakes(service: ServiceProcess, tab: Tab) -> None:
+    in_the_air(service, tab)
+    received: dict[str, Any] = {}
+
+    def faster(than_mps: float) -> bool:
+        return "vehicle" in received and math.hypot(*received["vehicle"]["velocity_ned_mps"][:2]) > than_mps
+
+    with service.client() as session:
+        for name in ("vehicle", "status"):
+            listen(
+                session, name, lambda key, text: received.update({key.rpartition("/")[2]: json.loads(text)})
+            )
+        tab.send("Emulation.setFocusEmulationEnabled", enabled=True)
+        tab.value("document.querySelector('#steer').click()")
+        tab.until(STEERING)
+        assert tab.value(REPLY).startswith("velocity source=page-")
+        hold_key(tab, "rawKeyDown")
+        wait_for(lambda: faster(0.6))
+        hold_key(tab, "keyUp")
+        tab.value(PAD.replace("AXIS", "0.1"))  # in the dead zone
+        wait_for(lambda: not faster(0.25))
+        tab.value(PAD.replace("AXIS", "1"))  # the stick back
+        wait_for(lambda: faster(0.6))
+        tab.send("Page.navigate", url="about:blank")
+        wait_for(lambda: not faster(0.25))
+        wait_for(lambda: re.match("velocity of page-.*, silent", received["status"]["pilot"]["behaviour"]))
+
+
+def test_second_window_cannot_steer_and_another_command_ends_it(
     browser: Browser, service: ServiceProcess, tab: Tab
 ) -> None:
-    other = open_page(browser, service.url)
-    in_the_air(service, tab)
-    tab.send("Emulation.setFocusEmulationEnabled", enabled=True)
-    tab.value("document.querySelector('#steer').click()")
-    tab.until(STEERING)
-    assert tab.value(REPLY).startswith("velocity source=page-")
-    hold_key(tab, "rawKeyDown")
-    other.until(f"{SPEED} > 0.6")
-    hold_key(tab, "keyUp")
-    other.until(f"{SPEED} < 0.25")
-    tab.value(PAD.replace("AXIS", "1"))  # the stick back
-    other.until(f"{SPEED} > 0.6")
-    tab.value(PAD.replace("AXIS", "0.1"))  # in the dead zone
-    other.until(f"{SPEED} < 0.25")
-    hold_key(tab, "rawKeyDown")
-    other.until(f"{SPEED} > 0.6")
-    tab.send("Page.navigate", url="about:blank")
-    other.until(f"{SPEED} < 0.25")
-    other.until("/^velocity of page-.*, silent/.test(state.topics.status.pilot.behaviour)")
-    other.close()
-
-
-def test_another_command_ends_steering(service: ServiceProcess, tab: Tab) -> None:
-    in_the_air(service, tab)
-    tab.value("document.querySelector('#steer').click()")
-    tab.until(STEERING)
-    tab.press(" ", " ")
-    tab.until(f"{REPLY}.startsWith('stop: done')")
-    tab.until(f"!({STEERING})")
-
-
-def test_steering_of_a_second_window_is_refused(browser: Browser, service: ServiceProcess, tab: Tab) -> None:
     other = open_page(browser, service.url)
     in_the_air(service, tab)
     tab.value("document.querySelector('#steer').click()")
@@ -279,6 +269,9 @@ def test_steering_of_a_second_window_is_refused(browser: Browser, service: Servi
     assert not other.value(STEERING)
     assert tab.value(STEERING)
     other.close()
+    tab.press(" ", " ")
+    tab.until(f"{REPLY}.startsWith('stop: done')")
+    tab.until(f"!({STEERING})")
 
 
 def test_page_shows_a_stop_button_and_names_on_a_phone(tab: Tab) -> None:
@@ -372,9 +365,9 @@ def test_cameras_take_turns_and_stop_has_a_free_connection(browser: Browser, win
         # Cameras without images take no turns of the others.
         publish(1.0, "right")
         begin()
-        publish(4.0, "right")
+        publish(2.0, "right")
         assert most_at_once(images(tab)) == 2
-        assert answered()["right"] > 0.5 * max(counts.values())
+        assert answered()["right"] > 0.5 * max(counts.values()) / 2.0  # in half of the time
         # A second window takes its part of the connections.
         other = open_page(browser, url)
         other.until("state.maxImages === 1 && cameras.size === 4")

@@ -1,9 +1,8 @@
-"""The example plug-in, installed as a package and flown."""
+"""The example plug-in, installed and flown in lockstep; `test_examples` flies it by the service."""
 
 from __future__ import annotations
 
 import math
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -13,9 +12,6 @@ import pytest
 
 from companion.bench.lockstep_flight import LockstepFlight, plain_settings
 from companion.guidance.command import COMMANDS
-from mavlink_sim.testing import RunningSimulator
-from tests.companion.command_line import companion_here
-from tests.companion.service_process import TWICE, running_service
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "circle"
 
@@ -62,22 +58,3 @@ def test_plugin_flies_its_circle(installed: Path, monkeypatch: pytest.MonkeyPatc
     radius = math.sqrt(rest + north**2 + east**2)
     assert abs(radius - 6.0) < 1.0
     assert np.ptp(np.hypot(*(points - (north, east)).T)) < 1.2
-
-
-@pytest.mark.realtime
-@pytest.mark.timeout(200)
-@pytest.mark.vehicle.with_args(**TWICE)
-def test_service_flies_an_installed_plugin(
-    installed: Path, vehicle: RunningSimulator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(installed), os.environ.get("PYTHONPATH", "")]))
-    flags = ["--source", "none", "--plugins-modules", "circle"]
-    with running_service(vehicle.onboard_port, flags, cwd=tmp_path) as service:
-        service.take_off(3.0)
-        # `send` does not know the command: the service does.
-        sent = companion_here("send", "circle radius=4", "--connect", service.endpoint, cwd=tmp_path)
-        assert sent.returncode == 0, sent.stdout + sent.stderr
-        assert "accepted" in sent.stdout
-        landed = companion_here("send", "land", "--connect", service.endpoint, cwd=tmp_path)
-        assert landed.returncode == 0, landed.stdout + landed.stderr
-        assert landed.stdout.startswith("done: ")

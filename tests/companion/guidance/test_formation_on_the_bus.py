@@ -25,7 +25,7 @@ from tests.companion.live_flight import LiveFlight
 
 pytestmark = pytest.mark.realtime
 
-VEHICLES = int(os.environ.get("FORMATION_VEHICLES", "3"))
+VEHICLES = int(os.environ.get("FORMATION_VEHICLES", "2"))
 
 
 class Companion:

@@ -1,4 +1,4 @@
-"""Mission files: parsing, errors, and a mission flown by the whole service."""
+"""Mission files: parsing and errors."""
 
 from __future__ import annotations
 
@@ -18,9 +18,7 @@ from companion.guidance.missions.mission_file import (
     read_mission,
 )
 from companion.guidance.missions.sequence import ABORT, END, LAND, RTL
-from mavlink_sim.testing import running_simulator
-from tests.companion.command_line import companion, companion_here
-from tests.companion.service_process import TWICE, running_service
+from tests.companion.command_line import companion_here
 
 NAMES = ("person", "car", "traffic light")
 DOCUMENT = Path(__file__).parents[3] / "docs" / "flight.md"
@@ -210,61 +208,6 @@ def test_cli_checks_a_mission_and_prints_its_plan(exported_model: Path, tmp_path
     done = companion_here("mission", "demo", *options, "--detector-runtime", "torch", cwd=tmp_path)
     assert done.returncode == 2
     assert "cannot run .onnx files" in done.stderr
-
-
-SHORT = """
-name = "up and down"
-
-[[step]]
-do = "takeoff 2.5"
-
-[[step]]
-name = "wait"
-do = "hold"
-timeout_s = 1
-
-[[step]]
-name = "look"
-do = "seek boat laps=0.25 rate=1 confidence=1"
-on_failure = "continue"
-
-[[step]]
-name = "down"
-do = "land"
-"""
-
-
-@pytest.mark.realtime
-@pytest.mark.timeout(120)
-def test_service_flies_a_mission_and_logs_its_steps(seeing: list[str], tmp_path: Path) -> None:
-    (tmp_path / "here").mkdir()
-    (tmp_path / "here" / "short.toml").write_text(SHORT)
-    flown_at = tmp_path / "service"
-    flown_at.mkdir()
-    with (
-        running_simulator(**TWICE) as simulator,
-        running_service(simulator.onboard_port, [*seeing, "--source-rate-hz", "3"], cwd=flown_at) as service,
-    ):
-        # The service cannot access the file: its text is sent with the command.
-        done = companion("mission", "short.toml", "--connect", service.endpoint, cwd=tmp_path / "here")
-        assert done.returncode == 0, done.stdout + done.stderr
-        assert done.stdout.splitlines()[-1] == "done: flown, 4 steps"
-        service.wait_for_line("mission up and down: step 4 of 4: land", 5.0)
-        assert any("step 2 of 4: hold" in line for line in service.lines)
-
-        reply = service.command("mission short")
-        assert not reply["success"]
-        assert "mission 'short' " in reply["reason"]
-        assert "bundled missions: " in reply["reason"]
-        reply = service.command("mission broken\n[[step]]\ndo = 'seek zebra'\n")
-        assert reply["reason"].startswith("broken: step 1")
-        reply = service.command("hold\n[[step]]\ndo = 'land'\n")
-        assert reply["reason"].startswith("hold: ")
-        assert "one line" in reply["reason"]
-        # From the ground its first step is refused, and with it the mission.
-        reply = service.command("mission from_the_ground\n[[step]]\ndo = 'hold 3'\n")
-        assert "the air" in reply["reason"]
-        assert reply["steps"] == []
 
 
 @pytest.mark.parametrize("name", ["x" * 300, "\0", ".", "/", "a/" * 3000])

@@ -128,7 +128,10 @@ def test_appearance_and_loss_are_reported_once() -> None:
 
 
 @pytest.mark.realtime
-@pytest.mark.parametrize(("kind", "autopilot"), [("mavsdk", "px4"), ("pymavlink", "ardupilot")])
+@pytest.mark.parametrize(
+    ("kind", "autopilot"),
+    [("mavsdk", "px4"), pytest.param("pymavlink", "ardupilot", marks=pytest.mark.slow)],
+)
 async def test_two_services_on_two_links_of_one_vehicle(kind: str, autopilot: str) -> None:
     options = TWICE if autopilot == "px4" else {**TWICE, "parameters": {"LAND_SPEED": 200}}
     with running_simulator(autopilot=autopilot, **options) as simulator:

@@ -20,6 +20,7 @@ import zenoh
 from companion.bus.client import listen
 from companion.bus.topics import command_key
 from mavlink_sim.testing import QUICK_FLIGHT, free_port, running_simulator
+from tests.companion.command_line import companion_here
 from tests.companion.service_process import TWICE, ServiceProcess, running_service
 
 pytestmark = pytest.mark.realtime
@@ -100,8 +101,6 @@ def test_mavsdk_flight_with_frames_on_standard_input(exported_model: Path, tmp_p
             assert service.command("orbit radius=3 speed=1")["success"]
             listen(session, "detections", lambda _key, text: detections.put(json.loads(text)))
             messages = [detections.get(timeout=20) for _ in range(3)]
-            assert service.command("land")["success"]
-            simulator.wait_for_event("disarmed")
     finally:
         writer.kill()
         writer.wait()
@@ -145,8 +144,29 @@ def test_lost_vehicle_is_reconnected_and_no_command_retaken(tmp_path: Path) -> N
             assert not back, f"in OFFBOARD again at {times_s} s: {service.lines}"
 
 
-def test_flight_with_detections_survives_a_killed_worker(seeing: list[str], tmp_path: Path) -> None:
+MISSION = """
+name = "around"
+
+[[step]]
+name = "wait"
+do = "hold"
+timeout_s = 1
+
+[[step]]
+name = "look"
+do = "seek boat laps=0.25 rate=1 confidence=1"
+on_failure = "continue"
+
+[[step]]
+do = "orbit radius=3 speed=1"
+timeout_s = 1
+"""
+
+
+def test_mission_is_flown_and_flight_survives_a_killed_worker(seeing: list[str], tmp_path: Path) -> None:
     path = tmp_path / "truth.jsonl"
+    (tmp_path / "here").mkdir()
+    (tmp_path / "here" / "short.toml").write_text(MISSION)
     with (
         running_simulator(truth=path, **TWICE) as simulator,
         running_service(simulator.onboard_port, seeing, cwd=tmp_path) as service,
@@ -156,11 +176,30 @@ def test_flight_with_detections_survives_a_killed_worker(seeing: list[str], tmp_
         listen(session, "status", lambda _key, text: statuses.put(json.loads(text)))
         received: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
         listen(session, "detections", lambda _key, text: received.put(json.loads(text)))
+        reply = service.command("mission short")
+        assert not reply["success"]
+        assert "mission 'short' " in reply["reason"]
+        assert "bundled missions: " in reply["reason"]
+        reply = service.command("mission broken\n[[step]]\ndo = 'seek zebra'\n")
+        assert reply["reason"].startswith("broken: step 1")
+        reply = service.command("hold\n[[step]]\ndo = 'land'\n")
+        assert reply["reason"].startswith("hold: ")
+        assert "one line" in reply["reason"]
+        # From the ground its first step is refused, and with it the mission.
+        while (
+            "the air" not in (reply := service.command("mission ground\n[[step]]\ndo = 'hold 3'"))["reason"]
+        ):
+            time.sleep(0.1)  # an estimate that is not there yet is named first
+        assert reply["steps"] == []
         service.take_off(2.5)
+        # The service cannot access the file: its text is sent with the command.
+        done = companion_here("mission", "short.toml", "--connect", service.endpoint, cwd=tmp_path / "here")
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert done.stdout.splitlines()[-1] == "done: flown, 3 steps"
+        service.wait_for_line("mission around: step 3 of 3: orbit", 5.0)
+        assert any("step 1 of 3: hold" in line for line in service.lines)
+
         assert service.command("orbit radius=3 speed=1")["success"]
-        refused = service.command("seek bicycle")
-        assert not refused["success"]
-        assert " class 'bicycle'" in refused["reason"]
         before = statuses.get(timeout=10)["perception"]
         while not statuses.empty():
             before = statuses.get()["perception"]
