@@ -137,8 +137,8 @@ def test_flight_with_depth_ranges_replays_without_it_as_inexact(lossless: Path, 
 
 
 @pytest.fixture(scope="module")
-def jpeg(lossless: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The same flight with JPEG images."""
+def jpeg(short: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same short flight with JPEG images."""
 
     def change(message: Recorded) -> Recorded:
         if message.channel.topic != "/image":
@@ -150,7 +150,7 @@ def jpeg(lossless: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         body |= {"data": base64.b64encode(encoded.tobytes()).decode(), "format": "jpeg"}
         return message._replace(data=json.dumps(body).encode())
 
-    return rewritten(lossless, tmp_path_factory.mktemp("jpeg"), change)
+    return rewritten(short, tmp_path_factory.mktemp("jpeg"), change)
 
 
 def test_jpeg_replays_are_equal_and_say_what_images_change(jpeg: Path) -> None:
@@ -169,7 +169,7 @@ def test_jpeg_replays_are_equal_and_say_what_images_change(jpeg: Path) -> None:
 
 
 def test_model_without_detections_explains_other_setpoints(
-    lossless: Path, small_model: Path, tmp_path: Path
+    lossless: Path, short: Path, small_model: Path, tmp_path: Path
 ) -> None:
     done = companion_here("replay", lossless, "--model", small_model, "--json", cwd=tmp_path)
     assert done.returncode == 1, done.stderr
@@ -183,9 +183,11 @@ def test_model_without_detections_explains_other_setpoints(
     assert first["seconds"] <= found["first"]["seconds"] <= setpoint["seconds"] < setpoint["until_s"]
     reached = [change["text"] for change in later if ": reached car" in change["text"]]
     assert any(text.startswith("event only ") and "the recording: " in text for text in reached)
-    lines = list(report(replay([lossless], {}, str(small_model))))
+    shown = replay([short], {}, str(small_model))
+    lines = list(report(shown))
     assert any("open loop" in line for line in lines)
-    assert any(line.startswith(f"{setpoint['seconds']:g} to {setpoint['until_s']:g} s: ") for line in lines)
+    changed = next(change for change in shown.timeline if change.text.startswith("setpoint"))
+    assert any(line.startswith(f"{changed.seconds:g} to {changed.until_s:g} s: ") for line in lines)
 
 
 def test_exported_file_of_the_model_is_another_model(short: Path, exported_model: Path) -> None:
