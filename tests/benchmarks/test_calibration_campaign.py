@@ -25,6 +25,7 @@ def test_seed_gives_its_lens() -> None:
     assert {random_lens(seed)[0] for seed in range(4)} == set(LENSES)
 
 
+@pytest.mark.slow
 def test_fisheye_is_calibrated_from_rendered_views() -> None:
     check_lens(3, 7)
 

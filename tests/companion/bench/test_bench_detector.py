@@ -14,15 +14,15 @@ from companion.cli import app
 
 
 def bench(model: Path, *more: str) -> str:
-    arguments = ["bench", "detector", "--model", str(model), "--runtime", "torch", "--image-size", "64"]
-    arguments += ["--frame", "64x48", "--frames", "6", "--threads", "1", "--precision", "float32", *more]
+    arguments = ["bench", "detector", "--model", str(model), "--runtime", "onnxruntime"]
+    arguments += ["--frame", "64x48", "--frames", "6", "--threads", "1", *more]
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
     return result.output
 
 
 def test_measurement_has_all_figures_and_can_be_compared(
-    small_model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    exported_model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     results = []
 
@@ -31,7 +31,7 @@ def test_measurement_has_all_figures_and_can_be_compared(
         return results[-1]
 
     monkeypatch.setattr("companion.bench.detector.measure_detectors", measure)
-    heading, line = bench(small_model, "--classes", "car").splitlines()
+    heading, line = bench(exported_model, "--classes", "car").splitlines()
     (earlier,) = results
     (row,) = earlier["rows"]
     names = [
@@ -40,7 +40,7 @@ def test_measurement_has_all_figures_and_can_be_compared(
     ]  # fmt: skip
     assert heading.split() == names
     assert line.split() == [str(row[name]) for name in names]
-    assert (row["runtime"], row["threads"], row["frames"]) == ("torch", 1, 6)
+    assert (row["runtime"], row["threads"], row["frames"]) == ("onnxruntime", 1, 6)
     assert earlier["classes"] == ["car"]
     assert earlier["frame"] == "64x48"
     assert 0 < row["p50_ms"] <= row["p99_ms"] <= row["max_ms"]
@@ -50,11 +50,11 @@ def test_measurement_has_all_figures_and_can_be_compared(
     assert row["memory_mb"] > 10
     assert row["first_detection_s"] > 0
     monkeypatch.setattr("companion.bench.detector.measure_detectors", lambda *_, **__: earlier)
-    (tmp_path / "earlier.json").write_text(bench(small_model, "--json"))
+    (tmp_path / "earlier.json").write_text(bench(exported_model, "--json"))
     assert json.loads((tmp_path / "earlier.json").read_text()) == earlier
     later = earlier | {"rows": [row | {"p50_ms": 2 * row["p50_ms"]}]}
     monkeypatch.setattr("companion.bench.detector.measure_detectors", lambda *_, **__: later)
-    _, line = bench(small_model, "--against", str(tmp_path / "earlier.json")).splitlines()
+    _, line = bench(exported_model, "--against", str(tmp_path / "earlier.json")).splitlines()
     assert line.endswith(f"p50 was {row['p50_ms']} ms: 2.00 of it")
 
 
@@ -100,9 +100,18 @@ def test_exported_file_is_measured_on_the_runtimes_that_run_it(
     ],
 )
 def test_what_cannot_be_measured_is_exit_code_2(
-    small_model: Path, arguments: list[str], expected: str
+    exported_model: Path, arguments: list[str], expected: str
 ) -> None:
-    common = ["bench", "detector", "--model", str(small_model), "--runtime", "torch", "--frames", "5"]
+    common = [
+        "bench",
+        "detector",
+        "--model",
+        str(exported_model),
+        "--runtime",
+        "onnxruntime",
+        "--frames",
+        "5",
+    ]
     common += ["--frame", "64x48"]
     result = CliRunner().invoke(app, [*common, *arguments])
     assert result.exit_code == 2

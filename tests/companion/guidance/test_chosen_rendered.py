@@ -75,12 +75,12 @@ def test_follow_by_track_keeps_to_the_farther_of_two_cars() -> None:
     cars = [t for t in seen.flight.inputs.steering.targets if t.class_name == "car" and t.trusted]
     farther = max(cars, key=lambda target: target.ground_range_m)
     assert len(cars) == 2
-    log = seen.flight.fly(f"follow track={farther.track_id} distance=9", 30.0)
+    log = seen.flight.fly(f"follow track={farther.track_id} distance=13", 20.0)
     assert log.outcome is not None
     assert log.outcome.reason == "in progress"
-    seen.flight.run(8.0)
+    seen.flight.run(4.0)
     assert seen.flight.guidance.busy
-    assert seen.range_m(1) == pytest.approx(9.0, abs=0.8)
+    assert seen.range_m(1) == pytest.approx(13.0, abs=0.8)
 
 
 @pytest.mark.parametrize(
@@ -94,7 +94,7 @@ def test_follow_by_track_keeps_to_the_farther_of_two_cars() -> None:
 def test_selected_object_of_no_class_is_approached_and_held(
     class_name: str, size_m: tuple[float, float, float], depth: bool
 ) -> None:
-    seen = Flight([standing(class_name, 16.0, 1.5, size_m)], 12, depth=depth)
+    seen = Flight([standing(class_name, 12.0, 1.1, size_m)], 12, depth=depth)
     track_id = seen.select(0)
     log = seen.flight.fly(f"approach track={track_id} distance=6", 90.0)
     assert log.outcome is not None

@@ -26,7 +26,7 @@ from vision.camera_model import CameraModel, CameraMount
 CAMERA = CameraModel.from_horizontal_fov(480, 360, math.radians(75.0))
 MOUNT = CameraMount(forward_m=0.1, pitch_rad=math.radians(-8.0))
 SETTINGS = {"detector.enabled": "false", "markers.dictionary": "APRILTAG_36h11", "markers.size_m": "0.8"}
-HEIGHT_M, AHEAD_M = 3.0, 11.0
+HEIGHT_M, AHEAD_M = 3.0, 8.0
 FAR_AWAY = (500.0, 500.0)
 
 

@@ -77,9 +77,9 @@ def test_followers_keep_their_slots_through_turns(shape: str) -> None:
     fleet = flying(4, as_text=True)
     follow(fleet, "bcd", shape)
     assert fleet.run_until(lambda: settled(fleet, "bcd"), 30.0)
-    fleet.command("a", FollowPathBehaviour(((15.0, 0.0), (15.0, 15.0), (30.0, 15.0)), 2.0))
+    fleet.command("a", FollowPathBehaviour(((9.0, 0.0), (9.0, 9.0), (18.0, 9.0)), 2.0))
     worst = []
-    fleet.run(25.0, lambda: worst.append(max(fleet.slot_errors().values())))
+    fleet.run(15.0, lambda: worst.append(max(fleet.slot_errors().values())))
     assert fleet.run_until(lambda: fleet.members["a"].outcome is not None and settled(fleet, "bcd"), 30.0)
     assert max(worst) < 3.0
     assert separated(fleet)
@@ -202,7 +202,7 @@ def test_impossible_leaders_are_refused() -> None:
 
 def test_virtual_structure_flies_its_path_and_ends() -> None:
     fleet = flying(3)
-    points = ((0.0, 0.0), (20.0, 0.0), (20.0, 12.0, 8.0))
+    points = ((0.0, 0.0), (12.0, 0.0), (12.0, 8.0, 8.0))
     for name in "abc":
         assert (
             fleet.command(name, FormationBehaviour("line", "virtual", points=points, speed_mps=2.5)) is None
@@ -215,12 +215,12 @@ def test_virtual_structure_flies_its_path_and_ends() -> None:
     assert separated(fleet)
     centre = [sum(member.airframe.place()[axis] for member in members) / 3 for axis in range(3)]
     # Three abreast: their centre is the structure's.
-    assert centre == pytest.approx([20.0, 12.0, -8.0], abs=0.8)
+    assert centre == pytest.approx([12.0, 8.0, -8.0], abs=0.8)
 
 
 def test_next_vehicle_takes_over_the_virtual_structure() -> None:
     fleet = flying(3, as_text=True)
-    points = ((0.0, 0.0), (24.0, 0.0))
+    points = ((0.0, 0.0), (18.0, 0.0))
     for name in "abc":
         fleet.command(name, FormationBehaviour("line", "virtual", points=points))
     fleet.run(8.0)
@@ -228,7 +228,7 @@ def test_next_vehicle_takes_over_the_virtual_structure() -> None:
     assert fleet.run_until(lambda: all(fleet.members[name].outcome for name in "bc"), 90.0)
     assert all(ended(fleet, name).success for name in "bc")
     norths = [fleet.members[name].airframe.place()[0] for name in "bc"]
-    assert norths == pytest.approx([24.0, 24.0], abs=1.5)
+    assert norths == pytest.approx([18.0, 18.0], abs=1.5)
 
 
 def test_hovering_vehicle_is_flown_around() -> None:

@@ -82,7 +82,9 @@ def errors_deg(flight: LockstepFlight, text: str, point: Callable[[], Vector3]) 
     return errors
 
 
-@pytest.mark.parametrize("text", ["goto 20 0 speed=5", "orbit radius=8 speed=3 laps=0.5"])
+@pytest.mark.parametrize(
+    "text", ["goto 20 0 speed=5", pytest.param("orbit radius=8 speed=3 laps=0.5", marks=pytest.mark.slow)]
+)
 def test_gimbal_stays_on_a_place_while_flying(text: str) -> None:
     flight = gimbal_flight(person(180.0), seed=31)
     assert "the place" in kept(flight, place_command(flight, PLACE))

@@ -21,6 +21,7 @@ from vision.yolo.checkpoint import load_checkpoint, save_checkpoint
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     kept = tmp_path / "kept"
     monkeypatch.setenv("COMPANION_MODELS_FOLDER", str(kept))
+    monkeypatch.setattr("vision.runtimes.torch_runtime._TRIAL_S", 0.05)
     return kept
 
 
@@ -78,8 +79,7 @@ def test_bare_name_is_found_in_models_folder(folder: Path, small_model: Path) ->
     assert json.loads(run("info", "mine", "--json"))["file"] == str(folder / "mine.pt")
 
 
-def test_info_describes_model(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vision.runtimes.torch_runtime._TRIAL_S", 0.05)
+def test_info_describes_model() -> None:
     facts = json.loads(run("info", "default", "--json"))
     assert facts["model_family"] == "YOLOv8"
     assert facts["licence"] == "Apache-2.0"
