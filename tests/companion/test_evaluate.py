@@ -104,7 +104,7 @@ def test_real_model_detects_objects_in_photographs(tmp_path: Path) -> None:
     detector = Detector(
         DATA / "models" / "yolov8n_coco.pt", confidence=0.001, image_size=320, precision="float32"
     )
-    data = replace(data, samples=data.samples[:16])
+    data = replace(data, samples=data.samples[:8])
     score = evaluate_dataset(data, detector, map_classes(detector.class_names, data)).score
     assert score.map50 > 0.5
 

@@ -219,7 +219,7 @@ def test_video_is_detected_and_tracked(
 ) -> None:
     path = str(tmp_path / "video.avi")
     video = cv2.VideoWriter(path, cv2.VideoWriter.fourcc(*"MJPG"), 5.0, (640, 480))
-    for frame in scene_frames(MOTIONS[0], seconds=1.6, rate_hz=5.0):
+    for frame in scene_frames(MOTIONS[0], seconds=1.0, rate_hz=5.0):
         video.write(frame.image)
     video.release()
     run_example(monkeypatch, "detect_video.py", path)

@@ -41,7 +41,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
         assert outcome is not None
         assert outcome.success, outcome.reason
         approach = "approach person distance=6"
-        assert flight.fly(approach, 8.0).moments
+        assert flight.fly(approach, 4.0).moments
         refused = flight.fly("goto forward=900 right=0", 5.0).outcome
         assert refused is not None
         assert not refused.success

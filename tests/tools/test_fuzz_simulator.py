@@ -7,7 +7,12 @@ import pytest
 from mavlink_sim.wire.messages import parser
 from tools.fuzz_simulator import Fuzzer, SocketReport, Target, fuzz_in_lockstep, fuzz_over_sockets
 
-TARGETS = [Target(), Target(gimbal=True), Target("ardupilot"), Target(signed=True)]
+TARGETS = [
+    Target(),
+    pytest.param(Target(gimbal=True), marks=pytest.mark.slow),
+    Target("ardupilot"),
+    Target(signed=True),
+]
 NAMES = ["px4", "gimbal", "ardupilot", "signed"]
 
 

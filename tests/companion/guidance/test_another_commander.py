@@ -123,7 +123,7 @@ def test_single_reposition_does_not_end_command() -> None:
     assert flight.guidance.phase is Phase.OFFBOARD
 
 
-@pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+@pytest.mark.parametrize("autopilot", ["px4", pytest.param("ardupilot", marks=pytest.mark.slow)])
 def test_flight_in_gusts_counts_as_following(autopilot: str) -> None:
     """The largest lasting residual is far below the threshold."""
     flight = LockstepFlight.airborne(seed=4, height_m=6.0, wind_mps=3.0, gusts_mps=0.6, autopilot=autopilot)

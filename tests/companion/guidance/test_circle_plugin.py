@@ -42,9 +42,9 @@ def test_plugin_flies_its_circle(installed: Path, monkeypatch: pytest.MonkeyPatc
         settings = plain_settings({"plugins.modules": "circle"})
         flight = LockstepFlight.airborne(seed=3, settings=settings)
         flight.command("circle radius=6 speed=1.5")
-        flight.run(15.0)
+        flight.run(10.0)
         positions = []
-        for _ in range(25):  # one lap: 2 pi 6 m / 1.5 m/s
+        for _ in range(17):  # two thirds of a lap: 2 pi 6 m / 1.5 m/s
             flight.run(1.0)
             positions.append(flight.vehicle.truth.position_ned_m)
     finally:

@@ -23,7 +23,7 @@ def distance_m(flight: LockstepFlight, point_ned_m: tuple[float, ...]) -> float:
     return math.dist(flight.vehicle.truth.position_ned_m, point_ned_m)
 
 
-@pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+@pytest.mark.parametrize("autopilot", ["px4", pytest.param("ardupilot", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("reset_s", [pytest.param(3.0, marks=pytest.mark.slow), 0.5])
 def test_goal_keeps_its_ground_position_through_a_reset(autopilot: str, reset_s: float) -> None:
     flight = airborne(autopilot)

@@ -91,7 +91,7 @@ def test_views_from_two_sides_shrink_the_ellipse() -> None:
 def test_ellipse_covers_the_error_that_all_frames_share() -> None:
     """Half of each flight's variance is one error of the whole flight, such as of the camera's mount."""
     rng, inside, errors_m = np.random.default_rng(31), [], []
-    for _ in range(200):
+    for _ in range(100):
         tracks, common = FusedTracks(), rng.normal(0.0, math.sqrt(0.5), 3)
         turn = float(rng.uniform(0.0, math.pi))
         for frame in range(60):

@@ -113,6 +113,7 @@ def test_mission_step_holds_until_the_gimbal_points_there() -> None:
     assert manager.primary == (0, 0)
 
 
+@pytest.mark.slow
 def test_without_sweep_it_is_not_found() -> None:
     _, log, _ = fly("seek person laps=1", person(0.0))
     assert_failed(log.outcome, "found in 1 lap")

@@ -123,7 +123,7 @@ def test_repulsion_only_from_vehicles_too_near() -> None:
     assert repulsion((0, 0, 0), [neighbour((0.5, 0.0, 0.0), role="virtual")], 9.0) == (0.0, 0.0)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(st.randoms(use_true_random=False), st.integers(2, 5), st.booleans())
 def test_vehicles_flown_at_each_other_keep_separation(random: Random, count: int, by_position: bool) -> None:
     """Each vehicle is commanded to the same point, or at full speed in some direction."""

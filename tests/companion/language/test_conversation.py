@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import socket
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -290,10 +291,19 @@ async def test_question_then_plan_then_answer(style: str) -> None:
     assert roles == ["system", "user", "assistant", "tool", "assistant", "tool"]
 
 
-async def test_models_calls_of_the_table_become_its_commands() -> None:
+# A sentence of each sequence of commands.
+OF_EACH_KIND = list(
+    {tuple(word.split()[0] for word in words): (text, words) for text, words in SENTENCES}.values()
+)
+
+
+@pytest.mark.parametrize("sentences", [OF_EACH_KIND, pytest.param(SENTENCES, marks=pytest.mark.slow)])
+async def test_models_calls_of_the_table_become_its_commands(
+    sentences: Sequence[tuple[str, Sequence[str]]],
+) -> None:
     """The model's part of the hundred sentences: calls on the wire to commands, checked and in order."""
     answers = []
-    for _, expected in SENTENCES:
+    for _, expected in sentences:
         calls = [
             (word[1:].split()[0], {}) if word.startswith("?") else (parse(word).word, arguments_in(word))
             for word in expected
@@ -301,12 +311,12 @@ async def test_models_calls_of_the_table_become_its_commands() -> None:
         answers += [ollama(calls=calls), ollama("Done.")]
     async with serving(*answers) as script:
         talk = Talk(script.url)
-        for text, expected in SENTENCES:
+        for text, expected in sentences:
             talk.vehicle.commands.clear()
             assert await talk.ask(f"model: {text}"), text
             commands = [parse(word) for word in expected if not word.startswith("?")]
             assert talk.vehicle.commands == ([plan_of(commands, CLASSES)[0]] if commands else []), text
-    assert len(script.requests) == 2 * len(SENTENCES)
+    assert len(script.requests) == 2 * len(sentences)
 
 
 def arguments_in(text: str) -> dict[str, Any]:
