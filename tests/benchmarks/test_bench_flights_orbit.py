@@ -20,7 +20,7 @@ def test_orbit_outside_of_its_tolerance_is_no_success(monkeypatch: pytest.Monkey
     monkeypatch.setattr(flights_orbit, "WITHIN_M", 0.05)
     result = flights_orbit.run(1)
     assert not result.success
-    assert result.values["radius_error_max_m"] > 0.05
+    assert result.values["radius_error_p95_m"] > 0.05
 
 
 def test_orbit_that_is_not_flown_is_no_success(monkeypatch: pytest.MonkeyPatch) -> None:
