@@ -214,7 +214,8 @@ def _with_position(command: int, given: _Head) -> tuple[int, _Head]:
             raise ItemRejectedError(INVALID_PARAM1, f"a region of interest with a position, mode {given[0]}")
         command = SET_ROI
     elif command in _HEADING_COMMANDS:
-        kept[3] = kept[3] % 360.0 if math.isfinite(kept[3]) else math.nan
+        # Twice: the remainder of a tiny negative angle is 360 itself.
+        kept[3] = kept[3] % 360.0 % 360.0 if math.isfinite(kept[3]) else math.nan
     if command == LOITER_TIME:
         kept[1] = float(kept[1] > 0.0)
     elif command == LOITER_TO_ALTITUDE:
