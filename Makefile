@@ -32,8 +32,9 @@ test: $(READY)
 
 test-slow: $(READY)
 	$(BIN)/python -m pytest tests/alone -m slow
-	$(BIN)/python -m pytest --ignore tests/alone -n $(WORKERS) -m slow
-	$(BIN)/python -m pytest --ignore tests/alone -n $(WORKERS) -m "hypothesis and not slow" --hypothesis-profile explore
+	$(BIN)/python -m pytest --ignore tests/alone -n $(WORKERS) -m "slow and not realtime"
+	$(BIN)/python -m pytest $(REALTIME) -n $(REALTIME_WORKERS) --dist worksteal -m "slow and realtime" --reruns 1
+	$(BIN)/python -m pytest --ignore tests/alone -n $(WORKERS) -m "hypothesis and not slow" --hypothesis-profile explore --reruns 1
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -10,7 +10,7 @@ import typer
 from hypothesis import settings
 
 # How long an example takes says more of the machine than of the code. The same examples every time, so that a
-# failure is of the change; `make test-slow` tries more and new ones.
+# failure is of the change; `make test-slow` tries new ones, and more where a test sets no number.
 settings.register_profile("steady", deadline=None, derandomize=True, max_examples=40)
 settings.register_profile("explore", deadline=None, max_examples=300)
 settings.load_profile("steady")

@@ -12,6 +12,7 @@ import re
 import runpy
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Coroutine, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -164,7 +165,7 @@ def test_service_detects_and_flies_by_plugins(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     page = CLIENT_PAGE.read_text().partition("```python\n")[2].partition("```")[0]
-    flags = [*("--source", "square://320x240?rate=10", "--detector-kind", "red")]
+    flags = ["--source", "square://320x240?rate=10", "--detector-kind", "red"]
     flags += ["--plugins-modules", "red,square,circle"]
     with running_service(vehicle.onboard_port, flags, cwd=tmp_path) as service:
         with service.client() as session:
@@ -187,6 +188,11 @@ def test_service_detects_and_flies_by_plugins(
         sent = companion_here("send", "circle radius=4", "--connect", service.endpoint, cwd=tmp_path)
         assert sent.returncode == 0, sent.stdout + sent.stderr
         assert "accepted" in sent.stdout
+        with service.client() as session:
+            listen(session, "status", lambda _key, text: statuses.put(json.loads(text)))
+            until_s = time.monotonic() + 30
+            while (behaviour := statuses.get(timeout=30)["pilot"]["behaviour"]) != "circle":
+                assert time.monotonic() < until_s, behaviour
     assert set(names) <= {"blob"}
     *lines, reply = capsys.readouterr().out.splitlines()
     assert reply.startswith("takeoff 2: done")

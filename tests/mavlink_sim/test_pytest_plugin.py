@@ -155,7 +155,6 @@ def test_loading_the_plugin_loads_nothing_heavy() -> None:
     assert not {"numpy", "pymavlink", "typer", "cv2", "mavlink_sim.testing"} & loaded
 
 
-@pytest.mark.realtime
 def test_installed_package_provides_plugin(
     pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
 ) -> None:

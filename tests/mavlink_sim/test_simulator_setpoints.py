@@ -16,7 +16,7 @@ from mavlink_sim.testing import QUICK_FLIGHT, RunningSimulator
 from tests.mavlink_sim.conftest import SIH_FRAME
 from tests.mavlink_sim.mavsdk_client import mavsdk_client, wait_for
 
-# In `make test`, test_client_mavsdk.py flies with these plugins, and the tests in lockstep every setpoint.
+# In `make test`, test_client_mavsdk.py flies velocities and local positions, lockstep tests every setpoint.
 pytestmark = [pytest.mark.realtime, pytest.mark.slow]
 
 SPEED = 3.0  # simulated seconds a second; MAVSDK repeats a setpoint 20 times a real second

@@ -289,7 +289,9 @@ def test_a_checkpoint_of_the_first_releases_is_read(
     assert_same_maps(model, loaded.model)
 
 
-@pytest.mark.parametrize("model_family", ["YOLOv10", "YOLO26"])
+@pytest.mark.parametrize(
+    "model_family", [pytest.param("YOLOv8", marks=pytest.mark.slow), "YOLOv10", "YOLO26"]
+)
 def test_a_checkpoint_saved_folded_is_read(tmp_path: Path, foreign: Classes, model_family: str) -> None:
     model = trained_model(shrunk(model_family, "s"))
     model.fuse()

@@ -133,9 +133,9 @@ TABLES = {
     "YOLOv9, e": yolov9_e(),
     "YOLOv3-tiny": yolov3_tiny(),
 }
-# As in `test_model_families`.
 # The parts of "c" are also in the others.
 READ = [pytest.param(name, marks=pytest.mark.slow) if name == "YOLOv9, c" else name for name in TABLES]
+# As in `test_model_families`.
 GOLDEN: dict[str, tuple[float, float, float]] = {
     "YOLOv9, t to m": (0.0320455, 0.211631, 0.0188872),
     "YOLOv9, c": (-0.0185499, 0.203102, -0.00218473),

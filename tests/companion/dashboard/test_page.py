@@ -247,9 +247,11 @@ def test_keys_and_gamepad_steer_and_a_lost_page_brakes(service: ServiceProcess, 
         hold_key(tab, "rawKeyDown")
         wait_for(lambda: faster(0.6))
         hold_key(tab, "keyUp")
+        tab.value(PAD.replace("AXIS", "1"))
+        wait_for(lambda: faster(0.6))
         tab.value(PAD.replace("AXIS", "0.1"))  # in the dead zone
         wait_for(lambda: not faster(0.25))
-        tab.value(PAD.replace("AXIS", "1"))  # the stick back
+        tab.value(PAD.replace("AXIS", "1"))
         wait_for(lambda: faster(0.6))
         tab.send("Page.navigate", url="about:blank")
         wait_for(lambda: not faster(0.25))

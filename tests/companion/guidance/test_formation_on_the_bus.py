@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import json
 import math
-import os
 import socket
 import time
 from collections.abc import AsyncIterator, Callable
@@ -24,8 +23,6 @@ from mavlink_sim.testing import QUICK_FLIGHT, FleetMember, RunningSimulator, fre
 from tests.companion.live_flight import LiveFlight
 
 pytestmark = pytest.mark.realtime
-
-VEHICLES = int(os.environ.get("FORMATION_VEHICLES", "2"))
 
 
 class Companion:
@@ -91,11 +88,12 @@ async def until(condition: Callable[[], object], timeout_s: float = 60.0) -> Non
             await asyncio.sleep(0.02)
 
 
-async def test_vehicles_share_poses_and_fly_in_formation() -> None:
+@pytest.mark.parametrize("vehicles", [2, pytest.param(5, marks=pytest.mark.slow)])
+async def test_vehicles_share_poses_and_fly_in_formation(vehicles: int) -> None:
     with running_simulator(
-        vehicles=VEHICLES, spacing=7.0, ready_after=0.0, parameters=QUICK_FLIGHT
+        vehicles=vehicles, spacing=7.0, ready_after=0.0, parameters=QUICK_FLIGHT
     ) as simulator:
-        async with companions(simulator, VEHICLES) as fleet:
+        async with companions(simulator, vehicles) as fleet:
             leader, followers = fleet[0], fleet[1:]
             names = {member.name for member in fleet}
             await until(

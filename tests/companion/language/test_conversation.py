@@ -297,11 +297,13 @@ OF_EACH_KIND = list(
 )
 
 
-@pytest.mark.parametrize("sentences", [OF_EACH_KIND, pytest.param(SENTENCES, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "sentences", [OF_EACH_KIND, pytest.param(SENTENCES, marks=pytest.mark.slow)], ids=["each kind", "all"]
+)
 async def test_models_calls_of_the_table_become_its_commands(
     sentences: Sequence[tuple[str, Sequence[str]]],
 ) -> None:
-    """The model's part of the hundred sentences: calls on the wire to commands, checked and in order."""
+    """The model's part of the sentences: calls on the wire to commands, checked and in order."""
     answers = []
     for _, expected in sentences:
         calls = [

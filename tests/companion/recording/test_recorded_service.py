@@ -142,8 +142,10 @@ def test_recorder_is_started_again_but_not_for_a_full_disk(filming: list[str], t
     """The limit of a file's size stands for a full disk: the same write fails, with EFBIG for ENOSPC."""
     folder = tmp_path / "recordings"
     with (
-        heartbeats() as port,
-        running_service(port, [*filming, "--recording-directory", str(folder)], cwd=tmp_path) as service,
+        running_simulator(**TWICE) as simulator,
+        running_service(
+            simulator.onboard_port, [*filming, "--recording-directory", str(folder)], cwd=tmp_path
+        ) as service,
     ):
         wait_for(lambda: files(folder) and messages_of(files(folder)[0])["guidance_input"] > 20)
         recorder = recorder_of(service)
@@ -154,13 +156,14 @@ def test_recorder_is_started_again_but_not_for_a_full_disk(filming: list[str], t
         (first,) = files(folder)
         assert messages_of(first)["guidance_input"] > 20
         assert library_times(first) == [message.log_time_ns for message in RecordingReader(first).messages()]
+        service.take_off(2.5)
         wait_for(lambda: len(files(folder)) == 2 and messages_of(files(folder)[1])["guidance_input"] > 100)
         recorder = recorder_of(service)
         _, hard = resource.prlimit(recorder, resource.RLIMIT_FSIZE)
         resource.prlimit(recorder, resource.RLIMIT_FSIZE, (files(folder)[1].stat().st_size, hard))
         line = service.wait_for_line("cannot be written")
         assert str(files(folder)[1]) in line
-        assert service.command("stop")["success"]
+        assert service.command("hold")["success"]
         assert service.stop() == 0
     assert [each for each in service.last_lines() if "recorder" in each].count(line) == 1
     assert len([each for each in service.lines if "started again" in each]) == 1

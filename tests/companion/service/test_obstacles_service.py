@@ -18,9 +18,7 @@ import pytest
 from mavlink_sim.testing import QUICK_FLIGHT, RunningSimulator, running_simulator
 from tests.companion.service_process import ServiceProcess, running_service
 
-# `test_avoidance_flights` passes a pillar and `test_obstacles` brakes before a wall and without depth, in
-# lockstep; in `test_every_message_of_a_flight_is_valid` the service flies a planned path by depth images.
-pytestmark = [pytest.mark.realtime, pytest.mark.slow]
+pytestmark = pytest.mark.realtime
 
 WALL_NORTH_M, THICKNESS_M, MARGIN_M = 9.0, 0.4, 2.0
 # As for `python -m benchmarks.flights obstacles`: gusts push it a little into the margin.
@@ -101,6 +99,7 @@ def north_m(row: dict[str, Any]) -> float:
     return float(row["position_ned_m"][0])
 
 
+@pytest.mark.slow  # in lockstep: `test_avoidance_flights`
 def test_flies_around_a_pillar_to_the_goal(tmp_path: Path) -> None:
     scene = SCENE.format(kind="box", north_m=6.0, size_m=[1.0, 1.0, 6.0])
     flags = ("--guidance-avoid", "true", "--guidance-obstacle-margin-m", "1")

@@ -186,9 +186,9 @@ def test_mission_is_flown_and_flight_survives_a_killed_worker(seeing: list[str],
         assert reply["reason"].startswith("hold: ")
         assert "one line" in reply["reason"]
         # From the ground its first step is refused, and with it the mission.
-        while (
-            "the air" not in (reply := service.command("mission ground\n[[step]]\ndo = 'hold 3'"))["reason"]
-        ):
+        ground, until_s = "mission ground\n[[step]]\ndo = 'hold 3'", time.monotonic() + 20
+        while "the air" not in (reply := service.command(ground))["reason"]:
+            assert time.monotonic() < until_s, reply
             time.sleep(0.1)  # an estimate that is not there yet is named first
         assert reply["steps"] == []
         service.take_off(2.5)

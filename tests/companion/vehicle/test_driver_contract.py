@@ -20,8 +20,9 @@ from tests.companion.vehicle.fake_autopilot import streaming, wait_for_state, wa
 
 pytestmark = pytest.mark.realtime
 
-# pymavlink, the default, flies in the service's tests. What AutopilotDriver does is the same with both.
+# pymavlink, the default, flies so in the service's tests. What AutopilotDriver does is the same with both.
 FLIGHTS = pytest.mark.parametrize("kind", ["mavsdk", pytest.param("pymavlink", marks=pytest.mark.slow)])
+BOTH = pytest.mark.parametrize("kind", ["mavsdk", "pymavlink"])
 SHARED = pytest.mark.parametrize("kind", ["pymavlink", pytest.param("mavsdk", marks=pytest.mark.slow)])
 
 # Simulated seconds are short; the loss timeout is long enough in them for a busy test machine.
@@ -149,7 +150,7 @@ async def test_driver_continues_after_a_vehicle_restart(
     assert sum("no heartbeat" in line or "received again" in line for line in lines) == 2
 
 
-@FLIGHTS
+@BOTH
 async def test_vision_position_reaches_the_estimator(kind: DriverKind) -> None:
     covariance = tuple(0.01 if index in (0, 6, 11, 15, 18, 20) else 0.0 for index in range(21))
     with vehicle(parameters={"EKF2_EV_CTRL": 1}) as simulator:

@@ -21,8 +21,7 @@ from tests.companion.vehicle.fake_autopilot import streaming, wait_for_state, wa
 
 pytestmark = pytest.mark.realtime
 
-# For what AutopilotDriver does, with whichever library: with MAVSDK, in `make test-slow`. The commands and
-# parameters on a bad link are each library's own.
+# What each library does itself is tested with both in test_driver_commands.py, and below on a bad link.
 SHARED = pytest.mark.parametrize("kind", ["pymavlink", pytest.param("mavsdk", marks=pytest.mark.slow)])
 PARAMETERS = {**QUICK_FLIGHT, "COM_OF_LOSS_T": 2.0, "COM_OBL_RC_ACT": 4.0}
 

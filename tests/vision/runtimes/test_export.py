@@ -75,7 +75,8 @@ def reference(checkpoint: Path) -> TorchRuntime:
 
 
 @pytest.mark.parametrize(
-    ("kind", "runtime"), [PAIRS[0], pytest.param(*PAIRS[1], marks=pytest.mark.slow), *PAIRS[2:]]
+    ("kind", "runtime"),
+    [pytest.param(*each, marks=pytest.mark.slow if each == ("onnx", "openvino") else ()) for each in PAIRS],
 )
 def test_exported_network_matches_torch_at_every_size(
     exported: Any, reference: TorchRuntime, kind: ExportKind, runtime: RuntimeName
