@@ -290,9 +290,9 @@ def traced(network: Network, pixels: Tensor) -> Graph:
     """
 
     def trace() -> Graph:
-        traced: Any = torch.jit.trace
+        jit_trace: Any = torch.jit.trace
         with torch.no_grad():
-            graph: Graph = traced(lambda image_bgr: network(image_bgr), pixels, check_trace=False)
+            graph: Graph = jit_trace(lambda image_bgr: network(image_bgr), pixels, check_trace=False)
         return graph
 
     with warnings.catch_warnings(), ThreadPoolExecutor(1) as thread:
