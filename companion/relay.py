@@ -20,6 +20,7 @@ from companion.vehicle.driver import LinkError
 from companion.vehicle.framing import frames_of
 from companion.vehicle.link_url import LinkScheme, LinkUrl, parse_link_url
 from companion.vehicle.state import HEARTBEAT_MAX_AGE_S
+from companion.vehicle.vehicle_type import AUTOPILOT_NAMES, MULTICOPTERS, autopilot_text, type_text
 
 logger = logging.getLogger(__name__)
 
@@ -27,19 +28,6 @@ _HEARTBEAT = struct.Struct("<IBBBBB")  # custom_mode, type, autopilot, base_mode
 _FIRST_HEARTBEAT_S = 10.0
 # Heartbeats are sent once a second: a second autopilot on the port is received in this time.
 _LISTEN_S = 1.5
-_AUTOPILOTS = frozenset({mavlink.MAV_AUTOPILOT_PX4, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA})
-_MULTIROTORS = frozenset(
-    {
-        mavlink.MAV_TYPE_QUADROTOR,
-        mavlink.MAV_TYPE_COAXIAL,
-        mavlink.MAV_TYPE_HELICOPTER,
-        mavlink.MAV_TYPE_HEXAROTOR,
-        mavlink.MAV_TYPE_OCTOROTOR,
-        mavlink.MAV_TYPE_TRICOPTER,
-        mavlink.MAV_TYPE_DODECAROTOR,
-        mavlink.MAV_TYPE_DECAROTOR,
-    }
-)
 
 
 class AutopilotHeartbeat(NamedTuple):
@@ -118,12 +106,12 @@ class Relay:
         if self.others:
             senders = ", ".join(f"{host}:{port}" for host, port, *_ in (self._source, *self.others))
             raise ValueError(f"{self.url}: two autopilots send to this port ({senders}); end one of them")
-        if autopilot not in _AUTOPILOTS:
-            name = _name("MAV_AUTOPILOT", autopilot)
-            raise ValueError(f"{self.url}: system {system_id} is a {name}; expected PX4 or ArduPilot")
-        if vehicle_type not in _MULTIROTORS:
-            name = _name("MAV_TYPE", vehicle_type)
-            raise ValueError(f"{self.url}: system {system_id} is a {name}; expected a multirotor")
+        if autopilot not in AUTOPILOT_NAMES:
+            name = autopilot_text(autopilot)
+            raise ValueError(f"{self.url}: system {system_id} is {name}; expected PX4 or ArduPilot")
+        if vehicle_type not in MULTICOPTERS:
+            name = type_text(vehicle_type)
+            raise ValueError(f"{self.url}: system {system_id} is {name}; expected a multirotor")
         if base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED:
             raise ValueError(f"{self.url}: system {system_id} is armed; it must be disarmed on the ground")
         self._checked = True
@@ -181,8 +169,3 @@ def _heartbeat_in(data: bytes) -> AutopilotHeartbeat | None:
             if autopilot != mavlink.MAV_AUTOPILOT_INVALID:
                 return AutopilotHeartbeat(frame.system_id, vehicle_type, autopilot, base_mode)
     return None
-
-
-def _name(enumeration: str, value: int) -> str:
-    entry = mavlink.enums[enumeration].get(value)
-    return f"{enumeration} {value}" if entry is None else str(entry.name)

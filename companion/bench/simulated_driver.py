@@ -19,13 +19,7 @@ from companion.guidance.interface import (
     TakeOff,
 )
 from companion.vehicle.ardupilot_profile import ArduPilotProfile
-from companion.vehicle.autopilot_profile import (
-    ARDUPILOT,
-    HOME_POSITION_ID,
-    PX4,
-    AutopilotProfile,
-    Px4Profile,
-)
+from companion.vehicle.autopilot_profile import HOME_POSITION_ID, AutopilotProfile, Px4Profile
 from companion.vehicle.driver import CommandRefusedError
 from companion.vehicle.gimbal_commands import CONFIGURE, PITCHYAW, RELEASE, UNCHANGED, pitchyaw_parameters
 from companion.vehicle.landing_target import LandingTarget, landing_target_fields
@@ -36,6 +30,7 @@ from companion.vehicle.setpoint import Setpoint, setpoint_fields
 from companion.vehicle.state import VehicleState
 from companion.vehicle.telemetry import TELEMETRY_MESSAGES, apply_message
 from companion.vehicle.telemetry_state import REPORTS_KEPT
+from companion.vehicle.vehicle_type import ARDUPILOT, PX4
 from companion.vehicle.vision_position import VisionPosition, vision_position_fields
 from mavlink_sim.lockstep import COMPANION, LockstepVehicle
 from mavlink_sim.services.vehicle_files import event_metadata

@@ -64,6 +64,7 @@ def status_message(
             "mode": state.mode.value,
             "armed": state.armed,
             "failsafe": state.failsafe,
+            "not_flown": state.not_flown,
             "missing_streams": list(state.missing_streams),
             "status_texts": [report.text for report in state.reports],
             "other_commanders": others,

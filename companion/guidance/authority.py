@@ -128,6 +128,8 @@ class Authority:
         if not state.connected(now_ns):
             silent_s = (now_ns - state.heartbeat_ns) / 1e9
             return f"autopilot heartbeat lost: none for {silent_s:.1f} s"
+        if (why := state.not_flown) is not None:
+            return why
         explained = self._explained(state, now_ns)
         self._failsafe_before &= state.failsafe
         if state.failsafe and not self._failsafe_before and (flying_by_setpoint or not explained):

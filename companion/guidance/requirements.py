@@ -40,6 +40,8 @@ def check_requirements(
     state, now_ns = context.state, context.now_ns
     if not state.connected(now_ns):
         return "no link to the autopilot"
+    if (why := state.not_flown) is not None:
+        return why
     missing = []
     for requirement in sorted(behaviour.requirements):
         match requirement:

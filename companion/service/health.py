@@ -13,6 +13,7 @@ from companion.service.other_commanders import OtherCommanders
 from companion.service.systemd_notify import SystemdNotifier
 from companion.vehicle.driver import CommandRefusedError, Driver, SystemStatus
 from companion.vehicle.state import VehicleState
+from companion.vehicle.vehicle_type import VTOL_STATE_MISSING
 
 HEARTBEAT_PERIOD_S = 1.0
 HUD_PERIOD_S = 0.2
@@ -42,6 +43,7 @@ class Health:
         self._others, self._on_event = others, on_event
         self._heartbeat_due_ns = self._hud_due_ns = 0
         self._linked = False
+        self._not_flown: str | None = None
         self._link_count = 0
         self._check_due = asyncio.Event()
 
@@ -93,6 +95,7 @@ class Health:
                 self._on_event("info", f"autopilot heartbeat received: {autopilot}, {library} driver")
             else:
                 self._on_event("error", "autopilot heartbeat lost")
+        self._report_not_flown(self._driver.state)
         if now_ns >= self._heartbeat_due_ns:
             self._heartbeat_due_ns = now_ns + round(HEARTBEAT_PERIOD_S * 1e9)
             healthy = self.healthy(now_ns)
@@ -108,6 +111,17 @@ class Health:
             lines = hud_lines(self._driver.state, guidance.status)
             for camera in self._cameras:
                 camera.supervisor.send_hud(lines)
+
+    def _report_not_flown(self, state: VehicleState) -> None:
+        """Report a vehicle that gets no flight commands, and when it gets them again."""
+        why = state.not_flown
+        if why == self._not_flown or why == VTOL_STATE_MISSING:  # which is no answer yet
+            return
+        self._not_flown = why
+        if why is not None:
+            self._on_event("error", f"no flight commands: {why}")
+        else:
+            self._on_event("info", "flight commands are accepted: the vehicle is flown")
 
 
 def hud_lines(state: VehicleState, status: str) -> tuple[str, ...]:

@@ -33,6 +33,7 @@ from companion.vehicle.framing import EKF_STATUS_REPORT_ID
 from companion.vehicle.setpoint import IGNORE_ACCELERATION, IGNORE_YAW, IGNORE_YAW_RATE
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
 from companion.vehicle.telemetry import Fields
+from companion.vehicle.vehicle_type import ARDUPILOT, AUTOPILOT_NAMES, VTOL_STATE_MISSING, why_not_flown
 
 GUIDED, BRAKE = 4, 17
 
@@ -73,7 +74,7 @@ def custom_mode_of_mode(mode: FlightMode) -> int:
 class ArduPilotProfile(AutopilotProfile):
     """ArduPilot Copter; see the module docstring."""
 
-    name = "ArduPilot"
+    name = AUTOPILOT_NAMES[ARDUPILOT]
     parameters_bytewise = False
     takeoff_needs_home = False
     has_events = False
@@ -99,7 +100,7 @@ class ArduPilotProfile(AutopilotProfile):
 
     def translate(self, name: str, fields: Fields, state: VehicleState) -> list[tuple[str, Fields]]:
         if name in ("HEARTBEAT", "CURRENT_MODE"):
-            return [(name, {**fields, "flight_mode": self._mode(fields["custom_mode"])})]
+            return [(name, {**fields, "flight_mode": self._mode(fields, state)})]
         if name == "EXTENDED_SYS_STATE" and self._guided_use is FlightMode.TAKEOFF:
             if fields["landed_state"] == _IN_AIR and state.landed is LandedState.TAKING_OFF:
                 self._guided_use = FlightMode.HOLD  # take-off finished: it waits for setpoints
@@ -112,7 +113,14 @@ class ArduPilotProfile(AutopilotProfile):
             return [("ESTIMATOR_STATUS", fields)]
         return [(name, fields)]
 
-    def _mode(self, custom_mode: int) -> FlightMode:
+    def _mode(self, fields: Fields, state: VehicleState) -> FlightMode:
+        """Return the mode; UNKNOWN for a vehicle that is not Copter, whose numbers mean other modes."""
+        mav_type, autopilot = fields.get("type", state.mav_type), fields.get("autopilot", state.mav_autopilot)
+        custom_mode: int = fields["custom_mode"]
+        if mav_type is not None and autopilot is not None:
+            why = why_not_flown(mav_type, autopilot, state.vtol_state)
+            if autopilot != ARDUPILOT or why not in (None, VTOL_STATE_MISSING):
+                return FlightMode.UNKNOWN
         if custom_mode == GUIDED:
             self._seen_guided = True
             return self._guided_use

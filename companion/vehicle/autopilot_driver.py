@@ -17,16 +17,17 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-from companion.vehicle.autopilot_profile import ARDUPILOT, PX4, AutopilotProfile, Px4Profile
+from companion.vehicle.autopilot_profile import AutopilotProfile, Px4Profile
 from companion.vehicle.byte_link import ByteLink, Source, open_link
 from companion.vehicle.commander import NAME as COMMANDER_NAME
 from companion.vehicle.commander import ONBOARD_CONTROLLER, commander_mode, read_commander
 from companion.vehicle.connection_advice import no_answer_advice, no_autopilot_text, unsupported_autopilot
 from companion.vehicle.driver import CommandRefusedError, LinkError, NoAnswerError, OnBytes, SystemStatus
 from companion.vehicle.flight_commands import FlightCommands
-from companion.vehicle.framing import CURRENT_MODE_ID, Frame, Framer, is_signed, pack_frame
+from companion.vehicle.framing import CURRENT_MODE_ID, Frame, Framer, frames_of, is_signed, pack_frame
 from companion.vehicle.gimbal import Address, GimbalAim
 from companion.vehicle.gimbal_commands import GimbalCommands
+from companion.vehicle.harmless import is_harmless
 from companion.vehicle.landing_target import LandingTarget, landing_target_fields
 from companion.vehicle.link_url import LinkScheme, LinkUrl
 from companion.vehicle.obstacle_distance import obstacle_distance_fields
@@ -37,6 +38,7 @@ from companion.vehicle.state import HEARTBEAT_MAX_AGE_S, FlightMode, VehicleStat
 from companion.vehicle.stream_requests import StreamRequests
 from companion.vehicle.telemetry import Fields
 from companion.vehicle.telemetry_state import TelemetryState
+from companion.vehicle.vehicle_type import ARDUPILOT, PX4
 from companion.vehicle.vision_position import VisionPosition, vision_position_fields
 from vision.obstacle_sectors import ObstacleSectors
 
@@ -103,6 +105,7 @@ class AutopilotDriver(ABC):
         self._others: set[tuple[Any, ...]] = set()
         self._time_sent_ns = 0
         self._signs = False  # the autopilot's frames are signed
+        self._withheld = ""  # the logged reason
         self._only_heartbeats = True
         self.link_count = 0
         self._streams: StreamRequests | None = None
@@ -294,7 +297,13 @@ class AutopilotDriver(ABC):
         if self._link is not None:
             self._link.answer_to(source)
         self._newest_heartbeat = frame
-        fields = {"custom_mode": custom_mode, "base_mode": base_mode, "system_status": system_status}
+        fields = {
+            "type": mav_type,
+            "autopilot": autopilot,
+            "custom_mode": custom_mode,
+            "base_mode": base_mode,
+            "system_status": system_status,
+        }
         self._telemetry.handle("HEARTBEAT", fields)
         self._heartbeat_received.set()
 
@@ -356,7 +365,7 @@ class AutopilotDriver(ABC):
     # --- sending ------------------------------------------------------------------------------------
 
     def _transmit(self, frame: bytes) -> None:
-        if self._link is None:
+        if self._link is None or self._is_withheld(frame):
             return
         ready = frame if self._signer is None else self._signer.signed(frame)
         # A stopped process resumes where it was, perhaps after the freshness check of a setpoint; sending it
@@ -368,6 +377,24 @@ class AutopilotDriver(ABC):
         self._link.send(ready)
         if self._on_bytes is not None:
             self._on_bytes(True, ready)
+
+    def _is_withheld(self, frame: bytes) -> bool:
+        """Whether a frame may not go to this vehicle. Everything that is sent passes here.
+
+        What the callers refuse beforehand may have been sent by then, and would be repeated.
+        """
+        why = self._telemetry.state.not_flown
+        if why is None or all(map(is_harmless, frames_of(frame))):
+            return False
+        if why != self._withheld:
+            logger.warning("%s: nothing is sent that moves the vehicle: %s", self.url, why)
+        self._withheld = why
+        return True
+
+    def _check_flown(self, what: str) -> None:
+        """Raise CommandRefusedError for a vehicle that is not flown."""
+        if (why := self._telemetry.state.not_flown) is not None:
+            raise CommandRefusedError(f"{what} not sent: {why}")
 
     def _boot_ms(self) -> int:
         return (time.monotonic_ns() - self._started_ns) // 1_000_000 & 0xFFFF_FFFF
@@ -447,18 +474,22 @@ class AutopilotDriver(ABC):
 
     async def arm(self) -> None:
         """See Driver."""
+        self._check_flown("arm")
         await self._flight_commands.arm_or_disarm(True, self._system_id)
 
     async def disarm(self) -> None:
         """See Driver."""
+        self._check_flown("disarm")
         await self._flight_commands.arm_or_disarm(False, self._system_id)
 
     async def set_mode(self, mode: FlightMode, *, timeout_s: float = 3.0) -> None:
         """See Driver."""
+        self._check_flown(f"mode {mode}")
         await self._flight_commands.set_mode(mode, timeout_s=timeout_s)
 
     async def takeoff(self, altitude_m: float) -> None:
         """See Driver."""
+        self._check_flown("take-off")
         await self._flight_commands.takeoff(altitude_m)
 
     @property

@@ -16,8 +16,8 @@ from companion.vehicle.framing import CURRENT_MODE_ID
 from companion.vehicle.px4_modes import request_of_mode
 from companion.vehicle.state import FlightMode, VehicleState
 from companion.vehicle.telemetry import Fields
+from companion.vehicle.vehicle_type import AUTOPILOT_NAMES, PX4
 
-PX4, ARDUPILOT = 12, 3  # MAV_AUTOPILOT
 HOME_POSITION_ID = 242
 ESTIMATOR_STATUS_ID = 230
 ODOMETRY_ID = 331
@@ -81,7 +81,7 @@ class AutopilotProfile(ABC):
 class Px4Profile(AutopilotProfile):
     """PX4. Its onboard link sends most of the streams without a request."""
 
-    name = "PX4"
+    name = AUTOPILOT_NAMES[PX4]
     parameters_bytewise = True
     takeoff_needs_home = True
     has_events = True

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from companion.vehicle.autopilot_profile import ARDUPILOT
 from companion.vehicle.link_url import LinkScheme, LinkUrl
 from companion.vehicle.signing import FrameSigner
+from companion.vehicle.vehicle_type import ARDUPILOT
 
 _AUTOPILOT_NAMES = {0: "a generic autopilot", 3: "ArduPilot"}
 

@@ -12,8 +12,8 @@ import math
 from dataclasses import dataclass
 
 from companion.vehicle.state import Vector3
+from companion.vehicle.vehicle_type import ARDUPILOT
 
-AUTOPILOT_ARDUPILOT = 3  # MAV_AUTOPILOT_ARDUPILOTMEGA
 FRAME_LOCAL_NED, FRAME_BODY_FRD = 1, 12  # MAV_FRAME
 TYPE_VISION_FIDUCIAL = 2  # LANDING_TARGET_TYPE
 LARGEST_NUMBER = 255
@@ -67,7 +67,7 @@ def landing_target_fields(
     }
     north, east, down_m = (p + o for p, o in zip(target.position_ned_m, offset_ned_m, strict=True))
     position = (north, east, down_m)
-    if autopilot == AUTOPILOT_ARDUPILOT:
+    if autopilot == ARDUPILOT:
         position = target.offset_frd_m
         fields["frame"] = FRAME_BODY_FRD
     if down > 0.0:

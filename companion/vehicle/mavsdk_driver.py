@@ -194,6 +194,7 @@ class MavsdkDriver(AutopilotDriver):
 
     async def set_parameter(self, name: str, value: float) -> None:
         """See Driver."""
+        self._check_flown(f"parameter {name}")
         before = await self._read_parameter(name)
         if isinstance(before, int):
             if not float(value).is_integer() or not -(2**31) <= value < 2**31:

@@ -12,12 +12,12 @@ from typing import Any
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.vehicle.autopilot_driver import AUTOPILOT_COMPONENT, HEARTBEAT_ID, AutopilotDriver
-from companion.vehicle.autopilot_profile import ARDUPILOT, PX4
 from companion.vehicle.driver import CommandRefusedError, OnBytes
 from companion.vehicle.framing import EKF_STATUS_REPORT_ID, Frame
 from companion.vehicle.link_url import LinkUrl
 from companion.vehicle.mav_result import IN_PROGRESS
 from companion.vehicle.telemetry import TELEMETRY_MESSAGES, Fields
+from companion.vehicle.vehicle_type import ARDUPILOT, PX4
 
 logger = logging.getLogger(__name__)
 
@@ -165,6 +165,7 @@ class PymavlinkDriver(AutopilotDriver):
 
     async def set_parameter(self, name: str, value: float) -> None:
         """See Driver."""
+        self._check_flown(f"parameter {name}")
         _, kind = await self._read_parameter(name)
         wanted = _parameter_bytes(name, value, kind, bytewise=self._telemetry.profile.parameters_bytewise)
         payload = _PARAM_SET.pack(

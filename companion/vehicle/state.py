@@ -19,6 +19,7 @@ from companion.vehicle.commander import Commander
 from companion.vehicle.gimbal import GimbalState
 from companion.vehicle.ground import GROUND_MAX_AGE_S, GroundLevel
 from companion.vehicle.report import WARNING, Report
+from companion.vehicle.vehicle_type import AUTOPILOT_NAMES, VtolState, autopilot_text, why_not_flown
 
 __all__ = [
     "HEARTBEAT_MAX_AGE_S",
@@ -133,6 +134,8 @@ class VehicleState:
         gimbal: attitude and control of the gimbal; None until one is received.
         reports: the newest text reports, the newest last.
         autopilot: "PX4" or "ArduPilot", None until its first heartbeat.
+        mav_type, mav_autopilot: MAV_TYPE and MAV_AUTOPILOT of the newest heartbeat; None until the first.
+        vtol_state: None until EXTENDED_SYS_STATE is received.
         missing_streams: names of required messages received below half of their rate.
         other_commanders: other companion services received on the link, of any age.
     """
@@ -172,6 +175,9 @@ class VehicleState:
     gimbal: GimbalState | None = None
     reports: tuple[Report, ...] = ()
     autopilot: str | None = None
+    mav_type: int | None = None
+    mav_autopilot: int | None = None
+    vtol_state: VtolState | None = None
     missing_streams: tuple[str, ...] = ()
     other_commanders: tuple[Commander, ...] = ()
 
@@ -226,8 +232,23 @@ class VehicleState:
         return self.ground.disagreement_m(level, self.position_ns)
 
     @property
+    def not_flown(self) -> str | None:
+        """Why this vehicle gets no flight command, in words; None: it is flown, or not known yet."""
+        if self.mav_type is None or self.mav_autopilot is None:
+            return None
+        reported = AUTOPILOT_NAMES.get(self.mav_autopilot)
+        if self.autopilot is not None and reported != self.autopilot:
+            now = autopilot_text(self.mav_autopilot)
+            return (
+                f"the autopilot was {self.autopilot} and is {now} now: another vehicle; restart the service"
+            )
+        return why_not_flown(self.mav_type, self.mav_autopilot, self.vtol_state)
+
+    @property
     def without_setpoints(self) -> str:
         """What the autopilot does when setpoints stop, as text."""
+        if self.not_flown is not None:
+            return "what the vehicle does next is its autopilot's own"
         return _WITHOUT_SETPOINTS.get(self.autopilot or "", "the autopilot performs its configured failsafe")
 
     def connected(self, now_ns: int) -> bool:

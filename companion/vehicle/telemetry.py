@@ -11,6 +11,7 @@ from companion.vehicle.gimbal_telemetry import GIMBAL_STEPS
 from companion.vehicle.ground import GroundLevel, may_measure, range_below_m
 from companion.vehicle.px4_modes import mode_of_custom_mode
 from companion.vehicle.state import FlightMode, LandedState, Odometry, Vector3, VehicleState, with_fields
+from companion.vehicle.vehicle_type import VtolState
 
 Fields = Mapping[str, Any]
 
@@ -35,6 +36,7 @@ _LANDED = {
     3: LandedState.TAKING_OFF,
     4: LandedState.LANDING,
 }
+_VTOL_STATES = {state.value: state for state in VtolState}
 
 
 def apply_message(state: VehicleState, name: str, fields: Fields, now_ns: int) -> VehicleState:
@@ -59,6 +61,8 @@ def _heartbeat(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState
         armed=bool(fields["base_mode"] & _SAFETY_ARMED),
         mode=_mode(fields),
         failsafe=fields["system_status"] in (_STATE_CRITICAL, _STATE_EMERGENCY),
+        mav_type=fields["type"],
+        mav_autopilot=fields["autopilot"],
     )
 
 
@@ -76,7 +80,8 @@ def _current_mode(state: VehicleState, fields: Fields, _now_ns: int) -> VehicleS
 
 def _extended_sys_state(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:
     landed = _LANDED.get(fields["landed_state"], LandedState.UNKNOWN)
-    return with_fields(state, landed=landed)
+    vtol_state = _VTOL_STATES.get(fields["vtol_state"])
+    return with_fields(state, landed=landed, vtol_state=vtol_state)
 
 
 def _attitude_quaternion(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:

@@ -172,6 +172,7 @@ class TelemetryState:
             home_altitude_amsl_m=None,
             home_position_ned_m=None,
             position_valid=None,
+            vtol_state=None,
             ground=None,
             odometry=None,
             clock=None,

@@ -158,9 +158,9 @@ async def test_autopilot_back_on_another_port_is_answered(monkeypatch: pytest.Mo
 @pytest.mark.parametrize(
     ("sent", "named"),
     [
-        (heartbeat(vehicle_type=mavlink.MAV_TYPE_FIXED_WING), "MAV_TYPE_FIXED_WING"),
-        (heartbeat(vehicle_type=mavlink.MAV_TYPE_GROUND_ROVER), "MAV_TYPE_GROUND_ROVER"),
-        (heartbeat(autopilot=mavlink.MAV_AUTOPILOT_GENERIC), "MAV_AUTOPILOT_GENERIC"),
+        (heartbeat(vehicle_type=mavlink.MAV_TYPE_FIXED_WING), r"a fixed wing \(MAV_TYPE 1\)"),
+        (heartbeat(vehicle_type=mavlink.MAV_TYPE_GROUND_ROVER), r"a rover \(MAV_TYPE 10\)"),
+        (heartbeat(autopilot=mavlink.MAV_AUTOPILOT_GENERIC), "MAV_AUTOPILOT 0"),
         (heartbeat(armed=True), "armed"),
         (b"", "no autopilot heartbeat"),
     ],

@@ -42,6 +42,8 @@ class StatusVehicleBody(TypedDict):
     """motors are armed"""
     failsafe: bool
     """MAV_STATE_CRITICAL or EMERGENCY"""
+    not_flown: str | None
+    """why it gets no flight commands, by its type; null: it gets them"""
     missing_streams: list[str]
     """required messages that arrive at less than half their rate"""
     status_texts: list[str]

@@ -18,6 +18,7 @@ from companion.service.systemd_notify import SystemdNotifier
 from companion.settings.vehicle import VehicleSection
 from companion.vehicle.driver import CommandRefusedError, Driver
 from companion.vehicle.state import VehicleState
+from companion.vehicle.vehicle_type import PX4, VtolState
 
 
 class FakeDriver:
@@ -116,6 +117,28 @@ async def test_parameter_changed_between_links_is_read_again() -> None:
     assert inputs.altitude_acceptance_m is None
     assert [level for level, _ in events] == ["warning"]
     running.cancel()
+
+
+def test_vehicle_that_is_not_flown_is_reported_once_per_change() -> None:
+    health, driver, _, events = health_of("PX4", {})
+    guidance = Guidance(guidance_options(plain_settings(), (1, 191)))
+
+    def step(mav_type: int | None, vtol_state: VtolState | None) -> list[str]:
+        autopilot = None if mav_type is None else PX4
+        driver.state = VehicleState(
+            autopilot="PX4", mav_type=mav_type, mav_autopilot=autopilot, vtol_state=vtol_state
+        )
+        events.clear()
+        health.after_step(0, guidance)
+        health.after_step(0, guidance)
+        return [level for level, _ in events]
+
+    tiltrotor, fixed_wing = 21, 1
+    assert step(None, None) == []
+    assert step(tiltrotor, None) == []  # not known yet
+    assert step(tiltrotor, VtolState.FW) == ["error"]
+    assert step(tiltrotor, VtolState.MC) == ["info"]
+    assert step(fixed_wing, VtolState.UNDEFINED) == ["error"]
 
 
 async def test_unknown_autopilot_is_asked_for_no_parameter() -> None:

@@ -36,7 +36,7 @@ class FakeAutopilot:
             "COMMAND_LONG": lambda m: self.acknowledge(m.command)
         }
         self.custom_mode, self.base_mode, self.system_status = HOLD, 29, 3
-        self.autopilot = autopilot
+        self.autopilot, self.mav_type, self.vtol_state = autopilot, 2, 0
         self.sends_heartbeats = True
         self._port = port
         self._codec = mavlink.MAVLink(None, system_id, component_id)
@@ -59,9 +59,12 @@ class FakeAutopilot:
     def heartbeat(self) -> None:
         self.send(
             mavlink.MAVLink_heartbeat_message(
-                2, self.autopilot, self.base_mode, self.custom_mode, self.system_status, 3
+                self.mav_type, self.autopilot, self.base_mode, self.custom_mode, self.system_status, 3
             )
         )
+
+    def landed(self, landed_state: int = 1) -> None:
+        self.send(mavlink.MAVLink_extended_sys_state_message(self.vtol_state, landed_state))
 
     def acknowledge(self, command: int, result: int = 0) -> None:
         self.send(mavlink.MAVLink_command_ack_message(command, result, 0, 0, 1, 191))

@@ -164,6 +164,8 @@ async def test_messages_sent_to_ardupilot() -> None:
     driver = open_driver("pymavlink", f"udpin://127.0.0.1:{port}")
     try:
         await driver.connect(10.0)
+        autopilot.landed()
+        await wait_for_state(driver, lambda state: state.not_flown is None)
         driver.send_setpoint(Setpoint.velocity((1.0, 0.0, 0.0), time.monotonic_ns()))
         (message,) = await autopilot.wait_for(SETPOINT)
         assert message.type_mask == 0b0101_1100_0111  # a yaw rate of zero: the heading is kept

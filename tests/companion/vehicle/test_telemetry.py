@@ -10,7 +10,8 @@ from pymavlink.dialects.v20 import common as mavlink
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
 from companion.vehicle.telemetry import TELEMETRY_MESSAGES, apply_message
 
-HEARTBEAT = {"custom_mode": 0x03040000, "base_mode": 29, "system_status": 3}
+QUADROTOR = {"type": 2, "autopilot": 12}
+HEARTBEAT = {"custom_mode": 0x03040000, "base_mode": 29, "system_status": 3, **QUADROTOR}
 
 
 @pytest.mark.parametrize(
@@ -26,7 +27,7 @@ HEARTBEAT = {"custom_mode": 0x03040000, "base_mode": 29, "system_status": 3}
 def test_heartbeat_sets_armed_and_failsafe(
     base_mode: int, system_status: int, armed: bool, failsafe: bool
 ) -> None:
-    fields = {"custom_mode": 0x00060000, "base_mode": base_mode, "system_status": system_status}
+    fields = {**HEARTBEAT, "custom_mode": 0x00060000, "base_mode": base_mode, "system_status": system_status}
     state = apply_message(VehicleState(), "HEARTBEAT", fields, 77)
     assert (state.armed, state.failsafe, state.heartbeat_ns) == (armed, failsafe, 77)
     assert state.mode is FlightMode.OFFBOARD
@@ -59,7 +60,7 @@ def test_unknown_current_mode_is_ignored() -> None:
     ],
 )
 def test_landed_state_is_decoded(number: int, landed: LandedState) -> None:
-    state = apply_message(VehicleState(), "EXTENDED_SYS_STATE", {"landed_state": number}, 5)
+    state = apply_message(VehicleState(), "EXTENDED_SYS_STATE", {"landed_state": number, "vtol_state": 0}, 5)
     assert state.landed is landed
 
 
