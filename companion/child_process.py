@@ -15,6 +15,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 
 from companion.scheduling import schedule_as_any_program
+from companion.tasks import spawn
 
 # Exit code of a program that has printed in one line why it cannot work: it is not started again.
 EXIT_REFUSED = 2
@@ -36,7 +37,7 @@ async def child_process(
         name: for people. say: called in the loop with each line that it prints, and with its end.
         end_s: it is killed if it takes longer to end, seconds.
     """
-    running = asyncio.create_task(_supervise(name, (module, argument), say, end_s), name=name)
+    running = spawn(_supervise(name, (module, argument), say, end_s), name)
     try:
         yield
     finally:

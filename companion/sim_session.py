@@ -26,6 +26,7 @@ from companion.service import Service
 from companion.settings import Settings
 from companion.settings.calibration import adopt_calibration
 from companion.settings.perception import DEFAULT_MODEL, NO_SOURCE
+from companion.tasks import spawn
 from mavlink_sim.camera.scene import CameraSettings
 from mavlink_sim.testing import free_port, free_udp_port_range
 from vision.camera_model import CameraCalibration
@@ -98,7 +99,7 @@ class SimProcess:
         self._process = process
         self._lines: deque[str] = deque(maxlen=_LINES_KEPT)
         self._ready, self._lost = asyncio.Event(), asyncio.Event()
-        self._reading = asyncio.create_task(self._read(log_path), name="simulator output")
+        self._reading = spawn(self._read(log_path), "simulator output")
 
     @property
     def pid(self) -> int:

@@ -14,6 +14,25 @@ class BusError(ConnectionError):
     """The zenoh session cannot be opened (a busy port, a bad endpoint, a bad configuration file)."""
 
 
+# Of one message to the service: zenoh drops a larger one before Python reads any part of it. A selector has
+# no other limit; that of a payload is smaller, and then the sender of a command is answered.
+LARGEST_RECEIVED_BYTES = 16 * 1024 * 1024
+_MESSAGE_SIZE = "transport/link/rx/max_message_size"
+
+
+def service_config(settings: ZenohSection) -> zenoh.Config:
+    """Convert settings into the configuration of a service, which receives small messages alone.
+
+    Raises:
+        BusError: as `zenoh_config`.
+    """
+    config, default = zenoh_config(settings), zenoh.Config().get_json(_MESSAGE_SIZE)
+    # A router passes on the images of others.
+    if config.get_json(_MESSAGE_SIZE) == default and json.loads(config.get_json("mode")) != "router":
+        config.insert_json5(_MESSAGE_SIZE, str(LARGEST_RECEIVED_BYTES))
+    return config
+
+
 def zenoh_config(settings: ZenohSection) -> zenoh.Config:
     """Convert settings into zenoh's configuration.
 

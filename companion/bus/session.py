@@ -25,7 +25,8 @@ from zenoh import ext
 
 from companion.bus.bodies.frames import CloudBody, DepthImageBody, ImageBody
 from companion.bus.command_intake import COMMANDS_PER_S, MAX_SENDER_BYTES, Allowance, CommandIntake
-from companion.bus.config import BusError, first_line, zenoh_config
+from companion.bus.config import BusError, first_line, service_config, zenoh_config
+from companion.bus.listeners import Listener, ListenerQueue
 from companion.bus.topics import (
     RECORDER_TOPICS,
     ROOT,
@@ -37,13 +38,13 @@ from companion.bus.topics import (
 )
 from companion.scheduling import set_scheduler_slice
 from companion.settings import ZenohSection
+from companion.tasks import spawn
 
 __all__ = ["Bus", "BusError", "encode", "zenoh_config"]
 
 logger = logging.getLogger(__name__)
 
 CommandHandler = Callable[[str], Awaitable[dict[str, Any]]]
-Listener = Callable[[bytes, int], None]
 QueryHandler = Callable[[], Awaitable[Any]]
 _Publisher = zenoh.Publisher | ext.AdvancedPublisher
 
@@ -77,14 +78,13 @@ class Bus:
         queries: path of a queryable → function that returns its reply, a body or a JPEG; called as
             `on_command`. A TimeoutError or KeyError is replied as an error.
         views: names of the views that publish besides the first.
-        listeners: keys, each with a callback in the loop for its messages and their time of receipt
-            (CLOCK_MONOTONIC nanoseconds).
+        listeners: to topics of other programs.
 
     Attributes:
         published: path of a topic (`Topic.path`) → messages so far. Without a subscriber they are neither
             encoded nor sent, unless they are kept for a later one (`Topic.cached`).
         publish_failed: messages without a session, or refused by zenoh.
-        intake: accepts or refuses commands.
+        intake: accepts or refuses commands. listeners: to other programs.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class Bus:
         on_command: CommandHandler,
         queries: Mapping[str, QueryHandler] = MappingProxyType({}),
         views: Sequence[str] = (),
-        listeners: Sequence[tuple[str, Listener]] = (),
+        listeners: Sequence[Listener] = (),
     ) -> None:
         self._settings = settings
         self._vehicle = vehicle
@@ -121,7 +121,8 @@ class Bus:
         self._kept_slots = threading.Semaphore(_MOST_UNSENT)
         self._command_replies = ThreadPoolExecutor(1, "zenoh command replies")
         self._query_replies = ThreadPoolExecutor(1, "zenoh query replies")
-        self._listeners = tuple(listeners)
+        self.listeners = tuple(listeners)
+        self._received: list[ListenerQueue] = []
         self._subscribers: list[zenoh.Subscriber[None]] = []
         self._token: zenoh.LivelinessToken | None = None
         self._streams: list[tuple[Topic, str | None]] = [
@@ -139,6 +140,11 @@ class Bus:
         return self._session is not None
 
     @property
+    def ignored(self) -> dict[str, int]:
+        """Topic that is listened to → messages that were not used."""
+        return {queue.topic.name: queue.ignored for queue in self._received}
+
+    @property
     def connected(self) -> bool:
         """Whether at least one other node is connected, or `connect` is empty."""
         return self.open and (self._connected or not self._settings.connect)
@@ -150,7 +156,7 @@ class Bus:
             BusError: a peer cannot listen on its endpoints.
         """
         self._loop = asyncio.get_running_loop()
-        config = zenoh_config(self._settings)
+        config = service_config(self._settings)
         if json.loads(config.get_json("mode")) != "client":
             try:
                 self._adopt(await asyncio.to_thread(_open, config))
@@ -288,10 +294,11 @@ class Bus:
             session.declare_queryable(f"{ROOT}/{self._vehicle}/{path}", partial(self._on_query, path))
             for path in self._queries
         ]
-        self._subscribers = [
-            session.declare_subscriber(key, partial(self._on_sample, listener))
-            for key, listener in self._listeners
-        ]
+        for listener in self.listeners:
+            queue = ListenerQueue(listener, self._call_soon, self._on_event)
+            self._received.append(queue)
+            key = listener.topic.key(listener.vehicle)
+            self._subscribers.append(session.declare_subscriber(key, partial(self._on_sample, queue)))
 
     def _declare(self, session: zenoh.Session, topic: Topic, view: str | None) -> None:
         path, key = topic.path(view), topic.key(self._vehicle, view)
@@ -335,10 +342,16 @@ class Bus:
         if publisher.matching_status.matching:  # type: ignore[attr-defined]
             self._watched[path] = True
 
-    def _on_sample(self, listener: Listener, sample: zenoh.Sample) -> None:
-        received_ns = time.monotonic_ns()
-        if self._loop is not None and not self._loop.is_closed():
-            self._loop.call_soon_threadsafe(listener, sample.payload.to_bytes(), received_ns)
+    def _call_soon(self, call: Callable[..., None], *arguments: Any) -> None:
+        """Schedule a call in the loop, from any thread; nothing once the loop has ended."""
+        if self._loop is not None:
+            with suppress(RuntimeError):  # the loop is closed
+                self._loop.call_soon_threadsafe(call, *arguments)
+
+    @staticmethod
+    def _on_sample(queue: ListenerQueue, sample: zenoh.Sample) -> None:
+        payload = sample.payload
+        queue.offer(len(payload), payload.to_bytes, time.monotonic_ns())
 
     def _from_zenoh_thread(self, query: zenoh.Query) -> None:
         sender = query.attachment
@@ -395,7 +408,7 @@ class Bus:
         endpoints = ", ".join(self._settings.connect)
         while self._session is None:
             try:
-                self._adopt(await asyncio.to_thread(_open, zenoh_config(self._settings)))
+                self._adopt(await asyncio.to_thread(_open, service_config(self._settings)))
             except zenoh.ZError:
                 if not reported:
                     self._on_event("warning", f"zenoh: no peer at {endpoints}, retrying")
@@ -419,15 +432,10 @@ class Bus:
             await asyncio.sleep(_WATCH_PERIOD_S)
 
     def _spawn(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
-        task = asyncio.create_task(work)
+        task = spawn(work, "zenoh task")
         self._tasks.add(task)
-        task.add_done_callback(self._finished)
+        task.add_done_callback(self._tasks.discard)
         return task
-
-    def _finished(self, task: asyncio.Task[None]) -> None:
-        self._tasks.discard(task)
-        if not task.cancelled() and (error := task.exception()) is not None:
-            logger.error("zenoh task failed", exc_info=error)
 
 
 def _open(config: zenoh.Config) -> zenoh.Session:

@@ -92,7 +92,6 @@ def status_message(
         "gimbal": _gimbal(guidance.gimbal, now_ns, state),
         "neighbours": {
             "ages_s": poses.ages_s(now_ns),
-            "unread": poses.unread,
             "out_of_order": poses.out_of_order,
         },
         "bus": {
@@ -100,6 +99,7 @@ def status_message(
             "published": dict(bus.published),
             "publish_failed": bus.publish_failed,
             "refused_commands": bus.intake.refused,
+            "ignored": bus.ignored,
         },
         "log": {"dropped_lines": dropped_lines},
     }

@@ -26,6 +26,10 @@ from companion.bus.bodies.service import EventBody, StatusBody
 from companion.bus.bodies.vehicle import ObstaclesBody, PoseBody, SetpointsBody, VehicleBody, VelocityBody
 
 ROOT = "companion"
+LARGEST_JSON_BYTES = 256 * 1024
+LARGEST_BINARY_BYTES = 64 * 1024 * 1024
+"""Of point clouds and depth images; a preview image has at most `LARGEST_IMAGE_BYTES`."""
+LARGEST_IMAGE_BYTES = 8 * 1024 * 1024
 
 _JSON = zenoh.Encoding.APPLICATION_JSON
 _REAL_TIME = zenoh.Priority.REAL_TIME
@@ -44,6 +48,7 @@ class Topic:
         published: when, in words.
         rate_hz: nominal; None if it follows the camera or is irregular.
         max_age_s: max age of a valid message; None if it does not age (events).
+        largest_bytes: readers ignore a larger message, without a copy of it.
         of_camera: published by every camera.
         cached: number of newest messages kept for late subscribers; 0: none are, and nothing is encoded
             without a subscriber.
@@ -58,6 +63,7 @@ class Topic:
     published: str
     rate_hz: float | None = None
     max_age_s: float | None = None
+    largest_bytes: int = LARGEST_JSON_BYTES
     of_camera: bool = False
     cached: int = 0
     encoding: zenoh.Encoding = field(default_factory=lambda: _JSON)
@@ -144,6 +150,7 @@ IMAGE: Final = Topic(
     "at most `preview.rate_hz`, only with subscribers",
     rate_hz=15.0,
     max_age_s=1.0,
+    largest_bytes=LARGEST_IMAGE_BYTES,
     of_camera=True,
     encoding=zenoh.Encoding.IMAGE_JPEG,
     priority=zenoh.Priority.BACKGROUND,
@@ -155,6 +162,7 @@ DEPTH_IMAGE: Final = Topic(
     "at most `preview.rate_hz`, only with subscribers, of cameras with depth",
     rate_hz=15.0,
     max_age_s=1.0,
+    largest_bytes=LARGEST_BINARY_BYTES,
     of_camera=True,
     encoding=zenoh.Encoding.APPLICATION_OCTET_STREAM,
     priority=zenoh.Priority.BACKGROUND,
@@ -166,6 +174,7 @@ CLOUD: Final = Topic(
     "at most `preview.cloud_rate_hz`, only with subscribers, of cameras with depth",
     rate_hz=2.0,
     max_age_s=1.0,
+    largest_bytes=LARGEST_BINARY_BYTES,
     of_camera=True,
     encoding=zenoh.Encoding.APPLICATION_OCTET_STREAM,
     priority=zenoh.Priority.BACKGROUND,
@@ -195,6 +204,7 @@ POSE: Final = Topic(
     "10 Hz while known",
     rate_hz=10.0,
     max_age_s=1.0,
+    largest_bytes=16 * 1024,
     priority=_REAL_TIME,
     express=True,
 )
@@ -214,6 +224,7 @@ STATUS: Final = Topic(
     "1 Hz",
     rate_hz=1.0,
     max_age_s=3.0,
+    largest_bytes=64 * 1024,
     cached=1,
 )
 EVENTS: Final = Topic(
@@ -231,6 +242,7 @@ VELOCITY: Final = Topic(
     "a velocity to fly, for the command `velocity`",
     "by the program that steers, at least twice a second",
     max_age_s=0.5,
+    largest_bytes=1024,
     priority=_REAL_TIME,
     express=True,
 )
@@ -242,6 +254,7 @@ RUN: Final = Topic(
     "version and settings of the service, for a replay",
     "1 Hz",
     rate_hz=1.0,
+    largest_bytes=LARGEST_BINARY_BYTES,
     priority=_RECORD,
 )
 GUIDANCE_INPUT: Final = Topic(
@@ -249,6 +262,7 @@ GUIDANCE_INPUT: Final = Topic(
     dict[str, Any],
     "the input of each step of guidance",
     "per step",
+    largest_bytes=LARGEST_BINARY_BYTES,
     priority=_RECORD,
 )
 GUIDANCE_OUTPUT: Final = Topic(
@@ -256,6 +270,7 @@ GUIDANCE_OUTPUT: Final = Topic(
     dict[str, Any],
     "the output of each step of guidance",
     "per step",
+    largest_bytes=LARGEST_BINARY_BYTES,
     priority=_RECORD,
 )
 MAVLINK: Final = Topic(
@@ -263,6 +278,7 @@ MAVLINK: Final = Topic(
     bytes,
     "the bytes on the autopilot's link, both ways (`recording.tap`)",
     "20 Hz",
+    largest_bytes=LARGEST_BINARY_BYTES,
     encoding=zenoh.Encoding.APPLICATION_OCTET_STREAM,
     priority=_RECORD,
 )
@@ -301,11 +317,6 @@ RECORDER_TOPICS: Final = (RUN, GUIDANCE_INPUT, GUIDANCE_OUTPUT, MAVLINK)
 COMMAND: Final = "command"
 
 NO_OBJECTS = "no objects detected"
-
-
-def all_vehicles_key(topic: Topic) -> str:
-    """Return the key expression of one stream of all vehicles."""
-    return topic.key("*")
 
 
 def command_key(vehicle: str) -> str:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from companion.cli.flags import EXIT_FAILED, plain_errors, warn_rendered_only
+from companion.tasks import spawn
 from vision.gc_pause import gc_paused
 
 if TYPE_CHECKING:
@@ -75,7 +76,7 @@ async def _run_until_signal(settings: Settings, service: Service) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         # Before the service is ready there is nothing to shut down.
         loop.add_signal_handler(number, lambda: service.stop() if service.ready else running.cancel())
-    page = asyncio.create_task(_run_dashboard(settings, ready))
+    page = spawn(_run_dashboard(settings, ready), "dashboard")
     try:
         await running
     except asyncio.CancelledError:

@@ -24,6 +24,7 @@ from companion.dashboard.fleet import Fleet
 from companion.operator.reply_text import ENDED_BY_STOP
 from companion.plugins import PluginError, load_plugins
 from companion.settings import LanguageSection
+from companion.tasks import spawn
 
 if TYPE_CHECKING:
     import zenoh
@@ -105,7 +106,7 @@ class Chat:
     def begin(self, text: str, stops: int) -> None:
         """Answer a sentence; none is being answered."""
         self.stops = stops
-        self._running = asyncio.create_task(self._run(self.add(text), text))
+        self._running = spawn(self._run(self.add(text), text), "chat")
 
     def end(self) -> None:
         """End what is being answered; what it flies is stopped."""
@@ -265,7 +266,7 @@ class Chats:
             reply = await outcome
             exchange.show(f"{'done' if reply['success'] else 'failed'}: {reply['reason']}")
 
-        task = asyncio.create_task(note())
+        task = spawn(note(), "stop in a chat")
         self._noting.add(task)
         task.add_done_callback(self._noting.discard)
 

@@ -35,6 +35,7 @@ from companion.dashboard.bridge import Bridge, News
 from companion.dashboard.chat import MAX_SENTENCE_CHARACTERS, Chats
 from companion.dashboard.fleet import MAX_VEHICLES, Fleet
 from companion.settings import LanguageSection, ZenohSection
+from companion.tasks import spawn
 
 NICENESS = 5
 """Of the server's process: the loop that steers has priority."""
@@ -128,9 +129,9 @@ async def serve(options: DashboardOptions, on_ready: Callable[[str], None], flag
         fleet = Fleet(options.zenoh, options.vehicle)
         chats = Chats(fleet, options.language, options.plugins)
         server = http_server(create_app(fleet, chats, access))
-        bridging = asyncio.create_task(fleet.run())
+        bridging = spawn(fleet.run(), "bridge to zenoh")
         bridging.add_done_callback(lambda _: setattr(server, "should_exit", True))
-        loading = asyncio.create_task(chats.load())
+        loading = spawn(chats.load(), "loading of the chats")
         try:
             on_ready(f"http://{host}:{port}/")
             await server.serve(sockets=[listener])

@@ -5,14 +5,14 @@ A pose is published only while the global position is known; without one the oth
 
 from __future__ import annotations
 
-import json
 import uuid
 from collections.abc import Callable
 
 from companion.guidance.behaviour import Behaviour
 from companion.guidance.behaviours.formation import FormationBehaviour
 from companion.guidance.formation.neighbours import Neighbourhood, Neighbours
-from companion.guidance.formation.pose import Pose, PoseError, pose_from_message, pose_of
+from companion.guidance.formation.pose import Pose, pose_from_message, pose_of
+from companion.peer_data import parse_object
 from companion.vehicle.state import VehicleState
 
 
@@ -24,26 +24,20 @@ class PoseSharing:
 
     Attributes:
         vehicle: its name. source: random identifier of this run of the service.
-        unread: count of invalid messages.
     """
 
     def __init__(self, vehicle: str, on_event: Callable[[str, str], None]) -> None:
         self.vehicle, self._on_event = vehicle, on_event
         self.source = uuid.uuid4().hex[:12]
         self._neighbours = Neighbours(vehicle, self.source)
-        self.unread = 0
 
     def on_message(self, payload: bytes, receipt_ns: int) -> None:
-        """Handle a message on any vehicle's `pose` topic, received at that time (CLOCK_MONOTONIC ns)."""
-        try:
-            pose = pose_from_message(json.loads(payload))
-        except (PoseError, ValueError) as error:
-            # Logged once: it may come ten times a second.
-            if not self.unread:
-                self._on_event("warning", f"invalid pose message ignored: {error}")
-            self.unread += 1
-            return
-        self.ingest(pose, receipt_ns)
+        """Handle a message on any vehicle's `pose` topic, received at that time (CLOCK_MONOTONIC ns).
+
+        Raises:
+            PoseError: the message is not valid.
+        """
+        self.ingest(pose_from_message(parse_object(payload)), receipt_ns)
 
     def ingest(self, pose: Pose, receipt_ns: int) -> None:
         """Handle a pose received at that time, CLOCK_MONOTONIC nanoseconds."""

@@ -28,6 +28,7 @@ from companion.guidance.command import Command, GrammarError
 from companion.language.clauses import QUESTIONS
 from companion.language.conversation import Vehicle, answer_to
 from companion.language.tools import ToolCall, class_names_of, read_call, tools_of
+from companion.tasks import spawn
 
 PATH = "/mcp"
 WAIT_S = 20.0
@@ -137,7 +138,7 @@ class FlightTools:
         return None
 
     async def _send(self, command: Command) -> Reply:
-        task = asyncio.create_task(self._sent(command))
+        task = spawn(self._sent(command), f"{command.word}")
         self._sending.add(task)
         task.add_done_callback(self._sending.discard)
         if command.word not in NON_FLIGHT:

@@ -16,6 +16,7 @@ from contextlib import suppress
 from companion.scheduling import schedule_as_any_program
 from companion.settings import Settings
 from companion.settings.reading import flags
+from companion.tasks import spawn
 
 NICENESS = 5
 _SECTIONS = ("zenoh", "language", "plugins")
@@ -53,7 +54,7 @@ class AskProcess:
             with suppress(OSError):  # it has ended already
                 os.setpriority(os.PRIO_PROCESS, self._process.pid, min(os.nice(0) + NICENESS, 19))
             schedule_as_any_program(self._process.pid)
-            self._reading = asyncio.create_task(_pass_on(self._process, write))
+            self._reading = spawn(_pass_on(self._process, write), "output of ask")
         assert self._process is not None
         assert self._process.stdin is not None
         self._process.stdin.write(f"{line}\n".encode())

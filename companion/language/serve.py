@@ -19,6 +19,7 @@ from companion.language.conversation import Conversation, Operator
 from companion.language.endpoints import LanguageError
 from companion.language.sentences import is_stop
 from companion.operator.reply_text import ENDED_BY_STOP
+from companion.tasks import spawn
 
 ASK = "ask"
 MAX_SENTENCE_BYTES = 2000
@@ -94,7 +95,7 @@ async def serve(session: zenoh.Session, vehicle: str, converse: Callable[[Operat
             query.reply(query.key_expr, json.dumps(body))
 
     def begin(query: zenoh.Query) -> None:
-        task = loop.create_task(answer(query))
+        task = spawn(answer(query), "answer to a query")
         tasks.add(task)
         task.add_done_callback(tasks.discard)
 

@@ -12,6 +12,7 @@ from typing import Any, Protocol
 from aioconsole.stream import StandardStreamReader, StandardStreamReaderProtocol
 
 from companion.operator.reply_text import reply_text
+from companion.tasks import spawn
 
 logger = logging.getLogger(__name__)
 
@@ -106,7 +107,7 @@ async def _read_commands(
             elif text:
                 if ask is not None and ask.running and text.split()[-1].lower() == "stop":
                     await pass_on(_CANCEL)  # it sends nothing after the stop
-                task = asyncio.create_task(answer(text))
+                task = spawn(answer(text), "answer on the console")
                 running.add(task)
                 task.add_done_callback(running.discard)
     finally:

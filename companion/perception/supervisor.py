@@ -38,6 +38,7 @@ from companion.perception.process import PerceptionProcess, RateLimiter, Watchdo
 from companion.perception.standard_input import STANDARD_INPUT, StandardInput
 from companion.perception.status import LiveTracks, PerceptionState, PerceptionStatus, StageTimes
 from companion.settings import Settings
+from companion.tasks import spawn
 from companion.vehicle.state import Vector3
 from vision.attitude import Quaternion
 from vision.camera_model import CameraCalibration
@@ -150,7 +151,7 @@ class PerceptionSupervisor:
             raise RuntimeError("a perception supervisor can be started only once; create another")
         self._state = PerceptionState.STARTING
         started: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._task = asyncio.create_task(self._run(started), name="perception supervisor")
+        self._task = spawn(self._run(started), "perception supervisor")
         self._task.add_done_callback(self._on_fault)
         try:
             await asyncio.wait({started, self._task}, return_when=asyncio.FIRST_COMPLETED)
@@ -308,7 +309,6 @@ class PerceptionSupervisor:
         if not task.cancelled() and (error := task.exception()) is not None:
             self._state = PerceptionState.FAILED
             self._problem = f"{type(error).__name__}: {error}"
-            logger.error("perception supervisor failed", exc_info=error)
             self._on_event("error", f"perception failed: {self._problem}")
 
     # --- successive workers

@@ -67,7 +67,7 @@ class InputAssembler:
         self.steering = next(camera for camera in cameras if camera.name == settings.guidance.camera)
         self.history = StateHistory()
         self.poses = PoseSharing(settings.vehicle.name, on_event)
-        self.velocities = VelocitySenders(on_event)
+        self.velocities = VelocitySenders()
         self.altitude_acceptance_m: float | None = None
         self._markers = MarkerTracker(cameras, on_event)
         self._state: VehicleState | None = None

@@ -7,13 +7,13 @@ its `status` under the same name on the network. The one with the longer uptime 
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from companion.bus.bodies.service import OtherCommanderBody
 from companion.guidance.interface import CommandInput
 from companion.guidance.limits.battery import needs_charge
+from companion.peer_data import PeerDataError, parse_object
 from companion.settings.vehicle import VehicleSection
 from companion.vehicle.state import VehicleState
 
@@ -21,8 +21,8 @@ from companion.vehicle.state import VehicleState
 GONE_AFTER_S = 3.5
 # Uptimes are whole seconds, and delayed: of two services started this close together neither is the first.
 SAME_START_S = 2.0
-# Limits of a processed `status`, and of the number of services known by their status.
-LARGEST_STATUS_BYTES, MOST_SERVICES = 64 * 1024, 16
+# Services known by their status.
+MOST_SERVICES = 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,16 +69,18 @@ class OtherCommanders:
         return (now_ns - self._started_ns) / 1e9
 
     def on_status(self, payload: bytes, now_ns: int) -> None:
-        """Process a `status` message of any service, including our own."""
-        if len(payload) > LARGEST_STATUS_BYTES:
-            return
+        """Process a `status` message of any service, including our own.
+
+        Raises:
+            PeerDataError: it is not a status of a companion service.
+        """
+        message = parse_object(payload)
         try:
-            message = json.loads(payload)
             name, service = message["vehicle"]["name"], str(message["service"])
             started_ns = now_ns - round(float(message["uptime_s"]) * 1e9)
             in_command = bool(message["pilot"]["in_command"])
-        except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
-            return  # not a status of a companion service
+        except (ValueError, TypeError, KeyError, OverflowError) as error:
+            raise PeerDataError(f"not the status of a service: {type(error).__name__}: {error}") from None
         known = service in self._by_status or len(self._by_status) < MOST_SERVICES
         if name == self._vehicle and service != self._service and known and len(service) <= 64:
             self._by_status[service] = _Other("zenoh", service, now_ns, started_ns, in_command)

@@ -19,6 +19,7 @@ from companion.guidance.interface import (
     TakeGimbal,
     TakeOff,
 )
+from companion.tasks import spawn
 from companion.vehicle.driver import CommandRefusedError, Driver, LinkError
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.streamer import Streamer
@@ -70,7 +71,7 @@ class RequestRunner:
 
     def start(self, request: Request) -> None:
         """Start a request."""
-        task = asyncio.get_running_loop().create_task(self._run(request))
+        task = spawn(self._run(request), f"request {request.action}")
         self._tasks[request.identifier] = task
         task.add_done_callback(lambda done: self._on_done(request.identifier, done))
 

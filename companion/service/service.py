@@ -12,6 +12,7 @@ from typing import Any
 
 from companion.bus import topics
 from companion.bus.bodies.service import StatusBody
+from companion.bus.listeners import Listener
 from companion.bus.messages import Localization
 from companion.bus.session import Bus
 from companion.bus.status_message import status_message
@@ -93,9 +94,9 @@ class Service:
             queries=self._queries.handlers(self.cameras),
             views=tuple(settings.cameras),
             listeners=[
-                (topics.all_vehicles_key(topics.POSE), self.inputs.poses.on_message),
-                (topics.all_vehicles_key(topics.STATUS), self.others.on_status),
-                (topics.VELOCITY.key(settings.vehicle.name), self.inputs.velocities.on_message),
+                Listener(topics.POSE, self.inputs.poses.on_message),
+                Listener(topics.STATUS, self.others.on_status),
+                Listener(topics.VELOCITY, self.inputs.velocities.on_message, settings.vehicle.name),
             ],
         )
         self._tap = FlightTap(

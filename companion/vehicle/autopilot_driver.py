@@ -17,6 +17,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+from companion.tasks import spawn
 from companion.vehicle.autopilot_profile import AutopilotProfile, Px4Profile
 from companion.vehicle.byte_link import ByteLink, Source, open_link
 from companion.vehicle.commander import NAME as COMMANDER_NAME
@@ -189,7 +190,7 @@ class AutopilotDriver(ABC):
             (self._gimbal_commands.run(), "gimbal"),
             *([(self._reports.load_events(), "events")] if self._telemetry.profile.has_events else []),
         ):
-            self._tasks.append(asyncio.create_task(loop, name=f"{what} of {self.url}"))
+            self._tasks.append(spawn(loop, f"{what} of {self.url}"))
 
     async def close(self) -> None:
         """See Driver."""

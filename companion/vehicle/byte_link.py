@@ -19,6 +19,7 @@ import tty
 from collections.abc import Callable
 from typing import Any, Protocol
 
+from companion.tasks import spawn
 from companion.vehicle.driver import LinkError
 from companion.vehicle.link_url import LinkScheme, LinkUrl
 
@@ -234,7 +235,7 @@ class _StreamLink:
     def _on_lost(self, reason: str) -> None:
         logger.error("%s: link lost: %s; reopening", self._url, reason)
         self._release()
-        self._reopening = self._loop.create_task(self._reopen())
+        self._reopening = spawn(self._reopen(), f"reopening of {self._url}")
 
     async def _reopen(self) -> None:
         while self._descriptor < 0:

@@ -192,8 +192,6 @@ class StatusNeighboursBody(TypedDict):
 
     ages_s: dict[str, float]
     """vehicle: age of its pose"""
-    unread: int
-    """invalid messages"""
     out_of_order: int
     """messages older than the newest"""
 
@@ -209,6 +207,8 @@ class StatusBusBody(TypedDict):
     """messages without a session, or refused by zenoh"""
     refused_commands: int
     """commands refused by the rate limit"""
+    ignored: dict[str, int]
+    """topic that is listened to: messages that were too large, not valid, or too many"""
 
 
 class StatusLogBody(TypedDict):

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from companion.geometry.formation import SHAPES
+from companion.peer_data import PeerDataError
 from companion.vehicle.state import LandedState, Vector3, VehicleState
 
 # GLOBAL_POSITION_INT comes 5 to 50 times a second.
@@ -19,7 +20,7 @@ GLOBAL_MAX_AGE_S = 0.5
 ROLES = ("alone", "leader", "follower", "virtual")
 
 
-class PoseError(ValueError):
+class PoseError(PeerDataError):
     """The message is not a valid pose. The text is one line for a person."""
 
 

@@ -9,7 +9,7 @@ import os
 import signal
 import socket
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -18,6 +18,7 @@ import zenoh
 
 from companion.bus import topics
 from companion.bus.client import client_settings, listen, open_client, subscribe_kept
+from companion.bus.listeners import Listener
 from companion.bus.session import Bus, QueryHandler
 from companion.settings import ZenohSection
 from mavlink_sim.testing import free_port
@@ -36,10 +37,17 @@ async def until(condition: Callable[[], bool]) -> None:
 class OpenBus:
     """A bus and a client of it, as an asynchronous context manager."""
 
-    def __init__(self, queries: Mapping[str, QueryHandler] | None = None) -> None:
+    def __init__(
+        self, queries: Mapping[str, QueryHandler] | None = None, listeners: Sequence[Listener] = ()
+    ) -> None:
         self._settings = ZenohSection(listen=(f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}",))
         self.bus = Bus(
-            self._settings, "alpha", on_event=lambda *_: None, on_command=_refuse, queries=queries or {}
+            self._settings,
+            "alpha",
+            on_event=lambda *_: None,
+            on_command=_refuse,
+            queries=queries or {},
+            listeners=listeners,
         )
 
     async def __aenter__(self) -> OpenBus:
@@ -218,3 +226,19 @@ async def test_queries_are_answered_with_a_body_an_image_or_an_error() -> None:
         replies = [await opened.ask("status") for _ in range(60)]
     assert any(reply.err is not None for reply in replies)
     assert replies[0].ok is not None
+
+
+async def test_huge_messages_do_not_reach_the_service() -> None:
+    """Of a pose of 40 MB no part is copied, and the next pose is used; a selector is no larger either."""
+    received: list[int] = []
+    listener = Listener(topics.POSE, lambda data, _: received.append(len(data)))
+    async with OpenBus(listeners=(listener,)) as opened:
+        key = topics.POSE.key("beta")
+        for data in (b"{}", b"x" * 40_000_000, b"x" * 200_000, b"{  }"):
+            await asyncio.to_thread(opened.session.put, key, data)
+        await until(lambda: received == [2, 4])
+        assert opened.bus.ignored == {"pose": 1}  # zenoh drops the largest itself
+        selector = f"companion/alpha/command?text={'x' * 20_000_000}"
+        replies = await asyncio.to_thread(lambda: list(opened.session.get(selector, timeout=2.0)))
+        assert not [reply for reply in replies if reply.ok is not None]
+        assert (await opened.ask("command?text=hold")).ok is not None

@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 
 from companion.bus import topics
+from companion.bus.listeners import Listener
 from companion.bus.session import Bus
 from companion.bus.vehicle_messages import pose_message
 from companion.guidance.behaviours.formation import FormationBehaviour
@@ -42,7 +43,7 @@ class Companion:
             name,
             on_event=lambda level, text: None,
             on_command=self.flight.loop.execute,
-            listeners=[(topics.all_vehicles_key(topics.POSE), self.poses.on_message)],
+            listeners=[Listener(topics.POSE, self.poses.on_message)],
         )
 
     async def command(self, text: str) -> dict[str, Any]:
