@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
 import logging
 import lzma
 import os
@@ -18,11 +17,14 @@ import struct
 import time
 import zlib
 from collections import deque
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, NamedTuple, NotRequired, TypeVar
 
-from companion.vehicle.driver import CommandRefusedError
+from pydantic import Field, TypeAdapter, ValidationError
+from typing_extensions import TypedDict
+
+from companion.peer_data import PeerDataError, check_size
 from companion.vehicle.framing import (
     COMPONENT_METADATA_ID,
     CURRENT_EVENT_SEQUENCE_ID,
@@ -51,8 +53,9 @@ _LAYOUTS = {
     "float": "<f",
 }
 # {argument, from 1}{decimals}{unit}; literal braces are escaped.
-_ARGUMENT = re.compile(r"(?<!\\)\{(\d+)(?::\.(\d+))?([^}]*)\}")
-_TAG = re.compile(r"(?<!\\)<[^>]*>")
+# Digits and unit are bounded: the width of a text is not the autopilot's to choose.
+_ARGUMENT = re.compile(r"(?<!\\)\{(\d{1,2})(?::\.(\d{1,2}))?([^}]{0,20})\}")
+_TAG = re.compile(r"(?<!\\)<[^>]{0,100}>")
 _UNITS = {"m": " m", "m_v": " m", "m^2": " m²", "m/s": " m/s", "C": " °C"}
 _MODES_TYPE = "navigation_mode_group_t"
 _MAX_LEVEL = 7  # MAV_SEVERITY_DEBUG; above it are messages between machines
@@ -64,7 +67,12 @@ _ERRORS = {1: "failed", 2: "failed: errno", 4: "wrong session", 5: "no free sess
 _HEADER = struct.Struct("<3BHBBBBBBI")
 _DATA = 239
 _ATTEMPTS, _ATTEMPT_S = 6, 0.5
-LARGEST_FILE = 4 * 1024 * 1024
+# PX4 1.16: 16,508 bytes, unpacked 164,112.
+LARGEST_FILE, LARGEST_UNPACKED = 256 * 1024, 2 * 1024 * 1024
+# Reading takes 20 s on a slow radio. Parsing takes 10 ms, in a thread; a longer one is not waited for.
+_READING_S, _PARSING_S = 180.0, 10.0
+_XZ_MEMORY = 128 * 1024 * 1024  # of the decoder; xz -9 needs 65 MiB
+_Kind = TypeVar("_Kind")
 _REQUEST_MESSAGE = 512
 # id, boot ms, sequence, destination component and system, levels, arguments
 _EVENT = struct.Struct("<IIHBBB40s")
@@ -116,6 +124,94 @@ class Event(NamedTuple):
     arguments: bytes
 
 
+_Name = Annotated[str, Field(max_length=100)]
+_Words = Annotated[str, Field(max_length=1000)]
+_Byte = Annotated[int, Field(ge=0, le=0xFF)]
+_MAX_ENTRIES, _MAX_ARGUMENTS = 256, 40
+
+
+class _Argument(TypedDict):
+    type: _Name
+
+
+class _EventEntry(TypedDict, total=False):
+    name: _Name
+    message: _Words
+    type: _Name
+    arguments: Annotated[list[_Argument], Field(max_length=_MAX_ARGUMENTS)]
+
+
+class _EnumEntry(TypedDict):
+    name: _Name
+    description: NotRequired[_Words]
+
+
+class _Enum(TypedDict):
+    type: _Name
+    is_bitfield: NotRequired[bool]
+    entries: Annotated[
+        dict[Annotated[int, Field(ge=0, lt=2**64)], _EnumEntry], Field(max_length=_MAX_ENTRIES)
+    ]
+
+
+class _Group(TypedDict, total=False):
+    events: dict[Annotated[int, Field(ge=0, le=0xFFFFFF)], _EventEntry]
+
+
+class _Component(TypedDict):
+    namespace: _Name
+    enums: NotRequired[dict[_Name, _Enum]]
+    event_groups: NotRequired[dict[_Name, _Group]]
+
+
+class _Events(TypedDict):
+    """The part that is used of MAVLink's schema of events metadata, with limits."""
+
+    components: dict[_Byte, _Component]
+
+
+class _MetadataFile(TypedDict):
+    type: int
+    uri: NotRequired[_Words]
+    fileCrc: NotRequired[Annotated[int, Field(ge=0, lt=2**32)]]
+
+
+class _General(TypedDict):
+    """The part that is used of MAVLink's schema of general metadata."""
+
+    metadataTypes: Annotated[list[_MetadataFile], Field(max_length=100)]
+
+
+_EVENTS, _GENERAL = TypeAdapter(_Events), TypeAdapter(_General)
+
+
+def _checked(schema: TypeAdapter[_Kind], content: bytes) -> _Kind:
+    """Parse JSON by a schema. Raises PeerDataError."""
+    check_size(len(content), LARGEST_UNPACKED)
+    try:
+        return schema.validate_json(content)
+    except ValidationError as error:
+        first = error.errors(include_input=False)[0]
+        where = ".".join(map(str, first["loc"]))[:100]
+        raise PeerDataError(f"not metadata{where and f', {where}'}: {first['msg']}") from None
+
+
+def _unpacked(path: str, served: bytes) -> bytes:
+    """Return the content of a file; of `.xz` no more is unpacked than is accepted. Raises PeerDataError."""
+    if not path.endswith(".xz"):
+        check_size(len(served), LARGEST_UNPACKED)
+        return served
+    try:
+        unpacker = lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=_XZ_MEMORY)
+        content = unpacker.decompress(served, LARGEST_UNPACKED + 1)
+    except (lzma.LZMAError, EOFError, MemoryError) as error:
+        raise PeerDataError(f"{path}: not xz: {error}") from error
+    check_size(len(content), LARGEST_UNPACKED)
+    if not unpacker.eof:
+        raise PeerDataError(f"{path}: truncated xz")
+    return content
+
+
 class EventCatalogue:
     """The events of one autopilot's metadata.
 
@@ -123,50 +219,43 @@ class EventCatalogue:
         metadata: the events JSON; None: not available, so events are reported by number.
 
     Raises:
-        ValueError: `metadata` is not events JSON.
+        PeerDataError: `metadata` is not events JSON.
     """
 
     def __init__(self, metadata: bytes | None) -> None:
-        self._events: dict[int, tuple[str, Mapping[str, Any]]] = {}
-        self._enums: dict[str, Mapping[str, Any]] = {}
+        self._events: dict[int, tuple[str, _EventEntry]] = {}
+        self._enums: dict[str, _Enum] = {}
         if metadata is None:
             return
-        try:
-            components = json.loads(metadata)["components"]
-            for number, component in components.items():
-                self._enums |= {
-                    f"{component['namespace']}::{name}": enum
-                    for name, enum in component.get("enums", {}).items()
-                }
-                for group, content in component.get("event_groups", {}).items():
-                    for identifier, event in content.get("events", {}).items():
-                        self._events[int(number) << 24 | int(identifier)] = (group, event)
-        except (KeyError, TypeError, AttributeError, UnicodeDecodeError) as error:
-            raise ValueError(f"not events metadata: {type(error).__name__}: {error}") from error
+        for number, component in _checked(_EVENTS, metadata)["components"].items():
+            for name, enum in component.get("enums", {}).items():
+                self._enums[f"{component['namespace']}::{name}"] = enum
+            for group, content in component.get("event_groups", {}).items():
+                for identifier, event in content.get("events", {}).items():
+                    self._events[number << 24 | identifier] = (group, event)
 
     def report(self, event: Event, now_ns: int) -> Report | None:
         """Convert an event to a report. None for summaries and for levels beyond debug."""
         level = event.log_levels & 0x0F
-        group, known = self._events.get(event.identifier, ("", {}))
+        group, known = self._events.get(event.identifier, ("", _EventEntry()))
         if level > _MAX_LEVEL or known.get("type") == "summary":
             return None
         if "message" not in known:
             return Report(now_ns, level, f"event {event.identifier:#010x} (not in the metadata)")
-        arguments = known.get("arguments", ())
+        arguments = known.get("arguments", [])
         values = self._values(arguments, event.arguments)
-        of_modes = bool(arguments) and arguments[0]["type"].endswith(_MODES_TYPE)
+        of_modes = len(arguments) > 0 and arguments[0]["type"].endswith(_MODES_TYPE)
         modes = int.from_bytes(event.arguments[:4], "little") if of_modes else ALL_MODES
 
         def formatted(match: re.Match[str]) -> str:
             number = int(match[1]) - 1
-            return _value(values[number], match[2], match[3]) if number < len(values) else "?"
+            return _value(values[number], match[2], match[3]) if 0 <= number < len(values) else "?"
 
         text = _ARGUMENT.sub(formatted, _TAG.sub("", str(known["message"])))
-        return Report(
-            now_ns, level, re.sub(r"\\(.)", r"\1", text).strip(), group, str(known.get("name", "")), modes
-        )
+        text = re.sub(r"\\(.)", r"\1", text).strip()[:_LONGEST_TEXT]
+        return Report(now_ns, level, text, group, known.get("name", ""), modes)
 
-    def _values(self, arguments: Any, packed: bytes) -> list[str | float]:
+    def _values(self, arguments: Sequence[_Argument], packed: bytes) -> list[str | float]:
         """Decode the arguments in order, up to the first that the metadata does not describe."""
         values: list[str | float] = []
         offset = 0
@@ -181,8 +270,8 @@ class EventCatalogue:
         return values
 
 
-def _named(enum: Mapping[str, Any], number: int) -> str:
-    entries = {int(value): entry["description"] or entry["name"] for value, entry in enum["entries"].items()}
+def _named(enum: _Enum, number: int) -> str:
+    entries = {value: entry.get("description") or entry["name"] for value, entry in enum["entries"].items()}
     if not enum.get("is_bitfield"):
         return str(entries.get(number, number))
     return ", ".join(words for bit, words in sorted(entries.items()) if number & bit) or "none"
@@ -224,7 +313,7 @@ class FileReader:
         size = int.from_bytes(opened[:4], "little")
         if size > LARGEST_FILE:
             raise FileReadError(f"{path}: {size} bytes exceed the limit of {LARGEST_FILE}")
-        content = b""
+        content = bytearray()
         try:
             while len(content) < size:
                 _, part = await self._request(path, _READ, session=session, offset=len(content), size=_DATA)
@@ -234,7 +323,7 @@ class FileReader:
         finally:
             with contextlib.suppress(FileReadError):
                 await self._request(path, _TERMINATE, session=session)
-        return content
+        return bytes(content)
 
     async def _request(
         self, path: str, opcode: int, data: bytes = b"", *, session: int = 0, offset: int = 0, size: int = 0
@@ -331,12 +420,25 @@ class ReportReader:
             self._send(REQUEST_EVENT_ID, struct.pack("<HHBB", first, following - 1 & 0xFFFF, *self._target()))
 
     async def load_events(self) -> None:
-        """Read the event metadata once. On failure, log the reason and report events by number."""
+        """Read the event metadata once. On any failure, log the reason and report events by number."""
         try:
-            catalogue = EventCatalogue(await self._read_metadata())
-        except (FileReadError, CommandRefusedError, ValueError, lzma.LZMAError) as error:
-            logger.warning("%s: event metadata not available, events are numbers: %s", self._url, error)
-            catalogue = EventCatalogue(None)
+            async with asyncio.timeout(_READING_S):
+                metadata = await self._read_metadata()
+            async with asyncio.timeout(_PARSING_S):
+                catalogue = await asyncio.to_thread(EventCatalogue, metadata)
+        except TimeoutError:
+            self._without_metadata(f"not read within {_READING_S:g} s")
+            return
+        except Exception as error:  # whatever the file has, reasons are reported
+            self._without_metadata(f"{type(error).__name__}: {error}")
+            return
+        self._use(catalogue)
+
+    def _without_metadata(self, reason: str) -> None:
+        logger.warning("%s: event metadata not available, events are numbers: %s", self._url, reason)
+        self._use(EventCatalogue(None))
+
+    def _use(self, catalogue: EventCatalogue) -> None:
         self._catalogue = catalogue
         while self._waiting:
             event, now_ns = self._waiting.popleft()
@@ -347,12 +449,10 @@ class ReportReader:
         await self._command(_REQUEST_MESSAGE, COMPONENT_METADATA_ID)
         if not await self._telemetry.until(lambda: self._metadata is not None, _METADATA_S):
             raise FileReadError("COMPONENT_METADATA not received (PX4 1.13 and newer send it)")
-        assert self._metadata is not None
-        crc, uri = self._metadata
-        general = json.loads(await self._file("general", crc, uri))
-        for entry in general["metadataTypes"]:
+        crc, uri = self._metadata or (0, "")
+        for entry in _checked(_GENERAL, await self._file("general", crc, uri))["metadataTypes"]:
             if entry["type"] == _EVENTS_TYPE:
-                return await self._file("events", int(entry["fileCrc"]), str(entry["uri"]))
+                return await self._file("events", entry["fileCrc"], entry["uri"])
         raise FileReadError(f"{uri} lists no events metadata")
 
     async def _file(self, what: str, crc: int, uri: str) -> bytes:
@@ -360,18 +460,16 @@ class ReportReader:
         path = _MFTP.fullmatch(uri)
         if path is None:
             raise FileReadError(f"{uri}: only mftp:// is supported")
-        unpack = lzma.decompress if path[1].endswith(".xz") else bytes
         cached = cache_folder() / f"{what}-{crc:08x}.json{'.xz' * path[1].endswith('.xz')}"
         if cached.exists():
-            with contextlib.suppress(OSError, lzma.LZMAError):
-                served = cached.read_bytes()
-                content = unpack(served)
+            with contextlib.suppress(OSError, PeerDataError):
+                served = _read_limited(cached)
+                content = await asyncio.to_thread(_unpacked, path[1], served)
                 if _matches(crc, served, content):
                     return content
             logger.warning("%s: %s does not match its checksum: read again", self._url, cached)
         served = await self._files.read(path[1])
-        content = unpack(served)
-        json.loads(content)
+        content = await asyncio.to_thread(_unpacked, path[1], served)
         if not _matches(crc, served, content):
             logger.warning("%s: %s does not match its checksum: not cached", self._url, uri)
             return content
@@ -383,6 +481,12 @@ class ReportReader:
         except OSError as error:
             logger.info("%s: metadata cannot be cached, it is read at every start: %s", self._url, error)
         return content
+
+
+def _read_limited(path: Path) -> bytes:
+    """Return a file's content, and no more than is accepted of it."""
+    with path.open("rb") as file:
+        return file.read(LARGEST_FILE + 1)
 
 
 def _matches(crc: int, served: bytes, content: bytes) -> bool:

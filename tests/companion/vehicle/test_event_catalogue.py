@@ -4,9 +4,12 @@ import json
 import struct
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from companion.peer_data import PeerDataError
 from companion.vehicle.report import ALL_MODES, Report
-from companion.vehicle.report_reader import Event, EventCatalogue
+from companion.vehicle.report_reader import LARGEST_UNPACKED, Event, EventCatalogue
 
 ERROR, INFO, PROTOCOL = 0x63, 0x66, 0x68
 
@@ -87,7 +90,88 @@ def test_events_without_metadata_have_numbers() -> None:
     assert report.text.startswith("event 0x01abcdef")
 
 
-@pytest.mark.parametrize("metadata", [b"", b"{", b"[]", b'{"components": 3}', b'{"components": {"1": 3}}'])
+def metadata_with(**event: object) -> bytes:
+    """Events metadata of one event, number 1, and a bit field."""
+    named = {"name": "an_event", "message": "text", "arguments": [], **event}
+    enum = {"type": "uint8_t", "is_bitfield": True, "entries": {"1": {"name": "a", "description": "x" * 900}}}
+    group = {"default": {"events": {"1": named}}}
+    component = {"namespace": "px4", "enums": {"e": enum}, "event_groups": group}
+    return json.dumps({"components": {"1": component}}).encode()
+
+
+@pytest.mark.parametrize(
+    "metadata",
+    [
+        b"",
+        b"{",
+        b"[]",
+        b"\xff",
+        b"null",
+        b"[" * 100_000,
+        b'{"components":' * 10_000,
+        b'{"components": 3}',
+        b'{"components": {"1": 3}}',
+        b'{"components": {"' + b"9" * 5000 + b'": {}}}',
+        b'{"components": {"1": {"namespace": 5}}}',
+        b'{"components": ' + b"9" * 5000 + b"}",
+        metadata_with(message=5),
+        metadata_with(message="x" * 1001),
+        metadata_with(arguments=[{"name": "no type"}]),
+        metadata_with(arguments=[{"type": "uint8_t"}] * 41),
+        b" " * (LARGEST_UNPACKED + 1),
+    ],
+)
 def test_invalid_metadata_is_refused(metadata: bytes) -> None:
-    with pytest.raises(ValueError, match=r"metadata|JSON|Expecting"):
+    with pytest.raises(PeerDataError) as caught:
         EventCatalogue(metadata)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 300
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        "{1:.1000000000}",
+        "{1:.99}",
+        "{" + "9" * 900 + "}",
+        "{1" * 300,
+        "<" * 1000,
+        "{1}" * 300,
+        "{1:>1000000000}",
+        "{0}",
+        "\\" * 999,
+    ],
+)
+def test_text_of_an_event_is_bounded(message: str) -> None:
+    for kind in ("float", "double", "uint64_t", "e", "px4::e"):
+        known = EventCatalogue(metadata_with(message=message, arguments=[{"type": kind}]))
+        for packed in (b"\0" * 40, b"\xff" * 40, struct.pack("<f", 3e38) + bytes(36)):
+            report = known.report(Event(1 << 24 | 1, 9, ERROR, packed), 5)
+            assert report is not None
+            assert len(report.text) <= 500
+
+
+def _any_json() -> st.SearchStrategy[object]:
+    plain = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5)
+    return st.recursive(
+        plain,
+        lambda each: st.lists(each, max_size=3) | st.dictionaries(st.text(max_size=3), each, max_size=3),
+    )
+
+
+@given(
+    st.fixed_dictionaries(
+        {}, optional={"name": _any_json(), "message": st.text() | _any_json(), "type": _any_json()}
+    ),
+    st.lists(st.fixed_dictionaries({}, optional={"type": st.sampled_from(["e", "float"]) | _any_json()})),
+    st.binary(min_size=40, max_size=40),
+)
+def test_any_metadata_is_refused_or_reported(
+    event: dict[str, object], arguments: list[dict[str, object]], packed: bytes
+) -> None:
+    try:
+        known = EventCatalogue(metadata_with(**event, arguments=arguments))
+    except PeerDataError:
+        return
+    report = known.report(Event(1 << 24 | 1, 9, ERROR, packed), 5)
+    assert report is None or len(report.text) <= 500

@@ -4,6 +4,7 @@ import asyncio
 import json
 import lzma
 import struct
+import tracemalloc
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -20,7 +21,14 @@ from companion.vehicle.framing import (
     pack_frame,
 )
 from companion.vehicle.report import Report
-from companion.vehicle.report_reader import FileReader, FileReadError, ReportReader, StatusTexts, cache_folder
+from companion.vehicle.report_reader import (
+    LARGEST_FILE,
+    FileReader,
+    FileReadError,
+    ReportReader,
+    StatusTexts,
+    cache_folder,
+)
 from companion.vehicle.telemetry_state import TelemetryState
 from mavlink_sim.services.file_transfer import checksum
 
@@ -173,13 +181,20 @@ async def test_events_wait_for_the_metadata(
 class AutopilotWithMetadata(Autopilot):
     """Has the text of one event. Its checksum is that of the file as served, as PX4's."""
 
-    def __init__(self, *, wrong_checksum: bool = False) -> None:
+    def __init__(
+        self,
+        *,
+        wrong_checksum: bool = False,
+        general: bytes | None = None,
+        changed: Mapping[str, bytes] | None = None,
+    ) -> None:
         named = {"5": {"name": "tested", "message": "Tested"}}
         group = {"namespace": "px4", "event_groups": {"default": {"events": named}}}
         events = lzma.compress(json.dumps({"version": 2, "components": {"1": group}}).encode())
         kind = {"type": 4, "uri": "mftp://events.xz", "fileCrc": checksum(events) ^ wrong_checksum}
-        self._general = json.dumps({"version": 1, "metadataTypes": [kind]}).encode()
-        super().__init__({"general.xz": lzma.compress(self._general), "events.xz": events})
+        self._general = general or json.dumps({"version": 1, "metadataTypes": [kind]}).encode()
+        files = {"general.xz": lzma.compress(self._general), "events.xz": events}
+        super().__init__({**files, **(changed or {})})
 
     async def read_texts(self) -> tuple[list[str], int]:
         """Start with this autopilot; returns the texts of its event, and how many messages that took."""
@@ -228,3 +243,45 @@ async def test_metadata_with_a_wrong_checksum_is_used_but_not_cached(
     assert (await AutopilotWithMetadata(wrong_checksum=True).read_texts())[0] == ["Tested"]
     assert len(caplog.messages) == 1
     assert cached() == []
+
+
+BOMB = lzma.compress(b" " * (200 * 1024 * 1024), preset=1)
+
+
+@pytest.mark.parametrize(
+    ("general", "changed"),
+    [
+        (None, {"events.xz": BOMB}),
+        (None, {"general.xz": BOMB}),
+        (None, {"events.xz": b""}),
+        (None, {"events.xz": lzma.compress(b"{}")[:-10]}),
+        (None, {"events.xz": b"not xz"}),
+        (None, {"events.xz": lzma.compress(b"[" * 100_000)}),
+        (None, {"events.xz": bytes(LARGEST_FILE + 1)}),
+        (b"{}", None),
+        (b"[]", None),
+        (b'{"metadataTypes": [{}]}', None),
+        (b'{"metadataTypes": [{"type": 4}]}', None),
+        (b'{"metadataTypes": [{"type": 4, "uri": 5, "fileCrc": 1}]}', None),
+        (b'{"metadataTypes": [{"type": 4, "uri": "http://x", "fileCrc": 1}]}', None),
+        (b'{"metadataTypes": ' + b"[" * 5000, None),
+    ],
+)
+async def test_unusable_metadata_leaves_numbers_and_one_line(
+    cached: Callable[[], list[Path]],
+    caplog: pytest.LogCaptureFixture,
+    general: bytes | None,
+    changed: Mapping[str, bytes] | None,
+) -> None:
+    autopilot = AutopilotWithMetadata(general=general, changed=changed)
+    tracemalloc.start()
+    try:
+        texts, _ = await autopilot.read_texts()
+        assert tracemalloc.get_traced_memory()[1] < 40e6
+    finally:
+        tracemalloc.stop()
+    assert [text.startswith("event 0x01000005") for text in texts] == [True]
+    lines = [message for message in caplog.messages if "events are numbers" in message]
+    assert len(lines) == 1
+    assert "\n" not in lines[0]
+    assert len(lines[0]) < 400
