@@ -64,21 +64,26 @@ def map_seeds(
 
 def seeds_of(text: str) -> list[int]:
     """`1..50` or `1,5,9..12` as numbers. Raises ValueError for what is none, and for a seed given twice."""
-    seeds: list[int] = []
+    return numbers_of(text, "seeds", MAX_SEED)
+
+
+def numbers_of(text: str, name: str, largest: int) -> list[int]:
+    """The same for other numbers of this name, 0 to `largest`."""
+    numbers: list[int] = []
     for part in text.split(","):
         first, dots, last = part.strip().partition("..")
         try:
             low = int(first)
             high = int(last) if dots else low
         except ValueError:
-            raise ValueError(f"seeds {text!r}: expected numbers and ranges such as 1..50 or 3,7") from None
-        if not 0 <= low <= high <= MAX_SEED:
-            raise ValueError(f"seeds {text!r}: {part.strip()} is no range of seeds from 0 to {MAX_SEED}")
-        seeds.extend(range(low, high + 1))
-    twice = next((seed for seed, count in Counter(seeds).items() if count > 1), None)
+            raise ValueError(f"{name} {text!r}: expected numbers and ranges such as 1..50 or 3,7") from None
+        if not 0 <= low <= high <= largest:
+            raise ValueError(f"{name} {text!r}: {part.strip()} is no range of {name} from 0 to {largest}")
+        numbers.extend(range(low, high + 1))
+    twice = next((number for number, count in Counter(numbers).items() if count > 1), None)
     if twice is not None:
-        raise ValueError(f"seeds {text!r}: {twice} is given twice")
-    return seeds
+        raise ValueError(f"{name} {text!r}: {twice} is given twice")
+    return numbers
 
 
 def _named(function: Callable[[int], Result], seed: int) -> Result:

@@ -1,6 +1,6 @@
-"""The image of docs/how-to/markers.md: markers of a map as the camera sees them, with outlines and axes.
+"""The images of docs/how-to/markers.md: markers of a map as the camera sees them; and whose print one has.
 
-python -m tools.marker_figure docs/images/markers.jpg
+python -m tools.marker_figure docs/images/markers.jpg docs/images/marker-prints.png
 """
 
 from __future__ import annotations
@@ -10,13 +10,14 @@ import sys
 from pathlib import Path
 
 import cv2
+import numpy as np
 
 from mavlink_sim.camera.renderer import Renderer
 from mavlink_sim.world.fiducials import Print
 from mavlink_sim.world.world import Ground, World, WorldObject
 from vision.annotate import annotate_markers
 from vision.camera_model import CameraModel, CameraMount
-from vision.markers import MarkerDetector, MarkerKind
+from vision.markers import PRINTS, MarkerDetector, MarkerKind, marker_modules
 from vision.rotation import matrix_from_euler
 
 DICTIONARY, SIZE_M = "APRILTAG_36h11", 0.5
@@ -50,11 +51,34 @@ def draw() -> cv2.typing.MatLike:
     return annotate_markers(image, markers, camera)
 
 
+def draw_prints() -> cv2.typing.MatLike:
+    """Ids 0 and 1 of each print, upright, with an arrow up."""
+    module_px, margin_px = 14, 40
+    plates = []
+    for printed in PRINTS:
+        for identifier in (0, 1):
+            black = marker_modules(MarkerKind(DICTIONARY, SIZE_M, print=printed), identifier)
+            cells = np.where(black, 0, 255).astype(np.uint8)
+            plate = np.pad(
+                np.kron(cells, np.ones((module_px, module_px), np.uint8)), margin_px, constant_values=255
+            )
+            middle = plate.shape[1] // 2
+            cv2.arrowedLine(plate, (middle, margin_px - 6), (middle, 6), (0,), 2, cv2.LINE_AA, tipLength=0.4)
+            text = f"{printed}  id {identifier}"
+            (width, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1)
+            where = (middle - width // 2, plate.shape[0] - 14)
+            cv2.putText(plate, text, where, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0,), 1, cv2.LINE_AA)
+            plates.append(plate)
+    return np.hstack(plates)
+
+
 def main() -> None:
-    """Write the image to the file that is named."""
-    path = Path(sys.argv[1])
-    if not cv2.imwrite(str(path), draw(), (cv2.IMWRITE_JPEG_QUALITY, 85)):
-        raise SystemExit(f"cannot write {path}")
+    """Write the images to the files that are named."""
+    markers, prints = map(Path, sys.argv[1:3])
+    jpeg = (cv2.IMWRITE_JPEG_QUALITY, 85)
+    for path, image, options in ((markers, draw(), jpeg), (prints, draw_prints(), ())):
+        if not cv2.imwrite(str(path), image, options):
+            raise SystemExit(f"cannot write {path}")
 
 
 if __name__ == "__main__":

@@ -43,12 +43,14 @@ class Board:
         sizes_m: side of each marker's black square.
         origin: (latitude, longitude in degrees, altitude above mean sea level in metres) of a map's frame;
             None: local NED.
+        print: whose print its markers are, one of `vision.markers.PRINTS`; None: that of the others.
     """
 
     name: str
     corners_m: Mapping[int, NDArray[np.float64]]
     sizes_m: Mapping[int, float] = field(default_factory=dict)
     origin: tuple[float, float, float] | None = None
+    print: str | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -27,6 +27,9 @@ from vision.marker_edges import CORNER_SIGMA_PX, corners_on_edges
 WORST_FIT, WORST_FIT_PX = 0.05, 2.0
 # Two poses rotated less than this apart are the same; the most iterations of a fit.
 SAME_RAD, _MAX_STEPS = 0.005, 8
+# Whose print a marker is: its upper edge differs. The images that AprilRobotics publishes are those of
+# OpenCV's dictionaries turned by 180 degrees: all four families, compared with the codes of its library.
+PRINTS = ("opencv", "apriltag")
 # OpenCV has two spellings of some names; the usual one is offered.
 DICTIONARIES = tuple(
     sorted(
@@ -47,18 +50,22 @@ class MarkerKind:
         dictionary: one of DICTIONARIES: "4X4_50", "APRILTAG_36h11".
         size_m: side of the black square, metres.
         sizes_m: size per id, for ids with another size.
+        print: one of PRINTS: whose print the markers are. prints: the same per id, for others.
 
     Raises:
-        ValueError: no such dictionary, an id that is not in it, or a size that is not positive.
+        ValueError: no such dictionary, an id that is not in it, a size that is not positive, or a print that
+            the dictionary does not have.
     """
 
     dictionary: str
     size_m: float
     sizes_m: Mapping[int, float] = field(default_factory=dict)
+    print: str = PRINTS[0]
+    prints: Mapping[int, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         count = markers_in(self.dictionary)
-        for identifier in self.sizes_m:
+        for identifier in (*self.sizes_m, *self.prints):
             if not 0 <= identifier < count:
                 raise ValueError(
                     f"marker id {identifier} is not in dictionary {self.dictionary} (0 to {count - 1})"
@@ -66,10 +73,22 @@ class MarkerKind:
         for size_m in (self.size_m, *self.sizes_m.values()):
             if not (math.isfinite(size_m) and size_m > 0.0):
                 raise ValueError(f"a marker's side must be finite and above 0 m, got {size_m}")
+        for origin in (self.print, *self.prints.values()):
+            if origin not in PRINTS:
+                raise ValueError(f"the print must be one of {', '.join(PRINTS)}, got {origin!r}")
+            if origin == "apriltag" and not is_apriltag(self.dictionary):
+                raise ValueError(
+                    f"the print 'apriltag' is for AprilTag's dictionaries, got {self.dictionary}: "
+                    "use 'opencv'"
+                )
 
     def size_of(self, identifier: int) -> float:
         """Side of that marker's black square, metres."""
         return self.sizes_m.get(identifier, self.size_m)
+
+    def turned(self, identifier: int) -> bool:
+        """Whether that marker's print is OpenCV's turned by 180 degrees."""
+        return self.prints.get(identifier, self.print) == "apriltag"
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,6 +174,26 @@ def markers_in(dictionary: str) -> int:
     return len(_dictionary(dictionary).bytesList)
 
 
+def is_apriltag(dictionary: str) -> bool:
+    """Whether a dictionary is one of AprilTag's families."""
+    return dictionary.startswith("APRILTAG_")
+
+
+def marker_modules(kind: MarkerKind, identifier: int) -> NDArray[np.bool_]:
+    """(N, N) the modules of a print as seen upright, its black border included; True is black.
+
+    Raises:
+        ValueError: the id is not in the dictionary.
+    """
+    count = markers_in(kind.dictionary)
+    if not 0 <= identifier < count:
+        raise ValueError(f"marker id {identifier} is not in dictionary {kind.dictionary} (0 to {count - 1})")
+    dictionary = _dictionary(kind.dictionary)
+    image = cv2.aruco.generateImageMarker(dictionary, identifier, dictionary.markerSize + 2)
+    black = np.asarray(image) < 128
+    return np.rot90(black, 2) if kind.turned(identifier) else black
+
+
 class MarkerDetector:
     """Detects the markers of one dictionary in images."""
 
@@ -196,6 +235,8 @@ class MarkerDetector:
         self, grey: NDArray[Any], identifier: int, corners_px: NDArray[Any], camera: CameraModel
     ) -> Marker | None:
         refined_px, sigma_px = corners_on_edges(grey, corners_px, self._modules, camera)
+        if self.kind.turned(identifier):
+            refined_px = np.roll(refined_px, 2, axis=0)
         return marker_from_corners(identifier, refined_px, self.kind.size_of(identifier), camera, sigma_px)
 
 

@@ -7,24 +7,14 @@ import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-import typer.core
 
-from companion.cli.flags import check_finite, check_folder, plain_errors, settings_command
+from companion.cli.flags import check_finite, check_folder, plain_errors, settings_command, with_default
 
 if TYPE_CHECKING:
     from companion.settings import Settings
-
-
-class _LensByDefault(typer.core.TyperGroup):
-    """`companion calibrate SOURCE` is `companion calibrate lens SOURCE`."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        if args and args[0] not in (*self.commands, "--help"):
-            args = ["lens", *args]
-        return super().parse_args(ctx, args)
 
 
 _ROTATE = Annotated[
@@ -42,7 +32,7 @@ _DICTIONARY = Annotated[
 _MIRROR = Annotated[bool, typer.Option("--mirror", help="Exchange left and right first, as source.mirror.")]
 
 calibrate = typer.Typer(
-    cls=_LensByDefault,
+    cls=with_default("lens"),
     help="Calibrate a lens, a mount or a depth camera's pose.\n\n"
     "`companion calibrate SOURCE` is `companion calibrate lens SOURCE`.",
     no_args_is_help=True,
@@ -202,6 +192,9 @@ def mount(
         Path | None, typer.Option(help="Calibration file. Default: the source's own calibration.")
     ] = None,
     dictionary: Annotated[str, typer.Option(help="Dictionary of the marker.")] = "4X4_50",
+    printed: Annotated[
+        str, typer.Option("--print", help="Whose print: opencv, or apriltag (AprilRobotics' images).")
+    ] = "opencv",
     heading: Annotated[
         float, typer.Option(help="Direction of the marker's upper edge, degrees clockwise from the nose.")
     ] = 0.0,
@@ -238,7 +231,7 @@ def mount(
             raise ValueError("--connect is for --live")
         for flag, angle in (("--heading", heading), ("--roll", roll), ("--pitch", pitch)):
             check_finite(flag, angle)
-        kind = MarkerKind(dictionary, size, {marker: size})
+        kind = MarkerKind(dictionary, size, {marker: size}, printed)
         reading = SourceSettings(every_frame=True, rotate_deg=rotate, mirror=mirror)
         model = None
         if calibration is not None:

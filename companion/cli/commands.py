@@ -24,7 +24,7 @@ from companion.cli.demo import demo
 from companion.cli.detect import detect
 from companion.cli.evaluate import evaluate
 from companion.cli.flags import CompanionCommands, plain_errors, settings_command
-from companion.cli.markers import MARKER_SETTINGS, markers
+from companion.cli.markers import markers
 from companion.cli.mcp import MCP_SETTINGS, mcp
 from companion.cli.mission import mission
 from companion.cli.models import models
@@ -62,7 +62,6 @@ ORDER = (
     "replay",
     "sightings",
     "config",
-    "markers",
     "collect",
     "evaluate",
     "train",
@@ -80,6 +79,7 @@ app = typer.Typer(
 
 app.add_typer(models, name="models")
 app.add_typer(calibrate, name="calibrate")
+app.add_typer(markers, name="markers")
 settings_command(app)(run)
 app.command()(demo)
 app.command()(detect)
@@ -97,7 +97,6 @@ settings_command(app, *CLOUD_SETTINGS)(cloud)
 settings_command(app, *ASK_SETTINGS)(ask)
 settings_command(app, *MCP_SETTINGS)(mcp)
 settings_command(app)(play)
-settings_command(app, *MARKER_SETTINGS)(markers)
 settings_command(app, *CLIENT_SETTINGS, "dashboard", "language", "plugins")(dashboard)
 app.add_typer(bench, name="bench")
 settings_command(app, *CLIENT_SETTINGS, *RECORD_SETTINGS)(record)

@@ -68,6 +68,18 @@ class CompanionCommands(typer.core.TyperGroup):
             raise
 
 
+def with_default(name: str) -> type[typer.core.TyperGroup]:
+    """A group of commands with a default one: `GROUP SOURCE` is `GROUP NAME SOURCE`."""
+
+    class WithDefault(typer.core.TyperGroup):
+        def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+            if args and args[0] not in (*self.commands, "--help"):
+                args = [name, *args]
+            return super().parse_args(ctx, args)
+
+    return WithDefault
+
+
 def _renamed_flag(flag: str) -> str | None:
     from companion.settings.reading import RENAMED
 

@@ -1,7 +1,8 @@
-"""The command line of `companion markers`."""
+"""The command line of `companion markers`: `detect` (SOURCE) and `print`."""
 
 from __future__ import annotations
 
+import builtins
 import functools
 import logging
 import sys
@@ -10,27 +11,35 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from companion.cli.flags import EXIT_BAD_INPUT, plain_errors
+from companion.cli.flags import EXIT_BAD_INPUT, check_folder, plain_errors, settings_command, with_default
 from vision.gc_pause import gc_paused
 
 if TYPE_CHECKING:
     from companion.settings import Settings
     from companion.settings.perception import MarkersSection
 
-MARKER_SETTINGS = ("camera", "markers.others", "markers.boards_file")
+markers = typer.Typer(
+    cls=with_default("detect"),
+    help="Detect printed markers, or print them.\n\n"
+    "`companion markers SOURCE` is `companion markers detect SOURCE`.",
+    no_args_is_help=True,
+)
+_DICTIONARY = Annotated[
+    str | None, typer.Option(help="OpenCV's dictionary: APRILTAG_36h11. Default: markers.dictionary.")
+]
+_SIZE = Annotated[
+    float | None, typer.Option(help="Side of the black square, metres. Default: markers.size_m.")
+]
 
 
-def markers(
+@settings_command(markers, "camera", "markers.others", "markers.boards_file", "markers.print")
+def detect(
     settings: Settings,
     source: Annotated[
         str, typer.Argument(help="File, folder, /dev/video0, FIFO, - (standard input), shm:// or URL.")
     ],
-    dictionary: Annotated[
-        str | None, typer.Option(help="OpenCV's dictionary: APRILTAG_36h11. Default: markers.dictionary.")
-    ] = None,
-    size: Annotated[
-        float | None, typer.Option(help="Side of the black square, metres. Default: markers.size_m.")
-    ] = None,
+    dictionary: _DICTIONARY = None,
+    size: _SIZE = None,
     limit: Annotated[int | None, typer.Option(min=1, help="Maximum number of frames.")] = None,
     width: Annotated[
         int | None, typer.Option(min=16, help="Width of raw frames or a camera, pixels.")
@@ -63,11 +72,41 @@ def markers(
             limit=limit,
             save=save,
             as_json=as_json,
-            write=functools.partial(print, flush=True),
+            write=functools.partial(builtins.print, flush=True),
         )
     if not frames_read:
         typer.echo(f"companion: {source}: contains no frames", err=True)
         raise typer.Exit(EXIT_BAD_INPUT)
+
+
+@settings_command(markers, "markers.others", "markers.boards_file", "markers.map_file", "markers.print")
+def print(
+    settings: Settings,
+    identifiers: Annotated[str, typer.Argument(metavar="IDS", help="Ids of the markers: 0..9 or 3,7.")],
+    dictionary: _DICTIONARY = None,
+    size: _SIZE = None,
+    paper: Annotated[
+        str, typer.Option(help="A4, A3, A2, A1, A0, letter, or WIDTHxHEIGHT in millimetres.")
+    ] = "A4",
+    output: Annotated[Path, typer.Option("--output", "-o", help="PDF file to write.")] = Path("markers.pdf"),
+) -> None:
+    """Write printable sheets of markers.
+
+    Each with an arrow to its upper edge, its dictionary, id and size. Print at 100 %, and measure the line at
+    the foot of the page.
+    """
+    with gc_paused():
+        from companion.campaign import numbers_of
+        from vision.marker_sheets import marker_sheets, paper_of
+        from vision.markers import markers_in
+
+    with plain_errors(ValueError, OSError):
+        check_folder(output)
+        kind = _section(settings.markers, dictionary, size).kind()
+        assert kind is not None
+        wanted = numbers_of(identifiers, "ids", markers_in(kind.dictionary) - 1)
+        output.write_bytes(marker_sheets(kind, wanted, paper_of(paper)))
+    typer.echo(f"written: {output}, {len(wanted)} markers")
 
 
 def _section(section: MarkersSection, dictionary: str | None, size_m: float | None) -> MarkersSection:

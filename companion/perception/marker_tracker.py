@@ -8,7 +8,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from companion.guidance.targets.from_detections import HistoryError, StateHistory, mount_at
-from companion.guidance.targets.from_map import VisionGate, map_origin_ned_m, position_from_map
+from companion.guidance.targets.from_map import (
+    TURNED_RAD,
+    VisionGate,
+    map_origin_ned_m,
+    position_from_map,
+    tilt_error_rad,
+)
 from companion.guidance.targets.from_markers import (
     CONFIRM_FRAMES,
     CONFIRM_GAP_S,
@@ -26,6 +32,7 @@ from companion.vehicle.state import VehicleState
 from companion.vehicle.vision_position import VisionPosition
 from vision.marker_ambiguity import AmbiguityResolver
 from vision.marker_boards import MAP
+from vision.markers import is_apriltag
 from vision.pipeline import PerceptionResult
 
 # The fastest that positions from a map are sent; slower cameras send one for each frame with a map.
@@ -58,8 +65,8 @@ class MarkerTracker:
         self._seen: dict[str | None, _SeenMarkers] = {}
         # Camera → id → frames in a row with the marker, and the newest.
         self._runs: dict[str | None, dict[int, tuple[int, MarkerTarget]]] = {}
-        self._origins = {
-            camera.name: board.origin
+        self._maps = {
+            camera.name: board
             for camera in self._detecting
             if camera.settings.markers.localise
             for board in camera.settings.markers.boards()
@@ -67,6 +74,11 @@ class MarkerTracker:
         }
         self._gate, self._vision_ns, self._event_ns = VisionGate(), 0, 0
         self._on_event = on_event
+
+    @property
+    def vision_dropped(self) -> int:
+        """Number of positions from a map that were not sent, since the start."""
+        return self._gate.dropped
 
     def localize(
         self,
@@ -95,7 +107,7 @@ class MarkerTracker:
             )
             targets = self._confirmed(camera.name, targets)
             boards = board_targets(result.boards, result.captured_ns, mount, history)
-            if camera.name in self._origins and state is not None:
+            if camera.name in self._maps and state is not None:
                 confirmed = {target.identifier for target in targets if target.confirmed}
                 vision = self._vision(camera, result, history, state, confirmed)
         except HistoryError as error:
@@ -120,10 +132,16 @@ class MarkerTracker:
 
         One marker in one frame may be a false detection; two that agree with the map hardly are.
         """
-        origin_ned_m = map_origin_ned_m(self._origins[camera.name], state)
+        the_map = self._maps[camera.name]
+        origin_ned_m = map_origin_ned_m(the_map.origin, state)
         board = next((board for board in result.boards if board.name == MAP), None)
         early = result.captured_ns - self._vision_ns < 0.9e9 / MAX_VISION_HZ
-        if board is None or origin_ned_m is None or early:
+        if origin_ned_m is None or early:
+            return None
+        if board is None:
+            if len(seen := confirmed & the_map.corners_m.keys()) > 1:
+                self._gate.dropped += 1
+                self._report(camera, result.captured_ns, seen, "these markers contradict each other", True)
             return None
         used = set(board.identifiers)
         if len(used) < 2 and not used <= confirmed:
@@ -131,20 +149,48 @@ class MarkerTracker:
         mount = camera.settings.camera.mount()
         vision = position_from_map(board, result.captured_ns, mount, history, origin_ned_m)
         if vision is None:
+            tilt_rad = tilt_error_rad(board, result.captured_ns, mount, history)
+            self._gate.dropped += 1
+            words = f"its tilt differs from the autopilot's by {math.degrees(tilt_rad):.0f} degrees"
+            self._report(camera, result.captured_ns, used, words, tilt_rad > TURNED_RAD)
             return None
+        if state.position_valid is not False:
+            pose = history.at(result.captured_ns)
+            if off := self._gate.contradiction(vision, pose, state.reset_offset_ned_m):
+                words = (
+                    f"{off.distance_m:.1f} m ({off.allowed_m:.1f} m allowed) and "
+                    f"{math.degrees(off.heading_rad):.0f} degrees of heading from the autopilot's estimate"
+                )
+                self._report(camera, result.captured_ns, used, words, abs(off.heading_rad) > TURNED_RAD)
+                return None
         jump_m = self._gate.check(vision)
         if jump_m is None:
             self._vision_ns = result.captured_ns
             return vision
-        if result.captured_ns - self._event_ns >= EVENT_INTERVAL_S * 1e9:
-            self._event_ns = result.captured_ns
-            self._on_event(
-                "warning",
-                f"markers: position from the map dropped, {jump_m:.1f} m from the last one sent "
-                f"(markers {', '.join(map(str, sorted(used)))}; {self._gate.dropped} dropped so far): "
-                "check markers.map_file",
-            )
+        self._report(camera, result.captured_ns, used, f"{jump_m:.1f} m from the last one sent", False)
         return None
+
+    def _report(
+        self, camera: PerceptionCamera, captured_ns: int, used: set[int], words: str, turned: bool
+    ) -> None:
+        """Publish why a position was dropped. `turned`: as if the prints were turned by 180 degrees."""
+        if captured_ns - self._event_ns < EVENT_INTERVAL_S * 1e9:
+            return
+        self._event_ns = captured_ns
+        section = camera.settings.markers
+        printed = self._maps[camera.name].print or section.print
+        cause = "check markers.map_file and the markers' sizes"
+        if turned and is_apriltag(section.dictionary or ""):
+            other = "apriltag" if printed == "opencv" else "opencv"
+            cause = (
+                "AprilRobotics' prints are turned by 180 degrees against OpenCV's: if these are "
+                f'{other}\'s, set markers.print = "{other}"; else check markers.map_file'
+            )
+        self._on_event(
+            "warning",
+            f"markers: position from the map dropped, {words} "
+            f"(markers {', '.join(map(str, sorted(used)))}; {self.vision_dropped} dropped so far): {cause}",
+        )
 
     def _confirmed(self, camera: str | None, targets: tuple[MarkerTarget, ...]) -> tuple[MarkerTarget, ...]:
         """The markers of one processed frame, `confirmed` where the frames before show them at that position.

@@ -6,7 +6,7 @@ import math
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,9 @@ from vision.rotation import matrix_from_euler
 _Number = Annotated[float, Field(strict=False, ge=-10_000, le=10_000)]
 _Vector = Annotated[list[_Number], Field(min_length=3, max_length=3)]
 _Size = Annotated[float, Field(strict=False, ge=0.01, le=50)]
-_Identifier = Annotated[int, Field(ge=0, le=1023)]
+_Identifier = Annotated[int, Field(ge=0, le=2319)]  # the largest dictionary's, APRILTAG_36h10
+Print = Literal["opencv", "apriltag"]
+"""Whose print a marker is: `vision.markers.PRINTS`."""
 
 
 class BoardError(ValueError):
@@ -42,6 +44,7 @@ class _BoardMarker(_Table):
 
 class _Board(_Table):
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=64)]
+    print: Print | None = None
     markers: Annotated[list[_BoardMarker], Field(min_length=1, max_length=1024)]
 
 
@@ -65,6 +68,7 @@ class _MapMarker(_Table):
 
 class _Map(_Table):
     origin: _Origin | None = None
+    print: Print | None = None
     markers: Annotated[list[_MapMarker], Field(min_length=1, max_length=1024)]
 
 
@@ -84,6 +88,7 @@ def read_boards(path: str | Path) -> tuple[Board, ...]:
                 )
                 for marker in board.markers
             ],
+            printed=board.print,
         )
         for board in file.boards
     )
@@ -108,7 +113,7 @@ def read_map(path: str | Path) -> Board:
     ]
     origin = file.origin
     place = None if origin is None else (origin.latitude_deg, origin.longitude_deg, origin.altitude_m)
-    return _board(str(path), MAP, rows, place)
+    return _board(str(path), MAP, rows, place, file.print)
 
 
 def _board(
@@ -116,13 +121,14 @@ def _board(
     name: str,
     markers: Sequence[tuple[int, float, Sequence[float], NDArray[np.float64]]],
     origin: tuple[float, float, float] | None = None,
+    printed: str | None = None,
 ) -> Board:
     corners: dict[int, NDArray[np.float64]] = {}
     for identifier, size_m, position_m, rotation in markers:
         if identifier in corners:
             raise BoardError(f"{path}: marker {identifier} is given twice in {name!r}")
         corners[identifier] = square(size_m) @ rotation.T + np.array(position_m)
-    return Board(name, corners, {identifier: size_m for identifier, size_m, _, _ in markers}, origin)
+    return Board(name, corners, {identifier: size_m for identifier, size_m, _, _ in markers}, origin, printed)
 
 
 def _read(path: str | Path, kind: type[_Kind]) -> _Kind:

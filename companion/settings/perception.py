@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from companion.settings.marker_files import read_boards, read_map
+from companion.settings.marker_files import Print, read_boards, read_map
 from companion.settings.section import Section
 from companion.settings.texts import HEIGHT_TEXT, KEY_WORD, MARKER_TEXT
 from vision.calibration.camera_info import read_camera_info, read_registration
@@ -374,6 +374,8 @@ class MarkersSection(Section):
     """OpenCV's dictionary name without DICT_: APRILTAG_36h11, 4X4_50; unset: no marker detection"""
     size_m: Annotated[float, Field(ge=0.01, le=50)] = 0.5
     """side of a marker's black square, metres"""
+    print: Print = "opencv"
+    """whose print: AprilRobotics' images (apriltag) are turned by 180 degrees against OpenCV's"""
     others: tuple[Annotated[str, MARKER_TEXT], ...] = ()
     """other sizes: ID:SIZE; on the pad of marker PAD: ID:SIZE@PAD, off its centre ID:SIZE@PAD:RIGHT:UP"""
     boards_file: str | None = None
@@ -399,14 +401,23 @@ class MarkersSection(Section):
         sizes = {identifier: size for identifier, size, _ in map(_other_marker, self.others)}
         if len(sizes) < len(self.others):
             raise ValueError(f"others: an id is given twice in {', '.join(self.others)}")
+        prints: dict[int, str] = {}
         for board in self.boards():
             for identifier, size_m in board.sizes_m.items():
+                printed = board.print or self.print
+                if prints.setdefault(identifier, printed) != printed:
+                    raise ValueError(
+                        f"marker {identifier} is the print {prints[identifier]!r} in another board, and "
+                        f"{printed!r} in board {board.name!r}"
+                    )
                 if sizes.setdefault(identifier, size_m) != size_m:
                     raise ValueError(
                         f"marker {identifier} is {sizes[identifier]:g} m in others or another board, and "
                         f"{size_m:g} m in board {board.name!r}"
                     )
-        return None if self.dictionary is None else MarkerKind(self.dictionary, self.size_m, sizes)
+        if self.dictionary is None:
+            return None
+        return MarkerKind(self.dictionary, self.size_m, sizes, self.print, prints)
 
     def boards(self) -> tuple[Board, ...]:
         """Read the boards, and the map, which is one. Raises BoardError, a ValueError."""

@@ -482,6 +482,23 @@ def test_mount_is_printed_as_settings(marker_images: Path) -> None:
     )
 
 
+@pytest.mark.parametrize(("printed", "turned_deg"), [("opencv", 0.0), ("apriltag", 180.0)])
+def test_mount_from_either_print_of_an_apriltag(tmp_path: Path, printed: str, turned_deg: float) -> None:
+    """The simulated plate is OpenCV's print: AprilRobotics' with its upper edge aft."""
+    lens = CameraModel.from_horizontal_fov(640, 480, 1.2)
+    write_camera_info(tmp_path / "lens.yaml", lens, "lens")
+    yaw = math.radians(turned_deg)
+    plate = WorldObject(0, "plate", (2.0, 0.1, 0.0), yaw, printed=Print("APRILTAG_36h11", 7, 0.6))
+    mount = CameraMount(pitch_rad=np.radians(-30.0), yaw_rad=np.radians(4.0))
+    renderer = Renderer(World((plate,), Ground(("concrete",), 0, 256, 0.05)), lens, mount)
+    image = renderer.render((0.0, 0.0, -1.2), matrix_from_euler(0.0, 0.0, 0.0)).image
+    cv2.imwrite(str(tmp_path / "0.png"), image)
+    words = ("--marker", "7", "--size", "0.6", "--calibration", tmp_path / "lens.yaml")
+    done = calibrate("mount", tmp_path, *words, "--dictionary", "APRILTAG_36h11", "--print", printed)
+    values = dict(re.findall(r"^mount_(\w+)_deg = (\S+)$", done.stdout, re.MULTILINE))
+    assert float(values["yaw"]) == pytest.approx(4.0, abs=0.5)
+
+
 def test_mount_without_its_marker_or_lens(marker_images: Path) -> None:
     lens = ("--calibration", marker_images / "lens.yaml")
     assert "none" in one_line_of_bad_input(

@@ -9,16 +9,17 @@ heading is the map's alone.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from companion.geometry.geodesy import north_east
-from companion.guidance.targets.from_detections import StateHistory, mount_at
+from companion.guidance.targets.from_detections import Pose, StateHistory, mount_at
 from companion.vehicle.state import Vector3, VehicleState
 from companion.vehicle.vision_position import VisionPosition
-from vision.attitude import euler_from_quaternion
+from vision.attitude import euler_from_quaternion, wrap_angle
 from vision.camera_model import CameraMount
 from vision.marker_boards import BoardPose, cross_matrix
 from vision.markers import MarkerPose
@@ -31,10 +32,31 @@ FARTHEST_TILT_RAD = np.radians(15.0)
 # A position that the vehicle cannot have reached since the last one is sent only after positions have agreed
 # for this long, with gaps of at most this. No multirotor above markers is faster.
 FASTEST_MPS, AGREED_S, AGREED_GAP_S = 15.0, 1.0, 0.5
+# A position may be this far from the autopilot's own, horizontally: three sigma of both, the usual error of
+# GNSS and of a surveyed map, and the drift since they agreed last, of an estimate that has no other aid.
+ESTIMATE_SIGMAS, ESTIMATE_MARGIN_M = 3.0, 3.0
+DRIFT_MPS, MAX_DRIFT_M = 0.3, 10.0
+# A compass among steel is off by less.
+FARTHEST_HEADING_RAD = np.radians(60.0)
+# From here on a difference is that of a print turned by 180 degrees.
+TURNED_RAD = np.radians(150.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Contradiction:
+    """The difference of a position from the autopilot's own, where that is too large.
+
+    Attributes:
+        distance_m, allowed_m: horizontally. heading_rad: of the map's heading, -π..π.
+    """
+
+    distance_m: float
+    allowed_m: float
+    heading_rad: float
 
 
 class VisionGate:
-    """Drops positions that the vehicle cannot have reached since the last one sent.
+    """Drops positions that contradict the autopilot, or that the vehicle cannot have reached.
 
     Attributes:
         dropped: number of positions dropped so far.
@@ -46,6 +68,29 @@ class VisionGate:
         # The newest dropped one, and since when those agree with each other.
         self._other: VisionPosition | None = None
         self._since_ns = 0
+
+    def contradiction(
+        self, vision: VisionPosition, pose: Pose, offset_ned_m: Vector3
+    ) -> Contradiction | None:
+        """Compare with the autopilot's estimate at the capture, which is valid. None: it agrees.
+
+        Args:
+            offset_ned_m: of the estimate's resets, `VehicleState.reset_offset_ned_m`.
+        """
+        north, east, _ = np.array(vision.position_ned_m) - pose.position_ned_m - offset_ned_m
+        nose = pose.ned_from_body[:, 0]
+        heading_rad = wrap_angle(vision.euler_rad[2] - math.atan2(float(nose[1]), float(nose[0])))
+        variance = vision.covariance[0] + vision.covariance[6] + 2.0 * pose.error.horizontal_m**2
+        drift_m = MAX_DRIFT_M
+        if self._sent is not None:
+            since_s = abs(vision.captured_ns - self._sent.captured_ns) / 1e9
+            drift_m = min(DRIFT_MPS * since_s, MAX_DRIFT_M)
+        allowed_m = ESTIMATE_MARGIN_M + drift_m + ESTIMATE_SIGMAS * math.sqrt(variance)
+        distance_m = math.hypot(north, east)
+        if distance_m <= allowed_m and abs(heading_rad) <= FARTHEST_HEADING_RAD:
+            return None
+        self.dropped += 1
+        return Contradiction(distance_m, allowed_m, heading_rad)
 
     def check(self, vision: VisionPosition) -> float | None:
         """None: send it. Else it is dropped, and this is its distance from the last one sent, metres."""
@@ -122,6 +167,17 @@ def position_from_map(
         euler_from_quaternion(quaternion_from_matrix(attitude)),
         tuple(spread[np.triu_indices(6)].tolist()),
     )
+
+
+def tilt_error_rad(board: BoardPose, captured_ns: int, mount: CameraMount, history: StateHistory) -> float:
+    """Angle between a map's down and the autopilot's, of the pose that agrees best.
+
+    Raises:
+        HistoryError: as `position_from_map`.
+    """
+    mount = mount_at(mount, history, captured_ns)
+    down_optical = mount.ned_from_optical(history.at(captured_ns).ned_from_body)[2]
+    return min(_tilt_rad(pose, down_optical) for pose in board.poses)
 
 
 def _tilt_rad(pose: MarkerPose, down_optical: NDArray[np.float64]) -> float:

@@ -111,6 +111,64 @@ def test_unrelated_images_are_judged_by_themselves(tmp_path: Path) -> None:
         assert marker["resolved"] is True
 
 
+def test_print_setting_turns_the_heading_by_180_degrees(folder: Path) -> None:
+    headings = []
+    for printed in ("opencv", "apriltag"):
+        words = ["markers", "detect", str(folder), *PRINTED, *LENS, "--json", "--limit", "1"]
+        done = CliRunner().invoke(app, [*words, "--markers-print", printed])
+        (marker,) = json.loads(done.stdout)["markers"]
+        headings.append(marker["heading_rad"])
+    assert headings == pytest.approx([0.4, 0.4 - math.pi], abs=0.02)
+
+
+def test_sheets_are_written_to_a_pdf_file(tmp_path: Path) -> None:
+    output = tmp_path / "sheets.pdf"
+    words = [
+        "markers",
+        "print",
+        "0..3,7",
+        "--dictionary",
+        "APRILTAG_36h11",
+        "--size",
+        "0.16",
+        "-o",
+        str(output),
+    ]
+    done = CliRunner().invoke(app, words)
+    assert (done.exit_code, done.stdout) == (0, f"written: {output}, 5 markers\n")
+    sheets = output.read_bytes()
+    assert sheets.startswith(b"%PDF-1.4\n")
+    for identifier in (0, 1, 2, 3, 7):
+        assert b"APRILTAG_36h11 id %d 160 mm print opencv" % identifier in sheets
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["0", "--size", "0.1"], ["--dictionary"]),
+        (["0..50", "--dictionary", "4X4_50"], ["0..50", "from 0 to 49"]),
+        (["0..99999999999", "--dictionary", "4X4_50"], ["from 0 to 49"]),
+        (["1,1", "--dictionary", "4X4_50", "--size", "0.1"], ["1 is given twice"]),
+        (["x", "--dictionary", "4X4_50", "--size", "0.1"], ["'x'"]),
+        (["0", "--dictionary", "4X4_50", "--size", "2"], ["2000 mm", "needs a paper"]),
+        (["0", "--dictionary", "4X4_50", "--size", "nan"], ["nan"]),
+        (["0", "--dictionary", "4X4_50", "--paper", "A7"], ["'A7'", "WIDTHxHEIGHT"]),
+        (["0", "--dictionary", "4X4_50", "--markers-print", "apriltag"], ["4X4_50", "'opencv'"]),
+        (["0", "--dictionary", "4X4_50", "-o", "none/a.pdf"], ["none/a.pdf", "no such folder"]),
+    ],
+)
+def test_sheets_that_cannot_be_are_one_line(
+    arguments: list[str], words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = CliRunner().invoke(app, ["markers", "print", *arguments])
+    assert (done.exit_code, done.stdout) == (2, "")
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("companion: ")
+    assert all(word in line for word in words), line
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
