@@ -16,20 +16,23 @@ class Release:
             own answer (since v1.16; PX4's commit 01abe35563).
         has_parameter_errors: an invalid parameter request is answered by PARAM_ERROR (since v1.17); before,
             it is not answered.
+        joins_ftp_paths: MAVLink FTP takes a path without a leading "/" from its root (since v1.16); before,
+            in SITL, there is no such file. Its metadata is announced without one.
     """
 
     name: str
     software_version: int
     acknowledges_modes_twice: bool
     has_parameter_errors: bool
+    joins_ftp_paths: bool = True
 
 
 # FIRMWARE_VERSION_TYPE: 64 is an alpha, as was the v1.17 that was measured; 255 is a release.
 RELEASES = {
     release.name: release
     for release in (
-        Release("1.14", 0x010E00FF, False, False),
-        Release("1.15", 0x010F00FF, False, False),
+        Release("1.14", 0x010E00FF, False, False, joins_ftp_paths=False),
+        Release("1.15", 0x010F00FF, False, False, joins_ftp_paths=False),
         Release("1.16", 0x011000FF, True, False),
         Release("1.17", 0x01110040, True, True),
     )

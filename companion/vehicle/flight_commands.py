@@ -91,9 +91,8 @@ class FlightCommands:
             for report in state.reports
             if report.stamp_ns >= asked_ns and among_modes(state.mode, report.modes)
         ]
-        # PX4 reports at level info what prevents only some modes, such as a missing mission.
         failing = [report for report in reports if report.is_check]
-        return words_of(failing or [report for report in reports if report.is_mode_check])
+        return words_of(failing or [report for report in reports if report.is_listed_check])
 
     async def set_mode(self, mode: FlightMode, *, timeout_s: float = 3.0) -> None:
         """Request a mode, and return when the vehicle reports it."""

@@ -37,9 +37,13 @@ class Report:
         return self.level <= WARNING and (self.group in _CHECK_GROUPS or self.text.startswith(_CHECK_TEXTS))
 
     @property
-    def is_mode_check(self) -> bool:
-        """Whether it is a check, at any level, that only some modes require."""
-        return self.group in _CHECK_GROUPS and self.modes != ALL_MODES
+    def is_listed_check(self) -> bool:
+        """Whether it is one of PX4's failing checks, at any level.
+
+        At level info PX4 reports also what prevents arming in all modes: a missing mission (COM_ARM_MIS_REQ),
+        the safety button, an estimator that is not initialized (v1.14 to v1.18, by source).
+        """
+        return self.group in _CHECK_GROUPS
 
 
 def words_of(reports: Iterable[Report]) -> str:

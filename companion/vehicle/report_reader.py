@@ -61,8 +61,14 @@ _MODES_TYPE = "navigation_mode_group_t"
 _MAX_LEVEL = 7  # MAV_SEVERITY_DEBUG; above it are messages between machines
 FTP_ID = 110  # FILE_TRANSFER_PROTOCOL
 _TERMINATE, _RESET, _OPEN, _READ, _ACK = 1, 2, 4, 5, 128
-_END_OF_FILE = 6
-_ERRORS = {1: "failed", 2: "failed: errno", 4: "wrong session", 5: "no free session", 10: "no such file"}
+_END_OF_FILE, _NO_SUCH_FILE = 6, 10
+_ERRORS = {
+    1: "failed",
+    2: "failed: errno",
+    4: "wrong session",
+    5: "no free session",
+    _NO_SUCH_FILE: "no such file",
+}
 # target network, system, component; sequence, session, opcode, size, request opcode, burst, padding, offset
 _HEADER = struct.Struct("<3BHBBBBBBI")
 _DATA = 239
@@ -286,6 +292,10 @@ class FileReadError(OSError):
     """The file cannot be read. The message says which and why."""
 
 
+class NoSuchFileError(FileReadError):
+    """The autopilot has no file of this name."""
+
+
 class FileReader:
     """Reads one file at a time.
 
@@ -350,7 +360,8 @@ class FileReader:
         error = part[0] if part else 0
         if opcode in (_RESET, _TERMINATE) or (opcode == _READ and error == _END_OF_FILE):
             return answered, b""
-        raise FileReadError(f"{path}: {_ERRORS.get(error, f'MAVLink FTP error {error}')}")
+        kind = NoSuchFileError if error == _NO_SUCH_FILE else FileReadError
+        raise kind(f"{path}: {_ERRORS.get(error, f'MAVLink FTP error {error}')}")
 
 
 class ReportReader:
@@ -468,7 +479,10 @@ class ReportReader:
                 if _matches(crc, served, content):
                     return content
             logger.warning("%s: %s does not match its checksum: read again", self._url, cached)
-        served = await self._files.read(path[1])
+        try:
+            served = await self._files.read(path[1])
+        except NoSuchFileError:  # PX4 before v1.16, in SITL, appends the path to its root without a "/"
+            served = await self._files.read(f"/{path[1]}")
         content = await asyncio.to_thread(_unpacked, path[1], served)
         if not _matches(crc, served, content):
             logger.warning("%s: %s does not match its checksum: not cached", self._url, uri)

@@ -157,12 +157,16 @@ class Autopilot:
             and not self.terminated
             and (self.position_valid or not position_failsafe.needs_position(self.mode))
             and (self.armed or self.mode not in MODES_PREVENTING_ARMING)  # irrelevant once armed
-            and (self.mode is not Mode.MISSION or self.navigator.mission.valid)
+            and (self.navigator.mission.valid or not (self.requires_mission or self.mode is Mode.MISSION))
             and not self.navigator.is_breached
             and (self.mode is not Mode.OFFBOARD or self.has_setpoints)
             and (self.mode not in MANUAL_MODES or self.pilot_has_sticks)
             and self.supervision.allows_arming
         )
+
+    @property
+    def requires_mission(self) -> bool:
+        return self.supervision.requires_mission
 
     @property
     def system_status(self) -> SystemState:

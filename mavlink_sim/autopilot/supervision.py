@@ -78,6 +78,9 @@ class SupervisedAutopilot(Protocol):
     @property
     def lacks_ground_station(self) -> bool: ...
 
+    @property
+    def requires_mission(self) -> bool: ...
+
     def arm(self, by: str = ...) -> int: ...
 
     def disarm(self, force: bool = False, by: str = ...) -> int: ...
@@ -164,6 +167,11 @@ class Supervision:
     def lacks_ground_station(self) -> bool:
         """NAV_DLL_ACT requires a ground station, and none is connected."""
         return self._parameters.number("NAV_DLL_ACT") > 0 and self.conditions.ground_station_lost
+
+    @property
+    def requires_mission(self) -> bool:
+        """COM_ARM_MIS_REQ: nothing is armed without a mission."""
+        return self._parameters.number("COM_ARM_MIS_REQ") > 0
 
     @property
     def allows_arming(self) -> bool:
@@ -504,12 +512,13 @@ def failing_checks(autopilot: SupervisedAutopilot) -> list[tuple[str, int, tuple
     mission, sticks = autopilot.navigator.mission, autopilot.pilot_has_sticks
     breaches = autopilot.navigator.breaches
     unlinked = autopilot.lacks_ground_station
+    of_missions = None if autopilot.requires_mission else [Mode.MISSION]
     checks = (
         ("check_estimator_heading_not_stable", not autopilot.sensors_ready, _ERROR, None, _NO_COMPONENT),
         ("check_modes_local_pos", not autopilot.position_valid, _ERROR, with_position, _NO_COMPONENT),
         *((name, words in breaches, _ERROR, None, _SYSTEM) for name, words in GEOFENCE_CHECKS.items()),
         ("check_rc_dl_no_dllink", unlinked, _ERROR, None, _NO_COMPONENT),
-        ("check_modes_mission", not mission.valid, _INFO, [Mode.MISSION], _SYSTEM),
+        ("check_modes_mission", not mission.valid, _INFO, of_missions, _SYSTEM),
         ("check_modes_offboard_signal", not autopilot.has_setpoints, _ERROR, [Mode.OFFBOARD], _SYSTEM),
         ("check_modes_manual_control", not sticks, _ERROR, MANUAL_MODES, _MANUAL_CONTROL),
         ("check_modes_cannot_takeoff", in_wrong_mode, _ERROR, MODES_PREVENTING_ARMING, _SYSTEM),

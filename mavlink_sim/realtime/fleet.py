@@ -1,7 +1,7 @@
 """Many vehicles in one process: each with its own system id, ports, seed and start, on one clock.
 
 Ports and ids are as in PX4's SITL: instance i has system id 1 + i, sends to 14540 + i from 14580 + i, and to
-the one ground station at 14550 from 18570 + i.
+the one ground station at 14550 from 18570 + i. PX4's instances from 10 on all send to 14549; these do not.
 """
 
 from __future__ import annotations

@@ -34,10 +34,12 @@ class FileSystem:
 
     Args:
         capacity_bytes: limit of all written files together; more is ENOSPC.
+        joins_root: a path without a leading "/" is below the root; else there is no such file, as in PX4's
+            SITL before v1.16, which appends it to its root "." (".etc").
     """
 
-    def __init__(self, capacity_bytes: int = CAPACITY_BYTES) -> None:
-        self._capacity_bytes = capacity_bytes
+    def __init__(self, capacity_bytes: int = CAPACITY_BYTES, *, joins_root: bool = True) -> None:
+        self._capacity_bytes, self._joins_root = capacity_bytes, joins_root
         self._files: dict[Path, bytearray] = {}
         self._provided: dict[Path, Callable[[], bytes]] = {}
         self._directories: set[Path] = {()}
@@ -75,7 +77,7 @@ class FileSystem:
 
     def read(self, path: str) -> bytes | bytearray:
         """A file's content: the live buffer of a written one. ENOENT, EISDIR."""
-        parts = resolve(path)
+        parts = self._parts(path)
         if parts in self._files:
             return self._files[parts]
         if parts in self._provided:
@@ -128,7 +130,7 @@ class FileSystem:
         del self._files[parts]  # a session that has it open keeps it, as in POSIX
 
     def make_directory(self, path: str) -> None:
-        parts = resolve(path)
+        parts = self._parts(path)
         if parts in self._directories or parts in self._files or parts in self._provided:
             raise _error(errno.EEXIST, path)
         self._check_new(parts, path)
@@ -179,13 +181,19 @@ class FileSystem:
 
     # ---- within
 
+    def _parts(self, path: str) -> Path:
+        """The components of a path in a request. ENOENT if it is not below the root."""
+        if path and not path.startswith("/") and not self._joins_root:
+            raise _error(errno.ENOENT, path)
+        return resolve(path)
+
     def _entries(self) -> Iterator[Path]:
         yield from (parts for parts in self._directories if parts)
         yield from self._files
         yield from self._provided
 
     def _directory(self, path: str) -> Path:
-        parts = resolve(path)
+        parts = self._parts(path)
         if parts not in self._directories:
             known = parts in self._files or parts in self._provided
             raise _error(errno.ENOTDIR, path) if known else self._missing(parts, path)
@@ -194,7 +202,7 @@ class FileSystem:
     def _writable(self, path: str) -> Path:
         if self.is_protected(path):
             raise _error(errno.EROFS, path)
-        return resolve(path)
+        return self._parts(path)
 
     def _missing(self, parts: Path, path: str) -> OSError:
         """The error of a missing path: ENOTDIR if it leads through a file, else ENOENT."""

@@ -16,6 +16,7 @@ from typing import Any
 
 from mavlink_sim.autopilot.supervision import NAVIGATION_STATES
 from mavlink_sim.px4.parameters import INT32, Parameter, Parameters, default_parameters, is_volatile
+from mavlink_sim.releases import Release
 from mavlink_sim.services.context import ServiceContext
 from mavlink_sim.services.file_transfer import FileSystem, checksum
 from mavlink_sim.wire import announcements
@@ -245,15 +246,15 @@ EVENTS_TYPE = 4
 _BSON_DOUBLE, _BSON_INT32 = 0x01, 0x10
 
 
-def vehicle_files(parameters: Parameters) -> FileSystem:
+def vehicle_files(parameters: Parameters, release: Release) -> FileSystem:
     """The files of a new vehicle; parameter files are generated from the current values."""
-    files = FileSystem()
+    files = FileSystem(joins_root=release.joins_ftp_paths)
     files.provide("parameters.bson", partial(_customised, parameters))
     files.provide("parameters_backup.bson", partial(_customised, parameters))
     files.provide(GENERAL, partial(_compressed_from, general_metadata))
     files.provide(PARAMETERS, partial(_compressed_from, parameter_metadata))
     files.provide(EVENTS, partial(_compressed_from, event_metadata))
-    files.make_directory("log")
+    files.make_directory("/log")
     return files
 
 

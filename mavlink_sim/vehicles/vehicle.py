@@ -199,7 +199,7 @@ class Vehicle:
         self._air = None if air_seed is None else WindModel(air_seed, gusts_mps)
         self.estimate = FallibleEstimate(self.airframe, seed, noise)
         self.links: dict[str, Link] = {}
-        self.files = vehicle_files(self.parameters)
+        self.files = vehicle_files(self.parameters, self.release)
         self._signing_streams: SigningStreams = {}
         self.clock_ns: Callable[[], int] = self._simulated_clock_ns
         self.utc_ns: Callable[[], int] = self._simulated_utc_ns

@@ -300,6 +300,8 @@ def test_the_metadata_is_found_through_component_metadata(harness: SimHarness) -
     assert message.uri.startswith("mftp://")
 
     def content(uri: str) -> bytes:
+        # As in every release.
+        assert uri.startswith("mftp://etc/")
         return lzma.decompress(bytes(harness.vehicle.files.read(uri.removeprefix("mftp://"))))
 
     def crc(data: bytes) -> int:
@@ -316,6 +318,19 @@ def test_the_metadata_is_found_through_component_metadata(harness: SimHarness) -
 
 
 # ---- other clients
+
+
+@pytest.mark.parametrize(
+    ("release", "joins"), [("1.14", False), ("1.15", False), ("1.16", True), ("1.17", True)]
+)
+def test_path_without_a_slash_is_joined_since_v1_16(release: str, joins: bool) -> None:
+    client = Client(SimHarness(px4=release))
+    assert client.ack(Opcode.OPEN_FILE_RO, b"/etc/extras/all_events.json.xz")
+    client.ack(Opcode.RESET_SESSIONS)
+    if joins:
+        assert client.ack(Opcode.OPEN_FILE_RO, b"etc/extras/all_events.json.xz")
+    else:
+        assert client.nak(Opcode.OPEN_FILE_RO, b"etc/extras/all_events.json.xz") == (Failure.FILE_NOT_FOUND,)
 
 
 @pytest.fixture(scope="module")

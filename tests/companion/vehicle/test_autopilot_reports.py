@@ -11,6 +11,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from companion.vehicle.driver import CommandRefusedError, Driver
 from companion.vehicle.drivers import DriverKind, open_driver
+from mavlink_sim.releases import RELEASES
 from mavlink_sim.testing import running_simulator
 from tests.companion.vehicle.fake_autopilot import FakeAutopilot, wait_for_state
 
@@ -41,6 +42,25 @@ async def test_denied_arming_of_px4_has_its_reason(
             await driver.close()
     events = next((tmp_path / "companion" / "metadata").glob("events-*.json.xz"))
     assert json.loads(lzma.decompress(events.read_bytes()))["version"] == 2
+
+
+@pytest.mark.parametrize("release", RELEASES)
+async def test_check_of_level_info_is_the_reason_if_it_is_the_only_one(
+    release: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A missing mission, of all modes. Its text is in the metadata, whose path differs by release."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    parameters = {"COM_ARM_MIS_REQ": 1.0}
+    with running_simulator(px4=release, parameters=parameters, ready_after=0.0) as simulator:
+        driver = open_driver("pymavlink", f"udpin://127.0.0.1:{simulator.onboard_port}")
+        await driver.connect(20.0)
+        try:
+            await wait_for_state(driver, lambda state: state.home_position_ned_m is not None)
+            with pytest.raises(CommandRefusedError) as refused:
+                await driver.arm()
+        finally:
+            await driver.close()
+    assert str(refused.value).endswith("(temporarily rejected): No valid mission available")
 
 
 async def test_reasons_of_denied_arming_may_come_late(driver: Driver, autopilot: FakeAutopilot) -> None:

@@ -179,7 +179,11 @@ async def test_events_wait_for_the_metadata(
 
 
 class AutopilotWithMetadata(Autopilot):
-    """Has the text of one event. Its checksum is that of the file as served, as PX4's."""
+    """Has the text of one event. Its checksum is that of the file as served, as PX4's.
+
+    Args:
+        root: before the path that a client has to ask for.
+    """
 
     def __init__(
         self,
@@ -187,13 +191,14 @@ class AutopilotWithMetadata(Autopilot):
         wrong_checksum: bool = False,
         general: bytes | None = None,
         changed: Mapping[str, bytes] | None = None,
+        root: str = "",
     ) -> None:
         named = {"5": {"name": "tested", "message": "Tested"}}
         group = {"namespace": "px4", "event_groups": {"default": {"events": named}}}
         events = lzma.compress(json.dumps({"version": 2, "components": {"1": group}}).encode())
         kind = {"type": 4, "uri": "mftp://events.xz", "fileCrc": checksum(events) ^ wrong_checksum}
         self._general = general or json.dumps({"version": 1, "metadataTypes": [kind]}).encode()
-        files = {"general.xz": lzma.compress(self._general), "events.xz": events}
+        files = {f"{root}general.xz": lzma.compress(self._general), f"{root}events.xz": events}
         super().__init__({**files, **(changed or {})})
 
     async def read_texts(self) -> tuple[list[str], int]:
@@ -217,6 +222,17 @@ def cached(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[], list
     """Returns the cached event metadata."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     return lambda: list(cache_folder().glob("events-*"))
+
+
+@pytest.mark.parametrize("root", ["", "/"])
+async def test_metadata_is_asked_for_with_and_without_a_slash(
+    root: str, cached: Callable[[], list[Path]], caplog: pytest.LogCaptureFixture
+) -> None:
+    """PX4 announces a path without one; before v1.16, in SITL, only one with it is found."""
+    autopilot = AutopilotWithMetadata(root=root)
+    assert (await autopilot.read_texts())[0] == ["Tested"]
+    assert caplog.messages == []
+    assert len(cached()) == 1
 
 
 @pytest.mark.parametrize("spoil", [lambda content: content[:40], lambda content: b"", lambda content: b"{}"])
