@@ -50,6 +50,7 @@ def link() -> Iterator[AutopilotLink]:
     opened = AutopilotLink(parse_link_url(os.environ[URL]))
     try:
         opened.until(lambda: opened.autopilot in NAMES, HEARTBEAT_S, f"heartbeat at {os.environ[URL]}")
+        opened.read_version()
         yield opened
         if opened.other_senders:
             addresses = sorted(opened.other_senders)

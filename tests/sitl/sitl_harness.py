@@ -36,6 +36,7 @@ OFFBOARD = {PX4: 6 << 16, ARDUPILOT: 4}
 HOLD = {PX4: 4 << 16 | 3 << 24, ARDUPILOT: 17}  # ArduPilot's BRAKE
 PARKED = {PX4: HOLD[PX4], ARDUPILOT: 0}  # disarmed: PX4 is never ready in LAND, ArduPilot boots in STABILIZE
 LAND = {PX4: 4 << 16 | 6 << 24, ARDUPILOT: 9}
+NAMED_BY = "CURRENT_MODE, by which a failsafe is told from a pilot's change of mode,"
 STANDING_MPS = 0.3
 SIGNING_EPOCH_S, SIGNING_MINUTE = 1_420_070_400, 6_000_000  # 2015-01-01, and units of 10 us from then on
 PREARM_CHECK = dialect.MAV_SYS_STATUS_PREARM_CHECK
@@ -76,6 +77,7 @@ class AutopilotLink:
         cut: nothing is passed on while it is true; what the autopilot sends is still recorded.
         uplink_deaf: what the service sends is not passed on while it is true; it is still recorded.
         autopilot, system_id: MAV_AUTOPILOT of its first heartbeat, and who sent it; None and 0 before.
+        version: major and minor of its AUTOPILOT_VERSION; (0, 0) before.
         modes: (time_s, custom_mode) of every change.
         poses, setpoints_s: everything since the start; when each setpoint of the service came.
         commands: time and number of each COMMAND_LONG of the service.
@@ -95,6 +97,7 @@ class AutopilotLink:
         self.cut = self.uplink_deaf = False
         self.autopilot: int | None = None
         self.system_id = 0
+        self.version = (0, 0)
         self.modes: list[tuple[float, int]] = []
         self.poses: list[Pose] = []
         self.setpoints_s: list[float] = []
@@ -155,6 +158,20 @@ class AutopilotLink:
         """Record for so long."""
         with self._changed:
             self._changed.wait_for(lambda: False, seconds)
+
+    def read_version(self) -> None:
+        """Request AUTOPILOT_VERSION until it is received."""
+        until_s = time.monotonic() + READY_S
+        while self.version == (0, 0):
+            self.command(dialect.MAV_CMD_REQUEST_MESSAGE, dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
+            self.after(_ANSWER_S / 3)
+            if time.monotonic() > until_s:
+                raise TimeoutError(f"no AUTOPILOT_VERSION within {READY_S:g} s")
+
+    @property
+    def name(self) -> str:
+        """Of the autopilot, with its version."""
+        return f"{NAMES[self.autopilot or 0]} {self.version[0]}.{self.version[1]}"
 
     @property
     def connected(self) -> bool:
@@ -359,6 +376,8 @@ class AutopilotLink:
                 self.autopilot, self.system_id = message.autopilot, message.get_srcSystem()
                 self.armed = bool(message.base_mode & _ARMED)
                 self._note_mode(message.custom_mode, now_s)
+            case "AUTOPILOT_VERSION":
+                self.version = (message.flight_sw_version >> 24, message.flight_sw_version >> 16 & 0xFF)
             case "CURRENT_MODE":
                 self._note_mode(message.custom_mode, now_s)
             case "SYS_STATUS":
@@ -447,7 +466,7 @@ class Flight:
 
     def note(self, name: str, **figures: float | None) -> None:
         """Keep measured figures for the report."""
-        title = f"{NAMES[self.link.autopilot or 0]}, {self.driver}"
+        title = f"{self.link.name}, {self.driver}"
         rounded = {key: None if value is None else round(value, 2) for key, value in figures.items()}
         FIGURES.setdefault(title, {})[name] = rounded
 
@@ -500,6 +519,12 @@ def set_for_test(link: AutopilotLink, values: dict[str, float]) -> dict[str, flo
             link.set_parameter(name, value)
         raise
     return before
+
+
+def needs_px4(link: AutopilotLink, version: tuple[int, int], what: str) -> None:
+    """Skip for an older PX4, which does not have that; another autopilot is not judged."""
+    if link.autopilot == PX4 and link.version < version:
+        pytest.skip(f"{link.name}: {what} since PX4 {version[0]}.{version[1]}")
 
 
 def command_or_skip(link: AutopilotLink, number: int, *parameters: float) -> None:

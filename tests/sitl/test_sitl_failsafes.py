@@ -16,11 +16,13 @@ from tests.sitl.sitl_harness import (
     ARDUPILOT,
     GROUNDED_S,
     HOLD,
+    NAMED_BY,
     PILOT,
     PX4,
     AutopilotLink,
     Flight,
     bring_down,
+    needs_px4,
     orbiting,
     repeated,
     set_for_test,
@@ -55,6 +57,7 @@ def test_a_critical_battery_is_named(flight: Flight, parameters: dict[str, float
     link = flight.link
     if link.autopilot != PX4:
         pytest.skip("the simulated battery is PX4's")
+    needs_px4(link, (1, 15), NAMED_BY)
     orbiting(flight)
     named, since_s = flight.said("autopilot failsafe"), time.monotonic()
     values = {"COM_LOW_BAT_ACT": 3.0, "SIM_BAT_MIN_PCT": 6.0, "SIM_BAT_DRAIN": 10.0}
@@ -70,6 +73,7 @@ def test_lost_sticks_are_named(flight: Flight, parameters: dict[str, float]) -> 
     link = flight.link
     if link.autopilot != PX4:
         pytest.skip("Copter in GUIDED needs no sticks")
+    needs_px4(link, (1, 15), NAMED_BY)
     with repeated(1.0 / JOYSTICK_HZ, centred_sticks(link)):
         parameters |= set_for_test(link, {"COM_RC_IN_MODE": 1.0, "COM_RCL_EXCEPT": 0.0, "NAV_RCL_ACT": 1.0})
         link.after(2.0)
@@ -89,6 +93,7 @@ def test_a_return_at_the_geofence_is_named(flight: Flight, parameters: dict[str,
     link = flight.link
     if link.autopilot != PX4:
         pytest.skip("GF_ACTION is PX4's")
+    needs_px4(link, (1, 15), NAMED_BY)
     flight.take_off(5.0)
     flight.fly("hold")
     parameters |= set_for_test(link, {"GF_MAX_HOR_DIST": 15.0, "GF_ACTION": 3.0})

@@ -11,7 +11,7 @@ from companion.vehicle.link_url import parse_link_url
 from mavlink_sim.testing import free_port
 from mavlink_sim.wire.messages import dialect
 from tests.sitl import sitl_harness
-from tests.sitl.sitl_harness import HOLD, PX4, AutopilotLink
+from tests.sitl.sitl_harness import ARDUPILOT, HOLD, PX4, AutopilotLink, needs_px4
 
 pytestmark = pytest.mark.realtime
 TAKEOFF = 4 << 16 | 2 << 24
@@ -30,6 +30,13 @@ def heartbeat(custom_mode: int) -> bytes:
     return bytes(message.pack(dialect.MAVLink(None, 1, 1)))
 
 
+def version(number: int) -> bytes:
+    """AUTOPILOT_VERSION of a PX4."""
+    zeros = [0] * 8
+    message = dialect.MAVLink_autopilot_version_message(0, number, 0, 0, 0, zeros, zeros, zeros, 0, 0, 0)
+    return bytes(message.pack(dialect.MAVLink(None, 1, 1)))
+
+
 class Sender:
     """Sends heartbeats from an address of its own."""
 
@@ -40,6 +47,9 @@ class Sender:
 
     def heartbeat(self, custom_mode: int) -> None:
         self._socket.send(heartbeat(custom_mode))
+
+    def version(self, number: int) -> None:
+        self._socket.send(version(number))
 
     def receive(self) -> bytes:
         """The next datagram from the link."""
@@ -122,3 +132,19 @@ def test_a_deaf_uplink_passes_on_telemetry_alone(link: AutopilotLink, senders: t
         link.uplink_deaf = False
         service.sendto(b"received", near)
         assert autopilot.receive() == b"received"
+
+
+def test_a_test_is_skipped_for_an_older_px4_with_the_reason(
+    link: AutopilotLink, senders: tuple[Sender, Sender]
+) -> None:
+    sender, _ = senders
+    sender.heartbeat(HOLD[PX4])
+    link.until(lambda: link.autopilot == PX4, 5.0, "heard")
+    sender.version(0x010E04FF)
+    link.read_version()
+    assert (link.version, link.name) == ((1, 14), "PX4 1.14")
+    needs_px4(link, (1, 14), "nothing")
+    with pytest.raises(pytest.skip.Exception, match=r"PX4 1\.14: signing since PX4 1\.17"):
+        needs_px4(link, (1, 17), "signing")
+    link.autopilot = ARDUPILOT
+    needs_px4(link, (1, 17), "signing")

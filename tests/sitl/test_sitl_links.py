@@ -28,6 +28,7 @@ from tests.sitl.sitl_harness import (
     AutopilotLink,
     Flight,
     bring_down,
+    needs_px4,
     set_for_test,
     signing_time,
 )
@@ -63,6 +64,7 @@ def signing(flight: Flight, parameters: dict[str, float]) -> Iterator[AutopilotL
     """The autopilot signs what it sends, and takes nothing unsigned."""
     link = flight.link
     if link.autopilot == PX4:
+        needs_px4(link, (1, 17), "signing (MAV_SIGN_CFG, and a folder for its key)")
         # It takes SETUP_SIGNING over USB alone, and reads its key when it starts.
         if RESTART not in os.environ:
             pytest.skip(f"{RESTART} names no command")
