@@ -10,6 +10,7 @@ from typing import Any, Protocol
 from companion.guidance.interface import (
     Answer,
     Arm,
+    Disarm,
     FindGimbal,
     PointGimbal,
     ReleaseGimbal,
@@ -177,6 +178,11 @@ class SimulatedDriver:
                 failure = "the vehicle refused to arm"
                 self._command(
                     request, failure, lambda: self._state.armed, mav.MAV_CMD_COMPONENT_ARM_DISARM, 1.0
+                )
+            case Disarm():
+                failure = "the vehicle refused to disarm"
+                self._command(
+                    request, failure, lambda: not self._state.armed, mav.MAV_CMD_COMPONENT_ARM_DISARM, 0.0
                 )
             case TakeOff(altitude_m):
                 if self._profile.takeoff_needs_home:

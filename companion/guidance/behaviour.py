@@ -38,6 +38,11 @@ class Requirement(StrEnum):
     STEERING_MARKER = "steering_marker"  # marker detection with the steering camera
     GIMBAL = "gimbal"  # a gimbal manager that responds
     NEIGHBOURS = "neighbours"  # fresh poses of other vehicles
+    HOME = "home"  # home's altitude, if the autopilot's take-off needs it
+
+
+# Requirements that change in the course of a mission: checked when their step begins.
+OF_THE_MOMENT = frozenset({Requirement.IN_AIR, Requirement.ON_GROUND})
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,11 +251,16 @@ class Behaviour(ABC):
     neighbour_names: tuple[str, ...] = ()
     # Pitches that the gimbal must reach, radians above the horizon, if it requires GIMBAL.
     gimbal_pitches_rad: tuple[float, ...] = ()
+    # Behaviours that it begins later. What they need is checked before it begins, except `OF_THE_MOMENT`.
+    later: Sequence[Behaviour] = ()
     # Replaced, never extended: a subclass need not call an `__init__`.
     _new_notes: Sequence[str] = ()
 
     def goals(self, context: BehaviourContext) -> tuple[Vector3, ...]:
-        """Points it would fly to if it began now, local NED metres, as far as they are known."""
+        """Points it would fly to if it began now, local NED metres, as far as they are known.
+
+        For one of `later` the horizontal position is NaN, and a point with a NaN is not checked.
+        """
         return ()
 
     def blocked_by(self, active: Behaviour, context: BehaviourContext) -> str | None:

@@ -236,7 +236,7 @@ class BehaviourRunner:
         if self._modes.phase is Phase.REQUESTING:
             self._modes.drop_request()
         if not self._setpoints.streaming or handed_over:
-            self._modes.release()
+            self._modes.release(context.state)
             return
         hold = HoldBehaviour()
         self._begin(hold, None, busy=False)
@@ -298,7 +298,7 @@ class BehaviourRunner:
             self._modes.resume(context.state.mode)
             self._begin(HoldBehaviour(), None, busy=False)
         else:
-            self._modes.release()
+            self._modes.release(context.state)
 
     def _lose(self, why: str) -> None:
         """Command was lost: stop streaming and end the behaviour."""

@@ -1,4 +1,6 @@
-"""Queue of commands: one that needs a gimbal waits until the gimbal manager has responded.
+"""Queue of commands: one that needs a gimbal or home waits until that is known.
+
+The gimbal manager is asked; PX4 sends home every two seconds.
 
 A waiting command is superseded by another command, any change of mode or arming, a loss of command, a low
 battery, or the end of the service.
@@ -13,15 +15,18 @@ from companion.guidance.gimbal.controller import ENDING, FIND_TIMEOUT_S, GimbalC
 from companion.guidance.interface import CommandInput, OutputCollector
 from companion.vehicle.state import VehicleState
 
+_GIMBAL = "the gimbal"
+
 
 @dataclass(frozen=True, slots=True)
 class _Waiting:
     command: CommandInput
     until_ns: float
+    awaited: str
 
 
 class CommandQueue:
-    """Holds commands until the gimbal that they need is known; a newer command supersedes them.
+    """Holds commands until what they need is known; a newer command supersedes them.
 
     Args:
         gimbal: carries out commands that only point the gimbal.
@@ -50,13 +55,12 @@ class CommandQueue:
             reason = f"gimbal: in use by {gimbal_user}; end that behaviour first"
             out.result(command.identifier, Outcome(False, reason))
             return
-        behaviour = command.behaviour
-        needs_gimbal = behaviour is None or Requirement.GIMBAL in behaviour.requirements
-        if needs_gimbal and not is_known(state.gimbal, now_ns):
-            self._waiting.append(_Waiting(command, now_ns + FIND_TIMEOUT_S * 1e9))
-            self._gimbal.find(out)
-        else:
+        if not (awaited := _awaited(command, state, now_ns)):
             self._due.append(command)
+            return
+        self._waiting.append(_Waiting(command, now_ns + FIND_TIMEOUT_S * 1e9, awaited))
+        if awaited == _GIMBAL:
+            self._gimbal.find(out)
 
     def watch(self, mode_changes: int, state: VehicleState, out: OutputCollector) -> None:
         """Supersede waiting commands after a change of mode or arming."""
@@ -71,7 +75,7 @@ class CommandQueue:
             if waiting.command.behaviour is None:  # gimbal only
                 left.append(waiting)
             else:
-                reason = f"superseded by {by} while waiting for the gimbal"
+                reason = f"superseded by {by} while waiting for {waiting.awaited}"
                 out.result(waiting.command.identifier, Outcome(False, reason))
         self._waiting = left
 
@@ -85,14 +89,31 @@ class CommandQueue:
     def take_due(self, context: BehaviourContext, out: OutputCollector) -> list[CommandInput]:
         """Remove and return the behaviours to begin now, in order. Gimbal commands go to the gimbal."""
         now_ns = context.now_ns
-        known = is_known(context.state.gimbal, now_ns)
-        done = [w for w in self._waiting if known or now_ns > w.until_ns or self._gimbal.not_found]
-        self._waiting = [w for w in self._waiting if w not in done]
-        due, self._due = [*(w.command for w in done), *self._due], []
+        due, left = list[CommandInput](), list[_Waiting]()
+        for waiting in self._waiting:
+            awaited = _awaited(waiting.command, context.state, now_ns)
+            found = not awaited or (awaited == _GIMBAL and self._gimbal.not_found)
+            if found or now_ns > waiting.until_ns:
+                due.append(waiting.command)
+            else:
+                left.append(waiting)
+        self._waiting = left
+        due, self._due = [*due, *self._due], []
         for command in due:
             if command.aim is not None:
                 self._gimbal.point(command.identifier, command.aim, context, out)
         return [command for command in due if command.behaviour is not None]
+
+
+def _awaited(command: CommandInput, state: VehicleState, now_ns: int) -> str:
+    """What the command waits for, in words; empty: nothing."""
+    behaviour = command.behaviour
+    needed = {Requirement.GIMBAL} if behaviour is None else set(behaviour.requirements)
+    for later in () if behaviour is None else behaviour.later:
+        needed |= later.requirements
+    if Requirement.GIMBAL in needed and not is_known(state.gimbal, now_ns):
+        return _GIMBAL
+    return "home" if Requirement.HOME in needed and state.home_fault() is not None else ""
 
 
 def _change(state: VehicleState) -> str:

@@ -12,7 +12,8 @@ once and nothing is streamed until the operator's next command, even if OFFBOARD
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 from companion.guidance.behaviour import Behaviour, BehaviourContext, Outcome
 from companion.guidance.behaviour_runner import BehaviourRunner
@@ -206,8 +207,13 @@ class Guidance:
         )
         if missing is not None or context is None:
             return missing
-        why = self._setpoints.check_goals(behaviour.goals(context), context.state)
-        return None if why is None else f"{behaviour.name} would leave the limits: {why}"
+        home = context.state.home_position_ned_m or (0.0, 0.0, 0.0)
+        _, _, down = context.state.position_ned_m or home
+        elsewhere = replace(context, state=replace(context.state, position_ned_m=(math.nan, math.nan, down)))
+        for each, begun in ((behaviour, context), *((later, elsewhere) for later in behaviour.later)):
+            if (why := self._setpoints.check_goals(each.goals(begun), context.state)) is not None:
+                return f"{each.name} would leave the limits: {why}"
+        return None
 
     def _observe(self, now_ns: int, inputs: GuidanceInput) -> BehaviourContext:
         """The input of behaviours, without targets that are too old or whose camera direction is unknown."""

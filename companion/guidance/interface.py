@@ -35,6 +35,11 @@ class Arm:
 
 
 @dataclass(frozen=True, slots=True)
+class Disarm:
+    """Disarm, never forced in the air; done when the vehicle shows it."""
+
+
+@dataclass(frozen=True, slots=True)
 class TakeOff:
     """The autopilot's own take-off to a height above home, metres; done when it is accepted."""
 
@@ -63,7 +68,7 @@ class ReleaseGimbal:
     """Release primary control of the gimbal."""
 
 
-Action = SetMode | Arm | TakeOff | FindGimbal | TakeGimbal | PointGimbal | ReleaseGimbal
+Action = SetMode | Arm | Disarm | TakeOff | FindGimbal | TakeGimbal | PointGimbal | ReleaseGimbal
 
 
 @dataclass(frozen=True, slots=True)

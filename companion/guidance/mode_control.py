@@ -6,9 +6,9 @@ from enum import StrEnum
 
 from companion.guidance.authority import Authority, silence
 from companion.guidance.behaviour import BehaviourContext, ModeRequest
-from companion.guidance.interface import Answer, Arm, GuidanceInput, OutputCollector, SetMode, TakeOff
+from companion.guidance.interface import Answer, Arm, Disarm, GuidanceInput, OutputCollector, SetMode, TakeOff
 from companion.guidance.setpoint_output import SetpointOutput
-from companion.vehicle.state import FlightMode, VehicleState
+from companion.vehicle.state import FlightMode, LandedState, VehicleState
 from companion.vehicle.streamer import StreamState
 
 # PX4 accepts OFFBOARD after one setpoint; two more cost 60 ms and tolerate a lost packet.
@@ -55,6 +55,8 @@ class ModeControl:
         self._engaging_since_ns = 0
         self._sent_before_engaging = 0
         self._yielded: tuple[int, str] | None = None
+        self._armed_on_ground = False  # by us, and it has not taken off since
+        self._disarm: int | None = None
 
     @property
     def yielded(self) -> str | None:
@@ -63,6 +65,9 @@ class ModeControl:
 
     def prepare(self, state: VehicleState) -> None:
         """A command begins: take command of the vehicle, or drop the autopilot mode of the one before."""
+        if self._disarm is not None:
+            self._out.cancel(self._disarm)
+            self._disarm = None
         if self.phase is Phase.IDLE:
             self._authority.acquire(state)
             self.phase = Phase.READY
@@ -75,6 +80,7 @@ class ModeControl:
         self, context: BehaviourContext, inputs: GuidanceInput, paused_s: float, *, landing: bool
     ) -> str | None:
         """Why command was lost; None while in command. Call it once per step. `paused_s`: since the last."""
+        self._armed_on_ground &= context.state.landed is LandedState.ON_GROUND
         stream = inputs.stream.state
         interrupted = silence(stream, context.state, paused_s) if self._setpoints.streaming else None
         active = stream is StreamState.FRESH and self.phase is Phase.OFFBOARD
@@ -137,6 +143,7 @@ class ModeControl:
             action = self._sequence.next(context.now_ns, context.state)
             if action is not None:
                 self.request = self._out.request(action)
+                self._armed_on_ground |= isinstance(action, Arm)
 
     def take_answer(self, answer: Answer, now_ns: int) -> str | None:
         """Handle the answer to the pending request. Returns why it failed; None: it did not."""
@@ -181,8 +188,16 @@ class ModeControl:
         if self.phase in (Phase.REQUESTING, Phase.DELEGATED):
             self.phase = Phase.READY
 
-    def release(self) -> None:
-        """Give up command."""
+    def release(self, ended_in: VehicleState | None = None) -> None:
+        """Give up command.
+
+        Args:
+            ended_in: the state in which the behaviour ended by itself: a vehicle that was armed by us and is
+                still on the ground is disarmed. None: someone else is in command.
+        """
+        if ended_in is not None and self._armed_on_ground and ended_in.armed:
+            self._disarm = self._out.request(Disarm())
+        self._armed_on_ground = False
         self._yielded = None
         self.drop_request()
         self._setpoints.stop()

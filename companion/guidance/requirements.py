@@ -1,10 +1,14 @@
-"""Check of a behaviour's requirements before it begins; the reply names what is missing."""
+"""Check of a behaviour's requirements before it begins; the reply names what is missing.
+
+A mission, and whatever else begins others (`Behaviour.later`), begins only if nothing is missing for any of
+them, as far as that is known now: nothing is armed for a step that cannot be flown.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from companion.guidance.behaviour import Behaviour, BehaviourContext, Requirement
+from companion.guidance.behaviour import OF_THE_MOMENT, Behaviour, BehaviourContext, Requirement
 from companion.guidance.formation.neighbours import missing_neighbours
 from companion.guidance.gimbal.controller import missing_gimbal
 from companion.guidance.limits.battery import NO_MINIMUM, BatteryMinimum
@@ -37,13 +41,34 @@ def check_requirements(
     """
     if context is None:
         return "vehicle state not received yet"
-    state, now_ns = context.state, context.now_ns
-    if not state.connected(now_ns):
+    if not context.state.connected(context.now_ns):
         return "no link to the autopilot"
-    if (why := state.not_flown) is not None:
+    if (why := context.state.not_flown) is not None:
         return why
+    rules = (class_names, battery, obstacles)
+    if missing := _missing(behaviour, behaviour.requirements, context, *rules):
+        return f"{behaviour.name} needs {' and '.join(missing)}"
+    for later in behaviour.later:
+        if missing := _missing(later, later.requirements - OF_THE_MOMENT, context, *rules):
+            return f"{behaviour.name}: {later.name} needs {' and '.join(missing)}"
+    if behaviour.track_id is not None:
+        why = context.tracks.missing(behaviour.track_id, context.now_ns)
+        return None if why is None else f"{behaviour.name}: {why}"
+    return None
+
+
+def _missing(
+    behaviour: Behaviour,
+    requirements: frozenset[Requirement],
+    context: BehaviourContext,
+    class_names: Sequence[str] | None,
+    battery: BatteryMinimum,
+    obstacles: ObstacleRules,
+) -> list[str]:
+    """What is missing for a behaviour, in words."""
+    state, now_ns = context.state, context.now_ns
     missing = []
-    for requirement in sorted(behaviour.requirements):
+    for requirement in sorted(requirements):
         match requirement:
             case Requirement.POSITION if (fault := state.position_fault(now_ns)) is not None:
                 missing.append(f"position ({fault})")
@@ -51,13 +76,15 @@ def check_requirements(
                 missing.append(f"to be in the air ({_where(context)})")
             case Requirement.ON_GROUND if state.landed is not LandedState.ON_GROUND:
                 missing.append(f"to be on the ground ({_where(context)})")
+            case Requirement.HOME if (fault := state.home_fault()) is not None:
+                missing.append(f"home ({fault})")
             case Requirement.PERCEPTION if not _perceiving(context):
                 missing.append(f"perception ({_perception_age(context)})")
             case Requirement.PERCEPTION if context.gimbal.direction_fault:
                 missing.append(f"the camera's direction ({context.gimbal.direction_fault})")
             case Requirement.GIMBAL:
                 missing += missing_gimbal(state, now_ns, context.gimbal, behaviour.gimbal_pitches_rad)
-                seeing = {Requirement.PERCEPTION, Requirement.STEERING_MARKER} & behaviour.requirements
+                seeing = {Requirement.PERCEPTION, Requirement.STEERING_MARKER} & requirements
                 if seeing and not context.gimbal.carries_camera:
                     missing.append("the camera on the gimbal (camera.on_gimbal is not set)")
             case Requirement.DEPTH_OR_SIZE:
@@ -81,12 +108,7 @@ def check_requirements(
         unknown = [name for name in behaviour.class_names if name not in class_names]
         if unknown:
             missing.append(f"a detector that knows {', '.join(unknown)}")
-    if missing:
-        return f"{behaviour.name} needs {' and '.join(missing)}"
-    if behaviour.track_id is not None:
-        why = context.tracks.missing(behaviour.track_id, now_ns)
-        return None if why is None else f"{behaviour.name}: {why}"
-    return None
+    return missing
 
 
 def _class_names(behaviour: Behaviour, context: BehaviourContext) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -111,8 +112,8 @@ class SetpointOutput:
         )
 
     def check_goals(self, goals: Sequence[Vector3], state: VehicleState) -> str | None:
-        """Why a goal is outside the limits, in words; None: none is."""
-        found = (self._envelope.check_goal(goal, state) for goal in goals)
+        """Why a goal is outside the limits, in words; None: none is. One with a NaN is not checked."""
+        found = (self._envelope.check_goal(goal, state) for goal in goals if all(map(math.isfinite, goal)))
         return next((why for why in found if why is not None), None)
 
     def take_path_request(self) -> PathRequest | None:

@@ -10,6 +10,7 @@ from companion.guidance.interface import (
     Action,
     Answer,
     Arm,
+    Disarm,
     FindGimbal,
     GuidanceOutput,
     PointGimbal,
@@ -121,6 +122,8 @@ class RequestRunner:
                 await self._driver.set_mode(mode)
             case Arm():
                 await self._driver.arm()
+            case Disarm():
+                await self._driver.disarm()
             case TakeOff(altitude_m):
                 await self._driver.takeoff(altitude_m)
             case FindGimbal():

@@ -275,6 +275,15 @@ class VehicleState:
             return "the autopilot's estimator reports it as not valid"
         return None
 
+    def home_fault(self) -> str | None:
+        """Return why the height of a take-off is not known, as text; None if it is.
+
+        PX4 takes an altitude AMSL, so home's is needed. ArduPilot takes a height above the home that it sets.
+        """
+        if self.home_altitude_amsl_m is not None or self.autopilot == "ArduPilot":
+            return None
+        return "not received: wait for the position estimate, or set home or the EKF origin"
+
     def reset_words(self, before: VehicleState) -> str:
         """Return the reset of the estimate since another snapshot, as text."""
         north, east, down = (

@@ -55,7 +55,9 @@ class TakeoffBehaviour(Behaviour):
 
     @property
     def requirements(self) -> frozenset[Requirement]:  # type: ignore[override]
-        """The end of the climb is flown by setpoints and needs a fresh position."""
+        """A position and home before it arms; a fresh position again at the end, flown by setpoints."""
+        if self._until_ns == 0:
+            return frozenset({Requirement.ON_GROUND, Requirement.POSITION, Requirement.HOME})
         climbing = set() if self._top is None else {Requirement.POSITION}
         return frozenset({Requirement.ON_GROUND} | climbing)
 

@@ -12,9 +12,16 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome, Requirement
+from companion.guidance.behaviour import (
+    OF_THE_MOMENT,
+    Behaviour,
+    BehaviourContext,
+    BehaviourOutput,
+    Outcome,
+    Requirement,
+)
 from companion.vehicle.landing_target import LandingTarget
-from companion.vehicle.state import Vector3
+from companion.vehicle.state import LandedState, Vector3
 
 logger = logging.getLogger(__name__)
 
@@ -106,17 +113,18 @@ class SequenceBehaviour(Behaviour):
         self._failure = ""
         self._ended = False
         self._goal_ned_m: Vector3 | None = None
-        known = {name for step in plan.steps for name in step.make().class_names}
-        self.class_names = tuple(sorted(known))
+        self.later = tuple(step.make() for step in plan.steps)
+        self.class_names = tuple(sorted({name for step in self.later for name in step.class_names}))
 
     @property
     def requirements(self) -> frozenset[Requirement]:  # type: ignore[override]
-        """Of the current step; before the start, of the first one if its failure aborts the mission."""
+        """Of the current step, before the start of the first one; `later` has all steps."""
         if self._active is not None:
             return self._active.requirements
-        if self._first is None or self._plan.steps[0].on_failure != ABORT:
+        if self._first is None:
             return frozenset()
-        return self._first.requirements
+        branches = self._plan.steps[0].on_failure != ABORT
+        return self._first.requirements - (OF_THE_MOMENT if branches else frozenset())
 
     def blocked_by(self, active: Behaviour, context: BehaviourContext) -> str | None:
         """See Behaviour: as its first step."""
@@ -266,7 +274,7 @@ class SequenceBehaviour(Behaviour):
             return self._begin(follows, context)
         if follows == END:
             return Outcome(True, f"flown, {len(self.records)} steps", self._goal_ned_m)
-        if follows == ABORT:
+        if follows == ABORT or context.state.landed is LandedState.ON_GROUND:  # there is no way down
             return Outcome(False, reason)
         self._failure = reason
         self._active, self._activated, self._begun_ns = self._plan.way_down(follows), False, context.now_ns

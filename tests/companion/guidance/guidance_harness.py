@@ -18,6 +18,7 @@ from companion.guidance.interface import (
     Answer,
     Arm,
     CommandInput,
+    Disarm,
     EventKind,
     GuidanceEvent,
     GuidanceInput,
@@ -119,6 +120,7 @@ class ScriptedAutopilot:
         self.gimbal: ScriptedGimbal | None = None
         self.refuse: dict[FlightMode, str] = {}
         self.refuse_arming: str | None = None
+        self.refuse_takeoff: str | None = None
         self.linked = True
         self.failsafe = False
         self.position_alive = True
@@ -173,6 +175,12 @@ class ScriptedAutopilot:
                 self.requests.append("arm")
                 self.vehicle.armed = True
                 self._wait(request, lambda: self._shown[0])
+            case Disarm():
+                self.requests.append("disarm")
+                self.vehicle.armed = False
+                self._wait(request, lambda: not self._shown[0])
+            case TakeOff() if self.refuse_takeoff is not None:
+                self._answers.append(Answer(request.identifier, self.refuse_takeoff))
             case TakeOff(altitude_m):
                 self.requests.append(f"takeoff {altitude_m:g}")
                 self._takeoff_m = altitude_m

@@ -225,9 +225,10 @@ def test_visits_limit_ends_a_loop() -> None:
 
 def test_loop_of_steps_that_fail_at_once_ends() -> None:
     harness = GuidanceHarness(flying())
-    harness.perception_age_s = None
     behaviour = mission(harness, {"do": "hold 0.2"}, {"do": "seek car", "name": "look", "on_failure": "look"})
-    outcome = harness.outcome(begun(harness, behaviour))
+    pending = begun(harness, behaviour)
+    harness.perception_age_s = None
+    outcome = harness.outcome(pending)
     assert_failed(outcome, "loop of ", "at once", "perception")
 
 

@@ -1,0 +1,358 @@
+"""What a take-off or a mission needs later is checked before it arms; a failed take-off disarms again."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import pytest
+
+from companion.guidance.behaviour import OF_THE_MOMENT, Outcome, Requirement
+from companion.guidance.behaviours.stop import StopBehaviour
+from companion.guidance.behaviours.takeoff import BASE_TIMEOUT_S, TakeoffBehaviour
+from companion.guidance.command import COMMANDS, NO_CONTEXT
+from companion.guidance.core import GuidanceOptions
+from companion.guidance.formation.neighbours import Neighbour, Neighbourhood
+from companion.guidance.gimbal.controller import GimbalMounting
+from companion.guidance.grammar import parse
+from companion.guidance.interface import GuidanceInput
+from companion.guidance.limits.battery import BatteryMinimum
+from companion.guidance.limits.envelope import Limits
+from companion.guidance.limits.obstacles import ObstacleRules
+from companion.guidance.missions.mission_file import MissionError, plan_from
+from companion.guidance.missions.sequence import SequenceBehaviour
+from companion.guidance.targets.from_markers import NO_MARKERS, MarkerSight
+from companion.guidance.targets.ranging import RangeMeans
+from companion.vehicle.state import FlightMode, LandedState
+from tests.companion.guidance.guidance_harness import GuidanceHarness, Pending, ScriptedGimbal, parked
+from vision.obstacle_sectors import SECTORS, ObstacleSectors
+
+CLASSES = ("person", "car")
+LEADER = Neighbour("alpha", (5.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0, 0.0, age_s=0.1)
+MARKERS = MarkerSight((), 1, 0.1, fresh=True, missing="")
+OPTIONS = GuidanceOptions(
+    battery=BatteryMinimum(0.2),
+    obstacles=ObstacleRules("required"),
+    gimbal=GimbalMounting(carries_camera=True, carries_steering=True),
+)
+# One of each command that flies by setpoints, and with each of its needs. `policy` needs a file.
+STEPS = [
+    "hold 5",
+    "goto 6 0",
+    "orbit radius=5 laps=1",
+    "orbit car laps=1",
+    "follow-path points=0,0;5,5",
+    "figure-eight laps=1",
+    "velocity",
+    "seek car",
+    "seek car sweep=-60",
+    "seek car pattern=square radius=10",
+    "approach car",
+    "approach marker=7",
+    "approach car gimbal=track",
+    "follow car",
+    "follow marker=7",
+    "follow car gimbal=track",
+    "patrol points=0,0;5,5 classes=car laps=1",
+    "patrol points=0,0;5,5 classes=car laps=1 on_detection=approach",
+    "formation line alpha",
+    "land-on-marker 3",
+]
+NOT_FLOWN = {"takeoff", "land", "rtl", "stop", "mission", "select", "gimbal", "policy"}
+
+
+@dataclass
+class World:
+    """Everything that a behaviour may need; a fault takes one part away."""
+
+    harness: GuidanceHarness
+    changes: dict[str, Any]
+    home: bool = True
+
+    def inputs(self, inputs: GuidanceInput) -> GuidanceInput:
+        now_ns = inputs.state.heartbeat_ns
+        if not self.home:
+            inputs = replace(inputs, state=replace(inputs.state, home_altitude_amsl_m=None))
+        return replace(
+            inputs,
+            **{
+                "neighbourhood": Neighbourhood("own", (LEADER,)),
+                "markers": MARKERS,
+                "steering_markers": MARKERS,
+                "obstacles": ObstacleSectors(now_ns, (math.inf,) * SECTORS),
+            }
+            | self.changes,
+        )
+
+
+def world(options: GuidanceOptions = OPTIONS) -> World:
+    harness = GuidanceHarness(
+        parked(), class_names=CLASSES, options=options, inputs=lambda inputs: made.inputs(inputs)
+    )
+    harness.autopilot.gimbal = ScriptedGimbal()
+    made = World(harness, {})
+    harness.run(0.1)
+    return made
+
+
+def _without_position(made: World) -> None:
+    made.harness.autopilot.position_alive = False
+
+
+def _without_home(made: World) -> None:
+    made.home = False
+
+
+def _without_frames(made: World) -> None:
+    made.harness.perception_age_s = None
+
+
+def _without_gimbal(made: World) -> None:
+    made.harness.autopilot.gimbal = None
+
+
+def _change(name: str, value: object) -> Callable[[World], None]:
+    return lambda made: made.changes.update({name: value})
+
+
+FAULTS: dict[Requirement, Callable[[World], None]] = {
+    Requirement.POSITION: _without_position,
+    Requirement.PERCEPTION: _without_frames,
+    Requirement.BATTERY: lambda made: setattr(made.harness.autopilot, "battery_fraction", 0.1),
+    Requirement.DEPTH_OR_SIZE: _change("ranging", RangeMeans(depth=False, ground=False)),
+    Requirement.MARKER: _change("markers", NO_MARKERS),
+    Requirement.STEERING_MARKER: _change("steering_markers", NO_MARKERS),
+    Requirement.GIMBAL: _without_gimbal,
+    Requirement.NEIGHBOURS: _change("neighbourhood", Neighbourhood("own")),
+    Requirement.HOME: _without_home,
+}
+
+
+def mission(harness: GuidanceHarness, *steps: str, on_failure: str = "rtl") -> SequenceBehaviour:
+    text = "".join(
+        f'[[step]]\ndo = "{step}"\ntimeout_s = 60\non_failure = "{on_failure}"\n' for step in steps
+    )
+    return SequenceBehaviour(plan_from(text, "test.toml"), harness.guidance.check_requirements)
+
+
+def started(made: World, *steps: str, on_failure: str = "rtl") -> Pending:
+    harness = made.harness
+    pending = harness.command(mission(harness, *steps, on_failure=on_failure))
+    harness.run(6.0)  # longer than a command waits for a gimbal
+    return pending
+
+
+def test_every_command_is_in_the_table() -> None:
+    assert {step.split()[0] for step in STEPS} | NOT_FLOWN == set(COMMANDS)
+    assert set(FAULTS) | OF_THE_MOMENT == set(Requirement)
+
+
+@pytest.mark.parametrize("step", STEPS)
+def test_mission_with_all_it_needs_arms(step: str) -> None:
+    made = world()
+    assert not started(made, "takeoff 4", step).done()
+    assert "arm" in made.harness.autopilot.requests
+
+
+@pytest.mark.parametrize(
+    ("step", "missing"),
+    [
+        (step, requirement)
+        for step in STEPS
+        for requirement in sorted(parse(step).build(NO_CONTEXT).requirements - OF_THE_MOMENT)
+    ],
+)
+@pytest.mark.parametrize("on_failure", ["rtl", "continue", "abort"])
+def test_missing_part_refuses_a_mission_disarmed(step: str, missing: Requirement, on_failure: str) -> None:
+    made = world()
+    FAULTS[missing](made)
+    made.harness.run(1.0)  # the last position is too old by then
+    pending = started(made, "takeoff 4", step, on_failure=on_failure)
+    assert not pending.result().success
+    assert made.harness.autopilot.requests == []
+    assert not made.harness.vehicle.armed
+
+
+@pytest.mark.parametrize("step", STEPS)
+@pytest.mark.parametrize(
+    "fault",
+    [
+        _change("obstacles", None),
+        lambda made: setattr(made.harness.autopilot, "battery_fraction", 0.1),
+        lambda made: setattr(made.harness.autopilot, "battery_fraction", None),
+        _without_position,
+        _without_home,
+    ],
+)
+def test_needs_of_all_flights_refuse_a_mission_disarmed(step: str, fault: Callable[[World], None]) -> None:
+    made = world()
+    fault(made)
+    made.harness.run(1.0)
+    assert not started(made, "takeoff 4", step).result().success
+    assert made.harness.autopilot.requests == []
+
+
+@pytest.mark.parametrize(
+    "step", ["seek zebra", "approach zebra", "patrol points=0,0;5,5 classes=zebra laps=1"]
+)
+def test_unknown_class_refuses_a_mission_disarmed(step: str) -> None:
+    made = world()
+    assert not started(made, "takeoff 4", step).result().success
+    assert made.harness.autopilot.requests == []
+
+
+@pytest.mark.parametrize(
+    "step",
+    [
+        "goto 300 0",
+        "goto 5 0 altitude=70",
+        "follow-path points=0,0;0,400",
+        "patrol points=0,0;400,5 classes=car laps=1",
+    ],
+)
+def test_goal_beyond_the_limits_refuses_a_mission_disarmed(step: str) -> None:
+    made = world()
+    outcome = started(made, "takeoff 4", "hold 1", step).result()
+    assert "limits" in outcome.reason
+    assert made.harness.autopilot.requests == []
+
+
+def test_goal_from_the_later_position_is_not_refused() -> None:
+    made = world(replace(OPTIONS, limits=Limits(max_distance_m=20.0)))
+    # 24 m ahead of where the mission begins, but 14 m from home where the step begins.
+    made.harness.vehicle.position[0] = 0.0
+    steps = ("takeoff 4", "goto -10 0", "goto forward=24 right=0")
+    assert not started(made, *steps).done()
+    assert "arm" in made.harness.autopilot.requests
+
+
+def test_unknown_command_of_a_step_is_refused_when_read() -> None:
+    with pytest.raises(MissionError, match="step 2"):
+        mission(GuidanceHarness(parked()), "takeoff 4", "circle-of-a-plugin 5")
+
+
+@pytest.mark.parametrize(
+    ("fault", "word"),
+    [(_without_position, "position"), (_without_home, "home"), (_change("obstacles", None), "depth")],
+)
+def test_takeoff_is_refused_before_it_arms(fault: Callable[[World], None], word: str) -> None:
+    made = world()
+    fault(made)
+    made.harness.run(1.0)
+    outcome = made.harness.outcome(made.harness.command(TakeoffBehaviour(4.0)), 5.0)
+    assert word in outcome.reason
+    assert made.harness.autopilot.requests == []
+
+
+def test_takeoff_waits_for_the_first_report_of_home() -> None:
+    made = world()
+    _without_home(made)
+    pending = made.harness.command(TakeoffBehaviour(4.0))
+    made.harness.run(2.0)
+    assert made.harness.autopilot.requests == []
+    made.home = True
+    assert made.harness.outcome(pending).success
+
+
+def test_ardupilot_takes_off_without_a_known_home() -> None:
+    made = world()
+    state = made.harness.autopilot.state
+    made.changes["state"] = replace(state, home_altitude_amsl_m=None, autopilot="ArduPilot")
+    made.harness.run(0.1)
+    made.harness.command(TakeoffBehaviour(4.0))
+    assert "arm" in made.harness.autopilot.requests
+
+
+# --- a failed take-off --------------------------------------------------------------------------------------
+
+
+def refused_on_the_ground() -> GuidanceHarness:
+    harness = GuidanceHarness(parked())
+    harness.autopilot.refuse_takeoff = "no home"
+    harness.run(0.1)
+    return harness
+
+
+def test_refused_takeoff_disarms_what_it_armed() -> None:
+    harness = refused_on_the_ground()
+    outcome = harness.outcome(harness.command(TakeoffBehaviour(4.0)), 5.0)
+    assert outcome == Outcome(False, "no home")
+    harness.run(1.0)
+    assert harness.autopilot.requests == ["arm", "disarm"]
+    assert not harness.vehicle.armed
+
+
+@pytest.mark.parametrize("on_failure", ["abort", "continue", "rtl", "land"])
+def test_refused_takeoff_of_a_mission_disarms(on_failure: str) -> None:
+    harness = refused_on_the_ground()
+    harness.outcome(harness.command(mission(harness, "takeoff 4", "hold 1", on_failure=on_failure)), 5.0)
+    harness.run(1.0)
+    assert harness.autopilot.requests == ["arm", "disarm"]
+    assert not harness.vehicle.armed
+
+
+def test_takeoff_that_never_lifts_disarms() -> None:
+    harness = GuidanceHarness(parked())
+    harness.run(0.1)
+    pending = harness.command(TakeoffBehaviour(4.0))
+    for _ in range(round((BASE_TIMEOUT_S + 10.0) / 0.04)):
+        harness.vehicle.position[2], harness.vehicle.landed = 0.0, LandedState.ON_GROUND
+        harness.autopilot.step(0.04)
+        harness.vehicle.position[2], harness.vehicle.landed = 0.0, LandedState.ON_GROUND
+        harness.step()
+    assert not pending.result().success
+    assert harness.autopilot.requests[-1] == "disarm"
+
+
+def test_stop_before_the_takeoff_disarms() -> None:
+    harness = GuidanceHarness(parked(), lag_s=0.5)
+    harness.run(0.6)
+    harness.command(TakeoffBehaviour(4.0))
+    harness.until(lambda: harness.autopilot.state.armed, 2.0)
+    harness.autopilot.cancel(2)
+    harness.vehicle.mode = FlightMode.HOLD
+    harness.command(StopBehaviour())
+    harness.run(3.0)
+    assert harness.autopilot.requests[-1] == "disarm"
+
+
+def test_vehicle_that_was_armed_before_stays_armed() -> None:
+    harness = refused_on_the_ground()
+    harness.vehicle.armed = True
+    harness.run(0.1)
+    assert not harness.outcome(harness.command(TakeoffBehaviour(4.0)), 5.0).success
+    harness.run(1.0)
+    assert harness.autopilot.requests == []
+    assert harness.vehicle.armed
+
+
+def test_pilot_who_took_over_keeps_it_armed() -> None:
+    harness = GuidanceHarness(parked(), lag_s=0.2)
+    harness.run(0.3)
+    pending = harness.command(TakeoffBehaviour(4.0))
+    harness.until(lambda: harness.vehicle.armed, 2.0)
+    harness.autopilot.change_mode(FlightMode.POSITION)
+    harness.vehicle.landed = LandedState.ON_GROUND
+    assert not harness.outcome(pending, 5.0).success
+    harness.run(2.0)
+    assert "disarm" not in harness.autopilot.requests
+    assert harness.vehicle.armed
+
+
+def test_vehicle_in_the_air_is_not_disarmed() -> None:
+    harness = GuidanceHarness(parked())
+    harness.run(0.1)
+    harness.command(TakeoffBehaviour(4.0))
+    harness.until(lambda: harness.vehicle.landed is LandedState.TAKING_OFF)
+    harness.command(StopBehaviour())
+    harness.run(3.0)
+    assert "disarm" not in harness.autopilot.requests
+    assert harness.vehicle.armed
+
+
+def test_new_takeoff_cancels_the_pending_disarming() -> None:
+    harness = refused_on_the_ground()
+    harness.outcome(harness.command(TakeoffBehaviour(4.0)), 5.0)
+    request = harness.outputs[-1].requests[-1]
+    harness.command(TakeoffBehaviour(4.0))
+    assert request.identifier in harness.outputs[-1].cancelled
