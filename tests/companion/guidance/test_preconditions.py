@@ -73,16 +73,13 @@ class World:
         now_ns = inputs.state.heartbeat_ns
         if not self.home:
             inputs = replace(inputs, state=replace(inputs.state, home_altitude_amsl_m=None))
-        return replace(
-            inputs,
-            **{
-                "neighbourhood": Neighbourhood("own", (LEADER,)),
-                "markers": MARKERS,
-                "steering_markers": MARKERS,
-                "obstacles": ObstacleSectors(now_ns, (math.inf,) * SECTORS),
-            }
-            | self.changes,
-        )
+        parts: dict[str, Any] = {
+            "neighbourhood": Neighbourhood("own", (LEADER,)),
+            "markers": MARKERS,
+            "steering_markers": MARKERS,
+            "obstacles": ObstacleSectors(now_ns, (math.inf,) * SECTORS),
+        }
+        return replace(inputs, **parts | self.changes)
 
 
 def world(options: GuidanceOptions = OPTIONS) -> World:
