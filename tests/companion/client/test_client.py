@@ -19,6 +19,7 @@ import pytest
 
 from companion import connect
 from companion.bus import topics
+from companion.bus.listeners import Listener
 from companion.bus.session import Bus
 from companion.client import CommandFailedError, Drone, NoAnswerError, Stream
 from companion.client.commands import Commands, Reply
@@ -53,7 +54,7 @@ class Vehicle:
             on_event=lambda *_: None,
             on_command=self._execute,
             listeners=[
-                (topics.VELOCITY.key(name), lambda data, _ns: self.velocities.append(json.loads(data)))
+                Listener(topics.VELOCITY, lambda data, _ns: self.velocities.append(json.loads(data)), name)
             ],
         )
 
